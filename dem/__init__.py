@@ -1,0 +1,17 @@
+"""Mechanics of rigid grains with contact and friction, in non-smooth time stepping; no solver.
+
+The loop of a simulation, on any number of ranks:
+
+    world = World.from_scene(scene, comm)
+    while world.time < end:
+        contacts = find_contacts(world, delta)
+        system = ContactSystem(world, contacts, dt, recovery_speed)
+        impulse = solve(system)
+        advance(world, system.velocity(impulse), dt)
+        rebalance(world)
+
+Import from the modules: `dem.scene`, `dem.shapes`, `dem.motion` describe what there is; `dem.world`,
+`dem.bodies`, `dem.partition` and `dem.neighbourhood` hold it on the ranks; `dem.contact`, `dem.system`,
+`dem.stepper` and `dem.impulses` are the time step; `dem.scenes` has ready-made scenes. All quantities are in
+SI units.
+"""

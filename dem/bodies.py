@@ -1,0 +1,88 @@
+"""The table of rigid bodies: one row per body, one array per quantity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from dem import quaternion
+from dem.arrays import Bools, Floats, Ints
+
+#: Kinds of bodies (the column `shape`); a COMPOUND is a large body, its primitives are kept elsewhere.
+SPHERE, BOX, COMPOUND = 0, 1, 2
+
+
+@dataclass
+class Bodies:
+    """Rigid bodies as a struct of arrays; all vectors in the world frame, SI units.
+
+    Bodies whose motion is prescribed have infinite mass and moments, so that every inverse is exactly zero.
+    """
+
+    id: Ints  #: (n,) persistent number: grains first, then large bodies
+    position: Floats  #: (n, 3) centre of mass; of a body with prescribed motion its reference point [m]
+    quaternion: Floats  #: (n, 4) orientation (w, x, y, z)
+    velocity: Floats  #: (n, 6) linear [m/s] and angular [rad/s] velocity
+    mass: Floats  #: (n,) [kg]
+    inertia: Floats  #: (n, 3) principal moments of inertia in the body frame [kg m^2]
+    material: Ints  #: (n,) row of the friction table
+    shape: Ints  #: (n,) SPHERE, BOX or COMPOUND
+    size: Floats  #: (n, 3) sphere: (radius, 0, 0); box: half extents [m]
+    weight: Floats  #: (n,) contacts owned at the last search, the load that balancing spreads
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The arrays by name, without copies."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def take(self, rows: Ints | Bools | slice) -> Bodies:
+        """The bodies of the given rows (index array, mask or slice)."""
+        return Bodies(**{name: column[rows] for name, column in self.columns().items()})
+
+
+def concatenate(parts: Sequence[Bodies]) -> Bodies:
+    """One table of the rows of several, in their order."""
+    names = [field.name for field in fields(Bodies)]
+    return Bodies(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def empty() -> Bodies:
+    """A table without rows."""
+    return Bodies(
+        id=np.zeros(0, np.int64),
+        position=np.zeros((0, 3)),
+        quaternion=np.zeros((0, 4)),
+        velocity=np.zeros((0, 6)),
+        mass=np.zeros(0),
+        inertia=np.zeros((0, 3)),
+        material=np.zeros(0, np.int64),
+        shape=np.zeros(0, np.int64),
+        size=np.zeros((0, 3)),
+        weight=np.zeros(0),
+    )
+
+
+def is_dynamic(bodies: Bodies) -> Bools:
+    """Mask (n,) of the bodies that forces can move."""
+    return np.isfinite(bodies.mass)
+
+
+def bounding_radius(bodies: Bodies) -> Floats:
+    """Radius (n,) of the sphere about the centre that encloses a grain [m]."""
+    return np.linalg.norm(bodies.size, axis=1)
+
+
+def inverse_root_inertia(bodies: Bodies) -> Floats:
+    """Symmetric square roots (n, 3, 3) of the inverse inertia tensors in the world frame."""
+    turn = quaternion.matrix(bodies.quaternion)
+    return (turn / np.sqrt(bodies.inertia)[:, None, :]) @ turn.transpose(0, 2, 1)
+
+
+def inverse_inertia(bodies: Bodies) -> Floats:
+    """Inverse inertia tensors (n, 3, 3) in the world frame [1/(kg m^2)]."""
+    turn = quaternion.matrix(bodies.quaternion)
+    return (turn / bodies.inertia[:, None, :]) @ turn.transpose(0, 2, 1)

@@ -1,0 +1,43 @@
+"""Sending rows of tables to other ranks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from mpi4py import MPI
+
+from dem.arrays import Ints
+
+
+def exchange(comm: MPI.Comm, columns: Mapping[str, np.ndarray], destination: Ints) -> dict[str, np.ndarray]:
+    """Send row i of every column to the rank destination[i]; collective.
+
+    columns: arrays (n, ...) of the same names, types and trailing shapes on every rank; destination: (n,).
+    Rows arrive in the order of the sending ranks and, from one rank, in the order sent.
+    """
+    order = np.argsort(destination, kind="stable")
+    if comm.size == 1:
+        return {name: column[order] for name, column in columns.items()}
+    # All columns travel as one message: each row is the bytes of its entries side by side.
+    packed = np.concatenate([_as_bytes(column) for column in columns.values()], axis=1)[order]
+    send = np.bincount(destination, minlength=comm.size)
+    receive = np.empty_like(send)
+    comm.Alltoall(send, receive)
+    arrived = np.empty((int(receive.sum()), packed.shape[1]), np.uint8)
+    row = MPI.BYTE.Create_contiguous(packed.shape[1]).Commit()
+    comm.Alltoallv([packed, (send, None), row], [arrived, (receive, None), row])
+    row.Free()
+    out, start = {}, 0
+    for name, column in columns.items():
+        width = _as_bytes(column[:0]).shape[1]
+        block = np.ascontiguousarray(arrived[:, start : start + width])
+        out[name] = block.view(column.dtype).reshape((len(arrived), *column.shape[1:]))
+        start += width
+    return out
+
+
+def _as_bytes(column: np.ndarray) -> np.ndarray:
+    """The rows of an array (n, ...) as bytes (n, bytes per row)."""
+    entries = int(np.prod(column.shape[1:]))
+    return np.ascontiguousarray(column).reshape(len(column), entries).view(np.uint8)

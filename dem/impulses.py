@@ -1,0 +1,65 @@
+"""Memory of the last impulses of contacts, wherever their bodies have gone since.
+
+The memory is a directory distributed by a hash of the contact key: it does not depend on which rank owns a
+contact, so that neither migration of bodies nor a restart on another number of ranks matters.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from dem.arrays import Bools, Floats, Ints
+from dem.exchange import exchange
+
+
+class ImpulseMemory:
+    """Impulses of the contacts of one step, by key.
+
+    The normal impulse is kept as a number and the tangential one as a vector in the world, because the
+    contact frames of the next step are others.
+    """
+
+    def __init__(self, comm: MPI.Comm) -> None:
+        self._comm = comm
+        self._key = np.zeros(0, np.int64)
+        self._impulse = np.zeros((0, 4))
+
+    def remember(self, key: Ints, impulse: Floats, frame: Floats) -> None:
+        """Replace the memory by impulses (nc, 3) of contacts with keys (nc,) and frames (nc, 3, 3);
+        collective."""
+        tangential = (impulse[:, None, 1:] @ frame[:, 1:])[:, 0]
+        self.restore(key, np.hstack([impulse[:, :1], tangential]))
+
+    def recall(self, key: Ints, frame: Floats) -> tuple[Floats, Bools]:
+        """Impulses (nc, 3) in the given frames (nc, 3, 3), zero where unknown, and the mask (nc,) of those
+        known.
+
+        Collective."""
+        count = len(key)
+        rank = np.full(count, self._comm.rank)
+        asked = exchange(self._comm, {"key": key, "rank": rank, "row": np.arange(count)}, self._home(key))
+        place = np.searchsorted(self._key, asked["key"])
+        known = place < len(self._key)
+        known[known] = self._key[place[known]] == asked["key"][known]
+        answer = {"row": asked["row"][known], "impulse": self._impulse[place[known]]}
+        answer = exchange(self._comm, answer, asked["rank"][known])
+        stored, found = np.zeros((count, 4)), np.zeros(count, dtype=bool)
+        stored[answer["row"]], found[answer["row"]] = answer["impulse"], True
+        tangential = (frame[:, 1:] @ stored[:, 1:, None])[:, :, 0]
+        return np.hstack([stored[:, :1], tangential]), found
+
+    def state(self) -> tuple[Ints, Floats]:
+        """Keys (n,) and impulses (n, 4) (normal, tangential vector) that this rank stores, for `restore`."""
+        return self._key, self._impulse
+
+    def restore(self, key: Ints, stored: Floats) -> None:
+        """Replace the memory by rows of `state`, distributed in any way; collective."""
+        rows = exchange(self._comm, {"key": key, "impulse": stored}, self._home(key))
+        order = np.argsort(rows["key"])
+        self._key, self._impulse = rows["key"][order], rows["impulse"][order]
+
+    def _home(self, key: Ints) -> Ints:
+        # Fibonacci hashing: the low bits of keys are mostly zero and must not choose the rank.
+        mixed = (key.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)
+        return (mixed % np.uint64(self._comm.size)).astype(np.int64)

@@ -1,0 +1,88 @@
+"""The bodies that a rank's contacts can involve: its own grains, ghosts of other ranks' grains, large bodies.
+
+A contact belongs to the rank of the lower global body index: ghosts only travel from higher to lower ranks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dem import bodies
+from dem.arrays import Floats, Ints
+from dem.bodies import Bodies
+from dem.exchange import exchange
+
+if TYPE_CHECKING:
+    from dem.world import World
+
+#: Boxes by which a rank tells the others where its grains are.
+BOXES = 8
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Rows: the local grains, then the ghosts in the order of global indices, then the large bodies."""
+
+    bodies: Bodies
+    index: Ints  #: (rows,) global body index
+    grains: int  #: number of local grains
+    ghosts: int  #: number of ghosts
+
+
+def neighbourhood(world: World, reach: float) -> Neighbourhood:
+    """All bodies that may come within `reach` [m] of a local grain; collective.
+
+    FloatingPointError, on all ranks, if a position is no longer finite.
+    """
+    comm, grains = world.comm, world.grains
+    radius = bodies.bounding_radius(grains)
+    boxes = np.empty((comm.size, BOXES, 2, 3))
+    comm.Allgather(_chunk_boxes(grains.position, radius), boxes)
+    if np.isnan(boxes).any():
+        raise FloatingPointError(
+            f"a grain has no finite position at step {world.step} (time {world.time:g} s)"
+        )
+    first = world.slabs[comm.rank]
+    columns = dict(grains.columns(), index=np.arange(first, first + len(grains)))
+    row, rank = _touched(grains.position, radius + reach, boxes[: comm.rank])
+    ghosts = exchange(comm, {name: column[row] for name, column in columns.items()}, rank)
+    ghost_index = ghosts.pop("index")
+    large_index = world.slabs[-1] + np.arange(len(world.large))
+    return Neighbourhood(
+        bodies=bodies.concatenate([grains, Bodies(**ghosts), world.large]),
+        index=np.concatenate([columns["index"], ghost_index, large_index]),
+        grains=len(grains),
+        ghosts=len(ghost_index),
+    )
+
+
+def _chunk_boxes(position: Floats, radius: Floats) -> Floats:
+    """Bounding boxes (BOXES, 2, 3) of equal pieces of a slab; empty ones reach from +inf to -inf."""
+    boxes = np.empty((BOXES, 2, 3))
+    boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
+    if not np.isfinite(position).all():
+        boxes[:] = np.nan  # seen by every rank, so that all of them stop
+        return boxes
+    cuts = np.linspace(0, len(position), BOXES + 1).astype(int)
+    for box, start, stop in zip(boxes, cuts[:-1], cuts[1:]):
+        if start < stop:
+            box[0] = (position[start:stop] - radius[start:stop, None]).min(axis=0)
+            box[1] = (position[start:stop] + radius[start:stop, None]).max(axis=0)
+    return boxes
+
+
+def _touched(position: Floats, radius: Floats, boxes: Floats) -> tuple[Ints, Ints]:
+    """Pairs (row, rank) of the balls that touch a box of a rank; boxes (ranks, BOXES, 2, 3)."""
+    rows, ranks = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    if len(position):
+        low, high = (position - radius[:, None]).min(axis=0), (position + radius[:, None]).max(axis=0)
+        for rank, theirs in enumerate(boxes):
+            near = theirs[((theirs[:, 0] <= high) & (theirs[:, 1] >= low)).all(axis=1)]
+            outside = np.maximum(near[:, 0] - position[:, None], position[:, None] - near[:, 1]).max(axis=2)
+            row = np.flatnonzero((outside <= radius[:, None]).any(axis=1))
+            rows.append(row)
+            ranks.append(np.full(len(row), rank))
+    return np.concatenate(rows), np.concatenate(ranks)

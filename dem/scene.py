@@ -1,0 +1,244 @@
+"""Description of a scene: what there is at time zero.
+
+A scene is the same on every rank and knows nothing of ranks; `dem.world.World.from_scene` distributes it.
+
+    scene = Scene(friction=0.3)
+    scene.add_body("floor", [Plane(normal=(0, 0, 1))])
+    scene.add_spheres(positions, radius=0.1, density=2500.0)
+    world = World.from_scene(scene, MPI.COMM_WORLD)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dem import bodies, checks, quaternion, shapes
+from dem.arrays import ArrayLike, Floats, Ints
+from dem.bodies import BOX, COMPOUND, SPHERE, Bodies
+from dem.motion import Dynamic, Fixed, Motion
+from dem.shapes import Shape
+
+
+@dataclass(frozen=True)
+class LargeBody:
+    """A body that every rank holds: container, tool, incline. The pose is that of time zero."""
+
+    name: str
+    shapes: tuple[Shape, ...]  #: in the body frame
+    motion: Motion
+    material: int
+    position: Floats  #: (3,) [m]
+    quaternion: Floats  #: (4,)
+    velocity: Floats  #: (6,) at time zero, of dynamic bodies
+    mass: float  #: infinite unless the motion is dynamic [kg]
+    inertia: Floats  #: (3,) principal moments in the body frame [kg m^2]
+
+
+class Scene:
+    """Collects grains, large bodies, materials and gravity; checks each as it comes (ValueError)."""
+
+    def __init__(self, friction: float, gravity: Sequence[float] = (0.0, 0.0, -9.81)) -> None:
+        """`friction`: coefficient of all pairs of materials not set otherwise; `gravity`: (3,) [m/s^2]."""
+        self.gravity = np.array(checks.finite_vector("gravity", gravity))
+        self.large_bodies: list[LargeBody] = []
+        self._friction = float(checks.not_negative("friction", friction))
+        self._pairs: dict[tuple[int, int], float] = {}
+        self._materials: dict[str, int] = {}
+        self._grains: list[Bodies] = []
+
+    def add_spheres(
+        self,
+        positions: ArrayLike,
+        radius: ArrayLike,
+        density: ArrayLike,
+        *,
+        material: str = "default",
+        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Ints:
+        """Add solid spheres and return their ids (n,).
+
+        positions (n, 3) [m]; radius [m] and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3).
+        """
+        centers = _points("positions of spheres", positions)
+        count = len(centers)
+        radii = checks.positive_column("radius", radius, count)
+        mass, inertia = shapes.sphere_mass(radii, checks.positive_column("density", density, count))
+        size = np.zeros((count, 3))
+        size[:, 0] = radii
+        upright = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        speeds = _velocities(velocity, angular_velocity, count)
+        return self._add_grains(SPHERE, centers, upright, speeds, mass, inertia, material, size)
+
+    def add_boxes(
+        self,
+        positions: ArrayLike,
+        half_extents: ArrayLike,
+        density: ArrayLike,
+        *,
+        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        material: str = "default",
+        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Ints:
+        """Add solid boxes and return their ids (n,).
+
+        positions (n, 3) and half extents (3,) or (n, 3) [m]; density [kg/m^3] one for all or (n,);
+        quaternions (4,) or (n, 4); velocities (3,) or (n, 3). Boxes may touch spheres and planes, not boxes.
+        """
+        centers = _points("positions of boxes", positions)
+        count = len(centers)
+        size = checks.rows("half extents", checks.positive("half extents", half_extents), count, 3)
+        mass, inertia = shapes.box_mass(size, checks.positive_column("density", density, count))
+        turns = checks.unit_quaternions("quaternions of boxes", quaternions, count)
+        speeds = _velocities(velocity, angular_velocity, count)
+        return self._add_grains(BOX, centers, turns, speeds, mass, inertia, material, size)
+
+    def add_body(
+        self,
+        name: str,
+        shapes: Sequence[Shape],
+        motion: Motion = Fixed(),  # noqa: B008 - immutable
+        *,
+        position: Sequence[float] = (0.0, 0.0, 0.0),
+        quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
+        material: str = "default",
+        density: float | None = None,
+        mass: float | None = None,
+        inertia: Sequence[float] | None = None,
+        velocity: Sequence[float] = (0.0, 0.0, 0.0),
+        angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Add a large body made of `shapes`, which are placed in its body frame.
+
+        The pose and the velocities are those of time zero. A dynamic body needs either `density` [kg/m^3],
+        and its frame is then moved to the centre of mass and the principal axes, or `mass` [kg] with the
+        principal moments `inertia` (3,) [kg m^2] of a frame that is there already. Large bodies touch grains,
+        not each other.
+        """
+        if not name or name in (body.name for body in self.large_bodies):
+            raise ValueError(f"large bodies need distinct names, got {name!r}")
+        if not shapes:
+            raise ValueError(f"large body {name!r} has no shape")
+        place = np.array(checks.finite_vector(f"position of {name!r}", position))
+        turn = checks.unit_quaternions(f"quaternion of {name!r}", quaternion, 1)[0]
+        speed = _velocities(velocity, angular_velocity, 1)[0]
+        parts = tuple(shapes)
+        if not isinstance(motion, Dynamic):
+            if speed.any():
+                raise ValueError(f"the motion of {name!r} is prescribed: it takes no initial velocity")
+            weight, moments = np.inf, np.full(3, np.inf)
+        elif density is not None and mass is None and inertia is None:
+            solid = float(checks.positive(f"density of {name!r}", density))
+            parts, place, turn, weight, moments = _centered(parts, place, turn, solid)
+        elif density is None and mass is not None and inertia is not None:
+            weight = float(checks.positive(f"mass of {name!r}", mass))
+            moments = checks.rows("inertia", checks.positive(f"inertia of {name!r}", inertia), 1, 3)[0]
+        else:
+            raise ValueError(f"dynamic body {name!r} needs either its density or both mass and inertia")
+        number = self._material(material)
+        self.large_bodies.append(LargeBody(name, parts, motion, number, place, turn, speed, weight, moments))
+
+    def set_friction(self, friction: float, material: str, other: str) -> None:
+        """Friction coefficient between two materials (which may be the same one)."""
+        pair = sorted((self._material(material), self._material(other)))
+        self._pairs[pair[0], pair[1]] = float(checks.not_negative("friction", friction))
+
+    def friction_table(self) -> Floats:
+        """Friction coefficients (materials, materials), symmetric."""
+        table = np.full((len(self._materials), len(self._materials)), self._friction)
+        for (i, j), friction in self._pairs.items():
+            table[i, j] = table[j, i] = friction
+        return table
+
+    def grains(self) -> Bodies:
+        """All grains, in the order of their ids. ValueError if there is none."""
+        if sum(len(part) for part in self._grains) == 0:
+            raise ValueError("empty scene: there is no grain")
+        return bodies.concatenate(self._grains)
+
+    def large(self) -> Bodies:
+        """The table of the large bodies at time zero, in the order in which they were added."""
+        count, members = len(self.large_bodies), self.large_bodies
+        first = sum(len(part) for part in self._grains)
+        return Bodies(
+            id=np.arange(first, first + count),
+            position=np.array([body.position for body in members]).reshape(count, 3),
+            quaternion=np.array([body.quaternion for body in members]).reshape(count, 4),
+            velocity=np.array([body.velocity for body in members]).reshape(count, 6),
+            mass=np.array([body.mass for body in members]),
+            inertia=np.array([body.inertia for body in members]).reshape(count, 3),
+            material=np.array([body.material for body in members], dtype=np.int64),
+            shape=np.full(count, COMPOUND),
+            size=np.zeros((count, 3)),
+            weight=np.zeros(count),
+        )
+
+    def _material(self, name: str) -> int:
+        return self._materials.setdefault(name, len(self._materials))
+
+    def _add_grains(
+        self,
+        kind: int,
+        position: Floats,
+        turn: Floats,
+        velocity: Floats,
+        mass: Floats,
+        inertia: Floats,
+        material: str,
+        size: Floats,
+    ) -> Ints:
+        first = sum(len(part) for part in self._grains)
+        ids = np.arange(first, first + len(position))
+        same = np.ones(len(ids), dtype=np.int64)
+        number = self._material(material)
+        self._grains.append(
+            Bodies(
+                id=ids,
+                position=position,
+                quaternion=turn,
+                velocity=velocity,
+                mass=mass,
+                inertia=inertia,
+                material=number * same,
+                shape=kind * same,
+                size=size,
+                weight=np.zeros(len(ids)),
+            )
+        )
+        return ids
+
+
+def _points(name: str, values: ArrayLike) -> Floats:
+    array = np.atleast_2d(checks.finite(name, values))
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"{name} must have shape (n, 3), got {array.shape}")
+    return array.copy()
+
+
+def _velocities(linear: ArrayLike, angular: ArrayLike, count: int) -> Floats:
+    return np.hstack(
+        [checks.rows("velocity", linear, count, 3), checks.rows("angular velocity", angular, count, 3)]
+    )
+
+
+def _centered(
+    parts: tuple[Shape, ...], position: Floats, turn: Floats, density: float
+) -> tuple[tuple[Shape, ...], Floats, Floats, float, Floats]:
+    """The same body with its frame at the centre of mass along the principal axes, with mass and moments."""
+    mass, center, tensor = shapes.mass_properties(parts, density)
+    moments, axes = np.diag(tensor).copy(), np.eye(3)
+    if np.abs(tensor - np.diag(moments)).max() > 1e-12 * moments.max():
+        moments, axes = np.linalg.eigh(tensor)
+        axes[:, 2] *= np.linalg.det(axes)  # right-handed
+    inner = quaternion.from_matrix(axes)
+    return (
+        tuple(shapes.moved(part, center, inner) for part in parts),
+        position + quaternion.rotate(turn, center),
+        quaternion.multiply(turn, inner),
+        mass,
+        moments,
+    )

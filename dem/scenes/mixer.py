@@ -1,0 +1,121 @@
+"""Sedimentation of spheres into an open box in which a paddle turns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from math import pi, sqrt
+from typing import Any, ClassVar
+
+import numpy as np
+
+from dem import checks
+from dem.arrays import Floats
+from dem.motion import Rotation
+from dem.scene import Scene
+from dem.shapes import Box, Plane
+
+
+def _option(default: Any, unit: str, text: str) -> Any:
+    return field(default=default, metadata={"unit": unit, "help": text})
+
+
+@dataclass(frozen=True)
+class Mixer:
+    """(2n+1)^3 spheres on a randomly perturbed cubic lattice fall into a fixed box onto a turning paddle.
+
+    The box is open at the top, and its width grows as 2n+1, so that the number of spheres per floor area and
+    the filling height relative to the width do not depend on n. With the box and the paddle there are
+    (2n+1)^3 + 2 bodies. The shape of the paddle relative to the box and its speed are those of the mixer
+    benchmark of Chrono.
+    """
+
+    n: int = _option(4, "", "size: there are (2n+1)^3 spheres")
+    radius: float = _option(0.1, "m", "radius of the spheres")
+    density: float = _option(2500.0, "kg/m^3", "density of the spheres (glass)")
+    friction: float = _option(0.25, "", "friction coefficient of all contacts")
+    pitch: float = _option(0.25, "m", "spacing of the lattice on which the spheres start")
+    perturbation: float = _option(
+        0.02, "m", "greatest displacement of a sphere from its lattice point, per axis"
+    )
+    seed: int = _option(1, "", "seed of the perturbation")
+    margin: float = _option(0.0, "m", "width of the box beyond (2n+1) pitch")
+    paddle_length: float = _option(1 / 2, "box widths", "length of the paddle")
+    paddle_height: float = _option(1 / 4, "box widths", "height of the paddle")
+    paddle_thickness: float = _option(1 / 20, "box widths", "thickness of the paddle")
+    clearance: float = _option(0.05, "m", "gap between the floor and the paddle")
+    angular_velocity: float = _option(pi / 3, "rad/s", "angular velocity of the paddle about the vertical")
+    gravity: float = _option(9.81, "m/s^2", "gravity, downwards")
+
+    #: Recommended time step [s] and contact distance [m].
+    dt: ClassVar[float] = 0.025
+    delta: ClassVar[float] = 0.02
+
+    def __post_init__(self) -> None:
+        for option in fields(self):
+            checks.finite(option.name, getattr(self, option.name))
+        if self.n < 1:
+            raise ValueError(f"n must be at least 1, got {self.n}")
+        sizes = ("radius", "pitch", "paddle_length", "paddle_height", "paddle_thickness")
+        for name in (*sizes, "density", "gravity"):
+            checks.positive(name, getattr(self, name))
+        for name in ("friction", "perturbation", "margin", "clearance"):
+            checks.not_negative(name, getattr(self, name))
+        free = self.pitch / 2 - self.radius
+        if self.perturbation >= free:
+            raise ValueError(
+                f"perturbation {self.perturbation:g} m must be less than pitch / 2 - radius = {free:g} m, "
+                "half the free space between spheres of the lattice"
+            )
+        if self.radius <= self.clearance <= 2 * self.radius:
+            raise ValueError(
+                f"clearance {self.clearance:g} m between one and two radii ({self.radius:g} m): "
+                "the paddle would jam spheres against the floor"
+            )
+        reach = sqrt(self.paddle_length**2 + self.paddle_thickness**2)
+        if reach >= 1.0:
+            raise ValueError(f"the paddle does not fit into the box: it sweeps {reach:g} box widths")
+
+    @property
+    def width(self) -> float:
+        """Width of the square box [m]."""
+        return (2 * self.n + 1) * self.pitch + self.margin
+
+    @property
+    def lattice_bottom(self) -> float:
+        """Height of the lowest layer of the lattice [m]: all spheres start above the paddle."""
+        return self.clearance + self.paddle_height * self.width + self.radius + 2 * self.perturbation
+
+    @property
+    def settling_time(self) -> float:
+        """Time [s] after which the packing may be taken as settled: free fall of the highest sphere to the
+        floor, and two seconds in which the bed, compressed by the last arrivals, comes to rest."""
+        height = self.lattice_bottom + 2 * self.n * self.pitch + self.perturbation
+        return sqrt(2 * height / self.gravity) + 2.0
+
+    def positions(self) -> Floats:
+        """Centres ((2n+1)^3, 3) of the spheres at the start [m]; the floor is z = 0, the axis x = y = 0."""
+        side = np.arange(-self.n, self.n + 1) * self.pitch
+        height = self.lattice_bottom + np.arange(2 * self.n + 1) * self.pitch
+        lattice = np.stack(np.meshgrid(side, side, height, indexing="ij"), axis=-1).reshape(-1, 3)
+        shift = np.random.default_rng(self.seed).uniform(-1.0, 1.0, lattice.shape)
+        return lattice + self.perturbation * shift
+
+    def build(self) -> Scene:
+        """The scene, with the large bodies "box" and "mixer"."""
+        scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
+        scene.add_spheres(self.positions(), self.radius, self.density)
+        wall = self.width / 2
+        walls = [
+            Plane((-sx, -sy, 0), (sx * wall, sy * wall, 0)) for sx, sy in ((1, 0), (-1, 0), (0, 1), (0, -1))
+        ]
+        scene.add_body("box", [Plane((0, 0, 1)), *walls])
+        length, height, thickness = (
+            share * self.width for share in (self.paddle_length, self.paddle_height, self.paddle_thickness)
+        )
+        scene.add_body(
+            "mixer",
+            [Box((length / 2, thickness / 2, height / 2))],
+            Rotation((0, 0, self.angular_velocity)),
+            position=(0, 0, self.clearance + height / 2),
+        )
+        return scene

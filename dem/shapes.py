@@ -1,0 +1,108 @@
+"""The primitives of which large bodies are made, placed in the body frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Union
+
+import numpy as np
+
+from dem import quaternion
+from dem.arrays import Floats
+from dem.checks import finite_vector, positive, unit_quaternions, unit_vector
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Half space: everything on the side of `center` away from the outward `normal` is solid."""
+
+    normal: Sequence[float]  #: outward normal (3,), normalised
+    center: Sequence[float] = (0.0, 0.0, 0.0)  #: a point of the surface (3,) [m]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "normal", unit_vector("normal of a plane", self.normal))
+        object.__setattr__(self, "center", finite_vector("point of a plane", self.center))
+
+
+@dataclass(frozen=True)
+class Box:
+    """Oriented box."""
+
+    half_extents: Sequence[float]  #: (3,) [m]
+    center: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) [m]
+    quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0)  #: (4,)
+
+    def __post_init__(self) -> None:
+        positive("half extents of a box", self.half_extents)
+        object.__setattr__(self, "half_extents", finite_vector("half extents of a box", self.half_extents))
+        object.__setattr__(self, "center", finite_vector("centre of a box", self.center))
+        turn = unit_quaternions("quaternion of a box", self.quaternion, 1)[0]
+        object.__setattr__(self, "quaternion", tuple(turn.tolist()))
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """Ball."""
+
+    radius: float  #: [m]
+    center: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) [m]
+
+    def __post_init__(self) -> None:
+        positive("radius of a sphere", self.radius)
+        object.__setattr__(self, "center", finite_vector("centre of a sphere", self.center))
+
+
+Shape = Union[Plane, Box, Sphere]
+
+
+def sphere_mass(radius: Floats, density: Floats) -> tuple[Floats, Floats]:
+    """Masses (n,) and principal moments (n, 3) of solid spheres of radius (n,) and density (n,)."""
+    mass = density * (4.0 / 3.0) * np.pi * radius**3
+    return mass, np.repeat((0.4 * mass * radius**2)[:, None], 3, axis=1)
+
+
+def box_mass(half_extents: Floats, density: Floats) -> tuple[Floats, Floats]:
+    """Masses (n,) and principal moments (n, 3) of solid boxes of half extents (n, 3) and density (n,)."""
+    mass = density * 8.0 * half_extents.prod(axis=1)
+    squares = half_extents**2
+    return mass, mass[:, None] / 3.0 * (squares.sum(axis=1, keepdims=True) - squares)
+
+
+def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Floats, Floats]:
+    """Mass, centre of mass (3,) and inertia tensor (3, 3) about it, in the body frame.
+
+    Volumes that shapes share count once for each of them. ValueError for half spaces: they have no mass.
+    """
+    masses, centers, tensors = [], [], []
+    for shape in shapes:
+        if isinstance(shape, Plane):
+            raise ValueError("a half space has no finite mass: give mass and inertia, or a prescribed motion")
+        turn = np.eye(3)
+        if isinstance(shape, Box):
+            mass, moments = box_mass(np.array([shape.half_extents]), np.array([density]))
+            turn = quaternion.matrix(np.array(shape.quaternion))
+        else:
+            mass, moments = sphere_mass(np.array([shape.radius]), np.array([density]))
+        masses.append(mass[0])
+        centers.append(shape.center)
+        tensors.append((turn * moments[0]) @ turn.T)
+    weights, points = np.array(masses), np.array(centers)
+    total = weights.sum()
+    center = weights @ points / total
+    arms = points - center
+    # Parallel axes: m (|r|^2 E - r r') for every part.
+    steiner = np.sum(weights * (arms**2).sum(axis=1)) * np.eye(3) - (arms.T * weights) @ arms
+    return float(total), center, np.sum(tensors, axis=0) + steiner
+
+
+def moved(shape: Shape, center: Floats, turn: Floats) -> Shape:
+    """The shape in a frame with origin `center` (3,) and orientation `turn` (4,) in the present one."""
+    back = quaternion.conjugate(turn)
+    place = tuple(quaternion.rotate(back, np.array(shape.center) - center).tolist())
+    if isinstance(shape, Plane):
+        return Plane(tuple(quaternion.rotate(back, np.array(shape.normal)).tolist()), place)
+    if isinstance(shape, Box):
+        orientation = quaternion.multiply(back, np.array(shape.quaternion))
+        return Box(shape.half_extents, place, tuple(orientation.tolist()))
+    return replace(shape, center=place)

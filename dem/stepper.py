@@ -1,0 +1,40 @@
+"""The semi-implicit step: new velocities come from the contact problem, and positions follow them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dem import quaternion
+from dem.arrays import Floats
+from dem.bodies import Bodies
+from dem.motion import Dynamic
+
+if TYPE_CHECKING:
+    from dem.world import World
+
+
+def advance(world: World, velocity: Floats, dt: float) -> None:
+    """Take the velocities (owned, 6) of `ContactSystem.velocity` and move all bodies by dt [s]; collective.
+
+    x <- x + dt v, q <- exp(dt w) q. Prescribed motions are followed exactly, whatever dt.
+    """
+    count = len(world.grains)
+    _move(world.grains, velocity[:count], dt)
+    large_velocity = np.zeros_like(world.large.velocity)
+    large_velocity[: len(velocity) - count] = velocity[count:]  # all of them on the last rank, none elsewhere
+    world.comm.Bcast(large_velocity, root=world.comm.size - 1)
+    _move(world.large, large_velocity, dt)
+    world.time += dt
+    world.step += 1
+    for row, body in enumerate(world.large_bodies):
+        if not isinstance(body.motion, Dynamic):
+            pose = body.motion.pose(world.time, body.position, body.quaternion)
+            world.large.position[row], world.large.quaternion[row] = pose
+
+
+def _move(table: Bodies, velocity: Floats, dt: float) -> None:
+    table.velocity = velocity.copy()
+    table.position = table.position + dt * velocity[:, :3]
+    table.quaternion = quaternion.integrate(table.quaternion, velocity[:, 3:], dt)

@@ -1,0 +1,108 @@
+"""Every listed preconditioner on the same Newton systems, with the same KSP, tolerance and iteration cap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.ccp.krylov import Krylov, Solve
+from pctt.options import OptionError
+
+# names beside PETSc's own PC types: options that make them
+NAMED: dict[str, dict[str, str]] = {
+    "ilu-shifted": {"pc_type": "ilu", "pc_factor_shift_type": "positive_definite"},
+    "icc-shifted": {"pc_type": "icc", "pc_factor_shift_type": "positive_definite"},
+    "cholesky": {"pc_type": "cholesky", "ksp_type": "preonly"},
+}
+
+
+@dataclass
+class Record:
+    """What one preconditioner did over the systems of a run."""
+
+    solves: list[Solve] = field(default_factory=list)
+
+    def summary(self) -> dict[str, float]:
+        its = [s.iterations for s in self.solves]
+        return {
+            "systems": len(self.solves),
+            "converged": sum(s.converged for s in self.solves),
+            "ksp_its_mean": float(np.mean(its)) if its else 0.0,
+            "ksp_its_max": max(its, default=0),
+            "setup_s": sum(s.setup_s for s in self.solves),
+            "solve_s": sum(s.solve_s for s in self.solves),
+            "true_residual_max": float(max((s.true_residual for s in self.solves), default=0.0)),
+        }
+
+
+class Comparison:
+    """Solves every ``every``-th Newton system by each of ``names`` (``-compare``, ``-compare_every``).
+
+    A name is a PETSc PC type or one of NAMED; its KSP has the prefix ``compare_<name>_`` for further options.
+    Raises OptionError for a name that PETSc does not know.
+    """
+
+    def __init__(self, comm: MPI.Comm, names: list[str], every: int = 1):
+        for name in names:
+            _check_name(name, comm)
+        self.comm, self.names, self.every = comm, list(dict.fromkeys(names)), every
+        self.records = {name: Record() for name in self.names}
+        self._seen = 0
+        self._krylov: dict[str, Krylov] = {}
+
+    def due(self) -> bool:
+        """Whether the next system is one to compare on; counts it."""
+        self._seen += 1
+        return (self._seen - 1) % self.every == 0
+
+    def run(self, S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
+        """All preconditioners on one system; x is of the first that converged, else of the best."""
+        chosen: Solve | None = None
+        kept = None
+        for name in self.names:
+            done = self._solver(name, rtol).solve(S, b, x)
+            self.records[name].solves.append(done)
+            if chosen is None or (not chosen.converged and done.true_residual < chosen.true_residual):
+                chosen, kept = done, x.array.copy()
+        assert chosen is not None
+        x.array[:] = kept
+        return chosen
+
+    def forget_systems(self) -> None:
+        """The next system has another structure."""
+        for krylov in self._krylov.values():
+            krylov.destroy()
+        self._krylov.clear()
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        return {name: record.summary() for name, record in self.records.items()}
+
+    def labels(self) -> dict[str, str]:
+        """What each name means on this number of ranks, where that is not plain from the name."""
+        remark = " (within each rank)" if self.comm.size > 1 else ""
+        return {name: name + remark * name.startswith(("ilu", "icc")) for name in self.names}
+
+    def _solver(self, name: str, rtol: float) -> Krylov:
+        if name not in self._krylov:
+            defaults = NAMED.get(name, {"pc_type": name})
+            self._krylov[name] = Krylov(self.comm, f"compare_{name}_", defaults, rtol)
+        return self._krylov[name]
+
+
+def _check_name(name: str, comm: MPI.Comm) -> None:
+    pc = PETSc.PC().create(comm)
+    try:
+        PETSc.Sys.pushErrorHandler("ignore")
+        pc.setType(NAMED.get(name, {"pc_type": name})["pc_type"])
+    except PETSc.Error:
+        known = [*NAMED, "none", "jacobi", "pbjacobi", "bjacobi", "sor", "ilu", "icc", "gamg", "hypre"]
+        raise OptionError(
+            f"-compare {name}: PETSc has no such preconditioner here; allowed are its PC types, such as "
+            + ", ".join(known)
+        ) from None
+    finally:
+        PETSc.Sys.popErrorHandler()
+        pc.destroy()

@@ -1,0 +1,42 @@
+"""What a solver of the cone problem hands back, and the options that all of them share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from pctt.ccp.cone import Array
+from pctt.options import POSITIVE, option
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Options of every solver: ``-ccp_tol``, ``-ccp_max_it``."""
+
+    tol: float = option(1e-4, "natural residual at which a cone problem counts as solved", check=POSITIVE)
+    max_it: int = option(-1, "iterations before a solver gives up; -1: the solver's own default")
+
+
+@dataclass
+class Result:
+    """Impulses of a cone problem and how they were found.
+
+    Attributes
+    ----------
+    impulse : (nc, 3) impulses of this rank's contacts (N s)
+    converged : whether the natural residual fell below the tolerance
+    reason : why the iteration ended, in words
+    natural_residual : the solver's own last value
+    iterations : Newton steps, or steps of a first-order method
+    ksp_its : Krylov iterations in all Newton steps
+    fallbacks : Newton systems that the asked-for KSP did not solve
+    history : natural residual per iteration
+    """
+
+    impulse: Array
+    converged: bool
+    reason: str
+    natural_residual: float
+    iterations: int
+    ksp_its: int = 0
+    fallbacks: int = 0
+    history: list[float] = field(default_factory=list)

@@ -1,0 +1,28 @@
+"""Phases of a run as PETSc log events, which ``-log_view`` shows, and their seconds for our own reports."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+from petsc4py import PETSc
+
+_seconds: dict[str, float] = defaultdict(float)
+
+
+@contextmanager
+def phase(name: str) -> Iterator[None]:
+    """Log a phase under the event ``name`` and add its wall seconds on this rank to ``name``'s account."""
+    start = time.perf_counter()
+    with PETSc.Log.Event(name):
+        try:
+            yield
+        finally:
+            _seconds[name] += time.perf_counter() - start
+
+
+def take_seconds(names: Iterable[str]) -> dict[str, float]:
+    """Seconds on the accounts of the phases since they were last taken."""
+    return {name: _seconds.pop(name, 0.0) for name in names}

@@ -1,0 +1,145 @@
+"""Options of the project: dataclass fields that are read from the PETSc options database.
+
+A group of options is a frozen dataclass whose fields carry ``metadata`` with ``help`` and, where they apply,
+``unit``, ``choices`` and ``check``. The field ``name`` of a group with prefix ``scene_`` is ``-scene_name``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, TypeVar
+
+Group = TypeVar("Group")
+
+
+class OptionError(ValueError):
+    """A bad option: the message names the option, the value and what is allowed."""
+
+
+def option(
+    default: Any,
+    help: str,
+    unit: str = "",
+    choices: Iterable[str] | None = None,
+    check: tuple[str, Callable[[Any], bool]] | None = None,
+) -> Any:
+    """A dataclass field that is an option; ``check`` is (what is allowed, test of a value)."""
+    metadata = {"help": help, "unit": unit, "choices": tuple(choices) if choices else None, "check": check}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+POSITIVE = ("a positive number", lambda x: math.isfinite(x) and x > 0)
+NOT_NEGATIVE = ("a number >= 0", lambda x: math.isfinite(x) and x >= 0)
+FRACTION = ("a number between 0 and 1, both excluded", lambda x: 0 < x < 1)
+AT_LEAST_ONE = ("a whole number >= 1", lambda x: x >= 1)
+COUNT = ("a whole number >= 0", lambda x: x >= 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Description:
+    """One option as ``-help`` shows it."""
+
+    name: str
+    default: Any
+    unit: str
+    help: str
+    choices: tuple[str, ...] | None
+
+    def __str__(self) -> str:
+        default = str(self.default).lower() if isinstance(self.default, bool) else self.default
+        default = "none" if default in (None, "") else default
+        unit = f" {self.unit}" if self.unit else ""
+        choices = f" (one of: {', '.join(self.choices)})" if self.choices else ""
+        return f"  -{self.name} <{default}{unit}>: {self.help}{choices}"
+
+
+def describe(group: type, prefix: str = "") -> list[Description]:
+    """The options of a group, in the order of its fields."""
+    return [
+        Description(
+            prefix + f.name,
+            f.default,
+            f.metadata.get("unit", ""),
+            f.metadata["help"],
+            f.metadata.get("choices"),
+        )
+        for f in dataclasses.fields(group)
+    ]
+
+
+def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "") -> Group:
+    """A group with the values that the database gives; raises OptionError for a bad one.
+
+    ``database`` maps names without the dash to strings, as ``PETSc.Options().getAll()`` does.
+    """
+    types = typing.get_type_hints(group)
+    values = {
+        f.name: _value(prefix + f.name, database[prefix + f.name], types[f.name], f.metadata)
+        for f in dataclasses.fields(group)  # type: ignore[arg-type]
+        if prefix + f.name in database
+    }
+    return group(**values)
+
+
+def _value(name: str, text: str | None, kind: Any, metadata: Mapping[str, Any]) -> Any:
+    text = text or ""  # the database has None where an option is given without a value
+    choices, check = metadata.get("choices"), metadata.get("check")
+    inner = [k for k in typing.get_args(kind) if k is not type(None)]  # the X of Optional[X]
+    kind = inner[0] if inner else kind
+    kinds = {int: "a whole number", float: "a number", bool: "true or false"}
+    allowed = check[0] if check else kinds.get(kind)
+    try:
+        value = _truth(text) if kind is bool else kind(text)
+    except ValueError:
+        raise OptionError(f"-{name} {text}: allowed is {allowed}") from None
+    if choices and value not in choices:
+        raise OptionError(f"-{name} {text}: allowed is one of {', '.join(choices)}{_nearest(text, choices)}")
+    if kind is float and not math.isfinite(value) and not check:
+        raise OptionError(f"-{name} {text}: allowed is a finite number")
+    if check and not check[1](value):
+        raise OptionError(f"-{name} {text}: allowed is {allowed}")
+    return value
+
+
+def _truth(text: str) -> bool:
+    truths = {"": True, "1": True, "true": True, "yes": True, "on": True}
+    truths |= {"0": False, "false": False, "no": False, "off": False}
+    try:
+        return truths[text.lower()]
+    except KeyError:
+        raise ValueError(text) from None
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+# first words of the names that PETSc, its solvers and its own command line take
+_PETSC = (
+    "ksp_", "pc_", "mat_", "vec_", "sub_", "mg_", "fieldsplit_", "prefix_", "log_", "options_", "info",
+    "malloc", "memory_", "viewer_", "citations", "help", "version", "on_error", "error_output_", "debug",
+    "start_in_debugger", "stop_for_debugger", "fp_trap", "check_pointer", "object_", "objects_", "petsc_",
+    "sf_", "is_", "dm_", "tao_", "snes_", "ts_", "mpi_", "use_gpu", "device_", "cuda_", "hip_", "kokkos_",
+    "not_shared_tmp", "shared_tmp", "tmp", "nox", "saws", "x_", "skip_petscrc", "get_", "threads",
+    "blas_", "checkstack", "history", "draw_", "display", "matmatmult", "matptap", "matproduct", "st_",
+    "eps_", "svd_", "python",
+)
+
+
+def refuse_unknown(names: Iterable[str], known: Iterable[str], prefixes: Iterable[str] = ()) -> None:
+    """Raise OptionError for a name that neither the project nor PETSc knows, with the nearest of ours.
+
+    ``prefixes`` are first words beside PETSc's own that are let through.
+    """
+    known = set(known)
+    through = (*_PETSC, *prefixes)
+    for name in names:
+        if name not in known and not name.startswith(through):
+            close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.5)
+            hint = f"did you mean -{close[0]}?" if close else "-help lists the options"
+            raise OptionError(f"-{name}: no such option; {hint}")

@@ -1,0 +1,55 @@
+"""``python -m pctt.run``: simulate a scene, settle one, or solve a cone problem from a file."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+
+import petsc4py
+
+# before anything else imports PETSc; -help is answered here, without PETSc's own hundred lines
+petsc4py.init([word for word in sys.argv if word not in ("-help", "--help", "-h")])
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.options import OptionError
+from pctt.run.hdf5 import FileError
+from pctt.run.options import help_text, read_options
+from pctt.run.problem import solve_file
+from pctt.run.simulate import SceneError, simulate
+
+
+def main(comm: MPI.Comm) -> None:
+    database = PETSc.Options().getAll()
+    if {"-help", "--help", "-h"} & set(sys.argv):
+        if comm.rank == 0:
+            print(help_text(database))
+        return
+    options = read_options(database, comm)
+    if options.problem is not None:
+        solve_file(options, comm)
+    else:
+        simulate(options, comm)
+
+
+def run() -> int:
+    """Exit status: 0, or 2 for a bad option, file or scene, told once. Other errors abort all ranks."""
+    comm = MPI.COMM_WORLD
+    try:
+        main(comm)
+    except (OptionError, FileError, SceneError) as error:  # raised on all ranks alike
+        if comm.rank == 0:
+            print(f"pctt.run: {error}", file=sys.stderr, flush=True)
+        return 2
+    except BaseException as error:
+        if comm.size == 1 or isinstance(error, SystemExit):
+            raise
+        traceback.print_exc()
+        sys.stderr.flush()
+        comm.Abort(1)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run())

@@ -1,0 +1,181 @@
+"""Options of ``python -m pctt.run``, read and checked before any work."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Optional
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from dem.scenes import SCENES
+from pctt import ccp
+from pctt.options import (
+    AT_LEAST_ONE,
+    COUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    OptionError,
+    describe,
+    option,
+    read,
+    refuse_unknown,
+)
+from pctt.run.hdf5 import refuse_serial
+
+# what runs when no option is given
+DEMO = {
+    "scene": "mixer",
+    "scene_n": "4",
+    "restart": "settled",
+    "steps": "5",
+    "compare": "none,ilu,ilu-shifted,pbjacobi",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Options without a prefix."""
+
+    scene: str = option("mixer", "what to simulate", choices=SCENES)
+    steps: int = option(5, "time steps to make", check=COUNT)
+    dt: Optional[float] = option(None, "time step; none: the scene's own", "s", check=POSITIVE)
+    delta: Optional[float] = option(
+        None, "gap below which a pair of bodies is a contact; none: the scene's own", "m", check=NOT_NEGATIVE
+    )
+    recovery_speed: float = option(
+        1.0, "greatest speed at which bodies that overlap are pushed apart", "m/s", check=NOT_NEGATIVE
+    )
+    restart: str = option(
+        "",
+        "file to start from: checkpoint.h5 of a run; settled: the scene's settled state, made at first use",
+    )
+    settle: bool = option(False, "make the scene's settled state with APGD, keep it in the cache, and stop")
+    settle_delta: float = option(
+        0.1,
+        "-delta while settling: falling bodies come closer within a step than bodies at rest",
+        "m",
+        check=NOT_NEGATIVE,
+    )
+    settle_tol: float = option(1e-3, "natural residual of the steps of -settle", check=POSITIVE)
+    output: str = option("results", "folder for state.h5, checkpoint.h5 and summary.json")
+    output_every: int = option(1, "steps between two records in state.h5; 0: none", check=COUNT)
+    checkpoint_every: int = option(1, "steps between two checkpoints", check=AT_LEAST_ONE)
+    problem: str = option("", "FCLIB file with a cone problem to solve instead of a scene")
+    ccp_type: str = option("pdip", "solver of the cone problems", choices=ccp.SOLVERS)
+    compare: str = option("", "preconditioners, with commas between, that each solve the same Newton systems")
+    compare_every: int = option(1, "compare on every k-th Newton system", check=AT_LEAST_ONE)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Everything that a run needs to know, with the scene's own values filled in.
+
+    ``scene`` is an instance of a class of ``dem.scenes.SCENES``; ``solver`` of the options class of
+    ``ccp_type``.
+    """
+
+    run: Run
+    scene: Any
+    dt: float
+    delta: float
+    limits: ccp.Limits
+    solver: Any
+    demo: bool
+
+    @property
+    def problem(self) -> str | None:
+        return self.run.problem or None
+
+    def compare_names(self) -> list[str]:
+        return [name for name in self.run.compare.split(",") if name]
+
+
+def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
+    """The options of the database; raises OptionError, the same on every rank, before any work."""
+    demo = not database
+    database = DEMO if demo else database
+    run = read(Run, database)
+    solver = ccp.SOLVERS[run.ccp_type]
+    prefix = f"ccp_{run.ccp_type}_"
+    scene_class = SCENES[run.scene]
+    known = [d.name for group, start in _groups(run.scene) for d in describe(group, start)]
+    refuse_unknown(database, known, prefixes=("compare_", "fallback_"))
+    for name in known:
+        PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
+    try:
+        scene = read(scene_class, database, "scene_")
+    except OptionError:
+        raise
+    except ValueError as error:  # the scene's message starts with the name of its field
+        raise OptionError(f"-scene_{error}") from None
+    if run.compare and not solver.newton:
+        raise OptionError(
+            f"-compare {run.compare}: -ccp_type {run.ccp_type} solves no Newton systems; allowed is pdip"
+        )
+    options = Options(
+        run,
+        scene,
+        run.dt if run.dt is not None else scene.dt,
+        run.delta if run.delta is not None else scene.delta,
+        read(ccp.Limits, database, "ccp_"),
+        read(solver.options, database, prefix),
+        demo,
+    )
+    ccp.Comparison(comm, options.compare_names())  # refuses unknown names
+    refuse_serial(comm)
+    _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
+    _refuse_missing("-problem", run.problem, comm)
+    if not run.settle:
+        _refuse_unwritable(Path(run.output), comm)
+    return options
+
+
+def _groups(scene: str) -> list[tuple[type, str]]:
+    solvers = [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
+    return [(Run, ""), (SCENES[scene], "scene_"), (ccp.Limits, "ccp_"), *solvers]
+
+
+def help_text(database: Mapping[str, str]) -> str:
+    """All options with default, unit and meaning."""
+    scene = database.get("scene", "mixer")
+    scene = scene if scene in SCENES else "mixer"
+    lines = ["Options of pctt.run (names <default unit>: meaning); without any, it runs the demo:"]
+    lines += ["  " + " ".join(f"-{name} {value}" for name, value in DEMO.items()), ""]
+    titles = ["Run", f"Scene {scene}", "Cone problem"]
+    titles += [f"-ccp_type {name}: {solver.help}" for name, solver in ccp.SOLVERS.items()]
+    for title, (group, prefix) in zip(titles, _groups(scene)):
+        lines += [title, *(str(line) for line in describe(group, prefix)), ""]
+    lines += [
+        "Newton systems: the KSP without prefix, e.g. -ksp_type bcgs -ksp_rtol 1e-3 -ksp_max_it 1000",
+        "  -ksp_pc_side right -pc_type pbjacobi (the defaults; rtol is 10 ccp_tol where that is smaller),",
+        "  -ksp_monitor, -ksp_view, -log_view. A compared preconditioner NAME has the prefix -compare_NAME_,",
+        "  e.g. -compare_ilu_pc_factor_levels 1. On several ranks ilu and icc work within each rank.",
+    ]
+    return "\n".join(lines)
+
+
+def _refuse_missing(name: str, path: str, comm: MPI.Comm) -> None:
+    readable = comm.bcast(not path or os.access(path, os.R_OK) and os.path.isfile(path))
+    if not readable:
+        raise OptionError(f"{name} {path}: no such file, or not readable")
+
+
+def _refuse_unwritable(folder: Path, comm: MPI.Comm) -> None:
+    error = None
+    if comm.rank == 0:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            probe = folder / ".pctt-probe"
+            probe.touch()
+            probe.unlink()
+        except OSError as problem:
+            error = problem.strerror
+    error = comm.bcast(error)
+    if error:
+        raise OptionError(
+            f"-output {folder}: cannot write there ({error}); allowed is a folder that can be written"
+        )

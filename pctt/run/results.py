@@ -1,0 +1,115 @@
+"""The output folder of a run.
+
+    state.h5         group steps/000012 per recorded step, each a link to its own file in frames/
+    frames/          one file per recorded step
+    checkpoint.h5    all that ``-restart`` needs
+    summary.json     figures per step, and of the compared preconditioners
+
+Every file is written under a temporary name and renamed, so that a killed run leaves whole files only.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from dem.contact.search import Contacts
+from dem.exchange import exchange
+from dem.system import ContactSystem
+from dem.world import World
+from pctt.run.hdf5 import RowWriter, write_text, written
+
+
+class Results:
+    """Writes the output folder; files of steps that a new run makes again are replaced."""
+
+    def __init__(self, folder: Path, comm: MPI.Comm, record: str, first_step: int):
+        self.folder, self.comm, self.record = folder, comm, record
+        self.checkpoint = folder / "checkpoint.h5"
+        self._frames = folder / "frames"
+        self._recorded: list[int] = []
+        self._steps: list[dict[str, Any]] = []
+        if comm.rank == 0:
+            self._frames.mkdir(parents=True, exist_ok=True)
+            self._take_over(first_step)
+        comm.Barrier()
+
+    def _take_over(self, first_step: int) -> None:
+        """Keep what an earlier run of the same scene left up to the step from which this one starts."""
+        summary = self.folder / "summary.json"
+        try:
+            old = json.loads(summary.read_text())
+        except (OSError, ValueError):
+            old = {}
+        same = first_step > 0 and old.get("scene") == json.loads(self.record)
+        if same:
+            self._steps = [line for line in old.get("steps", []) if line["step"] <= first_step]
+        for frame in sorted(self._frames.glob("*.h5")):
+            step = int(frame.stem) if frame.stem.isdigit() else -1
+            if same and 0 <= step <= first_step:
+                self._recorded.append(step)
+            else:
+                frame.unlink()
+
+    def record_step(
+        self, world: World, contacts: Contacts, system: ContactSystem, impulse: np.ndarray
+    ) -> None:
+        """Write the state at the end of a step, and the contacts and impulses that led to it; collective.
+
+        Bodies are in the order of their ids (grains, then large bodies).
+        """
+        name = f"{world.step:06d}.h5"
+        with written(self._frames / name, self.comm) as file:
+            file.attributes("/", {"step": world.step, "time": world.time})
+            _write_bodies(file, world)
+            near = contacts.near.bodies
+            file.rows("contact/key", contacts.key)
+            file.rows("contact/body", np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1))
+            file.rows("contact/point", contacts.point)
+            file.rows("contact/frame", system.frame)
+            file.rows("contact/gap", contacts.gap)
+            file.rows("contact/impulse", impulse)
+        if self.comm.rank == 0:
+            self._recorded.append(world.step)
+            self._link_frames(world)
+
+    def _link_frames(self, world: World) -> None:
+        temporary = self.folder / ".state.h5.tmp"
+        with h5py.File(temporary, "w") as file:
+            file.attrs["scene"] = self.record
+            file.attrs["large_bodies"] = [body.name for body in world.large_bodies]
+            file.attrs["contents"] = (
+                "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, by body id; "
+                "contact: bodies a and b, point m, frame rows (normal from a to b, t1, t2), gap m, "
+                "impulse on b N s"
+            )
+            for step in self._recorded:
+                file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
+        temporary.replace(self.folder / "state.h5")
+
+    def add(self, line: dict[str, Any]) -> None:
+        """Append the figures of a step; rank 0."""
+        self._steps.append(line)
+
+    def write_summary(self, totals: dict[str, Any]) -> None:
+        """Write summary.json with what is known so far; rank 0."""
+        summary = {**totals, "scene": json.loads(self.record), "steps": self._steps}
+        write_text(self.folder / "summary.json", json.dumps(summary, indent=1, allow_nan=True) + "\n")
+
+
+def _write_bodies(file: RowWriter, world: World) -> None:
+    grains, comm = world.grains, world.comm
+    columns = {"id": grains.id, "position": grains.position, "quaternion": grains.quaternion}
+    columns["velocity"] = grains.velocity
+    starts = np.arange(comm.size + 1) * int(world.slabs[-1]) // comm.size
+    rows = exchange(comm, columns, np.searchsorted(starts, grains.id, side="right") - 1)
+    order = np.argsort(rows["id"])
+    last = comm.rank == comm.size - 1
+    for name in ("position", "quaternion", "velocity"):
+        large = getattr(world.large, name)
+        file.rows(name, np.concatenate([rows[name][order], large if last else large[:0]]))

@@ -1,0 +1,210 @@
+"""The simulation of a scene: search contacts, solve the cone problem, move the bodies, record."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dem.contact import find_contacts
+from dem.impulses import ImpulseMemory
+from dem.partition import rebalance
+from dem.stepper import advance
+from dem.system import ContactSystem
+from dem.world import World
+from pctt import ccp, log
+from pctt.options import OptionError
+from pctt.run import checkpoint, report
+from pctt.run.options import Options
+from pctt.run.results import Results
+
+
+def simulate(options: Options, comm: MPI.Comm) -> None:
+    """Run the scene of the options, or settle it with ``-settle``."""
+    progress = report.Progress(comm.rank == 0)
+    if options.run.settle:
+        path = settled_state(options, comm, progress, anew=True)
+        progress.say(f"settled state: {path}")
+        return
+    if options.demo:
+        progress.say("no options: the demo; -help lists the options")
+    world, memory = _first_state(options, comm, progress)
+    record = checkpoint.scene_record(options.run.scene, options.scene)
+    results = Results(Path(options.run.output), comm, record, world.step)
+    compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
+    stepper = Stepper(options, world, memory, compare if compare.names else None)
+    method = f"{options.run.ccp_type} to {options.limits.tol:g}"
+    progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
+    progress.say(report.COLUMNS)
+    lines = []
+    for k in range(1, options.run.steps + 1):
+        progress.doing(f"step {world.step + 1}, time {world.time:.3f} s")
+        line = stepper.step()
+        last = k == options.run.steps
+        with log.phase("output"):
+            if options.run.output_every and (world.step % options.run.output_every == 0 or last):
+                results.record_step(world, stepper.contacts, stepper.system, stepper.impulse)
+            if k % options.run.checkpoint_every == 0 or last:
+                checkpoint.save(results.checkpoint, record, world, memory)
+        line["phases"] |= log.take_seconds(("output",))
+        line["seconds"] = sum(line["phases"].values())
+        lines.append(line)
+        progress.say(report.step_line(line))
+        if comm.rank == 0:
+            results.add(line)
+            results.write_summary(
+                {"bodies": world.body_count, "ranks": comm.size, "compare": compare.summary()}
+            )
+    if lines:
+        progress.say(report.phase_table(lines))
+    if compare.names:
+        progress.say("\n" + report.compare_table(compare.summary(), compare.labels()))
+    progress.say(f"\nresults: {results.folder}/state.h5, summary.json, checkpoint.h5")
+
+
+class SceneError(RuntimeError):
+    """A scene that cannot go on; raised on all ranks alike."""
+
+
+class Stepper:
+    """One time step after another of a world; keeps the last step's contacts and impulses for output."""
+
+    contacts: Any
+    system: ContactSystem
+    impulse: np.ndarray
+
+    def __init__(
+        self, options: Options, world: World, memory: ImpulseMemory, compare: ccp.Comparison | None = None
+    ):
+        self.options, self.world, self.memory, self.compare = options, world, memory, compare
+
+    def step(self) -> dict[str, Any]:
+        """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no number)
+        or boxes come upon boxes."""
+        options, world = self.options, self.world
+        with log.phase("search"):
+            rebalance(world)
+            try:
+                self.contacts = find_contacts(world, options.delta)
+            except (FloatingPointError, NotImplementedError) as error:  # raised on all ranks alike
+                raise SceneError(f"step {world.step + 1}: {error}") from None
+        with log.phase("assembly"):
+            self.system = ContactSystem(world, self.contacts, options.dt, options.run.recovery_speed)
+            problem = cone_problem(self.system, world.comm)
+            guess, _ = self.memory.recall(self.system.key, self.system.frame)
+        with log.phase("solve"):
+            result, solver = self._solve(problem, guess)
+            accuracy = ccp.measure(problem, result.impulse)
+        with log.phase("advance"):
+            self.impulse = result.impulse
+            advance(world, self.system.velocity(self.impulse), options.dt)
+            self.memory.remember(self.system.key, self.impulse, self.system.frame)
+        contacts = problem.size
+        problem.destroy()
+        return {
+            "step": world.step,
+            "time": world.time,
+            "contacts": contacts,
+            "newton_its": result.iterations if ccp.SOLVERS[solver].newton else 0,
+            "iterations": result.iterations,
+            "ksp_its": result.ksp_its,
+            **dataclasses.asdict(accuracy),
+            "converged": result.converged,
+            "reason": result.reason,
+            "fallbacks": result.fallbacks,
+            "solver": solver,
+            "asked_solver": options.run.ccp_type,
+            "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
+        }
+
+    def _solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> tuple[ccp.Result, str]:
+        """Solve as asked; where that does not converge, go on with APGD from there and keep the better."""
+        options = self.options
+        asked = options.run.ccp_type
+        result = ccp.solve(problem, guess, asked, options.limits, options.solver, self.compare)
+        if result.converged or asked == "apgd":
+            return result, asked
+        limits = dataclasses.replace(options.limits, max_it=-1)
+        second = ccp.solve(problem, result.impulse, "apgd", limits)
+        if second.natural_residual < result.natural_residual:
+            second.ksp_its, second.fallbacks = result.ksp_its, result.fallbacks
+            return second, "apgd"
+        return result, asked
+
+
+def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
+    """The cone problem of a step's contacts."""
+    G = ccp.BlockRows(*system.G, columns=system.owned_bodies)
+    return ccp.ConeProblem(comm, system.r, system.mu, G=G, point=system.point, key=system.key)
+
+
+def _first_state(options: Options, comm: MPI.Comm, progress: report.Progress) -> tuple[World, ImpulseMemory]:
+    name, scene = options.run.scene, options.scene
+    if not options.run.restart:
+        return _new_world(scene, comm), ImpulseMemory(comm)
+    if options.run.restart == "settled":
+        path = settled_state(options, comm, progress)
+    else:
+        path = Path(options.run.restart)
+    world, memory = checkpoint.load(path, name, scene, comm)
+    progress.say(f"from {path}: step {world.step}, time {world.time:g} s")
+    return world, memory
+
+
+def _new_world(scene: Any, comm: MPI.Comm) -> World:
+    try:
+        return World.from_scene(scene.build(), comm)
+    except ValueError as error:
+        raise OptionError(f"scene {type(scene).__name__}: {error}") from None
+
+
+def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, anew: bool = False) -> Path:
+    """The cached settled state of the scene, made if it is not there (or ``anew``): the scene's settling time
+    with APGD, its last tenth with the contacts and ten times the accuracy, so that no overlap is left that
+    a first accurate step would have to push apart."""
+    settling = dataclasses.replace(
+        options,
+        run=dataclasses.replace(options.run, ccp_type="apgd"),
+        delta=options.run.settle_delta,
+        limits=ccp.Limits(tol=options.run.settle_tol),
+        solver=ccp.SOLVERS["apgd"].options(),
+    )
+    record = checkpoint.scene_record(options.run.scene, options.scene)
+    settings = {
+        "dt": options.dt,
+        "delta": [options.run.settle_delta, options.delta],
+        "recovery_speed": options.run.recovery_speed,
+        "tol": options.run.settle_tol,
+    }
+    path = checkpoint.settled_path(record, settings)
+    if not anew and comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
+        return path
+    steps = math.ceil(options.scene.settling_time / options.dt)
+    progress.say(f"settling {options.run.scene}, {steps} steps with APGD to {options.run.settle_tol:g}:")
+    if comm.rank == 0:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    stepper = Stepper(settling, _new_world(options.scene, comm), ImpulseMemory(comm))
+    start = time.perf_counter()
+    for k in range(1, steps + 1):
+        progress.doing(f"settling step {k} of {steps}")
+        if k == steps - steps // 10:
+            limits = ccp.Limits(tol=0.1 * options.run.settle_tol)
+            stepper.options = dataclasses.replace(settling, delta=options.delta, limits=limits)
+        line = stepper.step()
+        if k % max(1, steps // 10) == 0 or k == steps:
+            spent = time.perf_counter() - start
+            progress.say(
+                f"  step {k:5d}  time {line['time']:6.2f} s  contacts {line['contacts']:8d}"
+                f"  residual {line['natural_residual']:.1e}  {spent:7.1f} s spent"
+            )
+    comm.Barrier()
+    checkpoint.save(path, record, stepper.world, stepper.memory)
+    if comm.rank == 0:
+        checkpoint.write_checksum(path)
+    comm.Barrier()
+    return path

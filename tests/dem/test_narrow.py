@@ -1,0 +1,141 @@
+"""Contact geometry against analytic values and dense sampling."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cases import random_quaternions
+
+from dem import quaternion
+from dem.contact.narrow import CORNERS, boxes_within, corner_plane, sphere_box, sphere_plane, sphere_sphere
+
+RNG = np.random.default_rng(2)
+UNIT = np.eye(3)[None]
+
+
+def check_consistency(touch, center, radius):
+    """The normal is a unit vector, and the point lies half the gap outside the sphere along it."""
+    np.testing.assert_allclose(np.linalg.norm(touch.normal, axis=1), 1.0, rtol=1e-12)
+    expected = center + (radius + touch.gap / 2)[:, None] * touch.normal
+    np.testing.assert_allclose(touch.point, expected, atol=1e-12)
+
+
+def test_spheres():
+    x, y = np.array([[0.0, 0, 0], [0, 0, 0]]), np.array([[3.0, 4, 0], [0, 0, 1]])
+    touch = sphere_sphere(x, np.array([2.0, 1.0]), y, np.array([2.0, 0.5]))
+    np.testing.assert_allclose(touch.gap, [1.0, -0.5])
+    np.testing.assert_allclose(touch.normal, [[0.6, 0.8, 0], [0, 0, 1]])
+    np.testing.assert_allclose(touch.point, [[1.5, 2.0, 0], [0, 0, 0.75]])
+
+
+def test_concentric_spheres_are_parted_along_z():
+    touch = sphere_sphere(np.zeros((1, 3)), np.ones(1), np.zeros((1, 3)), np.ones(1))
+    np.testing.assert_array_equal(touch.normal, [[0, 0, 1]])
+    assert touch.gap[0] == -2.0
+
+
+def test_sphere_above_and_below_a_tilted_plane():
+    outward, origin = np.array([0.6, 0.0, 0.8]), np.array([1.0, 2.0, 3.0])
+    center = origin + np.outer([1.5, -4.0], outward) + np.array([0.8, 5.0, -0.6])
+    touch = sphere_plane(center, np.array([1.0, 1.0]), outward, origin)
+    np.testing.assert_allclose(touch.gap, [0.5, -5.0])
+    np.testing.assert_allclose(touch.normal, -np.tile(outward, (2, 1)))
+    check_consistency(touch, center, np.ones(2))
+
+
+@pytest.mark.parametrize(
+    ("center", "outward", "distance"),
+    [
+        ((0, 0, 5), (0, 0, 1), 2.0),  # face
+        ((0.9, -1.9, -3.5), (0, 0, -1), 0.5),  # face, near a corner of it
+        ((4, 6, 0), (0.6, 0.8, 0), 5.0),  # edge
+        ((2, 4, 5), (1 / 3, 2 / 3, 2 / 3), 3.0),  # corner
+        ((0.5, 0, 0), (1, 0, 0), -0.5),  # inside
+        ((0, -1.9, 2.8), (0, -1, 0), -0.1),  # inside, near an edge
+        ((1, 0, 0), (1, 0, 0), 0.0),  # on the surface
+        ((1 + 1e-15, 0, 0), (1, 0, 0), 0.0),  # on the surface but for rounding
+    ],
+)
+def test_sphere_on_faces_edges_corners_and_inside_a_box(center, outward, distance):
+    center, radius = np.array([center], dtype=float), np.array([0.25])
+    touch = sphere_box(center, radius, np.zeros((1, 3)), UNIT, np.array([[1.0, 2.0, 3.0]]))
+    np.testing.assert_allclose(touch.gap, distance - 0.25, atol=1e-14)
+    np.testing.assert_allclose(touch.normal, -np.array([outward]), atol=1e-14)
+    check_consistency(touch, center, radius)
+
+
+def box_surface(half, resolution=80):
+    """Points on the surface of a box, including its edges and corners."""
+    side = np.linspace(-1.0, 1.0, resolution)
+    grid = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    faces = [np.insert(grid, axis, sign, axis=1) for axis in range(3) for sign in (-1.0, 1.0)]
+    return np.concatenate(faces) * half
+
+
+def test_sphere_and_rotated_boxes_against_sampling():
+    count = 60
+    turn = quaternion.matrix(random_quaternions(RNG, count))
+    half, box_center = RNG.uniform(0.3, 1.0, (count, 3)), RNG.normal(size=(count, 3))
+    local = RNG.uniform(-1.6, 1.6, (count, 3)) * half
+    center = box_center + np.einsum("mij,mj->mi", turn, local)
+    radius = RNG.uniform(0.1, 0.3, count)
+    touch = sphere_box(center, radius, box_center, turn, half)
+    inside = (np.abs(local) < half).all(axis=1)
+    assert 5 < inside.sum() < count - 5
+    for k in range(count):
+        surface = box_center[k] + box_surface(half[k]) @ turn[k].T
+        sampled = np.linalg.norm(surface - center[k], axis=1)
+        distance = touch.gap[k] + radius[k]
+        assert np.sign(distance) == (-1 if inside[k] else 1)
+        spacing = 2 * half[k].max() / 79
+        # The nearest sample is at most half a cell diagonal away from the nearest point.
+        assert abs(distance) <= sampled.min() + 1e-12
+        assert sampled.min() <= np.hypot(abs(distance), spacing * np.sqrt(0.5)) + 1e-12
+        foot = center[k] + distance * touch.normal[k]
+        assert np.linalg.norm(surface - foot, axis=1).min() <= spacing * np.sqrt(0.5)
+    check_consistency(touch, center, radius)
+
+
+def test_one_box_serves_many_spheres():
+    q = random_quaternions(RNG, 1)
+    turn, half, place = quaternion.matrix(q), np.array([0.5, 0.2, 0.4]), np.array([1.0, 2.0, 3.0])
+    center, radius = place + RNG.normal(size=(30, 3)), np.full(30, 0.1)
+    shared = sphere_box(center, radius, place, turn[0], half)
+    each = sphere_box(center, radius, np.tile(place, (30, 1)), np.repeat(turn, 30, 0), np.tile(half, (30, 1)))
+    for one, other in zip(shared, each):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_corners_of_a_box_on_a_plane():
+    q = quaternion.exponential(np.array([[0.0, np.pi / 4, 0.0]]))
+    turn = np.repeat(quaternion.matrix(q), 8, axis=0)
+    center, half = np.tile([0.0, 0, 1.5], (8, 1)), np.tile([1.0, 2.0, 1.0], (8, 1))
+    touch = corner_plane(center, turn, half, np.arange(8), np.array([0.0, 0, 1]), np.zeros(3))
+    tip = center + (half * CORNERS) @ turn[0].T
+    np.testing.assert_allclose(touch.gap, tip[:, 2], atol=1e-14)
+    np.testing.assert_allclose(np.sort(touch.gap)[:2], 1.5 - np.sqrt(2.0))
+    np.testing.assert_allclose(touch.point, tip * [1, 1, 0.5], atol=1e-14)
+    np.testing.assert_allclose(touch.normal, np.tile([0.0, 0, -1], (8, 1)))
+
+
+def test_boxes_meet_where_sampling_says():
+    count = 200
+    turns = [quaternion.matrix(random_quaternions(RNG, count)) for _ in range(2)]
+    halves = [RNG.uniform(0.2, 1.0, (count, 3)) for _ in range(2)]
+    offset = RNG.uniform(-1.2, 1.2, (count, 3))
+    meets = boxes_within(np.zeros((count, 3)), turns[0], halves[0], offset, turns[1], halves[1], 0.0)
+    overlaps = np.zeros(count, bool)
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3), axis=-1).reshape(-1, 3)
+    for k in range(count):
+        world = offset[k] + (grid * halves[1][k]) @ turns[1][k].T
+        overlaps[k] = (np.abs(world @ turns[0][k]) <= halves[0][k]).all(axis=1).any()
+    assert meets[overlaps].all()
+    assert (meets & ~overlaps).sum() < 0.1 * count  # sampling misses a few thin overlaps
+    assert not meets.all()
+
+
+def test_parallel_boxes_at_a_distance():
+    one = (np.zeros((1, 3)), UNIT, np.ones((1, 3)))
+    other = (np.array([[0.0, 0.0, 2.1]]), UNIT, np.ones((1, 3)))
+    assert not boxes_within(*one, *other, 0.05)[0]
+    assert boxes_within(*one, *other, 0.15)[0]

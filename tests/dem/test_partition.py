@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dem.partition import morton_codes
+
+
+def interleave(x, y, z):
+    return sum(((x >> i & 1) | (y >> i & 1) << 1 | (z >> i & 1) << 2) << 3 * i for i in range(21))
+
+
+def test_morton_codes_interleave_the_bits():
+    rng = np.random.default_rng(1)
+    cells = rng.integers(0, 2**21, (200, 3))
+    cells[0], cells[1] = 0, 2**21 - 1
+    codes = morton_codes(cells.astype(float), np.zeros(3), np.full(3, 2.0**21 - 1))
+    assert codes.tolist() == [interleave(*map(int, cell)) for cell in cells]
+    assert codes.min() == 0
+    assert codes.max() == 2**63 - 1
+
+
+def test_morton_codes_of_one_point():
+    assert morton_codes(np.ones((1, 3)), np.ones(3), np.ones(3)).tolist() == [0]
+
+
+SPLIT = """
+import numpy as np
+from mpi4py import MPI
+from dem.partition import splitters
+comm = MPI.COMM_WORLD
+rng = np.random.default_rng(comm.rank)
+codes = rng.integers(0, 2**63 - 1, 1000 * (comm.rank + 1)) >> rng.integers(0, 60)
+weights = rng.integers(1, 10, len(codes)).astype(float)
+cuts = splitters(comm, codes, weights)
+assert comm.bcast(cuts.tolist()) == cuts.tolist()
+everything = comm.allgather((codes, weights))
+codes, weights = (np.concatenate(part) for part in zip(*everything))
+below = np.array([weights[codes < cut].sum() for cut in cuts])
+up_to = np.array([weights[codes <= cut].sum() for cut in cuts])
+target = weights.sum() * np.arange(1, comm.size) / comm.size
+assert (below <= target).all() and (up_to > target).all(), (below, target, up_to)
+"""
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [2, 3, 4])
+def test_splitters_cut_the_weight_evenly(mpirun, ranks):
+    mpirun(SPLIT, ranks)
+
+
+REBALANCE = """
+import numpy as np
+from mpi4py import MPI
+from cases import grains_by_id, heap, step
+from dem.contact import find_contacts
+from dem.partition import imbalance, morton_codes, rebalance
+from dem.world import World
+comm = MPI.COMM_WORLD
+world = World.from_scene(heap(1, side=8, boxes=False), comm)
+for _ in range(3):
+    step(world)
+before = grains_by_id(world)
+
+# Unbalance: the first rank takes everything.
+parts = comm.allgather(world.grains.columns())
+from dem.bodies import Bodies
+whole = Bodies(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+world.set_grains(whole if comm.rank == 0 else whole.take(slice(0, 0)))
+find_contacts(world, 0.05)
+before.weight = grains_by_id(world).weight
+if comm.size > 1:
+    assert imbalance(world) > 1.9
+    assert rebalance(world)
+assert imbalance(world) < 1.05, imbalance(world)
+assert not rebalance(world)
+
+after = grains_by_id(world)
+assert (after.id == np.arange(512)).all()
+for name, column in after.columns().items():
+    assert (column == getattr(before, name)).all(), name
+assert (world.slabs == np.cumsum([0] + comm.allgather(len(world.grains)))).all()
+
+# Sorted along one curve over all ranks.
+low, high = after.position.min(axis=0), after.position.max(axis=0)
+codes = np.concatenate(comm.allgather(morton_codes(world.grains.position, low, high)))
+if comm.size > 1:
+    assert (np.diff(codes) >= 0).all()
+"""
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [1, 2, 3, 4])
+def test_rebalancing_keeps_the_bodies_and_spreads_the_contacts(mpirun, ranks):
+    mpirun(REBALANCE, ranks)

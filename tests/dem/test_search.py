@@ -1,0 +1,227 @@
+"""The contact search against all pairs, one by one."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from cases import contacts_by_key, heap, step
+from mpi4py import MPI
+
+from dem import quaternion
+from dem.bodies import BOX
+from dem.contact import find_contacts
+from dem.contact.broad import close_pairs
+from dem.motion import Rotation
+from dem.scene import Scene
+from dem.shapes import Box, Plane, Sphere
+from dem.world import World
+
+SELF = MPI.COMM_SELF
+
+
+def box_gap(center, radius, place, turn, half):
+    """Signed distance of a sphere and a box, the textbook formula of one point."""
+    local = np.abs(quaternion.matrix(turn).T @ (center - place)) - half
+    return np.linalg.norm(np.maximum(local, 0.0)) + min(local.max(), 0.0) - radius
+
+
+def all_pairs(world, delta):
+    """Gaps at most delta of every pair of bodies, {(id a, id b): sorted gaps}."""
+    grains, gaps = world.grains, {}
+
+    def note(i, j, gap):
+        if gap <= delta:
+            gaps.setdefault((min(i, j), max(i, j)), []).append(gap)
+
+    for i, j in itertools.combinations(range(len(grains)), 2):
+        p, q = (j, i) if grains.shape[i] == BOX else (i, j)
+        center, radius = grains.position[p], grains.size[p, 0]
+        if grains.shape[q] == BOX:
+            gap = box_gap(center, radius, grains.position[q], grains.quaternion[q], grains.size[q])
+        else:
+            gap = np.linalg.norm(center - grains.position[q]) - radius - grains.size[q, 0]
+        if grains.shape[p] != BOX:
+            note(grains.id[i], grains.id[j], gap)
+    for row, body in enumerate(world.large_bodies):
+        turn, origin = world.large.quaternion[row], world.large.position[row]
+        for part, i in itertools.product(body.shapes, range(len(grains))):
+            place = origin + quaternion.rotate(turn, np.array(part.center))
+            center, radius, half = grains.position[i], grains.size[i, 0], grains.size[i]
+            other = world.large.id[row]
+            if isinstance(part, Plane):
+                up = quaternion.rotate(turn, np.array(part.normal))
+                if grains.shape[i] == BOX:
+                    for signs in itertools.product((-1, 1), repeat=3):
+                        tip = center + quaternion.rotate(grains.quaternion[i], half * signs)
+                        note(grains.id[i], other, up @ (tip - place))
+                else:
+                    note(grains.id[i], other, up @ (center - place) - radius)
+            elif isinstance(part, Sphere):
+                if grains.shape[i] == BOX:
+                    gap = box_gap(place, part.radius, center, grains.quaternion[i], half)
+                else:
+                    gap = np.linalg.norm(center - place) - radius - part.radius
+                note(grains.id[i], other, gap)
+            elif grains.shape[i] != BOX:
+                frame = quaternion.multiply(turn, np.array(part.quaternion))
+                note(grains.id[i], other, box_gap(center, radius, place, frame, np.array(part.half_extents)))
+    return {pair: sorted(values) for pair, values in gaps.items()}
+
+
+def found_pairs(world, delta):
+    found = contacts_by_key(find_contacts(world, delta), world.comm)
+    gaps = {}
+    for a, b, gap in zip(found["a"], found["b"], found["gap"]):
+        gaps.setdefault((a, b), []).append(gap)
+    return {pair: sorted(values) for pair, values in gaps.items()}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_search_finds_what_all_pairs_have(seed):
+    world = World.from_scene(heap(seed, side=4), SELF)
+    for _ in range(30):
+        step(world)
+    expected, found = all_pairs(world, 0.03), found_pairs(world, 0.03)
+    assert len(expected) > 60
+    assert found.keys() == expected.keys()
+    for pair, gaps in expected.items():
+        np.testing.assert_allclose(found[pair], gaps, atol=1e-13)
+
+
+def test_search_next_to_a_turned_box_with_spheres_at_faces_edges_corners_and_inside():
+    rng = np.random.default_rng(5)
+    scene = Scene(friction=0.2)
+    scene.add_spheres(rng.uniform(-1.5, 1.5, (150, 3)), 0.1, 1000.0)
+    shapes = [Box((0.8, 0.1, 0.6), (0.1, 0.2, 0.3), tuple(rng.normal(size=4)))]
+    scene.add_body("blade", shapes, Rotation((0.2, 1.0, 0.0)), quaternion=tuple(rng.normal(size=4)))
+    world = World.from_scene(scene, SELF, overlap=np.inf)
+    blade = {pair: gaps for pair, gaps in all_pairs(world, 0.4).items() if pair[1] == 150}
+    assert len(blade) > 10
+    assert min(blade.values())[0] < -0.1  # a centre inside
+    assert {pair: gaps for pair, gaps in found_pairs(world, 0.4).items() if pair[1] == 150} == {
+        pair: pytest.approx(gaps, abs=1e-13) for pair, gaps in blade.items()
+    }
+
+
+def test_broad_phase_with_radii_over_three_decades():
+    rng = np.random.default_rng(3)
+    position, radius = rng.uniform(size=(300, 3)), 10.0 ** rng.uniform(-3, -0.5, 300)
+    distance = np.linalg.norm(position[:, None] - position, axis=2)
+    i, j = np.nonzero(np.triu(distance <= radius[:, None] + radius + 0.01, 1))
+    pairs = close_pairs(position, radius, 0.01)
+    assert (pairs[:, 0] < pairs[:, 1]).all()
+    found = set(map(tuple, pairs))
+    assert len(found) == len(pairs)
+    assert set(zip(i, j)) <= found
+    assert len(found) < 0.5 * 300 * 299 / 2
+
+
+def test_normals_point_from_the_first_to_the_second_body():
+    world = World.from_scene(heap(2, side=3), SELF)
+    for _ in range(10):
+        step(world)
+    contacts = find_contacts(world, 0.03)
+    table = contacts.near.bodies
+    assert (table.id[contacts.a] < table.id[contacts.b]).all()
+    both_grains = table.id[contacts.b] < world.slabs[-1]
+    assert 10 < both_grains.sum() < len(contacts)
+    offset = table.position[contacts.b] - table.position[contacts.a]
+    assert (np.einsum("ij,ij->i", contacts.normal, offset)[both_grains] > 0).all()
+    floor = np.isin(contacts.b, np.flatnonzero(table.id == world.slabs[-1]))
+    assert (
+        np.einsum("ij,ij->i", contacts.normal, contacts.point - table.position[contacts.a])[floor] > 0
+    ).all()
+
+
+def test_friction_is_that_of_the_pair_of_materials():
+    scene = Scene(friction=0.3)
+    scene.add_spheres([[0, 0, 0.1], [1, 0, 0.1]], 0.1, 1000.0, material="glass")
+    scene.add_spheres([[0, 0, 0.3]], 0.1, 1000.0, material="steel")
+    scene.add_body("floor", [Plane((0, 0, 1))], material="wood")
+    scene.set_friction(0.7, "steel", "glass")
+    scene.set_friction(0.5, "wood", "glass")
+    found = contacts_by_key(find_contacts(World.from_scene(scene, SELF), 0.01), SELF)
+    assert list(zip(found["a"], found["b"], found["friction"])) == [(0, 2, 0.7), (0, 3, 0.5), (1, 3, 0.5)]
+
+
+def test_keys_are_unique_and_persist_while_contacts_do():
+    world = World.from_scene(heap(4), SELF)
+    known = {}
+    kept = 0
+    for _ in range(20):
+        found = contacts_by_key(step(world), SELF)
+        assert len(set(found["key"])) == len(found["key"])
+        for key, a, b in zip(found["key"], found["a"], found["b"]):
+            kept += key in known
+            assert known.setdefault(key, (a, b)) == (a, b)
+    assert kept > len(known)
+
+
+def test_corner_contacts_of_one_box_have_distinct_persistent_keys():
+    scene = Scene(friction=0.3)
+    scene.add_boxes([[0, 0, 0.1]], (0.3, 0.2, 0.1), 1000.0)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    world = World.from_scene(scene, SELF)
+    flat = find_contacts(world, 0.01)
+    assert len(flat) == 4
+    assert set(find_contacts(world, 0.3).key) > set(flat.key)
+    # Turned about the vertical, each corner keeps its key.
+    world.grains.quaternion = quaternion.exponential(np.array([[0, 0, 0.5]]))
+    turned = find_contacts(world, 0.01)
+    np.testing.assert_array_equal(turned.key, flat.key)
+    spin = quaternion.rotate(world.grains.quaternion, flat.point)
+    np.testing.assert_allclose(turned.point, spin, atol=1e-15)
+
+
+def test_contacts_are_ordered_by_owner_and_key():
+    world = World.from_scene(heap(6), SELF)
+    contacts = step(world)
+    owner = contacts.body.min(axis=1)
+    assert (np.lexsort((contacts.key, owner)) == np.arange(len(contacts))).all()
+    np.testing.assert_array_equal(world.grains.weight, np.bincount(owner, minlength=len(world.grains)))
+
+
+def test_threshold_is_inclusive_and_gap_is_signed():
+    scene = Scene(friction=0.3)
+    scene.add_spheres([[0, 0, 0], [0, 0, 2.5], [5, 0, 0], [5, 0, 1.99]], 1.0, 1000.0)
+    world = World.from_scene(scene, SELF, overlap=0.1)
+    np.testing.assert_allclose(np.sort(find_contacts(world, 0.5).gap), [-0.01, 0.5])
+    np.testing.assert_allclose(find_contacts(world, 0.49).gap, [-0.01])
+    with pytest.raises(ValueError, match="delta"):
+        find_contacts(world, -0.1)
+
+
+def test_no_contact_and_one_body():
+    scene = Scene(friction=0.3)
+    scene.add_spheres([[0, 0, 0]], 1.0, 1000.0)
+    contacts = find_contacts(World.from_scene(scene, SELF), 0.5)
+    assert len(contacts) == 0
+    assert contacts.body.shape == (0, 2)
+    assert contacts.normal.shape == (0, 3)
+
+
+@pytest.mark.parametrize("apart", [0.21, 1.0])
+def test_boxes_in_reach_of_boxes_are_refused(apart):
+    scene = Scene(friction=0.3)
+    scene.add_boxes([[0, 0, 0], [apart, 0, 0]], (0.1, 0.1, 0.1), 1000.0)
+    scene.add_body("press", [Box((0.1, 0.1, 0.1), (0, 0, 0.2 + apart))])
+    world = World.from_scene(scene, SELF)
+    assert len(find_contacts(world, 0.005)) == 0
+    world.grains.position[1, 2] += 0.1 * apart  # still apart
+    if apart > 0.5:
+        assert len(find_contacts(world, 0.05)) == 0
+        world.grains.position[1] = (0.0, 0.0, apart + 0.02)
+        with pytest.raises(NotImplementedError, match="box 1 and body 'press'"):
+            find_contacts(world, 0.05)
+    else:
+        with pytest.raises(NotImplementedError, match="boxes 0 and 1 are within reach"):
+            find_contacts(world, 0.05)
+
+
+def test_a_lost_grain_is_an_error():
+    world = World.from_scene(heap(1, side=3), SELF)
+    world.grains.position[4, 1] = np.nan
+    with pytest.raises(FloatingPointError, match="no finite position at step 0"):
+        find_contacts(world, 0.02)

@@ -1,0 +1,271 @@
+"""The maps between bodies and contacts against their definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cases import heap, step
+from mpi4py import MPI
+
+from dem import bodies, quaternion
+from dem.contact import find_contacts
+from dem.motion import Dynamic, Fixed
+from dem.scene import Scene
+from dem.shapes import Box, Plane
+from dem.stepper import advance
+from dem.system import ContactSystem, contact_frames, free_velocity
+from dem.world import World
+
+SELF = MPI.COMM_SELF
+RNG = np.random.default_rng(7)
+DT = 0.01
+
+
+@pytest.fixture(scope="module")
+def world():
+    world = World.from_scene(heap(3, side=4), SELF)
+    for _ in range(20):
+        step(world)
+    return world
+
+
+@pytest.fixture(scope="module")
+def contacts(world):
+    return find_contacts(world, 0.02)
+
+
+@pytest.fixture(scope="module")
+def system(world, contacts):
+    return ContactSystem(world, contacts, DT, recovery_speed=0.1)
+
+
+def dense(mat):
+    return mat.convert("dense").getDenseArray()
+
+
+def dense_g(system):
+    rows = np.zeros((system.local_contacts, 3, system.total_bodies, 6))
+    for c in range(system.local_contacts):
+        for k in range(system.G.indptr[c], system.G.indptr[c + 1]):
+            rows[c, :, system.G.indices[k]] = system.G.data[k]
+    return rows.reshape(3 * system.local_contacts, 6 * system.total_bodies)
+
+
+def inverse_mass(world):
+    """M^-1 from first principles, body by body."""
+    table = bodies.concatenate([world.grains, world.large])
+    inverse = np.zeros((6 * len(table), 6 * len(table)))
+    for i in np.flatnonzero(np.isfinite(table.mass)):
+        turn = quaternion.matrix(table.quaternion[i])
+        inverse[6 * i : 6 * i + 3, 6 * i : 6 * i + 3] = np.eye(3) / table.mass[i]
+        tensor = turn @ np.diag(table.inertia[i]) @ turn.T
+        inverse[6 * i + 3 : 6 * i + 6, 6 * i + 3 : 6 * i + 6] = np.linalg.inv(tensor)
+    return inverse
+
+
+def test_the_case_has_all_kinds_of_contacts(world, contacts):
+    table = contacts.near.bodies
+    kinds = {
+        (table.shape[a], min(b - len(world.grains), 0), table.shape[b])
+        for a, b in zip(contacts.a, contacts.b)
+    }
+    assert len(kinds) >= 4
+    assert {"walls", "slab", "blade"} <= {
+        world.large_bodies[i - world.slabs[-1]].name for i in table.id[contacts.b] if i >= world.slabs[-1]
+    }
+
+
+def test_frames_are_right_handed_and_orthonormal():
+    normal = RNG.normal(size=(500, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal[:6] = np.concatenate([np.eye(3), -np.eye(3)])
+    frame = contact_frames(normal)
+    np.testing.assert_allclose(frame @ frame.transpose(0, 2, 1), np.tile(np.eye(3), (500, 1, 1)), atol=1e-14)
+    np.testing.assert_allclose(np.linalg.det(frame), 1.0, rtol=1e-13)
+    np.testing.assert_array_equal(frame[:, 0], normal)
+
+
+def test_frames_change_little_with_the_normal():
+    normal = RNG.normal(size=(500, 3))
+    normal[:, 2] = np.copysign(np.abs(normal[:, 2]) + 1e-3, normal[:, 2])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    near = normal + 1e-6 * RNG.normal(size=(500, 3))
+    near /= np.linalg.norm(near, axis=1, keepdims=True)
+    assert np.abs(contact_frames(near) - contact_frames(normal)).max() < 2e-5
+
+
+def test_relative_velocity_is_the_rate_of_gaps_and_points(contacts):
+    """D' v by finite differences: move all bodies a little, look at gaps and at material points."""
+    world = World.from_scene(heap(3, side=4), SELF)
+    for _ in range(20):
+        step(world)
+    system = ContactSystem(world, contacts, DT)
+    velocity = RNG.normal(size=(world.owned, 6))
+    fixed = len(world.grains) + np.flatnonzero(~bodies.is_dynamic(world.large))
+    velocity[fixed] = world.prescribed_velocity(1e-6)[fixed - len(world.grains)]
+    rate = (dense(system.D).T @ velocity.ravel()).reshape(-1, 3)
+
+    eps = 1e-6
+    before = contacts.near.bodies
+    local = [
+        quaternion.rotate(quaternion.conjugate(before.quaternion[row]), contacts.point - before.position[row])
+        for row in (contacts.a, contacts.b)
+    ]
+    advance(world, velocity, eps)
+    after = find_contacts(world, 0.03)
+    place = {key: i for i, key in enumerate(after.key)}
+    same = np.array([place[key] for key in contacts.key])
+    np.testing.assert_allclose((after.gap[same] - contacts.gap) / eps, rate[:, 0], atol=3e-4)
+
+    table = after.near.bodies
+    carried = [
+        table.position[row] + quaternion.rotate(table.quaternion[row], arm)
+        for row, arm in zip((contacts.a, contacts.b), local)
+    ]
+    drift = np.einsum("cij,cj->ci", system.frame, carried[1] - carried[0]) / eps
+    np.testing.assert_allclose(drift, rate, atol=3e-4)
+
+
+def test_delassus_matrix_from_both_maps(world, system):
+    D, G = dense(system.D), dense_g(system)
+    expected = D.T @ inverse_mass(world) @ D
+    np.testing.assert_allclose(G @ G.T, expected, rtol=1e-10, atol=1e-12 * np.abs(expected).max())
+
+
+def test_prescribed_bodies_have_no_blocks_in_g_and_dynamic_ones_do(world, system):
+    prescribed = len(world.grains) + np.flatnonzero(~bodies.is_dynamic(world.large))
+    slab = len(world.grains) + world.large_row("slab")
+    assert not np.isin(system.G.indices, prescribed).any()
+    assert (system.G.indices == slab).sum() > 0
+    both = np.flatnonzero(np.diff(system.G.indptr) == 2)
+    first = system.G.indptr[both]
+    assert (system.G.indices[first] < system.G.indices[first + 1]).all()
+    assert np.abs(dense(system.D)[6 * prescribed[0] : 6 * prescribed[0] + 3]).max() > 0.5
+
+
+def test_velocity_is_free_velocity_plus_response(world, system):
+    impulse = RNG.normal(size=(system.local_contacts, 3))
+    response = inverse_mass(world) @ dense(system.D) @ impulse.ravel()
+    np.testing.assert_allclose(
+        system.velocity(impulse), system.free_velocity + response.reshape(-1, 6), rtol=1e-10, atol=1e-10
+    )
+
+
+def test_r_is_b_plus_relative_free_velocity(world, contacts, system):
+    relative = (dense(system.D).T @ system.free_velocity.ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(system.r, system.b + relative, atol=1e-12)
+    np.testing.assert_allclose(system.b[:, 0], np.maximum(contacts.gap / DT, -0.1))
+    assert not system.b[:, 1:].any()
+    assert (contacts.gap < -0.1 * DT).any()
+
+
+def test_free_velocity_of_prescribed_bodies_is_the_mean_one(world, system):
+    velocity = system.free_velocity[len(world.grains) :]
+    np.testing.assert_array_equal(velocity[world.large_row("walls")], 0.0)
+    blade = world.large_row("blade")
+    np.testing.assert_array_equal(velocity[blade], world.prescribed_velocity(DT)[blade])
+    np.testing.assert_array_equal(velocity[blade, 3:], [0, 0.3, 1.0])
+    slab = world.large_row("slab")
+    np.testing.assert_allclose(velocity[slab, :3] - world.large.velocity[slab, :3], DT * world.gravity)
+
+
+def test_gyroscopic_torque_keeps_the_angular_momentum_to_first_order():
+    scene = Scene(friction=0.0, gravity=(0, 0, 0))
+    scene.add_boxes(
+        [[0, 0, 0]], (0.1, 0.2, 0.4), 1000.0, quaternions=(1, 0.3, 0.2, 0.1), angular_velocity=(1, 2, 3)
+    )
+    change = []
+    for dt in (1e-3, 5e-4):
+        table = scene.grains()
+        start = np.linalg.solve(bodies.inverse_inertia(table)[0], table.velocity[0, 3:])
+        table.velocity = free_velocity(table, np.zeros(3), dt)
+        table.quaternion = quaternion.integrate(table.quaternion, table.velocity[:, 3:], dt)
+        end = np.linalg.solve(bodies.inverse_inertia(table)[0], table.velocity[0, 3:])
+        change.append(np.linalg.norm(end - start) / np.linalg.norm(start))
+    assert change[0] < 1e-5
+    assert change[0] / change[1] == pytest.approx(4.0, rel=0.05)  # the error of one step is of second order
+
+
+def test_contact_impulses_between_grains_conserve_momentum():
+    world = World.from_scene(heap(5, side=4, large=False), SELF)
+    contacts = find_contacts(world, 0.1)
+    assert len(contacts) > 100
+    world.gravity = np.zeros(3)
+    system = ContactSystem(world, contacts, DT)
+    change = system.velocity(RNG.normal(size=(len(contacts), 3))) - system.free_velocity
+    grains = world.grains
+    linear = grains.mass[:, None] * change[:, :3]
+    spin = np.linalg.solve(bodies.inverse_inertia(grains), change[:, 3:, None])[:, :, 0]
+    angular = np.cross(grains.position, linear) + spin
+    np.testing.assert_allclose(linear.sum(axis=0), 0.0, atol=1e-12 * np.abs(linear).sum())
+    np.testing.assert_allclose(angular.sum(axis=0), 0.0, atol=1e-12 * np.abs(angular).sum())
+
+
+def test_force_on_a_body_is_the_reaction_of_what_the_grains_feel(world, system):
+    impulse = RNG.normal(size=(system.local_contacts, 3))
+    load = (dense(system.D) @ impulse.ravel()).reshape(-1, 6)
+    for name in ("walls", "blade", "slab"):
+        expected = load[len(world.grains) + world.large_row(name)] / DT
+        np.testing.assert_allclose(system.force_on(name, impulse), expected, atol=1e-10)
+    with pytest.raises(KeyError, match="no large body 'lid'"):
+        system.force_on("lid", impulse)
+
+
+def test_weight_of_a_resting_block_reaches_the_floor():
+    scene = Scene(friction=0.3)
+    scene.add_boxes([[0.5, 0, 0.1]], (0.3, 0.2, 0.1), 1000.0)
+    scene.add_body("floor", [Plane((0, 0, 1))], Fixed(), position=(-1, 0, 0))
+    world = World.from_scene(scene, SELF)
+    system = ContactSystem(world, find_contacts(world, 0.01), DT)
+    weight = world.grains.mass[0] * 9.81
+    impulse = np.zeros((4, 3))
+    impulse[:, 0] = weight * DT / 4
+    np.testing.assert_allclose(system.velocity(impulse), 0.0, atol=1e-14)
+    force = system.force_on("floor", impulse)
+    np.testing.assert_allclose(force, [0, 0, -weight, 0, 1.5 * weight, 0], atol=1e-10 * weight)
+
+
+def test_no_contacts_and_bad_arguments():
+    scene = Scene(friction=0.3)
+    scene.add_spheres([[0, 0, 5]], 0.1, 1000.0, velocity=(1, 0, 0))
+    world = World.from_scene(scene, SELF)
+    contacts = find_contacts(world, 0.01)
+    system = ContactSystem(world, contacts, DT, 1.0)
+    assert system.D.getSize() == (6, 0)
+    assert system.G.data.shape == (0, 3, 6)
+    np.testing.assert_allclose(system.velocity(np.zeros((0, 3))), [[1, 0, -9.81 * DT, 0, 0, 0]])
+    with pytest.raises(ValueError, match="time step must be positive"):
+        ContactSystem(world, contacts, 0.0)
+    with pytest.raises(ValueError, match="recovery speed"):
+        ContactSystem(world, contacts, DT, -1.0)
+
+
+def test_mass_of_a_dynamic_body_made_of_shapes():
+    """Two halves of a box, off centre and turned, are the box."""
+    turn = quaternion.normalized(np.array([1.0, 0.2, 0.3, 0.4]))
+    scene = Scene(friction=0.3)
+    for name, parts in (
+        ("whole", [Box((0.2, 0.3, 0.4), (1, 2, 3), turn)]),
+        (
+            "halves",
+            [
+                Box((0.1, 0.3, 0.4), np.array([1, 2, 3]) + quaternion.rotate(turn, np.array([x, 0, 0])), turn)
+                for x in (-0.1, 0.1)
+            ],
+        ),
+    ):
+        scene.add_body(name, parts, Dynamic(), density=100.0)
+    large = scene.large()
+    np.testing.assert_allclose(large.mass, 8 * 0.2 * 0.3 * 0.4 * 100.0)
+    np.testing.assert_allclose(large.position, [[1, 2, 3]] * 2)
+    expected = np.sort(large.mass[0] / 3 * np.array([0.3**2 + 0.4**2, 0.2**2 + 0.4**2, 0.2**2 + 0.3**2]))
+    np.testing.assert_allclose(np.sort(large.inertia, axis=1), [expected] * 2)
+    inverse = bodies.inverse_inertia(large)
+    np.testing.assert_allclose(inverse[0], inverse[1], rtol=1e-9, atol=1e-9 * inverse.max())
+    # The shapes have not moved in the world.
+    for row, body in enumerate(scene.large_bodies):
+        centers = [
+            large.position[row] + quaternion.rotate(large.quaternion[row], np.array(p.center))
+            for p in body.shapes
+        ]
+        np.testing.assert_allclose(np.mean(centers, axis=0), [1, 2, 3])
