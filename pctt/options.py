@@ -140,6 +140,11 @@ def refuse_unknown(names: Iterable[str], known: Iterable[str], prefixes: Iterabl
     through = (*_PETSC, *prefixes)
     for name in names:
         if name not in known and not name.startswith(through):
-            close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.5)
-            hint = f"did you mean -{close[0]}?" if close else "-help lists the options"
-            raise OptionError(f"-{name}: no such option; {hint}")
+            raise no_such_option(name, known)
+
+
+def no_such_option(name: str, known: Iterable[str]) -> OptionError:
+    """The error for a name that is not known, with the nearest that is."""
+    close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.5)
+    hint = f"did you mean -{close[0]}?" if close else "-help lists the options"
+    return OptionError(f"-{name}: no such option; {hint}")

@@ -73,7 +73,10 @@ class Mixer:
             )
         reach = sqrt(self.paddle_length**2 + self.paddle_thickness**2)
         if reach >= 1.0:
-            raise ValueError(f"the paddle does not fit into the box: it sweeps {reach:g} box widths")
+            raise ValueError(
+                f"paddle_length {self.paddle_length:g} box widths does not fit into the box: the paddle sweeps "
+                f"{reach:g} box widths, and must stay below 1"
+            )
 
     @property
     def width(self) -> float:

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from pctt.blocks import BlockRows
 from pctt.ccp import apgd, pdip
 from pctt.ccp.accuracy import Accuracy, measure
 from pctt.ccp.compare import Comparison
 from pctt.ccp.cone import Array
-from pctt.ccp.delassus import BlockRows
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 from pctt.log import phase

@@ -11,11 +11,17 @@ from petsc4py import PETSc
 from pctt.ccp.krylov import Krylov, Solve
 from pctt.options import OptionError
 
+_BODY = {"ksp_type": "preonly", "pc_type": "python", "pc_python_type": "pctt.pc.BodySchur"}
+
 # names beside PETSc's own PC types: options that make them
 NAMED: dict[str, dict[str, str]] = {
     "ilu-shifted": {"pc_type": "ilu", "pc_factor_shift_type": "positive_definite"},
     "icc-shifted": {"pc_type": "icc", "pc_factor_shift_type": "positive_definite"},
     "cholesky": {"pc_type": "cholesky", "ksp_type": "preonly"},
+    "tt": {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain"},
+    "body-pbjacobi": _BODY,
+    "body-ilu": {**_BODY, "body_pc_type": "ilu", "body_pc_factor_levels": "1"},
+    "body-cholesky": {**_BODY, "body_pc_type": "cholesky", "pc_body_shift": "0"},
 }
 
 
@@ -65,7 +71,7 @@ class Comparison:
         for name in self.names:
             done = self._solver(name, rtol).solve(S, b, x)
             self.records[name].solves.append(done)
-            if chosen is None or (not chosen.converged and done.true_residual < chosen.true_residual):
+            if chosen is None or (not chosen.converged and _is_better(done, chosen)):
                 chosen, kept = done, x.array.copy()
         assert chosen is not None
         x.array[:] = kept
@@ -90,6 +96,10 @@ class Comparison:
             defaults = NAMED.get(name, {"pc_type": name})
             self._krylov[name] = Krylov(self.comm, f"compare_{name}_", defaults, rtol)
         return self._krylov[name]
+
+
+def _is_better(one: Solve, other: Solve) -> bool:
+    return (one.converged, -one.true_residual) > (other.converged, -other.true_residual)
 
 
 def _check_name(name: str, comm: MPI.Comm) -> None:

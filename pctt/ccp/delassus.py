@@ -8,36 +8,13 @@ its two bodies: those of other ranks come through the owners of the bodies' colu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.blocks import BlockRows, block_csr_matrix, square_block_matrix
 from pctt.ccp.cone import Array
-
-
-@dataclass(frozen=True)
-class BlockRows:
-    """Local block rows of G in block CSR: one row of 3 x 6 blocks per contact, one block column per body.
-
-    Attributes
-    ----------
-    indptr : (nc + 1,) start of each contact's blocks
-    indices : (nnz,) global block columns (bodies)
-    blocks : (nnz, 3, 6)
-    columns : number of block columns that this rank owns
-    """
-
-    indptr: np.ndarray
-    indices: np.ndarray
-    blocks: Array
-    columns: int
-
-    @property
-    def rows(self) -> int:
-        return len(self.indptr) - 1
 
 
 def offsets(comm: MPI.Comm, count: int) -> np.ndarray:
@@ -45,39 +22,12 @@ def offsets(comm: MPI.Comm, count: int) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(comm.allgather(count))])
 
 
-def block_matrix(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
-    """G as a Mat (3Nc x 6M) of block size 3."""
-    indices = (2 * G.indices[:, None] + [0, 1]).ravel()
-    blocks = G.blocks.reshape(-1, 3, 2, 3).transpose(0, 2, 1, 3)
-    return _baij(comm, 3 * G.rows, 6 * G.columns, 2 * G.indptr, indices, blocks)
-
-
-def square_block_matrix(comm: MPI.Comm, rows: sp.bsr_matrix) -> PETSc.Mat:
-    """A square Mat of block size 3 from this rank's block rows (3nc x 3Nc)."""
-    shape = (rows.shape[0] // 3, rows.shape[1] // 3)
-    order = sp.csr_matrix((np.arange(len(rows.indices)), rows.indices, rows.indptr), shape=shape)
-    order.sort_indices()  # PETSc wants sorted columns; sorting positions is much faster than sorting blocks
-    count = rows.shape[0]
-    return _baij(comm, count, count, rows.indptr, order.indices, rows.data[order.data])
-
-
-def _baij(comm: MPI.Comm, rows: int, columns: int, indptr, indices, blocks: Array) -> PETSc.Mat:
-    csr = (indptr.astype(PETSc.IntType), indices.astype(PETSc.IntType), np.ascontiguousarray(blocks).ravel())
-    size = ((rows, PETSc.DETERMINE), (columns, PETSc.DETERMINE))
-    mat = PETSc.Mat().create(comm)
-    mat.setSizes(size)
-    mat.setBlockSize(3)
-    mat.setType(PETSc.Mat.Type.BAIJ)
-    mat.setPreallocationCSR(csr)
-    return mat
-
-
 def diagonal_blocks(G: BlockRows) -> Array:
     """Diagonal 3 x 3 blocks of G G' (nc, 3, 3)."""
-    out = np.zeros((G.rows, 3, 3))
-    row = np.repeat(np.arange(G.rows), np.diff(G.indptr))
-    np.add.at(out, row, G.blocks @ G.blocks.transpose(0, 2, 1))
-    return out
+    products = G.blocks @ G.blocks.transpose(0, 2, 1)
+    shape = (G.rows, len(products))
+    add = sp.csr_matrix((np.ones(len(products)), np.arange(len(products)), G.indptr), shape=shape)
+    return (add @ products.reshape(-1, 9)).reshape(-1, 3, 3)
 
 
 def local_blocks(N: PETSc.Mat) -> Array:
@@ -114,7 +64,7 @@ def delassus(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
             shape=(3 * len(names), 6 * len(bodies)),
         )
     if G.rows == 0:
-        return _baij(comm, 0, 0, np.zeros(1), np.zeros(0), np.zeros(0))
+        return block_csr_matrix(comm, 0, 0, np.zeros(1), np.zeros(0), np.zeros(0))
     near = left @ right.T
     shape = (3 * G.rows, 3 * (names[-1] + 1))
     rows = sp.bsr_matrix((near.data, names[near.indices], near.indptr), shape=shape)

@@ -15,7 +15,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from scipy.sparse.linalg import spsolve
 
-from pctt.ccp.delassus import square_block_matrix
+from pctt.blocks import square_block_matrix
 from pctt.ccp.problem import ConeProblem
 
 

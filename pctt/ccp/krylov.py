@@ -19,7 +19,7 @@ _NOT_SUPPORTED = 56  # PETSC_ERR_SUP: this method has no code for block formats
 
 @dataclass(frozen=True)
 class Solve:
-    """One linear solve: ``true_residual`` is ||b - S x|| / ||b||, computed afterwards."""
+    """One linear solve: ``true_residual`` is ||b - S x|| / ||b||, computed afterwards (1 after a breakdown)."""
 
     converged: bool
     reason: str
@@ -55,6 +55,9 @@ class Krylov:
             self.ksp.pc.setType(given["pc_type"])
             self.ksp.pc.setFactorSolverType("mumps")
         self.ksp.setFromOptions()
+        # PETSc lets preonly have no options, but its preconditioner may be an iteration that wants the tolerance
+        self.rtol = PETSc.Options().getReal(prefix + "ksp_rtol", rtol)
+        self.ksp.setTolerances(rtol=self.rtol)
 
     def solve(self, S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> Solve:
         """x = S^-1 b from zero. A set-up or solve that breaks down is reported, never raised."""
@@ -65,7 +68,8 @@ class Krylov:
             if error.ierr == _NOT_SUPPORTED and not self.scalar:
                 self.scalar = True
                 return self.solve(S, b, x)
-            return Solve(False, f"PETSc error {error.ierr}", 0, 0.0, 0.0, np.inf)
+            x.zeroEntries()
+            return Solve(False, f"PETSc error {error.ierr}", 0, 0.0, 0.0, 1.0)
 
     def _solve(self, S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> Solve:
         start = _now(self.comm)
@@ -80,7 +84,7 @@ class Krylov:
             self.ksp.reset()
         true = _true_residual(S, b, x)
         # twice: BiCGStab's recursive residual may drift a little without harm
-        converged = reason > 0 and true <= 2 * self.ksp.getTolerances()[0]
+        converged = reason > 0 and true <= 2 * self.rtol
         words = _REASONS.get(reason, str(reason))
         return Solve(converged, words, iterations, setup - start, end - setup, true)
 
@@ -137,13 +141,15 @@ def _localise(prefix: str, given: dict[str, str]) -> str:
 
 
 def _true_residual(S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:
+    """||b - S x|| / ||b||; an x that is no number is replaced by zero, and leaves 1."""
     residual = b.duplicate()
     S.mult(x, residual)
     residual.aypx(-1.0, b)
     norm, reference = residual.norm(), b.norm()
     residual.destroy()
     if not np.isfinite(norm):
-        return np.inf
+        x.zeroEntries()
+        return 1.0
     return norm / reference if reference > 0 else norm
 
 

@@ -36,6 +36,11 @@ class SchurSystem:
         self.problem, self.rtol, self.compare = problem, rtol, compare
         self.S = problem.N.duplicate(copy=True)
         self.S.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        # what preconditioners may ask for: the places of the contacts, and what S is made of
+        if problem.point is not None:
+            self.S.setAttr("coordinates", problem.point)
+        if problem.contact_map is not None:
+            self.S.setAttr("contact_map", problem.contact_map)
         first, last = self.S.getOwnershipRange()
         self._block_rows = np.arange(first // 3, last // 3, dtype=PETSc.IntType)[:, None]
         self._x, self._b = self.S.createVecs()
@@ -45,8 +50,10 @@ class SchurSystem:
     def update(self, barrier: Array) -> None:
         """Put the barrier blocks (nc, 3, 3) in."""
         with phase("CCPUpdate"):
+            self.S.setAttr("barrier", barrier)
             blocks = self.problem.diagonal_blocks + barrier
-            self.S.setValuesBlockedRCV(self._block_rows, self._block_rows, blocks.reshape(-1, 9))
+            if len(blocks):  # petsc4py divides by their number
+                self.S.setValuesBlockedRCV(self._block_rows, self._block_rows, blocks.reshape(-1, 9))
             self.S.assemble()
 
     def solve(self, rhs: Array) -> Array:
@@ -66,6 +73,7 @@ class SchurSystem:
     def _climb_down(self, best: float) -> None:
         """Try the ladder; keep in x what has the smallest true residual, or zero if nothing is below 1."""
         kept = self._x.array.copy() if best < 1 else np.zeros(self._x.getLocalSize())
+        best = min(best, 1.0)
         for name in LADDER:
             done = self._solver(name).solve(self.S, self._b, self._x)
             self.ksp_its += done.iterations

@@ -8,8 +8,9 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.blocks import BlockRows, block_matrix
 from pctt.ccp.cone import Array, project
-from pctt.ccp.delassus import BlockRows, block_matrix, delassus, diagonal_blocks, local_blocks
+from pctt.ccp.delassus import delassus, diagonal_blocks, local_blocks
 
 
 class ConeProblem:
@@ -21,6 +22,7 @@ class ConeProblem:
     ----------
     r : (nc, 3) velocities of the contacts without impulses, plus gap/dt (m/s)
     mu : (nc,) friction coefficients
+    contact_map : the block rows of G, or None
     point : (nc, 3) contact points (m) or None; orders the unknowns of hierarchical preconditioners
     key : (nc,) persistent names of the contacts or None
     size : contacts on all ranks, Nc
@@ -48,7 +50,7 @@ class ConeProblem:
         if self.sum(bad.sum()):
             raise ValueError(f"{self.sum(bad.sum())} contacts with a NaN, infinite or negative coefficient")
         self.size = self.sum(len(self.mu))
-        self._G_rows, self._N = G, N
+        self.contact_map, self._N = G, N
         if N is not None:
             self._in, self._out = N.createVecs()
         elif G is not None:
@@ -57,7 +59,7 @@ class ConeProblem:
             self._in = self._out.duplicate()
 
     def __repr__(self) -> str:
-        given = "N" if self._G_rows is None else "G"
+        given = "N" if self.contact_map is None else "G"
         return f"ConeProblem({self.size} contacts, {self.comm.size} ranks, given by {given})"
 
     # -- the operator ---------------------------------------------------------------------------------------
@@ -83,12 +85,12 @@ class ConeProblem:
     @cached_property
     def N(self) -> PETSc.Mat:
         """The Delassus matrix N as a Mat of block size 3 (BAIJ), built at its first use and kept."""
-        return self._N if self._G_rows is None else delassus(self.comm, self._G_rows)
+        return self._N if self.contact_map is None else delassus(self.comm, self.contact_map)
 
     @cached_property
     def diagonal_blocks(self) -> Array:
         """The 3 x 3 diagonal blocks of N (nc, 3, 3)."""
-        return local_blocks(self._N) if self._G_rows is None else diagonal_blocks(self._G_rows)
+        return local_blocks(self._N) if self.contact_map is None else diagonal_blocks(self.contact_map)
 
     @cached_property
     def mean_diagonal(self) -> float:

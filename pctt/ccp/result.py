@@ -13,7 +13,11 @@ class Limits:
     """Options of every solver: ``-ccp_tol``, ``-ccp_max_it``."""
 
     tol: float = option(1e-4, "natural residual at which a cone problem counts as solved", check=POSITIVE)
-    max_it: int = option(-1, "iterations before a solver gives up; -1: the solver's own default")
+    max_it: int = option(
+        -1,
+        "iterations before a solver gives up; -1: the solver's own default",
+        check=("a whole number >= -1", lambda x: x >= -1),
+    )
 
 
 @dataclass

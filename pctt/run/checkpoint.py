@@ -11,12 +11,16 @@ from typing import Any
 
 from mpi4py import MPI
 
+from dem.bodies import Bodies
 from dem.impulses import ImpulseMemory
 from dem.world import World, restart_rows
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError, readable, write_text, written
 
 FORMAT = "pctt checkpoint 1"
+
+_COLUMNS = [field.name for field in dataclasses.fields(Bodies)]
+_LARGE = [f"large_{name}" for name in _COLUMNS]
 
 
 def scene_record(name: str, scene: Any) -> str:
@@ -47,24 +51,28 @@ def load(path: Path, name: str, scene: Any, comm: MPI.Comm) -> tuple[World, Impu
     with readable(path, comm) as file:
         if file.attrs.get("format") != FORMAT:
             raise FileError(f"{path}: no checkpoint of this program (it is not marked '{FORMAT}')")
-        _refuse_other_scene(path, file.attrs["scene"], scene_record(name, scene))
+        failure = None
         try:
-            replicated = {n: data[()] for n, data in file["world"].items()}
+            stored = json.loads(file.attrs["scene"])
+            replicated = {n: file[f"world/{n}"][()] for n in (*_LARGE, "slabs", "time", "step")}
             rows = restart_rows(replicated["slabs"], comm)
-            local = {n: data[rows] for n, data in file["grains"].items()}
+            local = {n: file[f"grains/{n}"][rows] for n in _COLUMNS}
             count = len(file["contacts/key"])
             part = slice(count * comm.rank // comm.size, count * (comm.rank + 1) // comm.size)
             key, impulse = file["contacts/key"][part], file["contacts/impulse"][part]
-        except (KeyError, OSError) as error:
-            raise FileError(f"{path}: incomplete checkpoint ({error})") from error
+        except (KeyError, OSError, ValueError) as error:
+            failure = str(error)
+        failures = [text for text in comm.allgather(failure) if text]
+        if failures:
+            raise FileError(f"{path}: incomplete checkpoint ({failures[0]})")
+    _refuse_other_scene(path, stored, json.loads(scene_record(name, scene)))
     world = World.restore(scene.build(), comm, local, replicated)
     memory = ImpulseMemory(comm)
     memory.restore(key, impulse)
     return world, memory
 
 
-def _refuse_other_scene(path: Path, stored: str, wanted: str) -> None:
-    old, new = json.loads(stored), json.loads(wanted)
+def _refuse_other_scene(path: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
     if old["scene"] != new["scene"]:
         raise OptionError(f"-scene {new['scene']}: {path} holds the scene {old['scene']}")
     for field, value in new.items():

@@ -126,6 +126,8 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         demo,
     )
     ccp.Comparison(comm, options.compare_names())  # refuses unknown names
+    if solver.newton:
+        _refuse_for_petsc(database, comm)
     refuse_serial(comm)
     _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
     _refuse_missing("-problem", run.problem, comm)
@@ -156,6 +158,22 @@ def help_text(database: Mapping[str, str]) -> str:
         "  e.g. -compare_ilu_pc_factor_levels 1. On several ranks ilu and icc work within each rank.",
     ]
     return "\n".join(lines)
+
+
+def _refuse_for_petsc(database: Mapping[str, str], comm: MPI.Comm) -> None:
+    """OptionError for options of the KSP that PETSc refuses; it would do so at the first Newton system."""
+    given = [f"-{name} {value or ''}".strip() for name, value in database.items() if name.startswith(("ksp_", "pc_"))]
+    ksp = PETSc.KSP().create(comm)
+    try:
+        ksp.setFromOptions()
+    except OptionError:  # from a preconditioner of ours
+        raise
+    except Exception as error:  # PETSc's own, and whatever importing a -pc_python_type raises
+        reason = str(error).splitlines()[-1]
+        reason = reason.partition("] ")[2] or reason
+        raise OptionError(f"{', '.join(given)}: PETSc refuses: {reason}") from None
+    finally:
+        ksp.destroy()
 
 
 def _refuse_missing(name: str, path: str, comm: MPI.Comm) -> None:

@@ -11,6 +11,7 @@ Every file is written under a temporary name and renamed, so that a killed run l
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +100,16 @@ class Results:
     def write_summary(self, totals: dict[str, Any]) -> None:
         """Write summary.json with what is known so far; rank 0."""
         summary = {**totals, "scene": json.loads(self.record), "steps": self._steps}
-        write_text(self.folder / "summary.json", json.dumps(summary, indent=1, allow_nan=True) + "\n")
+        write_text(self.folder / "summary.json", json.dumps(_finite(summary), indent=1) + "\n")
+
+
+def _finite(value: Any) -> Any:
+    """The same with null for numbers that JSON has no word for."""
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _write_bodies(file: RowWriter, world: World) -> None:

@@ -147,10 +147,8 @@ def _first_state(options: Options, comm: MPI.Comm, progress: report.Progress) ->
     name, scene = options.run.scene, options.scene
     if not options.run.restart:
         return _new_world(scene, comm), ImpulseMemory(comm)
-    if options.run.restart == "settled":
-        path = settled_state(options, comm, progress)
-    else:
-        path = Path(options.run.restart)
+    settled = options.run.restart == "settled"
+    path = settled_state(options, comm, progress) if settled else Path(options.run.restart)
     world, memory = checkpoint.load(path, name, scene, comm)
     progress.say(f"from {path}: step {world.step}, time {world.time:g} s")
     return world, memory

@@ -8,8 +8,8 @@ import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 
+from pctt.blocks import square_block_matrix
 from pctt.ccp import BlockRows, ConeProblem
-from pctt.ccp.delassus import square_block_matrix
 
 SELF = MPI.COMM_SELF
 
@@ -71,7 +71,7 @@ def random_graph(
         frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         for sign, body in zip((1.0, -1.0), touched):
             arm = 0.1 * rng.normal(size=3)
-            turn = np.cross(arm, frame) / 0.05  # frame rows times the angular velocity, of radius of gyration 0.05
+            turn = np.cross(arm, frame) / 0.05  # 0.05: the radius of gyration
             blocks.append(sign * np.hstack([frame, turn]) / np.sqrt(mass[body]))
             indices.append(body)
         indptr.append(len(indices))
@@ -135,15 +135,18 @@ def from_matrix(known: Known, comm: MPI.Comm = SELF) -> ConeProblem:
     return ConeProblem(comm, known.r[rows], known.mu[rows], N=matrix(comm, known.N))
 
 
-def from_graph(known: Known, graph: Graph, comm: MPI.Comm = SELF, contact_ends=None, body_ends=None) -> ConeProblem:
+def from_graph(
+    known: Known, graph: Graph, comm: MPI.Comm = SELF, contact_ends=None, body_ends=None
+) -> ConeProblem:
     """The problem given by the contact map of which N is the Gram matrix."""
     rows = part(comm, len(known.mu), contact_ends)
     return ConeProblem(comm, known.r[rows], known.mu[rows], G=graph.part(comm, contact_ends, body_ends))
 
 
 def heap(seed: int = 0, contacts: int = 40, bodies: int = 12, mu=None, **graph) -> tuple[Known, Graph]:
-    """A random problem of known optimum with its contact map; by default of friction 0.1 to 1, N of rank < 3 nc."""
+    """A random problem of known optimum with its contact map; by default mu is 0.1 to 1, and N singular."""
     made = random_graph(seed, contacts, bodies, **graph)
     G = made.dense()
-    mu = np.random.default_rng(seed + 1).uniform(0.1, 1.0, contacts) if mu is None else np.broadcast_to(mu, contacts)
-    return known_optimum(seed + 2, G @ G.T, np.array(mu, float)), made
+    if mu is None:
+        mu = np.random.default_rng(seed + 1).uniform(0.1, 1.0, contacts)
+    return known_optimum(seed + 2, G @ G.T, np.array(np.broadcast_to(mu, contacts), float)), made

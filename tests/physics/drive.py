@@ -1,4 +1,8 @@
-"""The loop of a simulation, one step at a time, and the scenes that several tests use."""
+"""The loop of a simulation, one step at a time, and small scenes that several tests use.
+
+The plain cone complementarity problem (CCP) asks y_n >= mu |y_t| of the contact velocities y, where y_n is
+gap/dt + the normal velocity. A contact that slides with speed s keeps a gap of dt mu s: here, the lift.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
-from dem import quaternion
 from dem.arrays import Floats
-from dem.bodies import Bodies
 from dem.contact import Contacts, find_contacts
-from dem.motion import Fixed, Motion
 from dem.partition import rebalance
 from dem.scene import Scene
 from dem.shapes import Plane
@@ -22,8 +23,14 @@ from dem.world import World
 from pctt import ccp
 from pctt.run.simulate import cone_problem
 
+Triple = tuple[float, float, float]
+
 G = 9.81  #: gravity [m/s^2]
-SOLVERS = ("pdip", "apgd")
+RADIUS = 0.1  #: of single spheres [m]
+HALF = (0.2, 0.15, 0.05)  #: half extents of single blocks [m]
+
+#: Both solvers, with tolerances that they reach on small problems.
+SOLVERS = {"pdip": 1e-8, "apgd": 1e-10}
 
 
 @dataclass
@@ -32,44 +39,83 @@ class Step:
 
     contacts: Contacts
     system: ContactSystem
-    impulse: Floats
-    result: ccp.Result
+    impulse: Floats  #: (nc, 3) normal, t1, t2 [N s]
 
-    def normal_impulses(self) -> Floats:
-        return self.impulse[:, 0]
+    def impulse_on_b(self) -> Floats:
+        """Impulses (nc, 3) on the second bodies, in the world frame [N s]."""
+        return (self.impulse[:, None, :] @ self.system.frame)[:, 0]
+
+    def friction_used(self) -> float:
+        """Sum of the tangential impulses over the sum of the normal ones."""
+        return float(np.hypot(self.impulse[:, 1], self.impulse[:, 2]).sum() / self.impulse[:, 0].sum())
 
 
-def world_of(scene: Scene, comm: MPI.Comm = MPI.COMM_SELF) -> World:
-    return World.from_scene(scene, comm)
-
-
-def run(
+def steps(
     world: World,
-    steps: int,
+    count: int,
     dt: float,
-    *,
     solver: str = "apgd",
-    tol: float = 1e-8,
+    tol: float | None = None,
     delta: float = 0.01,
     recovery_speed: float = np.inf,
+    iterations: int | None = None,
 ) -> Iterator[Step]:
-    """Make steps one by one; each must be solved to `tol`."""
-    for _ in range(steps):
+    """Make steps one by one; each must be solved to `tol`, by default that of SOLVERS, or is left after a
+    number of `iterations`."""
+    limits = ccp.Limits(SOLVERS[solver] if tol is None else tol)
+    if iterations is not None:
+        limits = ccp.Limits(1e-300, iterations)
+    for _ in range(count):
         rebalance(world)
         contacts = find_contacts(world, delta)
         system = ContactSystem(world, contacts, dt, recovery_speed)
         problem = cone_problem(system, world.comm)
-        result = ccp.solve(problem, None, solver, ccp.Limits(tol=tol))
+        result = ccp.solve(problem, None, solver, limits)
         problem.destroy()
-        assert result.converged, f"step {world.step + 1}: {result.reason}, residual {result.natural_residual:.1e}"
+        reached = f"{result.reason}, residual {result.natural_residual:.1e}"
+        assert result.converged or iterations, f"step {world.step + 1}: {reached}"
         advance(world, system.velocity(result.impulse), dt)
-        yield Step(contacts, system, result.impulse, result)
+        yield Step(contacts, system, result.impulse)
 
 
-def finish(steps: Iterator[Step]) -> Step:
+def make_steps(world: World, count: int, dt: float, *args, **options) -> Step:
     """Make all steps; the last one."""
-    last = None
-    for last in steps:
-        pass
-    assert last is not None
-    return last
+    return list(steps(world, count, dt, *args, **options))[-1]
+
+
+def on_incline(slope: float, friction: float) -> Scene:
+    """An empty incline, seen in its own axes: x down the slope, z away from it; gravity is turned instead."""
+    scene = Scene(friction, gravity=(G * np.sin(slope), 0.0, -G * np.cos(slope)))
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    return scene
+
+
+def block(scene: Scene, lift: float = 0.0, velocity: Triple = (0.0, 0.0, 0.0)) -> World:
+    """The scene with one block at the height `lift` above the plane z = 0."""
+    scene.add_boxes([0.0, 0.0, HALF[2] + lift], HALF, 1000.0, velocity=velocity)
+    return World.from_scene(scene, MPI.COMM_SELF)
+
+
+def sphere(
+    scene: Scene, lift: float = 0.0, velocity: Triple = (0.0, 0.0, 0.0), spin: Triple = (0.0, 0.0, 0.0)
+) -> World:
+    """The scene with one sphere at the height `lift` above the plane z = 0."""
+    scene.add_spheres([0.0, 0.0, RADIUS + lift], RADIUS, 1000.0, velocity=velocity, angular_velocity=spin)
+    return World.from_scene(scene, MPI.COMM_SELF)
+
+
+def momentum(world: World) -> Floats:
+    """Linear and angular momentum (6,) of the spheres of this rank, about the origin [N s, N m s]."""
+    grains = world.grains
+    linear = grains.mass[:, None] * grains.velocity[:, :3]
+    angular = np.cross(grains.position, linear) + grains.inertia * grains.velocity[:, 3:]
+    return np.concatenate([linear.sum(axis=0), angular.sum(axis=0)])
+
+
+def by_id(world: World) -> dict[str, Floats]:
+    """Positions, quaternions and velocities of all grains in the order of their ids, on every rank."""
+    names = ("id", "position", "quaternion", "velocity")
+    parts = world.comm.allgather({name: getattr(world.grains, name) for name in names})
+    table = {name: np.concatenate([part[name] for part in parts]) for name in names}
+    order = np.argsort(table["id"])
+    return {name: column[order] for name, column in table.items()}

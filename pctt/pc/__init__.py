@@ -1,0 +1,6 @@
+"""Preconditioners for ``-pc_type python -pc_python_type pctt.pc.NAME``."""
+
+from pctt.pc.body_schur import BodySchur
+from pctt.pc.tensor_train import TensorTrain
+
+__all__ = ["BodySchur", "TensorTrain"]

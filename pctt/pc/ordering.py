@@ -1,0 +1,49 @@
+"""An order of a matrix's block rows in which neighbours in space are neighbours in number."""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+
+_BITS = 21  # per axis: three of them fill a signed 64 bit integer
+
+
+def block_order(P: PETSc.Mat) -> np.ndarray:
+    """Place of each local block row of P among this rank's (n,), a permutation of 0 ... n-1.
+
+    Along a Morton curve through the points that the Mat's attribute ``coordinates`` holds, an array (n, 3), (n, 2) or
+    (n, 1) with a row per local block row (``P.setAttr("coordinates", points)``); without points, by reverse
+    Cuthill-McKee of this rank's part.
+    """
+    bs = P.getBlockSize()
+    count = P.getLocalSize()[0] // bs
+    points = P.getAttr("coordinates")
+    if points is not None:
+        codes = morton_codes(np.asarray(points, dtype=float).reshape(count, -1))
+        order = np.argsort(codes, kind="stable")
+    else:
+        rows, _ = P.getDiagonalBlock().getOrdering(PETSc.Mat.OrderingType.RCM)
+        order = rows.getIndices().astype(np.int64)
+        if len(order) != count:  # scalar rows: a block goes where its first row goes
+            order = order[order % bs == 0] // bs
+    place = np.empty(count, np.int64)
+    place[order] = np.arange(count)
+    return place
+
+
+def morton_codes(points: np.ndarray) -> np.ndarray:
+    """Interleaved bits of the coordinates (n, up to 3) on a grid over their bounding cube (n,).
+
+    >>> morton_codes(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])).argsort()
+    array([0, 1, 2, 3])
+    """
+    codes = np.zeros(len(points), np.int64)
+    if len(points) == 0:
+        return codes
+    low = points.min(axis=0)
+    extent = max(float((points.max(axis=0) - low).max()), np.finfo(float).tiny)
+    grid = ((points - low) * ((2**_BITS - 1) / extent)).astype(np.int64)
+    for bit in range(_BITS):
+        for axis in range(grid.shape[1]):
+            codes |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return codes

@@ -1,0 +1,81 @@
+"""Which rank the next preconditioner gets: what has paid in measured seconds per digit of residual.
+
+Rank 1 is block Jacobi, which costs nothing to set up. A higher rank must earn its compression, its inversion and its
+dearer application by fewer iterations; on random packings it seldom does, and then trying it must not cost either: all
+trials together may take a small part of the time of the solves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+BUDGET = 0.03  # of the seconds of all solves, for trials
+MEMORY = 0.5  # weight of the newest figure in a rank's average
+
+
+@dataclass
+class Figures:
+    """A rank's running figures: ``cost`` seconds per digit, ``overhead`` set-up and trial seconds of one use."""
+
+    cost: float = float("inf")
+    seconds: float = 0.0
+    uses: int = 0
+    banned: bool = False
+
+    def add(self, seconds: float, digits: float) -> None:
+        cost = seconds / max(digits, 1e-3)
+        self.cost = cost if self.uses == 0 else (1 - MEMORY) * self.cost + MEMORY * cost
+        self.seconds = seconds if self.uses == 0 else (1 - MEMORY) * self.seconds + MEMORY * seconds
+        self.uses += 1
+
+
+@dataclass
+class RankPolicy:
+    """Ranks 1 and those of ``ladder``; ``automatic`` False always takes the last of the ladder that is not banned.
+
+    A rank whose preconditioner was not positive, or with which the Krylov method stalled, is banned until ``forgive``.
+    """
+
+    ladder: tuple[int, ...]
+    automatic: bool = True
+    figures: dict[int, Figures] = field(default_factory=dict)
+    spent: float = 0.0
+    on_trials: float = 0.0
+    last_trial: int = 1
+
+    def __post_init__(self) -> None:
+        self.ladder = tuple(sorted({1, *self.ladder}))
+        self.figures = {rank: Figures() for rank in self.ladder}
+
+    def choose(self) -> int:
+        """The rank of the next preconditioner."""
+        allowed = [rank for rank in self.ladder if not self.figures[rank].banned]
+        if not self.automatic:
+            return allowed[-1]
+        best = min(allowed, key=lambda rank: (self.figures[rank].cost, rank))
+        untried = [rank for rank in allowed if rank != best]
+        if not untried or self.figures[best].uses == 0:
+            return best
+        candidate = min(untried, key=lambda rank: (self.figures[rank].uses, rank))
+        # what is known of it, or a guess: a first trial builds the tables of the structure too
+        price = self.figures[candidate].seconds or 10 * self.figures[best].seconds
+        if self.on_trials + price <= BUDGET * self.spent:
+            self.last_trial = candidate
+            return candidate
+        return best
+
+    def report(self, rank: int, seconds: float, digits: float, sound: bool = True) -> None:
+        """Tell what a use of a rank took (set-up and solve) and reached; ``sound`` False bans the rank."""
+        best = min(self.figures.values(), key=lambda f: f.cost)
+        self.figures[rank].add(seconds, digits)
+        self.spent += seconds
+        if self.figures[rank] is not best:
+            expected = best.cost * max(digits, 1e-3) if best.uses else seconds
+            self.on_trials += max(0.0, seconds - expected)
+        if not sound and rank > 1:
+            self.figures[rank].banned = True
+
+    def forgive(self) -> None:
+        """Allow all ranks again: a new problem."""
+        for figures in self.figures.values():
+            figures.banned = False

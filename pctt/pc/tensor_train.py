@@ -1,0 +1,261 @@
+"""``-pc_type python -pc_python_type pctt.pc.TensorTrain``: a tensor train as approximate inverse.
+
+The blocks of the matrix are ordered along a space-filling curve, scaled by the Cholesky factors of the diagonal
+blocks, their off-diagonal part is compressed into a quantized tensor train T (paper, section 3), and I + T is inverted
+as a train. At rank 1 there is no train: the scaled diagonal alone, which is block Jacobi. By default the rank is the
+one that has paid in measured seconds per digit (``rank_policy.py``).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, option
+from pctt.pc.base import PythonPC
+from pctt.pc.rank_policy import RankPolicy
+from pctt.pc.slotted import SlottedMatrix
+from pctt.tt.als import Compression, compress
+from pctt.tt.apply import Apply
+from pctt.tt.inverse import Inverse, invert, lowest
+from pctt.tt.quantise import check_modes, choose_modes
+from pctt.tt.sparse import SparseHierarchy
+from pctt.tt.train import Train, identity
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options ``-pc_tt_*``, behind the prefix of the PC."""
+
+    eps: float = option(1e-2, "relative Frobenius error at which a compression ends", check=FRACTION)
+    max_rank: int = option(10, "cap of the ranks of matrix and inverse", check=AT_LEAST_ONE)
+    rank: str = option("auto", "auto: the rank that pays, 1 included; fixed: max_rank", choices=("auto", "fixed"))
+    scaling: str = option(
+        "block", "block: by Cholesky factors of the diagonal blocks; none: the matrix as it is (the paper)",
+        choices=("block", "none"),
+    )
+    leaf: int = option(16, "least number of blocks in the first and last mode", check=AT_LEAST_ONE)
+    modes: str = option("", "modes of the blocks with commas between; none: chosen for little padding")
+    precision: str = option("double", "of the application; single is watched", choices=("double", "single"))
+    reuse: bool = option(True, "start from the cores of the last matrix of the same structure")
+    seed: int = option(0, "seed of the random starts", check=COUNT)
+    monitor: bool = option(False, "print a line per set-up")
+
+
+@dataclass
+class Account:
+    """What the preconditioner did so far, for ``-ksp_view`` and the run's summary."""
+
+    setups: int = 0
+    reused: int = 0
+    setup_s: float = 0.0
+    fallbacks: list[str] = field(default_factory=list)
+
+
+class TensorTrain(PythonPC):
+    """The python PC; see the module and ``Options``. Works on symmetric positive definite Mats of any block size."""
+
+    options_class = Options
+    options_prefix = "pc_tt_"
+    options: Options
+
+    def create(self, pc: PETSc.PC) -> None:
+        super().create(pc)
+        self.account = Account()
+        self.policy: RankPolicy | None = None
+        self.rank = 1
+        self._double = False  # single precision was found wanting
+        self._jacobi: PETSc.PC | None = None
+        self._forget_structure()
+
+    def _forget_structure(self) -> None:
+        self.slots: SlottedMatrix | None = None
+        self.hierarchy: SparseHierarchy | None = None
+        self.compression: Compression | None = None
+        self.inverse: Inverse | None = None
+        self._apply: Apply | None = None
+
+    # -- set-up ---------------------------------------------------------------------------------------------
+
+    def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
+        self.comm = P.comm.tompi4py()
+        self._forget_structure()
+        if self.policy is None:
+            self.policy = RankPolicy((self.options.max_rank,), self.options.rank == "auto")
+        if self._jacobi is not None:
+            self._jacobi.destroy()
+        self._jacobi = PETSc.PC().create(P.comm)
+        self._jacobi.setType(PETSc.PC.Type.PBJACOBI)
+
+    def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
+        """A preconditioner of the rank that the policy chooses; one that fails is replaced by block Jacobi."""
+        assert self.policy is not None
+        start = time.perf_counter()
+        self.rank = self.policy.choose()
+        if self.rank > 1 and not self._make_train(P, self.rank):
+            self.policy.report(self.rank, time.perf_counter() - start, 0.0, sound=False)
+            self.rank = 1
+        if self.rank == 1:
+            assert self._jacobi is not None
+            self._jacobi.setOperators(P)
+            self._jacobi.setUp()
+        self._setup_seconds = self._slowest(time.perf_counter() - start)
+        self.account.setups += 1
+        self.account.setup_s += self._setup_seconds
+        if self.options.monitor:
+            PETSc.Sys.Print(f"  pctt.pc.TensorTrain: {self._line()}", comm=P.comm)
+
+    def _make_train(self, P: PETSc.Mat, rank: int) -> bool:
+        """Compress and invert; False, with the reason on the account, if no positive inverse came of it."""
+        options = self.options
+        if self.slots is None or self.hierarchy is None:
+            with PETSc.Log.Event("TTBuild"):
+                self.slots = SlottedMatrix(P, self.comm, options.scaling == "block")
+                modes = self._modes(self.slots.size)
+                self.hierarchy = SparseHierarchy(
+                    self.slots.rows, self.slots.columns, modes, self.slots.block, self._add
+                )
+        try:
+            values, singular = self.slots.load(P), False
+        except np.linalg.LinAlgError:
+            values, singular = np.empty(0), True
+        if self.comm.allreduce(singular, op=MPI.LOR):
+            return self._refuse("a diagonal block is not positive definite")
+        self.hierarchy.set_values(values)
+        rng = np.random.default_rng(options.seed)
+        warm = options.reuse and self.compression is not None
+        with PETSc.Log.Event("TTCompress"):
+            start = self.compression.train if warm and self.compression is not None else None
+            self.compression = compress(self.hierarchy, rank, options.eps, start, rng=rng)
+        with PETSc.Log.Event("TTInvert"):
+            S = self.compression.train
+            if options.scaling == "block":
+                S = identity(self.hierarchy.modes) + S
+            before = self.inverse.train if warm and self.inverse is not None else None
+            self.inverse = invert(S, rank, before, rng=rng)
+        self.account.reused += warm
+        # every rank has inverted the same train; a last bit of difference must not part their ways
+        sound, self.inverse = self.comm.bcast((lowest(self.inverse.train) > 0, self.inverse))
+        if not sound:
+            return self._refuse(f"the inverse of rank {rank} is not positive")
+        self._prepare_apply(self.inverse.train)
+        return True
+
+    def _modes(self, slots: int) -> tuple[int, ...]:
+        if self.options.modes:
+            return check_modes([int(word) for word in self.options.modes.split(",")], slots)
+        return choose_modes(slots, self.options.leaf)
+
+    def _prepare_apply(self, train: Train) -> None:
+        assert self.slots is not None
+        slots = self.slots
+        if self._apply is None:
+            bs = slots.block
+            rows = (slots.first * bs, (slots.first + len(slots.place)) * bs)
+            dtype = np.float32 if self.options.precision == "single" and not self._double else np.float64
+            self._apply = Apply(train, slots.size * bs, rows, dtype)
+            self._local = np.empty((len(slots.place), bs))
+            self._scaled = np.empty((len(slots.place), bs, 1))
+            self._whole = np.empty(slots.size * bs)
+        else:
+            self._apply.set_train(train)
+
+    def _refuse(self, why: str) -> bool:
+        self.account.fallbacks.append(why)
+        self.compression = self.inverse = None
+        return False
+
+    def _add(self, x: np.ndarray) -> np.ndarray:
+        if self.comm.size > 1:
+            out = np.empty_like(x)
+            self.comm.Allreduce(np.ascontiguousarray(x), out)
+            return out
+        return x
+
+    # -- application ----------------------------------------------------------------------------------------
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = M x with M block Jacobi or L^-T X L^-1, X the train of the inverse."""
+        if self.rank == 1:
+            assert self._jacobi is not None
+            self._jacobi.apply(x, y)
+            return
+        assert self.slots is not None
+        assert self._apply is not None
+        with PETSc.Log.Event("TTApply"):
+            slots, root = self.slots, self.slots.root
+            self._local[slots.place] = x.array_r.reshape(-1, slots.block)
+            np.matmul(root, self._local[:, :, None], out=self._scaled)
+            slots.gather_slots(self._scaled.ravel(), self._whole)
+            self._apply.x[: self._apply.n] = self._whole
+            z = self._apply.product().reshape(-1, slots.block, 1)
+            np.matmul(root.transpose(0, 2, 1), z, out=self._scaled)
+            y.array_w[:] = self._scaled[slots.place].ravel()
+
+    # -- watching the solves --------------------------------------------------------------------------------
+
+    def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        self._solve_start = time.perf_counter()
+
+    def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Tell the policy what the solve took and reached; ban a rank with which the method stalled."""
+        assert self.policy is not None
+        seconds = self._slowest(time.perf_counter() - self._solve_start)
+        reference = b.norm()
+        if reference == 0 or ksp.getIterationNumber() == 0:
+            return
+        residual = b.duplicate()
+        pc.getOperators()[0].mult(x, residual)
+        residual.aypx(-1.0, b)
+        true = residual.norm() / reference
+        residual.destroy()
+        rtol = ksp.getTolerances()[0]
+        stalled = ksp.getConvergedReason() < 0 and ksp.getType() not in ("preonly", "richardson")
+        drifted = not stalled and true > 10 * rtol and self.options.precision == "single" and not self._double
+        if drifted and self.rank > 1 and self.inverse is not None:
+            self._double, self._apply = True, None
+            self._prepare_apply(self.inverse.train)
+            self.account.fallbacks.append(f"single precision left a true residual of {true:.1e}: double from now on")
+        digits = -np.log10(max(true, 1e-16)) if np.isfinite(true) else 0.0
+        if stalled and self.rank > 1:
+            self.account.fallbacks.append(f"{ksp.getType()} stalled at rank {self.rank}")
+        self.policy.report(self.rank, self._setup_seconds + seconds, max(digits, 0.0), not stalled)
+        self._setup_seconds = 0.0  # a second solve with the same matrix has no set-up
+
+    def _slowest(self, seconds: float) -> float:
+        return self.comm.allreduce(seconds, op=MPI.MAX)
+
+    # -- words ----------------------------------------------------------------------------------------------
+
+    def report(self) -> list[str]:
+        a = self.account
+        lines = [
+            f"tensor train: {self._line()}",
+            f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, scaling {self.options.scaling}, "
+            f"precision {'double' if self._double else self.options.precision}",
+        ]
+        lines += [f"fell back: {why} ({a.fallbacks.count(why)} times)" for why in dict.fromkeys(a.fallbacks)]
+        if self.policy is not None:
+            figures = self.policy.figures.items()
+            costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
+            lines.append(f"seconds per digit: {costs or 'none measured yet'}")
+        return lines
+
+    def _line(self) -> str:
+        if self.rank == 1 or self.compression is None or self.inverse is None:
+            return f"rank 1 (block Jacobi), set up in {self._setup_seconds:.2e} s"
+        T, X = self.compression.train, self.inverse.train
+        return (
+            f"modes {'x'.join(map(str, T.rows))}, matrix ranks {T.ranks} error {self.compression.error:.2g}, inverse "
+            f"ranks {X.ranks} residual {self.inverse.residual:.2g}, {X.storage} numbers, {self._setup_seconds:.2e} s"
+        )
+
+    def destroy(self, pc: PETSc.PC) -> None:
+        if self._jacobi is not None:
+            self._jacobi.destroy()
+            self._jacobi = None
+        self._forget_structure()

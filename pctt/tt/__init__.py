@@ -1,0 +1,51 @@
+"""Quantised tensor trains: approximate sparse matrices, their inverses and products, in numpy.
+
+    modes = choose_modes(slots)                            cut the index
+    A = SparseHierarchy(rows, columns, modes, block)       once per pattern
+    A.set_values(blocks)
+    T = compress(A, max_rank=10, eps=1e-2).train           or `cross`
+    X = invert(identity(T.rows) + T, max_rank=10).train
+    y = Apply(X, n)(x)
+
+Nothing here knows of PETSc or MPI: where the rows are distributed, a function that adds an array over the
+ranks is passed in.
+"""
+
+from __future__ import annotations
+
+from pctt.tt.als import Compression, compress, relative_error
+from pctt.tt.apply import Apply
+from pctt.tt.cross import Cross, cross
+from pctt.tt.inverse import Inverse, invert, invert_near_identity, lowest, residual, symmetrise
+from pctt.tt.quantise import binary_modes, check_modes, choose_modes, merge, scalar_modes, slots_of
+from pctt.tt.sparse import SparseHierarchy
+from pctt.tt.train import Train, decompose, decompose_matrix, identity, matrix_train, random, zeros
+
+__all__ = [
+    "Apply",
+    "Compression",
+    "Cross",
+    "Inverse",
+    "SparseHierarchy",
+    "Train",
+    "binary_modes",
+    "check_modes",
+    "choose_modes",
+    "compress",
+    "cross",
+    "decompose",
+    "decompose_matrix",
+    "identity",
+    "invert",
+    "invert_near_identity",
+    "lowest",
+    "matrix_train",
+    "merge",
+    "random",
+    "relative_error",
+    "residual",
+    "scalar_modes",
+    "slots_of",
+    "symmetrise",
+    "zeros",
+]

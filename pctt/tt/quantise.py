@@ -1,0 +1,118 @@
+"""Modes of a long vector: how its index is cut into digits, how it is padded, how neighbouring modes are merged.
+
+A vector of n *slots* (blocks of `block` unknowns each: a contact, a node, a body) gets modes m_1, ..., m_d
+with m_1 m_2 ... m_d >= n. The last mode is the leaf: a run of neighbouring slots that no rank separates. The
+scalar modes of a train are the slot modes with the leaf times the block size; slots keep their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pctt.tt.train import Array, Train
+
+
+def choose_modes(n: int, leaf: int = 16, middle: int = 4) -> tuple[int, ...]:
+    """Slot modes [first, middle, ..., middle, last] for n slots.
+
+    The first mode is between `leaf` and `leaf * middle`, the last between `leaf` and 5/4 `leaf`, whichever
+    pads least; few slots get one or two modes. A train of rank r with these modes costs about 2 n r (first +
+    r sum(middle) + last) operations to apply, which is why the ends are not larger.
+
+    >>> choose_modes(134_547)
+    (31, 4, 4, 4, 4, 17)
+    >>> choose_modes(1000), choose_modes(20)
+    ((50, 20), (20,))
+    """
+    if n < 1:
+        raise ValueError(f"there is no train of {n} slots")
+    if n <= 2 * leaf:
+        return (n,)
+    levels = 0
+    while n > leaf * middle ** (levels + 1) * leaf:
+        levels += 1
+    best: tuple[int, ...] = ()
+    for last in range(leaf, leaf + leaf // 4 + 1):
+        below = last * middle**levels
+        candidate = (-(-n // below), *[middle] * levels, last)
+        if not best or slots_of(candidate) < slots_of(best):
+            best = candidate
+    return best
+
+
+def binary_modes(n: int, leaf: int = 1) -> tuple[int, ...]:
+    """Modes [2, ..., 2, leaf] of the least power of two times `leaf` that holds n slots: the QTT of the paper.
+
+    >>> binary_modes(100, leaf=16)
+    (2, 2, 2, 16)
+    """
+    levels = max(0, int(np.ceil(np.log2(max(1.0, n / leaf)))))
+    return (2,) * levels + ((leaf,) if leaf > 1 or levels == 0 else ())
+
+
+def check_modes(modes: Sequence[int], n: int) -> tuple[int, ...]:
+    """Modes that a user gave, as a tuple; raises ValueError if they do not hold n slots."""
+    if not modes or min(modes) < 1 or slots_of(modes) < n:
+        raise ValueError(f"modes {list(modes)} hold {slots_of(modes)} slots, but {n} are needed")
+    return tuple(int(m) for m in modes)
+
+
+def slots_of(modes: Sequence[int]) -> int:
+    """The number of slots (or scalars) that modes hold: their product."""
+    return int(np.prod([int(m) for m in modes], dtype=np.int64))
+
+
+def scalar_modes(modes: Sequence[int], block: int) -> tuple[int, ...]:
+    """Modes of the unknowns: the leaf holds `block` of them per slot.
+
+    >>> scalar_modes([2, 4, 16], 3)
+    (2, 4, 48)
+    """
+    return (*modes[:-1], modes[-1] * block)
+
+
+def digits(index: Array, modes: Sequence[int]) -> Array:
+    """Multi-indices (d, ...) of linear indices (...), the first mode slowest."""
+    return np.stack(np.unravel_index(index, tuple(modes)))
+
+
+def linear(multi: Array, modes: Sequence[int]) -> Array:
+    """Linear indices (...) of multi-indices (d, ...): the inverse of `digits`."""
+    return np.ravel_multi_index(tuple(multi), tuple(modes))
+
+
+def pad(x: Array, size: int, value: float = 0.0) -> Array:
+    """x (n, ...) lengthened to (size, ...) with a constant."""
+    out = np.full((size, *x.shape[1:]), value, x.dtype)
+    out[: len(x)] = x
+    return out
+
+
+def merge(train: Train, groups: Sequence[int]) -> Train:
+    """The same train with neighbouring modes merged: groups[k] cores become core k.
+
+    >>> from pctt.tt.train import identity
+    >>> merge(identity([2, 3, 4, 5]), [2, 1, 1]).rows
+    (6, 4, 5)
+    """
+    if sum(groups) != len(train) or min(groups) < 1:
+        raise ValueError(f"groups {list(groups)} do not divide a train of {len(train)} cores")
+    cores, start = [], 0
+    for count in groups:
+        core = train.cores[start]
+        for other in train.cores[start + 1 : start + count]:
+            core = _join(core, other)
+        cores.append(core)
+        start += count
+    return Train(cores)
+
+
+def _join(a: Array, b: Array) -> Array:
+    """Core of two merged modes."""
+    core = np.tensordot(a, b, 1)
+    if a.ndim == 3:
+        return core.reshape(a.shape[0], -1, b.shape[-1])
+    core = core.transpose(0, 1, 3, 2, 4, 5)
+    return core.reshape(a.shape[0], a.shape[1] * b.shape[1], a.shape[2] * b.shape[2], b.shape[-1])

@@ -1,0 +1,274 @@
+"""A sparse matrix as a hierarchy of block pairs, and its contractions with the cores of a train.
+
+The pair (i, j) of a nonzero block has digits (i_1, j_1), ..., (i_d, j_d) in the modes of the train. The
+distinct prefixes of length k are the *nodes of bond k*: the pairs of coarse boxes between which the matrix
+has an entry (the nonempty nodes of the product tree of the paper, section 3.2). Everything that a compression
+needs is a product over these lists:
+
+    down     x_{k+1}(node) = x_k(parent) G(digit)           rows of the left interface, level by level
+    up       V_k(node) = sum over children  V_{k+1} G(digit)'  the matrix contracted with the right interface
+    middle   sum over nodes  x_k(node)' V_{k+1}(child)         the matrix contracted with both: a new core
+
+Their cost is linear in the number of nodes, and that of the leaf in the number of nonzeros. Each is a sum
+over nonzeros: where several ranks hold the entries of their own rows, an injected reduction adds the small
+results of `middle` and `leaf_core`, nothing else is exchanged, and all ranks hold the same cores.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+
+from pctt.tt.quantise import scalar_modes, slots_of
+from pctt.tt.train import Array
+
+Reduction = Callable[[Array], Array]
+
+
+def alone(x: Array) -> Array:
+    """The reduction of a single rank."""
+    return x
+
+
+class SparseHierarchy:
+    """The nonzero blocks of a sparse matrix, sorted into the hierarchy of the modes of a train.
+
+    rows, columns : (nb,) slots of the blocks; the same slot pair may come several times (its blocks are
+        added)
+    modes : slot modes m_1, ..., m_d of rows and columns alike
+    block : size of a block
+    reduce : adds an array over the ranks (see the module)
+
+    The list is built once per pattern; `set_values` takes new blocks (nb, block, block) in the order of
+    `rows` and `columns`.
+
+    >>> i = np.arange(7)
+    >>> A = SparseHierarchy(i, i + 1, [2, 4])
+    >>> A.set_values(np.ones(7))
+    >>> A.nodes, A.modes, round(A.norm() ** 2, 12)
+    ([1, 3], (2, 4), 7.0)
+    """
+
+    def __init__(
+        self, rows: Array, columns: Array, modes: Sequence[int], block: int = 1, reduce: Reduction = alone
+    ) -> None:
+        self.slot_modes = tuple(int(m) for m in modes)
+        self.modes = scalar_modes(self.slot_modes, block)
+        self.block = int(block)
+        self.reduce = reduce
+        keys = _hierarchical_keys(rows, columns, self.slot_modes)
+        self._order = np.argsort(keys, kind="stable")
+        keys = keys[self._order]
+        new = _starts(keys)
+        self._starts = None if len(new) == len(keys) else new  # of runs of blocks that are added
+        self.keys = keys[new]
+        self._rows = np.asarray(rows)[self._order[new]]
+        self._index_leaf()
+        self._index_bonds()
+        self.set_values(np.zeros((len(rows), block, block)))
+
+    def _index_leaf(self) -> None:
+        """Row pointers and columns of the leaf matrix: a row per node of the last bond, its leaf's entries in it.
+
+        Its columns are ordered (i, j, s, t), slots before places in the block, so that blocks are contiguous.
+        """
+        square, bb = self.slot_modes[-1] ** 2, self.block**2
+        starts = _starts(self.keys // square)
+        wide = np.int64 if len(self.keys) * bb >= 2**31 else np.int32
+        digit: Array = (self.keys % square).astype(wide)
+        self._leaf_columns = np.add.outer(digit * bb, np.arange(bb, dtype=wide)).ravel()
+        self._leaf_pointers = (np.append(starts, len(self.keys)) * bb).astype(wide)
+        self._leaf_keys = self.keys[starts] // square
+
+    def _index_bonds(self) -> None:
+        """For each bond the places parent * m^2 + digit of its nodes among all children of its parents."""
+        keys = self._leaf_keys
+        self.nodes = [len(keys)]
+        self.places: list[Array] = []
+        for m in self.slot_modes[-2::-1]:
+            parents = keys // (m * m)
+            starts = _starts(parents)
+            parent = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(keys)))
+            self.places.insert(0, parent * (m * m) + keys % (m * m))
+            keys = parents[starts]
+            self.nodes.insert(0, len(keys))
+        self.nodes[0] = 1  # the root stays where there is no entry
+
+    def set_values(self, values: Array) -> None:
+        """New blocks (nb, block, block), in the order in which their slots were given."""
+        values = np.asarray(values).reshape(len(self._order), self.block**2)[self._order]
+        if self._starts is not None:
+            values = np.add.reduceat(values, self._starts, axis=0)
+        width = self.modes[-1] ** 2
+        shape = (self.nodes[-1], width)
+        parts = (values.ravel(), self._leaf_columns, self._leaf_pointers)
+        if len(values) == 0:
+            parts = (values.ravel(), self._leaf_columns, np.zeros(shape[0] + 1, np.int32))
+        self._leaf = sparse.csr_matrix(parts, shape=shape)
+        self._leaf_transposed = self._leaf.T
+
+    def thinned(self, part: int) -> SparseHierarchy:
+        """One in `part` of the nodes of the last bond, with all that they hold, chosen by their keys alone."""
+        hashed = self._leaf_keys.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(32)
+        kept = np.flatnonzero(hashed % np.uint64(part) == 0)
+        thin = copy(self)
+        thin._leaf_keys = self._leaf_keys[kept]
+        thin._leaf = self._leaf[kept]
+        thin._leaf_transposed = thin._leaf.T
+        thin._index_bonds()
+        return thin
+
+    @property
+    def values(self) -> Array:
+        """The distinct blocks (number, block, block), in the order of `keys`."""
+        return self._leaf.data.reshape(-1, self.block, self.block)
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self._leaf.dtype
+
+    @property
+    def size(self) -> int:
+        """Scalar rows, padding included."""
+        return slots_of(self.modes)
+
+    def lookup(self, keys: Array) -> Array:
+        """Entries by scalar keys: digits i_k m_k + j_k of base m_k^2 in the scalar modes, the first most significant.
+
+        Zero where nothing is stored; summed over the ranks.
+        """
+        m, q, b = self.modes[-1], self.slot_modes[-1], self.block
+        node, leaf = np.divmod(keys, m * m)
+        (i, s), (j, t) = (np.divmod(index, b) for index in np.divmod(leaf, m))
+        wanted = node * (q * q) + i * q + j
+        out = np.zeros(keys.shape, self.dtype)
+        if len(self.keys):
+            place = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
+            found = self.keys[place] == wanted
+            out[found] = self.values[place[found], s[found], t[found]]
+        return self.reduce(out)
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Scalar keys of `count` stored entries (none where there are none), the same on all ranks if `rng` is.
+
+        Half of them in random rows, half near the first or last row of a random box of a random bond; of the row
+        a random entry, the leftmost or the rightmost: entries that join coarse boxes may be few, but they matter.
+        A row belongs to one rank; it contributes the key, the others nothing.
+        """
+        by_row, sorted_rows, rows_of_all = self._by_row
+        if len(rows_of_all) == 0:
+            return np.zeros(0, np.int64)
+        rows = rows_of_all[rng.integers(0, len(rows_of_all), count)]
+        edges = rows[::2]
+        length = np.array([slots_of(self.slot_modes[k:]) for k in range(1, len(self.slot_modes) + 1)])
+        box = length[rng.integers(0, len(length), len(edges))]
+        edges += np.where(rng.random(len(edges)) < 0.5, -edges % box - 1, -(edges % box))
+        rows = rows_of_all[np.minimum(np.searchsorted(rows_of_all, rows), len(rows_of_all) - 1)]
+        which, place = rng.uniform(-0.5, 1.5, count), rng.integers(0, self.block, (2, count))
+        start, stop = np.searchsorted(sorted_rows, rows), np.searchsorted(sorted_rows, rows, "right")
+        mine = stop > start
+        column = np.clip(np.floor(which * (stop - start)).astype(np.int64), 0, stop - start - 1)
+        found = np.zeros(count, np.int64)
+        found[mine] = self._scalar_key(self.keys[by_row[(start + column)[mine]]], *place[:, mine])
+        return self.reduce(found)
+
+    def _scalar_key(self, key: Array, s: Array, t: Array) -> Array:
+        """Scalar keys of the entries (s, t) of blocks given by their keys."""
+        q, b, m = self.slot_modes[-1], self.block, self.modes[-1]
+        node, leaf = np.divmod(key, q * q)
+        i, j = np.divmod(leaf, q)
+        return node * (m * m) + (i * b + s) * m + j * b + t
+
+    @cached_property
+    def _by_row(self) -> tuple[Array, Array, Array]:
+        """Places of my blocks in the order of their row slots, these, and the row slots that hold blocks anywhere."""
+        order = np.argsort(self._rows, kind="stable")
+        holds = np.zeros(slots_of(self.slot_modes), np.int64)
+        holds[self._rows] = 1
+        return order, self._rows[order], np.flatnonzero(self.reduce(holds))
+
+    def norm(self) -> float:
+        """Frobenius norm of the matrix (of all ranks)."""
+        values = self._leaf.data
+        return float(self.reduce(np.array([values @ values], float))[0]) ** 0.5
+
+    # Contractions; cores are flat, (r, m^2, r')
+
+    def root(self) -> Array:
+        """The left interface of bond 0."""
+        return np.ones((1, 1), self.dtype)
+
+    def down(self, k: int, x: Array, core: Array) -> Array:
+        """Left interface (nodes[k+1], r') of bond k+1 from that of bond k, x (nodes[k], r), and core k."""
+        r, m2, r_ = core.shape
+        return (x @ core.reshape(r, m2 * r_)).reshape(-1, r_).take(self.places[k], axis=0)
+
+    def spread(self, k: int, V: Array) -> Array:
+        """V (nodes[k+1], r) with a place for every child of a node of bond k: (nodes[k], m^2 r)."""
+        r = V.shape[1]
+        out = np.zeros((self.nodes[k] * self.slot_modes[k] ** 2, r), V.dtype)
+        out[self.places[k]] = V
+        return out.reshape(self.nodes[k], self.slot_modes[k] ** 2 * r)
+
+    def up(self, spread: Array, core: Array) -> Array:
+        """The matrix contracted with the right interface, one core further: (nodes[k], r) from `spread`."""
+        return spread @ core.reshape(len(core), -1).T
+
+    def middle(self, x: Array, spread: Array, rank: int) -> Array:
+        """The matrix contracted with both interfaces of core k: (r, m^2, rank), summed over the ranks."""
+        return self.reduce(x.T @ spread).reshape(x.shape[1], -1, rank)
+
+    def leaf_core(self, x: Array) -> Array:
+        """The matrix contracted with the last left interface x: the last core (r, m^2, 1), summed over ranks."""
+        core = np.ascontiguousarray((self._leaf_transposed @ x).T)
+        return self._leaf_order(self.reduce(core), to_train=True)
+
+    def leaf_up(self, core: Array) -> Array:
+        """The matrix contracted with the last core (r, m^2, 1): (nodes of the last bond, r)."""
+        return self._leaf @ np.ascontiguousarray(self.leaf_row(core).T)
+
+    def leaf_row(self, core: Array) -> Array:
+        """The last core (r, m^2, 1) as rows (r, m^2) in the column order of the leaf matrix."""
+        return self._leaf_order(core, to_train=False)
+
+    def leaf_rows(self, part: slice) -> Array:
+        """Dense leaves of some nodes of the last bond, in the column order of the leaf matrix."""
+        return self._leaf[part].toarray()
+
+    def inner(self, cores: Sequence[Array]) -> float:
+        """Sum of products of the entries with those of a train."""
+        x = self.root()
+        for k, core in enumerate(cores[:-1]):
+            x = self.down(k, x, core)
+        return float(np.vdot(self.leaf_core(x), cores[-1]))
+
+    def _leaf_order(self, core: Array, to_train: bool) -> Array:
+        """Between the column orders (i, j, s, t) of the leaf matrix and (i, s, j, t) of a core."""
+        q, b = self.slot_modes[-1], self.block
+        shape = (-1, q, q, b, b) if to_train else (-1, q, b, q, b)
+        rank = len(core)
+        core = core.reshape(shape).transpose(0, 1, 3, 2, 4)
+        return core.reshape(rank, -1, 1) if to_train else core.reshape(rank, -1)
+
+
+def _hierarchical_keys(rows: Array, columns: Array, modes: Sequence[int]) -> Array:
+    """Keys of slot pairs that sort them by (i_1, j_1), then (i_2, j_2), ...: digits of base m_1^2, m_2^2, ..."""
+    if float(slots_of(modes)) ** 2 >= 2.0**63:
+        raise ValueError(f"too many slots for one key of 64 bits: modes {list(modes)}")
+    row_key = np.zeros(1, np.int64)
+    column_key = np.zeros(1, np.int64)
+    for m in modes:
+        row_key = (row_key[:, None] * (m * m) + np.arange(m) * m).ravel()
+        column_key = (column_key[:, None] * (m * m) + np.arange(m)).ravel()
+    return row_key[rows] + column_key[columns]
+
+
+def _starts(keys: Array) -> Array:
+    """Where runs of equal sorted keys start."""
+    if len(keys) == 0:
+        return np.zeros(0, np.int64)
+    return np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))

@@ -1,0 +1,83 @@
+"""The figures of a solution against examples worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from problems import SELF, from_graph, from_matrix, heap, matrix
+
+from pctt import ccp
+
+
+def problem(diagonal, r, mu) -> ccp.ConeProblem:
+    return ccp.ConeProblem(SELF, np.array(r, float), np.array(mu, float), N=matrix(SELF, np.diag(diagonal)))
+
+
+def test_a_sticking_contact_worked_out_by_hand():
+    """N = diag(2, 4, 6), of mean 4; y = N g + r = (0, 2, 0); g - y / 4 = (1, -0.25, 0) is inside the cone."""
+    figures = ccp.measure(problem([2, 4, 6], [[-2, 1, 0]], [0.5]), np.array([[1, 0.25, 0]]))
+    norm = np.sqrt(1 + 0.25**2)
+    assert figures.natural_residual == pytest.approx(0.5 / norm)
+    assert figures.objective == pytest.approx(0.5 * (2 + 4 * 0.25**2) + (-2 + 0.25))
+    assert figures.cone_violation == 0.0
+    assert figures.dual_violation == pytest.approx(1.0)
+    assert figures.complementarity == pytest.approx(0.5)
+    assert figures.impulse_norm == pytest.approx(norm)
+    assert figures.velocity_norm == pytest.approx(2.0)
+
+
+def test_two_contacts_worked_out_by_hand():
+    """N = 1, y = g + r. First contact: g - y = -r = (1, 0, 3), projected at mu = 1 on (2, 0, 2). Second,
+    without friction: -r = (-1, 4, 0), projected on the origin."""
+    figures = ccp.measure(
+        problem(np.ones(6), [[-1, 0, -3], [1, -4, 0]], [1, 0]), np.array([[2, 0, 3], [0.5, 0.3, 0.4]])
+    )
+    norm = np.sqrt(13 + 0.5)
+    assert figures.natural_residual == pytest.approx(np.sqrt(1 + 0.5) / norm)
+    assert figures.objective == pytest.approx(0.5 * 13.5 + (-2 - 9) + (0.5 - 1.2))
+    assert figures.cone_violation == pytest.approx(1.0)  # 3 - 2; the second is out by 0.5
+    assert figures.dual_violation == 0.0  # y = (1, 0, 0) and (1.5, -3.7, 0.4)
+    assert figures.complementarity == pytest.approx(2.0)  # of the first; that of the second is -0.2
+    assert figures.velocity_norm == pytest.approx(np.sqrt(1 + 1.5**2 + 3.7**2 + 0.4**2))
+
+
+def test_zero_impulses_are_exact_where_no_contact_closes():
+    """r inside the dual cones, of a rough and of a smooth contact, one of them without any sliding."""
+    open_ = problem(np.ones(9), [[1, 0.3, 0.4], [1, 5, 5], [1, 0, 0]], [1.7, 0, 0])
+    figures = ccp.measure(open_, np.zeros((3, 3)))
+    assert figures.natural_residual == 0.0
+    assert figures.objective == 0.0
+    assert figures.dual_violation == 0.0
+    assert figures.impulse_norm == 0.0
+
+
+def test_zero_impulses_are_as_wrong_as_can_be_where_a_contact_closes():
+    closing = problem(np.ones(3), [[-1, 0, 0]], [0.5])
+    assert ccp.measure(closing, np.zeros((1, 3))).natural_residual > 1e300
+    assert ccp.measure(closing, np.zeros((1, 3))).dual_violation == pytest.approx(1.0)
+    assert closing.natural_residual(np.zeros((1, 3)), closing.r) == np.inf
+
+
+def test_the_known_optimum_measures_as_one():
+    known, graph = heap(seed=4)
+    for each in (from_graph(known, graph), from_matrix(known)):
+        figures = ccp.measure(each, known.g)
+        assert figures.natural_residual < 1e-14
+        assert figures.objective == pytest.approx(known.objective, rel=1e-12)
+        assert max(figures.cone_violation, figures.dual_violation, figures.complementarity) < 1e-12
+
+
+def test_the_measure_agrees_with_the_stop_test_of_the_solvers():
+    """They share no code."""
+    known, graph = heap(seed=5, mu=np.arange(40) % 3 * 0.4)
+    each = from_graph(known, graph)
+    rng = np.random.default_rng(0)
+    for size in (1e-6, 1e-2, 1.0, 100.0):
+        g = known.g + size * rng.normal(size=known.g.shape)
+        y = each.product(g) + each.r
+        assert ccp.measure(each, g).natural_residual == pytest.approx(each.natural_residual(g, y), rel=1e-9)
+
+
+def test_a_problem_without_contacts():
+    figures = ccp.measure(problem([], np.zeros((0, 3)), []), np.zeros((0, 3)))
+    assert figures == ccp.Accuracy(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -1,0 +1,104 @@
+"""The smooth forms of the cone constraint against finite differences, and the barrier blocks made of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pctt.ccp.barrier import CONSTRAINTS, Perspective, Quadratic
+from pctt.ccp.pdip import _barrier_blocks
+
+BOTH = pytest.mark.parametrize("name", CONSTRAINTS)
+
+
+def inside(count: int = 60, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Friction coefficients, every fifth of them zero, and points inside their cones."""
+    rng = np.random.default_rng(seed)
+    mu = rng.uniform(0.05, 3.0, count)
+    mu[::5] = 0.0
+    g = np.empty((count, 3))
+    g[:, 0] = rng.uniform(0.3, 2.0, count)
+    angle, radius = rng.uniform(0, 2 * np.pi, count), 0.95 * rng.random(count) * mu * g[:, 0]
+    g[:, 1], g[:, 2] = radius * np.cos(angle), radius * np.sin(angle)
+    return g, mu
+
+
+def derivative(function, g: np.ndarray, step: float = 1e-5) -> np.ndarray:
+    """Central differences of a function of the rows of g, its last axis the component of g."""
+    columns = []
+    for k in range(3):
+        e = np.zeros(3)
+        e[k] = step
+        columns.append((function(g + e) - function(g - e)) / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+@BOTH
+def test_gradient_and_hessian_are_the_derivatives(name):
+    g, mu = inside()
+    cone = CONSTRAINTS[name](mu)
+    assert np.allclose(cone.gradient(g), derivative(cone.value, g), rtol=1e-6, atol=1e-7)
+    assert np.allclose(cone.hessian(g), derivative(cone.gradient, g), rtol=1e-6, atol=1e-7)
+
+
+@BOTH
+def test_value_is_negative_inside_zero_on_the_surface_positive_outside(name):
+    g, mu = inside()
+    cone = CONSTRAINTS[name](mu)
+    assert (cone.value(g) < 0).all()
+    rough = mu > 0
+    angle = np.random.default_rng(1).uniform(0, 6, len(mu))
+    rim = np.stack([g[:, 0], *(mu * g[:, 0] * [np.cos(angle), np.sin(angle)])], axis=1)
+    assert np.allclose(cone.value(rim)[rough], 0, atol=1e-14)
+    assert (cone.value(rim * [1, 1.1, 1.1])[rough] > 0).all()
+    assert (cone.value(-g)[~rough] > 0).all()
+
+
+def test_values_are_those_of_the_formulas():
+    g, mu = np.array([[2.0, 0.3, -0.4], [2.0, 0.0, 0.0]]), np.array([0.5, 0.0])
+    assert np.allclose(Quadratic(mu).value(g), [0.5 * (0.25 - 1.0), -2.0])
+    assert np.allclose(Perspective(mu).value(g), [0.5 * (0.125 - 0.5), -2.0])
+    # the correction of the paper's slip: the Hessian is diag(-mu^2, 1, 1)
+    assert np.array_equal(Quadratic(mu).hessian(g)[0], np.diag([-0.25, 1.0, 1.0]))
+
+
+def test_perspective_is_convex_and_of_degree_one():
+    g, mu = inside()
+    cone = Perspective(mu)
+    assert np.allclose(cone.value(7 * g), 7 * cone.value(g))
+    assert np.allclose((cone.gradient(g) * g).sum(1), cone.value(g))
+    assert np.linalg.eigvalsh(cone.hessian(g)).min() > -1e-12
+    # its gradient stays away from zero towards the apex, where the quadratic form's vanishes
+    assert np.allclose(cone.gradient(1e-9 * g), cone.gradient(g))
+    assert np.abs(Quadratic(mu).gradient(1e-9 * g)[mu > 0]).max() < 1e-7
+
+
+@BOTH
+def test_without_friction_the_constraint_is_a_normal_impulse_that_pushes(name):
+    g = np.array([[2.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    cone = CONSTRAINTS[name](np.zeros(2))
+    assert np.array_equal(cone.value(g), [-2.0, -0.1])
+    assert np.array_equal(cone.gradient(g), [[-1, 0, 0], [-1, 0, 0]])
+    assert np.array_equal(cone.hessian(g), np.zeros((2, 3, 3)))
+
+
+@BOTH
+@pytest.mark.parametrize("towards_surface", [0.0, 1 - 1e-4])
+def test_barrier_blocks_are_symmetric_and_positive_definite_inside(name, towards_surface):
+    g, mu = inside()
+    radius = np.maximum(np.hypot(g[:, 1], g[:, 2]), 1e-300)
+    g[:, 1:] *= (1 + towards_surface * (0.9999 * mu * g[:, 0] / radius - 1))[:, None]
+    cone = CONSTRAINTS[name](mu)
+    f, df = cone.value(g), cone.gradient(g)
+    lam = np.random.default_rng(2).uniform(0.1, 2.0, len(mu))
+    blocks = _barrier_blocks(cone, g, lam, f, df)
+    assert np.allclose(blocks, blocks.transpose(0, 2, 1))
+    assert np.linalg.eigvalsh(blocks).min() > 0
+    rough = mu > 0
+    outer = df[:, :, None] * df[:, None, :]
+    expected = lam[:, None, None] * cone.hessian(g) + (lam / -f)[:, None, None] * outer
+    assert np.allclose(blocks[rough], expected[rough])
+    # without friction: lambda / g_n in the normal direction, and none of the tangential ones can move
+    assert np.allclose(blocks[~rough, 0, 0], (lam / g[:, 0])[~rough])
+    assert (blocks[~rough][:, [1, 2], [1, 2]] >= 1e11 * blocks[~rough, 0, 0][:, None]).all()
+    assert (blocks[~rough][:, 0, 1:] == 0).all()

@@ -1,0 +1,214 @@
+"""The Delassus matrix against G G' in dense arithmetic, on one rank and several."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from problems import SELF, Graph, from_graph, heap, matrix, random_graph
+
+from pctt.blocks import block_matrix, square_block_matrix
+from pctt.ccp import ConeProblem
+from pctt.ccp.delassus import delassus, diagonal_blocks, local_blocks
+
+GRAPHS = {
+    "sparse": {"contacts": 30, "bodies": 25},
+    "dense": {"contacts": 60, "bodies": 5},
+    "hub": {"contacts": 50, "bodies": 20, "hub": True},
+    "one dynamic body each": {"contacts": 20, "bodies": 6, "one_body": 1.0},
+    "two dynamic bodies each": {"contacts": 20, "bodies": 8, "one_body": 0.0},
+    "one body": {"contacts": 7, "bodies": 1},
+    "one contact": {"contacts": 1, "bodies": 2, "one_body": 0.0},
+    "bodies without contacts": {"contacts": 5, "bodies": 50},
+    "no contacts": {"contacts": 0, "bodies": 3},
+}
+
+
+def dense(mat) -> np.ndarray:
+    rows, columns = mat.getSize()
+    if not rows:
+        return np.zeros((rows, columns))
+    indptr, indices, values = mat.convert("aij").getValuesCSR()
+    return sp.csr_matrix((values, indices, indptr), shape=(rows, columns)).toarray()
+
+
+@pytest.fixture(params=GRAPHS)
+def graph(request) -> Graph:
+    return random_graph(5, **GRAPHS[request.param])
+
+
+def blocks_of(N: np.ndarray) -> np.ndarray:
+    return np.array([N[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] for c in range(len(N) // 3)]).reshape(-1, 3, 3)
+
+
+def test_block_matrix_is_the_contact_map(graph):
+    assert np.array_equal(dense(block_matrix(SELF, graph.part(SELF))), graph.dense())
+
+
+def test_delassus_is_the_gram_matrix(graph):
+    G = graph.dense()
+    N = delassus(SELF, graph.part(SELF))
+    assert N.getBlockSize() == 3
+    assert N.getType().endswith("baij")
+    assert np.allclose(dense(N), G @ G.T, rtol=0, atol=1e-13 * max(1, np.abs(G @ G.T).max(initial=0)))
+
+
+def test_blocks_are_stored_where_two_contacts_share_a_body_and_nowhere_else(graph):
+    touches = np.zeros((graph.contacts, graph.bodies))
+    touches[np.repeat(np.arange(graph.contacts), np.diff(graph.indptr)), graph.indices] = 1
+    N = delassus(SELF, graph.part(SELF))
+    assert N.getInfo()["nz_used"] == 9 * np.count_nonzero(touches @ touches.T)
+
+
+def test_product_goes_through_the_bodies(graph):
+    G = graph.dense()
+    count = graph.contacts
+    problem = ConeProblem(SELF, np.ones((count, 3)), np.ones(count), G=graph.part(SELF))
+    g = np.random.default_rng(0).normal(size=(count, 3))
+    assert np.allclose(problem.product(g).ravel(), G @ (G.T @ g.ravel()), rtol=1e-12, atol=1e-10)
+    assert "N" not in vars(problem)  # the matrix is not built for a product
+    assert np.allclose(dense(problem.N) @ g.ravel(), problem.product(g).ravel(), rtol=1e-12, atol=1e-10)
+
+
+def test_products_do_not_share_their_memory():
+    problem = from_graph(*heap())
+    one, two = np.eye(3 * problem.size)[:2].reshape(2, -1, 3)
+    first = problem.product(one)
+    kept = first.copy()
+    problem.product(two)
+    assert np.array_equal(first, kept)
+
+
+def test_diagonal_blocks_and_their_mean(graph):
+    N = graph.dense() @ graph.dense().T
+    problem = ConeProblem(
+        SELF, np.ones((graph.contacts, 3)), np.ones(graph.contacts), G=graph.part(SELF)
+    )
+    assert np.allclose(diagonal_blocks(graph.part(SELF)), blocks_of(N))
+    assert np.allclose(problem.diagonal_blocks, blocks_of(N))
+    assert problem.mean_diagonal == pytest.approx(np.diag(N).mean() if len(N) else 1.0)
+
+
+@pytest.mark.parametrize("kind", ["aij", "baij"])
+def test_local_blocks_of_a_matrix(kind):
+    N = heap()[0].N
+    assert np.allclose(local_blocks(matrix(SELF, N).convert(kind)), blocks_of(N))
+
+
+def test_a_problem_given_by_its_matrix_does_the_same():
+    known, graph = heap()
+    by_graph = from_graph(known, graph)
+    by_matrix = ConeProblem(SELF, known.r, known.mu, N=matrix(SELF, known.N))
+    there, here = by_graph.product(known.r), by_matrix.product(known.r)
+    assert np.allclose(here, there, rtol=0, atol=1e-12 * np.abs(known.N).max())
+    assert np.allclose(by_graph.diagonal_blocks, by_matrix.diagonal_blocks)
+    assert by_graph.mean_diagonal == pytest.approx(by_matrix.mean_diagonal)
+    assert np.allclose(dense(by_graph.N), dense(by_matrix.N))
+
+
+def test_columns_may_come_in_any_order():
+    """Block CSR from a sparse product has its columns unsorted; PETSc takes them sorted only."""
+    rng = np.random.default_rng(0)
+    blocks = rng.normal(size=(4, 3, 3))
+    rows = sp.bsr_matrix((blocks, [2, 0, 1, 2], [0, 2, 3, 4]), shape=(9, 9))
+    expected = rows.toarray()
+    assert np.allclose(dense(square_block_matrix(SELF, rows)), expected)
+    assert np.array_equal(rows.toarray(), expected)  # its argument is as it was
+
+
+def test_a_problem_needs_one_operator_and_matching_finite_data():
+    known, graph = heap()
+    G = graph.part(SELF)
+    with pytest.raises(ValueError, match="either the map G or the matrix N"):
+        ConeProblem(SELF, known.r, known.mu)
+    with pytest.raises(ValueError, match="either the map G or the matrix N"):
+        ConeProblem(SELF, known.r, known.mu, G=G, N=matrix(SELF, known.N))
+    with pytest.raises(ValueError, match="40 contacts in r but 39"):
+        ConeProblem(SELF, known.r, known.mu[1:], G=G)
+    for name, value in (("r", np.nan), ("r", np.inf), ("mu", np.nan), ("mu", -0.1)):
+        data = {"r": known.r.copy(), "mu": known.mu.copy()}
+        data[name][3] = value
+        with pytest.raises(ValueError, match="1 contacts with a NaN, infinite or negative coefficient"):
+            ConeProblem(SELF, data["r"], data["mu"], G=G)
+
+
+def test_known_problems_are_what_they_say():
+    """The optimality conditions hold for the pairs that the tests of the solvers are built on."""
+    for mu in (0.0, 0.4, np.linspace(0, 1, 40)):
+        known, graph = heap(mu=mu)
+        assert np.linalg.matrix_rank(known.N) < len(known.N)
+        assert np.allclose((known.N @ known.g.ravel()).reshape(-1, 3) + known.r, known.y)
+        assert (np.hypot(*known.g.T[1:]) <= known.mu * known.g[:, 0] * (1 + 1e-14)).all()
+        assert (known.mu * np.hypot(*known.y.T[1:]) <= known.y[:, 0] * (1 + 1e-14)).all()
+        assert np.allclose((known.g * known.y).sum(1), 0, atol=1e-14)
+        g = known.g.ravel()
+        assert known.objective == pytest.approx(0.5 * g @ known.N @ g + known.r.ravel() @ g)
+
+
+PROGRAM = """
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+from petsc4py import PETSc
+from problems import part, random_graph
+from pctt.blocks import block_matrix, square_block_matrix
+from pctt.ccp import ConeProblem
+from pctt.ccp.delassus import delassus
+
+comm = MPI.COMM_WORLD
+last = comm.size - 1
+def own(mat, block):
+    indptr, indices, values = mat.convert("aij").getValuesCSR()
+    return sp.csr_matrix((values, indices, indptr), shape=(len(indptr) - 1, mat.getSize()[1])).toarray()
+
+cases = 0
+for seed, arguments in enumerate([
+    dict(contacts=60, bodies=25),
+    dict(contacts=80, bodies=30, hub=True),
+    dict(contacts=40, bodies=6),
+    dict(contacts=30, bodies=12, one_body=1.0),
+    dict(contacts=3, bodies=2),
+    dict(contacts=0, bodies=4),
+]):
+    graph = random_graph(seed, **arguments)
+    G = graph.dense()
+    N = G @ G.T
+    scale = max(1.0, np.abs(N).max(initial=0.0))
+    nc, nb = graph.contacts, graph.bodies
+    rng = np.random.default_rng(seed)
+    partitions = [
+        (None, None),
+        ([0] * last + [nc], [nb] * comm.size),  # all contacts on the last rank, all bodies on the first
+        ([nc] * comm.size, [0] * last + [nb]),  # and the other way round
+        (None, [0] * last + [nb]),
+        ([*sorted(rng.integers(0, nc + 1, last)), nc], [*sorted(rng.integers(0, nb + 1, last)), nb]),
+    ]
+    for contact_ends, body_ends in partitions:
+        rows = part(comm, nc, contact_ends)
+        near = slice(3 * rows.start, 3 * rows.stop)
+        local = graph.part(comm, contact_ends, body_ends)
+        assert np.array_equal(own(block_matrix(comm, local), 6), G[near])
+        assert np.allclose(own(delassus(comm, local), 3), N[near], rtol=0, atol=1e-13 * scale)
+        count = rows.stop - rows.start
+        problem = ConeProblem(comm, np.ones((count, 3)), np.ones(count), G=local)
+        g = np.random.default_rng(1).normal(size=3 * nc)
+        y = problem.product(g[near].reshape(-1, 3))
+        assert np.allclose(y.ravel(), (N @ g)[near], rtol=0, atol=1e-12 * scale)
+        v = problem.N.createVecRight()
+        v.array[:] = g[near]
+        assert np.allclose((problem.N * v).array, (N @ g)[near], rtol=0, atol=1e-12 * scale)
+        blocks = N.reshape(nc, 3, nc, 3)[np.arange(nc), :, np.arange(nc)]
+        assert np.allclose(problem.diagonal_blocks, blocks[rows], rtol=0, atol=1e-13 * scale)
+        assert np.isclose(problem.mean_diagonal, np.diag(N).mean() if nc else 1.0)
+        assert problem.size == nc
+        cases += 1
+if comm.rank == 0:
+    print("cases", cases)
+"""
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [2, 3, 4])
+def test_delassus_over_the_ranks(mpirun, ranks):
+    """Ranks without contacts, ranks that own bodies that they do not touch, bodies all on one rank."""
+    assert mpirun(PROGRAM, ranks) == "cases 30\n"

@@ -1,0 +1,276 @@
+"""The KSP of a Newton system: its defaults, the user's options, and what it says of itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from petsc4py import PETSc
+from problems import SELF, from_graph, heap, matrix
+
+from pctt.ccp import ConeProblem, Limits
+from pctt.ccp.krylov import Krylov
+from pctt.ccp.newton import LADDER, SchurSystem
+
+
+def system(seed: int = 0, size: int = 60, shift: float = 1.0):
+    """A symmetric positive definite matrix, its Mat, a right-hand side and room for the solution."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(size, size)) * np.exp(rng.normal(size=size))
+    dense = A @ A.T + shift * np.eye(size)
+    S = matrix(SELF, dense)
+    x, b = S.createVecs()
+    b.array[:] = rng.normal(size=size)
+    return dense, S, x, b
+
+
+def overwrite(S, dense: np.ndarray) -> None:
+    """New values in the old structure."""
+    everywhere = np.arange(len(dense), dtype=PETSc.IntType)
+    S.setValues(everywhere, everywhere, dense)
+    S.assemble()
+
+
+@pytest.mark.parametrize("pc", ["none", "jacobi", "pbjacobi", "ilu", "icc", "sor", "gamg", "hypre", "cholesky"])
+@pytest.mark.parametrize("method", ["bcgs", "cg", "gmres"])
+def test_the_true_residual_is_the_true_one(pc, method):
+    """||b - S x|| / ||b|| from S, x and b themselves, and small where the solve says that it converged."""
+    dense, S, x, b = system()
+    krylov = Krylov(SELF, f"{pc}_{method}_", {"pc_type": pc, "ksp_type": method}, rtol=1e-7)
+    done = krylov.solve(S, b, x)
+    residual = np.linalg.norm(b.array - dense @ x.array) / np.linalg.norm(b.array)
+    assert done.true_residual == pytest.approx(residual, rel=1e-3, abs=1e-12)
+    assert done.converged == (done.true_residual <= 2e-7)
+    if method == "bcgs" and pc != "none":
+        assert done.converged
+    assert min(done.setup_s, done.solve_s) > 0
+
+
+def test_the_true_residual_is_reported_where_the_method_claims_success():
+    dense, S, x, b = system()
+    done = Krylov(SELF, "", {"ksp_type": "preonly", "pc_type": "jacobi"}).solve(S, b, x)
+    assert done.reason == "converged_its"
+    assert done.true_residual == pytest.approx(np.linalg.norm(b.array - dense @ x.array) / np.linalg.norm(b.array))
+    assert not done.converged
+
+
+def test_iterations_are_capped_and_the_failure_said(database):
+    _, S, x, b = system()
+    database["ksp_max_it"] = 3
+    done = Krylov(SELF, "", rtol=1e-10).solve(S, b, x)
+    assert (done.converged, done.reason, done.iterations) == (False, "diverged_max_it", 3)
+    assert 1e-10 < done.true_residual < 10
+
+
+def test_defaults_and_the_users_options(database):
+    ksp = Krylov(SELF).ksp
+    assert (ksp.getType(), ksp.pc.getType(), ksp.getPCSide()) == ("bcgs", "pbjacobi", PETSc.PC.Side.RIGHT)
+    assert ksp.getTolerances()[0] == 1e-3
+    assert ksp.getTolerances()[3] == 1000
+    database["one_pc_type"] = "sor"
+    database["one_ksp_rtol"] = 1e-9
+    ksp = Krylov(SELF, "one_", {"pc_type": "jacobi", "ksp_type": "cg"}, rtol=1e-2).ksp
+    assert (ksp.getType(), ksp.pc.getType(), ksp.getTolerances()[0]) == ("cg", "sor", 1e-9)
+
+
+def test_a_prefixed_ksp_takes_the_ksp_options_of_the_one_without(database):
+    database["ksp_type"] = "gmres"
+    database["ksp_rtol"] = 1e-9
+    database["ksp_max_it"] = 7
+    database["pc_type"] = "ilu"
+    ksp = Krylov(SELF, "two_", {"pc_type": "jacobi"}, rtol=1e-2).ksp
+    assert (ksp.getType(), ksp.pc.getType()) == ("gmres", "jacobi")
+    assert ksp.getTolerances()[0] == 1e-9
+    assert ksp.getTolerances()[3] == 7
+    database["three_ksp_rtol"] = 1e-5  # unless told otherwise
+    assert Krylov(SELF, "three_", {"pc_type": "jacobi"}).ksp.getTolerances()[0] == 1e-5
+
+
+@pytest.mark.parametrize("pc", ["pbjacobi", "ilu", "icc", "cholesky", "lu", "gamg"])
+def test_new_values_are_used(pc):
+    """Also by what works on a copy in another format."""
+    _, S, x, b = system(0, shift=100.0)
+    krylov = Krylov(SELF, "again_", {"pc_type": pc}, rtol=1e-6)
+    assert krylov.solve(S, b, x).converged
+    dense = system(1, shift=100.0)[0]
+    overwrite(S, dense)
+    assert krylov.solve(S, b, x).converged
+    assert np.linalg.norm(dense @ x.array - b.array) <= 2e-6 * np.linalg.norm(b.array)
+
+
+def test_eisenstat_works_on_scalar_rows():
+    """On blocks of three PETSc 3.18 ends in a segmentation fault."""
+    dense, S, x, b = system(shift=100.0)
+    assert Krylov(SELF, "e_", {"pc_type": "eisenstat"}, rtol=1e-7).solve(S, b, x).iterations > 1
+    assert np.linalg.norm(dense @ x.array - b.array) <= 1e-5 * np.linalg.norm(b.array)
+
+
+@pytest.mark.parametrize("pc", ["lu", "cholesky", "ilu", "icc", "hypre", "pbjacobi", "none"])
+def test_a_breakdown_is_reported_and_forgotten(pc):
+    """A matrix with a NaN: nothing is raised, and the next matrix is solved as if nothing had been."""
+    dense, S, x, b = system()
+    krylov = Krylov(SELF, "broken_", {"pc_type": pc}, rtol=1e-6)
+    broken = dense.copy()
+    broken[4, 4] = np.nan
+    overwrite(S, broken)
+    done = krylov.solve(S, b, x)
+    assert not done.converged
+    assert done.true_residual == 1.0
+    assert np.array_equal(x.array, np.zeros(60))
+    overwrite(S, dense)
+    assert krylov.solve(S, b, x).converged
+
+
+def test_a_failing_set_up_is_reported_not_raised():
+    _, S, x, b = system()
+    x.array[:] = np.nan
+    krylov = Krylov(SELF, "none_", {"pc_type": "python"})
+    done = krylov.solve(S, b, x)
+    krylov.destroy()
+    assert not done.converged
+    assert done.reason.startswith("PETSc error")
+    assert done.true_residual == 1.0
+    assert np.array_equal(x.array, np.zeros(60))
+
+
+def test_a_right_hand_side_of_zero():
+    _, S, x, b = system()
+    b.zeroEntries()
+    x.array[:] = 1.0
+    done = Krylov(SELF).solve(S, b, x)
+    assert done.converged
+    assert np.array_equal(x.array, np.zeros(60))
+
+
+# -- Newton systems -----------------------------------------------------------------------------------------
+
+
+def spd_blocks(count: int, seed: int = 0) -> np.ndarray:
+    A = np.random.default_rng(seed).normal(size=(count, 3, 3))
+    return A @ A.transpose(0, 2, 1) + np.eye(3)
+
+
+def test_a_newton_system_is_n_plus_the_barrier_blocks():
+    """Written anew at every update, not added up; N itself stays as it is."""
+    known, graph = heap()
+    problem = from_graph(known, graph)
+    newton = SchurSystem(problem, 1e-10)
+    rhs = np.random.default_rng(1).normal(size=(40, 3))
+    for seed in (0, 1):
+        blocks = spd_blocks(40, seed)
+        S = known.N.copy()
+        for c in range(40):
+            S[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] += blocks[c]
+        newton.update(blocks)
+        assert np.allclose(newton.S.convert("dense").getDenseArray(), S)
+        assert np.allclose(newton.solve(rhs).ravel(), np.linalg.solve(S, rhs.ravel()), atol=1e-8)
+    assert newton.fallbacks == 0
+    newton.destroy()
+    assert np.allclose(problem.N.convert("dense").getDenseArray(), known.N)
+
+
+@pytest.mark.parametrize("first", [None, *LADDER])
+def test_the_ladder_is_climbed_down_until_a_rung_holds(first, database):
+    """Rungs before ``first`` are made to fail."""
+    rungs = list(LADDER)
+    for rung in rungs[: rungs.index(first) if first else 0]:
+        database[f"fallback_{rung}_pc_type"] = "python"
+    database["pc_type"] = "python"
+    known, graph = heap()
+    newton = SchurSystem(from_graph(known, graph), 1e-8)
+    blocks, rhs = spd_blocks(40), np.random.default_rng(1).normal(size=(40, 3))
+    newton.update(blocks)
+    x = newton.solve(rhs)
+    S = newton.S.convert("dense").getDenseArray()
+    assert np.linalg.norm(S @ x.ravel() - rhs.ravel()) <= 2e-8 * np.linalg.norm(rhs)
+    assert newton.fallbacks == 1
+    assert newton.ksp_its >= 1
+    newton.destroy()
+
+
+def test_where_every_rung_fails_the_step_is_the_best_there_is(database):
+    """Of three that stop early the one of the smallest true residual; zero where nothing is any good."""
+    known, graph = heap()
+    problem = from_graph(known, graph)
+    blocks, rhs = 1e-6 * spd_blocks(40), np.random.default_rng(1).normal(size=(40, 3))
+    database["ksp_type"] = "cg"
+    database["ksp_max_it"] = 2
+    database["fallback_pbjacobi_ksp_max_it"] = 20
+    database["fallback_cholesky_ksp_type"] = "cg"
+    database["fallback_cholesky_pc_type"] = "none"
+    newton = SchurSystem(problem, 1e-12)
+    newton.update(blocks)
+    S = newton.S.convert("dense").getDenseArray()
+    residuals = []
+    for prefix in ("", "fallback_pbjacobi_", "fallback_cholesky_"):
+        x, b = newton.S.createVecs()
+        b.array[:] = rhs.ravel()
+        residuals.append(Krylov(SELF, prefix, LADDER.get(prefix[9:-1]), 1e-12).solve(newton.S, b, x).true_residual)
+    best = min(residuals + [1.0])
+    x = newton.solve(rhs)
+    assert np.linalg.norm(S @ x.ravel() - rhs.ravel()) / np.linalg.norm(rhs) == pytest.approx(best, rel=1e-6)
+    newton.destroy()
+    for rung in ("", "fallback_pbjacobi_", "fallback_cholesky_"):
+        database[rung + "pc_type"] = "python"
+    newton = SchurSystem(problem, 1e-8)
+    newton.update(blocks)
+    assert np.array_equal(newton.solve(rhs), np.zeros((40, 3)))
+    newton.destroy()
+
+
+def test_systems_of_another_structure_follow_each_other():
+    """Solvers make and destroy a system per cone problem."""
+    from pctt import ccp
+
+    for contacts in (10, 40, 25):
+        known, graph = heap(3, contacts)
+        problem: ConeProblem = from_graph(known, graph)
+        assert ccp.solve(problem, limits=Limits(1e-5)).converged
+        problem.destroy()
+
+
+PROGRAM = """
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from problems import heap, matrix
+from pctt.ccp.krylov import Krylov
+
+comm = MPI.COMM_WORLD
+rng = np.random.default_rng(0)
+A = rng.normal(size=(90, 90))
+dense = A @ A.T + np.eye(90)
+S = matrix(comm, dense)
+x, b = S.createVecs()
+first, last = S.getOwnershipRange()
+rhs = rng.normal(size=90)
+b.array[:] = rhs[first:last]
+for pc in ("ilu", "icc", "pbjacobi", "cholesky", "lu", "none", "gamg", "hypre"):
+    krylov = Krylov(comm, pc + "_", {"pc_type": pc}, 1e-7)
+    done = krylov.solve(S, b, x)
+    whole = np.concatenate(comm.allgather(x.array))
+    residual = np.linalg.norm(dense @ whole - rhs) / np.linalg.norm(rhs)
+    assert abs(done.true_residual - residual) <= 1e-3 * residual + 1e-14, (pc, done, residual)
+    assert done.converged == (residual <= 2e-7), (pc, done)
+    assert done.converged or pc == "none", (pc, done)
+    assert comm.allgather((done.iterations, done.converged)) == [(done.iterations, done.converged)] * comm.size
+    expected = pc + " within each rank" if pc in ("ilu", "icc") else pc
+    assert krylov.name == expected, krylov.name
+    assert krylov.ksp.pc.getType() == ("bjacobi" if pc in ("ilu", "icc") else pc)
+# options of the factorisation reach those of the ranks: more fill, fewer iterations
+N = matrix(comm, heap(contacts=200, bodies=150)[0].N + 0.01 * np.eye(600))
+x, b = N.createVecs()
+b.array[:] = 1.0
+PETSc.Options()["filled_pc_factor_levels"] = 3
+plain, filled = (Krylov(comm, prefix, {"pc_type": "ilu"}, 1e-7).solve(N, b, x) for prefix in ("plain_", "filled_"))
+assert plain.converged
+assert filled.converged
+assert filled.iterations < plain.iterations, (filled, plain)
+if comm.rank == 0:
+    print("done")
+"""
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_on_several_ranks_factorisations_of_one_rank_work_within_each(mpirun, ranks):
+    assert mpirun(PROGRAM, ranks) == "done\n"

@@ -1,0 +1,52 @@
+"""Matrices that the preconditioner tests solve with."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.blocks import BlockRows, square_block_matrix
+
+
+def poisson(n: int) -> PETSc.Mat:
+    """The five-point stencil on an n x n grid, AIJ, with its points as attribute."""
+    line = sp.diags([-1.0, 2.0, -1.0], [-1, 0, 1], shape=(n, n))
+    A = (sp.kron(line, sp.identity(n)) + sp.kron(sp.identity(n), line)).tocsr()
+    comm = MPI.COMM_WORLD
+    first, last = (n * n * rank // comm.size for rank in (comm.rank, comm.rank + 1))
+    rows = A[first:last]
+    mat = PETSc.Mat().createAIJ(
+        ((last - first, n * n), (last - first, n * n)), csr=(rows.indptr, rows.indices, rows.data), comm=comm
+    )
+    mat.setAttr("coordinates", np.stack(np.divmod(np.arange(first, last), n), axis=1))
+    return mat
+
+
+def contacts(count: int, bodies: int, seed: int = 0) -> tuple[BlockRows, np.ndarray]:
+    """A random contact map on one rank (contacts of two bodies, some of one) and barrier blocks."""
+    rng = np.random.default_rng(seed)
+    pairs = np.stack([rng.permutation(bodies)[:2] for _ in range(count)])
+    single = rng.random(count) < 0.2
+    indptr = np.concatenate([[0], np.cumsum(np.where(single, 1, 2))])
+    keep = np.stack([np.ones(count, bool), ~single], axis=1)
+    indices = np.sort(pairs, axis=1)[keep]
+    root = rng.standard_normal((count, 3, 3))
+    barrier = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    return BlockRows(indptr, indices, rng.standard_normal((len(indices), 3, 6)), bodies), barrier
+
+
+def contact_matrix(G: BlockRows, barrier: np.ndarray) -> PETSc.Mat:
+    """S = G G' + B, BAIJ of block size 3, with what it is made of as attributes."""
+    rows = sp.bsr_matrix((G.blocks, G.indices, G.indptr), shape=(3 * G.rows, 6 * G.columns))
+    B = sp.bsr_matrix((barrier, np.arange(G.rows), np.arange(G.rows + 1)))
+    S = square_block_matrix(MPI.COMM_WORLD, sp.bsr_matrix(rows @ rows.T + B, blocksize=(3, 3)))
+    S.setAttr("contact_map", G)
+    S.setAttr("barrier", barrier)
+    return S
+
+
+def dense(mat: PETSc.Mat) -> np.ndarray:
+    """All of a sequential Mat."""
+    return mat.convert("dense", PETSc.Mat()).getDenseArray()

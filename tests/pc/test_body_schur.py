@@ -1,0 +1,66 @@
+"""Contact systems solved through the bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from petsc4py import PETSc
+from systems import contact_matrix, contacts, dense, poisson
+
+
+def solve(mat: PETSc.Mat, ksp_type: str, rtol: float, **options: object) -> tuple[float, np.ndarray, np.ndarray]:
+    """True residual, solution, right-hand side."""
+    for name, value in options.items():
+        PETSc.Options()[name] = str(value)
+    ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOperators(mat)
+    ksp.setType(ksp_type)
+    ksp.setTolerances(rtol=rtol)
+    ksp.pc.setType("python")
+    ksp.pc.setPythonType("pctt.pc.BodySchur")
+    ksp.setFromOptions()
+    ksp.setTolerances(rtol=rtol)
+    x, b = mat.createVecs()
+    b.array[:] = np.random.default_rng(1).standard_normal(b.getLocalSize())
+    ksp.solve(b, x)
+    residual = b - mat * x
+    return residual.norm() / b.norm(), x.array.copy(), b.array.copy()
+
+
+@pytest.mark.parametrize("rtol", [1e-3, 1e-6, 1e-10])
+def test_reaches_the_tolerance_in_one_application(rtol):
+    mat = contact_matrix(*contacts(80, 30))
+    residual, x, b = solve(mat, "preonly", rtol)
+    assert residual <= rtol
+    if rtol < 1e-9:
+        assert np.allclose(x, np.linalg.solve(dense(mat), b))
+
+
+@pytest.mark.parametrize(("pc", "shift"), [("pbjacobi", 0.03), ("ilu", 0.03), ("cholesky", 0.0)])
+def test_every_inner_preconditioner(pc, shift):
+    mat = contact_matrix(*contacts(60, 20, seed=3))
+    residual, _, _ = solve(mat, "preonly", 1e-8, body_pc_type=pc, pc_body_shift=shift)
+    assert residual <= 1e-8
+
+
+def test_preconditions_fgmres():
+    mat = contact_matrix(*contacts(60, 20, seed=4))
+    residual, _, _ = solve(mat, "fgmres", 1e-9, pc_body_rtol=1e-2)
+    assert residual <= 1e-8
+
+
+def test_follows_new_barriers():
+    G, barrier = contacts(50, 20, seed=5)
+    mat = contact_matrix(G, barrier)
+    before, _, _ = solve(mat, "preonly", 1e-8)
+    rows = np.arange(G.rows, dtype=PETSc.IntType)[:, None]
+    mat.setValuesBlockedRCV(rows, rows, 6.0 * barrier.reshape(-1, 9), PETSc.InsertMode.ADD_VALUES)
+    mat.assemble()
+    mat.setAttr("barrier", 7.0 * barrier)
+    after, _, _ = solve(mat, "preonly", 1e-8)
+    assert max(before, after) <= 1e-8
+
+
+def test_a_matrix_that_does_not_say_what_it_is_made_of_is_refused():
+    with pytest.raises((ValueError, PETSc.Error)):
+        solve(poisson(4), "preonly", 1e-3)

@@ -1,0 +1,208 @@
+"""pctt.pc.TensorTrain as any petsc4py program uses it."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from petsc4py import PETSc
+from systems import contact_matrix, contacts, dense, poisson
+
+from pctt.pc import TensorTrain
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def solver(mat: PETSc.Mat, ksp_type: str = "cg", **options: object) -> PETSc.KSP:
+    database = PETSc.Options()
+    for name, value in options.items():
+        database[f"pc_tt_{name}"] = str(value)
+    ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOperators(mat)
+    ksp.setType(ksp_type)
+    ksp.setTolerances(rtol=1e-8, max_it=2000)
+    ksp.pc.setType("python")
+    ksp.pc.setPythonType("pctt.pc.TensorTrain")
+    ksp.setFromOptions()
+    return ksp
+
+
+def context(ksp: PETSc.KSP) -> TensorTrain:
+    return ksp.pc.getPythonContext()
+
+
+def solve(ksp: PETSc.KSP) -> tuple[int, float]:
+    """Iterations and true residual for a random right-hand side."""
+    mat = ksp.getOperators()[0]
+    x, b = mat.createVecs()
+    b.array[:] = np.random.default_rng(0).standard_normal(b.getLocalSize())
+    ksp.solve(b, x)
+    residual = b.duplicate()
+    mat.mult(x, residual)
+    residual.aypx(-1.0, b)
+    return ksp.getIterationNumber(), residual.norm() / b.norm()
+
+
+def operator(ksp: PETSc.KSP) -> np.ndarray:
+    """The preconditioner as a dense matrix."""
+    mat = ksp.getOperators()[0]
+    x, y = mat.createVecs()
+    columns = []
+    for k in range(mat.getSize()[0]):
+        x.zeroEntries()
+        x[k] = 1.0
+        x.assemble()
+        ksp.pc.apply(x, y)
+        columns.append(y.array.copy())
+    return np.stack(columns, axis=1)
+
+
+def test_full_ranks_give_the_inverse():
+    mat = poisson(8)
+    ksp = solver(mat, rank="fixed", max_rank=64, eps=1e-12, leaf=4)
+    ksp.setUp()
+    assert context(ksp).rank == 64
+    assert context(ksp).compression.error < 1e-6
+    assert np.linalg.norm(operator(ksp) @ dense(mat) - np.eye(64)) / 8 < 0.05
+
+
+def test_rank_one_is_block_jacobi():
+    G, barrier = contacts(40, 30)
+    mat = contact_matrix(G, barrier)
+    ksp = solver(mat, max_rank=1)
+    ksp.setUp()
+    blocks = dense(mat).reshape(40, 3, 40, 3)[np.arange(40), :, np.arange(40)]
+    expected = np.zeros((40, 3, 40, 3))
+    expected[np.arange(40), :, np.arange(40)] = np.linalg.inv(blocks)
+    assert np.allclose(operator(ksp), expected.reshape(120, 120))
+
+
+@pytest.mark.parametrize("block", [1, 3])
+def test_applied_operator_is_symmetric_and_positive(block):
+    G, barrier = contacts(60, 25)
+    mat = poisson(12) if block == 1 else contact_matrix(G, 30 * barrier)
+    ksp = solver(mat, rank="fixed", max_rank=6)
+    ksp.setUp()
+    M = operator(ksp)
+    assert context(ksp).rank == 6
+    assert np.allclose(M, M.T, atol=1e-10 * np.abs(M).max())
+    assert np.linalg.eigvalsh(0.5 * (M + M.T)).min() > 0
+
+
+@pytest.mark.parametrize("ksp_type", ["cg", "bcgs", "gmres", "fgmres"])
+def test_solves_under_every_method_with_fewer_iterations_than_jacobi(ksp_type):
+    plain = solver(poisson(32), ksp_type, max_rank=1)
+    train = solver(poisson(32), ksp_type, rank="fixed", max_rank=24)
+    jacobi_its, _ = solve(plain)
+    PETSc.Options()["pc_tt_max_rank"] = "24"
+    train_its, residual = solve(train)
+    assert residual < 1e-6
+    assert train_its < jacobi_its
+
+
+def test_refines_by_itself():
+    """The inverse as a direct solver, and in iterative refinement."""
+    mat = poisson(8)
+    options = {"rank": "fixed", "max_rank": 64, "eps": 1e-12, "leaf": 4}
+    direct = solver(mat, "preonly", **options)
+    _, once = solve(direct)
+    refined = solver(mat, "richardson", **options)
+    _, many = solve(refined)
+    assert once < 0.5
+    assert many < 1e-6
+
+
+def test_works_without_coordinates():
+    mat = poisson(16)
+    mat.setAttr("coordinates", None)
+    ksp = solver(mat, rank="fixed", max_rank=8)
+    _, residual = solve(ksp)
+    assert context(ksp).rank == 8
+    assert residual < 1e-6
+
+
+def test_new_values_start_from_the_old_train():
+    mat = poisson(16)
+    ksp = solver(mat, rank="fixed", max_rank=8)
+    solve(ksp)
+    mat.shift(0.5)
+    _, residual = solve(ksp)
+    assert residual < 1e-6
+    assert context(ksp).account.reused == 1
+    cold = solver(mat, rank="fixed", max_rank=8)
+    cold.setUp()
+    assert context(ksp).compression.error <= 1.2 * context(cold).compression.error
+
+
+def test_an_indefinite_diagonal_falls_back_to_block_jacobi():
+    mat = poisson(8)
+    diagonal = mat.getDiagonal()
+    diagonal.array[5] = -1.0
+    mat.setDiagonal(diagonal)
+    ksp = solver(mat, "gmres", rank="fixed")
+    ksp.setUp()
+    assert context(ksp).rank == 1
+    assert any("not positive definite" in why for why in context(ksp).account.fallbacks)
+
+
+def test_single_precision_is_given_up_where_it_is_not_enough():
+    ksp = solver(poisson(24), "bcgs", rank="fixed", max_rank=4, precision="single")
+    ksp.setTolerances(rtol=1e-13)
+    ksp.setPCSide(PETSc.PC.Side.RIGHT)
+    solve(ksp)
+    _, residual = solve(ksp)
+    assert residual < 1e-10 or context(ksp).rank == 1
+
+
+def test_auto_keeps_to_block_jacobi_until_a_trial_can_be_paid_for():
+    ksp = solver(poisson(16), rank="auto")
+    solve(ksp)
+    assert context(ksp).rank == 1
+    assert "rank 1" in "\n".join(context(ksp).report())
+
+
+@pytest.mark.parametrize("name", ["max_rnk", "epsilon"])
+def test_misspelt_options_are_refused(name):
+    with pytest.raises((ValueError, PETSc.Error)):
+        solver(poisson(4), **{name: 1})
+
+
+def test_modes_must_hold_the_matrix():
+    ksp = solver(poisson(8), rank="fixed", modes="2,2")
+    with pytest.raises((ValueError, PETSc.Error)):
+        ksp.setUp()
+
+
+def test_the_example_of_the_documentation_runs():
+    text = (DOCS / "preconditioners.md").read_text()
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "pctt.pc.TensorTrain" in done.stdout
+    assert "inverse ranks" in done.stdout
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [1, 2, 3, 4])
+def test_any_number_of_ranks(mpirun, ranks):
+    printed = mpirun(
+        """
+import sys, petsc4py
+petsc4py.init(sys.argv)
+from petsc4py import PETSc
+from systems import poisson
+from test_tensor_train import context, solve, solver
+ksp = solver(poisson(20), rank="fixed", max_rank=8)
+its, residual = solve(ksp)
+assert context(ksp).rank == 8, context(ksp).account.fallbacks
+PETSc.Sys.Print("done", its, residual < 1e-6)
+""",
+        ranks,
+    )
+    word, its, good = printed.split()
+    assert (word, good) == ("done", "True")
+    assert int(its) < 60

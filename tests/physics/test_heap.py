@@ -1,0 +1,89 @@
+"""A heap of spheres in a box around a paddle: what the walls carry, and the balance of momentum."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drive import G, momentum, steps
+from mpi4py import MPI
+
+from dem.motion import Dynamic, Fixed, Rotation
+from dem.scene import Scene
+from dem.shapes import Box, Plane
+from dem.world import World
+
+DT = 0.01
+LOOSE = 1e-3  #: the balances hold for any impulses, solved well or not
+
+
+def heap(layers, motion, lid=False):
+    """3 x 3 x layers spheres above a floor with walls and a paddle, the first body, in the middle."""
+    scene = Scene(0.3)
+    places = np.stack(np.meshgrid(np.arange(3), np.arange(3), np.arange(layers), indexing="ij"), axis=-1)
+    jitter = np.random.default_rng(3).uniform(-0.01, 0.01, (9 * layers, 3))
+    scene.add_spheres(0.23 * places.reshape(-1, 3) + [0.13, 0.13, 0.25] + jitter, 0.1, 2500.0)
+    width = 0.72
+    walls = [Plane((1, 0, 0)), Plane((-1, 0, 0), (width, 0, 0))]
+    walls += [Plane((0, 1, 0)), Plane((0, -1, 0), (0, width, 0))]
+    scene.add_body("paddle", [Box((0.1, 0.03, 0.05))], motion, position=(width / 2, width / 2, 0.07))
+    scene.add_body("floor", [Plane((0, 0, 1))], position=(0.1, 0.2, 0.0))
+    scene.add_body("walls", walls)
+    if lid:
+        parts = [Box((width / 2, width / 2, 0.05))]
+        position = (width / 2, width / 2, 0.23 * layers + 0.25)
+        scene.add_body("lid", parts, Dynamic(), density=500.0, position=position)
+    return World.from_scene(scene, MPI.COMM_SELF)
+
+
+@pytest.mark.parametrize(("solver", "tol"), [("apgd", LOOSE), ("pdip", LOOSE), ("apgd", 0.5)])
+def test_every_step_keeps_the_balance_of_linear_and_angular_momentum(solver, tol):
+    """What grains gain and large bodies take is what gravity gives, to rounding, however badly solved."""
+    world = heap(2, Rotation((0, 0, 2.0), (0.36, 0.36, 0)))
+    weight = world.grains.mass * np.array([[0.0], [0.0], [-G]])
+    largest = 0.0
+    run = steps(world, 70, DT, solver, tol, delta=0.02, recovery_speed=0.5)
+    for _ in range(70):
+        before, place, reference = momentum(world), world.grains.position, world.large.position.copy()
+        step = next(run)
+        taken = np.array([step.system.force_on(body.name, step.impulse) for body in world.large_bodies]) * DT
+        taken[:, 3:] += np.cross(reference, taken[:, :3])
+        given = np.concatenate([weight.sum(axis=1), np.cross(place, weight.T).sum(axis=0)]) * DT
+        scale = np.abs(step.impulse).sum() + np.abs(before).max()
+        np.testing.assert_allclose(momentum(world) - before + taken.sum(axis=0), given, atol=1e-13 * scale)
+        largest = max(largest, step.impulse[:, 0].sum())
+    assert largest > np.abs(weight).sum() * DT  # there was something to balance
+
+
+def test_floor_walls_and_paddle_carry_the_weight_of_a_settled_heap():
+    world = heap(3, Fixed())
+    weight = world.grains.mass.sum() * G
+    forces = [
+        [step.system.force_on(body.name, step.impulse) for body in world.large_bodies]
+        for step in steps(world, 240, DT, tol=LOOSE, delta=0.02, recovery_speed=0.5)
+    ]
+    paddle, floor, walls = np.mean(forces[120:], axis=0)[:, :3]
+    total = paddle + floor + walls
+    np.testing.assert_allclose(total, [0, 0, -weight], atol=0.01 * weight)
+    assert paddle[2] < 0  # spheres lie on it
+    assert floor[2] < -0.5 * weight
+    np.testing.assert_allclose(floor[:2] + paddle[:2], -walls[:2], atol=0.01 * weight)
+
+
+def test_a_free_lid_has_its_share_in_the_balance():
+    world = heap(2, Fixed(), lid=True)
+    lid, grains = world.large_row("lid"), world.grains.mass.sum()
+    mass = world.large.mass[lid]
+    carried = 0.0
+    run = steps(world, 80, DT, tol=LOOSE, delta=0.02, recovery_speed=0.5)
+    for _ in range(80):
+        before, speed = momentum(world)[:3], world.large.velocity[lid, :3]
+        step = next(run)
+        push = step.system.force_on("lid", step.impulse)[:3] * DT
+        others = [step.system.force_on(name, step.impulse)[:3] for name in ("paddle", "floor", "walls")]
+        scale = 1e-13 * (np.abs(step.impulse).sum() + mass * G)
+        gain = mass * (world.large.velocity[lid, :3] - speed)
+        np.testing.assert_allclose(gain, push + [0, 0, -mass * G * DT], atol=scale)
+        gain += momentum(world)[:3] - before
+        np.testing.assert_allclose(gain, [0, 0, -(grains + mass) * G * DT] - DT * sum(others), atol=scale)
+        carried = max(carried, push[2])
+    assert carried > mass * G * DT

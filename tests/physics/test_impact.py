@@ -1,0 +1,105 @@
+"""Two free spheres that meet, without gravity: inelastic, with momentum kept and friction bounded.
+
+With the reduced mass m = 1/(1/m1 + 1/m2), a closing speed u and a sliding speed s before, a touching pair of
+solid spheres has the contact velocities y_n = -u + p_n/m and y_t = s - 3.5 p_t/m. It sticks with p_n = m u,
+p_t = m s / 3.5 where that is within the cone, and otherwise slides with p_t = mu p_n and y_n = mu y_t.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drive import RADIUS, SOLVERS, make_steps, momentum
+from mpi4py import MPI
+
+from dem.scene import Scene
+from dem.world import World
+
+MASSES = [(1000.0, 1000.0), (500.0, 4000.0)]
+RUBS = [(0.5, 1.0), (0.3, 1.9), (0.3, 4.0), (0.1, 2.0), (0.0, 1.0)]  #: friction coefficient, sliding speed
+
+
+def pair(closing, sliding, densities, friction, gap=0.0, axis=(1.0, 0.0, 0.0)):
+    """Two spheres along `axis`; the first one moves, away from the origin so that angular momentum counts."""
+    normal = np.array(axis) / np.linalg.norm(axis)
+    tangent = np.cross(normal, [0.3, -0.5, 0.8])
+    tangent /= np.linalg.norm(tangent)
+    scene = Scene(friction, gravity=(0, 0, 0))
+    place = np.array([0.3, -0.2, 0.5])
+    both = np.stack([place, place + (2 * RADIUS + gap) * normal])
+    velocity = np.stack([closing * normal + sliding * tangent, np.zeros(3)])
+    scene.add_spheres(both, RADIUS, densities, velocity=velocity)
+    return World.from_scene(scene, MPI.COMM_SELF), normal, tangent
+
+
+def in_order(world):
+    order = np.argsort(world.grains.id)
+    return world.grains.mass[order], world.grains.velocity[order]
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("densities", MASSES)
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 0, -1), (1, 2, -3)])
+def test_a_head_on_impact_is_perfectly_inelastic(solver, densities, axis):
+    world, normal, _ = pair(2.0, 0.0, densities, 0.3, axis=axis)
+    before = momentum(world)
+    make_steps(world, 1, 0.01, solver)
+    mass, velocity = in_order(world)
+    common = 2.0 * mass[0] / mass.sum() * normal
+    np.testing.assert_allclose(velocity, np.tile([*common, 0, 0, 0], (2, 1)), atol=1e-7)
+    np.testing.assert_allclose(momentum(world), before, atol=1e-12 * np.abs(before).max())
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_gap_is_closed_before_the_impulse_acts(solver):
+    """Within one step the first sphere may come as near as the gap."""
+    dt, gap = 0.01, 0.005
+    world, normal, _ = pair(2.0, 0.0, (1000.0, 1000.0), 0.3, gap=gap)
+    last = make_steps(world, 1, dt, solver)
+    mass, velocity = in_order(world)
+    assert (velocity[0, :3] - velocity[1, :3]) @ normal == pytest.approx(gap / dt, abs=1e-7)
+    assert last.impulse[0, 0] == pytest.approx(mass[0] / 2 * (2.0 - gap / dt), rel=1e-7)
+    last = make_steps(world, 1, dt, solver)
+    assert last.contacts.gap[0] == pytest.approx(0.0, abs=1e-9)
+    _, velocity = in_order(world)
+    np.testing.assert_allclose(velocity[0], velocity[1], atol=1e-7)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("densities", MASSES)
+@pytest.mark.parametrize(("friction", "sliding"), RUBS)
+@pytest.mark.parametrize("axis", [(1, 0, 0), (1, 2, -3)])
+def test_an_oblique_impact_sticks_or_slides_at_the_cone(solver, densities, friction, sliding, axis):
+    closing = 2.0
+    world, normal, tangent = pair(closing, sliding, densities, friction, axis=axis)
+    before = momentum(world)
+    last = make_steps(world, 1, 0.01, solver)
+    mass, velocity = in_order(world)
+    reduced = 1 / (1 / mass).sum()
+    if sliding / 3.5 <= friction * closing:
+        p_n, p_t = reduced * closing, reduced * sliding / 3.5
+    else:
+        p_n = reduced * (closing + friction * sliding) / (1 + 3.5 * friction**2)
+        p_t = friction * p_n
+    on_b = last.impulse_on_b()[0]
+    np.testing.assert_allclose(on_b, p_n * normal + p_t * tangent, atol=1e-6 * reduced)
+    np.testing.assert_allclose(velocity[1, :3], on_b / mass[1], atol=1e-9)
+    spin = np.cross(normal, tangent) * -p_t * RADIUS / (0.4 * mass * RADIUS**2)[:, None]
+    np.testing.assert_allclose(velocity[:, 3:], spin, atol=1e-5)
+    assert np.hypot(*last.impulse[0, 1:]) <= friction * last.impulse[0, 0] * (1 + 1e-9)
+    np.testing.assert_allclose(momentum(world), before, atol=1e-12 * np.abs(before).max())
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_an_impact_gives_no_energy(solver):
+    for sliding in (0.0, 1.0, 4.0, 20.0):
+        world, *_ = pair(2.0, sliding, MASSES[1], 0.6, axis=(1, 2, -3))
+        mass, velocity = in_order(world)
+        inertia = 0.4 * mass * RADIUS**2
+
+        def energy(velocity, mass=mass, inertia=inertia):
+            return mass @ (velocity[:, :3] ** 2).sum(1) / 2 + inertia @ (velocity[:, 3:] ** 2).sum(1) / 2
+
+        before = energy(velocity)
+        make_steps(world, 1, 0.01, solver)
+        assert energy(in_order(world)[1]) < before

@@ -1,0 +1,149 @@
+"""Grains on and in front of bodies whose motion is prescribed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drive import RADIUS, SOLVERS, G, make_steps, steps
+from mpi4py import MPI
+
+from dem import quaternion
+from dem.motion import Oscillation, Rotation, mean_velocity
+from dem.scene import Scene
+from dem.shapes import Box, Plane
+from dem.world import World
+
+HALF = (0.04, 0.03, 0.02)  #: of the block that rides on the turntable
+
+
+def turntable(speed, friction):
+    scene = Scene(friction)
+    scene.add_body("table", [Plane((0, 0, 1))], Rotation((0, 0, speed)))
+    return scene
+
+
+def riding_block(speed, friction, radius):
+    scene = turntable(speed, friction)
+    velocity = (0, speed * radius, 0)
+    scene.add_boxes([radius, 0, HALF[2]], HALF, 1000.0, velocity=velocity, angular_velocity=(0, 0, speed))
+    return World.from_scene(scene, MPI.COMM_SELF)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_turntable_carries_a_block_while_friction_can_hold_it(solver):
+    """Without slip every step goes along the tangent: the radius grows by sqrt(1 + (w dt)^2) a step."""
+    speed, radius, friction, dt, count = 3.0, 0.3, 0.5, 0.005, 60
+    assert speed**2 * radius < friction * G
+    world = riding_block(speed, friction, radius)
+    used = 0.0
+    for step in steps(world, count, dt, solver):
+        used = step.friction_used()
+        x, y, z = world.grains.position[0]
+        spiral = radius * np.hypot(1, speed * dt) ** world.step
+        assert np.hypot(x, y) == pytest.approx(spiral, abs=1e-7)
+        assert np.arctan2(y, x) == pytest.approx(world.step * np.arctan(speed * dt), abs=1e-6)
+        assert z == pytest.approx(HALF[2], abs=1e-7)
+        np.testing.assert_allclose(world.grains.velocity[0, 3:], [0, 0, speed], atol=1e-5)
+    assert used == pytest.approx(speed**2 * spiral / G, rel=0.02)
+    turn = quaternion.exponential(world.time * np.array([0, 0, speed]))
+    np.testing.assert_allclose(world.grains.quaternion[0], turn, atol=1e-6)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_turntable_that_is_too_fast_loses_the_block(solver):
+    speed, radius, friction, dt = 5.0, 0.3, 0.5, 0.005
+    assert speed**2 * radius > friction * G
+    world = riding_block(speed, friction, radius)
+    last = make_steps(world, 60, dt, solver)
+    assert last.friction_used() == pytest.approx(friction, rel=1e-3)
+    x, y, _ = world.grains.position[0]
+    assert np.hypot(x, y) > 1.2 * radius
+    assert np.arctan2(y, x) < 0.9 * 60 * np.arctan(speed * dt)
+
+
+def test_a_sphere_on_a_turntable_circles_at_two_sevenths_of_its_speed():
+    """A rolling ball has dv/dt = 2/7 w x v (Weltner 1979): put on the table at r, it circles with 3.5 r."""
+    speed, radius, time = 2.0, 0.5, 0.6
+    way = radius * np.array([1.0, 0.0])
+    around = way - 3.5 * way
+    angle = 2 / 7 * speed * time
+    expected = around + 3.5 * radius * np.array([np.cos(angle), np.sin(angle)])
+    errors = []
+    for dt in (0.02, 0.01):
+        scene = turntable(speed, 0.5)
+        motion = {"velocity": (0, speed * radius, 0), "angular_velocity": (0, 0, speed)}
+        scene.add_spheres([radius, 0, RADIUS], RADIUS, 1000.0, **motion)
+        world = World.from_scene(scene, MPI.COMM_SELF)
+        for _ in steps(world, round(time / dt), dt):
+            assert world.grains.position[0, 2] == pytest.approx(RADIUS, abs=1e-8)
+        errors.append(np.linalg.norm(world.grains.position[0, :2] - expected))
+    assert errors[1] < 0.01 * radius
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.05)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_a_paddle_gives_a_sphere_its_velocity(solver, friction):
+    """A turning paddle hits a sphere at rest: the point of contact takes the normal velocity of the face."""
+    speed, arm, dt = 2.0, 0.4, 0.01
+    scene = Scene(friction, gravity=(0, 0, 0))
+    scene.add_body("paddle", [Box((0.6, 0.02, 0.2))], Rotation((0, 0, speed)))
+    scene.add_spheres([arm, 0.02 + RADIUS, 0], RADIUS, 1000.0)
+    world = World.from_scene(scene, MPI.COMM_SELF)
+    step = make_steps(world, 1, dt, solver)
+    assert len(step.contacts) == 1
+    sliding = speed * 0.02  # of the paddle's face at the point of contact, in the direction -x
+    mass, normal_speed = world.grains.mass[0], speed * arm
+    if sliding / 3.5 <= friction * normal_speed:
+        p_n, p_t = mass * normal_speed, mass * sliding / 3.5
+    else:
+        p_n = mass * (normal_speed + friction * sliding) / (1 + 3.5 * friction**2)
+        p_t = friction * p_n
+    np.testing.assert_allclose(world.grains.velocity[0, :3], [-p_t / mass, p_n / mass, 0], atol=1e-7)
+    spin = -RADIUS * p_t / (0.4 * mass * RADIUS**2)
+    np.testing.assert_allclose(world.grains.velocity[0, 3:], [0, 0, spin], atol=1e-6)
+    force = step.system.force_on("paddle", step.impulse)
+    np.testing.assert_allclose(force[:3] * dt, [p_t, -p_n, 0], atol=1e-6 * p_n)
+    assert force[5] * dt == pytest.approx(-p_n * arm - p_t * 0.02, rel=1e-6)
+
+
+def test_a_sphere_in_the_pocket_of_a_turning_paddle_is_carried_along():
+    """The end wall of the pocket gives the centripetal force. (In the long run the place is unstable.)"""
+    speed, dt, reach = 1.5, 0.01, 0.4
+    scene = Scene(0.5, gravity=(0, 0, 0))
+    face = Box((0.6, 0.02, 0.2), center=(0, -RADIUS - 0.02, 0))
+    end = Box((0.02, 0.4, 0.2), center=(reach + RADIUS + 0.02, 0, 0))
+    scene.add_body("paddle", [face, end], Rotation((0, 0, speed)))
+    velocity = (0, speed * reach, 0)
+    scene.add_spheres([reach, 0, 0], RADIUS, 1000.0, velocity=velocity, angular_velocity=(0, 0, speed))
+    world = World.from_scene(scene, MPI.COMM_SELF)
+    weight = world.grains.mass[0] * speed**2 * reach
+    change = speed**2 * reach * dt  # of the velocity in a step; the sphere touches every other step
+    pushes = []
+    for step in steps(world, 80, dt):
+        pushes.append(step.impulse[:, 0].sum())
+        back = quaternion.conjugate(world.large.quaternion[0])
+        place = quaternion.rotate(back, world.grains.position[0])
+        np.testing.assert_allclose(place, [reach, 0, 0], atol=change * (dt + world.time))
+        moving = quaternion.rotate(back, world.grains.velocity[0].reshape(2, 3))
+        np.testing.assert_allclose(moving[0], [0, speed * reach, 0], atol=1.1 * change)
+        np.testing.assert_allclose(moving[1], [0, 0, speed], atol=1.1 * change / RADIUS)
+    assert np.mean(pushes) == pytest.approx(weight * dt, rel=0.05)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_an_oscillating_wall_pushes_a_sphere_and_lets_it_go_at_its_greatest_speed(solver):
+    """The sphere has the mean velocity of the wall over each step, to rounding, while the wall speeds up."""
+    dt = 0.01
+    motion = Oscillation((1, 0, 0), 0.1, 0.8, phase=-np.pi / 2)  # starts at rest
+    scene = Scene(0.3, gravity=(0, 0, 0))
+    scene.add_body("wall", [Plane((1, 0, 0))], motion)
+    scene.add_spheres([RADIUS, 0.2, 0.1], RADIUS, 1000.0)
+    world = World.from_scene(scene, MPI.COMM_SELF)
+    origin, upright = np.zeros(3), np.array([1.0, 0, 0, 0])
+    wall = [mean_velocity(motion, k * dt, dt, origin, upright)[0] for k in range(40)]
+    for k, _ in enumerate(steps(world, 40, dt, solver)):
+        fastest = max(wall[: k + 1])
+        np.testing.assert_allclose(world.grains.velocity[0], [fastest, 0, 0, 0, 0, 0], atol=1e-7)
+    assert fastest == pytest.approx(2 * np.pi * 0.1 / 0.8, rel=2e-3)
+    assert world.large.position[0, 0] + RADIUS < world.grains.position[0, 0] - 0.03

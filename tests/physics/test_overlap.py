@@ -1,0 +1,56 @@
+"""Bodies that overlap are pushed apart no faster than the recovery speed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drive import RADIUS, SOLVERS, G, steps
+from mpi4py import MPI
+
+from dem.scene import Scene
+from dem.shapes import Plane
+from dem.world import World
+
+
+def overlapping_pair(depth):
+    scene = Scene(0.3, gravity=(0, 0, 0))
+    scene.add_spheres([[0, 0, 0], [2 * RADIUS - depth, 0, 0]], RADIUS, [1000.0, 3000.0])
+    return World.from_scene(scene, MPI.COMM_SELF, overlap=0.5)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize(("depth", "speed"), [(0.02, 0.5), (0.02, 1.9), (0.003, 0.5), (0.02, np.inf)])
+def test_overlapping_spheres_part_at_the_recovery_speed_at_most(solver, depth, speed):
+    dt, world = 0.01, overlapping_pair(depth)
+    gaps = []
+    for step in steps(world, 8, dt, solver, recovery_speed=speed):
+        order = np.argsort(world.grains.id)
+        mass, velocity = world.grains.mass[order], world.grains.velocity[order, 0]
+        assert velocity[1] - velocity[0] == pytest.approx(min(depth / dt, speed), rel=1e-6)
+        assert mass @ velocity == pytest.approx(0.0, abs=1e-12)
+        gaps += list(step.contacts.gap)
+    assert gaps[0] == pytest.approx(-depth)
+    needed = max(1, round(depth / dt / min(depth / dt, speed)))
+    assert np.less(gaps[:needed], -1e-6).all()
+
+
+def test_without_recovery_an_overlap_stays_and_does_not_grow():
+    world = overlapping_pair(0.02)
+    for step in steps(world, 5, 0.01, recovery_speed=0.0):
+        np.testing.assert_allclose(world.grains.velocity, 0.0, atol=1e-9)
+        assert step.contacts.gap[0] == pytest.approx(-0.02)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_sphere_sunk_into_the_floor_comes_up_at_the_recovery_speed_and_rests(solver):
+    depth, speed, dt = 0.03, 0.4, 0.01
+    scene = Scene(0.3)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_spheres([0, 0, RADIUS - depth], RADIUS, 1000.0)
+    world = World.from_scene(scene, MPI.COMM_SELF, overlap=0.5)
+    for _ in steps(world, 30, dt, solver, recovery_speed=speed):
+        rising = world.grains.velocity[0, 2]
+        assert rising <= speed + 1e-6
+        assert world.grains.position[0, 2] < RADIUS + speed**2 / (2 * G) + dt * speed
+    assert world.grains.position[0, 2] == pytest.approx(RADIUS, abs=1e-6)
+    np.testing.assert_allclose(world.grains.velocity[0], 0.0, atol=1e-6)

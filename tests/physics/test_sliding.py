@@ -1,0 +1,110 @@
+"""A block on a plane sticks, slides and stops as Coulomb says, apart from the lift of the plain CCP."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drive import HALF, SOLVERS, G, block, make_steps, on_incline, steps
+
+MU = 0.3
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
+def test_below_the_friction_angle_a_block_stays_where_it_is(solver, share):
+    slope = np.arctan(share * MU)
+    world, dt = block(on_incline(slope, MU)), 0.01
+    last = make_steps(world, 40, dt, solver)
+    np.testing.assert_allclose(world.grains.position[0], [0, 0, HALF[2]], atol=1e-8)
+    np.testing.assert_allclose(world.grains.velocity[0], 0.0, atol=1e-7)
+    held = world.grains.mass[0] * G * dt * np.array([np.sin(slope), 0.0, -np.cos(slope)])
+    np.testing.assert_allclose(last.impulse_on_b().sum(axis=0), held, atol=1e-6)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize(("slope", "friction"), [(0.3, 0.3), (0.5, 0.3), (0.5, 0.1), (0.4, 0.0)])
+def test_a_block_that_slides_steadily_is_exactly_implicit_euler(solver, slope, friction):
+    """Started with the lift of a sliding block, it has v_k = v_0 + a dt k from the first step."""
+    acceleration = G * (np.sin(slope) - friction * np.cos(slope))
+    start, dt, count = 0.5, 0.01, 30
+    world = block(
+        on_incline(slope, friction),
+        lift=dt * friction * start,
+        velocity=(start, 0.0, friction * acceleration * dt),
+    )
+    for _ in steps(world, count, dt, solver):
+        k = world.step
+        speed = start + acceleration * dt * k
+        position = start * dt * k + acceleration * dt**2 * k * (k + 1) / 2
+        velocity = [speed, 0, friction * acceleration * dt, 0, 0, 0]
+        np.testing.assert_allclose(world.grains.velocity[0], velocity, atol=1e-6)
+        lift = dt * friction * speed
+        np.testing.assert_allclose(world.grains.position[0], [position, 0, HALF[2] + lift], atol=1e-7)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_from_rest_the_plain_cone_costs_a_lag_of_mu_squared_steps(solver):
+    """The lift has to be climbed first: v_k = a dt (k - mu^2 (1 - q^k)) with q = mu^2 / (1 + mu^2)."""
+    slope, dt, mu = 0.5, 0.01, 0.4
+    acceleration = G * (np.sin(slope) - mu * np.cos(slope))
+    world = block(on_incline(slope, mu))
+    q = mu**2 / (1 + mu**2)
+    for _ in steps(world, 30, dt, solver):
+        k = world.step
+        expected = acceleration * dt * (k - mu**2 * (1 - q**k))
+        assert world.grains.velocity[0, 0] == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_lift_and_its_effects_are_of_first_order_in_the_step():
+    slope, mu, time = 0.5, 0.3, 0.4
+    acceleration = G * (np.sin(slope) - mu * np.cos(slope))
+    lifts, lags = [], []
+    for dt in (0.02, 0.01, 0.005):
+        world = block(on_incline(slope, mu))
+        make_steps(world, round(time / dt), dt)
+        lifts.append(world.grains.position[0, 2] - HALF[2])
+        lags.append(acceleration * time - world.grains.velocity[0, 0])
+        assert lifts[-1] == pytest.approx(dt * mu * world.grains.velocity[0, 0], rel=1e-6)
+    for errors in (lifts, lags):
+        assert min(errors) > 0.0
+        np.testing.assert_allclose(np.divide(errors[:-1], errors[1:]), 2.0, rtol=0.02)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("flush", [False, True])
+def test_a_sliding_block_comes_to_rest_after_its_braking_distance(solver, flush):
+    """v0^2 / (2 mu g), short by dt v0 / 2, also from a flush start, where the plain CCP makes it hop."""
+    start, errors = 1.0, []
+    distance = start**2 / (2 * MU * G)
+    for dt in (0.02, 0.01):
+        lift, sink = (0.0, 0.0) if flush else (dt * MU * start, -(MU**2) * G * dt)
+        world = block(on_incline(0.0, MU), lift, velocity=(start, 0.0, sink))
+        make_steps(world, round(0.5 / dt), dt, solver)
+        np.testing.assert_allclose(world.grains.velocity[0], 0.0, atol=1e-7)
+        np.testing.assert_allclose(world.grains.position[0, 1:], [0.0, HALF[2]], atol=1e-7)
+        errors.append(distance - world.grains.position[0, 0])
+        assert errors[-1] == pytest.approx(dt * start / 2, rel=0.02)
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.02)
+
+
+def test_a_block_thrown_flush_on_the_floor_is_thrown_up_by_the_plain_cone():
+    """The first step gives the normal velocity mu v: v = (v0 - mu g dt) / (1 + mu^2)."""
+    start, dt = 1.0, 0.01
+    world = block(on_incline(0.0, MU), velocity=(start, 0.0, 0.0))
+    make_steps(world, 1, dt)
+    speed = (start - MU * G * dt) / (1 + MU**2)
+    np.testing.assert_allclose(world.grains.velocity[0], [speed, 0, MU * speed, 0, 0, 0], atol=1e-8)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_friction_is_isotropic(solver):
+    """Sliding under any angle of the contact frame: the same path."""
+    start, dt = 1.0, 0.01
+    reached = []
+    for angle in (0.0, 0.4, 1.3, 2.9):
+        way = np.array([np.cos(angle), np.sin(angle), 0.0])
+        world = block(on_incline(0.0, MU), velocity=tuple(start * way))
+        make_steps(world, 20, dt, solver)
+        np.testing.assert_allclose(np.cross(world.grains.position[0] * [1, 1, 0], way), 0.0, atol=1e-7)
+        reached.append(world.grains.position[0] @ way)
+    np.testing.assert_allclose(reached, reached[0], atol=1e-7)

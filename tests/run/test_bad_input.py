@@ -1,0 +1,292 @@
+"""Every bad input: status 2, one line that names it, and nothing changed that was there before."""
+
+from __future__ import annotations
+
+import re
+
+import h5py
+import numpy as np
+import pytest
+from conftest import SMALL, arrays
+from mpi4py import MPI
+
+from pctt.options import OptionError
+from pctt.run.options import read_options
+
+# options, and what the line must name beside the first of them: value and what is allowed
+BAD_OPTIONS = {
+    "-stepss 3": ["did you mean -steps?"],
+    "-scene_nn 3": ["did you mean -scene_n?"],
+    "-ccp_typ apgd": ["did you mean -ccp_type?"],
+    "-ccp_pdip_strat 1": ["did you mean -ccp_pdip_start?"],
+    "-nonsense": ["no such option"],
+    "-steps abc": ["abc", "whole number"],
+    "-steps 1.5": ["1.5", "whole number"],
+    "-steps -1": ["-1", ">= 0"],
+    "-steps": ["whole number"],
+    "-dt -1": ["-1", "positive"],
+    "-dt 0": ["0", "positive"],
+    "-dt nan": ["nan", "positive"],
+    "-dt inf": ["inf", "positive"],
+    "-delta -0.1": ["-0.1", ">= 0"],
+    "-recovery_speed nan": ["nan", ">= 0"],
+    "-output_every -1": ["-1", ">= 0"],
+    "-checkpoint_every 0": ["0", ">= 1"],
+    "-settle maybe": ["maybe", "true or false"],
+    "-scene nosuch": ["nosuch", "mixer"],
+    "-scene_n 0": ["0", "at least 1"],
+    "-scene_n two": ["two", "whole number"],
+    "-scene_radius nan": ["nan", "finite number"],
+    "-scene_radius -0.1": ["-0.1", "positive"],
+    "-scene_friction -1": ["-1", "not be negative"],
+    "-scene_perturbation 0.03": ["0.03", "0.025"],  # the spheres could overlap
+    "-scene_clearance 0.15": ["0.15", "jam"],
+    "-scene_paddle_length 1.5": ["1.5", "does not fit", "below 1"],
+    "-ccp_type nosuch": ["nosuch", "pdip", "apgd"],
+    "-ccp_type pdpi": ["pdpi", "did you mean pdip?"],
+    "-ccp_tol 0": ["0", "positive"],
+    "-ccp_tol 1e-4x": ["1e-4x", "positive"],
+    "-ccp_max_it -2": ["-2", ">= -1"],
+    "-ccp_pdip_centering 2": ["2", "between 0 and 1"],
+    "-compare nosuch": ["nosuch", "ilu", "pbjacobi"],
+    "-compare none,nosuch": ["nosuch", "ilu", "pbjacobi"],
+    "-compare ilu -ccp_type apgd": ["apgd", "pdip"],
+    "-compare_every 0": ["0", ">= 1"],
+    "-ksp_type nosuch": ["nosuch"],
+    "-pc_type nosuch": ["nosuch"],
+    "-ksp_rtol abc": ["abc"],
+    "-pc_python_type nosuch.Thing -pc_type python": ["nosuch.Thing"],
+    "-restart missing.h5": ["missing.h5", "no such file"],
+    "-restart .": ["no such file"],
+    "-problem missing.hdf5": ["missing.hdf5", "no such file"],
+}
+
+#: These go through the program, the others through its function that reads the options.
+FROM_OUTSIDE = (
+    "-stepss 3",
+    "-steps abc",
+    "-steps -1",
+    "-steps",
+    "-dt nan",
+    "-scene nosuch",
+    "-scene_n 0",
+    "-scene_radius nan",
+    "-compare nosuch",
+    "-ksp_type nosuch",
+    "-pc_type nosuch",
+    "-ksp_rtol abc",
+    "-pc_python_type nosuch.Thing -pc_type python",
+    "-restart missing.h5",
+    "-problem missing.hdf5",
+)
+
+
+@pytest.fixture
+def results(tmp_path):
+    """A folder with files of an earlier run, which must stay as they are."""
+    folder = tmp_path / "results"
+    (folder / "frames").mkdir(parents=True)
+    for name in ("summary.json", "state.h5", "checkpoint.h5", "frames/000001.h5", "notes.txt"):
+        (folder / name).write_text(f"what was in {name}")
+    return folder
+
+
+def contents(folder):
+    return {
+        str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mtime_ns)
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def refused(program, folder, *options, ranks=1):
+    """Run with bad options; the one line that it said."""
+    before = contents(folder)
+    done = program(*options, ranks=ranks, status=None)
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert contents(folder) == before
+    said = [line for line in done.stderr.splitlines() if line.startswith("pctt.run: ")]
+    assert len(said) == 1, done.stderr
+    for word in ("Traceback", "PETSC ERROR", "HDF5-DIAG"):
+        assert word not in done.stdout + done.stderr
+    if ranks == 1:  # mpiexec adds its own remark
+        assert done.stderr.count("\n") == 1, done.stderr
+        assert "results" not in done.stdout
+    return said[0]
+
+
+def check_words(said, options):
+    name = options.split()[0]
+    assert re.match(rf"{name}(?!\w)", said), said
+    for word in BAD_OPTIONS[options]:
+        assert word in said
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize("options", [options for options in BAD_OPTIONS if options not in FROM_OUTSIDE])
+def test_a_bad_option_is_refused_before_any_work(options, results, monkeypatch):
+    monkeypatch.chdir(results.parent)
+    before = contents(results)
+    words = [*options.split(), "-"]
+    database = {
+        name[1:]: None if value.startswith("-") and not value[1:2].isdigit() else value
+        for name, value in zip(words, words[1:])
+        if name.startswith("-") and not name[1:2].isdigit()
+    }
+    with pytest.raises(OptionError) as refusal:
+        read_options(database, MPI.COMM_SELF)
+    check_words(str(refusal.value), options)
+    assert contents(results) == before
+
+
+@pytest.mark.parametrize("options", FROM_OUTSIDE)
+def test_a_bad_option_ends_the_program_with_one_line(options, program, results):
+    check_words(refused(program, results, *options.split()).partition(": ")[2], options)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("options", ["-stepss 3", "-scene_n 0", "-compare nosuch", "-pc_type nosuch"])
+def test_two_ranks_speak_with_one_voice(options, program, results):
+    check_words(refused(program, results, *options.split(), ranks=2).partition(": ")[2], options)
+
+
+# -- files ------------------------------------------------------------------------------------------------
+
+
+def no_hdf5(path, checkpoint):
+    path.write_text("these are no data\n" * 100)
+
+
+def empty(path, checkpoint):
+    path.touch()
+
+
+def truncated(path, checkpoint):
+    whole = checkpoint.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+
+
+def scrambled(path, checkpoint):
+    """The middle of the file, where the tables of HDF5 are, overwritten."""
+    whole = bytearray(checkpoint.read_bytes())
+    whole[512:4096] = bytes(3584)
+    path.write_bytes(bytes(whole))
+
+
+def other_hdf5(path, checkpoint):
+    with h5py.File(path, "w") as file:
+        file["data"] = np.zeros(3)
+
+
+def without_grains(path, checkpoint):
+    path.write_bytes(checkpoint.read_bytes())
+    with h5py.File(path, "a") as file:
+        del file["grains"]
+
+
+def without_velocity(path, checkpoint):
+    path.write_bytes(checkpoint.read_bytes())
+    with h5py.File(path, "a") as file:
+        del file["grains/velocity"]
+
+
+def without_scene(path, checkpoint):
+    path.write_bytes(checkpoint.read_bytes())
+    with h5py.File(path, "a") as file:
+        del file.attrs["scene"]
+
+
+def fclib(path, checkpoint):
+    with h5py.File(path, "w") as file:
+        file["fclib_local/vectors/mu"] = np.ones(1)
+        file["fclib_local/spacedim"] = 3
+
+
+DAMAGES = [no_hdf5, empty, truncated, scrambled, other_hdf5, without_grains, without_velocity, without_scene, fclib]
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=lambda f: f.__name__)
+def test_a_file_that_is_no_checkpoint_is_refused(damage, program, results, settled, tmp_path):
+    damage(tmp_path / "bad.h5", settled)
+    said = refused(program, results, *SMALL, "-restart", "bad.h5", "-steps", 1)
+    assert "bad.h5" in said
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("damage", [truncated, without_velocity, other_hdf5], ids=lambda f: f.__name__)
+def test_a_file_that_is_no_checkpoint_is_refused_by_two_ranks_at_once(
+    damage, program, results, settled, tmp_path
+):
+    damage(tmp_path / "bad.h5", settled)
+    said = refused(program, results, *SMALL, "-restart", "bad.h5", "-steps", 1, ranks=2)
+    assert "bad.h5" in said
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("-scene_friction", "0.5"), ("-scene_n", "2"), ("-scene_seed", "7")]
+)
+def test_a_checkpoint_of_another_scene_is_refused(option, value, program, results, settled):
+    said = refused(program, results, *SMALL, option, value, "-restart", settled)
+    assert f"{option} {value}" in said
+    assert settled.name in said
+
+
+@pytest.mark.parametrize("damage", [no_hdf5, empty, other_hdf5, truncated, fclib], ids=lambda f: f.__name__)
+def test_a_file_that_is_no_fclib_problem_is_refused(damage, program, results, settled, tmp_path):
+    damage(tmp_path / "bad.hdf5", settled)
+    said = refused(program, results, "-problem", "bad.hdf5")
+    assert "bad.hdf5" in said
+
+
+@pytest.mark.parametrize("numbers", ["NaN in q", "negative mu", "short q"])
+def test_an_fclib_problem_with_bad_numbers_is_refused(numbers, program, results, tmp_path):
+    q, mu = np.array([-1.0, 0.0, 0.0]), np.array([0.3])
+    if numbers == "NaN in q":
+        q[1] = np.nan
+    elif numbers == "negative mu":
+        mu[0] = -0.1
+    else:
+        q = q[:2]
+    with h5py.File(tmp_path / "bad.hdf5", "w") as file:
+        group = file.create_group("fclib_local")
+        group["spacedim"] = 3
+        for name, value in {"m": 3, "n": 3, "nz": 3, "nzmax": 3}.items():
+            group[f"W/{name}"] = value
+        group["W/i"], group["W/p"], group["W/x"] = np.arange(3), np.arange(3), np.ones(3)
+        group["vectors/q"], group["vectors/mu"] = q, mu
+    said = refused(program, results, "-problem", "bad.hdf5")
+    assert "bad.hdf5" in said
+
+
+def test_an_output_folder_under_a_regular_file_is_refused(program, results, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    said = refused(program, results, *SMALL, "-steps", 1, "-output", "file/results")
+    assert "-output file/results" in said
+    assert (tmp_path / "file").read_text() == "in the way"
+
+
+def test_an_output_that_is_a_regular_file_is_refused(program, results, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    said = refused(program, results, *SMALL, "-steps", 1, "-output", "file")
+    assert "-output file" in said
+    assert (tmp_path / "file").read_text() == "in the way"
+
+
+def test_a_settled_state_that_does_not_agree_with_its_checksum_is_refused(
+    program, results, settled, tmp_path
+):
+    cache = tmp_path / "cache"
+    (cache / "pctt").mkdir(parents=True)
+    for path in settled.parent.iterdir():
+        (cache / "pctt" / path.name).write_bytes(path.read_bytes())
+    copy = cache / "pctt" / settled.name
+    with h5py.File(copy, "a") as file:  # a readable file, but another state
+        file["grains/position"][0, 0] += 0.5
+
+    def here(*options, **keywords):
+        return program(*options, **keywords, cache=cache)
+
+    said = refused(here, results, *SMALL, "-restart", "settled", "-steps", 1)
+    assert str(copy) in said
+    assert "checksum" in said
+    assert arrays(copy)["grains/position"].shape == (27, 3)

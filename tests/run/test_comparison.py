@@ -1,0 +1,86 @@
+"""-compare: every preconditioner on the same Newton systems."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from conftest import SETTLED
+
+FIELDS = {
+    "systems": int,
+    "converged": int,
+    "ksp_its_mean": float,
+    "ksp_its_max": int,
+    "setup_s": float,
+    "solve_s": float,
+    "true_residual_max": float,
+}
+# accurate Newton steps, so that every cone problem is solved by PDIP alone
+ACCURATE = ("-ksp_rtol", "1e-6", "-ksp_max_it", "2000", "-ccp_tol", "1e-4")
+
+
+def compared(program, folder, *options, ranks=1):
+    done = program(*SETTLED, *ACCURATE, "-steps", 3, *options, ranks=ranks)
+    summary = json.loads((folder / "results" / "summary.json").read_text())
+    table = done.stdout.partition("preconditioner  ")[2].splitlines()
+    rows = [line for line in table[2:] if line.strip()]
+    return summary, {tuple(row.rsplit(maxsplit=7)[:1])[0].strip(): row.rsplit(maxsplit=7)[1:] for row in rows[:-1]}
+
+
+def test_all_see_the_same_systems_and_the_table_agrees_with_the_summary(program, settled, tmp_path):
+    summary, table = compared(program, tmp_path, "-compare", "none,ilu,pbjacobi")
+    newton = sum(line["newton_its"] for line in summary["steps"])
+    assert list(summary["compare"]) == list(table) == ["none", "ilu", "pbjacobi"]
+    for name, record in summary["compare"].items():
+        for field, kind in FIELDS.items():
+            assert type(record[field]) is kind, f"{field}: {record[field]!r}"
+        assert set(record) == set(FIELDS)
+        assert record["systems"] == newton > 20
+        assert 0 <= record["converged"] <= record["systems"]
+        assert 0 < record["ksp_its_mean"] <= record["ksp_its_max"] <= 2000
+        assert math.isfinite(record["true_residual_max"])
+        assert record["setup_s"] >= 0
+        assert record["solve_s"] > 0
+        systems, converged, mean, most, _, _, worst = table[name]
+        assert (int(systems), int(converged), int(most)) == (newton, record["converged"], record["ksp_its_max"])
+        assert float(mean) == pytest.approx(record["ksp_its_mean"], abs=0.06)
+        assert float(worst) == pytest.approx(record["true_residual_max"], rel=0.06)
+        if record["converged"] == record["systems"]:
+            assert record["true_residual_max"] <= 2e-6
+    assert summary["compare"]["pbjacobi"]["ksp_its_mean"] < summary["compare"]["none"]["ksp_its_mean"]
+    assert summary["compare"]["pbjacobi"]["converged"] == newton
+
+
+@pytest.mark.parametrize("every", [2, 7])
+def test_only_every_kth_system_is_compared_on(every, program, settled, tmp_path):
+    summary, table = compared(program, tmp_path, "-compare", "pbjacobi,sor", "-compare_every", every)
+    newton = sum(line["newton_its"] for line in summary["steps"])
+    for name in ("pbjacobi", "sor"):
+        assert summary["compare"][name]["systems"] == math.ceil(newton / every)
+        assert int(table[name][0]) == math.ceil(newton / every)
+
+
+def test_a_compared_preconditioner_takes_options_of_its_own(program, settled, tmp_path):
+    more = ("-compare_ilu_pc_factor_levels", "3")
+    plain, _ = compared(program, tmp_path, "-compare", "pbjacobi,ilu")
+    filled, _ = compared(program, tmp_path, "-compare", "pbjacobi,ilu", *more)
+    assert filled["compare"]["ilu"]["ksp_its_mean"] < plain["compare"]["ilu"]["ksp_its_mean"]
+
+
+@pytest.mark.mpi
+def test_on_two_ranks_ilu_is_said_to_work_within_each(program, settled, tmp_path):
+    summary, table = compared(program, tmp_path, "-compare", "none,ilu,pbjacobi", ranks=2)
+    assert list(summary["compare"]) == ["none", "ilu", "pbjacobi"]
+    assert list(table) == ["none", "ilu (within each rank)", "pbjacobi"]
+    newton = sum(line["newton_its"] for line in summary["steps"])
+    assert {record["systems"] for record in summary["compare"].values()} == {newton}
+
+
+def test_a_failing_preconditioner_stays_in_the_table(program, settled, tmp_path):
+    summary, table = compared(program, tmp_path, "-compare", "none,pbjacobi", "-compare_none_ksp_max_it", 2)
+    assert summary["compare"]["none"]["converged"] < summary["compare"]["none"]["systems"]
+    assert summary["compare"]["none"]["ksp_its_max"] <= 2
+    assert int(table["none"][1]) == summary["compare"]["none"]["converged"]
+    assert all(line["natural_residual"] <= 1e-4 for line in summary["steps"])

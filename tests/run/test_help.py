@@ -1,0 +1,46 @@
+"""-help lists every option with its default, unit and meaning, and does nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import pytest
+from conftest import SMALL
+
+from dem.scenes import Mixer
+from pctt import ccp
+from pctt.run.options import Run
+
+GROUPS = [(Run, ""), (Mixer, "scene_"), (ccp.Limits, "ccp_")]
+GROUPS += [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
+
+
+@pytest.mark.parametrize(
+    ("ranks", "options"), [(1, ()), (1, (*SMALL, "-steps", "1")), pytest.param(2, (), marks=pytest.mark.mpi)]
+)
+def test_help_lists_every_option_and_runs_nothing(ranks, options, program, tmp_path):
+    done = program("-help", *options, ranks=ranks)
+    assert not list(tmp_path.iterdir())
+    listed = re.findall(r"^  -(\w+) <(.*?)>: (.+)$", done.stdout, re.MULTILINE)
+    names = [name for name, _, _ in listed]
+    assert len(names) == len(set(names))
+    table = {name: (default, meaning) for name, default, meaning in listed}
+    count = 0
+    for group, prefix in GROUPS:
+        for field in dataclasses.fields(group):
+            default, meaning = table[prefix + field.name]
+            assert field.metadata["help"] in meaning
+            unit = field.metadata.get("unit", "")
+            assert default.endswith(f" {unit}" if unit else "")
+            if isinstance(field.default, (int, float)) and not isinstance(field.default, bool):
+                assert float(default.split()[0]) == field.default
+            count += 1
+    assert count == len(names)
+
+
+def test_lengths_times_and_speeds_have_units():
+    units = {prefix + f.name: f.metadata.get("unit") for group, prefix in GROUPS for f in dataclasses.fields(group)}
+    expected = {"dt": "s", "delta": "m", "recovery_speed": "m/s", "scene_radius": "m", "scene_density": "kg/m^3"}
+    expected |= {"scene_angular_velocity": "rad/s", "scene_gravity": "m/s^2", "settle_delta": "m"}
+    assert expected.items() <= units.items()

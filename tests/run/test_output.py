@@ -1,0 +1,187 @@
+"""What a run leaves behind: summary.json, state.h5 and what it says."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import h5py
+import numpy as np
+import pytest
+from conftest import SETTLED, SMALL, arrays
+
+from dem.scenes import Mixer
+
+STEP = {
+    "step": int,
+    "time": float,
+    "contacts": int,
+    "newton_its": int,
+    "ksp_its": int,
+    "natural_residual": float,
+    "objective": float,
+    "seconds": float,
+}
+
+
+def refuse(constant):
+    raise AssertionError(f"{constant} is not JSON")
+
+
+def summary_of(folder):
+    return json.loads((folder / "summary.json").read_text(), parse_constant=refuse)
+
+
+def frame(path, step):
+    """The data sets of one step of a state.h5, and the attributes of the step."""
+    with h5py.File(path, "r") as file:
+        attributes = dict(file[f"steps/{step:06d}"].attrs)
+    return {n[7:]: a for n, a in arrays(path).items() if n.startswith(f"{step:06d}/")}, attributes
+
+
+@pytest.mark.parametrize("solver", ["pdip", "apgd"])
+def test_the_summary_has_the_documented_fields(solver, program, settled, tmp_path):
+    program(*SETTLED, "-steps", 3, "-ccp_type", solver)
+    summary = summary_of(tmp_path / "results")
+    assert {"bodies", "ranks", "steps", "compare"} <= set(summary)
+    assert (summary["bodies"], summary["ranks"], summary["compare"]) == (29, 1, {})
+    first = summary["steps"][0]["step"]
+    for k, line in enumerate(summary["steps"]):
+        for name, kind in STEP.items():
+            assert type(line[name]) is kind, f"{name}: {line[name]!r}"
+        assert line["step"] == first + k
+        assert line["time"] == pytest.approx(Mixer.dt * line["step"])
+        assert line["contacts"] > 40
+        assert 0 < line["natural_residual"] <= 1e-4
+        assert line["objective"] < 0
+        assert 0 < line["seconds"] < 100
+        newton = solver == "pdip"
+        assert (line["newton_its"] > 0) == newton
+        assert (line["ksp_its"] >= line["newton_its"]) if newton else line["ksp_its"] == 0
+    assert len(summary["steps"]) == 3
+
+
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+def test_the_first_step_without_contacts_is_free_fall(ranks, program, tmp_path):
+    """It tells the order of the rows: by id, the large bodies last."""
+    options = ("-steps", 1, "-scene_gravity", 5.0, "-delta", 1e-6)
+    done = program(*SMALL, *options, ranks=ranks)
+    scene = Mixer(n=1, margin=0.5)
+    (line,) = summary_of(tmp_path / "results")["steps"]
+    assert (line["contacts"], line["newton_its"], line["natural_residual"], line["objective"]) == (0, 0, 0, 0)
+    assert "NOT CONVERGED" not in done.stdout
+    data, attributes = frame(tmp_path / "results" / "state.h5", 1)
+    assert attributes == {"step": 1, "time": scene.dt}
+    fallen = scene.positions() - [0, 0, 5.0 * scene.dt**2]
+    np.testing.assert_allclose(data["position"][:27], fallen, atol=1e-14)
+    paddle = [0, 0, scene.clearance + scene.paddle_height * scene.width / 2]
+    np.testing.assert_allclose(data["position"][27:], [[0, 0, 0], paddle], atol=1e-14)
+    falling = [0, 0, -5.0 * scene.dt, 0, 0, 0]
+    np.testing.assert_allclose(data["velocity"][:27], np.tile(falling, (27, 1)), atol=1e-14)
+    turning = [0, 0, 0, 0, 0, scene.angular_velocity]
+    np.testing.assert_allclose(data["velocity"][27:], [np.zeros(6), turning], atol=1e-12)
+    half = scene.angular_velocity * scene.dt / 2
+    np.testing.assert_allclose(data["quaternion"][:28], np.tile([1.0, 0, 0, 0], (28, 1)), atol=1e-14)
+    np.testing.assert_allclose(data["quaternion"][28], [math.cos(half), 0, 0, math.sin(half)], atol=1e-14)
+    assert data["contact/impulse"].shape == (0, 3)
+
+
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled, tmp_path):
+    program(*SETTLED, "-steps", 2, "-ccp_type", "apgd", ranks=ranks)
+    path = tmp_path / "results" / "state.h5"
+    with h5py.File(path, "r") as file:
+        assert json.loads(file.attrs["scene"])["margin"] == 0.5
+        assert list(file.attrs["large_bodies"]) == ["box", "mixer"]
+    summary = summary_of(tmp_path / "results")
+    assert summary["ranks"] == ranks
+    radius, friction = 0.1, 0.25
+    before = None
+    for line in summary["steps"]:
+        data, _ = frame(path, line["step"])
+        shapes = {name: array.shape for name, array in data.items()}
+        nc = line["contacts"]
+        assert shapes == {
+            "position": (29, 3),
+            "quaternion": (29, 4),
+            "velocity": (29, 6),
+            "contact/key": (nc,),
+            "contact/body": (nc, 2),
+            "contact/point": (nc, 3),
+            "contact/frame": (nc, 3, 3),
+            "contact/gap": (nc,),
+            "contact/impulse": (nc, 3),
+        }
+        np.testing.assert_allclose(np.linalg.norm(data["quaternion"], axis=1), 1.0, atol=1e-14)
+        contact = {name[8:]: array for name, array in data.items() if name.startswith("contact/")}
+        assert len(np.unique(contact["key"])) == nc
+        assert (contact["body"][:, 0] < contact["body"][:, 1]).all()
+        unit = contact["frame"] @ contact["frame"].transpose(0, 2, 1)
+        np.testing.assert_allclose(unit, np.tile(np.eye(3), (nc, 1, 1)), atol=1e-12)
+        normal, sliding = contact["impulse"][:, 0], np.hypot(*contact["impulse"][:, 1:].T)
+        assert (sliding <= friction * normal + 1e-12).all()
+        assert (contact["impulse"][:, 0] > 1e-3).sum() > 20
+        if before is not None:  # gaps are those of the start of the step, between the bodies named
+            place = before["position"]
+            both = contact["body"][:, 1] < 27
+            a, b = contact["body"][both].T
+            offset = place[b] - place[a]
+            distance = np.linalg.norm(offset, axis=1)
+            np.testing.assert_allclose(contact["gap"][both], distance - 2 * radius, atol=1e-13)
+            np.testing.assert_allclose(contact["frame"][both, 0], offset / distance[:, None], atol=1e-12)
+            # momentum of each grain: from the impulses in the file alone
+            mass = 2500.0 * 4 / 3 * np.pi * radius**3
+            push = np.einsum("ci,cij->cj", contact["impulse"], contact["frame"])
+            total = np.zeros((29, 3))
+            np.add.at(total, contact["body"][:, 1], push)
+            np.subtract.at(total, contact["body"][:, 0], push)
+            gained = mass * (data["velocity"][:27, :3] - before["velocity"][:27, :3])
+            gained += [0, 0, mass * 9.81 * Mixer.dt]
+            np.testing.assert_allclose(gained, total[:27], atol=1e-10)
+        before = data
+
+
+def test_recorded_steps_are_every_kth_and_the_last(program, settled, tmp_path):
+    program(*SETTLED, "-steps", 5, "-output_every", 2, "-checkpoint_every", 3, "-ccp_type", "apgd")
+    steps = [line["step"] for line in summary_of(tmp_path / "results")["steps"]]
+    assert len(steps) == 5
+    recorded = {int(name.partition("/")[0]) for name in arrays(tmp_path / "results" / "state.h5")}
+    assert recorded == {k for k in steps if k % 2 == 0} | {steps[-1]}
+    assert int(arrays(tmp_path / "results" / "checkpoint.h5")["world/step"]) == steps[-1]
+
+
+def test_no_state_is_written_if_none_is_wanted(program, settled, tmp_path):
+    program(*SETTLED, "-steps", 2, "-output_every", 0, "-ccp_type", "apgd")
+    assert sorted(p.name for p in (tmp_path / "results").iterdir() if p.is_file()) == [
+        "checkpoint.h5",
+        "summary.json",
+    ]
+
+
+def test_the_same_run_again_writes_the_same_files_anew(program, settled, tmp_path):
+    options = (*SETTLED, "-ccp_type", "apgd")
+    program(*options, "-steps", 4)
+    old = arrays(tmp_path / "results" / "state.h5")
+    program(*options, "-steps", 2)
+    new = arrays(tmp_path / "results" / "state.h5")
+    assert 0 < len(new) < len(old)
+    for name, array in new.items():
+        assert array.tobytes() == old[name].tobytes()
+    assert len(summary_of(tmp_path / "results")["steps"]) == 2
+
+
+def test_a_step_that_is_not_solved_says_so(program, settled, tmp_path):
+    done = program(*SETTLED, "-steps", 1, "-ccp_type", "apgd", "-ccp_max_it", 3)
+    (line,) = summary_of(tmp_path / "results")["steps"]
+    assert line["natural_residual"] > 1e-4
+    assert "NOT CONVERGED" in done.stdout
+
+
+def test_lines_are_plain_where_there_is_no_terminal(program, settled):
+    done = program(*SETTLED, "-steps", 2, "-ccp_type", "apgd")
+    assert done.stderr == ""
+    assert "\r" not in done.stdout
+    assert "\033" not in done.stdout
+    head, first = (done.stdout.splitlines()[k].split() for k in (2, 3))
+    assert head[:3] == ["step", "time", "s"]
+    assert int(first[0]) > 90

@@ -1,0 +1,95 @@
+"""A run that goes on from a checkpoint takes the way that it would have taken."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from conftest import SETTLED, SMALL, arrays, assert_same_bits
+
+
+@pytest.mark.parametrize("solver", ["pdip", "apgd"])
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+def test_on_as_many_ranks_the_way_is_the_same_bit_for_bit(solver, ranks, program, settled, tmp_path):
+    options = ("-ccp_type", solver)
+    program(*SETTLED, *options, "-steps", 6, "-output", "whole", ranks=ranks)
+    program(*SETTLED, *options, "-steps", 3, "-output", "parts", ranks=ranks)
+    again = (*SMALL, *options, "-restart", "parts/checkpoint.h5", "-output", "parts")
+    program(*again, "-steps", 3, ranks=ranks)
+    for name in ("state.h5", "checkpoint.h5"):
+        assert_same_bits(tmp_path / "whole" / name, tmp_path / "parts" / name)
+    steps = [json.loads((tmp_path / d / "summary.json").read_text())["steps"] for d in ("whole", "parts")]
+    for one, two in zip(*steps):
+        for field in ("step", "time", "contacts", "newton_its", "ksp_its", "natural_residual", "objective"):
+            assert one[field] == two[field], field
+    assert len(steps[0]) == len(steps[1]) == 6
+
+
+def test_steps_can_be_made_again_into_another_folder(program, settled, tmp_path):
+    options = (*SMALL, "-ccp_type", "apgd", "-steps", 2)
+    program(*options, "-restart", "settled", "-output", "first")
+    before = (tmp_path / "first" / "checkpoint.h5").read_bytes()
+    for name in ("second", "third"):
+        program(*options, "-restart", "first/checkpoint.h5", "-output", name)
+    assert (tmp_path / "first" / "checkpoint.h5").read_bytes() == before
+    assert_same_bits(tmp_path / "second" / "state.h5", tmp_path / "third" / "state.h5")
+
+
+@pytest.mark.mpi
+def test_on_another_number_of_ranks_the_way_is_the_same_but_for_rounding(program, settled, tmp_path):
+    """Twenty iterations a step, solved or not: only the order of sums depends on the ranks."""
+    options = ("-ccp_type", "apgd", "-ccp_max_it", 20)
+    program(*SETTLED, *options, "-steps", 4, "-output", "whole")
+    program(*SETTLED, *options, "-steps", 2, "-output", "half", ranks=2)
+    restart = (*SMALL, *options, "-restart", "half/checkpoint.h5", "-steps", 2)
+    for ranks in (1, 2, 3, 4):
+        program(*restart, "-output", f"on{ranks}", ranks=ranks)
+    whole = arrays(tmp_path / "whole" / "state.h5")
+    last = max(name.partition("/")[0] for name in whole)
+    for ranks in (1, 2, 3, 4):
+        part = arrays(tmp_path / f"on{ranks}" / "state.h5")
+        for name in ("position", "quaternion", "velocity"):
+            here, there = part[f"{last}/{name}"], whole[f"{last}/{name}"]
+            np.testing.assert_allclose(here, there, rtol=0, atol=1e-10, err_msg=f"{name} on {ranks}")
+        keys = [np.argsort(table[f"{last}/contact/key"]) for table in (part, whole)]
+        for name in ("key", "body", "gap", "impulse"):
+            here, there = (t[f"{last}/contact/{name}"][k] for t, k in zip((part, whole), keys))
+            np.testing.assert_allclose(here, there, rtol=0, atol=1e-9, err_msg=f"{name} on {ranks}")
+
+
+@pytest.mark.mpi
+def test_solved_to_a_tolerance_the_way_on_other_ranks_is_near(program, settled, tmp_path):
+    options = ("-ccp_type", "pdip", "-ccp_tol", 1e-6, "-ksp_rtol", 1e-8, "-steps", 3)
+    for ranks in (1, 2, 3):
+        program(*SETTLED, *options, "-output", f"on{ranks}", ranks=ranks)
+    tables = [arrays(tmp_path / f"on{ranks}" / "state.h5") for ranks in (1, 2, 3)]
+    last = max(name.partition("/")[0] for name in tables[0])
+    for table in tables[1:]:
+        for name, limit in (("position", 1e-6), ("velocity", 1e-3)):
+            here, there = table[f"{last}/{name}"], tables[0][f"{last}/{name}"]
+            np.testing.assert_allclose(here, there, rtol=0, atol=limit)
+
+
+def test_the_settled_state_is_made_once_and_used_again(program, tmp_path):
+    cache = tmp_path / "own cache"
+    options = ("-scene_n", 1, "-scene_margin", 0.4, "-restart", "settled", "-steps", 1, "-ccp_type", "apgd")
+    first = program(*options, "-output", "first", cache=cache)
+    assert "settling mixer" in first.stdout
+    (state,) = cache.glob("pctt/*.h5")
+    assert sorted(path.name for path in state.parent.iterdir()) == [state.name, f"{state.name}.sha256"]
+    made = state.stat().st_mtime_ns
+    second = program(*options, "-output", "second", cache=cache)
+    assert "settling" not in second.stdout
+    assert state.stat().st_mtime_ns == made
+    assert_same_bits(tmp_path / "first" / "state.h5", tmp_path / "second" / "state.h5")
+    assert not list(tmp_path.glob("first/*.tmp"))
+
+
+def test_another_scene_gets_another_settled_state(program, settled, tmp_path):
+    """By every option of the scene, and by what settles it."""
+    cache = tmp_path / "own cache"
+    quick = ("-scene_n", 1, "-scene_gravity", 400.0, "-settle")  # the fall is short; what comes of it is no matter
+    for more in ((), ("-scene_friction", 0.3), ("-settle_tol", 1e-2), ("-dt", 0.05)):
+        program(*quick, *more, cache=cache)
+    assert len(list(cache.glob("pctt/*.h5"))) == 4

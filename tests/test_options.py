@@ -1,0 +1,223 @@
+"""Options: conversion, errors that name option, value and what is allowed, unknown names, descriptions."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Optional
+
+import pytest
+
+from pctt.options import (
+    AT_LEAST_ONE,
+    COUNT,
+    FRACTION,
+    NOT_NEGATIVE,
+    POSITIVE,
+    OptionError,
+    describe,
+    option,
+    read,
+    refuse_unknown,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """One option of each kind."""
+
+    count: int = option(3, "bodies along a side", check=COUNT)
+    every: int = option(1, "steps between two records", check=AT_LEAST_ONE)
+    number: int = option(-1, "any whole number")
+    dt: float = option(0.025, "time step", "s", check=POSITIVE)
+    gap: float = option(0.0, "gap", "m", check=NOT_NEGATIVE)
+    part: float = option(0.5, "part", check=FRACTION)
+    angle: float = option(1.0, "any finite number", "rad")
+    maybe: Optional[float] = option(None, "none: the scene's own", "s", check=POSITIVE)
+    steps: Optional[int] = option(None, "none: all")
+    on: bool = option(False, "whether")
+    off: bool = option(True, "whether not")
+    shape: str = option("sphere", "form of a body", choices=("sphere", "box", "tetrahedron"))
+    path: str = option("", "file to read")
+
+
+def value(name: str, text: str | None):
+    return getattr(read(Group, {"x_" + name: text}, "x_"), name)
+
+
+def error(name: str, text: str | None) -> str:
+    with pytest.raises(OptionError) as raised:
+        read(Group, {"x_" + name: text}, "x_")
+    return str(raised.value)
+
+
+def test_without_options_all_defaults_hold():
+    assert read(Group, {}) == Group()
+    assert read(Group, {"count": "7"}, "x_") == Group()  # the name of another group
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("count", "0", 0),
+        ("count", "12", 12),
+        ("every", "1", 1),
+        ("number", "-7", -7),
+        ("dt", "1e-3", 0.001),
+        ("dt", "2", 2.0),
+        ("gap", "0", 0.0),
+        ("part", ".25", 0.25),
+        ("angle", "-3.5", -3.5),
+        ("maybe", "0.5", 0.5),
+        ("steps", "4", 4),
+        ("shape", "box", "box"),
+        ("path", "a/b c.h5", "a/b c.h5"),
+        ("path", None, ""),
+        *[("on", text, True) for text in ("true", "True", "1", "yes", "on", "", None)],
+        *[("off", text, False) for text in ("false", "FALSE", "0", "no", "off")],
+    ],
+)
+def test_values_are_converted(name, text, expected):
+    found = value(name, text)
+    assert found == expected
+    assert type(found) is type(expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "allowed"),
+    [
+        ("count", "-1", "a whole number >= 0"),
+        ("count", "1.5", "a whole number >= 0"),
+        ("count", "many", "a whole number >= 0"),
+        ("count", "1e3", "a whole number >= 0"),
+        ("every", "0", "a whole number >= 1"),
+        ("number", "1.0", "a whole number"),
+        ("number", "", "a whole number"),
+        ("dt", "0", "a positive number"),
+        ("dt", "-1", "a positive number"),
+        ("dt", "nan", "a positive number"),
+        ("dt", "inf", "a positive number"),
+        ("dt", "0,1", "a positive number"),
+        ("gap", "-1e-9", "a number >= 0"),
+        ("gap", "nan", "a number >= 0"),
+        ("part", "0", "a number between 0 and 1, both excluded"),
+        ("part", "1", "a number between 0 and 1, both excluded"),
+        ("part", "nan", "a number between 0 and 1, both excluded"),
+        ("angle", "nan", "a finite number"),
+        ("angle", "-inf", "a finite number"),
+        ("angle", "steep", "a number"),
+        ("maybe", "-2", "a positive number"),
+        ("maybe", "soon", "a positive number"),
+        ("steps", "2.5", "a whole number"),
+        ("on", "maybe", "true or false"),
+        ("shape", "", "one of sphere, box, tetrahedron"),
+        ("shape", "Box", "one of sphere, box, tetrahedron"),
+    ],
+)
+def test_errors_name_option_value_and_what_is_allowed(name, text, allowed):
+    assert error(name, text).startswith(f"-x_{name} {text}: allowed is {allowed}")
+
+
+def test_an_option_without_its_value_is_an_error_too():
+    assert error("dt", None) == "-x_dt : allowed is a positive number"
+
+
+def test_a_misspelt_choice_gets_the_nearest():
+    assert error("shape", "tetrahedon").endswith("; did you mean tetrahedron?")
+    assert "did you mean" not in error("shape", "cylinder")
+
+
+def test_the_first_bad_option_is_raised_and_no_group_made():
+    with pytest.raises(OptionError, match="-dt x"):
+        read(Group, {"count": "1", "dt": "x"})
+
+
+def test_an_option_error_is_a_value_error():
+    assert issubclass(OptionError, ValueError)
+
+
+# -- unknown names ------------------------------------------------------------------------------------------
+
+KNOWN = ["scene", "scene_n", "steps", "dt", "restart", "output", "compare", "compare_every", "ccp_tol"]
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [("sceen", "scene"), ("step", "steps"), ("restrat", "restart"), ("ccp_toll", "ccp_tol"), ("outptu", "output")],
+)
+def test_a_misspelt_name_gets_the_nearest(name, nearest):
+    with pytest.raises(OptionError, match=f"^-{name}: no such option; did you mean -{nearest}\\?$"):
+        refuse_unknown(["scene", name], KNOWN)
+
+
+def test_a_name_like_none_of_ours_gets_a_pointer_to_the_help():
+    with pytest.raises(OptionError, match="^-qqq: no such option; -help lists the options$"):
+        refuse_unknown(["qqq"], KNOWN)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ksp_type",
+        "ksp_monitor",
+        "pc_type",
+        "pc_factor_shift_type",
+        "pc_tt_max_rank",
+        "mat_mumps_icntl_14",
+        "sub_pc_type",
+        "mg_levels_ksp_type",
+        "log_view",
+        "options_left",
+        "options_file",
+        "help",
+        "malloc_debug",
+        "on_error_abort",
+        "start_in_debugger",
+        "info",
+        "citations",
+        "vec_type",
+        "viewer_binary_skip_info",
+    ],
+)
+def test_petscs_own_names_pass(name):
+    refuse_unknown([name], KNOWN)
+
+
+def test_known_names_and_those_of_further_prefixes_pass():
+    refuse_unknown([*KNOWN, "compare_ilu_pc_factor_levels"], KNOWN, prefixes=("compare_",))
+    with pytest.raises(OptionError, match="-compare_ilu_pc_factor_levels"):
+        refuse_unknown(["compare_ilu_pc_factor_levels"], KNOWN)
+
+
+# -- descriptions -------------------------------------------------------------------------------------------
+
+
+def test_every_option_is_described_with_default_unit_and_meaning():
+    lines = {line.name: str(line) for line in describe(Group, "x_")}
+    assert list(lines) == ["x_" + field.name for field in dataclasses.fields(Group)]
+    assert lines == {
+        "x_count": "  -x_count <3>: bodies along a side",
+        "x_every": "  -x_every <1>: steps between two records",
+        "x_number": "  -x_number <-1>: any whole number",
+        "x_dt": "  -x_dt <0.025 s>: time step",
+        "x_gap": "  -x_gap <0.0 m>: gap",
+        "x_part": "  -x_part <0.5>: part",
+        "x_angle": "  -x_angle <1.0 rad>: any finite number",
+        "x_maybe": "  -x_maybe <none s>: none: the scene's own",
+        "x_steps": "  -x_steps <none>: none: all",
+        "x_on": "  -x_on <false>: whether",
+        "x_off": "  -x_off <true>: whether not",
+        "x_shape": "  -x_shape <sphere>: form of a body (one of: sphere, box, tetrahedron)",
+        "x_path": "  -x_path <none>: file to read",
+    }
+
+
+def test_described_defaults_pass_their_own_checks():
+    """Of the groups of the project: what -help shows as a default can be given as a value."""
+    from pctt import ccp
+    from pctt.run.options import Run
+
+    groups = [(Run, ""), (ccp.Limits, "ccp_"), *((s.options, f"ccp_{n}_") for n, s in ccp.SOLVERS.items())]
+    for group, prefix in groups:
+        given = {line.name: str(line.default) for line in describe(group, prefix) if line.default not in (None, "")}
+        assert given
+        assert read(group, given, prefix) == group()

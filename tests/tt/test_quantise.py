@@ -1,0 +1,53 @@
+"""Modes, digits, merged modes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pctt import tt
+from pctt.tt.quantise import digits, linear, pad
+
+
+@given(st.integers(1, 10**7))
+def test_chosen_modes_pad_little(n: int) -> None:
+    modes = tt.choose_modes(n)
+    slots = tt.slots_of(modes)
+    assert slots >= n
+    assert slots <= 1.07 * n + (20 if n < 1000 else 0)
+    assert all(m <= 64 for m in modes)
+
+
+@given(st.integers(1, 5000), st.integers(1, 40))
+def test_binary_modes(n: int, leaf: int) -> None:
+    modes = tt.binary_modes(n, leaf)
+    assert tt.slots_of(modes) >= n
+    assert n <= leaf or tt.slots_of(modes) < 2 * n
+
+
+@given(st.lists(st.integers(1, 6), min_size=1, max_size=5))
+def test_digits_and_indices(modes: list[int]) -> None:
+    index = np.arange(tt.slots_of(modes))
+    np.testing.assert_array_equal(linear(digits(index, modes), modes), index)
+    np.testing.assert_array_equal(digits(index, modes)[0], index // tt.slots_of(modes[1:] or [1]))
+
+
+@given(st.data(), st.lists(st.integers(1, 4), min_size=1, max_size=5), st.booleans())
+def test_merged_modes_leave_the_matrix_alone(data: st.DataObject, modes: list[int], matrix: bool) -> None:
+    train = tt.random(modes, 3, modes[::-1] if matrix else None)
+    groups: list[int] = []
+    while sum(groups) < len(modes):
+        groups.append(data.draw(st.integers(1, len(modes) - sum(groups))))
+    merged = tt.merge(train, groups)
+    assert len(merged) == len(groups)
+    np.testing.assert_allclose(merged.full().ravel(), train.full().ravel(), atol=1e-12)
+
+
+def test_user_modes() -> None:
+    assert tt.check_modes([4, 4], 15) == (4, 4)
+    assert tt.scalar_modes((4, 5), 3) == (4, 15)
+    with pytest.raises(ValueError, match="hold 16 slots, but 17"):
+        tt.check_modes([4, 4], 17)
+    np.testing.assert_array_equal(pad(np.ones(2), 4, 7.0), [1, 1, 7, 7])
