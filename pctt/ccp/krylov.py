@@ -64,7 +64,7 @@ class Krylov:
         try:
             return self._solve(S, b, x)
         except PETSc.Error as error:
-            self.ksp.reset()  # else MUMPS, once failed, fails for every later matrix
+            self.ksp.reset()
             if error.ierr == _NOT_SUPPORTED and not self.scalar:
                 self.scalar = True
                 return self.solve(S, b, x)
@@ -81,7 +81,7 @@ class Krylov:
         reason, iterations = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
         end = _now(self.comm)
         if reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
-            self.ksp.reset()
+            self.ksp.reset()  # else MUMPS, once failed, fails for every later matrix
         true = _true_residual(S, b, x)
         # twice: BiCGStab's recursive residual may drift a little without harm
         converged = reason > 0 and true <= 2 * self.rtol

@@ -32,7 +32,8 @@ DEMO = {
     "scene_n": "4",
     "restart": "settled",
     "steps": "5",
-    "compare": "none,ilu,ilu-shifted,pbjacobi",
+    "compare": "ilu,ilu-shifted,pbjacobi,none",
+    "compare_every": "4",
 }
 
 

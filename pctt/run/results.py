@@ -27,9 +27,12 @@ from pctt.run.hdf5 import RowWriter, write_text, written
 
 
 class Results:
-    """Writes the output folder; files of steps that a new run makes again are replaced."""
+    """Writes the output folder.
 
-    def __init__(self, folder: Path, comm: MPI.Comm, record: str, first_step: int):
+    A run that goes on from this folder's own checkpoint adds to what the earlier one left; any other replaces it.
+    """
+
+    def __init__(self, folder: Path, comm: MPI.Comm, record: str, world: World, restart: str):
         self.folder, self.comm, self.record = folder, comm, record
         self.checkpoint = folder / "checkpoint.h5"
         self._frames = folder / "frames"
@@ -37,25 +40,25 @@ class Results:
         self._steps: list[dict[str, Any]] = []
         if comm.rank == 0:
             self._frames.mkdir(parents=True, exist_ok=True)
-            self._take_over(first_step)
+            self._take_over(world, bool(restart) and Path(restart).resolve() == self.checkpoint.resolve())
         comm.Barrier()
 
-    def _take_over(self, first_step: int) -> None:
-        """Keep what an earlier run of the same scene left up to the step from which this one starts."""
-        summary = self.folder / "summary.json"
+    def _take_over(self, world: World, goes_on: bool) -> None:
+        """Keep what is there up to the step from which this run goes on, and remove the rest."""
         try:
-            old = json.loads(summary.read_text())
+            old = json.loads((self.folder / "summary.json").read_text()) if goes_on else {}
         except (OSError, ValueError):
             old = {}
-        same = first_step > 0 and old.get("scene") == json.loads(self.record)
-        if same:
-            self._steps = [line for line in old.get("steps", []) if line["step"] <= first_step]
-        for frame in sorted(self._frames.glob("*.h5")):
-            step = int(frame.stem) if frame.stem.isdigit() else -1
-            if same and 0 <= step <= first_step:
-                self._recorded.append(step)
-            else:
-                frame.unlink()
+        self._steps = [line for line in old.get("steps", []) if line["step"] <= world.step]
+        frames = {int(path.stem): path for path in self._frames.glob("*.h5") if path.stem.isdigit()}
+        self._recorded = sorted(step for step in frames if goes_on and step <= world.step)
+        # first the links, then what they led to: a run killed in between leaves no link without a file
+        if self._recorded:
+            self._link_frames(world)
+        else:
+            (self.folder / "state.h5").unlink(missing_ok=True)
+        for step in frames.keys() - set(self._recorded):
+            frames[step].unlink()
 
     def record_step(
         self, world: World, contacts: Contacts, system: ContactSystem, impulse: np.ndarray
@@ -93,12 +96,13 @@ class Results:
                 file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
         temporary.replace(self.folder / "state.h5")
 
-    def add(self, line: dict[str, Any]) -> None:
-        """Append the figures of a step; rank 0."""
-        self._steps.append(line)
-
-    def write_summary(self, totals: dict[str, Any]) -> None:
-        """Write summary.json with what is known so far; rank 0."""
+    def write_summary(self, world: World, compare: dict[str, Any], line: dict[str, Any] | None = None) -> None:
+        """Write summary.json with what is known so far, and the figures of a new step if there is one."""
+        if self.comm.rank != 0:
+            return
+        if line is not None:
+            self._steps.append(line)
+        totals = {"bodies": world.body_count, "ranks": self.comm.size, "compare": compare}
         summary = {**totals, "scene": json.loads(self.record), "steps": self._steps}
         write_text(self.folder / "summary.json", json.dumps(_finite(summary), indent=1) + "\n")
 

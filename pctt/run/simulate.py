@@ -35,7 +35,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         progress.say("no options: the demo; -help lists the options")
     world, memory = _first_state(options, comm, progress)
     record = checkpoint.scene_record(options.run.scene, options.scene)
-    results = Results(Path(options.run.output), comm, record, world.step)
+    results = Results(Path(options.run.output), comm, record, world, options.run.restart)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     stepper = Stepper(options, world, memory, compare if compare.names else None)
     method = f"{options.run.ccp_type} to {options.limits.tol:g}"
@@ -46,25 +46,31 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         progress.doing(f"step {world.step + 1}, time {world.time:.3f} s")
         line = stepper.step()
         last = k == options.run.steps
+        lines.append(line)
         with log.phase("output"):
             if options.run.output_every and (world.step % options.run.output_every == 0 or last):
                 results.record_step(world, stepper.contacts, stepper.system, stepper.impulse)
+        # before the checkpoint: a run that goes on from there must find the step in the summary
+        _count_output(line)
+        results.write_summary(world, compare.summary(), line)
+        with log.phase("output"):
             if k % options.run.checkpoint_every == 0 or last:
                 checkpoint.save(results.checkpoint, record, world, memory)
-        line["phases"] |= log.take_seconds(("output",))
-        line["seconds"] = sum(line["phases"].values())
-        lines.append(line)
+        _count_output(line)
         progress.say(report.step_line(line))
-        if comm.rank == 0:
-            results.add(line)
-            results.write_summary(
-                {"bodies": world.body_count, "ranks": comm.size, "compare": compare.summary()}
-            )
     if lines:
+        results.write_summary(world, compare.summary())
         progress.say(report.phase_table(lines))
     if compare.names:
         progress.say("\n" + report.compare_table(compare.summary(), compare.labels()))
     progress.say(f"\nresults: {results.folder}/state.h5, summary.json, checkpoint.h5")
+
+
+def _count_output(line: dict[str, Any]) -> None:
+    """Add the seconds of output since the last count to the figures of a step."""
+    phases = line["phases"]
+    phases["output"] = phases.get("output", 0.0) + log.take_seconds(("output",))["output"]
+    line["seconds"] = sum(phases.values())
 
 
 class SceneError(RuntimeError):
@@ -98,7 +104,7 @@ class Stepper:
             problem = cone_problem(self.system, world.comm)
             guess, _ = self.memory.recall(self.system.key, self.system.frame)
         with log.phase("solve"):
-            result, solver = self._solve(problem, guess)
+            result, solver, newton_its = self._solve(problem, guess)
             accuracy = ccp.measure(problem, result.impulse)
         with log.phase("advance"):
             self.impulse = result.impulse
@@ -110,7 +116,7 @@ class Stepper:
             "step": world.step,
             "time": world.time,
             "contacts": contacts,
-            "newton_its": result.iterations if ccp.SOLVERS[solver].newton else 0,
+            "newton_its": newton_its,
             "iterations": result.iterations,
             "ksp_its": result.ksp_its,
             **dataclasses.asdict(accuracy),
@@ -122,19 +128,22 @@ class Stepper:
             "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
         }
 
-    def _solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> tuple[ccp.Result, str]:
-        """Solve as asked; where that does not converge, go on with APGD from there and keep the better."""
+    def _solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> tuple[ccp.Result, str, int]:
+        """Solve as asked; where that does not converge, go on with APGD from there and keep the better.
+
+        The result, the method that it is of, and the Newton steps made."""
         options = self.options
         asked = options.run.ccp_type
         result = ccp.solve(problem, guess, asked, options.limits, options.solver, self.compare)
+        newton_its = result.iterations if ccp.SOLVERS[asked].newton else 0
         if result.converged or asked == "apgd":
-            return result, asked
+            return result, asked, newton_its
         limits = dataclasses.replace(options.limits, max_it=-1)
         second = ccp.solve(problem, result.impulse, "apgd", limits)
         if second.natural_residual < result.natural_residual:
             second.ksp_its, second.fallbacks = result.ksp_its, result.fallbacks
-            return second, "apgd"
-        return result, asked
+            return second, "apgd", newton_its
+        return result, asked, newton_its
 
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:

@@ -3,7 +3,7 @@
     modes = choose_modes(slots)                            cut the index
     A = SparseHierarchy(rows, columns, modes, block)       once per pattern
     A.set_values(blocks)
-    T = compress(A, max_rank=10, eps=1e-2).train           or `cross`
+    T = compress(A, max_rank=10, eps=1e-2).train           or `compress_cross`
     X = invert(identity(T.rows) + T, max_rank=10).train
     y = Apply(X, n)(x)
 
@@ -15,9 +15,10 @@ from __future__ import annotations
 
 from pctt.tt.als import Compression, compress, relative_error
 from pctt.tt.apply import Apply
-from pctt.tt.cross import Cross, cross
+from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.inverse import Inverse, invert, invert_near_identity, lowest, residual, symmetrise
 from pctt.tt.quantise import binary_modes, check_modes, choose_modes, merge, scalar_modes, slots_of
+from pctt.tt.root import inverse_root
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Train, decompose, decompose_matrix, identity, matrix_train, random, zeros
 
@@ -32,10 +33,11 @@ __all__ = [
     "check_modes",
     "choose_modes",
     "compress",
-    "cross",
+    "compress_cross",
     "decompose",
     "decompose_matrix",
     "identity",
+    "inverse_root",
     "invert",
     "invert_near_identity",
     "lowest",

@@ -59,27 +59,36 @@ def compress(
     norm = matrix.norm()
     if norm == 0 or len(matrix.modes) == 1:
         return _exact(matrix)
-    if start is None and slots_of(matrix.slot_modes) > MANY:
-        start = compress(matrix.thinned(PART), max_rank, eps, rng=rng).train
-    sweeps = (1 if start is None else 0) if sweeps is None else sweeps
-    full = full_ranks([m * m for m in matrix.modes])
-    rank, done = min(max_rank, FIRST_RANK if start is None else max(FIRST_RANK, *start.ranks)), 0
+    full = max(full_ranks([m * m for m in matrix.modes]))
+    rank = min(max_rank, FIRST_RANK if start is None else max(FIRST_RANK, *start.ranks))
     cores = [] if start is None else start.astype(matrix.dtype).flat()
+    if start is None and slots_of(matrix.slot_modes) > MANY:
+        cores = _passes(matrix.thinned(PART), [], rank, 1, rng)
+    sweeps = (0 if cores else 1) if sweeps is None else sweeps
+    passes = 0
     while True:
-        cores, x = forward(matrix, _spreads(matrix, _right_orthonormal(_widen(matrix, cores, rank, rng))))
-        for _ in range(sweeps):
-            cores, x = forward(matrix, backward(matrix, x, cores[-1]))
-        done += 1 + sweeps
+        cores = _passes(matrix, cores, rank, sweeps, rng)
+        passes += 1 + sweeps
         error = max(0.0, 1 - float(np.vdot(cores[-1], cores[-1])) / norm**2) ** 0.5
-        if error <= eps or rank >= min(max_rank, max(full)):
+        if error <= eps or rank >= min(max_rank, full):
             break
         rank = min(2 * rank, max_rank)
     train = matrix_train(cores, matrix.modes)
     slack = (eps**2 - error**2) ** 0.5 if error < eps else eps
     rounded = train.round(0.99 * slack)
     if rounded.ranks == train.ranks and error**2 > _certain(train):
-        return Compression(train, error, done)
-    return Compression(rounded, relative_error(matrix, rounded), done)
+        return Compression(train, error, passes)
+    return Compression(rounded, relative_error(matrix, rounded), passes)
+
+
+def _passes(
+    matrix: SparseHierarchy, cores: list[Array], rank: int, sweeps: int, rng: np.random.Generator
+) -> list[Array]:
+    """Cores of the given rank after a forward pass and so many sweeps, from old cores, if any."""
+    cores, x = forward(matrix, _spreads(matrix, _right_orthonormal(_widen(matrix, cores, rank, rng))))
+    for _ in range(sweeps):
+        cores, x = forward(matrix, backward(matrix, x, cores[-1]))
+    return cores
 
 
 def forward(matrix: SparseHierarchy, spreads: list[Array]) -> tuple[list[Array], list[Array]]:

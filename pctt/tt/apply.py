@@ -104,7 +104,7 @@ class Apply:
     def __call__(self, x: Array, out: Array | None = None) -> Array:
         """My rows of T x, from my rows of x."""
         start, stop = self.rows
-        if stop - start < self.n:
+        if self.reduce is not alone:
             self.x[:] = 0
             self.x[start:stop] = x
             self.x[:] = self.reduce(self.x)

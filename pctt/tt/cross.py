@@ -23,7 +23,7 @@ from pctt.tt.als import relative_error
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Array, Train, low_rank, matrix_train, zeros
 
-SAMPLES = 512  # stored entries, and as many others, on which a train is validated
+SAMPLES = 1024  # stored entries, and as many others, on which a train is validated
 WORTH = 0.9  # a sweep that leaves more than this of the error was idle
 
 
@@ -44,12 +44,12 @@ class Cross:
     suffixes: list[Array]
 
 
-def cross(
+def compress_cross(
     matrix: SparseHierarchy,
     max_rank: int = 10,
     eps: float = 1e-2,
     start: Cross | None = None,
-    sweeps: int = 6,
+    sweeps: int = 10,
     measure: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Cross:
@@ -64,7 +64,7 @@ def cross(
     >>> i = np.arange(63)
     >>> A = SparseHierarchy(np.r_[i, i + 1], np.r_[i + 1, i], [4, 4, 4])
     >>> A.set_values(np.ones(126))
-    >>> cross(A, eps=1e-10).train.ranks
+    >>> compress_cross(A, eps=1e-10).train.ranks
     (1, 3, 3, 1)
     """
     rng = np.random.default_rng(0) if rng is None else rng
@@ -146,7 +146,7 @@ class _Entries:
 
     def worst(self, train: Train, count: int) -> Array:
         """Keys of the stored entries, out of a sample, where the train is worst."""
-        keys = np.unique(self.stored(SAMPLES))
+        keys = self.rng.permutation(np.unique(self.stored(SAMPLES)))  # equal errors are spread over the matrix
         error = np.abs(self.at(keys) - self.of_train(train, keys))
         return keys[np.argsort(-error, kind="stable")[:count]]
 

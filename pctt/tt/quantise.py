@@ -13,11 +13,13 @@ import numpy as np
 
 from pctt.tt.train import Array, Train
 
+FIRST = 64  # the largest first mode
+
 
 def choose_modes(n: int, leaf: int = 16, middle: int = 4) -> tuple[int, ...]:
     """Slot modes [first, middle, ..., middle, last] for n slots.
 
-    The first mode is between `leaf` and `leaf * middle`, the last between `leaf` and 5/4 `leaf`, whichever
+    The first mode is at most FIRST, the last between `leaf` and 5/4 `leaf`, whichever
     pads least; few slots get one or two modes. A train of rank r with these modes costs about 2 n r (first +
     r sum(middle) + last) operations to apply, which is why the ends are not larger.
 
@@ -31,7 +33,7 @@ def choose_modes(n: int, leaf: int = 16, middle: int = 4) -> tuple[int, ...]:
     if n <= 2 * leaf:
         return (n,)
     levels = 0
-    while n > leaf * middle ** (levels + 1) * leaf:
+    while n > FIRST * middle**levels * leaf:
         levels += 1
     best: tuple[int, ...] = ()
     for last in range(leaf, leaf + leaf // 4 + 1):

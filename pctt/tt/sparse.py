@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from functools import cached_property
 
 import numpy as np
 from scipy import sparse
@@ -67,9 +66,10 @@ class SparseHierarchy:
         self._starts = None if len(new) == len(keys) else new  # of runs of blocks that are added
         self.keys = keys[new]
         self._rows = np.asarray(rows)[self._order[new]]
+        self._by_row: tuple[Array, Array, Array] | None = None
         self._index_leaf()
         self._index_bonds()
-        self.set_values(np.zeros((len(rows), block, block)))
+        self._set_leaf(np.zeros(len(self._leaf_columns)))
 
     def _index_leaf(self) -> None:
         """Row pointers and columns of the leaf matrix: a row per node of the last bond, its leaf's entries in it.
@@ -103,12 +103,12 @@ class SparseHierarchy:
         values = np.asarray(values).reshape(len(self._order), self.block**2)[self._order]
         if self._starts is not None:
             values = np.add.reduceat(values, self._starts, axis=0)
-        width = self.modes[-1] ** 2
-        shape = (self.nodes[-1], width)
-        parts = (values.ravel(), self._leaf_columns, self._leaf_pointers)
-        if len(values) == 0:
-            parts = (values.ravel(), self._leaf_columns, np.zeros(shape[0] + 1, np.int32))
-        self._leaf = sparse.csr_matrix(parts, shape=shape)
+        self._set_leaf(values.ravel())
+
+    def _set_leaf(self, data: Array) -> None:
+        shape = (self.nodes[-1], self.modes[-1] ** 2)
+        pointers = self._leaf_pointers if len(data) else np.zeros(shape[0] + 1, np.int32)
+        self._leaf = sparse.csr_matrix((data, self._leaf_columns, pointers), shape=shape)
         self._leaf_transposed = self._leaf.T
 
     def thinned(self, part: int) -> SparseHierarchy:
@@ -155,11 +155,11 @@ class SparseHierarchy:
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Scalar keys of `count` stored entries (none where there are none), the same on all ranks if `rng` is.
 
-        Half of them in random rows, half near the first or last row of a random box of a random bond; of the row
-        a random entry, the leftmost or the rightmost: entries that join coarse boxes may be few, but they matter.
-        A row belongs to one rank; it contributes the key, the others nothing.
+        Half of them in random rows, half near the first or last row of a random box of a random bond; of the
+        row a random entry, the leftmost or the rightmost: entries that join coarse boxes may be few, but they
+        matter. A row belongs to one rank; it contributes the key, the others nothing.
         """
-        by_row, sorted_rows, rows_of_all = self._by_row
+        by_row, sorted_rows, rows_of_all = self._rows_sorted()
         if len(rows_of_all) == 0:
             return np.zeros(0, np.int64)
         rows = rows_of_all[rng.integers(0, len(rows_of_all), count)]
@@ -183,13 +183,14 @@ class SparseHierarchy:
         i, j = np.divmod(leaf, q)
         return node * (m * m) + (i * b + s) * m + j * b + t
 
-    @cached_property
-    def _by_row(self) -> tuple[Array, Array, Array]:
+    def _rows_sorted(self) -> tuple[Array, Array, Array]:
         """Places of my blocks in the order of their row slots, these, and the row slots that hold blocks anywhere."""
-        order = np.argsort(self._rows, kind="stable")
-        holds = np.zeros(slots_of(self.slot_modes), np.int64)
-        holds[self._rows] = 1
-        return order, self._rows[order], np.flatnonzero(self.reduce(holds))
+        if self._by_row is None:
+            order = np.argsort(self._rows, kind="stable")
+            holds = np.zeros(slots_of(self.slot_modes), np.int64)
+            holds[self._rows] = 1
+            self._by_row = order, self._rows[order], np.flatnonzero(self.reduce(holds))
+        return self._by_row
 
     def norm(self) -> float:
         """Frobenius norm of the matrix (of all ranks)."""

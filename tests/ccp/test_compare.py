@@ -134,7 +134,7 @@ def test_every_kth_system_is_compared():
 
 
 def test_the_count_goes_on_over_several_problems():
-    comparison = Comparison(SELF, ["pbjacobi", "icc"], 2)
+    comparison = Comparison(SELF, ["pbjacobi", "icc", "cholesky"], 2)
     systems = 0
     for contacts in (5, 30, 12):  # of other structures: nothing of the last may be left
         known, graph = heap(contacts, contacts)
@@ -144,6 +144,7 @@ def test_the_count_goes_on_over_several_problems():
         systems += result.iterations
         problem.destroy()
     assert comparison.summary()["icc"]["systems"] == -(-systems // 2)
+    assert comparison.summary()["cholesky"]["converged"] == -(-systems // 2)
 
 
 def test_names_that_petsc_does_not_know_are_refused():

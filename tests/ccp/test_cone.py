@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
@@ -13,6 +13,8 @@ from pctt.ccp.cone import margin, project, step_to_boundary, step_to_zero
 
 FRICTION = [0.0, 1e-9, 0.01, 0.3, 1.0, 7.0, 1e5]
 PROJECTIONS = [project, _nearest_in_cone]
+
+unhurried = settings(deadline=None)  # a busy machine is no failure
 
 numbers = st.floats(-1e3, 1e3).map(lambda x: 0.0 if abs(x) < 1e-100 else x)
 points = st.tuples(numbers, numbers, numbers).map(lambda x: np.array([x]))
@@ -37,6 +39,7 @@ def random_inside(rng: np.random.Generator, mu: np.ndarray, depth: float = 1.0) 
 
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
+@unhurried
 @given(x=points, mu=frictions)
 def test_projection_satisfies_its_optimality_conditions(projection, x, mu):
     """p is the nearest point of a convex cone K to x: p in K, p - x in the dual cone, p.(p - x) = 0."""
@@ -73,12 +76,14 @@ def test_projection_is_the_nearest_point_that_a_minimisation_finds(projection, m
             assert np.allclose(p, found.x, atol=1e-4)
 
 
+@unhurried
 @given(x=points, mu=frictions)
 def test_projecting_twice_changes_nothing(x, mu):
     once = project(x, mu)
     assert np.allclose(project(once, mu), once, rtol=1e-13, atol=1e-13 * np.abs(x).max() * mu[0] + 1e-300)
 
 
+@unhurried
 @given(x=points, mu=st.floats(1e-3, 1e3).map(lambda mu: np.array([mu])))
 def test_moreau_decomposition(x, mu):
     """x = P_K(x) - P_K*(-x), and the dual cone mu |y_t| <= y_n is the cone of friction 1 / mu."""
@@ -87,6 +92,7 @@ def test_moreau_decomposition(x, mu):
     assert abs((inside * outside).sum()) <= 1e-11 * (x * x).sum()
 
 
+@unhurried
 @given(x=points, y=points, mu=frictions)
 def test_projection_brings_no_two_points_further_apart(x, y, mu):
     before, after = np.linalg.norm(x - y), np.linalg.norm(project(x, mu) - project(y, mu))
@@ -128,6 +134,7 @@ def test_surface_points_stay(mu):
     assert np.allclose(project(x, np.full(50, mu)), x, rtol=1e-14, atol=1e-14 * mu)
 
 
+@unhurried
 @given(x=points, mu=frictions)
 def test_the_two_projections_agree(x, mu):
     """That of the solvers and that of the accuracy figures are written independently."""

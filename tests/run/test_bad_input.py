@@ -290,3 +290,13 @@ def test_a_settled_state_that_does_not_agree_with_its_checksum_is_refused(
     assert str(copy) in said
     assert "checksum" in said
     assert arrays(copy)["grains/position"].shape == (27, 3)
+
+
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+def test_a_scene_that_flies_apart_ends_with_one_line(ranks, program):
+    done = program(*SMALL, "-scene_gravity", 1e308, "-dt", 1e3, "-steps", 3, ranks=ranks, status=None)
+    assert done.returncode == 2, done.stdout + done.stderr
+    said = [line for line in done.stderr.splitlines() if line.startswith("pctt.run: ")]
+    assert len(said) == 1
+    assert "step" in said[0]
+    assert "Traceback" not in done.stderr

@@ -84,3 +84,16 @@ def test_a_failing_preconditioner_stays_in_the_table(program, settled, tmp_path)
     assert summary["compare"]["none"]["ksp_its_max"] <= 2
     assert int(table["none"][1]) == summary["compare"]["none"]["converged"]
     assert all(line["natural_residual"] <= 1e-4 for line in summary["steps"])
+
+
+@pytest.mark.slow
+@pytest.mark.mpi
+def test_without_options_the_program_is_the_demo(program, tmp_path):
+    done = program(ranks=2, cache=tmp_path / "cache")
+    summary = json.loads((tmp_path / "results" / "summary.json").read_text())
+    assert (summary["bodies"], summary["ranks"], len(summary["steps"])) == (731, 2, 5)
+    assert {"none", "ilu"} <= set(summary["compare"])
+    assert all(line["natural_residual"] <= 1e-4 for line in summary["steps"])
+    assert "NOT CONVERGED" not in done.stdout
+    assert "ilu (within each rank)" in done.stdout
+    assert "results: " in done.stdout.splitlines()[-1]

@@ -15,7 +15,10 @@ from pctt import tt
 MODES = st.lists(st.integers(1, 5), min_size=1, max_size=6)
 
 
-@given(MODES, st.integers(1, 7), st.integers(0, 2**32 - 1), st.floats(0.3, 1), st.sampled_from([np.float32, np.float64]))
+DTYPES = st.sampled_from([np.float32, np.float64])
+
+
+@given(MODES, st.integers(1, 7), st.integers(0, 2**32 - 1), st.floats(0.3, 1), DTYPES)
 def test_product_is_the_dense_one(modes: list[int], rank: int, seed: int, part: float, dtype: type) -> None:
     rng = np.random.default_rng(seed)
     T = tt.random(modes, rank, modes, rng)

@@ -15,7 +15,7 @@ from ranks import on_ranks
 
 from pctt import tt
 
-BOTH = pytest.mark.parametrize("compress", [tt.compress, tt.cross])
+BOTH = pytest.mark.parametrize("compress", [tt.compress, tt.compress_cross])
 
 
 def kronecker_sum(*terms: sp.spmatrix) -> sp.spmatrix:
@@ -28,6 +28,7 @@ def kronecker_sum(*terms: sp.spmatrix) -> sp.spmatrix:
 KNOWN = {  # matrix, modes, greatest rank (Kazeev & Khoromskij 2012: binary Laplacians have 3 in one dimension)
     "laplacian, binary": (laplacian(256), (2,) * 8, 3),
     "laplacian, mixed": (laplacian(4096), tt.choose_modes(4096), 3),
+    "laplacian, large": (laplacian(2**16), tt.choose_modes(2**16), 3),
     "laplacian, padded": (laplacian(5000), tt.choose_modes(5000), 5),
     "shift": (sp.diags([np.ones(255)], [1], shape=(256, 256)), (4, 4, 4, 4), 2),
     "banded Toeplitz": (sp.diags([1.0, -4, 6, -4, 1], [-2, -1, 0, 1, 2], shape=(512, 512)), (8, 8, 8), 3),
@@ -100,24 +101,24 @@ def test_warm_start_is_no_worse() -> None:
     assert again.error <= first.error * (1 + 1e-12)
     wider = tt.compress(A, 9, 1e-2, start=first.train)
     assert wider.error < first.error
-    crossed = tt.cross(A, 6, 1e-2)
-    warm = tt.cross(A, 6, 1e-2, start=crossed, sweeps=1)
+    crossed = tt.compress_cross(A, 6, 1e-2)
+    warm = tt.compress_cross(A, 6, 1e-2, start=crossed, sweeps=1)
     assert warm.error <= 1.1 * crossed.error
 
 
 def test_cross_is_sublinear_and_survives_nearly_empty_matrices() -> None:
     looked = []
     for n in (2**12, 2**18):
-        found = tt.cross(of_sparse(laplacian(n)).hierarchy(tt.choose_modes(n)), 8, 1e-10, measure=False)
+        found = tt.compress_cross(of_sparse(laplacian(n)).hierarchy(tt.choose_modes(n)), 8, 1e-10, measure=False)
         assert found.error < 1e-8
         looked.append(found.evaluations)
     assert looked[1] < 4 * looked[0]
     single = of_sparse(sp.csr_matrix(([2.0], ([1234], [77])), shape=(4096, 4096)))
-    found = tt.cross(single.hierarchy(tt.choose_modes(4096)), 5, 1e-10)
+    found = tt.compress_cross(single.hierarchy(tt.choose_modes(4096)), 5, 1e-10)
     assert found.error < 1e-12
     assert found.train.entries([1234], [77])[0] == pytest.approx(2.0)
     nothing = scattered(np.random.default_rng(0), 100, 0, 3).hierarchy((10, 10))
-    for compress in (tt.compress, tt.cross):
+    for compress in (tt.compress, tt.compress_cross):
         found = compress(nothing)
         assert found.error == 0
         assert found.train.norm() == 0
@@ -127,7 +128,7 @@ def test_cross_is_sublinear_and_survives_nearly_empty_matrices() -> None:
 def test_dtypes(dtype: type) -> None:
     triplets = of_sparse(laplacian(512))
     A = triplets._replace(blocks=triplets.blocks.astype(dtype)).hierarchy((8, 8, 8))
-    for compress in (tt.compress, tt.cross):
+    for compress in (tt.compress, tt.compress_cross):
         found = compress(A, 6, 1e-3)
         assert found.train.dtype == dtype
         assert found.error < 1e-3

@@ -99,3 +99,21 @@ def test_lowest_eigenvalue_is_bounded_from_above(seed: int, rank: int) -> None:
     assert bound >= least - 1e-9 * X.norm()
     assert bound < 0 < -least
     assert tt.lowest(X, 15, sweeps=4) == pytest.approx(least, rel=0.05)
+
+
+@pytest.mark.parametrize("rank", [2, 6, 40])
+def test_inverse_root_is_positive_and_good(rank: int) -> None:
+    for dense, modes in (
+        (positive(np.random.default_rng(0), 36, 2).dense(), (3, 4, 6)),
+        (laplacian(64).toarray() + 0.1 * np.eye(64), (4, 4, 4)),
+    ):
+        Z, error = tt.inverse_root(exact(dense, modes), rank)
+        M = Z.full() @ Z.full().T
+        assert max(Z.ranks) <= rank
+        assert np.linalg.eigvalsh(M)[0] > 0
+        w = np.linalg.eigvals(dense @ M).real
+        condition = np.linalg.cond(dense)
+        assert w.max() / w.min() < (condition if rank == 2 else 0.5 * condition**0.5 + 1)
+        if rank == 40:
+            assert error < 1e-3
+            assert np.linalg.norm(np.eye(len(M)) - dense @ M) < 1e-2 * len(M) ** 0.5

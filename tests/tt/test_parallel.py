@@ -25,7 +25,7 @@ modes = tt.choose_modes(slots, leaf=8)
 bounds = np.linspace(0, slots, comm.size + 1).astype(int)
 first, last = bounds[comm.rank], bounds[comm.rank + 1]
 mine = (triplets.rows >= first) & (triplets.rows < last)
-for compress in (tt.compress, tt.cross):
+for compress in (tt.compress, tt.compress_cross):
     A = triplets.hierarchy(modes, mine, reduce=add)
     found = compress(A, 8, 1e-2)
     X = tt.invert(tt.identity(A.modes) + found.train, 8).train

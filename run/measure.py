@@ -1,0 +1,48 @@
+"""What the measuring scripts share: the machine, a run of the program, the record of the result."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy
+import petsc4py
+import scipy
+
+
+def machine() -> dict[str, object]:
+    """What the figures were measured on."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "?")
+    versions = {"python": platform.python_version(), "numpy": numpy.__version__, "scipy": scipy.__version__}
+    threads = os.environ.get("OMP_NUM_THREADS", "1")
+    petsc = petsc4py.__version__
+    return {"cpu": cpu, "cores": os.cpu_count(), "OMP_NUM_THREADS": threads, "petsc4py": petsc, **versions}
+
+
+def say_machine() -> dict[str, object]:
+    about = machine()
+    print(", ".join(f"{name} {value}" for name, value in about.items()), flush=True)
+    return about
+
+
+def summary(ranks: int, *options: object) -> dict[str, Any]:
+    """Run pctt.run with these options; its summary.json."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [".venv/bin/mpiexec", "-n", str(ranks), ".venv/bin/python", "-m", "pctt.run"]
+        command += [*map(str, options), "-output", folder]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        return json.loads((Path(folder) / "summary.json").read_text())
+
+
+def record(name: str, about: dict[str, object], rows: list[dict]) -> None:
+    """Write results/NAME.json."""
+    Path("results").mkdir(exist_ok=True)
+    path = Path("results") / f"{name}.json"
+    path.write_text(json.dumps({"machine": about, "rows": rows}, indent=1) + "\n")
+    print(path)

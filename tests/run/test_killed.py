@@ -1,0 +1,150 @@
+"""A run that is killed at any moment leaves whole files, and goes on from its last checkpoint."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import time
+
+import h5py
+import pytest
+from conftest import SETTLED, SMALL, arrays, assert_same_bits, command, environment
+
+STEPS = 40
+OPTIONS = ("-ccp_type", "apgd", "-ccp_tol", 1e-3)
+
+
+def processes(parent):
+    """Ids of all descendants of a process."""
+    try:
+        with open(f"/proc/{parent}/task/{parent}/children") as file:
+            children = [int(word) for word in file.read().split()]
+    except OSError:
+        return []
+    return children + [late for child in children for late in processes(child)]
+
+
+def python_of(parent):
+    """Descendants that run the program."""
+    found = []
+    for process in processes(parent):
+        try:
+            with open(f"/proc/{process}/cmdline") as file:
+                words = file.read().split("\0")
+        except OSError:
+            continue
+        if "pctt.run" in words and "python" in words[0]:
+            found.append(process)
+    return found
+
+
+def kill_later(folder, cache, tmp_path, options, ranks, delay):
+    """Start a run, wait for its next checkpoint and a little more, and kill -9 it, or one of several ranks.
+
+    Whether it was killed: it may have come to its end before.
+    """
+    checkpoint = folder / "checkpoint.h5"
+    before = checkpoint.stat().st_mtime_ns if checkpoint.exists() else None
+    with subprocess.Popen(
+        command(*options, ranks=ranks),
+        cwd=tmp_path,
+        env=environment(cache),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    ) as run:
+        end = time.monotonic() + 60
+        while not checkpoint.exists() or checkpoint.stat().st_mtime_ns == before:
+            assert run.poll() is None, "the run ended before its first checkpoint"
+            assert time.monotonic() < end, "no checkpoint came"
+            time.sleep(0.002)
+        time.sleep(delay)
+        if ranks == 1:
+            run.kill()
+        else:
+            for process in python_of(run.pid)[-1:]:
+                os.kill(process, signal.SIGKILL)
+        return run.wait(60) != 0
+
+
+def check_files(folder):
+    """All files can be read; the step of the checkpoint."""
+    summary = json.loads((folder / "summary.json").read_text())
+    step = int(arrays(folder / "checkpoint.h5")["world/step"])
+    with h5py.File(folder / "state.h5", "r") as file:
+        recorded = [int(name) for name in file["steps"]]
+        for name in file["steps"]:  # no link without its file
+            assert file["steps"][name]["position"].shape == (29, 3)
+            assert file["steps"][name]["contact/impulse"].shape[1] == 3
+    noted = [line["step"] for line in summary["steps"]]
+    for steps in (recorded, noted):  # nothing is missing up to the checkpoint
+        assert steps == list(range(steps[0], steps[-1] + 1))
+        assert steps[0] <= step <= steps[-1]
+    return step
+
+
+@pytest.mark.parametrize(
+    ("ranks", "kills"),
+    [
+        (1, 3),
+        pytest.param(1, 12, marks=pytest.mark.slow),
+        pytest.param(2, 3, marks=[pytest.mark.mpi, pytest.mark.slow]),
+    ],
+)
+def test_a_killed_run_goes_on_as_if_nothing_had_happened(ranks, kills, program, settled, cache, tmp_path):
+    options = (*SMALL, *OPTIONS)
+    program(*SETTLED, *OPTIONS, "-steps", STEPS, "-output", "whole", ranks=ranks)
+    start = int(arrays(settled)["world/step"])
+    folder = tmp_path / "killed"
+    rng = random.Random()
+    restart, done, killed = settled, start, 0
+    for _ in range(kills):
+        left = start + STEPS - done
+        if left <= 2:
+            break
+        more = (*options, "-restart", restart, "-output", "killed", "-steps", left)
+        delay = rng.uniform(0.0, 0.5 / kills)
+        killed += kill_later(folder, cache, tmp_path, more, ranks, delay)
+        done = check_files(folder)
+        restart = folder / "checkpoint.h5"
+    assert killed > 0
+    if done < start + STEPS:
+        program(*options, "-restart", restart, "-output", "killed", "-steps", start + STEPS - done, ranks=ranks)
+    assert check_files(folder) == start + STEPS
+    assert_same_bits(tmp_path / "whole" / "state.h5", folder / "state.h5")
+    assert_same_bits(tmp_path / "whole" / "checkpoint.h5", folder / "checkpoint.h5")
+    lines = [json.loads((f / "summary.json").read_text())["steps"] for f in (tmp_path / "whole", folder)]
+    for one, two in zip(*lines):
+        for field in ("step", "time", "contacts", "natural_residual", "objective"):
+            assert one[field] == two[field]
+    assert len(lines[0]) == len(lines[1]) == STEPS
+
+
+def test_a_checkpoint_that_lies_behind_makes_the_steps_anew(program, settled, tmp_path):
+    """What a run killed between two checkpoints leaves: records of steps that are made again."""
+    options = (*OPTIONS, "-output", "out")
+    program(*SETTLED, *options, "-steps", 3)
+    behind = (tmp_path / "out" / "checkpoint.h5").read_bytes()
+    program(*SMALL, *options, "-restart", "out/checkpoint.h5", "-steps", 4)
+    whole = arrays(tmp_path / "out" / "state.h5")
+    (tmp_path / "out" / "checkpoint.h5").write_bytes(behind)
+    program(*SMALL, *options, "-restart", "out/checkpoint.h5", "-steps", 2)
+    again = arrays(tmp_path / "out" / "state.h5")
+    assert len({name.partition("/")[0] for name in whole}) == 7
+    assert len({name.partition("/")[0] for name in again}) == 5
+    for name, array in again.items():
+        assert array.tobytes() == whole[name].tobytes()
+    assert len(json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]) == 5
+
+
+def test_another_run_in_the_same_folder_does_not_mix_with_the_earlier_one(program, settled, tmp_path):
+    program(*SMALL, *OPTIONS, "-steps", 3)  # steps 1 to 3, from the lattice
+    program(*SETTLED, *OPTIONS, "-steps", 2)
+    start = int(arrays(settled)["world/step"])
+    summary = json.loads((tmp_path / "results" / "summary.json").read_text())
+    assert [line["step"] for line in summary["steps"]] == [start + 1, start + 2]
+    recorded = {int(name.partition("/")[0]) for name in arrays(tmp_path / "results" / "state.h5")}
+    assert recorded == {start + 1, start + 2}
+    assert len(list((tmp_path / "results" / "frames").iterdir())) == 2

@@ -1,0 +1,105 @@
+"""Scenes at the edge of what can be simulated, through the Python interface: few bodies, none, or bad ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dem.bodies import Bodies
+from dem.impulses import ImpulseMemory
+from dem.scene import Scene
+from dem.scenes import Mixer
+from dem.shapes import Plane
+from dem.world import World
+from pctt import ccp
+from pctt.run.options import read_options
+from pctt.run.simulate import SceneError, Stepper
+
+
+def stepper_of(scene, **options):
+    """The time stepper of the program for a scene of our own."""
+    words = {"scene_n": "1", **{name: str(value) for name, value in options.items()}}
+    world = World.from_scene(scene, MPI.COMM_SELF)
+    return Stepper(read_options(words, MPI.COMM_SELF), world, ImpulseMemory(MPI.COMM_SELF))
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("solver", ["pdip", "apgd"])
+def test_one_body_falls_and_lands(solver):
+    scene = Scene(0.3)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_spheres([0, 0, 0.2], 0.1, 1000.0)
+    stepper = stepper_of(scene, ccp_type=solver, ccp_tol=1e-8)
+    lines = [stepper.step() for _ in range(12)]
+    assert [line["contacts"] for line in lines[:3]] == [0, 0, 0]
+    assert lines[-1]["contacts"] == 1
+    for line in lines:
+        assert line["converged"]
+        assert line["natural_residual"] <= 1e-8
+        assert np.isfinite(line["objective"])
+    np.testing.assert_allclose(stepper.world.grains.position[0], [0, 0, 0.1], atol=1e-8)
+    weight = stepper.world.grains.mass[0] * 9.81
+    np.testing.assert_allclose(stepper.impulse, [[weight * stepper.options.dt, 0, 0]], rtol=1e-7)
+
+
+def test_one_body_alone_has_no_contacts():
+    scene = Scene(0.3)
+    scene.add_spheres([0, 0, 0], 0.1, 1000.0, velocity=(1, 2, 3))
+    stepper = stepper_of(scene)
+    line = stepper.step()
+    assert (line["contacts"], line["newton_its"], line["ksp_its"]) == (0, 0, 0)
+    assert line["natural_residual"] == 0.0
+    assert line["reason"] == "no contacts"
+    expected = [1, 2, 3 - 9.81 * Mixer.dt, 0, 0, 0]
+    np.testing.assert_allclose(stepper.world.grains.velocity[0], expected, rtol=1e-14)
+
+
+def test_a_contact_that_does_not_close_needs_no_impulse():
+    scene = Scene(0.3, gravity=(0, 0, 0))
+    scene.add_spheres([[0, 0, 0], [0.21, 0, 0]], 0.1, 1000.0)
+    line = stepper_of(scene).step()
+    assert (line["contacts"], line["newton_its"], line["natural_residual"]) == (1, 0, 0.0)
+
+
+def test_an_empty_scene_is_refused():
+    scene = Scene(0.3)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    with pytest.raises(ValueError, match="empty scene"):
+        World.from_scene(scene, MPI.COMM_SELF)
+
+
+def test_an_overlapping_start_names_the_bodies_and_the_depth():
+    scene = Scene(0.3)
+    scene.add_spheres([[0, 0, 0], [1, 0, 0], [1.15, 0, 0]], 0.1, 1000.0)
+    with pytest.raises(ValueError, match=r"grain 1 and grain 2 overlap by 0\.05 m"):
+        World.from_scene(scene, MPI.COMM_SELF)
+
+
+@pytest.mark.parametrize("name", ["radius", "density", "friction", "pitch", "gravity", "angular_velocity"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_number_that_is_none_is_refused_by_the_scene(name, value):
+    with pytest.raises(ValueError, match=name):
+        Mixer(**{name: value})
+
+
+def test_a_problem_with_a_number_that_is_none_is_refused():
+    rows = ccp.BlockRows(np.array([0, 1]), np.array([0]), np.ones((1, 3, 6)), 1)
+    for r, mu in (([[np.nan, 0, 0]], [0.3]), ([[1.0, 0, 0]], [np.nan]), ([[1.0, 0, 0]], [-0.3])):
+        with pytest.raises(ValueError, match="1 contact"):
+            ccp.ConeProblem(MPI.COMM_SELF, np.array(r), np.array(mu), G=rows)
+
+
+def test_a_body_that_is_lost_ends_the_run():
+    scene = Scene(0.3)
+    scene.add_spheres([[0, 0, 0], [1, 0, 0]], 0.1, 1000.0)
+    stepper = stepper_of(scene)
+    columns = {name: column.copy() for name, column in stepper.world.grains.columns().items()}
+    columns["position"][1, 0] = np.nan
+    stepper.world.set_grains(Bodies(**columns))
+    with pytest.raises(SceneError, match="step 1"):
+        stepper.step()
