@@ -77,6 +77,11 @@ class Comparison:
         x.array[:] = kept
         return chosen
 
+    def set_rtol(self, rtol: float) -> None:
+        """Another relative tolerance for all, unless ``-ksp_rtol`` has fixed it."""
+        for krylov in self._krylov.values():
+            krylov.set_rtol(rtol)
+
     def forget_systems(self) -> None:
         """The next system has another structure."""
         for krylov in self._krylov.values():

@@ -56,8 +56,15 @@ class Krylov:
             self.ksp.pc.setFactorSolverType("mumps")
         self.ksp.setFromOptions()
         # PETSc lets preonly have no options, but its preconditioner may be an iteration that wants the tolerance
+        self._rtol_is_given = PETSc.Options().hasName(prefix + "ksp_rtol")
         self.rtol = PETSc.Options().getReal(prefix + "ksp_rtol", rtol)
         self.ksp.setTolerances(rtol=self.rtol)
+
+    def set_rtol(self, rtol: float) -> None:
+        """Another relative tolerance, unless ``-ksp_rtol`` has fixed it."""
+        if not self._rtol_is_given:
+            self.rtol = rtol
+            self.ksp.setTolerances(rtol=rtol)
 
     def solve(self, S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> Solve:
         """x = S^-1 b from zero. A set-up or solve that breaks down is reported, never raised."""
@@ -95,7 +102,9 @@ class Krylov:
             self._scalar_matrix = S.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
         else:
             S.convert(PETSc.Mat.Type.AIJ, self._scalar_matrix)
-        self._scalar_matrix.setOption(PETSc.Mat.Option.SPD, True)
+        # a factorisation that takes S for definite fails where rounding has made it just indefinite
+        definite = self.ksp.pc.getType() not in ("cholesky", "lu")
+        self._scalar_matrix.setOption(PETSc.Mat.Option.SPD if definite else PETSc.Mat.Option.SYMMETRIC, True)
         return self._scalar_matrix
 
     def destroy(self) -> None:

@@ -21,8 +21,10 @@ from pctt.pc.rank_policy import RankPolicy
 from pctt.pc.slotted import SlottedMatrix
 from pctt.tt.als import Compression, compress
 from pctt.tt.apply import Apply
-from pctt.tt.inverse import Inverse, invert, lowest
+from pctt.tt.cross import Cross, compress_cross
+from pctt.tt.inverse import invert, invert_near_identity, lowest, residual
 from pctt.tt.quantise import check_modes, choose_modes
+from pctt.tt.root import inverse_root
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Train, identity
 
@@ -34,6 +36,14 @@ class Options:
     eps: float = option(1e-2, "relative Frobenius error at which a compression ends", check=FRACTION)
     max_rank: int = option(10, "cap of the ranks of matrix and inverse", check=AT_LEAST_ONE)
     rank: str = option("auto", "auto: the rank that pays, 1 included; fixed: max_rank", choices=("auto", "fixed"))
+    compress: str = option(
+        "als", "als: alternating least squares over the nonzeros; cross: AMEn cross (the paper)",
+        choices=("als", "cross"),
+    )
+    inverse: str = option(
+        "als", "als: alternating minimisation; root: Z Z', always positive, Z near the inverse square root",
+        choices=("als", "root"),
+    )
     scaling: str = option(
         "block", "block: by Cholesky factors of the diagonal blocks; none: the matrix as it is (the paper)",
         choices=("block", "none"),
@@ -44,6 +54,16 @@ class Options:
     reuse: bool = option(True, "start from the cores of the last matrix of the same structure")
     seed: int = option(0, "seed of the random starts", check=COUNT)
     monitor: bool = option(False, "print a line per set-up")
+
+
+@dataclass(frozen=True)
+class ApproximateInverse:
+    """The trains of an inverse: X, or I + Z with ``identity``, or Z Z' with ``squared``."""
+
+    train: Train
+    residual: float
+    identity: bool = False
+    squared: bool = False
 
 
 @dataclass
@@ -75,8 +95,8 @@ class TensorTrain(PythonPC):
     def _forget_structure(self) -> None:
         self.slots: SlottedMatrix | None = None
         self.hierarchy: SparseHierarchy | None = None
-        self.compression: Compression | None = None
-        self.inverse: Inverse | None = None
+        self.compression: Compression | Cross | None = None
+        self.inverse: ApproximateInverse | None = None
         self._apply: Apply | None = None
 
     # -- set-up ---------------------------------------------------------------------------------------------
@@ -111,10 +131,9 @@ class TensorTrain(PythonPC):
 
     def _make_train(self, P: PETSc.Mat, rank: int) -> bool:
         """Compress and invert; False, with the reason on the account, if no positive inverse came of it."""
-        options = self.options
         if self.slots is None or self.hierarchy is None:
             with PETSc.Log.Event("TTBuild"):
-                self.slots = SlottedMatrix(P, self.comm, options.scaling == "block")
+                self.slots = SlottedMatrix(P, self.comm, self.options.scaling == "block")
                 modes = self._modes(self.slots.size)
                 self.hierarchy = SparseHierarchy(
                     self.slots.rows, self.slots.columns, modes, self.slots.block, self._add
@@ -126,24 +145,47 @@ class TensorTrain(PythonPC):
         if self.comm.allreduce(singular, op=MPI.LOR):
             return self._refuse("a diagonal block is not positive definite")
         self.hierarchy.set_values(values)
-        rng = np.random.default_rng(options.seed)
-        warm = options.reuse and self.compression is not None
+        warm = self.options.reuse and self.compression is not None
         with PETSc.Log.Event("TTCompress"):
-            start = self.compression.train if warm and self.compression is not None else None
-            self.compression = compress(self.hierarchy, rank, options.eps, start, rng=rng)
+            self.compression = self._compress(rank, warm)
         with PETSc.Log.Event("TTInvert"):
-            S = self.compression.train
-            if options.scaling == "block":
-                S = identity(self.hierarchy.modes) + S
-            before = self.inverse.train if warm and self.inverse is not None else None
-            self.inverse = invert(S, rank, before, rng=rng)
+            # every rank inverts the same train; a last bit of difference must not part their ways
+            self.inverse, positive = self.comm.bcast(self._invert(rank, warm))
         self.account.reused += warm
-        # every rank has inverted the same train; a last bit of difference must not part their ways
-        sound, self.inverse = self.comm.bcast((lowest(self.inverse.train) > 0, self.inverse))
-        if not sound:
+        if not positive:
             return self._refuse(f"the inverse of rank {rank} is not positive")
         self._prepare_apply(self.inverse.train)
         return True
+
+    def _compress(self, rank: int, warm: bool) -> Compression | Cross:
+        assert self.hierarchy is not None
+        options, rng = self.options, np.random.default_rng(self.options.seed)
+        if options.compress == "cross":
+            start = self.compression if warm and isinstance(self.compression, Cross) else None
+            return compress_cross(self.hierarchy, rank, options.eps, start, rng=rng)
+        train = self.compression.train if warm and self.compression is not None else None
+        return compress(self.hierarchy, rank, options.eps, train, rng=rng)
+
+    def _invert(self, rank: int, warm: bool) -> tuple[ApproximateInverse, bool]:
+        """The inverse and whether no direction was found in which it is negative."""
+        assert self.compression is not None
+        T = self.compression.train
+        scaled = self.options.scaling == "block"
+        rng = np.random.default_rng(self.options.seed)
+        one = identity(T.rows)
+        if self.options.inverse == "root":
+            S = one + T if scaled else T
+            Z, _ = inverse_root(S, rank)
+            return ApproximateInverse(Z, residual(S, Z @ Z.T), squared=True), True
+        start = self.inverse.train if warm and self.inverse is not None else None
+        if scaled:
+            found = invert_near_identity(T, rank, start, rng=rng)
+            assert found.correction is not None
+            inverse = ApproximateInverse(found.correction, found.residual, identity=True)
+        else:
+            found = invert(T, rank, start, rng=rng)
+            inverse = ApproximateInverse(found.train, found.residual)
+        return inverse, lowest(found.train) > 0
 
     def _modes(self, slots: int) -> tuple[int, ...]:
         if self.options.modes:
@@ -158,11 +200,15 @@ class TensorTrain(PythonPC):
             rows = (slots.first * bs, (slots.first + len(slots.place)) * bs)
             dtype = np.float32 if self.options.precision == "single" and not self._double else np.float64
             self._apply = Apply(train, slots.size * bs, rows, dtype)
+            if self.options.inverse == "root":
+                self._apply_transposed = Apply(train.T, slots.size * bs, rows, dtype)
             self._local = np.empty((len(slots.place), bs))
             self._scaled = np.empty((len(slots.place), bs, 1))
             self._whole = np.empty(slots.size * bs)
         else:
             self._apply.set_train(train)
+            if self.options.inverse == "root":
+                self._apply_transposed.set_train(train.T)
 
     def _refuse(self, why: str) -> bool:
         self.account.fallbacks.append(why)
@@ -190,11 +236,24 @@ class TensorTrain(PythonPC):
             slots, root = self.slots, self.slots.root
             self._local[slots.place] = x.array_r.reshape(-1, slots.block)
             np.matmul(root, self._local[:, :, None], out=self._scaled)
-            slots.gather_slots(self._scaled.ravel(), self._whole)
-            self._apply.x[: self._apply.n] = self._whole
-            z = self._apply.product().reshape(-1, slots.block, 1)
+            z = self._inverse_times(self._scaled.ravel()).reshape(-1, slots.block, 1)
             np.matmul(root.transpose(0, 2, 1), z, out=self._scaled)
             y.array_w[:] = self._scaled[slots.place].ravel()
+
+    def _inverse_times(self, x: np.ndarray) -> np.ndarray:
+        """This rank's part of X x in slot order, from its part of x."""
+        assert self.inverse is not None
+        if self.inverse.squared:
+            return self._times(self._apply, self._times(self._apply_transposed, x).copy())
+        product = self._times(self._apply, x)
+        return x + product if self.inverse.identity else product
+
+    def _times(self, apply: Apply | None, x: np.ndarray) -> np.ndarray:
+        assert self.slots is not None
+        assert apply is not None
+        self.slots.gather_slots(x, self._whole)
+        apply.x[: apply.n] = self._whole
+        return apply.product()
 
     # -- watching the solves --------------------------------------------------------------------------------
 
@@ -249,9 +308,11 @@ class TensorTrain(PythonPC):
         if self.rank == 1 or self.compression is None or self.inverse is None:
             return f"rank 1 (block Jacobi), set up in {self._setup_seconds:.2e} s"
         T, X = self.compression.train, self.inverse.train
+        form = "I + Z" if self.inverse.identity else "Z Z'" if self.inverse.squared else "X"
         return (
             f"modes {'x'.join(map(str, T.rows))}, matrix ranks {T.ranks} error {self.compression.error:.2g}, inverse "
-            f"ranks {X.ranks} residual {self.inverse.residual:.2g}, {X.storage} numbers, {self._setup_seconds:.2e} s"
+            f"{form} ranks {X.ranks} residual {self.inverse.residual:.2g}, {X.storage} numbers, "
+            f"{self._setup_seconds:.2e} s"
         )
 
     def destroy(self, pc: PETSc.PC) -> None:

@@ -166,7 +166,6 @@ def test_bodies_of_very_different_mass(solver, seed, database):
     check(known, problem, ccp.solve(problem, type=solver, limits=Limits(1e-5)), 1e-5)
 
 
-@pytest.mark.xfail(reason="the default -ksp_rtol of 10 -ccp_tol is too loose where masses differ", strict=True)
 def test_bodies_of_very_different_mass_with_default_options():
     for seed in range(0, 100, 10):
         known, graph = heap(seed, mass_ratio=1e4)

@@ -138,6 +138,16 @@ def test_new_values_start_from_the_old_train():
     assert context(ksp).compression.error <= 1.2 * context(cold).compression.error
 
 
+@pytest.mark.parametrize("way", [{"compress": "cross"}, {"inverse": "root"}, {"scaling": "none"}])
+def test_other_ways_to_a_train(way):
+    ksp = solver(poisson(16), rank="fixed", max_rank=8, **way)
+    jacobi_its, _ = solve(solver(poisson(16), max_rank=8, rank="auto"))
+    its, residual = solve(ksp)
+    assert context(ksp).rank == 8, context(ksp).account.fallbacks
+    assert residual < 1e-6
+    assert its < jacobi_its
+
+
 def test_an_indefinite_diagonal_falls_back_to_block_jacobi():
     mat = poisson(8)
     diagonal = mat.getDiagonal()
@@ -183,7 +193,7 @@ def test_the_example_of_the_documentation_runs():
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     assert "pctt.pc.TensorTrain" in done.stdout
-    assert "inverse ranks" in done.stdout
+    assert "inverse I + Z ranks" in done.stdout
 
 
 @pytest.mark.mpi

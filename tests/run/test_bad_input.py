@@ -7,8 +7,8 @@ import re
 import h5py
 import numpy as np
 import pytest
-from conftest import SMALL, arrays
 from mpi4py import MPI
+from program import SMALL, arrays
 
 from pctt.options import OptionError
 from pctt.run.options import read_options

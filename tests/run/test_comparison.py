@@ -6,7 +6,7 @@ import json
 import math
 
 import pytest
-from conftest import SETTLED
+from program import SETTLED
 
 FIELDS = {
     "systems": int,

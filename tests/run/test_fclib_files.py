@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from conftest import ROOT
+from program import ROOT
 
 FOLDER = ROOT.parent / "shared" / "fclib"
 

@@ -6,7 +6,7 @@ import dataclasses
 import re
 
 import pytest
-from conftest import SMALL
+from program import SMALL
 
 from dem.scenes import Mixer
 from pctt import ccp

@@ -11,9 +11,9 @@ import time
 
 import h5py
 import pytest
-from conftest import SETTLED, SMALL, arrays, assert_same_bits, command, environment
+from program import SETTLED, SMALL, arrays, assert_same_bits, command, environment
 
-STEPS = 40
+STEPS = 30
 OPTIONS = ("-ccp_type", "apgd", "-ccp_tol", 1e-3)
 
 
@@ -88,7 +88,7 @@ def check_files(folder):
 @pytest.mark.parametrize(
     ("ranks", "kills"),
     [
-        (1, 3),
+        (1, 2),
         pytest.param(1, 12, marks=pytest.mark.slow),
         pytest.param(2, 3, marks=[pytest.mark.mpi, pytest.mark.slow]),
     ],

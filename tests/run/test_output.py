@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import pty
+import subprocess
 
 import h5py
 import numpy as np
 import pytest
-from conftest import SETTLED, SMALL, arrays
+from program import SETTLED, SMALL, arrays, command, environment
 
 from dem.scenes import Mixer
 
@@ -185,3 +188,24 @@ def test_lines_are_plain_where_there_is_no_terminal(program, settled):
     head, first = (done.stdout.splitlines()[k].split() for k in (2, 3))
     assert head[:3] == ["step", "time", "s"]
     assert int(first[0]) > 90
+
+
+def test_on_a_terminal_the_present_step_is_shown(settled, cache, tmp_path):
+    inner, outer = pty.openpty()
+    words = command(*SETTLED, "-steps", 2, "-ccp_type", "apgd")
+    with subprocess.Popen(words, cwd=tmp_path, env=environment(cache), stdout=outer, stderr=outer) as run:
+        os.close(outer)
+        said = b""
+        while True:
+            try:
+                part = os.read(inner, 4096)
+            except OSError:  # the other end is closed
+                break
+            if not part:
+                break
+            said += part
+    os.close(inner)
+    assert run.returncode == 0
+    first = int(arrays(settled)["world/step"]) + 1
+    assert f"step {first}, time".encode() in said
+    assert b"\r\033[K" in said

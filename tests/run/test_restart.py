@@ -6,15 +6,22 @@ import json
 
 import numpy as np
 import pytest
-from conftest import SETTLED, SMALL, arrays, assert_same_bits
+from program import SETTLED, SMALL, arrays, assert_same_bits
 
 from dem.scenes import Mixer
 from pctt.run.checkpoint import scene_record, settled_path
 
 
-@pytest.mark.parametrize("solver", ["pdip", "apgd"])
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
-def test_on_as_many_ranks_the_way_is_the_same_bit_for_bit(solver, ranks, program, settled, tmp_path):
+@pytest.mark.parametrize(
+    ("ranks", "solver"),
+    [
+        (1, "pdip"),
+        (1, "apgd"),
+        pytest.param(2, "pdip", marks=pytest.mark.mpi),
+        pytest.param(2, "apgd", marks=[pytest.mark.mpi, pytest.mark.slow]),
+    ],
+)
+def test_on_as_many_ranks_the_way_is_the_same_bit_for_bit(ranks, solver, program, settled, tmp_path):
     options = ("-ccp_type", solver)
     program(*SETTLED, *options, "-steps", 6, "-output", "whole", ranks=ranks)
     program(*SETTLED, *options, "-steps", 3, "-output", "parts", ranks=ranks)
@@ -62,6 +69,7 @@ def test_on_another_number_of_ranks_the_way_is_the_same_but_for_rounding(program
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_solved_to_a_tolerance_the_way_on_other_ranks_is_near(program, settled, tmp_path):
     options = ("-ccp_type", "pdip", "-ccp_tol", 1e-6, "-ksp_rtol", 1e-8, "-steps", 3)
     for ranks in (1, 2, 3):
