@@ -74,7 +74,9 @@ class BodySchur(PythonPC):
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """K for the present barrier blocks."""
         G = P.getAttr("contact_map")
-        self.inverse_barrier = np.linalg.inv(P.getAttr("barrier"))
+        barrier = P.getAttr("barrier")
+        floor = 1e-14 * np.trace(barrier, axis1=1, axis2=2)  # a block that rounding has made singular
+        self.inverse_barrier = np.linalg.inv(barrier + floor[:, None, None] * np.eye(3))
         weighted = self.inverse_barrier[self._row] @ G.blocks
         i, j = self._pairs
         contributions = G.blocks[i].transpose(0, 2, 1) @ weighted[j]
