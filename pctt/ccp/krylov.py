@@ -9,11 +9,12 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.pc.base import factor_within_ranks
+
 # right preconditioning makes the residual that the method sees the true one
 _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
 # what wants scalar rows; others switch when PETSc says so
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu", "eisenstat"}
-_ONE_RANK = {"ilu", "icc"}
 _NOT_SUPPORTED = 56  # PETSC_ERR_SUP: this method has no code for block formats
 
 
@@ -43,7 +44,7 @@ class Krylov:
         self.comm, self.prefix = comm, prefix
         given = _with_defaults(prefix, defaults or {})
         self.method = given["ksp_type"]
-        self.name = _localise(prefix, given) if comm.size > 1 else given["pc_type"]
+        self.name = factor_within_ranks(prefix, comm.size)
         self.scalar = given["pc_type"] in _SCALAR_FORMAT
         self._scalar_matrix: PETSc.Mat | None = None
         self.ksp = PETSc.KSP().create(comm)
@@ -133,20 +134,6 @@ def _with_defaults(prefix: str, defaults: dict[str, str]) -> dict[str, str]:
         if prefix + name not in everything:
             database[prefix + name] = value
     return {name: database.getString(prefix + name) for name in wanted}
-
-
-def _localise(prefix: str, given: dict[str, str]) -> str:
-    """On several ranks: factor within each rank what PETSc factors on one rank only; the name to report."""
-    pc = given["pc_type"]
-    if pc not in _ONE_RANK:
-        return pc
-    database = PETSc.Options()
-    for name, value in database.getAll().items():
-        if name.startswith(prefix + "pc_factor_"):
-            database[prefix + "sub_" + name[len(prefix) :]] = value
-    database[prefix + "pc_type"] = "bjacobi"
-    database[prefix + "sub_pc_type"] = pc
-    return f"{pc} within each rank"
 
 
 def _true_residual(S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:

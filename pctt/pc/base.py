@@ -79,6 +79,21 @@ class PythonPC:
         return []
 
 
+def factor_within_ranks(prefix: str, ranks: int) -> str:
+    """The name of the PC type of a prefix; on several ranks ILU and ICC, which PETSc has for one rank only, are made
+    block Jacobi with that factorisation within each rank."""
+    database = PETSc.Options()
+    pc = database.getString(prefix + "pc_type", "")
+    if ranks == 1 or pc not in ("ilu", "icc"):
+        return pc
+    for name, value in database.getAll().items():
+        if name.startswith(prefix + "pc_factor_"):
+            database[prefix + "sub_" + name[len(prefix) :]] = value
+    database[prefix + "pc_type"] = "bjacobi"
+    database[prefix + "sub_pc_type"] = pc
+    return f"{pc} within each rank"
+
+
 @atexit.register
 def _destroy_garbage() -> None:
     """PETSc destroys what petsc4py has let go of when it is finalised, which is after Python's own end: a

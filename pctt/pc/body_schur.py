@@ -21,7 +21,7 @@ from petsc4py import PETSc
 
 from pctt.blocks import BlockRows, block_matrix
 from pctt.options import NOT_NEGATIVE, option
-from pctt.pc.base import PythonPC
+from pctt.pc.base import PythonPC, factor_within_ranks
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,9 @@ class BodySchur(PythonPC):
         self.shifted: PETSc.Mat | None = None
         self._y, self._rhs = self.K.createVecs()
         self.ksp = PETSc.KSP().create(P.comm)
-        self.ksp.setOptionsPrefix((pc.getOptionsPrefix() or "") + "body_")
+        prefix = (pc.getOptionsPrefix() or "") + "body_"
+        factor_within_ranks(prefix, P.comm.size)
+        self.ksp.setOptionsPrefix(prefix)
         self.ksp.setType(PETSc.KSP.Type.CG)
         self.ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         self.ksp.setTolerances(max_it=10_000)
