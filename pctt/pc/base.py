@@ -28,7 +28,7 @@ class PythonPC:
 
     def create(self, pc: PETSc.PC) -> None:
         self.options: Any = self.options_class()
-        self._structure: tuple[int, int] | None = None
+        self._structure: tuple | None = None
 
     def setFromOptions(self, pc: PETSc.PC) -> None:
         """Read the options behind the PC's prefix; OptionError for a bad one, or a misspelt one."""
@@ -46,7 +46,7 @@ class PythonPC:
 
     def setUp(self, pc: PETSc.PC) -> None:
         _, P = pc.getOperators()
-        structure = (P.handle, P.getNonzeroState() if hasattr(P, "getNonzeroState") else 0)
+        structure = (P.handle, P.getSize(), P.getInfo()["nz_used"])
         if structure != self._structure:
             self.build(pc, P)
             self._structure = structure

@@ -15,7 +15,7 @@ MEMORY = 0.5  # weight of the newest figure in a rank's average
 
 @dataclass
 class Figures:
-    """A rank's running figures: ``cost`` seconds per digit, ``overhead`` set-up and trial seconds of one use."""
+    """A rank's running figures: ``cost`` seconds per digit, ``seconds`` of one use, set-up included."""
 
     cost: float = float("inf")
     seconds: float = 0.0
@@ -41,7 +41,6 @@ class RankPolicy:
     figures: dict[int, Figures] = field(default_factory=dict)
     spent: float = 0.0
     on_trials: float = 0.0
-    last_trial: int = 1
 
     def __post_init__(self) -> None:
         self.ladder = tuple(sorted({1, *self.ladder}))
@@ -60,7 +59,6 @@ class RankPolicy:
         # what is known of it, or a guess: a first trial builds the tables of the structure too
         price = self.figures[candidate].seconds or 10 * self.figures[best].seconds
         if self.on_trials + price <= BUDGET * self.spent:
-            self.last_trial = candidate
             return candidate
         return best
 

@@ -106,6 +106,8 @@ class TensorTrain(PythonPC):
         self._forget_structure()
         if self.policy is None:
             self.policy = RankPolicy((self.options.max_rank,), self.options.rank == "auto")
+        else:
+            self.policy.forgive()  # what failed on another matrix may do here
         if self._jacobi is not None:
             self._jacobi.destroy()
         self._jacobi = PETSc.PC().create(P.comm)
