@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,39 @@ class BlockRows:
         return len(self.indptr) - 1
 
 
+MANY = 500  # contacts of a body above which its columns of G are kept apart
+
+
+def without_crowded(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, np.ndarray]:
+    """G without the columns of bodies with more than MANY contacts, and these bodies (global block columns)."""
+    bodies, count = np.unique(G.indices, return_counts=True)
+    columns = comm.allreduce(G.columns)
+    # a body with more than MANY contacts has more than MANY / ranks on some rank
+    often = comm.allreduce(set(bodies[count > MANY / comm.size].tolist()), op=operator.or_)
+    candidates = np.array(sorted(often), dtype=np.int64)
+    here = np.bincount(G.indices, minlength=columns)[candidates] if len(candidates) else np.zeros(0, np.int64)
+    crowded = candidates[comm.allreduce(here) > MANY] if len(candidates) else candidates
+    if len(crowded) == 0:
+        return G, crowded
+    kept = ~np.isin(G.indices, crowded)
+    before = np.concatenate([[0], np.cumsum(kept)])
+    return BlockRows(before[G.indptr], G.indices[kept], G.blocks[kept], G.columns), crowded
+
+
+def dense_columns(comm: MPI.Comm, G: BlockRows, bodies: np.ndarray) -> PETSc.Mat | None:
+    """The columns of some bodies (global block columns) of G as a dense Mat (3Nc x 6 per body); None without bodies."""
+    if len(bodies) == 0:
+        return None
+    columns = np.zeros((G.rows, 3, len(bodies), 6))
+    row = np.repeat(np.arange(G.rows), np.diff(G.indptr))
+    chosen = np.isin(G.indices, bodies)
+    columns[row[chosen], :, np.searchsorted(bodies, G.indices[chosen])] = G.blocks[chosen]
+    size = ((3 * G.rows, PETSc.DETERMINE), (PETSc.DECIDE, 6 * len(bodies)))
+    mat = PETSc.Mat().createDense(size, array=columns.reshape(3 * G.rows, -1), comm=comm)
+    mat.assemble()
+    return mat
+
+
 def block_matrix(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
     """G as a Mat (3Nc x 6M) of block size 3."""
     indices = (2 * G.indices[:, None] + [0, 1]).ravel()
@@ -41,8 +75,9 @@ def block_matrix(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
 
 
 def square_block_matrix(comm: MPI.Comm, rows: sp.bsr_matrix) -> PETSc.Mat:
-    """A square Mat of block size 3 from this rank's block rows (3nc x 3Nc)."""
-    shape = (rows.shape[0] // 3, rows.shape[1] // 3)
+    """A square Mat from this rank's block rows (b nc x b Nc), of their block size b."""
+    size = rows.blocksize[0]
+    shape = (rows.shape[0] // size, rows.shape[1] // size)
     columns = rows.indices.copy()  # sorted in place
     order = sp.csr_matrix((np.arange(len(columns)), columns, rows.indptr), shape=shape)
     order.sort_indices()  # PETSc wants sorted columns; sorting positions is much faster than sorting blocks
@@ -53,12 +88,13 @@ def square_block_matrix(comm: MPI.Comm, rows: sp.bsr_matrix) -> PETSc.Mat:
 def block_csr_matrix(
     comm: MPI.Comm, rows: int, columns: int, indptr: np.ndarray, indices: np.ndarray, blocks: NDArray[np.float64]
 ) -> PETSc.Mat:
-    """A BAIJ Mat of block size 3 from local block CSR arrays; ``rows`` and ``columns`` are local scalar sizes."""
+    """A BAIJ Mat from local block CSR arrays, ``blocks`` (nb, b, b); ``rows`` and ``columns`` are local scalar
+    sizes."""
     csr = (indptr.astype(PETSc.IntType), indices.astype(PETSc.IntType), np.ascontiguousarray(blocks).ravel())
     size = ((rows, PETSc.DETERMINE), (columns, PETSc.DETERMINE))
     mat = PETSc.Mat().create(comm)
     mat.setSizes(size)
-    mat.setBlockSize(3)
+    mat.setBlockSize(blocks.shape[-1])
     mat.setType(PETSc.Mat.Type.BAIJ)
     mat.setPreallocationCSR(csr)
     return mat

@@ -12,25 +12,31 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
 from pctt.blocks import BlockRows
-from pctt.ccp import apgd, pdip
+from pctt.ccp import apgd
 from pctt.ccp.accuracy import Accuracy, measure
-from pctt.ccp.compare import Comparison
 from pctt.ccp.cone import Array
+from pctt.ccp.interior import conic, pdip
+from pctt.ccp.newton import FORMS, Newton
+from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 from pctt.log import phase
 
 __all__ = [
+    "FORMS",
     "SOLVERS",
     "Accuracy",
     "BlockRows",
     "Comparison",
     "ConeProblem",
     "Limits",
+    "Newton",
     "Result",
     "measure",
+    "newton_for",
     "solve",
 ]
 
@@ -47,6 +53,9 @@ class Solver:
 
 SOLVERS = {
     "pdip": Solver(pdip.solve, pdip.PDIP, True, "the paper's primal-dual interior point method"),
+    "conic": Solver(
+        conic.solve, conic.Conic, True, "symmetric cone interior point method with Nesterov-Todd scaling"
+    ),
     "apgd": Solver(apgd.solve, apgd.APGD, False, "accelerated projected gradient descent with restart"),
 }
 
@@ -57,12 +66,13 @@ def solve(
     type: str = "pdip",
     limits: Limits | None = None,
     options: Any = None,
-    compare: Comparison | None = None,
+    newton: Newton | None = None,
 ) -> Result:
     """Solve a cone problem by a method of SOLVERS.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an
-    instance of the method's options class; ``compare`` works with methods that solve Newton systems.
+    instance of the method's options class; ``newton``, for methods that solve Newton systems, keeps what serves one
+    problem after another.
     """
     solver = SOLVERS[type]
     guess = np.zeros_like(problem.r) if guess is None else guess
@@ -71,6 +81,20 @@ def solve(
         return Result(nothing, True, "no contacts", 0.0, 0)
     if problem.natural_residual(nothing, problem.r) == 0:
         return Result(nothing, True, "no contact closes", 0.0, 0)
-    extra = {"compare": compare} if solver.newton else {}
+    arguments = (problem, guess, limits or Limits(), options or solver.options())
     with phase("CCPSolve"):
-        return solver.function(problem, guess, limits or Limits(), options or solver.options(), **extra)
+        if not solver.newton:
+            return solver.function(*arguments)
+        own = newton or newton_for(problem.comm, type)
+        try:
+            return solver.function(*arguments, own)
+        finally:
+            if newton is None:
+                own.destroy()
+
+
+def newton_for(comm: MPI.Comm, type: str, form: str = "auto", compare: Comparison | None = None) -> Newton:
+    """The Newton systems that a method of SOLVERS works with; ``form`` is auto or of FORMS."""
+    if form == "auto":
+        form = "body" if type == "conic" and not (compare and compare.names) else "contact"
+    return Newton(comm, form, compare if compare is not None and compare.names else None)

@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, block_matrix
+from pctt.blocks import BlockRows, block_matrix, dense_columns, without_crowded
 from pctt.ccp.cone import Array, project
 from pctt.ccp.delassus import delassus, diagonal_blocks, local_blocks
 
@@ -16,7 +16,9 @@ from pctt.ccp.delassus import delassus, diagonal_blocks, local_blocks
 class ConeProblem:
     """One step's cone problem, its contacts distributed over the ranks of ``comm``.
 
-    N = G G' is given by the mass-scaled contact map G = D' M^-1/2 (3Nc x 6M), or directly (``N``).
+    N = G G' + C is given by the mass-scaled contact map G = D' M^-1/2 (3Nc x 6M), or directly (``N``). The compliance
+    C is e mean(diag G G') times the identity in the variables (mu g_n, g_t) in which all cones are the same: contacts
+    that yield a little. Without friction the normal direction gets what tangents get.
 
     Attributes
     ----------
@@ -25,6 +27,7 @@ class ConeProblem:
     contact_map : the block rows of G, or None
     point : (nc, 3) contact points (m) or None; orders the unknowns of hierarchical preconditioners
     key : (nc,) persistent names of the contacts or None
+    compliance : (nc, 3) the diagonal of C
     size : contacts on all ranks, Nc
     """
 
@@ -38,6 +41,7 @@ class ConeProblem:
         N: PETSc.Mat | None = None,
         point: Array | None = None,
         key: np.ndarray | None = None,
+        compliance: float = 0.0,
     ):
         if (G is None) == (N is None):
             raise ValueError("a cone problem is given by either the map G or the matrix N")
@@ -50,13 +54,18 @@ class ConeProblem:
         if self.sum(bad.sum()):
             raise ValueError(f"{self.sum(bad.sum())} contacts with a NaN, infinite or negative coefficient")
         self.size = self.sum(len(self.mu))
-        self.contact_map, self._N = G, N
+        self.contact_map = G
+        self._given: PETSc.Mat = N  # where there is no G
         if N is not None:
             self._in, self._out = N.createVecs()
         elif G is not None:
             self._G = block_matrix(comm, G)
             self._momentum, self._out = self._G.createVecs()
             self._in = self._out.duplicate()
+        along_normal = np.where(self.mu > 0, self.mu**2, 1.0)
+        ones = np.ones_like(along_normal)
+        self.compliance = np.stack([along_normal, ones, ones], axis=1)
+        self.compliance *= compliance * self.mean_diagonal if compliance else 0.0
 
     def __repr__(self) -> str:
         given = "N" if self.contact_map is None else "G"
@@ -66,11 +75,24 @@ class ConeProblem:
 
     def product(self, g: Array) -> Array:
         """N g for impulses g (nc, 3): velocities of the contacts (nc, 3)."""
-        self._in.array[:] = g.ravel()
-        if self._N is not None:
-            self._N.mult(self._in, self._out)
+        return self.velocity_of(self.momentum(g)) + self.compliance * g
+
+    def momentum(self, g: Array) -> Array:
+        """G' g (6m,): what impulses g (nc, 3) change in the mass-scaled velocities of this rank's bodies. Of a
+        problem that is given by N, which knows no bodies, g itself."""
+        if self.contact_map is None:
+            return g.ravel().copy()
+        self._out.array[:] = g.ravel()
+        self._G.multTranspose(self._out, self._momentum)
+        return self._momentum.array.copy()
+
+    def velocity_of(self, momentum: Array) -> Array:
+        """G v: velocities of the contacts (nc, 3) for those of the bodies; N g where the problem is given by N."""
+        if self.contact_map is None:
+            self._in.array[:] = momentum
+            self._given.mult(self._in, self._out)
         else:
-            self._G.multTranspose(self._in, self._momentum)
+            self._momentum.array[:] = momentum
             self._G.mult(self._momentum, self._out)
         return self._out.array.reshape(-1, 3).copy()
 
@@ -84,18 +106,60 @@ class ConeProblem:
 
     @cached_property
     def N(self) -> PETSc.Mat:
-        """The Delassus matrix N as a Mat of block size 3 (BAIJ), built at its first use and kept."""
-        return self._N if self.contact_map is None else delassus(self.comm, self.contact_map)
+        """N as a Mat of block size 3 (BAIJ), but for the low-rank term; built at its first use and kept."""
+        given = self.contact_map is None
+        N = self._given.duplicate(copy=True) if given else delassus(self.comm, self._split[0])
+        if self.compliance.any():
+            diagonal = self._out.duplicate()
+            diagonal.array[:] = self.compliance.ravel()
+            N.setDiagonal(diagonal, PETSc.InsertMode.ADD_VALUES)
+            diagonal.destroy()
+        return N
+
+    @cached_property
+    def low_rank(self) -> PETSc.Mat | None:
+        """The columns U (3Nc x 6 per body, dense) of G of bodies with more than MANY contacts, or None: they would
+        fill N, which is ``N`` + U U'."""
+        return None if self.contact_map is None else dense_columns(self.comm, self.contact_map, self._split[1])
+
+    @cached_property
+    def _split(self) -> tuple[BlockRows, np.ndarray]:
+        assert self.contact_map is not None
+        return without_crowded(self.comm, self.contact_map)
 
     @cached_property
     def diagonal_blocks(self) -> Array:
-        """The 3 x 3 diagonal blocks of N (nc, 3, 3)."""
-        return local_blocks(self._N) if self.contact_map is None else diagonal_blocks(self.contact_map)
+        """The 3 x 3 diagonal blocks of N (nc, 3, 3), the low-rank term and the compliance included."""
+        return self._rigid_blocks + self.compliance_blocks
+
+    @cached_property
+    def sparse_diagonal_blocks(self) -> Array:
+        """The same without the low-rank term."""
+        if self.contact_map is None:
+            return self.diagonal_blocks
+        return diagonal_blocks(self._split[0]) + self.compliance_blocks
+
+    @cached_property
+    def compliance_blocks(self) -> Array:
+        """C as blocks (nc, 3, 3)."""
+        return self.compliance[:, :, None] * np.eye(3)
+
+    @cached_property
+    def _rigid_blocks(self) -> Array:
+        return local_blocks(self._given) if self.contact_map is None else diagonal_blocks(self.contact_map)
+
+    def structure(self) -> tuple[np.ndarray, ...]:
+        """Arrays of this rank that are equal where contacts, their bodies and all sizes are."""
+        key = np.zeros(0) if self.key is None else self.key
+        if self.contact_map is None:
+            return (key, np.array([self._given.handle, self.size]))
+        G = self.contact_map
+        return (key, G.indptr, G.indices, np.array([G.columns, self.size]))
 
     @cached_property
     def mean_diagonal(self) -> float:
-        """Mean of diag(N) (1/kg); 1 for a problem without contacts."""
-        trace = self.sum(np.trace(self.diagonal_blocks, axis1=1, axis2=2).sum())
+        """Mean of the diagonal of N without compliance (1/kg); 1 for a problem without contacts."""
+        trace = self.sum(np.trace(self._rigid_blocks, axis1=1, axis2=2).sum())
         return trace / (3 * self.size) if trace > 0 else 1.0
 
     # -- reductions over all contacts -----------------------------------------------------------------------
@@ -120,5 +184,6 @@ class ConeProblem:
         for name in ("_G", "_momentum", "_in", "_out"):
             if name in self.__dict__:
                 self.__dict__.pop(name).destroy()
-        if "N" in self.__dict__:
-            self.__dict__.pop("N").destroy()
+        for name in ("N", "low_rank"):
+            if self.__dict__.get(name) is not None:
+                self.__dict__.pop(name).destroy()

@@ -19,9 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, block_matrix
+from pctt.blocks import block_matrix
 from pctt.options import NOT_NEGATIVE, option
 from pctt.pc.base import PythonPC, factor_within_ranks
+from pctt.pc.body_matrix import BodyMatrix
 
 
 @dataclass(frozen=True)
@@ -54,11 +55,11 @@ class BodySchur(PythonPC):
         if G is None:
             raise ValueError("pctt.pc.BodySchur: the Mat has no attribute contact_map; see the class's module")
         self.destroy(pc)
-        self._row = np.repeat(np.arange(len(G.indptr) - 1), np.diff(G.indptr))
-        self._pairs = _pairs(G.indptr)
-        self.K = _body_matrix(P.comm, G)
-        self.shifted: PETSc.Mat | None = None
-        self._y, self._rhs = self.K.createVecs()
+        self.K = BodyMatrix(P.comm, G)
+        points = P.getAttr("coordinates")
+        if points is not None:
+            self.K.mat.setAttr("coordinates", self.K.places(points))
+        self._y, self._rhs = self.K.mat.createVecs()
         self.ksp = PETSc.KSP().create(P.comm)
         prefix = (pc.getOptionsPrefix() or "") + "body_"
         factor_within_ranks(prefix, P.comm.size)
@@ -75,25 +76,13 @@ class BodySchur(PythonPC):
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """K for the present barrier blocks."""
-        G = P.getAttr("contact_map")
         barrier = P.getAttr("barrier")
         floor = 1e-14 * np.trace(barrier, axis1=1, axis2=2)  # a block that rounding has made singular
         self.inverse_barrier = np.linalg.inv(barrier + floor[:, None, None] * np.eye(3))
-        weighted = self.inverse_barrier[self._row] @ G.blocks
-        i, j = self._pairs
-        contributions = G.blocks[i].transpose(0, 2, 1) @ weighted[j]
-        self.K.zeroEntries()
-        add = PETSc.InsertMode.ADD_VALUES
-        if len(i):
-            rows, columns = (G.indices[k].astype(PETSc.IntType)[:, None] for k in (i, j))
-            self.K.setValuesBlockedRCV(rows, columns, contributions.reshape(len(i), -1), add)
-        first, last = self.K.getOwnershipRange()
-        bodies = np.arange(first // 6, last // 6, dtype=PETSc.IntType)[:, None]
-        if len(bodies):
-            self.K.setValuesBlockedRCV(bodies, bodies, np.tile(np.eye(6).ravel(), (len(bodies), 1)), add)
-        self.K.assemble()
+        self.K.update(self.inverse_barrier)
         assert self.ksp is not None
-        self.ksp.setOperators(self.K, self._enlarged_diagonal(bodies) if self.options.shift else self.K)
+        shift = self.options.shift
+        self.ksp.setOperators(self.K.mat, self.K.enlarged(shift) if shift else self.K.mat)
         self.ksp.setUp()
 
     def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
@@ -113,19 +102,6 @@ class BodySchur(PythonPC):
         rest = r - self._contact.array_r.reshape(-1, 3)
         y.array_w[:] = (self.inverse_barrier @ rest[:, :, None]).ravel()
 
-    def _enlarged_diagonal(self, bodies: np.ndarray) -> PETSc.Mat:
-        """K with its diagonal blocks times 1 + shift: without, incomplete factorisations break down."""
-        if self.shifted is None:
-            self.shifted = self.K.duplicate(copy=True)
-        else:
-            self.K.copy(self.shifted, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        if len(bodies):
-            diagonal = np.linalg.inv(self.K.invertBlockDiagonal().reshape(-1, 6, 6))
-            enlarged = self.options.shift * diagonal.reshape(-1, 36)
-            self.shifted.setValuesBlockedRCV(bodies, bodies, enlarged, PETSc.InsertMode.ADD_VALUES)
-        self.shifted.assemble()
-        return self.shifted
-
     def report(self) -> list[str]:
         inner = self.its / max(self.solves, 1)
         return [f"through the bodies: {self.solves} solves with K, {inner:.1f} inner iterations on average"]
@@ -134,35 +110,7 @@ class BodySchur(PythonPC):
         if self.ksp is not None:
             for thing in (self.ksp, self.K, self._G, self._y, self._rhs, self._contact):
                 thing.destroy()
-            if self.shifted is not None:
-                self.shifted.destroy()
             self.ksp = None
-
-
-def _pairs(indptr: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All ordered pairs of entries of the same block row, itself included."""
-    count = np.diff(indptr)
-    start = np.repeat(indptr[:-1], count**2)
-    width = np.repeat(count, count**2)
-    within = np.arange(len(start)) - np.repeat(np.cumsum(count**2) - count**2, count**2)
-    return start + within // np.maximum(width, 1), start + within % np.maximum(width, 1)
-
-
-def _body_matrix(comm: PETSc.Comm, G: BlockRows) -> PETSc.Mat:
-    """K's structure: a block per body and per pair of bodies in contact."""
-    degree = PETSc.Vec().createMPI((G.columns, PETSc.DETERMINE), comm=comm)
-    degree.setValues(G.indices.astype(PETSc.IntType), np.ones(len(G.indices)), PETSc.InsertMode.ADD_VALUES)
-    degree.assemble()
-    most = (degree.array_r + 1).astype(PETSc.IntType)
-    total = degree.getSize()
-    degree.destroy()
-    K = PETSc.Mat().create(comm)
-    K.setSizes(((6 * G.columns, PETSc.DETERMINE), (6 * G.columns, PETSc.DETERMINE)))
-    K.setBlockSize(6)
-    K.setType(PETSc.Mat.Type.BAIJ)
-    K.setPreallocationNNZ((np.minimum(most, max(G.columns, 1)), np.minimum(most, max(total - G.columns, 1))))
-    K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-    return K
 
 
 def _largest_eigenvalue(G: PETSc.Mat, iterations: int = 15) -> float:

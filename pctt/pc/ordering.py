@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from petsc4py import PETSc
 
@@ -31,18 +33,33 @@ def block_order(P: PETSc.Mat) -> np.ndarray:
     return place
 
 
-def morton_codes(points: np.ndarray) -> np.ndarray:
-    """Interleaved bits of the coordinates (n, up to 3) on a grid over their bounding cube (n,).
+@dataclass(frozen=True)
+class Frame:
+    """A cube that points are placed in before they are numbered."""
+
+    low: np.ndarray
+    extent: float
+
+    @classmethod
+    def of(cls, points: np.ndarray) -> Frame:
+        """The bounding cube of points (n, d)."""
+        points = np.asarray(points, dtype=float).reshape(len(points), -1)
+        if len(points) == 0:
+            return cls(np.zeros(points.shape[1]), 1.0)
+        low = points.min(axis=0)
+        return cls(low, max(float((points.max(axis=0) - low).max()), float(np.finfo(float).tiny)))
+
+
+def morton_codes(points: np.ndarray, frame: Frame | None = None) -> np.ndarray:
+    """Interleaved bits of the coordinates (n, up to 3) on a grid over a cube, by default their bounding cube (n,).
 
     >>> morton_codes(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])).argsort()
     array([0, 1, 2, 3])
     """
     codes = np.zeros(len(points), np.int64)
-    if len(points) == 0:
-        return codes
-    low = points.min(axis=0)
-    extent = max(float((points.max(axis=0) - low).max()), np.finfo(float).tiny)
-    grid = ((points - low) * ((2**_BITS - 1) / extent)).astype(np.int64)
+    frame = Frame.of(points) if frame is None else frame
+    place = np.clip((points - frame.low) / frame.extent, 0.0, 1.0)
+    grid = (place * (2**_BITS - 1)).astype(np.int64)
     for bit in range(_BITS):
         for axis in range(grid.shape[1]):
             codes |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)

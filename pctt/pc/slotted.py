@@ -1,8 +1,8 @@
 """A Mat's blocks by slots: what a train compresses.
 
-A slot is a block row in the order of ``ordering.py``; each rank has a contiguous range of them. With block Cholesky
-scaling L_i L_i' = P_ii the matrix becomes I + T with T_ij = L_i^-1 P_ij L_j^-T, and T, without its diagonal, is what
-is compressed: the identity stays exact, and a train of rank zero is block Jacobi.
+Slots are those of ``slots.py``; an empty one stands for a row of the identity. With block Cholesky scaling L_i L_i' =
+P_ii the matrix becomes I + T with T_ij = L_i^-1 P_ij L_j^-T, and T, without its diagonal, is what is compressed: the
+identity stays exact, and a train of rank zero is block Jacobi.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.pc.ordering import block_order
+from pctt.pc.slots import Slots
 
 
 class SlottedMatrix:
@@ -21,27 +21,35 @@ class SlottedMatrix:
     Attributes
     ----------
     place : (n,) slot of each local block row, counted from ``first``
-    first, size : first slot of this rank, slots of all ranks
+    first, capacity, size : first slot of this rank, slots of this rank, slots of all ranks
     rows, columns : (nb,) global slots of the local blocks off the diagonal
-    root : (n, bs, bs) L_i^-1 of each local slot (scaled), in slot order
+    root : (capacity, bs, bs) L_i^-1 of each local slot (scaled), in slot order
     """
 
-    def __init__(self, P: PETSc.Mat, comm: MPI.Comm, scaled: bool):
+    def __init__(self, P: PETSc.Mat, slots: Slots, comm: MPI.Comm, scaled: bool):
         self.comm, self.block, self.scaled = comm, P.getBlockSize(), scaled
         count = P.getLocalSize()[0] // self.block
         self._counts = np.array(comm.allgather(count))
-        self.first, self.size = int(self._counts[: comm.rank].sum()), int(self._counts.sum())
-        self.place = block_order(P)
+        self._total = int(self._counts.sum())
+        self._capacities = np.array(comm.allgather(slots.capacity))
+        self.first, self.size = int(self._capacities[: comm.rank].sum()), int(self._capacities.sum())
+        self.place, self.capacity = slots.place, slots.capacity
+        own = int(self._counts[: comm.rank].sum())  # the first block row of this rank
         self._slot = self._gathered(self.first + self.place)  # of every global block row
         pattern = self._block_rows(P)
         row = np.repeat(np.arange(count), np.diff(pattern.indptr))
         self._row, self._column = row, pattern.indices
         self._kept = np.ones(len(row), bool)
         if scaled:
-            self._kept = pattern.indices != self.first + row
+            self._kept = pattern.indices != own + row
         self.rows = self.first + self.place[row[self._kept]]
         self.columns = self._slot[pattern.indices[self._kept]]
-        self.root = np.tile(np.eye(self.block), (count, 1, 1))
+        self._own = own
+        if not scaled:  # empty slots hold a multiple of the identity
+            empty = self.first + np.setdiff1d(np.arange(self.capacity), self.place)
+            self._empty = len(empty)
+            self.rows, self.columns = np.append(self.rows, empty), np.append(self.columns, empty)
+        self.root = np.tile(np.eye(self.block), (self.capacity, 1, 1))
 
     def load(self, P: PETSc.Mat) -> np.ndarray:
         """The blocks (nb, bs, bs) at ``rows`` and ``columns`` for P's present values, scaled if asked for.
@@ -50,29 +58,30 @@ class SlottedMatrix:
         """
         blocks = self._block_rows(P).data
         if not self.scaled:
-            return blocks
+            typical = P.getDiagonal().sum() / P.getSize()[0]
+            return np.concatenate([blocks, np.tile(typical * np.eye(self.block), (self._empty, 1, 1))])
         roots = self._inverse_roots(blocks)
         self.root[self.place] = roots
         everywhere = self._gathered(roots)
         left = sp.bsr_matrix((roots, np.arange(len(roots)), np.arange(len(roots) + 1)))
-        right = sp.bsr_matrix((everywhere.transpose(0, 2, 1), np.arange(self.size), np.arange(self.size + 1)))
+        right = sp.bsr_matrix((everywhere.transpose(0, 2, 1), np.arange(self._total), np.arange(self._total + 1)))
         scaled = left @ self._bsr(blocks) @ right  # scipy keeps the order of the blocks: one factor per block
         return scaled.data[self._kept]
 
     def _bsr(self, blocks: np.ndarray) -> sp.bsr_matrix:
         indptr = np.concatenate([[0], np.cumsum(np.bincount(self._row, minlength=len(self.place)))])
-        shape = (self.block * len(self.place), self.block * self.size)
+        shape = (self.block * len(self.place), self.block * self._total)
         return sp.bsr_matrix((blocks, self._column, indptr), shape=shape)
 
     def _inverse_roots(self, blocks: np.ndarray) -> np.ndarray:
-        diagonal = np.zeros_like(self.root)
-        on_diagonal = self._column == self.first + self._row
+        diagonal = np.zeros((len(self.place), self.block, self.block))
+        on_diagonal = self._column == self._own + self._row
         diagonal[self._row[on_diagonal]] = blocks[on_diagonal]
         return np.linalg.inv(np.linalg.cholesky(diagonal))
 
     def _block_rows(self, P: PETSc.Mat) -> sp.bsr_matrix:
         indptr, indices, values = P.getValuesCSR()
-        shape = (len(indptr) - 1, self.block * self.size)
+        shape = (len(indptr) - 1, self.block * self._total)
         rows = sp.csr_matrix((values, indices, indptr), shape=shape)
         return rows.tobsr((self.block, self.block))
 
@@ -81,7 +90,7 @@ class SlottedMatrix:
         if self.comm.size == 1:
             return local
         width = int(np.prod(local.shape[1:]))
-        out = np.empty((self.size, *local.shape[1:]), local.dtype)
+        out = np.empty((self._total, *local.shape[1:]), local.dtype)
         self.comm.Allgatherv(np.ascontiguousarray(local), [out, self._counts * width])
         return out
 
@@ -90,4 +99,4 @@ class SlottedMatrix:
         if self.comm.size == 1:
             out[:] = local
         else:
-            self.comm.Allgatherv(local, [out, self._counts * self.block])
+            self.comm.Allgatherv(local, [out, self._capacities * self.block])

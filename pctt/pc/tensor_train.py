@@ -18,6 +18,7 @@ from petsc4py import PETSc
 from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, option
 from pctt.pc.base import PythonPC
 from pctt.pc.rank_policy import RankPolicy
+from pctt.pc.slots import Slots
 from pctt.pc.slotted import SlottedMatrix
 from pctt.tt.als import Compression, compress
 from pctt.tt.apply import Apply
@@ -51,7 +52,12 @@ class Options:
     leaf: int = option(16, "least number of blocks in the first and last mode", check=AT_LEAST_ONE)
     modes: str = option("", "modes of the blocks with commas between; none: chosen for little padding")
     precision: str = option("double", "of the application; single is watched", choices=("double", "single"))
-    reuse: bool = option(True, "start from the cores of the last matrix of the same structure")
+    reuse: str = option(
+        "steps",
+        "newton: cores, index sets and block pairs of the last matrix of the same structure; steps: also its slots and "
+        "cores for the next structure; none: everything anew",
+        choices=("none", "newton", "steps"),
+    )
     seed: int = option(0, "seed of the random starts", check=COUNT)
     monitor: bool = option(False, "print a line per set-up")
 
@@ -72,6 +78,7 @@ class Account:
 
     setups: int = 0
     reused: int = 0
+    resets: int = 0
     setup_s: float = 0.0
     fallbacks: list[str] = field(default_factory=list)
 
@@ -90,11 +97,16 @@ class TensorTrain(PythonPC):
         self.rank = 1
         self._double = False  # single precision was found wanting
         self._jacobi: PETSc.PC | None = None
+        self.tree: Slots | None = None
         self._forget_structure()
+        self._forget_trains()
 
     def _forget_structure(self) -> None:
         self.slots: SlottedMatrix | None = None
         self.hierarchy: SparseHierarchy | None = None
+
+    def _forget_trains(self) -> None:
+        self.tree = None
         self.compression: Compression | Cross | None = None
         self.inverse: ApproximateInverse | None = None
         self._apply: Apply | None = None
@@ -104,6 +116,8 @@ class TensorTrain(PythonPC):
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         self.comm = P.comm.tompi4py()
         self._forget_structure()
+        if self.options.reuse != "steps":
+            self._forget_trains()
         if self.policy is None:
             self.policy = RankPolicy((self.options.max_rank,), self.options.rank == "auto")
         else:
@@ -133,13 +147,14 @@ class TensorTrain(PythonPC):
 
     def _make_train(self, P: PETSc.Mat, rank: int) -> bool:
         """Compress and invert; False, with the reason on the account, if no positive inverse came of it."""
+        if self.options.reuse == "none":
+            self._forget_structure()
+            self._forget_trains()
         if self.slots is None or self.hierarchy is None:
             with PETSc.Log.Event("TTBuild"):
-                self.slots = SlottedMatrix(P, self.comm, self.options.scaling == "block")
-                modes = self._modes(self.slots.size)
-                self.hierarchy = SparseHierarchy(
-                    self.slots.rows, self.slots.columns, modes, self.slots.block, self._add
-                )
+                self._build_hierarchy(P)
+                assert self.slots is not None
+                assert self.hierarchy is not None
         try:
             values, singular = self.slots.load(P), False
         except np.linalg.LinAlgError:
@@ -147,7 +162,7 @@ class TensorTrain(PythonPC):
         if self.comm.allreduce(singular, op=MPI.LOR):
             return self._refuse("a diagonal block is not positive definite")
         self.hierarchy.set_values(values)
-        warm = self.options.reuse and self.compression is not None
+        warm = self.compression is not None
         with PETSc.Log.Event("TTCompress"):
             self.compression = self._compress(rank, warm)
         with PETSc.Log.Event("TTInvert"):
@@ -158,6 +173,20 @@ class TensorTrain(PythonPC):
             return self._refuse(f"the inverse of rank {rank} is not positive")
         self._prepare_apply(self.inverse.train)
         return True
+
+    def _build_hierarchy(self, P: PETSc.Mat) -> None:
+        """The slots of P's block rows, those of the last structure where they fit, and the list of its block pairs."""
+        if self.tree is not None and not self.tree.follow(P, self._agree):
+            self.account.resets += 1
+            self._forget_trains()
+        if self.tree is None:
+            self.tree = Slots(P, self.options.leaf)
+        self.slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaling == "block")
+        modes = self._modes(self.slots.size)
+        self.hierarchy = SparseHierarchy(self.slots.rows, self.slots.columns, modes, self.slots.block, self._add)
+
+    def _agree(self, here: bool) -> bool:
+        return bool(self.comm.allreduce(here, op=MPI.LAND))
 
     def _compress(self, rank: int, warm: bool) -> Compression | Cross:
         assert self.hierarchy is not None
@@ -199,13 +228,13 @@ class TensorTrain(PythonPC):
         slots = self.slots
         if self._apply is None:
             bs = slots.block
-            rows = (slots.first * bs, (slots.first + len(slots.place)) * bs)
+            rows = (slots.first * bs, (slots.first + slots.capacity) * bs)
             dtype = np.float32 if self.options.precision == "single" and not self._double else np.float64
             self._apply = Apply(train, slots.size * bs, rows, dtype)
             if self.options.inverse == "root":
                 self._apply_transposed = Apply(train.T, slots.size * bs, rows, dtype)
-            self._local = np.empty((len(slots.place), bs))
-            self._scaled = np.empty((len(slots.place), bs, 1))
+            self._local = np.empty((slots.capacity, bs))
+            self._scaled = np.empty((slots.capacity, bs, 1))
             self._whole = np.empty(slots.size * bs)
         else:
             self._apply.set_train(train)
@@ -236,6 +265,8 @@ class TensorTrain(PythonPC):
         assert self._apply is not None
         with PETSc.Log.Event("TTApply"):
             slots, root = self.slots, self.slots.root
+            if slots.capacity > len(slots.place):
+                self._local[:] = 0.0
             self._local[slots.place] = x.array_r.reshape(-1, slots.block)
             np.matmul(root, self._local[:, :, None], out=self._scaled)
             z = self._inverse_times(self._scaled.ravel()).reshape(-1, slots.block, 1)
@@ -296,8 +327,8 @@ class TensorTrain(PythonPC):
         a = self.account
         lines = [
             f"tensor train: {self._line()}",
-            f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, scaling {self.options.scaling}, "
-            f"precision {'double' if self._double else self.options.precision}",
+            f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, trees made anew {a.resets}",
+            f"scaling {self.options.scaling}, precision {'double' if self._double else self.options.precision}",
         ]
         lines += [f"fell back: {why} ({a.fallbacks.count(why)} times)" for why in dict.fromkeys(a.fallbacks)]
         if self.policy is not None:
@@ -322,3 +353,4 @@ class TensorTrain(PythonPC):
             self._jacobi.destroy()
             self._jacobi = None
         self._forget_structure()
+        self._forget_trains()

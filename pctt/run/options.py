@@ -67,6 +67,12 @@ class Run:
     checkpoint_every: int = option(1, "steps between two checkpoints", check=AT_LEAST_ONE)
     problem: str = option("", "FCLIB file with a cone problem to solve instead of a scene")
     ccp_type: str = option("pdip", "solver of the cone problems", choices=ccp.SOLVERS)
+    ccp_newton: str = option(
+        "auto", "unknowns of the Newton systems; auto: contact for pdip, body for conic", choices=("auto", *ccp.FORMS)
+    )
+    ccp_compliance: float = option(
+        0.0, "compliance of the contacts, as a part of mean diag N; 0: rigid (docs/ccp.md)", check=NOT_NEGATIVE
+    )
     compare: str = option("", "preconditioners, with commas between, that each solve the same Newton systems")
     compare_every: int = option(1, "compare on every k-th Newton system", check=AT_LEAST_ONE)
 

@@ -23,6 +23,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
     except fclib.FileFormatError as error:
         raise FileError(str(error)) from None
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
+    newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
     start = time.perf_counter()
     result = ccp.solve(
         problem,
@@ -30,11 +31,12 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         options.run.ccp_type,
         options.limits,
         options.solver,
-        compare if compare.names else None,
+        newton,
     )
     seconds = time.perf_counter() - start
+    newton.destroy()
     accuracy = ccp.measure(problem, result.impulse)
-    newton = ccp.SOLVERS[options.run.ccp_type].newton
+    by_newton = ccp.SOLVERS[options.run.ccp_type].newton
     summary = {
         "problem": str(options.problem),
         "contacts": problem.size,
@@ -42,7 +44,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         "solver": options.run.ccp_type,
         "objective": accuracy.objective,
         "natural_residual": accuracy.natural_residual,
-        "newton_its": result.iterations if newton else 0,
+        "newton_its": result.iterations if by_newton else 0,
         "iterations": result.iterations,
         "ksp_its": result.ksp_its,
         "seconds": seconds,

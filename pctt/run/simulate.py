@@ -37,7 +37,8 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     record = checkpoint.scene_record(options.run.scene, options.scene)
     results = Results(Path(options.run.output), comm, record, world, options.run.restart)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
-    stepper = Stepper(options, world, memory, compare if compare.names else None)
+    newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
+    stepper = Stepper(options, world, memory, newton)
     method = f"{options.run.ccp_type} to {options.limits.tol:g}"
     progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
     progress.say(report.COLUMNS)
@@ -63,6 +64,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         progress.say(report.phase_table(lines))
     if compare.names:
         progress.say("\n" + report.compare_table(compare.summary(), compare.labels()))
+    newton.destroy()
     progress.say(f"\nresults: {results.folder}/state.h5, summary.json, checkpoint.h5")
 
 
@@ -85,9 +87,9 @@ class Stepper:
     impulse: np.ndarray
 
     def __init__(
-        self, options: Options, world: World, memory: ImpulseMemory, compare: ccp.Comparison | None = None
+        self, options: Options, world: World, memory: ImpulseMemory, newton: ccp.Newton | None = None
     ):
-        self.options, self.world, self.memory, self.compare = options, world, memory, compare
+        self.options, self.world, self.memory, self.newton = options, world, memory, newton
 
     def step(self) -> dict[str, Any]:
         """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no number)
@@ -101,7 +103,7 @@ class Stepper:
                 raise SceneError(f"step {world.step + 1}: {error}") from None
         with log.phase("assembly"):
             self.system = ContactSystem(world, self.contacts, options.dt, options.run.recovery_speed)
-            problem = cone_problem(self.system, world.comm)
+            problem = cone_problem(self.system, world.comm, options.run.ccp_compliance)
             guess, _ = self.memory.recall(self.system.key, self.system.frame)
         with log.phase("solve"):
             result, solver, newton_its = self._solve(problem, guess)
@@ -134,7 +136,7 @@ class Stepper:
         The result, the method that it is of, and the Newton steps made."""
         options = self.options
         asked = options.run.ccp_type
-        result = ccp.solve(problem, guess, asked, options.limits, options.solver, self.compare)
+        result = ccp.solve(problem, guess, asked, options.limits, options.solver, self.newton)
         newton_its = result.iterations if ccp.SOLVERS[asked].newton else 0
         if result.converged or asked == "apgd":
             return result, asked, newton_its
@@ -146,10 +148,12 @@ class Stepper:
         return result, asked, newton_its
 
 
-def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
+def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
     G = ccp.BlockRows(*system.G, columns=system.owned_bodies)
-    return ccp.ConeProblem(comm, system.r, system.mu, G=G, point=system.point, key=system.key)
+    return ccp.ConeProblem(
+        comm, system.r, system.mu, G=G, point=system.point, key=system.key, compliance=compliance
+    )
 
 
 def _first_state(options: Options, comm: MPI.Comm, progress: report.Progress) -> tuple[World, ImpulseMemory]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pctt.ccp.barrier import CONSTRAINTS, Perspective, Quadratic
-from pctt.ccp.pdip import _barrier_blocks
+from pctt.ccp.interior.barrier import CONSTRAINTS, Perspective, Quadratic
+from pctt.ccp.interior.pdip import _barrier_blocks
 
 BOTH = pytest.mark.parametrize("name", CONSTRAINTS)
 

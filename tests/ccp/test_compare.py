@@ -10,7 +10,7 @@ from problems import SELF, from_graph, heap, matrix
 
 from pctt import ccp
 from pctt.ccp import Comparison, Limits
-from pctt.ccp.krylov import Krylov
+from pctt.ccp.newton.krylov import Krylov
 from pctt.options import OptionError
 
 FIELDS = {"systems", "converged", "ksp_its_mean", "ksp_its_max", "setup_s", "solve_s", "true_residual_max"}
@@ -25,11 +25,15 @@ def system(size: int = 40):
     return dense, S, b, x
 
 
+def by(comparison: Comparison) -> ccp.Newton:
+    return ccp.newton_for(SELF, "pdip", compare=comparison)
+
+
 def compared(names: list[str], **keywords) -> Comparison:
     comparison = Comparison(SELF, names)
     _, S, b, x = system()
     comparison.run(S, b, x, **{"rtol": 1e-6, **keywords})
-    comparison.forget_systems()
+    comparison.destroy()
     return comparison
 
 
@@ -37,7 +41,7 @@ def test_every_preconditioner_solves_every_system():
     names = ["none", "jacobi", "pbjacobi", "ilu", "ilu-shifted", "icc-shifted", "sor", "cholesky"]
     comparison = Comparison(SELF, names)
     known, graph = heap()
-    result = ccp.solve(from_graph(known, graph), limits=Limits(1e-5), compare=comparison)
+    result = ccp.solve(from_graph(known, graph), limits=Limits(1e-5), newton=by(comparison))
     assert result.converged
     summary = comparison.summary()
     assert list(summary) == names
@@ -115,7 +119,7 @@ def test_where_none_converged_the_best_is_used_and_the_step_is_saved(database):
     best = min(record.solves[0].true_residual for record in comparison.records.values())
     assert done.true_residual == best == pytest.approx(np.linalg.norm(dense @ x.array - b.array) / b.norm())
     known, graph = heap()
-    result = ccp.solve(from_graph(known, graph), limits=Limits(1e-5), compare=Comparison(SELF, ["none"]))
+    result = ccp.solve(from_graph(known, graph), limits=Limits(1e-5), newton=by(Comparison(SELF, ["none"])))
     assert result.converged
     assert 0 < result.fallbacks <= result.iterations
     figures = ccp.measure(from_graph(known, graph), result.impulse)
@@ -127,7 +131,7 @@ def test_every_kth_system_is_compared():
     plain = ccp.solve(from_graph(known, graph), limits=Limits(1e-5))
     for every in (1, 2, 7, 1000):
         comparison = Comparison(SELF, ["pbjacobi"], every)
-        result = ccp.solve(from_graph(known, graph), limits=Limits(1e-5), compare=comparison)
+        result = ccp.solve(from_graph(known, graph), limits=Limits(1e-5), newton=by(comparison))
         assert comparison.summary()["pbjacobi"]["systems"] == -(-result.iterations // every)
         assert result.history == plain.history  # pbjacobi is what solves the others
         assert result.ksp_its == plain.ksp_its
@@ -139,7 +143,7 @@ def test_the_count_goes_on_over_several_problems():
     for contacts in (5, 30, 12):  # of other structures: nothing of the last may be left
         known, graph = heap(contacts, contacts)
         problem = from_graph(known, graph)
-        result = ccp.solve(problem, limits=Limits(1e-4), compare=comparison)
+        result = ccp.solve(problem, limits=Limits(1e-4), newton=by(comparison))
         assert result.converged
         systems += result.iterations
         problem.destroy()
@@ -206,7 +210,8 @@ comm = MPI.COMM_WORLD
 PETSc.Options()["compare_ilu_pc_factor_levels"] = 1
 comparison = Comparison(comm, ["ilu", "ilu-shifted", "icc", "pbjacobi", "python"])
 known, graph = heap(bodies=30)
-result = ccp.solve(from_graph(known, graph, comm), limits=Limits(1e-5), compare=comparison)
+newton = ccp.newton_for(comm, "pdip", compare=comparison)
+result = ccp.solve(from_graph(known, graph, comm), limits=Limits(1e-5), newton=newton)
 refused = False
 try:
     Comparison(comm, ["nonsense"])

@@ -38,15 +38,14 @@ class Krylov:
     work within each rank (block Jacobi).
     """
 
-    def __init__(
-        self, comm: MPI.Comm, prefix: str = "", defaults: dict[str, str] | None = None, rtol: float = 1e-3
-    ):
+    def __init__(self, comm: MPI.Comm, prefix: str = "", defaults: dict[str, str] | None = None, rtol: float = 1e-3):
         self.comm, self.prefix = comm, prefix
-        given = _with_defaults(prefix, defaults or {})
+        given, self._entered = _with_defaults(prefix, defaults or {})
         self.method = given["ksp_type"]
         self.name = factor_within_ranks(prefix, comm.size)
         self.scalar = given["pc_type"] in _SCALAR_FORMAT
         self._scalar_matrix: PETSc.Mat | None = None
+        self._converted: tuple[int, int] | None = None
         self.ksp = PETSc.KSP().create(comm)
         self.ksp.setOptionsPrefix(prefix)
         self.ksp.setTolerances(rtol=rtol, atol=1e-300, max_it=1000)
@@ -67,21 +66,38 @@ class Krylov:
             self.rtol = rtol
             self.ksp.setTolerances(rtol=rtol)
 
-    def solve(self, S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> Solve:
-        """x = S^-1 b from zero. A set-up or solve that breaks down is reported, never raised."""
+    def solve(
+        self,
+        A: PETSc.Mat,
+        b: PETSc.Vec,
+        x: PETSc.Vec,
+        rtol: float | None = None,
+        P: PETSc.Mat | None = None,
+        keep: bool = False,
+    ) -> Solve:
+        """x = A^-1 b from zero. A set-up or solve that breaks down is reported, never raised.
+
+        P : the Mat from which the preconditioner is made; none: A
+        keep : use the preconditioner of the last solve, whatever the matrix is now
+        """
+        if rtol is not None:
+            self.set_rtol(float(rtol))
         try:
-            return self._solve(S, b, x)
+            return self._solve(A, P if P is not None else A, b, x, keep)
         except PETSc.Error as error:
-            self.ksp.reset()
+            self.forget()
             if error.ierr == _NOT_SUPPORTED and not self.scalar:
                 self.scalar = True
-                return self.solve(S, b, x)
+                return self.solve(A, b, x, rtol, P)
             x.zeroEntries()
             return Solve(False, f"PETSc error {error.ierr}", 0, 0.0, 0.0, 1.0)
 
-    def _solve(self, S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> Solve:
+    def _solve(self, A: PETSc.Mat, P: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, keep: bool) -> Solve:
         start = _now(self.comm)
-        self.ksp.setOperators(self._in_format(S))
+        self.ksp.pc.setReusePreconditioner(keep)
+        if not keep:
+            formed = self._in_format(P)
+            self.ksp.setOperators(formed if A is P else A, formed)
         self.ksp.setUp()
         setup = _now(self.comm)
         x.zeroEntries()
@@ -90,26 +106,37 @@ class Krylov:
         end = _now(self.comm)
         if reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
             self.ksp.reset()  # else MUMPS, once failed, fails for every later matrix
-        true = _true_residual(S, b, x)
+        true = _true_residual(A, b, x)
         # twice: BiCGStab's recursive residual may drift a little without harm
         converged = reason > 0 and true <= 2 * self.rtol
         words = _REASONS.get(reason, str(reason))
         return Solve(converged, words, iterations, setup - start, end - setup, true)
 
-    def _in_format(self, S: PETSc.Mat) -> PETSc.Mat:
+    def _in_format(self, P: PETSc.Mat) -> PETSc.Mat:
         if not self.scalar:
-            return S
+            return P
+        version = (P.handle, P.stateGet())
         if self._scalar_matrix is None:
-            self._scalar_matrix = S.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
-        else:
-            S.convert(PETSc.Mat.Type.AIJ, self._scalar_matrix)
-        # a factorisation that takes S for definite fails where rounding has made it just indefinite
+            self._scalar_matrix = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
+        elif version != self._converted:  # else the preconditioner would be made anew
+            P.convert(PETSc.Mat.Type.AIJ, self._scalar_matrix)
+        self._converted = version
+        # a factorisation that takes the matrix for definite fails where rounding has made it just indefinite
         definite = self.ksp.pc.getType() not in ("cholesky", "lu")
         self._scalar_matrix.setOption(PETSc.Mat.Option.SPD if definite else PETSc.Mat.Option.SYMMETRIC, True)
         return self._scalar_matrix
 
+    def forget(self) -> None:
+        """The next matrix has another structure; a python preconditioner keeps what may serve that one too."""
+        self.ksp.reset()
+        if self._scalar_matrix is not None:
+            self._scalar_matrix.destroy()
+            self._scalar_matrix = None
+
     def destroy(self) -> None:
         self.ksp.destroy()
+        for name in self._entered:
+            PETSc.Options().delValue(name)
         if self._scalar_matrix is not None:
             self._scalar_matrix.destroy()
 
@@ -119,8 +146,8 @@ _REASONS = {
 }
 
 
-def _with_defaults(prefix: str, defaults: dict[str, str]) -> dict[str, str]:
-    """Enter defaults in the database where the user has said nothing; the type names in force.
+def _with_defaults(prefix: str, defaults: dict[str, str]) -> tuple[dict[str, str], list[str]]:
+    """Enter defaults in the database where the user has said nothing; the type names in force, and what was entered.
 
     A prefixed KSP takes the ``-ksp_*`` options of the one without prefix, so that compared preconditioners
     work under the same method and tolerance.
@@ -130,10 +157,10 @@ def _with_defaults(prefix: str, defaults: dict[str, str]) -> dict[str, str]:
     wanted = {"ksp_type": "bcgs", "pc_type": "pbjacobi"}
     if prefix:
         wanted |= {name: value for name, value in everything.items() if name.startswith("ksp_")}
-    for name, value in (wanted | defaults).items():
-        if prefix + name not in everything:
-            database[prefix + name] = value
-    return {name: database.getString(prefix + name) for name in wanted}
+    entered = {prefix + name: value for name, value in (wanted | defaults).items() if prefix + name not in everything}
+    for name, value in entered.items():
+        database[name] = value
+    return {name: database.getString(prefix + name) for name in wanted}, list(entered)
 
 
 def _true_residual(S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.ccp.krylov import Krylov, Solve
+from pctt.ccp.newton.krylov import Krylov, Solve
 from pctt.options import OptionError
 
 _BODY = {"ksp_type": "preonly", "pc_type": "python", "pc_python_type": "pctt.pc.BodySchur"}
@@ -64,12 +64,12 @@ class Comparison:
         self._seen += 1
         return (self._seen - 1) % self.every == 0
 
-    def run(self, S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
+    def run(self, A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: PETSc.Mat | None = None) -> Solve:
         """All preconditioners on one system; x is of the first that converged, else of the best."""
         chosen: Solve | None = None
         kept = None
         for name in self.names:
-            done = self._solver(name, rtol).solve(S, b, x)
+            done = self._solver(name).solve(A, b, x, rtol, P)
             self.records[name].solves.append(done)
             if chosen is None or (not chosen.converged and _is_better(done, chosen)):
                 chosen, kept = done, x.array.copy()
@@ -77,13 +77,12 @@ class Comparison:
         x.array[:] = kept
         return chosen
 
-    def set_rtol(self, rtol: float) -> None:
-        """Another relative tolerance for all, unless ``-ksp_rtol`` has fixed it."""
-        for krylov in self._krylov.values():
-            krylov.set_rtol(rtol)
-
-    def forget_systems(self) -> None:
+    def forget(self) -> None:
         """The next system has another structure."""
+        for krylov in self._krylov.values():
+            krylov.forget()
+
+    def destroy(self) -> None:
         for krylov in self._krylov.values():
             krylov.destroy()
         self._krylov.clear()
@@ -96,10 +95,10 @@ class Comparison:
         remark = " (within each rank)" if self.comm.size > 1 else ""
         return {name: name + remark * name.startswith(("ilu", "icc")) for name in self.names}
 
-    def _solver(self, name: str, rtol: float) -> Krylov:
+    def _solver(self, name: str) -> Krylov:
         if name not in self._krylov:
             defaults = NAMED.get(name, {"pc_type": name})
-            self._krylov[name] = Krylov(self.comm, f"compare_{name}_", defaults, rtol)
+            self._krylov[name] = Krylov(self.comm, f"compare_{name}_", defaults)
         return self._krylov[name]
 
 

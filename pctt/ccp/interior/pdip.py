@@ -21,10 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pctt.ccp.barrier import CONSTRAINTS, Perspective, Quadratic
-from pctt.ccp.compare import Comparison
 from pctt.ccp.cone import Array, step_to_boundary, step_to_zero
-from pctt.ccp.newton import SchurSystem
+from pctt.ccp.interior.barrier import CONSTRAINTS, Perspective, Quadratic
+from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 from pctt.log import phase
@@ -54,16 +53,15 @@ class PDIP:
     )
 
 
-def solve(
-    problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, compare: Comparison | None = None
-) -> Result:
+def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, newton: Newton) -> Result:
     """Impulses; ``guess`` (nc, 3) gives the normal impulses of persistent contacts, 0 elsewhere.
 
     Default iteration limit 100 Newton steps.
     """
     max_it = limits.max_it if limits.max_it >= 0 else 100
     cone = CONSTRAINTS[options.constraint](problem.mu)
-    system = SchurSystem(problem, min(1e-3, 10 * limits.tol), compare)
+    newton.begin(problem)
+    rtol = min(1e-3, 10 * limits.tol)  # of the linear solves, where ``-ksp_rtol`` does not say otherwise
     g, lam = _start(problem, guess, cone, options)
     history: list[float] = []
     tightened = 0
@@ -77,13 +75,13 @@ def solve(
             reason = f"{max_it} Newton steps"
             break
         if _stalls(history, iteration - tightened):  # the Newton directions are too inexact
-            system.tighten()
-            tightened = iteration
+            rtol, tightened = max(0.1 * rtol, 1e-12), iteration
         f, df = cone.value(g), cone.gradient(g)
         gap = problem.sum(-(lam @ f)) / problem.size
         barrier = options.centering * gap  # 1/t
-        system.update(_barrier_blocks(cone, g, lam, f, df))
-        dg = system.solve(-(y - (barrier / f)[:, None] * df))
+        newton.update(_barrier_blocks(cone, g, lam, f, df))
+        q = -(y - (barrier / f)[:, None] * df)
+        dg, _ = newton.solve(q, rtol * problem.norm(q) / np.sqrt(problem.mean_diagonal))
         dg[problem.mu == 0, 1:] = 0.0
         dlam = -(lam + (barrier + lam * (df * dg).sum(1)) / f)
         step = _step_length(problem, cone, g, lam, dg, dlam, options)
@@ -92,9 +90,8 @@ def solve(
             break
         g = g + step * dg
         lam = lam + step * dlam
-    system.destroy()
     converged = history[-1] <= limits.tol
-    return Result(g, converged, reason, history[-1], iteration, system.ksp_its, system.fallbacks, history)
+    return Result(g, converged, reason, history[-1], iteration, newton.ksp_its, newton.fallbacks, history)
 
 
 def _stalls(history: list[float], since: int) -> bool:

@@ -1,0 +1,177 @@
+"""Symmetric cone interior point method: Nesterov-Todd scaling, Mehrotra's predictor and corrector.
+
+In the variables s = (mu g_n, g_t) and z = (y_n / mu, y_t) all cones are the same and self-dual. The method follows
+the central path s o z = t e of
+
+    v = G' g,    y = G v + C g + r,    s and z in the cones, s'z = 0,
+
+with the mass-scaled momenta v as unknowns of their own: what an inexact linear solve leaves (``-ccp_newton body``)
+spoils v = G' g alone, which the next step mends. With H = W^-2, W the scaling of the pair (s, z), a step solves
+
+    G dv + C dg + r_z = dy,    dv = G' dg - r_v,    H ds + dz = c.
+
+Source: Nesterov and Todd (1997), Mehrotra (1992); Acary, Armand, Nguyen and Shpakovych, "Second-order cone
+programming for frictional contact mechanics using interior point algorithm", Optim. Methods Softw. (2023), for their
+use with friction. """
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pctt.ccp.cone import Array
+from pctt.ccp.interior import lorentz
+from pctt.ccp.interior.lorentz import NesterovTodd
+from pctt.ccp.newton import Newton
+from pctt.ccp.problem import ConeProblem
+from pctt.ccp.result import Limits, Result
+from pctt.log import phase
+from pctt.options import FRACTION, NOT_NEGATIVE, POSITIVE, option
+
+PATIENCE = 3  # iterations without progress before the Newton systems are sharpened
+
+
+@dataclass(frozen=True)
+class Conic:
+    """Options ``-ccp_conic_*``."""
+
+    start: float = option(
+        30.0, "complementarity of a cold start, in units of mean(r^2) / mean diag N", check=POSITIVE
+    )
+    warm: float = option(0.3, "the same of a start from the last impulses", check=POSITIVE)
+    forcing: float = option(
+        0.2, "residual of a linear solve, as a part of the root of the complementarity", check=POSITIVE
+    )
+    proximal: float = option(
+        1e-8, "compliance within a step, in units of mean diag N; the answer does not have it", check=NOT_NEGATIVE
+    )
+    boundary: float = option(0.99, "part of the way to the cone's boundary that a step may go", check=FRACTION)
+
+
+def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, newton: Newton) -> Result:
+    """Impulses; ``guess`` (nc, 3) holds those of the last step. Default iteration limit 60."""
+    max_it = limits.max_it if limits.max_it >= 0 else 60
+    newton.begin(problem)
+    scale, frictionless = _cone_scale(problem.mu)
+    s, z = _start(problem, guess, scale, frictionless, options)
+    v = problem.momentum(s / scale)
+    best, history, patience, last_gap = s / scale, [], 0, np.inf
+    for iteration in range(max_it + 1):
+        g = s / scale
+        r_v, r_z = _residuals(problem, g, z, v, scale, frictionless)
+        gap = problem.dot(s, z)
+        history.append(problem.natural_residual(g, _velocity(problem, g, frictionless)))
+        best = g if history[-1] <= min(history) else best
+        progress = history[-1] <= 0.9 * min(history[:-1], default=np.inf) or gap <= 0.5 * last_gap
+        patience, last_gap = (0 if progress else patience + 1), gap
+        if history[-1] <= limits.tol or iteration == max_it:
+            break
+        if patience > PATIENCE:
+            if not newton.sharpen():
+                break
+            patience = 0
+        W = NesterovTodd.of(s, z)
+        newton.update(*_barrier_blocks(problem, W, scale, frictionless, options.proximal))
+        tol = options.forcing * np.sqrt(gap)
+
+        def direction(c: Array, start: Array | None) -> tuple[Array, Array, Array, Array]:
+            dg, x = newton.solve((c - r_z) * scale, tol, r_v, start)  # noqa: B023 - used within the iteration
+            dv = newton.momentum(x, dg, r_v)  # noqa: B023
+            ds = dg * scale
+            if newton.primary == "momenta":  # r_z vanishes, r_v takes the error of the linear solve
+                dz = (problem.velocity_of(dv) + problem.compliance * dg) / scale + r_z  # noqa: B023
+            else:  # r_v vanishes, r_z takes it
+                dz = c - W.divide(W.divide(ds))  # noqa: B023
+            dz[frictionless, 1:] = ds[frictionless, 1:] = 0.0
+            return ds, dz, dv, x
+
+        with phase("ConicPredictor"):
+            ds, dz, dv, x = direction(-z, None)
+            reach = min(1.0, _step(problem, s, z, ds, dz))
+            target = (1.0 - reach) ** 3 * gap / problem.size
+        with phase("ConicCorrector"):
+            ds, dz, dv, x = direction(_centred(W, z, ds, dz, target), x)
+            step = min(1.0, options.boundary * _step(problem, s, z, ds, dz))
+            again = direction(_centred(W, z, ds, dz, target), x)
+            longer = min(1.0, options.boundary * _step(problem, s, z, *again[:2]))
+            if longer > step:
+                step, (ds, dz, dv, x) = longer, again
+        if step > 0:
+            s, z, v = s + step * ds, z + step * dz, v + step * dv
+    converged = history[-1] <= limits.tol
+    words = f"{max_it} iterations" if iteration == max_it else f"stalled after {iteration} iterations"
+    words = "natural residual below the tolerance" if converged else words
+    return Result(best, converged, words, min(history), iteration, newton.ksp_its, newton.fallbacks, history)
+
+
+def _cone_scale(mu: Array) -> tuple[Array, Array]:
+    """(mu, 1, 1) per contact (nc, 3), and which contacts have no friction: their normal is kept as it is, and their
+    tangential part, which the problem does not have, is held at zero."""
+    scale = np.ones((len(mu), 3))
+    frictionless = mu == 0
+    scale[:, 0] = np.where(frictionless, 1.0, mu)
+    return scale, frictionless
+
+
+def _velocity(problem: ConeProblem, g: Array, frictionless: Array) -> Array:
+    """y = N g + r but for the sliding of contacts without friction, which no impulse answers."""
+    y = problem.product(g) + problem.r
+    y[frictionless, 1:] = 0.0
+    return y
+
+
+def _residuals(
+    problem: ConeProblem, g: Array, z: Array, v: Array, scale: Array, frictionless: Array
+) -> tuple[Array, Array]:
+    """r_v = v - G' g and r_z = y / scale - z."""
+    r_z = (problem.velocity_of(v) + problem.compliance * g + problem.r) / scale - z
+    r_z[frictionless, 1:] = 0.0
+    return v - problem.momentum(g), r_z
+
+
+def _start(
+    problem: ConeProblem, guess: Array, scale: Array, frictionless: Array, options: Conic
+) -> tuple[Array, Array]:
+    """A pair on the central path near the guess: s - tau z = s_0 - tau z_0."""
+    s, z = guess * scale, _velocity(problem, guess, frictionless) / scale
+    s[frictionless, 1:] = 0.0
+    diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2
+    tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
+    closing = problem.dot(problem.r, problem.r) / problem.size
+    warm = problem.sum(int((guess[:, 0] > 0).sum())) > 0.5 * problem.size
+    amount = (options.warm if warm else options.start) * closing / problem.mean_diagonal
+    return lorentz.central_pair(s - tau[:, None] * z, tau, amount)
+
+
+def _barrier_blocks(
+    problem: ConeProblem, W: NesterovTodd, scale: Array, frictionless: Array, proximal: float
+) -> tuple[Array, Array]:
+    """B and (B + C)^-1 (nc, 3, 3) from the spectral form of the scaled blocks: no tiny block is inverted."""
+    with phase("CCPBarrier"):
+        squares = W.square_values()
+        soft = proximal * problem.mean_diagonal
+        yielding = problem.compliance[:, 1] + soft  # the same along all axes of the scaled variables
+        both = scale[:, :, None] * scale[:, None, :]
+        B = W.blocks(*(1.0 / k + soft for k in squares)) * both
+        inverse = W.blocks(*(k / (1.0 + yielding * k) for k in squares)) / both
+        if frictionless.any():
+            stiff = 1e12 * np.maximum(B[frictionless, 0, 0], problem.mean_diagonal)
+            B[frictionless, 1, 1] = B[frictionless, 2, 2] = stiff
+            inverse[frictionless, 1:] = inverse[frictionless, :, 1:] = 0.0
+        return B, inverse
+
+
+def _centred(W: NesterovTodd, z: Array, ds: Array, dz: Array, target: float) -> Array:
+    """The right-hand side c of H ds + dz = c that aims at s o z = target e, with the second-order term of the last
+    direction."""
+    aim = -lorentz.product(W.divide(ds), W.times(dz))
+    aim[:, 0] += target
+    return W.divide(lorentz.divide(W.times(z), aim)) - z
+
+
+def _step(problem: ConeProblem, s: Array, z: Array, ds: Array, dz: Array) -> float:
+    """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""
+    longest = problem.min(min(lorentz.step_to_boundary(s, ds), lorentz.step_to_boundary(z, dz)))
+    return longest if np.isfinite(problem.sum(float(ds.sum() + dz.sum()))) else 0.0
+

@@ -1,0 +1,176 @@
+"""Newton systems of the interior point methods, in one of three forms, and what solves them.
+
+An interior point step has barrier blocks B (nc, 3, 3), one per contact, and asks for impulses dg and mass-scaled
+momenta dv with
+
+    (N + C + B) dg = q + G r_v,    dv = G' dg - r_v,
+
+N = G G' + C the Delassus matrix with its compliance. ``-ccp_newton`` chooses the unknowns: ``contact`` (`contact.py`),
+``kkt`` (`kkt.py`), ``body`` (`body.py`). A `Newton` object lives as long as the simulation: Krylov methods and
+preconditioners stay from one cone problem to the next, and matrices too where the contacts are the same.
+"""
+
+from __future__ import annotations
+
+from typing import Union
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.ccp.cone import Array
+from pctt.ccp.newton.body import BodySystem
+from pctt.ccp.newton.compare import Comparison
+from pctt.ccp.newton.contact import ContactSystem
+from pctt.ccp.newton.kkt import KKTSystem
+from pctt.ccp.newton.linear import AskedFor, Cheapest
+from pctt.ccp.problem import ConeProblem
+from pctt.log import phase
+
+Linear = Union[AskedFor, Cheapest]
+System = Union[ContactSystem, KKTSystem, BodySystem]
+FORMS: dict[str, type[System]] = {"contact": ContactSystem, "kkt": KKTSystem, "body": BodySystem}
+_ASKED = {"pc_type", "ksp_type"}  # options that say how a system is to be solved
+SHARP_LIMIT = 50_000  # contacts: above, factors of the kkt system take too much memory
+REFINEMENTS = 3  # of a solution whose impulses rounding has made inexact
+DEFAULTS = {
+    "contact": {"ksp_type": "bcgs", "pc_type": "pbjacobi"},
+    "kkt": {"ksp_type": "preonly", "pc_type": "cholesky"},
+    "body": {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "pc_type": "pbjacobi"},
+}
+
+
+class Newton:
+    """The Newton systems of one cone problem after another.
+
+    form : of FORMS. The body form has its own ladder of preconditioners unless the options name a KSP or PC; a problem
+        that knows no bodies (given by N) is solved in the form `kkt` instead.
+
+    Attributes
+    ----------
+    ksp_its, fallbacks : of the present problem: Krylov iterations, systems not solved as asked for
+    """
+
+    def __init__(self, comm: MPI.Comm, form: str = "contact", compare: Comparison | None = None):
+        self.comm, self.form, self.compare = comm, form, compare
+        self.system: System | None = None
+        self._present = form
+        self._structure: tuple | None = None
+        self._linear: dict[str, Linear] = {}
+
+    def begin(self, problem: ConeProblem) -> None:
+        """Take the next problem; its structure is kept where contacts and bodies are those of the last."""
+        self.problem = problem
+        present = "kkt" if self.form == "body" and problem.contact_map is None else self.form
+        for linear in self._linear.values():
+            linear.begin()
+        structure = problem.structure()
+        same = self.system is not None and present == self._present and _equal(structure, self._structure)
+        if problem.comm.allreduce(same, op=MPI.LAND):
+            assert self.system is not None
+            self.system.load(problem)
+        else:
+            self._take(present)
+        self._structure = structure
+
+    def sharpen(self) -> bool:
+        """Go on with this problem in the form that rounding hurts least, `kkt`; False if that is so already, or too
+        large. Body systems of rigid contacts lose a natural residual of 1e-8: (B + C)^-1 grows like its inverse."""
+        if self._present == "kkt" or self.problem.size > SHARP_LIMIT or self.problem.low_rank is not None:
+            return False
+        self._take("kkt")
+        self._structure = None
+        return True
+
+    def _take(self, form: str) -> None:
+        self.forget()
+        self._present = form
+        self.system = FORMS[form](self.problem)
+        self._x, self._b = self.system.matrix.createVecs()
+
+    @property
+    def linear(self) -> Linear:
+        """What solves the systems of the present form."""
+        form = self._present
+        if form not in self._linear:
+            own_ladder = form == "body" and self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
+            prefix = "" if form == self.form else f"{form}_"
+            asked = AskedFor(self.comm, DEFAULTS[form], self.compare if form == self.form else None, prefix)
+            self._linear[form] = Cheapest(self.comm) if own_ladder else asked
+        return self._linear[form]
+
+    @property
+    def primary(self) -> str:
+        """What solutions are exact in but for the system's residual: momenta or impulses."""
+        return "momenta" if self._present == "body" else "impulses"
+
+    @property
+    def ksp_its(self) -> int:
+        return sum(linear.iterations for linear in self._linear.values())
+
+    @property
+    def fallbacks(self) -> int:
+        return sum(linear.fallbacks for linear in self._linear.values())
+
+    def update(self, barrier: Array, inverse: Array | None = None) -> None:
+        """New barrier blocks B (nc, 3, 3); ``inverse`` is (B + C)^-1 where the caller knows it better."""
+        with phase("CCPUpdate"):
+            assert self.system is not None
+            self.system.update(barrier, inverse)
+            self.linear.new_matrix(self.system)
+
+    def solve(self, q: Array, tol: float, r_v: Array | None = None, start: Array | None = None) -> tuple[Array, Array]:
+        """dg (nc, 3) and the system's solution x, to a residual of ``tol`` (sqrt J: of momenta; of velocities times
+        the root of the mean diagonal of N). ``start`` is an earlier x to begin from."""
+        with phase("CCPKrylov"):
+            assert self.system is not None
+            b = self.system.right_hand_side(q, r_v)
+            x = np.zeros_like(b)
+            if start is not None:
+                self._x.array[:] = x = start.copy()
+                self.system.matrix.mult(self._x, self._b)
+                b = b - self._b.array
+            wanted = self.system.tolerance(tol)
+            x += self._solve(b, wanted)
+            dg = self.system.impulses(x, q)
+            for _ in range(REFINEMENTS):
+                error = None if r_v is None else self.system.rounding(x, dg, r_v)
+                if error is None or self.problem.norm(error) <= 3 * wanted:
+                    break
+                more = self._solve(-error, wanted)
+                x += more
+                dg += self.system.impulses(more, np.zeros_like(q))
+            return dg, x
+
+    def _solve(self, b: Array, wanted: float) -> Array:
+        """x with a residual of norm ``wanted``."""
+        self._b.array[:] = b
+        norm = self._b.norm()
+        if norm <= wanted:
+            return np.zeros_like(b)
+        self.linear.solve(self._b, self._x, max(wanted / norm, 1e-14))
+        return self._x.array.copy()
+
+    def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
+        """dv of a solution x."""
+        assert self.system is not None
+        return self.system.momentum(x, dg, r_v)
+
+    def forget(self) -> None:
+        """Drop what belongs to the last problem's structure."""
+        for linear in self._linear.values():
+            linear.forget()
+        if self.system is not None:
+            for thing in (self.system, self._x, self._b):
+                thing.destroy()
+            self.system = None
+
+    def destroy(self) -> None:
+        self.forget()
+        for linear in self._linear.values():
+            linear.destroy()
+        self._linear.clear()
+
+
+def _equal(one: tuple, other: tuple | None) -> bool:
+    return other is not None and all(np.array_equal(a, b) for a, b in zip(one, other))

@@ -1,0 +1,78 @@
+"""The Newton system of the bodies, K = I + G' (B + C)^-1 G (6M x 6M, block size 6), in mass-scaled velocities.
+
+    K dv = G' (B + C)^-1 q - r_v,    dg = (B + C)^-1 (q - G dv).
+
+What an inexact solve leaves in K stays in the momenta: it is not multiplied by anything. K is smaller than the contact
+system and far better conditioned once contacts open or slide.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pctt.ccp.cone import Array
+from pctt.ccp.problem import ConeProblem
+from pctt.pc.body_matrix import BodyMatrix
+
+SHIFT = 0.03  # of the diagonal blocks, for incomplete factorisations
+
+
+class BodySystem:
+    """See the module; the same members as `ContactSystem`."""
+
+    def __init__(self, problem: ConeProblem):
+        if problem.contact_map is None:
+            raise ValueError("-ccp_newton body: the problem is given by N alone; allowed are contact and kkt")
+        self.problem = problem
+        self.body_matrix = BodyMatrix(problem.comm, problem.contact_map)
+        self.matrix = self.body_matrix.mat
+        if problem.point is not None:
+            self.matrix.setAttr("coordinates", self.body_matrix.places(problem.point))
+
+    def load(self, problem: ConeProblem) -> None:
+        """Take another problem with the same contacts between the same bodies."""
+        assert problem.contact_map is not None
+        self.problem = problem
+        self.body_matrix.load(problem.contact_map)
+
+    def update(self, barrier: Array, inverse: Array | None = None) -> None:
+        """K for the barrier blocks B, or for ``inverse`` = (B + C)^-1 where the caller has it more accurately."""
+        if inverse is None:
+            whole = barrier + self.problem.compliance_blocks
+            floor = 1e-14 * np.trace(whole, axis1=1, axis2=2)  # a block that rounding has made singular
+            inverse = np.linalg.inv(whole + floor[:, None, None] * np.eye(3))
+        self._inverse = inverse
+        self.body_matrix.update(inverse)
+
+    @property
+    def preconditioned(self):
+        return self.matrix
+
+    def enlarged(self):
+        """K with larger diagonal blocks, from which incomplete factorisations are made."""
+        return self.body_matrix.enlarged(SHIFT)
+
+    def right_hand_side(self, q: Array, r_v: Array | None) -> Array:
+        push = self.problem.momentum(_times(self._inverse, q))
+        return push if r_v is None else push - r_v
+
+    def impulses(self, x: Array, q: Array) -> Array:
+        return _times(self._inverse, q - self.problem.velocity_of(x))
+
+    def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
+        return x
+
+    def rounding(self, x: Array, dg: Array, r_v: Array) -> Array | None:
+        """dv - G' dg + r_v: the residual of K as the impulses see it. Late in an iteration it is larger than x's own,
+        as rounding in q - G dv comes back multiplied by the inverse of B."""
+        return x - self.problem.momentum(dg) + r_v
+
+    def tolerance(self, tol: float) -> float:
+        return tol
+
+    def destroy(self) -> None:
+        self.body_matrix.destroy()
+
+
+def _times(blocks: Array, x: Array) -> Array:
+    return (blocks @ x[:, :, None])[:, :, 0]

@@ -1,0 +1,90 @@
+"""The Newton system with multipliers, 5 unknowns per contact (5Nc x 5Nc, block size 5), symmetric and quasi-definite.
+
+The barrier block B = sum_i k_i v_i v_i' of a contact has entries without bound. Its two stiffest directions get
+unknowns of their own, the changes w_i of their multipliers, as the paper's two constraints per contact have before
+they are eliminated:
+
+    [ N + C + k_1 v_1 v_1'   d V  ] [dg]   [q]
+    [ d V'                -d^2 K^-1 ] [w ] = [0],     V = (v_2, v_3),  K = diag(k_2, k_3),
+
+d^2 = mean diag N. All entries stay bounded as contacts open or stick.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from petsc4py import PETSc
+
+from pctt.blocks import square_block_matrix
+from pctt.ccp.cone import Array
+from pctt.ccp.problem import ConeProblem
+
+
+class KKTSystem:
+    """See the module; the same members as `ContactSystem`."""
+
+    def __init__(self, problem: ConeProblem):
+        if problem.low_rank is not None:
+            raise NotImplementedError("-ccp_newton kkt: a body has too many contacts; allowed are contact and body")
+        self.problem = problem
+        indptr, indices, values = problem.N.getValuesCSR()
+        shape = (len(indptr) - 1, 3 * problem.size)
+        small = sp.csr_matrix((values, indices, indptr), shape=shape).tobsr((3, 3))
+        self._indptr, self._indices = small.indptr, small.indices
+        self.matrix = self.preconditioned = square_block_matrix(problem.comm, self._padded(small.data))
+        self.matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        if problem.point is not None:
+            self.matrix.setAttr("coordinates", problem.point)
+        first, last = self.matrix.getOwnershipRange()
+        self._block_rows = np.arange(first // 5, last // 5, dtype=PETSc.IntType)[:, None]
+
+    def _padded(self, blocks: Array) -> sp.bsr_matrix:
+        wide = np.zeros((len(blocks), 5, 5))
+        wide[:, :3, :3] = blocks
+        shape = (5 * (len(self._indptr) - 1), 5 * self.problem.size)
+        return sp.bsr_matrix((wide, self._indices, self._indptr), shape=shape)
+
+    def load(self, problem: ConeProblem) -> None:
+        """Take another problem with the same contacts between the same bodies."""
+        other = KKTSystem(problem)
+        other.matrix.copy(self.matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        other.destroy()
+        self.problem = problem
+
+    def update(self, barrier: Array, inverse: Array | None = None) -> None:
+        """Put the barrier blocks (nc, 3, 3) in."""
+        k, V = np.linalg.eigh(barrier)
+        scale = np.sqrt(self.problem.mean_diagonal)
+        blocks = np.zeros((len(barrier), 5, 5))
+        soft = V[:, :, 0]
+        blocks[:, :3, :3] = self.problem.diagonal_blocks
+        blocks[:, :3, :3] += np.maximum(k[:, 0], 0.0)[:, None, None] * soft[:, :, None] * soft[:, None, :]
+        blocks[:, :3, 3:] = scale * V[:, :, 1:]
+        blocks[:, 3:, :3] = scale * V[:, :, 1:].transpose(0, 2, 1)
+        tiny = np.finfo(float).tiny
+        blocks[:, [3, 4], [3, 4]] = -(scale**2) / np.maximum(k[:, 1:], tiny**0.5)
+        if len(blocks):
+            self.matrix.setValuesBlockedRCV(self._block_rows, self._block_rows, blocks.reshape(-1, 25))
+        self.matrix.assemble()
+
+    def right_hand_side(self, q: Array, r_v: Array | None) -> Array:
+        out = np.zeros((len(q), 5))
+        out[:, :3] = q if r_v is None else q + self.problem.velocity_of(r_v)
+        return out.ravel()
+
+    def impulses(self, x: Array, q: Array) -> Array:
+        return np.ascontiguousarray(x.reshape(-1, 5)[:, :3])
+
+    def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
+        return self.problem.momentum(dg) - r_v
+
+    def rounding(self, x: Array, dg: Array, r_v: Array) -> Array | None:
+        """Nothing: the impulses are the unknowns."""
+        return None
+
+    def tolerance(self, tol: float) -> float:
+        return tol * float(np.sqrt(self.problem.mean_diagonal))
+
+    def destroy(self) -> None:
+        self.matrix.destroy()

@@ -1,0 +1,109 @@
+"""Slots of the block rows of one matrix after another: the tree of the paper's evolving hierarchies.
+
+A slot is a place in the order along which a train is quantised; each rank has a contiguous range of them, in boxes of
+equal size along a Morton curve. Where the block rows have names (the Mat's attribute ``key``), a few slots stay
+empty, so that the rows of the next matrix can take and leave places: a row that stays near its box keeps its slot, a
+new one gets the nearest empty slot. Cores of a train for the last matrix are then a start for the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from petsc4py import PETSc
+
+from pctt.pc.ordering import Frame, block_order, morton_codes
+
+SPARE = 0.06  # part of the slots that is empty at first
+NEAR = 1  # boxes by which a row may be off without being moved
+REACH = 12  # boxes within which an empty slot is looked for
+
+
+class Slots:
+    """Slots of this rank's block rows.
+
+    Attributes
+    ----------
+    place : (n,) slot of each block row of the present matrix
+    capacity : slots of this rank
+    moved, entered, left : rows that got another slot, a first one, or were gone at the last `follow`
+    """
+
+    def __init__(self, P: PETSc.Mat, box: int):
+        """Rows along the curve, evenly spread; ``box`` slots make a box."""
+        count = P.getLocalSize()[0] // P.getBlockSize()
+        keys, points = P.getAttr("key"), P.getAttr("coordinates")
+        self.box = box
+        self.evolving = keys is not None and points is not None
+        order = np.argsort(block_order(P), kind="stable")
+        self.capacity = -(-int(np.ceil(count * (1 + SPARE))) // box) * box if self.evolving else count
+        self.place = np.empty(count, np.int64)
+        self.place[order] = np.arange(count) * self.capacity // max(count, 1)
+        self.moved = self.entered = self.left = 0
+        if self.evolving:
+            self._frame = Frame.of(points)
+            codes = morton_codes(points, self._frame)[order]
+            boxes = np.arange(self.capacity // box) * box
+            first = np.searchsorted(self.place[order], boxes)  # the first row at or after each box's start
+            self._starts = np.append(codes, np.iinfo(np.int64).max)[first]
+            self._remember(keys)
+
+    def _remember(self, keys: np.ndarray) -> None:
+        by_key = np.argsort(keys)
+        self._keys, self._key_places = np.asarray(keys)[by_key], self.place[by_key]
+
+    def follow(self, P: PETSc.Mat, agree: Callable[[bool], bool]) -> bool:
+        """Take the rows of another matrix; False, and nothing changes, if they do not fit or little would be kept.
+
+        ``agree`` tells whether all ranks say yes.
+        """
+        keys, points = P.getAttr("key"), P.getAttr("coordinates")
+        place = None
+        if self.evolving and keys is not None and points is not None:
+            place = self._follow(np.asarray(keys), np.asarray(points, dtype=float))
+        if not agree(place is not None):
+            return False
+        assert place is not None
+        self.place = place
+        self._remember(keys)
+        return True
+
+    def _follow(self, keys: np.ndarray, points: np.ndarray) -> np.ndarray | None:
+        if len(keys) > self.capacity:
+            return None
+        at = np.minimum(np.searchsorted(self._keys, keys), max(len(self._keys) - 1, 0))
+        known = self._keys[at] == keys if len(self._keys) else np.zeros(len(keys), bool)
+        home = np.searchsorted(self._starts, morton_codes(points, self._frame), side="right") - 1
+        home = np.clip(home, 0, len(self._starts) - 1)
+        place = np.full(len(keys), -1)
+        place[known] = self._key_places[at[known]]
+        stays = known & (np.abs(place // self.box - home) <= NEAR)
+        place[~stays] = -1
+        self.moved = int((known & ~stays).sum())
+        self.entered, self.left = int((~known).sum()), len(self._keys) - int(known.sum())
+        if stays.sum() < 0.5 * len(keys):
+            return None
+        free = np.ones(self.capacity, bool)
+        free[place[stays]] = False
+        for distance in range(REACH + 1):
+            for side in (1, -1) if distance else (1,):
+                _settle(place, home + side * distance, free, self.box)
+        return place if (place >= 0).all() else None
+
+
+def _settle(place: np.ndarray, target: np.ndarray, free: np.ndarray, box: int) -> None:
+    """Give rows without a place (-1) the empty slots of their target boxes, as far as these go."""
+    waiting = np.flatnonzero((place < 0) & (target >= 0) & (target < len(free) // box))
+    if len(waiting) == 0:
+        return
+    waiting = waiting[np.argsort(target[waiting], kind="stable")]
+    wanted = target[waiting]
+    turn = np.arange(len(wanted)) - np.searchsorted(wanted, wanted)  # how many wait for the same box before
+    empty = np.flatnonzero(free)
+    start = np.searchsorted(empty, wanted * box)
+    room = np.searchsorted(empty, (wanted + 1) * box) - start
+    served = turn < room
+    slots = empty[(start + turn)[served]]
+    place[waiting[served]] = slots
+    free[slots] = False
