@@ -7,18 +7,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import dataclasses
 from typing import Any
 
 import numpy as np
 
 from pctt.blocks import BlockRows
-from pctt.ccp import apgd, pdip
 from pctt.ccp.accuracy import Accuracy, measure
 from pctt.ccp.compare import Comparison
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
+from pctt.ccp.registry import SOLVERS
 from pctt.ccp.result import Limits, Result
 from pctt.log import phase
 
@@ -35,22 +34,6 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
-class Solver:
-    """A method of the registry: its function, its options class, whether it solves Newton systems."""
-
-    function: Callable[..., Result]
-    options: type
-    newton: bool
-    help: str
-
-
-SOLVERS = {
-    "pdip": Solver(pdip.solve, pdip.PDIP, True, "the paper's primal-dual interior point method"),
-    "apgd": Solver(apgd.solve, apgd.APGD, False, "accelerated projected gradient descent with restart"),
-}
-
-
 def solve(
     problem: ConeProblem,
     guess: Array | None = None,
@@ -65,6 +48,9 @@ def solve(
     instance of the method's options class; ``compare`` works with methods that solve Newton systems.
     """
     solver = SOLVERS[type]
+    limits = limits or Limits()
+    if limits.max_it < 0:
+        limits = dataclasses.replace(limits, max_it=solver.iterations)
     guess = np.zeros_like(problem.r) if guess is None else guess
     nothing = np.zeros_like(problem.r)
     if problem.size == 0:
@@ -73,4 +59,4 @@ def solve(
         return Result(nothing, True, "no contact closes", 0.0, 0)
     extra = {"compare": compare} if solver.newton else {}
     with phase("CCPSolve"):
-        return solver.function(problem, guess, limits or Limits(), options or solver.options(), **extra)
+        return solver.function(problem, guess, limits, options or solver.options(), **extra)
