@@ -7,21 +7,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import dataclasses
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from pctt.blocks import BlockRows
-from pctt.ccp import apgd
 from pctt.ccp.accuracy import Accuracy, measure
 from pctt.ccp.cone import Array
-from pctt.ccp.interior import conic, pdip
 from pctt.ccp.newton import FORMS, Newton
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
+from pctt.ccp.registry import SOLVERS
 from pctt.ccp.result import Limits, Result
 from pctt.log import phase
 
@@ -41,25 +39,6 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
-class Solver:
-    """A method of the registry: its function, its options class, whether it solves Newton systems."""
-
-    function: Callable[..., Result]
-    options: type
-    newton: bool
-    help: str
-
-
-SOLVERS = {
-    "pdip": Solver(pdip.solve, pdip.PDIP, True, "the paper's primal-dual interior point method"),
-    "conic": Solver(
-        conic.solve, conic.Conic, True, "symmetric cone interior point method with Nesterov-Todd scaling"
-    ),
-    "apgd": Solver(apgd.solve, apgd.APGD, False, "accelerated projected gradient descent with restart"),
-}
-
-
 def solve(
     problem: ConeProblem,
     guess: Array | None = None,
@@ -75,13 +54,16 @@ def solve(
     problem after another.
     """
     solver = SOLVERS[type]
+    limits = limits or Limits()
+    if limits.max_it < 0:
+        limits = dataclasses.replace(limits, max_it=solver.iterations)
     guess = np.zeros_like(problem.r) if guess is None else guess
     nothing = np.zeros_like(problem.r)
     if problem.size == 0:
         return Result(nothing, True, "no contacts", 0.0, 0)
     if problem.natural_residual(nothing, problem.r) == 0:
         return Result(nothing, True, "no contact closes", 0.0, 0)
-    arguments = (problem, guess, limits or Limits(), options or solver.options())
+    arguments = (problem, guess, limits, options or solver.options())
     with phase("CCPSolve"):
         if not solver.newton:
             return solver.function(*arguments)

@@ -9,24 +9,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+TINY = np.finfo(float).tiny
 
 
-def project(x: Array, mu: Array) -> Array:
-    """Euclidean projection of each row on its friction cone.
+def project(x: Array, mu: Array, out: Array | None = None) -> Array:
+    """Euclidean projection of each row on its friction cone; ``out`` may be x itself.
 
     >>> project(np.array([[1.0, 0.0, 1.0], [-1.0, 0.0, 0.1]]), np.array([1.0, 1.0]))
     array([[1., 0., 1.],
            [0., 0., 0.]])
     """
-    normal = x[:, 0]
-    tangential = np.hypot(x[:, 1], x[:, 2])
-    on_surface = np.maximum(normal + mu * tangential, 0.0) / (1.0 + mu * mu)  # 0 in the polar cone
-    inside = (tangential <= mu * normal) & (normal >= 0)  # mu normal is -0.0 without friction
-    shorten = ~inside & (tangential > 0)
-    shrink = np.divide(mu * on_surface, tangential, out=np.zeros_like(tangential), where=shorten)
-    out = np.empty_like(x)
-    out[:, 0] = np.where(inside, normal, on_surface)
-    out[:, 1:] = x[:, 1:] * np.where(inside, 1.0, shrink)[:, None]
+    out = np.empty_like(x) if out is None else out
+    normal, tangent_1, tangent_2 = x[:, 0], x[:, 1], x[:, 2]
+    tangential = tangent_1 * tangent_1
+    tangential += tangent_2 * tangent_2
+    np.sqrt(tangential, out=tangential)
+    # on the surface (n + mu t) / (1 + mu^2), which is below n inside the cone and below 0 in the polar cone
+    height = mu * tangential
+    height += normal
+    height /= 1.0 + mu * mu
+    np.maximum(height, normal, out=height)
+    np.maximum(height, 0.0, out=height)
+    out[:, 0] = height
+    radius = np.multiply(mu, height, out=height)
+    shrink = np.divide(radius, np.maximum(np.maximum(tangential, radius), TINY), out=radius)  # 1 inside
+    np.multiply(tangent_1, shrink, out=out[:, 1])
+    np.multiply(tangent_2, shrink, out=out[:, 2])
     return out
 
 

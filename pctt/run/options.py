@@ -120,8 +120,9 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     except ValueError as error:  # the scene's message starts with the name of its field
         raise OptionError(f"-scene_{error}") from None
     if run.compare and not solver.newton:
+        newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
         raise OptionError(
-            f"-compare {run.compare}: -ccp_type {run.ccp_type} solves no Newton systems; allowed is pdip"
+            f"-compare {run.compare}: -ccp_type {run.ccp_type} solves no Newton systems; allowed is {newton}"
         )
     options = Options(
         run,

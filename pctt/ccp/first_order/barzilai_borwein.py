@@ -1,0 +1,71 @@
+"""Projected Barzilai-Borwein method with adaptive nonmonotone line search.
+
+Dai and Fletcher, "Projected Barzilai-Borwein methods for large-scale box-constrained quadratic programming",
+Numer. Math. 100 (2005); on cones because the method asks for nothing but the projection. Steps alternate
+between the two Barzilai-Borwein lengths. A step is shortened, to the exact minimiser on its segment, only
+where the objective would rise above a reference value: the worst of the values since the best one, taken
+over when MEMORY steps have brought no new best. One product with N per iteration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pctt.ccp.cone import Array
+from pctt.ccp.first_order.progress import FirstOrder, Progress
+from pctt.ccp.first_order.scaled import ScaledProblem
+from pctt.ccp.problem import ConeProblem
+from pctt.ccp.result import Limits, Result
+
+MEMORY = 10
+
+
+@dataclass(frozen=True)
+class BarzilaiBorwein(FirstOrder):
+    """Options ``-ccp_barzilai_borwein_*``."""
+
+
+def solve(problem: ConeProblem, guess: Array, limits: Limits, options: BarzilaiBorwein) -> Result:
+    """Impulses from a first guess (nc, 3)."""
+    scaled = ScaledProblem(problem)
+    progress = Progress(scaled, limits, options)
+    x = scaled.start(guess)
+    y = scaled.gradient(x)
+    step = 1.0  # A has a diagonal of about one
+    reference, best, worst, since = np.inf, 0.0, 0.0, 0  # objectives, less that of x
+    while progress.goes_on(x, y):
+        d = y * -step
+        d += x
+        d = scaled.project(d)
+        d -= x
+        Ad = scaled.product(d)
+        progress.iterations += 1
+        slope, length, curvature, stretch = scaled.dots((y, d), (d, d), (d, Ad), (Ad, Ad))
+        slope = min(slope, -length / step)  # so it is for a projection; y'd drowns in rounding near the solution
+        fraction = 1.0
+        if curvature > 0 and slope + 0.5 * curvature > reference:
+            fraction = min(1.0, -slope / curvature)
+        change = fraction * slope + 0.5 * fraction**2 * curvature
+        reference, best, worst = reference - change, best - change, worst - change
+        if fraction != 1.0:
+            d *= fraction
+            Ad *= fraction
+        x = np.add(x, d, out=d)
+        y += Ad
+        if best > 0:
+            best, worst, since = 0.0, 0.0, 0
+        else:
+            worst, since = max(worst, 0.0), since + 1
+            if since == MEMORY:
+                reference, worst, since = worst, 0.0, 0
+        step = barzilai_borwein_step(length, curvature, stretch, progress.iterations)
+    return progress.result()
+
+
+def barzilai_borwein_step(length: float, curvature: float, stretch: float, iteration: int) -> float:
+    """The long step d'd / d'Ad in odd iterations, the short one d'Ad / |Ad|^2 in even ones; 1 if neither is one."""
+    if not curvature > 1e-14 * length:
+        return 1.0
+    return float(length / curvature if iteration % 2 else curvature / stretch)

@@ -1,0 +1,81 @@
+"""When a first-order method looks at its accuracy, why it stops, and what it hands back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pctt.ccp.cone import Array
+from pctt.ccp.first_order.scaled import ScaledProblem
+from pctt.ccp.result import Limits, Result
+from pctt.options import AT_LEAST_ONE, option
+
+PATIENCE = 5000  # iterations that may go by without a new best natural residual, by one per cent
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """Options of every first-order method."""
+
+    check: int = option(10, "iterations between two looks at the natural residual", check=AT_LEAST_ONE)
+
+
+class Progress:
+    """Counts the iterations of a method (products with N) and keeps its best point.
+
+    The objective of these methods need not fall in every step, and the natural residual falls in none of them
+    steadily: what is handed back is the best point that was looked at.
+    """
+
+    def __init__(self, problem: ScaledProblem, limits: Limits, options: FirstOrder):
+        self.problem, self.limits, self.check = problem, limits, options.check
+        self.iterations = 0
+        self.history: list[float] = []
+        self.reason = ""
+        self._best = np.inf
+        self._next_look = 0
+        self._gain = (np.inf, 0)  # natural residual and iteration of the last progress
+
+    def goes_on(self, x: Array, gradient: Array | None = None) -> bool:
+        """Whether to iterate further from x; looks at the natural residual where that is due.
+
+        ``gradient`` is A x + b if the method has it."""
+        if self.iterations < min(self._next_look, self.limits.max_it):
+            return True
+        self._next_look = self.iterations + self.check
+        residual = self._residual(x, gradient)
+        self.history.append(residual)
+        if residual < self._best or len(self.history) == 1:
+            self._best, self._point = residual, x.copy()
+        self.reason = self._why_stop(residual)
+        return not self.reason
+
+    def result(self) -> Result:
+        converged = self._best <= self.limits.tol
+        impulse = self.problem.impulse(self._point)
+        return Result(impulse, converged, self.reason, self._best, self.iterations, history=self.history)
+
+    def _residual(self, x: Array, gradient: Array | None) -> float:
+        """The natural residual; nan where x or its gradient is no number."""
+        if gradient is not None:
+            residual = self.problem.natural_residual(x, gradient)
+            # inf where x = 0, or x is no number; methods that update the gradient collect rounding: look twice
+            if self.limits.tol < residual < np.inf:
+                return residual
+        gradient = self.problem.gradient(x)
+        finite = np.isfinite(self.problem.dots((x, gradient))[0])
+        return self.problem.natural_residual(x, gradient) if finite else np.nan
+
+    def _why_stop(self, residual: float) -> str:
+        if residual <= self.limits.tol:
+            return "natural residual below the tolerance"
+        if np.isnan(residual):
+            return f"not a number after {self.iterations} iterations"
+        if self.iterations >= self.limits.max_it:
+            return f"{self.iterations} iterations"
+        if residual < 0.99 * self._gain[0]:
+            self._gain = (residual, self.iterations)
+        if self.iterations - self._gain[1] >= PATIENCE:
+            return f"no progress in the last {PATIENCE} of {self.iterations} iterations"
+        return ""

@@ -1,0 +1,95 @@
+"""The cone problem in unknowns of equal size, and the arithmetic on them that first-order methods share."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from petsc4py import PETSc
+
+from pctt.ccp import cone
+from pctt.ccp.cone import Array
+from pctt.ccp.problem import ConeProblem
+
+
+class ScaledProblem:
+    """min 1/2 x'Ax + b'x over friction cones, where the diagonal of A is about one.
+
+    x = S g, A = S^-1 N S^-1, b = S^-1 r. The diagonal S has two values per contact, the roots of its normal and
+    of its mean tangential entry of diag N: the cones stay friction cones, of friction mu s_t / s_n. This is
+    diagonal preconditioning by a metric in which the projection is still exact.
+    """
+
+    def __init__(self, problem: ConeProblem):
+        self.problem = problem
+        diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2)
+        size = np.empty_like(problem.r)
+        size[:, 0] = diagonal[:, 0]
+        size[:, 1:] = diagonal[:, 1:].mean(axis=1, keepdims=True)
+        self._scale = np.sqrt(np.where(size > 0, size, problem.mean_diagonal))
+        self._shrink = 1.0 / self._scale
+        self.mu = problem.mu * self._scale[:, 1] / self._scale[:, 0]
+        self.b = problem.r * self._shrink
+
+    def start(self, guess: Array) -> Array:
+        """The scaled point of a first guess of the impulses (nc, 3), in the cones."""
+        return self.project(guess * self._scale)
+
+    def impulse(self, x: Array) -> Array:
+        return x * self._shrink
+
+    def product(self, x: Array) -> Array:
+        """A x (nc, 3)."""
+        out = self.problem.product(x * self._shrink)
+        out *= self._shrink
+        return out
+
+    def gradient(self, x: Array) -> Array:
+        """A x + b (nc, 3)."""
+        out = self.product(x)
+        out += self.b
+        return out
+
+    def project(self, x: Array) -> Array:
+        """x moved to the nearest point of the cones, in place."""
+        return cone.project(x, self.mu, out=x)
+
+    def dots(self, *pairs: tuple[Array, Array]) -> Array:
+        """Scalar products of pairs of arrays over all contacts, in one reduction over the ranks."""
+        return self.problem.sum(np.array([np.vdot(x, y) for x, y in pairs]))
+
+    def matrix(self) -> PETSc.Mat:
+        """A as a Mat of its own."""
+        A = self.problem.N.duplicate(copy=True)
+        shrink = A.createVecLeft()
+        shrink.array[:] = self._shrink.ravel()
+        A.diagonalScale(shrink, shrink)
+        shrink.destroy()
+        return A
+
+    @cached_property
+    def blocks(self) -> Array:
+        """The 3 x 3 diagonal blocks of A (nc, 3, 3)."""
+        return self.problem.diagonal_blocks * (self._shrink[:, :, None] * self._shrink[:, None, :])
+
+    def block_steps(self) -> Array:
+        """1 over the largest eigenvalue of each contact's block of A, per unknown (nc, 3)."""
+        largest = np.linalg.eigvalsh(self.blocks)[:, -1]
+        return np.repeat(1.0 / np.where(largest > 0, largest, 1.0), 3).reshape(-1, 3)
+
+    def natural_residual(self, x: Array, gradient: Array) -> float:
+        """That of the impulse of x, in its own units."""
+        return self.problem.natural_residual(self.impulse(x), gradient * self._scale)
+
+    def largest_curvature(self, steps: int = 10) -> float:
+        """Estimate from below of the largest eigenvalue of A: ``steps`` power iterations from b."""
+        x = self.b
+        curvature = 1.0
+        for _ in range(steps):
+            norm = np.sqrt(self.dots((x, x))[0])
+            if not norm > 0:
+                break
+            Ax = self.product(x / norm)
+            curvature = self.dots((x, Ax))[0] / norm
+            x = Ax
+        return max(curvature, 1.0)  # the mean of diag A is 1

@@ -1,0 +1,80 @@
+"""The solvers of the cone problem: what ``-ccp_type``, the table of the documentation and the tests are made from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pctt.ccp.first_order import apgd, barzilai_borwein, gauss_seidel, gpminres, jacobi, kucera, spectral
+from pctt.ccp.interior import conic, pdip
+from pctt.ccp.result import Result
+from pctt.options import describe
+
+PRODUCT, MATRIX, NEWTON = "products with N", "rows of N", "Newton systems"
+
+
+@dataclass(frozen=True)
+class Solver:
+    """A method: ``function(problem, guess, limits, options)``, with a ``pctt.ccp.Newton`` after them if it solves Newton systems.
+
+    ``needs`` is PRODUCT, MATRIX or NEWTON; ``iterations`` the default limit (``-ccp_max_it``).
+    """
+
+    name: str
+    function: Callable[..., Result]
+    options: type
+    needs: str
+    iterations: int
+    help: str
+    source: str
+
+    @property
+    def newton(self) -> bool:
+        return self.needs == NEWTON
+
+    @property
+    def prefix(self) -> str:
+        """What the names of its options start with."""
+        return f"ccp_{self.name}_"
+
+
+SOLVERS = {
+    solver.name: solver
+    for solver in (
+        Solver("pdip", pdip.solve, pdip.PDIP, NEWTON, 100,
+               "the paper's primal-dual interior point method", "the paper, section 2.4"),
+        Solver("conic", conic.solve, conic.Conic, NEWTON, 60,
+               "symmetric cone interior point method, Nesterov-Todd scaling, Mehrotra's corrector",
+               "Nesterov, Todd 1997; Acary et al. 2023"),
+        Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
+               "accelerated projected gradient descent with restart", "Mazhar et al. 2015"),
+        Solver("barzilai_borwein", barzilai_borwein.solve, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,
+               "projected Barzilai-Borwein steps with an adaptive nonmonotone line search", "Dai, Fletcher 2005"),
+        Solver("spectral", spectral.solve, spectral.Spectral, PRODUCT, 20_000,
+               "preconditioned spectral projected gradient with fallback (P-SPG-FB)",
+               "Heyn et al. 2013; Birgin, Martinez, Raydan 2000"),
+        Solver("kucera", kucera.solve, kucera.Kucera, PRODUCT, 20_000,
+               "conjugate gradients in the faces of the cones, gradient projection between them",
+               "Kucera 2007, 2008"),
+        Solver("gpminres", gpminres.solve, gpminres.GPMINRES, PRODUCT, 20_000,
+               "gradient projection alternating with MINRES in a face", "Heyn et al. 2013"),
+        Solver("gauss_seidel", gauss_seidel.solve, gauss_seidel.GaussSeidel, MATRIX, 20_000,
+               "projected block Gauss-Seidel over the colours of the contact graph",
+               "Tasora, Anitescu 2011; Jones, Plassmann 1993"),
+        Solver("jacobi", jacobi.solve, jacobi.Jacobi, PRODUCT, 50_000,
+               "projected block Jacobi, relaxed by an exact line search", "Tasora, Anitescu 2011"),
+    )
+}  # fmt: skip
+
+
+def table() -> str:
+    """The solvers as a Markdown table."""
+    lines = ["| `-ccp_type` | method | needs | iterations | options and defaults | source |", "|" + "---|" * 6]
+    for solver in SOLVERS.values():
+        options = ", ".join(
+            f"`-{d.name} {str(d.default).lower() if isinstance(d.default, bool) else d.default}`"
+            for d in describe(solver.options, solver.prefix)
+        )
+        cells = [f"`{solver.name}`", solver.help, solver.needs, f"{solver.iterations:,}", options, solver.source]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"

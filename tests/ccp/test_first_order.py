@@ -1,0 +1,300 @@
+"""First-order methods: what they share, their steps, and how they end. All of the registry that solve no Newton
+systems are tested; that they find known optima is in test_solvers.py."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from problems import SELF, from_graph, from_matrix, heap, matrix
+
+from pctt import ccp
+from pctt.ccp import Limits
+from pctt.ccp.cone import margin, project
+from pctt.ccp.first_order import colouring, gauss_seidel, progress, spectral
+from pctt.ccp.first_order.faces import Face, GradientProjection
+from pctt.ccp.first_order.scaled import ScaledProblem
+
+METHODS = [name for name, solver in ccp.SOLVERS.items() if not solver.newton]
+EVERY = pytest.mark.parametrize("method", METHODS)
+
+
+def objective(problem: ccp.ConeProblem, g: np.ndarray) -> float:
+    return float(np.vdot(g, 0.5 * problem.product(g) + problem.r))
+
+
+# -- scaled problem -----------------------------------------------------------------------------------------
+
+
+def test_the_scaled_problem_is_the_same_problem():
+    known, graph = heap(mass_ratio=100.0)
+    problem = from_graph(known, graph)
+    scaled = ScaledProblem(problem)
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(40, 3))
+    g = scaled.impulse(x)
+    N = known.N
+    assert scaled.dots((x, scaled.product(x)))[0] == pytest.approx(g.ravel() @ N @ g.ravel())
+    assert scaled.dots((x, scaled.b))[0] == pytest.approx(np.vdot(g, known.r))
+    assert np.allclose(margin(x, scaled.mu) > 0, margin(g, known.mu) > 0)
+    blocks = scaled.blocks
+    assert np.allclose(blocks[:, 0, 0], 1.0)
+    assert np.allclose(blocks[:, 1, 1] + blocks[:, 2, 2], 2.0)
+    A = scaled.matrix()
+    A.convert("aij")
+    dense = A.getValues(range(120), range(120))
+    assert np.allclose(dense @ x.ravel(), scaled.product(x).ravel())
+    assert np.allclose(dense[:3, :3], blocks[0])
+    largest = np.linalg.eigvalsh(dense)[-1]
+    assert 0.8 * largest <= scaled.largest_curvature(50) <= largest * (1 + 1e-12)
+    y = scaled.gradient(scaled.start(g))
+    start = scaled.impulse(scaled.start(g))
+    expected = problem.natural_residual(start, problem.product(start) + problem.r)
+    assert scaled.natural_residual(scaled.start(g), y) == pytest.approx(expected)
+
+
+def test_an_impulse_in_the_cones_starts_as_it_is():
+    known, graph = heap()
+    scaled = ScaledProblem(from_graph(known, graph))
+    assert np.allclose(scaled.impulse(scaled.start(known.g)), known.g, atol=1e-14)
+
+
+# -- faces --------------------------------------------------------------------------------------------------
+
+
+def test_faces_of_projected_points():
+    mu = np.array([0.5, 0.5, 0.5, 0.0, 0.0])
+    x = project(np.array([[1.0, 0.1, 0], [1.0, 3, 4], [-1.0, 0.1, 0.1], [1.0, 2, 0], [-1.0, 0, 0]]), mu)
+    face = Face(x, mu)
+    assert face.inside.tolist() == [True, False, False, False, False]
+    assert face.sliding.tolist() == [False, True, False, True, False]
+    v = np.random.default_rng(0).normal(size=(5, 3))
+    part = face.part(v)
+    assert np.array_equal(part[0], v[0])
+    assert np.allclose(part[1], x[1] * (x[1] @ v[1]) / (x[1] @ x[1]))
+    assert np.array_equal(part[[2, 4]], np.zeros((2, 3)))
+    assert np.allclose(part[3], [v[3, 0], 0, 0])
+    assert np.allclose(face.part(part), part)  # a projection
+    assert face.same(Face(1.1 * x, mu))
+    assert not face.same(Face(x[::-1].copy(), mu))
+
+
+def test_the_way_in_a_face_ends_at_its_boundary():
+    rng = np.random.default_rng(1)
+    mu = rng.uniform(0.1, 1.0, 60)
+    x = project(rng.normal(size=(60, 3)) + [0.5, 0, 0], mu)
+    face = Face(x, mu)
+    assert min(face.inside.sum(), face.sliding.sum(), (~face.inside & ~face.sliding).sum()) > 5
+    p = face.part(rng.normal(size=(60, 3)))
+    way = face.way(x, p)
+    assert 0 < way < np.inf
+    assert margin(x + way * (1 - 1e-9) * p, mu).min() >= -1e-12
+    assert margin(x + way * (1 + 1e-6) * p, mu).min() < -1e-12 or (x + way * (1 + 1e-6) * p)[:, 0].min() < 0
+
+
+def test_a_gradient_projection_raises_a_bound_that_is_too_small_and_descends():
+    known, graph = heap()
+    scaled = ScaledProblem(from_graph(known, graph))
+    projection = GradientProjection(scaled)
+    projection.lipschitz = 0.05
+    x = scaled.start(np.zeros((40, 3)))
+    y = scaled.gradient(x)
+    values = []
+    products = 0
+    for _ in range(30):
+        values.append(scaled.dots((x, 0.5 * (y + scaled.b)))[0])
+        x, y, count = projection.step(x, y)
+        products += count
+    assert products > 30
+    assert 1.0 < projection.lipschitz < 2 * np.linalg.eigvalsh(known.N).max()
+    assert np.all(np.diff(values) <= 1e-14 * abs(values[-1]))
+    assert np.allclose(y, scaled.gradient(x))
+    assert margin(x, scaled.mu).min() >= -1e-13
+
+
+def test_the_line_search_takes_the_whole_step_where_it_may():
+    assert spectral._line_search(-1.0, 1.0, 0.0) == (1.0, -0.5)
+    assert spectral._line_search(-1.0, 3.0, 1.0) == (1.0, 0.5)  # a rise that is allowed
+    fraction, change = spectral._line_search(-1.0, 4.0, 0.0)
+    assert fraction == 0.25  # the minimiser on the segment
+    assert change == -0.125
+    assert spectral._line_search(-1.0, 1e3, 0.0)[0] >= 1e-4
+    assert spectral._line_search(0.0, 0.0, 0.0) == (1.0, 0.0)
+
+
+# -- colours and sweeps -------------------------------------------------------------------------------------
+
+
+def neighbourhood(known) -> colouring.Neighbourhood:
+    blocks = sp.csr_matrix(known.N).tobsr((3, 3))
+    return colouring.Neighbourhood(SELF, blocks.indptr, blocks.indices.copy())
+
+
+@pytest.mark.parametrize("hub", [False, True])
+def test_neighbours_have_different_colours(hub):
+    known, _ = heap(contacts=80, bodies=30, hub=hub)
+    graph = neighbourhood(known)
+    colour = colouring.colours(graph)
+    coupled = np.abs(known.N).reshape(80, 3, 80, 3).max(axis=(1, 3)) > 0
+    same = colour[:, None] == colour[None, :]
+    assert np.array_equal(coupled & same, np.eye(80, dtype=bool))
+    assert colour.min() == 0
+    assert colour.max() <= coupled.sum(1).max() - 1  # no more than a greedy colouring may need
+    # a colour is the smallest that is free
+    for k in range(colour.max()):
+        later = colour > k
+        assert (coupled[later][:, colour == k]).any(axis=1).all()
+
+
+def test_colours_are_kept_while_the_graph_stays(monkeypatch):
+    known, _ = heap(5)
+    first = colouring.colours(neighbourhood(known))
+    monkeypatch.setattr(colouring, "_jones_plassmann", lambda graph: pytest.fail("made anew"))
+    assert np.array_equal(colouring.colours(neighbourhood(known)), first)
+    monkeypatch.undo()
+    other, _ = heap(6)
+    assert not np.array_equal(colouring.colours(neighbourhood(other)), first)
+
+
+def test_a_sweep_is_gauss_seidel_contact_by_contact():
+    known, graph = heap(2, mu=np.arange(40) % 4 * 0.3)
+    scaled = ScaledProblem(from_graph(known, graph))
+    colour = colouring.colours(neighbourhood(known))
+    sweep = gauss_seidel.Sweep(scaled, 1.3)
+    x = scaled.start(np.abs(known.r))
+    swept = sweep(x)
+    expected = x.copy()
+    for c in np.argsort(colour, kind="stable"):
+        y = scaled.gradient(expected)[c]
+        step = 1.3 / np.linalg.eigvalsh(scaled.blocks[c])[-1]
+        expected[c] = project((expected[c] - step * y)[None], scaled.mu[c : c + 1])[0]
+    assert np.allclose(swept, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+    assert not np.allclose(swept, x)
+
+
+@pytest.mark.parametrize("method", ["jacobi", "gauss_seidel"])
+def test_every_iteration_descends(method, monkeypatch):
+    """From a start that is far off, on a singular N with a body of many contacts."""
+    known, graph = heap(1, hub=True, mass_ratio=100.0)
+    problem = from_graph(known, graph)
+    values = []
+    goes_on = progress.Progress.goes_on
+
+    def watched(self, x, gradient=None):
+        values.append(objective(problem, self.problem.impulse(x)))
+        return goes_on(self, x, gradient)
+
+    monkeypatch.setattr(progress.Progress, "goes_on", watched)
+    ccp.solve(problem, project(100 * np.abs(known.r), known.mu), method, Limits(1e-12, 40))
+    assert len(values) == 41
+    assert np.all(np.diff(values) < 0)
+
+
+# -- how runs end -------------------------------------------------------------------------------------------
+
+
+@EVERY
+def test_the_point_handed_back_is_the_best_that_was_looked_at(method):
+    known, graph = heap(1, hub=True)
+    problem = from_graph(known, graph)
+    options = ccp.SOLVERS[method].options(check=3)
+    result = ccp.solve(problem, type=method, limits=Limits(1e-14, 60), options=options)
+    assert not result.converged
+    assert result.natural_residual == min(result.history)
+    assert ccp.measure(problem, result.impulse).natural_residual == pytest.approx(result.natural_residual, rel=1e-6)
+
+
+@EVERY
+def test_an_accuracy_that_cannot_be_reached_ends_with_a_reason(method, monkeypatch):
+    monkeypatch.setattr(progress, "PATIENCE", 150)
+    known, graph = heap(bodies=60, contacts=10)
+    problem = from_graph(known, graph)
+    result = ccp.solve(problem, type=method, limits=Limits(1e-30))
+    if not result.converged:  # a residual of exactly zero is no stagnation
+        assert "no progress" in result.reason
+        assert result.natural_residual < 1e-12
+    assert result.iterations < ccp.SOLVERS[method].iterations
+    assert ccp.measure(problem, result.impulse).natural_residual < 1e-11
+
+
+@EVERY
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_matrix_with_a_nan_does_not_converge(method):
+    known, _ = heap(contacts=6, bodies=4)
+    N = known.N.copy()
+    N[0, 5] = N[5, 0] = np.nan
+    problem = ccp.ConeProblem(SELF, known.r, known.mu, N=matrix(SELF, N))
+    result = ccp.solve(problem, type=method, limits=Limits(1e-6))
+    assert not result.converged
+    assert "not a number" in result.reason
+    assert result.iterations <= 30
+
+
+@EVERY
+def test_a_good_start_saves_iterations(method):
+    known, graph = heap(4, bodies=60)
+    problem = from_graph(known, graph)
+    cold = ccp.solve(problem, type=method, limits=Limits(1e-5))
+    near = known.g * (1 + 1e-4 * np.random.default_rng(0).normal(size=(40, 3)))
+    warm = ccp.solve(problem, near, method, Limits(1e-5))
+    assert cold.converged
+    assert warm.converged
+    assert warm.iterations < cold.iterations
+
+
+def test_a_solution_given_by_n_and_by_g_is_the_same():
+    known, graph = heap(7)
+    for method in METHODS:
+        limits = Limits(1e-12, 20)
+        one, two = (ccp.solve(p, type=method, limits=limits) for p in (from_graph(known, graph), from_matrix(known)))
+        assert np.allclose(one.impulse, two.impulse, atol=1e-11)
+
+
+# -- several ranks ------------------------------------------------------------------------------------------
+
+PROGRAM = """
+import json
+import numpy as np
+from mpi4py import MPI
+from problems import from_graph, from_matrix, heap
+from pctt import ccp
+from pctt.ccp import Limits
+
+comm = MPI.COMM_WORLD
+last = comm.size - 1
+known, graph = heap(1, mu=np.arange(40) % 4 * 0.3)
+few, few_graph = heap(1, contacts=2, bodies=2)
+found = {}
+for name, problem in {
+    "even": from_graph(known, graph, comm),
+    "matrix": from_matrix(known, comm),
+    "uneven": from_graph(known, graph, comm, [0] * last + [40], [12] * comm.size),
+    "few": from_graph(few, few_graph, comm),
+}.items():
+    for method in {METHODS}:
+        result = ccp.solve(problem, type=method, limits=Limits(1e-13, 15))
+        said = (result.converged, result.reason, result.iterations, result.history)
+        assert comm.allgather(said) == [said] * comm.size
+        impulse = np.concatenate(comm.allgather(result.impulse))
+        found[name + " " + method] = [result.iterations, impulse.tolist()]
+    problem.destroy()
+if comm.rank == 0:
+    print(json.dumps(found))
+"""
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_iterates_do_not_depend_on_the_ranks(mpirun, ranks):
+    """Also where a rank has no contact. After 15 iterations rounding has not grown yet."""
+    found = json.loads(mpirun(PROGRAM.replace("{METHODS}", repr(METHODS)), ranks))
+    known, graph = heap(1, mu=np.arange(40) % 4 * 0.3)
+    few, few_graph = heap(1, contacts=2, bodies=2)
+    assert len(found) == 4 * len(METHODS)
+    for name, (iterations, impulse) in found.items():
+        problem = from_graph(few, few_graph) if name.startswith("few") else from_graph(known, graph)
+        alone = ccp.solve(problem, type=name.split()[1], limits=Limits(1e-13, 15))
+        assert abs(iterations - alone.iterations) <= (1 if name.startswith("few") else 0)
+        assert np.allclose(impulse, alone.impulse, rtol=0, atol=1e-9)

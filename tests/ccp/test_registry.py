@@ -1,0 +1,56 @@
+"""The registry of the solvers, and what is made from it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problems import from_graph, heap
+
+from pctt import ccp
+from pctt.ccp import Limits, registry
+from pctt.options import describe, read
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "ccp.md"
+
+
+def test_the_documentation_has_the_table_of_the_registry():
+    """If this fails: python -c "from pctt.ccp import registry; print(registry.table())" prints the new table."""
+    assert registry.table() in DOCS.read_text()
+
+
+@pytest.mark.parametrize("name", ccp.SOLVERS)
+def test_an_entry_is_complete(name):
+    solver = ccp.SOLVERS[name]
+    assert solver.name == name
+    assert re.fullmatch("[a-z_]+", name)
+    assert solver.help
+    assert solver.source
+    assert solver.iterations > 0
+    assert solver.needs in (registry.PRODUCT, registry.MATRIX, registry.NEWTON)
+    assert solver.newton == (solver.needs == registry.NEWTON)
+    assert read(solver.options, {}, solver.prefix) == solver.options()
+    row = next(line for line in registry.table().splitlines() if line.startswith(f"| `{name}`"))
+    for option in describe(solver.options, f"ccp_{name}_"):
+        assert option.help
+        assert f"-{option.name} " in row
+    assert f"| {solver.iterations:,} |" in row
+
+
+@pytest.mark.parametrize("name", ccp.SOLVERS)
+def test_the_default_limit_is_that_of_the_registry(name, monkeypatch):
+    """A limit that is asked for goes before it."""
+    known, graph = heap(contacts=5, bodies=3)
+    seen = []
+
+    def function(problem, guess, limits, options, **extra):
+        seen.append(limits.max_it)
+        return ccp.Result(np.zeros_like(guess), False, "nothing done", 1.0, 0)
+
+    solver = ccp.SOLVERS[name]
+    monkeypatch.setitem(ccp.SOLVERS, name, type(solver)(**{**vars(solver), "function": function}))
+    for limits in (None, Limits(), Limits(max_it=0), Limits(max_it=7)):
+        ccp.solve(from_graph(known, graph), type=name, limits=limits)
+    assert seen == [solver.iterations, solver.iterations, 0, 7]
