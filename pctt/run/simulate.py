@@ -20,6 +20,7 @@ from dem.world import World
 from pctt import ccp, log
 from pctt.options import OptionError
 from pctt.run import checkpoint, report
+from pctt.run.dump import Dump
 from pctt.run.options import Options
 from pctt.run.results import Results
 
@@ -34,10 +35,11 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     if options.demo:
         progress.say("no options: the demo; -help lists the options")
     world, memory = _first_state(options, comm, progress)
+    dump = Dump(options, world)
     record = checkpoint.scene_record(options.run.scene, options.scene)
     results = Results(Path(options.run.output), comm, record, world, options.run.restart)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
-    stepper = Stepper(options, world, memory, compare if compare.names else None)
+    stepper = Stepper(options, world, memory, compare if compare.names else None, dump)
     method = f"{options.run.ccp_type} to {options.limits.tol:g}"
     progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
     progress.say(report.COLUMNS)
@@ -85,9 +87,14 @@ class Stepper:
     impulse: np.ndarray
 
     def __init__(
-        self, options: Options, world: World, memory: ImpulseMemory, compare: ccp.Comparison | None = None
+        self,
+        options: Options,
+        world: World,
+        memory: ImpulseMemory,
+        compare: ccp.Comparison | None = None,
+        dump: Dump | None = None,
     ):
-        self.options, self.world, self.memory, self.compare = options, world, memory, compare
+        self.options, self.world, self.memory, self.compare, self.dump = options, world, memory, compare, dump
 
     def step(self) -> dict[str, Any]:
         """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no number)
@@ -106,6 +113,8 @@ class Stepper:
         with log.phase("solve"):
             result, solver, newton_its = self._solve(problem, guess)
             accuracy = ccp.measure(problem, result.impulse)
+        with log.phase("output"):
+            files = self.dump.step(self.system, problem, guess, result, self._asked) if self.dump else {}
         with log.phase("advance"):
             self.impulse = result.impulse
             advance(world, self.system.velocity(self.impulse), options.dt)
@@ -125,6 +134,7 @@ class Stepper:
             "fallbacks": result.fallbacks,
             "solver": solver,
             "asked_solver": options.run.ccp_type,
+            **files,
             "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
         }
 
@@ -134,7 +144,7 @@ class Stepper:
         The result, the method that it is of, and the Newton steps made."""
         options = self.options
         asked = options.run.ccp_type
-        result = ccp.solve(problem, guess, asked, options.limits, options.solver, self.compare)
+        result = self._asked = ccp.solve(problem, guess, asked, options.limits, options.solver, self.compare)
         newton_its = result.iterations if ccp.SOLVERS[asked].newton else 0
         if result.converged or asked == "apgd":
             return result, asked, newton_its
