@@ -24,6 +24,7 @@ from pctt.options import (
     read,
     refuse_unknown,
 )
+from pctt.run.dump import dump_folder
 from pctt.run.hdf5 import refuse_serial
 
 # what runs when no option is given
@@ -65,7 +66,17 @@ class Run:
     output: str = option("results", "folder for state.h5, checkpoint.h5 and summary.json")
     output_every: int = option(1, "steps between two records in state.h5; 0: none", check=COUNT)
     checkpoint_every: int = option(1, "steps between two checkpoints", check=AT_LEAST_ONE)
-    problem: str = option("", "FCLIB file with a cone problem to solve instead of a scene")
+    problem: str = option("", "FCLIB or PETSc binary file with a cone problem to solve instead of a scene")
+    problem_guess: bool = option(True, "start -problem from the guess in the file, if there is one")
+    dump_problem: str = option(
+        "",
+        "folder for the steps' cone problems as FCLIB and PETSc binary files; or names of the FCLIB files, with {step} "
+        "and perhaps {contacts} in them",
+    )
+    dump_steps: str = option("", "steps that -dump_problem writes, with commas between; none: every step")
+    dump_hard: int = option(
+        5, "how many cone problems that -ccp_type does not solve are written to the folder hard of -output", check=COUNT
+    )
     ccp_type: str = option("pdip", "solver of the cone problems", choices=ccp.SOLVERS)
     ccp_newton: str = option(
         "auto", "unknowns of the Newton systems; auto: contact for pdip, body for conic", choices=("auto", *ccp.FORMS)
@@ -139,8 +150,11 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     refuse_serial(comm)
     _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
     _refuse_missing("-problem", run.problem, comm)
+    problems = dump_folder(run)
     if not run.settle:
-        _refuse_unwritable(Path(run.output), comm)
+        _refuse_unwritable("-output", Path(run.output), comm)
+        if run.dump_problem:
+            _refuse_unwritable("-dump_problem", problems, comm)
     return options
 
 
@@ -190,7 +204,7 @@ def _refuse_missing(name: str, path: str, comm: MPI.Comm) -> None:
         raise OptionError(f"{name} {path}: no such file, or not readable")
 
 
-def _refuse_unwritable(folder: Path, comm: MPI.Comm) -> None:
+def _refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
     error = None
     if comm.rank == 0:
         try:
@@ -203,5 +217,5 @@ def _refuse_unwritable(folder: Path, comm: MPI.Comm) -> None:
     error = comm.bcast(error)
     if error:
         raise OptionError(
-            f"-output {folder}: cannot write there ({error}); allowed is a folder that can be written"
+            f"{name} {folder}: cannot write there ({error}); allowed is a folder that can be written"
         )

@@ -1,15 +1,17 @@
-"""Solve the cone problem of an FCLIB file: ``python -m pctt.run -problem FILE``."""
+"""Solve the cone problem of an FCLIB or PETSc binary file: ``python -m pctt.run -problem FILE``."""
 
 from __future__ import annotations
 
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 
 from pctt import ccp
-from pctt.ccp import fclib
+from pctt.ccp import fclib, petsc_binary
+from pctt.ccp.cone import Array
 from pctt.run.hdf5 import FileError, write_text
 from pctt.run.options import Options
 from pctt.run.report import compare_table
@@ -18,16 +20,14 @@ from pctt.run.report import compare_table
 def solve_file(options: Options, comm: MPI.Comm) -> None:
     """Solve, print the figures, and write them to summary.json in the output folder."""
     assert options.problem is not None
-    try:
-        problem = fclib.read(options.problem, comm)
-    except fclib.FileFormatError as error:
-        raise FileError(str(error)) from None
+    stored = _load(options.problem, comm)
+    problem, guess = stored.problem, stored.guess if options.run.problem_guess else None
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
     start = time.perf_counter()
     result = ccp.solve(
         problem,
-        None,
+        guess,
         options.run.ccp_type,
         options.limits,
         options.solver,
@@ -39,6 +39,9 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
     by_newton = ccp.SOLVERS[options.run.ccp_type].newton
     summary = {
         "problem": str(options.problem),
+        "format": stored.form,
+        "title": stored.title,
+        "start": "cold" if guess is None else "the guess in the file",
         "contacts": problem.size,
         "ranks": comm.size,
         "solver": options.run.ccp_type,
@@ -54,16 +57,46 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         "dual_violation": accuracy.dual_violation,
         "complementarity": accuracy.complementarity,
         "velocity_norm": accuracy.velocity_norm,
+        "references": {
+            name: _distance(problem, result.impulse, impulse)
+            for name, impulse in (("solution", stored.solution), ("guess", stored.guess))
+            if impulse is not None
+        },
         "compare": compare.summary(),
     }
     if comm.rank == 0:
         width = max(map(len, summary))
         for name, value in summary.items():
-            if name != "compare":
+            if not isinstance(value, dict) and value != "":
                 shown = f"{value:.12g}" if isinstance(value, float) else value
                 print(f"{name:{width}}  {shown}")
+        for name, figures in summary["references"].items():
+            listed = ", ".join(f"{word} {figure:.6g}" for word, figure in figures.items())
+            print(f"the file's {name}: {listed}")
         if compare.names:
             print("\n" + compare_table(compare.summary(), compare.labels()))
         if not result.converged:
             print(f"NOT CONVERGED: {result.reason}")
         write_text(Path(options.run.output) / "summary.json", json.dumps(summary, indent=1) + "\n")
+
+
+def _load(path: str, comm: MPI.Comm) -> fclib.Stored:
+    """The problem in a file of either format; FileError on all ranks if it is none."""
+    binary = comm.bcast(petsc_binary.is_one(path) if comm.rank == 0 else None)
+    try:
+        return (petsc_binary if binary else fclib).load(path, comm)
+    except fclib.FileFormatError as error:
+        raise FileError(str(error)) from None
+
+
+def _distance(problem: ccp.ConeProblem, impulse: Array, reference: Array) -> dict[str, Any]:
+    """How far W r + q, which is unique at the optimum, is from that of the file's own impulses, and how good
+    those are."""
+    distance = problem.norm(problem.product(impulse - reference))
+    accuracy = ccp.measure(problem, reference)
+    return {
+        "velocity_distance": distance,
+        "relative_distance": distance / (accuracy.velocity_norm or 1.0),
+        "natural_residual": accuracy.natural_residual,
+        "objective": accuracy.objective,
+    }

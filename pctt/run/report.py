@@ -23,6 +23,8 @@ def step_line(line: Mapping[str, Any]) -> str:
         remark += f"  ({line['fallbacks']} Newton systems by a fallback)"
     if line["solver"] != line["asked_solver"]:
         remark += f"  (by {line['solver']})"
+    if line.get("hard_problem"):
+        remark += f"  (hard problem kept: {line['hard_problem']})"
     return (
         f"{line['step']:6d} {line['time']:9.3f} {line['contacts']:9d} {line['iterations']:7d}"
         f" {line['ksp_its']:7d}  {line['natural_residual']:8.1e} {line['seconds']:15.2f} {search:7.2f}"

@@ -4,6 +4,7 @@
     frames/          one file per recorded step
     checkpoint.h5    all that ``-restart`` needs
     summary.json     figures per step, and of the compared preconditioners
+    hard/            cone problems that the asked-for solver did not solve
 
 Every file is written under a temporary name and renamed, so that a killed run leaves whole files only.
 """
@@ -23,6 +24,7 @@ from dem.contact.search import Contacts
 from dem.exchange import exchange
 from dem.system import ContactSystem
 from dem.world import World
+from pctt.run.dump import HARD
 from pctt.run.hdf5 import RowWriter, write_text, written
 
 
@@ -59,6 +61,9 @@ class Results:
             (self.folder / "state.h5").unlink(missing_ok=True)
         for step in frames.keys() - set(self._recorded):
             frames[step].unlink()
+        for path in (self.folder / HARD).glob("step??????_*its.h5"):
+            if not goes_on or int(path.name[4:10]) > world.step:
+                path.unlink()
 
     def record_step(
         self, world: World, contacts: Contacts, system: ContactSystem, impulse: np.ndarray

@@ -20,6 +20,7 @@ from dem.world import World
 from pctt import ccp, log
 from pctt.options import OptionError
 from pctt.run import checkpoint, report
+from pctt.run.dump import Dump
 from pctt.run.options import Options
 from pctt.run.results import Results
 
@@ -34,11 +35,12 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     if options.demo:
         progress.say("no options: the demo; -help lists the options")
     world, memory = _first_state(options, comm, progress)
+    dump = Dump(options, world)
     record = checkpoint.scene_record(options.run.scene, options.scene)
     results = Results(Path(options.run.output), comm, record, world, options.run.restart)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
-    stepper = Stepper(options, world, memory, newton)
+    stepper = Stepper(options, world, memory, newton, dump)
     method = f"{options.run.ccp_type} to {options.limits.tol:g}"
     progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
     progress.say(report.COLUMNS)
@@ -87,9 +89,14 @@ class Stepper:
     impulse: np.ndarray
 
     def __init__(
-        self, options: Options, world: World, memory: ImpulseMemory, newton: ccp.Newton | None = None
+        self,
+        options: Options,
+        world: World,
+        memory: ImpulseMemory,
+        newton: ccp.Newton | None = None,
+        dump: Dump | None = None,
     ):
-        self.options, self.world, self.memory, self.newton = options, world, memory, newton
+        self.options, self.world, self.memory, self.newton, self.dump = options, world, memory, newton, dump
 
     def step(self) -> dict[str, Any]:
         """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no number)
@@ -108,6 +115,8 @@ class Stepper:
         with log.phase("solve"):
             result, solver, newton_its = self._solve(problem, guess)
             accuracy = ccp.measure(problem, result.impulse)
+        with log.phase("output"):
+            files = self.dump.step(self.system, problem, guess, result, self._asked) if self.dump else {}
         with log.phase("advance"):
             self.impulse = result.impulse
             advance(world, self.system.velocity(self.impulse), options.dt)
@@ -127,6 +136,7 @@ class Stepper:
             "fallbacks": result.fallbacks,
             "solver": solver,
             "asked_solver": options.run.ccp_type,
+            **files,
             "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
         }
 
@@ -136,7 +146,7 @@ class Stepper:
         The result, the method that it is of, and the Newton steps made."""
         options = self.options
         asked = options.run.ccp_type
-        result = ccp.solve(problem, guess, asked, options.limits, options.solver, self.newton)
+        result = self._asked = ccp.solve(problem, guess, asked, options.limits, options.solver, self.newton)
         newton_its = result.iterations if ccp.SOLVERS[asked].newton else 0
         if result.converged or asked == "apgd":
             return result, asked, newton_its

@@ -1,4 +1,4 @@
-"""FCLIB files that the tests write themselves, broken ones, and three published problems."""
+"""Cone problems in files: FCLIB, read and written, broken files, three published problems; PETSc binary files."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import h5py
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import SELF, Known, heap
+from petsc4py import PETSc
+from problems import SELF, Known, from_graph, from_matrix, heap
 
 from pctt import ccp
-from pctt.ccp import Limits, fclib
-from pctt.ccp.fclib import FileFormatError
+from pctt.ccp import Limits, fclib, petsc_binary
+from pctt.ccp.fclib import FileFormatError, Info, Solution
 
 FORMATS = ["triplets", "triplets with duplicates", "csc", "csr"]
 FCLIB = Path(os.environ.get("PCTT_FCLIB", Path(__file__).resolve().parents[3] / "shared" / "fclib"))
@@ -100,17 +101,73 @@ def test_a_matrix_that_is_not_quite_symmetric_is_made_so(tmp_path):
 def test_a_global_problem_is_read(tmp_path, kind, block_mass):
     path, known, W = write_global(tmp_path / "global.hdf5", kind, block_mass)
     problem = fclib.read(path, SELF)
+    assert problem.contact_map is not None  # masses in 6 x 6 blocks: given by the bodies' map
     assert np.allclose(dense(problem), W, atol=1e-12 * np.abs(W).max())
     assert np.allclose(problem.r, known.r, atol=1e-12 * np.abs(known.r).max())
     assert np.array_equal(problem.mu, known.mu)
 
 
-def test_bilateral_constraints_are_refused(tmp_path):
+def test_a_mass_matrix_that_couples_bodies_gives_the_matrix(tmp_path):
+    """As of finite elements: N = H' M^-1 H, with the map of no body."""
+    path, known, _ = write_global(tmp_path / "global.hdf5")
+    with h5py.File(path, "a") as file:
+        H = _dense_triplets(file["fclib_global/H"])
+        n = len(H)
+        M = 3.0 * np.eye(n) + np.eye(n, k=1) + np.eye(n, k=-1)
+        del file["fclib_global/M"]
+        write_matrix(file["fclib_global"].create_group("M"), M, "csr")
+        f, w = file["fclib_global/vectors/f"][:], file["fclib_global/vectors/w"][:]
+    problem = fclib.read(path, SELF)
+    assert problem.contact_map is None
+    assert np.allclose(dense(problem), H.T @ np.linalg.solve(M, H), atol=1e-12)
+    assert np.allclose(problem.r.ravel(), w + H.T @ np.linalg.solve(M, f), atol=1e-12)
+
+
+def _dense_triplets(group: h5py.Group) -> np.ndarray:
+    """A matrix in CSC or in triplets, by the definition of the formats."""
+    m, n, nz = (int(group[name][0]) for name in ("m", "n", "nz"))
+    i, p, x = (group[name][:] for name in ("i", "p", "x"))
+    A = np.zeros((m, n))
+    if nz == -1:
+        for column in range(n):
+            near = slice(p[column], p[column + 1])
+            np.add.at(A, (i[near], column), x[near])
+    else:
+        assert nz >= 0
+        np.add.at(A, (i[:nz], p[:nz]), x[:nz])
+    return A
+
+
+def test_parts_of_global_problems_that_do_not_fit_are_refused(tmp_path):
     path, _, _ = write_global(tmp_path / "global.hdf5")
     with h5py.File(path, "a") as file:
-        write_matrix(file["fclib_global"].create_group("G"), np.eye(3), "csc")
-    with pytest.raises(FileFormatError, match=r"global\.hdf5.*bilateral"):
+        del file["fclib_global/vectors/w"]
+        file["fclib_global/vectors/w"] = np.zeros(3)
+    with pytest.raises(FileFormatError, match="do not fit together"):
         fclib.read(path, SELF)
+
+
+@pytest.mark.parametrize("name", ["global G", "local V", "local R"])
+def test_bilateral_constraints_are_refused(tmp_path, name):
+    form, matrix = name.split()
+    path = tmp_path / f"{form}.hdf5"
+    if form == "global":
+        write_global(path)
+    else:
+        write_local(path, heap(0, 12, 8)[0])
+    with h5py.File(path, "a") as file:
+        write_matrix(file[f"fclib_{form}"].create_group(matrix), np.eye(3), "csc")
+    with pytest.raises(FileFormatError, match=rf"{form}\.hdf5.*bilateral"):
+        fclib.read(path, SELF)
+
+
+def test_columns_outside_a_compressed_matrix_are_refused(tmp_path):
+    for kind in ("csc", "csr"):
+        path = write_local(tmp_path / "outside.hdf5", heap(0, 12, 8)[0], kind)
+        with h5py.File(path, "a") as file:
+            file["fclib_local/W/i"][4] = 4000
+        with pytest.raises(FileFormatError, match=r"outside\.hdf5"):
+            fclib.read(path, SELF)
 
 
 def set_(name: str, value):
@@ -212,6 +269,224 @@ def test_every_rank_gets_its_part_and_the_same_error(mpirun, tmp_path):
         assert float(objective) == pytest.approx(known.objective, rel=1e-5)
 
 
+# -- writing -----------------------------------------------------------------------------------------------
+
+
+def sparse_mat(A: np.ndarray) -> PETSc.Mat:
+    rows = sp.csr_matrix(A)
+    return PETSc.Mat().createAIJ(A.shape, csr=(rows.indptr, rows.indices, rows.data), comm=SELF)
+
+
+def random_solution(known: Known, n: int | None = None) -> Solution:
+    rng = np.random.default_rng(5)
+    u = (known.N @ known.g.ravel()).reshape(-1, 3) + known.r
+    return Solution(known.g, u, None if n is None else rng.normal(size=n))
+
+
+@pytest.mark.parametrize("given", ["G", "N"])
+def test_a_local_problem_is_written_and_read_again(tmp_path, given):
+    known, graph = heap(0, 12, 8)
+    problem = from_matrix(known) if given == "N" else from_graph(known, graph)
+    problem.point = np.random.default_rng(0).random((12, 3))
+    path, solution = tmp_path / "local.h5", random_solution(known)
+    guess = Solution(2 * known.g, known.r)
+    fclib.write_local(path, problem, Info("a heap", "of \u00b5 0.1 to 1", "random"), solution, guess)
+    assert [file.name for file in tmp_path.iterdir()] == ["local.h5"]
+    stored = fclib.load(path, SELF)
+    assert np.allclose(dense(stored.problem), known.N, atol=1e-14 * np.abs(known.N).max())
+    assert np.array_equal(stored.problem.r, known.r)
+    assert np.array_equal(stored.problem.mu, known.mu)
+    assert np.array_equal(stored.problem.point, problem.point)
+    assert np.array_equal(stored.solution, known.g)
+    assert np.array_equal(stored.guess, 2 * known.g)
+    assert (stored.form, stored.title) == ("FCLIB local", "a heap")
+
+
+def test_the_layout_is_that_of_fclib(tmp_path):
+    """What FCLIB's reader in C takes for granted: types, sizes, a zero at the end of strings, v of a global problem."""
+    known, _ = heap(0, 12, 8)
+    fclib.write_local(tmp_path / "l.h5", from_matrix(known), Info("a title"), random_solution(known))
+    with h5py.File(tmp_path / "l.h5") as file:
+        W = file["fclib_local/W"]
+        for name in ("m", "n", "nz", "nzmax"):
+            assert W[name].shape == (1,)
+            assert W[name].dtype == np.int32
+        assert W["nz"][0] == W["nzmax"][0] == len(W["i"]) == len(W["p"]) == len(W["x"]) == np.count_nonzero(known.N)
+        assert W["i"].dtype == W["p"].dtype == np.int32
+        assert np.allclose(_dense_triplets(W), known.N, atol=1e-14)
+        assert file["fclib_local/spacedim"][0] == 3
+        assert file["fclib_local/info/title"].id.get_type().get_size() == len("a title") + 1
+        assert set(file["fclib_local/info"]) == {"title", "description", "math_info"}
+        assert set(file["solution"]) == {"u", "r"}
+        assert "guesses" not in file
+        assert np.allclose(file["solution/u"][:], known.y.ravel(), atol=1e-12)
+
+
+@pytest.mark.parametrize("bodies_alone", [True, False], ids=["6 x 6 masses", "coupled masses"])
+def test_a_global_problem_is_written_and_read_again(tmp_path, bodies_alone):
+    rng = np.random.default_rng(2)
+    known, graph = heap(2, 15, 6)
+    H = graph.dense().T
+    n = len(H)
+    M = np.kron(np.eye(6), np.ones((6, 6))) if bodies_alone else np.ones((n, n))
+    roots = rng.normal(size=(n, n)) * np.tril(M)
+    M = roots @ roots.T + np.eye(n)
+    f, w = rng.normal(size=n), rng.normal(size=(15, 3))
+    state = random_solution(known, n)
+    fclib.write_global(tmp_path / "g.h5", sparse_mat(M), sparse_mat(H), f, w, known.mu, Info("bodies"), state, state)
+    stored = fclib.load(tmp_path / "g.h5", SELF)
+    assert (stored.problem.contact_map is not None) == bodies_alone
+    W = H.T @ np.linalg.solve(M, H)
+    assert np.allclose(dense(stored.problem), W, atol=1e-12 * np.abs(W).max())
+    q = w.ravel() + H.T @ np.linalg.solve(M, f)
+    assert np.allclose(stored.problem.r.ravel(), q, atol=1e-12 * np.abs(q).max())
+    assert np.array_equal(stored.solution, known.g)
+    with h5py.File(tmp_path / "g.h5") as file:
+        group = file["fclib_global"]
+        assert np.array_equal(_dense_triplets(group["H"]), H)
+        assert np.array_equal(_dense_triplets(group["M"]), M)
+        assert np.array_equal(group["vectors/f"][:], f)
+        assert np.array_equal(group["vectors/w"][:], w.ravel())
+        assert np.array_equal(file["solution/v"][:], state.v)
+        assert set(file["guesses/1"]) == {"u", "r", "v"}
+        assert file["guesses/number_of_guesses"][0] == 1
+
+
+def test_impulses_that_are_all_zero_are_no_reference(tmp_path):
+    known, _ = heap(0, 12, 8)
+    nothing = Solution(0 * known.g, known.r)
+    fclib.write_local(tmp_path / "zero.h5", from_matrix(known), None, nothing, nothing)
+    stored = fclib.load(tmp_path / "zero.h5", SELF)
+    assert stored.solution is None
+    assert stored.guess is None
+
+
+def test_a_solution_of_another_size_is_refused(tmp_path):
+    known, _ = heap(0, 12, 8)
+    path = write_local(tmp_path / "local.hdf5", known)
+    with h5py.File(path, "a") as file:
+        file["solution/r"] = np.ones(35)
+    with pytest.raises(FileFormatError, match="solution is not 36 finite numbers"):
+        fclib.read(path, SELF)
+
+
+@pytest.mark.parametrize("write", [fclib.write_local, petsc_binary.write], ids=["FCLIB", "PETSc"])
+def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path, write):
+    problem = from_matrix(heap(0, 12, 8)[0])
+    with pytest.raises(OSError, match=r"nowhere/local\.h5: cannot write"):
+        write(tmp_path / "nowhere" / "local.h5", problem)
+    path = tmp_path / "there.h5"
+    path.write_text("old")
+    (tmp_path / ".there.h5.tmp").mkdir()  # in the way
+    with pytest.raises(OSError, match=r"there\.h5: cannot write"):
+        write(path, problem)
+    assert path.read_text() == "old"
+
+
+# -- PETSc binary files ------------------------------------------------------------------------------------
+
+
+def test_a_petsc_file_is_written_loaded_by_petsc_and_read_again(tmp_path):
+    known, graph = heap(0, 12, 8)
+    path = tmp_path / "problem.petsc"
+    petsc_binary.write(path, from_graph(known, graph))
+    assert [file.name for file in tmp_path.iterdir()] == ["problem.petsc"]
+    assert petsc_binary.is_one(path)
+    assert not petsc_binary.is_one(write_local(tmp_path / "local.hdf5", known))
+    viewer = PETSc.Viewer().createBinary(str(path), "r", comm=PETSc.COMM_SELF)
+    N = PETSc.Mat().create(PETSc.COMM_SELF).load(viewer)
+    r, mu = (PETSc.Vec().create(PETSc.COMM_SELF).load(viewer) for _ in range(2))
+    assert np.allclose(N.convert("dense").getDenseArray(), known.N, atol=1e-14 * np.abs(known.N).max())
+    assert np.array_equal(r.array, known.r.ravel())
+    assert np.array_equal(mu.array, known.mu)
+    stored = petsc_binary.load(path, SELF)
+    assert stored.form == "PETSc binary"
+    assert np.allclose(dense(stored.problem), known.N, atol=1e-14 * np.abs(known.N).max())
+    assert np.array_equal(stored.problem.r, known.r)
+    assert np.array_equal(stored.problem.mu, known.mu)
+
+
+def test_broken_petsc_files_are_refused_by_name(tmp_path):
+    known, _ = heap(0, 12, 8)
+    path = tmp_path / "whole.petsc"
+    petsc_binary.write(path, from_matrix(known))
+    whole = path.read_bytes()
+    broken = tmp_path / "broken.petsc"
+    for length in (8, 100, len(whole) // 2, len(whole) - 4):
+        broken.write_bytes(whole[:length])
+        with pytest.raises(FileFormatError, match=r"broken\.petsc: no PETSc binary problem: [^\n]+$"):
+            petsc_binary.load(broken, SELF)
+    broken.write_bytes(whole[:-8] + np.array(-0.1, ">f8").tobytes())  # the last friction coefficient
+    with pytest.raises(FileFormatError, match="negative friction"):
+        petsc_binary.load(broken, SELF)
+
+
+WRITER = """
+import sys
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from problems import from_graph, heap, part
+from pctt.ccp import fclib, petsc_binary
+
+comm = MPI.COMM_WORLD
+known, graph = heap(0, 12, 8)
+problem = from_graph(known, graph, comm)
+mine = part(comm, 12)
+solution = fclib.Solution(known.g[mine], known.y[mine])
+fclib.write_local("local.h5", problem, fclib.Info(), solution, solution)
+petsc_binary.write("local.petsc", problem)
+
+H = graph.dense().T
+rows, columns = part(comm, 8), part(comm, 12)
+M, D = (PETSc.Mat().createAIJ(((6 * (rows.stop - rows.start), None), (width, None)), nnz=n, comm=comm)
+        for width, n in ((6 * (rows.stop - rows.start), 1), (3 * (columns.stop - columns.start), 36)))
+for i in range(6 * rows.start, 6 * rows.stop):
+    M[i, i] = 1.0 + i
+    for j in np.flatnonzero(H[i]):
+        D[i, j] = H[i, j]
+M.assemble()
+D.assemble()
+f = np.arange(48.0)[6 * rows.start : 6 * rows.stop]
+fclib.write_global("global.h5", M, D, f, known.r[mine], known.mu[mine], point=known.g[mine])
+failed = 0
+try:
+    fclib.write_local("nowhere/local.h5", problem)
+except OSError:
+    failed = 1
+assert comm.allreduce(failed) == comm.size
+
+for load, name in ((fclib.load, "local.h5"), (petsc_binary.load, "local.petsc"), (fclib.load, "global.h5")):
+    stored = load(name, comm)
+    assert np.array_equal(stored.problem.mu, known.mu[mine])
+    if name == "local.h5":
+        assert np.array_equal(stored.solution, known.g[mine]) and np.array_equal(stored.guess, known.g[mine])
+    g = known.g[mine]
+    if name == "global.h5":
+        assert stored.problem.contact_map is not None
+        assert np.array_equal(stored.problem.point, g)
+        W = H.T @ (H / (1.0 + np.arange(48))[:, None])
+        r = known.r.ravel() + H.T @ (np.arange(48.0) / (1.0 + np.arange(48)))
+    else:
+        W, r = known.N, known.r.ravel()
+    assert np.allclose(stored.problem.r, r.reshape(-1, 3)[mine], atol=1e-12)
+    assert np.allclose(stored.problem.product(g), (W @ known.g.ravel()).reshape(-1, 3)[mine], atol=1e-11)
+"""
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [2, 4])
+def test_files_written_and_read_by_several_ranks(mpirun, tmp_path, ranks):
+    mpirun(WRITER, ranks)
+    known, _ = heap(0, 12, 8)
+    for problem in (fclib.read(tmp_path / "local.h5", SELF), petsc_binary.load(tmp_path / "local.petsc", SELF).problem):
+        assert np.allclose(dense(problem), known.N, atol=1e-13 * np.abs(known.N).max())
+        assert np.array_equal(problem.r, known.r)
+
+
+# -- published problems ------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
     ("name", "contacts", "objective", "velocity_norm"),
     [
@@ -234,3 +509,41 @@ def test_published_problems(name, contacts, objective, velocity_norm, solver):
     assert figures.natural_residual <= 1.01e-7
     assert figures.objective == pytest.approx(objective, rel=1e-7)
     assert figures.velocity_norm == pytest.approx(velocity_norm, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "name", ["LMGC_100_PR_PerioBox-i00361-60-03000", "Box_Stacks-i0122-82-5", "Spheres-i099-356-679"]
+)
+def test_published_problems_are_written_and_read_again(tmp_path, name):
+    """Global ones are given by the map of their bodies, whose N is that of scipy's sparse products of M and H."""
+    path = FCLIB / f"{name}.hdf5"
+    if not path.exists():
+        pytest.skip(f"{path} is not here; PCTT_FCLIB names the folder of the FCLIB files")
+    stored = fclib.load(path, SELF)
+    with h5py.File(path) as file:
+        if "fclib_global" in file:
+            assert stored.form == "FCLIB global"
+            assert stored.problem.contact_map is not None
+            group = file["fclib_global"]
+            M, H = (
+                sp.coo_matrix((A["x"][:], (A["i"][:], A["p"][:])), (A["m"][0], A["n"][0])).tocsr()
+                for A in (group["M"], group["H"])
+            )
+            over_M = sp.diags(1.0 / M.diagonal()) @ H
+            W, q = (H.T @ over_M).toarray(), group["vectors/w"][:] + over_M.T @ group["vectors/f"][:]
+        else:
+            assert stored.form == "FCLIB local"
+            group = file["fclib_local"]
+            A = group["W"]
+            W = sp.csr_matrix((A["x"][:], A["i"][:], A["p"][:]), (A["m"][0], A["n"][0])).toarray()
+            W, q = 0.5 * (W + W.T), group["vectors/q"][:]
+    assert stored.title
+    assert stored.solution is None  # nothing but zeros there
+    assert np.allclose(dense(stored.problem), W, atol=1e-13 * np.abs(W).max())
+    assert np.allclose(stored.problem.r.ravel(), q, atol=1e-13 * np.abs(q).max())
+    for write, load in ((fclib.write_local, fclib.load), (petsc_binary.write, petsc_binary.load)):
+        write(tmp_path / "copy", stored.problem)
+        again = load(tmp_path / "copy", SELF).problem
+        assert np.allclose(dense(again), W, atol=1e-13 * np.abs(W).max())
+        assert np.array_equal(again.r, stored.problem.r)
+        assert np.array_equal(again.mu, stored.problem.mu)

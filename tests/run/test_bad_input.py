@@ -59,6 +59,15 @@ BAD_OPTIONS = {
     "-restart missing.h5": ["missing.h5", "no such file"],
     "-restart .": ["no such file"],
     "-problem missing.hdf5": ["missing.hdf5", "no such file"],
+    "-dump_hard -1": ["-1", ">= 0"],
+    "-dump_steps 3,x -dump_problem d": ["3,x", "whole numbers >= 1"],
+    "-dump_steps 0 -dump_problem d": ["0", "whole numbers >= 1"],
+    "-dump_steps 3": ["3", "-dump_problem"],
+    "-dump_problem d{contacts}.h5": ["d{contacts}.h5", "{step} in it"],
+    "-dump_problem d{stop}.h5": ["d{stop}.h5", "{step} in it"],
+    "-dump_problem d{step:x.h5": ["d{step:x.h5", "{step} in it"],
+    "-dump_problem d{step}": ["d{step}", ".h5 or .hdf5"],
+    "-dump_problem results/notes.txt": ["results/notes.txt", "folder that can be written"],
 }
 
 #: These go through the program, the others through its function that reads the options.

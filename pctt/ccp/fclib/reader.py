@@ -1,0 +1,128 @@
+"""FCLIB files read as cone problems."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+from scipy.sparse.linalg import spsolve
+
+from pctt.ccp.cone import Array
+from pctt.ccp.problem import ConeProblem
+from pctt.ccp.stored import FileFormatError, Stored, Whole, spread, symmetric_blocks
+
+
+def read(path: str | Path, comm: MPI.Comm) -> ConeProblem:
+    """The cone problem of an FCLIB file, its contacts in equal parts over the ranks.
+
+    A local problem is given by N = W. A global one is given by the map G = H' L^-T of the bodies, with
+    M = L L', where M has 6 x 6 blocks on its diagonal and nothing else, and otherwise by N = H' M^-1 H.
+    Raises FileFormatError on every rank where the file cannot be read as one.
+    """
+    return load(path, comm).problem
+
+
+def load(path: str | Path, comm: MPI.Comm) -> Stored:
+    """The cone problem as ``read`` gives it, with the solution and the first guess of the file if it has
+    impulses there: all published files have the groups, many with nothing but zeros in them."""
+    return spread(comm, path, "FCLIB", lambda: _whole(path))
+
+
+def _whole(path: str | Path) -> Whole:
+    with h5py.File(path, "r") as file:
+        form = next((form for form in ("local", "global") if f"fclib_{form}" in file), None)
+        if form is None:
+            raise FileFormatError("it has neither fclib_local nor fclib_global")
+        group = file[f"fclib_{form}"]
+        if int(np.ravel(group["spacedim"][()])[0]) != 3:
+            raise FileFormatError("its space dimension is not 3")
+        matrix, q = _local(group) if form == "local" else _global(group)
+        point = file["pctt/point"][()] if "pctt/point" in file else None
+        return Whole(
+            f"FCLIB {form}",
+            _text(group, "info/title"),
+            matrix,
+            q,
+            group["vectors/mu"][:],
+            _impulses(file, "solution/r"),
+            _impulses(file, "guesses/1/r"),
+            point,
+        )
+
+
+def _local(group: h5py.Group) -> tuple[sp.bsr_matrix, Array]:
+    """N = W and q."""
+    if "V" in group or "R" in group:
+        raise FileFormatError("it has bilateral constraints (V, R), which a cone problem has not")
+    return symmetric_blocks(_matrix(group["W"])), group["vectors/q"][:]
+
+
+def _global(group: h5py.Group) -> tuple[sp.bsr_matrix, Array]:
+    """G or N, and q = w + H' M^-1 f."""
+    if "G" in group:
+        raise FileFormatError("it has bilateral constraints (G), which a cone problem has not")
+    M, H = _matrix(group["M"]), _matrix(group["H"])
+    f, w = group["vectors/f"][:], group["vectors/w"][:]
+    if M.shape != (len(f), len(f)) or H.shape != (len(f), len(w)) or len(w) % 3:
+        raise FileFormatError(f"M {M.shape}, H {H.shape}, f {f.shape} and w {w.shape} do not fit together")
+    if not (np.isfinite(M.data).all() and (M.diagonal() > 0).all()):
+        raise FileFormatError("its mass matrix is not positive")
+    M = (0.5 * (M + M.T)).tocsr()
+    roots = _inverse_roots(M)
+    if roots is None:
+        H_over_M = sp.csr_matrix(spsolve(M.tocsc(), H.tocsc())).reshape(H.shape)
+        return symmetric_blocks(H.T @ H_over_M), w + H_over_M.T @ f
+    G = H.T.tocsr()
+    G.sort_indices()
+    G = G.tobsr((3, 6))
+    G.data = G.data @ roots[G.indices].transpose(0, 2, 1)
+    return G, w + G @ (roots @ f.reshape(-1, 6, 1)).ravel()
+
+
+def _inverse_roots(M: sp.csr_matrix) -> Array | None:
+    """L^-1 of the 6 x 6 diagonal blocks L L' of M (bodies, 6, 6); None if M is not made of such blocks."""
+    if M.shape[0] % 6:
+        return None
+    entries = M.tocoo()
+    entries.eliminate_zeros()
+    if (entries.row // 6 != entries.col // 6).any():
+        return None
+    blocks = np.zeros((M.shape[0] // 6, 6, 6))
+    blocks[entries.row // 6, entries.row % 6, entries.col % 6] = entries.data
+    try:
+        return np.linalg.inv(np.linalg.cholesky(blocks))
+    except np.linalg.LinAlgError:
+        raise FileFormatError("its mass matrix is not positive") from None
+
+
+def _matrix(group: h5py.Group) -> sp.csr_matrix:
+    """A matrix in triplets (nz >= 0: rows i, columns p, duplicates summed), CSC (-1) or CSR (-2).
+
+    fclib.h says of triplets that p holds the rows; the files have it as CSparse does.
+    """
+    m, n, nz = (int(np.ravel(group[name][()])[0]) for name in ("m", "n", "nz"))
+    i, p, x = (group[name][:] for name in ("i", "p", "x"))
+    if nz >= 0:
+        return sp.coo_matrix((x[:nz], (i[:nz], p[:nz])), shape=(m, n)).tocsr()
+    if nz not in (-1, -2):
+        raise FileFormatError(f"{group.name}/nz is {nz}; known are triplets (>= 0), CSC (-1) and CSR (-2)")
+    matrix = (sp.csc_matrix if nz == -1 else sp.csr_matrix)((x, i, p), shape=(m, n))
+    matrix.check_format(full_check=True)
+    matrix.sum_duplicates()
+    return matrix.tocsr()
+
+
+def _impulses(file: h5py.File, name: str) -> Array | None:
+    """Impulses of a solution or guess; None where there is none but zeros."""
+    impulses = file[name][()] if name in file else np.zeros(0)
+    return impulses if impulses.any() else None
+
+
+def _text(group: h5py.Group, name: str) -> str:
+    if name not in group:
+        return ""
+    text = np.ravel(group[name][()])[0]
+    return (text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)).strip("\0 \n")

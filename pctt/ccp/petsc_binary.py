@@ -1,0 +1,93 @@
+"""Cone problems in PETSc's binary format: the Mat N, then the Vecs r and mu.
+
+>>> viewer = PETSc.Viewer().createBinary("step000012_18213contacts.petsc", "r")    # doctest: +SKIP
+>>> N = PETSc.Mat().load(viewer)                                                   # doctest: +SKIP
+>>> r, mu = PETSc.Vec().load(viewer), PETSc.Vec().load(viewer)                     # doctest: +SKIP
+
+Rank 0 reads and writes, with objects of its own: the format does not depend on the number of ranks, and an
+error in collective input or output of PETSc leaves the other ranks waiting.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.ccp.cone import Array
+from pctt.ccp.gather import gather_matrix, gather_rows, write_whole
+from pctt.ccp.problem import ConeProblem
+from pctt.ccp.stored import FileFormatError, Stored, Whole, spread, symmetric_blocks
+
+# the first number of a file that begins with a Mat, MAT_FILE_CLASSID of petscmat.h, with 32- and 64-bit indices
+_BEGINNINGS = tuple((1211216).to_bytes(size, "big") for size in (4, 8))
+
+
+def is_one(path: str | Path) -> bool:
+    """Whether a file begins as these do."""
+    with open(path, "rb") as file:
+        return file.read(8).startswith(_BEGINNINGS)
+
+
+def write(path: str | Path, problem: ConeProblem) -> None:
+    """Write N, r, mu; collective. Raises OSError on all ranks if the file cannot be written."""
+    N = gather_matrix(problem.N)
+    vectors = [gather_rows(problem.comm, x).ravel() for x in (problem.r, problem.mu)]
+
+    def write_it(temporary: Path) -> None:
+        viewer = None
+        try:
+            viewer = PETSc.Viewer().createBinary(str(temporary), "w", comm=PETSc.COMM_SELF)
+            csr = (N.indptr.astype(PETSc.IntType), N.indices.astype(PETSc.IntType), N.data)
+            PETSc.Mat().createAIJ(N.shape, csr=csr, comm=PETSc.COMM_SELF).view(viewer)
+            for vector in vectors:
+                PETSc.Vec().createWithArray(vector, comm=PETSc.COMM_SELF).view(viewer)
+        except PETSc.Error as error:
+            raise OSError(_reason(error)) from None
+        finally:
+            if viewer is not None:
+                viewer.destroy()
+            temporary.with_name(f"{temporary.name}.info").unlink(missing_ok=True)
+
+    write_whole(path, problem.comm, write_it)
+
+
+def load(path: str | Path, comm: MPI.Comm) -> Stored:
+    """The cone problem of a file, its contacts in equal parts over the ranks; collective.
+
+    Raises FileFormatError on every rank where the file cannot be read as one.
+    """
+    return spread(comm, path, "PETSc binary", lambda: _whole(path))
+
+
+def _whole(path: str | Path) -> Whole:
+    viewer = None
+    try:
+        viewer = PETSc.Viewer().createBinary(str(path), "r", comm=PETSc.COMM_SELF)
+        N = PETSc.Mat().create(PETSc.COMM_SELF)
+        N.setType(PETSc.Mat.Type.AIJ)
+        N.load(viewer)
+        indptr, indices, values = N.getValuesCSR()
+        W = sp.csr_matrix((values, indices, indptr), shape=N.getSize())
+        r, mu = (_vector(viewer) for _ in range(2))
+    except PETSc.Error as error:
+        raise FileFormatError(_reason(error)) from None
+    finally:
+        if viewer is not None:
+            viewer.destroy()
+    return Whole("PETSc binary", "", symmetric_blocks(W), r, mu)
+
+
+def _vector(viewer: PETSc.Viewer) -> Array:
+    vector = PETSc.Vec().create(PETSc.COMM_SELF)
+    vector.setType(PETSc.Vec.Type.SEQ)
+    return np.array(vector.load(viewer).array)
+
+
+def _reason(error: PETSc.Error) -> str:
+    """The last line of an error, which says what is wrong; those above it are functions and lines of PETSc."""
+    last = str(error).splitlines()[-1]
+    return last.partition("] ")[2] or last

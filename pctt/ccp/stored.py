@@ -1,0 +1,141 @@
+"""A cone problem as a file holds it: whole on rank 0, which reads the file, then in parts on all ranks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+
+from pctt.blocks import BlockRows, square_block_matrix
+from pctt.ccp.cone import Array
+from pctt.ccp.problem import ConeProblem
+
+
+class FileFormatError(ValueError):
+    """A file that is no cone problem in a format known here; raised on all ranks alike."""
+
+
+@dataclass(frozen=True)
+class Whole:
+    """All of a file, for nc contacts; checked when made.
+
+    Attributes
+    ----------
+    form, title : the file's format in words, and what it says of itself
+    matrix : (3 nc, 6 bodies) the map G in 3 x 6 blocks, or (3 nc, 3 nc) the matrix N in 3 x 3 blocks
+    r : (3 nc,) velocities without impulses (m/s)
+    mu : (nc,) friction coefficients
+    solution, guess : (3 nc,) impulses (N s) or None
+    point : (nc, 3) contact points (m) or None
+    """
+
+    form: str
+    title: str
+    matrix: sp.bsr_matrix
+    r: Array
+    mu: Array
+    solution: Array | None = None
+    guess: Array | None = None
+    point: Array | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.mu)
+        if self.matrix.shape[0] != 3 * count or len(self.r) != 3 * count:
+            raise FileFormatError(
+                f"{count} friction coefficients, but a matrix {self.matrix.shape} and a vector {self.r.shape}"
+            )
+        if self.matrix.blocksize == (3, 3) and self.matrix.shape[1] != 3 * count:
+            raise FileFormatError(f"its matrix {self.matrix.shape} is not square")
+        finite = np.isfinite(self.matrix.data).all() and np.isfinite(self.r).all()
+        if not (finite and (np.isfinite(self.mu) & (self.mu >= 0)).all()):
+            raise FileFormatError("it has a NaN, an infinite value or a negative friction coefficient")
+        for name in ("solution", "guess", "point"):
+            array = getattr(self, name)
+            if array is not None and not (np.size(array) == 3 * count and np.isfinite(array).all()):
+                raise FileFormatError(f"its {name} is not {3 * count} finite numbers")
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A problem from a file, and with it the impulses (nc, 3) of this rank's contacts that the file has."""
+
+    problem: ConeProblem
+    form: str
+    title: str
+    solution: Array | None = None
+    guess: Array | None = None
+
+
+def symmetric_blocks(W: sp.spmatrix) -> sp.bsr_matrix:
+    """(W + W') / 2 in 3 x 3 blocks: matrices in files are symmetric up to the rounding of their writers."""
+    if W.shape[0] != W.shape[1] or W.shape[0] % 3:
+        raise FileFormatError(f"its matrix {W.shape} is not square with three rows per contact")
+    symmetric = (0.5 * (W + W.T)).tocsr()
+    symmetric.sort_indices()
+    return symmetric.tobsr((3, 3))
+
+
+def spread(comm: MPI.Comm, path: str | Path, format: str, read: Callable[[], Whole]) -> Stored:
+    """The problem that ``read`` finds on rank 0, contacts (and bodies) in equal parts over the ranks; collective.
+
+    Raises FileFormatError on every rank where ``read`` raises one, or what h5py, numpy and scipy raise for bad data.
+    """
+    parts: list[_Part] | None = None
+    error = None
+    if comm.rank == 0:
+        try:
+            whole = read()
+            parts = [_part(whole, rank, comm.size) for rank in range(comm.size)]
+        except (OSError, LookupError, ValueError, TypeError, RuntimeError) as reason:
+            error = f"{path}: no {format} problem: {reason}"
+    error = comm.bcast(error)
+    if error:
+        raise FileFormatError(error)
+    return comm.scatter(parts or []).stored(comm)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What one rank gets: a file's words, the vectors of the rank's contacts, and their rows of the matrix."""
+
+    form: str
+    title: str
+    mu: Array  # (nc,)
+    triples: dict[str, Array | None]  # r, solution, guess, point, (nc, 3)
+    rows: tuple[np.ndarray, np.ndarray, Array]  # indptr, indices, blocks
+    columns: int  # block columns that the rank owns
+    contacts: int  # on all ranks
+
+    def stored(self, comm: MPI.Comm) -> Stored:
+        """The problem of all parts; collective."""
+        indptr, indices, blocks = self.rows
+        G = N = None
+        if blocks.shape[1:] == (3, 6):
+            G = BlockRows(indptr, indices, blocks, self.columns)
+        else:
+            shape = (3 * len(self.mu), 3 * self.contacts)
+            N = square_block_matrix(comm, sp.bsr_matrix((blocks, indices, indptr), shape=shape))
+        r, solution, guess, point = (self.triples[name] for name in ("r", "solution", "guess", "point"))
+        assert r is not None
+        problem = ConeProblem(comm, r, self.mu, G=G, N=N, point=point)
+        return Stored(problem, self.form, self.title, solution, guess)
+
+
+def _part(whole: Whole, rank: int, ranks: int) -> _Part:
+    A, contacts, bodies = whole.matrix, len(whole.mu), whole.matrix.shape[1] // whole.matrix.blocksize[1]
+    mine = slice(contacts * rank // ranks, contacts * (rank + 1) // ranks)
+    near = slice(A.indptr[mine.start], A.indptr[mine.stop])
+    vectors = {name: getattr(whole, name) for name in ("r", "solution", "guess", "point")}
+    return _Part(
+        whole.form,
+        whole.title,
+        whole.mu[mine],
+        {name: None if x is None else np.reshape(x, (-1, 3))[mine] for name, x in vectors.items()},
+        (A.indptr[mine.start : mine.stop + 1] - near.start, A.indices[near], A.data[near]),
+        bodies * (rank + 1) // ranks - bodies * rank // ranks,
+        contacts,
+    )

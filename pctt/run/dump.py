@@ -1,0 +1,220 @@
+"""Cone problems of steps written to files: those that ``-dump_problem`` asks for, and hard ones by themselves.
+
+FCLIB files hold the global problem, M v = H r + f, u = H'v + w, because it says more than W does and takes
+less room (W of a packing has four times the nonzeros of H), and W follows from it. Bodies of prescribed
+motion have no rows: their velocity is part of w. With v_free the velocities without contacts,
+
+    f = M v_free,    H = D,    w = r - H' v_free    (gap/dt, and what the prescribed bodies move).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from dem import bodies
+from dem.system import ContactSystem
+from dem.world import World
+from pctt import ccp
+from pctt.ccp import fclib, petsc_binary
+from pctt.ccp.cone import Array
+from pctt.options import OptionError
+from pctt.run.hdf5 import FileError
+
+if TYPE_CHECKING:
+    from pctt.run.options import Options, Run
+
+HARD = "hard"  # folder of the hard problems within -output
+
+
+class Dump:
+    """Writes the cone problems of a run's steps; raises OptionError for a step that the run does not make."""
+
+    def __init__(self, options: Options, world: World):
+        self._options, self._world = options, world
+        run = self.run = options.run
+        self._steps = dump_steps(run)
+        outside = [step for step in self._steps if not world.step < step <= world.step + run.steps]
+        if outside:
+            raise OptionError(
+                f"-dump_steps {run.dump_steps}: there is no step {outside[0]}; "
+                f"this run makes steps {world.step + 1} to {world.step + run.steps}"
+            )
+        self._hard_left = run.dump_hard
+
+    def step(
+        self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result, asked: ccp.Result
+    ) -> dict[str, Any]:
+        """Write the problem of the step being made, before the bodies move, if it is to be; collective.
+
+        ``asked`` is what the asked-for solver made of it, ``result`` what the step goes on with. Returns what
+        the step's figures say of it; FileError if a file cannot be written.
+        """
+        comm, number = self._world.comm, self._world.step + 1
+        wanted = self.run.dump_problem and (not self._steps or number in self._steps)
+        hard = not asked.converged and self._hard_left > 0
+        files: dict[str, Any] = {"dumped": [], "hard_problem": ""}
+
+        def as_fclib(path: Path) -> None:
+            self._write_fclib(path, system, problem, guess, result, asked)
+
+        if problem.size and wanted:
+            path = problem_path(self.run.dump_problem, number, problem.size)
+            binary = path.with_suffix(".petsc")
+            _write(path, comm, as_fclib)
+            _write(binary, comm, lambda path: petsc_binary.write(path, problem))
+            files["dumped"] = [str(path), str(binary)]
+        if problem.size and hard:
+            self._hard_left -= 1
+            name = f"step{number:06d}_{problem.size}contacts_{asked.iterations}its.h5"
+            path = Path(self.run.output) / HARD / name
+            _write(path, comm, as_fclib)
+            files["hard_problem"] = str(path)
+        return files
+
+    def _write_fclib(
+        self,
+        path: Path,
+        system: ContactSystem,
+        problem: ccp.ConeProblem,
+        guess: Array,
+        result: ccp.Result,
+        asked: ccp.Result,
+    ) -> None:
+        """The global problem, the guess if there is one, and the solution if the step has one."""
+        dynamic, M = _mass(self._world)
+        H = _dynamic_rows(system, dynamic)
+        v_free = M.createVecLeft()
+        v_free.array = system.free_velocity[dynamic].ravel()
+        f, moved = M.createVecLeft(), H.createVecRight()
+        M.mult(v_free, f)
+        H.multTranspose(v_free, moved)
+        w = problem.r - moved.array.reshape(-1, 3)
+
+        def state(g: Array) -> fclib.Solution:
+            return fclib.Solution(g, problem.product(g) + problem.r, system.velocity(g)[dynamic].ravel())
+
+        guess_known = problem.norm(guess) > 0
+        fclib.write_global(
+            path,
+            M,
+            H,
+            f.array,
+            w,
+            problem.mu,
+            self._info(problem, result, asked),
+            state(result.impulse) if result.converged else None,
+            state(guess) if guess_known else None,
+            system.point,
+        )
+        for petsc_object in (M, H, v_free, f, moved):
+            petsc_object.destroy()
+
+    def _info(self, problem: ccp.ConeProblem, result: ccp.Result, asked: ccp.Result) -> fclib.Info:
+        options, world = self._options, self._world
+        scene, solver = options.run.scene, options.run.ccp_type
+        stored = f"The solution has natural residual {result.natural_residual:.3g}." if result.converged else ""
+        return fclib.Info(
+            f"{scene}, step {world.step + 1}",
+            f"{problem.size} contacts of {options.scene!r}, from time {world.time:g} s over {options.dt:g} s. "
+            f"{solver} with -ccp_tol {options.limits.tol:g}: {asked.reason}, {asked.iterations} iterations, "
+            f"natural residual {asked.natural_residual:.3g}. {stored}",
+            "Solution and guess are those of the convex cone problem, min 1/2 r'Wr + q'r over the friction cones "
+            "(no mu |u_t| in the normal velocity). W is positive semidefinite; r need not be unique, u is.",
+        )
+
+
+def _write(path: Path, comm: MPI.Comm, write: Callable[[Path], None]) -> None:
+    """Let ``write`` make a file, and its folder before; collective. FileError if that fails."""
+    failure = None
+    if comm.rank == 0:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            failure = f"{path}: cannot write ({error.strerror})"
+    failure = comm.bcast(failure)
+    try:
+        if failure:
+            raise OSError(failure)
+        write(path)
+    except OSError as error:  # raised on all ranks alike
+        raise FileError(str(error)) from None
+
+
+def _mass(world: World) -> tuple[np.ndarray, PETSc.Mat]:
+    """Mask of the bodies of this rank's rows that are dynamic, and the mass matrix (6 n x 6 n) of those."""
+    last = world.comm.rank == world.comm.size - 1
+    parts = [world.grains, world.large] if last else [world.grains]
+    owned = bodies.concatenate(parts)
+    dynamic = bodies.is_dynamic(owned)
+    owned = owned.take(dynamic)
+    blocks = np.zeros((len(owned), 6, 6))
+    blocks[:, range(3), range(3)] = owned.mass[:, None]
+    blocks[:, 3:, 3:] = np.linalg.inv(bodies.inverse_inertia(owned))
+    alike = np.ptp(owned.inertia, axis=1) == 0  # exactly diagonal, as for spheres
+    blocks[alike, 3:, 3:] = owned.inertia[alike, :, None] * np.eye(3)
+    count = len(owned)
+    first = sum(world.comm.allgather(count)[: world.comm.rank])
+    rows = sp.bsr_matrix((blocks, np.arange(count), np.arange(count + 1)), shape=(6 * count, 6 * count)).tocsr()
+    csr = (rows.indptr.astype(PETSc.IntType), (rows.indices + 6 * first).astype(PETSc.IntType), rows.data)
+    return dynamic, PETSc.Mat().createAIJ(((6 * count, None), (6 * count, None)), csr=csr, comm=world.comm)
+
+
+def _dynamic_rows(system: ContactSystem, dynamic: np.ndarray) -> PETSc.Mat:
+    """D of the dynamic bodies alone; collective."""
+    D = system.D
+    first, _ = D.getOwnershipRange()
+    rows = first + np.flatnonzero(np.repeat(dynamic, 6))
+    columns = np.arange(*D.getOwnershipRangeColumn())
+    index_sets = [PETSc.IS().createGeneral(x.astype(PETSc.IntType), comm=D.comm) for x in (rows, columns)]
+    H = D.createSubMatrix(*index_sets)
+    for index_set in index_sets:
+        index_set.destroy()
+    return H
+
+
+# -- options -------------------------------------------------------------------------------------------------
+
+
+def problem_path(place: str, step: int, contacts: int) -> Path:
+    """The FCLIB file of a step: in the folder ``place``, or ``place`` itself where that has {step} in it."""
+    if "{" not in place:
+        return Path(place) / f"step{step:06d}_{contacts}contacts.h5"
+    return Path(place.format(step=step, contacts=contacts))
+
+
+def dump_steps(run: Run) -> list[int]:
+    """The steps of ``-dump_steps``; OptionError if they are not whole numbers."""
+    try:
+        steps = [int(word) for word in run.dump_steps.split(",")] if run.dump_steps else []
+    except ValueError:
+        steps = [0]
+    if min(steps, default=1) < 1:
+        raise OptionError(f"-dump_steps {run.dump_steps}: allowed are whole numbers >= 1 with commas between")
+    return steps
+
+
+def dump_folder(run: Run) -> Path:
+    """The folder above all that ``-dump_problem`` writes; raises OptionError for options that do not fit."""
+    place = run.dump_problem
+    if dump_steps(run) and not place:
+        raise OptionError(f"-dump_steps {run.dump_steps}: -dump_problem FOLDER has to say where to")
+    if place and run.problem:
+        raise OptionError(f"-dump_problem {place}: -problem {run.problem} makes no steps; allowed is one of the two")
+    if "{" in place:
+        try:
+            two = {problem_path(place, step, 1) for step in (1, 2)}
+        except (LookupError, ValueError, AttributeError):
+            two = set()
+        if len(two) < 2 or two.pop().suffix not in (".h5", ".hdf5"):
+            raise OptionError(
+                f"-dump_problem {place}: allowed is a folder, or a file name that ends in .h5 or .hdf5 with {{step}} "
+                "in it, and {contacts} if wanted, such as problems/{step:06d}_{contacts}.h5"
+            )
+    return Path(place.partition("{")[0] + "x").parent if "{" in place else Path(place)

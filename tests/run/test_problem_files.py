@@ -1,0 +1,149 @@
+"""Cone problems of steps in files: -dump_problem, the hard ones by themselves, and -problem that solves them again."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from program import SETTLED, SMALL
+
+TOL = ("-ccp_tol", 1e-8)
+HARD = (*SETTLED, "-ccp_max_it", 2)  # no step is solved in two Newton steps
+
+
+def summary(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+def product(group: h5py.Group, x: np.ndarray, transposed: bool = False) -> np.ndarray:
+    """A x or A' x for a matrix in triplets."""
+    assert group["nz"][0] == len(group["x"])
+    row, column = (group["p"][:], group["i"][:]) if transposed else (group["i"][:], group["p"][:])
+    y = np.zeros(int(group["n" if transposed else "m"][0]))
+    np.add.at(y, row, group["x"][:] * x[column])
+    return y
+
+
+def first_step(settled: Path) -> int:
+    with h5py.File(settled) as file:
+        return int(file["world/step"][()]) + 1
+
+
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+def test_the_problem_of_a_step_is_written_and_solved_again(ranks, program, settled, tmp_path):
+    """Steps one and three of three."""
+    numbers = f"{first_step(settled)},{first_step(settled) + 2}"
+    program(*SETTLED, *TOL, "-steps", 3, "-dump_problem", "problems", "-dump_steps", numbers, ranks=ranks)
+    first, second, third = summary(tmp_path / "results")["steps"]
+    assert second["dumped"] == []
+    names = {f"problems/step{line['step']:06d}_{line['contacts']}contacts" for line in (first, third)}
+    assert {name for line in (first, third) for name in line["dumped"]} == {
+        name + suffix for name in names for suffix in (".h5", ".petsc")
+    }
+    assert {str(path.relative_to(tmp_path)) for path in (tmp_path / "problems").iterdir()} == {
+        name + suffix for name in names for suffix in (".h5", ".petsc")
+    }
+    for path in third["dumped"]:
+        # from the file's guess; PETSc's has none
+        done = program("-problem", path, *TOL, "-output", "again", ranks=ranks)
+        again = summary(tmp_path / "again")
+        assert again["converged"]
+        assert again["contacts"] == third["contacts"]
+        assert again["objective"] == pytest.approx(third["objective"], rel=1e-6)
+        assert again["velocity_norm"] == pytest.approx(third["velocity_norm"], rel=1e-5)
+        if path.endswith(".h5"):
+            assert again["format"] == "FCLIB global"
+            assert again["title"] == f"mixer, step {third['step']}"
+            assert again["start"] == "the guess in the file"
+            reference = again["references"]["solution"]
+            assert reference["relative_distance"] < 1e-6
+            assert reference["natural_residual"] == pytest.approx(third["natural_residual"], rel=1e-3, abs=1e-12)
+            assert again["references"]["guess"]["relative_distance"] > 1e-4
+            assert "the file's solution: velocity_distance" in done.stdout
+        else:
+            assert (again["format"], again["start"], again["references"]) == ("PETSc binary", "cold", {})
+    check_mechanics(third, tmp_path)
+
+
+def check_mechanics(line: dict, tmp_path: Path) -> None:
+    """M v = H r + f, u = H'v + w, with the velocities and impulses of state.h5, which the solver's side did not write;
+    the walls and the paddle have no rows."""
+    with h5py.File(tmp_path / line["dumped"][0]) as file, h5py.File(tmp_path / "results" / "state.h5") as state:
+        step = state[f"steps/{line['step']:06d}"]
+        group, solution = file["fclib_global"], file["solution"]
+        r, u, v = (solution[name][:] for name in "ruv")
+        assert len(v) == 6 * 27
+        f, w = group["vectors/f"][:], group["vectors/w"][:]
+        assert np.allclose(product(group["M"], v), product(group["H"], r) + f, atol=1e-12 * np.abs(f).max())
+        assert np.allclose(product(group["H"], v, transposed=True) + w, u, atol=1e-12)
+        assert np.array_equal(step["contact/impulse"][:].ravel(), r)
+        assert np.array_equal(file["pctt/point"][:], step["contact/point"][:])
+        grains = step["velocity"][:27]
+        assert np.allclose(np.sort(grains[:, 2]), np.sort(v.reshape(-1, 6)[:, 2]), atol=1e-13)
+        mass = 2500 * 4 / 3 * np.pi * 0.1**3
+        assert group["M/nz"][0] == 6 * 27
+        assert np.allclose(np.sort(group["M/x"][:]), np.repeat([0.4 * mass * 0.01, mass], 81))
+        # a contact's w is its gap over dt, but where the paddle moves
+        touches_large = (step["contact/body"][:] >= 27).any(1)
+        gap = np.maximum(step["contact/gap"][:] / 0.025, -1.0)
+        assert (~touches_large).any()
+        assert np.allclose(w.reshape(-1, 3)[~touches_large, 0], gap[~touches_large], atol=1e-12)
+        assert np.allclose(w.reshape(-1, 3)[~touches_large, 1:], 0, atol=1e-12)
+
+
+def test_names_by_a_pattern_a_start_without_guess_and_a_broken_file(program, settled, tmp_path):
+    program(*SETTLED, "-steps", 2, "-dump_problem", "all/{contacts}/{step:03d}.hdf5")
+    steps = summary(tmp_path / "results")["steps"]
+    for line in steps:
+        path = tmp_path / "all" / str(line["contacts"]) / f"{line['step']:03d}.hdf5"
+        assert line["dumped"] == [str(p.relative_to(tmp_path)) for p in (path, path.with_suffix(".petsc"))]
+        assert path.exists()
+    program("-problem", steps[1]["dumped"][0], "-problem_guess", "false", "-ccp_type", "apgd", "-ccp_tol", 1e-10)
+    cold = summary(tmp_path / "results")
+    assert cold["start"] == "cold"
+    assert cold["converged"]
+    assert cold["natural_residual"] <= 1.1e-10
+    assert not (tmp_path / "results" / "hard").exists()  # no step was hard
+    whole = (tmp_path / steps[1]["dumped"][1]).read_bytes()
+    (tmp_path / "cut.petsc").write_bytes(whole[:1000])
+    done = program("-problem", "cut.petsc", status=2)
+    assert done.stderr == "pctt.run: cut.petsc: no PETSc binary problem: Read past end of file\n"
+
+
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+def test_hard_problems_are_kept_and_the_steps_say_so(ranks, program, settled, tmp_path):
+    done = program(*HARD, "-steps", 3, "-dump_hard", 2, ranks=ranks)
+    steps = summary(tmp_path / "results")["steps"]
+    kept = [f"results/hard/step{s['step']:06d}_{s['contacts']}contacts_2its.h5" for s in steps[:2]]
+    assert [line["hard_problem"] for line in steps] == [*kept, ""]
+    assert sorted(str(p.relative_to(tmp_path)) for p in (tmp_path / "results" / "hard").iterdir()) == kept
+    assert re.findall(r"hard problem kept: (\S+)\)", done.stdout) == kept
+    program("-problem", kept[1], *TOL, "-output", "solved")
+    solved = summary(tmp_path / "solved")
+    assert solved["converged"]
+    assert solved["contacts"] == steps[1]["contacts"]
+
+
+def test_hard_problems_of_another_run_are_replaced_and_of_this_one_kept(program, settled, tmp_path):
+    def hard() -> list[int]:
+        return sorted(int(path.name[4:10]) for path in (tmp_path / "results" / "hard").iterdir())
+
+    first = first_step(settled)
+    program(*HARD, "-steps", 2)
+    assert hard() == [first, first + 1]
+    again = [*SMALL, "-ccp_max_it", 2, "-restart", "results/checkpoint.h5", "-steps", 1]
+    program(*again)
+    assert hard() == [first, first + 1, first + 2]
+    program(*HARD, "-steps", 1, "-dump_hard", 0)  # anew, and none wanted
+    assert hard() == []
+
+
+def test_a_step_that_the_run_does_not_make_is_refused(program, settled, tmp_path):
+    first = first_step(settled)
+    done = program(*SETTLED, "-steps", 2, "-dump_problem", "d", "-dump_steps", f"{first},1", status=2)
+    assert f"-dump_steps {first},1: there is no step 1; this run makes steps {first} to {first + 1}" in done.stderr
+    assert not (tmp_path / "results" / "summary.json").exists()
