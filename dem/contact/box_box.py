@@ -252,7 +252,8 @@ def _closest_points(pairs: _Pairs, tolerance: Floats) -> Manifold:
     """The contact of two edges where boxes overlap or these are closest; else the closest corner, and others that
     are as close but for the tolerance (m,), as where two edges are parallel."""
     edge, touch = _edge_edge(pairs)
-    tip = np.flatnonzero(np.maximum(pairs.faces.max(axis=1), pairs.edges.max(axis=1)) > 0.0)
+    separation = np.maximum(pairs.faces.max(axis=1), pairs.edges.max(axis=1))
+    tip = np.flatnonzero(separation > TIE * pairs.size())
     corners = _corners(pairs.take(tip))
     smallest, size = corners.gap.min(axis=1), pairs.size()[tip]
     least = np.minimum(smallest, touch.gap[tip])
@@ -317,7 +318,7 @@ def _edge_edge(pairs: _Pairs) -> tuple[Ints, Touch]:
 
     between = two - one
     distance = np.linalg.norm(between, axis=1)
-    apart = separation > 0.0
+    apart = separation > TIE * pairs.size()  # in contact, the two points are too close to give a direction
     normal = np.where(apart[:, None], between / np.where(apart, distance, 1.0)[:, None], normal)
     gap = np.where(apart, distance, np.where(np.isfinite(separation), separation, np.inf))
     return feature, Touch(pairs.center + 0.5 * (one + two), normal, gap)

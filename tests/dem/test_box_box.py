@@ -107,7 +107,7 @@ def test_a_corner_on_a_face_is_one_point(swap):
     np.testing.assert_allclose(normal, [[0, 0, -1 if swap else 1]], atol=1e-14)
 
 
-@pytest.mark.parametrize("gap", [0.03, -0.01])
+@pytest.mark.parametrize("gap", [0.03, 1e-12, 1e-16, 0.0, -1e-16, -0.01])
 def test_crossed_edges_touch_in_one_point(gap):
     """Two roofs, one on its head and turned by a right angle: ridge on ridge."""
     reach = np.sqrt(2)
