@@ -11,7 +11,7 @@ from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
 
 #: Kinds of bodies (the column `shape`); a COMPOUND is a large body, its primitives are kept elsewhere.
-SPHERE, BOX, COMPOUND = 0, 1, 2
+SPHERE, BOX, COMPOUND, CAPSULE = 0, 1, 2, 3
 
 
 @dataclass
@@ -28,8 +28,8 @@ class Bodies:
     mass: Floats  #: (n,) [kg]
     inertia: Floats  #: (n, 3) principal moments of inertia in the body frame [kg m^2]
     material: Ints  #: (n,) row of the friction table
-    shape: Ints  #: (n,) SPHERE, BOX or COMPOUND
-    size: Floats  #: (n, 3) sphere: (radius, 0, 0); box: half extents [m]
+    shape: Ints  #: (n,) SPHERE, BOX, CAPSULE or COMPOUND
+    size: Floats  #: (n, 3) sphere: (radius, 0, 0); box: half extents; capsule: (radius, half length, 0) [m]
     weight: Floats  #: (n,) contacts owned at the last search, the load that balancing spreads
 
     def __len__(self) -> int:
@@ -73,7 +73,12 @@ def is_dynamic(bodies: Bodies) -> Bools:
 
 def bounding_radius(bodies: Bodies) -> Floats:
     """Radius (n,) of the sphere about the centre that encloses a grain [m]."""
-    return np.linalg.norm(bodies.size, axis=1)
+    return enclosing_radius(bodies.shape, bodies.size)
+
+
+def enclosing_radius(kind: Ints, size: Floats) -> Floats:
+    """Radius (n,) of the sphere about the centre that encloses a shape of kind (n,) and size (n, 3) [m]."""
+    return np.where(kind == CAPSULE, size.sum(axis=1), np.linalg.norm(size, axis=1))
 
 
 def inverse_root_inertia(bodies: Bodies) -> Floats:

@@ -17,7 +17,7 @@ import numpy as np
 
 from dem import bodies, checks, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints
-from dem.bodies import BOX, COMPOUND, SPHERE, Bodies
+from dem.bodies import BOX, CAPSULE, COMPOUND, SPHERE, Bodies
 from dem.motion import Dynamic, Fixed, Motion
 from dem.shapes import Shape
 
@@ -87,7 +87,7 @@ class Scene:
         """Add solid boxes and return their ids (n,).
 
         positions (n, 3) and half extents (3,) or (n, 3) [m]; density [kg/m^3] one for all or (n,);
-        quaternions (4,) or (n, 4); velocities (3,) or (n, 3). Boxes may touch spheres and planes, not boxes.
+        quaternions (4,) or (n, 4); velocities (3,) or (n, 3).
         """
         centers = _points("positions of boxes", positions)
         count = len(centers)
@@ -96,6 +96,33 @@ class Scene:
         turns = checks.unit_quaternions("quaternions of boxes", quaternions, count)
         speeds = _velocities(velocity, angular_velocity, count)
         return self._add_grains(BOX, centers, turns, speeds, mass, inertia, material, size)
+
+    def add_capsules(
+        self,
+        positions: ArrayLike,
+        radius: ArrayLike,
+        half_length: ArrayLike,
+        density: ArrayLike,
+        *,
+        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        material: str = "default",
+        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Ints:
+        """Add solid capsules, along the z axes of their frames, and return their ids (n,).
+
+        positions (n, 3) [m]; radius, half length of the core segment [m] and density [kg/m^3] one for all or (n,);
+        quaternions (4,) or (n, 4); velocities (3,) or (n, 3).
+        """
+        centers = _points("positions of capsules", positions)
+        count = len(centers)
+        radii = checks.positive_column("radius", radius, count)
+        halves = checks.positive_column("half length", half_length, count)
+        mass, inertia = shapes.capsule_mass(radii, halves, checks.positive_column("density", density, count))
+        size = np.stack([radii, halves, np.zeros(count)], axis=1)
+        turns = checks.unit_quaternions("quaternions of capsules", quaternions, count)
+        speeds = _velocities(velocity, angular_velocity, count)
+        return self._add_grains(CAPSULE, centers, turns, speeds, mass, inertia, material, size)
 
     def add_body(
         self,
@@ -116,8 +143,8 @@ class Scene:
 
         The pose and the velocities are those of time zero. A dynamic body needs either `density` [kg/m^3],
         and its frame is then moved to the centre of mass and the principal axes, or `mass` [kg] with the
-        principal moments `inertia` (3,) [kg m^2] of a frame that is there already. Large bodies touch grains,
-        not each other.
+        principal moments `inertia` (3,) [kg m^2] of a frame that is there already. Two large bodies touch if at
+        least one of them is dynamic.
         """
         if not name or name in (body.name for body in self.large_bodies):
             raise ValueError(f"large bodies need distinct names, got {name!r}")

@@ -53,7 +53,25 @@ class Sphere:
         object.__setattr__(self, "center", finite_vector("centre of a sphere", self.center))
 
 
-Shape = Union[Plane, Box, Sphere]
+@dataclass(frozen=True)
+class Capsule:
+    """Cylinder with two half balls as its ends: all points within `radius` of a core segment along the z axis of its
+    frame."""
+
+    radius: float  #: [m]
+    half_length: float  #: of the core segment [m]
+    center: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) [m]
+    quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0)  #: (4,)
+
+    def __post_init__(self) -> None:
+        positive("radius of a capsule", self.radius)
+        positive("half length of a capsule", self.half_length)
+        object.__setattr__(self, "center", finite_vector("centre of a capsule", self.center))
+        turn = unit_quaternions("quaternion of a capsule", self.quaternion, 1)[0]
+        object.__setattr__(self, "quaternion", tuple(turn.tolist()))
+
+
+Shape = Union[Plane, Box, Sphere, Capsule]
 
 
 def sphere_mass(radius: Floats, density: Floats) -> tuple[Floats, Floats]:
@@ -69,6 +87,17 @@ def box_mass(half_extents: Floats, density: Floats) -> tuple[Floats, Floats]:
     return mass, mass[:, None] / 3.0 * (squares.sum(axis=1, keepdims=True) - squares)
 
 
+def capsule_mass(radius: Floats, half_length: Floats, density: Floats) -> tuple[Floats, Floats]:
+    """Masses (n,) and principal moments (n, 3), the axis last, of solid capsules of radius, half length of the core
+    segment and density (n,): a cylinder and two half balls, each with its centre of mass 3/8 radius off its base."""
+    cylinder = density * 2.0 * np.pi * radius**2 * half_length
+    ball, moments = sphere_mass(radius, density)
+    axial = 0.5 * cylinder * radius**2 + moments[:, 0]
+    lateral = cylinder * (radius**2 / 4.0 + half_length**2 / 3.0)
+    lateral += moments[:, 0] + ball * (half_length**2 + 0.75 * half_length * radius)
+    return cylinder + ball, np.stack([lateral, lateral, axial], axis=1)
+
+
 def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Floats, Floats]:
     """Mass, centre of mass (3,) and inertia tensor (3, 3) about it, in the body frame.
 
@@ -78,12 +107,15 @@ def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Flo
     for shape in shapes:
         if isinstance(shape, Plane):
             raise ValueError("a half space has no finite mass: give mass and inertia, or a prescribed motion")
-        turn = np.eye(3)
-        if isinstance(shape, Box):
-            mass, moments = box_mass(np.array([shape.half_extents]), np.array([density]))
-            turn = quaternion.matrix(np.array(shape.quaternion))
+        turn, solid = np.eye(3), np.array([density])
+        if isinstance(shape, Sphere):
+            mass, moments = sphere_mass(np.array([shape.radius]), solid)
         else:
-            mass, moments = sphere_mass(np.array([shape.radius]), np.array([density]))
+            turn = quaternion.matrix(np.array(shape.quaternion))
+            if isinstance(shape, Box):
+                mass, moments = box_mass(np.array([shape.half_extents]), solid)
+            else:
+                mass, moments = capsule_mass(np.array([shape.radius]), np.array([shape.half_length]), solid)
         masses.append(mass[0])
         centers.append(shape.center)
         tensors.append((turn * moments[0]) @ turn.T)
@@ -102,7 +134,7 @@ def moved(shape: Shape, center: Floats, turn: Floats) -> Shape:
     place = tuple(quaternion.rotate(back, np.array(shape.center) - center).tolist())
     if isinstance(shape, Plane):
         return Plane(tuple(quaternion.rotate(back, np.array(shape.normal)).tolist()), place)
-    if isinstance(shape, Box):
-        orientation = quaternion.multiply(back, np.array(shape.quaternion))
-        return Box(shape.half_extents, place, tuple(orientation.tolist()))
-    return replace(shape, center=place)
+    if isinstance(shape, Sphere):
+        return replace(shape, center=place)
+    orientation = quaternion.multiply(back, np.array(shape.quaternion))
+    return replace(shape, center=place, quaternion=tuple(orientation.tolist()))

@@ -43,8 +43,8 @@ class World:
     def from_scene(cls, scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
         """The scene at time zero, distributed; collective.
 
-        ValueError if there is no grain, if grains overlap each other or a large body by more than `overlap`
-        radii, or if boxes come within reach of boxes.
+        ValueError if there is no grain, or if grains overlap each other or a large body by more than `overlap`
+        radii.
         """
         grains = scene.grains()
         world = _share(scene, comm, grains.take(_even_slice(len(grains), comm)))

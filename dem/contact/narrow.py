@@ -1,9 +1,10 @@
-"""Narrow phase: where two shapes touch.
+"""Narrow phase: where two shapes touch in one point.
 
 Each function takes m pairs of a first and a second shape and returns for each
     point (m, 3)   middle between the two surfaces [m],
     normal (m, 3)  unit vector from the first shape to the second,
     gap (m,)       signed distance of the surfaces, negative if they overlap [m].
+Pairs that touch in several points are in `capsules` and `box_box`; they return a `Manifold`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dem.arrays import Bools, Floats, Ints
+from dem.arrays import Floats, Ints
 from dem.quaternion import cross
 
 
@@ -22,6 +23,29 @@ class Touch(NamedTuple):
     point: Floats
     normal: Floats
     gap: Floats
+
+
+class Manifold(NamedTuple):
+    """Contact geometry of k points of m pairs."""
+
+    pair: Ints  #: (k,) number of the pair
+    feature: Ints  #: (k,) what touches in this point; distinct within a pair, the same while it goes on touching
+    touch: Touch  #: (k, ...)
+
+
+#: Shapes touch in several points if the smallest gap among these is within this share of the contact distance
+#: of the distance of the shapes; if not, in the closest point alone.
+FLUSH = 0.1
+
+
+def dot(a: Floats, b: Floats) -> Floats:
+    """Scalar products (...,) of vectors (..., 3)."""
+    return np.einsum("...i,...i->...", a, b)
+
+
+def reversed_touch(touch: Touch) -> Touch:
+    """The same contacts with first and second shape exchanged."""
+    return touch._replace(normal=-touch.normal)
 
 
 def sphere_sphere(center: Floats, radius: Floats, other_center: Floats, other_radius: Floats) -> Touch:
@@ -34,10 +58,43 @@ def sphere_sphere(center: Floats, radius: Floats, other_center: Floats, other_ra
     return Touch(center + (radius + 0.5 * gap)[:, None] * normal, normal, gap)
 
 
+def sphere_capsule(
+    center: Floats, radius: Floats, other: Floats, axis: Floats, half_length: Floats, other_radius: Floats
+) -> Touch:
+    """Spheres of centres (m, 3) and radii (m,), and capsules: centres and unit axes (m, 3), half lengths of the
+    core segments and radii (m,). A centre on the core is pushed out across it."""
+    along = np.clip(dot(center - other, axis), -half_length, half_length)
+    foot = other + along[:, None] * axis
+    touch = sphere_sphere(center, radius, foot, other_radius)
+    on_core = np.flatnonzero((center == foot).all(axis=1))
+    touch.normal[on_core] = across(axis[on_core])
+    touch.point[on_core] = center[on_core] + (radius + 0.5 * touch.gap)[on_core, None] * touch.normal[on_core]
+    return touch
+
+
+def across(axis: Floats) -> Floats:
+    """Unit vectors (m, 3) normal to the given ones."""
+    rows = np.arange(len(axis))
+    other = np.zeros_like(axis)
+    other[rows, np.abs(axis).argmin(axis=1)] = 1.0
+    normal = cross(axis, other)
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def closest_on_lines(point: Floats, axis: Floats, other: Floats, other_axis: Floats) -> tuple[Floats, Floats]:
+    """Positions (m,) [m] along two lines, from their points (m, 3) along unit axes (m, 3), where they are closest.
+    Parallel ones give numbers without meaning."""
+    offset = other - point
+    a, b, c = dot(axis, other_axis), dot(offset, axis), dot(offset, other_axis)
+    normal = cross(axis, other_axis)
+    square = np.maximum(dot(normal, normal), 1e-30)
+    return (b - a * c) / square, (a * b - c) / square
+
+
 def sphere_plane(center: Floats, radius: Floats, outward: Floats, origin: Floats) -> Touch:
-    """Spheres of centres (m, 3) and radii (m,), and a half space: point (3,) of its surface, normal (3,)."""
-    height = (center - origin) @ outward
-    gap = height - radius
+    """Spheres of centres (m, 3) and radii (m,), and half spaces: normals and points of the surfaces, (m, 3) or
+    (3,) for all."""
+    gap = dot(center - origin, outward) - radius
     point = center - (radius + 0.5 * gap)[:, None] * outward
     return Touch(point, np.broadcast_to(-outward, center.shape), gap)
 
@@ -75,32 +132,5 @@ def corner_plane(
 ) -> Touch:
     """One corner (m,) each of boxes, as in `sphere_box`, and a half space, as in `sphere_plane`."""
     tip = center + (turn @ (half * CORNERS[corner])[:, :, None])[:, :, 0]
-    gap = (tip - origin) @ outward
+    gap = dot(tip - origin, outward)
     return Touch(tip - 0.5 * gap[:, None] * outward, np.broadcast_to(-outward, tip.shape), gap)
-
-
-def boxes_within(
-    center: Floats,
-    turn: Floats,
-    half: Floats,
-    other_center: Floats,
-    other_turn: Floats,
-    other_half: Floats,
-    reach: float,
-) -> Bools:
-    """Mask (m,) of the pairs of boxes that none of their 15 separating axes parts by more than `reach` [m].
-
-    All pairs within reach are among them, and some whose corners are nearly so. Gottschalk, Lin, Manocha
-    (1996), "OBBTree".
-    """
-    offset = other_center - center
-    faces = [turn[:, :, i] for i in range(3)] + [other_turn[:, :, i] for i in range(3)]
-    edges = [cross(faces[i], faces[j]) for i in range(3) for j in range(3, 6)]
-    within = np.ones(len(center), dtype=bool)
-    for axis in faces + edges:
-        extent = np.abs(np.einsum("mij,mi->mj", turn, axis) * half).sum(axis=1)
-        other_extent = np.abs(np.einsum("mij,mi->mj", other_turn, axis) * other_half).sum(axis=1)
-        length = np.linalg.norm(axis, axis=1)  # zero for parallel edges, which part nothing
-        apart = np.abs(np.einsum("mi,mi->m", offset, axis)) - extent - other_extent
-        within &= apart <= reach * length
-    return within

@@ -3,32 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dem import bodies, quaternion
-from dem.arrays import Bools, Floats, Ints
-from dem.bodies import BOX, SPHERE, Bodies
+from dem.arrays import Floats, Ints
 from dem.checks import not_negative
 from dem.contact.broad import close_pairs
-from dem.contact.narrow import (
-    CORNERS,
-    Touch,
-    boxes_within,
-    corner_plane,
-    sphere_box,
-    sphere_plane,
-    sphere_sphere,
-)
+from dem.contact.narrow import dot
+from dem.contact.primitives import FEATURES, PLANE, Primitives, primitives, touches
+from dem.motion import Dynamic
 from dem.neighbourhood import Neighbourhood, neighbourhood
-from dem.shapes import Box, Plane, Shape
 
 if TYPE_CHECKING:
     from dem.world import World
-
-#: Contacts that one pair of shapes can have at a time (a box lies on a plane with its eight corners).
-FEATURES = 8
 
 
 @dataclass(frozen=True)
@@ -49,44 +37,30 @@ class Contacts:
         return len(self.key)
 
 
-class _Hits(NamedTuple):
-    """Contacts of one kind of pair."""
-
-    a: Ints  # rows of the bodies
-    b: Ints
-    shape_a: Ints  # numbers of the shapes
-    shape_b: Ints
-    feature: Ints  # number of the contact among those of the two shapes
-    touch: Touch
-
-
 def find_contacts(world: World, delta: float) -> Contacts:
     """All contacts of gap at most `delta` [m] that this rank owns; collective.
 
     A contact belongs to the rank that owns the body of lower global index. The numbers of contacts that the
-    grains own are left in `world.grains.weight`. NotImplementedError, on all ranks, if boxes come within
-    reach of boxes.
+    grains own are left in `world.grains.weight`.
     """
     not_negative("contact distance delta", delta)
     near = neighbourhood(world, delta)
-    found, clashes = _grain_pairs(near, delta)
-    # Shapes are numbered: a grain is one shape, whose number is its id; those of the large bodies follow.
-    shape = int(world.slabs[-1])
-    for row, body in enumerate(world.large_bodies, start=near.grains + near.ghosts):
-        for part in body.shapes:
-            hits, boxes = _grains_on_shape(near, row, part, shape, delta)
-            found += hits
-            clashes += [f"box {grain} and body {body.name!r}" for grain in boxes]
-            shape += 1
-    _refuse(world, clashes)
+    table = primitives(near, [body.shapes for body in world.large_bodies], int(world.slabs[-1]))
+    pairs = np.concatenate([_grain_pairs(near, table, delta), *_grains_on_parts(near, table, delta)])
+    if world.comm.rank == world.comm.size - 1:
+        pairs = np.concatenate([pairs, _large_pairs(world, near, table)])
+    swap = table.number[pairs[:, 0]] > table.number[pairs[:, 1]]
+    i, j = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
 
-    a, b, shape_a, shape_b, feature = (np.concatenate(parts) for parts in list(zip(*found))[:5])
-    touch = Touch(*(np.concatenate(parts) for parts in zip(*(hits.touch for hits in found))))
-    key = (shape_a * shape + shape_b) * FEATURES + feature
+    pair, feature, touch = touches(table, i, j, delta)
+    i, j = i[pair], j[pair]
+    shapes = int(world.slabs[-1]) + len(table.number) - near.grains - near.ghosts
+    key = (table.number[i] * shapes + table.number[j]) * FEATURES + feature
+    a, b = table.row[i], table.row[j]
     owner = np.minimum(a, b)  # the local grains are the first rows, and ghosts come from higher ranks only
     order = np.lexsort((key, owner))
     a, b = a[order], b[order]
-    world.grains.weight = np.bincount(owner, minlength=near.grains).astype(np.float64)
+    world.grains.weight = np.bincount(owner, minlength=near.grains)[: near.grains].astype(np.float64)
     material = near.bodies.material
     return Contacts(
         key=key[order],
@@ -101,102 +75,34 @@ def find_contacts(world: World, delta: float) -> Contacts:
     )
 
 
-def _grain_pairs(near: Neighbourhood, delta: float) -> tuple[list[_Hits], list[str]]:
-    """Contacts among local grains and ghosts, and the names of pairs of boxes in reach."""
-    table = near.bodies
+def _grain_pairs(near: Neighbourhood, table: Primitives, delta: float) -> Ints:
+    """Rows (m, 2) of local grains, and of a local grain and a ghost, that may be in reach of each other."""
     count = near.grains + near.ghosts
-    pairs = close_pairs(table.position[:count], bodies.bounding_radius(table)[:count], delta)
-    if near.ghosts:
-        pairs = pairs[pairs[:, 0] < near.grains]
-    swap = table.id[pairs[:, 0]] > table.id[pairs[:, 1]]
-    a, b = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
-    box_a, box_b = table.shape[a] == BOX, table.shape[b] == BOX
-
-    def kind(mask: Bools) -> tuple[Ints, Ints]:
-        return a[mask], b[mask]
-
-    found = []
-    i, j = kind(~box_a & ~box_b)
-    x, radius = table.position, table.size[:, 0]
-    found.append(_hits(table, i, j, sphere_sphere(x[i], radius[i], x[j], radius[j]), delta))
-    i, j = kind(~box_a & box_b)
-    found.append(_hits(table, i, j, sphere_box(x[i], radius[i], x[j], *_frames(table, j)), delta))
-    i, j = kind(box_a & ~box_b)
-    found.append(_hits(table, i, j, _reversed(sphere_box(x[j], radius[j], x[i], *_frames(table, i))), delta))
-    i, j = kind(box_a & box_b)
-    meet = boxes_within(x[i], *_frames(table, i), x[j], *_frames(table, j), delta)
-    clashes = [f"boxes {table.id[p]} and {table.id[q]}" for p, q in zip(i[meet], j[meet])]
-    return found, clashes
+    pairs = close_pairs(table.center[:count], table.radius[:count], delta)
+    return pairs[pairs[:, 0] < near.grains] if near.ghosts else pairs
 
 
-def _grains_on_shape(
-    near: Neighbourhood, row: int, part: Shape, shape: int, delta: float
-) -> tuple[list[_Hits], Ints]:
-    """Contacts of the local grains with one shape, of number `shape`, of the large body in `row`, and the ids
-    of box grains in reach of a box."""
-    table = near.bodies
-    body_turn = table.quaternion[row]
-    center = table.position[row] + quaternion.rotate(body_turn, np.array(part.center))
-    kinds = table.shape[: near.grains]
-    spheres, boxes = np.flatnonzero(kinds == SPHERE), np.flatnonzero(kinds == BOX)
-    none = np.zeros(0, np.int64)
-
-    def hits(rows: Ints, touch: Touch, feature: Ints | None = None) -> _Hits:
-        return _hits(table, rows, np.full(len(rows), row), touch, delta, np.full(len(rows), shape), feature)
-
-    x, radius = table.position[spheres], table.size[spheres, 0]
-    if isinstance(part, Plane):
-        outward = quaternion.rotate(body_turn, np.array(part.normal))
-        tips = np.repeat(boxes, len(CORNERS))
-        corner = np.tile(np.arange(len(CORNERS)), len(boxes))
-        on_corner = corner_plane(table.position[tips], *_frames(table, tips), corner, outward, center)
-        return [hits(spheres, sphere_plane(x, radius, outward, center)), hits(tips, on_corner, corner)], none
-    if isinstance(part, Box):
-        frame = quaternion.matrix(quaternion.multiply(body_turn, np.array(part.quaternion)))
-        half = np.array(part.half_extents)
-        close = np.linalg.norm(x - center, axis=1) <= radius + np.linalg.norm(half) + delta
-        spheres, x, radius = spheres[close], x[close], radius[close]
-        meet = boxes_within(table.position[boxes], *_frames(table, boxes), center, frame[None], half, delta)
-        return [hits(spheres, sphere_box(x, radius, center, frame, half))], table.id[boxes[meet]]
-    other = np.full(len(spheres), part.radius)
-    on_box = sphere_box(center[None], np.array(part.radius), table.position[boxes], *_frames(table, boxes))
-    return [hits(spheres, sphere_sphere(x, radius, center, other)), hits(boxes, _reversed(on_box))], none
+def _grains_on_parts(near: Neighbourhood, table: Primitives, delta: float) -> list[Ints]:
+    """For each part of a large body the rows (m, 2) of local grains that may be in its reach, and of the part."""
+    position, reach = table.center[: near.grains], table.radius[: near.grains] + delta
+    pairs = []
+    for part in range(near.grains + near.ghosts, len(table.number)):
+        offset = position - table.center[part]
+        if table.kind[part] == PLANE:
+            rows = np.flatnonzero(offset @ table.size[part] <= reach)
+        else:
+            rows = np.flatnonzero(dot(offset, offset) <= (reach + table.radius[part]) ** 2)
+        pairs.append(np.stack([rows, np.full(len(rows), part)], axis=1))
+    return pairs
 
 
-def _hits(
-    table: Bodies,
-    a: Ints,
-    b: Ints,
-    touch: Touch,
-    delta: float,
-    shape_b: Ints | None = None,
-    feature: Ints | None = None,
-) -> _Hits:
-    """The touches of gap at most delta; the shape of b is the grain itself unless given."""
-    near = np.flatnonzero(touch.gap <= delta)
-    a, b = a[near], b[near]
-    return _Hits(
-        a,
-        b,
-        table.id[a],
-        table.id[b] if shape_b is None else shape_b[near],
-        np.zeros(len(near), np.int64) if feature is None else feature[near],
-        Touch(*(values[near] for values in touch)),
-    )
-
-
-def _frames(table: Bodies, rows: Ints) -> tuple[Floats, Floats]:
-    """Rotation matrices (m, 3, 3) and half extents (m, 3) of boxes."""
-    return quaternion.matrix(table.quaternion[rows]), table.size[rows]
-
-
-def _reversed(touch: Touch) -> Touch:
-    return touch._replace(normal=-touch.normal)
-
-
-def _refuse(world: World, clashes: list[str]) -> None:
-    everywhere = world.comm.allreduce(clashes)
-    if everywhere:
-        raise NotImplementedError(
-            f"contact of boxes with boxes is not supported: {everywhere[0]} are within reach"
-        )
+def _large_pairs(world: World, near: Neighbourhood, table: Primitives) -> Ints:
+    """Rows (m, 2) of the parts of any two large bodies of which one at least is free to move."""
+    first = near.grains + near.ghosts
+    free = np.array([isinstance(body.motion, Dynamic) for body in world.large_bodies], dtype=bool)
+    if not free.any():
+        return np.zeros((0, 2), np.int64)
+    body = table.row[first:] - first
+    i, j = np.triu_indices(len(body), 1)
+    touch = (body[i] != body[j]) & (free[body[i]] | free[body[j]])
+    return first + np.stack([i[touch], j[touch]], axis=1)

@@ -99,14 +99,14 @@ class Stepper:
         self.options, self.world, self.memory, self.newton, self.dump = options, world, memory, newton, dump
 
     def step(self) -> dict[str, Any]:
-        """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no number)
-        or boxes come upon boxes."""
+        """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no
+        number)."""
         options, world = self.options, self.world
         with log.phase("search"):
             rebalance(world)
             try:
                 self.contacts = find_contacts(world, options.delta)
-            except (FloatingPointError, NotImplementedError) as error:  # raised on all ranks alike
+            except FloatingPointError as error:  # raised on all ranks alike
                 raise SceneError(f"step {world.step + 1}: {error}") from None
         with log.phase("assembly"):
             self.system = ContactSystem(world, self.contacts, options.dt, options.run.recovery_speed)

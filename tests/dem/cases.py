@@ -21,27 +21,39 @@ def random_quaternions(rng: np.random.Generator, count: int) -> Floats:
     return quaternion.normalized(rng.normal(size=(count, 4)))
 
 
-def heap(seed: int = 0, side: int = 5, boxes: bool = True, large: bool = True) -> Scene:
-    """A loose jittered lattice of spheres of three sizes, every seventh grain a small box, with spins and
-    speeds, among walls, a turning blade, an oscillating ball and a free slab."""
+def heap(
+    seed: int = 0, side: int = 5, boxes: bool = True, large: bool = True, capsules: bool = False
+) -> Scene:
+    """A loose jittered lattice of spheres of three sizes, every seventh grain a small box, every other seventh a
+    capsule, with spins and speeds, among walls, a turning blade, an oscillating ball and a free slab."""
     rng = np.random.default_rng(seed)
     scene = Scene(friction=0.3)
     grid = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     position = 0.25 * grid + 0.13 + rng.uniform(-0.02, 0.02, grid.shape)
     is_box = (grid @ [1, 2, 3] % 7 == 3) & boxes  # no two of them next to each other
 
+    is_capsule = (grid @ [1, 2, 3] % 7 == 5) & capsules
+    is_sphere = ~is_box & ~is_capsule
+
     def speeds(count: int) -> dict[str, Floats]:
         linear, angular = rng.normal(size=(count, 3)), 5.0 * rng.normal(size=(count, 3))
         return {"velocity": linear, "angular_velocity": angular}
 
-    count = int((~is_box).sum())
+    count = int(is_sphere.sum())
     radius = rng.choice([0.09, 0.1, 0.104], count)
-    scene.add_spheres(position[~is_box], radius, 1000.0, material="glass", **speeds(count))
+    scene.add_spheres(position[is_sphere], radius, 1000.0, material="glass", **speeds(count))
     if boxes:
         count = int(is_box.sum())
         half = rng.uniform(0.04, 0.06, (count, 3))
         turns = random_quaternions(rng, count)
         scene.add_boxes(position[is_box], half, 700.0, quaternions=turns, material="wood", **speeds(count))
+    if capsules:
+        count = int(is_capsule.sum())
+        radius, half_length = rng.uniform(0.03, 0.05, count), rng.uniform(0.03, 0.05, count)
+        turns = random_quaternions(rng, count)
+        scene.add_capsules(
+            position[is_capsule], radius, half_length, 900.0, quaternions=turns, material="wood", **speeds(count)
+        )
     if large:
         width = 0.25 * side + 0.01
         walls = [Plane((0, 0, 1)), Plane((1, 0, 0)), Plane((-1, 0, 0), (width, 0, 0)), Plane((0, 1, 0))]

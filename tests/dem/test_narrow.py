@@ -7,7 +7,15 @@ import pytest
 from cases import random_quaternions
 
 from dem import quaternion
-from dem.contact.narrow import CORNERS, boxes_within, corner_plane, sphere_box, sphere_plane, sphere_sphere
+from dem.contact.narrow import (
+    CORNERS,
+    closest_on_lines,
+    corner_plane,
+    sphere_box,
+    sphere_capsule,
+    sphere_plane,
+    sphere_sphere,
+)
 
 RNG = np.random.default_rng(2)
 UNIT = np.eye(3)[None]
@@ -118,24 +126,21 @@ def test_corners_of_a_box_on_a_plane():
     np.testing.assert_allclose(touch.normal, np.tile([0.0, 0, -1], (8, 1)))
 
 
-def test_boxes_meet_where_sampling_says():
-    count = 200
-    turns = [quaternion.matrix(random_quaternions(RNG, count)) for _ in range(2)]
-    halves = [RNG.uniform(0.2, 1.0, (count, 3)) for _ in range(2)]
-    offset = RNG.uniform(-1.2, 1.2, (count, 3))
-    meets = boxes_within(np.zeros((count, 3)), turns[0], halves[0], offset, turns[1], halves[1], 0.0)
-    overlaps = np.zeros(count, bool)
-    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3), axis=-1).reshape(-1, 3)
-    for k in range(count):
-        world = offset[k] + (grid * halves[1][k]) @ turns[1][k].T
-        overlaps[k] = (np.abs(world @ turns[0][k]) <= halves[0][k]).all(axis=1).any()
-    assert meets[overlaps].all()
-    assert (meets & ~overlaps).sum() < 0.1 * count  # sampling misses a few thin overlaps
-    assert not meets.all()
+def test_sphere_beside_beyond_and_on_the_core_of_a_capsule():
+    center = np.array([[0.0, 0.5, 0.3], [0, 0.6, -1.8], [0, 0, 0.4], [0.0, 0.0, 1.0]])
+    up, none = np.tile([0.0, 0.0, 1.0], (4, 1)), np.zeros((4, 3))
+    touch = sphere_capsule(center, np.full(4, 0.1), none, up, np.full(4, 1.0), np.full(4, 0.25))
+    np.testing.assert_allclose(touch.gap, [0.15, 0.65, -0.35, -0.35])
+    np.testing.assert_allclose(touch.normal[:2], [[0, -1, 0], [0, -0.6, 0.8]], atol=1e-15)
+    np.testing.assert_allclose(touch.normal[2:, 2], 0.0)
+    check_consistency(touch, center, np.full(4, 0.1))
 
 
-def test_parallel_boxes_at_a_distance():
-    one = (np.zeros((1, 3)), UNIT, np.ones((1, 3)))
-    other = (np.array([[0.0, 0.0, 2.1]]), UNIT, np.ones((1, 3)))
-    assert not boxes_within(*one, *other, 0.05)[0]
-    assert boxes_within(*one, *other, 0.15)[0]
+def test_closest_points_of_lines():
+    count = 50
+    axis, other_axis = (v / np.linalg.norm(v, axis=1)[:, None] for v in RNG.normal(size=(2, count, 3)))
+    point, other = RNG.normal(size=(2, count, 3))
+    s, t = closest_on_lines(point, axis, other, other_axis)
+    between = other + t[:, None] * other_axis - point - s[:, None] * axis
+    np.testing.assert_allclose(np.einsum("ij,ij->i", between, axis), 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.einsum("ij,ij->i", between, other_axis), 0.0, atol=1e-9)

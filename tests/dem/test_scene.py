@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from dem.bodies import bounding_radius
 from dem.motion import Dynamic
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere
@@ -41,6 +42,10 @@ def test_bad_velocities_boxes_and_friction():
         scene.add_spheres([[0, 0, 0]], 0.1, 1000.0, velocity=[[0, 0, 0], [0, 0, 0]])
     with pytest.raises(ValueError, match="half extents must be positive"):
         scene.add_boxes([[0, 0, 0]], (0.1, 0.0, 0.1), 1000.0)
+    with pytest.raises(ValueError, match="half length must be positive, got 0"):
+        scene.add_capsules([[0, 0, 0]], 0.1, 0.0, 1000.0)
+    with pytest.raises(ValueError, match=r"half length must have shape \(\) or \(1,\), got \(2,\)"):
+        scene.add_capsules([[0, 0, 0]], 0.1, [0.1, 0.2], 1000.0)
     with pytest.raises(ValueError, match="zero quaternion"):
         scene.add_boxes([[0, 0, 0]], (0.1, 0.1, 0.1), 1000.0, quaternions=(0, 0, 0, 0))
     with pytest.raises(ValueError, match="friction must not be negative"):
@@ -74,6 +79,16 @@ def test_bad_large_bodies():
     with pytest.raises(ValueError, match="radius of a sphere must be positive"):
         Sphere(0.0)
     assert [body.name for body in scene.large_bodies] == ["floor"]
+
+
+def test_capsules_and_the_spheres_that_enclose_them():
+    scene = Scene(friction=0.3)
+    scene.add_boxes([[0, 0, 0]], (0.3, 0.4, 1.2), 1000.0)
+    ids = scene.add_capsules([[0, 0, 2], [0, 0, 4]], 0.1, [0.2, 0.5], [1000.0, 2000.0])
+    grains = scene.grains()
+    np.testing.assert_array_equal(ids, [1, 2])
+    np.testing.assert_allclose(bounding_radius(grains), [1.3, 0.3, 0.6])
+    np.testing.assert_allclose(grains.mass[1:], np.pi * 0.01 * np.array([0.4 + 0.4 / 3, 2 * (1.0 + 0.4 / 3)]) * 1000)
 
 
 def test_an_empty_scene_is_refused():

@@ -6,16 +6,17 @@ import itertools
 
 import numpy as np
 import pytest
-from cases import contacts_by_key, heap, step
+from cases import contacts_by_key, heap, random_quaternions, step
+from convex import signed_distance
 from mpi4py import MPI
 
 from dem import quaternion
-from dem.bodies import BOX
+from dem.bodies import BOX, CAPSULE, COMPOUND, SPHERE
 from dem.contact import find_contacts
 from dem.contact.broad import close_pairs
-from dem.motion import Rotation
+from dem.motion import Dynamic, Fixed, Rotation
 from dem.scene import Scene
-from dem.shapes import Box, Plane, Sphere
+from dem.shapes import Box, Capsule, Plane, Sphere
 from dem.world import World
 
 SELF = MPI.COMM_SELF
@@ -44,6 +45,12 @@ def all_pairs(world, delta):
             gap = np.linalg.norm(center - grains.position[q]) - radius - grains.size[q, 0]
         if grains.shape[p] != BOX:
             note(grains.id[i], grains.id[j], gap)
+    slab = world.large.take([len(world.large) - 1])
+    for part, ball in itertools.product(world.large_bodies[0].shapes, world.large_bodies[-1].shapes):
+        if isinstance(part, Plane) and isinstance(ball, Sphere):
+            center = slab.position[0] + quaternion.rotate(slab.quaternion[0], np.array(ball.center))
+            gap = np.array(part.normal) @ (center - np.array(part.center)) - ball.radius
+            note(world.large.id[0], slab.id[0], gap)
     for row, body in enumerate(world.large_bodies):
         turn, origin = world.large.quaternion[row], world.large.position[row]
         for part, i in itertools.product(body.shapes, range(len(grains))):
@@ -84,6 +91,9 @@ def test_search_finds_what_all_pairs_have(seed):
     for _ in range(30):
         step(world)
     expected, found = all_pairs(world, 0.03), found_pairs(world, 0.03)
+    boxes = set(world.grains.id[world.grains.shape == BOX]) | {world.large.id[1]}  # see the test of all shapes
+    found = {pair: gaps for pair, gaps in found.items() if not boxes.issuperset(pair)}
+    expected = {pair: gaps for pair, gaps in expected.items() if not boxes.issuperset(pair)}
     assert len(expected) > 60
     assert found.keys() == expected.keys()
     for pair, gaps in expected.items():
@@ -202,22 +212,108 @@ def test_no_contact_and_one_body():
     assert contacts.normal.shape == (0, 3)
 
 
-@pytest.mark.parametrize("apart", [0.21, 1.0])
-def test_boxes_in_reach_of_boxes_are_refused(apart):
+def primitives_of(world):
+    """All shapes but half spaces: (id of the body, centre, frame, half extents of the core, radius)."""
+    found = []
+    for table, row in itertools.chain(*([(t, r) for r in range(len(t))] for t in (world.grains, world.large))):
+        if table is world.large:
+            parts = world.large_bodies[row].shapes
+        else:
+            size = table.size[row]
+            make = {SPHERE: lambda r, *_: Sphere(r), BOX: lambda *h: Box(h), CAPSULE: lambda r, h, _: Capsule(r, h)}
+            parts = [make[int(table.shape[row])](*size)]
+        for part in parts:
+            if isinstance(part, Plane):
+                continue
+            turn = np.array(getattr(part, "quaternion", (1.0, 0.0, 0.0, 0.0)))
+            frame = quaternion.matrix(quaternion.multiply(table.quaternion[row], turn))
+            center = table.position[row] + quaternion.rotate(table.quaternion[row], np.array(part.center))
+            half = np.array(getattr(part, "half_extents", (0.0, 0.0, getattr(part, "half_length", 0.0))))
+            found.append((table.id[row], (center, frame, half, getattr(part, "radius", 0.0))))
+    return found
+
+
+def crowd(seed, side=4):
+    """Turned grains of three kinds on a jittered lattice, so close that many overlap, and four large bodies."""
+    rng = np.random.default_rng(seed)
     scene = Scene(friction=0.3)
-    scene.add_boxes([[0, 0, 0], [apart, 0, 0]], (0.1, 0.1, 0.1), 1000.0)
-    scene.add_body("press", [Box((0.1, 0.1, 0.1), (0, 0, 0.2 + apart))])
-    world = World.from_scene(scene, SELF)
-    assert len(find_contacts(world, 0.005)) == 0
-    world.grains.position[1, 2] += 0.1 * apart  # still apart
-    if apart > 0.5:
-        assert len(find_contacts(world, 0.05)) == 0
-        world.grains.position[1] = (0.0, 0.0, apart + 0.02)
-        with pytest.raises(NotImplementedError, match="box 1 and body 'press'"):
-            find_contacts(world, 0.05)
-    else:
-        with pytest.raises(NotImplementedError, match="boxes 0 and 1 are within reach"):
-            find_contacts(world, 0.05)
+    grid = 0.2 * np.stack(np.meshgrid(*[np.arange(side)] * 3), axis=-1).reshape(-1, 3)
+    spheres, boxes, capsules = np.split(rng.permutation(grid + rng.uniform(-0.02, 0.02, grid.shape)), [24, 44])
+    scene.add_spheres(spheres, rng.uniform(0.08, 0.11, len(spheres)), 1000.0)
+    half, turns = rng.uniform(0.05, 0.1, (len(boxes), 3)), random_quaternions(rng, len(boxes))
+    scene.add_boxes(boxes, half, 1000.0, quaternions=turns)
+    radius, half_length = rng.uniform(0.05, 0.07, (2, len(capsules)))
+    turns = random_quaternions(rng, len(capsules))
+    scene.add_capsules(capsules, radius, half_length, 1000.0, quaternions=turns)
+    turns = random_quaternions(rng, 4)
+    parts = [Box((0.3, 0.2, 0.1), (0.1, 0, 0), turns[0]), Capsule(0.1, 0.2, (-0.3, 0, 0), turns[1])]
+    for name, place, motion, density in (
+        ("low", (0.3, 0.3, -0.3), Fixed(), None),
+        ("high", (0.3, 0.3, 0.9), Dynamic(), 500.0),
+        ("top", (0.3, 0.3, 1.2), Dynamic(), 500.0),
+        ("side", (0.3, 1.0, 0.9), Fixed(), None),
+    ):
+        scene.add_body(name, [*parts, Sphere(0.1, (0.2, 0.2, 0))], motion, position=place, density=density)
+    return World.from_scene(scene, SELF, overlap=np.inf)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_pairs_of_any_shapes_touch_where_optimisation_says(seed):
+    delta, world = 0.03, crowd(seed)
+    free = {world.large.id[1], world.large.id[2]}
+    expected = {}
+    for (i, one), (j, other) in itertools.combinations(primitives_of(world), 2):
+        reach = sum(np.linalg.norm(body[2]) + body[3] for body in (one, other)) + delta
+        both_large = min(i, j) >= world.slabs[-1]
+        if i == j or (both_large and not {i, j} & free) or np.linalg.norm(one[0] - other[0]) > reach:
+            continue
+        gap, pair = signed_distance(one, other), (min(i, j), max(i, j))
+        expected[pair] = min(gap, expected.get(pair, np.inf))
+    found = {pair: gaps[0] for pair, gaps in found_pairs(world, delta).items()}
+    kinds = np.append(world.grains.shape[np.argsort(world.grains.id)], world.large.shape)
+    met = {tuple(sorted((kinds[i], kinds[j]))) for i, j in found}
+    assert met == set(itertools.combinations_with_replacement((SPHERE, BOX, COMPOUND, CAPSULE), 2))
+    assert found.keys() <= {pair for pair, gap in expected.items() if gap <= delta}
+    assert found.keys() >= {pair for pair, gap in expected.items() if gap <= 0.9 * delta - 1e-4}
+    deep = 0.0
+    for pair, gap in found.items():
+        if gap > -0.04:  # the cores of capsules do not overlap
+            assert gap == pytest.approx(expected[pair], abs=0.1 * delta + 2e-4)
+        deep = min(deep, gap)
+    assert deep < -0.02
+
+
+def test_keys_of_all_shapes_are_unique():
+    world = World.from_scene(heap(4, capsules=True), SELF)
+    for _ in range(20):
+        contacts = step(world, delta=0.05)
+        assert len(np.unique(contacts.key)) == len(contacts)
+
+
+def press_scene(motion):
+    scene = Scene(friction=0.3)
+    scene.add_spheres([[0, 0, 5]], 0.1, 1000.0)
+    scene.add_body("walls", [Plane((0, 0, 1)), Plane((1, 0, 0), (-1, 0, 0)), Box((0.1, 1, 1), (1.1, 0, 1))])
+    mass = {"density": 500.0} if isinstance(motion, Dynamic) else {}
+    scene.add_body("press", [Box((0.995, 0.5, 0.2)), Sphere(0.1, (0, 0, 0.4))], motion, position=(0, 0, 0.2), **mass)
+    scene.add_body("ram", [Capsule(0.1, 0.5, (0, 0, 1.3))])
+    return World.from_scene(scene, SELF)
+
+
+def test_a_free_large_body_touches_other_large_bodies():
+    world = press_scene(Dynamic())
+    found = contacts_by_key(find_contacts(world, 0.01), SELF)
+    pairs = list(zip(found["a"], found["b"]))
+    assert pairs.count((1, 2)) == 4 + 4 + 4  # floor, wall and side box
+    assert pairs.count((2, 3)) == 1  # ball under the ram
+    assert len(pairs) == 13
+    assert len(set(found["key"])) == 13
+    np.testing.assert_allclose(np.sort(np.abs(found["gap"])), [0] * 5 + [0.005] * 8, atol=1e-12)
+    np.testing.assert_array_equal(world.grains.weight, [0])
+
+
+def test_large_bodies_that_are_not_free_do_not_touch_each_other():
+    assert len(find_contacts(press_scene(Fixed()), 0.01)) == 0
 
 
 def test_a_lost_grain_is_an_error():

@@ -1,0 +1,192 @@
+"""Narrow phase of capsules: one or two points, or more where two of them cross at a small angle.
+
+A capsule is all that lies within its radius of a core segment: centre (m, 3), unit axis (m, 3), half length (m,).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dem.arrays import Floats, Ints
+from dem.contact.narrow import (
+    FLUSH,
+    Manifold,
+    Touch,
+    across,
+    closest_on_lines,
+    dot,
+    reversed_touch,
+    sphere_box,
+    sphere_capsule,
+    sphere_plane,
+)
+from dem.quaternion import cross
+
+#: Ends of core segments that face each other within this share of the length are one contact.
+SNAP = 1e-6
+
+
+def capsule_plane(
+    center: Floats, axis: Floats, half_length: Floats, radius: Floats, outward: Floats, origin: Floats, delta: float
+) -> Manifold:
+    """Capsules and half spaces as in `sphere_plane`: the two end balls, features 0 and 1."""
+    ends = [sphere_plane(center + (side * half_length)[:, None] * axis, radius, outward, origin) for side in (-1, 1)]
+    return _manifold(ends, [end.gap <= delta for end in ends])
+
+
+def capsule_capsule(
+    center: Floats,
+    axis: Floats,
+    half_length: Floats,
+    radius: Floats,
+    other: Floats,
+    other_axis: Floats,
+    other_half: Floats,
+    other_radius: Floats,
+    delta: float,
+) -> Manifold:
+    """Capsules on capsules.
+
+    Features 0 and 1 are the end balls of the first capsule that lie beside the core of the second, 2 and 3 those of
+    the second beside the core of the first. Where none of them is as close as the capsules are, feature 4 is the
+    closest point, at the crossing of the cores or between two ends.
+    """
+    first = (center, axis, half_length, radius)
+    second = (other, other_axis, other_half, other_radius)
+    ends, beside = [], []
+    for one, two, margin in ((first, second, SNAP), (second, first, -SNAP)):
+        for side in (-1.0, 1.0):
+            end = one[0] + (side * one[2])[:, None] * one[1]
+            touch = sphere_capsule(end, one[3], *two)
+            ends.append(touch if one is first else reversed_touch(touch))
+            beside.append(np.abs(dot(end - two[0], two[1])) <= two[2] + margin * (half_length + other_half))
+
+    crossing = _crossing(first, second)
+    closest = _least([*ends, crossing])
+    lowest = np.min([np.where(mask, end.gap, np.inf) for end, mask in zip(ends, beside)], axis=0)
+    flush = lowest <= closest.gap + _tolerance(delta, radius, other_radius)
+    shown = [flush & mask & (end.gap <= delta) for end, mask in zip(ends, beside)]
+    return _manifold([*ends, closest], [*shown, ~flush & (closest.gap <= delta)])
+
+
+def capsule_box(
+    center: Floats,
+    axis: Floats,
+    half_length: Floats,
+    radius: Floats,
+    box_center: Floats,
+    turn: Floats,
+    half: Floats,
+    delta: float,
+) -> Manifold:
+    """Capsules and boxes: centres, frames (m, 3, 3), half extents (m, 3).
+
+    A capsule that lies over a face touches it at both ends of the stretch that is over the face, features 0 and 1.
+    Otherwise, feature 2 is the point where it is closest to the box. A core that meets the box is pushed out through
+    the face for which that is the shortest way.
+    """
+    rows = np.arange(len(center))
+    middle = ((center - box_center)[:, None, :] @ turn)[:, 0]
+    reach = half_length[:, None] * (axis[:, None, :] @ turn)[:, 0]
+    start, way = middle - reach, 2.0 * reach  # of the core, in the frame of the box
+
+    low = np.minimum(start, start + way)
+    apart = np.concatenate([low - half, -(low + np.abs(way)) - half], axis=1)  # of the six faces
+    slack = SNAP * (half_length + half.min(axis=1))
+    face = (apart >= apart.max(axis=1, keepdims=True) - SNAP * slack[:, None]).argmax(axis=1)
+    separation = apart[rows, face]
+    k, sign = face % 3, np.where(face < 3, 1.0, -1.0)
+
+    at = _closest_to_box(start, way, half)
+    closest = sphere_box(center + ((2.0 * at - 1.0) * half_length)[:, None] * axis, radius, box_center, turn, half)
+    distance = closest.gap + radius
+    meets = distance <= 0.0
+    distance = np.where(meets, separation, distance)
+
+    # The stretch of the core over the face: clipped with the slabs of the two other axes.
+    begin, end = np.zeros(len(center)), np.ones(len(center))
+    for other in ((k + 1) % 3, (k + 2) % 3):
+        enter, leave = _slab(start[rows, other], way[rows, other], half[rows, other] + slack)
+        begin, end = np.maximum(begin, enter), np.minimum(end, leave)
+    over = begin <= end
+    normal = -sign[:, None] * turn[rows, :, k]
+    stretch = []
+    for place in (begin, end):
+        place = np.where(over, place, 0.0)
+        gap = sign * (start[rows, k] + place * way[rows, k]) - half[rows, k] - radius
+        ball = center + ((2.0 * place - 1.0) * half_length)[:, None] * axis
+        stretch.append(Touch(ball + (radius + 0.5 * gap)[:, None] * normal, normal, gap))
+    tolerance = _tolerance(delta, radius, half.min(axis=1))
+    lowest = np.minimum(stretch[0].gap, stretch[1].gap) + radius
+    flush = (separation >= distance - tolerance) & (lowest <= distance + tolerance)
+    flush = over & (flush | meets)
+    long = (end - begin) * half_length > slack
+    near = [touch.gap <= delta for touch in (*stretch, closest)]
+    return _manifold([*stretch, closest], [flush & near[0], flush & near[1] & long, ~flush & near[2]])
+
+
+def _tolerance(delta: float, size: Floats, other_size: Floats) -> Floats:
+    return FLUSH * delta + SNAP * np.minimum(size, other_size)
+
+
+def _manifold(touches: list[Touch], shown: list[np.ndarray]) -> Manifold:
+    """Feature f of the pairs in the mask shown[f] has the geometry touches[f]."""
+    pair = [np.flatnonzero(mask) for mask in shown]
+    parts = [Touch(*(values[rows] for values in touch)) for touch, rows in zip(touches, pair)]
+    feature = np.repeat(np.arange(len(pair)), [len(rows) for rows in pair])
+    return Manifold(np.concatenate(pair), feature, Touch(*(np.concatenate(values) for values in zip(*parts))))
+
+
+def _least(touches: list[Touch]) -> Touch:
+    """For each pair the touch of the least gap."""
+    best: Ints = np.argmin([touch.gap for touch in touches], axis=0)
+    rows = np.arange(len(best))
+    return Touch(*(np.stack(values)[best, rows] for values in zip(*touches)))
+
+
+def _crossing(first: tuple[Floats, ...], second: tuple[Floats, ...]) -> Touch:
+    """Where both core segments have the closest point of their lines inside; the gap is infinite elsewhere."""
+    center, axis, half_length, radius = first
+    other, other_axis, other_half, other_radius = second
+    s, t = closest_on_lines(center, axis, other, other_axis)
+    normal = cross(axis, other_axis)
+    length = np.sqrt(dot(normal, normal))
+    inside = (np.abs(s) <= half_length) & (np.abs(t) <= other_half) & (length > SNAP)
+    normal = np.where(inside[:, None], normal / np.where(inside, length, 1.0)[:, None], across(axis))
+    offset = dot(other - center, normal)
+    normal *= np.copysign(1.0, offset)[:, None]
+    gap = np.where(inside, np.abs(offset) - radius - other_radius, np.inf)
+    ahead = np.where(inside, radius + 0.5 * gap, 0.0)
+    return Touch(center + np.where(inside, s, 0.0)[:, None] * axis + ahead[:, None] * normal, normal, gap)
+
+
+def _slab(start: Floats, way: Floats, half: Floats) -> tuple[Floats, Floats]:
+    """Parameters between which start + t way (m,) stays within +-half; the first is the greater where it never does."""
+    moving = np.abs(way) > 1e-12 * half
+    divisor = np.where(moving, way, 1.0)
+    one, two = (-half - start) / divisor, (half - start) / divisor
+    outside = np.where(np.abs(start) <= half, -np.inf, np.inf)
+    return np.where(moving, np.minimum(one, two), outside), np.where(moving, np.maximum(one, two), -outside)
+
+
+def _closest_to_box(start: Floats, way: Floats, half: Floats) -> Floats:
+    """Parameters t in [0, 1] (m,) of the points of segments start + t way (m, 3) that are closest to boxes about the
+    origin.
+
+    The squared distance is convex in t, and its derivative is linear between the parameters at which the segment
+    crosses the planes of the faces: the root is found exactly.
+    """
+    divisor = np.where(way == 0.0, 1.0, way)
+    with np.errstate(over="ignore"):  # a way next to nothing: the crossing is far away on either side
+        crossings = np.concatenate([(-half - start) / divisor, (half - start) / divisor], axis=1)
+    crossings = np.concatenate([np.zeros((len(start), 1)), crossings, np.ones((len(start), 1))], axis=1)
+    t = np.sort(np.clip(crossings, 0.0, 1.0), axis=1)
+    place = start[:, None, :] + t[:, :, None] * way[:, None, :]
+    beyond = place - np.clip(place, -half[:, None], half[:, None])
+    slope = dot(beyond, way[:, None, :])
+    rows, last = np.arange(len(t)), t.shape[1] - 1
+    after = np.clip((slope <= 0.0).sum(axis=1), 1, last)  # the first crossing at which the distance grows
+    before = after - 1
+    rise = slope[rows, after] - slope[rows, before]
+    share = np.clip(-slope[rows, before] / np.where(rise > 0.0, rise, 1.0), 0.0, 1.0)
+    return t[rows, before] + share * (t[rows, after] - t[rows, before])

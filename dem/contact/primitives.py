@@ -1,0 +1,155 @@
+"""The primitives that a rank knows, in one table, and where pairs of them touch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from dem import quaternion
+from dem.arrays import Floats, Ints
+from dem.bodies import BOX, CAPSULE, SPHERE, enclosing_radius
+from dem.contact.box_box import BOX_FEATURES, box_box
+from dem.contact.capsules import capsule_box, capsule_capsule, capsule_plane
+from dem.contact.narrow import (
+    CORNERS,
+    Manifold,
+    Touch,
+    corner_plane,
+    reversed_touch,
+    sphere_box,
+    sphere_capsule,
+    sphere_plane,
+    sphere_sphere,
+)
+from dem.neighbourhood import Neighbourhood
+from dem.shapes import Box, Plane, Shape, Sphere
+
+#: Kind of the half spaces; those of the others are the kinds of grains.
+PLANE = 4
+
+#: Features that the contacts of one pair of primitives can have.
+FEATURES = BOX_FEATURES
+
+
+class Primitives(NamedTuple):
+    """Spheres, boxes, capsules and half spaces in the world frame; first all grains, then parts of large bodies."""
+
+    number: Ints  #: (n,) of the grain its id, of parts the numbers that follow: the same at all times
+    row: Ints  #: (n,) row of the body
+    kind: Ints  #: (n,) SPHERE, BOX, CAPSULE or PLANE
+    center: Floats  #: (n, 3); a point of the surface of a half space [m]
+    quaternion: Floats  #: (n, 4)
+    size: Floats  #: (n, 3) as of `Bodies` [m]; the outward normal of a half space
+    radius: Floats  #: (n,) of the sphere about the centre that encloses it, without meaning for half spaces [m]
+
+    def sphere(self, rows: Ints) -> tuple[Floats, Floats]:
+        """Centres and radii."""
+        return self.center[rows], self.size[rows, 0]
+
+    def box(self, rows: Ints) -> tuple[Floats, Floats, Floats]:
+        """Centres, frames (m, 3, 3) and half extents."""
+        return self.center[rows], quaternion.matrix(self.quaternion[rows]), self.size[rows]
+
+    def capsule(self, rows: Ints) -> tuple[Floats, Floats, Floats, Floats]:
+        """Centres, axes, half lengths and radii."""
+        axis = quaternion.rotate(self.quaternion[rows], np.array([0.0, 0.0, 1.0]))
+        return self.center[rows], axis, self.size[rows, 1], self.size[rows, 0]
+
+    def plane(self, rows: Ints) -> tuple[Floats, Floats]:
+        """Outward normals and points of the surfaces."""
+        return self.size[rows], self.center[rows]
+
+
+def primitives(near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int) -> Primitives:
+    """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies; `grains` is the number of
+    grains on all ranks."""
+    table, count = near.bodies, near.grains + near.ghosts
+    row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
+    parts = [_placed(shape) for body in shapes for shape in body]
+    kind, center, turn, size = (np.array(column) for column in zip(*parts)) if parts else _NOTHING
+    body_turn = table.quaternion[row]
+    size = np.where((kind == PLANE)[:, None], quaternion.rotate(body_turn, size), size)
+    sizes, kinds = np.concatenate([table.size[:count], size]), np.concatenate([table.shape[:count], kind])
+    center = table.position[row] + quaternion.rotate(body_turn, center)
+    return Primitives(
+        number=np.concatenate([table.id[:count], grains + np.arange(len(row))]),
+        row=np.concatenate([np.arange(count), row]),
+        kind=kinds,
+        center=np.concatenate([table.position[:count], center]),
+        quaternion=np.concatenate([table.quaternion[:count], quaternion.multiply(body_turn, turn)]),
+        size=sizes,
+        radius=enclosing_radius(kinds, sizes),
+    )
+
+
+_UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+_NOTHING = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3))
+
+
+def _placed(shape: Shape) -> tuple[int, Floats, Floats, Floats]:
+    """Kind, centre, quaternion and size of a shape in the frame of its body."""
+    center = np.array(shape.center)
+    if isinstance(shape, Sphere):
+        return SPHERE, center, _UPRIGHT, np.array([shape.radius, 0.0, 0.0])
+    if isinstance(shape, Plane):
+        return PLANE, center, _UPRIGHT, np.array(shape.normal)
+    turn = np.array(shape.quaternion)
+    if isinstance(shape, Box):
+        return BOX, center, turn, np.array(shape.half_extents)
+    return CAPSULE, center, turn, np.array([shape.radius, shape.half_length, 0.0])
+
+
+def touches(table: Primitives, i: Ints, j: Ints, delta: float) -> Manifold:
+    """All contacts of gap at most `delta` [m] of the pairs of rows i, j (m,); normals point from i to j.
+
+    Two half spaces have none.
+    """
+    found = [Manifold(*_no_rows, Touch(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))]
+    code = 8 * table.kind[i] + table.kind[j]
+    for one, two in (divmod(int(kinds), 8) for kinds in np.flatnonzero(np.bincount(code))):
+        rows = np.flatnonzero(code == 8 * one + two)
+        if (one, two) in _TOUCH:
+            pair, feature, touch = _TOUCH[one, two](table, i[rows], j[rows], delta)
+        elif (two, one) in _TOUCH:
+            pair, feature, touch = _TOUCH[two, one](table, j[rows], i[rows], delta)
+            touch = reversed_touch(touch)
+        else:
+            continue
+        found.append(Manifold(rows[pair], feature, touch))
+    pairs, features, geometry = zip(*found)
+    return Manifold(
+        np.concatenate(pairs),
+        np.concatenate(features),
+        Touch(*(np.concatenate(values) for values in zip(*geometry))),
+    )
+
+
+_no_rows = np.zeros(0, np.int64), np.zeros(0, np.int64)
+
+
+def _single(touch: Touch, delta: float) -> Manifold:
+    """The manifold of pairs that touch in one point."""
+    pair = np.flatnonzero(touch.gap <= delta)
+    return Manifold(pair, np.zeros_like(pair), Touch(*(values[pair] for values in touch)))
+
+
+def _box_plane(table: Primitives, i: Ints, j: Ints, delta: float) -> Manifold:
+    corner = np.tile(np.arange(len(CORNERS)), len(i))
+    pair = np.repeat(np.arange(len(i)), len(CORNERS))
+    manifold = _single(corner_plane(*table.box(i[pair]), corner, *table.plane(j[pair])), delta)
+    return Manifold(pair[manifold.pair], corner[manifold.pair], manifold.touch)
+
+
+_TOUCH: dict[tuple[int, int], Callable[[Primitives, Ints, Ints, float], Manifold]] = {
+    (SPHERE, SPHERE): lambda t, i, j, delta: _single(sphere_sphere(*t.sphere(i), *t.sphere(j)), delta),
+    (SPHERE, BOX): lambda t, i, j, delta: _single(sphere_box(*t.sphere(i), *t.box(j)), delta),
+    (SPHERE, CAPSULE): lambda t, i, j, delta: _single(sphere_capsule(*t.sphere(i), *t.capsule(j)), delta),
+    (SPHERE, PLANE): lambda t, i, j, delta: _single(sphere_plane(*t.sphere(i), *t.plane(j)), delta),
+    (CAPSULE, CAPSULE): lambda t, i, j, delta: capsule_capsule(*t.capsule(i), *t.capsule(j), delta),
+    (CAPSULE, BOX): lambda t, i, j, delta: capsule_box(*t.capsule(i), *t.box(j), delta),
+    (CAPSULE, PLANE): lambda t, i, j, delta: capsule_plane(*t.capsule(i), *t.plane(j), delta),
+    (BOX, BOX): lambda t, i, j, delta: box_box(*t.box(i), *t.box(j), delta),
+    (BOX, PLANE): _box_plane,
+}
