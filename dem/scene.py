@@ -18,7 +18,7 @@ import numpy as np
 from dem import bodies, checks, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.bodies import BOX, CAPSULE, COMPOUND, SPHERE, Bodies
-from dem.motion import Dynamic, Fixed, Motion
+from dem.motion import Dynamic, Fixed, Guided, Motion
 from dem.shapes import Shape
 
 
@@ -34,7 +34,7 @@ class LargeBody:
     quaternion: Floats  #: (4,)
     velocity: Floats  #: (6,) at time zero, of dynamic bodies
     mass: float  #: infinite unless the motion is dynamic [kg]
-    inertia: Floats  #: (3,) principal moments in the body frame [kg m^2]
+    inertia: Floats  #: (3,) principal moments in the body frame; infinite if the body cannot turn [kg m^2]
 
 
 class Scene:
@@ -143,8 +143,8 @@ class Scene:
 
         The pose and the velocities are those of time zero. A dynamic body needs either `density` [kg/m^3],
         and its frame is then moved to the centre of mass and the principal axes, or `mass` [kg] with the
-        principal moments `inertia` (3,) [kg m^2] of a frame that is there already. Two large bodies touch if at
-        least one of them is dynamic.
+        principal moments `inertia` (3,) [kg m^2] of a frame that is there already; a guided one needs no moments.
+        Two large bodies touch if at least one of them is dynamic.
         """
         if not name or name in (body.name for body in self.large_bodies):
             raise ValueError(f"large bodies need distinct names, got {name!r}")
@@ -164,8 +164,15 @@ class Scene:
         elif density is None and mass is not None and inertia is not None:
             weight = float(checks.positive(f"mass of {name!r}", mass))
             moments = checks.rows("inertia", checks.positive(f"inertia of {name!r}", inertia), 1, 3)[0]
+        elif density is None and mass is not None and isinstance(motion, Guided):
+            weight = float(checks.positive(f"mass of {name!r}", mass))
         else:
             raise ValueError(f"dynamic body {name!r} needs either its density or both mass and inertia")
+        if isinstance(motion, Guided):
+            across = speed[:3] - motion.free_directions() @ speed[:3]
+            if speed[3:].any() or np.linalg.norm(across) > 1e-12 * np.linalg.norm(speed):
+                raise ValueError(f"{name!r} is guided: its initial velocity must be along the guide")
+            moments = np.full(3, np.inf)
         number = self._material(material)
         self.large_bodies.append(LargeBody(name, parts, motion, number, place, turn, speed, weight, moments))
 

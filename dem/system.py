@@ -8,12 +8,14 @@ With v the velocities of all bodies (6 each) and g the impulses of all contacts 
     G          = D' M^-1/2, the mass-scaled map, so that the Delassus matrix is N = G G' = D' M^-1 D,
     r          = b + D' v_free,  b = (gap / dt, 0, 0) per contact.
 
-Bodies of prescribed motion have M^-1 = 0 and their prescribed velocity as v_free.
+Bodies of prescribed motion have M^-1 = 0 and their prescribed velocity as v_free. For a guided body M^-1 is
+d d' / m, with d the direction of its guide.
 Source: Anitescu and Hart (2004), Tasora and Anitescu (2011): the cone complementarity problem of a time step.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -27,9 +29,11 @@ from dem.bodies import Bodies
 from dem.checks import positive
 from dem.contact import Contacts
 from dem.exchange import exchange
+from dem.motion import Dynamic
 from dem.quaternion import cross
 
 if TYPE_CHECKING:
+    from dem.scene import LargeBody
     from dem.world import World
 
 
@@ -76,7 +80,9 @@ class ContactSystem:
         self._sign = 2.0 * order - 1.0
 
         grains = near.grains + near.ghosts
+        self._free_directions = _free_directions(world.large_bodies)
         free = free_velocity(table, world.gravity, dt)
+        free[grains:, :3] = _project(self._free_directions, free[grains:, :3])
         prescribed = ~bodies.is_dynamic(world.large)
         free[grains:][prescribed] = world.prescribed_velocity(dt)[prescribed]
         owned_large = slice(grains, grains + world.owned - near.grains)
@@ -89,12 +95,16 @@ class ContactSystem:
     def G(self) -> BlockRows:
         """Mass-scaled map D' M^-1/2, local block rows; bodies of prescribed motion have no blocks.
 
-        M^-1/2 of a body is diag(m^-1/2 E, I^-1/2), with the symmetric root of the inertia tensor.
+        M^-1/2 of a body is diag(m^-1/2 E, I^-1/2), with the symmetric root of the inertia tensor; of a guided
+        body diag(m^-1/2 d d', 0).
         """
         table, row = self._near.bodies, self._row
         blocks = self._blocks()
         blocks[..., :3] /= np.sqrt(table.mass)[row][:, :, None, None]
         blocks[..., 3:] = blocks[..., 3:] @ bodies.inverse_root_inertia(table)[row]
+        first_large = len(table) - len(self._free_directions)
+        large = row >= first_large
+        blocks[large, :, :3] = blocks[large, :, :3] @ self._free_directions[row[large] - first_large]
         dynamic = bodies.is_dynamic(table)[row]
         indptr = np.concatenate([[0], np.cumsum(dynamic.sum(axis=1))])
         return BlockRows(indptr, self._body[dynamic], blocks[dynamic])
@@ -119,19 +129,20 @@ class ContactSystem:
     def velocity(self, impulse: Floats) -> Floats:
         """Velocities (owned, 6) after the step, v_free + M^-1 D g, for impulses (nc, 3); collective."""
         near = self._near
-        load, large_load = self._generalised_impulse(impulse)
+        load, large_load = self.generalised_impulse(impulse)
         grains, large = (
             near.bodies.take(slice(0, near.grains)),
             near.bodies.take(slice(near.grains + near.ghosts, None)),
         )
         change = np.concatenate([_accelerate(grains, load), _accelerate(large, large_load)])
+        change[near.grains :, :3] = _project(self._free_directions, change[near.grains :, :3])
         return self.free_velocity + change[: self.owned_bodies]  # only the last rank owns the large bodies
 
     def force_on(self, name: str, impulse: Floats) -> Floats:
         """Contact force and torque (6,) [N, N m] on a large body, about its reference point, averaged over
         the step, from the impulses (nc, 3) of all ranks; collective. KeyError if there is no such body."""
         row = self._large_row(name)
-        return self._generalised_impulse(impulse)[1][row] / self.dt
+        return self.generalised_impulse(impulse)[1][row] / self.dt
 
     def _arm(self, side: int) -> Floats:
         """Vectors (nc, 3) from the centre of one of the two bodies to the contact point."""
@@ -156,8 +167,9 @@ class ContactSystem:
             relative += self._sign[:, side, None] * at_point
         return (self.frame @ relative[:, :, None])[:, :, 0]
 
-    def _generalised_impulse(self, impulse: Floats) -> tuple[Floats, Floats]:
-        """D g of the local grains (grains, 6) and of the large bodies, summed over all ranks; collective."""
+    def generalised_impulse(self, impulse: Floats) -> tuple[Floats, Floats]:
+        """D g of the local grains (grains, 6), and of the large bodies (large, 6), the same on all ranks, from
+        the impulses (nc, 3) of all ranks [N s, N m s]; collective."""
         near, count = self._near, len(self._near.bodies)
         push = (impulse[:, None, :] @ self.frame)[:, 0]
         load = np.zeros((count, 6))
@@ -201,11 +213,23 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
     rows = np.flatnonzero(bodies.is_dynamic(table))
     velocity[rows, :3] += dt * gravity
     # The torque vanishes where all moments are equal, as for spheres.
+    rows = rows[np.isfinite(table.inertia[rows]).all(axis=1)]  # guided bodies do not turn
     rows = rows[np.ptp(table.inertia[rows], axis=1) > 0.0]
     turn, moments = table.quaternion[rows], table.inertia[rows]
     spin = quaternion.rotate(quaternion.conjugate(turn), velocity[rows, 3:])
     velocity[rows, 3:] += dt * quaternion.rotate(turn, -cross(spin, moments * spin) / moments)
     return velocity
+
+
+def _free_directions(members: Sequence[LargeBody]) -> Floats:
+    """Projectors (large, 3, 3) on the directions that are open to the velocities of large bodies."""
+    open_to = [body.motion.free_directions() if isinstance(body.motion, Dynamic) else np.eye(3) for body in members]
+    return np.array(open_to).reshape(len(members), 3, 3)
+
+
+def _project(projectors: Floats, vectors: Floats) -> Floats:
+    """Products (n, 3) of matrices (n, 3, 3) and vectors (n, 3)."""
+    return (projectors @ vectors[:, :, None])[:, :, 0]
 
 
 def _accelerate(table: Bodies, load: Floats) -> Floats:

@@ -64,7 +64,7 @@ def describe(group: type, prefix: str = "") -> list[Description]:
             prefix + f.name,
             f.default,
             f.metadata.get("unit", ""),
-            f.metadata["help"],
+            f.metadata.get("help", ""),  # fields of a user's scene may be plain
             f.metadata.get("choices"),
         )
         for f in dataclasses.fields(group)
@@ -97,7 +97,7 @@ def _value(name: str, text: str | None, kind: Any, metadata: Mapping[str, Any]) 
     except ValueError:
         raise OptionError(f"-{name} {text}: allowed is {allowed}") from None
     if choices and value not in choices:
-        raise OptionError(f"-{name} {text}: allowed is one of {', '.join(choices)}{_nearest(text, choices)}")
+        raise OptionError(f"-{name} {text}: allowed is one of {', '.join(choices)}{nearest(text, choices)}")
     if kind is float and not math.isfinite(value) and not check:
         raise OptionError(f"-{name} {text}: allowed is a finite number")
     if check and not check[1](value):
@@ -114,7 +114,8 @@ def _truth(text: str) -> bool:
         raise ValueError(text) from None
 
 
-def _nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The end of a message: which of the known names may have been meant."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
     return f"; did you mean {close[0]}?" if close else ""
 

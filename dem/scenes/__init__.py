@@ -1,11 +1,12 @@
-"""The scenes that come with the package, by name.
+"""The scenes that come with the package, by name. Each is an `Experiment`, see `dem.experiment`."""
 
-A scene class is a frozen dataclass: its fields, with "help" and "unit" in their metadata, are its options,
-`build` makes the scene, and `settling_time`, `dt` and `delta` are what it recommends for its simulation.
-"""
+from __future__ import annotations
 
+from dem.experiment import Experiment
+from dem.scenes.blade import Blade
 from dem.scenes.mixer import Mixer
+from dem.scenes.shear import Shear
 
-SCENES = {"mixer": Mixer}
+SCENES: dict[str, type[Experiment]] = {"mixer": Mixer, "blade": Blade, "shear": Shear}
 
-__all__ = ["SCENES", "Mixer"]
+__all__ = ["SCENES", "Blade", "Mixer", "Shear"]

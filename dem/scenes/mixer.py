@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from math import pi, sqrt
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf, pi, sqrt
+from typing import ClassVar
 
 import numpy as np
 
 from dem import checks
 from dem.arrays import Floats
+from dem.experiment import Experiment, option
 from dem.motion import Rotation
 from dem.scene import Scene
+from dem.scenes.lattice import check_room, perturbed
 from dem.shapes import Box, Plane
 
 
-def _option(default: Any, unit: str, text: str) -> Any:
-    return field(default=default, metadata={"unit": unit, "help": text})
-
-
 @dataclass(frozen=True)
-class Mixer:
+class Mixer(Experiment):
     """(2n+1)^3 spheres on a randomly perturbed cubic lattice fall into a fixed box onto a turning paddle.
 
     The box is open at the top, and its width grows as 2n+1, so that the number of spheres per floor area and
@@ -29,43 +28,35 @@ class Mixer:
     benchmark of Chrono.
     """
 
-    n: int = _option(4, "", "size: there are (2n+1)^3 spheres")
-    radius: float = _option(0.1, "m", "radius of the spheres")
-    density: float = _option(2500.0, "kg/m^3", "density of the spheres (glass)")
-    friction: float = _option(0.25, "", "friction coefficient of all contacts")
-    pitch: float = _option(0.25, "m", "spacing of the lattice on which the spheres start")
-    perturbation: float = _option(
-        0.02, "m", "greatest displacement of a sphere from its lattice point, per axis"
-    )
-    seed: int = _option(1, "", "seed of the perturbation")
-    margin: float = _option(0.0, "m", "width of the box beyond (2n+1) pitch")
-    paddle_length: float = _option(1 / 2, "box widths", "length of the paddle")
-    paddle_height: float = _option(1 / 4, "box widths", "height of the paddle")
-    paddle_thickness: float = _option(1 / 20, "box widths", "thickness of the paddle")
-    clearance: float = _option(0.05, "m", "gap between the floor and the paddle")
-    angular_velocity: float = _option(pi / 3, "rad/s", "angular velocity of the paddle about the vertical")
-    gravity: float = _option(9.81, "m/s^2", "gravity, downwards")
+    n: int = option(4, "", "size: there are (2n+1)^3 spheres")
+    radius: float = option(0.1, "m", "radius of the spheres")
+    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
+    friction: float = option(0.25, "", "friction coefficient of all contacts")
+    pitch: float = option(0.25, "m", "spacing of the lattice on which the spheres start")
+    perturbation: float = option(0.02, "m", "greatest displacement of a sphere from its lattice point, per axis")
+    seed: int = option(1, "", "seed of the perturbation")
+    margin: float = option(0.0, "m", "width of the box beyond (2n+1) pitch")
+    paddle_length: float = option(1 / 2, "box widths", "length of the paddle")
+    paddle_height: float = option(1 / 4, "box widths", "height of the paddle")
+    paddle_thickness: float = option(1 / 20, "box widths", "thickness of the paddle")
+    clearance: float = option(0.05, "m", "gap between the floor and the paddle")
+    angular_velocity: float = option(pi / 3, "rad/s", "angular velocity of the paddle about the vertical")
+    gravity: float = option(9.81, "m/s^2", "gravity, downwards")
 
     #: Recommended time step [s] and contact distance [m].
     dt: ClassVar[float] = 0.025
     delta: ClassVar[float] = 0.02
 
     def __post_init__(self) -> None:
-        for option in fields(self):
-            checks.finite(option.name, getattr(self, option.name))
+        super().__post_init__()
         if self.n < 1:
             raise ValueError(f"n must be at least 1, got {self.n}")
         sizes = ("radius", "pitch", "paddle_length", "paddle_height", "paddle_thickness")
         for name in (*sizes, "density", "gravity"):
             checks.positive(name, getattr(self, name))
-        for name in ("friction", "perturbation", "margin", "clearance"):
+        for name in ("friction", "margin", "clearance"):
             checks.not_negative(name, getattr(self, name))
-        free = self.pitch / 2 - self.radius
-        if self.perturbation >= free:
-            raise ValueError(
-                f"perturbation {self.perturbation:g} m must be less than pitch / 2 - radius = {free:g} m, "
-                "half the free space between spheres of the lattice"
-            )
+        check_room(self.radius, self.pitch, self.perturbation)
         if self.radius <= self.clearance <= 2 * self.radius:
             raise ValueError(
                 f"clearance {self.clearance:g} m between one and two radii ({self.radius:g} m): "
@@ -84,6 +75,12 @@ class Mixer:
         return (2 * self.n + 1) * self.pitch + self.margin
 
     @property
+    def domain(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """The inside of the box [m]."""
+        wall = self.width / 2
+        return (-wall, -wall, 0.0), (wall, wall, inf)
+
+    @property
     def lattice_bottom(self) -> float:
         """Height of the lowest layer of the lattice [m]: all spheres start above the paddle."""
         return self.clearance + self.paddle_height * self.width + self.radius + 2 * self.perturbation
@@ -99,9 +96,7 @@ class Mixer:
         """Centres ((2n+1)^3, 3) of the spheres at the start [m]; the floor is z = 0, the axis x = y = 0."""
         side = np.arange(-self.n, self.n + 1) * self.pitch
         height = self.lattice_bottom + np.arange(2 * self.n + 1) * self.pitch
-        lattice = np.stack(np.meshgrid(side, side, height, indexing="ij"), axis=-1).reshape(-1, 3)
-        shift = np.random.default_rng(self.seed).uniform(-1.0, 1.0, lattice.shape)
-        return lattice + self.perturbation * shift
+        return perturbed(side, side, height, self.perturbation, self.seed)
 
     def build(self) -> Scene:
         """The scene, with the large bodies "box" and "mixer"."""
@@ -122,3 +117,7 @@ class Mixer:
             position=(0, 0, self.clearance + height / 2),
         )
         return scene
+
+    def analyse(self, records: Mapping[str, Floats]) -> Mapping[str, float | Floats]:
+        """The mean of the torque that turns the mixer."""
+        return {"mean_torque [N m]": float(-np.mean(records["torque_mixer_z [N m]"]))}

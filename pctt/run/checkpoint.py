@@ -90,7 +90,8 @@ def settled_path(record: str, settings: dict[str, Any]) -> Path:
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pctt"
     scene = json.loads(record)
     digest = hashlib.sha256((record + json.dumps(settings, sort_keys=True)).encode()).hexdigest()[:12]
-    return cache / f"{scene['scene']}_n{scene['n']}_{digest}.h5"
+    size = f"_n{scene['n']}" if "n" in scene else ""
+    return cache / f"{scene['scene']}{size}_{digest}.h5"
 
 
 def write_checksum(path: Path) -> None:

@@ -48,8 +48,8 @@ class RowWriter:
             data[...] = array
 
     def attributes(self, name: str, values: Mapping[str, Any]) -> None:
-        """Collective: attributes of a group or dataset ('/' the file)."""
-        self._file[name].attrs.update(values)
+        """Collective: attributes of a group ('/' the file), which is made if it is not there."""
+        self._file.require_group(name).attrs.update(values)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from typing import Any, Optional
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.experiment import Experiment, SceneFileError, from_file
 from dem.scenes import SCENES
 from pctt import ccp
 from pctt.options import (
@@ -20,6 +21,7 @@ from pctt.options import (
     POSITIVE,
     OptionError,
     describe,
+    nearest,
     option,
     read,
     refuse_unknown,
@@ -42,7 +44,7 @@ DEMO = {
 class Run:
     """Options without a prefix."""
 
-    scene: str = option("mixer", "what to simulate", choices=SCENES)
+    scene: str = option("mixer", f"what to simulate: {', '.join(SCENES)}, or a file FILE.py with a scene of your own")
     steps: int = option(5, "time steps to make", check=COUNT)
     dt: Optional[float] = option(None, "time step; none: the scene's own", "s", check=POSITIVE)
     delta: Optional[float] = option(
@@ -63,7 +65,7 @@ class Run:
         check=NOT_NEGATIVE,
     )
     settle_tol: float = option(1e-3, "natural residual of the steps of -settle", check=POSITIVE)
-    output: str = option("results", "folder for state.h5, checkpoint.h5 and summary.json")
+    output: str = option("results", "folder for state.h5, records.csv, summary.json, checkpoint.h5")
     output_every: int = option(1, "steps between two records in state.h5; 0: none", check=COUNT)
     checkpoint_every: int = option(1, "steps between two checkpoints", check=AT_LEAST_ONE)
     problem: str = option("", "FCLIB or PETSc binary file with a cone problem to solve instead of a scene")
@@ -92,8 +94,8 @@ class Run:
 class Options:
     """Everything that a run needs to know, with the scene's own values filled in.
 
-    ``scene`` is an instance of a class of ``dem.scenes.SCENES``; ``solver`` of the options class of
-    ``ccp_type``.
+    ``scene`` is an instance of a class of ``dem.scenes.SCENES`` or of the user's; ``solver`` of the options class
+    of ``ccp_type``.
     """
 
     run: Run
@@ -119,8 +121,8 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     run = read(Run, database)
     solver = ccp.SOLVERS[run.ccp_type]
     prefix = f"ccp_{run.ccp_type}_"
-    scene_class = SCENES[run.scene]
-    known = [d.name for group, start in _groups(run.scene) for d in describe(group, start)]
+    scene_class = find_scene(run.scene)
+    known = [d.name for group, start in _groups(scene_class) for d in describe(group, start)]
     refuse_unknown(database, known, prefixes=("compare_", "fallback_"))
     for name in known:
         PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
@@ -158,20 +160,38 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     return options
 
 
-def _groups(scene: str) -> list[tuple[type, str]]:
+def find_scene(name: str) -> type[Experiment]:
+    """The scene of that name, or the one that the file of that name defines; OptionError if there is none."""
+    if name.endswith(".py"):
+        try:
+            return from_file(Path(name))
+        except SceneFileError as error:
+            raise OptionError(f"-scene {name}: {error}") from None
+    if name not in SCENES:
+        allowed = f"one of {', '.join(SCENES)}, or a file FILE.py"
+        raise OptionError(f"-scene {name}: allowed is {allowed}{nearest(name, SCENES)}")
+    return SCENES[name]
+
+
+def scene_name(name: str) -> str:
+    """How results name a scene: a file of the user's without folder and suffix."""
+    return Path(name).stem
+
+
+def _groups(scene: type[Experiment]) -> list[tuple[type, str]]:
     solvers = [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
-    return [(Run, ""), (SCENES[scene], "scene_"), (ccp.Limits, "ccp_"), *solvers]
+    return [(Run, ""), (scene, "scene_"), (ccp.Limits, "ccp_"), *solvers]
 
 
 def help_text(database: Mapping[str, str]) -> str:
     """All options with default, unit and meaning."""
     scene = database.get("scene", "mixer")
-    scene = scene if scene in SCENES else "mixer"
+    scene_class = find_scene(scene)
     lines = ["Options of pctt.run (names <default unit>: meaning); without any, it runs the demo:"]
     lines += ["  " + " ".join(f"-{name} {value}" for name, value in DEMO.items()), ""]
     titles = ["Run", f"Scene {scene}", "Cone problem"]
     titles += [f"-ccp_type {name}: {solver.help}" for name, solver in ccp.SOLVERS.items()]
-    for title, (group, prefix) in zip(titles, _groups(scene)):
+    for title, (group, prefix) in zip(titles, _groups(scene_class)):
         lines += [title, *(str(line) for line in describe(group, prefix)), ""]
     lines += [
         "Newton systems: the KSP without prefix, e.g. -ksp_type bcgs -ksp_rtol 1e-3 -ksp_max_it 1000",

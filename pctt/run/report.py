@@ -79,6 +79,12 @@ def phase_table(steps: Sequence[Mapping[str, Any]]) -> str:
     return f"median seconds per step: {total:.3f} ({cells})"
 
 
+def figure_table(figures: Mapping[str, float]) -> str:
+    """A line per number of the scene's analysis."""
+    width = max(map(len, figures), default=0)
+    return "\n".join(f"{name:{width}}  {value:.6g}" for name, value in figures.items())
+
+
 def _median(values: Sequence[float]) -> float:
     ordered = sorted(values)
     middle = len(ordered) // 2

@@ -2,6 +2,8 @@
 
     state.h5         group steps/000012 per recorded step, each a link to its own file in frames/
     frames/          one file per recorded step
+    records.csv      a row per step, see ``dem.record`` and ``pctt.run.records``
+    analysis.csv     the series that the scene makes of them at the end
     checkpoint.h5    all that ``-restart`` needs
     summary.json     figures per step, and of the compared preconditioners
     hard/            cone problems that the asked-for solver did not solve
@@ -26,6 +28,7 @@ from dem.system import ContactSystem
 from dem.world import World
 from pctt.run.dump import HARD
 from pctt.run.hdf5 import RowWriter, write_text, written
+from pctt.run.records import Records
 
 
 class Results:
@@ -40,10 +43,12 @@ class Results:
         self._frames = folder / "frames"
         self._recorded: list[int] = []
         self._steps: list[dict[str, Any]] = []
+        goes_on = comm.bcast(bool(restart) and Path(restart).resolve() == self.checkpoint.resolve())
         if comm.rank == 0:
             self._frames.mkdir(parents=True, exist_ok=True)
-            self._take_over(world, bool(restart) and Path(restart).resolve() == self.checkpoint.resolve())
+            self._take_over(world, goes_on)
         comm.Barrier()
+        self.records = Records(folder, comm, kept_steps=world.step if goes_on else 0)
 
     def _take_over(self, world: World, goes_on: bool) -> None:
         """Keep what is there up to the step from which this run goes on, and remove the rest."""
@@ -66,15 +71,17 @@ class Results:
                 path.unlink()
 
     def record_step(
-        self, world: World, contacts: Contacts, system: ContactSystem, impulse: np.ndarray
+        self, world: World, contacts: Contacts, system: ContactSystem, impulse: np.ndarray, row: dict[str, float]
     ) -> None:
-        """Write the state at the end of a step, and the contacts and impulses that led to it; collective.
+        """Write the state at the end of a step, the contacts and impulses that led to it, and the row of its records
+        as attributes of the group `record`; collective.
 
         Bodies are in the order of their ids (grains, then large bodies).
         """
         name = f"{world.step:06d}.h5"
         with written(self._frames / name, self.comm) as file:
             file.attributes("/", {"step": world.step, "time": world.time})
+            file.attributes("record", row)
             _write_bodies(file, world)
             near = contacts.near.bodies
             file.rows("contact/key", contacts.key)
@@ -94,6 +101,7 @@ class Results:
             file.attrs["large_bodies"] = [body.name for body in world.large_bodies]
             file.attrs["contents"] = (
                 "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, by body id; "
+                "record: attributes as in records.csv; "
                 "contact: bodies a and b, point m, frame rows (normal from a to b, t1, t2), gap m, "
                 "impulse on b N s"
             )
@@ -101,14 +109,21 @@ class Results:
                 file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
         temporary.replace(self.folder / "state.h5")
 
-    def write_summary(self, world: World, compare: dict[str, Any], line: dict[str, Any] | None = None) -> None:
-        """Write summary.json with what is known so far, and the figures of a new step if there is one."""
+    def write_summary(
+        self,
+        world: World,
+        compare: dict[str, Any],
+        line: dict[str, Any] | None = None,
+        analysis: dict[str, float] | None = None,
+    ) -> None:
+        """Write summary.json with what is known so far, the figures of a new step and those of the analysis."""
         if self.comm.rank != 0:
             return
         if line is not None:
             self._steps.append(line)
         totals = {"bodies": world.body_count, "ranks": self.comm.size, "compare": compare}
-        summary = {**totals, "scene": json.loads(self.record), "steps": self._steps}
+        scene = json.loads(self.record)
+        summary = {**totals, "scene": scene, "analysis": analysis or {}, "steps": self._steps}
         write_text(self.folder / "summary.json", json.dumps(_finite(summary), indent=1) + "\n")
 
 

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from dem import record as recording
 from dem.contact import find_contacts
 from dem.impulses import ImpulseMemory
 from dem.partition import rebalance
+from dem.scene import Scene
 from dem.stepper import advance
 from dem.system import ContactSystem
 from dem.world import World
@@ -21,7 +23,7 @@ from pctt import ccp, log
 from pctt.options import OptionError
 from pctt.run import checkpoint, report
 from pctt.run.dump import Dump
-from pctt.run.options import Options
+from pctt.run.options import Options, scene_name
 from pctt.run.results import Results
 
 
@@ -36,7 +38,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         progress.say("no options: the demo; -help lists the options")
     world, memory = _first_state(options, comm, progress)
     dump = Dump(options, world)
-    record = checkpoint.scene_record(options.run.scene, options.scene)
+    record = checkpoint.scene_record(scene_name(options.run.scene), options.scene)
     results = Results(Path(options.run.output), comm, record, world, options.run.restart)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
@@ -51,8 +53,10 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         last = k == options.run.steps
         lines.append(line)
         with log.phase("output"):
+            row = stepper.records()
+            results.records.add(row)
             if options.run.output_every and (world.step % options.run.output_every == 0 or last):
-                results.record_step(world, stepper.contacts, stepper.system, stepper.impulse)
+                results.record_step(world, stepper.contacts, stepper.system, stepper.impulse, row)
         # before the checkpoint: a run that goes on from there must find the step in the summary
         _count_output(line)
         results.write_summary(world, compare.summary(), line)
@@ -62,12 +66,32 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         _count_output(line)
         progress.say(report.step_line(line))
     if lines:
-        results.write_summary(world, compare.summary())
+        figures = _analyse(options.scene, results, comm)
+        results.write_summary(world, compare.summary(), analysis=figures)
         progress.say(report.phase_table(lines))
+        if figures:
+            progress.say(report.figure_table(figures))
+        if row.get("grains_outside"):
+            progress.say(f"{row['grains_outside']:.0f} grains have left the domain of the scene")
     if compare.names:
         progress.say("\n" + report.compare_table(compare.summary(), compare.labels()))
     newton.destroy()
-    progress.say(f"\nresults: {results.folder}/state.h5, summary.json, checkpoint.h5")
+    progress.say(f"\nresults: {results.folder}/state.h5, records.csv, summary.json, checkpoint.h5")
+
+
+def _analyse(scene: Any, results: Results, comm: MPI.Comm) -> dict[str, float]:
+    """The numbers that the scene finds in the records; SceneError if it fails on them."""
+    figures: dict[str, float] = {}
+    failure = None
+    if comm.rank == 0:
+        try:
+            figures = results.records.analyse(scene)
+        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+            failure = f"{type(error).__name__}: {error}"
+    figures, failure = comm.bcast((figures, failure))
+    if failure:
+        raise SceneError(f"analyse of the scene {type(scene).__name__}: {failure}")
+    return figures
 
 
 def _count_output(line: dict[str, Any]) -> None:
@@ -140,6 +164,15 @@ class Stepper:
             "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
         }
 
+    def records(self) -> dict[str, float]:
+        """What the last step shows, by name; collective. SceneError if the scene's own records are at fault."""
+        try:
+            step = recording.Step(self.world, self.contacts, self.system, self.impulse)
+            return recording.row(step, self.options.scene)
+        except (LookupError, TypeError, ValueError) as error:
+            scene = type(self.options.scene).__name__
+            raise SceneError(f"record of the scene {scene}: {type(error).__name__}: {error}") from None
+
     def _solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> tuple[ccp.Result, str, int]:
         """Solve as asked; where that does not converge, go on with APGD from there and keep the better.
 
@@ -167,7 +200,7 @@ def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0)
 
 
 def _first_state(options: Options, comm: MPI.Comm, progress: report.Progress) -> tuple[World, ImpulseMemory]:
-    name, scene = options.run.scene, options.scene
+    name, scene = scene_name(options.run.scene), options.scene
     if not options.run.restart:
         return _new_world(scene, comm), ImpulseMemory(comm)
     settled = options.run.restart == "settled"
@@ -179,7 +212,10 @@ def _first_state(options: Options, comm: MPI.Comm, progress: report.Progress) ->
 
 def _new_world(scene: Any, comm: MPI.Comm) -> World:
     try:
-        return World.from_scene(scene.build(), comm)
+        built = scene.build()
+        if not isinstance(built, Scene):
+            raise ValueError(f"build must return a dem.scene.Scene, not {type(built).__name__}")
+        return World.from_scene(built, comm)
     except ValueError as error:
         raise OptionError(f"scene {type(scene).__name__}: {error}") from None
 
@@ -195,17 +231,21 @@ def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, a
         limits=ccp.Limits(tol=options.run.settle_tol),
         solver=ccp.SOLVERS["apgd"].options(),
     )
-    record = checkpoint.scene_record(options.run.scene, options.scene)
-    settings = {
+    if not options.scene.settling_time:
+        raise OptionError(f"-scene {options.run.scene}: has no settling_time and so no settled state")
+    record = checkpoint.scene_record(scene_name(options.run.scene), options.scene)
+    settings: dict[str, Any] = {
         "dt": options.dt,
         "delta": [options.run.settle_delta, options.delta],
         "recovery_speed": options.run.recovery_speed,
         "tol": options.run.settle_tol,
     }
+    if options.scene.digest:
+        settings["file"] = options.scene.digest  # a file that was changed may build another scene
     path = checkpoint.settled_path(record, settings)
     if not anew and comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
         return path
-    steps = math.ceil(options.scene.settling_time / options.dt)
+    steps = math.ceil(options.scene.settling_time / options.dt * (1 - 1e-12))
     progress.say(f"settling {options.run.scene}, {steps} steps with APGD to {options.run.settle_tol:g}:")
     if comm.rank == 0:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -59,6 +59,13 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
+def table(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a CSV file by name."""
+    with path.open() as file:
+        names = file.readline().rstrip("\n").split(",")
+        return dict(zip(names, np.loadtxt(file, delimiter=",", ndmin=2).T))
+
+
 def _collect(group, prefix, found):
     for name, item in group.items():
         if isinstance(item, h5py.Dataset):

@@ -157,6 +157,7 @@ def test_no_state_is_written_if_none_is_wanted(program, settled, tmp_path):
     program(*SETTLED, "-steps", 2, "-output_every", 0, "-ccp_type", "apgd")
     assert sorted(p.name for p in (tmp_path / "results").iterdir() if p.is_file()) == [
         "checkpoint.h5",
+        "records.csv",
         "summary.json",
     ]
 

@@ -1,0 +1,47 @@
+"""What the records of a run show: filtered series, means of the steady part, the friction angle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from dem.arrays import Bools, Floats
+
+
+def low_pass(time: Floats, values: Floats, cutoff: float) -> Floats:
+    """Values (n,) at equally spaced times (n,) [s] without what is faster than `cutoff` [Hz].
+
+    Butterworth filter of second order, forwards and backwards, so that nothing is shifted in time. As they are if
+    there are fewer than three or if they do not resolve the cutoff.
+    """
+    if len(values) < 3:
+        return values.copy()
+    from scipy import signal  # here, as its import would slow down every start
+
+    rate = 1.0 / float(np.median(np.diff(time)))
+    if cutoff >= 0.5 * rate:
+        return values.copy()
+    sections = signal.butter(2, cutoff, fs=rate, output="sos")
+    return signal.sosfiltfilt(sections, values, padlen=min(9, len(values) - 1))
+
+
+def filtered(records: Mapping[str, Floats], names: list[str], cutoff: float) -> dict[str, Floats]:
+    """The named records through `low_pass`, under the names "force_filtered [N]" and the like."""
+    out = {}
+    for name in names:
+        stem, bracket, unit = name.partition(" [")
+        out[f"{stem}_filtered{bracket}{unit}"] = low_pass(records["time [s]"], records[name], cutoff)
+    return out
+
+
+def steady_part(time: Floats, start: float, period: float) -> Bools:
+    """Mask (n,) of the first stroke of a sinusoidal motion where its speed is above 1/sqrt(2) of the greatest: from
+    1/8 to 3/8 of the period after `start` [s]."""
+    phase = (time - start) / period
+    return (phase >= 1 / 8) & (phase <= 3 / 8)
+
+
+def friction_angle(shear: Floats, normal: Floats) -> float:
+    """Angle [degrees] whose tangent is the mean shear over the mean normal stress."""
+    return float(np.degrees(np.arctan2(np.mean(shear), np.mean(normal))))

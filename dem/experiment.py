@@ -1,0 +1,144 @@
+"""What a scene is to the program: options, recommended numerics, bodies to build, quantities to record.
+
+    @dataclass(frozen=True)
+    class Drop(Experiment):
+        '''One sphere falls onto a floor.'''
+
+        height: float = option(1.0, "m", "height of the centre at the start")
+        settling_time = 2.0
+
+        def build(self) -> Scene:
+            scene = Scene(friction=0.3)
+            scene.add_body("floor", [Plane(normal=(0, 0, 1))])
+            scene.add_spheres([0, 0, self.height], radius=0.1, density=2500.0)
+            return scene
+
+In a file `drop.py` of its own this is simulated by `python -m pctt.run -scene drop.py -scene_height 2`. The scenes of
+the package, `dem.scenes`, are written in the same way and need nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.util
+import sys
+import traceback
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from dem import checks
+from dem.arrays import Floats
+from dem.scene import Scene
+
+if TYPE_CHECKING:
+    from dem.record import Step
+
+#: Types that an option can have.
+KINDS = (int, float, bool, str)
+
+
+def option(default: Any, unit: str, text: str) -> Any:
+    """A field of an experiment: its default, unit ("" if it has none) and meaning, which `-help` shows."""
+    return dataclasses.field(default=default, metadata={"unit": unit, "help": text})
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """Base of all scenes. A scene is a frozen dataclass; its fields, each with a default, are its options.
+
+    A scene defines `build`, and may define the rest. The attributes may be properties that depend on the options.
+    """
+
+    #: Recommended time step [s].
+    dt: ClassVar[Any] = 0.01
+    #: Recommended contact distance: pairs with smaller gaps are contacts [m].
+    delta: ClassVar[Any] = 0.02
+    #: Time after which the start may be taken as settled [s]. A motion that is to begin then has it as its `start`.
+    settling_time: ClassVar[Any] = 0.0
+    #: Lower and upper corner of the box that no centre of a grain should leave [m]; None: there is none.
+    domain: ClassVar[Any] = None
+    #: Digest of the file that the scene was read from; empty for a scene of the package.
+    digest: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        """ValueError, which starts with the name of the option, for numbers that are none; extend it to check more."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, float):
+                checks.finite(field.name, value)
+
+    def build(self) -> Scene:
+        """The bodies, materials and motions at time zero."""
+        raise NotImplementedError(f"scene {type(self).__name__} has no method build")
+
+    def record(self, step: Step) -> Mapping[str, float]:
+        """Quantities of the scene's own to record after every step, by name with the unit in brackets: "depth [m]".
+
+        Called on all ranks, and must return the same on all: what `Step` offers is of that kind.
+        """
+        return {}
+
+    def analyse(self, records: Mapping[str, Floats]) -> Mapping[str, float | Floats]:
+        """What the records (by name, one entry per step) show at the end of a run.
+
+        Numbers are printed and go to summary.json; arrays, with an entry per record, become columns of analysis.csv.
+        """
+        return {}
+
+
+class SceneFileError(ValueError):
+    """A file that holds no scene, or more than one."""
+
+
+def from_file(path: Path) -> type[Experiment]:
+    """The one class derived from `Experiment` that a Python file defines. SceneFileError if there is not just one, if
+    the file cannot be run, or if an option has no default or an unknown type."""
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "no text"
+        raise SceneFileError(f"cannot be read ({reason})") from None
+    name = f"scene_file_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses and type hints look their module up
+    try:
+        exec(compile(text, str(path), "exec"), module.__dict__)
+    except SyntaxError as error:
+        raise SceneFileError(f"line {error.lineno}: {error.msg}") from None
+    except Exception as error:
+        own = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        raise SceneFileError(f"line {own[-1] if own else '?'}: {type(error).__name__}: {error}") from None
+    found = [
+        item
+        for item in vars(module).values()
+        if isinstance(item, type) and issubclass(item, Experiment) and item.__module__ == name
+    ]
+    if len(found) != 1:
+        what = ", ".join(item.__name__ for item in found) or "no class derived from dem.experiment.Experiment"
+        raise SceneFileError(f"must define one scene, has {what}")
+    _check_options(found[0])
+    found[0].digest = hashlib.sha256(text.encode()).hexdigest()
+    return found[0]
+
+
+def _check_options(scene: type[Experiment]) -> None:
+    if "__dataclass_fields__" not in vars(scene):
+        raise SceneFileError(f"{scene.__name__} must be marked @dataclass(frozen=True)")
+    if scene.build is Experiment.build:
+        raise SceneFileError(f"{scene.__name__} has no method build")
+    try:
+        kinds = typing.get_type_hints(scene)
+    except Exception as error:
+        raise SceneFileError(f"types of {scene.__name__}: {error}") from None
+    for field in dataclasses.fields(scene):
+        if field.default is dataclasses.MISSING:
+            raise SceneFileError(f"option {field.name} of {scene.__name__} has no default")
+        if kinds[field.name] not in KINDS:
+            allowed = ", ".join(kind.__name__ for kind in KINDS)
+            raise SceneFileError(f"option {field.name} of {scene.__name__}: the type must be one of {allowed}")

@@ -1,0 +1,162 @@
+"""What a time step shows: forces on the large bodies, energies and their balance, statistics of the contacts.
+
+All functions are collective, and their results are the same on all ranks and, to rounding, for any number of ranks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import bodies, quaternion
+from dem.arrays import ArrayLike, Floats
+from dem.bodies import COMPOUND, Bodies
+from dem.contact import Contacts
+from dem.experiment import Experiment
+from dem.system import ContactSystem
+from dem.world import World
+
+#: A contact is active if its normal impulse exceeds this part of the mean: solvers leave small impulses at others.
+ACTIVE = 0.01
+
+#: A contact slides if its tangential impulse exceeds this part of what friction can bear.
+SLIDING = 0.99
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step that was just made: `advance` was called, the grains are not yet balanced anew."""
+
+    world: World  #: at the end of the step
+    contacts: Contacts
+    system: ContactSystem
+    impulse: Floats  #: (nc, 3) of the local contacts: normal, t1, t2 [N s]
+
+    def force_on(self, name: str) -> Floats:
+        """Contact force and torque (6,) [N, N m] on a large body, about its reference point, averaged over the step."""
+        row = self.world.large_row(name)
+        normal, tangential = self._impulses
+        return (normal[1][row] + tangential[1][row]) / self.system.dt
+
+    def position(self, name: str) -> Floats:
+        """Position (3,) of a large body [m]."""
+        return self.world.large.position[self.world.large_row(name)].copy()
+
+    def velocity(self, name: str) -> Floats:
+        """Linear and angular velocity (6,) of a large body [m/s, rad/s]."""
+        return self.world.large.velocity[self.world.large_row(name)].copy()
+
+    def total(self, values: ArrayLike) -> float:
+        """The sum over all grains, of values (grains,) of those in `world.grains`."""
+        return float(self.world.comm.allreduce(float(np.sum(values))))
+
+    @cached_property
+    def _impulses(self) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+        """Generalised impulses on grains and large bodies by the normal and by the tangential impulses."""
+        normal = self.impulse * [1.0, 0.0, 0.0]
+        return self.system.generalised_impulse(normal), self.system.generalised_impulse(self.impulse - normal)
+
+
+def row(step: Step, scene: Experiment) -> dict[str, float]:
+    """All quantities of a step by name, with units in brackets; ValueError for bad ones of the scene's own."""
+    out = {"step": step.world.step, "time [s]": step.world.time}
+    out |= energy_balance(step) | contact_statistics(step)
+    if scene.domain is not None:
+        out["grains_outside"] = outside(step, *scene.domain)
+    for body in step.world.large_bodies:
+        force = step.force_on(body.name)
+        out |= {f"force_{body.name}_{axis} [N]": force[k] for k, axis in enumerate("xyz")}
+        out |= {f"torque_{body.name}_{axis} [N m]": force[3 + k] for k, axis in enumerate("xyz")}
+    own = scene.record(step)
+    _refuse_bad_names(own, out)
+    out |= {name: float(value) for name, value in own.items()}
+    return out
+
+
+def _refuse_bad_names(own: Any, taken: Mapping[str, float]) -> None:
+    if not isinstance(own, Mapping):
+        raise ValueError(f"record must return a dict of numbers by name, not {type(own).__name__}")
+    for name, value in own.items():
+        if not isinstance(name, str) or name in taken or not name or set(name) & set(',"\n'):
+            raise ValueError(f"record returns the name {name!r}: allowed is text without comma that is not in use")
+        if np.ndim(value) != 0:
+            raise ValueError(f"record returns {name!r} = {value!r}: allowed is a number")
+
+
+def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
+    """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
+    place = step.world.grains.position
+    return step.total(((place < np.asarray(low)) | (place > np.asarray(high))).any(axis=1))
+
+
+def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:
+    """Kinetic and potential energy [J] of the bodies of a table that forces can move, the latter zero at the origin."""
+    table = table.take(bodies.is_dynamic(table))
+    spin = quaternion.rotate(quaternion.conjugate(table.quaternion), table.velocity[:, 3:])
+    turns = np.isfinite(table.inertia)  # guided bodies do not
+    rotational = np.where(turns, table.inertia, 0.0) * spin**2
+    kinetic = 0.5 * (table.mass * (table.velocity[:, :3] ** 2).sum(axis=1)).sum() + 0.5 * rotational.sum()
+    return float(kinetic), float(-(table.mass * (table.position @ gravity)).sum())
+
+
+def energy_balance(step: Step) -> dict[str, float]:
+    """Energies at the end of the step and where their change came from [J].
+
+        change of kinetic + potential = work of motions - friction loss - impact loss + time stepping
+
+    With g the impulses and w the mean of the velocities before and after (of prescribed motions: that of the step),
+    the impulses do the work g' D' w: its tangential part is the friction loss, and its normal part is lost in impacts
+    or, where it is gained, spent on pushing overlaps apart. What prescribed bodies do to the others is the work of
+    motions. The rest is the error of the semi-implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
+    """
+    world, near, comm = step.world, step.contacts.near, step.world.comm
+    before = near.bodies.take(slice(0, near.grains)), near.bodies.take(slice(near.grains + near.ghosts, None))
+    after = world.grains, world.large
+    moves = bodies.is_dynamic(world.large)
+    mean = [0.5 * (old.velocity + new.velocity) for old, new in zip(before, after)]
+    mean[1][~moves] = world.large.velocity[~moves]
+
+    def sums(grains: Any, large: Any) -> Floats:
+        """Local sums; what all ranks know of the large bodies counts once."""
+        return np.array(grains) + (np.array(large) if comm.rank == 0 else 0.0)
+
+    was = sums(*(energy(table, world.gravity) for table in before))
+    now = sums(*(energy(table, world.gravity) for table in after))
+    normal, tangential = ((sums(*map(np.vdot, load, mean))) for load in step._impulses)
+    received = np.vdot((step._impulses[0][1] + step._impulses[1][1])[~moves], mean[1][~moves])
+    whole = comm.allreduce(np.array([*was, *now, normal, tangential]))
+    change = whole[2] + whole[3] - whole[0] - whole[1]
+    return {
+        "kinetic_energy [J]": whole[2],
+        "potential_energy [J]": whole[3],
+        "work_of_motions [J]": -received,
+        "friction_loss [J]": -whole[5],
+        "impact_loss [J]": -whole[4],
+        "time_stepping [J]": change + received - whole[4] - whole[5],
+    }
+
+
+def contact_statistics(step: Step) -> dict[str, float]:
+    """Numbers of contacts, and what they are like; overlaps are those at the start of the step.
+
+    The coordination number is the mean number of active contacts per grain.
+    """
+    comm, contacts = step.world.comm, step.contacts
+    normal, tangential = step.impulse[:, 0], np.hypot(step.impulse[:, 1], step.impulse[:, 2])
+    count, weight = comm.allreduce(np.array([len(contacts), normal.sum()]))
+    active = normal > ACTIVE * weight / max(count, 1.0)
+    sliding = active & (tangential >= SLIDING * contacts.friction * normal)
+    ends = 1 + (contacts.near.bodies.shape[contacts.b] != COMPOUND)  # the first body of a contact is always a grain
+    sums = comm.allreduce(np.array([active.sum(), sliding.sum(), ends[active].sum()]))
+    return {
+        "contacts": count,
+        "active_contacts": sums[0],
+        "coordination_number": sums[2] / step.world.slabs[-1],
+        "sliding_fraction": sums[1] / max(sums[0], 1),
+        "worst_overlap [m]": comm.allreduce(float((-contacts.gap).max(initial=0.0)), MPI.MAX),
+    }

@@ -1,0 +1,162 @@
+"""Drafting test: a blade is drawn through a bed of spheres, and the force that this takes is recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import pi
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from dem import analysis, checks
+from dem.arrays import Floats
+from dem.experiment import Experiment, option
+from dem.motion import Oscillation
+from dem.scene import Scene
+from dem.scenes.lattice import check_room, perturbed, rest_after_fall
+from dem.shapes import Box, Plane
+
+if TYPE_CHECKING:
+    from dem.record import Step
+
+
+@dataclass(frozen=True)
+class Blade(Experiment):
+    """(2n+1)^3 spheres settle in a closed box, then a blade goes from one end to the other and back.
+
+    The blade spans the width of the box, as in the bin of Melanz et al. (2017), and stands upright, its lower edge at
+    about two thirds of the height of the bed and its upper edge above the surface. It starts at rest near one end;
+    the spheres start beside it, so that only those that flow under it come behind it. Its velocity is
+    v = pi travel / period * sin(2 pi t / period), with t since the end of settling. It stops short of both ends, so
+    that the spheres in front can flow under it and are not crushed; in small boxes some jam all the same, and the
+    force has peaks. With the box and the blade there are (2n+1)^3 + 2 bodies; lengths given in box widths keep the
+    experiment similar for all n.
+    """
+
+    n: int = option(4, "", "size: there are (2n+1)^3 spheres")
+    radius: float = option(0.1, "m", "radius of the spheres")
+    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
+    friction: float = option(0.25, "", "friction coefficient of all contacts")
+    pitch: float = option(0.25, "m", "spacing of the lattice on which the spheres start")
+    perturbation: float = option(0.02, "m", "greatest displacement of a sphere from its lattice point, per axis")
+    seed: int = option(1, "", "seed of the perturbation")
+    margin: float = option(0.0, "m", "width of the box beyond (2n+1) pitch")
+    thickness: float = option(0.1, "m", "thickness of the blade")
+    blade_height: float = option(0.3, "box widths", "height of the blade")
+    clearance: float = option(0.3, "box widths", "gap between the floor and the blade")
+    end_gap: float = option(0.3, "box widths", "gap between the blade and the end walls where it turns")
+    period: float = option(4.0, "s", "period of the velocity of the blade: it crosses the box in half of it")
+    gravity: float = option(9.81, "m/s^2", "gravity, downwards")
+    cutoff: float = option(2.0, "Hz", "cutoff frequency of the low-pass filter of the forces")
+
+    dt: ClassVar[float] = 0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.n < 1:
+            raise ValueError(f"n must be at least 1, got {self.n}")
+        for name in ("radius", "density", "pitch", "thickness", "blade_height", "period", "gravity", "cutoff"):
+            checks.positive(name, getattr(self, name))
+        for name in ("friction", "margin"):
+            checks.not_negative(name, getattr(self, name))
+        check_room(self.radius, self.pitch, self.perturbation)
+        for name in ("clearance", "end_gap"):
+            gap = getattr(self, name) * self.width
+            if gap < 2 * self.radius:
+                raise ValueError(
+                    f"{name} {getattr(self, name):g} box widths is {gap:g} m: spheres of radius {self.radius:g} m "
+                    "would jam; make it or the margin of the box wider"
+                )
+        if self.end_gap >= 1.0:
+            raise ValueError(f"end_gap {self.end_gap:g} box widths leaves the blade no way to go, must be below 1")
+        if (self.clearance + self.blade_height) * self.width > self.height:
+            raise ValueError(
+                f"blade_height {self.blade_height:g} box widths: the blade reaches above the lid at {self.height:g} m"
+            )
+
+    @property
+    def width(self) -> float:
+        """Width of the box, across the way of the blade [m]."""
+        return (2 * self.n + 1) * self.pitch + self.margin
+
+    @property
+    def length(self) -> float:
+        """Length of the box, along the way of the blade [m]: the cube of spheres, and the place of the blade."""
+        return self.width + self.end_gap * self.width + self.thickness
+
+    @property
+    def height(self) -> float:
+        """Height of the lid [m]."""
+        return (2 * self.n + 2) * self.pitch + self.margin
+
+    @property
+    def travel(self) -> float:
+        """Way of the blade from one end to the other [m]."""
+        return self.width - self.end_gap * self.width
+
+    @property
+    def start(self) -> float:
+        """x coordinate of the middle of the blade at the start [m]; the middle of the box is x = 0."""
+        return -self.length / 2 + self.end_gap * self.width + self.thickness / 2
+
+    @property
+    def delta(self) -> float:
+        """Contact distance [m]: not less than the way of the blade in a step, that no sphere is run over."""
+        return max(0.02, self.dt * pi * self.travel / self.period)
+
+    @property
+    def settling_time(self) -> float:
+        """Time [s] after which the blade starts."""
+        return rest_after_fall(self.height, self.gravity)
+
+    @property
+    def domain(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """The inside of the box [m]."""
+        return (-self.length / 2, -self.width / 2, 0.0), (self.length / 2, self.width / 2, self.height)
+
+    def positions(self) -> Floats:
+        """Centres ((2n+1)^3, 3) of the spheres at the start [m], between the blade and the far end."""
+        steps = (np.arange(2 * self.n + 1) + 0.5) * self.pitch
+        x = self.start + self.thickness / 2 + self.margin / 2 + steps
+        y = steps - self.width / 2 + self.margin / 2
+        return perturbed(x, y, steps, self.perturbation, self.seed)
+
+    def build(self) -> Scene:
+        """The scene, with the large bodies "box" and "blade"."""
+        scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
+        scene.add_spheres(self.positions(), self.radius, self.density)
+        low, high = np.array(self.domain)
+        scene.add_body("box", [Plane(way, low) for way in np.eye(3)] + [Plane(-way, high) for way in np.eye(3)])
+        tall = self.blade_height * self.width
+        scene.add_body(
+            "blade",
+            [Box((self.thickness / 2, self.width / 2, tall / 2))],
+            # from rest at one end: displacement travel / 2 (1 - cos(2 pi t / period))
+            Oscillation((1, 0, 0), self.travel / 2, self.period, phase=-pi / 2, start=self.settling_time),
+            position=(self.start, 0, self.clearance * self.width + tall / 2),
+        )
+        return scene
+
+    def record(self, step: Step) -> dict[str, float]:
+        """Where the blade is, and the force against its way out."""
+        return {
+            "blade_position [m]": step.position("blade")[0] - self.start,
+            "blade_speed [m/s]": step.velocity("blade")[0],
+            "draft_force [N]": -step.force_on("blade")[0],
+        }
+
+    def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
+        """Filtered forces and torques, and mean, median and standard deviation of the draft force while the blade is
+        fast on its first way, see `dem.analysis.steady_part`."""
+        names = ["draft_force [N]"]
+        names += [f"force_blade_{axis} [N]" for axis in "xyz"] + [f"torque_blade_{axis} [N m]" for axis in "xyz"]
+        out: dict[str, float | Floats] = {"blade_position [m]": records["blade_position [m]"]}
+        out |= analysis.filtered(records, names, self.cutoff)
+        steady = analysis.steady_part(records["time [s]"], self.settling_time, self.period)
+        if steady.any():
+            force = records["draft_force [N]"][steady]
+            out["steady_draft_force [N]"] = float(force.mean())
+            out["median_draft_force [N]"] = float(np.median(force))
+            out["draft_force_deviation [N]"] = float(force.std())
+        return out

@@ -1,0 +1,179 @@
+"""Direct shear test: the lower half of a box of spheres under load is displaced, and the stresses are recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import pi
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from dem import analysis, checks
+from dem.arrays import Floats
+from dem.experiment import Experiment, option
+from dem.motion import Guided, Oscillation
+from dem.scene import Scene
+from dem.scenes.lattice import check_room, perturbed, rest_after_fall
+from dem.shapes import Box, Plane, Shape
+
+if TYPE_CHECKING:
+    from dem.record import Step
+
+#: Share of the volume that spheres take in the bed, by which the plane between the halves is placed in its middle.
+PACKING = 0.6
+
+
+@dataclass(frozen=True)
+class Shear(Experiment):
+    """(3n+1)(2n+1)^2 spheres settle in a box under a press; then the lower half of the box moves along x and back.
+
+    The box is 3n+1 lattice cells long, along x, and 2n+1 wide. Its halves have thick walls, so that no gap opens where
+    one is displaced against the other; the floor moves with the lower half. The upper half is clamped. The press fills
+    the cross-section, can only move vertically, and lies on the spheres by its weight; it starts on top of the lattice
+    and falls with it. The velocity of the lower half is v = pi stroke / period * sin(2 pi t / period), with t since
+    the end of settling, up to the greatest displacement, the stroke, at half the period. With both halves and the
+    press there are (3n+1)(2n+1)^2 + 3 bodies; all lengths grow with n.
+    """
+
+    n: int = option(4, "", "size: there are (3n+1)(2n+1)^2 spheres")
+    radius: float = option(0.1, "m", "radius of the spheres")
+    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
+    friction: float = option(0.25, "", "friction coefficient between spheres")
+    wall_friction: float = option(0.25, "", "friction coefficient between spheres and walls, floor, press")
+    pitch: float = option(0.25, "m", "spacing of the lattice on which the spheres start")
+    perturbation: float = option(0.02, "m", "greatest displacement of a sphere from its lattice point, per axis")
+    seed: int = option(1, "", "seed of the perturbation")
+    press_density: float = option(10.0, "densities of the spheres", "density of the press")
+    press_thickness: float = option(0.05, "box widths", "thickness of the press")
+    split: float = option(0.5, "bed depths", "height of the plane between the halves, for a packing fraction of 0.6")
+    stroke: float = option(0.1, "box lengths", "greatest displacement of the lower half")
+    period: float = option(4.0, "s", "period of the velocity of the lower half")
+    gravity: float = option(9.81, "m/s^2", "gravity, downwards")
+    cutoff: float = option(2.0, "Hz", "cutoff frequency of the low-pass filter of the stresses")
+
+    dt: ClassVar[float] = 0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.n < 1:
+            raise ValueError(f"n must be at least 1, got {self.n}")
+        sizes = ("radius", "density", "pitch", "press_density", "press_thickness", "split", "stroke", "period")
+        for name in (*sizes, "gravity", "cutoff"):
+            checks.positive(name, getattr(self, name))
+        for name in ("friction", "wall_friction"):
+            checks.not_negative(name, getattr(self, name))
+        check_room(self.radius, self.pitch, self.perturbation)
+        if self.split >= 1.0:
+            raise ValueError(f"split {self.split:g} bed depths puts all spheres into the lower half, must be below 1")
+
+    @property
+    def length(self) -> float:
+        """Length of the box, along x [m]."""
+        return (3 * self.n + 1) * self.pitch
+
+    @property
+    def width(self) -> float:
+        """Width of the box, along y, and height of the lattice [m]."""
+        return (2 * self.n + 1) * self.pitch
+
+    @property
+    def split_height(self) -> float:
+        """Height of the plane between the halves above the floor [m]."""
+        depth = self.width * 4 / 3 * pi * (self.radius / self.pitch) ** 3 / PACKING
+        return self.split * depth
+
+    @property
+    def area(self) -> float:
+        """Area of the plane between the halves, to which the stresses refer at all displacements [m^2]."""
+        return self.length * self.width
+
+    @property
+    def way(self) -> float:
+        """Greatest displacement of the lower half [m]."""
+        return self.stroke * self.length
+
+    @property
+    def settling_time(self) -> float:
+        """Time [s] after which the lower half starts to move."""
+        return rest_after_fall(self.width, self.gravity)
+
+    @property
+    def domain(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """The inside of the box at the greatest displacement [m]."""
+        return (-self.length / 2, -self.width / 2, 0.0), (self.length / 2 + self.way, self.width / 2, self.width)
+
+    def positions(self) -> Floats:
+        """Centres ((3n+1)(2n+1)^2, 3) of the spheres at the start [m]; the floor is z = 0."""
+        x = (np.arange(3 * self.n + 1) - 1.5 * self.n) * self.pitch
+        y = np.arange(-self.n, self.n + 1) * self.pitch
+        z = (np.arange(2 * self.n + 1) + 0.5) * self.pitch
+        return perturbed(x, y, z, self.perturbation, self.seed)
+
+    def build(self) -> Scene:
+        """The scene, with the large bodies "lower", "upper" and "press"."""
+        scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
+        scene.set_friction(self.wall_friction, "spheres", "walls")
+        scene.add_spheres(self.positions(), self.radius, self.density, material="spheres")
+        thickness = self.press_thickness * self.width
+        scene.add_body(
+            "lower",
+            [Plane((0, 0, 1)), *self._walls(-2 * self.radius, self.split_height)],
+            # from rest: displacement way / 2 (1 - cos(2 pi t / period))
+            Oscillation((1, 0, 0), self.way / 2, self.period, phase=-pi / 2, start=self.settling_time),
+            material="walls",
+        )
+        scene.add_body("upper", self._walls(self.split_height, self.width + thickness), material="walls")
+        scene.add_body(
+            "press",
+            [Box((self.length / 2, self.width / 2, thickness / 2))],
+            Guided((0, 0, 1)),
+            position=(0, 0, self.width + thickness / 2),
+            density=self.press_density * self.density,
+            material="walls",
+        )
+        return scene
+
+    def _walls(self, bottom: float, top: float) -> list[Shape]:
+        """The four walls of a half, thick enough that they cover each other at the greatest displacement."""
+        thick, tall, middle = self.way + 4 * self.radius, (top - bottom) / 2, (top + bottom) / 2
+        x, y = self.length / 2, self.width / 2
+        ends = [Box((thick / 2, y + thick, tall), (side * (x + thick / 2), 0, middle)) for side in (-1, 1)]
+        sides = [Box((x, thick / 2, tall), (0, side * (y + thick / 2), middle)) for side in (-1, 1)]
+        return [*ends, *sides]
+
+    def record(self, step: Step) -> dict[str, float]:
+        """Displacement, mean stresses on the plane between the halves, from all contact forces on the lower half and
+        the weight of the spheres in it, and the height of the sample. The force of inertia is neglected."""
+        grains, force = step.world.grains, step.force_on("lower")
+        below = self.gravity * step.total(grains.mass[grains.position[:, 2] < self.split_height])
+        half_press = self.press_thickness * self.width / 2
+        return {
+            "shear_displacement [m]": step.position("lower")[0],
+            "shear_speed [m/s]": step.velocity("lower")[0],
+            "shear_stress [Pa]": -force[0] / self.area,
+            "normal_stress [Pa]": (-force[2] - below) / self.area,
+            "press_stress [Pa]": step.force_on("press")[2] / self.area,
+            "sample_height [m]": step.position("press")[2] - half_press,
+        }
+
+    def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
+        """Filtered stresses, the volume strain since the first record, and friction angles: that of the peak in the
+        first stroke, and the steady one while the lower half is fast, see `dem.analysis.steady_part`."""
+        time, height = records["time [s]"], records["sample_height [m]"]
+        stresses = ["shear_stress [Pa]", "normal_stress [Pa]"]
+        out: dict[str, float | Floats] = {"shear_displacement [m]": records["shear_displacement [m]"]}
+        out |= analysis.filtered(records, stresses, self.cutoff)
+        shear, normal = (np.asarray(out[f"{name}_stress_filtered [Pa]"]) for name in ("shear", "normal"))
+        out["volume_strain"] = height / height[0] - 1.0
+        stroke = (time > self.settling_time) & (time <= self.settling_time + self.period / 2)
+        steady = analysis.steady_part(time, self.settling_time, self.period)
+        if stroke.any():
+            peak = np.flatnonzero(stroke)[np.argmax(shear[stroke])]
+            out["peak_shear_stress [Pa]"] = float(shear[peak])
+            out["peak_friction_angle [degrees]"] = analysis.friction_angle(shear[peak], normal[peak])
+        if steady.any():
+            raw = [records[name][steady] for name in stresses]
+            out["steady_shear_stress [Pa]"], out["steady_normal_stress [Pa]"] = (float(values.mean()) for values in raw)
+            out["steady_friction_angle [degrees]"] = analysis.friction_angle(*raw)
+        return out

@@ -1,0 +1,98 @@
+"""Bodies that forces move along one direction only."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cases import crude_impulse
+from mpi4py import MPI
+
+from dem.contact import find_contacts
+from dem.motion import Dynamic, Guided
+from dem.scene import Scene
+from dem.shapes import Box, Plane
+from dem.stepper import advance
+from dem.system import ContactSystem
+from dem.world import World
+
+SELF = MPI.COMM_SELF
+SLANT = (1.0, 0.0, 2.0)
+
+
+def pressed(motion, **options):
+    """Four spheres on a floor under a press, all with some velocity."""
+    scene = Scene(0.4)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    places = [[0, 0, 0.1], [0.3, 0, 0.1], [0, 0.3, 0.1], [0.3, 0.3, 0.1]]
+    scene.add_spheres(places, 0.1, 1000.0, velocity=(0.3, 0.1, 0.4), angular_velocity=(1.0, 2.0, 3.0))
+    scene.add_body("press", [Box((0.5, 0.4, 0.05))], motion, position=(0.1, 0.1, 0.25), **options)
+    return World.from_scene(scene, SELF)
+
+
+def system_of(world):
+    return ContactSystem(world, find_contacts(world, 0.02), 0.01)
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 1), SLANT])
+def test_only_the_motion_along_the_guide_answers_to_forces(direction):
+    unit = np.array(direction) / np.linalg.norm(direction)
+    world = pressed(Guided(direction), density=500.0, velocity=0.2 * unit)
+    system = system_of(world)
+    impulse = crude_impulse(system)
+    force = system.force_on("press", impulse)
+    assert np.abs(force[[0, 2, 3, 4, 5]]).min() > 0
+    mass = world.large.mass[1]
+    assert mass == pytest.approx(500.0 * 1.0 * 0.8 * 0.1)
+    speed = 0.2 + 0.01 * unit @ (force[:3] / mass + [0, 0, -9.81])
+    velocity = system.velocity(impulse)[5]
+    np.testing.assert_allclose(velocity, [*(speed * unit), 0, 0, 0], atol=1e-13)
+    turn = world.large.quaternion[1].copy()
+    advance(world, system.velocity(impulse), 0.01)
+    np.testing.assert_array_equal(world.large.quaternion[1], turn)
+    np.testing.assert_allclose(world.large.position[1], [0.1, 0.1, 0.25] + 0.01 * speed * unit, atol=1e-14)
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 1), SLANT])
+def test_the_mass_scaled_map_is_consistent_with_the_velocities(direction):
+    """G G' g = D' M^-1 D g: the change of the contact velocities that impulses cause."""
+    world = pressed(Guided(direction), mass=40.0)
+    system = system_of(world)
+    impulse = crude_impulse(system)
+    dense = np.zeros((3 * system.local_contacts, 6 * world.body_count))
+    for c in range(system.local_contacts):
+        for k in range(system.G.indptr[c], system.G.indptr[c + 1]):
+            body = system.G.indices[k]
+            dense[3 * c : 3 * c + 3, 6 * body : 6 * body + 6] = system.G.data[k]
+    change = system.velocity(impulse) - system.free_velocity
+    contact_change = system.D.createVecRight()
+    bodies_change = system.D.createVecLeft()
+    bodies_change.array[:] = change.ravel()
+    system.D.multTranspose(bodies_change, contact_change)
+    np.testing.assert_allclose(dense @ (dense.T @ impulse.ravel()), contact_change.array, atol=1e-12)
+    assert np.linalg.matrix_rank(dense[:, -6:]) == 1
+
+
+def test_a_free_press_differs_from_a_guided_one():
+    free, guided = pressed(Dynamic(), density=500.0), pressed(Guided((0, 0, 1)), density=500.0)
+    velocity = [system_of(world).velocity(crude_impulse(system_of(world)))[5] for world in (free, guided)]
+    assert velocity[0][2] == pytest.approx(velocity[1][2])
+    assert np.abs(velocity[0][[0, 3, 4, 5]]).min() > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"density": 500.0, "velocity": (0.1, 0, 0)}, "along the guide"),
+        ({"density": 500.0, "angular_velocity": (0, 0, 1)}, "along the guide"),
+        ({}, "density or both mass"),
+        ({"mass": -1.0}, "mass of 'press' must be positive"),
+    ],
+)
+def test_bad_guided_bodies_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        pressed(Guided((0, 0, 1)), **options)
+
+
+def test_a_guide_needs_a_direction():
+    with pytest.raises(ValueError, match="direction of a guide is the zero vector"):
+        Guided((0, 0, 0))

@@ -1,0 +1,103 @@
+"""The scenes blade and shear; see test_mixer for the mixer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dem.contact import find_contacts
+from dem.motion import Guided
+from dem.scenes import Blade, Mixer, Shear
+from dem.world import World
+
+SELF = MPI.COMM_SELF
+SMALL = [Blade(n=2), Shear(n=1), Shear(n=2), Mixer(n=2)]
+
+
+@pytest.mark.parametrize(
+    ("scene", "count"),
+    [(Mixer(n=8), 4915), (Mixer(n=16), 35939), (Blade(n=8), 4915), (Blade(n=16), 35939), (Blade(n=4), 729 + 2)]
+    + [(Shear(n=8), 7228), (Shear(n=16), 53364), (Shear(n=4), 1053 + 3)],
+)
+def test_bodies_of_the_paper(scene, count):
+    built = scene.build()
+    assert len(built.grains()) + len(built.large_bodies) == count
+    assert (built.grains().size[:, 0] == 0.1).all()
+    assert built.friction_table() == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("scene", SMALL, ids=repr)
+def test_spheres_start_inside_without_contact(scene):
+    world = World.from_scene(scene.build(), SELF)
+    assert (find_contacts(world, 0.02).gap > 0).all()
+    low, high = scene.domain
+    assert (world.grains.position > np.array(low) + scene.radius).all()
+    assert (world.grains.position < np.array(high) - scene.radius).all()
+
+
+@pytest.mark.parametrize("scene", SMALL[:3], ids=repr)
+def test_nothing_moves_before_the_end_of_settling(scene):
+    world = World.from_scene(scene.build(), SELF)
+    world.time = scene.settling_time - scene.dt
+    np.testing.assert_allclose(world.prescribed_velocity(scene.dt), 0.0, atol=1e-12)
+    world.time = scene.settling_time + scene.period / 4 - scene.dt / 2
+    way = scene.travel if isinstance(scene, Blade) else scene.way
+    fastest = np.abs(world.prescribed_velocity(scene.dt)).max()
+    assert fastest == pytest.approx(np.pi * way / scene.period, rel=1e-4)
+    assert fastest * scene.dt <= scene.delta * (1 + 1e-4)  # no sphere is run over
+
+
+def test_the_blade_goes_from_one_end_to_the_other_and_back():
+    scene = Blade(n=8)
+    blade = scene.build().large_bodies[1]
+    half = (scene.period / 2, scene.period)
+    start, far, back = (
+        blade.motion.pose(scene.settling_time + time, blade.position, blade.quaternion)[0] for time in (0.0, *half)
+    )
+    np.testing.assert_allclose([start, back], [blade.position] * 2, atol=1e-12)
+    gap = scene.end_gap * scene.width + scene.thickness / 2
+    assert start[0] == pytest.approx(-scene.length / 2 + gap)
+    assert far[0] == pytest.approx(scene.length / 2 - gap)
+    np.testing.assert_array_equal(far[1:], start[1:])
+
+
+def test_the_press_is_guided_and_ten_times_denser_than_the_grains():
+    scene = Shear(n=3)
+    press = scene.build().large_bodies[2]
+    assert press.motion == Guided((0, 0, 1))
+    volume = scene.area * scene.press_thickness * scene.width
+    assert press.mass == pytest.approx(10 * scene.density * volume)
+
+
+def test_walls_of_the_halves_cover_each_other_at_the_greatest_displacement():
+    scene = Shear(n=1)
+    lower, upper, _ = scene.build().large_bodies
+    left, right = (max(x for x in xs) for xs in zip(*((-b.center[0], b.center[0]) for b in upper.shapes[:2])))
+    thick = upper.shapes[0].half_extents[0]
+    assert left - thick == right - thick == pytest.approx(scene.length / 2)
+    assert 2 * thick > scene.way + 2 * scene.radius
+    moved = lower.motion.pose(scene.settling_time + scene.period / 2, lower.position, lower.quaternion)[0]
+    np.testing.assert_allclose(moved, [scene.way, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("scene", "options", "message"),
+    [
+        (Blade, {"n": 0}, "n must be at least 1"),
+        (Blade, {"n": 1, "clearance": 0.2}, "clearance 0.2 box widths is 0.15 m"),
+        (Blade, {"end_gap": 0.01}, "end_gap 0.01 box widths is 0.0225 m"),
+        (Blade, {"end_gap": 1.0}, "end_gap 1 box widths leaves"),
+        (Blade, {"blade_height": 2.0}, "blade_height 2 box widths"),
+        (Blade, {"thickness": 0.0}, "thickness must be positive"),
+        (Blade, {"cutoff": np.nan}, "cutoff: NaN"),
+        (Shear, {"n": 0}, "n must be at least 1"),
+        (Shear, {"perturbation": 0.03}, "perturbation 0.03 m must be less than"),
+        (Shear, {"split": 1.0}, "split 1 bed depths"),
+        (Shear, {"wall_friction": -0.1}, "wall_friction must not be negative"),
+        (Shear, {"period": 0.0}, "period must be positive"),
+    ],
+)
+def test_bad_options(scene, options, message):
+    with pytest.raises(ValueError, match=message):
+        scene(**options)

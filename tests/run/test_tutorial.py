@@ -1,0 +1,161 @@
+"""The scene of docs/tutorial.md, as the page has it, and what is said to a user whose scene file is at fault."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from program import ROOT, table
+
+from dem.experiment import from_file
+from dem.impulses import ImpulseMemory
+from dem.world import World
+from pctt.options import OptionError
+from pctt.run.options import find_scene, read_options
+from pctt.run.simulate import SceneError, Stepper, simulate
+
+LOOSE = ("-ccp_type", "apgd", "-ccp_tol", "1e-3")
+
+
+@pytest.fixture
+def hopper(tmp_path, monkeypatch):
+    """The file hopper.py of the page."""
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "tutorial.md").read_text(), re.DOTALL)
+    assert len(code.splitlines()) <= 60
+    (tmp_path / "hopper.py").write_text(code)
+    return tmp_path / "hopper.py"
+
+
+def test_grains_flow_out_of_the_hopper_and_none_is_lost(hopper):
+    scene = from_file(hopper)(n=4, settling_time=0.3)
+    world = World.from_scene(scene.build(), MPI.COMM_SELF)
+    words = {"scene": str(hopper), "scene_n": "4", "scene_settling_time": "0.3", "ccp_type": "apgd", "ccp_tol": "1e-3"}
+    options = read_options(words, MPI.COMM_SELF)
+    assert repr(options.scene) == repr(scene)
+    stepper = Stepper(options, world, ImpulseMemory(MPI.COMM_SELF))
+    rows = []
+    for _ in range(90):
+        stepper.step()
+        rows.append(stepper.records())
+    out = np.array([row["grains_out"] for row in rows])
+    assert (out[:32] == 0).all()
+    assert out[-1] > 10
+    assert (np.diff(out) >= 0).all()
+    assert [row["grains_outside"] for row in rows] == [0] * 90
+    assert len(world.grains) == world.slabs[-1] == 64
+    door = np.array([row["force_door_z [N]"] for row in rows])
+    assert door[:30].min() < 0  # grains lay on it
+    records = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    assert scene.analyse(records)["mean_discharge_rate [1/s]"] == pytest.approx(out[-1] / 0.89)
+
+
+@pytest.mark.mpi
+def test_the_program_runs_the_file_on_any_number_of_ranks(hopper, program, tmp_path):
+    options = ("-scene", "hopper.py", "-scene_n", 4, "-scene_settling_time", 0.12)
+    close = ("-ccp_type", "apgd", "-ccp_tol", "1e-7")
+    first = None
+    for ranks in (1, 2):
+        done = program(*options, *close, "-restart", "settled", "-steps", 4, ranks=ranks, cache=tmp_path / "cache")
+        assert "mean_discharge_rate [1/s]" in done.stdout
+        rows = table(tmp_path / "results" / "records.csv")
+        if first is None:
+            first = rows
+    assert list(first) == list(rows)
+    assert list(first["step"]) == [13, 14, 15, 16]
+    for name in ("contacts", "kinetic_energy [J]", "potential_energy [J]", "force_door_z [N]", "grains_out"):
+        scale = np.abs(first[name]).max() + 1e-300
+        np.testing.assert_allclose(rows[name], first[name], atol=1e-3 * scale, err_msg=name)
+    assert len(list((tmp_path / "cache" / "pctt").glob("hopper_n4_*.h5"))) == 1
+
+
+def test_help_lists_the_options_of_the_file(hopper, program):
+    said = program("-help", "-scene", "hopper.py").stdout
+    assert "  -scene_slot <0.4 m>: width of the slot" in said
+    assert "paddle" not in said
+
+
+def test_an_option_that_the_file_does_not_have_is_refused(hopper):
+    with pytest.raises(OptionError, match="did you mean -scene_slot"):
+        read_options({"scene": str(hopper), "scene_slott": "1"}, MPI.COMM_SELF)
+
+
+GOOD = """
+from dataclasses import dataclass
+from dem.experiment import Experiment, option
+from dem.scene import Scene
+@dataclass(frozen=True)
+class One(Experiment):
+    height: float = 1.0
+    def build(self):
+        scene = Scene(0.3)
+        scene.add_spheres([0, 0, self.height], 0.1, 1000.0)
+        return scene
+"""
+BAD_FILES = {
+    "def f(:\n": "line 1: ",
+    "x = 1\ny = 1 / 0\n": "line 2: ZeroDivisionError",
+    "x = 1\n": "no class derived",
+    GOOD + GOOD.replace("One", "Two"): "must define one scene, has One, Two",
+    GOOD.replace("    height: float = 1.0", "    height: float"): "option height of One has no default",
+    GOOD.replace("height: float = 1.0", "height: list = None"): "option height of One: the type must be one of",
+    GOOD.replace("@dataclass(frozen=True)", ""): "must be marked @dataclass",
+    GOOD.replace("def build", "def bild"): "no method build",
+}
+
+
+@pytest.mark.parametrize("text", BAD_FILES)
+def test_a_bad_scene_file_is_refused_with_the_reason(text, tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(text)
+    with pytest.raises(OptionError, match=re.escape(BAD_FILES[text])) as error:
+        find_scene(str(path))
+    assert str(error.value).startswith(f"-scene {path}: ")
+
+
+def test_a_scene_file_that_is_not_there_is_refused():
+    with pytest.raises(OptionError, match="missing.py: cannot be read"):
+        find_scene("missing.py")
+
+
+FAULTS = {
+    "build must return a dem.scene.Scene, not NoneType": GOOD.replace("return scene", "return None"),
+    "no large body 'lid'": GOOD + "    def record(self, step):\n        return {'z': step.position('lid')[2]}\n",
+    "that is not in use": GOOD + "    def record(self, step):\n        return {'step': 1}\n",
+    "allowed is a number": GOOD + "    def record(self, step):\n        return {'z [m]': [1, 2]}\n",
+    "analyse of the scene One: KeyError": GOOD + "    def analyse(self, records):\n        return records['z']\n",
+    "has no settling_time": GOOD,
+}
+
+
+@pytest.mark.parametrize("message", FAULTS)
+def test_faults_of_a_scene_end_the_run(message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(FAULTS[message])
+    words = {"scene": "mine.py", "steps": "1", "ccp_type": "apgd"}
+    if FAULTS[message] is GOOD:
+        words["settle"] = "true"
+    with pytest.raises((OptionError, SceneError), match=re.escape(message)):
+        simulate(read_options(words, MPI.COMM_SELF), MPI.COMM_SELF)
+
+
+@pytest.mark.mpi
+def test_two_ranks_speak_with_one_voice(program, tmp_path):
+    (tmp_path / "mine.py").write_text("x = 1\n")
+    done = program("-scene", "mine.py", ranks=2, status=2)
+    assert done.stderr.count("pctt.run: -scene mine.py: must define one scene") == 1
+
+
+def test_a_scene_without_large_bodies_and_analysis_runs(program, tmp_path):
+    """One sphere in free fall: energies as in the formula for the semi-implicit step."""
+    (tmp_path / "mine.py").write_text(GOOD)
+    program("-scene", "mine.py", *LOOSE, "-steps", 3, "-scene_height", 2.0)
+    rows = table(tmp_path / "results" / "records.csv")
+    assert list(rows)[:2] == ["step", "time [s]"]
+    mass, k = 1000.0 * 4 / 3 * np.pi * 0.1**3, np.arange(1, 4)
+    np.testing.assert_allclose(rows["kinetic_energy [J]"], 0.5 * mass * (9.81 * 0.01 * k) ** 2, rtol=1e-12)
+    height = 2.0 - 9.81 * 0.01**2 * k * (k + 1) / 2
+    np.testing.assert_allclose(rows["potential_energy [J]"], mass * 9.81 * height, rtol=1e-12)
+    assert not (tmp_path / "results" / "analysis.csv").exists()
