@@ -12,7 +12,7 @@ from pctt import ccp
 from pctt.ccp import fclib
 from pctt.run.hdf5 import FileError, write_text
 from pctt.run.options import Options
-from pctt.run.report import compare_table
+from pctt.run.report import Progress, compare_table
 
 
 def solve_file(options: Options, comm: MPI.Comm) -> None:
@@ -54,14 +54,15 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         "velocity_norm": accuracy.velocity_norm,
         "compare": compare.summary(),
     }
+    progress = Progress(comm.rank == 0 and not options.run.quiet)
+    width = max(map(len, summary))
+    for name, value in summary.items():
+        if name != "compare":
+            shown = f"{value:.12g}" if isinstance(value, float) else value
+            progress.say(f"{name:{width}}  {shown}")
+    if compare.names:
+        progress.say("\n" + compare_table(compare.summary(), compare.labels()))
+    if not result.converged:
+        progress.say(f"NOT CONVERGED: {result.reason}")
     if comm.rank == 0:
-        width = max(map(len, summary))
-        for name, value in summary.items():
-            if name != "compare":
-                shown = f"{value:.12g}" if isinstance(value, float) else value
-                print(f"{name:{width}}  {shown}")
-        if compare.names:
-            print("\n" + compare_table(compare.summary(), compare.labels()))
-        if not result.converged:
-            print(f"NOT CONVERGED: {result.reason}")
         write_text(Path(options.run.output) / "summary.json", json.dumps(summary, indent=1) + "\n")

@@ -26,7 +26,7 @@ from pctt.run.results import Results
 
 def simulate(options: Options, comm: MPI.Comm) -> None:
     """Run the scene of the options, or settle it with ``-settle``."""
-    progress = report.Progress(comm.rank == 0)
+    progress = report.Progress(comm.rank == 0 and not options.run.quiet, options.run.monitor)
     if options.run.settle:
         path = settled_state(options, comm, progress, anew=True)
         progress.say(f"settled state: {path}")
@@ -40,8 +40,9 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     stepper = Stepper(options, world, memory, compare if compare.names else None)
     method = f"{options.run.ccp_type} to {options.limits.tol:g}"
     progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
-    progress.say(report.COLUMNS)
+    progress.say(report.COLUMNS, level=1)
     lines = []
+    progress.start(options.run.steps)
     for k in range(1, options.run.steps + 1):
         progress.doing(f"step {world.step + 1}, time {world.time:.3f} s")
         line = stepper.step()
@@ -57,10 +58,11 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
             if k % options.run.checkpoint_every == 0 or last:
                 checkpoint.save(results.checkpoint, record, world, memory)
         _count_output(line)
-        progress.say(report.step_line(line))
+        progress.say(report.step_line(line), level=1)
+        progress.say(report.accuracy_lines(line, stepper.history), level=2)
     if lines:
         results.write_summary(world, compare.summary())
-        progress.say(report.phase_table(lines))
+        progress.say("\n" + report.phase_table(lines))
     if compare.names:
         progress.say("\n" + report.compare_table(compare.summary(), compare.labels()))
     progress.say(f"\nresults: {results.folder}/state.h5, summary.json, checkpoint.h5")
@@ -83,6 +85,7 @@ class Stepper:
     contacts: Any
     system: ContactSystem
     impulse: np.ndarray
+    history: list[float]  #: natural residual by iteration
 
     def __init__(
         self, options: Options, world: World, memory: ImpulseMemory, compare: ccp.Comparison | None = None
@@ -107,7 +110,7 @@ class Stepper:
             result, solver, newton_its = self._solve(problem, guess)
             accuracy = ccp.measure(problem, result.impulse)
         with log.phase("advance"):
-            self.impulse = result.impulse
+            self.impulse, self.history = result.impulse, result.history
             advance(world, self.system.velocity(self.impulse), options.dt)
             self.memory.remember(self.system.key, self.impulse, self.system.frame)
         contacts = problem.size
@@ -197,8 +200,9 @@ def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, a
         path.parent.mkdir(parents=True, exist_ok=True)
     stepper = Stepper(settling, _new_world(options.scene, comm), ImpulseMemory(comm))
     start = time.perf_counter()
+    progress.start(steps)
     for k in range(1, steps + 1):
-        progress.doing(f"settling step {k} of {steps}")
+        progress.doing(f"settling, time {stepper.world.time:.3f} s")
         if k == steps - steps // 10:
             limits = ccp.Limits(tol=0.1 * options.run.settle_tol)
             stepper.options = dataclasses.replace(settling, delta=options.delta, limits=limits)
