@@ -62,8 +62,8 @@ def bodies(folder: Folder, frame: Frame) -> Any:
     data = surfaces.polydata(frame.position[grains], "verts")
     columns = {
         "id": np.arange(folder.grains),
-        "radius": np.linalg.norm(folder.size[grains], axis=1),
-        "extent": surfaces.extent(folder.shape[grains], folder.size[grains]),
+        "radius": surfaces.enclosing_radius(folder),
+        "extent": surfaces.extent(folder),
         "quaternion": frame.quaternion[grains],
         "velocity": frame.velocity[grains, :3],
         "angular_velocity": frame.velocity[grains, 3:],

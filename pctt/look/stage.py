@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from ctypes.util import find_library
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ import vtkmodules.vtkRenderingFreeType  # noqa: F401 - text
 import vtkmodules.vtkRenderingUI  # noqa: F401 - windows on a display
 from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkLogger, vtkLookupTable, vtkVersion
+from vtkmodules.vtkCommonDataModel import vtkPolyData
 from vtkmodules.vtkRenderingAnnotation import vtkScalarBarActor
 from vtkmodules.vtkRenderingCore import (
     vtkActor,
@@ -27,7 +29,8 @@ from vtkmodules.vtkRenderingCore import (
 )
 from vtkmodules.vtkRenderingOpenGL2 import vtkOpenGLSphereMapper
 
-from dem.bodies import SPHERE
+from dem import quaternion
+from dem.bodies import BOX, SPHERE
 from pctt.look import surfaces
 from pctt.look.folder import Folder, FolderError, Frame
 
@@ -79,8 +82,11 @@ class Stage:
         self._renderer.SetUseDepthPeeling(view.opacity < 1)
         vtkLightKit().AddLightsToRenderer(self._renderer)
         colours = _lookup_table(paint)
-        kinds = np.unique(folder.shape[: folder.grains]).tolist()
-        self._grains = {kind: self._add_grains(kind, colours) for kind in kinds}
+        self._spheres = vtkOpenGLSphereMapper()  # drawn pixel by pixel: round at any size, thousands cost little
+        self._spheres.SetScaleArray("radius")
+        self._boxes, self._cylinders = _glyphs(surfaces.cube()), _glyphs(surfaces.cylinder())
+        for mapper in (self._spheres, self._boxes, self._cylinders):
+            self._add_grains(mapper, colours)
         self._walls, self._edges, self._tools = (self._add_surface(rgb) for rgb in (WALL, EDGE, TOOL))
         walls, edges, tools = (actor.GetProperty() for actor in (self._walls, self._edges, self._tools))
         walls.BackfaceCullingOn()
@@ -101,39 +107,32 @@ class Stage:
     def draw(self, frame: Frame, value: np.ndarray) -> np.ndarray:
         """The picture (height, width, 3) of a frame, its grains coloured by value (grains,)."""
         folder = self.folder
-        table = {name: getattr(folder, name)[: folder.grains] for name in ("shape", "size")}
         place, turn = (a[: folder.grains] for a in (frame.position, frame.quaternion))
-        shown = (place - self.box.mean(axis=0)) @ _towards_camera(self.view, level=True) <= 0 if self.view.cut else True
-        for kind, mapper in self._grains.items():
-            rows = shown & (table["shape"] == kind)
-            extent = surfaces.extent(table["shape"][rows], table["size"][rows])
-            data = surfaces.polydata(place[rows].astype(np.float32), "verts")  # the mapper of spheres takes no other
-            columns = {"value": value[rows], "extent": extent, "turn": turn[rows]}
-            columns["radius"] = extent[:, 0].astype(np.float32) / 2
-            surfaces.add_arrays(data.GetPointData(), columns)
-            mapper.SetInputDataObject(data)
+        shape, extent = folder.shape[: folder.grains], surfaces.extent(folder)
+        shown = np.ones(folder.grains, dtype=bool)
+        if self.view.cut:
+            shown = (place - self.box.mean(axis=0)) @ _towards_camera(self.view, level=True) <= 0
+        ball, block, long = (np.flatnonzero(shown & (shape == kind)) for kind in (SPHERE, BOX, surfaces.CAPSULE))
+        # a capsule is a cylinder and two balls
+        core = extent - [0, 0, 1] * extent[:, :1]
+        tip = quaternion.rotate(turn[long], np.array([0, 0, 0.5]) * core[long])
+        rows = np.concatenate([ball, long, long])
+        centers = np.concatenate([place[ball], place[long] - tip, place[long] + tip])
+        _show(self._spheres, centers, {"value": value[rows], "radius": extent[rows, 0].astype(np.float32) / 2})
+        for mapper, rows, widths in ((self._boxes, block, extent), (self._cylinders, long, core)):
+            _show(mapper, place[rows], {"value": value[rows], "extent": widths[rows], "turn": turn[rows]})
         large = range(len(folder.large))
-        polygons = [polygon for row in large for polygon in surfaces.planes(folder, frame, row, self.box)]
+        polygons = [polygon for row in large for polygon in surfaces.walls(folder, frame, row, self.box)]
         self._walls.GetMapper().SetInputDataObject(surfaces.polygon_data(polygons))
         self._edges.GetMapper().SetInputDataObject(surfaces.outlines(polygons))
         self._tools.GetMapper().SetInputDataObject(
-            surfaces.joined([surfaces.finite(folder, frame, row) for row in large])
+            surfaces.joined([surfaces.finite(folder, frame, row, self.box) for row in large])
         )
         self._stamp.SetInput(f"t = {frame.time:.3f} s")
         self._renderer.ResetCameraClippingRange()
         return self._image()
 
-    def _add_grains(self, kind: int, colours: vtkLookupTable) -> vtkMapper:
-        if kind == SPHERE:  # drawn pixel by pixel: round at any size, and thousands cost little
-            mapper = vtkOpenGLSphereMapper()
-            mapper.SetScaleArray("radius")
-        else:
-            mapper = vtkGlyph3DMapper()
-            mapper.SetSourceData(surfaces.unit(kind))
-            mapper.SetScaleArray("extent")
-            mapper.SetScaleModeToScaleByVectorComponents()
-            mapper.SetOrientationArray("turn")
-            mapper.SetOrientationModeToQuaternion()
+    def _add_grains(self, mapper: vtkMapper, colours: vtkLookupTable) -> None:
         mapper.SetScalarModeToUsePointFieldData()
         mapper.SelectColorArray("value")
         mapper.SetLookupTable(colours)
@@ -144,7 +143,6 @@ class Stage:
         actor.GetProperty().SetSpecular(0.15)
         actor.GetProperty().SetSpecularPower(20)
         self._renderer.AddActor(actor)
-        return mapper
 
     def _add_surface(self, rgb: tuple[float, float, float]) -> vtkActor:
         actor = vtkActor()
@@ -201,6 +199,22 @@ def _window(view: View) -> vtkRenderWindow:
     window.SetMultiSamples(0)
     window.SetSize(view.width, view.height)
     return window
+
+
+def _glyphs(source: vtkPolyData) -> vtkGlyph3DMapper:
+    mapper = vtkGlyph3DMapper()
+    mapper.SetSourceData(source)
+    mapper.SetScaleArray("extent")
+    mapper.SetScaleModeToScaleByVectorComponents()
+    mapper.SetOrientationArray("turn")
+    mapper.SetOrientationModeToQuaternion()
+    return mapper
+
+
+def _show(mapper: vtkMapper, points: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
+    data = surfaces.polydata(points.astype(np.float32), "verts")  # the mapper of spheres takes no other
+    surfaces.add_arrays(data.GetPointData(), columns)
+    mapper.SetInputDataObject(data)
 
 
 def _towards_camera(view: View, level: bool = False) -> np.ndarray:

@@ -9,29 +9,55 @@ import numpy as np
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
 from vtkmodules.vtkCommonCore import vtkPoints
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
 from vtkmodules.vtkCommonTransforms import vtkTransform
-from vtkmodules.vtkFiltersCore import vtkAppendPolyData, vtkTriangleFilter
+from vtkmodules.vtkFiltersCore import vtkAppendPolyData
 from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
-from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkSphereSource
+from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSphereSource
 
 from dem import quaternion
 from dem.bodies import BOX, SPHERE
 from pctt.look.folder import Folder, FolderError, Frame
 
-MARGIN = 0.06  # how far planes go beyond the bodies, in diagonals of the scene
+CAPSULE = 3  # as in dem.bodies: size is (radius, half length of the core along z, 0)
+MARGIN = 0.06  # how far walls go beyond the grains, in diagonals of the scene
 
 
 def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
-    """Lowest and highest corner (2, 3) of the scene in these frames [m]: grains, and large bodies but for planes."""
-    radius = np.linalg.norm(folder.size[: folder.grains], axis=1)[:, None]
-    corners = []
+    """Lowest and highest corner (2, 3) of the scene in these frames [m]: of the grains, and of the large bodies among
+    them that are no walls."""
+    radius = enclosing_radius(folder)[:, None]
+    places = [frame.position[: folder.grains] for frame in frames]
+    low = np.min([(place - radius).min(axis=0) for place in places], axis=0)
+    high = np.max([(place + radius).max(axis=0) for place in places], axis=0)
+    box = np.array([low, high])
+    corners = [low, high]
     for frame in frames:
-        place = frame.position[: folder.grains]
-        corners += [(place - radius).min(axis=0), (place + radius).max(axis=0)]
-        for solid in (finite(folder, frame, row) for row in range(len(folder.large))):
+        for row in range(len(folder.large)):
+            solid = finite(folder, frame, row, box)
             if solid.GetNumberOfPoints():
                 corners += list(np.reshape(solid.GetBounds(), (3, 2)).T)
     return np.array([np.min(corners, axis=0), np.max(corners, axis=0)])
+
+
+def enclosing_radius(folder: Folder) -> np.ndarray:
+    """Radii (grains,) of the spheres about the grains [m]."""
+    return 0.5 * np.where(
+        folder.shape[: folder.grains] == BOX,
+        np.linalg.norm(extent(folder), axis=1),
+        extent(folder).max(axis=1),
+    )
+
+
+def extent(folder: Folder) -> np.ndarray:
+    """Widths (grains, 3) of the grains along their own axes [m]."""
+    shape, size = folder.shape[: folder.grains, None], folder.size[: folder.grains]
+    unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE}
+    if unknown:
+        raise FolderError(f"{folder.path}: no surface is known for grains of shape {unknown.pop()}")
+    round_ones = np.repeat(size[:, :1], 3, axis=1)
+    long_ones = round_ones + [0, 0, 1] * size[:, 1:2]
+    return 2 * np.where(shape == SPHERE, round_ones, np.where(shape == CAPSULE, long_ones, size))
 
 
 def polydata(points: np.ndarray, cells: str = "", ends: np.ndarray | None = None) -> vtkPolyData:
@@ -57,25 +83,40 @@ def add_arrays(attributes: Any, arrays: Mapping[str, np.ndarray]) -> None:
         attributes.AddArray(array)
 
 
-def unit(kind: int) -> vtkPolyData:
-    """The surface of a grain whose `extent` (n, 3) is (1, 1, 1)."""
-    if kind not in (SPHERE, BOX):
-        raise FolderError(f"no surface is known for grains of shape {kind}")
-    source = _ball(0.5) if kind == SPHERE else vtkCubeSource()
+def cube() -> vtkPolyData:
+    """The surface of a box of widths 1."""
+    source = vtkCubeSource()
     source.Update()
     return source.GetOutput()
 
 
-def extent(shape: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Widths (n, 3) of grains along their own axes [m]."""
-    return 2 * np.where((shape == SPHERE)[:, None], size[:, :1], size)
+def cylinder() -> vtkPolyData:
+    """The side of a cylinder along z of diameter and length 1."""
+    source = vtkCylinderSource()
+    source.SetResolution(32)
+    source.CappingOff()
+    return _along_z(source)
 
 
-def finite(folder: Folder, frame: Frame, row: int) -> vtkPolyData:
-    """The surface of the large body `row`, but for its planes."""
+def finite(folder: Folder, frame: Frame, row: int, box: np.ndarray | None = None) -> vtkPolyData:
+    """The surface of the large body `row`, but for its planes; with a box (2, 3), also but for its walls about it."""
     place, turn = _pose(folder, frame, row)
-    shapes = [shape for shape in folder.large[row]["shapes"] if shape["kind"] != "Plane"]
-    return joined([_placed(_surface(shape), shape, place, turn) for shape in shapes])
+    parts = []
+    for shape in folder.large[row]["shapes"]:
+        if shape["kind"] != "Plane":
+            part = _placed(_surface(shape), shape, place, turn)
+            if box is None or not (shape["kind"] == "Box" and _is_wall(part, box)):
+                parts.append(part)
+    return joined(parts)
+
+
+def _is_wall(solid: vtkPolyData, box: np.ndarray) -> bool:
+    """Whether a solid stands beside the box (2, 3) and is about as long as it is in some direction."""
+    low, high = np.reshape(solid.GetBounds(), (3, 2)).T
+    middle = (low + high) / 2
+    beside = (middle < box[0]) | (middle > box[1])
+    along = np.minimum(high, box[1]) - np.maximum(low, box[0]) > 0.8 * (box[1] - box[0])
+    return bool(beside.any() and along.any())
 
 
 def joined(parts: Sequence[vtkPolyData]) -> vtkPolyData:
@@ -96,9 +137,7 @@ def planes(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.n
         for shape in folder.large[row]["shapes"]
         if shape["kind"] == "Plane"
     ]
-    diagonal = float(np.linalg.norm(box[1] - box[0]))
-    low, high = box[0] - MARGIN * diagonal, box[1] + MARGIN * diagonal
-    sides = [(axis, low) for axis in np.eye(3)] + [(-axis, high) for axis in np.eye(3)]
+    size = 4 * float(np.linalg.norm(box[1] - box[0]))
     polygons = []
     for normal, point in halves:
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
@@ -106,13 +145,49 @@ def planes(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.n
         second = np.cross(normal, first)
         center = box.mean(axis=0)
         center = center - normal * (normal @ (center - point))
-        polygon = center + 4 * diagonal * np.array([first + second, second - first, -first - second, first - second])
-        for other, through in (*halves, *sides):
-            if abs(other @ normal) < 1 - 1e-9:
-                polygon = _clip(polygon, other, through)
-        if len(polygon):
-            polygons.append(polygon)
-    return polygons
+        square = center + size * np.array([first + second, second - first, -first - second, first - second])
+        polygons.append(_clipped(square, normal, [*halves, *_sides(box)]))
+    return [polygon for polygon in polygons if len(polygon)]
+
+
+def walls(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.ndarray]:
+    """What bounds the grains of the large body `row`, as polygons (k, 3) seen from inside: its planes, and of its boxes
+    beside `box` (2, 3) the faces towards it."""
+    polygons = planes(folder, frame, row, box)
+    place, turn = _pose(folder, frame, row)
+    middle = box.mean(axis=0)
+    for shape in folder.large[row]["shapes"]:
+        if shape["kind"] == "Box" and _is_wall(_placed(_surface(shape), shape, place, turn), box):
+            whole = quaternion.multiply(turn, np.array(shape["quaternion"]))
+            center = place + quaternion.rotate(turn, np.array(shape["center"]))
+            arms = quaternion.matrix(whole).T * np.array(shape["half_extents"])[:, None]
+            for axis in range(3):
+                for arm in (arms[axis], -arms[axis]):
+                    if (middle - center - arm) @ arm > 0:
+                        first, second = arms[axis - 2], arms[axis - 1]
+                        square = center + arm + np.array(
+                            [first + second, second - first, -first - second, first - second]
+                        )
+                        if np.cross(first, second) @ arm < 0:
+                            square = square[::-1]
+                        polygons.append(_clipped(square, arm / np.linalg.norm(arm), _sides(box)))
+    return [polygon for polygon in polygons if len(polygon)]
+
+
+def _sides(box: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Inward normals and points of the six planes at MARGIN beyond a box (2, 3)."""
+    beyond = MARGIN * float(np.linalg.norm(box[1] - box[0]))
+    return [(axis, box[0] - beyond) for axis in np.eye(3)] + [(-axis, box[1] + beyond) for axis in np.eye(3)]
+
+
+def _clipped(
+    polygon: np.ndarray, normal: np.ndarray, halves: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
+    """The part of a convex polygon (k, 3) of this normal before all planes (normal, point) that are not parallel."""
+    for other, through in halves:
+        if abs(other @ normal) < 1 - 1e-9:
+            polygon = _clip(polygon, other, through)
+    return polygon
 
 
 def polygon_data(polygons: Sequence[np.ndarray]) -> vtkPolyData:
@@ -147,29 +222,47 @@ def _pose(folder: Folder, frame: Frame, row: int) -> tuple[np.ndarray, np.ndarra
     return frame.position[folder.grains + row], frame.quaternion[folder.grains + row]
 
 
-def _ball(radius: float) -> vtkSphereSource:
-    source = vtkSphereSource()
-    source.SetRadius(radius)
-    source.SetThetaResolution(32)
-    source.SetPhiResolution(24)
-    return source
-
-
 def _surface(shape: Mapping[str, Any]) -> vtkPolyData:
     """A shape of a large body in its own frame."""
     if shape["kind"] == "Sphere":
-        source = _ball(shape["radius"])
-    elif shape["kind"] == "Box":
-        source = vtkCubeSource()
-        source.SetXLength(2 * shape["half_extents"][0])
-        source.SetYLength(2 * shape["half_extents"][1])
-        source.SetZLength(2 * shape["half_extents"][2])
-    else:
-        raise FolderError(f"no surface is known for the shape {shape['kind']}")
-    triangles = vtkTriangleFilter()
-    triangles.SetInputConnection(source.GetOutputPort())
-    triangles.Update()
-    return triangles.GetOutput()
+        ball = vtkSphereSource()
+        ball.SetRadius(shape["radius"])
+        ball.SetThetaResolution(32)
+        ball.SetPhiResolution(24)
+        ball.Update()
+        return ball.GetOutput()
+    if shape["kind"] == "Box":
+        x, y, z = np.array(shape["half_extents"]) * 2
+        block = vtkCubeSource()
+        block.SetXLength(x)
+        block.SetYLength(y)
+        block.SetZLength(z)
+        block.Update()
+        return block.GetOutput()
+    if shape["kind"] == "Capsule":
+        core = vtkCylinderSource()
+        core.SetRadius(shape["radius"])
+        core.SetHeight(2 * shape["half_length"])
+        core.SetResolution(32)
+        core.SetCapsuleCap(True)
+        return _along_z(core)
+    raise FolderError(f"no surface is known for the shape {shape['kind']}")
+
+
+def _along_z(source: vtkCylinderSource) -> vtkPolyData:
+    """The surface of a source along y, turned to z."""
+    turn = vtkTransform()
+    turn.RotateX(90)
+    return _moved(source, turn)
+
+
+def _moved(source: Any, transform: vtkTransform) -> vtkPolyData:
+    source.Update()
+    moved = vtkTransformPolyDataFilter()
+    moved.SetInputConnection(source.GetOutputPort())
+    moved.SetTransform(transform)
+    moved.Update()
+    return moved.GetOutput()
 
 
 def _placed(surface: vtkPolyData, shape: Mapping[str, Any], place: np.ndarray, turn: np.ndarray) -> vtkPolyData:
@@ -180,8 +273,6 @@ def _placed(surface: vtkPolyData, shape: Mapping[str, Any], place: np.ndarray, t
     matrix[:3, 3] = place + quaternion.rotate(turn, np.array(shape["center"]))
     transform = vtkTransform()
     transform.SetMatrix(matrix.ravel())
-    moved = vtkTransformPolyDataFilter()
-    moved.SetInputData(surface)
-    moved.SetTransform(transform)
-    moved.Update()
-    return moved.GetOutput()
+    still = vtkTrivialProducer()
+    still.SetOutput(surface)
+    return _moved(still, transform)
