@@ -108,7 +108,7 @@ def write_png(path: Path, picture: np.ndarray) -> None:
     from PIL import Image
 
     temporary = path.with_name(f".{path.name}.tmp")
-    Image.fromarray(np.ascontiguousarray(picture)).save(temporary, format="png")
+    Image.fromarray(np.ascontiguousarray(picture)).save(temporary, format="png", compress_level=4)
     os.replace(temporary, path)
 
 

@@ -102,10 +102,12 @@ def finite(folder: Folder, frame: Frame, row: int, box: np.ndarray | None = None
     """The surface of the large body `row`, but for its planes; with a box (2, 3), also but for its walls about it."""
     place, turn = _pose(folder, frame, row)
     parts = []
-    for shape in folder.large[row]["shapes"]:
+    shapes = folder.large[row]["shapes"]
+    for shape in shapes:
         if shape["kind"] != "Plane":
             part = _placed(_surface(shape), shape, place, turn)
-            if box is None or not (shape["kind"] == "Box" and _is_wall(part, box)):
+            # a single shape is a tool, such as a blade, and drawn whole
+            if box is None or len(shapes) == 1 or shape["kind"] != "Box" or not _is_wall(part, box):
                 parts.append(part)
     return joined(parts)
 
@@ -152,25 +154,24 @@ def planes(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.n
 
 def walls(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.ndarray]:
     """What bounds the grains of the large body `row`, as polygons (k, 3) seen from inside: its planes, and of its boxes
-    beside `box` (2, 3) the faces towards it."""
+    beside `box` (2, 3) the faces towards its middle."""
     polygons = planes(folder, frame, row, box)
     place, turn = _pose(folder, frame, row)
     middle = box.mean(axis=0)
-    for shape in folder.large[row]["shapes"]:
-        if shape["kind"] == "Box" and _is_wall(_placed(_surface(shape), shape, place, turn), box):
-            whole = quaternion.multiply(turn, np.array(shape["quaternion"]))
+    shapes = folder.large[row]["shapes"]
+    for shape in shapes:
+        if len(shapes) == 1 or shape["kind"] != "Box":
+            continue
+        if _is_wall(_placed(_surface(shape), shape, place, turn), box):
             center = place + quaternion.rotate(turn, np.array(shape["center"]))
-            arms = quaternion.matrix(whole).T * np.array(shape["half_extents"])[:, None]
-            for axis in range(3):
-                for arm in (arms[axis], -arms[axis]):
-                    if (middle - center - arm) @ arm > 0:
-                        first, second = arms[axis - 2], arms[axis - 1]
-                        square = center + arm + np.array(
-                            [first + second, second - first, -first - second, first - second]
-                        )
-                        if np.cross(first, second) @ arm < 0:
-                            square = square[::-1]
-                        polygons.append(_clipped(square, arm / np.linalg.norm(arm), _sides(box)))
+            axes = quaternion.matrix(quaternion.multiply(turn, np.array(shape["quaternion"]))).T
+            half = np.array(shape["half_extents"])
+            way = axes @ (middle - center)
+            k = int(np.argmax(np.abs(way) - half))
+            normal = np.sign(way[k]) * axes[k]
+            first, second = half[k - 2] * axes[k - 2], np.sign(way[k]) * half[k - 1] * axes[k - 1]
+            corners = np.array([first + second, second - first, -first - second, first - second])
+            polygons.append(_clipped(center + half[k] * normal + corners, normal, _sides(box)))
     return [polygon for polygon in polygons if len(polygon)]
 
 
@@ -183,10 +184,12 @@ def _sides(box: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 def _clipped(
     polygon: np.ndarray, normal: np.ndarray, halves: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray:
-    """The part of a convex polygon (k, 3) of this normal before all planes (normal, point) that are not parallel."""
+    """The part of a convex polygon (k, 3) of this normal that is before all planes (normal, point)."""
     for other, through in halves:
         if abs(other @ normal) < 1 - 1e-9:
             polygon = _clip(polygon, other, through)
+        elif len(polygon) and (polygon[0] - through) @ other < -1e-9 * np.ptp(polygon):
+            return polygon[:0]
     return polygon
 
 

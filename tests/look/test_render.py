@@ -90,21 +90,20 @@ def test_walls_before_the_grains_hide_nothing(render, tmp_path):
     assert ((picture[..., 2] < 100) & (picture[..., :2].min(axis=2) > 120)).sum() > 300
 
 
-def test_planes_are_cut_by_each_other(tmp_path):
+def test_planes_are_cut_by_each_other_and_to_the_scene(tmp_path):
     from pctt.look import surfaces
 
-    walls = [
-        {"kind": "Plane", "normal": [0, 0, 1], "center": [0, 0, 0]},
-        {"kind": "Plane", "normal": [1, 0, 0], "center": [-2, 0, 0]},
-        {"kind": "Plane", "normal": [-1, 0, 0], "center": [3, 0, 0]},
-    ]
+    normals, centers = ([0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, -1, 0]), ([0, 0, 0], [-1.1, 0, 0], [2.1, 0, 0], [0, 9, 0])
+    walls = [{"kind": "Plane", "normal": normal, "center": center} for normal, center in zip(normals, centers)]
     read = Folder(handmade.write(tmp_path / "made", walls))
     read.require_frames()
     box = np.array([[-1.0, -1, 0], [2, 1, 1]])
     beyond = surfaces.MARGIN * np.linalg.norm(box[1] - box[0])
     floor, *sides = surfaces.planes(read, read.frame(1), 0, box)
-    np.testing.assert_allclose(floor.min(axis=0), [-1 - beyond, -1 - beyond, 0], atol=1e-12)
-    np.testing.assert_allclose(floor.max(axis=0), [2 + beyond, 1 + beyond, 0], atol=1e-12)
-    for side, x in zip(sides, (-2, 3)):
+    assert len(sides) == 2  # the fourth is far away
+    np.testing.assert_allclose(floor.min(axis=0), [-1.1, -1 - beyond, 0], atol=1e-12)
+    np.testing.assert_allclose(floor.max(axis=0), [2.1, 1 + beyond, 0], atol=1e-12)
+    for side, x, way in zip(sides, (-1.1, 2.1), (1, -1)):
         np.testing.assert_allclose(side.min(axis=0), [x, -1 - beyond, 0], atol=1e-12)
         np.testing.assert_allclose(side.max(axis=0), [x, 1 + beyond, 1 + beyond], atol=1e-12)
+        assert np.cross(side[1] - side[0], side[2] - side[1])[0] * way > 0  # seen from the open side

@@ -102,7 +102,7 @@ def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled,
     constant = {name[7:]: array for name, array in arrays(path).items() if name.startswith("bodies/")}
     assert set(constant) == {"shape", "size", "mass", "material", "large"}
     assert constant["size"].tolist() == [[radius, 0, 0]] * 27 + [[0, 0, 0]] * 2
-    assert [body["name"] for body in json.loads(constant["large"][()])] == ["box", "mixer"]
+    assert [body["name"] for body in json.loads(constant["large"])] == ["box", "mixer"]
     before = None
     for line in summary["steps"]:
         data, _ = frame(path, line["step"])
