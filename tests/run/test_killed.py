@@ -147,4 +147,5 @@ def test_another_run_in_the_same_folder_does_not_mix_with_the_earlier_one(progra
     assert [line["step"] for line in summary["steps"]] == [start + 1, start + 2]
     recorded = {int(name) for name in recorded_steps(arrays(tmp_path / "results" / "state.h5"))}
     assert recorded == {start + 1, start + 2}
-    assert len(list((tmp_path / "results" / "frames").iterdir())) == 2
+    frames = {path.stem for path in (tmp_path / "results" / "frames").iterdir()}
+    assert frames == {"bodies", *(f"{step:06d}" for step in recorded)}
