@@ -81,15 +81,16 @@ class Folder:
         """FolderError unless there are recorded steps, with the shapes of the bodies."""
         if not self.steps:
             raise FolderError(f"{self.path}: no recorded steps; run with -output_every 1 or more")
-        with self._open() as file:
-            if "bodies" not in file:
-                raise FolderError(f"{self.path}: state.h5 lacks the shapes of the bodies; run again")
-            self.shape: np.ndarray = file["bodies/shape"][()]
-            self.size: np.ndarray = file["bodies/size"][()]
-            self.mass: np.ndarray = file["bodies/mass"][()]
-            self.material: np.ndarray = file["bodies/material"][()]
-            #: name and shapes of each large body, the rows after the grains
-            self.large: list[dict[str, Any]] = json.loads(file["bodies/large"][()])
+        try:
+            with self._open() as file:
+                self.shape: np.ndarray = file["bodies/shape"][()]
+                self.size: np.ndarray = file["bodies/size"][()]
+                self.mass: np.ndarray = file["bodies/mass"][()]
+                self.material: np.ndarray = file["bodies/material"][()]
+                #: name and shapes of each large body, the rows after the grains
+                self.large: list[dict[str, Any]] = json.loads(file["bodies/large"][()])
+        except (KeyError, OSError) as error:
+            raise FolderError(f"{self.path}: state.h5 lacks the shapes of the bodies; run again ({error})") from None
         self.grains = len(self.shape) - len(self.large)
 
     def frame(self, step: int) -> Frame:

@@ -91,6 +91,15 @@ def test_a_damaged_frame_is_named(tmp_path):
         read.frame(1)
 
 
+@pytest.mark.parametrize("program", ["plot", "render", "export"])
+def test_a_folder_without_the_bodies_is_refused(program, show, tmp_path):
+    made = handmade.write(tmp_path / "made", handmade.FLOOR)
+    (made / "frames" / "bodies.h5").unlink()
+    done = show(program, folder=made, status=2)
+    assert "lacks the shapes" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_records_are_columns_of_numbers(tmp_path):
     read = Folder(handmade.write(tmp_path / "made", handmade.FLOOR))
     assert read.records() == {}
