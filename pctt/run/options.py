@@ -88,6 +88,12 @@ class Run:
     )
     compare: str = option("", "preconditioners, with commas between, that each solve the same Newton systems")
     compare_every: int = option(1, "compare on every k-th Newton system", check=AT_LEAST_ONE)
+    monitor: int = option(
+        1,
+        "what to print: 0 the tables at the end; 1 and a line per step; 2 and the accuracy of each step",
+        check=("0, 1 or 2", lambda x: 0 <= x <= 2),
+    )
+    quiet: bool = option(False, "print nothing but errors")
 
 
 @dataclasses.dataclass(frozen=True)

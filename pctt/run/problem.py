@@ -14,7 +14,7 @@ from pctt.ccp import fclib, petsc_binary
 from pctt.ccp.cone import Array
 from pctt.run.hdf5 import FileError, write_text
 from pctt.run.options import Options
-from pctt.run.report import compare_table
+from pctt.run.report import Progress, compare_table
 
 
 def solve_file(options: Options, comm: MPI.Comm) -> None:
@@ -64,19 +64,20 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         },
         "compare": compare.summary(),
     }
+    progress = Progress(comm.rank == 0 and not options.run.quiet)
+    width = max(map(len, summary))
+    for name, value in summary.items():
+        if not isinstance(value, dict) and value != "":
+            shown = f"{value:.12g}" if isinstance(value, float) else value
+            progress.say(f"{name:{width}}  {shown}")
+    for name, figures in summary["references"].items():
+        listed = ", ".join(f"{word} {figure:.6g}" for word, figure in figures.items())
+        progress.say(f"the file's {name}: {listed}")
+    if compare.names:
+        progress.say("\n" + compare_table(compare.summary(), compare.labels()))
+    if not result.converged:
+        progress.say(f"NOT CONVERGED: {result.reason}")
     if comm.rank == 0:
-        width = max(map(len, summary))
-        for name, value in summary.items():
-            if not isinstance(value, dict) and value != "":
-                shown = f"{value:.12g}" if isinstance(value, float) else value
-                print(f"{name:{width}}  {shown}")
-        for name, figures in summary["references"].items():
-            listed = ", ".join(f"{word} {figure:.6g}" for word, figure in figures.items())
-            print(f"the file's {name}: {listed}")
-        if compare.names:
-            print("\n" + compare_table(compare.summary(), compare.labels()))
-        if not result.converged:
-            print(f"NOT CONVERGED: {result.reason}")
         write_text(Path(options.run.output) / "summary.json", json.dumps(summary, indent=1) + "\n")
 
 

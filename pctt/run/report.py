@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
+import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import median
 from typing import Any
+
+from pctt import log
 
 COLUMNS = (
     "  step    time s  contacts  Newton  Krylov  residual"
@@ -32,27 +38,93 @@ def step_line(line: Mapping[str, Any]) -> str:
     )
 
 
+def accuracy_lines(line: Mapping[str, Any], history: Sequence[float]) -> str:
+    """The accuracy of a step, and its natural residual by iteration: ten of them, evenly spread, and the last."""
+    figures = (
+        f"       objective {line['objective']:.6g} J, outside the cone {line['cone_violation']:.1e} N s, outside the"
+        f" dual cone {line['dual_violation']:.1e} m/s, complementarity {line['complementarity']:.1e} J"
+    )
+    if not history:
+        return figures
+    shown = sorted({round(k * (len(history) - 1) / 10) for k in range(11)})
+    course = "  ".join(f"{k}: {history[k]:.1e}" for k in shown)
+    return f"{figures}\n       residual by iteration  {course}"
+
+
 class Progress:
-    """Prints the lines of the steps; on a terminal also what is being done at the moment."""
+    """Prints what a run says, down to a level; on a terminal also a line of what is being done at the moment.
 
-    def __init__(self, active: bool):
-        self._active = active
-        # under mpiexec standard output looks like a terminal even where it goes to a file
-        self._live = active and sys.stdout.isatty() and not _under_mpiexec()
+    Levels: 0 what a run starts from and ends with, 1 a line per step, 2 the accuracy of each step.
+    """
 
-    def say(self, text: str = "") -> None:
-        if self._active:
+    def __init__(self, active: bool, level: int = 1):
+        self._active, self._level = active, level
+        self._live = active and _terminal()
+        self._text, self._phase, self._systems = "", "", 0
+        self._steps = self._done = 0
+        self._begun = self._drawn = 0.0
+        if self._live:
+            log.watch(self._enter)
+
+    def say(self, text: str = "", level: int = 0) -> None:
+        if self._active and level <= self._level:
             clear = "\r\033[K" if self._live else ""
             print(clear + text, flush=True)
 
+    def start(self, steps: int) -> None:
+        """Start the clock of so many steps."""
+        self._steps, self._done, self._begun = steps, -1, time.perf_counter()
+
     def doing(self, text: str) -> None:
-        """A transient line, on a terminal only."""
-        if self._live:
-            print(f"\r\033[K{text} ...", end="", flush=True)
+        """The next step begins; ``text`` says which, in a transient line, on a terminal only."""
+        self._done += 1
+        self._text, self._phase, self._systems = text, "", 0
+        self._draw()
+
+    def _enter(self, phase: str) -> None:
+        """Note the phase: those of a step have plain names, those within a solver names like CCPKrylov."""
+        if phase == "CCPKrylov":
+            self._systems += 1
+        elif phase.islower():
+            self._phase = phase
+        if time.perf_counter() - self._drawn > 0.1:
+            self._draw()
+
+    def _draw(self) -> None:
+        if not (self._live and self._text):
+            return
+        now = self._drawn = time.perf_counter()
+        parts = [f"{self._text} ({self._done + 1} of {self._steps})"]
+        if self._phase:
+            parts.append(self._phase)
+        if self._phase == "solve" and self._systems:
+            parts.append(f"Newton step {self._systems}")
+        if self._done > 0:
+            parts.append(remaining(now - self._begun, self._done, self._steps))
+        line = ", ".join(parts) + " ..."
+        width = shutil.get_terminal_size().columns - 1
+        print(f"\r\033[K{line[:width]}", end="", flush=True)
 
 
-def _under_mpiexec() -> bool:
-    return any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK"))
+def remaining(spent: float, done: int, steps: int) -> str:
+    """The time that is left, if steps go on to take as long as those that are done."""
+    left = max(0, round(spent / done * steps - spent))
+    minutes, seconds = divmod(left, 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"about {hours} h {minutes:02d} min left"
+    return f"about {minutes} min {seconds:02d} s left" if minutes else f"about {seconds} s left"
+
+
+def _terminal() -> bool:
+    """Whether a person watches. Under mpiexec standard output looks like a terminal even where it goes to a file:
+    then that of mpiexec itself, our parent, decides (where it cannot be seen, nobody watches)."""
+    if not any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK")):
+        return sys.stdout.isatty()
+    try:
+        return os.readlink(Path("/proc", str(os.getppid()), "fd/1")).startswith(("/dev/pts/", "/dev/tty"))
+    except OSError:
+        return False
 
 
 def compare_table(summary: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]) -> str:
@@ -71,21 +143,30 @@ def compare_table(summary: Mapping[str, Mapping[str, float]], labels: Mapping[st
 
 
 def phase_table(steps: Sequence[Mapping[str, Any]]) -> str:
-    """Median seconds per step of each phase."""
+    """Seconds of each phase over the run and in a median step, and what the steps came to."""
     names = list(dict.fromkeys(name for line in steps for name in line["phases"]))
-    medians = {name: _median([line["phases"].get(name, 0.0) for line in steps]) for name in names}
-    total = _median([line["seconds"] for line in steps])
-    cells = ", ".join(f"{name} {value:.3f}" for name, value in medians.items())
-    return f"median seconds per step: {total:.3f} ({cells})"
+    columns = {name: [line["phases"].get(name, 0.0) for line in steps] for name in names}
+    columns["total"] = [line["seconds"] for line in steps]
+    whole = sum(columns["total"]) or 1.0
+    head = f"{'phase':14}  seconds   share  median step s"
+    rows = [
+        f"{name:14} {sum(column):8.2f} {sum(column) / whole:7.1%} {median(column):14.3f}"
+        for name, column in columns.items()
+    ]
+    contacts = [line["contacts"] for line in steps]
+    failed = sum(not line["converged"] for line in steps)
+    figures = [
+        f"{len(steps)} steps",
+        f"{min(contacts)} to {max(contacts)} contacts",
+        f"{sum(line['newton_its'] for line in steps)} Newton steps",
+        f"{sum(line['ksp_its'] for line in steps)} Krylov iterations",
+        f"worst residual {max(line['natural_residual'] for line in steps):.1e}",
+        f"{failed} NOT CONVERGED" if failed else "all converged",
+    ]
+    return "\n".join([head, "-" * len(head), *rows, ", ".join(figures)])
 
 
 def figure_table(figures: Mapping[str, float]) -> str:
     """A line per number of the scene's analysis."""
     width = max(map(len, figures), default=0)
     return "\n".join(f"{name:{width}}  {value:.6g}" for name, value in figures.items())
-
-
-def _median(values: Sequence[float]) -> float:
-    ordered = sorted(values)
-    middle = len(ordered) // 2
-    return ordered[middle] if len(ordered) % 2 else 0.5 * (ordered[middle - 1] + ordered[middle])

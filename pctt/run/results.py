@@ -1,7 +1,7 @@
 """The output folder of a run.
 
     state.h5         group steps/000012 per recorded step, each a link to its own file in frames/
-    frames/          one file per recorded step
+    frames/          one file per recorded step, and bodies.h5 with what no step changes; state.h5 links to it
     records.csv      a row per step, see ``dem.record`` and ``pctt.run.records``
     analysis.csv     the series that the scene makes of them at the end
     checkpoint.h5    all that ``-restart`` needs
@@ -13,8 +13,10 @@ Every file is written under a temporary name and renamed, so that a killed run l
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,7 @@ class Results:
         self.folder, self.comm, self.record = folder, comm, record
         self.checkpoint = folder / "checkpoint.h5"
         self._frames = folder / "frames"
+        self._described = False
         self._recorded: list[int] = []
         self._steps: list[dict[str, Any]] = []
         goes_on = comm.bcast(bool(restart) and Path(restart).resolve() == self.checkpoint.resolve())
@@ -78,6 +81,10 @@ class Results:
 
         Bodies are in the order of their ids (grains, then large bodies).
         """
+        if not self._described:
+            with written(self._frames / "bodies.h5", self.comm) as file:
+                _write_constants(file, world)
+            self._described = True
         name = f"{world.step:06d}.h5"
         with written(self._frames / name, self.comm) as file:
             file.attributes("/", {"step": world.step, "time": world.time})
@@ -90,6 +97,7 @@ class Results:
             file.rows("contact/frame", system.frame)
             file.rows("contact/gap", contacts.gap)
             file.rows("contact/impulse", impulse)
+            file.attributes("contact", {"dt": system.dt})
         if self.comm.rank == 0:
             self._recorded.append(world.step)
             self._link_frames(world)
@@ -103,8 +111,10 @@ class Results:
                 "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, by body id; "
                 "record: attributes as in records.csv; "
                 "contact: bodies a and b, point m, frame rows (normal from a to b, t1, t2), gap m, "
-                "impulse on b N s"
+                "impulse on b N s; attribute dt s. bodies: shape, size m, mass kg, material by body id; "
+                "large: names and shapes of the large bodies, the last of the ids, in their frames"
             )
+            file["bodies"] = h5py.ExternalLink("frames/bodies.h5", "/")
             for step in self._recorded:
                 file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
         temporary.replace(self.folder / "state.h5")
@@ -137,13 +147,27 @@ def _finite(value: Any) -> Any:
 
 
 def _write_bodies(file: RowWriter, world: World) -> None:
+    _write_by_id(file, world, ("position", "quaternion", "velocity"))
+
+
+def _write_constants(file: RowWriter, world: World) -> None:
+    """What no step changes: columns of the table of bodies, and the shapes of the large ones as JSON."""
+    _write_by_id(file, world, ("shape", "size", "mass", "material"))
+    large = [
+        {"name": body.name, "shapes": [{"kind": type(s).__name__, **dataclasses.asdict(s)} for s in body.shapes]}
+        for body in world.large_bodies
+    ]
+    file.whole("large", np.bytes_(json.dumps(large, default=list)))  # arrays as lists
+
+
+def _write_by_id(file: RowWriter, world: World, names: Sequence[str]) -> None:
+    """Columns of the table of all bodies, in the order of their ids."""
     grains, comm = world.grains, world.comm
-    columns = {"id": grains.id, "position": grains.position, "quaternion": grains.quaternion}
-    columns["velocity"] = grains.velocity
+    columns = {"id": grains.id, **{name: getattr(grains, name) for name in names}}
     starts = np.arange(comm.size + 1) * int(world.slabs[-1]) // comm.size
     rows = exchange(comm, columns, np.searchsorted(starts, grains.id, side="right") - 1)
     order = np.argsort(rows["id"])
     last = comm.rank == comm.size - 1
-    for name in ("position", "quaternion", "velocity"):
+    for name in names:
         large = getattr(world.large, name)
         file.rows(name, np.concatenate([rows[name][order], large if last else large[:0]]))

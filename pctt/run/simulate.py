@@ -29,7 +29,7 @@ from pctt.run.results import Results
 
 def simulate(options: Options, comm: MPI.Comm) -> None:
     """Run the scene of the options, or settle it with ``-settle``."""
-    progress = report.Progress(comm.rank == 0)
+    progress = report.Progress(comm.rank == 0 and not options.run.quiet, options.run.monitor)
     if options.run.settle:
         path = settled_state(options, comm, progress, anew=True)
         progress.say(f"settled state: {path}")
@@ -45,8 +45,9 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     stepper = Stepper(options, world, memory, newton, dump)
     method = f"{options.run.ccp_type} to {options.limits.tol:g}"
     progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
-    progress.say(report.COLUMNS)
+    progress.say(report.COLUMNS, level=1)
     lines = []
+    progress.start(options.run.steps)
     for k in range(1, options.run.steps + 1):
         progress.doing(f"step {world.step + 1}, time {world.time:.3f} s")
         line = stepper.step()
@@ -64,11 +65,12 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
             if k % options.run.checkpoint_every == 0 or last:
                 checkpoint.save(results.checkpoint, record, world, memory)
         _count_output(line)
-        progress.say(report.step_line(line))
+        progress.say(report.step_line(line), level=1)
+        progress.say(report.accuracy_lines(line, stepper.history), level=2)
     if lines:
         figures = _analyse(options.scene, results, comm)
         results.write_summary(world, compare.summary(), analysis=figures)
-        progress.say(report.phase_table(lines))
+        progress.say("\n" + report.phase_table(lines))
         if figures:
             progress.say(report.figure_table(figures))
         if row.get("grains_outside"):
@@ -111,6 +113,7 @@ class Stepper:
     contacts: Any
     system: ContactSystem
     impulse: np.ndarray
+    history: list[float]  #: natural residual by iteration
 
     def __init__(
         self,
@@ -142,7 +145,7 @@ class Stepper:
         with log.phase("output"):
             files = self.dump.step(self.system, problem, guess, result, self._asked) if self.dump else {}
         with log.phase("advance"):
-            self.impulse = result.impulse
+            self.impulse, self.history = result.impulse, result.history
             advance(world, self.system.velocity(self.impulse), options.dt)
             self.memory.remember(self.system.key, self.impulse, self.system.frame)
         contacts = problem.size
@@ -251,8 +254,9 @@ def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, a
         path.parent.mkdir(parents=True, exist_ok=True)
     stepper = Stepper(settling, _new_world(options.scene, comm), ImpulseMemory(comm))
     start = time.perf_counter()
+    progress.start(steps)
     for k in range(1, steps + 1):
-        progress.doing(f"settling step {k} of {steps}")
+        progress.doing(f"settling, time {stepper.world.time:.3f} s")
         if k == steps - steps // 10:
             limits = ccp.Limits(tol=0.1 * options.run.settle_tol)
             stepper.options = dataclasses.replace(settling, delta=options.delta, limits=limits)

@@ -66,6 +66,11 @@ def table(path: Path) -> dict[str, np.ndarray]:
         return dict(zip(names, np.loadtxt(file, delimiter=",", ndmin=2).T))
 
 
+def recorded_steps(found: dict[str, np.ndarray]) -> list[str]:
+    """Names of the steps in the arrays of a state.h5."""
+    return sorted({name.partition("/")[0] for name in found} - {"bodies"})
+
+
 def _collect(group, prefix, found):
     for name, item in group.items():
         if isinstance(item, h5py.Dataset):

@@ -11,7 +11,7 @@ import subprocess
 import h5py
 import numpy as np
 import pytest
-from program import SETTLED, SMALL, arrays, command, environment
+from program import SETTLED, SMALL, arrays, command, environment, recorded_steps
 
 from dem.scenes import Mixer
 
@@ -99,6 +99,10 @@ def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled,
     summary = summary_of(tmp_path / "results")
     assert summary["ranks"] == ranks
     radius, friction = 0.1, 0.25
+    constant = {name[7:]: array for name, array in arrays(path).items() if name.startswith("bodies/")}
+    assert set(constant) == {"shape", "size", "mass", "material", "large"}
+    assert constant["size"].tolist() == [[radius, 0, 0]] * 27 + [[0, 0, 0]] * 2
+    assert [body["name"] for body in json.loads(constant["large"])] == ["box", "mixer"]
     before = None
     for line in summary["steps"]:
         data, _ = frame(path, line["step"])
@@ -148,7 +152,7 @@ def test_recorded_steps_are_every_kth_and_the_last(program, settled, tmp_path):
     program(*SETTLED, "-steps", 5, "-output_every", 2, "-checkpoint_every", 3, "-ccp_type", "apgd")
     steps = [line["step"] for line in summary_of(tmp_path / "results")["steps"]]
     assert len(steps) == 5
-    recorded = {int(name.partition("/")[0]) for name in arrays(tmp_path / "results" / "state.h5")}
+    recorded = {int(name) for name in recorded_steps(arrays(tmp_path / "results" / "state.h5"))}
     assert recorded == {k for k in steps if k % 2 == 0} | {steps[-1]}
     assert int(arrays(tmp_path / "results" / "checkpoint.h5")["world/step"]) == steps[-1]
 
@@ -210,3 +214,28 @@ def test_on_a_terminal_the_present_step_is_shown(settled, cache, tmp_path):
     first = int(arrays(settled)["world/step"]) + 1
     assert f"step {first}, time".encode() in said
     assert b"\r\033[K" in said
+    assert b"(2 of 2)" in said
+    assert b"about 0 s left" in said
+    assert b"solve" in said
+
+
+def test_a_quiet_run_says_nothing_but_errors(program, settled, tmp_path):
+    done = program(*SETTLED, "-steps", 1, "-ccp_type", "apgd", "-quiet")
+    assert done.stdout == done.stderr == ""
+    assert len(summary_of(tmp_path / "results")["steps"]) == 1
+    done = program(*SETTLED, "-quiet", "-steps", -1, status=2)
+    assert done.stdout == ""
+    assert "-steps -1" in done.stderr
+
+
+def test_the_monitor_has_levels(program, settled):
+    said = [program(*SETTLED, "-steps", 2, "-ccp_type", "apgd", "-monitor", k).stdout for k in (0, 1, 2)]
+    steps = [sum(line.split()[:1] == ["step"] for line in text.splitlines()) for text in said]
+    assert steps == [0, 1, 1]
+    assert ["residual by iteration" in text for text in said] == [False, False, True]
+    for text in said:
+        table = {line.split()[0]: line.split() for line in text.partition("\nphase")[2].splitlines()[2:] if line}
+        assert {"search", "assembly", "solve", "advance", "output", "total"} <= set(table)
+        parts = [float(table[name][1]) for name in ("search", "assembly", "solve", "advance", "output")]
+        assert sum(parts) == pytest.approx(float(table["total"][1]), abs=0.03)
+        assert "all converged" in text

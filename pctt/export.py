@@ -1,0 +1,149 @@
+"""``python -m pctt.export DIR``: the recorded steps of a run as time series for ParaView.
+
+Written are DIR/paraview/bodies.pvd, contacts.pvd and large.pvd, each a list of one .vtp file per step. Any number
+of ranks share the steps. These formats are read by every ParaView and VTK of the last fifteen years: a VTKHDF file
+of points that change in number needs ParaView 5.12, and a .pvd collection lists VTK's XML files only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from pctt.look.folder import Folder, FolderError, Frame
+from pctt.look.program import add_steps, chosen, made_folder, parser, run
+
+SERIES = ("bodies", "contacts", "large")
+
+
+def arguments() -> argparse.Namespace:
+    line = parser("export", "the recorded steps of a run as time series for ParaView (.pvd of .vtp files)")
+    add_steps(line)
+    line.add_argument("-output", metavar="DIR", help="where to write; none: paraview/ in the folder")
+    return line.parse_args()
+
+
+def main(comm: MPI.Comm) -> None:
+    given = arguments()
+    folder = Folder(given.folder)
+    folder.require_frames()
+    steps = chosen(folder.steps, given)
+    target = made_folder(Path(given.output) if given.output else folder.path / "paraview")
+
+    from pctt.look import surfaces  # needs vtk, which asking for help does not
+
+    box = surfaces.bounds(folder, [folder.frame(step) for step in {steps[0], steps[-1]}])
+    times = {}
+    for step in steps[comm.rank :: comm.size]:
+        frame = folder.frame(step)
+        times[step] = frame.time
+        for name, data in zip(SERIES, (bodies(folder, frame), contacts(folder, frame), large(folder, frame, box))):
+            write_vtp(target / f"{name}_{step:06d}.vtp", data, frame.time)
+    shared = comm.gather(times)
+    if comm.rank == 0:
+        together = {step: time for part in shared or [] for step, time in part.items()}
+        for name in SERIES:
+            write_pvd(target / f"{name}.pvd", {f"{name}_{step:06d}.vtp": together[step] for step in steps})
+        print(f"{len(steps)} steps: {target}/" + ", ".join(f"{name}.pvd" for name in SERIES))
+
+
+def bodies(folder: Folder, frame: Frame) -> Any:
+    """The grains as points, with what a glyph needs: a unit sphere or box scaled by the vector `extent` and turned by
+    `quaternion` is the grain; `radius` is that of the sphere about it."""
+    from pctt.look import surfaces
+
+    grains = slice(folder.grains)
+    data = surfaces.polydata(frame.position[grains], "verts")
+    columns = {
+        "id": np.arange(folder.grains),
+        "radius": surfaces.enclosing_radius(folder),
+        "extent": surfaces.extent(folder),
+        "quaternion": frame.quaternion[grains],
+        "velocity": frame.velocity[grains, :3],
+        "angular_velocity": frame.velocity[grains, 3:],
+        "speed": frame.speed[grains],
+        "force": frame.load()[grains],
+        "mass": folder.mass[grains],
+        "material": folder.material[grains],
+        "shape": folder.shape[grains],
+    }
+    surfaces.add_arrays(data.GetPointData(), columns)
+    return data
+
+
+def contacts(folder: Folder, frame: Frame) -> Any:
+    """The contacts as force chains: lines between the centres of the two bodies, to the contact point where a body is
+    a large one, whose centre says nothing."""
+    from pctt.look import surfaces
+
+    contact = frame.contacts
+    ends = frame.position[contact.body]
+    far = contact.body >= folder.grains
+    ends[far] = np.repeat(contact.point[:, None], 2, axis=1)[far]
+    data = surfaces.polydata(ends.reshape(-1, 3), "lines", 2 * np.arange(1, len(ends) + 1))
+    size = np.linalg.norm(contact.force, axis=1)
+    columns = {
+        "normal_impulse": contact.impulse[:, 0],
+        "impulse": contact.force * contact.dt,
+        "force": size,
+        "gap": contact.gap,
+        "point": contact.point,
+        "bodies": contact.body,
+    }
+    surfaces.add_arrays(data.GetCellData(), columns)
+    surfaces.add_arrays(data.GetPointData(), {"force": np.repeat(size, 2)})  # tubes take their width from points
+    return data
+
+
+def large(folder: Folder, frame: Frame, box: np.ndarray) -> Any:
+    """The surfaces of the large bodies, with the number of the body, its planes cut to the box (2, 3) of the scene."""
+    from pctt.look import surfaces
+
+    parts = []
+    for row in range(len(folder.large)):
+        for part in (
+            surfaces.finite(folder, frame, row),
+            surfaces.polygon_data(surfaces.planes(folder, frame, row, box)),
+        ):
+            part.GetPointData().Initialize()
+            surfaces.add_arrays(part.GetCellData(), {"body": np.full(part.GetNumberOfCells(), folder.grains + row)})
+            parts.append(part)
+    return surfaces.joined(parts)
+
+
+def write_vtp(path: Path, data: Any, time: float) -> None:
+    """Write polygonal data with its time, whole or not at all; FolderError if it cannot be written."""
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    from pctt.look import surfaces
+
+    temporary = path.with_name(f".{path.name}.tmp")
+    surfaces.add_arrays(data.GetFieldData(), {"TimeValue": np.array([time])})
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(data)
+    writer.SetFileName(str(temporary))
+    writer.SetHeaderTypeToUInt64()
+    writer.SetDataModeToAppended()
+    writer.EncodeAppendedDataOff()
+    if writer.Write() != 1:
+        raise FolderError(f"{path}: cannot write")
+    os.replace(temporary, path)
+
+
+def write_pvd(path: Path, files: dict[str, float]) -> None:
+    """Write a collection of files by their times [s]."""
+    lines = [f'    <DataSet timestep="{time!r}" file="{name}"/>' for name, time in files.items()]
+    head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n  <Collection>'
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text("\n".join([head, *lines, "  </Collection>", "</VTKFile>", ""]))
+    os.replace(temporary, path)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, "export"))

@@ -1,0 +1,128 @@
+"""The output folder of a run, read back."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+
+class FolderError(RuntimeError):
+    """A folder that lacks what is to be shown; the message names the folder and what to do."""
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """The contacts of a step, of bodies a and b, and the impulses that acted in it."""
+
+    body: np.ndarray  #: (nc, 2) ids of a and b
+    point: np.ndarray  #: (nc, 3) [m]
+    frame: np.ndarray  #: (nc, 3, 3) rows normal (from a to b), t1, t2
+    gap: np.ndarray  #: (nc,) [m]
+    impulse: np.ndarray  #: (nc, 3) on b, in the frame [N s]
+    dt: float  #: the step in which the impulses acted [s]
+
+    @property
+    def force(self) -> np.ndarray:
+        """(nc, 3) mean forces on b in the step, in the world frame [N]."""
+        return np.einsum("ci,cij->cj", self.impulse, self.frame) / self.dt
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A recorded step. Rows are bodies by id, the grains first, then the large bodies."""
+
+    step: int
+    time: float  #: [s]
+    position: np.ndarray  #: (n, 3) [m]
+    quaternion: np.ndarray  #: (n, 4) (w, x, y, z)
+    velocity: np.ndarray  #: (n, 6) linear [m/s] and angular [rad/s]
+    contacts: Contacts
+
+    @property
+    def speed(self) -> np.ndarray:
+        """(n,) of the centres [m/s]."""
+        return np.linalg.norm(self.velocity[:, :3], axis=1)
+
+    def load(self) -> np.ndarray:
+        """(n,) sum of the magnitudes of the contact forces on each body [N]."""
+        size = np.linalg.norm(self.contacts.force, axis=1)
+        return np.bincount(self.contacts.body.ravel(), np.repeat(size, 2), minlength=len(self.position))
+
+
+class Folder:
+    """The output folder of ``python -m pctt.run``. Raises FolderError if it is none.
+
+    Attributes: ``path``; ``summary`` (dict) is summary.json; ``steps`` (list) are the recorded steps, by which
+    ``frame`` reads them.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        summary = self.path / "summary.json"
+        if not self.path.is_dir():
+            raise FolderError(f"{path}: no such folder; it is the -output of python -m pctt.run")
+        try:
+            self.summary: dict[str, Any] = json.loads(summary.read_text())
+        except (OSError, ValueError) as error:
+            raise FolderError(f"{path}: no output folder of python -m pctt.run (summary.json: {error})") from None
+        self._state = self.path / "state.h5"
+        self.steps: list[int] = []
+        if self._state.exists():
+            with self._open() as file:
+                self.steps = sorted(map(int, file.get("steps", ())))
+
+    def require_frames(self) -> None:
+        """FolderError unless there are recorded steps, with the shapes of the bodies."""
+        if not self.steps:
+            raise FolderError(f"{self.path}: no recorded steps; run with -output_every 1 or more")
+        try:
+            with self._open() as file:
+                self.shape: np.ndarray = file["bodies/shape"][()]
+                self.size: np.ndarray = file["bodies/size"][()]
+                self.mass: np.ndarray = file["bodies/mass"][()]
+                self.material: np.ndarray = file["bodies/material"][()]
+                #: name and shapes of each large body, the rows after the grains
+                self.large: list[dict[str, Any]] = json.loads(file["bodies/large"][()])
+        except (KeyError, OSError) as error:
+            raise FolderError(f"{self.path}: state.h5 lacks the shapes of the bodies; run again ({error})") from None
+        self.grains = len(self.shape) - len(self.large)
+
+    def frame(self, step: int) -> Frame:
+        """A recorded step; FolderError if its file is damaged."""
+        try:
+            with self._open() as file:
+                group = file[f"steps/{step:06d}"]
+                contact = group["contact"]
+                columns = {name: contact[name][()] for name in ("body", "point", "frame", "gap", "impulse")}
+                contacts = Contacts(**columns, dt=float(contact.attrs["dt"]))
+                bodies = {name: group[name][()] for name in ("position", "quaternion", "velocity")}
+                return Frame(step, float(group.attrs["time"]), **bodies, contacts=contacts)
+        except (KeyError, OSError) as error:
+            raise FolderError(f"{self.path}/frames/{step:06d}.h5: incomplete ({error})") from None
+
+    def records(self) -> dict[str, np.ndarray]:
+        """Columns of records.csv by their heads, such as ``force_blade_x [N]``; none if there is no such file."""
+        path = self.path / "records.csv"
+        if not path.exists():
+            return {}
+        with path.open(newline="") as file:
+            rows = list(csv.reader(file))
+        try:
+            head, table = rows[0], np.array([[float(cell or "nan") for cell in row] for row in rows[1:]])
+            columns = dict(zip(head, table.reshape(-1, len(head)).T))
+            columns["time [s]"]
+        except (IndexError, KeyError, ValueError) as error:
+            raise FolderError(f"{path}: no table of numbers with a column time [s] ({error})") from None
+        return columns
+
+    def _open(self) -> h5py.File:
+        try:
+            return h5py.File(self._state, "r")
+        except OSError as error:
+            raise FolderError(f"{self._state}: no readable HDF5 file ({error})") from None

@@ -1,0 +1,82 @@
+"""What the programs that show a folder have in common: their command lines, their errors, their ranks."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from mpi4py import MPI
+
+from pctt.look.folder import FolderError
+
+
+def parser(program: str, text: str) -> argparse.ArgumentParser:
+    """A command line whose first word is the folder."""
+    line = argparse.ArgumentParser(
+        f"python -m pctt.{program}",
+        description=text,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        allow_abbrev=False,
+        add_help=False,
+    )
+    line.add_argument("-help", "--help", "-h", action="help", help="print this")
+    line.add_argument("folder", help="output folder of a run (-output of python -m pctt.run)")
+    return line
+
+
+def add_steps(line: argparse.ArgumentParser) -> None:
+    """Options that choose among the recorded steps."""
+    line.add_argument("-first", type=int, default=0, metavar="STEP", help="first step")
+    line.add_argument("-last", type=int, default=sys.maxsize, metavar="STEP", help="last step")
+    line.add_argument("-every", type=positive(int), default=1, metavar="K", help="only every k-th recorded step")
+
+
+def chosen(steps: list[int], arguments: argparse.Namespace) -> list[int]:
+    """The steps that the options of ``add_steps`` choose; FolderError if there is none."""
+    picked = [step for step in steps if arguments.first <= step <= arguments.last][:: arguments.every]
+    if not picked:
+        there = f"there are {steps[0]} to {steps[-1]}"
+        raise FolderError(f"{arguments.folder}: no recorded step from -first to -last; {there}")
+    return picked
+
+
+def positive(kind: Callable[[str], float]) -> Callable[[str], float]:
+    """Type of an option that must be above zero."""
+
+    def read(text: str) -> float:
+        value = kind(text)
+        if not 0 < value < float("inf"):
+            raise argparse.ArgumentTypeError(f"{text}: allowed is a positive number")
+        return value
+
+    read.__name__ = "positive number"
+    return read
+
+
+def run(main: Callable[[MPI.Comm], None], program: str) -> int:
+    """Exit status of ``main(comm)``: 0, or 2 for a folder that cannot be shown, told once."""
+    comm = MPI.COMM_WORLD
+    try:
+        main(comm)
+    except FolderError as error:
+        if comm.size > 1:  # perhaps on this rank alone
+            print(f"pctt.{program}: {error}", file=sys.stderr, flush=True)
+            comm.Abort(2)
+        print(f"pctt.{program}: {error}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        if comm.rank == 0:
+            print(f"pctt.{program}: {error}; pip install 'pctt[pictures]' has all that is needed", file=sys.stderr)
+        return 2
+    return 0
+
+
+def made_folder(path: Path) -> Path:
+    """The folder, made if it is not there; FolderError if it cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FolderError(f"{path}: cannot write there ({error.strerror})") from None
+    return path

@@ -1,0 +1,280 @@
+"""Bodies as surfaces of VTK: grains and large bodies, planes cut to the size of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+from vtkmodules.vtkCommonCore import vtkPoints
+from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
+from vtkmodules.vtkCommonTransforms import vtkTransform
+from vtkmodules.vtkFiltersCore import vtkAppendPolyData
+from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
+from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSphereSource
+
+from dem import quaternion
+from dem.bodies import BOX, CAPSULE, SPHERE
+from pctt.look.folder import Folder, FolderError, Frame
+
+MARGIN = 0.06  # how far walls go beyond the grains, in diagonals of the scene
+
+
+def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
+    """Lowest and highest corner (2, 3) of the scene in these frames [m]: of the grains, and of the large bodies among
+    them that are no walls."""
+    radius = enclosing_radius(folder)[:, None]
+    places = [frame.position[: folder.grains] for frame in frames]
+    low = np.min([(place - radius).min(axis=0) for place in places], axis=0)
+    high = np.max([(place + radius).max(axis=0) for place in places], axis=0)
+    box = np.array([low, high])
+    corners = [low, high]
+    for frame in frames:
+        for row in range(len(folder.large)):
+            solid = finite(folder, frame, row, box)
+            if solid.GetNumberOfPoints():
+                corners += list(np.reshape(solid.GetBounds(), (3, 2)).T)
+    return np.array([np.min(corners, axis=0), np.max(corners, axis=0)])
+
+
+def enclosing_radius(folder: Folder) -> np.ndarray:
+    """Radii (grains,) of the spheres about the grains [m]."""
+    return 0.5 * np.where(
+        folder.shape[: folder.grains] == BOX,
+        np.linalg.norm(extent(folder), axis=1),
+        extent(folder).max(axis=1),
+    )
+
+
+def extent(folder: Folder) -> np.ndarray:
+    """Widths (grains, 3) of the grains along their own axes [m]."""
+    shape, size = folder.shape[: folder.grains, None], folder.size[: folder.grains]
+    unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE}
+    if unknown:
+        raise FolderError(f"{folder.path}: no surface is known for grains of shape {unknown.pop()}")
+    round_ones = np.repeat(size[:, :1], 3, axis=1)
+    long_ones = round_ones + [0, 0, 1] * size[:, 1:2]
+    return 2 * np.where(shape == SPHERE, round_ones, np.where(shape == CAPSULE, long_ones, size))
+
+
+def polydata(points: np.ndarray, cells: str = "", ends: np.ndarray | None = None) -> vtkPolyData:
+    """Points (n, 3), and all of them in turn as `verts`, `lines` or `polys`; a cell ends before each of `ends`."""
+    data = vtkPolyData()
+    place = vtkPoints()
+    place.SetData(numpy_to_vtk(np.ascontiguousarray(points).reshape(-1, 3), deep=True))
+    data.SetPoints(place)
+    if cells:
+        array = vtkCellArray()
+        offsets = np.concatenate([[0], np.arange(1, len(points) + 1) if ends is None else ends]).astype(np.int64)
+        order = np.arange(len(points), dtype=np.int64)
+        array.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(order, deep=True))
+        {"verts": data.SetVerts, "lines": data.SetLines, "polys": data.SetPolys}[cells](array)
+    return data
+
+
+def add_arrays(attributes: Any, arrays: Mapping[str, np.ndarray]) -> None:
+    """Add arrays (n,) or (n, k) by name to the point, cell or field data."""
+    for name, values in arrays.items():
+        array = numpy_to_vtk(np.ascontiguousarray(values), deep=True)
+        array.SetName(name)
+        attributes.AddArray(array)
+
+
+def cube() -> vtkPolyData:
+    """The surface of a box of widths 1."""
+    source = vtkCubeSource()
+    source.Update()
+    return source.GetOutput()
+
+
+def cylinder() -> vtkPolyData:
+    """The side of a cylinder along z of diameter and length 1."""
+    source = vtkCylinderSource()
+    source.SetResolution(32)
+    source.CappingOff()
+    return _along_z(source)
+
+
+def finite(folder: Folder, frame: Frame, row: int, box: np.ndarray | None = None) -> vtkPolyData:
+    """The surface of the large body `row`, but for its planes; with a box (2, 3), also but for its walls about it."""
+    place, turn = _pose(folder, frame, row)
+    parts = []
+    shapes = folder.large[row]["shapes"]
+    for shape in shapes:
+        if shape["kind"] != "Plane":
+            part = _placed(_surface(shape), shape, place, turn)
+            # a single shape is a tool, such as a blade, and drawn whole
+            if box is None or len(shapes) == 1 or shape["kind"] != "Box" or not _is_wall(part, box):
+                parts.append(part)
+    return joined(parts)
+
+
+def _is_wall(solid: vtkPolyData, box: np.ndarray) -> bool:
+    """Whether a solid stands beside the box (2, 3) and is about as long as it is in some direction."""
+    low, high = np.reshape(solid.GetBounds(), (3, 2)).T
+    middle = (low + high) / 2
+    beside = (middle < box[0]) | (middle > box[1])
+    along = np.minimum(high, box[1]) - np.maximum(low, box[0]) > 0.8 * (box[1] - box[0])
+    return bool(beside.any() and along.any())
+
+
+def joined(parts: Sequence[vtkPolyData]) -> vtkPolyData:
+    """Several surfaces as one."""
+    whole = vtkAppendPolyData()
+    for part in (vtkPolyData(), *parts):
+        whole.AddInputData(part)
+    whole.Update()
+    return whole.GetOutput()
+
+
+def planes(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.ndarray]:
+    """The planes of the large body `row` as polygons (k, 3) seen from their open side, cut where another plane of the
+    body is before them and at MARGIN beyond `box`."""
+    place, turn = _pose(folder, frame, row)
+    halves = [
+        (quaternion.rotate(turn, np.array(shape["normal"])), place + quaternion.rotate(turn, np.array(shape["center"])))
+        for shape in folder.large[row]["shapes"]
+        if shape["kind"] == "Plane"
+    ]
+    size = 4 * float(np.linalg.norm(box[1] - box[0]))
+    polygons = []
+    for normal, point in halves:
+        first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+        first /= np.linalg.norm(first)
+        second = np.cross(normal, first)
+        center = box.mean(axis=0)
+        center = center - normal * (normal @ (center - point))
+        square = center + size * np.array([first + second, second - first, -first - second, first - second])
+        polygons.append(_clipped(square, normal, [*halves, *_sides(box)]))
+    return [polygon for polygon in polygons if len(polygon)]
+
+
+def walls(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.ndarray]:
+    """What bounds the grains of the large body `row`, as polygons (k, 3) seen from inside: its planes, and of its boxes
+    beside `box` (2, 3) the faces towards its middle."""
+    polygons = planes(folder, frame, row, box)
+    place, turn = _pose(folder, frame, row)
+    middle = box.mean(axis=0)
+    shapes = folder.large[row]["shapes"]
+    for shape in shapes:
+        if len(shapes) == 1 or shape["kind"] != "Box":
+            continue
+        if _is_wall(_placed(_surface(shape), shape, place, turn), box):
+            center = place + quaternion.rotate(turn, np.array(shape["center"]))
+            axes = quaternion.matrix(quaternion.multiply(turn, np.array(shape["quaternion"]))).T
+            half = np.array(shape["half_extents"])
+            way = axes @ (middle - center)
+            k = int(np.argmax(np.abs(way) - half))
+            normal = np.sign(way[k]) * axes[k]
+            first, second = half[k - 2] * axes[k - 2], np.sign(way[k]) * half[k - 1] * axes[k - 1]
+            corners = np.array([first + second, second - first, -first - second, first - second])
+            polygons.append(_clipped(center + half[k] * normal + corners, normal, _sides(box)))
+    return [polygon for polygon in polygons if len(polygon)]
+
+
+def _sides(box: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Inward normals and points of the six planes at MARGIN beyond a box (2, 3)."""
+    beyond = MARGIN * float(np.linalg.norm(box[1] - box[0]))
+    return [(axis, box[0] - beyond) for axis in np.eye(3)] + [(-axis, box[1] + beyond) for axis in np.eye(3)]
+
+
+def _clipped(
+    polygon: np.ndarray, normal: np.ndarray, halves: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
+    """The part of a convex polygon (k, 3) of this normal that is before all planes (normal, point)."""
+    for other, through in halves:
+        if abs(other @ normal) < 1 - 1e-9:
+            polygon = _clip(polygon, other, through)
+        elif len(polygon) and (polygon[0] - through) @ other < -1e-9 * np.ptp(polygon):
+            return polygon[:0]
+    return polygon
+
+
+def polygon_data(polygons: Sequence[np.ndarray]) -> vtkPolyData:
+    """Polygons as one surface."""
+    if not polygons:
+        return vtkPolyData()
+    return polydata(np.concatenate(polygons), "polys", np.cumsum([len(p) for p in polygons]))
+
+
+def outlines(polygons: Sequence[np.ndarray]) -> vtkPolyData:
+    """The edges of polygons."""
+    if not polygons:
+        return vtkPolyData()
+    closed = [np.concatenate([p, p[:1]]) for p in polygons]
+    return polydata(np.concatenate(closed), "lines", np.cumsum([len(p) for p in closed]))
+
+
+def _clip(polygon: np.ndarray, normal: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """The part of a convex polygon where normal . (x - point) >= 0 (Sutherland and Hodgman, 1974)."""
+    height = (polygon - point) @ normal
+    kept = []
+    for k in range(len(polygon)):
+        here, there = height[k - 1], height[k]
+        if here * there < 0:
+            kept.append(polygon[k - 1] + here / (here - there) * (polygon[k] - polygon[k - 1]))
+        if there >= 0:
+            kept.append(polygon[k])
+    return np.array(kept).reshape(-1, 3)
+
+
+def _pose(folder: Folder, frame: Frame, row: int) -> tuple[np.ndarray, np.ndarray]:
+    return frame.position[folder.grains + row], frame.quaternion[folder.grains + row]
+
+
+def _surface(shape: Mapping[str, Any]) -> vtkPolyData:
+    """A shape of a large body in its own frame."""
+    if shape["kind"] == "Sphere":
+        ball = vtkSphereSource()
+        ball.SetRadius(shape["radius"])
+        ball.SetThetaResolution(32)
+        ball.SetPhiResolution(24)
+        ball.Update()
+        return ball.GetOutput()
+    if shape["kind"] == "Box":
+        x, y, z = np.array(shape["half_extents"]) * 2
+        block = vtkCubeSource()
+        block.SetXLength(x)
+        block.SetYLength(y)
+        block.SetZLength(z)
+        block.Update()
+        return block.GetOutput()
+    if shape["kind"] == "Capsule":
+        core = vtkCylinderSource()
+        core.SetRadius(shape["radius"])
+        core.SetHeight(2 * shape["half_length"])
+        core.SetResolution(32)
+        core.SetCapsuleCap(True)
+        return _along_z(core)
+    raise FolderError(f"no surface is known for the shape {shape['kind']}")
+
+
+def _along_z(source: vtkCylinderSource) -> vtkPolyData:
+    """The surface of a source along y, turned to z."""
+    turn = vtkTransform()
+    turn.RotateX(90)
+    return _moved(source, turn)
+
+
+def _moved(source: Any, transform: vtkTransform) -> vtkPolyData:
+    source.Update()
+    moved = vtkTransformPolyDataFilter()
+    moved.SetInputConnection(source.GetOutputPort())
+    moved.SetTransform(transform)
+    moved.Update()
+    return moved.GetOutput()
+
+
+def _placed(surface: vtkPolyData, shape: Mapping[str, Any], place: np.ndarray, turn: np.ndarray) -> vtkPolyData:
+    """The surface of a shape moved into the body frame and with it into the world."""
+    inner = np.array(shape.get("quaternion", (1.0, 0.0, 0.0, 0.0)))
+    matrix = np.eye(4)
+    matrix[:3, :3] = quaternion.matrix(quaternion.multiply(turn, inner))
+    matrix[:3, 3] = place + quaternion.rotate(turn, np.array(shape["center"]))
+    transform = vtkTransform()
+    transform.SetMatrix(matrix.ravel())
+    still = vtkTrivialProducer()
+    still.SetOutput(surface)
+    return _moved(still, transform)

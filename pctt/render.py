@@ -1,0 +1,144 @@
+"""``python -m pctt.render DIR``: pictures of the recorded steps of a run and a film of them, without a display."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+from pctt.look.folder import Folder, Frame
+from pctt.look.program import add_steps, chosen, made_folder, parser, positive, run
+
+SAMPLE = 12  # frames that decide the camera and the range of the colours
+FILMS = ("mp4", "gif", "none")
+# title of the bar; colour map and the part of it that is used
+COLOURS: dict[str, tuple[str, str, tuple[float, float]]] = {
+    "speed": ("speed\n[m/s]", "viridis", (0.12, 1.0)),
+    "force": ("contact\nforce [N]", "YlOrRd", (0.0, 0.95)),
+    "id": ("body id", "turbo", (0.05, 0.95)),
+}
+
+
+def arguments() -> argparse.Namespace:
+    line = parser("render", (__doc__ or "").partition(": ")[2])
+    add_steps(line)
+    line.add_argument("-color", choices=COLOURS, default="speed", help="what the colour of a grain tells")
+    line.add_argument(
+        "-range", type=float, nargs=2, metavar=("LOW", "HIGH"), help="ends of the colour bar; none: from the data"
+    )
+    line.add_argument("-azimuth", type=float, default=-60.0, help="camera about the vertical, from x [degrees]")
+    line.add_argument("-elevation", type=float, default=25.0, help="camera above the horizon, below 90 [degrees]")
+    line.add_argument("-zoom", type=positive(float), default=1.0, help="1: the whole scene")
+    line.add_argument("-size", type=_size, default="1280x960", metavar="WxH", help="of a picture [pixels]")
+    line.add_argument("-opacity", type=float, default=1.0, help="of paddles, blades and other large bodies, 0 to 1")
+    line.add_argument("-cut", action="store_true", help="leave out the grains in the half nearer to the camera")
+    line.add_argument("-film", choices=FILMS, default="mp4", help="film of the pictures, if there are several")
+    line.add_argument("-fps", type=positive(float), default=20.0, help="pictures of the film per second")
+    line.add_argument("-output", metavar="DIR", help="where to write; none: pictures/ in the folder")
+    given = line.parse_args()
+    if not -90 < given.elevation < 90:
+        line.error(f"argument -elevation: {given.elevation:g}: allowed is a number between -90 and 90")
+    if not 0 <= given.opacity <= 1:
+        line.error(f"argument -opacity: {given.opacity:g}: allowed is a number from 0 to 1")
+    if given.range and not given.range[0] < given.range[1]:
+        line.error(f"argument -range: {given.range[0]:g} {given.range[1]:g}: allowed are two numbers that rise")
+    return given
+
+
+def _size(text: str) -> tuple[int, int]:
+    try:
+        width, height = map(int, text.split("x"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text}: allowed is WIDTHxHEIGHT, such as 1280x960") from None
+    if min(width, height) < 32 or width % 2 or height % 2:
+        raise argparse.ArgumentTypeError(f"{text}: allowed are even numbers from 32")
+    return width, height
+
+
+def main(comm: MPI.Comm) -> None:
+    given = arguments()
+    folder = Folder(given.folder)
+    folder.require_frames()
+    steps = chosen(folder.steps, given)
+    target = made_folder(Path(given.output) if given.output else folder.path / "pictures")
+
+    from pctt.look import stage, surfaces  # they need vtk, which asking for help does not
+
+    sample = [folder.frame(steps[k]) for k in np.unique(np.linspace(0, len(steps) - 1, SAMPLE).astype(int))]
+    title, name, ends = COLOURS[given.color]
+    low, high = given.range or _range(given.color, [_value(given.color, folder, frame) for frame in sample])
+    width, height = given.size
+    view = stage.View(given.azimuth, given.elevation, given.zoom, width, height, given.opacity, given.cut)
+    theatre = stage.Stage(folder, surfaces.bounds(folder, sample), view, stage.Paint(title, low, high, name, ends))
+    pictures = [target / f"{step:06d}.png" for step in steps]
+    for step, picture in list(zip(steps, pictures))[comm.rank :: comm.size]:
+        frame = folder.frame(step)
+        write_png(picture, theatre.draw(frame, _value(given.color, folder, frame)))
+    comm.Barrier()
+    if comm.rank == 0:
+        print(f"{len(pictures)} pictures: {target}/{pictures[0].name} to {pictures[-1].name}")
+        if len(pictures) > 1 and given.film != "none":
+            film = target / f"film.{given.film}"
+            {"mp4": write_mp4, "gif": write_gif}[given.film](film, pictures, given.fps)
+            print(f"film: {film}")
+
+
+def _value(colour: str, folder: Folder, frame: Frame) -> np.ndarray:
+    """What colours the grains (grains,)."""
+    values = {"speed": lambda: frame.speed, "force": frame.load, "id": lambda: np.arange(len(frame.position))}
+    return values[colour]()[: folder.grains].astype(float)
+
+
+def _range(colour: str, values: list[np.ndarray]) -> tuple[float, float]:
+    """From 0 to what one grain in a hundred exceeds, so that a few fast ones do not leave the others in one colour."""
+    together = np.concatenate(values)
+    if colour == "id":
+        return 0.0, max(together.max(), 1.0)
+    high = float(np.quantile(together, 0.99)) or 1.0
+    step = 10 ** np.floor(np.log10(high))
+    return 0.0, step * min(k for k in (1, 2, 4, 6, 8, 10) if k * step >= high)  # four equal parts are short numbers
+
+
+def write_png(path: Path, picture: np.ndarray) -> None:
+    """Write a picture (height, width, 3), whole or not at all."""
+    from PIL import Image
+
+    temporary = path.with_name(f".{path.name}.tmp")
+    Image.fromarray(np.ascontiguousarray(picture)).save(temporary, format="png", compress_level=4)
+    os.replace(temporary, path)
+
+
+def write_mp4(path: Path, pictures: list[Path], fps: float) -> None:
+    """Write a film in H.264, which browsers and slides play."""
+    import imageio_ffmpeg
+    from PIL import Image
+
+    temporary = path.with_name(f".tmp.{path.name}")
+    with Image.open(pictures[0]) as first:
+        writer = imageio_ffmpeg.write_frames(str(temporary), first.size, fps=fps, quality=7, macro_block_size=2)
+    writer.send(None)
+    for picture in pictures:
+        with Image.open(picture) as image:
+            writer.send(image.convert("RGB").tobytes())
+    writer.close()
+    os.replace(temporary, path)
+
+
+def write_gif(path: Path, pictures: list[Path], fps: float) -> None:
+    """Write a film that repeats, in the colours of its first picture."""
+    from PIL import Image
+
+    temporary = path.with_name(f".{path.name}.tmp")
+    images = [Image.open(picture).convert("RGB") for picture in pictures]
+    palette = images[0].quantize(255)
+    first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    first.save(temporary, format="gif", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
+    os.replace(temporary, path)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, "render"))

@@ -1,0 +1,105 @@
+"""Time series for ParaView, read back by VTK."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+
+import handmade
+import numpy as np
+import pytest
+
+from pctt.look.folder import Folder
+
+pytest.importorskip("vtkmodules", reason="vtk is not installed (extra `pictures`)")
+
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+SERIES = ("bodies", "contacts", "large")
+
+
+def collection(path):
+    return {float(entry.get("timestep")): entry.get("file") for entry in ElementTree.parse(path).iter("DataSet")}
+
+
+def read(path):
+    """The data of a .vtp file, and its arrays of points, cells and the whole."""
+    reader = vtkXMLPolyDataReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    data = reader.GetOutput()
+    parts = (data.GetPointData(), data.GetCellData(), data.GetFieldData())
+    arrays = [
+        {part.GetArrayName(k): vtk_to_numpy(part.GetArray(k)) for k in range(part.GetNumberOfArrays())}
+        for part in parts
+    ]
+    return data, *arrays
+
+
+def points(data):
+    return vtk_to_numpy(data.GetPoints().GetData())
+
+
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+def test_the_series_hold_what_the_run_recorded(ranks, folder, tmp_path, mpirun):
+    source = "from pctt import export; from pctt.look.program import run; assert run(export.main, 'export') == 0"
+    mpirun(source, ranks, folder, "-output", tmp_path / "series", "-first", 2)
+    run = Folder(folder)
+    run.require_frames()
+    for name in SERIES:
+        listed = collection(tmp_path / "series" / f"{name}.pvd")
+        assert listed == {run.frame(step).time: f"{name}_{step:06d}.vtp" for step in (2, 3, 4)}
+        assert all((tmp_path / "series" / file).exists() for file in listed.values())
+    frame = run.frame(4)
+    data, arrays, _, whole = read(tmp_path / "series" / "bodies_000004.vtp")
+    assert whole["TimeValue"] == frame.time
+    np.testing.assert_array_equal(points(data), frame.position[:125])
+    np.testing.assert_array_equal(arrays["velocity"], frame.velocity[:125, :3])
+    np.testing.assert_array_equal(arrays["quaternion"], frame.quaternion[:125])
+    np.testing.assert_array_equal(arrays["id"], np.arange(125))
+    assert (arrays["radius"] == 0.1).all()
+    data, _, arrays, _ = read(tmp_path / "series" / "contacts_000004.vtp")
+    assert data.GetNumberOfLines() == len(frame.contacts.gap) > 10
+    np.testing.assert_array_equal(arrays["normal_impulse"], frame.contacts.impulse[:, 0])
+
+
+def test_force_chains_join_centres_and_end_at_large_bodies(show, tmp_path):
+    made = handmade.write(tmp_path / "made", handmade.FLOOR)
+    show("export", folder=made)
+    data, ends, arrays, _ = read(made / "paraview" / "contacts_000001.vtp")
+    line = points(data).reshape(2, 2, 3)
+    np.testing.assert_allclose(line[0], [[0, 0, 0.5], [0, 0, 0]])  # to the contact point on the floor
+    np.testing.assert_allclose(line[1], [[0, 0, 0.5], [0, 1.5, 0.3]])
+    np.testing.assert_allclose(arrays["impulse"], [[4, 0, -3], [0, 2, 0]], atol=1e-14)
+    np.testing.assert_allclose(arrays["force"], [10, 4])
+    np.testing.assert_allclose(ends["force"], [10, 10, 4, 4])
+
+
+def test_glyphs_have_the_extents_of_the_grains(show, tmp_path):
+    made = handmade.write(tmp_path / "made", handmade.FLOOR)
+    show("export", folder=made)
+    _, arrays, _, _ = read(made / "paraview" / "bodies_000001.vtp")
+    np.testing.assert_allclose(arrays["extent"], [[1, 1, 1], [0.4, 0.8, 1.6], [0.6, 0.6, 1.8]])
+    np.testing.assert_allclose(arrays["radius"], [0.5, np.linalg.norm([0.2, 0.4, 0.8]), 0.9])
+    np.testing.assert_allclose(arrays["speed"], [5, 0, 2.5])
+
+
+def test_large_bodies_are_surfaces_where_they_are(show, folder, tmp_path):
+    """The paddle after four steps of its turning, and floor and walls cut by each other."""
+    show("export", "-output", tmp_path)
+    run = Folder(folder)
+    run.require_frames()
+    data, _, arrays, _ = read(tmp_path / "large_000004.vtp")
+    assert set(arrays["body"]) == {125, 126}
+    assert (arrays["body"] == 125).sum() == 5
+    place = points(data)
+    half = 0.625
+    bound = place[np.abs(np.abs(place[:, :2]) - half).max(axis=1) < 1e-9]
+    assert len(bound) == 5 * 4  # the corners of five faces
+    angle = 0.4 * np.pi / 3
+    length, thick, tall = run.large[1]["shapes"][0]["half_extents"]
+    center = run.frame(4).position[126]
+    corner = center + [
+        length * np.cos(angle) - thick * np.sin(angle), length * np.sin(angle) + thick * np.cos(angle), tall
+    ]
+    assert np.linalg.norm(place - corner, axis=1).min() < 1e-6

@@ -1,0 +1,112 @@
+"""Reading an output folder, and what the programs say of one that is none."""
+
+from __future__ import annotations
+
+import handmade
+import numpy as np
+import pytest
+
+from dem.scenes import Mixer
+from pctt.look.folder import Folder, FolderError
+
+
+def test_a_run_tells_the_shapes_of_its_bodies(folder):
+    read = Folder(folder)
+    read.require_frames()
+    assert read.steps == [1, 2, 3, 4]
+    assert read.grains == 125
+    assert (read.shape[:125] == 0).all()
+    assert (read.size[:125] == [0.1, 0, 0]).all()
+    np.testing.assert_allclose(read.mass, [*[2500 * 4 / 3 * np.pi * 0.1**3] * 125, np.inf, np.inf])
+    scene = Mixer(n=2).build()
+    assert [body["name"] for body in read.large] == ["box", "mixer"]
+    for stored, made in zip(read.large, scene.large_bodies):
+        assert [shape["kind"] for shape in stored["shapes"]] == [type(shape).__name__ for shape in made.shapes]
+    paddle = scene.large_bodies[1].shapes[0]
+    assert read.large[1]["shapes"][0]["half_extents"] == list(paddle.half_extents)
+
+
+def test_forces_of_the_contacts_change_the_momentum(folder):
+    """Newton's second law from the files alone: m dv = dt (sum of contact forces + weight)."""
+    read = Folder(folder)
+    read.require_frames()
+    before, after = read.frame(3), read.frame(4)
+    contacts = after.contacts
+    assert contacts.dt == 0.1
+    assert len(contacts.gap) > 10
+    total = np.zeros((127, 3))
+    np.add.at(total, contacts.body[:, 1], contacts.force)
+    np.subtract.at(total, contacts.body[:, 0], contacts.force)
+    mass = read.mass[:125, None]
+    gained = mass * (after.velocity - before.velocity)[:125, :3] / contacts.dt + mass * [0, 0, 9.81]
+    np.testing.assert_allclose(gained, total[:125], atol=1e-8)
+
+
+def test_loads_are_sums_of_force_magnitudes(tmp_path):
+    read = Folder(handmade.write(tmp_path / "made", handmade.FLOOR))
+    frame = read.frame(1)
+    np.testing.assert_allclose(frame.contacts.force, [[8, 0, -6], [0, 4, 0]], atol=1e-14)
+    np.testing.assert_allclose(frame.load(), [14, 0, 4, 10])
+    assert frame.speed[0] == 5
+
+
+@pytest.mark.parametrize("program", ["plot", "render", "export"])
+def test_a_folder_without_results_is_refused(program, show, tmp_path):
+    assert "no such folder" in show(program, folder=tmp_path / "absent", status=2).stderr
+    done = show(program, folder=tmp_path, status=2)
+    assert str(tmp_path) in done.stderr
+    assert "no output folder" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("program", ["render", "export"])
+def test_a_run_without_recorded_steps_is_refused(program, show, tmp_path):
+    (tmp_path / "summary.json").write_text('{"steps": []}')
+    assert "-output_every" in show(program, folder=tmp_path, status=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("program", "options", "words"),
+    [
+        ("plot", ("-step", 77), ("-step 77", "1 to 4")),
+        ("plot", ("-format", "bmp"), ("-format", "png")),
+        ("export", ("-first", 9), ("-first", "1 to 4")),
+        ("export", ("-every", 0), ("-every", "positive")),
+        ("render", ("-color", "heat"), ("-color", "speed")),
+        ("render", ("-size", "3x5"), ("-size", "3x5")),
+        ("render", ("-elevation", 95), ("-elevation", "95")),
+    ],
+)
+def test_a_bad_option_is_named(program, options, words, show):
+    done = show(program, *options, status=2)
+    for word in words:
+        assert word in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_damaged_frame_is_named(tmp_path):
+    read = Folder(handmade.write(tmp_path / "made", handmade.FLOOR))
+    (tmp_path / "made" / "frames" / "000001.h5").unlink()
+    with pytest.raises(FolderError, match="000001"):
+        read.frame(1)
+
+
+@pytest.mark.parametrize("program", ["plot", "render", "export"])
+def test_a_folder_without_the_bodies_is_refused(program, show, tmp_path):
+    made = handmade.write(tmp_path / "made", handmade.FLOOR)
+    (made / "frames" / "bodies.h5").unlink()
+    done = show(program, folder=made, status=2)
+    assert "lacks the shapes" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_records_are_columns_of_numbers(tmp_path):
+    read = Folder(handmade.write(tmp_path / "made", handmade.FLOOR))
+    assert read.records() == {}
+    table = tmp_path / "made" / "records.csv"
+    table.write_text("step,time [s],force_blade_x [N]\n1,0.5,3\n2,1.0,\n")
+    columns = read.records()
+    np.testing.assert_array_equal(columns["force_blade_x [N]"], [3, np.nan])
+    table.write_text("step,force\n1,many\n")
+    with pytest.raises(FolderError, match="records.csv"):
+        read.records()

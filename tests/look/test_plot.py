@@ -1,0 +1,68 @@
+"""The figures of a run."""
+
+from __future__ import annotations
+
+import handmade
+import numpy as np
+import pytest
+
+from pctt.look.folder import Folder
+
+pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+
+from matplotlib.image import imread
+
+from pctt.look import figures
+
+
+def test_all_figures_are_drawn(show, folder, tmp_path):
+    done = show("plot", "-output", tmp_path)
+    names = {"steps", "compare", "sparsity", "graphs"}
+    assert {path.name for path in tmp_path.iterdir()} == {f"{name}.png" for name in names}
+    assert all(f"{name}.png" in done.stdout for name in names)
+    for name in names:
+        picture = imread(tmp_path / f"{name}.png")[..., :3]
+        assert min(picture.shape[:2]) > 300
+        assert picture.std() > 0.05, name
+        assert (picture.min(axis=2) < 0.9).mean() > 0.003, name  # something is drawn
+
+
+def test_a_pdf_with_the_figures_of_records(show, tmp_path):
+    made = handmade.write(tmp_path / "made", handmade.FLOOR)
+    head = "step,time [s],force_x [N],force_y [N],energy [J],odd\n"
+    (made / "records.csv").write_text(head + "1,0.5,3,1,2,1\n2,1.0,4,1,2,1\n")
+    show("plot", "-format", "pdf", folder=made)
+    found = {path.name for path in (made / "figures").iterdir()}
+    assert found == {"forces.pdf", "energy.pdf", "figures.pdf", "sparsity.pdf", "graphs.pdf"}
+    assert all((made / "figures" / name).read_bytes().startswith(b"%PDF") for name in found)
+
+
+def test_nothing_to_plot_is_an_error(show, tmp_path):
+    (tmp_path / "summary.json").write_text("{}")
+    assert "nothing to plot" in show("plot", folder=tmp_path, status=2).stderr
+
+
+def test_the_pattern_is_that_of_the_delassus_matrix(folder):
+    """Against G G' with a random 3 x 6 block for every contact and body of finite mass."""
+    read = Folder(folder)
+    read.require_frames()
+    frame = read.frame(4)
+    pair = frame.contacts.body
+    blocks = np.zeros((len(pair), 3, 127, 6))
+    rng = np.random.default_rng(1)
+    for c, bodies in enumerate(pair):
+        for body in bodies[bodies < 125]:
+            blocks[c, :, body] = rng.uniform(size=(3, 6))
+    G = blocks.reshape(3 * len(pair), -1)
+    there = (np.abs(G @ G.T).reshape(len(pair), 3, len(pair), 3).max(axis=(1, 3)) > 0) | np.eye(len(pair), dtype=bool)
+    np.testing.assert_array_equal(figures._coupling(read, frame).toarray() > 0, there)
+
+
+def test_the_example_is_a_cluster_of_few_grains(folder):
+    read = Folder(folder)
+    read.require_frames()
+    frame = read.frame(4)
+    rows = figures.example(read, frame)
+    grains = np.unique(frame.contacts.body[rows])
+    assert 1 <= (grains < 125).sum() <= 13
+    assert len(rows) >= 1

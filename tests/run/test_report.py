@@ -1,0 +1,41 @@
+"""What a run says, without a run."""
+
+from __future__ import annotations
+
+import pytest
+
+from pctt.run import report
+
+
+@pytest.mark.parametrize(
+    ("spent", "done", "steps", "words"),
+    [
+        (2.0, 1, 2, "about 2 s left"),
+        (10.0, 4, 4, "about 0 s left"),
+        (10.0, 1, 10, "about 1 min 30 s left"),
+        (60.0, 1, 200, "about 3 h 19 min left"),
+    ],
+)
+def test_the_time_left_goes_on_as_before(spent, done, steps, words):
+    assert report.remaining(spent, done, steps) == words
+
+
+def test_the_table_counts_what_did_not_converge():
+    line = {
+        "phases": {"solve": 3.0, "search": 1.0}, "seconds": 4.0, "contacts": 7, "newton_its": 2, "ksp_its": 5,
+        "natural_residual": 1e-5, "converged": True,
+    }
+    other = {**line, "contacts": 9, "natural_residual": 2e-3, "converged": False}
+    text = report.phase_table([line, other])
+    assert "2 steps, 7 to 9 contacts, 4 Newton steps, 10 Krylov iterations" in text
+    assert "worst residual 2.0e-03, 1 NOT CONVERGED" in text
+    solve = next(row.split() for row in text.splitlines() if row.startswith("solve"))
+    assert solve == ["solve", "6.00", "75.0%", "3.000"]
+
+
+def test_accuracy_shows_the_course_of_the_residual():
+    line = {"objective": -1.5, "cone_violation": 0.0, "dual_violation": 1e-3, "complementarity": 1e-4}
+    text = report.accuracy_lines(line, [10.0**-k for k in range(41)])
+    assert "0: 1.0e+00  4: 1.0e-04" in text
+    assert text.endswith("40: 1.0e-40")
+    assert "by iteration" not in report.accuracy_lines(line, [])
