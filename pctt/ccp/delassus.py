@@ -15,11 +15,7 @@ from petsc4py import PETSc
 
 from pctt.blocks import BlockRows, block_csr_matrix, square_block_matrix
 from pctt.ccp.cone import Array
-
-
-def offsets(comm: MPI.Comm, count: int) -> np.ndarray:
-    """First global index of each rank's part, and the total (size + 1,)."""
-    return np.concatenate([[0], np.cumsum(comm.allgather(count))])
+from pctt.exchange import exchange, offsets
 
 
 def diagonal_blocks(G: BlockRows) -> Array:
@@ -80,7 +76,7 @@ def _neighbours(
     away = owner != comm.rank
     entries = (contact, G.indices, G.blocks)
     # to the owners of the bodies ...
-    (contact_in, body_in, blocks_in), source_in = _exchange(comm, [e[away] for e in entries], owner[away])
+    (contact_in, body_in, blocks_in), source_in = exchange(comm, [e[away] for e in entries], owner[away])
     # ... who hold all blocks of a column, and answer each rank that touches it with those of the others
     home = ~away
     all_contact = np.concatenate([contact[home], contact_in])
@@ -97,26 +93,7 @@ def _neighbours(
     asking = np.repeat(asked[:, 1], count)
     useful = source[pick] != asking
     pick, asking = pick[useful], asking[useful]
-    answer, _ = _exchange(comm, [all_contact[pick], all_body[pick], all_blocks[pick]], asking)
+    answer, _ = exchange(comm, [all_contact[pick], all_body[pick], all_blocks[pick]], asking)
     touched = np.isin(body_in, bodies)  # an owner may have no contact of its own at a body
     own = (contact_in[touched], body_in[touched], blocks_in[touched])
     return tuple(np.concatenate(pair) for pair in zip(answer, own))  # type: ignore[return-value]
-
-
-def _exchange(
-    comm: MPI.Comm, arrays: list[np.ndarray], rank: np.ndarray
-) -> tuple[list[np.ndarray], np.ndarray]:
-    """Send row i of each array to ``rank[i]``; the rows received and the ranks that they came from."""
-    order = np.argsort(rank, kind="stable")
-    send = np.bincount(rank, minlength=comm.size).astype(np.int64)
-    receive = np.empty_like(send)
-    comm.Alltoall(send, receive)
-    received = []
-    for array in arrays:
-        width = int(np.prod(array.shape[1:]))
-        out = np.empty((int(receive.sum()), *array.shape[1:]), array.dtype)
-        kind = MPI._typedict[array.dtype.char].Create_contiguous(width).Commit()
-        comm.Alltoallv([np.ascontiguousarray(array[order]), send, kind], [out, receive, kind])
-        kind.Free()
-        received.append(out)
-    return received, np.repeat(np.arange(comm.size), receive)

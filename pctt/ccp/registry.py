@@ -15,7 +15,8 @@ PRODUCT, MATRIX, NEWTON = "products with N", "rows of N", "Newton systems"
 
 @dataclass(frozen=True)
 class Solver:
-    """A method: ``function(problem, guess, limits, options)``, with a ``pctt.ccp.Newton`` after them if it solves Newton systems.
+    """A method: ``function(problem, guess, limits, options)``, with a ``pctt.ccp.Newton`` after them if it solves
+    Newton systems.
 
     ``needs`` is PRODUCT, MATRIX or NEWTON; ``iterations`` the default limit (``-ccp_max_it``).
     """

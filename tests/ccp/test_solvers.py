@@ -10,7 +10,7 @@ import pytest
 from problems import SELF, Graph, Known, from_graph, from_matrix, heap, known_optimum, matrix, random_graph
 
 from pctt import ccp
-from pctt.ccp import Limits, pdip
+from pctt.ccp import Limits
 from pctt.ccp.first_order import apgd
 
 EVERY = pytest.mark.parametrize("solver", ccp.SOLVERS)
@@ -79,7 +79,7 @@ def test_both_solvers_find_the_same_motion(seed):
 def test_both_forms_of_the_constraint_lead_to_the_optimum(constraint):
     known, graph = heap(bodies=30)
     problem = from_graph(known, graph)
-    result = ccp.solve(problem, limits=Limits(1e-5), options=pdip.PDIP(constraint=constraint))
+    result = ccp.solve(problem, limits=Limits(1e-5), options=ccp.SOLVERS["pdip"].options(constraint=constraint))
     check(known, problem, result, 1e-5)
 
 
@@ -315,7 +315,7 @@ def test_options_of_a_solver_are_used():
     """Careful centring takes more Newton steps, looking seldom more iterations than needed."""
     known, graph = heap()
     problem = from_graph(known, graph)
-    slow = ccp.solve(problem, limits=Limits(1e-6), options=pdip.PDIP(centering=0.8))
+    slow = ccp.solve(problem, limits=Limits(1e-6), options=ccp.SOLVERS["pdip"].options(centering=0.8))
     assert slow.iterations > 1.5 * ccp.solve(problem, limits=Limits(1e-6)).iterations
     every = ccp.solve(problem, type="apgd", limits=Limits(1e-6), options=apgd.APGD(check=1))
     seldom = ccp.solve(problem, type="apgd", limits=Limits(1e-6), options=apgd.APGD(check=500))

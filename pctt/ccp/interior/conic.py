@@ -29,6 +29,7 @@ from pctt.ccp.result import Limits, Result
 from pctt.log import phase
 from pctt.options import FRACTION, NOT_NEGATIVE, POSITIVE, option
 
+CENTERING = 0.02  # per deviation from the central path
 PATIENCE = 3  # iterations without progress before the Newton systems are sharpened
 
 
@@ -89,7 +90,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
         with phase("ConicPredictor"):
             ds, dz, dv, x = direction(-z, None)
             reach = min(1.0, _step(problem, s, z, ds, dz))
-            target = (1.0 - reach) ** 3 * gap / problem.size
+            target = max((1.0 - reach) ** 3, _centering(problem, s, z)) * gap / problem.size
         with phase("ConicCorrector"):
             ds, dz, dv, x = direction(_centred(W, z, ds, dz, target), x)
             step = min(1.0, options.boundary * _step(problem, s, z, ds, dz))
@@ -168,6 +169,15 @@ def _centred(W: NesterovTodd, z: Array, ds: Array, dz: Array, target: float) -> 
     aim = -lorentz.product(W.divide(ds), W.times(dz))
     aim[:, 0] += target
     return W.divide(lorentz.divide(W.times(z), aim)) - z
+
+
+def _centering(problem: ConeProblem, s: Array, z: Array) -> float:
+    """The least part of the complementarity to aim at: more, the further the pair is off the central path. On it s o
+    z has no tangential part; off it the sliding directions of impulse and velocity differ by an angle that falls like
+    the root of the complementarity only."""
+    turned = lorentz.product(s, z)
+    off = problem.norm(turned[:, 1:]) / max(problem.norm(turned[:, 0]), 1e-300)
+    return min(CENTERING * off, 0.5)
 
 
 def _step(problem: ConeProblem, s: Array, z: Array, ds: Array, dz: Array) -> float:

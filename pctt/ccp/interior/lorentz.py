@@ -15,13 +15,13 @@ import numpy as np
 
 from pctt.ccp.cone import Array
 
-_TINY = 1e-300
+_LEAST = 1e-17  # determinant of a unit point that rounding has put on or outside the boundary
 
 
 def determinant(x: Array) -> Array:
-    """x_0^2 - |x_1:|^2 (nc,), positive inside."""
+    """x_0^2 - |x_1:|^2 (nc,) of points inside, kept positive where rounding would not."""
     t = np.hypot(x[:, 1], x[:, 2])
-    return (x[:, 0] - t) * (x[:, 0] + t)
+    return np.maximum((x[:, 0] - t) * (x[:, 0] + t), np.maximum(_LEAST * x[:, 0] ** 2, np.finfo(float).tiny))
 
 
 def product(x: Array, y: Array) -> Array:
@@ -34,7 +34,7 @@ def product(x: Array, y: Array) -> Array:
 def divide(x: Array, y: Array) -> Array:
     """The w with x o w = y; x inside the cones."""
     out = np.empty_like(y)
-    out[:, 0] = (x[:, 0] * y[:, 0] - x[:, 1] * y[:, 1] - x[:, 2] * y[:, 2]) / np.maximum(determinant(x), _TINY)
+    out[:, 0] = (x[:, 0] * y[:, 0] - x[:, 1] * y[:, 1] - x[:, 2] * y[:, 2]) / determinant(x)
     out[:, 1:] = (y[:, 1:] - out[:, :1] * x[:, 1:]) / x[:, :1]
     return out
 
@@ -45,7 +45,7 @@ def step_to_boundary(x: Array, dx: Array) -> float:
     By the smallest spectral value of dx seen from x (Vandenberghe, "The CVXOPT linear and quadratic cone program
     solvers", 2010).
     """
-    size = np.sqrt(np.maximum(determinant(x), _TINY))
+    size = np.sqrt(determinant(x))
     unit = x / size[:, None]
     inner = unit[:, 0] * dx[:, 0] - unit[:, 1] * dx[:, 1] - unit[:, 2] * dx[:, 2]
     turned = dx[:, 1:] - ((inner + dx[:, 0]) / (unit[:, 0] + 1.0))[:, None] * unit[:, 1:]
@@ -95,7 +95,7 @@ class NesterovTodd:
 
     @classmethod
     def of(cls, s: Array, z: Array) -> NesterovTodd:
-        size_s, size_z = (np.sqrt(np.maximum(determinant(x), _TINY)) for x in (s, z))
+        size_s, size_z = (np.sqrt(determinant(x)) for x in (s, z))
         unit_s, unit_z = s / size_s[:, None], z / size_z[:, None]
         angle = np.sqrt(np.maximum(0.5 * (1.0 + (unit_s * unit_z).sum(1)), 0.5))
         point = unit_s

@@ -146,7 +146,7 @@ class Newton:
         """x with a residual of norm ``wanted``."""
         self._b.array[:] = b
         norm = self._b.norm()
-        if norm <= wanted:
+        if norm <= wanted or not np.isfinite(norm):  # the caller finds no step in a direction that is no number
             return np.zeros_like(b)
         self.linear.solve(self._b, self._x, max(wanted / norm, 1e-14))
         return self._x.array.copy()

@@ -14,6 +14,7 @@ from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.pc.body_matrix import BodyMatrix
 
+LEAST = 0.1  # of the mass: entries of a block between bodies that a factor is better off without
 SHIFT = 0.03  # of the diagonal blocks, for incomplete factorisations
 
 
@@ -51,6 +52,10 @@ class BodySystem:
     def enlarged(self):
         """K with larger diagonal blocks, from which incomplete factorisations are made."""
         return self.body_matrix.enlarged(SHIFT)
+
+    def stiff_part(self):
+        """What is worth factorising of K."""
+        return self.body_matrix.stiff_part(LEAST)
 
     def right_hand_side(self, q: Array, r_v: Array | None) -> Array:
         push = self.problem.momentum(_times(self._inverse, q))

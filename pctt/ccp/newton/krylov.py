@@ -113,7 +113,7 @@ class Krylov:
         return Solve(converged, words, iterations, setup - start, end - setup, true)
 
     def _in_format(self, P: PETSc.Mat) -> PETSc.Mat:
-        if not self.scalar:
+        if not self.scalar or P.getType() in ("seqaij", "mpiaij", "aij"):
             return P
         version = (P.handle, P.stateGet())
         if self._scalar_matrix is None:

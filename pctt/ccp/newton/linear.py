@@ -104,13 +104,14 @@ RUNGS = {
 CAP = {"pbjacobi": "1500", "ilu": "1000", "cholesky": "60"}
 
 # Costs in products with K, measured at 4,900 and 35,900 bodies (docs/ccp.md)
-ITERATION = {"pbjacobi": 1.8, "ilu": 4.0, "cholesky": 40.0}
-FEWER = {"pbjacobi": 1.0, "ilu": 4.5, "cholesky": np.inf}  # block Jacobi's iterations / this one's
-SOLVES = 2.5  # with the same matrix: predictor and corrector
+ITERATION = {"pbjacobi": 1.6, "ilu": 6.5, "cholesky": 70.0}
+FEWER = {"pbjacobi": 1.0, "ilu": 4.8, "cholesky": np.inf}  # block Jacobi's iterations / this one's
+SOLVES = 1.8  # iterations of predictor and correctors / those of the predictor
+OLD_FACTOR = 25.0  # iterations to expect with the factor of an earlier matrix
 
 
 def _setup_cost(rung: str, bodies: int) -> float:
-    return {"pbjacobi": 5.0, "ilu": 80.0, "cholesky": 1500.0 * (bodies / 5000.0) ** 0.55}[rung]
+    return {"pbjacobi": 5.0, "ilu": 90.0, "cholesky": 1400.0 * (bodies / 5000.0) ** 0.55}[rung]
 
 
 class Cheapest:
@@ -127,7 +128,7 @@ class Cheapest:
         self._hardness = 20.0  # expected iterations with block Jacobi
         self._growth = 1.0
         self._lagged: float | None = None  # expected iterations with the factor that is there
-        self._enlarged: PETSc.Mat | None = None
+        self._approximation: PETSc.Mat | None = None
         self.iterations = self.fallbacks = 0
         self.used: dict[str, int] = {}
 
@@ -142,7 +143,7 @@ class Cheapest:
         rung = min(costs, key=lambda name: costs[name])
         self._keep = False
         if self._lagged is not None:
-            lagged = SOLVES * ITERATION["cholesky"] * 1.6 * self._lagged
+            lagged = SOLVES * ITERATION["cholesky"] * self._lagged
             if lagged < min(costs.values()):
                 rung, self._keep = "cholesky", True
         self._rung = rung
@@ -164,9 +165,9 @@ class Cheapest:
 
     def _try(self, rung: str, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
         krylov = self._solver(rung)
-        if rung == "ilu" and self._fresh:
-            self._enlarged = self.system.enlarged()
-        P = self._enlarged if rung == "ilu" else self.system.preconditioned
+        if self._fresh and not self._keep:
+            self._approximation = self._approximate(rung)
+        P = self._approximation
         done = krylov.solve(self.system.matrix, b, x, rtol, P, keep=self._keep)
         self._fresh = False
         self.iterations += done.iterations
@@ -176,9 +177,15 @@ class Cheapest:
             self._learn(rung, done.iterations)
         return done
 
+    def _approximate(self, rung: str) -> PETSc.Mat:
+        """The matrix that a rung's preconditioner is made from."""
+        if rung == "ilu":
+            return self.system.enlarged()
+        return self.system.stiff_part() if rung == "cholesky" else self.system.matrix
+
     def _learn(self, rung: str, iterations: int) -> None:
         if rung == "cholesky":
-            self._lagged = float(max(iterations, 2))
+            self._lagged = 1.5 * iterations if self._keep else OLD_FACTOR
             return
         hardness = max(10.0, iterations * FEWER[rung])
         self._growth = min(max(hardness / self._hardness, 1.0), 2.0)

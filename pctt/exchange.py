@@ -1,0 +1,30 @@
+"""Rows of arrays that change ranks."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+
+def offsets(comm: MPI.Comm, count: int) -> np.ndarray:
+    """First global index of each rank's part, and the total (size + 1,)."""
+    return np.concatenate([[0], np.cumsum(comm.allgather(count))])
+
+
+def exchange(
+    comm: MPI.Comm, arrays: list[np.ndarray], rank: np.ndarray
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Send row i of each array to ``rank[i]``; the rows received and the ranks that they came from."""
+    order = np.argsort(rank, kind="stable")
+    send = np.bincount(rank, minlength=comm.size).astype(np.int64)
+    receive = np.empty_like(send)
+    comm.Alltoall(send, receive)
+    received = []
+    for array in arrays:
+        width = int(np.prod(array.shape[1:]))
+        out = np.empty((int(receive.sum()), *array.shape[1:]), array.dtype)
+        kind = MPI._typedict[array.dtype.char].Create_contiguous(width).Commit()
+        comm.Alltoallv([np.ascontiguousarray(array[order]), send, kind], [out, receive, kind])
+        kind.Free()
+        received.append(out)
+    return received, np.repeat(np.arange(comm.size), receive)
