@@ -38,9 +38,8 @@ class Conic:
     """Options ``-ccp_conic_*``."""
 
     start: float = option(
-        30.0, "complementarity of a cold start, in units of mean(r^2) / mean diag N", check=POSITIVE
+        30.0, "complementarity of the start, in units of mean(r^2) / mean diag N", check=POSITIVE
     )
-    warm: float = option(0.3, "the same of a start from the last impulses", check=POSITIVE)
     forcing: float = option(
         0.2, "residual of a linear solve, as a part of the root of the complementarity", check=POSITIVE
     )
@@ -140,8 +139,7 @@ def _start(
     diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2
     tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
     closing = problem.dot(problem.r, problem.r) / problem.size
-    warm = problem.sum(int((guess[:, 0] > 0).sum())) > 0.5 * problem.size
-    amount = (options.warm if warm else options.start) * closing / problem.mean_diagonal
+    amount = options.start * closing / problem.mean_diagonal
     return lorentz.central_pair(s - tau[:, None] * z, tau, amount)
 
 
