@@ -59,12 +59,17 @@ def delassus(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
             (np.concatenate([G.blocks, far_blocks])[order], all_columns[order], indptr),
             shape=(3 * len(names), 6 * len(bodies)),
         )
+    total = comm.allreduce(G.rows)
     if G.rows == 0:
         return block_csr_matrix(comm, 0, 0, np.zeros(1), np.zeros(0), np.zeros((0, 3, 3)))
     near = left @ right.T
-    shape = (3 * G.rows, 3 * (names[-1] + 1))
-    rows = sp.bsr_matrix((near.data, names[near.indices], near.indptr), shape=shape)
-    return square_block_matrix(comm, rows)
+    # contacts of bodies that are not in G (fixed, or kept apart) need a diagonal block all the same
+    lonely = np.flatnonzero(np.diff(G.indptr) == 0)
+    columns = np.insert(names[near.indices] if len(near.indices) else near.indices, near.indptr[lonely], first + lonely)
+    blocks = np.insert(near.data.reshape(-1, 3, 3), near.indptr[lonely], 0.0, axis=0)
+    indptr = near.indptr + np.searchsorted(lonely, np.arange(G.rows + 1))
+    shape = (3 * G.rows, 3 * total)
+    return square_block_matrix(comm, sp.bsr_matrix((blocks, columns, indptr), shape=shape))
 
 
 def _neighbours(

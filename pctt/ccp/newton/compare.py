@@ -17,7 +17,7 @@ _BODY = {"ksp_type": "preonly", "pc_type": "python", "pc_python_type": "pctt.pc.
 NAMED: dict[str, dict[str, str]] = {
     "ilu-shifted": {"pc_type": "ilu", "pc_factor_shift_type": "positive_definite"},
     "icc-shifted": {"pc_type": "icc", "pc_factor_shift_type": "positive_definite"},
-    "cholesky": {"pc_type": "cholesky", "ksp_type": "preonly"},
+    "cholesky": {"pc_type": "cholesky", "ksp_type": "gmres"},
     "tt": {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain"},
     "body-pbjacobi": _BODY,
     "body-ilu": {**_BODY, "body_pc_type": "ilu", "body_pc_factor_levels": "1"},

@@ -43,7 +43,8 @@ class Krylov:
         given, self._entered = _with_defaults(prefix, defaults or {})
         self.method = given["ksp_type"]
         self.name = factor_within_ranks(prefix, comm.size)
-        self.scalar = given["pc_type"] in _SCALAR_FORMAT
+        # block Gauss-Seidel over several ranks crashes in PETSc 3.18
+        self.scalar = given["pc_type"] in _SCALAR_FORMAT or (given["pc_type"] == "sor" and comm.size > 1)
         self._scalar_matrix: PETSc.Mat | None = None
         self._converted: tuple[int, int] | None = None
         self.ksp = PETSc.KSP().create(comm)

@@ -1,0 +1,158 @@
+"""Newton systems in their three forms against dense linear algebra, with crowded bodies, on several ranks."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from problems import SELF, from_graph, from_matrix, heap
+
+from pctt import blocks, ccp
+from pctt.ccp.newton.body import BodySystem
+from pctt.ccp.newton.kkt import KKTSystem
+
+FORMS = pytest.mark.parametrize("form", ccp.FORMS)
+
+PROGRAM = """
+import json
+import numpy as np
+from mpi4py import MPI
+from pctt import blocks, ccp
+
+blocks.MANY = {MANY}
+comm = MPI.COMM_WORLD
+contacts, bodies = 120, 30
+rng = np.random.default_rng(0)
+# the last body, a press, has 40 % of the contacts; some contacts are of the press and a wall alone
+one = rng.integers(0, bodies - 1, contacts)
+press = rng.random(contacts) < 0.4
+other = np.where(press, bodies - 1, (one + 1 + rng.integers(0, bodies - 2, contacts)) % (bodies - 1))
+pairs = np.sort(np.stack([one, other], axis=1), axis=1)
+pieces = rng.standard_normal((contacts, 2, 3, 6))
+alone = press & (rng.random(contacts) < 0.2)
+dense = np.zeros((contacts, 3, bodies, 6))
+for c in range(contacts):
+    for side in (0, 1):
+        if not (alone[c] and pairs[c, side] != bodies - 1):
+            dense[c, :, pairs[c, side]] += pieces[c, side]
+dense = dense.reshape(3 * contacts, 6 * bodies)
+cut, own = ([k * size // comm.size for k in range(comm.size + 1)] for size in (contacts, bodies))
+here = slice(cut[comm.rank], cut[comm.rank + 1])
+kept = ~(alone[here, None] & (pairs[here] != bodies - 1))
+indptr = np.concatenate([[0], np.cumsum(kept.sum(1))])
+G = ccp.BlockRows(indptr, pairs[here][kept], pieces[here][kept], own[comm.rank + 1] - own[comm.rank])
+mu, r = np.full(contacts, 0.5), rng.standard_normal((contacts, 3))
+root = rng.standard_normal((contacts, 3, 3))
+barrier = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
+q, e = rng.standard_normal((contacts, 3)), 1e-2
+N = dense @ dense.T
+N += e * np.diag(N).mean() * np.diag(np.tile([0.25, 1.0, 1.0], contacts))
+S = N.copy()
+for c in range(contacts):
+    S[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] += barrier[c]
+momenta = rng.standard_normal(6 * bodies)
+mine = slice(6 * own[comm.rank], 6 * own[comm.rank + 1])
+exact = np.linalg.solve(S, q.ravel() + dense @ momenta)
+errors = {}
+for form in {FORMS}:
+    problem = ccp.ConeProblem(comm, r[here], mu[here], G=G, compliance=e)
+    newton = ccp.Newton(comm, form)
+    newton.begin(problem)
+    newton.update(barrier[here])
+    dg, x = newton.solve(q[here], 1e-9, momenta[mine])
+    dv = newton.momentum(x, dg, momenta[mine])
+    parts = [
+        np.abs(dg.ravel() - exact[3 * here.start : 3 * here.stop]).max(),
+        np.abs(dv - (dense.T @ exact - momenta)[mine]).max(),
+        np.abs(problem.product(q[here]).ravel() - (N @ q.ravel())[3 * here.start : 3 * here.stop]).max(),
+    ]
+    errors[form] = [comm.allreduce(max(parts), op=MPI.MAX), newton.fallbacks, problem.low_rank is not None]
+    newton.destroy()
+if comm.rank == 0:
+    print(json.dumps(errors))
+"""
+
+
+def program(many: int, forms: list[str]) -> str:
+    return PROGRAM.replace("{MANY}", str(many)).replace("{FORMS}", repr(forms))
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [1, 2, 3, 4])
+@pytest.mark.parametrize("many", [20, 1000])
+def test_the_forms_agree_with_dense_algebra(mpirun, ranks, many):
+    """Also where a body has more contacts than N is filled with."""
+    forms = [form for form in ccp.FORMS if form != "kkt" or many == 1000]
+    errors = json.loads(mpirun(program(many, forms), ranks))
+    for form, (error, fallbacks, low_rank) in errors.items():
+        assert error < 1e-6, form
+        assert fallbacks == 0
+        assert low_rank == (many == 20)
+
+
+@FORMS
+@pytest.mark.parametrize("solver", ["pdip", "conic"])
+def test_every_form_gives_the_optimum(form, solver):
+    known, graph = heap(3)
+    problem = from_graph(known, graph)
+    tol = 1e-6
+    newton = ccp.newton_for(SELF, solver, form)
+    result = ccp.solve(problem, type=solver, limits=ccp.Limits(tol), newton=newton)
+    assert result.converged, result.reason
+    assert np.linalg.norm(problem.product(result.impulse) + problem.r - known.y) < 1e-3 * np.linalg.norm(known.y)
+    newton.destroy()
+
+
+@FORMS
+def test_matrices_stay_while_the_contacts_are_the_same(form):
+    newton = ccp.Newton(SELF, form)
+    known, graph = heap(3)
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((40, 3, 3))
+    barrier, q = root @ root.transpose(0, 2, 1) + np.eye(3), rng.standard_normal((40, 3))
+    first = from_graph(known, graph)
+    newton.begin(first)
+    matrix = newton.system.matrix
+    newton.update(barrier)
+    before, _ = newton.solve(q, 1e-9)
+    again = from_graph(known, graph)
+    newton.begin(again)
+    assert newton.system.matrix is matrix
+    newton.update(barrier)
+    after, _ = newton.solve(q, 1e-9)
+    assert np.allclose(after, before, atol=1e-7)
+    other, other_graph = heap(4)
+    newton.begin(from_graph(other, other_graph))
+    assert newton.system.matrix is not matrix
+    newton.destroy()
+
+
+def test_a_problem_without_bodies_is_solved_in_the_form_with_multipliers():
+    known, graph = heap(3)
+    newton = ccp.Newton(SELF, "body")
+    newton.begin(from_graph(known, graph))
+    assert isinstance(newton.system, BodySystem)
+    newton.begin(from_matrix(known))
+    assert isinstance(newton.system, KKTSystem)
+    newton.begin(from_graph(known, graph))
+    assert isinstance(newton.system, BodySystem)
+    newton.destroy()
+
+
+def test_sharpened_systems_are_of_one_problem_only():
+    known, graph = heap(3)
+    newton = ccp.Newton(SELF, "body")
+    newton.begin(from_graph(known, graph))
+    assert newton.sharpen()
+    assert isinstance(newton.system, KKTSystem)
+    assert not newton.sharpen()
+    newton.begin(from_graph(known, graph))
+    assert isinstance(newton.system, BodySystem)
+    newton.destroy()
+
+
+def test_few_contacts_are_never_kept_apart():
+    G, crowded = blocks.without_crowded(SELF, from_graph(*heap(3)).contact_map)
+    assert len(crowded) == 0
+    assert G.rows == 40
