@@ -79,9 +79,7 @@ def main(given: argparse.Namespace) -> None:
         count = len(replay.systems)
         chosen = sorted({min(count - 1, round(part * count)) for part in PARTS})
         print(f"{given.packing} n = {given.n}: {replay.contacts} contacts, {count} Newton steps, 1 rank")
-        print(
-            f"BiCGStab from the right to a true residual of {given.rtol:g}; iterations, set-up s, solve s of each system"
-        )
+        print(f"BiCGStab from the right to a true residual of {given.rtol:g}; per system iterations, set-up s, solve s")
         print("!: true residual of what was not solved; j: no positive train of this rank, block Jacobi in its place")
         print(f"{'Newton step':12} " + " ".join(f"{k + 1:>28}" for k in chosen))
         for name in methods():

@@ -63,10 +63,8 @@ class SlottedMatrix:
         roots = self._inverse_roots(blocks)
         self.root[self.place] = roots
         everywhere = self._gathered(roots)
-        left = sp.bsr_matrix((roots, np.arange(len(roots)), np.arange(len(roots) + 1)))
-        right = sp.bsr_matrix((everywhere.transpose(0, 2, 1), np.arange(self._total), np.arange(self._total + 1)))
-        scaled = left @ self._bsr(blocks) @ right  # scipy keeps the order of the blocks: one factor per block
-        return scaled.data[self._kept]
+        scaled = _diagonal(roots) @ self._bsr(blocks) @ _diagonal(everywhere.transpose(0, 2, 1))
+        return scaled.data[self._kept]  # scipy keeps the order of the blocks: one factor per block
 
     def _bsr(self, blocks: np.ndarray) -> sp.bsr_matrix:
         indptr = np.concatenate([[0], np.cumsum(np.bincount(self._row, minlength=len(self.place)))])
@@ -100,3 +98,9 @@ class SlottedMatrix:
             out[:] = local
         else:
             self.comm.Allgatherv(local, [out, self._capacities * self.block])
+
+
+def _diagonal(blocks: np.ndarray) -> sp.bsr_matrix:
+    """The block diagonal matrix of blocks (n, bs, bs)."""
+    size = len(blocks) * blocks.shape[1]
+    return sp.bsr_matrix((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)), shape=(size, size))

@@ -77,7 +77,9 @@ def _refuse_other_scene(path: Path, old: dict[str, Any], new: dict[str, Any]) ->
         raise OptionError(f"-scene {new['scene']}: {path} holds the scene {old['scene']}")
     for field, value in new.items():
         if old.get(field) != value:
-            raise OptionError(f"-scene_{field} {value}: {path} was made with {old.get(field)}; allowed is the same")
+            raise OptionError(
+                f"-scene_{field} {value}: {path} was made with {old.get(field)}; allowed is the same"
+            )
 
 
 # -- settled states, outside the project's folder ------------------------------------------------------------
@@ -109,3 +111,4 @@ def intact(path: Path) -> bool:
 
 def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
+

@@ -242,4 +242,6 @@ def _refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
             error = problem.strerror
     error = comm.bcast(error)
     if error:
-        raise OptionError(f"{name} {folder}: cannot write there ({error}); allowed is a folder that can be written")
+        raise OptionError(
+            f"{name} {folder}: cannot write there ({error}); allowed is a folder that can be written"
+        )

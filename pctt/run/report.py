@@ -13,7 +13,10 @@ from typing import Any
 
 from pctt import log
 
-COLUMNS = "  step    time s  contacts  Newton  Krylov  residual  seconds: total  search  assembly   solve  output"
+COLUMNS = (
+    "  step    time s  contacts  Newton  Krylov  residual"
+    "  seconds: total  search  assembly   solve  output"
+)
 
 
 def step_line(line: Mapping[str, Any]) -> str:
@@ -127,7 +130,10 @@ def _terminal() -> bool:
 def compare_table(summary: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]) -> str:
     """The compared preconditioners over all systems of the run, the losers too."""
     width = max(len("preconditioner"), *(len(label) for label in labels.values()))
-    head = f"{'preconditioner':{width}}  systems  converged  its mean   its max  set-up s   solve s  worst residual"
+    head = (
+        f"{'preconditioner':{width}}  systems  converged  its mean   its max"
+        "  set-up s   solve s  worst residual"
+    )
     rows = [
         f"{labels[name]:{width}} {s['systems']:8d} {s['converged']:10d} {s['ksp_its_mean']:9.1f}"
         f" {s['ksp_its_max']:9d} {s['setup_s']:9.3f} {s['solve_s']:9.3f} {s['true_residual_max']:15.1e}"

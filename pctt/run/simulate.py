@@ -197,7 +197,9 @@ class Stepper:
 def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
     G = ccp.BlockRows(*system.G, columns=system.owned_bodies)
-    return ccp.ConeProblem(comm, system.r, system.mu, G=G, point=system.point, key=system.key, compliance=compliance)
+    return ccp.ConeProblem(
+        comm, system.r, system.mu, G=G, point=system.point, key=system.key, compliance=compliance
+    )
 
 
 def first_state(options: Options, comm: MPI.Comm, progress: report.Progress) -> tuple[World, ImpulseMemory]:

@@ -7,7 +7,8 @@ cores the best core solves
     M y_j = f_j  for every column j of its mode,    M = P' S P  of order r m r',
 
 with the same symmetric positive definite M for all columns: one Cholesky factorisation, or, where that costs
-more, conjugate gradients that never form M. The condition of S is not squared, as it is where ||S X - B|| is minimised. (Alternating energy minimisation: Oseledets & Dolgov,
+more, conjugate gradients that never form M. The condition of S is not squared, as it is where ||S X - B|| is
+minimised. (Alternating energy minimisation: Oseledets & Dolgov,
 SIAM J. Sci. Comput. 34, 2012; Dolgov & Savostyanov, ibid. 36, 2014.)
 """
 
@@ -104,8 +105,8 @@ def symmetrise(X: Train, max_rank: int | None = None, eps: float = 1e-12) -> Tra
 
 
 def residual(S: Train, X: Train) -> float:
-    """||I - S X||_F / ||I||_F, in train arithmetic: of the cost of a product of both ranks. Where that is high, its root
-    mean square over random signs v, ||v - S X v|| / ||v||."""
+    """||I - S X||_F / ||I||_F, in train arithmetic: of the cost of a product of both ranks. Where that is high, the
+    root mean square of ||v - S X v|| / ||v|| over random signs v."""
     size = S.shape[0]
     if max(S.ranks) * max(X.ranks) > HIGH:
         V = np.random.default_rng(0).choice([-1.0, 1.0], (PROBES, size))
