@@ -150,6 +150,7 @@ class Stepper:
             self.memory.remember(self.system.key, self.impulse, self.system.frame)
         contacts = problem.size
         problem.destroy()
+        pc_report = self.newton.pc_report if self.newton is not None else []
         return {
             "step": world.step,
             "time": world.time,
@@ -163,6 +164,7 @@ class Stepper:
             "fallbacks": result.fallbacks,
             "solver": solver,
             "asked_solver": options.run.ccp_type,
+            **({"pc_report": pc_report} if pc_report else {}),
             **files,
             "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
         }
