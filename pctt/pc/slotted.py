@@ -36,7 +36,8 @@ class SlottedMatrix:
         self.place, self.capacity = slots.place, slots.capacity
         own = int(self._counts[: comm.rank].sum())  # the first block row of this rank
         self._slot = self._gathered(self.first + self.place)  # of every global block row
-        pattern = self._block_rows(P)
+        pattern = self._pattern(P)
+        self._order = pattern.data - 1  # of the entries of the blocks among P's values, -1 where there is none
         row = np.repeat(np.arange(count), np.diff(pattern.indptr))
         self._row, self._column = row, pattern.indices
         self._kept = np.ones(len(row), bool)
@@ -56,7 +57,7 @@ class SlottedMatrix:
 
         Raises numpy.linalg.LinAlgError, on the ranks concerned, where a diagonal block is not positive definite.
         """
-        blocks = self._block_rows(P).data
+        blocks = np.append(P.getValuesCSR()[2], 0.0)[self._order]
         if not self.scaled:
             typical = P.getDiagonal().sum() / P.getSize()[0]
             return np.concatenate([blocks, np.tile(typical * np.eye(self.block), (self._empty, 1, 1))])
@@ -77,10 +78,12 @@ class SlottedMatrix:
         diagonal[self._row[on_diagonal]] = blocks[on_diagonal]
         return np.linalg.inv(np.linalg.cholesky(diagonal))
 
-    def _block_rows(self, P: PETSc.Mat) -> sp.bsr_matrix:
+    def _pattern(self, P: PETSc.Mat) -> sp.bsr_matrix:
+        """The blocks of this rank's rows, with the numbers of P's values, from 1, for values."""
         indptr, indices, values = P.getValuesCSR()
         shape = (len(indptr) - 1, self.block * self._total)
-        rows = sp.csr_matrix((values, indices, indptr), shape=shape)
+        numbers = np.arange(1, len(values) + 1, dtype=np.int32)
+        rows = sp.csr_matrix((numbers, indices, indptr), shape=shape)
         return rows.tobsr((self.block, self.block))
 
     def _gathered(self, local: np.ndarray) -> np.ndarray:
