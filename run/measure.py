@@ -7,6 +7,8 @@ import os
 import platform
 import subprocess
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -45,4 +47,24 @@ def record(name: str, about: dict[str, object], rows: list[dict]) -> None:
     Path("results").mkdir(exist_ok=True)
     path = Path("results") / f"{name}.json"
     path.write_text(json.dumps({"machine": about, "rows": rows}, indent=1) + "\n")
+    print(path)
+
+
+@contextmanager
+def figure(name: str, panels: int) -> Iterator[Any]:
+    """Axes side by side, saved as results/NAME.png; without matplotlib nothing is drawn."""
+    try:
+        import matplotlib as mpl
+    except ImportError:
+        print("no matplotlib: no figure")
+        yield []
+        return
+    mpl.use("agg")
+    from matplotlib import pyplot
+
+    drawing, axes = pyplot.subplots(1, panels, figsize=(6.4 * panels, 4.8), layout="constrained", squeeze=False)
+    yield axes[0]
+    path = Path("results") / f"{name}.png"
+    drawing.savefig(path, dpi=150)
+    pyplot.close(drawing)
     print(path)

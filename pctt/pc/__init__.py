@@ -3,4 +3,6 @@
 from pctt.pc.body_schur import BodySchur
 from pctt.pc.tensor_train import TensorTrain
 
-__all__ = ["BodySchur", "TensorTrain"]
+PRECONDITIONERS = (TensorTrain, BodySchur)  # what -help describes
+
+__all__ = ["PRECONDITIONERS", "BodySchur", "TensorTrain"]

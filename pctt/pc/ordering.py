@@ -19,6 +19,8 @@ def block_order(P: PETSc.Mat) -> np.ndarray:
     """
     bs = P.getBlockSize()
     count = P.getLocalSize()[0] // bs
+    if count == 0:  # a rank without rows
+        return np.empty(0, np.int64)
     points = P.getAttr("coordinates")
     if points is not None:
         codes = morton_codes(np.asarray(points, dtype=float).reshape(count, -1))
@@ -43,9 +45,9 @@ class Frame:
     @classmethod
     def of(cls, points: np.ndarray) -> Frame:
         """The bounding cube of points (n, d)."""
-        points = np.asarray(points, dtype=float).reshape(len(points), -1)
         if len(points) == 0:
-            return cls(np.zeros(points.shape[1]), 1.0)
+            return cls(np.zeros(1), 1.0)
+        points = np.asarray(points, dtype=float).reshape(len(points), -1)
         low = points.min(axis=0)
         return cls(low, max(float((points.max(axis=0) - low).max()), float(np.finfo(float).tiny)))
 

@@ -86,6 +86,8 @@ class Slots:
             return None
         free = np.ones(self.capacity, bool)
         free[place[stays]] = False
+        if free.sum() != self.capacity - stays.sum():  # two rows of the same name
+            return None
         for distance in range(REACH + 1):
             for side in (1, -1) if distance else (1,):
                 _settle(place, home + side * distance, free, self.box)

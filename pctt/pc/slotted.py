@@ -36,7 +36,8 @@ class SlottedMatrix:
         self.place, self.capacity = slots.place, slots.capacity
         own = int(self._counts[: comm.rank].sum())  # the first block row of this rank
         self._slot = self._gathered(self.first + self.place)  # of every global block row
-        pattern = self._block_rows(P)
+        pattern = self._pattern(P)
+        self._order = pattern.data - 1  # of the entries of the blocks among P's values, -1 where there is none
         row = np.repeat(np.arange(count), np.diff(pattern.indptr))
         self._row, self._column = row, pattern.indices
         self._kept = np.ones(len(row), bool)
@@ -56,17 +57,15 @@ class SlottedMatrix:
 
         Raises numpy.linalg.LinAlgError, on the ranks concerned, where a diagonal block is not positive definite.
         """
-        blocks = self._block_rows(P).data
+        blocks = np.append(P.getValuesCSR()[2], 0.0)[self._order]
         if not self.scaled:
             typical = P.getDiagonal().sum() / P.getSize()[0]
             return np.concatenate([blocks, np.tile(typical * np.eye(self.block), (self._empty, 1, 1))])
         roots = self._inverse_roots(blocks)
         self.root[self.place] = roots
         everywhere = self._gathered(roots)
-        left = sp.bsr_matrix((roots, np.arange(len(roots)), np.arange(len(roots) + 1)))
-        right = sp.bsr_matrix((everywhere.transpose(0, 2, 1), np.arange(self._total), np.arange(self._total + 1)))
-        scaled = left @ self._bsr(blocks) @ right  # scipy keeps the order of the blocks: one factor per block
-        return scaled.data[self._kept]
+        scaled = _diagonal(roots) @ self._bsr(blocks) @ _diagonal(everywhere.transpose(0, 2, 1))
+        return scaled.data[self._kept]  # scipy keeps the order of the blocks: one factor per block
 
     def _bsr(self, blocks: np.ndarray) -> sp.bsr_matrix:
         indptr = np.concatenate([[0], np.cumsum(np.bincount(self._row, minlength=len(self.place)))])
@@ -79,10 +78,12 @@ class SlottedMatrix:
         diagonal[self._row[on_diagonal]] = blocks[on_diagonal]
         return np.linalg.inv(np.linalg.cholesky(diagonal))
 
-    def _block_rows(self, P: PETSc.Mat) -> sp.bsr_matrix:
+    def _pattern(self, P: PETSc.Mat) -> sp.bsr_matrix:
+        """The blocks of this rank's rows, with the numbers of P's values, from 1, for values."""
         indptr, indices, values = P.getValuesCSR()
         shape = (len(indptr) - 1, self.block * self._total)
-        rows = sp.csr_matrix((values, indices, indptr), shape=shape)
+        numbers = np.arange(1, len(values) + 1, dtype=np.int32)
+        rows = sp.csr_matrix((numbers, indices, indptr), shape=shape)
         return rows.tobsr((self.block, self.block))
 
     def _gathered(self, local: np.ndarray) -> np.ndarray:
@@ -100,3 +101,9 @@ class SlottedMatrix:
             out[:] = local
         else:
             self.comm.Allgatherv(local, [out, self._capacities * self.block])
+
+
+def _diagonal(blocks: np.ndarray) -> sp.bsr_matrix:
+    """The block diagonal matrix of blocks (n, bs, bs)."""
+    size = len(blocks) * blocks.shape[1]
+    return sp.bsr_matrix((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)), shape=(size, size))

@@ -26,6 +26,7 @@ from pctt.options import (
     read,
     refuse_unknown,
 )
+from pctt.pc import PRECONDITIONERS
 from pctt.run.dump import dump_folder
 from pctt.run.hdf5 import refuse_serial
 
@@ -199,6 +200,9 @@ def help_text(database: Mapping[str, str]) -> str:
     titles += [f"-ccp_type {name}: {solver.help}" for name, solver in ccp.SOLVERS.items()]
     for title, (group, prefix) in zip(titles, _groups(scene_class)):
         lines += [title, *(str(line) for line in describe(group, prefix)), ""]
+    for pc in PRECONDITIONERS:
+        title = f"-pc_type python -pc_python_type pctt.pc.{pc.__name__}"
+        lines += [title, *(str(line) for line in describe(pc.options_class, pc.options_prefix)), ""]
     lines += [
         "Newton systems: the KSP without prefix, e.g. -ksp_type bcgs -ksp_rtol 1e-3 -ksp_max_it 1000",
         "  -ksp_pc_side right -pc_type pbjacobi (the defaults; rtol is 10 ccp_tol where that is smaller),",

@@ -36,7 +36,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         return
     if options.demo:
         progress.say("no options: the demo; -help lists the options")
-    world, memory = _first_state(options, comm, progress)
+    world, memory = first_state(options, comm, progress)
     dump = Dump(options, world)
     record = checkpoint.scene_record(scene_name(options.run.scene), options.scene)
     results = Results(Path(options.run.output), comm, record, world, options.run.restart)
@@ -140,7 +140,7 @@ class Stepper:
             problem = cone_problem(self.system, world.comm, options.run.ccp_compliance)
             guess, _ = self.memory.recall(self.system.key, self.system.frame)
         with log.phase("solve"):
-            result, solver, newton_its = self._solve(problem, guess)
+            result, solver, newton_its = self.solve(problem, guess)
             accuracy = ccp.measure(problem, result.impulse)
         with log.phase("output"):
             files = self.dump.step(self.system, problem, guess, result, self._asked) if self.dump else {}
@@ -150,6 +150,7 @@ class Stepper:
             self.memory.remember(self.system.key, self.impulse, self.system.frame)
         contacts = problem.size
         problem.destroy()
+        pc_report = self.newton.pc_report if self.newton is not None else []
         return {
             "step": world.step,
             "time": world.time,
@@ -163,6 +164,7 @@ class Stepper:
             "fallbacks": result.fallbacks,
             "solver": solver,
             "asked_solver": options.run.ccp_type,
+            **({"pc_report": pc_report} if pc_report else {}),
             **files,
             "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
         }
@@ -176,7 +178,7 @@ class Stepper:
             scene = type(self.options.scene).__name__
             raise SceneError(f"record of the scene {scene}: {type(error).__name__}: {error}") from None
 
-    def _solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> tuple[ccp.Result, str, int]:
+    def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> tuple[ccp.Result, str, int]:
         """Solve as asked; where that does not converge, go on with APGD from there and keep the better.
 
         The result, the method that it is of, and the Newton steps made."""
@@ -202,7 +204,7 @@ def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0)
     )
 
 
-def _first_state(options: Options, comm: MPI.Comm, progress: report.Progress) -> tuple[World, ImpulseMemory]:
+def first_state(options: Options, comm: MPI.Comm, progress: report.Progress) -> tuple[World, ImpulseMemory]:
     name, scene = scene_name(options.run.scene), options.scene
     if not options.run.restart:
         return _new_world(scene, comm), ImpulseMemory(comm)

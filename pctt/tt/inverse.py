@@ -6,8 +6,9 @@ cores the best core solves
 
     M y_j = f_j  for every column j of its mode,    M = P' S P  of order r m r',
 
-with the same symmetric positive definite M for all columns: one Cholesky factorisation. The condition of S is
-not squared, as it is where ||S X - B|| is minimised. (Alternating energy minimisation: Oseledets & Dolgov,
+with the same symmetric positive definite M for all columns: one Cholesky factorisation, or, where that costs
+more, conjugate gradients that never form M. The condition of S is not squared, as it is where ||S X - B|| is
+minimised. (Alternating energy minimisation: Oseledets & Dolgov,
 SIAM J. Sci. Comput. 34, 2012; Dolgov & Savostyanov, ibid. 36, 2014.)
 """
 
@@ -19,9 +20,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
+from pctt.tt.apply import Apply
 from pctt.tt.train import Array, Train, identity, random
 
 SMALL = 1e-3  # of the norm of a start: the random directions that fill up its ranks
+LARGEST = 12_000  # unknowns of a local system that is factorised: 1.2 GB
+LOCAL_TOL, LOCAL_ITS = 1e-2, 30  # of conjugate gradients on a local system
+EXPECTED_ITS = 10  # of them
+HIGH = 1000  # product of ranks of S and X from which a residual is estimated
+PROBES = 16  # random vectors for that
 
 
 @dataclass(frozen=True)
@@ -98,8 +105,14 @@ def symmetrise(X: Train, max_rank: int | None = None, eps: float = 1e-12) -> Tra
 
 
 def residual(S: Train, X: Train) -> float:
-    """||I - S X||_F / ||I||_F, in train arithmetic: of the cost of a product of both ranks."""
+    """||I - S X||_F / ||I||_F, in train arithmetic: of the cost of a product of both ranks. Where that is high, the
+    root mean square of ||v - S X v|| / ||v|| over random signs v."""
     size = S.shape[0]
+    if max(S.ranks) * max(X.ranks) > HIGH:
+        V = np.random.default_rng(0).choice([-1.0, 1.0], (PROBES, size))
+        apply_S, apply_X = Apply(S), Apply(X)
+        rest = [v - apply_S(apply_X(v)) for v in V]
+        return float(np.linalg.norm(rest) / (PROBES * size) ** 0.5)
     SX = S @ X
     square = 1 - 2 * SX.trace() / size + SX.inner(SX) / size
     if square > 1e4 * float(np.finfo(SX.dtype).eps):
@@ -158,6 +171,21 @@ class Environment:
         n = left.shape[0] * S.shape[1] * right.shape[0]
         M = T.transpose(0, 2, 4, 1, 3, 5).reshape(n, n)
         return 0.5 * (M + M.T)
+
+    def times(self, k: int, x: Array) -> Array:
+        """(M + M') x / 2 for x (a, m, n, b), M = P' S P, without M."""
+        S, left, right = self.S[k], self.left[k], self.right[k]
+        one = _local_product(left, S, right, x)
+        other = _local_product(left.transpose(2, 1, 0), S.transpose(0, 2, 1, 3), right.transpose(2, 1, 0), x)
+        return 0.5 * (one + other)
+
+    def diagonal(self, k: int) -> Array:
+        """Diagonal of M, (a, m, 1, b)."""
+        left = np.diagonal(self.left[k], axis1=0, axis2=2)  # (R, a)
+        middle = np.diagonal(self.S[k], axis1=1, axis2=2)  # (R, R', m)
+        right = np.diagonal(self.right[k], axis1=0, axis2=2)  # (R', b)
+        T = np.tensordot(np.tensordot(left, middle, (0, 0)), right, (1, 0))  # (a, m, b)
+        return T[:, :, None, :]
 
     def right_side(self, k: int) -> Array:
         """P' B (a m b, n): a column for every index of the spectator."""
@@ -224,10 +252,14 @@ def _solve(
         nonlocal local, repaired
         a, m, n, b = environment.x[k].shape
         f = environment.right_side(k)
-        y, whole = _solve_positive(environment.projected(k), f)
+        if _large(a, m, n, b, *S.cores[k].shape[::3]):
+            f = f.reshape(a, m, b, n).transpose(0, 1, 3, 2)
+            y, whole = _conjugate_gradients(environment, k, f)
+        else:
+            y, whole = _solve_positive(environment.projected(k), f)
         repaired += not whole
         local = -0.5 * float(np.vdot(f, y)) / S.shape[0]
-        return y.reshape(a, m, b, n).transpose(0, 1, 3, 2)
+        return y if y.ndim == 4 else y.reshape(a, m, b, n).transpose(0, 1, 3, 2)
 
     for _ in range((2 if cold else 1) if sweeps is None else sweeps):
         environment.sweep(solve)
@@ -246,6 +278,47 @@ def _solve_positive(M: Array, f: Array) -> tuple[Array, bool]:
         w, V = linalg.eigh(M, check_finite=False)
         w = np.where(w > 1e-3 * w[-1], w, np.inf)
         return V @ ((V.T @ f) / w[:, None]), False
+
+
+def _large(a: int, m: int, n: int, b: int, R: int, R_next: int) -> bool:
+    """Whether a local system costs more operations to form, factorise and solve than to iterate on."""
+    size = a * m * b
+    forming = 2 * a * a * m * m * R_next * (R + b * b)
+    iteration = 4 * n * (a * m * b * (a * R + b * R_next) + a * b * m * m * R * R_next)
+    return size > LARGEST or EXPECTED_ITS * iteration < forming + size**3 / 3 + 2 * size * size * n
+
+
+def _conjugate_gradients(environment: Environment, k: int, f: Array) -> tuple[Array, bool]:
+    """Solution of M y = f (a, m, n, b) to LOCAL_TOL, all columns as one system, from the core that is there, scaled by
+    the diagonal; False, and y as far as it got, where M is not positive definite."""
+    weight = environment.diagonal(k)
+    if weight.min() <= 0:
+        weight = np.ones_like(weight)
+    y = environment.x[k].copy()
+    r = f - environment.times(k, y)
+    z = r / weight
+    p, rz = z, float(np.vdot(r, z))
+    goal = LOCAL_TOL * float(np.linalg.norm(f))
+    for _ in range(LOCAL_ITS):
+        if np.linalg.norm(r) <= goal:
+            break
+        q = environment.times(k, p)
+        curvature = float(np.vdot(p, q))
+        if curvature <= 0:
+            return y, False
+        y += rz / curvature * p
+        r -= rz / curvature * q
+        z = r / weight
+        rz, last = float(np.vdot(r, z)), rz
+        p = z + rz / last * p
+    return y, True
+
+
+def _local_product(left: Array, S: Array, right: Array, x: Array) -> Array:
+    """left (a, R, a'), S (R, i, j, R'), right (b, R', b') on x (a', j, n, b')."""
+    T = np.tensordot(left, x, 1)  # (a, R, j, n, b')
+    T = np.tensordot(T, S, ((1, 2), (0, 2)))  # (a, n, b', i, R')
+    return np.tensordot(T, right, ((2, 4), (2, 1))).transpose(0, 2, 1, 3)  # (a, i, n, b)
 
 
 def _fill(X: Train, max_rank: int, rng: np.random.Generator) -> Train:

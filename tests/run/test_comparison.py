@@ -97,3 +97,15 @@ def test_without_options_the_program_is_the_demo(program, tmp_path):
     assert "NOT CONVERGED" not in done.stdout
     assert "ilu (within each rank)" in done.stdout
     assert "results: " in done.stdout.splitlines()[-1]
+
+
+def test_fallbacks_of_a_train_reach_the_summary(program, settled, tmp_path):
+    summary, _ = compared(program, tmp_path, "-compare", "pbjacobi,tt", "-compare_tt_pc_tt_rank", "fixed")
+    assert "pc_report" not in summary["compare"]["pbjacobi"]
+    report = summary["compare"]["tt"]["pc_report"]
+    assert report[0].startswith("tensor train")
+    assert f"set-ups {summary['compare']['tt']['systems']} " in report[1]
+    assert all("pc_report" not in line for line in summary["steps"])
+    program(*SETTLED, "-steps", 1, "-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")
+    (step,) = json.loads((tmp_path / "results" / "summary.json").read_text())["steps"]
+    assert step["pc_report"][0].startswith("tensor train")

@@ -10,10 +10,12 @@ from program import SMALL
 
 from dem.scenes import Mixer
 from pctt import ccp
+from pctt.pc import PRECONDITIONERS
 from pctt.run.options import Run
 
 GROUPS = [(Run, ""), (Mixer, "scene_"), (ccp.Limits, "ccp_")]
 GROUPS += [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
+GROUPS += [(pc.options_class, pc.options_prefix) for pc in PRECONDITIONERS]
 
 
 @pytest.mark.parametrize(

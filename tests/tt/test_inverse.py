@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from matrices import laplacian, positive
 
 from pctt import tt
+from pctt.tt import inverse
 
 
 def exact(dense: np.ndarray, modes: tuple[int, ...]) -> tt.Train:
@@ -117,3 +118,27 @@ def test_inverse_root_is_positive_and_good(rank: int) -> None:
         if rank == 40:
             assert error < 1e-3
             assert np.linalg.norm(np.eye(len(M)) - dense @ M) < 1e-2 * len(M) ** 0.5
+
+
+def test_iterating_on_local_systems_is_as_good_as_factorising_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    S = exact(positive(np.random.default_rng(3), 64, 3).dense(), (4, 4, 12))
+    direct = tt.invert(S, 12, sweeps=4)
+    monkeypatch.setattr(inverse, "_large", lambda *sizes: True)
+    iterated = tt.invert(S, 12, sweeps=4)
+    assert iterated.repaired == 0
+    assert iterated.residual <= 1.05 * direct.residual
+    assert iterated.energy[-1] == pytest.approx(direct.energy[-1], rel=1e-3)
+
+
+def test_iterating_tells_of_a_matrix_that_is_not_positive(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inverse, "_large", lambda *sizes: True)
+    dense = positive(np.random.default_rng(3), 16, 1).dense() - 1.2 * np.eye(16)
+    assert tt.invert(exact(dense, (4, 4)), 8).repaired > 0
+
+
+def test_residual_of_high_ranks_is_estimated(monkeypatch: pytest.MonkeyPatch) -> None:
+    S = exact(positive(np.random.default_rng(4), 64, 3).dense(), (4, 4, 12))
+    X = tt.invert(S, 4).train
+    measured = tt.residual(S, X)
+    monkeypatch.setattr(inverse, "HIGH", 0)
+    assert tt.residual(S, X) == pytest.approx(measured, rel=0.1)

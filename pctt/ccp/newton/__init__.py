@@ -112,6 +112,11 @@ class Newton:
     def fallbacks(self) -> int:
         return sum(linear.fallbacks for linear in self._linear.values())
 
+    @property
+    def pc_report(self) -> list[str]:
+        """What the preconditioner tells of itself and its fallbacks so far, if it is one of the project's."""
+        return [line for linear in self._linear.values() for line in linear.report()]
+
     def update(self, barrier: Array, inverse: Array | None = None) -> None:
         """New barrier blocks B (nc, 3, 3); ``inverse`` is (B + C)^-1 where the caller knows it better."""
         with phase("CCPUpdate"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -87,8 +88,13 @@ class Comparison:
             krylov.destroy()
         self._krylov.clear()
 
-    def summary(self) -> dict[str, dict[str, float]]:
-        return {name: record.summary() for name, record in self.records.items()}
+    def summary(self) -> dict[str, dict[str, Any]]:
+        """Figures by name, and ``pc_report``, a list of lines, of the project's own preconditioners."""
+        figures: dict[str, dict[str, Any]] = {name: record.summary() for name, record in self.records.items()}
+        for name, krylov in self._krylov.items():
+            if lines := krylov.report():
+                figures[name]["pc_report"] = lines
+        return figures
 
     def labels(self) -> dict[str, str]:
         """What each name means on this number of ranks, where that is not plain from the name."""

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.pc.base import factor_within_ranks
+from pctt.pc.base import PythonPC, factor_within_ranks
 
 # right preconditioning makes the residual that the method sees the true one
 _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
@@ -126,6 +126,12 @@ class Krylov:
         definite = self.ksp.pc.getType() not in ("cholesky", "lu")
         self._scalar_matrix.setOption(PETSc.Mat.Option.SPD if definite else PETSc.Mat.Option.SYMMETRIC, True)
         return self._scalar_matrix
+
+    def report(self) -> list[str]:
+        """What a preconditioner of the project tells of itself and its fallbacks, as in ``-ksp_view``."""
+        pc = self.ksp.pc
+        context = pc.getPythonContext() if pc.getType() == PETSc.PC.Type.PYTHON else None
+        return context.report() if isinstance(context, PythonPC) else []
 
     def forget(self) -> None:
         """The next matrix has another structure; a python preconditioner keeps what may serve that one too."""

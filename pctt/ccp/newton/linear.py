@@ -56,6 +56,10 @@ class AskedFor:
         self.fallbacks += 1
         return self._climb_down(b, x, rtol, done)
 
+    def report(self) -> list[str]:
+        """What the asked-for preconditioner tells of itself, if it is one of the project's."""
+        return self._krylov[""].report() if "" in self._krylov else []
+
     def _climb_down(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float, done: Solve) -> bool:
         """Try the ladder; keep in x what has the smallest true residual, or zero if nothing is below 1."""
         A, P = self.system.matrix, self.system.preconditioned
@@ -186,6 +190,10 @@ class Cheapest:
         hardness = max(10.0, iterations * FEWER[rung])
         self._growth = min(max(hardness / self._hardness, 1.0), 2.0)
         self._hardness = hardness
+
+    def report(self) -> list[str]:
+        """Nothing: its rungs are PETSc's own."""
+        return []
 
     def begin(self) -> None:
         """Another problem: its first systems are easy ones."""

@@ -1,0 +1,277 @@
+"""Slots of block rows that come, stay, move and go."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from petsc4py import PETSc
+from scipy.spatial import cKDTree
+from test_tensor_train import context, operator, solve, solver
+
+from pctt.blocks import square_block_matrix
+from pctt.pc.slots import NEAR, Slots
+
+BOX = 16
+
+
+def cloud(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Random points in the unit cube and keys without order."""
+    rng = np.random.default_rng(seed)
+    return rng.random((count, 3)), rng.permutation(10 * count)[:count]
+
+
+def springs(points: np.ndarray, keys: np.ndarray | None, block: int = 1, shift: float = 0.5) -> PETSc.Mat:
+    """Laplacian of the graph of near points, in blocks; definite by ``shift``."""
+    reach = 1.6 * len(points) ** (-1 / 3)
+    i, j = cKDTree(points).query_pairs(reach, output_type="ndarray").T
+    n = len(points)
+    W = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
+    W = W + W.T
+    L = sp.diags(np.asarray(W.sum(axis=1)).ravel() + shift) - W
+    coupling = np.eye(block) + 0.1
+    mat = square_block_matrix(PETSc.COMM_SELF.tompi4py(), sp.kron(L, coupling).tobsr((block, block)))
+    mat.setAttr("coordinates", points)
+    if keys is not None:
+        mat.setAttr("key", keys)
+    return mat
+
+
+def yes(here: bool) -> bool:
+    return here
+
+
+def by_key(slots: Slots, keys: np.ndarray) -> dict[int, int]:
+    return dict(zip(keys.tolist(), slots.place.tolist()))
+
+
+def test_every_row_has_a_slot_of_its_own_and_the_spare_ones_are_spread():
+    points, keys = cloud(1000)
+    slots = Slots(springs(points, keys), BOX)
+    assert len(np.unique(slots.place)) == 1000
+    assert slots.capacity % BOX == 0
+    assert 1040 <= slots.capacity <= 1100
+    in_box = np.bincount(slots.place // BOX, minlength=slots.capacity // BOX)
+    assert in_box.min() >= BOX - 3
+    assert in_box.max() <= BOX
+
+
+def test_without_keys_there_are_no_spare_slots_and_nothing_is_followed():
+    points, _ = cloud(100)
+    slots = Slots(springs(points, None), BOX)
+    assert sorted(slots.place) == list(range(100))
+    assert slots.capacity == 100
+    assert not slots.follow(springs(points, None), yes)
+
+
+def test_rows_that_stay_keep_their_slots_whatever_comes_and_goes():
+    points, keys = cloud(1000)
+    slots = Slots(springs(points, keys), BOX)
+    before = by_key(slots, keys)
+    rng = np.random.default_rng(1)
+    stay = np.sort(rng.permutation(1000)[:970])
+    new_points, new_keys = rng.random((25, 3)), 10_000 + np.arange(25)
+    mixed = rng.permutation(995)  # rows come in another order
+    points = np.concatenate([points[stay], new_points])[mixed]
+    keys_then = np.concatenate([keys[stay], new_keys])[mixed]
+    assert slots.follow(springs(points, keys_then), yes)
+    after = by_key(slots, keys_then)
+    assert all(after[key] == before[key] for key in keys[stay].tolist())
+    assert len(set(after.values())) == 995
+    assert (slots.entered, slots.left, slots.moved) == (25, 30, 0)
+
+
+def test_new_rows_get_slots_near_their_neighbours():
+    points, keys = cloud(2000)
+    slots = Slots(springs(points, keys), BOX)
+    twins = np.arange(0, 2000, 100)  # new rows where these are
+    more = np.concatenate([points, points[twins]])
+    slots.follow(springs(more + 0.0, np.concatenate([keys, 50_000 + twins])), yes)
+    assert slots.entered == len(twins)
+    off = np.abs(slots.place[2000:] // BOX - slots.place[twins] // BOX)
+    assert off.max() <= NEAR + 1
+
+
+def test_rows_that_move_far_move_to_another_slot():
+    points, keys = cloud(1000)
+    slots = Slots(springs(points, keys), BOX)
+    before = slots.place.copy()
+    wanderers, hosts = np.array([3, 500]), np.array([700, 10])
+    moved = points + 1e-6
+    moved[wanderers] = points[hosts]
+    assert slots.follow(springs(moved, keys), yes)
+    others = np.setdiff1d(np.arange(1000), wanderers)
+    assert np.array_equal(slots.place[others], before[others])
+    assert slots.moved == 2
+    assert np.abs(slots.place[wanderers] // BOX - before[hosts] // BOX).max() <= NEAR + 1
+
+
+@pytest.mark.parametrize("what", ["too many", "too many in one place", "strangers", "another rank refuses"])
+def test_what_does_not_fit_changes_nothing(what):
+    points, keys = cloud(1000)
+    slots = Slots(springs(points, keys), BOX)
+    before = slots.place.copy()
+    more = {"too many": slots.capacity - 999, "too many in one place": slots.capacity - 1000}.get(what, 0)
+    crowd = np.full((more, 3), 0.01) + 1e-4 * np.arange(more)[:, None]
+    if what == "too many":
+        crowd = np.random.default_rng(2).random((more, 3))
+    points, names = np.concatenate([points, crowd]), np.concatenate([keys, 20_000 + np.arange(more)])
+    if what == "strangers":
+        names = 20_000 + names
+    agree = (lambda here: False) if what == "another rank refuses" else yes
+    assert not slots.follow(springs(points, names), agree)
+    assert np.array_equal(slots.place, before)
+    assert slots.follow(springs(*cloud(1000)), yes)  # and it still knows the rows that it had
+    assert np.array_equal(slots.place, before)
+
+
+def test_rows_of_the_same_name_never_share_a_slot():
+    points, keys = cloud(200)
+    slots = Slots(springs(points, keys), BOX)
+    keys[7] = keys[8]
+    assert not slots.follow(springs(points, keys), yes)
+
+
+def test_no_rows_at_all():
+    points, keys = np.empty((0, 3)), np.empty(0, np.int64)
+    empty = PETSc.Mat().createAIJ((0, 0), nnz=0, comm=PETSc.COMM_SELF)
+    empty.assemble()
+    empty.setAttr("coordinates", points)
+    empty.setAttr("key", keys)
+    slots = Slots(empty, BOX)
+    assert slots.capacity == 0
+    assert slots.follow(empty, yes)
+    assert not slots.follow(springs(*cloud(10)), yes)
+
+
+@pytest.mark.parametrize("scaling", ["block", "none"])
+@pytest.mark.parametrize("block", [1, 3])
+def test_empty_slots_leave_the_preconditioner_as_it_is(block, scaling):
+    """With full ranks the train is the inverse, whether there are empty slots or not."""
+    points, keys = cloud(40)
+    identity = np.eye(40 * block)
+    for names in (keys, None):
+        mat = springs(points, names, block)
+        ksp = solver(mat, rank="fixed", max_rank=400, eps=1e-12, leaf=4, scaling=scaling)
+        ksp.setUp()
+        pc = context(ksp)
+        assert pc.rank == 400, pc.account.fallbacks
+        assert (pc.slots.size > 40) == (names is not None)
+        A = mat.convert("dense", PETSc.Mat()).getDenseArray()
+        assert np.linalg.norm(operator(ksp) @ A - identity) < 0.05 * np.linalg.norm(identity)
+
+
+def contact_steps(count: int, share: float = 0.02) -> tuple[PETSc.Mat, PETSc.Mat]:
+    """The matrices of two steps: a share of the rows is replaced, the rest moves a little."""
+    points, keys = cloud(count)
+    rng = np.random.default_rng(5)
+    new = rng.permutation(count)[: int(share * count)]
+    later, names = points + 1e-4 * rng.standard_normal(points.shape), keys.copy()
+    later[new], names[new] = rng.random((len(new), 3)), 100_000 + new
+    return springs(points, keys), springs(later, names)
+
+
+def follow_up(ksp: PETSc.KSP, mat: PETSc.Mat) -> None:
+    ksp.reset()
+    ksp.setOperators(mat)
+    ksp.setUp()
+
+
+def test_the_next_structure_starts_from_the_last_train():
+    first, second = contact_steps(1500)
+    options = {"rank": "fixed", "max_rank": 8}
+    warm = solver(first, **options)
+    warm.setUp()
+    cold_passes = context(warm).compression.passes
+    follow_up(warm, second)
+    assert context(warm).account.reused == 1
+    assert context(warm).account.resets == 0
+    assert context(warm).compression.passes < cold_passes
+    cold = solver(second, **options)
+    cold.setUp()
+    assert context(warm).compression.error <= 1.02 * context(cold).compression.error
+    assert context(warm).inverse.residual <= 1.5 * context(cold).inverse.residual
+    warm_its, warm_residual = solve(warm)
+    cold_its, _ = solve(cold)
+    assert warm_residual < 1e-7
+    assert warm_its <= 1.2 * cold_its + 1
+
+
+@pytest.mark.parametrize(("reuse", "reused"), [("none", 0), ("newton", 0), ("steps", 1)])
+def test_reuse_goes_as_far_as_asked(reuse, reused):
+    first, second = contact_steps(600)
+    ksp = solver(first, rank="fixed", max_rank=4, reuse=reuse)
+    ksp.setUp()
+    follow_up(ksp, second)
+    assert context(ksp).account.reused == reused
+    _, residual = solve(ksp)
+    assert residual < 1e-7
+
+
+def test_an_overflow_makes_a_new_tree():
+    first, second = springs(*cloud(600)), springs(*cloud(800))
+    ksp = solver(first, rank="fixed", max_rank=4)
+    ksp.setUp()
+    follow_up(ksp, second)
+    assert context(ksp).account.resets == 1
+    assert context(ksp).account.reused == 0
+    assert context(ksp).slots.size >= 800
+    _, residual = solve(ksp)
+    assert residual < 1e-7
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [1, 3])
+def test_rows_that_change_ranks(mpirun, ranks):
+    """A grid of points, cut into slabs whose borders move; rows enter and leave every rank."""
+    printed = mpirun(
+        """
+import sys, petsc4py
+petsc4py.init(sys.argv)
+import numpy as np, scipy.sparse as sp
+from mpi4py import MPI
+from petsc4py import PETSc
+from pctt.blocks import square_block_matrix
+from test_tensor_train import context, solve, solver
+
+comm, n = MPI.COMM_WORLD, 24
+line = sp.diags([-1.0, 2.0, -1.0], [-1, 0, 1], shape=(n, n))
+A = (sp.kron(line, sp.identity(n)) + sp.kron(sp.identity(n), line)).tocsr()
+
+def matrix(keep, offset):
+    part = A[keep][:, keep]
+    border = [len(keep) * r // comm.size + offset * (0 < r < comm.size) for r in range(comm.size + 1)]
+    border = border if offset < len(keep) else [0] + [len(keep)] * comm.size
+    own = slice(border[comm.rank], border[comm.rank + 1])
+    mat = square_block_matrix(comm, part[own].tobsr((1, 1)))
+    mat.setAttr("coordinates", np.stack(np.divmod(keep[own], n), axis=1))
+    mat.setAttr("key", keep[own])
+    return mat
+
+everything = np.arange(n * n)
+ksp = solver(matrix(everything[: -8], 0), rank="fixed", max_rank=6)
+solve(ksp)
+for offset, keep in ((3, everything[4:-4]), (-3, everything[8:])):
+    ksp.reset()
+    ksp.setOperators(matrix(keep, offset))
+    ksp.setUp()
+    its, residual = solve(ksp)
+    pc = context(ksp)
+    assert pc.rank == 6, pc.account.fallbacks
+    assert residual < 1e-6
+    trains = comm.allgather([core.sum() for core in pc.inverse.train.cores])
+    assert all(np.array_equal(train, trains[0]) for train in trains)
+ksp.reset()
+ksp.setOperators(matrix(everything, n**3))  # all rows on the first rank
+ksp.setUp()
+_, residual = solve(ksp)
+assert pc.rank == 6, pc.account.fallbacks
+assert residual < 1e-6
+PETSc.Sys.Print("resets", pc.account.resets, "reused", pc.account.reused, "iterations", its)
+""",
+        ranks,
+    )
+    words = printed.split()
+    assert words[1] == ("0" if ranks == 1 else "1")  # for the last matrix: the first rank has no room for all
+    assert words[3] == ("3" if ranks == 1 else "2")
+    assert int(words[5]) < 70
