@@ -2,5 +2,6 @@
 
 from pctt.pc.body_schur import BodySchur
 from pctt.pc.tensor_train import TensorTrain
+from pctt.pc.two_level import TwoLevel
 
-__all__ = ["BodySchur", "TensorTrain"]
+__all__ = ["BodySchur", "TensorTrain", "TwoLevel"]
