@@ -55,6 +55,7 @@ class TwoLevel(PythonPC):
         self.coarse: PETSc.PC | None = None
         self._coarse_mat: PETSc.Mat | None = None
         self.boxes = self.width = 0
+        self._prefix = ""
         self._values: list = []  # PETSc objects that hold values of the matrix
         self._setup_s = 0.0
         self._indefinite = False  # the train was, in a solve
@@ -67,6 +68,9 @@ class TwoLevel(PythonPC):
         self._points = _everywhere(self.comm, _places(P))
         self._box = bisect(self._points, self.options.boxes)
         self.boxes = int(self._box.max()) + 1
+        centres = np.zeros((self.boxes, self._points.shape[1]))
+        np.add.at(centres, self._box, self._points)
+        self._centres = centres / np.bincount(self._box)[:, None]
         self._first = P.getOwnershipRange()[0] // self.block
         self._own = slice(self._first, self._first + P.getLocalSize()[0] // self.block)
         self._make_space(_modes(P, self.block))
@@ -114,30 +118,8 @@ class TwoLevel(PythonPC):
 
     def _invert(self, matrix: sp.bsr_matrix) -> None:
         """The inverse of the coarse matrix, on every rank alike."""
-        train = self._by_train
         if self.coarse is None:
-            centres = np.zeros((self.boxes, self._points.shape[1]))
-            np.add.at(centres, self._box, self._points)
-            self._centres = centres / np.bincount(self._box)[:, None]
-            self.coarse = PETSc.PC().create(PETSc.COMM_SELF)
-            prefix = f"{self._prefix}two_coarse_"
-            self.coarse.setOptionsPrefix(prefix)
-            if train:
-                wanted = {"pc_tt_rank": "fixed", "pc_tt_max_rank": str(self.options.rank)}
-                given = PETSc.Options().getAll()
-                wanted = {prefix + name: value for name, value in wanted.items() if prefix + name not in given}
-                for name, value in wanted.items():
-                    PETSc.Options()[name] = value
-                self.coarse.setType(PETSc.PC.Type.PYTHON)
-                self.coarse.setPythonType("pctt.pc.TensorTrain")
-                self.coarse.setFromOptions()
-                for name in wanted:
-                    PETSc.Options().delValue(name)
-            else:
-                self.coarse.setType(PETSc.PC.Type.CHOLESKY)
-                if PETSc.Sys.hasExternalPackage("mumps"):
-                    self.coarse.setFactorSolverType("mumps")
-                self.coarse.setFromOptions()
+            self.coarse = self._coarse_pc()
         if self._coarse_mat is not None:
             self._coarse_mat.destroy()
         self._coarse_mat = _mat(matrix)
@@ -147,11 +129,31 @@ class TwoLevel(PythonPC):
         self.coarse.setOperators(self._coarse_mat)
         self.coarse.setUp()
 
+    def _coarse_pc(self) -> PETSc.PC:
+        pc = PETSc.PC().create(PETSc.COMM_SELF)
+        prefix = f"{self._prefix}two_coarse_"
+        pc.setOptionsPrefix(prefix)
+        if not self._by_train:
+            pc.setType(PETSc.PC.Type.CHOLESKY)
+            if PETSc.Sys.hasExternalPackage("mumps"):
+                pc.setFactorSolverType("mumps")
+            pc.setFromOptions()
+            return pc
+        pc.setType(PETSc.PC.Type.PYTHON)
+        pc.setPythonType("pctt.pc.TensorTrain")
+        database = PETSc.Options()
+        wanted = {prefix + "pc_tt_rank": "fixed", prefix + "pc_tt_max_rank": str(self.options.rank)}
+        entered = [name for name in wanted if not database.hasName(name)]
+        for name in entered:
+            database[name] = wanted[name]
+        pc.setFromOptions()
+        for name in entered:
+            database.delValue(name)
+        return pc
+
     def setFromOptions(self, pc: PETSc.PC) -> None:
         super().setFromOptions(pc)
         self._prefix = pc.getOptionsPrefix() or ""
-
-    _prefix = ""
 
     # -- application ----------------------------------------------------------------------------------------
 

@@ -215,3 +215,23 @@ def test_system_with_gamg_and_two_levels_inside_body_schur():
         done = krylov.solve(S, b, x, 1e-6)
         assert done.converged, (name, done)
         krylov.destroy()
+
+
+class Negative:
+    """A PC of the wrong sign."""
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        x.copy(y)
+        y.scale(-1e3)
+
+
+def test_an_indefinite_train_is_replaced_by_factors():
+    mat = poisson(12)
+    ksp = solver(mat, boxes=16, coarse="tt")
+    ksp.pc.getPythonContext().coarse.setPythonContext(Negative())
+    x, b = mat.createVecs()
+    b.set(1.0)
+    ksp.solve(b, x)
+    assert ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC
+    assert iterations(ksp) > 0
+    assert "fell back" in " ".join(ksp.pc.getPythonContext().report())
