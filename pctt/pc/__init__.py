@@ -2,7 +2,8 @@
 
 from pctt.pc.body_schur import BodySchur
 from pctt.pc.tensor_train import TensorTrain
+from pctt.pc.two_level import TwoLevel
 
-PRECONDITIONERS = (TensorTrain, BodySchur)  # what -help describes
+PRECONDITIONERS = (TensorTrain, BodySchur, TwoLevel)  # what -help describes
 
-__all__ = ["PRECONDITIONERS", "BodySchur", "TensorTrain"]
+__all__ = ["PRECONDITIONERS", "BodySchur", "TensorTrain", "TwoLevel"]

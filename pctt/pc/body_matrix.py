@@ -120,6 +120,38 @@ class BodyMatrix:
         counts.destroy()
         return places
 
+    def set_rigid_modes(self, points: np.ndarray) -> None:
+        """Give ``mat`` the six rigid motions as near null space; points (nc, 3) of contact; collective.
+
+        A motion u(p) = t + w x p moves the contact point p of a body by F u in the contact frame F. Its mass-scaled
+        velocity z is the least squares solution of (block of G) z = F u over the contacts of the body, so that masses,
+        inertias and places need not be known. F are the first three columns of the block, with rows made unit vectors.
+        """
+        blocks = self._rows.data if self._rows is not None and len(points) else np.zeros((0, 3, 6))
+        contact = np.repeat(np.arange(len(points)), np.diff(self._rows.indptr)) if len(blocks) else np.zeros(0, int)
+        body = self.bodies[self._rows.indices] if len(blocks) else np.zeros(0, np.int64)
+        centre = self.comm.allreduce(points.sum(axis=0)) / max(self.comm.allreduce(len(points)), 1)
+        x, y, z = (points[contact] - centre).T
+        zero = np.zeros_like(x)
+        turn = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)  # w -> w x p
+        frame = blocks[:, :, :3] / np.linalg.norm(blocks[:, :, :3], axis=2, keepdims=True)
+        motion = frame @ np.concatenate([np.tile(np.eye(3), (len(x), 1, 1)), turn], axis=2)
+        both = blocks.transpose(0, 2, 1) @ np.concatenate([blocks, motion], axis=2)  # (n, 6, 12)
+        starts = offsets(self.comm, self.mat.getLocalSize()[0] // 6)
+        (own, both), _ = exchange(self.comm, [body, both], np.searchsorted(starts, body, side="right") - 1)
+        sums = np.zeros((self.mat.getLocalSize()[0] // 6, 6, 12))
+        np.add.at(sums, own - starts[self.comm.rank], both)
+        size = np.trace(sums[:, :, :6], axis1=1, axis2=2)
+        normal = sums[:, :, :6] + np.where(size > 0, 1e-10 * size, 1.0)[:, None, None] * np.eye(6)
+        modes = np.linalg.solve(normal, sums[:, :, 6:]).reshape(-1, 6)
+        values, vectors = np.linalg.eigh(self.comm.allreduce(modes.T @ modes))
+        kept = values > 1e-12 * values[-1]
+        modes = modes @ (vectors[:, kept] / np.sqrt(values[kept]))
+        columns = [self.mat.createVecRight() for _ in range(modes.shape[1])]
+        for vec, mode in zip(columns, modes.T):
+            vec.array_w[:] = mode
+        self.mat.setNearNullSpace(PETSc.NullSpace().create(constant=False, vectors=columns, comm=self.comm))
+
     def destroy(self) -> None:
         self.mat.destroy()
         if self._enlarged is not None:

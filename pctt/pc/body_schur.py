@@ -24,6 +24,9 @@ from pctt.options import NOT_NEGATIVE, option
 from pctt.pc.base import PythonPC, factor_within_ranks
 from pctt.pc.body_matrix import BodyMatrix
 
+_SCALAR_FORMAT = {"gamg", "hypre"}  # these have no code for block formats
+_COARSE_SPACE = {"gamg", "python"}  # these use the rigid motions
+
 
 @dataclass(frozen=True)
 class Options:
@@ -47,6 +50,7 @@ class BodySchur(PythonPC):
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
         self.ksp: PETSc.KSP | None = None
+        self._scalar: PETSc.Mat | None = None
         self.solves = self.its = 0
         self._rtol = 1e-3
 
@@ -69,6 +73,8 @@ class BodySchur(PythonPC):
         self.ksp.setTolerances(max_it=10_000)
         self.ksp.pc.setType(PETSc.PC.Type.PBJACOBI)
         self.ksp.setFromOptions()
+        if points is not None and self.ksp.pc.getType() in _COARSE_SPACE:
+            self.K.set_rigid_modes(points)
         self._G = block_matrix(P.comm, G)
         self._contact = self._G.createVecLeft()
         # an inner residual enters that of S through G; twice, as the power method stays below
@@ -82,8 +88,22 @@ class BodySchur(PythonPC):
         self.K.update(self.inverse_barrier)
         assert self.ksp is not None
         shift = self.options.shift
-        self.ksp.setOperators(self.K.mat, self.K.enlarged(shift) if shift else self.K.mat)
+        P = self.K.enlarged(shift) if shift else self.K.mat
+        if self.ksp.pc.getType() in _SCALAR_FORMAT:
+            P = self._in_scalar_format(P)
+        self.ksp.setOperators(self.K.mat, P)
         self.ksp.setUp()
+
+    def _in_scalar_format(self, P: PETSc.Mat) -> PETSc.Mat:
+        if self._scalar is None:
+            self._scalar = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
+            self._scalar.setBlockSize(6)
+            near = self.K.mat.getNearNullSpace()
+            if near.handle:
+                self._scalar.setNearNullSpace(near)
+        else:
+            P.convert(PETSc.Mat.Type.AIJ, self._scalar)
+        return self._scalar
 
     def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         self._rtol = self.options.rtol or 0.5 * ksp.getTolerances()[0]
@@ -111,6 +131,9 @@ class BodySchur(PythonPC):
             for thing in (self.ksp, self.K, self._G, self._y, self._rhs, self._contact):
                 thing.destroy()
             self.ksp = None
+        if self._scalar is not None:
+            self._scalar.destroy()
+            self._scalar = None
 
 
 def _largest_eigenvalue(G: PETSc.Mat, iterations: int = 15) -> float:

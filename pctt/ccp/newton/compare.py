@@ -13,6 +13,7 @@ from pctt.ccp.newton.krylov import Krylov, Solve
 from pctt.options import OptionError
 
 _BODY = {"ksp_type": "preonly", "pc_type": "python", "pc_python_type": "pctt.pc.BodySchur"}
+_TWO = {"body_pc_type": "python", "body_pc_python_type": "pctt.pc.TwoLevel", "pc_body_shift": "0"}
 
 # names beside PETSc's own PC types: options that make them
 NAMED: dict[str, dict[str, str]] = {
@@ -22,6 +23,9 @@ NAMED: dict[str, dict[str, str]] = {
     "tt": {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain"},
     "body-pbjacobi": _BODY,
     "body-ilu": {**_BODY, "body_pc_type": "ilu", "body_pc_factor_levels": "1"},
+    "body-tt": {**_BODY, **_TWO, "body_pc_two_coarse": "tt"},
+    "body-two-lu": {**_BODY, **_TWO, "body_pc_two_coarse": "lu"},
+    "body-gamg": {**_BODY, "body_pc_type": "gamg", "pc_body_shift": "0"},
     "body-cholesky": {**_BODY, "body_pc_type": "cholesky", "pc_body_shift": "0"},
 }
 

@@ -1,0 +1,237 @@
+"""Block Jacobi with a coarse space on boxes of block rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from mpi4py import MPI
+from petsc4py import PETSc
+from systems import contact_matrix, dense, poisson
+
+from pctt.blocks import BlockRows
+from pctt.ccp.newton.compare import NAMED
+from pctt.ccp.newton.krylov import Krylov
+from pctt.options import OptionError
+from pctt.pc.body_matrix import BodyMatrix
+from pctt.pc.two_level import bisect
+
+
+def solver(mat: PETSc.Mat, **options: object) -> PETSc.KSP:
+    """CG with TwoLevel; options without their prefix."""
+    for name, value in options.items():
+        PETSc.Options()["pc_two_" + name] = str(value)
+    ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOperators(mat)
+    ksp.setType("cg")
+    ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+    ksp.setTolerances(rtol=1e-6, max_it=2000)
+    ksp.pc.setType("python")
+    ksp.pc.setPythonType("pctt.pc.TwoLevel")
+    ksp.setFromOptions()
+    ksp.setUp()
+    return ksp
+
+
+def iterations(ksp: PETSc.KSP) -> int:
+    """Of a solve that reaches a true residual of 1e-6."""
+    mat = ksp.getOperators()[0]
+    x, b = mat.createVecs()
+    first = mat.getOwnershipRange()[0]
+    b.array[:] = np.sin(1.0 + 0.37 * (first + np.arange(b.getLocalSize())))
+    ksp.solve(b, x)
+    assert (b - mat * x).norm() <= 1.1e-6 * b.norm()
+    return ksp.getIterationNumber()
+
+
+def block_jacobi(mat: PETSc.Mat) -> PETSc.KSP:
+    ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOperators(mat)
+    ksp.setType("cg")
+    ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+    ksp.setTolerances(rtol=1e-6, max_it=2000)
+    ksp.pc.setType("pbjacobi")
+    return ksp
+
+
+def matrix_of(ksp: PETSc.KSP) -> np.ndarray:
+    """The preconditioner as a dense array."""
+    x, y = ksp.getOperators()[0].createVecs()
+    columns = []
+    for unit in np.eye(x.getLocalSize()):
+        x.array[:] = unit
+        ksp.pc.apply(x, y)
+        columns.append(y.array.copy())
+    return np.stack(columns, axis=1)
+
+
+def chain(count: int, comm: MPI.Comm = MPI.COMM_SELF, stiffness: float = 100.0) -> tuple[BodyMatrix, np.ndarray]:
+    """K of unequal bodies in a square lattice's rows, each glued to its neighbours, and the points of contact."""
+    line = np.arange(count * 4)
+    place = np.stack([line % count, line // count, np.zeros_like(line)], axis=1).astype(float)
+    right = np.stack([line, line + 1], axis=1)[line % count < count - 1]
+    above = np.stack([line, line + count], axis=1)[line // count < 3]
+    pairs = np.concatenate([right, above])
+    point = place[pairs].mean(axis=1)
+    mass = 1.0 + 0.5 * np.sin(line)
+    blocks = np.zeros((len(pairs), 2, 3, 6))
+    for side, sign in enumerate((-1.0, 1.0)):
+        body = pairs[:, side]
+        arm = point - place[body]
+        blocks[:, side, :, :3] = sign * np.eye(3) / np.sqrt(mass[body])[:, None, None]
+        turn = np.cross(np.eye(3)[None], arm[:, None]).transpose(0, 2, 1)  # w -> w x arm
+        blocks[:, side, :, 3:] = sign * turn / np.sqrt(0.1 * mass[body])[:, None, None]
+    first, last = (len(pairs) * r // comm.size for r in (comm.rank, comm.rank + 1))
+    bodies = 4 * count * (comm.rank + 1) // comm.size - 4 * count * comm.rank // comm.size
+    G = BlockRows(
+        2 * np.arange(last - first + 1), pairs[first:last].ravel(), blocks[first:last].reshape(-1, 3, 6), bodies
+    )
+    K = BodyMatrix(comm, G)
+    K.update(stiffness * np.tile(np.eye(3), (last - first, 1, 1)))
+    K.mat.setAttr("coordinates", K.places(point[first:last]))
+    K.set_rigid_modes(point[first:last])
+    return K, point[first:last]
+
+
+def test_rigid_motions_break_no_contact():
+    K, _ = chain(10)
+    K.update(1e6 * np.tile(np.eye(3), (len(K._rows.indptr) - 1, 1, 1)))
+    modes = K.mat.getNearNullSpace().getVecs()
+    assert len(modes) == 6
+    for mode in modes:
+        assert mode.norm() == pytest.approx(1)
+        assert (K.mat * mode).norm() == pytest.approx(1, rel=1e-3)  # of K = I + 1e6 G'G the I alone
+
+
+def test_bisection_makes_boxes_of_equal_number():
+    points = np.random.default_rng(0).random((1000, 3)) * [4, 1, 1]
+    box = bisect(points, 20)
+    assert np.ptp(np.bincount(box)) <= 1
+    assert box.max() == 15
+    halves = points[box < 8, 0], points[box >= 8, 0]
+    assert halves[0].max() <= halves[1].min()
+    assert bisect(points[:3], 64).max() == 1
+
+
+@pytest.mark.parametrize("correction", ["additive", "balanced"])
+def test_is_the_formula(correction):
+    mat = poisson(8)
+    ksp = solver(mat, boxes=8, coarse="lu", correction=correction)
+    A = dense(mat)
+    box = bisect(np.asarray(mat.getAttr("coordinates"), float), 8)
+    Z = (box[:, None] == np.arange(8)).astype(float)
+    Q = Z @ np.linalg.solve(Z.T @ A @ Z, Z.T)
+    D = np.diag(1 / np.diag(A))
+    one = np.eye(len(A))
+    expected = D + Q if correction == "additive" else Q + (one - Q @ A) @ D @ (one - A @ Q)
+    assert np.allclose(matrix_of(ksp), expected)
+
+
+@pytest.mark.parametrize("coarse", ["lu", "tt"])
+@pytest.mark.parametrize("correction", ["additive", "balanced"])
+def test_is_symmetric_and_positive(coarse, correction):
+    M = matrix_of(solver(chain(12)[0].mat, boxes=16, coarse=coarse, correction=correction, rank=4))
+    assert np.allclose(M, M.T, atol=1e-10 * abs(M).max())
+    assert np.linalg.eigvalsh(M).min() > 0
+
+
+@pytest.mark.parametrize(("coarse", "rank"), [("lu", 1), ("tt", 12)])
+def test_takes_fewer_iterations_than_block_jacobi(coarse, rank):
+    mat = chain(20)[0].mat
+    two = iterations(solver(mat, boxes=64, coarse=coarse, rank=rank, correction="balanced"))
+    assert two < 0.7 * iterations(block_jacobi(mat))
+
+
+def test_scalar_matrices_with_and_without_places():
+    for attribute in (True, False):
+        mat = poisson(24)
+        if not attribute:
+            mat.setAttr("coordinates", None)
+        assert iterations(solver(mat, boxes=64, coarse="lu")) < 0.8 * iterations(block_jacobi(mat))
+
+
+def test_follows_new_values():
+    K, point = chain(12)
+    ksp = solver(K.mat, boxes=16, coarse="lu", correction="balanced")
+    before = matrix_of(ksp)
+    K.update(7.0 * np.tile(np.eye(3), (len(point), 1, 1)))
+    ksp.setUp()
+    anew = solver(chain(12, stiffness=7.0)[0].mat, boxes=16, coarse="lu", correction="balanced")
+    assert np.allclose(matrix_of(ksp), matrix_of(anew))
+    assert not np.allclose(matrix_of(ksp), before)
+
+
+def test_rows_that_have_no_modes():
+    """A near null space that vanishes on a box leaves block Jacobi there."""
+    mat = poisson(8)
+    mode = mat.createVecRight()
+    mode.array[:32] = 1.0
+    mode.normalize()
+    mat.setNearNullSpace(PETSc.NullSpace().create(constant=False, vectors=[mode], comm=mat.comm))
+    M = matrix_of(solver(mat, boxes=4, coarse="lu"))
+    assert np.allclose(M[32:, 32:], np.eye(32) / 4)
+    assert not np.allclose(M[:32, :32], np.eye(32) / 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("boxes", "0"), ("coarse", "ilu"), ("rank", "-1"), ("correction", "none"), ("box", "3")]
+)
+def test_bad_options(name, value):
+    with pytest.raises((OptionError, PETSc.Error)) as error:
+        solver(poisson(4), **{name: value})
+    assert "pc_two_" + name in str(error.value) or isinstance(error.value, PETSc.Error)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_any_number_of_ranks(mpirun, ranks):
+    source = """
+import sys, petsc4py
+petsc4py.init(sys.argv)
+from petsc4py import PETSc
+from mpi4py import MPI
+from test_two_level import chain, iterations, solver
+for coarse in ("lu", "tt"):
+    K, _ = chain(12, MPI.COMM_WORLD, stiffness=1.0)
+    ksp = solver(K.mat, boxes=16, coarse=coarse, rank=6, correction="balanced")
+    PETSc.Sys.Print(iterations(ksp))
+    ksp.destroy()
+"""
+    here, alone = (np.array(mpirun(source, count).split(), int) for count in (ranks, 1))
+    assert abs(here - alone).max() <= 1
+
+
+def test_system_with_gamg_and_two_levels_inside_body_schur():
+    """The inner preconditioners that -compare knows as body-tt, body-two-lu and body-gamg."""
+    K, point = chain(12)
+    rows = K._rows
+    G = BlockRows(rows.indptr, K.bodies[rows.indices], rows.data, 48)
+    S = contact_matrix(G, np.tile(0.01 * np.eye(3), (len(point), 1, 1)))
+    S.setAttr("coordinates", point)
+    x, b = S.createVecs()
+    b.array[:] = sp.random(1, b.getLocalSize(), 1.0, random_state=0).toarray().ravel()
+    for name in ("body-tt", "body-two-lu", "body-gamg"):
+        krylov = Krylov(MPI.COMM_SELF, f"compare_{name}_", NAMED[name])
+        done = krylov.solve(S, b, x, 1e-6)
+        assert done.converged, (name, done)
+        krylov.destroy()
+
+
+class Negative:
+    """A PC of the wrong sign."""
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        x.copy(y)
+        y.scale(-1e3)
+
+
+def test_an_indefinite_train_is_replaced_by_factors():
+    mat = poisson(12)
+    ksp = solver(mat, boxes=16, coarse="tt")
+    ksp.pc.getPythonContext().coarse.setPythonContext(Negative())
+    x, b = mat.createVecs()
+    b.set(1.0)
+    ksp.solve(b, x)
+    assert ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC
+    assert iterations(ksp) > 0
+    assert "fell back" in " ".join(ksp.pc.getPythonContext().report())
