@@ -60,7 +60,7 @@ def delassus(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
             shape=(3 * len(names), 6 * len(bodies)),
         )
     if G.rows == 0:
-        return block_csr_matrix(comm, 0, 0, np.zeros(1), np.zeros(0), np.zeros(0))
+        return block_csr_matrix(comm, 0, 0, np.zeros(1), np.zeros(0), np.zeros((0, 3, 3)))
     near = left @ right.T
     shape = (3 * G.rows, 3 * (names[-1] + 1))
     rows = sp.bsr_matrix((near.data, names[near.indices], near.indptr), shape=shape)

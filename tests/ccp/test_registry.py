@@ -45,7 +45,7 @@ def test_the_default_limit_is_that_of_the_registry(name, monkeypatch):
     known, graph = heap(contacts=5, bodies=3)
     seen = []
 
-    def function(problem, guess, limits, options, **extra):
+    def function(problem, guess, limits, options, *newton):
         seen.append(limits.max_it)
         return ccp.Result(np.zeros_like(guess), False, "nothing done", 1.0, 0)
 

@@ -31,6 +31,8 @@ from pctt.log import phase
 from pctt.options import FRACTION, NOT_NEGATIVE, POSITIVE, option
 
 CENTERING = 0.02  # per deviation from the central path
+CLOSER = 0.01  # impulses as unknowns: what a linear solve leaves moves velocities, and they are compared with zero
+SHORT = 0.8  # a step after which the corrector is tried once more
 PATIENCE = 3  # iterations without progress before the Newton systems are sharpened
 
 
@@ -39,9 +41,8 @@ class Conic:
     """Options ``-ccp_conic_*``."""
 
     start: float = option(
-        30.0, "complementarity of a cold start, in units of mean(r^2) / mean diag N", check=POSITIVE
+        30.0, "complementarity of the start, in units of mean(r^2) / mean diag N", check=POSITIVE
     )
-    warm: float = option(0.3, "the same of a start from the last impulses", check=POSITIVE)
     forcing: float = option(
         0.2, "residual of a linear solve, as a part of the root of the complementarity", check=POSITIVE
     )
@@ -75,7 +76,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
             patience = 0
         W = NesterovTodd.of(s, z)
         newton.update(*_barrier_blocks(problem, W, scale, frictionless, options.proximal))
-        tol = options.forcing * np.sqrt(gap)
+        tol = options.forcing * np.sqrt(gap) * (1.0 if newton.primary == "momenta" else CLOSER)
 
         def direction(c: Array, start: Array | None) -> tuple[Array, Array, Array, Array]:
             dg, x = newton.solve((c - r_z) * scale, tol, r_v, start)  # noqa: B023 - used within the iteration
@@ -95,10 +96,11 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
         with phase("ConicCorrector"):
             ds, dz, dv, x = direction(_centred(W, z, ds, dz, target), x)
             step = min(1.0, options.boundary * _step(problem, s, z, ds, dz))
-            again = direction(_centred(W, z, ds, dz, target), x)
-            longer = min(1.0, options.boundary * _step(problem, s, z, *again[:2]))
-            if longer > step:
-                step, (ds, dz, dv, x) = longer, again
+            if step < SHORT:
+                again = direction(_centred(W, z, ds, dz, target), x)
+                longer = min(1.0, options.boundary * _step(problem, s, z, *again[:2]))
+                if longer > step:
+                    step, (ds, dz, dv, x) = longer, again
         if step > 0:
             s, z, v = s + step * ds, z + step * dz, v + step * dv
     converged = history[-1] <= limits.tol
@@ -141,8 +143,7 @@ def _start(
     diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2
     tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
     closing = problem.dot(problem.r, problem.r) / problem.size
-    warm = problem.sum(int((guess[:, 0] > 0).sum())) > 0.5 * problem.size
-    amount = (options.warm if warm else options.start) * closing / problem.mean_diagonal
+    amount = options.start * closing / problem.mean_diagonal
     return lorentz.central_pair(s - tau[:, None] * z, tau, amount)
 
 

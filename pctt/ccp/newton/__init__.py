@@ -160,6 +160,8 @@ class Newton:
         """Drop what belongs to the last problem's structure."""
         for linear in self._linear.values():
             linear.forget()
+        if self.compare is not None:
+            self.compare.forget()
         if self.system is not None:
             for thing in (self.system, self._x, self._b):
                 thing.destroy()
@@ -170,6 +172,8 @@ class Newton:
         for linear in self._linear.values():
             linear.destroy()
         self._linear.clear()
+        if self.compare is not None:
+            self.compare.destroy()
 
 
 def _equal(one: tuple, other: tuple | None) -> bool:

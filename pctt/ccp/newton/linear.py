@@ -83,15 +83,11 @@ class AskedFor:
         """The next matrix has another structure."""
         for krylov in self._krylov.values():
             krylov.forget()
-        if self.compare is not None:
-            self.compare.forget()
 
     def destroy(self) -> None:
         for krylov in self._krylov.values():
             krylov.destroy()
         self._krylov.clear()
-        if self.compare is not None:
-            self.compare.destroy()
 
 
 # -- the body system's own ladder ------------------------------------------------------------------------------
