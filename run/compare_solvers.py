@@ -1,7 +1,7 @@
 """Every solver of the cone problem on settled mixer steps and on harder variants; see run/compare_solvers.
 
-A solver starts cold. Its seconds are those until it first looked at a natural residual below the tolerance, in a process
-of its own on one core; what has not got there after --seconds is printed as such, with where it stood.
+A solver starts cold. Its seconds are those until it first looked at a natural residual below the tolerance, in a
+process of its own on one core; what has not got there after --seconds is printed as such, with where it stood.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ VARIANTS = {
 
 def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
     """The cone problem of the first step after the settled state of a mixer."""
-    options = read_options({"scene": "mixer", "scene_n": str(n), "restart": "settled", "output": tempfile.gettempdir()}, COMM)
+    database = {"scene": "mixer", "scene_n": str(n), "restart": "settled", "output": tempfile.gettempdir()}
+    options = read_options(database, COMM)
     world, _ = checkpoint.load(settled_state(options, COMM, Progress(True)), "mixer", options.scene, COMM)
     grains = world.grains
     if variant == "loose":
@@ -168,7 +169,7 @@ def main() -> None:
     parser.add_argument("n", type=int, nargs="*", default=[4, 8, 16], help="sizes of the mixer")
     parser.add_argument("--seconds", type=float, default=60.0, help="limit of a run")
     parser.add_argument("--variants", default=",".join(VARIANTS), help="with commas between")
-    parser.add_argument("--compliance", default="0,1e-5", help="of the contacts; the second and later only for `settled`")
+    parser.add_argument("--compliance", default="0,1e-5", help="the later ones for `settled` only")
     parser.add_argument("--methods", default="", help="instead of all, with commas between")
     parser.add_argument("--peers-up-to", type=int, default=8, help="largest n that peers get")
     words = parser.parse_args()
@@ -196,7 +197,8 @@ def main() -> None:
                 if method in PEERS and n > words.peers_up_to:
                     continue
                 rows = table[method] = (peer_rows if method in PEERS else own_rows)(path, method, words.seconds)
-                case = {"n": n, "variant": variant, "compliance": compliance, "contacts": problem.size, "method": method}
+                case = {"n": n, "variant": variant, "compliance": compliance, "contacts": problem.size}
+                case["method"] = method
                 record_rows += [case | row for row in rows]
                 show(method, rows)
         record("compare_solvers", about, record_rows)

@@ -3,8 +3,8 @@
 APGD's natural residual falls about like the square of its iterations: with k made, and a residual rho, it will need
 k sqrt(rho / tol) in all. The conic method takes about the same work for every problem of a size and accuracy. So:
 
-1. begin with APGD; from the 50th iteration on compare what it still needs with what the conic method would;
-2. where that is less, go over to it, from the guess of the beginning;
+1. begin with APGD; from the 100th iteration on compare what it still needs with what the conic method would;
+2. where that is half of it or less, go over to it, from the guess of the beginning;
 3. where it stalls, go back to APGD, from the better of the two points, to the end.
 
 The rules count iterations and look at no clock, so that a repeated run repeats its choices.
@@ -25,7 +25,7 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 from pctt.options import POSITIVE, option
 
-TRIAL = 50  # iterations of APGD before its residual says much
+TRIAL = 100  # iterations of APGD before its residual says much
 CONIC_IT = 60
 
 
@@ -34,7 +34,7 @@ class Auto:
     """Options ``-ccp_auto_*``."""
 
     bias: float = option(
-        1.0, "factor on the cost of the conic method: above 1 APGD is given more time", check=POSITIVE
+        2.0, "factor on the cost of the conic method: above 1, APGD is given more time", check=POSITIVE
     )
 
 
@@ -68,10 +68,10 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Auto, new
 
 def conic_cost(problem: ConeProblem, tol: float) -> float:
     """What the conic method costs, in iterations of APGD: measured on mixers of 2,600 and 18,000 contacts
-    (docs/ccp.md). Compliance halves it where it is the larger part of a system."""
+    (docs/ccp.md). With compliance it is a fraction of that."""
     size = max(1.0, np.sqrt(problem.size / 2600.0))  # small problems: a Newton step has its fixed costs
     accuracy = np.interp(np.log10(tol), [-8.0, -6.0, -4.0, -2.0], [3600.0, 1450.0, 1050.0, 600.0])
-    return float(size * accuracy * (0.4 if problem.softness >= 1e-6 else 1.0))
+    return float(size * accuracy * (0.25 if problem.softness >= 1e-6 else 1.0))
 
 
 def _named(result: Result, solver: str, reason: str) -> Result:

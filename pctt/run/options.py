@@ -105,8 +105,8 @@ class Run:
 class Options:
     """Everything that a run needs to know, with the scene's own values filled in.
 
-    ``coulomb`` is there with ``-ccp_coulomb``; ``scene`` is an instance of a class of ``dem.scenes.SCENES`` or of the user's; ``solver`` of the options class
-    of ``ccp_type``.
+    ``scene`` is an instance of a class of ``dem.scenes.SCENES`` or of the user's; ``solver`` of the options class
+    of ``ccp_type``; ``coulomb`` is there with ``-ccp_coulomb``.
     """
 
     run: Run
