@@ -160,7 +160,7 @@ def test_methods_agree_on_the_compliant_optimum(compliance):
     known, graph = heap(bodies=8)
     rigid = from_graph(known, graph)
     problem = ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF), compliance=compliance)
-    tol = 1e-4 * compliance
+    tol = 1e-3 * compliance
     found = {name: ccp.solve(problem, type=name, limits=Limits(tol)) for name in ("conic", "pdip", "apgd")}
     for result in found.values():
         check(problem, result, tol)
@@ -168,5 +168,5 @@ def test_methods_agree_on_the_compliant_optimum(compliance):
         assert figures.rigid_residual == pytest.approx(ccp.measure(rigid, result.impulse).natural_residual, rel=1e-6)
         assert figures.natural_residual < figures.rigid_residual < 3 * compliance
         size = np.linalg.norm(found["conic"].impulse)
-        assert np.linalg.norm(result.impulse - found["conic"].impulse) <= 0.03 * size
+        assert np.linalg.norm(result.impulse - found["conic"].impulse) <= 0.1 * size
     assert ccp.measure(rigid, known.g).rigid_residual == ccp.measure(rigid, known.g).natural_residual
