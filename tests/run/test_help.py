@@ -12,7 +12,7 @@ from dem.scenes import Mixer
 from pctt import ccp
 from pctt.run.options import Run
 
-GROUPS = [(Run, ""), (Mixer, "scene_"), (ccp.Limits, "ccp_")]
+GROUPS = [(Run, ""), (Mixer, "scene_"), (ccp.Limits, "ccp_"), (ccp.Coulomb, "ccp_coulomb_")]
 GROUPS += [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
 
 
