@@ -14,13 +14,16 @@ import numpy as np
 from mpi4py import MPI
 
 from pctt.blocks import BlockRows
+from pctt.ccp import coulomb as coulombs_law
 from pctt.ccp.accuracy import Accuracy, measure
 from pctt.ccp.cone import Array
+from pctt.ccp.coulomb import Coulomb
 from pctt.ccp.newton import FORMS, Newton
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.registry import SOLVERS
+from pctt.ccp.registry import SOLVERS, Solver
 from pctt.ccp.result import Limits, Result
+from pctt.ccp.unbounded import why_unbounded
 from pctt.log import phase
 
 __all__ = [
@@ -30,6 +33,7 @@ __all__ = [
     "BlockRows",
     "Comparison",
     "ConeProblem",
+    "Coulomb",
     "Limits",
     "Newton",
     "Result",
@@ -46,37 +50,55 @@ def solve(
     limits: Limits | None = None,
     options: Any = None,
     newton: Newton | None = None,
+    coulomb: Coulomb | None = None,
 ) -> Result:
-    """Solve a cone problem by a method of SOLVERS.
+    """Solve a cone problem by a method of SOLVERS, or with ``coulomb`` one cone problem after another until Coulomb's
+    law holds.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an
     instance of the method's options class; ``newton``, for methods that solve Newton systems, keeps what serves one
-    problem after another.
+    problem after another. A problem without a solution is not converged, for a reason that begins with "unbounded".
     """
     solver = SOLVERS[type]
     limits = limits or Limits()
     if limits.max_it < 0:
         limits = dataclasses.replace(limits, max_it=solver.iterations)
     guess = np.zeros_like(problem.r) if guess is None else guess
+    own = newton_for(problem.comm, type) if solver.newton and newton is None else None
+
+    def convex(problem: ConeProblem, guess: Array, tol: float) -> Result:
+        to = dataclasses.replace(limits, tol=tol)
+        return _convex(problem, guess, solver, to, options or solver.options(), newton or own)
+
+    try:
+        if coulomb is None or problem.size == 0:
+            return convex(problem, guess, limits.tol)
+        return coulombs_law.solve(problem, guess, limits.tol, coulomb, convex)
+    finally:
+        if own is not None:
+            own.destroy()
+
+
+def _convex(
+    problem: ConeProblem, guess: Array, solver: Solver, limits: Limits, options: Any, newton: Newton | None
+) -> Result:
+    """Solve the cone problem as it is."""
     nothing = np.zeros_like(problem.r)
     if problem.size == 0:
         return Result(nothing, True, "no contacts", 0.0, 0)
     if problem.natural_residual(nothing, problem.r) == 0:
         return Result(nothing, True, "no contact closes", 0.0, 0)
-    arguments = (problem, guess, limits, options or solver.options())
+    arguments = (problem, guess, limits, options)
     with phase("CCPSolve"):
-        if not solver.newton:
-            return solver.function(*arguments)
-        own = newton or newton_for(problem.comm, type)
-        try:
-            return solver.function(*arguments, own)
-        finally:
-            if newton is None:
-                own.destroy()
+        result = solver.function(*arguments, newton) if solver.newton else solver.function(*arguments)
+        unbounded = why_unbounded(problem, result.impulse)
+        if unbounded:
+            result.converged, result.reason = False, unbounded
+        return result
 
 
 def newton_for(comm: MPI.Comm, type: str, form: str = "auto", compare: Comparison | None = None) -> Newton:
     """The Newton systems that a method of SOLVERS works with; ``form`` is auto or of FORMS."""
     if form == "auto":
-        form = "body" if type == "conic" and not (compare and compare.names) else "contact"
+        form = "body" if type in ("conic", "auto") and not (compare and compare.names) else "contact"
     return Newton(comm, form, compare if compare is not None and compare.names else None)

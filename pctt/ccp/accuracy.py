@@ -20,6 +20,8 @@ class Accuracy:
     """Figures of an impulse g with velocities y = N g + r (design: ``docs/ccp.md``).
 
     natural_residual : ||g - P(g - s y)|| / ||g||, s = 1 / mean(diag N)
+    rigid_residual : the same of the problem without its compliance
+    coulomb_residual : the same with y_n + mu |y_t| for y_n: zero where impulses obey Coulomb's law (``coulomb.py``)
     objective : 1/2 g'Ng + r'g (J)
     cone_violation : largest distance |g_t| - mu g_n outside the friction cone (N s)
     dual_violation : largest distance mu |y_t| - y_n outside the dual cone (m/s)
@@ -28,6 +30,8 @@ class Accuracy:
     """
 
     natural_residual: float
+    rigid_residual: float
+    coulomb_residual: float
     objective: float
     cone_violation: float
     dual_violation: float
@@ -39,14 +43,15 @@ class Accuracy:
 def measure(problem: ConeProblem, g: Array) -> Accuracy:
     """The figures of an impulse g (nc, 3), the same on every rank."""
     y = problem.product(g) + problem.r
-    moved = g - y / problem.mean_diagonal
-    gap = g - _nearest_in_cone(moved, problem.mu)
     norm = problem.norm(g)
-    tiny = float(np.finfo(float).tiny)
     tangential = np.hypot(g[:, 1], g[:, 2])
     sliding = np.hypot(y[:, 1], y[:, 2])
+    with_opening = y.copy()
+    with_opening[:, 0] += problem.mu * sliding
     return Accuracy(
-        natural_residual=problem.norm(gap) / max(norm, tiny),
+        natural_residual=_residual(problem, g, y),
+        rigid_residual=_residual(problem, g, y - problem.compliance * g),
+        coulomb_residual=_residual(problem, g, with_opening),
         objective=problem.dot(g, 0.5 * (y + problem.r)),
         cone_violation=max(0.0, problem.max((tangential - problem.mu * g[:, 0]).max(initial=0.0))),
         dual_violation=max(0.0, problem.max((problem.mu * sliding - y[:, 0]).max(initial=0.0))),
@@ -54,6 +59,12 @@ def measure(problem: ConeProblem, g: Array) -> Accuracy:
         impulse_norm=norm,
         velocity_norm=problem.norm(y),
     )
+
+
+def _residual(problem: ConeProblem, g: Array, y: Array) -> float:
+    """||g - P(g - s y)|| / ||g|| of velocities y (nc, 3)."""
+    distance = g - _nearest_in_cone(g - y / problem.mean_diagonal, problem.mu)
+    return problem.norm(distance) / max(problem.norm(g), float(np.finfo(float).tiny))
 
 
 def _nearest_in_cone(x: Array, mu: Array) -> Array:

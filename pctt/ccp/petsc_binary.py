@@ -1,4 +1,5 @@
-"""Cone problems in PETSc's binary format: the Mat N, then the Vecs r and mu.
+"""Cone problems in PETSc's binary format: the Mat N of rigid contacts, then the Vecs r and mu, and where there is
+compliance a Vec of length 1 with it.
 
 >>> viewer = PETSc.Viewer().createBinary("step000012_18213contacts.petsc", "r")    # doctest: +SKIP
 >>> N = PETSc.Mat().load(viewer)                                                   # doctest: +SKIP
@@ -34,8 +35,12 @@ def is_one(path: str | Path) -> bool:
 
 def write(path: str | Path, problem: ConeProblem) -> None:
     """Write N, r, mu; collective. Raises OSError on all ranks if the file cannot be written."""
-    N = gather_matrix(problem.N)
+    rigid = problem.rigid_matrix()
+    N = gather_matrix(rigid)
+    rigid.destroy()
     vectors = [gather_rows(problem.comm, x).ravel() for x in (problem.r, problem.mu)]
+    if problem.softness:
+        vectors.append(np.array([problem.softness]))
 
     def write_it(temporary: Path) -> None:
         viewer = None
@@ -55,12 +60,13 @@ def write(path: str | Path, problem: ConeProblem) -> None:
     write_whole(path, problem.comm, write_it)
 
 
-def load(path: str | Path, comm: MPI.Comm) -> Stored:
-    """The cone problem of a file, its contacts in equal parts over the ranks; collective.
+def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> Stored:
+    """The cone problem of a file, its contacts in equal parts over the ranks; collective. ``compliance`` takes the
+    place of the file's.
 
     Raises FileFormatError on every rank where the file cannot be read as one.
     """
-    return spread(comm, path, "PETSc binary", lambda: _whole(path))
+    return spread(comm, path, "PETSc binary", lambda: _whole(path), compliance)
 
 
 def _whole(path: str | Path) -> Whole:
@@ -73,12 +79,22 @@ def _whole(path: str | Path) -> Whole:
         indptr, indices, values = N.getValuesCSR()
         W = sp.csr_matrix((values, indices, indptr), shape=N.getSize())
         r, mu = (_vector(viewer) for _ in range(2))
+        plain = _bytes(len(r), len(mu), len(values), len(indptr))
+        compliance = _vector(viewer) if Path(path).stat().st_size > plain else np.zeros(1)
     except PETSc.Error as error:
         raise FileFormatError(_reason(error)) from None
     finally:
         if viewer is not None:
             viewer.destroy()
-    return Whole("PETSc binary", "", symmetric_blocks(W), r, mu)
+    if len(compliance) != 1:
+        raise FileFormatError(f"a vector of length {len(compliance)} follows mu; allowed is its compliance, a number")
+    return Whole("PETSc binary", "", symmetric_blocks(W), r, mu, compliance=float(compliance[0]))
+
+
+def _bytes(r: int, mu: int, nonzeros: int, rows_and_one: int) -> int:
+    """Length of a file without compliance, for objects of these lengths."""
+    integers = 4 + rows_and_one - 1 + nonzeros + 2 * 2
+    return np.dtype(PETSc.IntType).itemsize * integers + 8 * (nonzeros + r + mu)
 
 
 def _vector(viewer: PETSc.Viewer) -> Array:

@@ -28,6 +28,7 @@ class ConeProblem:
     point : (nc, 3) contact points (m) or None; orders the unknowns of hierarchical preconditioners
     key : (nc,) persistent names of the contacts or None
     compliance : (nc, 3) the diagonal of C
+    softness : e, the same on all ranks; 0 for rigid contacts
     size : contacts on all ranks, Nc
     """
 
@@ -62,6 +63,7 @@ class ConeProblem:
             self._G = block_matrix(comm, G)
             self._momentum, self._out = self._G.createVecs()
             self._in = self._out.duplicate()
+        self.softness = float(compliance)
         along_normal = np.where(self.mu > 0, self.mu**2, 1.0)
         ones = np.ones_like(along_normal)
         self.compliance = np.stack([along_normal, ones, ones], axis=1)
@@ -97,24 +99,31 @@ class ConeProblem:
         return self._out.array.reshape(-1, 3).copy()
 
     def natural_residual(self, g: Array, y: Array) -> float:
-        """||g - P(g - y / mean diag N)|| / ||g||, velocities y = N g + r: the stop test of every solver."""
+        """||g - P(g - y / mean diag N)|| / ||g||, velocities y = N g + r: the stop test of every solver.
+
+        inf where that is no number: for g = 0 that does not solve the problem, and where g or y is nan or inf."""
         moved = project(g - y / self.mean_diagonal, self.mu)
         distance, norm = np.sqrt(self.sum(np.array([np.vdot(g - moved, g - moved), np.vdot(g, g)])))
         if distance == 0:
             return 0.0
-        return float(distance / norm) if norm > 0 else np.inf
+        residual = float(distance / norm) if norm > 0 else np.inf
+        return residual if residual == residual else np.inf
 
     @cached_property
     def N(self) -> PETSc.Mat:
         """N as a Mat of block size 3 (BAIJ), but for the low-rank term; built at its first use and kept."""
-        given = self.contact_map is None
-        N = self._given.duplicate(copy=True) if given else delassus(self.comm, self._split[0])
-        if self.compliance.any():
+        N = self.rigid_matrix()
+        if self.softness:
             diagonal = self._out.duplicate()
             diagonal.array[:] = self.compliance.ravel()
             N.setDiagonal(diagonal, PETSc.InsertMode.ADD_VALUES)
             diagonal.destroy()
         return N
+
+    def rigid_matrix(self) -> PETSc.Mat:
+        """A new Mat like ``N`` without the compliance."""
+        given = self.contact_map is None
+        return self._given.duplicate(copy=True) if given else delassus(self.comm, self._split[0])
 
     @cached_property
     def low_rank(self) -> PETSc.Mat | None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from pctt.ccp import auto
 from pctt.ccp.first_order import apgd, barzilai_borwein, gauss_seidel, gpminres, jacobi, kucera, spectral
 from pctt.ccp.interior import conic, pdip
 from pctt.ccp.result import Result
 from pctt.options import describe
 
 PRODUCT, MATRIX, NEWTON = "products with N", "rows of N", "Newton systems"
+EITHER = "products with N, or Newton systems"
 
 
 @dataclass(frozen=True)
@@ -18,7 +20,7 @@ class Solver:
     """A method: ``function(problem, guess, limits, options)``, with a ``pctt.ccp.Newton`` after them if it solves
     Newton systems.
 
-    ``needs`` is PRODUCT, MATRIX or NEWTON; ``iterations`` the default limit (``-ccp_max_it``).
+    ``needs`` is PRODUCT, MATRIX, NEWTON or EITHER; ``iterations`` the default limit (``-ccp_max_it``).
     """
 
     name: str
@@ -31,7 +33,7 @@ class Solver:
 
     @property
     def newton(self) -> bool:
-        return self.needs == NEWTON
+        return self.needs in (NEWTON, EITHER)
 
     @property
     def prefix(self) -> str:
@@ -47,6 +49,8 @@ SOLVERS = {
         Solver("conic", conic.solve, conic.Conic, NEWTON, 60,
                "symmetric cone interior point method, Nesterov-Todd scaling, Mehrotra's corrector",
                "Nesterov, Todd 1997; Acary et al. 2023"),
+        Solver("auto", auto.solve, auto.Auto, EITHER, 20_000,
+               "`apgd` as long as it is expected to be the faster, else `conic`", "`pctt/ccp/auto.py`"),
         Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
                "accelerated projected gradient descent with restart", "Mazhar et al. 2015"),
         Solver("barzilai_borwein", barzilai_borwein.solve, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,

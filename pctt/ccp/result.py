@@ -34,6 +34,10 @@ class Result:
     ksp_its : Krylov iterations in all Newton steps
     fallbacks : Newton systems that the asked-for KSP did not solve
     history : natural residual per iteration
+    cone_problems : how many were solved for it: more than one for Coulomb's law
+    solver : name of the method that found it, where that was chosen; "" otherwise
+
+    With Coulomb's law the residuals are those of that law, ``history`` has one per cone problem.
     """
 
     impulse: Array
@@ -44,3 +48,5 @@ class Result:
     ksp_its: int = 0
     fallbacks: int = 0
     history: list[float] = field(default_factory=list)
+    cone_problems: int = 1
+    solver: str = ""

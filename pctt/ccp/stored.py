@@ -31,6 +31,7 @@ class Whole:
     mu : (nc,) friction coefficients
     solution, guess : (3 nc,) impulses (N s) or None
     point : (nc, 3) contact points (m) or None
+    compliance : e of `ConeProblem`; the matrix is that of rigid contacts
     """
 
     form: str
@@ -41,6 +42,7 @@ class Whole:
     solution: Array | None = None
     guess: Array | None = None
     point: Array | None = None
+    compliance: float = 0.0
 
     def __post_init__(self) -> None:
         count = len(self.mu)
@@ -53,6 +55,8 @@ class Whole:
         finite = np.isfinite(self.matrix.data).all() and np.isfinite(self.r).all()
         if not (finite and (np.isfinite(self.mu) & (self.mu >= 0)).all()):
             raise FileFormatError("it has a NaN, an infinite value or a negative friction coefficient")
+        if not (np.isfinite(self.compliance) and self.compliance >= 0):
+            raise FileFormatError(f"its compliance {self.compliance} is not a number >= 0")
         for name in ("solution", "guess", "point"):
             array = getattr(self, name)
             if array is not None and not (np.size(array) == 3 * count and np.isfinite(array).all()):
@@ -79,8 +83,12 @@ def symmetric_blocks(W: sp.spmatrix) -> sp.bsr_matrix:
     return symmetric.tobsr((3, 3))
 
 
-def spread(comm: MPI.Comm, path: str | Path, format: str, read: Callable[[], Whole]) -> Stored:
+def spread(
+    comm: MPI.Comm, path: str | Path, format: str, read: Callable[[], Whole], compliance: float | None = None
+) -> Stored:
     """The problem that ``read`` finds on rank 0, contacts (and bodies) in equal parts over the ranks; collective.
+
+    ``compliance`` takes the place of the file's.
 
     Raises FileFormatError on every rank where ``read`` raises one, or what h5py, numpy and scipy raise for bad data.
     """
@@ -95,7 +103,7 @@ def spread(comm: MPI.Comm, path: str | Path, format: str, read: Callable[[], Who
     error = comm.bcast(error)
     if error:
         raise FileFormatError(error)
-    return comm.scatter(parts or []).stored(comm)
+    return comm.scatter(parts or []).stored(comm, compliance)
 
 
 @dataclass(frozen=True)
@@ -109,8 +117,9 @@ class _Part:
     rows: tuple[np.ndarray, np.ndarray, Array]  # indptr, indices, blocks
     columns: int  # block columns that the rank owns
     contacts: int  # on all ranks
+    compliance: float
 
-    def stored(self, comm: MPI.Comm) -> Stored:
+    def stored(self, comm: MPI.Comm, compliance: float | None) -> Stored:
         """The problem of all parts; collective."""
         indptr, indices, blocks = self.rows
         G = N = None
@@ -121,7 +130,8 @@ class _Part:
             N = square_block_matrix(comm, sp.bsr_matrix((blocks, indices, indptr), shape=shape))
         r, solution, guess, point = (self.triples[name] for name in ("r", "solution", "guess", "point"))
         assert r is not None
-        problem = ConeProblem(comm, r, self.mu, G=G, N=N, point=point)
+        e = self.compliance if compliance is None else compliance
+        problem = ConeProblem(comm, r, self.mu, G=G, N=N, point=point, compliance=e)
         return Stored(problem, self.form, self.title, solution, guess)
 
 
@@ -138,4 +148,5 @@ def _part(whole: Whole, rank: int, ranks: int) -> _Part:
         (A.indptr[mine.start : mine.stop + 1] - near.start, A.indices[near], A.data[near]),
         bodies * (rank + 1) // ranks - bodies * rank // ranks,
         contacts,
+        whole.compliance,
     )

@@ -112,6 +112,7 @@ class Dump:
             state(result.impulse) if result.converged else None,
             state(guess) if guess_known else None,
             system.point,
+            problem.softness,
         )
         for petsc_object in (M, H, v_free, f, moved):
             petsc_object.destroy()
@@ -125,7 +126,9 @@ class Dump:
             f"{problem.size} contacts of {options.scene!r}, from time {world.time:g} s over {options.dt:g} s. "
             f"{solver} with -ccp_tol {options.limits.tol:g}: {asked.reason}, {asked.iterations} iterations, "
             f"natural residual {asked.natural_residual:.3g}. {stored}",
-            "Solution and guess are those of the convex cone problem, min 1/2 r'Wr + q'r over the friction cones "
+            "Solution and guess are those of Coulomb's law (mu |u_t| is added to the normal velocity)."
+            if options.coulomb
+            else "Solution and guess are those of the convex cone problem, min 1/2 r'Wr + q'r over the friction cones "
             "(no mu |u_t| in the normal velocity). W is positive semidefinite; r need not be unique, u is.",
         )
 

@@ -84,8 +84,13 @@ class Run:
     ccp_newton: str = option(
         "auto", "unknowns of the Newton systems; auto: contact for pdip, body for conic", choices=("auto", *ccp.FORMS)
     )
-    ccp_compliance: float = option(
-        0.0, "compliance of the contacts, as a part of mean diag N; 0: rigid (docs/ccp.md)", check=NOT_NEGATIVE
+    ccp_compliance: Optional[float] = option(
+        None,
+        "compliance of the contacts, as a part of mean diag N; none: 0, rigid, or that of the file of -problem",
+        check=NOT_NEGATIVE,
+    )
+    ccp_coulomb: bool = option(
+        False, "Coulomb's law: no opening of sliding contacts, by several cone problems per step (docs/ccp.md)"
     )
     compare: str = option("", "preconditioners, with commas between, that each solve the same Newton systems")
     compare_every: int = option(1, "compare on every k-th Newton system", check=AT_LEAST_ONE)
@@ -102,7 +107,7 @@ class Options:
     """Everything that a run needs to know, with the scene's own values filled in.
 
     ``scene`` is an instance of a class of ``dem.scenes.SCENES`` or of the user's; ``solver`` of the options class
-    of ``ccp_type``.
+    of ``ccp_type``; ``coulomb`` is there with ``-ccp_coulomb``.
     """
 
     run: Run
@@ -111,6 +116,7 @@ class Options:
     delta: float
     limits: ccp.Limits
     solver: Any
+    coulomb: ccp.Coulomb | None
     demo: bool
 
     @property
@@ -151,6 +157,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         run.delta if run.delta is not None else scene.delta,
         read(ccp.Limits, database, "ccp_"),
         read(solver.options, database, prefix),
+        read(ccp.Coulomb, database, "ccp_coulomb_") if run.ccp_coulomb else None,
         demo,
     )
     ccp.Comparison(comm, options.compare_names())  # refuses unknown names
@@ -187,7 +194,8 @@ def scene_name(name: str) -> str:
 
 def _groups(scene: type[Experiment]) -> list[tuple[type, str]]:
     solvers = [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
-    return [(Run, ""), (scene, "scene_"), (ccp.Limits, "ccp_"), *solvers]
+    laws: list[tuple[type, str]] = [(ccp.Limits, "ccp_"), (ccp.Coulomb, "ccp_coulomb_")]
+    return [(Run, ""), (scene, "scene_"), *laws, *solvers]
 
 
 def help_text(database: Mapping[str, str]) -> str:
@@ -196,7 +204,7 @@ def help_text(database: Mapping[str, str]) -> str:
     scene_class = find_scene(scene)
     lines = ["Options of pctt.run (names <default unit>: meaning); without any, it runs the demo:"]
     lines += ["  " + " ".join(f"-{name} {value}" for name, value in DEMO.items()), ""]
-    titles = ["Run", f"Scene {scene}", "Cone problem"]
+    titles = ["Run", f"Scene {scene}", "Cone problem", "Coulomb's law, with -ccp_coulomb"]
     titles += [f"-ccp_type {name}: {solver.help}" for name, solver in ccp.SOLVERS.items()]
     for title, (group, prefix) in zip(titles, _groups(scene_class)):
         lines += [title, *(str(line) for line in describe(group, prefix)), ""]

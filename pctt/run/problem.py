@@ -20,7 +20,7 @@ from pctt.run.report import Progress, compare_table
 def solve_file(options: Options, comm: MPI.Comm) -> None:
     """Solve, print the figures, and write them to summary.json in the output folder."""
     assert options.problem is not None
-    stored = _load(options.problem, comm)
+    stored = _load(options.problem, comm, options.run.ccp_compliance)
     problem, guess = stored.problem, stored.guess if options.run.problem_guess else None
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
@@ -32,11 +32,13 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         options.limits,
         options.solver,
         newton,
+        options.coulomb,
     )
     seconds = time.perf_counter() - start
     newton.destroy()
     accuracy = ccp.measure(problem, result.impulse)
-    by_newton = ccp.SOLVERS[options.run.ccp_type].newton
+    used = result.solver or options.run.ccp_type
+    by_newton = ccp.SOLVERS[used].newton
     summary = {
         "problem": str(options.problem),
         "format": stored.form,
@@ -44,9 +46,14 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         "start": "cold" if guess is None else "the guess in the file",
         "contacts": problem.size,
         "ranks": comm.size,
-        "solver": options.run.ccp_type,
+        "solver": used,
+        "law": "Coulomb" if options.coulomb else "cone problem",
+        "compliance": problem.softness,
         "objective": accuracy.objective,
         "natural_residual": accuracy.natural_residual,
+        "rigid_residual": accuracy.rigid_residual,
+        "coulomb_residual": accuracy.coulomb_residual,
+        "cone_problems": result.cone_problems,
         "newton_its": result.iterations if by_newton else 0,
         "iterations": result.iterations,
         "ksp_its": result.ksp_its,
@@ -81,11 +88,12 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         write_text(Path(options.run.output) / "summary.json", json.dumps(summary, indent=1) + "\n")
 
 
-def _load(path: str, comm: MPI.Comm) -> fclib.Stored:
-    """The problem in a file of either format; FileError on all ranks if it is none."""
+def _load(path: str, comm: MPI.Comm, compliance: float | None) -> fclib.Stored:
+    """The problem in a file of either format, with another compliance if one is given; FileError on all ranks if it
+    is none."""
     binary = comm.bcast(petsc_binary.is_one(path) if comm.rank == 0 else None)
     try:
-        return (petsc_binary if binary else fclib).load(path, comm)
+        return (petsc_binary if binary else fclib).load(path, comm, compliance)
     except fclib.FileFormatError as error:
         raise FileError(str(error)) from None
 

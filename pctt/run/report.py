@@ -27,6 +27,8 @@ def step_line(line: Mapping[str, Any]) -> str:
     remark = "" if line["converged"] else f"  NOT CONVERGED: {line['reason']}"
     if line["fallbacks"]:
         remark += f"  ({line['fallbacks']} Newton systems by a fallback)"
+    if line["cone_problems"] > 1:
+        remark += f"  (Coulomb residual {line['coulomb_residual']:.1e} by {line['cone_problems']} cone problems)"
     if line["solver"] != line["asked_solver"]:
         remark += f"  (by {line['solver']})"
     if line.get("hard_problem"):
@@ -44,6 +46,9 @@ def accuracy_lines(line: Mapping[str, Any], history: Sequence[float]) -> str:
         f"       objective {line['objective']:.6g} J, outside the cone {line['cone_violation']:.1e} N s, outside the"
         f" dual cone {line['dual_violation']:.1e} m/s, complementarity {line['complementarity']:.1e} J"
     )
+    figures += f"\n       residual of Coulomb's law {line['coulomb_residual']:.1e}"
+    if line["rigid_residual"] != line["natural_residual"]:
+        figures += f", of rigid contacts {line['rigid_residual']:.1e}"
     if not history:
         return figures
     shown = sorted({round(k * (len(history) - 1) / 10) for k in range(11)})

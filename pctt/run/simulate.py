@@ -43,7 +43,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
     stepper = Stepper(options, world, memory, newton, dump)
-    method = f"{options.run.ccp_type} to {options.limits.tol:g}"
+    method = f"{options.run.ccp_type} to {options.limits.tol:g}{' with Coulomb law' if options.coulomb else ''}"
     progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
     progress.say(report.COLUMNS, level=1)
     lines = []
@@ -137,7 +137,7 @@ class Stepper:
                 raise SceneError(f"step {world.step + 1}: {error}") from None
         with log.phase("assembly"):
             self.system = ContactSystem(world, self.contacts, options.dt, options.run.recovery_speed)
-            problem = cone_problem(self.system, world.comm, options.run.ccp_compliance)
+            problem = cone_problem(self.system, world.comm, options.run.ccp_compliance or 0.0)
             guess, _ = self.memory.recall(self.system.key, self.system.frame)
         with log.phase("solve"):
             result, solver, newton_its = self.solve(problem, guess)
@@ -158,6 +158,7 @@ class Stepper:
             "newton_its": newton_its,
             "iterations": result.iterations,
             "ksp_its": result.ksp_its,
+            "cone_problems": result.cone_problems,
             **dataclasses.asdict(accuracy),
             "converged": result.converged,
             "reason": result.reason,
@@ -184,16 +185,17 @@ class Stepper:
         The result, the method that it is of, and the Newton steps made."""
         options = self.options
         asked = options.run.ccp_type
-        result = self._asked = ccp.solve(problem, guess, asked, options.limits, options.solver, self.newton)
-        newton_its = result.iterations if ccp.SOLVERS[asked].newton else 0
-        if result.converged or asked == "apgd":
-            return result, asked, newton_its
+        result = ccp.solve(problem, guess, asked, options.limits, options.solver, self.newton, options.coulomb)
+        self._asked, used = result, result.solver or asked
+        newton_its = result.iterations if ccp.SOLVERS[used].newton else 0
+        if result.converged or used == "apgd" or result.reason.startswith("unbounded"):
+            return result, used, newton_its
         limits = dataclasses.replace(options.limits, max_it=-1)
-        second = ccp.solve(problem, result.impulse, "apgd", limits)
+        second = ccp.solve(problem, result.impulse, "apgd", limits, coulomb=options.coulomb)
         if second.natural_residual < result.natural_residual:
             second.ksp_its, second.fallbacks = result.ksp_its, result.fallbacks
             return second, "apgd", newton_its
-        return result, asked, newton_its
+        return result, used, newton_its
 
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0) -> ccp.ConeProblem:
@@ -235,6 +237,7 @@ def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, a
         delta=options.run.settle_delta,
         limits=ccp.Limits(tol=options.run.settle_tol),
         solver=ccp.SOLVERS["apgd"].options(),
+        coulomb=None,
     )
     if not options.scene.settling_time:
         raise OptionError(f"-scene {options.run.scene}: has no settling_time and so no settled state")

@@ -547,3 +547,18 @@ def test_published_problems_are_written_and_read_again(tmp_path, name):
         assert np.allclose(dense(again), W, atol=1e-13 * np.abs(W).max())
         assert np.array_equal(again.r, stored.problem.r)
         assert np.array_equal(again.mu, stored.problem.mu)
+
+
+@pytest.mark.parametrize("format", [fclib, petsc_binary], ids=["FCLIB", "PETSc"])
+@pytest.mark.parametrize("compliance", [0.0, 0.03])
+def test_compliance_is_kept_beside_the_rigid_matrix(tmp_path, format, compliance):
+    known, graph = heap(0, 12, 8)
+    problem = ccp.ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF), compliance=compliance)
+    path = tmp_path / "problem"
+    (format.write_local if format is fclib else format.write)(path, problem)
+    for asked, expected in ((None, compliance), (0.0, 0.0), (0.5, 0.5)):
+        again = format.load(path, SELF, asked).problem
+        assert again.softness == expected
+        np.testing.assert_allclose(dense(again) - np.diag(again.compliance.ravel()), known.N, atol=1e-12)
+    again = format.load(path, SELF).problem
+    np.testing.assert_allclose(again.compliance, problem.compliance, rtol=1e-12)

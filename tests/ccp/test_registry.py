@@ -29,8 +29,8 @@ def test_an_entry_is_complete(name):
     assert solver.help
     assert solver.source
     assert solver.iterations > 0
-    assert solver.needs in (registry.PRODUCT, registry.MATRIX, registry.NEWTON)
-    assert solver.newton == (solver.needs == registry.NEWTON)
+    assert solver.needs in (registry.PRODUCT, registry.MATRIX, registry.NEWTON, registry.EITHER)
+    assert solver.newton == (solver.needs in (registry.NEWTON, registry.EITHER))
     assert read(solver.options, {}, solver.prefix) == solver.options()
     row = next(line for line in registry.table().splitlines() if line.startswith(f"| `{name}`"))
     for option in describe(solver.options, f"ccp_{name}_"):

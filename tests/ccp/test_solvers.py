@@ -12,6 +12,7 @@ from problems import SELF, Graph, Known, from_graph, from_matrix, heap, known_op
 from pctt import ccp
 from pctt.ccp import Limits
 from pctt.ccp.first_order import apgd
+from pctt.ccp.registry import NEWTON
 
 EVERY = pytest.mark.parametrize("solver", ccp.SOLVERS)
 FIRST_ORDER = pytest.mark.parametrize("solver", [n for n, s in ccp.SOLVERS.items() if not s.newton])
@@ -211,7 +212,7 @@ def test_other_units_need_the_same_steps(solver, a, b):
     plain = ccp.solve(from_matrix(known), type=solver, limits=Limits(tol))
     result = ccp.solve(from_matrix(scaled), type=solver, limits=Limits(tol))
     check(scaled, from_matrix(scaled), result, tol)
-    if ccp.SOLVERS[solver].newton:
+    if ccp.SOLVERS[solver].needs == NEWTON:
         assert result.iterations == plain.iterations
     else:  # rounding grows along the path of a nonmonotone method
         assert abs(result.iterations - plain.iterations) <= 10 + plain.iterations / 2
@@ -246,7 +247,7 @@ def test_giving_up_is_said_and_leaves_an_impulse_in_the_cones(solver, max_it):
     problem = from_graph(known, graph)
     result = ccp.solve(problem, type=solver, limits=Limits(1e-8, max_it))
     assert not result.converged
-    newton = ccp.SOLVERS[solver].newton
+    newton = ccp.SOLVERS[solver].needs == NEWTON
     assert str(max_it if newton else result.iterations) in result.reason
     assert max_it <= result.iterations <= max_it + 10 * (not newton)  # a line search repeats steps
     assert np.isfinite(result.impulse).all()
@@ -262,7 +263,7 @@ def test_more_steps_bring_it_nearer(solver):
     known, graph = heap()
     problem = from_graph(known, graph)
     errors = []
-    for max_it in (5, 15, 25) if ccp.SOLVERS[solver].newton else (10, 100, 1000):
+    for max_it in (5, 15, 25) if ccp.SOLVERS[solver].needs == NEWTON else (10, 100, 1000):
         impulse = ccp.solve(problem, type=solver, limits=Limits(1e-14, max_it)).impulse
         errors.append(np.linalg.norm(problem.product(impulse) + problem.r - known.y))
     assert errors[0] > 2 * errors[1] > 4 * errors[2]

@@ -59,6 +59,7 @@ def steps(
     delta: float = 0.01,
     recovery_speed: float = np.inf,
     iterations: int | None = None,
+    coulomb: ccp.Coulomb | None = None,
 ) -> Iterator[Step]:
     """Make steps one by one; each must be solved to `tol`, by default that of SOLVERS, or is left after a
     number of `iterations`."""
@@ -70,7 +71,7 @@ def steps(
         contacts = find_contacts(world, delta)
         system = ContactSystem(world, contacts, dt, recovery_speed)
         problem = cone_problem(system, world.comm)
-        result = ccp.solve(problem, None, solver, limits)
+        result = ccp.solve(problem, None, solver, limits, coulomb=coulomb)
         problem.destroy()
         reached = f"{result.reason}, residual {result.natural_residual:.1e}"
         assert result.converged or iterations, f"step {world.step + 1}: {reached}"

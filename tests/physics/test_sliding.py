@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from drive import HALF, SOLVERS, G, block, make_steps, on_incline, steps
 
+from pctt import ccp
+
 MU = 0.3
 
 
@@ -94,6 +96,19 @@ def test_a_block_thrown_flush_on_the_floor_is_thrown_up_by_the_plain_cone():
     make_steps(world, 1, dt)
     speed = (start - MU * G * dt) / (1 + MU**2)
     np.testing.assert_allclose(world.grains.velocity[0], [speed, 0, MU * speed, 0, 0, 0], atol=1e-8)
+
+
+@pytest.mark.parametrize("solver", [*SOLVERS, "conic"])
+def test_with_coulombs_law_a_block_slides_without_a_gap(solver):
+    """From rest, exactly v_k = a dt k; the plain cone opens a gap of dt mu v, of first order in dt (above)."""
+    slope, mu = 0.5, 0.3
+    acceleration = G * (np.sin(slope) - mu * np.cos(slope))
+    for dt in (0.02, 0.01):
+        world = block(on_incline(slope, mu))
+        for _ in steps(world, 10, dt, solver, tol=1e-8, coulomb=ccp.Coulomb()):
+            speed = acceleration * dt * world.step
+            np.testing.assert_allclose(world.grains.velocity[0], [speed, 0, 0, 0, 0, 0], atol=1e-6)
+            assert world.grains.position[0, 2] == pytest.approx(HALF[2], abs=1e-8)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)

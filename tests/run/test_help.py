@@ -13,7 +13,7 @@ from pctt import ccp
 from pctt.pc import PRECONDITIONERS
 from pctt.run.options import Run
 
-GROUPS = [(Run, ""), (Mixer, "scene_"), (ccp.Limits, "ccp_")]
+GROUPS = [(Run, ""), (Mixer, "scene_"), (ccp.Limits, "ccp_"), (ccp.Coulomb, "ccp_coulomb_")]
 GROUPS += [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
 GROUPS += [(pc.options_class, pc.options_prefix) for pc in PRECONDITIONERS]
 

@@ -53,10 +53,13 @@ def write_local(
 ) -> None:
     """Write N, r, mu of a problem as W, q, mu of a local problem; collective.
 
-    Raises OSError on all ranks if the file cannot be written.
+    W is that of rigid contacts; the compliance is kept outside the groups of FCLIB. Raises OSError on all ranks if
+    the file cannot be written.
     """
-    matrices, vectors = {"W": problem.N}, {"q": problem.r, "mu": problem.mu}
-    _write(path, problem.comm, "local", matrices, vectors, info, solution, guess, problem.point)
+    N = problem.rigid_matrix()
+    matrices, vectors = {"W": N}, {"q": problem.r, "mu": problem.mu}
+    _write(path, problem.comm, "local", matrices, vectors, info, solution, guess, problem.point, problem.softness)
+    N.destroy()
 
 
 def write_global(
@@ -70,15 +73,17 @@ def write_global(
     solution: Solution | None = None,
     guess: Solution | None = None,
     point: Array | None = None,
+    compliance: float = 0.0,
 ) -> None:
     """Write M v = H r + f, u = H'v + w with all rows distributed over the ranks; collective.
 
     M (n x n) masses and inertia tensors, H (n x 3nc) impulses to momenta, f (n,) momenta without contacts
     (N s), w (nc, 3) velocities of the contacts at v = 0 (m/s), mu (nc,); ``point`` (nc, 3) contact points
-    (m), kept outside the groups of FCLIB. Raises OSError on all ranks if the file cannot be written.
+    (m), and ``compliance``, that of a `ConeProblem`, are kept outside the groups of FCLIB. Raises OSError on all
+    ranks if the file cannot be written.
     """
     vectors = {"f": f, "w": w, "mu": mu}
-    _write(path, M.comm.tompi4py(), "global", {"M": M, "H": H}, vectors, info, solution, guess, point)
+    _write(path, M.comm.tompi4py(), "global", {"M": M, "H": H}, vectors, info, solution, guess, point, compliance)
 
 
 def _write(
@@ -91,6 +96,7 @@ def _write(
     solution: Solution | None,
     guess: Solution | None,
     point: Array | None,
+    compliance: float,
 ) -> None:
     """Gather, then write ``/fclib_local`` or ``/fclib_global``."""
     whole_matrices = {name: gather_matrix(A) for name, A in matrices.items()}
@@ -116,6 +122,8 @@ def _write(
                 file["guesses/number_of_guesses"] = _integers([1])
             if points is not None:
                 file["pctt/point"] = points
+            if compliance:
+                file["pctt/compliance"] = compliance
 
     write_whole(path, comm, write)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pctt.ccp.cone import Array
-from pctt.ccp.first_order.progress import FirstOrder, Progress
+from pctt.ccp.first_order.progress import FirstOrder, GiveUp, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
@@ -24,10 +24,12 @@ class APGD(FirstOrder):
     """Options ``-ccp_apgd_*``."""
 
 
-def solve(problem: ConeProblem, guess: Array, limits: Limits, options: APGD) -> Result:
+def solve(
+    problem: ConeProblem, guess: Array, limits: Limits, options: APGD, give_up: GiveUp | None = None
+) -> Result:
     """Impulses from a first guess (nc, 3)."""
     scaled = ScaledProblem(problem)
-    progress = Progress(scaled, limits, options)
+    progress = Progress(scaled, limits, options, give_up)
     x = scaled.start(guess)
     y = scaled.gradient(x)
     z, y_z = x, y  # the extrapolated point

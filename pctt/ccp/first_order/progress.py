@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.result import Limits, Result
 from pctt.options import AT_LEAST_ONE, option
 
+GiveUp = Callable[[int, float], str]  # from iterations and natural residual: why not to go on, or ""
 PATIENCE = 5000  # iterations that may go by without a new best natural residual, by one per cent
 
 
@@ -28,8 +30,8 @@ class Progress:
     steadily: what is handed back is the best point that was looked at.
     """
 
-    def __init__(self, problem: ScaledProblem, limits: Limits, options: FirstOrder):
-        self.problem, self.limits, self.check = problem, limits, options.check
+    def __init__(self, problem: ScaledProblem, limits: Limits, options: FirstOrder, give_up: GiveUp | None = None):
+        self.problem, self.limits, self.check, self.give_up = problem, limits, options.check, give_up
         self.iterations = 0
         self.history: list[float] = []
         self.reason = ""
@@ -78,4 +80,4 @@ class Progress:
             self._gain = (residual, self.iterations)
         if self.iterations - self._gain[1] >= PATIENCE:
             return f"no progress in the last {PATIENCE} of {self.iterations} iterations"
-        return ""
+        return self.give_up(self.iterations, residual) if self.give_up else ""

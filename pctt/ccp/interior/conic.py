@@ -26,6 +26,7 @@ from pctt.ccp.interior.lorentz import NesterovTodd
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
+from pctt.ccp.unbounded import why_unbounded
 from pctt.log import phase
 from pctt.options import FRACTION, NOT_NEGATIVE, POSITIVE, option
 
@@ -67,7 +68,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
         best = g if history[-1] <= min(history) else best
         progress = history[-1] <= 0.9 * min(history[:-1], default=np.inf) or gap <= 0.5 * last_gap
         patience, last_gap = (0 if progress else patience + 1), gap
-        if history[-1] <= limits.tol or iteration == max_it:
+        if history[-1] <= limits.tol or iteration == max_it or why_unbounded(problem, g):
             break
         if patience > PATIENCE:
             if not newton.sharpen():

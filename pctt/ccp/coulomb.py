@@ -1,0 +1,131 @@
+"""Coulomb's law, by a fixed-point iteration around the convex cone problem.
+
+The cone problem is a relaxation: a contact that slides with speed |y_t| gets the normal velocity mu |y_t|, it opens by
+dt mu |y_t| in a step. Coulomb's law has complementarity of g_n and y_n themselves, which the De Saxce velocity
+y + (mu |y_t|, 0, 0) states as a cone problem again, no longer convex. For a given opening s,
+
+    min 1/2 g'Ng + (r + s n)'g over the friction cones,    y = N g + r,
+
+is convex, and g obeys Coulomb's law where s = mu |y_t|. Source: De Saxce and Feng (1998); Acary, Cadoux, Lemarechal and
+Malick, "A formulation of the linear discrete Coulomb friction problem via convex optimization", ZAMM 91 (2011).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pctt.ccp.cone import Array
+from pctt.ccp.problem import ConeProblem
+from pctt.ccp.result import Result
+from pctt.options import AT_LEAST_ONE, COUNT, NOT_NEGATIVE, option
+
+INNER = 0.3  # accuracy of a cone problem, as a part of the Coulomb residual before it, or of the tolerance
+FIRST = 1e-2  # that of the first
+RESTART = 3.0  # growth of the residual at which what was learnt of the map is forgotten
+
+
+@dataclass(frozen=True)
+class Coulomb:
+    """Options ``-ccp_coulomb_*``."""
+
+    max_it: int = option(100, "cone problems before the iteration gives up", check=AT_LEAST_ONE)
+    tol: float = option(0.0, "Coulomb residual at which it ends; 0: that of -ccp_tol", check=NOT_NEGATIVE)
+    memory: int = option(5, "earlier openings from which Anderson's acceleration takes the next", check=COUNT)
+
+
+def residual(problem: ConeProblem, g: Array, y: Array) -> float:
+    """The natural residual of g (nc, 3) with the De Saxce velocity of y = N g + r."""
+    shifted = y.copy()
+    shifted[:, 0] += opening(problem, y)
+    return problem.natural_residual(g, shifted)
+
+
+def opening(problem: ConeProblem, y: Array) -> Array:
+    """mu |y_t| (nc,) of velocities y (nc, 3)."""
+    return problem.mu * np.hypot(y[:, 1], y[:, 2])
+
+
+def solve(
+    problem: ConeProblem,
+    guess: Array,
+    tol: float,
+    options: Coulomb,
+    convex: Callable[[ConeProblem, Array, float], Result],
+) -> Result:
+    """Impulses that obey Coulomb's law; ``convex(problem, guess, tol)`` solves a cone problem.
+
+    The result's residual and history are those of Coulomb's law, one value per cone problem; its iterations are those
+    of all cone problems. ``problem.r`` is another one while this works.
+    """
+    tol = options.tol or tol
+    # a lone contact that slides answers an opening s by -gain s: the step leads to its fixed point at once
+    N = problem.diagonal_blocks
+    gain = problem.mu**2 * 0.5 * (N[:, 1, 1] + N[:, 2, 2]) / np.where(N[:, 0, 0] > 0, N[:, 0, 0], np.inf)
+    relaxation = 1.0 / (1.0 + gain)
+    s = opening(problem, problem.product(guess) + problem.r) if problem.norm(guess) > 0 else np.zeros_like(problem.mu)
+    best: Result | None = None
+    history: list[float] = []
+    iterations = ksp_its = fallbacks = failed = 0
+    accuracy, g, r = max(FIRST, INNER * tol), guess, problem.r
+    anderson = Anderson(problem, relaxation, options.memory)
+    while len(history) < options.max_it:
+        problem.r = r + np.stack([s, 0 * s, 0 * s], axis=1)
+        try:
+            inner = convex(problem, g, accuracy)
+        finally:
+            problem.r = r
+        g = inner.impulse
+        iterations, ksp_its = iterations + inner.iterations, ksp_its + inner.ksp_its
+        fallbacks, failed = fallbacks + inner.fallbacks, 0 if inner.converged else failed + 1
+        y = problem.product(g) + r
+        history.append(residual(problem, g, y))
+        if best is None or history[-1] <= min(history):
+            best = inner
+        if history[-1] <= tol or failed > 1 or inner.reason.startswith("unbounded"):
+            break
+        if history[-1] > RESTART * min(history):
+            anderson.forget()
+        accuracy = min(accuracy, INNER * max(tol, history[-1]))
+        s = np.maximum(anderson.next(s, opening(problem, y) - s), 0.0)
+    assert best is not None
+    converged = min(history) <= tol
+    words = "Coulomb residual below the tolerance" if converged else f"{len(history)} cone problems for Coulomb's law"
+    if not converged and not inner.converged:
+        words = inner.reason if inner.reason.startswith("unbounded") else f"{words}, the last: {inner.reason}"
+    return Result(
+        best.impulse, converged, words, min(history), iterations, ksp_its, fallbacks, history, len(history), best.solver
+    )
+
+
+class Anderson:
+    """Anderson's acceleration of s = F(s), for distributed arrays (nc,); Walker and Ni (2011).
+
+    The residuals f = F(s) - s of the last ``memory`` points are taken for linear; ``relaxation`` (nc,) is the step
+    along what they leave.
+    """
+
+    def __init__(self, problem: ConeProblem, relaxation: Array, memory: int):
+        self.problem, self.relaxation, self.memory = problem, relaxation, memory
+        self.forget()
+
+    def forget(self) -> None:
+        self._last: tuple[Array, Array] | None = None
+        self._steps: list[tuple[Array, Array]] = []
+
+    def next(self, s: Array, f: Array) -> Array:
+        """The point after s, where F(s) - s is f."""
+        if self._last is not None:
+            self._steps = [*self._steps, (s - self._last[0], f - self._last[1])][-self.memory :] if self.memory else []
+        self._last = (s, f)
+        best = s + self.relaxation * f
+        if not self._steps:
+            return best
+        changes = np.stack([df for _, df in self._steps])
+        normal, right = self.problem.sum(changes @ changes.T), self.problem.sum(changes @ f)
+        weights = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
+        for weight, (ds, df) in zip(weights, self._steps):
+            best = best - weight * (ds + self.relaxation * df)
+        return best

@@ -1,0 +1,40 @@
+"""Cone problems without a solution: impulses that grow without limit while the objective falls.
+
+They come from bodies that are pushed into each other and cannot get out of it: a grain squeezed by closing walls, or a
+wedge that friction holds between them. The natural residual does not show it, it falls like 1 / ||g||.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pctt.ccp.cone import Array
+from pctt.ccp.problem import ConeProblem
+
+AMPLIFICATION = 1e3  # change of velocity per speed of the contacts that no step is believed to need
+ELSEWHERE = 1e-3  # how much speeds of contacts count that have no part in it
+ROUNDING = 1e-15  # of d'Nd, in units of mean diag N
+
+
+def why_unbounded(problem: ConeProblem, g: Array) -> str:
+    """In words, that the direction d = g / ||g|| of impulses g (nc, 3) in the cones shows the problem to be unbounded;
+    "" if it does not. One product with N.
+
+    A solution has velocities y = G v + r in the dual cones, so that d.y >= 0 and ||v|| >= -r.d / ||G'd||. The
+    right-hand side is infinite for an unbounded problem, where impulses grow along a d with G'd = 0 and r.d < 0; the
+    answer is yes where it is more than AMPLIFICATION times ||r|| / sqrt(mean diag N), the size that the data suggest,
+    where a contact counts in ||r|| by its share in d. Self-stress, G'd = 0 with r.d >= 0, is no sign of it, however
+    large; and nothing is unbounded with compliance, which d'Nd has.
+    """
+    r = problem.r.copy()
+    r[problem.mu == 0, 1:] = 0.0  # sliding that no impulse answers
+    sizes = np.linalg.norm(g, axis=1)
+    speeds = (r * r).sum(1)
+    weight = np.maximum(sizes / max(problem.max(sizes.max(initial=0.0)), 1e-300), ELSEWHERE**2)
+    parts = (np.vdot(r, g), weight @ speeds, np.vdot(problem.product(g), g), sizes @ sizes)
+    along, closing, bent, length = problem.sum(np.array(parts))
+    bent = max(bent / problem.mean_diagonal, ROUNDING * length)
+    if not -along > AMPLIFICATION * np.sqrt(closing * bent):
+        return ""
+    size = np.sqrt(length)
+    return f"unbounded: impulses grow without limit (norm {size:.1e} N s, {-along / size:.1e} J for each N s more)"

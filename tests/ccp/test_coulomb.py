@@ -1,0 +1,153 @@
+"""Coulomb's law by the fixed-point iteration: worked examples, published problems, ranks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problems import SELF, from_graph, heap, matrix
+
+from pctt import ccp
+from pctt.ccp import Coulomb, Limits, fclib
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "fclib"
+SOLVERS = pytest.mark.parametrize("solver", ["apgd", "conic", "pdip", "auto"])
+
+
+def solve(problem, solver="apgd", tol=1e-8, guess=None, **options):
+    return ccp.solve(problem, guess, solver, Limits(tol), coulomb=Coulomb(**options))
+
+
+@SOLVERS
+@pytest.mark.parametrize("mu", [0.2, 0.5, 1.5])
+def test_one_contact_worked_out_by_hand(solver, mu):
+    """A unit mass falls with speed 1 on a floor and slides with speed s. N = 1, r = (-1, s, 0): it stops if s <= mu,
+    else g = (1, -mu, 0) and it keeps s - mu, without leaving the floor."""
+    for s, expected in ((0.5 * mu, [1.0, -0.5 * mu, 0.0]), (3.0, [1.0, -mu, 0.0])):
+        problem = ccp.ConeProblem(SELF, np.array([[-1.0, s, 0.0]]), np.array([mu]), N=matrix(SELF, np.eye(3)))
+        result = solve(problem, solver)
+        assert result.converged, result.reason
+        assert result.impulse == pytest.approx(np.array([expected]), abs=1e-6)
+        y = problem.product(result.impulse) + problem.r
+        assert abs(y[0, 0]) < 1e-6
+        figures = ccp.measure(problem, result.impulse)
+        assert figures.coulomb_residual <= 1.01e-8
+        assert figures.coulomb_residual == pytest.approx(result.natural_residual, rel=1e-3, abs=1e-12)
+
+
+def sliding_heap(mu: float, seed: int = 0, comm=SELF):
+    known, graph = heap(seed, contacts=40, bodies=30, mu=mu)
+    return from_graph(known, graph, comm)
+
+
+@SOLVERS
+def test_contacts_obey_coulombs_law(solver):
+    """In its own words: no contact is open and pressed, none sticks outside and none slides inside its cone, and
+    friction is against the sliding."""
+    problem = sliding_heap(0.3)
+    result = solve(problem, solver, 1e-8 if solver == "apgd" else 1e-6)
+    assert result.converged, result.reason
+    assert len(result.history) == result.cone_problems > 2
+    g, y = result.impulse, problem.product(result.impulse) + problem.r
+    slack = 1e-4
+    sliding, used = np.hypot(*y.T[1:]), np.hypot(*g.T[1:])
+    assert (np.minimum(g[:, 0], y[:, 0]) >= -slack).all()
+    assert (np.minimum(g[:, 0], np.abs(y[:, 0])) <= slack).all()
+    slides = (sliding > 1e-2) & (g[:, 0] > 1e-2)
+    assert slides.sum() >= 5
+    assert used[slides] == pytest.approx(0.3 * g[slides, 0], abs=slack)
+    assert g[slides, 1:] == pytest.approx(-used[slides, None] * y[slides, 1:] / sliding[slides, None], abs=slack)
+    assert (sliding[used < 0.3 * g[:, 0] - 1e-2] < slack).all()
+    plain = ccp.measure(problem, ccp.solve(problem, type="apgd", limits=Limits(1e-8)).impulse)
+    assert plain.coulomb_residual > 1e-3  # what the relaxation costs
+    assert ccp.measure(problem, g).natural_residual > 1e-3
+
+
+def test_all_solvers_find_the_same():
+    problem = sliding_heap(0.3, seed=2)
+    found = [solve(problem, name, 1e-7).impulse for name in ("apgd", "conic")]
+    assert problem.product(found[0]) == pytest.approx(problem.product(found[1]), abs=1e-5)
+
+
+def test_acceleration_and_a_warm_start_save_cone_problems():
+    problem = sliding_heap(0.8)
+    plain, fast = (solve(problem, tol=1e-4, memory=memory) for memory in (0, 5))
+    assert fast.converged
+    assert fast.cone_problems < plain.cone_problems
+    again = solve(problem, tol=1e-4, guess=fast.impulse)
+    assert again.cone_problems <= 2
+
+
+def test_giving_up_is_said():
+    problem = sliding_heap(0.8)
+    r = problem.r.copy()
+    result = solve(problem, tol=1e-9, max_it=3)
+    assert not result.converged
+    assert (result.cone_problems, len(result.history)) == (3, 3)
+    assert "3 cone problems" in result.reason
+    assert np.array_equal(problem.r, r)  # put back
+    assert ccp.measure(problem, result.impulse).coulomb_residual == pytest.approx(min(result.history), rel=1e-3)
+
+
+def test_its_own_tolerance_goes_before():
+    result = solve(sliding_heap(0.3), tol=1e-9)
+    assert result.natural_residual <= 1e-9
+    loose = ccp.solve(sliding_heap(0.3), type="apgd", limits=Limits(1e-9), coulomb=Coulomb(tol=1e-3))
+    assert 1e-9 < loose.natural_residual <= 1e-3
+
+
+def test_without_friction_or_sliding_it_is_the_cone_problem():
+    problem = sliding_heap(0.0)
+    result = solve(problem, tol=1e-8)
+    figures = ccp.measure(problem, result.impulse)
+    assert figures.coulomb_residual == figures.natural_residual <= 1.01e-8
+    empty = ccp.ConeProblem(SELF, np.zeros((0, 3)), np.zeros(0), N=matrix(SELF, np.zeros((0, 0))))
+    assert solve(empty).reason == "no contacts"
+    opening = ccp.ConeProblem(SELF, np.array([[0.1, 5.0, 0.0]]), np.array([1.0]), N=matrix(SELF, np.eye(3)))
+    assert np.array_equal(solve(opening).impulse, np.zeros((1, 3)))  # the cone problem would hold it back
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="published problems are not here")
+@pytest.mark.parametrize(
+    ("name", "tol"),
+    [("Box_Stacks-i0122-82-5", 1e-8), ("LMGC_100_PR_PerioBox-i00361-60-03000", 1e-6), ("Spheres-i099-356-679", 1e-6)],
+)
+def test_published_problems(name, tol):
+    problem = fclib.read(SHARED / f"{name}.hdf5", SELF)
+    result = solve(problem, "apgd", tol)
+    assert result.converged, result.reason
+    figures = ccp.measure(problem, result.impulse)
+    assert figures.coulomb_residual <= 1.01 * tol
+    if name.startswith("Spheres"):  # Siconos 4.4, nonsmooth Gauss-Seidel to 1e-6
+        assert figures.velocity_norm == pytest.approx(2.63896, rel=1e-4)
+        assert figures.objective == pytest.approx(-207.9015, rel=1e-5)
+
+
+PROGRAM = """
+import json
+from mpi4py import MPI
+from pctt import ccp
+from pctt.ccp import Coulomb, Limits
+from test_coulomb import sliding_heap
+
+comm = MPI.COMM_WORLD
+problem = sliding_heap(0.3, comm=comm)
+found = []
+for name in ("apgd", "conic"):
+    result = ccp.solve(problem, None, name, Limits(1e-7), coulomb=Coulomb())
+    figures = ccp.measure(problem, result.impulse)
+    assert comm.allgather((figures, result.history)) == [(figures, result.history)] * comm.size
+    found.append([result.converged, figures.velocity_norm, figures.objective])
+if comm.rank == 0:
+    print(json.dumps(found))
+"""
+
+
+@pytest.mark.mpi
+def test_the_answer_does_not_depend_on_the_ranks(mpirun):
+    one, two = (np.array(json.loads(mpirun(PROGRAM, ranks))) for ranks in (1, 2))
+    assert one[:, 0].all()
+    np.testing.assert_allclose(one, two, rtol=1e-5)
+    np.testing.assert_allclose(one[0], one[1], rtol=1e-5)

@@ -1,0 +1,159 @@
+"""Cone problems without a solution are named so, and those with large impulses are not."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from problems import SELF, from_graph, from_matrix, heap, matrix
+
+from pctt import ccp
+from pctt.ccp import BlockRows, Limits
+from pctt.ccp.unbounded import why_unbounded
+
+SOLVERS = pytest.mark.parametrize("solver", ["conic", "pdip", "apgd", "auto"])
+
+
+def squeezed(closing, angle: float, mu: float, compliance: float = 0.0) -> ccp.ConeProblem:
+    """A sphere of mass 1 and radius 0.1 in a wedge of two walls, each turned by ``angle`` from facing the other. They
+    come nearer at ``closing`` (two speeds)."""
+    blocks = []
+    for side in (1.0, -1.0):
+        normal = np.array([side * np.cos(angle), np.sin(angle), 0.0])
+        frame = np.stack([normal, [-normal[1], normal[0], 0.0], [0.0, 0.0, 1.0]])
+        blocks.append(np.hstack([frame, np.cross(-0.1 * normal, frame) / (0.1 * np.sqrt(0.4))]))
+    G = BlockRows(np.arange(3), np.zeros(2, int), np.array(blocks), 1)
+    r = np.array([[-speed, 0.0, 0.0] for speed in closing])
+    return ccp.ConeProblem(SELF, r, np.full(2, mu), G=G, compliance=compliance)
+
+
+@SOLVERS
+@pytest.mark.parametrize(
+    ("closing", "angle", "mu"),
+    [
+        ((1.0, 1.0), 0.0, 0.5),
+        ((1.0, 1.0), 0.0, 0.0),
+        ((1.0, 1.0), 0.3, 0.5),  # friction holds it: the cones have opposite directions, mu > tan 0.3
+        ((1.0, 0.0), 0.3, 0.5),
+        ((1.0, -0.5), 0.0, 0.5),
+    ],
+    ids=["between parallel walls", "without friction", "in a wedge", "one wall moves", "one follows too slowly"],
+)
+def test_a_sphere_that_cannot_get_out_of_closing_walls(solver, closing, angle, mu):
+    for units in (1.0, 2.0**20):
+        problem = squeezed(np.multiply(closing, units), angle, mu)
+        result = ccp.solve(problem, type=solver, limits=Limits(1e-6))
+        assert not result.converged
+        assert result.reason.startswith("unbounded: ")
+
+
+@SOLVERS
+@pytest.mark.parametrize(
+    ("closing", "angle", "mu"),
+    [
+        ((1.0, 1.0), 0.3, 0.2),  # it slips out: mu < tan 0.3
+        ((1.0, 1.0), 0.3, 0.305),  # just so: tan 0.3 = 0.30934
+        ((1.0, -1.0), 0.0, 0.5),  # the walls move together, and any pressure between them is a solution
+        ((1.0, -2.0), 0.0, 0.5),
+    ],
+    ids=["it slips out", "it just slips out", "walls move together", "one wall flees"],
+)
+def test_a_sphere_that_can(solver, closing, angle, mu):
+    problem = squeezed(closing, angle, mu)
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-4))
+    assert result.converged, result.reason
+    assert "unbounded" not in result.reason
+    assert ccp.measure(problem, result.impulse).natural_residual <= 1.01e-4
+
+
+@SOLVERS
+def test_any_compliance_makes_it_bounded(solver):
+    problem = squeezed((1.0, 1.0), 0.0, 0.5, compliance=1e-3)
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-7))
+    assert result.converged, result.reason
+    # each of both yields with closing speed 1 = C_n g_n
+    assert result.impulse[:, 0] == pytest.approx(1.0 / problem.compliance[:, 0], rel=1e-3)
+
+
+def test_self_stress_of_any_size_is_no_sign_of_it():
+    problem = squeezed((1.0, -1.0), 0.0, 0.5)
+    for size in (1.0, 1e6, 1e12):
+        assert why_unbounded(problem, np.array([[size, 0, 0], [size - 0.1, 0, 0]])) == ""
+    known, graph = heap(bodies=4)  # 120 impulses on 24 velocities
+    for each in (from_graph(known, graph), from_matrix(known)):
+        assert why_unbounded(each, known.g) == ""
+        assert why_unbounded(each, np.zeros_like(known.g)) == ""
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_problems_with_a_solution_are_never_named(seed):
+    """Few bodies with many contacts, of a mass ratio of 1e4: much self-stress. Any impulses in the cones."""
+    known, graph = heap(seed, bodies=3 + seed, mass_ratio=1e4)
+    problem = from_graph(known, graph)
+    rng = np.random.default_rng(seed)
+    for size in (1e-3, 1.0, 1e3, 1e9):
+        g = ccp.cone.project(known.g + size * rng.normal(size=known.g.shape), known.mu)
+        assert why_unbounded(problem, g) == ""
+
+
+def test_a_problem_given_by_its_matrix_is_recognised_too():
+    """Two contacts with N = (1, -1; -1, 1) in their normals."""
+    N = np.kron(np.eye(2), np.diag([1.0, 1.0, 1.0]))
+    N[0, 3] = N[3, 0] = -1.0
+    problem = ccp.ConeProblem(SELF, np.array([[-1.0, 0, 0], [0.5, 0, 0]]), np.full(2, 0.5), N=matrix(SELF, N))
+    for solver in ("conic", "pdip", "apgd"):
+        result = ccp.solve(problem, type=solver, limits=Limits(1e-6))
+        assert (result.converged, result.reason.split(":")[0]) == (False, "unbounded")
+
+
+def test_coulombs_law_says_so_at_once():
+    result = ccp.solve(squeezed((1.0, 1.0), 0.0, 0.5), type="apgd", limits=Limits(1e-6), coulomb=ccp.Coulomb())
+    assert not result.converged
+    assert result.reason.startswith("unbounded: ")
+    assert result.cone_problems < 20
+
+
+PROGRAM = """
+import json
+import numpy as np
+from mpi4py import MPI
+from pctt import ccp
+from pctt.ccp import BlockRows, Limits
+from problems import from_graph, heap
+
+comm = MPI.COMM_WORLD
+known, graph = heap()
+problem = from_graph(known, graph, comm)
+# a sphere of its own between two walls, on the last rank
+G, last = problem.contact_map, comm.rank == comm.size - 1
+blocks = [np.hstack([side * np.eye(3), np.zeros((3, 3))]) for side in (1.0, -1.0)]
+r, mu, indptr, indices, data = problem.r, problem.mu, G.indptr, G.indices, G.blocks
+if last:
+    r, mu = np.concatenate([r, [[-1.0, 0, 0]] * 2]), np.concatenate([mu, [0.5, 0.5]])
+    indptr = np.concatenate([indptr, indptr[-1] + np.array([1, 2])])
+    indices, data = np.concatenate([indices, [graph.bodies] * 2]), np.concatenate([data, blocks])
+squeezed = ccp.ConeProblem(comm, r, mu, G=BlockRows(indptr, indices, data, G.columns + last))
+words = [ccp.solve(squeezed, type=name, limits=Limits(1e-6)).reason.split(":")[0] for name in ("conic", "apgd")]
+assert comm.allgather(words) == [words] * comm.size
+nothing = problem.natural_residual(np.full_like(problem.r, np.nan if comm.rank == 0 else 1.0), problem.r)
+if comm.rank == 0:
+    print(json.dumps([*words, nothing == np.inf]))
+"""
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_one_squeezed_sphere_among_many_contacts_on_several_ranks(mpirun, ranks):
+    assert json.loads(mpirun(PROGRAM, ranks)) == ["unbounded", "unbounded", True]
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_the_residual_of_impulses_that_are_no_numbers_is_infinite(wrong):
+    known, graph = heap()
+    problem = from_graph(known, graph)
+    g, y = known.g.copy(), known.y.copy()
+    g[3, 1] = wrong
+    with np.errstate(invalid="ignore"):
+        assert problem.natural_residual(g, y) == np.inf
+        assert problem.natural_residual(known.g, np.where(np.arange(40)[:, None] == 2, wrong, y)) == np.inf

@@ -1,0 +1,63 @@
+"""-ccp_coulomb, -ccp_compliance and -ccp_type auto in the program."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from program import SETTLED
+
+
+def steps(folder: Path) -> list[dict]:
+    return json.loads((folder / "results" / "summary.json").read_text())["steps"]
+
+
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+def test_steps_with_coulombs_law(ranks, program, settled, tmp_path):
+    options = ("-ccp_type", "apgd", "-ccp_tol", 1e-5, "-steps", 2, "-monitor", 2)
+    done = program(*SETTLED, *options, "-ccp_coulomb", ranks=ranks)
+    for line in steps(tmp_path):
+        assert line["converged"], line["reason"]
+        assert line["coulomb_residual"] <= 1.01e-5
+        assert line["cone_problems"] > 1
+        words = f"Coulomb residual {line['coulomb_residual']:.1e} by {line['cone_problems']} cone problems"
+        assert words in done.stdout
+    program(*SETTLED, *options, ranks=ranks)
+    assert all(line["natural_residual"] <= 1.01e-5 < line["coulomb_residual"] for line in steps(tmp_path))
+
+
+def test_compliance_is_reported_and_goes_with_the_problem(program, settled, tmp_path):
+    compliant = ("-ccp_compliance", 1e-3, "-ccp_tol", 1e-6)
+    done = program(*SETTLED, "-steps", 1, *compliant, "-monitor", 2, "-dump_problem", "problems")
+    (line,) = steps(tmp_path)
+    assert line["natural_residual"] <= 1.01e-6 < line["rigid_residual"] < 1e-2
+    assert f"of rigid contacts {line['rigid_residual']:.1e}" in done.stdout
+    for path in line["dumped"]:
+        for options, compliance in (((), 1e-3), (("-ccp_compliance", 0), 0.0)):
+            program("-problem", path, "-ccp_type", "apgd", "-ccp_tol", 1e-6, *options, "-output", "again")
+            again = json.loads((tmp_path / "again" / "summary.json").read_text())
+            assert again["compliance"] == compliance
+            assert (again["natural_residual"] == again["rigid_residual"]) == (compliance == 0)
+            same = again["objective"] == pytest.approx(line["objective"], rel=1e-5)
+            assert same == (compliance > 0)
+
+
+def test_auto_says_what_it_picked(program, settled, tmp_path):
+    done = program(*SETTLED, "-steps", 1, "-ccp_type", "auto", "-ccp_auto_bias", 100)
+    (line,) = steps(tmp_path)
+    assert line["converged"]
+    assert (line["solver"], line["asked_solver"]) == ("apgd", "auto")
+    assert "(by apgd)" in done.stdout
+    program(*SETTLED, "-steps", 1, "-ccp_type", "auto", "-ccp_auto_bias", 1e-6, "-ccp_tol", 1e-7)
+    (line,) = steps(tmp_path)
+    assert line["solver"] == "conic"
+    assert line["reason"].startswith("apgd at ")
+    assert line["newton_its"] > 0
+
+
+@pytest.mark.parametrize("option", ["-ccp_coulomb_max_it", "-ccp_coulomb_tol", "-ccp_auto_bias"])
+def test_values_that_are_not_allowed_are_refused(program, option):
+    done = program("-ccp_coulomb", "-ccp_type", "auto", option, -1, status=None)
+    assert done.returncode != 0
+    assert f"{option} -1" in done.stdout + done.stderr
