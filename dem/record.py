@@ -151,7 +151,8 @@ def contact_statistics(step: Step) -> dict[str, float]:
     count, weight = comm.allreduce(np.array([len(contacts), normal.sum()]))
     active = normal > ACTIVE * weight / max(count, 1.0)
     sliding = active & (tangential >= SLIDING * contacts.friction * normal)
-    ends = 1 + (contacts.near.bodies.shape[contacts.b] != COMPOUND)  # the first body of a contact is always a grain
+    shape = contacts.near.bodies.shape
+    ends = sum((shape[rows] != COMPOUND).astype(int) for rows in (contacts.a, contacts.b))  # grains of a contact
     sums = comm.allreduce(np.array([active.sum(), sliding.sum(), ends[active].sum()]))
     return {
         "contacts": count,

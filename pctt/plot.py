@@ -48,6 +48,7 @@ def main(comm: MPI.Comm) -> None:
         columns = folder.records()
         if columns:
             made.update(figures.records(columns))
+            made.update(figures.curves(columns, folder.analysis()))
         if folder.summary.get("compare"):
             made["compare"] = figures.compare(folder.summary["compare"])
         frame = _frame(folder, given.step)

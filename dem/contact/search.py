@@ -10,7 +10,7 @@ import numpy as np
 from dem.arrays import Floats, Ints
 from dem.checks import not_negative
 from dem.contact.broad import close_pairs
-from dem.contact.narrow import dot
+from dem.contact.narrow import Touch, dot
 from dem.contact.primitives import FEATURES, PLANE, Primitives, primitives, touches
 from dem.motion import Dynamic
 from dem.neighbourhood import Neighbourhood, neighbourhood
@@ -53,6 +53,8 @@ def find_contacts(world: World, delta: float) -> Contacts:
     i, j = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
 
     pair, feature, touch = touches(table, i, j, delta)
+    gives = _gives_way(world, near, table, i[pair], j[pair], touch.normal)
+    pair, feature, touch = pair[gives], feature[gives], Touch(*(values[gives] for values in touch))
     i, j = i[pair], j[pair]
     shapes = int(world.slabs[-1]) + len(table.number) - near.grains - near.ghosts
     key = (table.number[i] * shapes + table.number[j]) * FEATURES + feature
@@ -106,3 +108,19 @@ def _large_pairs(world: World, near: Neighbourhood, table: Primitives) -> Ints:
     i, j = np.triu_indices(len(body), 1)
     touch = (body[i] != body[j]) & (free[body[i]] | free[body[j]])
     return first + np.stack([i[touch], j[touch]], axis=1)
+
+
+def _gives_way(world: World, near: Neighbourhood, table: Primitives, i: Ints, j: Ints, normal: Floats) -> np.ndarray:
+    """Which contacts (nc,) a force can open: not those of a guided body with what holds it across its guide.
+
+    Their normal impulse would change no velocity, and any friction with it.
+    """
+    first = near.grains + near.ghosts
+    gives = np.ones(len(i), dtype=bool)
+    rows = np.flatnonzero((table.row[i] >= first) & (table.row[j] >= first))
+    if len(rows):
+        motions = [body.motion for body in world.large_bodies]
+        free = np.array([m.free_directions() if isinstance(m, Dynamic) else np.zeros((3, 3)) for m in motions])
+        both = free[table.row[i[rows]] - first] + free[table.row[j[rows]] - first]
+        gives[rows] = np.einsum("ci,cij,cj->c", normal[rows], both, normal[rows]) > 1e-8
+    return gives

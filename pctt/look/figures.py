@@ -31,10 +31,13 @@ UNITS = {"N": "forces", "N m": "torques", "J": "energy", "m": "lengths", "m/s": 
 
 
 def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
-    """Contacts, iterations, residual and seconds of each step; ``lines``: the steps of summary.json."""
+    """Contacts, iterations, residual, peak memory and seconds of each step; ``lines``: the steps of summary.json."""
     time = np.array([line["time"] for line in lines])
-    figure = Figure(figsize=(9, 6.4))
-    (contacts, its), (residual, seconds) = figure.subplots(2, 2, sharex=len(lines) > 1)
+    figure = Figure(figsize=(12.5, 6.4))
+    panels = figure.subplot_mosaic([["contacts", "its", "seconds"], ["residual", "memory", "seconds"]])
+    contacts, its, residual, memory, seconds = (
+        panels[name] for name in ("contacts", "its", "residual", "memory", "seconds")
+    )
     marker = "o" if len(lines) < 60 else None
     look = {"marker": marker, "markersize": 3, "linewidth": 1.2}
 
@@ -66,6 +69,10 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
         residual.legend()
     residual.set_ylabel("natural residual")
 
+    memory.plot(time, [line.get("peak_memory", np.nan) / 2**20 for line in lines], color="C0", **look)
+    memory.set_ylabel("peak memory of all ranks [MiB]")
+    memory.set_ylim(bottom=0)
+
     names = list(dict.fromkeys(name for line in lines for name in line["phases"]))
     table = np.array([[line["phases"].get(name, 0.0) for line in lines] for name in names])
     order = np.argsort(-table.sum(axis=1))
@@ -76,9 +83,41 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
     else:
         seconds.bar(labels, shown[:, 0])
     seconds.set_ylabel("seconds per step")
-    for axes in (residual, seconds):
+    for axes in (residual, memory, seconds) if len(time) > 1 else (residual, memory):
         axes.set_xlabel("time [s]")
     return figure
+
+
+def curves(records: Mapping[str, np.ndarray], analysis: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+    """What an experiment measures against how far its tool has gone: for a column ``TOOL_position [m]`` the columns of
+    forces, for ``..._displacement [m]`` those of stresses and the volume strain; raw, and filtered where the analysis
+    has it. The columns are those of records.csv and analysis.csv; no figure without them."""
+    made = {}
+    for way in [head for head in records if re.search(r"_(position|displacement) \[m\]$", head)]:
+        unit = "N" if "position" in way else "Pa"
+        heads = [head for head in records if head.endswith(f" [{unit}]") and not re.match("(force|torque)_", head)]
+        strain = analysis.get("volume_strain") if unit == "Pa" else None
+        if not heads:
+            continue
+        figure = Figure(figsize=(9, 4.8 if strain is None else 7.2))
+        axes, *below = figure.subplots(1 if strain is None else 2, 1, sharex=True, squeeze=False)[:, 0]
+        for k, head in enumerate(heads):
+            filtered = analysis.get(head.replace(" [", "_filtered [", 1))
+            name, raw = head.rpartition(" [")[0].replace("_", " "), records[head]
+            axes.plot(records[way], raw, color=f"C{k}", alpha=1 if filtered is None else 0.3, linewidth=0.9,
+                      label=name if filtered is None else f"{name}, raw")
+            if filtered is not None:
+                axes.plot(records[way], filtered, color=f"C{k}", linewidth=1.6, label=f"{name}, filtered")
+        low, high = np.nanpercentile([records[head] for head in heads], [0.5, 99.5])
+        axes.set_ylim(low - 0.08 * (high - low), high + 0.08 * (high - low) or 1.0)  # few peaks would flatten the rest
+        axes.set_ylabel(f"{UNITS[unit]} [{unit}]")
+        axes.legend(fontsize="small")
+        for panel in below:
+            panel.plot(records[way], strain, color="C0", linewidth=1.4)
+            panel.set_ylabel("volume strain")
+        figure.axes[-1].set_xlabel(way.replace("_", " "))
+        made[way.rpartition("_")[0] + ("_force" if unit == "N" else "_stress")] = figure
+    return made
 
 
 def records(columns: Mapping[str, np.ndarray]) -> dict[str, Figure]:

@@ -108,7 +108,16 @@ class Folder:
 
     def records(self) -> dict[str, np.ndarray]:
         """Columns of records.csv by their heads, such as ``force_blade_x [N]``; none if there is no such file."""
-        path = self.path / "records.csv"
+        return self._table("records.csv")
+
+    def analysis(self) -> dict[str, np.ndarray]:
+        """Columns of analysis.csv, as of `records`; none where the rows are not those of records.csv."""
+        found, records = self._table("analysis.csv"), self.records()
+        same = found and records and np.array_equal(found["time [s]"], records["time [s]"])
+        return found if same else {}
+
+    def _table(self, name: str) -> dict[str, np.ndarray]:
+        path = self.path / name
         if not path.exists():
             return {}
         with path.open(newline="") as file:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import resource
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -167,6 +169,7 @@ class Stepper:
             "asked_solver": options.run.ccp_type,
             **({"pc_report": pc_report} if pc_report else {}),
             **files,
+            "peak_memory": _peak_memory(world.comm),
             "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
         }
 
@@ -196,6 +199,12 @@ class Stepper:
             second.ksp_its, second.fallbacks = result.ksp_its, result.fallbacks
             return second, "apgd", newton_its
         return result, used, newton_its
+
+
+def _peak_memory(comm: MPI.Comm) -> int:
+    """The most memory that the ranks have had so far, their sum [bytes]; collective."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return int(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit))
 
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0) -> ccp.ConeProblem:

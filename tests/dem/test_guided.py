@@ -96,3 +96,19 @@ def test_bad_guided_bodies_are_refused(options, message):
 def test_a_guide_needs_a_direction():
     with pytest.raises(ValueError, match="direction of a guide is the zero vector"):
         Guided((0, 0, 0))
+
+
+def test_what_holds_a_guided_body_across_its_guide_makes_no_contact():
+    """A press between two walls that it fills exactly rubs on neither; it does touch a stop in its way."""
+    scene = Scene(0.4)
+    scene.add_spheres([[0, 0, 5.0]], 0.1, 1000.0)
+    scene.add_body("walls", [Box((0.1, 1, 1), (side * 0.6, 0, 0)) for side in (-1, 1)])
+    scene.add_body("stop", [Box((0.3, 0.3, 0.1), (0, 0, -0.15))])
+    scene.add_body("press", [Box((0.5, 0.5, 0.05))], Guided((0, 0, 1)), density=500.0)
+    contacts = find_contacts(World.from_scene(scene, SELF), 0.02)
+    assert len(contacts) > 0
+    assert set(map(tuple, contacts.body)) == {(2, 3)}  # the stop and the press
+    np.testing.assert_allclose(np.abs(contacts.normal), [[0, 0, 1]] * len(contacts), atol=1e-12)
+    step = ContactSystem(World.from_scene(scene, SELF), contacts, 0.01)
+    diagonal = np.einsum("cij,cij->ci", *[step.G.data] * 2)
+    assert diagonal[:, 0].min() > 0  # no normal impulse without effect

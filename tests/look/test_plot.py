@@ -17,7 +17,7 @@ from pctt.look import figures
 
 def test_all_figures_are_drawn(show, folder, tmp_path):
     done = show("plot", "-output", tmp_path)
-    names = {"steps", "compare", "sparsity", "graphs"}
+    names = {"steps", "compare", "sparsity", "graphs", "forces", "torques", "energy", "lengths", "figures"}
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}.png" for name in names}
     assert all(f"{name}.png" in done.stdout for name in names)
     for name in names:
@@ -35,6 +35,21 @@ def test_a_pdf_with_the_figures_of_records(show, tmp_path):
     found = {path.name for path in (made / "figures").iterdir()}
     assert found == {"forces.pdf", "energy.pdf", "figures.pdf", "sparsity.pdf", "graphs.pdf"}
     assert all((made / "figures" / name).read_bytes().startswith(b"%PDF") for name in found)
+
+
+def test_stresses_against_displacement_and_forces_against_position():
+    way = np.array([0.0, 1.0, 2.0])
+    rows = {"time [s]": way, "cart_displacement [m]": way, "shear_stress [Pa]": way**2, "force_x [N]": way}
+    made = figures.curves(rows, {"shear_stress_filtered [Pa]": way, "volume_strain": 0.1 * way})
+    assert set(made) == {"cart_stress"}
+    stress, strain = made["cart_stress"].axes
+    drawn = [line.get_xydata().T for line in stress.lines]
+    np.testing.assert_array_equal(drawn, [[way, way**2], [way, way]])
+    np.testing.assert_array_equal(strain.lines[0].get_ydata(), 0.1 * way)
+    made = figures.curves({"time [s]": way, "blade_position [m]": way, "draft_force [N]": way, "force_x [N]": way}, {})
+    (axes,) = made["blade_force"].axes
+    assert len(axes.lines) == 1
+    assert figures.curves({"time [s]": way, "worst_overlap [m]": way, "force_x [N]": way}, {}) == {}
 
 
 def test_nothing_to_plot_is_an_error(show, tmp_path):
