@@ -41,6 +41,8 @@ def run() -> int:
     except (OptionError, FileError, SceneError) as error:  # raised on all ranks alike
         if comm.rank == 0:
             print(f"pctt.run: {error}", file=sys.stderr, flush=True)
+        if comm.size > 1 and getattr(error, "alone", False):  # the others wait for this rank
+            comm.Abort(2)
         return 2
     except BaseException as error:
         if comm.size == 1 or isinstance(error, SystemExit):

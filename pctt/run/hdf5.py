@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +18,11 @@ from pctt.options import OptionError
 
 
 class FileError(RuntimeError):
-    """A file that cannot be read or written; raised on all ranks alike."""
+    """A file that cannot be read or written; raised on all ranks alike, or by the first rank `alone`."""
+
+    def __init__(self, text: str, alone: bool = False):
+        super().__init__(text)
+        self.alone = alone
 
 
 def refuse_serial(comm: MPI.Comm) -> None:
@@ -56,26 +62,44 @@ class RowWriter:
 def written(path: Path, comm: MPI.Comm) -> Iterator[RowWriter]:
     """A file for all ranks, under a temporary name until it is complete; collective.
 
-    Raises FileError on all ranks if it cannot be written; what stood under ``path`` is then untouched.
+    Raises FileError on all ranks if it cannot be written; what stood under ``path`` is then untouched. Where one of
+    several ranks fails in the middle (a full disk), all are ended, after a word of that rank.
     """
     temporary = path.with_name(f".{path.name}.tmp")
     parallel = {"driver": "mpio", "comm": comm} if comm.size > 1 else {}
-    failure = None
+    file, failure = None, None
     try:
-        with h5py.File(temporary, "w", **parallel) as file:
-            yield RowWriter(file, comm)
+        file = h5py.File(temporary, "w", **parallel)
+    except OSError as error:
+        failure = str(error)
+    _raise_together(path, temporary, failure, comm)
+    assert file is not None
+    try:
+        yield RowWriter(file, comm)
+        file.close()
         if comm.rank == 0:
             _flush_to_disk(temporary)
     except OSError as error:
         failure = str(error)
+        if comm.size > 1:  # the other ranks may be within a call that waits for this one
+            sys.stderr.write(f"pctt.run: {path}: cannot write ({failure})\n")
+            sys.stderr.flush()
+            comm.Abort(2)
+        with contextlib.suppress(OSError):
+            file.close()
+    _raise_together(path, temporary, failure, comm)
+    if comm.rank == 0:
+        os.replace(temporary, path)
+    comm.Barrier()
+
+
+def _raise_together(path: Path, temporary: Path, failure: str | None, comm: MPI.Comm) -> None:
+    """FileError on all ranks if one failed."""
     failures = [text for text in comm.allgather(failure) if text]
     if failures:
         if comm.rank == 0:
             temporary.unlink(missing_ok=True)
         raise FileError(f"{path}: cannot write ({failures[0]})")
-    if comm.rank == 0:
-        os.replace(temporary, path)
-    comm.Barrier()
 
 
 def write_text(path: Path, text: str) -> None:
@@ -86,7 +110,7 @@ def write_text(path: Path, text: str) -> None:
         _flush_to_disk(temporary)
         os.replace(temporary, path)
     except OSError as error:
-        raise FileError(f"{path}: cannot write ({error.strerror})") from error
+        raise FileError(f"{path}: cannot write ({error.strerror})", alone=True) from error
 
 
 def _flush_to_disk(path: Path) -> None:

@@ -29,7 +29,7 @@ from dem.exchange import exchange
 from dem.system import ContactSystem
 from dem.world import World
 from pctt.run.dump import HARD
-from pctt.run.hdf5 import RowWriter, write_text, written
+from pctt.run.hdf5 import FileError, RowWriter, write_text, written
 from pctt.run.records import Records
 
 
@@ -104,7 +104,15 @@ class Results:
 
     def _link_frames(self, world: World) -> None:
         temporary = self.folder / ".state.h5.tmp"
-        with h5py.File(temporary, "w") as file:
+        try:
+            self._write_links(temporary, world)
+            temporary.replace(self.folder / "state.h5")
+        except OSError as error:
+            temporary.unlink(missing_ok=True)
+            raise FileError(f"{self.folder / 'state.h5'}: cannot write ({error})", alone=True) from None
+
+    def _write_links(self, path: Path, world: World) -> None:
+        with h5py.File(path, "w") as file:
             file.attrs["scene"] = self.record
             file.attrs["large_bodies"] = [body.name for body in world.large_bodies]
             file.attrs["contents"] = (
@@ -117,7 +125,6 @@ class Results:
             file["bodies"] = h5py.ExternalLink("frames/bodies.h5", "/")
             for step in self._recorded:
                 file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
-        temporary.replace(self.folder / "state.h5")
 
     def write_summary(
         self,
