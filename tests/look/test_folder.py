@@ -91,8 +91,11 @@ def test_a_damaged_frame_is_named(tmp_path):
         read.frame(1)
 
 
-@pytest.mark.parametrize("program", ["plot", "render", "export"])
-def test_a_folder_without_the_bodies_is_refused(program, show, tmp_path):
+@pytest.mark.parametrize(
+    ("program", "library"), [("plot", "matplotlib"), ("render", "vtkmodules"), ("export", "vtkmodules")]
+)
+def test_a_folder_without_the_bodies_is_refused(program, library, show, tmp_path):
+    pytest.importorskip(library, reason=f"{library} is not installed (extra `pictures`)")
     made = handmade.write(tmp_path / "made", handmade.FLOOR)
     (made / "frames" / "bodies.h5").unlink()
     done = show(program, folder=made, status=2)
