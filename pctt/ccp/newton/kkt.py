@@ -19,6 +19,7 @@ from petsc4py import PETSc
 from pctt.blocks import square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
+from pctt.options import OptionError
 
 
 class KKTSystem:
@@ -26,7 +27,7 @@ class KKTSystem:
 
     def __init__(self, problem: ConeProblem):
         if problem.low_rank is not None:
-            raise NotImplementedError("-ccp_newton kkt: a body has too many contacts; allowed are contact and body")
+            raise OptionError("-ccp_newton kkt: a body has too many contacts; allowed are contact and body")
         self.problem = problem
         indptr, indices, values = problem.N.getValuesCSR()
         shape = (len(indptr) - 1, 3 * problem.size)
