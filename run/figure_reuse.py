@@ -53,7 +53,7 @@ def main(given: argparse.Namespace) -> None:
     for n in given.n:
         options = {"max_rank": given.rank, "eps": 1e-2, "scaling": given.scaling}
         watch = Watch(n, options)
-        replay_steps(settled(n), given.steps, watch)
+        replay_steps(settled(n), given.steps, watch, given.newton)
         watch.destroy()
         # the first step of a run has nothing to start from
         for step, row in enumerate(watch.rows[1:], start=2):
@@ -86,6 +86,8 @@ if __name__ == "__main__":
     words = argparse.ArgumentParser("run/figure_reuse", description=__doc__.partition(";")[0])
     words.add_argument("n", type=int, nargs="*", default=[4, 8], help="sizes of the mixer (4 8)")
     words.add_argument("-steps", type=int, default=31, help="time steps of each, the first not counted (31)")
+    words.add_argument("-newton", type=int,
+                       help="Newton systems of a time step, which APGD then makes (those of the whole PDIP)")  # fmt: skip
     words.add_argument("-rank", type=int, default=10, help="cap of the ranks (10)")
     words.add_argument("-scaling", choices=("block", "none"), default="block", help="-pc_tt_scaling (block)")
     main(words.parse_args())

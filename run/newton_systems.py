@@ -6,7 +6,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import petsc4py
@@ -73,24 +73,38 @@ class Replay:
 
 
 class ReplayingStepper(Stepper):
-    """Steps with pdip and hands the Newton systems of each to ``look`` before the next."""
+    """Steps with pdip and hands the Newton systems of each to ``look`` before the next.
 
-    def __init__(self, options: Options, world: World, memory: ImpulseMemory, look: Callable[[Replay], None]):
+    newton_steps : of pdip, after which APGD makes the time step; None: pdip makes it
+    """
+
+    def __init__(
+        self, options: Options, world: World, memory: ImpulseMemory, look: Callable[[Replay], None],
+        newton_steps: int | None = None,
+    ):  # fmt: skip
         super().__init__(options, world, memory, Recorder(world.comm))
-        self.look = look
+        self.look, self.newton_steps = look, newton_steps
 
     def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> tuple[ccp.Result, str, int]:
         assert isinstance(self.newton, Recorder)
         options = self.options
-        result = ccp.solve(problem, guess, "pdip", options.limits, options.solver, self.newton)
+        limits = options.limits if self.newton_steps is None else replace(options.limits, max_it=self.newton_steps)
+        result = ccp.solve(problem, guess, "pdip", limits, options.solver, self.newton)
         replay = Replay(problem, self.newton.systems)
         self.look(replay)
         replay.destroy()
-        return result, "pdip", result.iterations
+        if self.newton_steps is not None:
+            result = ccp.solve(problem, guess, "apgd", options.limits)
+        return result, "pdip" if self.newton_steps is None else "apgd", result.iterations
 
 
-def replay_steps(words: list[Any], steps: int, look: Callable[[Replay], None]) -> list[dict[str, Any]]:
-    """Make time steps with these options of pctt.run, ``["-scene_n", 4, ...]``; the figures of each step."""
+def replay_steps(
+    words: list[Any], steps: int, look: Callable[[Replay], None], newton_steps: int | None = None
+) -> list[dict[str, Any]]:
+    """Make time steps with these options of pctt.run, ``["-scene_n", 4, ...]``; the figures of each step.
+
+    newton_steps : how many Newton systems of each are looked at; the steps are then made by APGD
+    """
     database = {str(name)[1:]: str(value) for name, value in zip(words[::2], words[1::2])}
     comm = MPI.COMM_WORLD
     try:
@@ -98,7 +112,7 @@ def replay_steps(words: list[Any], steps: int, look: Callable[[Replay], None]) -
     except OptionError as error:
         sys.exit(str(error))
     world, memory = first_state(options, comm, Progress(False))
-    stepper = ReplayingStepper(options, world, memory, look)
+    stepper = ReplayingStepper(options, world, memory, look, newton_steps)
     lines = [stepper.step() for _ in range(steps)]
     assert stepper.newton is not None
     stepper.newton.destroy()
