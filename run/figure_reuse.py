@@ -87,7 +87,7 @@ if __name__ == "__main__":
     words.add_argument("n", type=int, nargs="*", default=[4, 8], help="sizes of the mixer (4 8)")
     words.add_argument("-steps", type=int, default=31, help="time steps of each, the first not counted (31)")
     words.add_argument("-newton", type=int,
-                       help="Newton systems of a time step, which APGD then makes (those of the whole PDIP)")  # fmt: skip
+                       help="Newton systems of a time step, which APGD then makes (the whole PDIP)")  # fmt: skip
     words.add_argument("-rank", type=int, default=10, help="cap of the ranks (10)")
     words.add_argument("-scaling", choices=("block", "none"), default="block", help="-pc_tt_scaling (block)")
     main(words.parse_args())
