@@ -15,6 +15,7 @@ from pctt.blocks import BlockRows
 from pctt.exchange import exchange, offsets
 
 ADD = PETSc.InsertMode.ADD_VALUES
+EXCESS = 1.15  # blocks of a kept pattern / those that are wanted
 
 
 class BodyMatrix:
@@ -59,6 +60,7 @@ class BodyMatrix:
         self.mat.setPreallocationCSR((self._indptr, self._indices))
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self._enlarged: PETSc.Mat | None = None
+        self._stiff: PETSc.Mat | None = None
 
     def _product(self, inverse: np.ndarray) -> sp.bsr_matrix:
         """G' B^-1 G of this rank's contacts, between the bodies that they touch."""
@@ -90,18 +92,41 @@ class BodyMatrix:
         return self._enlarged
 
     def stiff_part(self, least: float) -> PETSc.Mat:
-        """K without the blocks between bodies whose entries are all below ``least`` (of the mass), as a new AIJ Mat:
-        late in an iteration a third of the contacts have opened, and a factor of the rest costs half."""
+        """K without the blocks between bodies whose entries are all below ``least`` (of the mass), an AIJ Mat: late in
+        an iteration a third of the contacts have opened, and a factor of the rest costs half. Its pattern is kept, and
+        with it a factor's symbolic part, while it holds all such blocks and few others."""
         kept = np.abs(self._values).max(axis=(1, 2)) >= least
         kept[self._diagonal_places] = True
-        indptr = np.concatenate([[0], np.cumsum(kept)])[self._indptr]
-        own, total = self.mat.getLocalSize()[0], self.mat.getSize()[0]
-        rows = sp.bsr_matrix((self._values[kept], self._indices[kept], indptr), shape=(own, total)).tocsr()
-        rows.sort_indices()
-        csr = (rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType), rows.data)
-        part = PETSc.Mat().createAIJ(((own, total), (own, total)), csr=csr, comm=self.comm)
-        part.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        return part
+        if self._stiff is None or not self._holds(kept):
+            self._take_pattern(kept)
+        assert self._stiff is not None
+        csr = self._scalar_rows(self._values[self._kept])
+        self._stiff.setValuesCSR(csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType), csr.data)
+        self._stiff.assemble()
+        return self._stiff
+
+    def _holds(self, blocks: np.ndarray) -> bool:
+        """Whether the pattern of the stiff part has these blocks on all ranks and hardly more."""
+        missing, wanted = int((blocks & ~self._kept).sum()), int(blocks.sum())
+        sums = self.comm.allreduce(np.array([missing, wanted, int(self._kept.sum())]))
+        return bool(sums[0] == 0 and sums[2] <= EXCESS * sums[1])
+
+    def _take_pattern(self, kept: np.ndarray) -> None:
+        if self._stiff is not None:
+            self._stiff.destroy()
+        self._kept = kept
+        csr = self._scalar_rows(np.ones((int(kept.sum()), 6, 6)))
+        self._stiff = PETSc.Mat().create(self.comm)
+        self._stiff.setSizes(self.mat.getSizes())
+        self._stiff.setType(PETSc.Mat.Type.AIJ)
+        self._stiff.setPreallocationCSR((csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType)))
+        self._stiff.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+
+    def _scalar_rows(self, blocks: np.ndarray) -> sp.csr_matrix:
+        """Rows of the stiff part with these blocks."""
+        indptr = np.concatenate([[0], np.cumsum(self._kept)])[self._indptr]
+        shape = (self.mat.getLocalSize()[0], self.mat.getSize()[0])
+        return sp.bsr_matrix((blocks, self._indices[self._kept], indptr), shape=shape).tocsr()
 
     def places(self, points: np.ndarray) -> np.ndarray:
         """Places of this rank's bodies (n, 3): the means of their contact points (nc, 3); collective."""
@@ -154,8 +179,9 @@ class BodyMatrix:
 
     def destroy(self) -> None:
         self.mat.destroy()
-        if self._enlarged is not None:
-            self._enlarged.destroy()
+        for copy in (self._enlarged, self._stiff):
+            if copy is not None:
+                copy.destroy()
 
 
 def _put(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, blocks: np.ndarray) -> None:

@@ -12,7 +12,7 @@ spoils v = G' g alone, which the next step mends. With H = W^-2, W the scaling o
 
 Source: Nesterov and Todd (1997), Mehrotra (1992); Acary, Armand, Nguyen and Shpakovych, "Second-order cone
 programming for frictional contact mechanics using interior point algorithm", Optim. Methods Softw. (2023), for their
-use with friction. """
+use with friction."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ from pctt.options import FRACTION, NOT_NEGATIVE, POSITIVE, option
 
 CENTERING = 0.02  # per deviation from the central path
 CLOSER = 0.01  # impulses as unknowns: what a linear solve leaves moves velocities, and they are compared with zero
-SHORT = 0.8  # a step after which the corrector is tried once more
+SHORT = 0.8  # a step after which the direction is corrected
+CORRECTIONS, FURTHER = 3, 0.3  # at most so many, for a step that goes so much further
+NEAR = 0.1, 10.0  # the central path, in units of the complementarity that is aimed at
 PATIENCE = 3  # iterations without progress before the Newton systems are sharpened
 
 
@@ -40,9 +42,7 @@ PATIENCE = 3  # iterations without progress before the Newton systems are sharpe
 class Conic:
     """Options ``-ccp_conic_*``."""
 
-    start: float = option(
-        30.0, "complementarity of the start, in units of mean(r^2) / mean diag N", check=POSITIVE
-    )
+    start: float = option(30.0, "complementarity of the start, in units of mean(r^2) / mean diag N", check=POSITIVE)
     forcing: float = option(
         0.2, "residual of a linear solve, as a part of the root of the complementarity", check=POSITIVE
     )
@@ -94,13 +94,20 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
             reach = min(1.0, _step(problem, s, z, ds, dz))
             target = max((1.0 - reach) ** 3, _centering(problem, s, z)) * gap / problem.size
         with phase("ConicCorrector"):
-            ds, dz, dv, x = direction(_centred(W, z, ds, dz, target), x)
+            c = _centred(W, z, ds, dz, target)
+            ds, dz, dv, x = direction(c, x)
             step = min(1.0, options.boundary * _step(problem, s, z, ds, dz))
-            if step < SHORT:
-                again = direction(_centred(W, z, ds, dz, target), x)
+            for _ in range(CORRECTIONS):
+                if step >= SHORT:
+                    break
+                c = c + _towards_path(W, z, ds, dz, min(1.0, step + FURTHER), target)
+                again = direction(c, x)
                 longer = min(1.0, options.boundary * _step(problem, s, z, *again[:2]))
-                if longer > step:
-                    step, (ds, dz, dv, x) = longer, again
+                if longer <= step:
+                    break
+                gained, step, (ds, dz, dv, x) = longer - step, longer, again
+                if gained < 0.1 * FURTHER:
+                    break
         if step > 0:
             s, z, v = s + step * ds, z + step * dz, v + step * dv
     converged = history[-1] <= limits.tol
@@ -173,6 +180,22 @@ def _centred(W: NesterovTodd, z: Array, ds: Array, dz: Array, target: float) -> 
     return W.divide(lorentz.divide(W.times(z), aim)) - z
 
 
+def _towards_path(W: NesterovTodd, z: Array, ds: Array, dz: Array, reach: float, target: float) -> Array:
+    """What to add to c so that the eigenvalues of s o z, ``reach`` along the direction, come near the target.
+
+    Source: Gondzio (1996), multiple centrality corrections; here with the eigenvalues of second-order cones."""
+    centre = W.times(z)
+    after = lorentz.product(centre + reach * W.divide(ds), centre + reach * W.times(dz))
+    size = np.linalg.norm(after[:, 1:], axis=1)
+    eigenvalues = after[:, 0] + np.stack([size, -size])
+    aim = np.clip(eigenvalues, NEAR[0] * target, NEAR[1] * target) - eigenvalues
+    larger, smaller = np.maximum(aim, -NEAR[1] * target)
+    change = np.empty_like(after)
+    change[:, 0] = 0.5 * (larger + smaller)
+    change[:, 1:] = (0.5 * (larger - smaller) / np.maximum(size, 1e-300))[:, None] * after[:, 1:]
+    return W.divide(lorentz.divide(centre, change))
+
+
 def _centering(problem: ConeProblem, s: Array, z: Array) -> float:
     """The least part of the complementarity to aim at: more, the further the pair is off the central path. On it s o
     z has no tangential part; off it the sliding directions of impulse and velocity differ by an angle that falls like
@@ -186,4 +209,3 @@ def _step(problem: ConeProblem, s: Array, z: Array, ds: Array, dz: Array) -> flo
     """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""
     longest = problem.min(min(lorentz.step_to_boundary(s, ds), lorentz.step_to_boundary(z, dz)))
     return longest if np.isfinite(problem.sum(float(ds.sum() + dz.sum()))) else 0.0
-
