@@ -147,12 +147,12 @@ def forecast(k: Array, rho: Array, tol: float) -> float:
 def expected(forecast: float, last: Needed | None, iterations: int, cost: float) -> float:
     """Iterations that APGD is expected to need after so many, from its forecast and from what the last problem needed.
 
-    What was counted is believed as long as waiting costs nothing; then, and where the last was a forecast too, their
-    geometric mean; and the forecast alone once APGD has made more than the last problem needed."""
+    What was counted is believed: steps differ little, and courses from a warm start have plateaus. Where the last was
+    a forecast too, the geometric mean of both; and the forecast alone once APGD has made more than that."""
     forecast = min(forecast, iterations + FAR * cost)
     if last is None or iterations >= last.iterations:
         return forecast
-    if last.counted and iterations < SAVED * cost:
+    if last.counted:
         return last.iterations
     return float(np.sqrt(forecast * min(last.iterations, FAR * cost)))
 

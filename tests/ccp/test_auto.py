@@ -106,10 +106,11 @@ def test_what_the_last_problem_needed_joins_in():
     counted, forecasted = Needed(700.0, True), Needed(700.0, False)
     assert expected(9999.0, None, 100, 1000.0) == 4100.0
     assert expected(9999.0, counted, 100, 1000.0) == 700.0
-    assert expected(9999.0, counted, 300, 1000.0) == expected(9999.0, forecasted, 300, 1000.0)
+    assert expected(9999.0, counted, 690, 1000.0) == 700.0
     assert expected(2000.0, forecasted, 100, 1000.0) == pytest.approx(np.sqrt(2000.0 * 700.0))
     assert expected(2000.0, counted, 700, 1000.0) == 2000.0
-    assert given_up_after(decay(1500), 1000, counted) == 300
+    assert given_up_after(decay(2500), 1000, counted) == 700
+    assert given_up_after(decay(1500), 1000, forecasted) < 700
     assert given_up_after(decay(700), 1000, Needed(2000.0, True)) == 100
 
 
