@@ -1,19 +1,25 @@
-"""APGD as long as it is expected to need less than the conic interior point method, then that.
+"""APGD as long as it is expected to be done before the conic interior point method would be, then that.
 
-APGD's natural residual falls about like the square of its iterations: with k made, and a residual rho, it will need
-k sqrt(rho / tol) in all. The conic method takes about the same work for every problem of a size and accuracy. So:
+Costs are in iterations of APGD: the conic method's by a table (`conic_cost`), APGD's own by extrapolation.
 
-1. begin with APGD; from the 100th iteration on compare what it still needs with what the conic method would;
-2. where that is half of it or less, go over to it, from the guess of the beginning;
-3. where it stalls, go back to APGD, from the better of the two points, to the end.
+1. Begin with APGD. From a tenth of the conic method's cost on, fit its natural residual of the iterations k/4 to k by
+   log rho = a - b sqrt(k), which lies between the power law of its beginning and the geometric decay of its end.
+   Where the line meets the tolerance is the number of iterations that it will need (`forecast`).
+2. Where the rest of these is more than what the conic method would cost from here, go over to it. It begins at APGD's
+   point, which saves it about what APGD has cost until then (up to 0.3 of its own cost): trying APGD is almost free.
+3. Where it stalls, go back to APGD, from the better of the two points, to the end.
 
-The rules count iterations and look at no clock, so that a repeated run repeats its choices.
+From the second cone problem on a `Memory` joins in: how many iterations APGD needed, or was expected to, and what the
+conic method really cost, by the clock. Without it (``-ccp_auto_remember false``) the rules only count, so that a
+repeated run repeats its choices. docs/measurements.md has what these rules cost beside the better of the two methods.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +31,12 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 from pctt.options import POSITIVE, option
 
-TRIAL = 100  # iterations of APGD before its residual says much
 CONIC_IT = 60
+EARLIEST = 0.1  # of the conic method's cost, and
+LOOKS = 8  # looks at the natural residual, before the first forecast
+SAVED = 0.3  # of the conic method's cost, at most, by beginning at APGD's point
+FAR = 4.0  # times that cost: more iterations of APGD than this need not be told apart
+START = 3e4  # complementarity of the conic method's start, by APGD's natural residual; its own default at most
 
 
 @dataclass(frozen=True)
@@ -34,44 +44,136 @@ class Auto:
     """Options ``-ccp_auto_*``."""
 
     bias: float = option(
-        2.0, "factor on the cost of the conic method: above 1, APGD is given more time", check=POSITIVE
+        1.0, "factor on the cost of the conic method: above 1, APGD is given more time", check=POSITIVE
     )
+    remember: bool = option(True, "use what the last cone problems have cost, by the clock")
+
+
+class Needed(NamedTuple):
+    """Iterations that APGD needed for a problem: counted, or the last forecast before it was given up."""
+
+    iterations: float
+    counted: bool
+
+
+@dataclass
+class Memory:
+    """What the cone problems so far have shown, by decade of their tolerance; lives as long as a `Newton`.
+
+    needed : by APGD for the last problem
+    factor : what the conic method cost / what `conic_cost` says
+    """
+
+    needed: dict[int, Needed] = field(default_factory=dict)
+    factor: dict[int, float] = field(default_factory=dict)
+
+    def keep_cost(self, tol: float, ratio: float) -> None:
+        """The geometric mean with what was known: one slow moment of the machine is not to decide alone."""
+        mean = np.sqrt(self.factor.get(decade(tol), 1.0) * ratio)
+        self.factor[decade(tol)] = float(np.clip(mean, 0.25, 4.0))
 
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Auto, newton: Newton) -> Result:
     """Impulses by the method that is expected to be faster; ``solver`` of the result names it, ``reason`` says why."""
     most = limits.max_it if limits.max_it >= 0 else 20_000
-    worth = options.bias * conic_cost(problem, limits.tol)
+    memory = _memory(newton) if options.remember else Memory()
+    model = conic_cost(problem.size, problem.softness, limits.tol)
+    cost = options.bias * memory.factor.get(decade(limits.tol), 1.0) * model
+    watch = Watch(limits.tol, cost, memory.needed.get(decade(limits.tol)))
 
-    def give_up(iterations: int, residual: float) -> str:
-        if iterations < TRIAL:
-            return ""
-        needed = iterations * (np.sqrt(residual / limits.tol) - 1.0)
-        if needed <= worth:
-            return ""
-        return f"apgd at {residual:.0e} after {iterations} iterations, about {needed:.0f} more to go"
-
-    first = apgd.solve(problem, guess, dataclasses.replace(limits, max_it=most), apgd.APGD(), give_up)
+    start = perf_counter()
+    limited = dataclasses.replace(limits, max_it=most)
+    first = apgd.solve(problem, guess, limited, apgd.APGD(), watch)
+    switched = perf_counter()
     if first.converged or first.iterations >= most:
-        return _named(first, "apgd", first.reason)
+        memory.needed[decade(limits.tol)] = Needed(first.iterations, True)
+        return _named(first, "apgd", f"{first.reason}; conic would have cost about {cost:.0f} iterations")
     inner = dataclasses.replace(limits, max_it=min(CONIC_IT, most))
-    second = conic.solve(problem, guess, inner, conic.Conic(), newton)
+    begin = conic.Conic(start=min(conic.Conic().start, START * first.natural_residual))
+    result = second = conic.solve(problem, first.impulse, inner, begin, newton)
     words = f"{first.reason}; conic: {second.reason}"
-    if second.converged or second.reason.startswith("unbounded") or most <= CONIC_IT:
-        return _named(second, "conic", words)
-    best = min(first, second, key=lambda result: result.natural_residual)
-    third = apgd.solve(problem, best.impulse, dataclasses.replace(limits, max_it=most), apgd.APGD())
-    third.ksp_its, third.fallbacks = second.ksp_its, second.fallbacks
-    third.history = second.history + third.history
-    return _named(third, "apgd", f"{words}; apgd: {third.reason}")
+    solver = "conic"
+    if not (second.converged or second.reason.startswith("unbounded") or most <= CONIC_IT):
+        best = min(first, second, key=lambda result: result.natural_residual)
+        result = apgd.solve(problem, best.impulse, limited, apgd.APGD())
+        result.ksp_its, result.fallbacks = second.ksp_its, second.fallbacks
+        result.history = second.history + result.history
+        words, solver = f"{words}; apgd: {result.reason}", "apgd"
+    # the slowest rank's seconds, the same on all
+    before, after = (problem.max(s) for s in (switched - start, perf_counter() - switched))
+    done = first.iterations
+    memory.needed[decade(limits.tol)] = Needed(watch.needed, False)
+    memory.keep_cost(limits.tol, (after * max(done, 1) / before + min(done, SAVED * model)) / model)
+    return _named(result, solver, words)
 
 
-def conic_cost(problem: ConeProblem, tol: float) -> float:
-    """What the conic method costs, in iterations of APGD: measured on mixers of 2,600 and 18,000 contacts
-    (docs/ccp.md). With compliance it is a fraction of that."""
-    size = max(1.0, np.sqrt(problem.size / 2600.0))  # small problems: a Newton step has its fixed costs
-    accuracy = np.interp(np.log10(tol), [-8.0, -6.0, -4.0, -2.0], [3600.0, 1450.0, 1050.0, 600.0])
-    return float(size * accuracy * (0.25 if problem.softness >= 1e-6 else 1.0))
+class Watch:
+    """Looks at APGD's course, and says when to give it up."""
+
+    def __init__(self, tol: float, cost: float, last: Needed | None):
+        self.tol, self.cost, self.last = tol, cost, last
+        self.needed = np.inf  # the last forecast
+        self._course: list[tuple[int, float]] = []
+
+    def __call__(self, iterations: int, residual: float) -> str:
+        if iterations > 0 and np.isfinite(residual):
+            self._course.append((iterations, residual))
+        if iterations < EARLIEST * self.cost or len(self._course) < LOOKS:
+            return ""
+        k, rho = np.array(self._course).T
+        self.needed = expected(forecast(k, rho, self.tol), self.last, iterations, self.cost)
+        rest = self.cost - min(iterations, SAVED * self.cost)
+        if self.needed - iterations <= rest:
+            return ""
+        learnt = "" if self.last is None else f" (the last problem {self.last.iterations:.0f})"
+        return (
+            f"apgd at {residual:.0e} after {iterations} iterations, of about {self.needed:.0f}{learnt}; "
+            f"conic will cost as much as {rest:.0f} more"
+        )
+
+
+def forecast(k: Array, rho: Array, tol: float) -> float:
+    """Iterations at which natural residuals rho, looked at after k iterations, will have come down to tol; inf where
+    they do not fall."""
+    recent = k >= 0.25 * k[-1]
+    x, y = np.sqrt(k[recent]), np.log(np.minimum.accumulate(rho)[recent])
+    x_mean, y_mean = x.mean(), y.mean()
+    slope = ((x - x_mean) @ (y - y_mean)) / max((x - x_mean) @ (x - x_mean), 1e-300)
+    if not slope < 0:
+        return np.inf
+    return float(max(k[-1], (x_mean + (np.log(tol) - y_mean) / slope) ** 2))
+
+
+def expected(forecast: float, last: Needed | None, iterations: int, cost: float) -> float:
+    """Iterations that APGD is expected to need after so many, from its forecast and from what the last problem needed.
+
+    What was counted is believed: steps differ little, and courses from a warm start have plateaus. Where the last was
+    a forecast too, the geometric mean of both; and the forecast alone once APGD has made more than that."""
+    forecast = min(forecast, iterations + FAR * cost)
+    if last is None or iterations >= last.iterations:
+        return forecast
+    if last.counted:
+        return last.iterations
+    return float(np.sqrt(forecast * min(last.iterations, FAR * cost)))
+
+
+def conic_cost(contacts: int, softness: float, tol: float) -> float:
+    """What the conic method costs from a cold start, in iterations of APGD: measured on mixers, shear tests and blades
+    of 400 to 28,000 contacts. Below 1e-7 rigid problems need the form `kkt`."""
+    accuracy, rigid, soft = [-8, -7, -6, -4, -2], [90, 35, 24, 16, 6], [28, 25, 22, 15, 5]
+    per_root = np.interp(np.log10(tol), accuracy, soft if softness >= 1e-6 else rigid)
+    return float(per_root * np.sqrt(max(contacts, 400)))
+
+
+def decade(tol: float) -> int:
+    return round(np.log10(tol))
+
+
+def _memory(newton: Newton) -> Memory:
+    """That of the problems that were solved with these Newton systems."""
+    if not isinstance(newton.memory, Memory):
+        newton.memory = Memory()
+    return newton.memory
 
 
 def _named(result: Result, solver: str, reason: str) -> Result:

@@ -31,7 +31,7 @@ RESTART = 3.0  # growth of the residual at which what was learnt of the map is f
 class Coulomb:
     """Options ``-ccp_coulomb_*``."""
 
-    max_it: int = option(100, "cone problems before the iteration gives up", check=AT_LEAST_ONE)
+    max_it: int = option(200, "cone problems before the iteration gives up", check=AT_LEAST_ONE)
     tol: float = option(0.0, "Coulomb residual at which it ends; 0: that of -ccp_tol", check=NOT_NEGATIVE)
     memory: int = option(5, "earlier openings from which Anderson's acceleration takes the next", check=COUNT)
 
@@ -92,7 +92,9 @@ def solve(
         s = np.maximum(anderson.next(s, opening(problem, y) - s), 0.0)
     assert best is not None
     converged = min(history) <= tol
-    words = "Coulomb residual below the tolerance" if converged else f"{len(history)} cone problems for Coulomb's law"
+    words = "Coulomb residual below the tolerance"
+    if not converged:
+        words = f"Coulomb's law not met: residual {min(history):.1e} at best in {len(history)} cone problems"
     if not converged and not inner.converged:
         words = inner.reason if inner.reason.startswith("unbounded") else f"{words}, the last: {inner.reason}"
     return Result(

@@ -21,7 +21,7 @@ from petsc4py import PETSc
 from pctt.ccp.cone import Array
 from pctt.ccp.gather import gather_matrix, gather_rows, write_whole
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.stored import FileFormatError, Stored, Whole, spread, symmetric_blocks
+from pctt.ccp.stored import FileFormatError, Stored, Whole, sparse_matrix, spread, symmetric_blocks
 
 # the first number of a file that begins with a Mat, MAT_FILE_CLASSID of petscmat.h, with 32- and 64-bit indices
 _BEGINNINGS = tuple((1211216).to_bytes(size, "big") for size in (4, 8))
@@ -34,8 +34,9 @@ def is_one(path: str | Path) -> bool:
 
 
 def write(path: str | Path, problem: ConeProblem) -> None:
-    """Write N, r, mu; collective. Raises OSError on all ranks if the file cannot be written."""
-    rigid = problem.rigid_matrix()
+    """Write N, r, mu; collective. Raises OSError on all ranks if the file cannot be written, ValueError if a body
+    has so many contacts that it would fill N."""
+    rigid = sparse_matrix(problem)
     N = gather_matrix(rigid)
     rigid.destroy()
     vectors = [gather_rows(problem.comm, x).ravel() for x in (problem.r, problem.mu)]

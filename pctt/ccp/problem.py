@@ -121,7 +121,7 @@ class ConeProblem:
         return N
 
     def rigid_matrix(self) -> PETSc.Mat:
-        """A new Mat like ``N`` without the compliance."""
+        """A new Mat like ``N`` without the compliance; the low-rank term is not in it."""
         given = self.contact_map is None
         return self._given.duplicate(copy=True) if given else delassus(self.comm, self._split[0])
 

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
+from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, square_block_matrix
+from pctt.blocks import MANY, BlockRows, square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 
@@ -81,6 +82,19 @@ def symmetric_blocks(W: sp.spmatrix) -> sp.bsr_matrix:
     symmetric = (0.5 * (W + W.T)).tocsr()
     symmetric.sort_indices()
     return symmetric.tobsr((3, 3))
+
+
+def sparse_matrix(problem: ConeProblem) -> PETSc.Mat:
+    """A new Mat, all of N without compliance, for the formats that hold a sparse N and nothing beside it.
+
+    Raises ValueError, on all ranks alike, where a body has so many contacts that it would fill N.
+    """
+    if problem.low_rank is not None:
+        raise ValueError(
+            f"a body has more than {MANY} contacts and would fill N; allowed is a format of masses and contact map "
+            "(fclib.write_global)"
+        )
+    return problem.rigid_matrix()
 
 
 def spread(

@@ -68,8 +68,10 @@ class Dump:
             path = problem_path(self.run.dump_problem, number, problem.size)
             binary = path.with_suffix(".petsc")
             _write(path, comm, as_fclib)
-            _write(binary, comm, lambda path: petsc_binary.write(path, problem))
-            files["dumped"] = [str(path), str(binary)]
+            files["dumped"] = [str(path)]
+            if problem.low_rank is None:  # else N is no sparse matrix
+                _write(binary, comm, lambda path: petsc_binary.write(path, problem))
+                files["dumped"].append(str(binary))
         if problem.size and hard:
             self._hard_left -= 1
             name = f"step{number:06d}_{problem.size}contacts_{asked.iterations}its.h5"

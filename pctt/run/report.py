@@ -49,6 +49,8 @@ def accuracy_lines(line: Mapping[str, Any], history: Sequence[float]) -> str:
     figures += f"\n       residual of Coulomb's law {line['coulomb_residual']:.1e}"
     if line["rigid_residual"] != line["natural_residual"]:
         figures += f", of rigid contacts {line['rigid_residual']:.1e}"
+    if line["solver"] != line["asked_solver"]:
+        figures += f"\n       by {line['solver']}: {line['reason']}"
     if not history:
         return figures
     shown = sorted({round(k * (len(history) - 1) / 10) for k in range(11)})

@@ -12,9 +12,10 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 from problems import SELF, Known, from_graph, from_matrix, heap
 
-from pctt import ccp
-from pctt.ccp import Limits, fclib, petsc_binary
+from pctt import blocks, ccp
+from pctt.ccp import ConeProblem, Limits, fclib, petsc_binary
 from pctt.ccp.fclib import FileFormatError, Info, Solution
+from pctt.options import OptionError
 
 FORMATS = ["triplets", "triplets with duplicates", "csc", "csr"]
 FCLIB = Path(os.environ.get("PCTT_FCLIB", Path(__file__).resolve().parents[3] / "shared" / "fclib"))
@@ -381,6 +382,45 @@ def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path, write):
     with pytest.raises(OSError, match=r"there\.h5: cannot write"):
         write(path, problem)
     assert path.read_text() == "old"
+
+
+# -- crowded bodies ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def crowded(monkeypatch):
+    """A problem with a body of 11 contacts and more, where N has a low-rank term, and its N."""
+    monkeypatch.setattr(blocks, "MANY", 10)
+    known, graph = heap(1, 30, 12, hub=True)
+    problem = ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF), compliance=1e-3)
+    assert problem.low_rank is not None
+    return problem, graph
+
+
+def test_a_global_problem_with_a_crowded_body_is_the_same_when_read_again(tmp_path, crowded):
+    problem, graph = crowded
+    H = graph.dense().T
+    zeros, ones = np.zeros(len(H)), np.eye(len(H))
+    path = tmp_path / "global.h5"
+    fclib.write_global(path, sparse_mat(ones), sparse_mat(H), zeros, problem.r, problem.mu, compliance=1e-3)
+    again = fclib.read(path, SELF)
+    assert again.low_rank is not None
+    x = np.random.default_rng(0).normal(size=problem.r.shape)
+    np.testing.assert_allclose(again.product(x), problem.product(x), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(again.diagonal_blocks, problem.diagonal_blocks, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("write", [fclib.write_local, petsc_binary.write], ids=["FCLIB", "PETSc"])
+def test_a_crowded_body_is_refused_where_it_would_fill_the_matrix(tmp_path, crowded, write):
+    """N without its low-rank term would be another problem."""
+    with pytest.raises(ValueError, match="would fill N; allowed is"):
+        write(tmp_path / "file", crowded[0])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_gauss_seidel_refuses_a_crowded_body(crowded):
+    with pytest.raises(OptionError, match="-ccp_type gauss_seidel: a body has"):
+        ccp.solve(crowded[0], type="gauss_seidel")
 
 
 # -- PETSc binary files ------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from petsc4py import PETSc
 from pctt.ccp.cone import Array
 from pctt.ccp.gather import gather_matrix, gather_rows, write_whole
 from pctt.ccp.problem import ConeProblem
+from pctt.ccp.stored import sparse_matrix
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,9 @@ def write_local(
     """Write N, r, mu of a problem as W, q, mu of a local problem; collective.
 
     W is that of rigid contacts; the compliance is kept outside the groups of FCLIB. Raises OSError on all ranks if
-    the file cannot be written.
+    the file cannot be written, ValueError if a body has so many contacts that it would fill W.
     """
-    N = problem.rigid_matrix()
+    N = sparse_matrix(problem)
     matrices, vectors = {"W": N}, {"q": problem.r, "mu": problem.mu}
     _write(path, problem.comm, "local", matrices, vectors, info, solution, guess, problem.point, problem.softness)
     N.destroy()

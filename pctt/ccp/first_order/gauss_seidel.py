@@ -20,6 +20,7 @@ import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 
+from pctt.blocks import MANY
 from pctt.ccp import cone
 from pctt.ccp.cone import Array
 from pctt.ccp.first_order.colouring import Halo, Neighbourhood, colours
@@ -28,7 +29,7 @@ from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 from pctt.log import phase
-from pctt.options import option
+from pctt.options import OptionError, option
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,11 @@ class GaussSeidel(FirstOrder):
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: GaussSeidel) -> Result:
     """Impulses from a first guess (nc, 3)."""
+    if problem.low_rank is not None:
+        raise OptionError(
+            f"-ccp_type gauss_seidel: a body has more than {MANY} contacts, whose rows of N would be full; "
+            "allowed are the others"
+        )
     scaled = ScaledProblem(problem)
     progress = Progress(scaled, limits, options)
     with phase("CCPColour"):
