@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mpi4py import MPI
@@ -80,3 +82,17 @@ def made_folder(path: Path) -> Path:
     except OSError as error:
         raise FolderError(f"{path}: cannot write there ({error.strerror})") from None
     return path
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A temporary name for a file that gets its own when the block ends; FolderError if it cannot be written."""
+    temporary = path.with_name(f".tmp.{path.name}")  # with the ending of the file, which tells some writers the format
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise FolderError(f"{path}: cannot write ({error.strerror or error})") from None
+    finally:
+        with suppress(OSError):
+            temporary.unlink()

@@ -259,6 +259,12 @@ def test_a_file_that_is_no_fclib_problem_is_refused(damage, program, results, se
     assert "bad.hdf5" in said
 
 
+@pytest.mark.mpi
+def test_a_truncated_fclib_problem_is_refused_by_two_ranks_at_once(program, results, settled, tmp_path):
+    truncated(tmp_path / "bad.hdf5", settled)
+    assert "bad.hdf5" in refused(program, results, "-problem", "bad.hdf5", ranks=2)
+
+
 @pytest.mark.parametrize("numbers", ["NaN in q", "negative mu", "short q"])
 def test_an_fclib_problem_with_bad_numbers_is_refused(numbers, program, results, tmp_path):
     q, mu = np.array([-1.0, 0.0, 0.0]), np.array([0.3])
