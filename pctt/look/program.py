@@ -13,6 +13,9 @@ from mpi4py import MPI
 
 from pctt.look.folder import FolderError
 
+LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")
+EXTRA = "the libraries that draw are the extra `pictures`: pip install -e '.[pictures]' in the project's folder"
+
 
 def parser(program: str, text: str) -> argparse.ArgumentParser:
     """A command line whose first word is the folder."""
@@ -68,9 +71,11 @@ def run(main: Callable[[MPI.Comm], None], program: str) -> int:
             comm.Abort(2)
         print(f"pctt.{program}: {error}", file=sys.stderr)
         return 2
-    except ModuleNotFoundError as error:
+    except ImportError as error:
+        if (error.name or "").partition(".")[0] not in LIBRARIES:
+            raise
         if comm.rank == 0:
-            print(f"pctt.{program}: {error}; pip install 'pctt[pictures]' has all that is needed", file=sys.stderr)
+            print(f"pctt.{program}: {error}; {EXTRA}", file=sys.stderr)
         return 2
     return 0
 

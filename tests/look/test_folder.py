@@ -156,6 +156,31 @@ def test_a_folder_without_the_bodies_is_refused(program, library, show, tmp_path
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("program", "missing"), [("plot", "matplotlib"), ("render", "vtkmodules"), ("export", "vtkmodules")]
+)
+def test_without_the_libraries_one_line_names_the_extra(program, missing, python, tmp_path):
+    """Also where they are: the import finds nothing."""
+    made = handmade.write(tmp_path / "made", handmade.FLOOR)
+    source = f"""
+import importlib.abc, runpy, sys
+class Nothing(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name.partition(".")[0] in ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg"):
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Nothing())
+sys.argv = ["pctt.{program}", {str(made)!r}]
+runpy.run_module("pctt.{program}", run_name="__main__")
+"""
+    done = python("-c", source)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"pctt.{program}: No module named ")
+    assert missing in line or program == "render"  # which may ask for matplotlib first
+    assert "pip install -e '.[pictures]'" in line
+
+
 def test_records_are_columns_of_numbers(tmp_path):
     read = Folder(handmade.write(tmp_path / "made", handmade.FLOOR))
     assert read.records() == {}
