@@ -8,7 +8,6 @@ of points that change in number needs ParaView 5.12, and a .pvd collection lists
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,8 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from pctt.look.folder import Folder, FolderError, Frame
-from pctt.look.program import add_steps, chosen, made_folder, parser, run
+from pctt.look.folder import Folder, Frame
+from pctt.look.program import add_steps, chosen, made_folder, parser, run, whole
 
 SERIES = ("bodies", "contacts", "large")
 
@@ -36,8 +35,11 @@ def main(comm: MPI.Comm) -> None:
     steps = chosen(folder.steps, given)
     target = made_folder(Path(given.output) if given.output else folder.path / "paraview")
 
+    from vtkmodules.vtkCommonCore import vtkLogger
+
     from pctt.look import surfaces  # needs vtk, which asking for help does not
 
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # what fails is told by write_vtp
     box = surfaces.bounds(folder, [folder.frame(step) for step in {steps[0], steps[-1]}])
     times = {}
     for step in steps[comm.rank :: comm.size]:
@@ -119,30 +121,29 @@ def large(folder: Folder, frame: Frame, box: np.ndarray) -> Any:
 
 def write_vtp(path: Path, data: Any, time: float) -> None:
     """Write polygonal data with its time, whole or not at all; FolderError if it cannot be written."""
+    from vtkmodules.vtkCommonMisc import vtkErrorCode
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     from pctt.look import surfaces
 
-    temporary = path.with_name(f".{path.name}.tmp")
     surfaces.add_arrays(data.GetFieldData(), {"TimeValue": np.array([time])})
     writer = vtkXMLPolyDataWriter()
     writer.SetInputData(data)
-    writer.SetFileName(str(temporary))
     writer.SetHeaderTypeToUInt64()
     writer.SetDataModeToAppended()
     writer.EncodeAppendedDataOff()
-    if writer.Write() != 1:
-        raise FolderError(f"{path}: cannot write")
-    os.replace(temporary, path)
+    with whole(path) as temporary:
+        writer.SetFileName(str(temporary))
+        if writer.Write() != 1 or writer.GetErrorCode():
+            raise OSError(vtkErrorCode.GetStringFromErrorCode(writer.GetErrorCode()))
 
 
 def write_pvd(path: Path, files: dict[str, float]) -> None:
     """Write a collection of files by their times [s]."""
     lines = [f'    <DataSet timestep="{time!r}" file="{name}"/>' for name, time in files.items()]
     head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n  <Collection>'
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text("\n".join([head, *lines, "  </Collection>", "</VTKFile>", ""]))
-    os.replace(temporary, path)
+    with whole(path) as temporary:
+        temporary.write_text("\n".join([head, *lines, "  </Collection>", "</VTKFile>", ""]))
 
 
 if __name__ == "__main__":

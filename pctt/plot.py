@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 
 from mpi4py import MPI
 
 from pctt.look.folder import Folder, FolderError
-from pctt.look.program import made_folder, parser, run
+from pctt.look.program import made_folder, parser, run, whole
 
 FORMATS = ("png", "pdf", "svg")
 
@@ -58,10 +57,8 @@ def main(comm: MPI.Comm) -> None:
         if not made:
             raise FolderError(f"{folder.path}: nothing to plot: no steps, no comparison, no recorded contacts")
         for name, figure in made.items():
-            path = target / f"{name}.{given.format}"
-            temporary = path.with_name(f".{path.name}.tmp")
-            figure.savefig(temporary, format=given.format)
-            os.replace(temporary, path)
+            with whole(target / f"{name}.{given.format}") as path:
+                figure.savefig(path, format=given.format)
     print(f"{len(made)} figures: {target}/" + ", ".join(f"{name}.{given.format}" for name in made))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from pctt.look.folder import Folder, Frame
-from pctt.look.program import add_steps, chosen, made_folder, parser, positive, run
+from pctt.look.program import add_steps, chosen, made_folder, parser, positive, run, whole
 
 SAMPLE = 12  # frames that decide the camera and the range of the colours
 FILMS = ("mp4", "gif", "none")
@@ -107,9 +106,8 @@ def write_png(path: Path, picture: np.ndarray) -> None:
     """Write a picture (height, width, 3), whole or not at all."""
     from PIL import Image
 
-    temporary = path.with_name(f".{path.name}.tmp")
-    Image.fromarray(np.ascontiguousarray(picture)).save(temporary, format="png", compress_level=4)
-    os.replace(temporary, path)
+    with whole(path) as temporary:
+        Image.fromarray(np.ascontiguousarray(picture)).save(temporary, format="png", compress_level=4)
 
 
 def write_mp4(path: Path, pictures: list[Path], fps: float) -> None:
@@ -117,27 +115,24 @@ def write_mp4(path: Path, pictures: list[Path], fps: float) -> None:
     import imageio_ffmpeg
     from PIL import Image
 
-    temporary = path.with_name(f".tmp.{path.name}")
-    with Image.open(pictures[0]) as first:
+    with whole(path) as temporary, Image.open(pictures[0]) as first:
         writer = imageio_ffmpeg.write_frames(str(temporary), first.size, fps=fps, quality=7, macro_block_size=2)
-    writer.send(None)
-    for picture in pictures:
-        with Image.open(picture) as image:
-            writer.send(image.convert("RGB").tobytes())
-    writer.close()
-    os.replace(temporary, path)
+        writer.send(None)
+        for picture in pictures:
+            with Image.open(picture) as image:
+                writer.send(image.convert("RGB").tobytes())
+        writer.close()
 
 
 def write_gif(path: Path, pictures: list[Path], fps: float) -> None:
     """Write a film that repeats, in the colours of its first picture."""
     from PIL import Image
 
-    temporary = path.with_name(f".{path.name}.tmp")
     images = [Image.open(picture).convert("RGB") for picture in pictures]
     palette = images[0].quantize(255)
     first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    first.save(temporary, format="gif", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
-    os.replace(temporary, path)
+    with whole(path) as temporary:
+        first.save(temporary, format="gif", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
 
 
 if __name__ == "__main__":

@@ -25,10 +25,9 @@ from dem.system import ContactSystem
 from pctt import ccp
 from pctt.blocks import BlockRows, block_matrix
 from pctt.ccp import fclib
-from pctt.run import checkpoint
 from pctt.run.options import read_options
 from pctt.run.report import Progress
-from pctt.run.simulate import cone_problem, settled_state
+from pctt.run.simulate import cone_problem, first_state
 
 COMM = MPI.COMM_SELF
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8)
@@ -47,7 +46,7 @@ def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
     """The cone problem of the first step after the settled state of a mixer."""
     database = {"scene": "mixer", "scene_n": str(n), "restart": "settled", "output": tempfile.gettempdir()}
     options = read_options(database, COMM)
-    world, _ = checkpoint.load(settled_state(options, COMM, Progress(True)), "mixer", options.scene, COMM)
+    world, _ = first_state(options, COMM, Progress(True))
     grains = world.grains
     if variant == "loose":
         rng = np.random.default_rng(0)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from pctt.look.folder import Folder, Frame
 
@@ -27,7 +28,13 @@ STYLE = {
 }
 
 # names of the figures of what records.csv holds, by the unit in the heads of its columns
-UNITS = {"N": "forces", "N m": "torques", "J": "energy", "m": "lengths", "m/s": "velocities", "Pa": "stresses"}
+UNITS = {
+    "": "statistics", "N": "forces", "N m": "torques", "J": "energies", "m": "lengths", "m/s": "velocities",
+    "Pa": "stresses",
+}
+# columns of the energy balance, see dem.record.energy_balance
+BALANCE = ("kinetic_energy", "potential_energy", "work_of_motions", "friction_loss", "impact_loss", "time_stepping")
+ALIKE = 5  # curves share axes if their greatest values differ by less than this factor
 
 
 def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
@@ -54,8 +61,8 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
         if counts.any():
             its.plot(time, counts, label=label, **look)
     its.set_yscale("symlog", linthresh=1)
-    its.set_ylabel("per step")
-    its.set_ylim(bottom=0)
+    its.set_ylabel("iterations per step")
+    its.set_ylim(0, 2 * its.get_ylim()[1])
     if its.lines:
         its.legend()
 
@@ -67,11 +74,16 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
         bad = positive & ~good
         residual.semilogy(time[bad], values[bad], "x", color="C3", label="not converged")
         residual.legend()
+    if positive.any():  # a decade at least, or the labels of the axis say little
+        middle = np.sqrt(values[positive].min() * values[positive].max())
+        low, high = residual.get_ylim()
+        residual.set_ylim(min(low, 0.3 * middle), max(high, 3 * middle))
     residual.set_ylabel("natural residual")
 
-    memory.plot(time, [line.get("peak_memory", np.nan) / 2**20 for line in lines], color="C0", **look)
+    used = np.array([line.get("peak_memory", np.nan) / 2**20 for line in lines])
+    memory.plot(time, used, color="C0", **look)
     memory.set_ylabel("peak memory of all ranks [MiB]")
-    memory.set_ylim(bottom=0)
+    memory.set_ylim(0, 1.15 * max(np.nanmax(used, initial=0), 1))
 
     names = list(dict.fromkeys(name for line in lines for name in line["phases"]))
     table = np.array([[line["phases"].get(name, 0.0) for line in lines] for name in names])
@@ -121,26 +133,103 @@ def curves(records: Mapping[str, np.ndarray], analysis: Mapping[str, np.ndarray]
 
 
 def records(columns: Mapping[str, np.ndarray]) -> dict[str, Figure]:
-    """What records.csv holds over time, a figure for each unit in the heads ``name [unit]`` of its columns."""
+    """What records.csv holds over time: the energy balance, and a figure for each other unit in the heads
+    ``name [unit]`` of its columns. Vectors have axes of their own, and so has what is much larger or smaller."""
+    balance = [f"{name} [J]" for name in BALANCE]
+    figures = {}
+    if set(balance) <= set(columns):
+        figures["energy"] = energy(columns)
+    else:
+        balance = []
     units: dict[str, list[str]] = {}
     for head in columns:
         found = re.search(r"\[(.*)\]$", head)
-        if head not in ("step", "time [s]"):
+        if head not in ("step", "time [s]", *balance):
             units.setdefault(found.group(1) if found else "", []).append(head)
-    time = columns["time [s]"]
-    figures = {}
     for unit, heads in units.items():
-        figure = Figure(figsize=(9, 4.5))
-        axes = figure.subplots()
-        for k, head in enumerate(heads):
-            label = head.rpartition(" [")[0] or head
-            dashes = ("-", "--", ":")[k // 10 % 3]  # colours repeat after ten
-            axes.plot(time, columns[head], dashes, label=label.replace("_", " "), linewidth=1.2)
-        axes.set_xlabel("time [s]")
-        axes.set_ylabel(f"{UNITS.get(unit, '')} [{unit}]".strip() if unit else "")
-        axes.legend(fontsize="small", ncols=1 + len(heads) // 12, loc="center left", bbox_to_anchor=(1.0, 0.5))
-        figures[UNITS.get(unit, re.sub(r"\W+", "_", unit).strip("_") or "figures")] = figure
+        groups = _panels(columns, heads)
+        wide = 1 if len(groups) < 4 else 2
+        tall = -(-len(groups) // wide)
+        figure = Figure(figsize=(6.5 + 3 * wide, max(4.2, 2.3 * tall)))
+        panels = figure.subplots(tall, wide, sharex=True, squeeze=False)
+        for axes, (name, members) in zip(panels.ravel(), groups.items()):
+            for head in members:
+                label = (head.rpartition(" [")[0] or head).removeprefix(f"{name}_").replace("_", " ")
+                axes.plot(columns["time [s]"], columns[head], label=label, linewidth=1.2)
+            _with_unit(axes, name.replace("_", " ").strip() or (UNITS.get(unit, "") if unit else ""), unit)
+            if not any(np.any(columns[head]) for head in members):
+                axes.set_ylim(-0.05, 1.0)
+            if len(members) > 1:
+                axes.legend(fontsize="small", ncols=3)
+        for axes in panels.ravel()[len(groups) :]:
+            axes.remove()
+        for axes in panels.ravel()[len(groups) - wide : len(groups)]:
+            axes.set_xlabel("time [s]")
+            axes.tick_params(labelbottom=True)
+        figures[UNITS.get(unit, re.sub(r"\W+", "_", unit).strip("_") or "others")] = figure
     return figures
+
+
+def _panels(columns: Mapping[str, np.ndarray], heads: Sequence[str]) -> dict[str, list[str]]:
+    """The columns that share axes, by what they have in common: components x, y, z by the name of the vector, single
+    ones by their own, and others of like size by a name that is empty but for blanks."""
+    panels: dict[str, list[str]] = {}
+    sizes: list[tuple[float, list[str]]] = []
+    for head in heads:
+        vector = re.fullmatch(r"(.+)_[xyz]( \[.*\])?", head)
+        if vector:
+            panels.setdefault(vector[1], []).append(head)
+            continue
+        size = float(np.nanmax(np.abs(columns[head]), initial=0.0))
+        for other, members in sizes:
+            if size == other or (min(size, other) > 0 and 1 / ALIKE < size / other < ALIKE):
+                members.append(head)
+                break
+        else:
+            sizes.append((size, [head]))
+    for k, (_, members) in enumerate(sizes):
+        single = members[0].rpartition(" [")[0] or members[0]
+        panels[single if len(members) == 1 else " " * k] = members
+    return panels
+
+
+def _with_unit(axes: Axes, name: str, unit: str) -> None:
+    """Label the vertical axis, with prefixes such as k and m before SI units."""
+    if unit in ("N", "N m", "J", "Pa", "m", "W"):
+        axes.yaxis.set_major_formatter(EngFormatter(unit=unit))
+        axes.set_ylabel(name)
+    else:
+        axes.set_ylabel(f"{name} [{unit}]".strip() if unit else name)
+
+
+def energy(columns: Mapping[str, np.ndarray]) -> Figure:
+    """Energies, and the work and the losses up to the time; below, larger, the energies, and the drift of the balance,
+
+        kinetic + potential + losses - work - what it was before the first step,
+
+    which is the error of the time stepping. Potential energy counts from the first record."""
+    time = columns["time [s]"]
+    kinetic, potential, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
+    curves = {
+        "kinetic energy": kinetic,
+        "potential energy, change": potential - potential[0],
+        "work of moving bodies, sum": np.cumsum(work),
+        "friction loss, sum": np.cumsum(friction),
+        "impact loss, sum": np.cumsum(impact),
+    }
+    total = kinetic + curves["potential energy, change"] + np.cumsum(friction + impact - work)
+    figure = Figure(figsize=(9.5, 7.2))
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    for k, (label, values) in enumerate(curves.items()):
+        for axes in (above, below)[: 2 if k < 2 else 1]:
+            axes.plot(time, values, ("-", "-", "--", "-.", ":")[k], color=f"C{k}", label=label, linewidth=1.5)
+    above.plot(time, total, color="black", linewidth=1.8, label="kinetic + potential + losses - work")
+    below.plot(time, total - (total[0] - stepping[0]), color="black", linewidth=1.2, label="drift of the sum above")
+    for axes, name in ((above, "energy"), (below, "the same, larger")):
+        _with_unit(axes, name, "J")
+        axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
+    below.set_xlabel("time [s]")
+    return figure
 
 
 def compare(summary: Mapping[str, Mapping[str, float]]) -> Figure:
@@ -190,11 +279,11 @@ def sparsity(folder: Folder, frame: Frame) -> Figure:
     near = sp.kron(coupling[few][:, few], np.ones((3, 3)))
     gradient = sp.kron(sp.identity(len(few)), np.ones((3, 1)))
     newton = sp.bmat([[near, gradient], [gradient.T, sp.identity(len(few))]])
-    _spy(left, newton, 300 / newton.shape[0])
+    _spy(left, newton)
     left.axhline(3 * len(few) - 0.5, color="C1", linewidth=0.8)
     left.axvline(3 * len(few) - 0.5, color="C1", linewidth=0.8)
     left.set_title(f"Newton matrix of {len(few)} contacts: impulses, multipliers", fontsize=10)
-    _spy(right, coupling, max(0.25, 300 / coupling.shape[0]))
+    _spy(right, coupling)
     per_row = coupling.nnz / coupling.shape[0]
     right.set_title(f"3 x 3 blocks of S, all {coupling.shape[0]} contacts: {per_row:.1f} per row", fontsize=10)
     return figure
@@ -209,12 +298,14 @@ def graphs(folder: Folder, frame: Frame) -> Figure:
     middle = frame.position[grains].mean(axis=0)
     axes3 = np.linalg.svd(frame.position[grains] - middle, full_matrices=True)[2][:2]
     spot, centers = (point - middle) @ axes3.T, (frame.position - middle) @ axes3.T
-    for body in np.unique(pair[pair >= folder.grains]):  # a large body stands outside of its contacts
-        touched = spot[(pair == body).any(axis=1)].mean(axis=0)
-        centers[body] = 1.35 * touched
     radius = np.linalg.norm(folder.size, axis=1)
+    beyond = 1.15 * (np.linalg.norm(centers[grains], axis=1) + 0.5 * radius[grains]).max()
+    for body in np.unique(pair[pair >= folder.grains]):  # a large body stands outside of the grains
+        way = spot[(pair == body).any(axis=1)].mean(axis=0)
+        length = np.linalg.norm(way)
+        centers[body] = beyond * (way / length if length > 1e-9 * beyond else np.array([0.0, -1.0]))
 
-    figure = Figure(figsize=(12, 4.4))
+    figure = Figure(figsize=(12, 4.4), layout="constrained")
     bodies, body_graph, contact_graph = figure.subplots(1, 3, sharex=True, sharey=True)
     circle = np.exp(2j * np.pi * np.linspace(0, 1, 60))
     for body in grains:
@@ -224,7 +315,9 @@ def graphs(folder: Folder, frame: Frame) -> Figure:
         )
     bodies.plot(*centers[grains].T, "o", color="C3", label="centres")
     bodies.plot(*spot.T, "s", color="white", markeredgecolor="black", label="contacts")
-    bodies.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=2)
+    figure.legend(*bodies.get_legend_handles_labels(), loc="lower left", ncols=2)
+    # room for the legend, and for the titles, which axes of equal scales let stand out
+    figure.get_layout_engine().set(rect=(0, 0.08, 1, 0.9))
 
     for a, b in pair:
         body_graph.plot(*centers[[a, b]].T, color="0.6", linewidth=1, zorder=1)
@@ -277,10 +370,15 @@ def _coupling(folder: Folder, frame: Frame) -> sp.csr_matrix:
     return (touch @ touch.T + sp.identity(len(pair))).tocsr()
 
 
-def _spy(axes: Axes, pattern: Any, size: float) -> None:
+def _spy(axes: Axes, pattern: Any) -> None:
     entries = sp.coo_matrix(pattern)
-    axes.plot(entries.col, entries.row, "s", color="C0", markersize=size, markeredgewidth=0, rasterized=True)
     n = entries.shape[0]
+    if n <= 300:  # to the dot; markers of so large entries would leave gaps
+        filled = np.ma.masked_equal(entries.toarray() != 0, False)
+        axes.imshow(filled, cmap=ListedColormap(["C0"]), interpolation="nearest")
+    else:
+        size = max(0.25, 300 / n)
+        axes.plot(entries.col, entries.row, "s", color="C0", markersize=size, markeredgewidth=0, rasterized=True)
     axes.set(xlim=(-0.5, n - 0.5), ylim=(n - 0.5, -0.5), aspect="equal")
     axes.xaxis.tick_top()
     axes.grid(visible=False)

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mpi4py import MPI
 
 from pctt.look.folder import FolderError
+
+LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")
+EXTRA = "the libraries that draw are the extra `pictures`: pip install -e '.[pictures]' in the project's folder"
 
 
 def parser(program: str, text: str) -> argparse.ArgumentParser:
@@ -66,9 +71,11 @@ def run(main: Callable[[MPI.Comm], None], program: str) -> int:
             comm.Abort(2)
         print(f"pctt.{program}: {error}", file=sys.stderr)
         return 2
-    except ModuleNotFoundError as error:
+    except ImportError as error:
+        if (error.name or "").partition(".")[0] not in LIBRARIES:
+            raise
         if comm.rank == 0:
-            print(f"pctt.{program}: {error}; pip install 'pctt[pictures]' has all that is needed", file=sys.stderr)
+            print(f"pctt.{program}: {error}; {EXTRA}", file=sys.stderr)
         return 2
     return 0
 
@@ -80,3 +87,17 @@ def made_folder(path: Path) -> Path:
     except OSError as error:
         raise FolderError(f"{path}: cannot write there ({error.strerror})") from None
     return path
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A temporary name for a file that gets its own when the block ends; FolderError if it cannot be written."""
+    temporary = path.with_name(f".tmp.{path.name}")  # with the ending of the file, which tells some writers the format
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise FolderError(f"{path}: cannot write ({error.strerror or error})") from None
+    finally:
+        with suppress(OSError):
+            temporary.unlink()

@@ -194,7 +194,10 @@ def _window(view: View) -> vtkRenderWindow:
         vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # it warns that it tries X first, then EGL
     window = vtkRenderWindow()
     if window.GetClassName() == "vtkOSOpenGLRenderWindow" and not find_library("OSMesa"):
-        raise FolderError("vtk found no display, no EGL driver and no OSMesa: install libegl1 (Debian) or libosmesa6")
+        raise FolderError(
+            "vtk found no display, no EGL driver and no OSMesa; on Debian: apt-get install libosmesa6, "
+            "or libegl1 libgl1-mesa-dri"
+        )
     window.SetOffScreenRendering(True)
     window.SetMultiSamples(0)
     window.SetSize(view.width, view.height)

@@ -12,6 +12,7 @@ from typing import Any
 from mpi4py import MPI
 
 from dem.bodies import Bodies
+from dem.experiment import Experiment
 from dem.impulses import ImpulseMemory
 from dem.world import World, restart_rows
 from pctt.options import OptionError
@@ -28,8 +29,17 @@ def scene_record(name: str, scene: Any) -> str:
     return json.dumps({"scene": name, **dataclasses.asdict(scene)}, sort_keys=True)
 
 
-def save(path: Path, record: str, world: World, memory: ImpulseMemory) -> None:
-    """Write a checkpoint; collective. The previous one under this name stays until this one is complete."""
+def origin(name: str, scene: Experiment, dt: float) -> dict[str, Any]:
+    """What a run must have in common with the one that it goes on from, as attributes of a checkpoint.
+
+    ``scene`` is `scene_record`, ``dt`` the time step [s], ``scene_file`` the digest of the user's scene file or "".
+    """
+    return {"scene": scene_record(name, scene), "dt": dt, "scene_file": scene.digest}
+
+
+def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMemory) -> None:
+    """Write a checkpoint with its `origin`; collective. The previous one under this name stays until this one is
+    complete."""
     local, replicated = world.state()
     key, impulse = memory.state()
     with written(path, world.comm) as file:
@@ -39,21 +49,24 @@ def save(path: Path, record: str, world: World, memory: ImpulseMemory) -> None:
             file.whole(f"world/{name}", array)
         file.rows("contacts/key", key)
         file.rows("contacts/impulse", impulse)
-        file.attributes("/", {"format": FORMAT, "scene": record})
+        file.attributes("/", {"format": FORMAT, **made_with})
 
 
-def load(path: Path, name: str, scene: Any, comm: MPI.Comm) -> tuple[World, ImpulseMemory]:
+def load(
+    path: Path, scene: Experiment, made_with: dict[str, Any], comm: MPI.Comm, changed_file: bool = False
+) -> tuple[World, ImpulseMemory]:
     """The world and the impulses of a checkpoint; collective.
 
     On the number of ranks that wrote it the world is the same to the last bit. Raises FileError if it is no
-    checkpoint, OptionError if it is one of another scene.
+    checkpoint, OptionError if it is of another `origin`; with ``changed_file`` the scene file may be another.
     """
     with readable(path, comm) as file:
         if file.attrs.get("format") != FORMAT:
             raise FileError(f"{path}: no checkpoint of this program (it is not marked '{FORMAT}')")
         failure = None
         try:
-            stored = json.loads(file.attrs["scene"])
+            json.loads(file.attrs["scene"])
+            stored = {name: file.attrs[name] for name in made_with if name in file.attrs}
             replicated = {n: file[f"world/{n}"][()] for n in (*_LARGE, "slabs", "time", "step")}
             rows = restart_rows(replicated["slabs"], comm)
             local = {n: file[f"grains/{n}"][rows] for n in _COLUMNS}
@@ -65,21 +78,35 @@ def load(path: Path, name: str, scene: Any, comm: MPI.Comm) -> tuple[World, Impu
         failures = [text for text in comm.allgather(failure) if text]
         if failures:
             raise FileError(f"{path}: incomplete checkpoint ({failures[0]})")
-    _refuse_other_scene(path, stored, json.loads(scene_record(name, scene)))
-    world = World.restore(scene.build(), comm, local, replicated)
+    _refuse_other_origin(path, stored, made_with, changed_file)
+    try:
+        world = World.restore(scene.build(), comm, local, replicated)
+    except ValueError as error:  # another text of the scene file may build other bodies
+        raise OptionError(f"-restart {path}: {error}") from None
     memory = ImpulseMemory(comm)
     memory.restore(key, impulse)
     return world, memory
 
 
-def _refuse_other_scene(path: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
-    if old["scene"] != new["scene"]:
-        raise OptionError(f"-scene {new['scene']}: {path} holds the scene {old['scene']}")
-    for field, value in new.items():
-        if old.get(field) != value:
-            raise OptionError(
-                f"-scene_{field} {value}: {path} was made with {old.get(field)}; allowed is the same"
-            )
+def _refuse_other_origin(path: Path, old: dict[str, Any], new: dict[str, Any], changed_file: bool) -> None:
+    """OptionError for the first thing in which two origins differ; checkpoints of earlier versions lack some."""
+    old_scene, new_scene = json.loads(old["scene"]), json.loads(new["scene"])
+    was, now = (f"-scene {scene['scene']}" for scene in (old_scene, new_scene))
+    if was != now:
+        raise OptionError(f"{now}: {path} was made with {was}; allowed is the same")
+    digests = old.get("scene_file", new["scene_file"]), new["scene_file"]
+    if digests[0] != digests[1] and not changed_file:
+        old_file, new_file = (f"a file with SHA-256 {d[:12]}..." if d else "the package's scene" for d in digests)
+        raise OptionError(
+            f"{now}: {path} was made with {old_file}, given is {new_file}; allowed is the same text, or another with "
+            "-restart_changed_file"
+        )
+    for field in {**new_scene, **old_scene}:
+        was, now = (f"-scene_{field} {scene.get(field, '(no such option)')}" for scene in (old_scene, new_scene))
+        if was != now:
+            raise OptionError(f"{now}: {path} was made with {was}; allowed is the same")
+    if old.get("dt", new["dt"]) != new["dt"]:
+        raise OptionError(f"-dt {new['dt']}: {path} was made with -dt {old['dt']}; allowed is the same")
 
 
 # -- settled states, outside the project's folder ------------------------------------------------------------

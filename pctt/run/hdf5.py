@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from pctt.disk import reserve
 from pctt.options import OptionError
 
 
@@ -32,42 +33,69 @@ def refuse_serial(comm: MPI.Comm) -> None:
 
 
 class RowWriter:
-    """Datasets of an open file: ``rows`` are concatenated over the ranks, ``whole`` is the same on each."""
+    """What a file is to hold: datasets, of which ``rows`` are concatenated over the ranks and ``whole`` are the same on
+    each, and attributes. Arrays must not change until the file is written."""
 
-    def __init__(self, file: h5py.File, comm: MPI.Comm):
-        self._file, self._comm = file, comm
+    def __init__(self) -> None:
+        self._rows: dict[str, np.ndarray] = {}
+        self._whole: dict[str, np.ndarray] = {}
+        self._attributes: list[tuple[str, Mapping[str, Any]]] = []
 
     def rows(self, name: str, local: np.ndarray) -> None:
-        """Collective: a dataset of the rows of all ranks, in their order."""
-        local = np.ascontiguousarray(local)
-        ends = np.cumsum(self._comm.allgather(len(local)))
-        data = self._file.create_dataset(name, (int(ends[-1]), *local.shape[1:]), local.dtype)
-        if len(local):
-            end = int(ends[self._comm.rank])
-            data[end - len(local) : end] = local
+        """A dataset of the rows of all ranks, in their order."""
+        self._rows[name] = np.ascontiguousarray(local)
 
     def whole(self, name: str, array: Any) -> None:
-        """Collective: a dataset of the array that every rank holds."""
-        array = np.asarray(array)
-        data = self._file.create_dataset(name, array.shape, array.dtype)
-        if self._comm.rank == 0:
-            data[...] = array
+        """A dataset of the array that every rank holds."""
+        self._whole[name] = np.asarray(array)
 
     def attributes(self, name: str, values: Mapping[str, Any]) -> None:
-        """Collective: attributes of a group ('/' the file), which is made if it is not there."""
-        self._file.require_group(name).attrs.update(values)
+        """Attributes of a group ('/' the file), which is made if it is not there."""
+        self._attributes.append((name, values))
+
+    def size(self, comm: MPI.Comm) -> tuple[int, int]:
+        """Bytes of all numbers and texts, and how many datasets and attributes they are; collective."""
+        own = comm.allreduce(sum(array.nbytes for array in self._rows.values()))
+        shared = [np.asarray(value) for _, values in self._attributes for value in values.values()]
+        shared += self._whole.values()
+        return own + sum(array.nbytes for array in shared), len(self._rows) + len(shared)
+
+    def write(self, file: h5py.File, comm: MPI.Comm) -> None:
+        """Put all of it into an open file; collective."""
+        for name, local in self._rows.items():
+            ends = np.cumsum(comm.allgather(len(local)))
+            data = file.create_dataset(name, (int(ends[-1]), *local.shape[1:]), local.dtype)
+            if len(local):
+                end = int(ends[comm.rank])
+                data[end - len(local) : end] = local
+        for name, array in self._whole.items():
+            data = file.create_dataset(name, array.shape, array.dtype)
+            if comm.rank == 0:
+                data[...] = array
+        for name, values in self._attributes:
+            file.require_group(name).attrs.update(values)
 
 
 @contextmanager
 def written(path: Path, comm: MPI.Comm) -> Iterator[RowWriter]:
-    """A file for all ranks, under a temporary name until it is complete; collective.
+    """A file for all ranks, written under a temporary name when the block ends; collective.
 
     Raises FileError on all ranks if it cannot be written; what stood under ``path`` is then untouched. Where one of
-    several ranks fails in the middle (a full disk), all are ended, after a word of that rank.
+    several ranks fails in the middle all are ended, after a word of that rank.
     """
+    contents = RowWriter()
+    yield contents
     temporary = path.with_name(f".{path.name}.tmp")
+    numbers, items = contents.size(comm)
+    failure = None
+    if comm.rank == 0:
+        try:
+            reserve(temporary, numbers, items)
+        except OSError as error:
+            failure = error.strerror
+    _raise_together(path, temporary, failure, comm)
     parallel = {"driver": "mpio", "comm": comm} if comm.size > 1 else {}
-    file, failure = None, None
+    file = None
     try:
         file = h5py.File(temporary, "w", **parallel)
     except OSError as error:
@@ -75,17 +103,17 @@ def written(path: Path, comm: MPI.Comm) -> Iterator[RowWriter]:
     _raise_together(path, temporary, failure, comm)
     assert file is not None
     try:
-        yield RowWriter(file, comm)
+        contents.write(file, comm)
         file.close()
         if comm.rank == 0:
             _flush_to_disk(temporary)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # h5py raises both
         failure = str(error)
         if comm.size > 1:  # the other ranks may be within a call that waits for this one
             sys.stderr.write(f"pctt.run: {path}: cannot write ({failure})\n")
             sys.stderr.flush()
             comm.Abort(2)
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, RuntimeError):
             file.close()
     _raise_together(path, temporary, failure, comm)
     if comm.rank == 0:
@@ -110,6 +138,8 @@ def write_text(path: Path, text: str) -> None:
         _flush_to_disk(temporary)
         os.replace(temporary, path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise FileError(f"{path}: cannot write ({error.strerror})", alone=True) from error
 
 

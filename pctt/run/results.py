@@ -28,6 +28,7 @@ from dem.contact.search import Contacts
 from dem.exchange import exchange
 from dem.system import ContactSystem
 from dem.world import World
+from pctt.disk import reserve
 from pctt.run.dump import HARD
 from pctt.run.hdf5 import FileError, RowWriter, write_text, written
 from pctt.run.records import Records
@@ -48,8 +49,11 @@ class Results:
         self._steps: list[dict[str, Any]] = []
         goes_on = comm.bcast(bool(restart) and Path(restart).resolve() == self.checkpoint.resolve())
         if comm.rank == 0:
-            self._frames.mkdir(parents=True, exist_ok=True)
-            self._take_over(world, goes_on)
+            try:
+                self._frames.mkdir(parents=True, exist_ok=True)
+                self._take_over(world, goes_on)
+            except OSError as error:
+                raise FileError(f"{folder}: cannot write ({error.strerror})", alone=True) from None
         comm.Barrier()
         self.records = Records(folder, comm, kept_steps=world.step if goes_on else 0)
 
@@ -105,11 +109,12 @@ class Results:
     def _link_frames(self, world: World) -> None:
         temporary = self.folder / ".state.h5.tmp"
         try:
+            reserve(temporary, 1024, items=len(self._recorded))
             self._write_links(temporary, world)
             temporary.replace(self.folder / "state.h5")
         except OSError as error:
             temporary.unlink(missing_ok=True)
-            raise FileError(f"{self.folder / 'state.h5'}: cannot write ({error})", alone=True) from None
+            raise FileError(f"{self.folder / 'state.h5'}: cannot write ({error.strerror})", alone=True) from None
 
     def _write_links(self, path: Path, world: World) -> None:
         with h5py.File(path, "w") as file:

@@ -40,8 +40,8 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         progress.say("no options: the demo; -help lists the options")
     world, memory = first_state(options, comm, progress)
     dump = Dump(options, world)
-    record = checkpoint.scene_record(scene_name(options.run.scene), options.scene)
-    results = Results(Path(options.run.output), comm, record, world, options.run.restart)
+    made_with = checkpoint.origin(scene_name(options.run.scene), options.scene, options.dt)
+    results = Results(Path(options.run.output), comm, made_with["scene"], world, options.run.restart)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
     stepper = Stepper(options, world, memory, newton, dump)
@@ -65,7 +65,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         results.write_summary(world, compare.summary(), line)
         with log.phase("output"):
             if k % options.run.checkpoint_every == 0 or last:
-                checkpoint.save(results.checkpoint, record, world, memory)
+                checkpoint.save(results.checkpoint, made_with, world, memory)
         _count_output(line)
         progress.say(report.step_line(line), level=1)
         progress.say(report.accuracy_lines(line, stepper.history), level=2)
@@ -216,12 +216,12 @@ def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0)
 
 
 def first_state(options: Options, comm: MPI.Comm, progress: report.Progress) -> tuple[World, ImpulseMemory]:
-    name, scene = scene_name(options.run.scene), options.scene
-    if not options.run.restart:
+    run, scene = options.run, options.scene
+    if not run.restart:
         return _new_world(scene, comm), ImpulseMemory(comm)
-    settled = options.run.restart == "settled"
-    path = settled_state(options, comm, progress) if settled else Path(options.run.restart)
-    world, memory = checkpoint.load(path, name, scene, comm)
+    path = settled_state(options, comm, progress) if run.restart == "settled" else Path(run.restart)
+    made_with = checkpoint.origin(scene_name(run.scene), scene, options.dt)
+    world, memory = checkpoint.load(path, scene, made_with, comm, run.restart_changed_file)
     progress.say(f"from {path}: step {world.step}, time {world.time:g} s")
     return world, memory
 
@@ -250,7 +250,7 @@ def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, a
     )
     if not options.scene.settling_time:
         raise OptionError(f"-scene {options.run.scene}: has no settling_time and so no settled state")
-    record = checkpoint.scene_record(scene_name(options.run.scene), options.scene)
+    made_with = checkpoint.origin(scene_name(options.run.scene), options.scene, options.dt)
     settings: dict[str, Any] = {
         "dt": options.dt,
         "delta": [options.run.settle_delta, options.delta],
@@ -259,7 +259,7 @@ def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, a
     }
     if options.scene.digest:
         settings["file"] = options.scene.digest  # a file that was changed may build another scene
-    path = checkpoint.settled_path(record, settings)
+    path = checkpoint.settled_path(made_with["scene"], settings)
     if not anew and comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
         return path
     steps = math.ceil(options.scene.settling_time / options.dt * (1 - 1e-12))
@@ -282,7 +282,7 @@ def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, a
                 f"  residual {line['natural_residual']:.1e}  {spent:7.1f} s spent"
             )
     comm.Barrier()
-    checkpoint.save(path, record, stepper.world, stepper.memory)
+    checkpoint.save(path, made_with, stepper.world, stepper.memory)
     if comm.rank == 0:
         checkpoint.write_checksum(path)
     comm.Barrier()

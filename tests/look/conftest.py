@@ -31,6 +31,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def python():
+    """`python(*words)` starts Python with these words."""
+    return start
+
+
+@pytest.fixture
 def show(folder: Path):
     """`show(program, *options)` runs `python -m pctt.<program>` on the folder."""
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import resource
+
+import h5py
 import handmade
 import numpy as np
 import pytest
 
 from dem.scenes import Mixer
 from pctt.look.folder import Folder, FolderError
+from pctt.look.program import whole
 
 
 def test_a_run_tells_the_shapes_of_its_bodies(folder):
@@ -91,6 +95,55 @@ def test_a_damaged_frame_is_named(tmp_path):
         read.frame(1)
 
 
+def no_hdf5(path):
+    path.write_text("these are no data\n" * 100)
+
+
+def truncated(path):
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+def other_hdf5(path):
+    with h5py.File(path, "w") as file:
+        file["data"] = np.zeros(3)
+
+
+@pytest.mark.parametrize("damage", [no_hdf5, truncated, other_hdf5], ids=lambda f: f.__name__)
+@pytest.mark.parametrize("name", ["state.h5", "frames/000001.h5", "frames/bodies.h5"])
+def test_a_damaged_file_is_named(name, damage, tmp_path):
+    made = handmade.write(tmp_path / "made", handmade.FLOOR)
+    damage(made / name)
+
+    def read():
+        folder = Folder(made)
+        folder.require_frames()
+        folder.frame(1)
+
+    with pytest.raises(FolderError, match="state.h5|000001.h5|no recorded steps") as error:
+        read()
+    assert str(made) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kind", [FolderError, None], ids=["cannot be written", "can be written"])
+def test_a_file_is_written_whole_or_not_at_all(kind, tmp_path):
+    path = tmp_path / "figure.png"
+    path.write_text("before")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        if kind:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+            with pytest.raises(FolderError, match=r"figure.png: cannot write \(File too large\)"), whole(path) as new:
+                new.write_bytes(bytes(1000))
+        else:
+            with whole(path) as new:
+                new.write_bytes(bytes(1000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert path.read_bytes() == (b"before" if kind else bytes(1000))
+    assert [p.name for p in tmp_path.iterdir()] == ["figure.png"]
+
+
 @pytest.mark.parametrize(
     ("program", "library"), [("plot", "matplotlib"), ("render", "vtkmodules"), ("export", "vtkmodules")]
 )
@@ -101,6 +154,31 @@ def test_a_folder_without_the_bodies_is_refused(program, library, show, tmp_path
     done = show(program, folder=made, status=2)
     assert "lacks the shapes" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("program", "missing"), [("plot", "matplotlib"), ("render", "vtkmodules"), ("export", "vtkmodules")]
+)
+def test_without_the_libraries_one_line_names_the_extra(program, missing, python, tmp_path):
+    """Also where they are: the import finds nothing."""
+    made = handmade.write(tmp_path / "made", handmade.FLOOR)
+    source = f"""
+import importlib.abc, runpy, sys
+class Nothing(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name.partition(".")[0] in ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg"):
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Nothing())
+sys.argv = ["pctt.{program}", {str(made)!r}]
+runpy.run_module("pctt.{program}", run_name="__main__")
+"""
+    done = python("-c", source)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"pctt.{program}: No module named ")
+    assert missing in line or program == "render"  # which may ask for matplotlib first
+    assert "pip install -e '.[pictures]'" in line
 
 
 def test_records_are_columns_of_numbers(tmp_path):

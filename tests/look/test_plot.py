@@ -17,7 +17,7 @@ from pctt.look import figures
 
 def test_all_figures_are_drawn(show, folder, tmp_path):
     done = show("plot", "-output", tmp_path)
-    names = {"steps", "compare", "sparsity", "graphs", "forces", "torques", "energy", "lengths", "figures"}
+    names = {"steps", "compare", "sparsity", "graphs", "forces", "torques", "energy", "lengths", "statistics"}
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}.png" for name in names}
     assert all(f"{name}.png" in done.stdout for name in names)
     for name in names:
@@ -33,7 +33,7 @@ def test_a_pdf_with_the_figures_of_records(show, tmp_path):
     (made / "records.csv").write_text(head + "1,0.5,3,1,2,1\n2,1.0,4,1,2,1\n")
     show("plot", "-format", "pdf", folder=made)
     found = {path.name for path in (made / "figures").iterdir()}
-    assert found == {"forces.pdf", "energy.pdf", "figures.pdf", "sparsity.pdf", "graphs.pdf"}
+    assert found == {"forces.pdf", "energies.pdf", "statistics.pdf", "sparsity.pdf", "graphs.pdf"}
     assert all((made / "figures" / name).read_bytes().startswith(b"%PDF") for name in found)
 
 
@@ -50,6 +50,34 @@ def test_stresses_against_displacement_and_forces_against_position():
     (axes,) = made["blade_force"].axes
     assert len(axes.lines) == 1
     assert figures.curves({"time [s]": way, "worst_overlap [m]": way, "force_x [N]": way}, {}) == {}
+
+
+def test_the_energy_figure_is_a_balance():
+    """Energies that obey the balance but for a drift of 1 J per step, in the figure's curves."""
+    time, work, friction, impact = np.arange(1.0, 6.0), np.arange(5.0) ** 2, np.arange(5.0), np.full(5, 0.5)
+    kinetic = np.array([3.0, 1, 4, 1, 5])
+    total = 1e6 + np.cumsum(work - friction - impact + 1)
+    values = (kinetic, total - kinetic, work, friction, impact, np.ones(5))
+    columns = {"step": time, "time [s]": time} | {f"{k} [J]": v for k, v in zip(figures.BALANCE, values)}
+    made = figures.records(columns)
+    assert set(made) == {"energy"}
+    above, below = made["energy"].axes
+    drawn = {line.get_label(): line.get_ydata() for line in above.lines}
+    assert len(drawn) == 6
+    np.testing.assert_allclose(drawn["kinetic energy"], kinetic)
+    np.testing.assert_allclose(drawn["potential energy, change"], (total - kinetic) - (total - kinetic)[0])
+    np.testing.assert_allclose(drawn["work of moving bodies, sum"], [0, 1, 5, 14, 30])
+    np.testing.assert_allclose(drawn["friction loss, sum"], [0, 1, 3, 6, 10])
+    np.testing.assert_allclose(np.diff(drawn["kinetic + potential + losses - work"]), 1, atol=1e-9)
+    np.testing.assert_allclose(below.lines[-1].get_ydata(), time, atol=1e-9)
+
+
+def test_curves_of_other_sizes_have_other_axes():
+    time = np.arange(3.0)
+    columns = {"time [s]": time, "a [Pa]": time, "b [Pa]": 2 * time, "c [Pa]": 1e3 * time, "zero [Pa]": 0 * time}
+    made = figures.records({**columns, "force_x [N]": time, "force_y [N]": 1e6 * time, "push [N]": time})
+    labels = {name: [[line.get_label() for line in axes.lines] for axes in made[name].axes] for name in made}
+    assert labels == {"stresses": [["a", "b"], ["c"], ["zero"]], "forces": [["x", "y"], ["push"]]}
 
 
 def test_nothing_to_plot_is_an_error(show, tmp_path):

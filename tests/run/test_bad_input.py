@@ -232,12 +232,24 @@ def test_a_file_that_is_no_checkpoint_is_refused_by_two_ranks_at_once(
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("-scene_friction", "0.5"), ("-scene_n", "2"), ("-scene_seed", "7")]
+    ("option", "value", "stored"),
+    [
+        ("-scene_friction", "0.5", "0.25"),
+        ("-scene_seed", "7", "1"),
+        ("-dt", "0.02", "0.025"),
+        ("-scene", "shear", "mixer"),
+    ],
 )
-def test_a_checkpoint_of_another_scene_is_refused(option, value, program, results, settled):
-    said = refused(program, results, *SMALL, option, value, "-restart", settled)
-    assert f"{option} {value}" in said
-    assert settled.name in said
+def test_a_checkpoint_of_another_scene_or_time_step_is_refused(option, value, stored, program, results, settled):
+    own = () if option == "-scene" else SMALL
+    said = refused(program, results, *own, option, value, "-restart", settled)
+    assert said == f"pctt.run: {option} {value}: {settled} was made with {option} {stored}; allowed is the same"
+
+
+@pytest.mark.mpi
+def test_a_checkpoint_of_another_time_step_is_refused_by_two_ranks_with_one_voice(program, results, settled):
+    said = refused(program, results, *SMALL, "-dt", 0.02, "-restart", settled, ranks=2)
+    assert "-dt 0.02" in said
 
 
 @pytest.mark.parametrize("damage", [no_hdf5, empty, other_hdf5, truncated, fclib], ids=lambda f: f.__name__)
@@ -245,6 +257,12 @@ def test_a_file_that_is_no_fclib_problem_is_refused(damage, program, results, se
     damage(tmp_path / "bad.hdf5", settled)
     said = refused(program, results, "-problem", "bad.hdf5")
     assert "bad.hdf5" in said
+
+
+@pytest.mark.mpi
+def test_a_truncated_fclib_problem_is_refused_by_two_ranks_at_once(program, results, settled, tmp_path):
+    truncated(tmp_path / "bad.hdf5", settled)
+    assert "bad.hdf5" in refused(program, results, "-problem", "bad.hdf5", ranks=2)
 
 
 @pytest.mark.parametrize("numbers", ["NaN in q", "negative mu", "short q"])

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 
+import h5py
 import numpy as np
 import pytest
+from mpi4py import MPI
 from program import SETTLED, SMALL, arrays, assert_same_bits, recorded_steps
 
+from dem.experiment import Experiment
 from dem.scenes import Mixer
+from pctt.options import OptionError
 from pctt.run.checkpoint import scene_record, settled_path
+from pctt.run.options import read_options
+from pctt.run.simulate import simulate
 
 
 @pytest.mark.parametrize(
@@ -106,3 +113,82 @@ def test_a_settled_state_is_known_by_its_scene_and_by_what_settled_it(tmp_path, 
     assert len(set(paths)) == len(paths)
     assert {path.parent for path in paths} == {tmp_path / "pctt"}
     assert paths[0] == settled_path(scene_record("mixer", Mixer(n=2)), dict(settings))
+
+
+DROP = """
+from dataclasses import dataclass
+from dem.experiment import Experiment, option
+from dem.scene import Scene
+from dem.shapes import Plane
+
+@dataclass(frozen=True)
+class Drop(Experiment):
+    height: float = option(1.0, "m", "of the lowest centre")
+
+    def build(self):
+        scene = Scene(friction=0.3)
+        scene.add_body("floor", [Plane(normal=(0, 0, 1))])
+        scene.add_spheres([[0, 0, self.height + k] for k in range(3)], radius=0.1, density=2500.0)
+        return scene
+"""
+
+
+@pytest.fixture
+def drop(tmp_path, monkeypatch):
+    """`drop(text, options)` runs a scene file with this text on from out/checkpoint.h5, where two steps of DROP are."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(text, **options):
+        (tmp_path / "drop.py").write_text(text)
+        database = {"scene": "drop.py", "ccp_type": "apgd", "steps": "2", "output": "out", "quiet": "true", **options}
+        simulate(read_options(database, MPI.COMM_SELF), MPI.COMM_SELF)
+
+    run(DROP)
+
+    def go_on(text, **options):
+        return run(text, restart="out/checkpoint.h5", **options)
+
+    return go_on
+
+
+def step_of(path):
+    return int(arrays(path)["world/step"])
+
+
+def test_another_text_of_the_scene_file_is_refused_unless_asked_for(drop, tmp_path):
+    before = (tmp_path / "out" / "checkpoint.h5").read_bytes()
+    changed = DROP.replace("friction=0.3", "friction=0.4")
+    digests = [hashlib.sha256(text.encode()).hexdigest()[:12] for text in (DROP, changed)]
+    with pytest.raises(OptionError) as refusal:
+        drop(changed)
+    for word in ("-scene drop: out/checkpoint.h5", *digests, "allowed is the same text", "-restart_changed_file"):
+        assert word in str(refusal.value)
+    assert (tmp_path / "out" / "checkpoint.h5").read_bytes() == before
+    drop(changed, restart_changed_file="true")
+    assert step_of(tmp_path / "out" / "checkpoint.h5") == 4
+
+
+def test_other_bodies_or_options_of_a_changed_scene_file_are_refused(drop):
+    for text, words in {
+        DROP.replace("range(3)", "range(4)"): ("-restart out/checkpoint.h5", "3 grains", "4"),
+        DROP.replace("option(1.0", "option(2.0"): ("-scene_height 2.0", "made with -scene_height 1.0"),
+        DROP.replace("height", "level"): ("-scene_level 1.0", "made with -scene_level (no such option)"),
+    }.items():
+        with pytest.raises(OptionError) as refusal:
+            drop(text, restart_changed_file="true")
+        for word in words:
+            assert word in str(refusal.value)
+
+
+def test_options_of_the_solver_may_change(drop, tmp_path):
+    drop(DROP, ccp_type="pdip", ccp_tol="1e-6", delta="0.05", recovery_speed="0.5")
+    assert step_of(tmp_path / "out" / "checkpoint.h5") == 4
+
+
+def test_a_checkpoint_without_time_step_and_scene_file_is_taken(drop, tmp_path):
+    """As earlier versions wrote them."""
+    with h5py.File(tmp_path / "out" / "checkpoint.h5", "a") as file:
+        assert file.attrs["dt"] == Experiment.dt
+        del file.attrs["dt"], file.attrs["scene_file"]
+    drop(DROP + "# changed", dt="0.02")
+    assert step_of(tmp_path / "out" / "checkpoint.h5") == 4

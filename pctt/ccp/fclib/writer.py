@@ -20,6 +20,7 @@ from pctt.ccp.cone import Array
 from pctt.ccp.gather import gather_matrix, gather_rows, write_whole
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.stored import sparse_matrix
+from pctt.disk import reserve
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,11 @@ def _write(
     points = None if point is None else gather_rows(comm, point)
 
     def write(temporary: Path) -> None:
+        arrays = [part for A in whole_matrices.values() for part in (A.data, A.indices, A.indices)]
+        arrays += [*whole_vectors.values(), *(x for state in whole_states.values() for x in state.values())]
+        arrays += [] if points is None else [points]
+        texts = sum(len(text.encode()) for text in vars(info or Info()).values())
+        reserve(temporary, sum(array.nbytes for array in arrays) + texts, len(arrays) + 30)
         with h5py.File(temporary, "w") as file:
             group = file.create_group(f"fclib_{form}")
             group["spacedim"] = _integers([3])

@@ -1,0 +1,140 @@
+"""A disk that fills up, or takes no files: status 2, one clear line, and what was written before stays whole."""
+
+from __future__ import annotations
+
+import json
+import resource
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from program import SMALL, arrays, command, environment, recorded_steps
+
+from pctt.ccp import ConeProblem, fclib, petsc_binary
+from pctt.run.hdf5 import FileError
+from pctt.run.options import read_options
+from pctt.run.simulate import simulate
+
+LOOSE = ("-ccp_type", "apgd", "-ccp_tol", "1e-3")
+SCENE = {"scene_n": "1", "scene_margin": "0.5", "output": "out", "ccp_type": "apgd", "ccp_tol": "1e-3", "quiet": "true"}
+
+
+def check_whole(folder):
+    """All that is there can be read and nothing else is there; the step of the checkpoint."""
+    assert not list(folder.rglob("*.tmp"))
+    steps = [line["step"] for line in json.loads((folder / "summary.json").read_text())["steps"]]
+    step = int(arrays(folder / "checkpoint.h5")["world/step"])
+    assert set(steps) >= set(range(1, step + 1))
+    if (folder / "state.h5").exists():  # not with -output_every 0
+        state = arrays(folder / "state.h5")
+        assert all(state[f"{name}/position"].shape == (29, 3) for name in recorded_steps(state))
+        assert {int(name) for name in recorded_steps(state)} >= set(range(1, step + 1))
+    return step
+
+
+class Limit:
+    """Within it no file of this process gets longer than so many bytes, as if the disk were full."""
+
+    def __init__(self, size):
+        self.size = size
+
+    def __enter__(self):
+        self.before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (self.size, self.before[1]))
+
+    def __exit__(self, *_):
+        resource.setrlimit(resource.RLIMIT_FSIZE, self.before)
+
+
+@pytest.mark.parametrize(
+    ("size", "file", "options"),
+    [
+        (40_000, "out/frames/000003.h5", {}),
+        (1_000, "out/records.csv", {"output_every": "0"}),
+        (2_000, "out/summary.json", {"output_every": "0"}),
+        (40_000, "out/checkpoint.h5", {"output_every": "0"}),
+        (40_000, "problems/step000003_", {"dump_problem": "problems"}),
+        (10_000, "out/state.h5", {}),
+    ],
+)
+def test_a_file_that_cannot_be_written_ends_the_run_and_spares_the_others(size, file, options, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run(**more):
+        simulate(read_options({**SCENE, **more}, MPI.COMM_SELF), MPI.COMM_SELF)
+
+    run(steps="2", **options)
+    shutil.rmtree("problems", ignore_errors=True)
+    assert check_whole(tmp_path / "out") == 2
+    again = {"restart": "out/checkpoint.h5", "steps": "1"}
+    with Limit(size), pytest.raises(FileError, match=r"cannot write \(.*File too large\)") as error:
+        run(**again, **options)
+    assert str(error.value).startswith(file)
+    assert check_whole(tmp_path / "out") == 2
+    run(**again, **options)  # the disk has room again
+    assert check_whole(tmp_path / "out") == 3
+
+
+@pytest.mark.parametrize("write", [fclib.write_local, petsc_binary.write], ids=["fclib", "petsc"])
+def test_a_problem_that_cannot_be_written_leaves_the_old_file(write, tmp_path):
+    path = tmp_path / "problem"
+    path.write_text("what was there")
+    csr = (np.arange(601, dtype=np.int32), np.arange(600, dtype=np.int32), np.ones(600))
+    unit = PETSc.Mat().createAIJ((600, 600), bsize=3, csr=csr, comm=PETSc.COMM_SELF)
+    problem = ConeProblem(MPI.COMM_SELF, np.ones((200, 3)), np.ones(200), N=unit)
+    with Limit(2_000), pytest.raises(OSError, match="cannot write"):
+        write(path, problem)
+    assert [p.name for p in tmp_path.iterdir()] == ["problem"]
+    assert path.read_text() == "what was there"
+
+
+@pytest.fixture
+def small_disk(cache, tmp_path):
+    """`small_disk(how, *options, ranks)` runs with a file system of its own, mounted with these options, in the folder
+    disk, and copies what is there in the end to the folder left. In a name space of its own it needs no rights."""
+    (tmp_path / "disk").mkdir()
+    shell = [shutil.which("unshare") or "unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
+
+    def run(how, *options, ranks=1):
+        mount = f"mount -t tmpfs -o {how} none disk"
+        try:
+            subprocess.run([*shell, mount], cwd=tmp_path, check=True, capture_output=True)
+        except (OSError, subprocess.CalledProcessError):
+            pytest.skip("this system lets no user mount a file system of his own")
+        script = f'{mount} && "$@"; status=$?; cp -a disk left; exit $status'
+        return subprocess.run(
+            [*shell, script, "sh", *command(*options, ranks=ranks)],
+            cwd=tmp_path, env=environment(cache), capture_output=True, text=True, timeout=120, check=False,
+        )
+
+    return run
+
+
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+def test_a_disk_that_fills_up_ends_the_run(ranks, small_disk, program, tmp_path):
+    done = small_disk("size=200k", *SMALL, *LOOSE, "-steps", 40, "-output", "disk/out", ranks=ranks)
+    check_one_line(done, "disk/out/", "cannot write (No space left on device)")
+    step = check_whole(tmp_path / "left" / "out")
+    assert 2 <= step < 40
+    program(*SMALL, *LOOSE, "-restart", "left/out/checkpoint.h5", "-steps", 1, "-output", "left/out", ranks=ranks)
+    assert check_whole(tmp_path / "left" / "out") == step + 1
+
+
+@pytest.mark.parametrize("option", ["-output", "-dump_problem"])
+def test_a_folder_on_a_disk_that_cannot_be_written_is_refused_before_any_work(option, small_disk, tmp_path):
+    done = small_disk("ro", *SMALL, *LOOSE, "-steps", 1, option, "disk/out")
+    check_one_line(done, f"{option} disk/out", "Read-only file system", "allowed is a folder that can be written")
+    assert done.stdout == ""
+    assert not list((tmp_path / "left").iterdir())
+
+
+def check_one_line(done, *words):
+    assert done.returncode == 2, done.stdout + done.stderr
+    (said,) = [line for line in done.stderr.splitlines() if line.startswith("pctt.run: ")]
+    for word in words:
+        assert word in said
+    for word in ("Traceback", "PETSC ERROR", "HDF5"):
+        assert word not in done.stdout + done.stderr
