@@ -36,6 +36,7 @@ SHORT = 0.8  # a step after which the direction is corrected
 CORRECTIONS, FURTHER = 3, 0.3  # at most so many, for a step that goes so much further
 NEAR = 0.1, 10.0  # the central path, in units of the complementarity that is aimed at
 PATIENCE = 3  # iterations without progress before the Newton systems are sharpened
+LARGEST_PROXIMAL = 1e-5  # up to which the proximal compliance grows before that
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,9 @@ class Conic:
         0.2, "residual of a linear solve, as a part of the root of the complementarity", check=POSITIVE
     )
     proximal: float = option(
-        1e-8, "compliance within a step, in units of mean diag N; the answer does not have it", check=NOT_NEGATIVE
+        1e-8,
+        "compliance within a step, in units of mean diag N; the answer does not have it; it grows where progress ends",
+        check=NOT_NEGATIVE,
     )
     boundary: float = option(0.99, "part of the way to the cone's boundary that a step may go", check=FRACTION)
 
@@ -59,7 +62,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
     scale, frictionless = _cone_scale(problem.mu)
     s, z = _start(problem, guess, scale, frictionless, options)
     v = problem.momentum(s / scale)
-    best, history, patience, last_gap = s / scale, [], 0, np.inf
+    best, history, patience, last_gap, proximal = s / scale, [], 0, np.inf, options.proximal
     for iteration in range(max_it + 1):
         g = s / scale
         r_v, r_z = _residuals(problem, g, z, v, scale, frictionless)
@@ -70,12 +73,14 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
         patience, last_gap = (0 if progress else patience + 1), gap
         if history[-1] <= limits.tol or iteration == max_it or why_unbounded(problem, g):
             break
-        if patience > PATIENCE:
+        if newton.primary == "momenta" and patience > 1 and 0 < proximal < LARGEST_PROXIMAL:
+            proximal, patience = 10.0 * proximal, 0
+        elif patience > PATIENCE:
             if not newton.sharpen():
                 break
-            patience = 0
+            proximal, patience = options.proximal, 0
         W = NesterovTodd.of(s, z)
-        newton.update(*_barrier_blocks(problem, W, scale, frictionless, options.proximal))
+        newton.update(*_barrier_blocks(problem, W, scale, frictionless, proximal))
         tol = options.forcing * np.sqrt(gap) * (1.0 if newton.primary == "momenta" else CLOSER)
 
         def direction(c: Array, start: Array | None) -> tuple[Array, Array, Array, Array]:
