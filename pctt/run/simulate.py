@@ -57,6 +57,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         lines.append(line)
         with log.phase("output"):
             row = stepper.records()
+            line["worst_overlap"] = row["worst_overlap [m]"]
             results.records.add(row)
             if options.run.output_every and (world.step % options.run.output_every == 0 or last):
                 results.record_step(world, stepper.contacts, stepper.system, stepper.impulse, row)
@@ -75,6 +76,8 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         progress.say("\n" + report.phase_table(lines))
         if figures:
             progress.say(report.figure_table(figures))
+        if comm.rank == 0:
+            progress.say(report.overlap_line(results.worst_overlap()))
         if row.get("grains_outside"):
             progress.say(f"{row['grains_outside']:.0f} grains have left the domain of the scene")
     if compare.names:
@@ -134,7 +137,7 @@ class Stepper:
         with log.phase("search"):
             rebalance(world)
             try:
-                self.contacts = find_contacts(world, options.delta)
+                self.contacts = find_contacts(world, options.delta, options.dt)
             except FloatingPointError as error:  # raised on all ranks alike
                 raise SceneError(f"step {world.step + 1}: {error}") from None
         with log.phase("assembly"):
