@@ -9,7 +9,7 @@ import numpy as np
 
 from dem import bodies, quaternion
 from dem.arrays import Floats
-from dem.bodies import SPHERE, Bodies
+from dem.bodies import Bodies
 from dem.motion import Dynamic
 from dem.quaternion import cross
 
@@ -34,14 +34,6 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
     spin = quaternion.rotate(quaternion.conjugate(turn), velocity[rows, 3:])
     velocity[rows, 3:] += dt * quaternion.rotate(turn, -cross(spin, moments * spin) / moments)
     return velocity
-
-
-def free_way(table: Bodies, gravity: Floats, dt: float) -> Floats:
-    """The greatest ways (n,) of a point of each grain in dt [s] without contacts, about [m]; of spheres that of the
-    centre, as turning brings their surface nowhere."""
-    velocity = dt * free_velocity(table, gravity, dt)
-    radius = np.where(table.shape == SPHERE, 0.0, bodies.bounding_radius(table))
-    return np.linalg.norm(velocity[:, :3], axis=1) + radius * np.linalg.norm(velocity[:, 3:], axis=1)
 
 
 def free_velocities(world: World, near: Neighbourhood, dt: float) -> Floats:

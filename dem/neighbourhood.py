@@ -45,7 +45,7 @@ def without_ghosts(world: World, margin: Floats) -> Neighbourhood:
 def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
     """All bodies whose margin may meet that of a local grain; `margin` (grains,) [m] of the local ones; collective.
 
-    FloatingPointError, on all ranks, if a position is no longer finite.
+    FloatingPointError, on all ranks, if a position or margin is not finite.
     """
     comm, grains = world.comm, world.grains
     radius = bodies.bounding_radius(grains) + margin
@@ -53,7 +53,7 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
     comm.Allgather(_chunk_boxes(grains.position, radius), boxes)
     if np.isnan(boxes).any():
         raise FloatingPointError(
-            f"a grain has no finite position at step {world.step} (time {world.time:g} s)"
+            f"a grain has no finite position or velocity at step {world.step} (time {world.time:g} s)"
         )
     first = world.slabs[comm.rank]
     columns = dict(grains.columns(), margin=margin, index=np.arange(first, first + len(grains)))
@@ -74,7 +74,7 @@ def _chunk_boxes(position: Floats, radius: Floats) -> Floats:
     """Bounding boxes (BOXES, 2, 3) of equal pieces of a slab; empty ones reach from +inf to -inf."""
     boxes = np.empty((BOXES, 2, 3))
     boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
-    if not np.isfinite(position).all():
+    if not (np.isfinite(position).all() and np.isfinite(radius).all()):
         boxes[:] = np.nan  # seen by every rank, so that all of them stop
         return boxes
     cuts = np.linspace(0, len(position), BOXES + 1).astype(int)

@@ -6,19 +6,26 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 
+from dem import bodies
 from dem.arrays import Floats, Ints
+from dem.bodies import SPHERE, Bodies
 from dem.checks import not_negative
 from dem.contact.broad import close_pairs
 from dem.contact.narrow import Touch, dot
 from dem.contact.primitives import FEATURES, PLANE, Primitives, primitives, touches
-from dem.free_motion import free_way, large_free_velocity
+from dem.free_motion import free_velocity, large_free_velocity
 from dem.motion import Dynamic
 from dem.neighbourhood import Neighbourhood, neighbourhood, without_ghosts
 from dem.quaternion import cross
 
 if TYPE_CHECKING:
     from dem.world import World
+
+
+#: The margin of a grain is at most so many of its radii, whatever its speed.
+WIDEST = 2.0
 
 
 @dataclass(frozen=True)
@@ -39,19 +46,21 @@ class Contacts:
         return len(self.key)
 
 
-def find_contacts(world: World, delta: float, dt: float = 0.0) -> Contacts:
+def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | float = 0.0) -> Contacts:
     """All contacts that this rank owns of the pairs whose margins meet; collective.
 
     The margin of a body is delta/2 [m], or the way that it goes in dt [s] without contact forces if that is longer: a
     gap of at most `delta` is a contact, and so is a longer one that may close within the step, also as one of the two
     is stopped by a third. A grain in the margin of a large body has that of the large body there if it is wider, as
-    the large body may strike it and send it on. A contact belongs to the rank that owns the body of lower global
-    index. The numbers of contacts that the grains own are left in `world.grains.weight`.
+    the large body may strike it and send it on. `margin` (grains,) [m]: no margin of a local grain is to be less.
+    A contact belongs to the rank that owns the body of lower global index. The numbers of contacts that the grains own
+    are left in `world.grains.weight`.
     """
     not_negative("contact distance delta", delta)
     shapes = [body.shapes for body in world.large_bodies]
     shift = dt * large_free_velocity(world, dt) if dt else np.zeros_like(world.large.velocity)
-    margin = np.maximum(delta / 2, free_way(world.grains, world.gravity, dt))
+    way = _way(world.grains, free_velocity(world.grains, world.gravity, dt), dt)
+    margin = np.maximum(np.maximum(delta / 2, way), margin)
     if dt:
         alone = without_ghosts(world, margin)
         margin = _margins_of_struck(alone, primitives(alone, shapes, int(world.slabs[-1])), delta, shift)
@@ -89,13 +98,37 @@ def find_contacts(world: World, delta: float, dt: float = 0.0) -> Contacts:
     )
 
 
+def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Contacts | None:
+    """The contacts of wider margins, if with these velocities (owned, 6) grains go further in dt [s] than their margins
+    in the search for `contacts`; None if that brings no new ones: then no two grains meet unseen; collective.
+
+    A search for the contacts that are found may be followed by another: margins only grow.
+    """
+    seen = contacts.near.margin[: contacts.near.grains]
+    ways = _way(world.grains, velocity[: len(seen)], dt)
+    if not world.comm.allreduce(bool((ways > seen).any()), MPI.LOR):
+        return None
+    wider = find_contacts(world, delta, dt, np.maximum(seen, ways))
+    new = not np.isin(wider.key, contacts.key).all()
+    return wider if world.comm.allreduce(new, MPI.LOR) else None
+
+
+def _way(grains: Bodies, velocity: Floats, dt: float) -> Floats:
+    """How far (n,) a point of each grain goes in dt [s], about and at most WIDEST radii [m]; of spheres their centre,
+    as turning brings their surface nowhere. NaN where the velocity is not finite."""
+    radius = bodies.bounding_radius(grains)
+    turn = np.where(grains.shape == SPHERE, 0.0, radius) * np.linalg.norm(velocity[:, 3:], axis=1)
+    way = np.minimum(dt * (np.linalg.norm(velocity[:, :3], axis=1) + turn), WIDEST * radius)
+    return np.where(np.isfinite(velocity).all(axis=1), way, np.nan)
+
+
 def _margins_of_struck(near: Neighbourhood, table: Primitives, delta: float, shift: Floats) -> Floats:
     """The margins (grains,) of the grains, those in reach of a large body at least as wide as its own there."""
     pairs, reach = _grains_on_parts(near, table, delta, shift)
     grain, part = pairs[touches(table, pairs[:, 0], pairs[:, 1], reach).pair].T
     margin = near.margin.copy()
     np.maximum.at(margin, grain, _part_margin(near, table, part, grain, delta, shift))
-    return margin
+    return np.minimum(margin, np.maximum(near.margin, WIDEST * table.radius[: near.grains]))
 
 
 def _grain_pairs(near: Neighbourhood, table: Primitives) -> tuple[Ints, Floats]:

@@ -357,5 +357,5 @@ def test_large_bodies_that_are_not_free_do_not_touch_each_other():
 def test_a_lost_grain_is_an_error():
     world = World.from_scene(heap(1, side=3), SELF)
     world.grains.position[4, 1] = np.nan
-    with pytest.raises(FloatingPointError, match="no finite position at step 0"):
+    with pytest.raises(FloatingPointError, match="no finite position or velocity at step 0"):
         find_contacts(world, 0.02)
