@@ -4,7 +4,7 @@ The loop of a simulation, on any number of ranks:
 
     world = World.from_scene(scene, comm)
     while world.time < end:
-        contacts = find_contacts(world, delta)
+        contacts = find_contacts(world, delta, dt)
         system = ContactSystem(world, contacts, dt, recovery_speed)
         impulse = solve(system)
         advance(world, system.velocity(impulse), dt)

@@ -42,6 +42,11 @@ def steady_part(time: Floats, start: float, period: float) -> Bools:
     return (phase >= 1 / 8) & (phase <= 3 / 8)
 
 
+def swing(values: Floats, filtered_values: Floats) -> float:
+    """Standard deviation of what the filter takes away from a series (n,), relative to the mean of the series."""
+    return float(np.std(values - filtered_values) / np.mean(values))
+
+
 def friction_angle(shear: Floats, normal: Floats) -> float:
     """Angle [degrees] whose tangent is the mean shear over the mean normal stress."""
     return float(np.degrees(np.arctan2(np.mean(shear), np.mean(normal))))

@@ -81,6 +81,11 @@ def enclosing_radius(kind: Ints, size: Floats) -> Floats:
     return np.where(kind == CAPSULE, size.sum(axis=1), np.linalg.norm(size, axis=1))
 
 
+def least_half_thickness(bodies: Bodies) -> Floats:
+    """Radius (n,) of the greatest sphere that fits into a grain [m]."""
+    return np.where(bodies.shape == BOX, bodies.size.min(axis=1), bodies.size[:, 0])
+
+
 def inverse_root_inertia(bodies: Bodies) -> Floats:
     """Symmetric square roots (n, 3, 3) of the inverse inertia tensors in the world frame."""
     turn = quaternion.matrix(bodies.quaternion)

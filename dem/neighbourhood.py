@@ -27,32 +27,43 @@ class Neighbourhood:
     """Rows: the local grains, then the ghosts in the order of global indices, then the large bodies."""
 
     bodies: Bodies
+    margin: Floats  #: (grains + ghosts,) within which a grain is seen by others [m]
     index: Ints  #: (rows,) global body index
     grains: int  #: number of local grains
     ghosts: int  #: number of ghosts
 
 
-def neighbourhood(world: World, reach: float) -> Neighbourhood:
-    """All bodies that may come within `reach` [m] of a local grain; collective.
+def without_ghosts(world: World, margin: Floats) -> Neighbourhood:
+    """The local grains, of which `margin` (grains,) [m] is, and the large bodies."""
+    index = np.arange(world.slabs[world.comm.rank], world.slabs[world.comm.rank + 1])
+    large = world.slabs[-1] + np.arange(len(world.large))
+    return Neighbourhood(
+        bodies.concatenate([world.grains, world.large]), margin, np.concatenate([index, large]), len(index), 0
+    )
 
-    FloatingPointError, on all ranks, if a position is no longer finite.
+
+def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
+    """All bodies whose margin may meet that of a local grain; `margin` (grains,) [m] of the local ones; collective.
+
+    FloatingPointError, on all ranks, if a position or margin is not finite.
     """
     comm, grains = world.comm, world.grains
-    radius = bodies.bounding_radius(grains)
+    radius = bodies.bounding_radius(grains) + margin
     boxes = np.empty((comm.size, BOXES, 2, 3))
     comm.Allgather(_chunk_boxes(grains.position, radius), boxes)
     if np.isnan(boxes).any():
         raise FloatingPointError(
-            f"a grain has no finite position at step {world.step} (time {world.time:g} s)"
+            f"a grain has no finite position or velocity at step {world.step} (time {world.time:g} s)"
         )
     first = world.slabs[comm.rank]
-    columns = dict(grains.columns(), index=np.arange(first, first + len(grains)))
-    row, rank = _touched(grains.position, radius + reach, boxes[: comm.rank])
+    columns = dict(grains.columns(), margin=margin, index=np.arange(first, first + len(grains)))
+    row, rank = _touched(grains.position, radius, boxes[: comm.rank])
     ghosts = exchange(comm, {name: column[row] for name, column in columns.items()}, rank)
-    ghost_index = ghosts.pop("index")
+    ghost_index, ghost_margin = ghosts.pop("index"), ghosts.pop("margin")
     large_index = world.slabs[-1] + np.arange(len(world.large))
     return Neighbourhood(
         bodies=bodies.concatenate([grains, Bodies(**ghosts), world.large]),
+        margin=np.concatenate([margin, ghost_margin]),
         index=np.concatenate([columns["index"], ghost_index, large_index]),
         grains=len(grains),
         ghosts=len(ghost_index),
@@ -63,7 +74,7 @@ def _chunk_boxes(position: Floats, radius: Floats) -> Floats:
     """Bounding boxes (BOXES, 2, 3) of equal pieces of a slab; empty ones reach from +inf to -inf."""
     boxes = np.empty((BOXES, 2, 3))
     boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
-    if not np.isfinite(position).all():
+    if not (np.isfinite(position).all() and np.isfinite(radius).all()):
         boxes[:] = np.nan  # seen by every rank, so that all of them stop
         return boxes
     cuts = np.linspace(0, len(position), BOXES + 1).astype(int)

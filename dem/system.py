@@ -15,7 +15,6 @@ Source: Anitescu and Hart (2004), Tasora and Anitescu (2011): the cone complemen
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,17 +22,16 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem import bodies, quaternion
+from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.checks import positive
 from dem.contact import Contacts
 from dem.exchange import exchange
-from dem.motion import Dynamic
+from dem.free_motion import free_directions, free_velocities, project
 from dem.quaternion import cross
 
 if TYPE_CHECKING:
-    from dem.scene import LargeBody
     from dem.world import World
 
 
@@ -63,7 +61,7 @@ class ContactSystem:
         positive("time step", dt)
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
-        near, table = contacts.near, contacts.near.bodies
+        near = contacts.near
         self.dt = dt
         self.key, self.mu, self.point = contacts.key, contacts.friction, contacts.point
         self.frame = contact_frames(contacts.normal)
@@ -80,11 +78,8 @@ class ContactSystem:
         self._sign = 2.0 * order - 1.0
 
         grains = near.grains + near.ghosts
-        self._free_directions = _free_directions(world.large_bodies)
-        free = free_velocity(table, world.gravity, dt)
-        free[grains:, :3] = _project(self._free_directions, free[grains:, :3])
-        prescribed = ~bodies.is_dynamic(world.large)
-        free[grains:][prescribed] = world.prescribed_velocity(dt)[prescribed]
+        self._free_directions = free_directions(world.large_bodies)
+        free = free_velocities(world, near, dt)
         owned_large = slice(grains, grains + world.owned - near.grains)
         self.free_velocity = np.concatenate([free[: near.grains], free[owned_large]])
         self.b = np.zeros((len(contacts), 3))
@@ -135,7 +130,7 @@ class ContactSystem:
             near.bodies.take(slice(near.grains + near.ghosts, None)),
         )
         change = np.concatenate([_accelerate(grains, load), _accelerate(large, large_load)])
-        change[near.grains :, :3] = _project(self._free_directions, change[near.grains :, :3])
+        change[near.grains :, :3] = project(self._free_directions, change[near.grains :, :3])
         return self.free_velocity + change[: self.owned_bodies]  # only the last rank owns the large bodies
 
     def force_on(self, name: str, impulse: Floats) -> Floats:
@@ -202,34 +197,6 @@ def contact_frames(normal: Floats) -> Floats:
     frame[:, 1, 0], frame[:, 1, 1], frame[:, 1, 2] = 1.0 + sign * x * x * p, sign * q, -sign * x
     frame[:, 2, 0], frame[:, 2, 1], frame[:, 2, 2] = q, sign + y * y * p, -y
     return frame
-
-
-def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
-    """Velocities (n, 6) after dt [s] under gravity (3,) and the gyroscopic torque -w x I w, explicit in both.
-
-    Rows of bodies with prescribed motion come back as they are.
-    """
-    velocity = table.velocity.copy()
-    rows = np.flatnonzero(bodies.is_dynamic(table))
-    velocity[rows, :3] += dt * gravity
-    # The torque vanishes where all moments are equal, as for spheres.
-    rows = rows[np.isfinite(table.inertia[rows]).all(axis=1)]  # guided bodies do not turn
-    rows = rows[np.ptp(table.inertia[rows], axis=1) > 0.0]
-    turn, moments = table.quaternion[rows], table.inertia[rows]
-    spin = quaternion.rotate(quaternion.conjugate(turn), velocity[rows, 3:])
-    velocity[rows, 3:] += dt * quaternion.rotate(turn, -cross(spin, moments * spin) / moments)
-    return velocity
-
-
-def _free_directions(members: Sequence[LargeBody]) -> Floats:
-    """Projectors (large, 3, 3) on the directions that are open to the velocities of large bodies."""
-    open_to = [body.motion.free_directions() if isinstance(body.motion, Dynamic) else np.eye(3) for body in members]
-    return np.array(open_to).reshape(len(members), 3, 3)
-
-
-def _project(projectors: Floats, vectors: Floats) -> Floats:
-    """Products (n, 3) of matrices (n, 3, 3) and vectors (n, 3)."""
-    return (projectors @ vectors[:, :, None])[:, :, 0]
 
 
 def _accelerate(table: Bodies, load: Floats) -> Floats:

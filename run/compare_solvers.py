@@ -52,7 +52,8 @@ def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
         rng = np.random.default_rng(0)
         grains.position[:, 2] *= 1.01
         grains.velocity[:, :3] += 0.5 * rng.normal(size=(len(grains), 3)) - np.array([0, 0, 0.5])
-    system = ContactSystem(world, find_contacts(world, options.delta), options.dt, options.run.recovery_speed)
+    contacts = find_contacts(world, options.delta, options.dt)
+    system = ContactSystem(world, contacts, options.dt, options.run.recovery_speed)
     problem = cone_problem(system, COMM, compliance)
     mu, G = problem.mu, problem.contact_map
     if variant == "friction":

@@ -82,14 +82,15 @@ def box_box(
     other_center: Floats,
     other_turn: Floats,
     other_half: Floats,
-    delta: float,
+    delta: Floats,
 ) -> Manifold:
-    """Boxes on boxes: centres (m, 3), frames (m, 3, 3), half extents (m, 3); contacts of gap at most `delta` [m].
+    """Boxes on boxes: centres (m, 3), frames (m, 3, 3), half extents (m, 3); contacts of gap at most `delta` (m,) [m].
 
     Up to eight points per pair, on faces all with the same normal. The features are independent of which of the two
     faces gives the normal.
     """
     rows, pairs = _separated_within(center, turn, half, other_center, other_turn, other_half, delta)
+    delta = delta[rows]
     face, edge = pairs.faces.max(axis=1), pairs.edges.max(axis=1)
     least = np.maximum(face, edge)  # not more than the distance, and the very distance of overlapping boxes
     tolerance = FLUSH * delta + 2.0 * SNAP * pairs.size()
@@ -97,7 +98,7 @@ def box_box(
     flat = np.flatnonzero(face >= least - tolerance)
     laid = _faces_laid_over(pairs.take(flat))
     flush = laid.gap.min(axis=1) <= (least + tolerance)[flat]
-    pair, point = np.nonzero(flush[:, None] & (laid.gap <= delta))
+    pair, point = np.nonzero(flush[:, None] & (laid.gap <= delta[flat, None]))
     on_faces = Manifold(
         rows[flat[pair]],
         laid.feature[pair, point],
@@ -106,7 +107,7 @@ def box_box(
 
     pointed = np.setdiff1d(np.arange(len(rows)), flat[flush])
     pair, feature, touch = _closest_points(pairs.take(pointed), tolerance[pointed])
-    near = np.flatnonzero(touch.gap <= delta)
+    near = np.flatnonzero(touch.gap <= delta[pointed[pair]])
     return Manifold(
         np.concatenate([on_faces.pair, rows[pointed[pair[near]]]]),
         np.concatenate([on_faces.feature, feature[near]]),
@@ -121,7 +122,7 @@ def _separated_within(
     other_center: Floats,
     other_turn: Floats,
     other_half: Floats,
-    reach: float,
+    reach: Floats,
 ) -> tuple[Ints, _Pairs]:
     """The pairs that none of the 15 axes parts by more than `reach`, and their numbers."""
     offset = other_center - center
@@ -147,7 +148,7 @@ def _separated_within(
             apart -= g[:, j1] * absolute[:, i, j2] + g[:, j2] * absolute[:, i, j1]
             length = np.hypot(cosines[:, i1, j], cosines[:, i2, j])
             edges[:, 3 * i + j] = np.where(length > PARALLEL, apart / np.maximum(length, PARALLEL), -np.inf)
-    kept = np.flatnonzero(edges.max(axis=1) <= reach)
+    kept = np.flatnonzero(edges.max(axis=1) <= reach[rows])
     rows = rows[kept]
     return rows, _Pairs(
         center=center[rows],

@@ -27,7 +27,7 @@ SNAP = 1e-6
 
 
 def capsule_plane(
-    center: Floats, axis: Floats, half_length: Floats, radius: Floats, outward: Floats, origin: Floats, delta: float
+    center: Floats, axis: Floats, half_length: Floats, radius: Floats, outward: Floats, origin: Floats, delta: Floats
 ) -> Manifold:
     """Capsules and half spaces as in `sphere_plane`: the two end balls, features 0 and 1."""
     ends = [sphere_plane(center + (side * half_length)[:, None] * axis, radius, outward, origin) for side in (-1, 1)]
@@ -43,7 +43,7 @@ def capsule_capsule(
     other_axis: Floats,
     other_half: Floats,
     other_radius: Floats,
-    delta: float,
+    delta: Floats,
 ) -> Manifold:
     """Capsules on capsules.
 
@@ -77,7 +77,7 @@ def capsule_box(
     box_center: Floats,
     turn: Floats,
     half: Floats,
-    delta: float,
+    delta: Floats,
 ) -> Manifold:
     """Capsules and boxes: centres, frames (m, 3, 3), half extents (m, 3).
 
@@ -125,7 +125,7 @@ def capsule_box(
     return _manifold([*stretch, closest], [flush & near[0], flush & near[1] & long, ~flush & near[2]])
 
 
-def _tolerance(delta: float, size: Floats, other_size: Floats) -> Floats:
+def _tolerance(delta: Floats, size: Floats, other_size: Floats) -> Floats:
     return FLUSH * delta + SNAP * np.minimum(size, other_size)
 
 

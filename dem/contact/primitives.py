@@ -101,8 +101,8 @@ def _placed(shape: Shape) -> tuple[int, Floats, Floats, Floats]:
     return CAPSULE, center, turn, np.array([shape.radius, shape.half_length, 0.0])
 
 
-def touches(table: Primitives, i: Ints, j: Ints, delta: float) -> Manifold:
-    """All contacts of gap at most `delta` [m] of the pairs of rows i, j (m,); normals point from i to j.
+def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
+    """All contacts of gap at most `delta` (m,) [m] of the pairs of rows i, j (m,); normals point from i to j.
 
     Two half spaces have none.
     """
@@ -111,9 +111,9 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: float) -> Manifold:
     for one, two in (divmod(int(kinds), 8) for kinds in np.flatnonzero(np.bincount(code))):
         rows = np.flatnonzero(code == 8 * one + two)
         if (one, two) in _TOUCH:
-            pair, feature, touch = _TOUCH[one, two](table, i[rows], j[rows], delta)
+            pair, feature, touch = _TOUCH[one, two](table, i[rows], j[rows], delta[rows])
         elif (two, one) in _TOUCH:
-            pair, feature, touch = _TOUCH[two, one](table, j[rows], i[rows], delta)
+            pair, feature, touch = _TOUCH[two, one](table, j[rows], i[rows], delta[rows])
             touch = reversed_touch(touch)
         else:
             continue
@@ -129,20 +129,20 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: float) -> Manifold:
 _no_rows = np.zeros(0, np.int64), np.zeros(0, np.int64)
 
 
-def _single(touch: Touch, delta: float) -> Manifold:
+def _single(touch: Touch, delta: Floats) -> Manifold:
     """The manifold of pairs that touch in one point."""
     pair = np.flatnonzero(touch.gap <= delta)
     return Manifold(pair, np.zeros_like(pair), Touch(*(values[pair] for values in touch)))
 
 
-def _box_plane(table: Primitives, i: Ints, j: Ints, delta: float) -> Manifold:
+def _box_plane(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     corner = np.tile(np.arange(len(CORNERS)), len(i))
     pair = np.repeat(np.arange(len(i)), len(CORNERS))
-    manifold = _single(corner_plane(*table.box(i[pair]), corner, *table.plane(j[pair])), delta)
+    manifold = _single(corner_plane(*table.box(i[pair]), corner, *table.plane(j[pair])), delta[pair])
     return Manifold(pair[manifold.pair], corner[manifold.pair], manifold.touch)
 
 
-_TOUCH: dict[tuple[int, int], Callable[[Primitives, Ints, Ints, float], Manifold]] = {
+_TOUCH: dict[tuple[int, int], Callable[[Primitives, Ints, Ints, Floats], Manifold]] = {
     (SPHERE, SPHERE): lambda t, i, j, delta: _single(sphere_sphere(*t.sphere(i), *t.sphere(j)), delta),
     (SPHERE, BOX): lambda t, i, j, delta: _single(sphere_box(*t.sphere(i), *t.box(j)), delta),
     (SPHERE, CAPSULE): lambda t, i, j, delta: _single(sphere_capsule(*t.sphere(i), *t.capsule(j)), delta),

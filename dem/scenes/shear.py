@@ -175,5 +175,6 @@ class Shear(Experiment):
         if steady.any():
             raw = [records[name][steady] for name in stresses]
             out["steady_shear_stress [Pa]"], out["steady_normal_stress [Pa]"] = (float(values.mean()) for values in raw)
+            out["normal_stress_swing"] = analysis.swing(raw[1], normal[steady])
             out["steady_friction_angle [degrees]"] = analysis.friction_angle(*raw)
         return out

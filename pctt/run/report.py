@@ -18,6 +18,9 @@ COLUMNS = (
     "  seconds: total  search  assembly   solve  output"
 )
 
+#: Overlaps above this part of the radius of the smallest grain are worth a warning.
+LARGE_OVERLAP = 0.05
+
 
 def step_line(line: Mapping[str, Any]) -> str:
     """One step as a row under COLUMNS, with a remark where its solver needed help."""
@@ -171,6 +174,15 @@ def phase_table(steps: Sequence[Mapping[str, Any]]) -> str:
         f"{failed} NOT CONVERGED" if failed else "all converged",
     ]
     return "\n".join([head, "-" * len(head), *rows, ", ".join(figures)])
+
+
+def overlap_line(worst: Mapping[str, float]) -> str:
+    """The worst overlap of a run, and what to do about one that is not small."""
+    overlap, radius = worst["overlap [m]"], worst["smallest_radius [m]"]
+    line = f"worst overlap {overlap:.2g} m, {overlap / radius:.1%} of the smallest radius, at step {worst['step']}"
+    if overlap <= LARGE_OVERLAP * radius:
+        return line
+    return f"WARNING: {line}; try a smaller -ccp_tol, then a smaller -dt"
 
 
 def figure_table(figures: Mapping[str, float]) -> str:

@@ -24,6 +24,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from dem import bodies
 from dem.contact.search import Contacts
 from dem.exchange import exchange
 from dem.system import ContactSystem
@@ -47,6 +48,8 @@ class Results:
         self._described = False
         self._recorded: list[int] = []
         self._steps: list[dict[str, Any]] = []
+        smallest = float(bodies.least_half_thickness(world.grains).min(initial=np.inf))
+        self._smallest_radius = comm.allreduce(smallest, MPI.MIN)
         goes_on = comm.bcast(bool(restart) and Path(restart).resolve() == self.checkpoint.resolve())
         if comm.rank == 0:
             try:
@@ -131,6 +134,16 @@ class Results:
             for step in self._recorded:
                 file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
 
+    def worst_overlap(self) -> dict[str, float]:
+        """The deepest overlap at the start of a step so far, the step, and the radius of the smallest grain (half the
+        least side of a box); on rank 0."""
+        deepest = max(self._steps, key=lambda line: line.get("worst_overlap", 0.0), default={})
+        return {
+            "overlap [m]": deepest.get("worst_overlap", 0.0),
+            "step": deepest.get("step", 0),
+            "smallest_radius [m]": self._smallest_radius,
+        }
+
     def write_summary(
         self,
         world: World,
@@ -144,6 +157,7 @@ class Results:
         if line is not None:
             self._steps.append(line)
         totals = {"bodies": world.body_count, "ranks": self.comm.size, "compare": compare}
+        totals["worst_overlap"] = self.worst_overlap()
         scene = json.loads(self.record)
         summary = {**totals, "scene": scene, "analysis": analysis or {}, "steps": self._steps}
         write_text(self.folder / "summary.json", json.dumps(_finite(summary), indent=1) + "\n")

@@ -14,7 +14,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import record as recording
-from dem.contact import find_contacts
+from dem.contact import Contacts, find_contacts, find_overrun
 from dem.impulses import ImpulseMemory
 from dem.partition import rebalance
 from dem.scene import Scene
@@ -57,6 +57,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         lines.append(line)
         with log.phase("output"):
             row = stepper.records()
+            line["worst_overlap"] = row["worst_overlap [m]"]
             results.records.add(row)
             if options.run.output_every and (world.step % options.run.output_every == 0 or last):
                 results.record_step(world, stepper.contacts, stepper.system, stepper.impulse, row)
@@ -75,6 +76,8 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         progress.say("\n" + report.phase_table(lines))
         if figures:
             progress.say(report.figure_table(figures))
+        if comm.rank == 0:
+            progress.say(report.overlap_line(results.worst_overlap()))
         if row.get("grains_outside"):
             progress.say(f"{row['grains_outside']:.0f} grains have left the domain of the scene")
     if compare.names:
@@ -103,6 +106,10 @@ def _count_output(line: dict[str, Any]) -> None:
     phases = line["phases"]
     phases["output"] = phases.get("output", 0.0) + log.take_seconds(("output",))["output"]
     line["seconds"] = sum(phases.values())
+
+
+#: An overlap by a contact that the search did not foresee is solved for if it would be deeper than this part of delta.
+OVERRUN = 0.01
 
 
 class SceneError(RuntimeError):
@@ -134,15 +141,22 @@ class Stepper:
         with log.phase("search"):
             rebalance(world)
             try:
-                self.contacts = find_contacts(world, options.delta)
+                self.contacts = find_contacts(world, options.delta, options.dt)
             except FloatingPointError as error:  # raised on all ranks alike
                 raise SceneError(f"step {world.step + 1}: {error}") from None
-        with log.phase("assembly"):
-            self.system = ContactSystem(world, self.contacts, options.dt, options.run.recovery_speed)
-            problem = cone_problem(self.system, world.comm, options.run.ccp_compliance or 0.0)
-            guess, _ = self.memory.recall(self.system.key, self.system.frame)
+        problem, guess = self._assemble(self.contacts, self.memory)
         with log.phase("solve"):
             result, solver, newton_its = self.solve(problem, guess)
+        while again := self._overrun(result.impulse):
+            problem.destroy()
+            problem, guess = again
+            with log.phase("solve"):
+                first, (result, solver, more_its) = result, self.solve(problem, guess)
+            newton_its += more_its
+            result.iterations += first.iterations
+            result.ksp_its += first.ksp_its
+            result.fallbacks += first.fallbacks
+        with log.phase("solve"):
             accuracy = ccp.measure(problem, result.impulse)
         with log.phase("output"):
             files = self.dump.step(self.system, problem, guess, result, self._asked) if self.dump else {}
@@ -172,6 +186,37 @@ class Stepper:
             "peak_memory": _peak_memory(world.comm),
             "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
         }
+
+    def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, np.ndarray]:
+        """The problem of these contacts, and the impulses remembered."""
+        options = self.options
+        with log.phase("assembly"):
+            self.contacts = contacts
+            self.system = ContactSystem(self.world, contacts, options.dt, options.run.recovery_speed)
+            problem = cone_problem(self.system, self.world.comm, options.run.ccp_compliance or 0.0)
+            guess, _ = memory.recall(self.system.key, self.system.frame)
+        return problem, guess
+
+    def _overrun(self, impulse: np.ndarray) -> tuple[ccp.ConeProblem, np.ndarray] | None:
+        """The problem with the contacts that nobody foresaw, as impulses of the step sent a grain further than its
+        margin, and the impulses so far; None if it runs into nothing there."""
+        world, options = self.world, self.options
+        with log.phase("search"):
+            velocity = self.system.velocity(impulse)
+            wider = find_overrun(world, self.contacts, velocity, options.delta, options.dt)
+        if wider is None:
+            return None
+        memory = ImpulseMemory(world.comm)
+        memory.remember(self.system.key, impulse, self.system.frame)
+        new = ~np.isin(wider.key, self.contacts.key)
+        before = self.contacts, self.system
+        problem, guess = self._assemble(wider, memory)
+        opening = (problem.product(guess) + problem.r)[new, 0]
+        if options.dt * problem.min(opening.min(initial=0.0)) < -OVERRUN * options.delta:
+            return problem, guess
+        problem.destroy()
+        self.contacts, self.system = before
+        return None
 
     def records(self) -> dict[str, float]:
         """What the last step shows, by name; collective. SceneError if the scene's own records are at fault."""

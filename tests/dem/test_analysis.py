@@ -39,6 +39,10 @@ def test_the_friction_angle_is_that_of_the_means():
     assert angle == pytest.approx(np.degrees(np.arctan(0.5)))
 
 
+def test_the_swing_is_what_the_filter_takes_away():
+    assert analysis.swing(np.array([4.0, 0.0, 6.0, 2.0]), np.array([3.0, 1.0, 5.0, 3.0])) == pytest.approx(1 / 3)
+
+
 def test_the_steady_draft_force_is_the_mean_while_the_blade_is_fast():
     scene = Blade(n=4)
     time = np.arange(0.0, scene.settling_time + 5.0, scene.dt)
@@ -63,4 +67,7 @@ def test_friction_angles_of_a_shear_test_with_known_stresses():
     found = scene.analyse(records)
     assert found["steady_friction_angle [degrees]"] == pytest.approx(np.degrees(np.arctan(0.3)), abs=0.7)
     assert found["peak_friction_angle [degrees]"] > 22.0
+    assert found["normal_stress_swing"] == pytest.approx(0.0, abs=1e-12)
+    rough = records | {"normal_stress [Pa]": 5e4 * (1 + 0.4 * (-1.0) ** np.arange(len(time)))}
+    assert scene.analyse(rough)["normal_stress_swing"] == pytest.approx(0.4, abs=0.01)
     assert found["volume_strain"][-1] == pytest.approx(0.0399)

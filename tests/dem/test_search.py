@@ -14,9 +14,10 @@ from dem import quaternion
 from dem.bodies import BOX, CAPSULE, COMPOUND, SPHERE
 from dem.contact import find_contacts
 from dem.contact.broad import close_pairs
-from dem.motion import Dynamic, Fixed, Rotation
+from dem.motion import Dynamic, Fixed, Glide, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Capsule, Plane, Sphere
+from dem.system import ContactSystem
 from dem.world import World
 
 SELF = MPI.COMM_SELF
@@ -193,6 +194,43 @@ def test_contacts_are_ordered_by_owner_and_key():
     np.testing.assert_array_equal(world.grains.weight, np.bincount(owner, minlength=len(world.grains)))
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_search_sees_what_may_touch_within_the_step(seed):
+    """Against a search far beyond all that a step can bring."""
+    world, delta, dt = World.from_scene(heap(seed, side=4, capsules=True), SELF), 0.01, 0.05
+    far = find_contacts(world, 1.0)
+    system, table = ContactSystem(world, far, dt), far.near.bodies
+    found = find_contacts(world, delta, dt)
+    seen = {tuple(pair) for pair in found.body}
+    assert {tuple(pair) for pair in far.body[far.gap <= delta]} <= seen
+    # what the free motion brings together, by the gaps that the contact problem sees
+    late = (far.gap > delta) & (dt * system.r[:, 0] <= 0.0)
+    assert late.sum() > 30
+    assert {tuple(pair) for pair in far.body[late]} <= seen
+    # what comes together as one of two grains is stopped
+    speed = np.linalg.norm(table.velocity[:, :3] + dt * world.gravity, axis=1)
+    stopped = (far.b < len(world.grains)) & (far.gap <= dt * np.maximum(speed[far.a], speed[far.b]))
+    assert (stopped & ~late & (far.gap > delta)).sum() > 30
+    assert {tuple(pair) for pair in far.body[stopped]} <= seen
+
+
+def test_margins_of_two_bodies_meet():
+    """Half of delta each, or the way of the faster; a tool lends its margin to what it may strike."""
+    scene = Scene(friction=0.3, gravity=(0, 0, 0))
+    velocity = [[0, 0, 0], [3.0, 0, 0], [0, 0, 0], [0, 0, 0]]
+    scene.add_spheres([[0, 0, 0], [0.25, 0, 0], [0, 1, 0], [0.25, 1, 0]], 0.1, 1000.0, velocity=velocity)
+    scene.add_body("tool", [Box((0.01, 0.1, 0.1))], Glide((-3.0, 0, 0)), position=(0.4, 1, 0))
+    world = World.from_scene(scene, SELF)
+
+    def pairs(delta, dt):
+        found = contacts_by_key(find_contacts(world, delta, dt), SELF)
+        return list(zip(found["a"], found["b"]))
+
+    assert pairs(0.02, 0.0) == []
+    assert pairs(0.02, 0.013) == [(3, 4)]  # gaps 0.05, margins 0.01 + 0.039; from the tool 0.04, 0.01 + 0.039
+    assert pairs(0.02, 0.014) == [(0, 1), (2, 3), (3, 4)]
+
+
 def test_threshold_is_inclusive_and_gap_is_signed():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 0], [0, 0, 2.5], [5, 0, 0], [5, 0, 1.99]], 1.0, 1000.0)
@@ -319,5 +357,5 @@ def test_large_bodies_that_are_not_free_do_not_touch_each_other():
 def test_a_lost_grain_is_an_error():
     world = World.from_scene(heap(1, side=3), SELF)
     world.grains.position[4, 1] = np.nan
-    with pytest.raises(FloatingPointError, match="no finite position at step 0"):
+    with pytest.raises(FloatingPointError, match="no finite position or velocity at step 0"):
         find_contacts(world, 0.02)

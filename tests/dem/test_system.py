@@ -9,11 +9,12 @@ from mpi4py import MPI
 
 from dem import bodies, quaternion
 from dem.contact import find_contacts
+from dem.free_motion import free_velocity
 from dem.motion import Dynamic, Fixed
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.stepper import advance
-from dem.system import ContactSystem, contact_frames, free_velocity
+from dem.system import ContactSystem, contact_frames
 from dem.world import World
 
 SELF = MPI.COMM_SELF

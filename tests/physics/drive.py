@@ -68,7 +68,7 @@ def steps(
         limits = ccp.Limits(1e-300, iterations)
     for _ in range(count):
         rebalance(world)
-        contacts = find_contacts(world, delta)
+        contacts = find_contacts(world, delta, dt)
         system = ContactSystem(world, contacts, dt, recovery_speed)
         problem = cone_problem(system, world.comm)
         result = ccp.solve(problem, None, solver, limits, coulomb=coulomb)

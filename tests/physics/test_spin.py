@@ -6,9 +6,9 @@ import numpy as np
 from drive import G
 from mpi4py import MPI
 
+from dem.free_motion import free_velocity
 from dem.scene import Scene
 from dem.stepper import advance
-from dem.system import free_velocity
 from dem.world import World
 
 

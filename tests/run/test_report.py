@@ -33,6 +33,12 @@ def test_the_table_counts_what_did_not_converge():
     assert solve == ["solve", "6.00", "75.0%", "3.000"]
 
 
+def test_a_large_overlap_is_a_warning():
+    small = {"overlap [m]": 4e-4, "step": 7, "smallest_radius [m]": 0.1}
+    assert report.overlap_line(small) == "worst overlap 0.0004 m, 0.4% of the smallest radius, at step 7"
+    assert report.overlap_line({**small, "overlap [m]": 6e-3}).startswith("WARNING: worst overlap 0.006 m, 6.0%")
+
+
 def test_accuracy_shows_the_course_of_the_residual():
     line = {"objective": -1.5, "cone_violation": 0.0, "dual_violation": 1e-3, "complementarity": 1e-4}
     line |= {"coulomb_residual": 1e-2, "natural_residual": 1e-5, "rigid_residual": 1e-5}

@@ -8,9 +8,10 @@ from mpi4py import MPI
 
 from dem.bodies import Bodies
 from dem.impulses import ImpulseMemory
+from dem.motion import Glide
 from dem.scene import Scene
 from dem.scenes import Mixer
-from dem.shapes import Plane
+from dem.shapes import Box, Plane
 from dem.world import World
 from pctt import ccp
 from pctt.run.options import read_options
@@ -45,6 +46,23 @@ def test_one_body_falls_and_lands(solver):
     np.testing.assert_allclose(stepper.world.grains.position[0], [0, 0, 0.1], atol=1e-8)
     weight = stepper.world.grains.mass[0] * 9.81
     np.testing.assert_allclose(stepper.impulse, [[weight * stepper.options.dt, 0, 0]], rtol=1e-7)
+
+
+@pytest.mark.parametrize("solver", ["pdip", "apgd"])
+def test_what_a_struck_grain_strikes_is_seen(solver):
+    """A tool that goes 5 cm a step pushes two spheres in contact; the third, 3 cm ahead, was far from all motion."""
+    scene = Scene(0.0, gravity=(0, 0, 0))
+    scene.add_body("tool", [Box((0.02, 0.3, 0.3))], Glide((2.0, 0, 0)))
+    scene.add_spheres([[0.12, 0, 0], [0.32, 0, 0], [0.55, 0, 0]], 0.1, 1000.0)
+    stepper = stepper_of(scene, ccp_type=solver, ccp_tol=1e-8)
+    line = stepper.step()
+    assert line["contacts"] == 3
+    assert line["newton_its"] == (line["iterations"] if solver == "pdip" else 0)
+    order = np.argsort(stepper.world.grains.id)
+    np.testing.assert_allclose(stepper.world.grains.position[order, 0], [0.17, 0.37, 0.57], atol=1e-6)
+    assert stepper.records()["worst_overlap [m]"] < 1e-9
+    stepper.step()
+    assert stepper.records()["worst_overlap [m]"] < 1e-6
 
 
 def test_one_body_alone_has_no_contacts():
