@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 #: A mixer with 27 spheres and room enough that the paddle jams none of them.
-SMALL = ("-scene_n", "1", "-scene_margin", "0.5")
+SMALL = ("-scene_n", "1", "-scene_margin", "0.7")  # narrower boxes jam, and pdip leaves such steps to APGD
 SETTLED = (*SMALL, "-restart", "settled")
 
 

@@ -49,7 +49,8 @@ def test_auto_says_what_it_picked(program, settled, tmp_path):
     assert line["converged"]
     assert (line["solver"], line["asked_solver"]) == ("apgd", "auto")
     assert "(by apgd)" in done.stdout
-    program(*SETTLED, "-steps", 1, "-ccp_type", "auto", "-ccp_auto_bias", 1e-6, "-ccp_tol", 1e-7)
+    jammed = ("-scene_n", 1, "-scene_margin", 0.5, "-restart", "settled")  # APGD needs a while
+    program(*jammed, "-steps", 1, "-ccp_type", "auto", "-ccp_auto_bias", 1e-6, "-ccp_tol", 1e-7)
     (line,) = steps(tmp_path)
     assert line["solver"] == "conic"
     assert line["reason"].startswith("apgd at ")

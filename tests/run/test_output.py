@@ -69,7 +69,7 @@ def test_the_first_step_without_contacts_is_free_fall(ranks, program, tmp_path):
     """It tells the order of the rows: by id, the large bodies last."""
     options = ("-steps", 1, "-scene_gravity", 5.0, "-delta", 1e-6)
     done = program(*SMALL, *options, ranks=ranks)
-    scene = Mixer(n=1, margin=0.5)
+    scene = Mixer(n=1, margin=0.7)
     (line,) = summary_of(tmp_path / "results")["steps"]
     assert (line["contacts"], line["newton_its"], line["natural_residual"], line["objective"]) == (0, 0, 0, 0)
     assert "NOT CONVERGED" not in done.stdout
@@ -94,7 +94,7 @@ def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled,
     program(*SETTLED, "-steps", 2, "-ccp_type", "apgd", ranks=ranks)
     path = tmp_path / "results" / "state.h5"
     with h5py.File(path, "r") as file:
-        assert json.loads(file.attrs["scene"])["margin"] == 0.5
+        assert json.loads(file.attrs["scene"])["margin"] == 0.7
         assert list(file.attrs["large_bodies"]) == ["box", "mixer"]
     summary = summary_of(tmp_path / "results")
     assert summary["ranks"] == ranks

@@ -42,8 +42,10 @@ def test_a_large_overlap_is_a_warning():
 def test_accuracy_shows_the_course_of_the_residual():
     line = {"objective": -1.5, "cone_violation": 0.0, "dual_violation": 1e-3, "complementarity": 1e-4}
     line |= {"coulomb_residual": 1e-2, "natural_residual": 1e-5, "rigid_residual": 1e-5}
+    line |= {"solver": "conic", "asked_solver": "auto", "reason": "apgd given up"}
     assert "of rigid contacts 2.0e-03" in report.accuracy_lines({**line, "rigid_residual": 2e-3}, [])
     text = report.accuracy_lines(line, [10.0**-k for k in range(41)])
     assert "0: 1.0e+00  4: 1.0e-04" in text
     assert text.endswith("40: 1.0e-40")
+    assert "by conic: apgd given up" in text
     assert "by iteration" not in report.accuracy_lines(line, [])
