@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-OPTIONS = (*"-scene_n 2 -ccp_type pdip -dt 0.1 -compare pbjacobi,none -compare_every 8 -quiet".split(),)
+OPTIONS = (*["-scene_n", "2", "-ccp_type", "pdip", "-dt", "0.1", "-compare", "pbjacobi,none", "-compare_every", "8", "-quiet"],)
 
 
 def start(*words: object) -> subprocess.CompletedProcess[str]:
