@@ -34,6 +34,7 @@ UNITS = {
 }
 # columns of the energy balance, see dem.record.energy_balance
 BALANCE = ("kinetic_energy", "potential_energy", "work_of_motions", "friction_loss", "impact_loss", "time_stepping")
+NEIGHBOURS = 12  # of a grain, in an example
 ALIKE = 5  # curves share axes if their greatest values differ by less than this factor
 
 
@@ -346,14 +347,16 @@ def graphs(folder: Folder, frame: Frame) -> Figure:
 
 def example(folder: Folder, frame: Frame) -> np.ndarray:
     """Rows of the contacts of a small cluster: a grain that touches a large body if any does, the one with most
-    contacts, its neighbours, and what these touch of each other and of the large bodies."""
+    contacts, its NEIGHBOURS nearest neighbours, and what these touch of each other and of the large bodies."""
     pair = frame.contacts.body
     degree = np.bincount(pair.ravel(), minlength=len(frame.position))[: folder.grains]
     at_large = np.unique(pair[(pair >= folder.grains).any(axis=1)].min(axis=1, initial=folder.grains))
     at_large = at_large[at_large < folder.grains]
     middle = at_large[np.argmax(degree[at_large])] if len(at_large) else np.argmax(degree)
     cluster = np.zeros(len(frame.position), dtype=bool)
-    cluster[pair[(pair == middle).any(axis=1)].ravel()] = True
+    own = np.flatnonzero((pair == middle).any(axis=1))
+    nearest = own[np.argsort(frame.contacts.gap[own], kind="stable")[:NEIGHBOURS]]
+    cluster[pair[nearest].ravel()] = True
     cluster[folder.grains :] = True
     inside = cluster[pair].all(axis=1) & (pair < folder.grains).any(axis=1)
     return np.flatnonzero(inside)

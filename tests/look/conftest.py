@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-OPTIONS = (*["-scene_n", "2", "-ccp_type", "pdip", "-dt", "0.1", "-compare", "pbjacobi,none", "-compare_every", "8", "-quiet"],)
+OPTIONS = ("-scene_n", "2", "-ccp_type", "pdip", "-dt", "0.1", "-compare", "pbjacobi,none", "-compare_every", "8")
 
 
 def start(*words: object) -> subprocess.CompletedProcess[str]:
@@ -24,7 +24,7 @@ def start(*words: object) -> subprocess.CompletedProcess[str]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four steps of a mixer of 125 spheres, coarse enough that the lowest have come to the paddle and the floor."""
     path = tmp_path_factory.mktemp("look") / "results"
-    done = start("-m", "pctt.run", *OPTIONS, "-steps", 4, "-output", path)
+    done = start("-m", "pctt.run", *OPTIONS, "-quiet", "-steps", 4, "-output", path)
     assert done.returncode == 0, done.stderr
     assert done.stdout == ""
     return path
