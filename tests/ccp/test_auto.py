@@ -46,7 +46,7 @@ def test_back_to_apgd_where_conic_stalls(monkeypatch):
 
 
 def test_the_iteration_limit_holds():
-    result = solve(tol=1e-12, max_it=120)
+    result = solve(tol=1e-16, max_it=120)
     assert not result.converged
     assert result.iterations <= 130
 
@@ -161,7 +161,7 @@ def test_nothing_is_remembered_if_so_asked():
     newton = ccp.newton_for(SELF, "auto")
     newton.memory = Memory({-8: Needed(1e6, True)}, {-8: 0.25})
     for remember, solver in ((False, "apgd"), (True, "conic")):
-        options = Auto(remember=remember)
+        options = Auto(bias=2.0, remember=remember)
         result = ccp.solve(from_graph(known, graph), None, "auto", Limits(1e-8), options, newton)
         assert result.solver == solver
         assert ("the last problem 1000000" in result.reason) == remember

@@ -110,9 +110,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
                 longer = min(1.0, options.boundary * _step(problem, s, z, *again[:2]))
                 if longer <= step:
                     break
-                gained, step, (ds, dz, dv, x) = longer - step, longer, again
-                if gained < 0.1 * FURTHER:
-                    break
+                step, (ds, dz, dv, x) = longer, again
         if step > 0:
             s, z, v = s + step * ds, z + step * dz, v + step * dv
     converged = history[-1] <= limits.tol
