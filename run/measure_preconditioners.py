@@ -30,7 +30,14 @@ def main(n: int, every: int, names: str, options: list[str]) -> None:
             f"{row['name']:14} {solved:>8} {row['ksp_its_mean']:9.1f} {row['ksp_its_max']:9d} {row['setup_s']:9.3f} "
             f"{row['solve_s']:9.3f} {row['total_s']:9.3f} {row['total_s'] / total:9.2f}"
         )
+    print("\niterations / seconds of each system; in brackets the true residual of one that was not solved")
+    for row in rows:
+        print(f"{row['name']:14} " + " ".join(f"{cell(*solve):>22}" for solve in row["solves"]))
     record(f"measure_preconditioners_n{n}", about, rows)
+
+
+def cell(converged: bool, iterations: int, seconds: float, residual: float) -> str:
+    return f"{iterations} / {seconds:.2f}" + f" ({residual:.0e})" * (not converged)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ HEAD = ("scaling", "eps", "cap", "ranks S/X", "paper", "error", "residual", "pos
 
 def figures(replay: Replay, eps: float, cap: int, scaling: str, every: int, limit: float) -> dict[str, Any]:
     """Averages over the systems, and seconds per PDIP solve: means times all its Newton steps."""
-    pc, train = train_pc(MPI.COMM_WORLD, eps=eps, max_rank=cap, scaling=scaling)
+    pc, train = train_pc(MPI.COMM_WORLD, eps=eps, max_rank=cap, scaling=scaling, keep=False)
     for k, (matrix, _) in enumerate(replay.matrices()):
         spent = sum(row["setup_s"] for row in train.rows)
         if k % every == 0 and spent < limit:

@@ -94,6 +94,13 @@ def factor_within_ranks(prefix: str, ranks: int) -> str:
     return f"{pc} within each rank"
 
 
+def prefer_mumps(pc: PETSc.PC, kind: str) -> None:
+    """Let a factorisation be MUMPS's where PETSc has it: its own keeps to natural orders and one rank."""
+    if kind in ("cholesky", "lu") and PETSc.Sys.hasExternalPackage("mumps"):
+        pc.setType(kind)
+        pc.setFactorSolverType("mumps")
+
+
 @atexit.register
 def _destroy_garbage() -> None:
     """PETSc destroys what petsc4py has let go of when it is finalised, which is after Python's own end: a

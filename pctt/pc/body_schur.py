@@ -6,7 +6,8 @@ With S = G G' + B, B block diagonal (3 x 3) and positive definite, S z = r is
 
 and the residual of S is exactly G times the residual of K: r - S z = G (K y - G' B^-1 r). An inner Krylov method on K,
 stopped by what that leaves in S, is therefore safe, where a merely approximate inverse of K is not: its error comes
-back multiplied by B^-1. K is smaller than S, and far better conditioned where contacts slide or open.
+back multiplied by B^-1. So does rounding, where B is tiny: ``richardson`` refines what one solve leaves. K is smaller
+than S, and far better conditioned where contacts slide or open.
 
 The Mat S brings what it is made of as attributes: ``contact_map``, G as ``pctt.blocks.BlockRows``, and ``barrier``, the
 blocks of B (nc, 3, 3).
@@ -21,10 +22,10 @@ from petsc4py import PETSc
 
 from pctt.blocks import block_matrix
 from pctt.options import NOT_NEGATIVE, option
-from pctt.pc.base import PythonPC, factor_within_ranks
+from pctt.pc.base import PythonPC, factor_within_ranks, prefer_mumps
 from pctt.pc.body_matrix import BodyMatrix
 
-_SCALAR_FORMAT = {"gamg", "hypre"}  # these have no code for block formats
+_SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu"}  # these have no code for block formats
 _COARSE_SPACE = {"gamg", "python"}  # these use the rigid motions
 
 
@@ -41,7 +42,7 @@ class Options:
 
 
 class BodySchur(PythonPC):
-    """The python PC; used with ``-ksp_type preonly`` or ``fgmres``."""
+    """The python PC; used with ``-ksp_type preonly``, ``richardson`` (iterative refinement) or ``fgmres``."""
 
     options_class = Options
     options_prefix = "pc_body_"
@@ -52,7 +53,7 @@ class BodySchur(PythonPC):
         self.ksp: PETSc.KSP | None = None
         self._scalar: PETSc.Mat | None = None
         self.solves = self.its = 0
-        self._rtol = 1e-3
+        self._rtol, self._atol = 1e-3, 0.0
 
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         G = P.getAttr("contact_map")
@@ -66,12 +67,13 @@ class BodySchur(PythonPC):
         self._y, self._rhs = self.K.mat.createVecs()
         self.ksp = PETSc.KSP().create(P.comm)
         prefix = (pc.getOptionsPrefix() or "") + "body_"
-        factor_within_ranks(prefix, P.comm.size)
+        inner = factor_within_ranks(prefix, P.comm.size)
         self.ksp.setOptionsPrefix(prefix)
         self.ksp.setType(PETSc.KSP.Type.CG)
         self.ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         self.ksp.setTolerances(max_it=10_000)
         self.ksp.pc.setType(PETSc.PC.Type.PBJACOBI)
+        prefer_mumps(self.ksp.pc, inner)
         self.ksp.setFromOptions()
         if points is not None and self.ksp.pc.getType() in _COARSE_SPACE:
             self.K.set_rigid_modes(points)
@@ -107,6 +109,8 @@ class BodySchur(PythonPC):
 
     def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         self._rtol = self.options.rtol or 0.5 * ksp.getTolerances()[0]
+        # of what is left when the first solve has been refined, no more is asked than that the whole comes out right
+        self._atol = self._rtol * b.norm() if ksp.getType() in ("preonly", "richardson") else 0.0
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """z = B^-1 (r - G K^-1 G' B^-1 r), K by the inner KSP."""
@@ -114,7 +118,7 @@ class BodySchur(PythonPC):
         r = x.array_r.reshape(-1, 3)
         self._contact.array_w[:] = (self.inverse_barrier @ r[:, :, None]).ravel()
         self._G.multTranspose(self._contact, self._rhs)
-        self.ksp.setTolerances(rtol=1e-14, atol=self._rtol * x.norm() / self._gain)
+        self.ksp.setTolerances(rtol=1e-14, atol=(self._atol or self._rtol * x.norm()) / self._gain)
         self.ksp.solve(self._rhs, self._y)
         self.solves += 1
         self.its += self.ksp.getIterationNumber()

@@ -1,8 +1,8 @@
 """A Mat's blocks by slots: what a train compresses.
 
-Slots are those of ``slots.py``; an empty one stands for a row of the identity. With block Cholesky scaling L_i L_i' =
-P_ii the matrix becomes I + T with T_ij = L_i^-1 P_ij L_j^-T, and T, without its diagonal, is what is compressed: the
-identity stays exact, and a train of rank zero is block Jacobi.
+Slots are those of ``slots.py``; an empty one stands for a row of the identity. With block scaling L_i L_i' = P_ii
+(L_i^-T is the Cholesky factor of P_ii^-1) the matrix becomes I + T with T_ij = L_i^-1 P_ij L_j^-T, and T, without its
+diagonal, is what is compressed: the identity stays exact, and a train of rank zero is block Jacobi.
 """
 
 from __future__ import annotations
@@ -16,14 +16,16 @@ from pctt.pc.slots import Slots
 
 
 class SlottedMatrix:
-    """Local block rows of a Mat P, their slots, and their scaling; ``load`` takes the values of P.
+    """Local block rows of a Mat P, their slots, and their scaling.
+
+    ``scale`` follows the diagonal blocks of P; ``list_blocks``, once per structure, and ``load`` all of them.
 
     Attributes
     ----------
     place : (n,) slot of each local block row, counted from ``first``
     first, capacity, size : first slot of this rank, slots of this rank, slots of all ranks
     rows, columns : (nb,) global slots of the local blocks off the diagonal
-    root : (capacity, bs, bs) L_i^-1 of each local slot (scaled), in slot order
+    root : (capacity, bs, bs) R_i = L_i^-1 of each local slot (scaled), in slot order
     """
 
     def __init__(self, P: PETSc.Mat, slots: Slots, comm: MPI.Comm, scaled: bool):
@@ -34,49 +36,47 @@ class SlottedMatrix:
         self._capacities = np.array(comm.allgather(slots.capacity))
         self.first, self.size = int(self._capacities[: comm.rank].sum()), int(self._capacities.sum())
         self.place, self.capacity = slots.place, slots.capacity
-        own = int(self._counts[: comm.rank].sum())  # the first block row of this rank
-        self._slot = self._gathered(self.first + self.place)  # of every global block row
+        self.root = np.tile(np.eye(self.block), (self.capacity, 1, 1))
+
+    def list_blocks(self, P: PETSc.Mat) -> None:
+        """Find the blocks of P: ``rows`` and ``columns``."""
+        own = int(self._counts[: self.comm.rank].sum())  # the first block row of this rank
+        slot = self._gathered(self.first + self.place)  # of every global block row
         pattern = self._pattern(P)
         self._order = pattern.data - 1  # of the entries of the blocks among P's values, -1 where there is none
-        row = np.repeat(np.arange(count), np.diff(pattern.indptr))
-        self._row, self._column = row, pattern.indices
-        self._kept = np.ones(len(row), bool)
-        if scaled:
-            self._kept = pattern.indices != own + row
+        row = np.repeat(np.arange(len(self.place)), np.diff(pattern.indptr))
+        self._pointers, self._column = pattern.indptr, pattern.indices
+        self._kept = pattern.indices != own + row if self.scaled else np.ones(len(row), bool)
         self.rows = self.first + self.place[row[self._kept]]
-        self.columns = self._slot[pattern.indices[self._kept]]
-        self._own = own
-        if not scaled:  # empty slots hold a multiple of the identity
+        self.columns = slot[pattern.indices[self._kept]]
+        if not self.scaled:  # empty slots hold a multiple of the identity
             empty = self.first + np.setdiff1d(np.arange(self.capacity), self.place)
             self._empty = len(empty)
             self.rows, self.columns = np.append(self.rows, empty), np.append(self.columns, empty)
-        self.root = np.tile(np.eye(self.block), (self.capacity, 1, 1))
+
+    def scale(self, P: PETSc.Mat) -> None:
+        """Roots of the diagonal blocks of P's present values.
+
+        Raises numpy.linalg.LinAlgError, on the ranks concerned, where a block is not positive definite.
+        """
+        if self.scaled:
+            self.root[self.place] = np.linalg.cholesky(P.invertBlockDiagonal()).transpose(0, 2, 1)
 
     def load(self, P: PETSc.Mat) -> np.ndarray:
-        """The blocks (nb, bs, bs) at ``rows`` and ``columns`` for P's present values, scaled if asked for.
-
-        Raises numpy.linalg.LinAlgError, on the ranks concerned, where a diagonal block is not positive definite.
-        """
+        """The blocks (nb, bs, bs) at ``rows`` and ``columns`` for P's present values, scaled, if asked for, by the
+        roots of ``scale``."""
         blocks = np.append(P.getValuesCSR()[2], 0.0)[self._order]
         if not self.scaled:
             typical = P.getDiagonal().sum() / P.getSize()[0]
             return np.concatenate([blocks, np.tile(typical * np.eye(self.block), (self._empty, 1, 1))])
-        roots = self._inverse_roots(blocks)
-        self.root[self.place] = roots
+        roots = self.root[self.place]
         everywhere = self._gathered(roots)
         scaled = _diagonal(roots) @ self._bsr(blocks) @ _diagonal(everywhere.transpose(0, 2, 1))
         return scaled.data[self._kept]  # scipy keeps the order of the blocks: one factor per block
 
     def _bsr(self, blocks: np.ndarray) -> sp.bsr_matrix:
-        indptr = np.concatenate([[0], np.cumsum(np.bincount(self._row, minlength=len(self.place)))])
         shape = (self.block * len(self.place), self.block * self._total)
-        return sp.bsr_matrix((blocks, self._column, indptr), shape=shape)
-
-    def _inverse_roots(self, blocks: np.ndarray) -> np.ndarray:
-        diagonal = np.zeros((len(self.place), self.block, self.block))
-        on_diagonal = self._column == self._own + self._row
-        diagonal[self._row[on_diagonal]] = blocks[on_diagonal]
-        return np.linalg.inv(np.linalg.cholesky(diagonal))
+        return sp.bsr_matrix((blocks, self._column, self._pointers), shape=shape)
 
     def _pattern(self, P: PETSc.Mat) -> sp.bsr_matrix:
         """The blocks of this rank's rows, with the numbers of P's values, from 1, for values."""

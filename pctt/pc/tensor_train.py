@@ -17,6 +17,7 @@ from petsc4py import PETSc
 
 from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, option
 from pctt.pc.base import PythonPC
+from pctt.pc.patience import Patience
 from pctt.pc.rank_policy import RankPolicy
 from pctt.pc.slots import Slots
 from pctt.pc.slotted import SlottedMatrix
@@ -28,6 +29,8 @@ from pctt.tt.quantise import check_modes, choose_modes
 from pctt.tt.root import inverse_root
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Train, identity
+
+LOWER = 3  # part of the cap that is tried where the cap fails or does not pay
 
 
 @dataclass(frozen=True)
@@ -58,16 +61,26 @@ class Options:
         "cores for the next structure; none: everything anew",
         choices=("none", "newton", "steps"),
     )
+    keep: bool = option(
+        True, "keep a train, with the new matrix's scaling, while new trains are hardly better; not with reuse none"
+    )
     seed: int = option(0, "seed of the random starts", check=COUNT)
     monitor: bool = option(False, "print a line per set-up")
 
 
 @dataclass(frozen=True)
 class ApproximateInverse:
-    """The trains of an inverse: X, or I + Z with ``identity``, or Z Z' with ``squared``."""
+    """The trains of an inverse: X, or I + Z with ``identity``, or Z Z' with ``squared``.
+
+    residual : of the inverse of the train of the matrix
+    of : the compression that was inverted
+    cap : of the ranks
+    """
 
     train: Train
     residual: float
+    of: Compression | Cross
+    cap: int
     identity: bool = False
     squared: bool = False
 
@@ -78,6 +91,7 @@ class Account:
 
     setups: int = 0
     reused: int = 0
+    kept: int = 0
     resets: int = 0
     setup_s: float = 0.0
     fallbacks: list[str] = field(default_factory=list)
@@ -109,6 +123,8 @@ class TensorTrain(PythonPC):
         self.tree = None
         self.compression: Compression | Cross | None = None
         self.inverse: ApproximateInverse | None = None
+        self._opening: ApproximateInverse | None = None  # the inverse for the first matrix of a structure
+        self._patience = Patience()
         self._apply: Apply | None = None
 
     # -- set-up ---------------------------------------------------------------------------------------------
@@ -119,7 +135,8 @@ class TensorTrain(PythonPC):
         if self.options.reuse != "steps":
             self._forget_trains()
         if self.policy is None:
-            self.policy = RankPolicy((self.options.max_rank,), self.options.rank == "auto")
+            cap = self.options.max_rank
+            self.policy = RankPolicy((max(1, cap // LOWER), cap), self.options.rank == "auto")
         else:
             self.policy.forgive()  # what failed on another matrix may do here
         if self._jacobi is not None:
@@ -150,38 +167,89 @@ class TensorTrain(PythonPC):
         if self.options.reuse == "none":
             self._forget_structure()
             self._forget_trains()
-        if self.slots is None or self.hierarchy is None:
-            with PETSc.Log.Event("TTBuild"):
-                self._build_hierarchy(P)
-                assert self.slots is not None
-                assert self.hierarchy is not None
+        first = self.slots is None
+        if first:
+            self._take_slots(P)
+        assert self.slots is not None
         try:
-            values, singular = self.slots.load(P), False
+            self.slots.scale(P)
+            singular = False
         except np.linalg.LinAlgError:
-            values, singular = np.empty(0), True
+            singular = True
         if self.comm.allreduce(singular, op=MPI.LOR):
             return self._refuse("a diagonal block is not positive definite")
-        self.hierarchy.set_values(values)
+        if self.inverse is not None and self.inverse.cap != rank:
+            self.compression = self.inverse = self._opening = None
+        kept = (self._opening if first else self.inverse) if self.options.keep else None
+        if kept is not None and not self._patience.over():
+            self._use(kept)
+        elif not self._try_new(P, rank, kept):
+            return False
+        if first:
+            self._opening = self.inverse
+        return True
+
+    def _try_new(self, P: PETSc.Mat, rank: int, kept: ApproximateInverse | None) -> bool:
+        """Make a train for P and use it, or the kept one where that is as good; False without a positive one."""
+        assert self.slots is not None
+        if self.hierarchy is None:
+            with PETSc.Log.Event("TTBuild"):
+                self._list_block_pairs(P)
+        assert self.hierarchy is not None
+        self.hierarchy.set_values(self.slots.load(P))
         warm = self.compression is not None
         with PETSc.Log.Event("TTCompress"):
             self.compression = self._compress(rank, warm)
         with PETSc.Log.Event("TTInvert"):
             # every rank inverts the same train; a last bit of difference must not part their ways
-            self.inverse, positive = self.comm.bcast(self._invert(rank, warm))
+            new, positive = self.comm.bcast(self._invert(rank, warm))
         self.account.reused += warm
-        if not positive:
-            return self._refuse(f"the inverse of rank {rank} is not positive")
-        self._prepare_apply(self.inverse.train)
+        if kept is None:
+            if not positive:
+                return self._refuse(f"the inverse of rank {rank} is not positive")
+            self._patience = Patience()
+            self._use(new, kept=False)
+            return True
+        left = []
+        for inverse in (kept, new):
+            self._use(inverse, kept=False)
+            left.append(self._left(P) if positive or inverse is kept else np.inf)
+        if not self._patience.decide(*left):
+            self._use(kept)
         return True
 
-    def _build_hierarchy(self, P: PETSc.Mat) -> None:
-        """The slots of P's block rows, those of the last structure where they fit, and the list of its block pairs."""
+    def _use(self, inverse: ApproximateInverse, kept: bool = True) -> None:
+        self.inverse = inverse
+        self._prepare_apply(inverse.train)
+        self.account.kept += kept
+
+    def _left(self, P: PETSc.Mat) -> float:
+        """||w - S X w|| / ||w|| of a random vector w, S the scaled matrix."""
+        assert self.slots is not None
+        slots = self.slots
+        w = np.zeros((slots.capacity, slots.block))
+        w[slots.place] = np.random.default_rng(self.options.seed).standard_normal((len(slots.place), slots.block))
+        x, y = P.createVecs()
+        x.array_w[:] = self._from_slots(self._inverse_times(w.ravel()))
+        P.mult(x, y)
+        left = w.ravel() - self._to_slots(y.array_r)
+        squares = self.comm.allreduce(np.array([left @ left, w.ravel() @ w.ravel()]))
+        x.destroy()
+        y.destroy()
+        return float(np.sqrt(squares[0] / squares[1]))
+
+    def _take_slots(self, P: PETSc.Mat) -> None:
+        """The slots of P's block rows, those of the last structure where they fit."""
         if self.tree is not None and not self.tree.follow(P, self._agree):
             self.account.resets += 1
             self._forget_trains()
         if self.tree is None:
             self.tree = Slots(P, self.options.leaf)
         self.slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaling == "block")
+
+    def _list_block_pairs(self, P: PETSc.Mat) -> None:
+        assert self.slots is not None
+        self.slots.list_blocks(P)
         modes = self._modes(self.slots.size)
         self.hierarchy = SparseHierarchy(self.slots.rows, self.slots.columns, modes, self.slots.block, self._add)
 
@@ -204,19 +272,22 @@ class TensorTrain(PythonPC):
         scaled = self.options.scaling == "block"
         rng = np.random.default_rng(self.options.seed)
         one = identity(T.rows)
+
+        def made(train: Train, left: float, identity: bool = False, squared: bool = False) -> ApproximateInverse:
+            assert self.compression is not None
+            return ApproximateInverse(train, left, self.compression, rank, identity, squared)
+
         if self.options.inverse == "root":
             S = one + T if scaled else T
             Z, _ = inverse_root(S, rank)
-            return ApproximateInverse(Z, residual(S, Z @ Z.T), squared=True), True
+            return made(Z, residual(S, Z @ Z.T), squared=True), True
         start = self.inverse.train if warm and self.inverse is not None else None
         if scaled:
             found = invert_near_identity(T, rank, start, rng=rng)
             assert found.correction is not None
-            inverse = ApproximateInverse(found.correction, found.residual, identity=True)
-        else:
-            found = invert(T, rank, start, rng=rng)
-            inverse = ApproximateInverse(found.train, found.residual)
-        return inverse, lowest(found.train) > 0
+            return made(found.correction, found.residual, identity=True), lowest(found.train) > 0
+        found = invert(T, rank, start, rng=rng)
+        return made(found.train, found.residual), lowest(found.train) > 0
 
     def _modes(self, slots: int) -> tuple[int, ...]:
         if self.options.modes:
@@ -264,14 +335,24 @@ class TensorTrain(PythonPC):
         assert self.slots is not None
         assert self._apply is not None
         with PETSc.Log.Event("TTApply"):
-            slots, root = self.slots, self.slots.root
-            if slots.capacity > len(slots.place):
-                self._local[:] = 0.0
-            self._local[slots.place] = x.array_r.reshape(-1, slots.block)
-            np.matmul(root, self._local[:, :, None], out=self._scaled)
-            z = self._inverse_times(self._scaled.ravel()).reshape(-1, slots.block, 1)
-            np.matmul(root.transpose(0, 2, 1), z, out=self._scaled)
-            y.array_w[:] = self._scaled[slots.place].ravel()
+            y.array_w[:] = self._from_slots(self._inverse_times(self._to_slots(x.array_r)))
+
+    def _to_slots(self, x: np.ndarray) -> np.ndarray:
+        """L^-1 x in slot order, (capacity bs,), in a buffer that the next call reuses."""
+        assert self.slots is not None
+        slots = self.slots
+        if slots.capacity > len(slots.place):
+            self._local[:] = 0.0
+        self._local[slots.place] = x.reshape(-1, slots.block)
+        np.matmul(slots.root, self._local[:, :, None], out=self._scaled)
+        return self._scaled.ravel()
+
+    def _from_slots(self, z: np.ndarray) -> np.ndarray:
+        """L^-T z in the order of the block rows."""
+        assert self.slots is not None
+        slots = self.slots
+        np.matmul(slots.root.transpose(0, 2, 1), z.reshape(self._scaled.shape), out=self._scaled)
+        return self._scaled[slots.place].ravel()
 
     def _inverse_times(self, x: np.ndarray) -> np.ndarray:
         """This rank's part of X x in slot order, from its part of x."""
@@ -313,9 +394,13 @@ class TensorTrain(PythonPC):
             self._prepare_apply(self.inverse.train)
             self.account.fallbacks.append(f"single precision left a true residual of {true:.1e}: double from now on")
         digits = -np.log10(max(true, 1e-16)) if np.isfinite(true) else 0.0
+        sound = not stalled
         if stalled and self.rank > 1:
             self.account.fallbacks.append(f"{ksp.getType()} stalled at rank {self.rank}")
-        self.policy.report(self.rank, self._setup_seconds + seconds, max(digits, 0.0), not stalled)
+            if self._patience.served:  # a train of an earlier matrix: one made for the next may do
+                self._patience.lose()
+                sound = True
+        self.policy.report(self.rank, self._setup_seconds + seconds, max(digits, 0.0), sound)
         self._setup_seconds = 0.0  # a second solve with the same matrix has no set-up
 
     def _slowest(self, seconds: float) -> float:
@@ -327,7 +412,8 @@ class TensorTrain(PythonPC):
         a = self.account
         lines = [
             f"tensor train: {self._line()}",
-            f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, trees made anew {a.resets}",
+            f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, kept {a.kept} times, "
+            f"trees made anew {a.resets}",
             f"scaling {self.options.scaling}, precision {'double' if self._double else self.options.precision}",
         ]
         lines += [f"fell back: {why} ({a.fallbacks.count(why)} times)" for why in dict.fromkeys(a.fallbacks)]
@@ -338,12 +424,13 @@ class TensorTrain(PythonPC):
         return lines
 
     def _line(self) -> str:
-        if self.rank == 1 or self.compression is None or self.inverse is None:
+        if self.rank == 1 or self.inverse is None:
             return f"rank 1 (block Jacobi), set up in {self._setup_seconds:.2e} s"
-        T, X = self.compression.train, self.inverse.train
+        compression, X = self.inverse.of, self.inverse.train
+        T = compression.train
         form = "I + Z" if self.inverse.identity else "Z Z'" if self.inverse.squared else "X"
         return (
-            f"modes {'x'.join(map(str, T.rows))}, matrix ranks {T.ranks} error {self.compression.error:.2g}, inverse "
+            f"modes {'x'.join(map(str, T.rows))}, matrix ranks {T.ranks} error {compression.error:.2g}, inverse "
             f"{form} ranks {X.ranks} residual {self.inverse.residual:.2g}, {X.storage} numbers, "
             f"{self._setup_seconds:.2e} s"
         )

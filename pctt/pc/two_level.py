@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 
 from pctt.options import AT_LEAST_ONE, option
-from pctt.pc.base import PythonPC
+from pctt.pc.base import PythonPC, prefer_mumps
 from pctt.pc.ordering import block_order
 
 DEPENDENT = 1e-8  # part of the largest: modes of a box with smaller Gram eigenvalues depend on the others
@@ -135,8 +135,7 @@ class TwoLevel(PythonPC):
         pc.setOptionsPrefix(prefix)
         if not self._by_train:
             pc.setType(PETSc.PC.Type.CHOLESKY)
-            if PETSc.Sys.hasExternalPackage("mumps"):
-                pc.setFactorSolverType("mumps")
+            prefer_mumps(pc, "cholesky")
             pc.setFromOptions()
             return pc
         pc.setType(PETSc.PC.Type.PYTHON)

@@ -49,6 +49,17 @@ def test_preconditions_fgmres():
     assert residual <= 1e-8
 
 
+def test_refinement_mends_what_rounding_spoils_where_barriers_are_tiny():
+    G, barrier = contacts(60, 60, seed=6)
+    barrier *= 10 ** np.random.default_rng(0).uniform(-11, 0, len(barrier))[:, None, None]
+    mat = contact_matrix(G, barrier)
+    options = {"body_pc_type": "cholesky", "pc_body_shift": 0.0, "ksp_norm_type": "unpreconditioned"}
+    spoilt, _, _ = solve(mat, "preonly", 1e-10, **options)
+    refined, _, _ = solve(mat, "richardson", 1e-10, **options)
+    assert spoilt > 1e-9
+    assert refined <= 1e-10
+
+
 def test_follows_new_barriers():
     G, barrier = contacts(50, 20, seed=5)
     mat = contact_matrix(G, barrier)

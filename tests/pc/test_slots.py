@@ -179,7 +179,7 @@ def follow_up(ksp: PETSc.KSP, mat: PETSc.Mat) -> None:
 
 def test_the_next_structure_starts_from_the_last_train():
     first, second = contact_steps(1500)
-    options = {"rank": "fixed", "max_rank": 8}
+    options = {"rank": "fixed", "max_rank": 8, "keep": "false"}
     warm = solver(first, **options)
     warm.setUp()
     cold_passes = context(warm).compression.passes
@@ -200,12 +200,26 @@ def test_the_next_structure_starts_from_the_last_train():
 @pytest.mark.parametrize(("reuse", "reused"), [("none", 0), ("newton", 0), ("steps", 1)])
 def test_reuse_goes_as_far_as_asked(reuse, reused):
     first, second = contact_steps(600)
-    ksp = solver(first, rank="fixed", max_rank=4, reuse=reuse)
+    ksp = solver(first, rank="fixed", max_rank=4, reuse=reuse, keep="false")
     ksp.setUp()
     follow_up(ksp, second)
     assert context(ksp).account.reused == reused
     _, residual = solve(ksp)
     assert residual < 1e-7
+
+
+def test_the_train_of_the_first_matrix_of_a_structure_opens_the_next():
+    first, second = contact_steps(600)
+    ksp = solver(first, rank="fixed", max_rank=4)
+    ksp.setUp()
+    opening = context(ksp).inverse
+    follow_up(ksp, second)
+    assert context(ksp).inverse is opening
+    assert context(ksp).hierarchy is None  # block pairs are not listed for nothing
+    its, residual = solve(ksp)
+    assert residual < 1e-7
+    cold_its, _ = solve(solver(second, rank="fixed", max_rank=4))
+    assert its <= 1.2 * cold_its + 1
 
 
 def test_an_overflow_makes_a_new_tree():
@@ -249,7 +263,7 @@ def matrix(keep, offset):
     return mat
 
 everything = np.arange(n * n)
-ksp = solver(matrix(everything[: -8], 0), rank="fixed", max_rank=6)
+ksp = solver(matrix(everything[: -8], 0), rank="fixed", max_rank=6, keep="false")
 solve(ksp)
 for offset, keep in ((3, everything[4:-4]), (-3, everything[8:])):
     ksp.reset()

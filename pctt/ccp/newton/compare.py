@@ -12,7 +12,10 @@ from petsc4py import PETSc
 from pctt.ccp.newton.krylov import Krylov, Solve
 from pctt.options import OptionError
 
-_BODY = {"ksp_type": "preonly", "pc_type": "python", "pc_python_type": "pctt.pc.BodySchur"}
+_BODY = {
+    "ksp_type": "richardson", "ksp_norm_type": "unpreconditioned", "ksp_max_it": "4", "pc_type": "python",
+    "pc_python_type": "pctt.pc.BodySchur",
+}  # fmt: skip
 _TWO = {"body_pc_type": "python", "body_pc_python_type": "pctt.pc.TwoLevel", "pc_body_shift": "0"}
 
 # names beside PETSc's own PC types: options that make them
@@ -36,7 +39,8 @@ class Record:
 
     solves: list[Solve] = field(default_factory=list)
 
-    def summary(self) -> dict[str, float]:
+    def summary(self) -> dict[str, Any]:
+        """Figures over the systems; ``solves``: converged, iterations, seconds and true residual of each."""
         its = [s.iterations for s in self.solves]
         return {
             "systems": len(self.solves),
@@ -46,6 +50,7 @@ class Record:
             "setup_s": sum(s.setup_s for s in self.solves),
             "solve_s": sum(s.solve_s for s in self.solves),
             "true_residual_max": float(max((s.true_residual for s in self.solves), default=0.0)),
+            "solves": [[s.converged, s.iterations, s.setup_s + s.solve_s, s.true_residual] for s in self.solves],
         }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.pc.base import PythonPC, factor_within_ranks
+from pctt.pc.base import PythonPC, factor_within_ranks, prefer_mumps
 
 # right preconditioning makes the residual that the method sees the true one
 _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
@@ -52,9 +52,7 @@ class Krylov:
         self.ksp.setTolerances(rtol=rtol, atol=1e-300, max_it=1000)
         if self.method in _RIGHT_SIDED:
             self.ksp.setPCSide(PETSc.PC.Side.RIGHT)
-        if given["pc_type"] in ("cholesky", "lu") and _has_mumps():
-            self.ksp.pc.setType(given["pc_type"])
-            self.ksp.pc.setFactorSolverType("mumps")
+        prefer_mumps(self.ksp.pc, given["pc_type"])
         self.ksp.setFromOptions()
         # PETSc lets preonly have no options, but its preconditioner may be an iteration that wants the tolerance
         self._rtol_is_given = PETSc.Options().hasName(prefix + "ksp_rtol")
@@ -187,7 +185,3 @@ def _now(comm: MPI.Comm) -> float:
     if comm.size > 1:
         comm.Barrier()  # a phase lasts until its slowest rank
     return time.perf_counter()
-
-
-def _has_mumps() -> bool:
-    return bool(PETSc.Sys.hasExternalPackage("mumps"))
