@@ -66,6 +66,23 @@ def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
     return ccp.ConeProblem(COMM, problem.r, mu, G=G, point=problem.point, compliance=compliance)
 
 
+def copied(problem: ccp.ConeProblem, count: int) -> ccp.ConeProblem:
+    """Copies of a problem side by side, without contact between them."""
+    if count == 1:
+        return problem
+    G = problem.contact_map
+    which = np.arange(count)[:, None]
+    pointers = np.append(0, (G.indptr[1:] + which * G.indptr[-1]).ravel())
+    columns = (G.indices + which * G.columns).ravel()
+    G = BlockRows(pointers, columns, np.tile(G.blocks, (count, 1, 1)), count * G.columns)
+    points = None
+    if problem.point is not None:
+        points = np.tile(problem.point, (count, 1))
+        points[:, 0] += np.repeat(np.arange(count) * np.ptp(problem.point[:, 0]), problem.size)
+    r, mu = np.tile(problem.r, (count, 1)), np.tile(problem.mu, count)
+    return ccp.ConeProblem(COMM, r, mu, G=G, point=points, compliance=problem.softness)
+
+
 def write(path: Path, problem: ccp.ConeProblem) -> None:
     """As an FCLIB global problem of mass-scaled bodies: M = I, H = G'."""
     G = block_matrix(COMM, problem.contact_map)
@@ -172,6 +189,7 @@ def main() -> None:
     parser.add_argument("--compliance", default="0,1e-5", help="the later ones for `settled` only")
     parser.add_argument("--methods", default="", help="instead of all, with commas between")
     parser.add_argument("--peers-up-to", type=int, default=8, help="largest n that peers get")
+    parser.add_argument("--copies", type=int, default=1, help="of the problem, side by side: n = 32 has 8 of n = 16")
     words = parser.parse_args()
     everything = [*ccp.SOLVERS, *COULOMB, *(name for name, peer in PEERS.items() if peer.installed)]
     methods = words.methods.split(",") if words.methods else everything
@@ -187,9 +205,10 @@ def main() -> None:
     for n, variant, compliance in cases:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "problem.h5"
-            problem = step_problem(n, variant, compliance)
+            problem = copied(step_problem(n, variant, compliance), words.copies)
             write(path, problem)
             title = f"mixer n = {n}, {problem.size} contacts, {VARIANTS[variant]}, compliance {compliance:g}"
+            title += f", {words.copies} copies" * (words.copies > 1)
             heads = " ".join(f"{tol:9.0e}" for tol in TOLERANCES)
             print(f"\n{title}; limit {words.seconds:g} s\n{'seconds to':18} {heads} products   Krylov       MB")
             table = {}
@@ -198,7 +217,7 @@ def main() -> None:
                     continue
                 rows = table[method] = (peer_rows if method in PEERS else own_rows)(path, method, words.seconds)
                 case = {"n": n, "variant": variant, "compliance": compliance, "contacts": problem.size}
-                case["method"] = method
+                case |= {"method": method, "copies": words.copies}
                 record_rows += [case | row for row in rows]
                 show(method, rows)
         record("compare_solvers", about, record_rows)

@@ -13,11 +13,11 @@ def main(n: int, every: int, names: str, options: list[str]) -> None:
     about = say_machine()
     run = ["-scene_n", n, "-restart", "settled", "-steps", 1, "-compare", names, "-compare_every", every]
     result = summary(1, *run, *options)
-    (step,) = result["steps"]
-    print(
-        f"mixer n = {n}: {step['contacts']} contacts, {step['newton_its']} Newton steps to natural residual "
-        f"{step['natural_residual']:.1e}, every {every}. system, 1 rank"
-    )
+    for step in result["steps"]:
+        print(
+            f"mixer n = {n}: {step['contacts']} contacts, {step['newton_its']} Newton steps to natural residual "
+            f"{step['natural_residual']:.1e}, every {every}. system, 1 rank"
+        )
     rows = [{"name": name, **figures} for name, figures in result["compare"].items()]
     base = next(row for row in rows if row["name"] == "pbjacobi")
     total = base["setup_s"] + base["solve_s"]
