@@ -59,8 +59,12 @@ class SlottedMatrix:
 
         Raises numpy.linalg.LinAlgError, on the ranks concerned, where a block is not positive definite.
         """
-        if self.scaled:
-            self.root[self.place] = np.linalg.cholesky(P.invertBlockDiagonal()).transpose(0, 2, 1)
+        if not self.scaled:
+            return
+        inverse = P.invertBlockDiagonal()
+        if not np.isfinite(inverse).all():  # which numpy's Cholesky lets pass
+            raise np.linalg.LinAlgError("a diagonal block is singular")
+        self.root[self.place] = np.linalg.cholesky(inverse).transpose(0, 2, 1)
 
     def load(self, P: PETSc.Mat) -> np.ndarray:
         """The blocks (nb, bs, bs) at ``rows`` and ``columns`` for P's present values, scaled, if asked for, by the

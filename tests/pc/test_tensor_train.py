@@ -193,10 +193,11 @@ def test_other_ways_to_a_train(way):
     assert its < jacobi_its
 
 
-def test_an_indefinite_diagonal_falls_back_to_block_jacobi():
+@pytest.mark.parametrize("entry", [-1.0, 0.0])
+def test_a_diagonal_that_is_not_positive_falls_back_to_block_jacobi(entry):
     mat = poisson(8)
     diagonal = mat.getDiagonal()
-    diagonal.array[5] = -1.0
+    diagonal.array[5] = entry
     mat.setDiagonal(diagonal)
     ksp = solver(mat, "gmres", rank="fixed")
     ksp.setUp()
