@@ -16,6 +16,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, option
+from pctt.pc.approximate_inverse import ApproximateInverse, invert_by_als, invert_by_root
 from pctt.pc.base import PythonPC
 from pctt.pc.patience import Patience
 from pctt.pc.rank_policy import RankPolicy
@@ -24,11 +25,9 @@ from pctt.pc.slotted import SlottedMatrix
 from pctt.tt.als import Compression, compress
 from pctt.tt.apply import Apply
 from pctt.tt.cross import Cross, compress_cross
-from pctt.tt.inverse import invert, invert_near_identity, lowest, residual
 from pctt.tt.quantise import check_modes, choose_modes
-from pctt.tt.root import inverse_root
 from pctt.tt.sparse import SparseHierarchy
-from pctt.tt.train import Train, identity
+from pctt.tt.train import Train
 
 LOWER = 3  # part of the cap that is tried where the cap fails or does not pay
 
@@ -66,23 +65,6 @@ class Options:
     )
     seed: int = option(0, "seed of the random starts", check=COUNT)
     monitor: bool = option(False, "print a line per set-up")
-
-
-@dataclass(frozen=True)
-class ApproximateInverse:
-    """The trains of an inverse: X, or I + Z with ``identity``, or Z Z' with ``squared``.
-
-    residual : of the inverse of the train of the matrix
-    of : the compression that was inverted
-    cap : of the ranks
-    """
-
-    train: Train
-    residual: float
-    of: Compression | Cross
-    cap: int
-    identity: bool = False
-    squared: bool = False
 
 
 @dataclass
@@ -268,26 +250,11 @@ class TensorTrain(PythonPC):
     def _invert(self, rank: int, warm: bool) -> tuple[ApproximateInverse, bool]:
         """The inverse and whether no direction was found in which it is negative."""
         assert self.compression is not None
-        T = self.compression.train
-        scaled = self.options.scaling == "block"
-        rng = np.random.default_rng(self.options.seed)
-        one = identity(T.rows)
-
-        def made(train: Train, left: float, identity: bool = False, squared: bool = False) -> ApproximateInverse:
-            assert self.compression is not None
-            return ApproximateInverse(train, left, self.compression, rank, identity, squared)
-
-        if self.options.inverse == "root":
-            S = one + T if scaled else T
-            Z, _ = inverse_root(S, rank)
-            return made(Z, residual(S, Z @ Z.T), squared=True), True
+        options, rng = self.options, np.random.default_rng(self.options.seed)
         start = self.inverse.train if warm and self.inverse is not None else None
-        if scaled:
-            found = invert_near_identity(T, rank, start, rng=rng)
-            assert found.correction is not None
-            return made(found.correction, found.residual, identity=True), lowest(found.train) > 0
-        found = invert(T, rank, start, rng=rng)
-        return made(found.train, found.residual), lowest(found.train) > 0
+        if options.inverse == "root":
+            return invert_by_root(self.compression, rank, options.scaling == "block")
+        return invert_by_als(self.compression, rank, options.scaling == "block", start, rng)
 
     def _modes(self, slots: int) -> tuple[int, ...]:
         if self.options.modes:
