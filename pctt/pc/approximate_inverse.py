@@ -1,5 +1,7 @@
-"""The inverse of a compressed matrix as a train: I + T, of a matrix that is scaled to a diagonal of identities and whose
-off-diagonal part T is what was compressed, or T itself."""
+"""The inverse of a compressed matrix as a train.
+
+The matrix is I + T where it was scaled to a diagonal of identities, T its compressed off-diagonal part; else T.
+"""
 
 from __future__ import annotations
 

@@ -165,6 +165,7 @@ class TensorTrain(PythonPC):
         kept = (self._opening if first else self.inverse) if self.options.keep else None
         if kept is not None and not self._patience.over():
             self._use(kept)
+            self.account.kept += 1
         elif not self._try_new(P, rank, kept):
             return False
         if first:
@@ -190,20 +191,20 @@ class TensorTrain(PythonPC):
             if not positive:
                 return self._refuse(f"the inverse of rank {rank} is not positive")
             self._patience = Patience()
-            self._use(new, kept=False)
+            self._use(new)
             return True
         left = []
         for inverse in (kept, new):
-            self._use(inverse, kept=False)
+            self._use(inverse)
             left.append(self._left(P) if positive or inverse is kept else np.inf)
         if not self._patience.decide(*left):
             self._use(kept)
+            self.account.kept += 1
         return True
 
-    def _use(self, inverse: ApproximateInverse, kept: bool = True) -> None:
+    def _use(self, inverse: ApproximateInverse) -> None:
         self.inverse = inverse
         self._prepare_apply(inverse.train)
-        self.account.kept += kept
 
     def _left(self, P: PETSc.Mat) -> float:
         """||w - S X w|| / ||w|| of a random vector w, S the scaled matrix."""
