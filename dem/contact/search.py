@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,6 +44,11 @@ class Contacts:
 
     def __len__(self) -> int:
         return len(self.key)
+
+    def take(self, rows: np.ndarray) -> Contacts:
+        """Those of these rows, or where a mask (nc,) is true."""
+        columns = ("key", "a", "b", "body", "point", "normal", "gap", "friction")
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
 
 def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | float = 0.0) -> Contacts:

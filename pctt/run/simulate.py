@@ -147,7 +147,7 @@ class Stepper:
         problem, guess = self._assemble(self.contacts, self.memory)
         with log.phase("solve"):
             result, solver, newton_its = self.solve(problem, guess)
-        while again := self._overrun(result.impulse):
+        while again := self._overrun(problem, result.impulse):
             problem.destroy()
             problem, guess = again
             with log.phase("solve"):
@@ -197,7 +197,7 @@ class Stepper:
             guess, _ = memory.recall(self.system.key, self.system.frame)
         return problem, guess
 
-    def _overrun(self, impulse: np.ndarray) -> tuple[ccp.ConeProblem, np.ndarray] | None:
+    def _overrun(self, problem: ccp.ConeProblem, impulse: np.ndarray) -> tuple[ccp.ConeProblem, np.ndarray] | None:
         """The problem with the contacts that nobody foresaw, as impulses of the step sent a grain further than its
         margin, and the impulses so far; None if it runs into nothing there."""
         world, options = self.world, self.options
@@ -206,17 +206,18 @@ class Stepper:
             wider = find_overrun(world, self.contacts, velocity, options.delta, options.dt)
         if wider is None:
             return None
+        with log.phase("assembly"):
+            unseen = wider.take(~np.isin(wider.key, self.contacts.key))
+            system = ContactSystem(world, unseen, options.dt, options.run.recovery_speed)
+            alone = cone_problem(system, world.comm)
+            opening = (alone.velocity_of(problem.momentum(impulse)) + alone.r)[:, 0]
+            closes = options.dt * alone.min(opening.min(initial=0.0)) < -OVERRUN * options.delta
+            alone.destroy()
+        if not closes:
+            return None
         memory = ImpulseMemory(world.comm)
         memory.remember(self.system.key, impulse, self.system.frame)
-        new = ~np.isin(wider.key, self.contacts.key)
-        before = self.contacts, self.system
-        problem, guess = self._assemble(wider, memory)
-        opening = (problem.product(guess) + problem.r)[new, 0]
-        if options.dt * problem.min(opening.min(initial=0.0)) < -OVERRUN * options.delta:
-            return problem, guess
-        problem.destroy()
-        self.contacts, self.system = before
-        return None
+        return self._assemble(wider, memory)
 
     def records(self) -> dict[str, float]:
         """What the last step shows, by name; collective. SceneError if the scene's own records are at fault."""
