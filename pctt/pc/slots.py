@@ -18,6 +18,7 @@ from pctt.pc.ordering import Frame, block_order, morton_codes
 SPARE = 0.06  # part of the slots that is empty at first
 NEAR = 1  # boxes by which a row may be off without being moved
 REACH = 12  # boxes within which an empty slot is looked for
+FAR = 0.02  # part of the rows that may be put further away
 
 
 class Slots:
@@ -91,7 +92,20 @@ class Slots:
         for distance in range(REACH + 1):
             for side in (1, -1) if distance else (1,):
                 _settle(place, home + side * distance, free, self.box)
-        return place if (place >= 0).all() else None
+        far = np.flatnonzero(place < 0)
+        if len(far) > FAR * len(keys):
+            return None
+        far = far[np.argsort(home[far], kind="stable")]
+        place[far] = _nearest_in_order(home[far] * self.box, np.flatnonzero(free))
+        return place
+
+
+def _nearest_in_order(wanted: np.ndarray, empty: np.ndarray) -> np.ndarray:
+    """A slot of its own for each of ``wanted`` (n,) among the ``empty`` ones, at or after it where that goes; both
+    ascending."""
+    turn = np.arange(len(wanted))
+    at = np.maximum.accumulate(np.searchsorted(empty, wanted) - turn) + turn
+    return empty[np.minimum(at, len(empty) - len(wanted) + turn)]
 
 
 def _settle(place: np.ndarray, target: np.ndarray, free: np.ndarray, box: int) -> None:

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from test_tensor_train import context, operator, solve, solver
 
 from pctt.blocks import square_block_matrix
-from pctt.pc.slots import NEAR, Slots
+from pctt.pc.slots import NEAR, REACH, Slots
 
 BOX = 16
 
@@ -104,6 +104,18 @@ def test_rows_that_move_far_move_to_another_slot():
     assert np.array_equal(slots.place[others], before[others])
     assert slots.moved == 2
     assert np.abs(slots.place[wanderers] // BOX - before[hosts] // BOX).max() <= NEAR + 1
+
+
+def test_a_few_rows_that_find_no_room_nearby_go_further_away():
+    points, keys = cloud(4000)
+    slots = Slots(springs(points, keys), BOX)
+    before = slots.place.copy()
+    crowd = np.full((60, 3), 0.01) + 1e-4 * np.arange(60)[:, None]
+    more = springs(np.concatenate([points, crowd]), np.concatenate([keys, 50_000 + np.arange(60)]))
+    assert slots.follow(more, yes)
+    assert np.array_equal(slots.place[:4000], before)
+    assert len(set(slots.place)) == 4060
+    assert np.ptp(slots.place[4000:]) > 2 * REACH * BOX
 
 
 @pytest.mark.parametrize("what", ["too many", "too many in one place", "strangers", "another rank refuses"])

@@ -36,7 +36,9 @@ SHORT = 0.8  # a step after which the direction is corrected
 CORRECTIONS, FURTHER = 3, 0.3  # at most so many, for a step that goes so much further
 NEAR = 0.1, 10.0  # the central path, in units of the complementarity that is aimed at
 PATIENCE = 3  # iterations without progress before the Newton systems are sharpened
-LARGEST_PROXIMAL = 1e-5  # up to which the proximal compliance grows before that
+BACK = 0.9  # part of the way to the cone's boundary along the predictor
+TINY = 0.1  # a step after which the proximal compliance grows at once
+LARGEST_PROXIMAL = 1e-5  # up to which it grows before that
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,9 @@ class Conic:
         0.2, "residual of a linear solve, as a part of the root of the complementarity", check=POSITIVE
     )
     proximal: float = option(
-        1e-8,
-        "compliance within a step, in units of mean diag N; the answer does not have it; it grows where progress ends",
+        1e-7,
+        "compliance within a step of the form body, in units of mean diag N; the answer does not have it; it grows "
+        "where progress ends",
         check=NOT_NEGATIVE,
     )
     boundary: float = option(0.99, "part of the way to the cone's boundary that a step may go", check=FRACTION)
@@ -62,7 +65,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
     scale, frictionless = _cone_scale(problem.mu)
     s, z = _start(problem, guess, scale, frictionless, options)
     v = problem.momentum(s / scale)
-    best, history, patience, last_gap, proximal = s / scale, [], 0, np.inf, options.proximal
+    best, history, patience, last_gap, step, proximal = s / scale, [], 0, np.inf, 1.0, _proximal(options, newton)
     for iteration in range(max_it + 1):
         g = s / scale
         r_v, r_z = _residuals(problem, g, z, v, scale, frictionless)
@@ -73,12 +76,12 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
         patience, last_gap = (0 if progress else patience + 1), gap
         if history[-1] <= limits.tol or iteration == max_it or why_unbounded(problem, g):
             break
-        if newton.primary == "momenta" and patience > 1 and 0 < proximal < LARGEST_PROXIMAL:
+        if newton.primary == "momenta" and (patience > 1 or step < TINY) and 0 < proximal < 0.9 * LARGEST_PROXIMAL:
             proximal, patience = 10.0 * proximal, 0
         elif patience > PATIENCE:
             if not newton.sharpen():
                 break
-            proximal, patience = options.proximal, 0
+            proximal, patience = _proximal(options, newton), 0
         W = NesterovTodd.of(s, z)
         newton.update(*_barrier_blocks(problem, W, scale, frictionless, proximal))
         tol = options.forcing * np.sqrt(gap) * (1.0 if newton.primary == "momenta" else CLOSER)
@@ -95,7 +98,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
             return ds, dz, dv, x
 
         with phase("ConicPredictor"):
-            ds, dz, dv, x = direction(-z, None)
+            ds, dz, dv, x = affine = direction(-z, None)
             reach = min(1.0, _step(problem, s, z, ds, dz))
             target = max((1.0 - reach) ** 3, _centering(problem, s, z)) * gap / problem.size
         with phase("ConicCorrector"):
@@ -111,12 +114,19 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
                 if longer <= step:
                     break
                 step, (ds, dz, dv, x) = longer, again
+            if step < TINY < reach:  # rounding has spoilt the corrected one
+                step, (ds, dz, dv, x) = BACK * reach, affine
         if step > 0:
             s, z, v = s + step * ds, z + step * dz, v + step * dv
     converged = history[-1] <= limits.tol
     words = f"{max_it} iterations" if iteration == max_it else f"stalled after {iteration} iterations"
     words = "natural residual below the tolerance" if converged else words
     return Result(best, converged, words, min(history), iteration, newton.ksp_its, newton.fallbacks, history)
+
+
+def _proximal(options: Conic, newton: Newton) -> float:
+    """A tenth where impulses are unknowns: there no (B + C)^-1 is formed, and little need be bounded."""
+    return options.proximal if newton.primary == "momenta" else 0.1 * options.proximal
 
 
 def _cone_scale(mu: Array) -> tuple[Array, Array]:

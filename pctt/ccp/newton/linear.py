@@ -105,7 +105,7 @@ CAP = {"pbjacobi": "1500", "ilu": "1000", "cholesky": "60"}
 ITERATION = {"pbjacobi": 1.4, "ilu": 3.5, "cholesky": 22.0}
 FEWER = {"pbjacobi": 1.0, "ilu": 4.8, "cholesky": np.inf}  # block Jacobi's iterations / this one's
 SOLVES = 1.8  # iterations of predictor and correctors / those of the predictor
-OLD_FACTOR = 25.0  # iterations to expect with the factor of an earlier matrix
+OLD_FACTOR = 60.0  # iterations to expect with the factor of an earlier matrix
 
 
 def _setup_cost(rung: str, bodies: int) -> float:
