@@ -159,8 +159,8 @@ def expected(forecast: float, last: Needed | None, iterations: int, cost: float)
 
 def conic_cost(contacts: int, softness: float, tol: float) -> float:
     """What the conic method costs from a cold start, in iterations of APGD: measured on mixers, shear tests and blades
-    of 400 to 28,000 contacts. Below 1e-7 rigid problems differ: 30 to 110, as some need the form `kkt`."""
-    accuracy, rigid, soft = [-8, -7, -6, -4, -2], [57, 35, 24, 16, 6], [28, 25, 22, 15, 5]
+    of 400 to 28,000 contacts. Below 1e-7 rigid problems differ: 25 to 60."""
+    accuracy, rigid, soft = [-8, -7, -6, -4, -2], [40, 27, 19, 14, 5], [28, 25, 22, 15, 5]
     per_root = np.interp(np.log10(tol), accuracy, soft if softness >= 1e-6 else rigid)
     return float(per_root * np.sqrt(max(contacts, 400)))
 

@@ -116,7 +116,7 @@ def test_what_the_last_problem_needed_joins_in():
 
 def test_the_cost_grows_with_size_and_accuracy():
     assert conic_cost(40, 0, 1e-4) < conic_cost(40, 0, 1e-8) < conic_cost(9000, 0, 1e-8)
-    assert conic_cost(9000, 1e-5, 1e-8) < 0.5 * conic_cost(9000, 0, 1e-8)
+    assert conic_cost(9000, 1e-5, 1e-8) < 0.8 * conic_cost(9000, 0, 1e-8)
     assert conic_cost(10, 0, 1e-6) == conic_cost(300, 0, 1e-6)  # small problems have fixed costs
 
 
@@ -161,7 +161,7 @@ def test_nothing_is_remembered_if_so_asked():
     newton = ccp.newton_for(SELF, "auto")
     newton.memory = Memory({-8: Needed(1e6, True)}, {-8: 0.25})
     for remember, solver in ((False, "apgd"), (True, "conic")):
-        options = Auto(bias=2.0, remember=remember)
+        options = Auto(bias=4.0, remember=remember)
         result = ccp.solve(from_graph(known, graph), None, "auto", Limits(1e-8), options, newton)
         assert result.solver == solver
         assert ("the last problem 1000000" in result.reason) == remember
