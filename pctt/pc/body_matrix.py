@@ -29,7 +29,8 @@ class BodyMatrix:
 
     def load(self, G: BlockRows) -> None:
         """Take a G of the same structure."""
-        self.bodies, column = np.unique(G.indices, return_inverse=True)
+        # in 64 bits: pairs of bodies get a number each
+        self.bodies, column = np.unique(np.asarray(G.indices, np.int64), return_inverse=True)
         shape = (3 * G.rows, 6 * len(self.bodies))
         self._rows = sp.bsr_matrix((G.blocks, column, G.indptr), shape=shape)
         self._columns = self._rows.T.tobsr() if len(G.blocks) else None

@@ -7,6 +7,9 @@ import pytest
 from petsc4py import PETSc
 from systems import contact_matrix, contacts, dense, poisson
 
+from pctt.blocks import BlockRows
+from pctt.pc.body_matrix import BodyMatrix
+
 
 def solve(mat: PETSc.Mat, ksp_type: str, rtol: float, **options: object) -> tuple[float, np.ndarray, np.ndarray]:
     """True residual, solution, right-hand side."""
@@ -75,3 +78,16 @@ def test_follows_new_barriers():
 def test_a_matrix_that_does_not_say_what_it_is_made_of_is_refused():
     with pytest.raises((ValueError, PETSc.Error)):
         solve(poisson(4), "preonly", 1e-3)
+
+
+def test_bodies_are_numbered_in_64_bits():
+    """G of a file has 32 bits; 70,000 squared has more."""
+    bodies = 70_000
+    last = np.array([0, bodies - 1, bodies - 2, bodies - 1], np.int32)
+    G = BlockRows(np.array([0, 2, 4], np.int32), last, np.ones((4, 3, 6)), bodies)
+    K = BodyMatrix(PETSc.COMM_SELF, G)
+    K.update(np.tile(np.eye(3), (2, 1, 1)))
+    first, final = (np.arange(6 * body, 6 * body + 6, dtype=PETSc.IntType) for body in (0, bodies - 1))
+    for rows, columns in ((first, final), (final, first)):
+        assert np.array_equal(K.mat.getValues(rows, columns), np.full((6, 6), 3.0))
+    K.destroy()
