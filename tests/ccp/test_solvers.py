@@ -263,7 +263,7 @@ def test_more_steps_bring_it_nearer(solver):
     known, graph = heap()
     problem = from_graph(known, graph)
     errors = []
-    steps = {"pdip": (5, 15, 25), "conic": (3, 6, 9)}.get(solver, (10, 100, 1000))
+    steps = {"pdip": (5, 15, 25), "conic": (3, 6, 9), "auto": (10, 40, 200)}.get(solver, (10, 100, 1000))
     for max_it in steps:
         impulse = ccp.solve(problem, type=solver, limits=Limits(1e-14, max_it)).impulse
         errors.append(np.linalg.norm(problem.product(impulse) + problem.r - known.y))
