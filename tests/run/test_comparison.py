@@ -16,6 +16,7 @@ FIELDS = {
     "setup_s": float,
     "solve_s": float,
     "true_residual_max": float,
+    "solves": list,
 }
 # accurate Newton steps, so that every cone problem is solved by PDIP alone
 ACCURATE = ("-ksp_rtol", "1e-6", "-ksp_max_it", "2000", "-ccp_tol", "1e-4")
@@ -37,7 +38,8 @@ def test_all_see_the_same_systems_and_the_table_agrees_with_the_summary(program,
         for field, kind in FIELDS.items():
             assert type(record[field]) is kind, f"{field}: {record[field]!r}"
         assert set(record) == set(FIELDS)
-        assert record["systems"] == newton > 20
+        assert record["systems"] == len(record["solves"]) == newton > 20
+        assert sum(converged for converged, *_ in record["solves"]) == record["converged"]
         assert 0 <= record["converged"] <= record["systems"]
         assert 0 < record["ksp_its_mean"] <= record["ksp_its_max"] <= 2000
         assert math.isfinite(record["true_residual_max"])
