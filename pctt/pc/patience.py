@@ -29,7 +29,7 @@ class Patience:
     def decide(self, kept: float, new: float) -> bool:
         """Whether the new train is taken, by what both leave of a random right side."""
         better = not new * GAIN >= kept  # a kept train that leaves nan goes
-        self.wait = 1 if better else min(2 * self.wait, LONGEST)
+        self.wait = 1 if better else min(max(1, 2 * self.wait), LONGEST)
         self.served = 0
         return better
 

@@ -29,7 +29,7 @@ from pctt.tt.quantise import check_modes, choose_modes
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Train
 
-LOWER = 3  # part of the cap that is tried where the cap fails or does not pay
+LOWER = 3  # the cap divided by this is the rank that is tried where the cap fails or does not pay
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class TensorTrain(PythonPC):
             PETSc.Sys.Print(f"  pctt.pc.TensorTrain: {self._line()}", comm=P.comm)
 
     def _make_train(self, P: PETSc.Mat, rank: int) -> bool:
-        """Compress and invert; False, with the reason on the account, if no positive inverse came of it."""
+        """Keep the train or make one; False, with the reason on the account, if there is no positive inverse."""
         if self.options.reuse == "none":
             self._forget_structure()
             self._forget_trains()

@@ -38,4 +38,4 @@ def test_the_gain_must_be_worth_it():
 def test_after_a_failure_the_next_set_up_is_a_trial():
     patience = Patience(wait=32)
     patience.lose()
-    assert patience.over()
+    assert trials(patience, 10, 0.5, 0.5) == [1, 3, 6]  # and the waits grow again
