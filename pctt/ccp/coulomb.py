@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import Array, tangential
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Result
 from pctt.options import AT_LEAST_ONE, COUNT, NOT_NEGATIVE, option
@@ -45,7 +45,7 @@ def residual(problem: ConeProblem, g: Array, y: Array) -> float:
 
 def opening(problem: ConeProblem, y: Array) -> Array:
     """mu |y_t| (nc,) of velocities y (nc, 3)."""
-    return problem.mu * np.hypot(y[:, 1], y[:, 2])
+    return problem.mu * tangential(y)
 
 
 def solve(

@@ -13,14 +13,13 @@ from petsc4py import PETSc
 
 from pctt.blocks import BlockRows
 from pctt.exchange import exchange, offsets
+from pctt.pc.stiff_part import StiffPart
 
 ADD = PETSc.InsertMode.ADD_VALUES
-EXCESS = 1.15  # blocks of a kept pattern / those that are wanted
 
 
 class BodyMatrix:
-    """K as a Mat of block size 6 (``mat``), and ``enlarged``, a copy with its diagonal blocks multiplied by 1 + shift,
-    which incomplete factorisations need: without, they break down late in an interior point iteration."""
+    """K as a Mat of block size 6 (``mat``), and its ``stiff_part``, which is what factorisations are made of."""
 
     def __init__(self, comm: PETSc.Comm, G: BlockRows):
         self.comm = comm.tompi4py() if isinstance(comm, PETSc.Comm) else comm
@@ -60,8 +59,7 @@ class BodyMatrix:
         self.mat.setType(PETSc.Mat.Type.BAIJ)
         self.mat.setPreallocationCSR((self._indptr, self._indices))
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        self._enlarged: PETSc.Mat | None = None
-        self._stiff: PETSc.Mat | None = None
+        self._stiff: dict[bool, StiffPart] = {}  # in scalar format or not
 
     def _product(self, inverse: np.ndarray) -> sp.bsr_matrix:
         """G' B^-1 G of this rank's contacts, between the bodies that they touch."""
@@ -82,52 +80,12 @@ class BodyMatrix:
         self._values[self._diagonal_places] += np.eye(6)
         _put(self.mat, self._indptr, self._indices, self._values)
 
-    def enlarged(self, shift: float) -> PETSc.Mat:
-        """A copy of K whose diagonal blocks are multiplied by 1 + shift, kept and renewed at each call."""
-        if self._enlarged is None:
-            self._enlarged = self.mat.duplicate()
-            self._enlarged.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        values = self._values.copy()
-        values[self._diagonal_places] *= 1.0 + shift
-        _put(self._enlarged, self._indptr, self._indices, values)
-        return self._enlarged
-
-    def stiff_part(self, least: float) -> PETSc.Mat:
-        """K without the blocks between bodies whose entries are all below ``least`` (of the mass), an AIJ Mat: late in
-        an iteration a third of the contacts have opened, and a factor of the rest costs half. Its pattern is kept, and
-        with it a factor's symbolic part, while it holds all such blocks and few others."""
-        kept = np.abs(self._values).max(axis=(1, 2)) >= least
-        kept[self._diagonal_places] = True
-        if self._stiff is None or not self._holds(kept):
-            self._take_pattern(kept)
-        assert self._stiff is not None
-        csr = self._scalar_rows(self._values[self._kept])
-        self._stiff.setValuesCSR(csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType), csr.data)
-        self._stiff.assemble()
-        return self._stiff
-
-    def _holds(self, blocks: np.ndarray) -> bool:
-        """Whether the pattern of the stiff part has these blocks on all ranks and hardly more."""
-        missing, wanted = int((blocks & ~self._kept).sum()), int(blocks.sum())
-        sums = self.comm.allreduce(np.array([missing, wanted, int(self._kept.sum())]))
-        return bool(sums[0] == 0 and sums[2] <= EXCESS * sums[1])
-
-    def _take_pattern(self, kept: np.ndarray) -> None:
-        if self._stiff is not None:
-            self._stiff.destroy()
-        self._kept = kept
-        csr = self._scalar_rows(np.ones((int(kept.sum()), 6, 6)))
-        self._stiff = PETSc.Mat().create(self.comm)
-        self._stiff.setSizes(self.mat.getSizes())
-        self._stiff.setType(PETSc.Mat.Type.AIJ)
-        self._stiff.setPreallocationCSR((csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType)))
-        self._stiff.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-
-    def _scalar_rows(self, blocks: np.ndarray) -> sp.csr_matrix:
-        """Rows of the stiff part with these blocks."""
-        indptr = np.concatenate([[0], np.cumsum(self._kept)])[self._indptr]
-        shape = (self.mat.getLocalSize()[0], self.mat.getSize()[0])
-        return sp.bsr_matrix((blocks, self._indices[self._kept], indptr), shape=shape).tocsr()
+    def stiff_part(self, least: float, shift: float = 0.0, scalar: bool = False) -> PETSc.Mat:
+        """K without the blocks between bodies whose entries are all below ``least`` (of the mass), its diagonal blocks
+        multiplied by 1 + shift; one Mat in block format and one in scalar format are kept and renewed."""
+        if scalar not in self._stiff:
+            self._stiff[scalar] = StiffPart(self.mat, self._indptr, self._indices, self._diagonal_places, scalar)
+        return self._stiff[scalar].update(self._values, least, shift)
 
     def places(self, points: np.ndarray) -> np.ndarray:
         """Places of this rank's bodies (n, 3): the means of their contact points (nc, 3); collective."""
@@ -180,9 +138,8 @@ class BodyMatrix:
 
     def destroy(self) -> None:
         self.mat.destroy()
-        for copy in (self._enlarged, self._stiff):
-            if copy is not None:
-                copy.destroy()
+        for part in self._stiff.values():
+            part.destroy()
 
 
 def _put(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, blocks: np.ndarray) -> None:

@@ -27,6 +27,7 @@ from pctt.pc.body_matrix import BodyMatrix
 
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu"}  # these have no code for block formats
 _COARSE_SPACE = {"gamg", "python"}  # these use the rigid motions
+_FACTORS = {"ilu", "icc", "bjacobi", "cholesky", "lu"}
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,11 @@ class Options:
     )
     shift: float = option(
         0.03, "part by which the diagonal blocks are enlarged in the matrix that is factorised", check=NOT_NEGATIVE
+    )
+    least: float = option(
+        0.1,
+        "blocks of K with no entry above this part of the mass are left out of the matrix that is factorised",
+        check=NOT_NEGATIVE,
     )
 
 
@@ -51,7 +57,6 @@ class BodySchur(PythonPC):
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
         self.ksp: PETSc.KSP | None = None
-        self._scalar: PETSc.Mat | None = None
         self.solves = self.its = 0
         self._rtol, self._atol = 1e-3, 0.0
 
@@ -89,23 +94,16 @@ class BodySchur(PythonPC):
         self.inverse_barrier = np.linalg.inv(barrier + floor[:, None, None] * np.eye(3))
         self.K.update(self.inverse_barrier)
         assert self.ksp is not None
-        shift = self.options.shift
-        P = self.K.enlarged(shift) if shift else self.K.mat
-        if self.ksp.pc.getType() in _SCALAR_FORMAT:
-            P = self._in_scalar_format(P)
-        self.ksp.setOperators(self.K.mat, P)
-        self.ksp.setUp()
-
-    def _in_scalar_format(self, P: PETSc.Mat) -> PETSc.Mat:
-        if self._scalar is None:
-            self._scalar = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
-            self._scalar.setBlockSize(6)
+        kind = self.ksp.pc.getType()
+        least = self.options.least if kind in _FACTORS else 0.0
+        P = self.K.stiff_part(least, self.options.shift, scalar=kind in _SCALAR_FORMAT)
+        if kind in _COARSE_SPACE:
             near = self.K.mat.getNearNullSpace()
             if near.handle:
-                self._scalar.setNearNullSpace(near)
-        else:
-            P.convert(PETSc.Mat.Type.AIJ, self._scalar)
-        return self._scalar
+                P.setNearNullSpace(near)
+            P.setAttr("coordinates", self.K.mat.getAttr("coordinates"))
+        self.ksp.setOperators(self.K.mat, P)
+        self.ksp.setUp()
 
     def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         self._rtol = self.options.rtol or 0.5 * ksp.getTolerances()[0]
@@ -135,9 +133,6 @@ class BodySchur(PythonPC):
             for thing in (self.ksp, self.K, self._G, self._y, self._rhs, self._contact):
                 thing.destroy()
             self.ksp = None
-        if self._scalar is not None:
-            self._scalar.destroy()
-            self._scalar = None
 
 
 def _largest_eigenvalue(G: PETSc.Mat, iterations: int = 15) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Optional
@@ -250,9 +251,8 @@ def _refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
     if comm.rank == 0:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            probe = folder / ".pctt-probe"
-            probe.touch()
-            probe.unlink()
+            with tempfile.TemporaryFile(dir=folder):
+                pass
         except OSError as problem:
             error = problem.strerror
     error = comm.bcast(error)

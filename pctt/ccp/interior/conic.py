@@ -6,9 +6,12 @@ the central path s o z = t e of
     v = G' g,    y = G v + C g + r,    s and z in the cones, s'z = 0,
 
 with the mass-scaled momenta v as unknowns of their own: what an inexact linear solve leaves (``-ccp_newton body``)
-spoils v = G' g alone, which the next step mends. With H = W^-2, W the scaling of the pair (s, z), a step solves
+spoils v = G' g alone, which the next step mends. With W the scaling of the pair (s, z), a step solves
 
-    G dv + C dg + r_z = dy,    dv = G' dg - r_v,    H ds + dz = c.
+    dz = G dv + C dg + r_z,    dv = G' dg - r_v,    W^-1 ds + W dz = w - W z.
+
+Late in an iteration W^2 is large along an impulse that slides, and W^2 z, which is s, drowns in rounding when it is
+multiplied out: what each contact would do alone, ds = W w - s, is formed from s instead.
 
 Source: Nesterov and Todd (1997), Mehrotra (1992); Acary, Armand, Nguyen and Shpakovych, "Second-order cone
 programming for frictional contact mechanics using interior point algorithm", Optim. Methods Softw. (2023), for their
@@ -20,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import Array, tangential, times
 from pctt.ccp.interior import lorentz
 from pctt.ccp.interior.lorentz import NesterovTodd
 from pctt.ccp.newton import Newton
@@ -34,11 +37,10 @@ CENTERING = 0.02  # per deviation from the central path
 CLOSER = 0.01  # impulses as unknowns: what a linear solve leaves moves velocities, and they are compared with zero
 SHORT = 0.8  # a step after which the direction is corrected
 CORRECTIONS, FURTHER = 3, 0.3  # at most so many, for a step that goes so much further
+LEAST = 0.01  # part of the complementarity to aim at
 NEAR = 0.1, 10.0  # the central path, in units of the complementarity that is aimed at
 PATIENCE = 3  # iterations without progress before the Newton systems are sharpened
-BACK = 0.9  # part of the way to the cone's boundary along the predictor
-TINY = 0.1  # a step after which the proximal compliance grows at once
-LARGEST_PROXIMAL = 1e-5  # up to which it grows before that
+LONGER, LESS = 1.02, 0.7  # a short step, or what a long one leaves of the complementarity, after a correction to keep
 
 
 @dataclass(frozen=True)
@@ -46,14 +48,9 @@ class Conic:
     """Options ``-ccp_conic_*``."""
 
     start: float = option(30.0, "complementarity of the start, in units of mean(r^2) / mean diag N", check=POSITIVE)
-    forcing: float = option(
-        0.2, "residual of a linear solve, as a part of the root of the complementarity", check=POSITIVE
-    )
+    forcing: float = option(0.3, "residual of a linear solve, as a part of the natural residual", check=POSITIVE)
     proximal: float = option(
-        1e-7,
-        "compliance within a step of the form body, in units of mean diag N; the answer does not have it; it grows "
-        "where progress ends",
-        check=NOT_NEGATIVE,
+        1e-9, "compliance within a step, in units of mean diag N; the answer does not have it", check=NOT_NEGATIVE
     )
     boundary: float = option(0.99, "part of the way to the cone's boundary that a step may go", check=FRACTION)
 
@@ -65,7 +62,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
     scale, frictionless = _cone_scale(problem.mu)
     s, z = _start(problem, guess, scale, frictionless, options)
     v = problem.momentum(s / scale)
-    best, history, patience, last_gap, step, proximal = s / scale, [], 0, np.inf, 1.0, _proximal(options, newton)
+    best, history, patience, last_gap = s / scale, [], 0, np.inf
     for iteration in range(max_it + 1):
         g = s / scale
         r_v, r_z = _residuals(problem, g, z, v, scale, frictionless)
@@ -76,18 +73,21 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
         patience, last_gap = (0 if progress else patience + 1), gap
         if history[-1] <= limits.tol or iteration == max_it or why_unbounded(problem, g):
             break
-        if newton.primary == "momenta" and (patience > 1 or step < TINY) and 0 < proximal < 0.9 * LARGEST_PROXIMAL:
-            proximal, patience = 10.0 * proximal, 0
-        elif patience > PATIENCE:
+        if patience > PATIENCE:
             if not newton.sharpen():
                 break
-            proximal, patience = _proximal(options, newton), 0
+            patience = 0
         W = NesterovTodd.of(s, z)
-        newton.update(*_barrier_blocks(problem, W, scale, frictionless, proximal))
-        tol = options.forcing * np.sqrt(gap) * (1.0 if newton.primary == "momenta" else CLOSER)
+        B, inverse, yielding = _barrier_blocks(problem, W, scale, frictionless, options.proximal)
+        newton.update(B, inverse)
+        # a residual of v = G' g makes y wrong by G times that
+        tol = options.forcing * history[-1] * problem.norm(g) * np.sqrt(problem.mean_diagonal)
+        tol *= 1.0 if newton.primary == "momenta" else CLOSER
 
-        def direction(c: Array, start: Array | None) -> tuple[Array, Array, Array, Array]:
-            dg, x = newton.solve((c - r_z) * scale, tol, r_v, start)  # noqa: B023 - used within the iteration
+        def direction(w: Array, start: Array | None) -> tuple[Array, Array, Array, Array]:
+            c = W.divide(w) - z  # noqa: B023 - used within the iteration, as all that follows
+            alone = times(yielding, W.times(w) - s) / scale - times(inverse, r_z * scale)  # noqa: B023
+            dg, x = newton.solve((c - r_z) * scale, tol, r_v, start, alone)  # noqa: B023
             dv = newton.momentum(x, dg, r_v)  # noqa: B023
             ds = dg * scale
             if newton.primary == "momenta":  # r_z vanishes, r_v takes the error of the linear solve
@@ -98,35 +98,34 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
             return ds, dz, dv, x
 
         with phase("ConicPredictor"):
-            ds, dz, dv, x = affine = direction(-z, None)
+            ds, dz, dv, x = direction(np.zeros_like(z), None)
             reach = min(1.0, _step(problem, s, z, ds, dz))
-            target = max((1.0 - reach) ** 3, _centering(problem, s, z)) * gap / problem.size
+            target = max((1.0 - reach) ** 3, _centering(problem, s, z), LEAST) * gap / problem.size
         with phase("ConicCorrector"):
-            c = _centred(W, z, ds, dz, target)
-            ds, dz, dv, x = direction(c, x)
+            w = _centred(W, z, ds, dz, target)
+            ds, dz, dv, x = direction(w, x)
             step = min(1.0, options.boundary * _step(problem, s, z, ds, dz))
             for _ in range(CORRECTIONS):
-                if step >= SHORT:
+                short = step < SHORT
+                if short:
+                    w = w + _towards_path(W, z, ds, dz, min(1.0, step + FURTHER), target)
+                elif newton.factored:  # another solve costs next to nothing
+                    w = _centred(W, z, ds, dz, target)
+                else:
                     break
-                c = c + _towards_path(W, z, ds, dz, min(1.0, step + FURTHER), target)
-                again = direction(c, x)
+                again = direction(w, x)
                 longer = min(1.0, options.boundary * _step(problem, s, z, *again[:2]))
-                if longer <= step:
+                if short and longer < LONGER * step:
+                    break
+                if not short and _left(problem, s, z, longer, *again) > LESS * _left(problem, s, z, step, ds, dz):
                     break
                 step, (ds, dz, dv, x) = longer, again
-            if step < TINY < reach:  # rounding has spoilt the corrected one
-                step, (ds, dz, dv, x) = BACK * reach, affine
         if step > 0:
             s, z, v = s + step * ds, z + step * dz, v + step * dv
     converged = history[-1] <= limits.tol
     words = f"{max_it} iterations" if iteration == max_it else f"stalled after {iteration} iterations"
     words = "natural residual below the tolerance" if converged else words
     return Result(best, converged, words, min(history), iteration, newton.ksp_its, newton.fallbacks, history)
-
-
-def _proximal(options: Conic, newton: Newton) -> float:
-    """A tenth where impulses are unknowns: there no (B + C)^-1 is formed, and little need be bounded."""
-    return options.proximal if newton.primary == "momenta" else 0.1 * options.proximal
 
 
 def _cone_scale(mu: Array) -> tuple[Array, Array]:
@@ -169,44 +168,46 @@ def _start(
 
 def _barrier_blocks(
     problem: ConeProblem, W: NesterovTodd, scale: Array, frictionless: Array, proximal: float
-) -> tuple[Array, Array]:
-    """B and (B + C)^-1 (nc, 3, 3) from the spectral form of the scaled blocks: no tiny block is inverted."""
+) -> tuple[Array, Array, Array]:
+    """B, (B + C)^-1 and, in the scaled variables, (B + C)^-1 B (nc, 3, 3) from the spectral form of the scaled blocks:
+    no tiny block is inverted."""
     with phase("CCPBarrier"):
         squares = W.square_values()
         soft = proximal * problem.mean_diagonal
-        yielding = problem.compliance[:, 1] + soft  # the same along all axes of the scaled variables
+        give = problem.compliance[:, 1] + soft  # the same along all axes of the scaled variables
         both = scale[:, :, None] * scale[:, None, :]
         B = W.blocks(*(1.0 / k + soft for k in squares)) * both
-        inverse = W.blocks(*(k / (1.0 + yielding * k) for k in squares)) / both
+        inverse = W.blocks(*(k / (1.0 + give * k) for k in squares)) / both
+        yielding = W.blocks(*(1.0 / (1.0 + give * k) for k in squares))
         if frictionless.any():
             stiff = 1e12 * np.maximum(B[frictionless, 0, 0], problem.mean_diagonal)
             B[frictionless, 1, 1] = B[frictionless, 2, 2] = stiff
-            inverse[frictionless, 1:] = inverse[frictionless, :, 1:] = 0.0
-        return B, inverse
+            for blocks in (inverse, yielding):
+                blocks[frictionless, 1:] = blocks[frictionless, :, 1:] = 0.0
+        return B, inverse, yielding
 
 
 def _centred(W: NesterovTodd, z: Array, ds: Array, dz: Array, target: float) -> Array:
-    """The right-hand side c of H ds + dz = c that aims at s o z = target e, with the second-order term of the last
-    direction."""
+    """The w of a direction that aims at s o z = target e, with the second-order term of the last direction."""
     aim = -lorentz.product(W.divide(ds), W.times(dz))
     aim[:, 0] += target
-    return W.divide(lorentz.divide(W.times(z), aim)) - z
+    return lorentz.divide(W.times(z), aim)
 
 
 def _towards_path(W: NesterovTodd, z: Array, ds: Array, dz: Array, reach: float, target: float) -> Array:
-    """What to add to c so that the eigenvalues of s o z, ``reach`` along the direction, come near the target.
+    """What to add to w so that the eigenvalues of s o z, ``reach`` along the direction, come near the target.
 
     Source: Gondzio (1996), multiple centrality corrections; here with the eigenvalues of second-order cones."""
     centre = W.times(z)
     after = lorentz.product(centre + reach * W.divide(ds), centre + reach * W.times(dz))
-    size = np.linalg.norm(after[:, 1:], axis=1)
+    size = tangential(after)
     eigenvalues = after[:, 0] + np.stack([size, -size])
     aim = np.clip(eigenvalues, NEAR[0] * target, NEAR[1] * target) - eigenvalues
     larger, smaller = np.maximum(aim, -NEAR[1] * target)
     change = np.empty_like(after)
     change[:, 0] = 0.5 * (larger + smaller)
     change[:, 1:] = (0.5 * (larger - smaller) / np.maximum(size, 1e-300))[:, None] * after[:, 1:]
-    return W.divide(lorentz.divide(centre, change))
+    return lorentz.divide(centre, change)
 
 
 def _centering(problem: ConeProblem, s: Array, z: Array) -> float:
@@ -216,6 +217,11 @@ def _centering(problem: ConeProblem, s: Array, z: Array) -> float:
     turned = lorentz.product(s, z)
     off = problem.norm(turned[:, 1:]) / max(problem.norm(turned[:, 0]), 1e-300)
     return min(CENTERING * off, 0.5)
+
+
+def _left(problem: ConeProblem, s: Array, z: Array, step: float, ds: Array, dz: Array, *_: Array) -> float:
+    """Complementarity after a step."""
+    return problem.dot(s + step * ds, z + step * dz)
 
 
 def _step(problem: ConeProblem, s: Array, z: Array, ds: Array, dz: Array) -> float:

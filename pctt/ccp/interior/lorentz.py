@@ -13,21 +13,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import Array, dot, tangential
 
 _LEAST = 1e-17  # determinant of a unit point that rounding has put on or outside the boundary
 
 
 def determinant(x: Array) -> Array:
     """x_0^2 - |x_1:|^2 (nc,) of points inside, kept positive where rounding would not."""
-    t = np.hypot(x[:, 1], x[:, 2])
+    t = np.hypot(x[:, 1], x[:, 2])  # within half an ulp: what is left near the boundary depends on it
     return np.maximum((x[:, 0] - t) * (x[:, 0] + t), np.maximum(_LEAST * x[:, 0] ** 2, np.finfo(float).tiny))
 
 
 def product(x: Array, y: Array) -> Array:
     """x o y."""
-    out = x[:, :1] * y + y[:, :1] * x
-    out[:, 0] = (x * y).sum(1)
+    out = np.empty_like(x)
+    out[:, 0] = dot(x, y)
+    for k in (1, 2):
+        out[:, k] = x[:, 0] * y[:, k] + y[:, 0] * x[:, k]
     return out
 
 
@@ -35,7 +37,8 @@ def divide(x: Array, y: Array) -> Array:
     """The w with x o w = y; x inside the cones."""
     out = np.empty_like(y)
     out[:, 0] = (x[:, 0] * y[:, 0] - x[:, 1] * y[:, 1] - x[:, 2] * y[:, 2]) / determinant(x)
-    out[:, 1:] = (y[:, 1:] - out[:, :1] * x[:, 1:]) / x[:, :1]
+    for k in (1, 2):
+        out[:, k] = (y[:, k] - out[:, 0] * x[:, k]) / x[:, 0]
     return out
 
 
@@ -46,10 +49,10 @@ def step_to_boundary(x: Array, dx: Array) -> float:
     solvers", 2010).
     """
     size = np.sqrt(determinant(x))
-    unit = x / size[:, None]
-    inner = unit[:, 0] * dx[:, 0] - unit[:, 1] * dx[:, 1] - unit[:, 2] * dx[:, 2]
-    turned = dx[:, 1:] - ((inner + dx[:, 0]) / (unit[:, 0] + 1.0))[:, None] * unit[:, 1:]
-    fastest = ((np.hypot(turned[:, 0], turned[:, 1]) - inner) / size).max(initial=0.0)
+    inner = (x[:, 0] * dx[:, 0] - x[:, 1] * dx[:, 1] - x[:, 2] * dx[:, 2]) / size
+    along = (inner + dx[:, 0]) / (x[:, 0] + size)
+    turned_1, turned_2 = (dx[:, k] - along * x[:, k] for k in (1, 2))
+    fastest = ((np.sqrt(turned_1 * turned_1 + turned_2 * turned_2) - inner) / size).max(initial=0.0)
     return 1.0 / fastest if fastest > 0 else np.inf
 
 
@@ -58,7 +61,7 @@ def central_pair(x: Array, tau: Array, complementarity: Array | float) -> tuple[
 
     In the spectral values of x: s = (l + root(l^2 + 4 c tau)) / 2, and z likewise of -l.
     """
-    t = np.hypot(x[:, 1], x[:, 2])
+    t = tangential(x)
     direction = np.divide(x[:, 1:], t[:, None], out=np.zeros_like(x[:, 1:]), where=t[:, None] > 0)
     room = 4.0 * complementarity * tau
 
@@ -96,37 +99,40 @@ class NesterovTodd:
     @classmethod
     def of(cls, s: Array, z: Array) -> NesterovTodd:
         size_s, size_z = (np.sqrt(determinant(x)) for x in (s, z))
-        unit_s, unit_z = s / size_s[:, None], z / size_z[:, None]
-        angle = np.sqrt(np.maximum(0.5 * (1.0 + (unit_s * unit_z).sum(1)), 0.5))
-        point = unit_s
-        point[:, 0] += unit_z[:, 0]
-        point[:, 1:] -= unit_z[:, 1:]
-        point /= (2.0 * angle)[:, None]
-        t = np.hypot(point[:, 1], point[:, 2])
-        direction = np.zeros_like(point[:, 1:])
-        direction[:, 0] = 1.0
-        np.divide(point[:, 1:], t[:, None], out=direction, where=t[:, None] > 1e-14)
-        root = point.copy()
-        root[:, 0] += 1.0
-        root /= np.sqrt(2.0 * root[:, :1])
-        return cls(root, np.sqrt(size_s / size_z), point[:, 0] + t, direction)
+        angle = np.sqrt(np.maximum(0.5 * (1.0 + dot(s, z) / (size_s * size_z)), 0.5))
+        of_s, of_z = 0.5 / (angle * size_s), 0.5 / (angle * size_z)
+        point = np.empty_like(s)
+        point[:, 0] = of_s * s[:, 0] + of_z * z[:, 0]
+        for k in (1, 2):
+            point[:, k] = of_s * s[:, k] - of_z * z[:, k]
+        t = tangential(point)
+        pointing = t > 1e-14
+        direction = np.empty_like(point[:, 1:])
+        for k in (0, 1):
+            direction[:, k] = np.divide(point[:, 1 + k], t, out=np.full_like(t, 1.0 - k), where=pointing)
+        spread = point[:, 0] + t
+        point[:, 0] += 1.0
+        root = point / np.sqrt(2.0 * point[:, :1])
+        return cls(root, np.sqrt(size_s / size_z), spread, direction)
 
     def times(self, x: Array) -> Array:
         """W x."""
-        out = (2.0 * self.eta * (self.root * x).sum(1))[:, None] * self.root
-        flipped = self.eta[:, None] * x
-        out[:, 0] -= flipped[:, 0]
-        out[:, 1:] += flipped[:, 1:]
+        root, twice = self.root, 2.0 * dot(self.root, x)
+        out = np.empty_like(x)
+        out[:, 0] = self.eta * (twice * root[:, 0] - x[:, 0])
+        for k in (1, 2):
+            out[:, k] = self.eta * (twice * root[:, k] + x[:, k])
         return out
 
     def divide(self, x: Array) -> Array:
         """W^-1 x."""
-        mirrored = self.root.copy()
-        mirrored[:, 1:] *= -1.0
-        out = (2.0 * (mirrored * x).sum(1))[:, None] * mirrored
-        out[:, 0] -= x[:, 0]
-        out[:, 1:] += x[:, 1:]
-        return out / self.eta[:, None]
+        root = self.root
+        twice = 2.0 * (root[:, 0] * x[:, 0] - root[:, 1] * x[:, 1] - root[:, 2] * x[:, 2])
+        out = np.empty_like(x)
+        out[:, 0] = (twice * root[:, 0] - x[:, 0]) / self.eta
+        for k in (1, 2):
+            out[:, k] = (x[:, k] - twice * root[:, k]) / self.eta
+        return out
 
     def square_values(self) -> tuple[Array, Array, Array]:
         """Eigenvalues of W^2 for (1, u), (1, -u), (0, u')."""

@@ -107,6 +107,11 @@ class Newton:
         return "momenta" if self._present == "body" else "impulses"
 
     @property
+    def factored(self) -> bool:
+        """Whether the present matrix has been factorised, and another solve costs little."""
+        return self.linear.factored
+
+    @property
     def ksp_its(self) -> int:
         return sum(linear.iterations for linear in self._linear.values())
 
@@ -126,12 +131,20 @@ class Newton:
             self.system.update(barrier, inverse)
             self.linear.new_matrix(self.system)
 
-    def solve(self, q: Array, tol: float, r_v: Array | None = None, start: Array | None = None) -> tuple[Array, Array]:
+    def solve(
+        self,
+        q: Array,
+        tol: float,
+        r_v: Array | None = None,
+        start: Array | None = None,
+        alone: Array | None = None,
+    ) -> tuple[Array, Array]:
         """dg (nc, 3) and the system's solution x, to a residual of ``tol`` (sqrt J: of momenta; of velocities times
-        the root of the mean diagonal of N). ``start`` is an earlier x to begin from."""
+        the root of the mean diagonal of N). ``start`` is an earlier x to begin from; ``alone`` is (B + C)^-1 q where
+        the caller knows it better."""
         with phase("CCPKrylov"):
             assert self.system is not None
-            b = self.system.right_hand_side(q, r_v)
+            b = self.system.right_hand_side(q, r_v, alone)
             x = np.zeros_like(b)
             if start is not None:
                 self._x.array[:] = x = start.copy()
@@ -139,7 +152,7 @@ class Newton:
                 b = b - self._b.array
             wanted = self.system.tolerance(tol)
             x += self._solve(b, wanted)
-            dg = self.system.impulses(x, q)
+            dg = self.system.impulses(x, q, alone)
             for _ in range(REFINEMENTS):
                 error = None if r_v is None else self.system.rounding(x, dg, r_v)
                 if error is None or self.problem.norm(error) <= 3 * wanted:

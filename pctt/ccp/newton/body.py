@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import Array, times
 from pctt.ccp.problem import ConeProblem
 from pctt.pc.body_matrix import BodyMatrix
 
@@ -49,20 +49,20 @@ class BodySystem:
     def preconditioned(self):
         return self.matrix
 
-    def enlarged(self):
-        """K with larger diagonal blocks, from which incomplete factorisations are made."""
-        return self.body_matrix.enlarged(SHIFT)
+    def stiff_part(self, complete: bool):
+        """What is worth factorising of K: completely, by a method of scalar rows, or incompletely in blocks of bodies,
+        for which the diagonal blocks are enlarged (without, such a factorisation breaks down late in an iteration)."""
+        return self.body_matrix.stiff_part(LEAST, 0.0 if complete else SHIFT, scalar=complete)
 
-    def stiff_part(self):
-        """What is worth factorising of K."""
-        return self.body_matrix.stiff_part(LEAST)
-
-    def right_hand_side(self, q: Array, r_v: Array | None) -> Array:
-        push = self.problem.momentum(_times(self._inverse, q))
+    def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
+        """``alone`` is (B + C)^-1 q where the caller knows it better."""
+        push = self.problem.momentum(times(self._inverse, q) if alone is None else alone)
         return push if r_v is None else push - r_v
 
-    def impulses(self, x: Array, q: Array) -> Array:
-        return _times(self._inverse, q - self.problem.velocity_of(x))
+    def impulses(self, x: Array, q: Array, alone: Array | None = None) -> Array:
+        if alone is None:
+            return times(self._inverse, q - self.problem.velocity_of(x))
+        return alone - times(self._inverse, self.problem.velocity_of(x))
 
     def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
         return x
@@ -77,7 +77,3 @@ class BodySystem:
 
     def destroy(self) -> None:
         self.body_matrix.destroy()
-
-
-def _times(blocks: Array, x: Array) -> Array:
-    return (blocks @ x[:, :, None])[:, :, 0]

@@ -62,10 +62,10 @@ class ContactSystem:
             mat.setValuesBlockedRCV(self._block_rows, self._block_rows, blocks.reshape(-1, 9))
         mat.assemble()
 
-    def right_hand_side(self, q: Array, r_v: Array | None) -> Array:
+    def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
         return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
 
-    def impulses(self, x: Array, q: Array) -> Array:
+    def impulses(self, x: Array, q: Array, alone: Array | None = None) -> Array:
         """dg (nc, 3) of a solution."""
         return x.reshape(-1, 3).copy()
 

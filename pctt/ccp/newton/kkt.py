@@ -69,12 +69,12 @@ class KKTSystem:
             self.matrix.setValuesBlockedRCV(self._block_rows, self._block_rows, blocks.reshape(-1, 25))
         self.matrix.assemble()
 
-    def right_hand_side(self, q: Array, r_v: Array | None) -> Array:
+    def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
         out = np.zeros((len(q), 5))
         out[:, :3] = q if r_v is None else q + self.problem.velocity_of(r_v)
         return out.ravel()
 
-    def impulses(self, x: Array, q: Array) -> Array:
+    def impulses(self, x: Array, q: Array, alone: Array | None = None) -> Array:
         return np.ascontiguousarray(x.reshape(-1, 5)[:, :3])
 
     def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:

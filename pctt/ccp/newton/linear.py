@@ -54,6 +54,11 @@ class AskedFor:
         self.fallbacks += 1
         return self._climb_down(b, x, rtol, done)
 
+    @property
+    def factored(self) -> bool:
+        """Whether the preconditioner is a factorisation of the present matrix."""
+        return "" in self._krylov and self._krylov[""].ksp.pc.getType() in ("cholesky", "lu")
+
     def report(self) -> list[str]:
         """What the asked-for preconditioner tells of itself, if it is one of the project's."""
         return self._krylov[""].report() if "" in self._krylov else []
@@ -102,19 +107,19 @@ RUNGS = {
 CAP = {"pbjacobi": "1500", "ilu": "1000", "cholesky": "60"}
 
 # Costs in products with K, measured at 700, 4,900 and 35,900 bodies (docs/ccp.md)
-ITERATION = {"pbjacobi": 1.4, "ilu": 3.5, "cholesky": 22.0}
+ITERATION = {"pbjacobi": 1.3, "ilu": 2.8, "cholesky": 20.0}
 FEWER = {"pbjacobi": 1.0, "ilu": 4.8, "cholesky": np.inf}  # block Jacobi's iterations / this one's
 SOLVES = 1.8  # iterations of predictor and correctors / those of the predictor
 OLD_FACTOR = 60.0  # iterations to expect with the factor of an earlier matrix
 
 
 def _setup_cost(rung: str, bodies: int) -> float:
-    return {"pbjacobi": 3.0, "ilu": 60.0, "cholesky": 650.0 * (bodies / 5000.0) ** 0.4}[rung]
+    return {"pbjacobi": 3.0, "ilu": 45.0, "cholesky": 650.0 * (bodies / 5000.0) ** 0.4}[rung]
 
 
 class Cheapest:
     """Conjugate gradients on the body system, preconditioned by what is expected to cost least: block Jacobi while it
-    takes few iterations, block ILU(1) of the enlarged matrix then, Cholesky factors at the end; a factor of an earlier
+    takes few iterations, then block ILU(1), then Cholesky factors, of its stiff part; a factor of an earlier
     matrix is kept as long as iterating with it costs less than a new one.
 
     The choice rests on iteration counts and fixed costs, so that a repeated run repeats it.
@@ -177,9 +182,7 @@ class Cheapest:
 
     def _approximate(self, rung: str) -> PETSc.Mat:
         """The matrix that a rung's preconditioner is made from."""
-        if rung == "ilu":
-            return self.system.enlarged()
-        return self.system.stiff_part() if rung == "cholesky" else self.system.matrix
+        return self.system.matrix if rung == "pbjacobi" else self.system.stiff_part(complete=rung == "cholesky")
 
     def _learn(self, rung: str, iterations: int) -> None:
         if rung == "cholesky":
@@ -188,6 +191,11 @@ class Cheapest:
         hardness = max(10.0, iterations * FEWER[rung])
         self._growth = min(max(hardness / self._hardness, 1.0), 2.0)
         self._hardness = hardness
+
+    @property
+    def factored(self) -> bool:
+        """Whether the present matrix has factors of its own."""
+        return self._rung == "cholesky" and not self._keep
 
     def report(self) -> list[str]:
         """Nothing: its rungs are PETSc's own."""

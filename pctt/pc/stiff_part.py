@@ -1,0 +1,79 @@
+"""The part of a body matrix that is worth factorising: late in an interior point iteration a third of the contacts have
+opened, and a factor of the rest costs half, incomplete ones too, and serves as well."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+from petsc4py import PETSc
+
+EXCESS = 1.15  # blocks of a kept pattern / those that are wanted
+
+
+class StiffPart:
+    """A Mat with some of the blocks of a block matrix: its diagonal blocks, and those with an entry of at least
+    ``least``. Its pattern is kept, and with it a factor's symbolic part, while it holds all such blocks and few others.
+
+    whole : the block matrix
+    indptr, indices : this rank's block rows of it
+    diagonal : which blocks are diagonal ones
+    scalar : make an AIJ Mat, for what has no code for blocks, else BAIJ
+    """
+
+    def __init__(
+        self, whole: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, diagonal: np.ndarray, scalar: bool
+    ):
+        self.comm: MPI.Comm = whole.comm.tompi4py()
+        self._indptr, self._indices, self._diagonal = indptr, indices, diagonal
+        self._size, self._sizes, self._scalar = whole.getBlockSize(), whole.getSizes(), scalar
+        self.mat: PETSc.Mat | None = None
+
+    def update(self, values: np.ndarray, least: float, shift: float = 0.0) -> PETSc.Mat:
+        """The Mat for the blocks ``values`` (n, size, size) of the whole, diagonal ones multiplied by 1 + shift."""
+        wanted = np.abs(values).max(axis=(1, 2), initial=0.0) >= least
+        wanted[self._diagonal] = True
+        if self.mat is None or not self._holds(wanted):
+            self._take_pattern(wanted)
+        assert self.mat is not None
+        blocks = values[self._kept]
+        blocks[self._kept_diagonal] *= 1.0 + shift
+        if self._scalar:
+            rows = self._scalar_rows(blocks)
+            self.mat.setValuesCSR(rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType), rows.data)
+        elif len(blocks):
+            self.mat.setValuesBlockedCSR(self._kept_indptr, self._kept_indices, blocks.ravel())
+        self.mat.assemble()
+        return self.mat
+
+    def _holds(self, wanted: np.ndarray) -> bool:
+        """Whether the kept pattern has these blocks on all ranks and hardly more."""
+        counts = [int((wanted & ~self._kept).sum()), int(wanted.sum()), int(self._kept.sum())]
+        missing, needed, kept = self.comm.allreduce(np.array(counts))
+        return bool(missing == 0 and kept <= EXCESS * needed)
+
+    def _take_pattern(self, kept: np.ndarray) -> None:
+        self.destroy()
+        self._kept, before = kept, np.concatenate([[0], np.cumsum(kept)])
+        self._kept_diagonal = before[self._diagonal]
+        self._kept_indptr = before[self._indptr].astype(PETSc.IntType)
+        self._kept_indices = self._indices[kept].astype(PETSc.IntType)
+        self.mat = PETSc.Mat().create(self.comm)
+        self.mat.setSizes(self._sizes)
+        self.mat.setBlockSize(self._size)
+        self.mat.setType(PETSc.Mat.Type.AIJ if self._scalar else PETSc.Mat.Type.BAIJ)
+        if self._scalar:
+            rows = self._scalar_rows(np.ones((int(kept.sum()), self._size, self._size)))
+            self.mat.setPreallocationCSR((rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType)))
+        else:
+            self.mat.setPreallocationCSR((self._kept_indptr, self._kept_indices))
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+
+    def _scalar_rows(self, blocks: np.ndarray) -> sp.csr_matrix:
+        (own, _), (_, columns) = self._sizes
+        return sp.bsr_matrix((blocks, self._kept_indices, self._kept_indptr), shape=(own, columns)).tocsr()
+
+    def destroy(self) -> None:
+        if self.mat is not None:
+            self.mat.destroy()
+            self.mat = None
