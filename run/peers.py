@@ -22,7 +22,6 @@ import numpy as np
 import scipy.sparse as sp
 
 from pctt import ccp
-from pctt.ccp.gather import gather_matrix
 
 Found = tuple[np.ndarray, str]
 
@@ -40,11 +39,20 @@ class Peer:
         return importlib.util.find_spec(self.package) is not None
 
 
+def _contact_rows(problem: ccp.ConeProblem) -> sp.csr_matrix:
+    """G (3 nc x 6 M)."""
+    G = problem.contact_map
+    assert G is not None
+    return sp.bsr_matrix((G.blocks, G.indices, G.indptr), shape=(3 * problem.size, 6 * G.columns)).tocsr()
+
+
 def _siconos(solver: str, internal: bool = False) -> Callable[[ccp.ConeProblem, float, float], Found]:
     def solve(problem: ccp.ConeProblem, tol: float, seconds: float) -> Found:
         import siconos.numerics as numerics
 
-        W = gather_matrix(problem.N).tocoo()
+        # all of N, which for bodies with many contacts is more than problem.N
+        G = _contact_rows(problem)
+        W = (G @ G.T + sp.diags(problem.compliance.ravel())).tocoo()
         W.row, W.col = W.row.astype(np.int64), W.col.astype(np.int64)
         count = problem.size
         with warnings.catch_warnings(), _no_output():
@@ -78,9 +86,7 @@ def _no_output() -> Iterator[None]:
 def _clarabel(problem: ccp.ConeProblem, tol: float, seconds: float) -> Found:
     import clarabel
 
-    G = problem.contact_map
-    assert G is not None
-    rows = sp.bsr_matrix((G.blocks, G.indices, G.indptr), shape=(3 * problem.size, 6 * G.columns)).tocsr()
+    rows = _contact_rows(problem)
     if problem.softness:
         rows = sp.hstack([rows, sp.diags(np.sqrt(problem.compliance.ravel()))])
     scale = np.ones((problem.size, 3))

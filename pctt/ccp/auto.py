@@ -36,7 +36,6 @@ EARLIEST = 0.1  # of the conic method's cost, and
 LOOKS = 8  # looks at the natural residual, before the first forecast
 SAVED = 0.3  # of the conic method's cost, at most, by beginning at APGD's point
 FAR = 4.0  # times that cost: more iterations of APGD than this need not be told apart
-LARGE = 20_000  # contacts from which the cost grows more slowly than their root
 START = 3e4  # complementarity of the conic method's start, by APGD's natural residual; its own default at most
 
 
@@ -159,13 +158,12 @@ def expected(forecast: float, last: Needed | None, iterations: int, cost: float)
 
 
 def conic_cost(contacts: int, softness: float, tol: float) -> float:
-    """What the conic method costs from a cold start, in iterations of APGD: measured on mixers, shear tests and blades
-    of 400 to 28,000 contacts, and on a mixer of 147,000, where an iteration of APGD no longer fits into the cache.
-    Below 1e-7 rigid problems differ: 25 to 60 and more."""
-    accuracy, rigid, soft = [-8, -7, -6, -4, -2], [40, 27, 19, 14, 5], [28, 25, 22, 15, 5]
+    """What the conic method costs from a cold start, in iterations of APGD: as the cube root of the number of contacts,
+    measured on settled mixers of 2,640, 18,537 and 147,120 contacts (docs/measurements.md). Small problems have fixed
+    costs."""
+    accuracy, rigid, soft = [-8, -7, -6, -4, -2], [105, 90, 78, 50, 15], [95, 87, 75, 52, 15]
     per_root = np.interp(np.log10(tol), accuracy, soft if softness >= 1e-6 else rigid)
-    root = np.sqrt(np.clip(contacts, 400, LARGE)) * max(1.0, contacts / LARGE) ** 0.2
-    return float(per_root * root)
+    return float(per_root * np.cbrt(max(contacts, 400)))
 
 
 def decade(tol: float) -> int:

@@ -19,12 +19,12 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.ccp.cone import Array
+from pctt.ccp.newton.asked_for import AskedFor
 from pctt.ccp.newton.body import BodySystem
 from pctt.ccp.newton.cheapest import Cheapest
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.contact import ContactSystem
 from pctt.ccp.newton.kkt import KKTSystem
-from pctt.ccp.newton.asked_for import AskedFor
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase
 
