@@ -20,6 +20,7 @@ use with friction."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -83,27 +84,15 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
         # a residual of v = G' g makes y wrong by G times that
         tol = options.forcing * history[-1] * problem.norm(g) * np.sqrt(problem.mean_diagonal)
         tol *= 1.0 if newton.primary == "momenta" else CLOSER
-
-        def direction(w: Array, start: Array | None) -> tuple[Array, Array, Array, Array]:
-            c = W.divide(w) - z  # noqa: B023 - used within the iteration, as all that follows
-            alone = times(yielding, W.times(w) - s) / scale - times(inverse, r_z * scale)  # noqa: B023
-            dg, x = newton.solve((c - r_z) * scale, tol, r_v, start, alone)  # noqa: B023
-            dv = newton.momentum(x, dg, r_v)  # noqa: B023
-            ds = dg * scale
-            if newton.primary == "momenta":  # r_z vanishes, r_v takes the error of the linear solve
-                dz = (problem.velocity_of(dv) + problem.compliance * dg) / scale + r_z  # noqa: B023
-            else:  # r_v vanishes, r_z takes it
-                dz = c - W.divide(W.divide(ds))  # noqa: B023
-            dz[frictionless, 1:] = ds[frictionless, 1:] = 0.0
-            return ds, dz, dv, x
+        local = Linearised(s, z, r_v, r_z, W, inverse, yielding, scale, frictionless, tol)
 
         with phase("ConicPredictor"):
-            ds, dz, dv, x = direction(np.zeros_like(z), None)
+            ds, dz, dv, x = _direction(problem, newton, local, np.zeros_like(z))
             reach = min(1.0, _step(problem, s, z, ds, dz))
             target = max((1.0 - reach) ** 3, _centering(problem, s, z), LEAST) * gap / problem.size
         with phase("ConicCorrector"):
             w = _centred(W, z, ds, dz, target)
-            ds, dz, dv, x = direction(w, x)
+            ds, dz, dv, x = _direction(problem, newton, local, w, x)
             step = min(1.0, options.boundary * _step(problem, s, z, ds, dz))
             for _ in range(CORRECTIONS):
                 short = step < SHORT
@@ -113,7 +102,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
                     w = _centred(W, z, ds, dz, target)
                 else:
                     break
-                again = direction(w, x)
+                again = _direction(problem, newton, local, w, x)
                 longer = min(1.0, options.boundary * _step(problem, s, z, *again[:2]))
                 if short and longer < LONGER * step:
                     break
@@ -164,6 +153,39 @@ def _start(
     closing = problem.dot(problem.r, problem.r) / problem.size
     amount = options.start * closing / problem.mean_diagonal
     return lorentz.central_pair(s - tau[:, None] * z, tau, amount)
+
+
+class Linearised(NamedTuple):
+    """What the directions of an iteration share: the pair, its residuals and scaling, (B + C)^-1 and, in the scaled
+    variables, (B + C)^-1 B, the cones' scale, and how accurately to solve."""
+
+    s: Array
+    z: Array
+    r_v: Array
+    r_z: Array
+    W: NesterovTodd
+    inverse: Array
+    yielding: Array
+    scale: Array
+    frictionless: Array
+    tol: float
+
+
+def _direction(
+    problem: ConeProblem, newton: Newton, at: Linearised, w: Array, start: Array | None = None
+) -> tuple[Array, Array, Array, Array]:
+    """ds, dz, dv and the Newton system's solution for the right-hand side w; ``start``: an earlier solution."""
+    c = at.W.divide(w) - at.z
+    alone = times(at.yielding, at.W.times(w) - at.s) / at.scale - times(at.inverse, at.r_z * at.scale)
+    dg, x = newton.solve((c - at.r_z) * at.scale, at.tol, at.r_v, start, alone)
+    dv = newton.momentum(x, dg, at.r_v)
+    ds = dg * at.scale
+    if newton.primary == "momenta":  # r_z vanishes, r_v takes the error of the linear solve
+        dz = (problem.velocity_of(dv) + problem.compliance * dg) / at.scale + at.r_z
+    else:  # r_v vanishes, r_z takes it
+        dz = c - at.W.divide(at.W.divide(ds))
+    dz[at.frictionless, 1:] = ds[at.frictionless, 1:] = 0.0
+    return ds, dz, dv, x
 
 
 def _barrier_blocks(
