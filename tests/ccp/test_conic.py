@@ -71,7 +71,7 @@ def test_a_packing_to_high_accuracy(form, tol):
     problem = ConeProblem(SELF, r, mu, G=G)
     result = solve(problem, tol, form)
     check(problem, result, tol)
-    assert result.iterations <= 40
+    assert result.iterations <= 17  # before what contacts do alone was formed without rounding: 21 at 1e-10
 
 
 def test_all_forms_give_the_same_velocities_with_and_without_compliance():
