@@ -7,7 +7,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.ccp.newton.compare import Comparison
-from pctt.ccp.newton.krylov import Krylov, Solve
+from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
 
 CHOLESKY_LIMIT = 50_000  # contacts: above, a factor of the contact matrix takes more than the rest of the step
 
@@ -18,7 +18,7 @@ LADDER = {
 }
 
 
-class AskedFor:
+class AskedFor(KrylovFamily):
     """The KSP without prefix, as the options have it; what it does not solve goes down the ladder.
 
     Attributes
@@ -28,8 +28,8 @@ class AskedFor:
     """
 
     def __init__(self, comm: MPI.Comm, defaults: dict[str, str], compare: Comparison | None = None, prefix: str = ""):
-        self.comm, self.defaults, self.compare, self.prefix = comm, defaults, compare, prefix
-        self._krylov: dict[str, Krylov] = {}
+        super().__init__(comm)
+        self.defaults, self.compare, self.prefix = defaults, compare, prefix
         self.iterations = self.fallbacks = 0
 
     def begin(self) -> None:
@@ -84,13 +84,3 @@ class AskedFor:
             prefix = f"fallback_{name}_" if name else self.prefix
             self._krylov[name] = Krylov(self.comm, prefix, LADDER.get(name, self.defaults))
         return self._krylov[name]
-
-    def forget(self) -> None:
-        """The next matrix has another structure."""
-        for krylov in self._krylov.values():
-            krylov.forget()
-
-    def destroy(self) -> None:
-        for krylov in self._krylov.values():
-            krylov.destroy()
-        self._krylov.clear()

@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.ccp.newton.krylov import Krylov, Solve
+from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
 
 RUNGS = {
     "pbjacobi": {"pc_type": "pbjacobi"},
@@ -37,7 +37,7 @@ def solves_cost(rung: str, iterations: float, ranks: int) -> float:
     return SOLVES * iteration[rung] * max(1.0, iterations)
 
 
-class Cheapest:
+class Cheapest(KrylovFamily):
     """Conjugate gradients on the body system, preconditioned by what is expected to cost least: block Jacobi while it
     takes few iterations, then block ILU(1), then Cholesky factors, of its stiff part; a factor of an earlier
     matrix is kept as long as iterating with it costs less than a new one.
@@ -46,8 +46,7 @@ class Cheapest:
     """
 
     def __init__(self, comm: MPI.Comm):
-        self.comm = comm
-        self._krylov: dict[str, Krylov] = {}
+        super().__init__(comm)
         self._hardness = 20.0  # expected iterations with block Jacobi
         self._growth = 1.0
         self._lagged: float | None = None  # expected iterations with the factor that is there
@@ -129,12 +128,3 @@ class Cheapest:
                 defaults["pc_factor_mat_solver_type"] = "cholmod"  # 1.3 times faster than MUMPS, its solves twice
             self._krylov[rung] = Krylov(self.comm, f"body_{rung}_", defaults)
         return self._krylov[rung]
-
-    def forget(self) -> None:
-        for krylov in self._krylov.values():
-            krylov.forget()
-
-    def destroy(self) -> None:
-        for krylov in self._krylov.values():
-            krylov.destroy()
-        self._krylov.clear()

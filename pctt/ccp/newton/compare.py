@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.ccp.newton.krylov import Krylov, Solve
+from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
 from pctt.options import OptionError
 
 _BODY = {
@@ -54,7 +54,7 @@ class Record:
         }
 
 
-class Comparison:
+class Comparison(KrylovFamily):
     """Solves every ``every``-th Newton system by each of ``names`` (``-compare``, ``-compare_every``).
 
     A name is a PETSc PC type or one of NAMED; its KSP has the prefix ``compare_<name>_`` for further options.
@@ -64,10 +64,10 @@ class Comparison:
     def __init__(self, comm: MPI.Comm, names: list[str], every: int = 1):
         for name in names:
             _check_name(name, comm)
-        self.comm, self.names, self.every = comm, list(dict.fromkeys(names)), every
+        super().__init__(comm)
+        self.names, self.every = list(dict.fromkeys(names)), every
         self.records = {name: Record() for name in self.names}
         self._seen = 0
-        self._krylov: dict[str, Krylov] = {}
 
     def due(self) -> bool:
         """Whether the next system is one to compare on; counts it."""
@@ -86,16 +86,6 @@ class Comparison:
         assert chosen is not None
         x.array[:] = kept
         return chosen
-
-    def forget(self) -> None:
-        """The next system has another structure."""
-        for krylov in self._krylov.values():
-            krylov.forget()
-
-    def destroy(self) -> None:
-        for krylov in self._krylov.values():
-            krylov.destroy()
-        self._krylov.clear()
 
     def summary(self) -> dict[str, dict[str, Any]]:
         """Figures by name, and ``pc_report``, a list of lines, of the project's own preconditioners."""

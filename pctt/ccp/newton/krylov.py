@@ -146,6 +146,24 @@ class Krylov:
             self._scalar_matrix.destroy()
 
 
+class KrylovFamily:
+    """Krylov methods by name, each made when it is first needed."""
+
+    def __init__(self, comm: MPI.Comm):
+        self.comm = comm
+        self._krylov: dict[str, Krylov] = {}
+
+    def forget(self) -> None:
+        """The next matrix has another structure."""
+        for krylov in self._krylov.values():
+            krylov.forget()
+
+    def destroy(self) -> None:
+        for krylov in self._krylov.values():
+            krylov.destroy()
+        self._krylov.clear()
+
+
 _REASONS = {
     value: name.lower() for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)
 }
