@@ -13,11 +13,13 @@ petsc4py.init([word for word in sys.argv if word not in ("-help", "--help", "-h"
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.together import SceneError
 from pctt.options import OptionError
+from pctt.run import interrupt
 from pctt.run.hdf5 import FileError
 from pctt.run.options import help_text, read_options
 from pctt.run.problem import solve_file
-from pctt.run.simulate import SceneError, simulate
+from pctt.run.simulate import simulate
 
 
 def main(comm: MPI.Comm) -> None:
@@ -34,11 +36,17 @@ def main(comm: MPI.Comm) -> None:
 
 
 def run() -> int:
-    """Exit status: 0, or 2 for a bad option, file or scene, told once. Other errors abort all ranks."""
+    """Exit status: 0; 1 if a scene fails; 2 for a bad option or file; 130 if a signal has ended the run. What went
+    wrong is told once. Other errors abort all ranks."""
     comm = MPI.COMM_WORLD
+    interrupt.heed(comm)
     try:
         main(comm)
-    except (OptionError, FileError, SceneError) as error:  # raised on all ranks alike
+    except (SceneError, interrupt.InterruptError) as error:  # raised on all ranks alike
+        if comm.rank == 0:
+            print(f"pctt.run: {error}", file=sys.stderr, flush=True)
+        return interrupt.STATUS if isinstance(error, interrupt.InterruptError) else 1
+    except (OptionError, FileError) as error:  # raised on all ranks alike
         if comm.rank == 0:
             print(f"pctt.run: {error}", file=sys.stderr, flush=True)
         if comm.size > 1 and getattr(error, "alone", False):  # the others wait for this rank

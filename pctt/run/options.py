@@ -14,6 +14,7 @@ from petsc4py import PETSc
 
 from dem.experiment import Experiment, SceneFileError, from_file
 from dem.scenes import SCENES
+from dem.together import together
 from pctt import ccp
 from pctt.options import (
     AT_LEAST_ONE,
@@ -138,17 +139,13 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     run = read(Run, database)
     solver = ccp.SOLVERS[run.ccp_type]
     prefix = f"ccp_{run.ccp_type}_"
-    scene_class = find_scene(run.scene)
+    scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in _groups(scene_class) for d in describe(group, start)]
     refuse_unknown(database, known, prefixes=("compare_", "fallback_"))
     for name in known:
         PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
-    try:
-        scene = read(scene_class, database, "scene_")
-    except OptionError:
-        raise
-    except ValueError as error:  # the scene's message starts with the name of its field
-        raise OptionError(f"-scene_{error}") from None
+    what = f"options of the scene {scene_class.__name__}"
+    scene, dt, delta = together(comm, what, lambda: _read_scene(scene_class, database), own=(OptionError,))
     if run.compare and not solver.newton:
         newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
         raise OptionError(
@@ -157,8 +154,8 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     options = Options(
         run,
         scene,
-        run.dt if run.dt is not None else scene.dt,
-        run.delta if run.delta is not None else scene.delta,
+        run.dt if run.dt is not None else dt,
+        run.delta if run.delta is not None else delta,
         read(ccp.Limits, database, "ccp_"),
         read(solver.options, database, prefix),
         read(ccp.Coulomb, database, "ccp_coulomb_") if run.ccp_coulomb else None,
@@ -176,6 +173,21 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         if run.dump_problem:
             _refuse_unwritable("-dump_problem", problems, comm)
     return options
+
+
+def _read_scene(scene_class: type[Experiment], database: Mapping[str, str]) -> tuple[Experiment, Any, Any]:
+    """The scene with the options of the database, its time step and its contact distance; OptionError for an option
+    that it refuses."""
+    try:
+        scene = read(scene_class, database, "scene_")
+    except OptionError:
+        raise
+    except ValueError as error:
+        if not str(error).startswith(tuple(field.name for field in dataclasses.fields(scene_class))):
+            raise
+        raise OptionError(f"-scene_{error}") from None
+    _ = scene.settling_time, scene.domain  # they may be properties too: what fails is to fail before any work
+    return scene, scene.dt, scene.delta
 
 
 def find_scene(name: str) -> type[Experiment]:

@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import time
+from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
@@ -152,26 +153,49 @@ def compare_table(summary: Mapping[str, Mapping[str, float]], labels: Mapping[st
     return "\n".join([head, "-" * len(head), *rows])
 
 
-def phase_table(steps: Sequence[Mapping[str, Any]]) -> str:
-    """Seconds of each phase over the run and in a median step, and what the steps came to."""
-    names = list(dict.fromkeys(name for line in steps for name in line["phases"]))
-    columns = {name: [line["phases"].get(name, 0.0) for line in steps] for name in names}
-    columns["total"] = [line["seconds"] for line in steps]
-    whole = sum(columns["total"]) or 1.0
+class Totals:
+    """What the steps of a run came to; of each step it keeps the seconds of its phases alone."""
+
+    def __init__(self) -> None:
+        self.steps = self.newton_its = self.ksp_its = self.failed = 0
+        self.contacts: tuple[int, int] | None = None  #: fewest and most of a step
+        self.natural_residual = 0.0  #: the worst
+        self._seconds: dict[str, array[float]] = {"total": array("d")}
+
+    def add(self, line: Mapping[str, Any]) -> None:
+        """Count a step with these figures."""
+        for name, seconds in {**line["phases"], "total": line["seconds"]}.items():
+            column = self._seconds.setdefault(name, array("d"))
+            column.extend([0.0] * (self.steps - len(column)) + [seconds])
+        self.steps += 1
+        self.newton_its += line["newton_its"]
+        self.ksp_its += line["ksp_its"]
+        self.failed += not line["converged"]
+        fewest, most = self.contacts or (line["contacts"], line["contacts"])
+        self.contacts = min(fewest, line["contacts"]), max(most, line["contacts"])
+        self.natural_residual = max(self.natural_residual, line["natural_residual"])
+
+    def seconds(self) -> dict[str, tuple[float, float]]:
+        """Sum and median over the steps of the seconds of each phase, and of their total, which is the last."""
+        names = [*(name for name in self._seconds if name != "total"), "total"]
+        columns = {name: [*self._seconds[name], *[0.0] * (self.steps - len(self._seconds[name]))] for name in names}
+        return {name: (sum(column), median(column)) for name, column in columns.items()}
+
+
+def phase_table(totals: Totals) -> str:
+    """Seconds of each phase over the run and in a median step, and what the steps came to; of at least one step."""
+    seconds = totals.seconds()
+    whole = seconds["total"][0] or 1.0
     head = f"{'phase':14}  seconds   share  median step s"
-    rows = [
-        f"{name:14} {sum(column):8.2f} {sum(column) / whole:7.1%} {median(column):14.3f}"
-        for name, column in columns.items()
-    ]
-    contacts = [line["contacts"] for line in steps]
-    failed = sum(not line["converged"] for line in steps)
+    rows = [f"{name:14} {sum_:8.2f} {sum_ / whole:7.1%} {middle:14.3f}" for name, (sum_, middle) in seconds.items()]
+    fewest, most = totals.contacts or (0, 0)
     figures = [
-        f"{len(steps)} steps",
-        f"{min(contacts)} to {max(contacts)} contacts",
-        f"{sum(line['newton_its'] for line in steps)} Newton steps",
-        f"{sum(line['ksp_its'] for line in steps)} Krylov iterations",
-        f"worst residual {max(line['natural_residual'] for line in steps):.1e}",
-        f"{failed} NOT CONVERGED" if failed else "all converged",
+        f"{totals.steps} steps",
+        f"{fewest} to {most} contacts",
+        f"{totals.newton_its} Newton steps",
+        f"{totals.ksp_its} Krylov iterations",
+        f"worst residual {totals.natural_residual:.1e}",
+        f"{totals.failed} NOT CONVERGED" if totals.failed else "all converged",
     ]
     return "\n".join([head, "-" * len(head), *rows, ", ".join(figures)])
 
