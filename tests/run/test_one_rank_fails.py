@@ -1,4 +1,4 @@
-"""A scene whose own code fails on some ranks only: every run ends soon, with one message, and none waits for another."""
+"""A scene whose own code fails on some ranks only: the run ends with one message, and no rank waits for another."""
 
 from __future__ import annotations
 
