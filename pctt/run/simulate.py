@@ -26,6 +26,7 @@ from pctt.options import OptionError
 from pctt.run import checkpoint, report
 from pctt.run.dump import Dump
 from pctt.run.options import Options, scene_name
+from pctt.run.place import Place
 from pctt.run.results import Results
 
 
@@ -39,41 +40,44 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     if options.demo:
         progress.say("no options: the demo; -help lists the options")
     world, memory = first_state(options, comm, progress)
-    dump = Dump(options, world)
+    place = Place(Path(options.run.output), comm, options.run.restart)
+    dump = Dump(options, world, place)
     made_with = checkpoint.origin(scene_name(options.run.scene), options.scene, options.dt)
-    results = Results(Path(options.run.output), comm, made_with["scene"], world, options.run.restart)
+    results = Results(place, comm, made_with["scene"], world)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
     stepper = Stepper(options, world, memory, newton, dump)
     method = f"{options.run.ccp_type} to {options.limits.tol:g}{' with Coulomb law' if options.coulomb else ''}"
     progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
-    progress.say(report.COLUMNS, level=1)
-    lines = []
+    progress.say(report.columns(bool(compare.names)), level=1)
+    start = world.step
     progress.start(options.run.steps)
     for k in range(1, options.run.steps + 1):
         progress.doing(f"step {world.step + 1}, time {world.time:.3f} s")
         line = stepper.step()
         last = k == options.run.steps
-        lines.append(line)
         with log.phase("output"):
             row = stepper.records()
             line["worst_overlap"] = row["worst_overlap [m]"]
             results.records.add(row)
             if options.run.output_every and (world.step % options.run.output_every == 0 or last):
                 results.record_step(world, stepper.contacts, stepper.system, stepper.impulse, row)
-        # before the checkpoint: a run that goes on from there must find the step in the summary
         _count_output(line)
-        results.write_summary(world, compare.summary(), line)
         with log.phase("output"):
+            # before the checkpoint: a run that goes on from there must find the step
+            results.add_step(world, line, compare.summary())
             if k % options.run.checkpoint_every == 0 or last:
                 checkpoint.save(results.checkpoint, made_with, world, memory)
-        _count_output(line)
+            results.stands(world, line)
         progress.say(report.step_line(line), level=1)
         progress.say(report.accuracy_lines(line, stepper.history), level=2)
-    if lines:
+    if world.step > start:
+        results.link(world)
         figures = _analyse(options.scene, results, comm)
         results.write_summary(world, compare.summary(), analysis=figures)
-        progress.say("\n" + report.phase_table(lines))
+        if comm.rank == 0:
+            lines = [line for line in results.steps() if line["step"] > start]
+            progress.say("\n" + report.phase_table(lines))
         if figures:
             progress.say(report.figure_table(figures))
         if comm.rank == 0:
@@ -83,7 +87,8 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     if compare.names:
         progress.say("\n" + report.compare_table(compare.summary(), compare.labels()))
     newton.destroy()
-    progress.say(f"\nresults: {results.folder}/state.h5, records.csv, summary.json, checkpoint.h5")
+    if world.step > start:
+        progress.say(f"\nresults: {place.folder}/state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
 
 
 def _analyse(scene: Any, results: Results, comm: MPI.Comm) -> dict[str, float]:
@@ -102,9 +107,10 @@ def _analyse(scene: Any, results: Results, comm: MPI.Comm) -> dict[str, float]:
 
 
 def _count_output(line: dict[str, Any]) -> None:
-    """Add the seconds of output since the last count to the figures of a step."""
+    """Add the seconds of output since the last count to the figures of a step: those of its checkpoint count in the
+    next step, as the figures are written before."""
     phases = line["phases"]
-    phases["output"] = phases.get("output", 0.0) + log.take_seconds(("output",))["output"]
+    phases |= log.take_seconds(("output",))
     line["seconds"] = sum(phases.values())
 
 
@@ -166,7 +172,10 @@ class Stepper:
             self.memory.remember(self.system.key, self.impulse, self.system.frame)
         contacts = problem.size
         problem.destroy()
-        pc_report = self.newton.pc_report if self.newton is not None else []
+        newton = self.newton
+        pc_report = newton.pc_report if newton is not None else []
+        compare = newton.compare if newton is not None else None
+        phases = ("search", "assembly", "solve", *(["compare"] if compare else []), "advance")
         return {
             "step": world.step,
             "time": world.time,
@@ -183,8 +192,9 @@ class Stepper:
             "asked_solver": options.run.ccp_type,
             **({"pc_report": pc_report} if pc_report else {}),
             **files,
+            **({"compare": compare.take_solves()} if compare else {}),
             "peak_memory": _peak_memory(world.comm),
-            "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
+            "phases": log.take_seconds(phases),
         }
 
     def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, np.ndarray]:
