@@ -81,7 +81,7 @@ class Folder:
         if not self.steps:
             raise FolderError(f"{self.path}: no recorded steps; run with -output_every 1 or more")
         try:
-            with h5py.File(self._frames / "bodies.h5", "r") as file:
+            with h5py.File(self.bodies_path, "r") as file:
                 self.shape: np.ndarray = file["shape"][()]
                 self.size: np.ndarray = file["size"][()]
                 self.mass: np.ndarray = file["mass"][()]
@@ -89,8 +89,7 @@ class Folder:
                 #: name and shapes of each large body, the rows after the grains
                 self.large: list[dict[str, Any]] = json.loads(file["large"][()])
         except (KeyError, OSError) as error:
-            what = f"{self._frames}/bodies.h5: lacks the shapes of the bodies; run again ({error})"
-            raise FolderError(what) from None
+            raise FolderError(f"{self.bodies_path}: lacks the shapes of the bodies; run again ({error})") from None
         self.grains = len(self.shape) - len(self.large)
 
     def frame(self, step: int) -> Frame:
@@ -105,6 +104,11 @@ class Folder:
                 return Frame(step, float(group.attrs["time"]), **bodies, contacts=contacts)
         except (KeyError, OSError) as error:
             raise FolderError(f"{path}: incomplete ({error})") from None
+
+    @property
+    def bodies_path(self) -> Path:
+        """The file of what no step changes."""
+        return self._frames / "bodies.h5"
 
     def frame_path(self, step: int) -> Path:
         """The file of a recorded step."""

@@ -44,6 +44,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         "problem": str(options.problem),
         "format": stored.form,
         "title": stored.title,
+        "note": stored.note,
         "start": "cold" if guess is None else "the guess in the file",
         "contacts": problem.size,
         "ranks": comm.size,

@@ -42,13 +42,15 @@ from pctt.run.records import Records
 LAG = 0.01
 
 CONTENTS = (
-    "All is in the folder frames beside this file, which holds nothing but links and is empty without it; `python -m "
-    "pctt.export FOLDER -single FILE.h5` makes one file of all. "
     "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, by body id; "
     "record: attributes as in records.csv; "
     "contact: bodies a and b, point m, frame rows (normal from a to b, t1, t2), gap m, "
     "impulse on b N s; attribute dt s. bodies: shape, size m, mass kg, material by body id; "
     "large: names and shapes of the large bodies, the last of the ids, in their frames"
+)
+LINKS = (
+    "This file holds nothing but links to the folder frames beside it, and is empty without that folder. "
+    "python -m pctt.export FOLDER -single FILE.h5 makes one file of all."
 )
 
 
@@ -123,7 +125,7 @@ class Results:
             with h5py.File(temporary, "r+") as file:
                 file.attrs["scene"] = self.record
                 file.attrs["large_bodies"] = [body.name for body in world.large_bodies]
-                file.attrs["contents"] = CONTENTS
+                file.attrs["contents"], file.attrs["links"] = CONTENTS, LINKS
                 file["bodies"] = h5py.ExternalLink("frames/bodies.h5", "/")
                 for step in steps:
                     file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
