@@ -31,6 +31,7 @@ from pctt.options import (
 from pctt.pc import PRECONDITIONERS
 from pctt.run.dump import dump_folder
 from pctt.run.hdf5 import refuse_serial
+from pctt.run.place import held, is_checkpoint_of
 
 # what runs when no option is given
 DEMO = {
@@ -40,6 +41,8 @@ DEMO = {
     "steps": "5",
     "compare": "ilu,ilu-shifted,pbjacobi,none",
     "compare_every": "4",
+    "output": "results/demo",
+    "overwrite": "true",  # nothing but the demo writes to its folder
 }
 
 
@@ -71,7 +74,10 @@ class Run:
         check=NOT_NEGATIVE,
     )
     settle_tol: float = option(1e-3, "natural residual of the steps of -settle", check=POSITIVE)
-    output: str = option("results", "folder for state.h5, records.csv, summary.json, checkpoint.h5")
+    output: str = option("results", "folder for state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
+    overwrite: bool = option(
+        False, "let the run replace another one in the folder of -output, once its first step is written"
+    )
     output_every: int = option(1, "steps between two records in state.h5; 0: none", check=COUNT)
     checkpoint_every: int = option(1, "steps between two checkpoints", check=AT_LEAST_ONE)
     problem: str = option("", "FCLIB or PETSc binary file with a cone problem to solve instead of a scene")
@@ -170,6 +176,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     problems = dump_folder(run)
     if not run.settle:
         _refuse_unwritable("-output", Path(run.output), comm)
+        _refuse_occupied(run, comm)
         if run.dump_problem:
             _refuse_unwritable("-dump_problem", problems, comm)
     return options
@@ -271,4 +278,19 @@ def _refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
     if error:
         raise OptionError(
             f"{name} {folder}: cannot write there ({error}); allowed is a folder that can be written"
+        )
+
+
+def _refuse_occupied(run: Run, comm: MPI.Comm) -> None:
+    """OptionError if the output folder holds a run that this one neither goes on with nor may replace."""
+    folder = Path(run.output)
+    there: list[str] = []
+    if comm.rank == 0 and not run.overwrite and not (is_checkpoint_of(folder, run.restart) and not run.problem):
+        there = held(folder)
+    there = comm.bcast(there)
+    if there:
+        goes_on = f", or -restart {folder / 'checkpoint.h5'} to go on with it" * ("checkpoint.h5" in there)
+        raise OptionError(
+            f"-output {folder}: holds a run ({', '.join(there)}); allowed is another folder, -overwrite to replace that "
+            f"run{goes_on}"
         )

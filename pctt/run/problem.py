@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
-from pctt import ccp
+from pctt import ccp, log
 from pctt.ccp import fclib, petsc_binary
 from pctt.ccp.cone import Array
 from pctt.run.hdf5 import FileError, write_text
 from pctt.run.options import Options
+from pctt.run.place import Place
 from pctt.run.report import Progress, compare_table
 
 
@@ -24,25 +24,27 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
     problem, guess = stored.problem, stored.guess if options.run.problem_guess else None
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
-    start = time.perf_counter()
-    result = ccp.solve(
-        problem,
-        guess,
-        options.run.ccp_type,
-        options.limits,
-        options.solver,
-        newton,
-        options.coulomb,
-    )
-    seconds = time.perf_counter() - start
+    with log.phase("solve"):
+        result = ccp.solve(
+            problem,
+            guess,
+            options.run.ccp_type,
+            options.limits,
+            options.solver,
+            newton,
+            options.coulomb,
+        )
+    seconds = log.take_seconds(("solve", "compare"))
     newton.destroy()
     accuracy = ccp.measure(problem, result.impulse)
     used = result.solver or options.run.ccp_type
+    solves = compare.take_solves()
     by_newton = ccp.SOLVERS[used].newton
     summary = {
         "problem": str(options.problem),
         "format": stored.form,
         "title": stored.title,
+        "note": stored.note,
         "start": "cold" if guess is None else "the guess in the file",
         "contacts": problem.size,
         "ranks": comm.size,
@@ -57,7 +59,8 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         "newton_its": result.iterations if by_newton else 0,
         "iterations": result.iterations,
         "ksp_its": result.ksp_its,
-        "seconds": seconds,
+        "seconds": seconds["solve"],
+        **({"compare_seconds": seconds["compare"]} if compare.names else {}),
         "converged": result.converged,
         "reason": result.reason,
         "cone_violation": accuracy.cone_violation,
@@ -69,7 +72,9 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
             for name, impulse in (("solution", stored.solution), ("guess", stored.guess))
             if impulse is not None
         },
-        "compare": compare.summary(),
+        "compare": {
+            name: {**figures, "solves": solves[name]} for name, figures in compare.summary().items()
+        },
     }
     progress = Progress(comm.rank == 0 and not options.run.quiet)
     width = max(map(len, summary))
@@ -84,8 +89,11 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         progress.say("\n" + compare_table(compare.summary(), compare.labels()))
     if not result.converged:
         progress.say(f"NOT CONVERGED: {result.reason}")
+    place = Place(Path(options.run.output), comm)
+    place.make()
     if comm.rank == 0:
-        write_text(Path(options.run.output) / "summary.json", json.dumps(summary, indent=1) + "\n")
+        write_text(place.now / "summary.json", json.dumps(summary, indent=1) + "\n")
+    place.take()
 
 
 def _load(path: str, comm: MPI.Comm, compliance: float | None) -> fclib.Stored:

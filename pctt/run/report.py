@@ -6,7 +6,6 @@ import os
 import shutil
 import sys
 import time
-from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
@@ -14,20 +13,26 @@ from typing import Any
 
 from pctt import log
 
-COLUMNS = (
-    "  step    time s  contacts  Newton  Krylov  residual"
-    "  seconds: total  search  assembly   solve  output"
-)
 
 #: Overlaps above this part of the radius of the smallest grain are worth a warning.
 LARGE_OVERLAP = 0.05
 
 
+def columns(compared: bool) -> str:
+    """The heads of the columns of `step_line`."""
+    compare = " compare" * compared
+    return (
+        "  step    time s  contacts  Newton  Krylov  residual"
+        f"  seconds: total  search  assembly   solve{compare}  output"
+    )
+
+
 def step_line(line: Mapping[str, Any]) -> str:
-    """One step as a row under COLUMNS, with a remark where its solver needed help."""
+    """One step as a row under `columns`, with a remark where its solver needed help."""
     phases = line["phases"]
     names = ("search", "assembly", "solve", "output")
     search, assembly, solve, output = (phases.get(name, 0.0) for name in names)
+    compare = f" {phases['compare']:7.2f}" if "compare" in phases else ""
     remark = "" if line["converged"] else f"  NOT CONVERGED: {line['reason']}"
     if line["fallbacks"]:
         remark += f"  ({line['fallbacks']} Newton systems by a fallback)"
@@ -40,7 +45,7 @@ def step_line(line: Mapping[str, Any]) -> str:
     return (
         f"{line['step']:6d} {line['time']:9.3f} {line['contacts']:9d} {line['iterations']:7d}"
         f" {line['ksp_its']:7d}  {line['natural_residual']:8.1e} {line['seconds']:15.2f} {search:7.2f}"
-        f" {assembly:9.2f} {solve:7.2f} {output:7.2f}{remark}"
+        f" {assembly:9.2f} {solve:7.2f}{compare} {output:7.2f}{remark}"
     )
 
 
@@ -153,49 +158,26 @@ def compare_table(summary: Mapping[str, Mapping[str, float]], labels: Mapping[st
     return "\n".join([head, "-" * len(head), *rows])
 
 
-class Totals:
-    """What the steps of a run came to; of each step it keeps the seconds of its phases alone."""
-
-    def __init__(self) -> None:
-        self.steps = self.newton_its = self.ksp_its = self.failed = 0
-        self.contacts: tuple[int, int] | None = None  #: fewest and most of a step
-        self.natural_residual = 0.0  #: the worst
-        self._seconds: dict[str, array[float]] = {"total": array("d")}
-
-    def add(self, line: Mapping[str, Any]) -> None:
-        """Count a step with these figures."""
-        for name, seconds in {**line["phases"], "total": line["seconds"]}.items():
-            column = self._seconds.setdefault(name, array("d"))
-            column.extend([0.0] * (self.steps - len(column)) + [seconds])
-        self.steps += 1
-        self.newton_its += line["newton_its"]
-        self.ksp_its += line["ksp_its"]
-        self.failed += not line["converged"]
-        fewest, most = self.contacts or (line["contacts"], line["contacts"])
-        self.contacts = min(fewest, line["contacts"]), max(most, line["contacts"])
-        self.natural_residual = max(self.natural_residual, line["natural_residual"])
-
-    def seconds(self) -> dict[str, tuple[float, float]]:
-        """Sum and median over the steps of the seconds of each phase, and of their total, which is the last."""
-        names = [*(name for name in self._seconds if name != "total"), "total"]
-        columns = {name: [*self._seconds[name], *[0.0] * (self.steps - len(self._seconds[name]))] for name in names}
-        return {name: (sum(column), median(column)) for name, column in columns.items()}
-
-
-def phase_table(totals: Totals) -> str:
-    """Seconds of each phase over the run and in a median step, and what the steps came to; of at least one step."""
-    seconds = totals.seconds()
-    whole = seconds["total"][0] or 1.0
+def phase_table(steps: Sequence[Mapping[str, Any]]) -> str:
+    """Seconds of each phase over the run and in a median step, and what the steps came to."""
+    names = list(dict.fromkeys(name for line in steps for name in line["phases"]))
+    columns = {name: [line["phases"].get(name, 0.0) for line in steps] for name in names}
+    columns["total"] = [line["seconds"] for line in steps]
+    whole = sum(columns["total"]) or 1.0
     head = f"{'phase':14}  seconds   share  median step s"
-    rows = [f"{name:14} {sum_:8.2f} {sum_ / whole:7.1%} {middle:14.3f}" for name, (sum_, middle) in seconds.items()]
-    fewest, most = totals.contacts or (0, 0)
+    rows = [
+        f"{name:14} {sum(column):8.2f} {sum(column) / whole:7.1%} {median(column):14.3f}"
+        for name, column in columns.items()
+    ]
+    contacts = [line["contacts"] for line in steps]
+    failed = sum(not line["converged"] for line in steps)
     figures = [
-        f"{totals.steps} steps",
-        f"{fewest} to {most} contacts",
-        f"{totals.newton_its} Newton steps",
-        f"{totals.ksp_its} Krylov iterations",
-        f"worst residual {totals.natural_residual:.1e}",
-        f"{totals.failed} NOT CONVERGED" if totals.failed else "all converged",
+        f"{len(steps)} steps",
+        f"{min(contacts)} to {max(contacts)} contacts",
+        f"{sum(line['newton_its'] for line in steps)} Newton steps",
+        f"{sum(line['ksp_its'] for line in steps)} Krylov iterations",
+        f"worst residual {max(line['natural_residual'] for line in steps):.1e}",
+        f"{failed} NOT CONVERGED" if failed else "all converged",
     ]
     return "\n".join([head, "-" * len(head), *rows, ", ".join(figures)])
 

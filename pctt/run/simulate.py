@@ -29,6 +29,7 @@ from pctt.run import checkpoint, interrupt, report
 from pctt.run.dump import Dump
 from pctt.run.hdf5 import FileError
 from pctt.run.options import DEMO, Options, scene_name
+from pctt.run.place import Place
 from pctt.run.results import Results
 
 
@@ -42,44 +43,48 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     if options.demo:
         progress.say("no options: the demo; -help lists the options")
     world, memory = first_state(options, comm, progress)
-    dump = Dump(options, world)
+    place = Place(Path(options.run.output), comm, options.run.restart)
+    dump = Dump(options, world, place)
     made_with = checkpoint.origin(scene_name(options.run.scene), options.scene, options.dt)
-    results = Results(Path(options.run.output), comm, made_with["scene"], world, options.run.restart)
+    results = Results(place, comm, made_with["scene"], world)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
     method = f"{options.run.ccp_type} to {options.limits.tol:g}{' with Coulomb law' if options.coulomb else ''}"
     progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
-    progress.say(report.COLUMNS, level=1)
-    totals = report.Totals()
+    progress.say(report.columns(bool(compare.names)), level=1)
+    start, end = world.step, world.step + options.run.steps
     progress.start(options.run.steps)
     with Stepper(options, world, memory, newton, dump) as stepper:
-        for k in range(1, options.run.steps + 1):
+        while world.step < end:
             progress.doing(f"step {world.step + 1}, time {world.time:.3f} s")
             line = stepper.step()
-            interrupted = k < options.run.steps and interrupt.asked(comm)
-            last = k == options.run.steps or interrupted
+            interrupted = interrupt.asked(comm) and world.step < end
+            last = world.step == end or interrupted
             with log.phase("output"):
                 row = stepper.records()
                 line["worst_overlap"] = row["worst_overlap [m]"]
                 results.records.add(row)
                 if options.run.output_every and (world.step % options.run.output_every == 0 or last):
                     results.record_step(world, stepper.contacts, stepper.system, stepper.impulse, row)
-            # before the checkpoint: a run that goes on from there must find the step in the summary
             _count_output(line)
-            results.write_summary(world, compare.summary(), line)
             with log.phase("output"):
-                if k % options.run.checkpoint_every == 0 or last:
+                # before the checkpoint: a run that goes on from there must find the step
+                results.add_step(world, line, compare.summary())
+                if (world.step - start) % options.run.checkpoint_every == 0 or last:
                     checkpoint.save(results.checkpoint, made_with, world, memory)
-            _count_output(line)
-            totals.add(line)
+                results.stands(world, line)
             progress.say(report.step_line(line), level=1)
             progress.say(report.accuracy_lines(line, stepper.history), level=2)
             if interrupted:
-                raise interrupt.InterruptError(_how_to_go_on(options, world.step, results.checkpoint, k))
-        if options.run.steps:
+                results.link(world)
+                raise interrupt.InterruptError(_how_to_go_on(options, world.step, results.checkpoint, end))
+        if world.step > start:
+            results.link(world)
             figures = _analyse(options.scene, results, comm)
             results.write_summary(world, compare.summary(), analysis=figures)
-            progress.say("\n" + report.phase_table(totals))
+            if comm.rank == 0:
+                lines = [line for line in results.steps() if line["step"] > start]
+                progress.say("\n" + report.phase_table(lines))
             if figures:
                 progress.say(report.figure_table(figures))
             if comm.rank == 0:
@@ -88,16 +93,17 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
                 progress.say(f"{row['grains_outside']:.0f} grains have left the domain of the scene")
         if compare.names:
             progress.say("\n" + report.compare_table(compare.summary(), compare.labels()))
-    progress.say(f"\nresults: {results.folder}/state.h5, records.csv, summary.json, checkpoint.h5")
+    if world.step > start:
+        progress.say(f"\nresults: {place.folder}/state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
 
 
-def _how_to_go_on(options: Options, step: int, state: Path, done: int) -> str:
-    """What a user who has interrupted a run after so many steps is told."""
-    rest = f"-restart {state} -steps {options.run.steps - done}"
+def _how_to_go_on(options: Options, step: int, state: Path, end: int) -> str:
+    """What a user who has interrupted a run before its end is told."""
+    words = f"-restart {state} -steps {end - step}"
     if options.demo:
-        words = {name: value for name, value in DEMO.items() if name not in ("restart", "steps")}
-        rest = " ".join([*(f"-{name} {value}" for name, value in words.items()), rest])
-    return f"interrupted after step {step}; the same command with {rest} at its end goes on"
+        kept = {name: value for name, value in DEMO.items() if name not in ("restart", "steps", "overwrite")}
+        words = " ".join([*(f"-{name} {value}" for name, value in kept.items()), words])
+    return f"interrupted after step {step}; the same command with {words} at its end goes on"
 
 
 def _analyse(scene: Experiment, results: Results, comm: MPI.Comm) -> dict[str, float]:
@@ -111,9 +117,10 @@ def _analyse(scene: Experiment, results: Results, comm: MPI.Comm) -> dict[str, f
 
 
 def _count_output(line: dict[str, Any]) -> None:
-    """Add the seconds of output since the last count to the figures of a step."""
+    """Add the seconds of output since the last count to the figures of a step: those of its checkpoint count in the
+    next step, as the figures are written before."""
     phases = line["phases"]
-    phases["output"] = phases.get("output", 0.0) + log.take_seconds(("output",))["output"]
+    phases |= log.take_seconds(("output",))
     line["seconds"] = sum(phases.values())
 
 
@@ -191,7 +198,10 @@ class Stepper:
             advance(world, self.system.velocity(self.impulse), options.dt)
             self.memory.remember(self.system.key, self.impulse, self.system.frame)
         self._release()
-        pc_report = self.newton.pc_report if self.newton is not None else []
+        newton = self.newton
+        pc_report = newton.pc_report if newton is not None else []
+        compare = newton.compare if newton is not None else None
+        phases = ("search", "assembly", "solve", *(["compare"] if compare else []), "advance")
         return {
             "step": world.step,
             "time": world.time,
@@ -208,8 +218,9 @@ class Stepper:
             "asked_solver": options.run.ccp_type,
             **({"pc_report": pc_report} if pc_report else {}),
             **files,
+            **({"compare": compare.take_solves()} if compare else {}),
             "peak_memory": _peak_memory(world.comm),
-            "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
+            "phases": log.take_seconds(phases),
         }
 
     def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, np.ndarray]:

@@ -13,7 +13,7 @@ from pctt.ccp import Comparison, Limits
 from pctt.ccp.newton.krylov import Krylov
 from pctt.options import OptionError
 
-FIELDS = {"systems", "converged", "ksp_its_mean", "ksp_its_max", "setup_s", "solve_s", "true_residual_max", "solves"}
+FIELDS = {"systems", "converged", "ksp_its_mean", "ksp_its_max", "setup_s", "solve_s", "true_residual_max"}
 
 
 def system(size: int = 40):
@@ -47,8 +47,8 @@ def test_every_preconditioner_solves_every_system():
     assert list(summary) == names
     for name in names:
         assert set(summary[name]) == FIELDS
-        assert summary[name]["systems"] == len(summary[name]["solves"]) == result.iterations
         solves = comparison.records[name].solves
+        assert summary[name]["systems"] == len(solves) == result.iterations
         assert summary[name]["converged"] == sum(s.converged for s in solves)
         assert summary[name]["ksp_its_mean"] == pytest.approx(np.mean([s.iterations for s in solves]))
         assert summary[name]["ksp_its_max"] == max(s.iterations for s in solves)

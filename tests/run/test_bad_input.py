@@ -217,7 +217,7 @@ DAMAGES = [no_hdf5, empty, truncated, scrambled, other_hdf5, without_grains, wit
 @pytest.mark.parametrize("damage", DAMAGES, ids=lambda f: f.__name__)
 def test_a_file_that_is_no_checkpoint_is_refused(damage, program, results, settled, tmp_path):
     damage(tmp_path / "bad.h5", settled)
-    said = refused(program, results, *SMALL, "-restart", "bad.h5", "-steps", 1)
+    said = refused(program, results, *SMALL, "-restart", "bad.h5", "-overwrite", "-steps", 1)
     assert "bad.h5" in said
 
 
@@ -227,7 +227,7 @@ def test_a_file_that_is_no_checkpoint_is_refused_by_two_ranks_at_once(
     damage, program, results, settled, tmp_path
 ):
     damage(tmp_path / "bad.h5", settled)
-    said = refused(program, results, *SMALL, "-restart", "bad.h5", "-steps", 1, ranks=2)
+    said = refused(program, results, *SMALL, "-restart", "bad.h5", "-overwrite", "-steps", 1, ranks=2)
     assert "bad.h5" in said
 
 
@@ -242,27 +242,27 @@ def test_a_file_that_is_no_checkpoint_is_refused_by_two_ranks_at_once(
 )
 def test_a_checkpoint_of_another_scene_or_time_step_is_refused(option, value, stored, program, results, settled):
     own = () if option == "-scene" else SMALL
-    said = refused(program, results, *own, option, value, "-restart", settled)
+    said = refused(program, results, *own, option, value, "-restart", settled, "-overwrite")
     assert said == f"pctt.run: {option} {value}: {settled} was made with {option} {stored}; allowed is the same"
 
 
 @pytest.mark.mpi
 def test_a_checkpoint_of_another_time_step_is_refused_by_two_ranks_with_one_voice(program, results, settled):
-    said = refused(program, results, *SMALL, "-dt", 0.02, "-restart", settled, ranks=2)
+    said = refused(program, results, *SMALL, "-dt", 0.02, "-restart", settled, "-overwrite", ranks=2)
     assert "-dt 0.02" in said
 
 
 @pytest.mark.parametrize("damage", [no_hdf5, empty, other_hdf5, truncated, fclib], ids=lambda f: f.__name__)
 def test_a_file_that_is_no_fclib_problem_is_refused(damage, program, results, settled, tmp_path):
     damage(tmp_path / "bad.hdf5", settled)
-    said = refused(program, results, "-problem", "bad.hdf5")
+    said = refused(program, results, "-problem", "bad.hdf5", "-overwrite")
     assert "bad.hdf5" in said
 
 
 @pytest.mark.mpi
 def test_a_truncated_fclib_problem_is_refused_by_two_ranks_at_once(program, results, settled, tmp_path):
     truncated(tmp_path / "bad.hdf5", settled)
-    assert "bad.hdf5" in refused(program, results, "-problem", "bad.hdf5", ranks=2)
+    assert "bad.hdf5" in refused(program, results, "-problem", "bad.hdf5", "-overwrite", ranks=2)
 
 
 @pytest.mark.parametrize("numbers", ["NaN in q", "negative mu", "short q"])
@@ -281,7 +281,7 @@ def test_an_fclib_problem_with_bad_numbers_is_refused(numbers, program, results,
             group[f"W/{name}"] = value
         group["W/i"], group["W/p"], group["W/x"] = np.arange(3), np.arange(3), np.ones(3)
         group["vectors/q"], group["vectors/mu"] = q, mu
-    said = refused(program, results, "-problem", "bad.hdf5")
+    said = refused(program, results, "-problem", "bad.hdf5", "-overwrite")
     assert "bad.hdf5" in said
 
 
@@ -313,7 +313,7 @@ def test_a_settled_state_that_does_not_agree_with_its_checksum_is_refused(
     def here(*options, **keywords):
         return program(*options, **keywords, cache=cache)
 
-    said = refused(here, results, *SMALL, "-restart", "settled", "-steps", 1)
+    said = refused(here, results, *SMALL, "-restart", "settled", "-overwrite", "-steps", 1)
     assert str(copy) in said
     assert "checksum" in said
     assert arrays(copy)["grains/position"].shape == (27, 3)

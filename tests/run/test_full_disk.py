@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import resource
 import shutil
 import subprocess
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from program import SMALL, arrays, command, environment, recorded_steps
+from program import SMALL, arrays, command, environment, recorded_steps, steps_of
 
 from pctt.ccp import ConeProblem, fclib, petsc_binary
 from pctt.run.hdf5 import FileError
@@ -25,7 +24,7 @@ SCENE = {"scene_n": "1", "scene_margin": "0.5", "output": "out", "ccp_type": "ap
 def check_whole(folder):
     """All that is there can be read and nothing else is there; the step of the checkpoint."""
     assert not list(folder.rglob("*.tmp"))
-    steps = [line["step"] for line in json.loads((folder / "summary.json").read_text())["steps"]]
+    steps = [line["step"] for line in steps_of(folder)]
     step = int(arrays(folder / "checkpoint.h5")["world/step"])
     assert set(steps) >= set(range(1, step + 1))
     if (folder / "state.h5").exists():  # not with -output_every 0
@@ -54,7 +53,7 @@ class Limit:
     [
         (40_000, "out/frames/000003.h5", {}),
         (1_000, "out/records.csv", {"output_every": "0"}),
-        (2_000, "out/summary.json", {"output_every": "0"}),
+        (2_000, "out/steps.jsonl", {"output_every": "0"}),
         (40_000, "out/checkpoint.h5", {"output_every": "0"}),
         (40_000, "problems/step000003_", {"dump_problem": "problems"}),
         (10_000, "out/state.h5", {}),

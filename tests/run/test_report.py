@@ -26,10 +26,7 @@ def test_the_table_counts_what_did_not_converge():
         "natural_residual": 1e-5, "converged": True,
     }
     other = {**line, "contacts": 9, "natural_residual": 2e-3, "converged": False}
-    totals = report.Totals()
-    for step in (line, other):
-        totals.add(step)
-    text = report.phase_table(totals)
+    text = report.phase_table([line, other])
     assert "2 steps, 7 to 9 contacts, 4 Newton steps, 10 Krylov iterations" in text
     assert "worst residual 2.0e-03, 1 NOT CONVERGED" in text
     solve = next(row.split() for row in text.splitlines() if row.startswith("solve"))

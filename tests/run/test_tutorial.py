@@ -58,7 +58,8 @@ def test_the_program_runs_the_file_on_any_number_of_ranks(hopper, program, tmp_p
     close = ("-ccp_type", "apgd", "-ccp_tol", "1e-7")
     first = None
     for ranks in (1, 2):
-        done = program(*options, *close, "-restart", "settled", "-steps", 4, ranks=ranks, cache=tmp_path / "cache")
+        run = (*options, *close, "-restart", "settled", "-steps", 4, "-overwrite")
+        done = program(*run, ranks=ranks, cache=tmp_path / "cache")
         assert "mean_discharge_rate [1/s]" in done.stdout
         rows = table(tmp_path / "results" / "records.csv")
         if first is None:
