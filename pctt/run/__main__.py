@@ -17,6 +17,7 @@ from dem.together import SceneError
 from pctt.options import OptionError
 from pctt.run import interrupt
 from pctt.run.hdf5 import FileError
+from pctt.run.leftovers import refuse_stray
 from pctt.run.options import help_text, read_options
 from pctt.run.problem import solve_file
 from pctt.run.simulate import simulate
@@ -28,6 +29,7 @@ def main(comm: MPI.Comm) -> None:
         if comm.rank == 0:
             print(help_text(database))
         return
+    refuse_stray(sys.argv[1:])
     options = read_options(database, comm)
     if options.problem is not None:
         solve_file(options, comm)

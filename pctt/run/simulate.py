@@ -25,7 +25,7 @@ from dem.together import SceneError, together
 from dem.world import World
 from pctt import ccp, log
 from pctt.options import OptionError
-from pctt.run import checkpoint, interrupt, report
+from pctt.run import checkpoint, interrupt, leftovers, report
 from pctt.run.dump import Dump
 from pctt.run.hdf5 import FileError
 from pctt.run.options import DEMO, Options, scene_name
@@ -93,6 +93,8 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
                 progress.say(f"{row['grains_outside']:.0f} grains have left the domain of the scene")
         if compare.names:
             progress.say("\n" + report.compare_table(compare.summary(), compare.labels()))
+    if left := leftovers.remark():
+        progress.say(left)
     if world.step > start:
         progress.say(f"\nresults: {place.folder}/state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
 
