@@ -169,7 +169,7 @@ def test_a_mass_matrix_that_is_not_symmetric_is_refused_but_for_rounding(tmp_pat
     assert np.allclose(dense(stored.problem), W, atol=1e-10 * np.abs(W).max())
     for other in (off(M, 1e-5), np.where(np.tri(len(M), k=-1) * M != 0, 0.5 * M, M)):
         replace_mass(path, lambda _, other=other: other)
-        with pytest.raises(FileFormatError, match=r"global\.hdf5.*mass matrix is not symmetric: M\[\d+, \d+\] = .*one triangle"):
+        with pytest.raises(FileFormatError, match=r"global\.hdf5.*mass matrix is not symmetric: M\[\d+, \d+\] = "):
             fclib.read(path, SELF)
 
 

@@ -1,4 +1,4 @@
-"""A folder that holds a run is refused, or replaced with -overwrite; nothing goes before the first new step is written."""
+"""A folder that holds a run is refused, or replaced with -overwrite: not before the first new step is written."""
 
 from __future__ import annotations
 
