@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -73,15 +75,21 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
     with whole(path) as temporary:
         make_hdf5(temporary, sum(source.stat().st_size for source in groups.values()), items=0)
         with h5py.File(temporary, "r+") as file:
-            for name, source in {"/": folder.path / "state.h5", **groups}.items():
-                try:
-                    with h5py.File(source, "r") as part:
-                        if name == "/":
-                            file.attrs.update({key: value for key, value in part.attrs.items() if key != "links"})
-                        else:
-                            file.copy(part["/"], name)
-                except (OSError, RuntimeError) as error:
-                    raise FolderError(f"{source}: cannot be copied to {path} ({error})") from None
+            with _part(folder.path / "state.h5") as links:
+                file.attrs.update({name: value for name, value in links.attrs.items() if name != "links"})
+            for name, source in groups.items():
+                with _part(source) as part:
+                    file.copy(part["/"], name)
+
+
+@contextmanager
+def _part(path: Path) -> Iterator[h5py.File]:
+    """A file of a run, open to be copied; FolderError if it cannot be."""
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError) as error:
+        raise FolderError(f"{path}: cannot be copied ({error})") from None
 
 
 def bodies(folder: Folder, frame: Frame) -> Any:

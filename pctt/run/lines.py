@@ -14,8 +14,8 @@ from pctt.run.place import Place
 class StepLines:
     """A file in the place of a run that grows by a line per step; one rank.
 
-    Of the lines that are there those up to the step ``last`` stay. The first line that is added is written together with
-    them, at one stroke; every other one is a single write, whatever the length of the file.
+    Of the lines that are there those up to the step ``last`` stay. The first line that is added is written together
+    with them, at one stroke; every other one is a single write, whatever the length of the file.
     """
 
     def __init__(self, place: Place, name: str, step_of: Callable[[str], int], last: int):

@@ -186,9 +186,9 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     problems = dump_folder(run)
     if not run.settle:
         _refuse_unwritable("-output", Path(run.output), comm)
-        _refuse_occupied(run, comm)
         if run.dump_problem:
             _refuse_unwritable("-dump_problem", problems, comm)
+        _refuse_occupied(run, comm)
     return options
 
 
@@ -363,6 +363,6 @@ def _refuse_occupied(run: Run, comm: MPI.Comm) -> None:
     if there:
         goes_on = f", or -restart {folder / 'checkpoint.h5'} to go on with it" * ("checkpoint.h5" in there)
         raise OptionError(
-            f"-output {folder}: holds a run ({', '.join(there)}); allowed is another folder, -overwrite to replace that "
-            f"run{goes_on}"
+            f"-output {folder}: holds a run ({', '.join(there)}); allowed is another folder, -overwrite to replace "
+            f"that run{goes_on}"
         )

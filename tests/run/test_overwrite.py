@@ -1,4 +1,4 @@
-"""A folder that holds a run is refused, or replaced with -overwrite; nothing goes before the first new step is written."""
+"""A folder that holds a run is refused, or replaced with -overwrite: not before the first new step is written."""
 
 from __future__ import annotations
 
@@ -143,6 +143,9 @@ def test_a_run_that_goes_on_makes_anew_what_lies_behind_its_checkpoint(run, tmp_
     assert (tmp_path / "out" / "analysis.csv").read_bytes() == whole["analysis.csv"]
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["steps"], summary["first_step"], summary["last_step"]) == (6, 1, 6)
+    text = DROP.replace('{"twice": 2 * records["time [s]"]}', "{}")
+    run(text, steps="1", restart="out/checkpoint.h5", restart_changed_file="true")
+    assert not (tmp_path / "out" / "analysis.csv").exists()
 
 
 @pytest.mark.mpi

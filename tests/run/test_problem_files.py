@@ -102,7 +102,8 @@ def test_names_by_a_pattern_a_start_without_guess_and_a_broken_file(program, set
         path = tmp_path / "all" / str(line["contacts"]) / f"{line['step']:03d}.hdf5"
         assert line["dumped"] == [str(p.relative_to(tmp_path)) for p in (path, path.with_suffix(".petsc"))]
         assert path.exists()
-    program("-problem", steps[1]["dumped"][0], "-problem_guess", "false", "-ccp_type", "apgd", "-ccp_tol", 1e-10, "-output", "cold")
+    cold = ("-problem_guess", "false", "-ccp_type", "apgd", "-ccp_tol", 1e-10, "-output", "cold")
+    program("-problem", steps[1]["dumped"][0], *cold)
     cold = summary(tmp_path / "cold")
     assert cold["start"] == "cold"
     assert cold["converged"]

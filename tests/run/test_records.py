@@ -69,7 +69,8 @@ def test_records_with_other_columns_are_not_continued(tmp_path):
     (tmp_path / "records.csv").write_text("step,time\nnonsense\n")
     with pytest.raises(FileError, match="cannot be continued"):
         Records(place, MPI.COMM_SELF, 1)
-    Records(place, MPI.COMM_SELF, 0).add(other)
+    (tmp_path / "records.csv").write_text(",".join(other) + "\n7,3.5,1.0\n")
+    Records(place, MPI.COMM_SELF, 1).add(other)
     assert (tmp_path / "records.csv").read_text() == "step,time [s],b [m]\n2,1.0,2.0\n"
 
 

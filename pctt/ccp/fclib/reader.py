@@ -14,7 +14,6 @@ from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.stored import FileFormatError, Stored, Whole, spread, symmetric_blocks
 
-
 #: M_ij and M_ji of a symmetric M differ by no more than this part of sqrt(M_ii M_jj), which bounds both.
 ROUNDING = 1e-8
 MIRRORED = "M is stored as one triangle, which was mirrored"
@@ -102,8 +101,8 @@ def _symmetric(M: sp.csr_matrix) -> tuple[sp.csr_matrix, str]:
     if off.any():
         i, j = entries.row[off][0], entries.col[off][0]
         raise FileFormatError(
-            f"its mass matrix is not symmetric: M[{i}, {j}] = {M[i, j]:.9g}, M[{j}, {i}] = {M[j, i]:.9g}; allowed is one "
-            "triangle, or both up to rounding"
+            f"its mass matrix is not symmetric: M[{i}, {j}] = {M[i, j]:.9g}, M[{j}, {i}] = {M[j, i]:.9g}; allowed is "
+            "one triangle, or both equal up to rounding"
         )
     return (0.5 * (M + M.T)).tocsr(), ""
 
