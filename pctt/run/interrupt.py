@@ -15,9 +15,6 @@ from mpi4py import MPI
 #: Ctrl-C; what mpiexec and batch systems send before they kill; what mpiexec passes on without killing.
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
-#: Exit status of a run that was interrupted, as shells have it for Ctrl-C.
-STATUS = 130
-
 _noted: list[int] = []
 
 

@@ -19,9 +19,9 @@ OF_SOLVERS = (
 #: The options of Newton systems that are typed most, for what others are taken to be misspelt.
 COMMON = (
     "ksp_type", "ksp_rtol", "ksp_atol", "ksp_divtol", "ksp_max_it", "ksp_monitor", "ksp_view", "ksp_norm_type",
-    "ksp_pc_side", "ksp_converged_reason", "ksp_gmres_restart", "ksp_monitor_true_residual", "pc_type", "pc_python_type",
-    "pc_side", "pc_factor_levels", "pc_factor_shift_type", "pc_factor_mat_solver_type", "pc_factor_mat_ordering_type",
-    "pc_sor_omega", "pc_asm_overlap", "pc_gamg_threshold", "pc_hypre_type",
+    "ksp_pc_side", "ksp_converged_reason", "ksp_gmres_restart", "ksp_monitor_true_residual", "pc_type",
+    "pc_python_type", "pc_side", "pc_factor_levels", "pc_factor_shift_type", "pc_factor_mat_solver_type",
+    "pc_factor_mat_ordering_type", "pc_sor_omega", "pc_asm_overlap", "pc_gamg_threshold", "pc_hypre_type",
 )  # fmt: skip
 
 # PetscOptionsUsed, which petsc4py has no name for in every version; in the library that petsc4py stands on
@@ -62,5 +62,12 @@ def remark() -> str:
     """A line that names the options of solvers that had no effect; empty if there are none."""
     database = PETSc.Options().getAll()
     left = unused(name for name in database if name.startswith(OF_SOLVERS))
+    keep_from_petsc(left)
     listed = ", ".join(f"-{name} {database[name] or ''}".strip() for name in left)
     return f"options without effect in this run: {listed}" if listed else ""
+
+
+def keep_from_petsc(names: Iterable[str]) -> None:
+    """Have PETSc, which in some versions warns of options that nobody asked for, say nothing of these at its end."""
+    for name in names:
+        PETSc.Options().hasName(name)

@@ -6,7 +6,9 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 from program import SMALL, assert_same_bits, command, environment
@@ -17,9 +19,8 @@ RANKS = [1, pytest.param(2, marks=pytest.mark.mpi)]
 
 
 def interrupted(options, ranks, tmp_path, cache, ready, number, twice=False):
-    """Start a run, wait until `ready`, and send the signal: to the program where it is alone, else to its last rank.
-
-    Its exit status, and what it said to the standard error."""
+    """Start a run, wait until `ready`, and send the signal: to the program, or to the mpiexec of run/setup, or where there
+    is another, to the last rank. Its exit status, and what it said to the standard error."""
     with subprocess.Popen(
         command(*options, ranks=ranks), cwd=tmp_path, env=environment(cache), stderr=subprocess.PIPE, text=True
     ) as run:
@@ -28,7 +29,8 @@ def interrupted(options, ranks, tmp_path, cache, ready, number, twice=False):
             assert run.poll() is None, "the run ended too early"
             assert time.monotonic() < end, "nothing to wait for came"
             time.sleep(0.002)
-        target = run.pid if ranks == 1 else max(python_of(run.pid))
+        ours = ranks == 1 or Path(sys.executable).with_name("mpiexec").exists()
+        target = run.pid if ours else max(python_of(run.pid))
         os.kill(target, number)
         if twice:
             time.sleep(0.5)
@@ -38,7 +40,7 @@ def interrupted(options, ranks, tmp_path, cache, ready, number, twice=False):
 
 
 @pytest.mark.parametrize("ranks", RANKS)
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
 def test_an_interrupted_run_goes_on(number, ranks, program, tmp_path, cache):
     steps = 400
     late = ("-checkpoint_every", steps)  # so that no checkpoint is there but the one that an interrupted run writes
