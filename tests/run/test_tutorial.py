@@ -58,7 +58,8 @@ def test_the_program_runs_the_file_on_any_number_of_ranks(hopper, program, tmp_p
     close = ("-ccp_type", "apgd", "-ccp_tol", "1e-7")
     first = None
     for ranks in (1, 2):
-        done = program(*options, *close, "-restart", "settled", "-steps", 4, ranks=ranks, cache=tmp_path / "cache")
+        run = (*options, *close, "-restart", "settled", "-steps", 4, "-overwrite")
+        done = program(*run, ranks=ranks, cache=tmp_path / "cache")
         assert "mean_discharge_rate [1/s]" in done.stdout
         rows = table(tmp_path / "results" / "records.csv")
         if first is None:
@@ -134,9 +135,8 @@ FAULTS = {
 def test_faults_of_a_scene_end_the_run(message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(FAULTS[message])
-    words = {"scene": "mine.py", "steps": "1", "ccp_type": "apgd"}
-    if FAULTS[message] is GOOD:
-        words["settle"] = "true"
+    how = {"settle": "true"} if FAULTS[message] is GOOD else {"steps": "1", "ccp_type": "apgd"}
+    words = {"scene": "mine.py", **how}
     with pytest.raises((OptionError, SceneError), match=re.escape(message)):
         simulate(read_options(words, MPI.COMM_SELF), MPI.COMM_SELF)
 
