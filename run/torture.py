@@ -18,7 +18,7 @@ from pctt.disk import lines
 from pctt.look.folder import Folder
 
 ROOT = Path(__file__).resolve().parents[1]
-SCENE = ("-scene", "shear", "-ccp_type", "apgd", "-ccp_tol", "1e-3", "-checkpoint_every", "2", "-monitor", "0")
+SCENE = ("-scene", "shear", "-ccp_type", "apgd", "-ccp_tol", "1e-3", "-checkpoint_every", "2")
 
 
 def main(n: int = 4, kills: int = 20, steps: int = 60) -> int:

@@ -10,6 +10,7 @@ from mpi4py import MPI
 from pctt import ccp, figures_json, log
 from pctt.ccp import fclib, petsc_binary
 from pctt.ccp.cone import Array
+from pctt.run import leftovers
 from pctt.run.hdf5 import FileError, write_text
 from pctt.run.options import Options
 from pctt.run.place import Place
@@ -20,26 +21,48 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
     """Solve, print the figures, and write them to summary.json in the output folder."""
     assert options.problem is not None
     stored = _load(options.problem, comm, options.run.ccp_compliance)
-    problem, guess = stored.problem, stored.guess if options.run.problem_guess else None
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
+    with stored.problem:
+        summary = _solve(stored, options, compare)
+    progress = Progress(comm.rank == 0 and not options.run.quiet)
+    width = max(map(len, summary))
+    for name, value in summary.items():
+        if not isinstance(value, dict) and value != "":
+            shown = f"{value:.12g}" if isinstance(value, float) else value
+            progress.say(f"{name:{width}}  {shown}")
+    for name, figures in summary["references"].items():
+        listed = ", ".join(f"{word} {figure:.6g}" for word, figure in figures.items())
+        progress.say(f"the file's {name}: {listed}")
+    if compare.names:
+        progress.say("\n" + compare_table(compare.summary(), compare.labels()))
+    if not summary["converged"]:
+        progress.say(f"NOT CONVERGED: {summary['reason']}")
+    if left := leftovers.remark():
+        progress.say(left)
+    place = Place(Path(options.run.output), comm)
+    place.make()
+    if comm.rank == 0:
+        write_text(place.now / "summary.json", figures_json.dumps(summary, indent=1) + "\n")
+    place.take()
+
+
+def _solve(stored: fclib.Stored, options: Options, compare: ccp.Comparison) -> dict[str, Any]:
+    """The figures of solving a stored problem as the options say."""
+    problem, guess, comm = stored.problem, stored.guess if options.run.problem_guess else None, stored.problem.comm
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
-    with log.phase("solve"):
-        result = ccp.solve(
-            problem,
-            guess,
-            options.run.ccp_type,
-            options.limits,
-            options.solver,
-            newton,
-            options.coulomb,
-        )
+    try:
+        with log.phase("solve"):
+            result = ccp.solve(
+                problem, guess, options.run.ccp_type, options.limits, options.solver, newton, options.coulomb
+            )
+    finally:
+        newton.destroy()
     seconds = log.take_seconds(("solve", "compare"))
-    newton.destroy()
     accuracy = ccp.measure(problem, result.impulse)
     used = result.solver or options.run.ccp_type
     solves = compare.take_solves()
     by_newton = ccp.SOLVERS[used].newton
-    summary = {
+    return {
         "problem": str(options.problem),
         "format": stored.form,
         "title": stored.title,
@@ -75,24 +98,6 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
             name: {**figures, "solves": solves[name]} for name, figures in compare.summary().items()
         },
     }
-    progress = Progress(comm.rank == 0 and not options.run.quiet)
-    width = max(map(len, summary))
-    for name, value in summary.items():
-        if not isinstance(value, dict) and value != "":
-            shown = f"{value:.12g}" if isinstance(value, float) else value
-            progress.say(f"{name:{width}}  {shown}")
-    for name, figures in summary["references"].items():
-        listed = ", ".join(f"{word} {figure:.6g}" for word, figure in figures.items())
-        progress.say(f"the file's {name}: {listed}")
-    if compare.names:
-        progress.say("\n" + compare_table(compare.summary(), compare.labels()))
-    if not result.converged:
-        progress.say(f"NOT CONVERGED: {result.reason}")
-    place = Place(Path(options.run.output), comm)
-    place.make()
-    if comm.rank == 0:
-        write_text(place.now / "summary.json", figures_json.dumps(summary, indent=1) + "\n")
-    place.take()
 
 
 def _load(path: str, comm: MPI.Comm, compliance: float | None) -> fclib.Stored:

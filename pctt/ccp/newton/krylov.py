@@ -14,6 +14,7 @@ from petsc4py import PETSc
 from pctt.pc.base import PythonPC
 from pctt.pc.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
 from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
+from pctt.petsc import own_errors
 
 # right preconditioning makes the residual that the method sees the true one
 _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
@@ -53,7 +54,7 @@ class Krylov:
         self.ksp = PETSc.KSP().create(comm)
         self.ksp.setOptionsPrefix(prefix)
         self.ksp.setTolerances(rtol=rtol, atol=1e-300, max_it=1000)
-        with entered(self._options):
+        with entered(self._options), own_errors():
             self._configure(PETSc.Options(prefix), rtol)
         self._formed: PETSc.Mat | None = None  # what the preconditioner is made from, if not P itself
         self._version: tuple[int, int] | None = None  # of P, when it was
@@ -62,8 +63,10 @@ class Krylov:
         self.method, self.kind = options.getString("ksp_type"), options.getString("pc_type")
         within = {value for name, value in options.getAll().items() if name.endswith("_pc_type")}
         self._remembers_within = bool(BY_DIAGONAL_BLOCKS & within)
-        # block Gauss-Seidel over several ranks crashes in PETSc 3.18
-        self.scalar = self.kind in _SCALAR_FORMAT or (self.kind == "sor" and self.comm.size > 1)
+        # block Gauss-Seidel over several ranks crashes in PETSc 3.18, parts of a matrix of blocks have none
+        self.scalar = (
+            self.kind in _SCALAR_FORMAT or (self.kind == "sor" and self.comm.size > 1) or self._remembers_within
+        )
         if self.method in _RIGHT_SIDED:
             self.ksp.setPCSide(PETSc.PC.Side.RIGHT)
         prefer_mumps(self.ksp.pc, self.kind)
@@ -126,7 +129,9 @@ class Krylov:
 
     def _iterate(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         x.zeroEntries()
-        self.ksp.solve(b, x)
+        right_hand_side = b.copy()  # an error of PETSc may leave it locked
+        self.ksp.solve(right_hand_side, x)
+        right_hand_side.destroy()
 
     def _form(self, P: PETSc.Mat) -> PETSc.Mat:
         """P in the form that the preconditioner wants."""
@@ -137,8 +142,8 @@ class Krylov:
         return self._formed if self._formed is not None else P
 
     def _formed_anew(self, P: PETSc.Mat, old: PETSc.Mat | None) -> PETSc.Mat | None:
-        to_scalar = self.scalar and P.getType() not in ("seqaij", "mpiaij")
-        if self._remembers_within:  # and keeps parts of the matrix
+        to_scalar = self._remembers_within or (self.scalar and P.getType() not in ("seqaij", "mpiaij"))
+        if self._remembers_within:  # and the preconditioner keeps parts of the matrix
             self.ksp.reset()
         elif to_scalar and old is not None:
             return P.convert(PETSc.Mat.Type.AIJ, old)  # in place: a factorisation knows its structure
@@ -150,7 +155,7 @@ class Krylov:
             definite = self.kind not in ("cholesky", "lu")
             rows.setOption(PETSc.Mat.Option.SPD if definite else PETSc.Mat.Option.SYMMETRIC, True)
             return rows
-        return P.duplicate(copy=True) if self._remembers_within else without_memory(P, self.kind)
+        return without_memory(P, self.kind)
 
     def report(self) -> list[str]:
         """What a preconditioner of the project tells of itself and its fallbacks, as in ``-ksp_view``."""
@@ -223,7 +228,8 @@ def together(comm: MPI.Comm, work: Callable[[], None]) -> int:
     code = np.zeros(1, int)
     words = ""
     try:
-        work()
+        with own_errors():
+            work()
     except PETSc.Error as error:
         code[0], words = error.ierr, str(error)
     if comm.size == 1:
