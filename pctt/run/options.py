@@ -16,6 +16,8 @@ from dem.experiment import Experiment, SceneFileError, from_file
 from dem.scenes import SCENES
 from dem.together import together
 from pctt import ccp
+from pctt.ccp.newton import DEFAULTS
+from pctt.ccp.newton.asked_for import LADDER
 from pctt.options import (
     AT_LEAST_ONE,
     COUNT,
@@ -28,8 +30,6 @@ from pctt.options import (
     read,
     refuse_unknown,
 )
-from pctt.ccp.newton import DEFAULTS
-from pctt.ccp.newton.asked_for import LADDER
 from pctt.pc import PRECONDITIONERS
 from pctt.pc.ksp_options import entered, to_enter
 from pctt.run.dump import dump_folder
