@@ -30,7 +30,7 @@ class ContactSystem:
         self._low_rank = problem.low_rank is not None
         if self._low_rank:
             self._sparse = problem.N.duplicate(copy=True)
-            self.matrix = PETSc.Mat().createLRC(self._sparse, problem.low_rank, None, problem.low_rank)
+            self.matrix = _with_low_rank(self._sparse, problem.low_rank)
         else:
             self._sparse = self.matrix = self.preconditioned
         for mat in (self._sparse, self.preconditioned):
@@ -47,7 +47,7 @@ class ContactSystem:
         if self._low_rank:
             problem.N.copy(self._sparse, same)
             self.matrix.destroy()
-            self.matrix = PETSc.Mat().createLRC(self._sparse, problem.low_rank, None, problem.low_rank)
+            self.matrix = _with_low_rank(self._sparse, problem.low_rank)
         describe(self.preconditioned, problem)
 
     def update(self, barrier: Array, inverse: Array | None = None) -> None:
@@ -89,6 +89,15 @@ class ContactSystem:
         if self._low_rank:
             self._sparse.destroy()
             self.preconditioned.destroy()
+
+
+def _with_low_rank(A: PETSc.Mat, U: PETSc.Mat) -> PETSc.Mat:
+    """A + U U'."""
+    ones = U.createVecRight()  # petsc4py of 3.22 does not take None
+    ones.set(1.0)
+    mat = PETSc.Mat().createLRC(A, U, ones, U)
+    ones.destroy()
+    return mat
 
 
 def describe(mat: PETSc.Mat, problem: ConeProblem) -> None:
