@@ -22,8 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cone import TINY, Array, step_to_boundary, step_to_zero, times
+from pctt.ccp.cone import Array, step_to_boundary, step_to_zero, times
 from pctt.ccp.interior.barrier import CONSTRAINTS, Perspective, Quadratic
+from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
@@ -158,12 +159,10 @@ def _velocity(problem: ConeProblem, g: Array) -> Array:
 def _start(
     problem: ConeProblem, guess: Array, cone: Perspective | Quadratic, options: PDIP
 ) -> tuple[Array, Array]:
-    """Impulses on the cones' axes and multipliers of equal complementarity. The guess is made smaller where that
-    lowers the objective: impulses of a jam that has come loose are too large by orders."""
+    """Impulses on the cones' axes and multipliers of equal complementarity."""
     closing = problem.norm(_velocity(problem, np.zeros_like(problem.r))) / np.sqrt(problem.size)
     new = options.start * closing / problem.mean_diagonal
-    along, bent = problem.dot(problem.r, guess), problem.dot(problem.product(guess), guess)
-    known = min(max(-along / max(bent, TINY), 0.0), 1.0) * guess[:, 0]
+    known = no_larger_than_useful(problem, guess)[:, 0]
     g = np.zeros_like(problem.r)
     g[:, 0] = np.where(known > 0, np.maximum(known, 0.1 * new), new)
     speed = problem.norm(_velocity(problem, g)) / np.sqrt(problem.size)
