@@ -32,7 +32,7 @@ from pctt.log import phase
 from pctt.options import FRACTION, POSITIVE, option
 
 RTOL = 1e-3  # of the linear solves, where ``-ksp_rtol`` does not say otherwise
-FORCING = 0.1  # and what they may leave of velocities, as a part of what the natural residual shows
+FORCING = 0.3  # and what they may leave of velocities, as a part of what the natural residual shows
 SHORT = 0.5  # a step after which the direction is corrected,
 FURTHER = 0.3  # for one that goes so much further
 BENT = 100.0  # unless the terms of second order enlarge the right-hand side so much: no correction then helps
@@ -146,9 +146,9 @@ def _direction(
 
 
 def _bend(at: Linearised, dg: Array, dlam: Array, reach: float) -> tuple[Array, Array]:
-    """What the linearised conditions miss, ``reach`` along a direction and divided by that: the terms of second order of
-    sum lambda_i grad f_i (without third derivatives) and of lambda_i f_i. A contact that slides has to turn its impulse
-    along the cone, and straight steps leave it soon."""
+    """What the linearised conditions miss, ``reach`` along a direction and divided by that: the terms of second order
+    of sum lambda_i grad f_i (without third derivatives) and of lambda_i f_i. A contact that slides has to turn its
+    impulse along the cone, and straight steps leave it soon."""
     turned = times(at.hessian, dg)
     missed = dlam * (at.df * dg).sum(1) + 0.5 * at.lam * (dg * turned).sum(1)
     return reach * dlam[:, None] * turned, reach * missed
