@@ -235,11 +235,12 @@ class Inside:
         self.comm = MPI.COMM_WORLD
         self.folder, self.seconds = config.getoption(INSIDE), config.getoption("--rank-seconds")
         config.option.basetemp = self.folder / f"tmp-{self.comm.rank}"
+        self.terminal = os.dup(2)  # a test may capture its own
         self._watch()
 
     def _watch(self) -> None:
         """In so many seconds from now the rank shows where it is, and ends."""
-        faulthandler.dump_traceback_later(self.seconds, exit=True, file=sys.__stderr__)
+        faulthandler.dump_traceback_later(self.seconds, exit=True, file=self.terminal)
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         by_name = {item.nodeid: item for item in items}

@@ -22,8 +22,8 @@ FIELDS = {
 ACCURATE = ("-ksp_rtol", "1e-6", "-ksp_max_it", "2000", "-ccp_tol", "1e-4")
 
 
-def compared(program, folder, *options, ranks=1):
-    done = program(*SETTLED, *ACCURATE, "-steps", 3, *options, ranks=ranks)
+def compared(program, folder, *options):
+    done = program(*SETTLED, *ACCURATE, "-steps", 3, *options)
     summary = json.loads((folder / "results" / "summary.json").read_text())
     table = done.stdout.partition("preconditioner  ")[2].splitlines()
     rows = [line for line in table[2:] if line.strip()]
@@ -71,9 +71,9 @@ def test_a_compared_preconditioner_takes_options_of_its_own(program, settled, tm
     assert filled["compare"]["ilu"]["ksp_its_mean"] < plain["compare"]["ilu"]["ksp_its_mean"]
 
 
-@pytest.mark.mpi
+@pytest.mark.parallel(2)
 def test_on_two_ranks_ilu_is_said_to_work_within_each(program, settled, tmp_path):
-    summary, table = compared(program, tmp_path, "-compare", "none,ilu,pbjacobi", ranks=2)
+    summary, table = compared(program, tmp_path, "-compare", "none,ilu,pbjacobi")
     assert list(summary["compare"]) == ["none", "ilu", "pbjacobi"]
     assert list(table) == ["none", "ilu (within each rank)", "pbjacobi"]
     newton = sum(line["newton_its"] for line in summary["steps"])
