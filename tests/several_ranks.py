@@ -20,9 +20,11 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, TypeVar
 
 import pytest
 
+T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[1]
 INSIDE = "--of-ranks"  # the option by which a pytest inside mpiexec knows the folder where it finds and leaves all
 ENDS = 6000  # characters of what mpiexec said that are shown of a rank that died
@@ -79,6 +81,14 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
             metafunc.fixturenames.append("ranks")
         counts = [pytest.param(n, marks=pytest.mark.mpi if n > 1 else ()) for n in marker.args]
         metafunc.parametrize("ranks", counts, ids=[f"{n} rank{'s' * (n > 1)}" for n in marker.args])
+
+
+def alone(work: Callable[[Any], T]) -> T:
+    """What `work(MPI.COMM_SELF)` gives on the first rank, on all ranks of a test."""
+    from mpi4py import MPI
+
+    comm = MPI.COMM_WORLD
+    return comm.bcast(work(MPI.COMM_SELF) if comm.rank == 0 else None)
 
 
 # -- fixtures ----------------------------------------------------------------------------------------------------
