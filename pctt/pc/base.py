@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import weakref
 from typing import Any
 
 from petsc4py import PETSc
@@ -20,7 +21,7 @@ from pctt.options import describe, no_such_option, read
 class PythonPC:
     """Base class; subclasses set ``options_class`` and ``options_prefix`` and define build, update, apply.
 
-    The preconditioner is taken to be symmetric.
+    The preconditioner is taken to be symmetric. Matrices of other types than AIJ and BAIJ are converted.
     """
 
     options_class: type
@@ -28,11 +29,18 @@ class PythonPC:
 
     def create(self, pc: PETSc.PC) -> None:
         self.options: Any = self.options_class()
+        self.prefix = ""
         self._structure: tuple | None = None
+        self.P: PETSc.Mat | None = None  # what it is made from, in AIJ or BAIJ
+        self._converted: PETSc.Mat | None = None
+        pc.decRef()  # a reference that does not keep the PC alive; `destroy` gives it back
+        self._pc: PETSc.PC | None = pc
+        _living.add(self)
 
     def setFromOptions(self, pc: PETSc.PC) -> None:
         """Read the options behind the PC's prefix; OptionError for a bad one, or a misspelt one."""
-        prefix = (pc.getOptionsPrefix() or "") + self.options_prefix
+        self.prefix = pc.getOptionsPrefix() or ""
+        prefix = self.prefix + self.options_prefix
         database = PETSc.Options().getAll()
         known = [line.name for line in describe(self.options_class, prefix)]
         for name in database:
@@ -45,12 +53,43 @@ class PythonPC:
             PETSc.Sys.Print("\n".join(map(str, describe(self.options_class, prefix))), comm=pc.comm)
 
     def setUp(self, pc: PETSc.PC) -> None:
+        """ValueError, on all ranks alike, for a matrix that is not square or cannot be converted."""
         _, P = pc.getOperators()
-        structure = (P.handle, P.getSize(), P.getInfo()["nz_used"])
+        rows, columns = P.getSize()
+        if rows != columns:
+            raise ValueError(f"{self.name}: the matrix has {rows} rows and {columns} columns; allowed is a square one")
+        handle = P.handle
+        self.P = P = self._as_sparse(P)
+        structure = (handle, rows, P.getInfo()["nz_used"])
         if structure != self._structure:
             self.build(pc, P)
             self._structure = structure
         self.update(pc, P)
+
+    @property
+    def name(self) -> str:
+        """As in ``-pc_python_type``."""
+        return f"pctt.pc.{type(self).__name__}"
+
+    def _as_sparse(self, P: PETSc.Mat) -> PETSc.Mat:
+        """P, or a copy of it in AIJ where it is of another type."""
+        if P.getType().startswith(("seqaij", "mpiaij", "seqbaij", "mpibaij")):
+            return P
+        try:
+            sparse = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
+        except PETSc.Error:
+            raise ValueError(
+                f"{self.name}: a Mat of type {P.getType()} has no entries to read; allowed are aij, baij, sbaij, dense"
+            ) from None
+        if sparse.getBlockSize() != P.getBlockSize():
+            sparse.setBlockSize(P.getBlockSize())
+        for attribute in ATTRIBUTES:
+            if P.getAttr(attribute) is not None:
+                sparse.setAttr(attribute, P.getAttr(attribute))
+        if self._converted is not None:
+            self._converted.destroy()
+        self._converted = sparse
+        return sparse
 
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """What depends on the structure of P alone."""
@@ -67,11 +106,30 @@ class PythonPC:
 
     def reset(self, pc: PETSc.PC) -> None:
         """Forget the matrix; what may serve the next one stays."""
-        self._structure = None
+        self._structure = self.P = None
+
+    def release(self) -> None:
+        """Destroy the PETSc objects that it owns."""
+
+    def destroy(self, pc: PETSc.PC) -> None:
+        """PETSc's call at the end of the PC."""
+        self.release()
+        self.P = None
+        if self._converted is not None:
+            self._converted.destroy()
+            self._converted = None
+        if self._pc is not None:
+            self._pc.incRef()
+            self._pc = None
+
+    def leave(self) -> None:
+        """Have the PC that this belongs to go on without it, as ``-pc_type none``."""
+        if self._pc is not None:
+            self._pc.setType(PETSc.PC.Type.NONE)
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer | None = None) -> None:
         if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII:
-            for line in self.report():
+            for line in pc.comm.tompi4py().bcast(self.report()):
                 viewer.printfASCII(f"  {line}\n")
 
     def report(self) -> list[str]:
@@ -79,32 +137,16 @@ class PythonPC:
         return []
 
 
-def factor_within_ranks(prefix: str, ranks: int) -> str:
-    """The name of the PC type of a prefix; on several ranks ILU and ICC, which PETSc has for one rank only, are made
-    block Jacobi with that factorisation within each rank."""
-    database = PETSc.Options()
-    pc = database.getString(prefix + "pc_type", "")
-    if ranks == 1 or pc not in ("ilu", "icc"):
-        return pc
-    for name, value in database.getAll().items():
-        if name.startswith(prefix + "pc_factor_"):
-            database[prefix + "sub_" + name[len(prefix) :]] = value
-    database[prefix + "pc_type"] = "bjacobi"
-    database[prefix + "sub_pc_type"] = pc
-    return f"{pc} within each rank"
-
-
-def prefer_mumps(pc: PETSc.PC, kind: str) -> None:
-    """Let a factorisation be MUMPS's where PETSc has it: its own keeps to natural orders and one rank."""
-    if kind in ("cholesky", "lu") and PETSc.Sys.hasExternalPackage("mumps"):
-        pc.setType(kind)
-        pc.setFactorSolverType("mumps")
+#: What a user's Mat may bring, see docs/preconditioners.md.
+ATTRIBUTES = ("coordinates", "key", "contact_map", "barrier")
+_living: weakref.WeakSet[PythonPC] = weakref.WeakSet()
 
 
 @atexit.register
-def _destroy_garbage() -> None:
-    """PETSc destroys what petsc4py has let go of when it is finalised, which is after Python's own end: a
-    preconditioner written in Python must be gone before. (One that a global variable still holds must be destroyed by
-    its owner: ``ksp.destroy()``.)"""
+def _leave_pcs() -> None:
+    """What PETSc destroys after Python's end must not be written in Python: take our preconditioners out of PCs that
+    are still there, say in the traceback of an error, and let PETSc destroy what petsc4py has let go of."""
+    for living in list(_living):
+        living.leave()
     gc.collect()
     PETSc.garbage_cleanup()

@@ -13,6 +13,7 @@ from petsc4py import PETSc
 
 from pctt.blocks import BlockRows
 from pctt.exchange import exchange, offsets
+from pctt.pc.block_diagonal import set_diagonal_blocks
 from pctt.pc.stiff_part import StiffPart
 
 ADD = PETSc.InsertMode.ADD_VALUES
@@ -79,6 +80,7 @@ class BodyMatrix:
             np.add.at(self._values, self._received_places, received)
         self._values[self._diagonal_places] += np.eye(6)
         _put(self.mat, self._indptr, self._indices, self._values)
+        set_diagonal_blocks(self.mat, self._values[self._diagonal_places])
 
     def stiff_part(self, least: float, shift: float = 0.0, scalar: bool = False) -> PETSc.Mat:
         """K without the blocks between bodies whose entries are all below ``least`` (of the mass), its diagonal blocks

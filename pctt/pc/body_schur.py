@@ -22,8 +22,10 @@ from petsc4py import PETSc
 
 from pctt.blocks import block_matrix
 from pctt.options import NOT_NEGATIVE, option
-from pctt.pc.base import PythonPC, factor_within_ranks, prefer_mumps
+from pctt.pc.base import PythonPC
+from pctt.pc.block_diagonal import without_memory
 from pctt.pc.body_matrix import BodyMatrix
+from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
 
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu"}  # these have no code for block formats
 _COARSE_SPACE = {"gamg", "python"}  # these use the rigid motions
@@ -59,12 +61,13 @@ class BodySchur(PythonPC):
         self.ksp: PETSc.KSP | None = None
         self.solves = self.its = 0
         self._rtol, self._atol = 1e-3, 0.0
+        self._formed: PETSc.Mat | None = None  # what the inner preconditioner is made from, if not the stiff part
 
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         G = P.getAttr("contact_map")
         if G is None:
-            raise ValueError("pctt.pc.BodySchur: the Mat has no attribute contact_map; see the class's module")
-        self.destroy(pc)
+            raise ValueError("pctt.pc.BodySchur: the Mat has no attribute contact_map; see docs/preconditioners.md")
+        self.release()
         self.K = BodyMatrix(P.comm, G)
         points = P.getAttr("coordinates")
         if points is not None:
@@ -72,14 +75,14 @@ class BodySchur(PythonPC):
         self._y, self._rhs = self.K.mat.createVecs()
         self.ksp = PETSc.KSP().create(P.comm)
         prefix = (pc.getOptionsPrefix() or "") + "body_"
-        inner = factor_within_ranks(prefix, P.comm.size)
+        self._options = to_enter(prefix, {"pc_type": "pbjacobi"}, P.comm.size)
         self.ksp.setOptionsPrefix(prefix)
         self.ksp.setType(PETSc.KSP.Type.CG)
         self.ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         self.ksp.setTolerances(max_it=10_000)
-        self.ksp.pc.setType(PETSc.PC.Type.PBJACOBI)
-        prefer_mumps(self.ksp.pc, inner)
-        self.ksp.setFromOptions()
+        with entered(self._options):
+            prefer_mumps(self.ksp.pc, PETSc.Options(prefix).getString("pc_type"))
+            self.ksp.setFromOptions()
         if points is not None and self.ksp.pc.getType() in _COARSE_SPACE:
             self.K.set_rigid_modes(points)
         self._G = block_matrix(P.comm, G)
@@ -94,6 +97,16 @@ class BodySchur(PythonPC):
         self.inverse_barrier = np.linalg.inv(barrier + floor[:, None, None] * np.eye(3))
         self.K.update(self.inverse_barrier)
         assert self.ksp is not None
+        old, self._formed = self._formed, without_memory(self.K.mat, self.ksp.pc.getType())
+        self.ksp.setOperators(self.K.mat, self._stiff_part() if self._formed is None else self._formed)
+        with entered(self._options):
+            self.ksp.setUp()
+        if old is not None:
+            old.destroy()
+
+    def _stiff_part(self) -> PETSc.Mat:
+        """What the inner preconditioner is made from."""
+        assert self.ksp is not None
         kind = self.ksp.pc.getType()
         least = self.options.least if kind in _FACTORS else 0.0
         P = self.K.stiff_part(least, self.options.shift, scalar=kind in _SCALAR_FORMAT)
@@ -102,8 +115,7 @@ class BodySchur(PythonPC):
             if near.handle:
                 P.setNearNullSpace(near)
             P.setAttr("coordinates", self.K.mat.getAttr("coordinates"))
-        self.ksp.setOperators(self.K.mat, P)
-        self.ksp.setUp()
+        return P
 
     def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         self._rtol = self.options.rtol or 0.5 * ksp.getTolerances()[0]
@@ -128,11 +140,12 @@ class BodySchur(PythonPC):
         inner = self.its / max(self.solves, 1)
         return [f"through the bodies: {self.solves} solves with K, {inner:.1f} inner iterations on average"]
 
-    def destroy(self, pc: PETSc.PC) -> None:
+    def release(self) -> None:
         if self.ksp is not None:
-            for thing in (self.ksp, self.K, self._G, self._y, self._rhs, self._contact):
-                thing.destroy()
-            self.ksp = None
+            for thing in (self.ksp, self.K, self._G, self._y, self._rhs, self._contact, self._formed):
+                if thing is not None:
+                    thing.destroy()
+            self.ksp = self._formed = None
 
 
 def _largest_eigenvalue(G: PETSc.Mat, iterations: int = 15) -> float:

@@ -21,6 +21,14 @@ REACH = 12  # boxes within which an empty slot is looked for
 FAR = 0.02  # part of the rows that may be put further away
 
 
+def capacity(P: PETSc.Mat, box: int) -> int:
+    """Slots that this rank's block rows get."""
+    count = P.getLocalSize()[0] // P.getBlockSize()
+    if P.getAttr("key") is None or P.getAttr("coordinates") is None:
+        return count
+    return -(-int(np.ceil(count * (1 + SPARE))) // box) * box
+
+
 class Slots:
     """Slots of this rank's block rows.
 
@@ -38,7 +46,7 @@ class Slots:
         self.box = box
         self.evolving = keys is not None and points is not None
         order = np.argsort(block_order(P), kind="stable")
-        self.capacity = -(-int(np.ceil(count * (1 + SPARE))) // box) * box if self.evolving else count
+        self.capacity = capacity(P, box)
         self.place = np.empty(count, np.int64)
         self.place[order] = np.arange(count) * self.capacity // max(count, 1)
         self.moved = self.entered = self.left = 0

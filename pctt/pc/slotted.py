@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.pc.block_diagonal import inverse_diagonal_blocks
 from pctt.pc.slots import Slots
 
 
@@ -61,10 +62,7 @@ class SlottedMatrix:
         """
         if not self.scaled:
             return
-        inverse = P.invertBlockDiagonal()
-        if not np.isfinite(inverse).all():  # which numpy's Cholesky lets pass
-            raise np.linalg.LinAlgError("a diagonal block is singular")
-        self.root[self.place] = np.linalg.cholesky(inverse).transpose(0, 2, 1)
+        self.root[self.place] = np.linalg.cholesky(inverse_diagonal_blocks(P)).transpose(0, 2, 1)
 
     def load(self, P: PETSc.Mat) -> np.ndarray:
         """The blocks (nb, bs, bs) at ``rows`` and ``columns`` for P's present values, scaled, if asked for, by the

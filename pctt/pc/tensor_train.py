@@ -9,18 +9,22 @@ one that has paid in measured seconds per digit (``rank_policy.py``).
 from __future__ import annotations
 
 import time
+import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, option
+from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, OptionError, option
 from pctt.pc.approximate_inverse import ApproximateInverse, invert_by_als, invert_by_root
 from pctt.pc.base import PythonPC
+from pctt.pc.block_diagonal import block_diagonal
+from pctt.pc.mat import check_coordinates, is_symmetric
 from pctt.pc.patience import Patience
 from pctt.pc.rank_policy import RankPolicy
-from pctt.pc.slots import Slots
+from pctt.pc.second_solve import solve_again
+from pctt.pc.slots import Slots, capacity
 from pctt.pc.slotted import SlottedMatrix
 from pctt.tt.als import Compression, compress
 from pctt.tt.apply import Apply
@@ -29,6 +33,7 @@ from pctt.tt.quantise import check_modes, choose_modes
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Train
 
+NOT_SYMMETRIC = "the matrix is not symmetric, and a train for its inverse may not be of use"
 LOWER = 3  # the cap divided by this is the rank that is tried where the cap fails or does not pay
 
 
@@ -91,8 +96,10 @@ class TensorTrain(PythonPC):
         self.account = Account()
         self.policy: RankPolicy | None = None
         self.rank = 1
+        self.symmetric = True
         self._double = False  # single precision was found wanting
         self._jacobi: PETSc.PC | None = None
+        self._diagonal: PETSc.Mat | None = None  # what block Jacobi is made from
         self.tree: Slots | None = None
         self._forget_structure()
         self._forget_trains()
@@ -112,7 +119,13 @@ class TensorTrain(PythonPC):
     # -- set-up ---------------------------------------------------------------------------------------------
 
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
+        """ValueError, on all ranks alike, for coordinates or modes that do not fit the matrix."""
         self.comm = P.comm.tompi4py()
+        check_coordinates(P)
+        self._check_modes(self.comm.allreduce(capacity(P, self.options.leaf)))
+        self.symmetric = is_symmetric(P)
+        if not self.symmetric and self.comm.rank == 0:
+            warnings.warn(f"{self.name}: {NOT_SYMMETRIC}", stacklevel=2)
         self._forget_structure()
         if self.options.reuse != "steps":
             self._forget_trains()
@@ -121,8 +134,7 @@ class TensorTrain(PythonPC):
             self.policy = RankPolicy((max(1, cap // LOWER), cap), self.options.rank == "auto")
         else:
             self.policy.forgive()  # what failed on another matrix may do here
-        if self._jacobi is not None:
-            self._jacobi.destroy()
+        self.release()
         self._jacobi = PETSc.PC().create(P.comm)
         self._jacobi.setType(PETSc.PC.Type.PBJACOBI)
 
@@ -130,19 +142,26 @@ class TensorTrain(PythonPC):
         """A preconditioner of the rank that the policy chooses; one that fails is replaced by block Jacobi."""
         assert self.policy is not None
         start = time.perf_counter()
-        self.rank = self.policy.choose()
+        # the rank of all: figures that differ in a last bit must not part the ways of the processes
+        self.rank = self.comm.bcast(self.policy.choose())
         if self.rank > 1 and not self._make_train(P, self.rank):
-            self.policy.report(self.rank, time.perf_counter() - start, 0.0, sound=False)
+            self.policy.report(self.rank, self._slowest(time.perf_counter() - start), 0.0, sound=False)
             self.rank = 1
         if self.rank == 1:
-            assert self._jacobi is not None
-            self._jacobi.setOperators(P)
-            self._jacobi.setUp()
+            self._make_block_jacobi(P)
         self._setup_seconds = self._slowest(time.perf_counter() - start)
         self.account.setups += 1
         self.account.setup_s += self._setup_seconds
         if self.options.monitor:
-            PETSc.Sys.Print(f"  pctt.pc.TensorTrain: {self._line()}", comm=P.comm)
+            PETSc.Sys.Print(f"  {self.name}: {self._line()}", comm=P.comm)
+
+    def _make_block_jacobi(self, P: PETSc.Mat) -> None:
+        assert self._jacobi is not None
+        old, self._diagonal = self._diagonal, block_diagonal(P)
+        self._jacobi.setOperators(self._diagonal)
+        self._jacobi.setUp()
+        if old is not None:
+            old.destroy()
 
     def _make_train(self, P: PETSc.Mat, rank: int) -> bool:
         """Keep the train or make one; False, with the reason on the account, if there is no positive inverse."""
@@ -197,7 +216,7 @@ class TensorTrain(PythonPC):
         for inverse in (kept, new):
             self._use(inverse)
             left.append(self._left(P) if positive or inverse is kept else np.inf)
-        if not self._patience.decide(*left):
+        if not self._patience.decide(*self.comm.bcast(left)):
             self._use(kept)
             self.account.kept += 1
         return True
@@ -258,9 +277,20 @@ class TensorTrain(PythonPC):
         return invert_by_als(self.compression, rank, options.scaling == "block", start, rng)
 
     def _modes(self, slots: int) -> tuple[int, ...]:
-        if self.options.modes:
-            return check_modes([int(word) for word in self.options.modes.split(",")], slots)
-        return choose_modes(slots, self.options.leaf)
+        return self._check_modes(slots) or choose_modes(slots, self.options.leaf)
+
+    def _check_modes(self, slots: int) -> tuple[int, ...]:
+        """The modes that the user gave, none if none; OptionError if they are no numbers or too few."""
+        text = self.options.modes
+        if not text:
+            return ()
+        try:
+            return check_modes([int(word) for word in text.split(",")], slots)
+        except ValueError:
+            raise OptionError(
+                f"-{self.prefix}pc_tt_modes {text}: allowed are whole numbers >= 1 with commas between, whose product "
+                f"is at least {slots}"
+            ) from None
 
     def _prepare_apply(self, train: Train) -> None:
         assert self.slots is not None
@@ -345,6 +375,12 @@ class TensorTrain(PythonPC):
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Tell the policy what the solve took and reached; ban a rank with which the method stalled."""
         assert self.policy is not None
+        reason, rank = ksp.getConvergedReason(), self.rank
+        spoilt = rank > 1 and solve_again(ksp, self.P, b, x)
+        if spoilt:  # nor is another solve with this matrix to meet it
+            self.rank = 1
+            self._make_block_jacobi(self.P)
+            self.account.fallbacks.append(f"{ksp.getType()} broke down ({reason}) at rank {rank}, solved again at rank 1")
         seconds = self._slowest(time.perf_counter() - self._solve_start)
         reference = b.norm()
         if reference == 0 or ksp.getIterationNumber() == 0:
@@ -352,7 +388,7 @@ class TensorTrain(PythonPC):
         residual = b.duplicate()
         pc.getOperators()[0].mult(x, residual)
         residual.aypx(-1.0, b)
-        true = residual.norm() / reference
+        true = self.comm.bcast(residual.norm() / reference)
         residual.destroy()
         rtol = ksp.getTolerances()[0]
         stalled = ksp.getConvergedReason() < 0 and ksp.getType() not in ("preonly", "richardson")
@@ -362,13 +398,13 @@ class TensorTrain(PythonPC):
             self._prepare_apply(self.inverse.train)
             self.account.fallbacks.append(f"single precision left a true residual of {true:.1e}: double from now on")
         digits = -np.log10(max(true, 1e-16)) if np.isfinite(true) else 0.0
-        sound = not stalled
-        if stalled and self.rank > 1:
-            self.account.fallbacks.append(f"{ksp.getType()} stalled at rank {self.rank}")
-            if self._patience.served:  # a train of an earlier matrix: one made for the next may do
-                self._patience.lose()
-                sound = True
-        self.policy.report(self.rank, self._setup_seconds + seconds, max(digits, 0.0), sound)
+        if stalled and rank > 1 and not spoilt:
+            self.account.fallbacks.append(f"{ksp.getType()} stalled at rank {rank}")
+        sound = not (spoilt or stalled)
+        if not sound and self._patience.served:  # a train of an earlier matrix: one made for the next may do
+            self._patience.lose()
+            sound = True
+        self.policy.report(rank, self._setup_seconds + seconds, max(digits, 0.0), sound)
         self._setup_seconds = 0.0  # a second solve with the same matrix has no set-up
 
     def _slowest(self, seconds: float) -> float:
@@ -384,6 +420,7 @@ class TensorTrain(PythonPC):
             f"trees made anew {a.resets}",
             f"scaling {self.options.scaling}, precision {'double' if self._double else self.options.precision}",
         ]
+        lines += [] if self.symmetric else [NOT_SYMMETRIC]
         lines += [f"fell back: {why} ({a.fallbacks.count(why)} times)" for why in dict.fromkeys(a.fallbacks)]
         if self.policy is not None:
             figures = self.policy.figures.items()
@@ -403,9 +440,8 @@ class TensorTrain(PythonPC):
             f"{self._setup_seconds:.2e} s"
         )
 
-    def destroy(self, pc: PETSc.PC) -> None:
-        if self._jacobi is not None:
-            self._jacobi.destroy()
-            self._jacobi = None
-        self._forget_structure()
-        self._forget_trains()
+    def release(self) -> None:
+        for thing in (self._jacobi, self._diagonal):
+            if thing is not None:
+                thing.destroy()
+        self._jacobi = self._diagonal = None

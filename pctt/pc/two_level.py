@@ -8,7 +8,7 @@ Q = Z C Z' and C an inverse of Z' A Z, exact or a tensor train,
     additive   M = D^-1 + Q,
     balanced   M = Q + (I - Q A) D^-1 (I - A Q)                       (Mandel 1993; positive for any positive C).
 
-Z' A Z and its inverse are replicated on the ranks; an application reduces a coarse vector once (balanced: twice).
+The first rank inverts Z' A Z; an application sends it a coarse vector and gets one back (balanced: two).
 """
 
 from __future__ import annotations
@@ -21,8 +21,12 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 
 from pctt.options import AT_LEAST_ONE, option
-from pctt.pc.base import PythonPC, prefer_mumps
+from pctt.pc.base import PythonPC
+from pctt.pc.block_diagonal import block_diagonal
+from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
+from pctt.pc.mat import check_coordinates
 from pctt.pc.ordering import block_order
+from pctt.pc.second_solve import solve_again
 
 DEPENDENT = 1e-8  # part of the largest: modes of a box with smaller Gram eigenvalues depend on the others
 
@@ -33,7 +37,7 @@ class Options:
 
     boxes: int = option(256, "number of boxes, rounded down to a power of two", check=AT_LEAST_ONE)
     coarse: str = option(
-        "tt", "inverse of the coarse matrix: tt: a tensor train; lu: Cholesky factors", choices=("tt", "lu")
+        "lu", "inverse of the coarse matrix: tt: a tensor train; lu: Cholesky factors", choices=("tt", "lu")
     )
     rank: int = option(10, "rank of the train; 1: block Jacobi of the coarse matrix", check=AT_LEAST_ONE)
     correction: str = option(
@@ -54,16 +58,18 @@ class TwoLevel(PythonPC):
         super().create(pc)
         self.coarse: PETSc.PC | None = None
         self._coarse_mat: PETSc.Mat | None = None
+        self._diagonal: PETSc.Mat | None = None  # what block Jacobi is made from
         self.boxes = self.width = 0
-        self._prefix = ""
+        self._space: list = []  # PETSc objects of the coarse space
         self._values: list = []  # PETSc objects that hold values of the matrix
         self._setup_s = 0.0
         self._indefinite = False  # the train was, in a solve
 
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Boxes and coarse space."""
-        self.destroy(pc)
+        self.release()
         self.comm = P.comm.tompi4py()
+        check_coordinates(P)
         self.block = P.getBlockSize()
         self._points = _everywhere(self.comm, _places(P))
         self._box = bisect(self._points, self.options.boxes)
@@ -95,12 +101,16 @@ class TwoLevel(PythonPC):
         self._coarse_b = self._coarse_x.duplicate()
         self._jacobi = PETSc.PC().create(self.comm)
         self._jacobi.setType(PETSc.PC.Type.PBJACOBI)
+        self._space = [self._prolong, self._coarse_x, self._coarse_b, self._fine, self._jacobi]
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Block diagonal and coarse inverse."""
         start = time.perf_counter()
-        self._jacobi.setOperators(P)
+        old, self._diagonal = self._diagonal, block_diagonal(P)
+        self._jacobi.setOperators(self._diagonal)
         self._jacobi.setUp()
+        if old is not None:
+            old.destroy()
         indptr, indices, values = P.getValuesCSR()
         rows = sp.csr_matrix((values, indices, indptr), shape=(len(indptr) - 1, P.getSize()[1]))
         product = rows.tobsr((self.block, self.block)) @ self._Z_all
@@ -117,7 +127,18 @@ class TwoLevel(PythonPC):
         self._setup_s = time.perf_counter() - start
 
     def _invert(self, matrix: sp.bsr_matrix) -> None:
-        """The inverse of the coarse matrix, on every rank alike."""
+        """The inverse of the coarse matrix, on the first rank: made by several, it might differ between them."""
+        failure = None
+        if self.comm.rank == 0:
+            try:
+                self._invert_here(matrix)
+            except (PETSc.Error, ValueError) as error:
+                failure = error
+        failure = self.comm.bcast(str(failure) if failure else "")
+        if failure:
+            raise ValueError(f"{self.name}: the coarse matrix: {failure}")
+
+    def _invert_here(self, matrix: sp.bsr_matrix) -> None:
         if self.coarse is None:
             self.coarse = self._coarse_pc()
         if self._coarse_mat is not None:
@@ -131,7 +152,7 @@ class TwoLevel(PythonPC):
 
     def _coarse_pc(self) -> PETSc.PC:
         pc = PETSc.PC().create(PETSc.COMM_SELF)
-        prefix = f"{self._prefix}two_coarse_"
+        prefix = f"{self.prefix}two_coarse_"
         pc.setOptionsPrefix(prefix)
         if not self._by_train:
             pc.setType(PETSc.PC.Type.CHOLESKY)
@@ -140,19 +161,9 @@ class TwoLevel(PythonPC):
             return pc
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonType("pctt.pc.TensorTrain")
-        database = PETSc.Options()
-        wanted = {prefix + "pc_tt_rank": "fixed", prefix + "pc_tt_max_rank": str(self.options.rank)}
-        entered = [name for name in wanted if not database.hasName(name)]
-        for name in entered:
-            database[name] = wanted[name]
-        pc.setFromOptions()
-        for name in entered:
-            database.delValue(name)
+        with entered(to_enter(prefix, {"pc_tt_rank": "fixed", "pc_tt_max_rank": str(self.options.rank)}, ranks=1)):
+            pc.setFromOptions()
         return pc
-
-    def setFromOptions(self, pc: PETSc.PC) -> None:
-        super().setFromOptions(pc)
-        self._prefix = pc.getOptionsPrefix() or ""
 
     # -- application ----------------------------------------------------------------------------------------
 
@@ -178,23 +189,27 @@ class TwoLevel(PythonPC):
 
     def _correct(self, restrict: PETSc.Mat) -> None:
         """coarse_x = C R' fine, R this rank's rows of Z or of A Z."""
-        assert self.coarse is not None
         restrict.multTranspose(self._fine, self._coarse_b)
         if self.comm.size > 1:
-            self._coarse_b.array_w[:] = self._sum(self._coarse_b.array_r)
-        self.coarse.apply(self._coarse_b, self._coarse_x)
+            part = self._coarse_b.array_r.copy()
+            self.comm.Reduce(part, self._coarse_b.array_w if self.comm.rank == 0 else None)
+        if self.coarse is not None:
+            self.coarse.apply(self._coarse_b, self._coarse_x)
+        if self.comm.size > 1:
+            self.comm.Bcast(self._coarse_x.array_w)
 
     @property
     def _by_train(self) -> bool:
         return self.options.coarse == "tt" and not self._indefinite
 
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        """A train with which the method met a negative direction is replaced, from now on, by Cholesky factors."""
-        if ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC and self._by_train:
+        """A solve that a train has spoilt is made again with block Jacobi; from now on there are Cholesky factors in
+        its place."""
+        if self._by_train and solve_again(ksp, self.P, b, x):
             self._indefinite = True
-            assert self.coarse is not None
-            self.coarse.destroy()
-            self.coarse = None
+            if self.coarse is not None:
+                self.coarse.destroy()
+                self.coarse = None
             self._invert(self._matrix)
 
     def _sum(self, x: np.ndarray) -> np.ndarray:
@@ -220,15 +235,14 @@ class TwoLevel(PythonPC):
             thing.destroy()
         self._values = []
 
-    def destroy(self, pc: PETSc.PC) -> None:
+    def release(self) -> None:
         self._forget_values()
-        if self.coarse is not None:
-            for thing in (self.coarse, self._jacobi, self._prolong, self._coarse_x, self._coarse_b, self._fine):
+        own = (self.coarse, self._coarse_mat, self._diagonal)
+        for thing in (*own, *self._space):
+            if thing is not None:
                 thing.destroy()
-            self.coarse = None
-        if self._coarse_mat is not None:
-            self._coarse_mat.destroy()
-            self._coarse_mat = None
+        self.coarse = self._coarse_mat = self._diagonal = None
+        self._space = []
 
 
 def bisect(points: np.ndarray, boxes: int) -> np.ndarray:

@@ -50,3 +50,9 @@ def contact_matrix(G: BlockRows, barrier: np.ndarray) -> PETSc.Mat:
 def dense(mat: PETSc.Mat) -> np.ndarray:
     """All of a sequential Mat."""
     return mat.convert("dense", PETSc.Mat()).getDenseArray()
+
+
+def spd(size: int, seed: int) -> np.ndarray:
+    """A well-conditioned symmetric positive definite matrix without zeros."""
+    root = np.random.default_rng(seed).standard_normal((size, size))
+    return root @ root.T + size * np.eye(size)

@@ -217,12 +217,14 @@ class Negative:
 
 
 def test_an_indefinite_train_is_replaced_by_factors():
+    """The solve that it has spoilt is made again."""
     mat = poisson(12)
     ksp = solver(mat, boxes=16, coarse="tt")
     ksp.pc.getPythonContext().coarse.setPythonContext(Negative())
-    x, b = mat.createVecs()
-    b.set(1.0)
-    ksp.solve(b, x)
-    assert ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC
-    assert iterations(ksp) > 0
+    for _ in range(2):
+        x, b = mat.createVecs()
+        b.set(1.0)
+        ksp.solve(b, x)
+        assert ksp.getConvergedReason() > 0
+        assert (mat * x - b).norm() <= 1e-6 * b.norm()
     assert "fell back" in " ".join(ksp.pc.getPythonContext().report())

@@ -114,7 +114,6 @@ def _is_better(one: Solve, other: Solve) -> bool:
 def _check_name(name: str, comm: MPI.Comm) -> None:
     pc = PETSc.PC().create(comm)
     try:
-        PETSc.Sys.pushErrorHandler("ignore")
         pc.setType(NAMED.get(name, {"pc_type": name})["pc_type"])
     except PETSc.Error:
         known = [*NAMED, "none", "jacobi", "pbjacobi", "bjacobi", "sor", "ilu", "icc", "gamg", "hypre"]
@@ -123,5 +122,4 @@ def _check_name(name: str, comm: MPI.Comm) -> None:
             + ", ".join(known)
         ) from None
     finally:
-        PETSc.Sys.popErrorHandler()
         pc.destroy()

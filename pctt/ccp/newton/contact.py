@@ -12,6 +12,7 @@ from petsc4py import PETSc
 
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
+from pctt.pc.block_diagonal import set_diagonal_blocks
 
 
 class ContactSystem:
@@ -52,7 +53,9 @@ class ContactSystem:
     def update(self, barrier: Array, inverse: Array | None = None) -> None:
         """Put the barrier blocks (nc, 3, 3) in."""
         self.preconditioned.setAttr("barrier", barrier + self.problem.compliance_blocks)
-        self._put(self.preconditioned, self.problem.diagonal_blocks + barrier)
+        blocks = self.problem.diagonal_blocks + barrier
+        self._put(self.preconditioned, blocks)
+        set_diagonal_blocks(self.preconditioned, blocks)
         if self._low_rank:
             self._put(self._sparse, self.problem.sparse_diagonal_blocks + barrier)
             self.matrix.assemble()

@@ -20,6 +20,7 @@ from pctt.blocks import square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.options import OptionError
+from pctt.pc.block_diagonal import set_diagonal_blocks
 
 
 class KKTSystem:
@@ -68,6 +69,7 @@ class KKTSystem:
         if len(blocks):
             self.matrix.setValuesBlockedRCV(self._block_rows, self._block_rows, blocks.reshape(-1, 25))
         self.matrix.assemble()
+        set_diagonal_blocks(self.matrix, blocks)
 
     def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
         out = np.zeros((len(q), 5))

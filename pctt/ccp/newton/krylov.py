@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.pc.base import PythonPC, factor_within_ranks, prefer_mumps
+from pctt.pc.base import PythonPC
+from pctt.pc.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
+from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
 
 # right preconditioning makes the residual that the method sees the true one
 _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
 # what wants scalar rows; others switch when PETSc says so
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu", "eisenstat"}
+PATIENCE = 10.0  # seconds that a rank that has failed waits for the others
 _NOT_SUPPORTED = 56  # PETSC_ERR_SUP: this method has no code for block formats
 
 
@@ -35,28 +40,37 @@ class Krylov:
 
     Without options: BiCGStab, preconditioned from the right by the inverses of the diagonal blocks, to a
     relative residual of ``rtol`` in at most 1000 iterations (the paper's cap). On several ranks ILU and ICC
-    work within each rank (block Jacobi).
+    work within each rank (block Jacobi). A prefixed KSP takes the ``-ksp_*`` options of the one without prefix, so
+    that compared preconditioners work under the same method and tolerance.
     """
 
     def __init__(self, comm: MPI.Comm, prefix: str = "", defaults: dict[str, str] | None = None, rtol: float = 1e-3):
         self.comm, self.prefix = comm, prefix
-        given, self._entered = _with_defaults(prefix, defaults or {})
-        self.method = given["ksp_type"]
-        self.name = factor_within_ranks(prefix, comm.size)
-        # block Gauss-Seidel over several ranks crashes in PETSc 3.18
-        self.scalar = given["pc_type"] in _SCALAR_FORMAT or (given["pc_type"] == "sor" and comm.size > 1)
-        self._scalar_matrix: PETSc.Mat | None = None
-        self._converted: tuple[int, int] | None = None
+        given = PETSc.Options().getAll()
+        shared = {name: value for name, value in given.items() if prefix and name.startswith("ksp_")}
+        types = {"ksp_type": "bcgs", "pc_type": "pbjacobi"}
+        self._options = to_enter(prefix, types | shared | (defaults or {}), comm.size)
         self.ksp = PETSc.KSP().create(comm)
         self.ksp.setOptionsPrefix(prefix)
         self.ksp.setTolerances(rtol=rtol, atol=1e-300, max_it=1000)
+        with entered(self._options):
+            self._configure(PETSc.Options(prefix), rtol)
+        self._formed: PETSc.Mat | None = None  # what the preconditioner is made from, if not P itself
+        self._version: tuple[int, int] | None = None  # of P, when it was
+
+    def _configure(self, options: PETSc.Options, rtol: float) -> None:
+        self.method, self.kind = options.getString("ksp_type"), options.getString("pc_type")
+        within = {value for name, value in options.getAll().items() if name.endswith("_pc_type")}
+        self._remembers_within = bool(BY_DIAGONAL_BLOCKS & within)
+        # block Gauss-Seidel over several ranks crashes in PETSc 3.18
+        self.scalar = self.kind in _SCALAR_FORMAT or (self.kind == "sor" and self.comm.size > 1)
         if self.method in _RIGHT_SIDED:
             self.ksp.setPCSide(PETSc.PC.Side.RIGHT)
-        prefer_mumps(self.ksp.pc, given["pc_type"])
+        prefer_mumps(self.ksp.pc, self.kind)
         self.ksp.setFromOptions()
         # PETSc lets preonly have no options, but its preconditioner may be an iteration that wants the tolerance
-        self._rtol_is_given = PETSc.Options().hasName(prefix + "ksp_rtol")
-        self.rtol = PETSc.Options().getReal(prefix + "ksp_rtol", rtol)
+        self._rtol_is_given = options.hasName("ksp_rtol")
+        self.rtol = options.getReal("ksp_rtol", rtol)
         self.ksp.setTolerances(rtol=self.rtol)
 
     def set_rtol(self, rtol: float) -> None:
@@ -74,33 +88,25 @@ class Krylov:
         P: PETSc.Mat | None = None,
         keep: bool = False,
     ) -> Solve:
-        """x = A^-1 b from zero. A set-up or solve that breaks down is reported, never raised.
+        """x = A^-1 b from zero. A set-up or solve that breaks down, on whichever rank, is reported, never raised.
 
         P : the Mat from which the preconditioner is made; none: A
         keep : use the preconditioner of the last solve, whatever the matrix is now
         """
         if rtol is not None:
             self.set_rtol(float(rtol))
-        try:
-            return self._solve(A, P if P is not None else A, b, x, keep)
-        except PETSc.Error as error:
+        start = _now(self.comm)
+        with entered(self._options):
+            error = together(self.comm, lambda: self._set_up(A, P if P is not None else A, keep))
+            setup = _now(self.comm)
+            error = error or together(self.comm, lambda: self._iterate(b, x))
+        if error:
             self.forget()
-            if error.ierr == _NOT_SUPPORTED and not self.scalar:
+            if error == _NOT_SUPPORTED and not self.scalar:
                 self.scalar = True
                 return self.solve(A, b, x, rtol, P)
             x.zeroEntries()
-            return Solve(False, f"PETSc error {error.ierr}", 0, 0.0, 0.0, 1.0)
-
-    def _solve(self, A: PETSc.Mat, P: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, keep: bool) -> Solve:
-        start = _now(self.comm)
-        self.ksp.pc.setReusePreconditioner(keep)
-        if not keep:
-            formed = self._in_format(P)
-            self.ksp.setOperators(formed if A is P else A, formed)
-        self.ksp.setUp()
-        setup = _now(self.comm)
-        x.zeroEntries()
-        self.ksp.solve(b, x)
+            return Solve(False, f"PETSc error {error}", 0, 0.0, 0.0, 1.0)
         reason, iterations = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
         end = _now(self.comm)
         if reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
@@ -111,19 +117,40 @@ class Krylov:
         words = _REASONS.get(reason, str(reason))
         return Solve(converged, words, iterations, setup - start, end - setup, true)
 
-    def _in_format(self, P: PETSc.Mat) -> PETSc.Mat:
-        if not self.scalar or P.getType() in ("seqaij", "mpiaij", "aij"):
-            return P
+    def _set_up(self, A: PETSc.Mat, P: PETSc.Mat, keep: bool) -> None:
+        self.ksp.pc.setReusePreconditioner(keep)
+        if not keep:
+            form = self._form(P)
+            self.ksp.setOperators(form if self.kind == "eisenstat" else A, form)
+        self.ksp.setUp()
+
+    def _iterate(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        x.zeroEntries()
+        self.ksp.solve(b, x)
+
+    def _form(self, P: PETSc.Mat) -> PETSc.Mat:
+        """P in the form that the preconditioner wants."""
         version = (P.handle, P.stateGet())
-        if self._scalar_matrix is None:
-            self._scalar_matrix = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
-        elif version != self._converted:  # else the preconditioner would be made anew
-            P.convert(PETSc.Mat.Type.AIJ, self._scalar_matrix)
-        self._converted = version
-        # a factorisation that takes the matrix for definite fails where rounding has made it just indefinite
-        definite = self.ksp.pc.getType() not in ("cholesky", "lu")
-        self._scalar_matrix.setOption(PETSc.Mat.Option.SPD if definite else PETSc.Mat.Option.SYMMETRIC, True)
-        return self._scalar_matrix
+        if version != self._version:  # else the preconditioner would be made anew
+            self._version = version
+            self._formed = self._formed_anew(P, self._formed)
+        return self._formed if self._formed is not None else P
+
+    def _formed_anew(self, P: PETSc.Mat, old: PETSc.Mat | None) -> PETSc.Mat | None:
+        to_scalar = self.scalar and P.getType() not in ("seqaij", "mpiaij")
+        if self._remembers_within:  # and keeps parts of the matrix
+            self.ksp.reset()
+        elif to_scalar and old is not None:
+            return P.convert(PETSc.Mat.Type.AIJ, old)  # in place: a factorisation knows its structure
+        if old is not None:
+            old.destroy()
+        if to_scalar:
+            rows = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
+            # a factorisation that takes the matrix for definite fails where rounding has made it just indefinite
+            definite = self.kind not in ("cholesky", "lu")
+            rows.setOption(PETSc.Mat.Option.SPD if definite else PETSc.Mat.Option.SYMMETRIC, True)
+            return rows
+        return P.duplicate(copy=True) if self._remembers_within else without_memory(P, self.kind)
 
     def report(self) -> list[str]:
         """What a preconditioner of the project tells of itself and its fallbacks, as in ``-ksp_view``."""
@@ -134,16 +161,16 @@ class Krylov:
     def forget(self) -> None:
         """The next matrix has another structure; a python preconditioner keeps what may serve that one too."""
         self.ksp.reset()
-        if self._scalar_matrix is not None:
-            self._scalar_matrix.destroy()
-            self._scalar_matrix = None
+        self._version = None
+        if self._formed is not None:
+            self._formed.destroy()
+            self._formed = None
 
     def destroy(self) -> None:
         self.ksp.destroy()
-        for name in self._entered:
-            PETSc.Options().delValue(name)
-        if self._scalar_matrix is not None:
-            self._scalar_matrix.destroy()
+        if self._formed is not None:
+            self._formed.destroy()
+            self._formed = None
 
 
 class KrylovFamily:
@@ -169,23 +196,6 @@ _REASONS = {
 }
 
 
-def _with_defaults(prefix: str, defaults: dict[str, str]) -> tuple[dict[str, str], list[str]]:
-    """Enter defaults in the database where the user has said nothing; the type names in force, and what was entered.
-
-    A prefixed KSP takes the ``-ksp_*`` options of the one without prefix, so that compared preconditioners
-    work under the same method and tolerance.
-    """
-    database = PETSc.Options()
-    everything = database.getAll()
-    wanted = {"ksp_type": "bcgs", "pc_type": "pbjacobi"}
-    if prefix:
-        wanted |= {name: value for name, value in everything.items() if name.startswith("ksp_")}
-    entered = {prefix + name: value for name, value in (wanted | defaults).items() if prefix + name not in everything}
-    for name, value in entered.items():
-        database[name] = value
-    return {name: database.getString(prefix + name) for name in wanted}, list(entered)
-
-
 def _true_residual(S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:
     """||b - S x|| / ||b||; an x that is no number is replaced by zero, and leaves 1."""
     residual = b.duplicate()
@@ -203,3 +213,29 @@ def _now(comm: MPI.Comm) -> float:
     if comm.size > 1:
         comm.Barrier()  # a phase lasts until its slowest rank
     return time.perf_counter()
+
+
+def together(comm: MPI.Comm, work: Callable[[], None]) -> int:
+    """Do some work on all ranks: 0, or, alike on all of them, PETSc's error code where it failed on one or more.
+
+    A rank that has failed alone cannot call back the others from a collective call of PETSc: where they do not come
+    within PATIENCE, it ends the run, with a word."""
+    code = np.zeros(1, int)
+    words = ""
+    try:
+        work()
+    except PETSc.Error as error:
+        code[0], words = error.ierr, str(error)
+    if comm.size == 1:
+        return int(code[0])
+    worst = np.empty(1, int)
+    meeting = comm.Iallreduce(code, worst, op=MPI.MAX)
+    deadline = time.monotonic() + PATIENCE
+    while code[0] and not meeting.Test():
+        if time.monotonic() > deadline:
+            sys.stderr.write(f"pctt: rank {comm.rank} failed alone: {words}\n")
+            sys.stderr.flush()
+            comm.Abort(1)
+        time.sleep(0.01)
+    meeting.Wait()
+    return int(worst[0])

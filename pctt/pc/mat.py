@@ -1,0 +1,53 @@
+"""What a preconditioner asks of the Mat that a user brings."""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+
+ASYMMETRY = 1e-8  # ||A - A'|| / ||A|| that is put down to rounding
+
+
+def check_coordinates(P: PETSc.Mat) -> None:
+    """ValueError, on all ranks alike, unless the Mat's attribute ``coordinates`` is finite numbers, a row per local block row, or is
+    missing on all ranks; collective."""
+    points = P.getAttr("coordinates")
+    count = P.getLocalSize()[0] // P.getBlockSize()
+    wrong = ""
+    if points is not None:
+        try:
+            points = np.asarray(points, dtype=float)
+        except (TypeError, ValueError):
+            wrong = "are no numbers"
+        else:
+            if points.shape not in {(count, d) for d in (1, 2, 3)}:
+                wrong = f"have the shape {points.shape}"
+            elif not np.isfinite(points).all():
+                wrong = "have a NaN or infinity"
+    comm = P.comm.tompi4py()
+    found = comm.allgather((points is not None, wrong, count))
+    for rank, (given, wrong, count) in enumerate(found):
+        if wrong or given != found[0][0]:
+            raise ValueError(
+                f"coordinates of the Mat {wrong or 'are missing'} on rank {rank}; allowed are finite numbers of shape "
+                f"({count}, 1), ({count}, 2) or ({count}, 3), a row per local block row"
+            )
+
+
+def is_symmetric(P: PETSc.Mat) -> bool:
+    """Whether u'(P v) is v'(P u) but for rounding, for two random vectors; at once, where the Mat knows."""
+    known, symmetric = P.isSymmetricKnown()
+    if known:
+        return symmetric
+    u, v = P.createVecs()
+    product = u.duplicate()
+    rng = np.random.default_rng(P.comm.rank)
+    values = []
+    u.array_w[:], v.array_w[:] = rng.standard_normal((2, u.getLocalSize()))
+    for one, other in ((u, v), (v, u)):
+        P.mult(one, product)
+        values.append(other.dot(product))
+    size = product.norm()
+    for vec in (u, v, product):
+        vec.destroy()
+    return bool(P.comm.tompi4py().bcast(abs(values[0] - values[1]) <= ASYMMETRY * size or not np.isfinite(size)))

@@ -1,0 +1,99 @@
+"""The options database is the user's: what the project enters for its own KSPs goes again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from systems import contact_matrix, contacts
+
+from pctt.ccp.newton.krylov import Krylov
+from pctt.pc.ksp_options import entered, to_enter
+
+
+def test_options_stand_within_the_block_only(database):
+    database["mine"] = "1"
+    database["flag"] = None
+    before = database.getAll()
+    with pytest.raises(KeyError), entered({"mine": "2", "other": "3", "flag": "4"}):
+        assert database.getAll() == {"mine": "2", "other": "3", "flag": "4"}
+        raise KeyError
+    assert database.getAll() == before
+
+
+def test_a_krylov_method_leaves_the_database_as_it_was(database):
+    database["compare_x_ksp_max_it"] = "500"
+    before = database.getAll()
+    mat = contact_matrix(*contacts(40, 12))
+    x, b = mat.createVecs()
+    b.set(1.0)
+    body = {"pc_type": "python", "pc_python_type": "pctt.pc.BodySchur", "body_pc_type": "ilu"}
+    for prefix, defaults in (("", {}), ("compare_x_", {"pc_type": "ilu"}), ("compare_y_", body)):
+        krylov = Krylov(MPI.COMM_SELF, prefix, defaults)
+        assert database.getAll() == before
+        assert krylov.solve(mat, b, x).converged
+        assert database.getAll() == before
+        unrelated = PETSc.KSP().create(MPI.COMM_SELF)
+        unrelated.setFromOptions()
+        assert unrelated.getType() != "bcgs"
+        krylov.destroy()
+        assert database.getAll() == before
+
+
+def test_ilu_on_several_ranks_is_block_jacobi_with_ilu(database):
+    database["a_pc_type"] = "ilu"
+    database["a_pc_factor_levels"] = "2"
+    options = to_enter("a_", {"ksp_type": "cg", "pc_type": "sor"}, ranks=2)
+    assert options == {
+        "a_ksp_type": "cg", "a_pc_type": "bjacobi", "a_sub_pc_type": "ilu", "a_sub_pc_factor_levels": "2"
+    }  # fmt: skip
+    assert to_enter("a_", {"ksp_type": "cg", "pc_type": "sor"}, ranks=1) == {"a_ksp_type": "cg"}
+
+
+SKEW = """
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from systems import contact_matrix, contacts
+from pctt.ccp.newton.krylov import Krylov
+
+comm = MPI.COMM_WORLD
+PETSc.Options()["pc_type"] = "ilu"
+before = PETSc.Options().getAll()
+krylov = Krylov(comm)
+A = PETSc.Mat().createAIJ((40, 40), nnz=1, comm=comm)
+for i in range(*A.getOwnershipRange()):
+    A[i, i] = 2.0
+A.assemble()
+x, b = A.createVecs()
+b.set(1.0)
+assert krylov.solve(A, b, x).converged
+assert krylov.ksp.pc.getType() == "bjacobi"
+assert PETSc.Options().getAll() == before, PETSc.Options().getAll()
+krylov.destroy()
+
+
+class FailsAlone:
+    def setUp(self, pc):
+        if comm.rank == comm.size - 1:
+            raise PETSc.Error(76)
+
+    def apply(self, pc, x, y):
+        x.copy(y)
+
+
+krylov = Krylov(comm, "alone_", {"pc_type": "python"})
+krylov.ksp.pc.setPythonContext(FailsAlone())
+done = krylov.solve(A, b, x)
+assert not done.converged
+assert done.reason.startswith("PETSc error"), done
+assert comm.allgather(done.reason) == [done.reason] * comm.size
+assert x.norm() == 0
+print("done", flush=True)
+"""
+
+
+@pytest.mark.mpi
+def test_the_users_options_and_an_error_on_one_rank(mpirun):
+    assert mpirun(SKEW, 2).count("done") == 2
