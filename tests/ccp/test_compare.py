@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from problems import SELF, from_graph, heap, matrix
 
 from pctt import ccp
@@ -197,47 +198,28 @@ def test_labels_say_what_a_name_means_here():
     assert Comparison(SELF, ["ilu", "jacobi"]).labels() == {"ilu": "ilu", "jacobi": "jacobi"}
 
 
-PROGRAM = """
-import json
-from mpi4py import MPI
-from petsc4py import PETSc
-from problems import from_graph, heap
-from pctt import ccp
-from pctt.ccp import Comparison, Limits
-from pctt.options import OptionError
-
-comm = MPI.COMM_WORLD
-PETSc.Options()["compare_ilu_pc_factor_levels"] = 1
-comparison = Comparison(comm, ["ilu", "ilu-shifted", "icc", "pbjacobi", "python"])
-known, graph = heap(bodies=30)
-newton = ccp.newton_for(comm, "pdip", compare=comparison)
-result = ccp.solve(from_graph(known, graph, comm), limits=Limits(1e-5), newton=newton)
-refused = False
-try:
-    Comparison(comm, ["nonsense"])
-except OptionError:
-    refused = True
-assert refused
-counts = {n: [s["systems"], s["converged"], s["ksp_its_mean"]] for n, s in comparison.summary().items()}
-assert comm.allgather(counts) == [counts] * comm.size
-if comm.rank == 0:
-    print(json.dumps([result.converged, result.iterations, comparison.labels(), counts]))
-"""
-
-
-@pytest.mark.mpi
-def test_on_two_ranks_factorisations_work_within_each_rank_and_say_so(mpirun):
-    converged, iterations, labels, counts = json.loads(mpirun(PROGRAM, 2))
-    assert converged
-    assert labels == {
+@pytest.mark.parallel(2)
+def test_on_two_ranks_factorisations_work_within_each_rank_and_say_so(database):
+    comm = MPI.COMM_WORLD
+    database["compare_ilu_pc_factor_levels"] = 1
+    comparison = Comparison(comm, ["ilu", "ilu-shifted", "icc", "pbjacobi", "python"])
+    known, graph = heap(bodies=30)
+    newton = ccp.newton_for(comm, "pdip", compare=comparison)
+    result = ccp.solve(from_graph(known, graph, comm), limits=Limits(1e-5), newton=newton)
+    with pytest.raises(OptionError):
+        Comparison(comm, ["nonsense"])
+    assert result.converged
+    assert comparison.labels() == {
         "ilu": "ilu (within each rank)",
         "ilu-shifted": "ilu-shifted (within each rank)",
         "icc": "icc (within each rank)",
         "pbjacobi": "pbjacobi",
         "python": "python",
     }
-    assert all(systems == iterations for systems, _, _ in counts.values())
-    assert counts["ilu"][1] == counts["ilu-shifted"][1] == counts["pbjacobi"][1] == iterations
+    counts = {n: (s["systems"], s["converged"], s["ksp_its_mean"]) for n, s in comparison.summary().items()}
+    assert comm.allgather(counts) == [counts] * comm.size
+    assert all(systems == result.iterations for systems, _, _ in counts.values())
+    assert counts["ilu"][1] == counts["ilu-shifted"][1] == counts["pbjacobi"][1] == result.iterations
     assert counts["python"][1] == 0
     # levels 1 act on the name that they were given to, and both beat the diagonal blocks
     assert counts["ilu"][2] < counts["ilu-shifted"][2] < counts["pbjacobi"][2]

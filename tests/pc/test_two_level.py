@@ -185,10 +185,9 @@ def test_bad_options(name, value):
 @pytest.mark.parallel(2, 3)
 @pytest.mark.parametrize("coarse", ["lu", "tt"])
 def test_any_number_of_ranks(coarse):
-    here, alone = (
-        iterations(solver(chain(12, comm, stiffness=1.0)[0].mat, boxes=16, coarse=coarse, rank=6, correction="balanced"))
-        for comm in (MPI.COMM_WORLD, MPI.COMM_SELF)
-    )
+    options = {"boxes": 16, "coarse": coarse, "rank": 6, "correction": "balanced"}
+    mats = (chain(12, comm, stiffness=1.0)[0].mat for comm in (MPI.COMM_WORLD, MPI.COMM_SELF))
+    here, alone = (iterations(solver(mat, **options)) for mat in mats)
     assert abs(here - alone) <= 1
 
 

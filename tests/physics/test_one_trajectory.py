@@ -6,6 +6,8 @@ tolerance also stop at other points within it.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from drive import by_id, steps
@@ -49,7 +51,8 @@ def test_the_trajectory_does_not_depend_on_the_number_of_ranks(cases, ranks):
     state = alone(lambda comm: fallen())
     for case in cases:
         settings, limits = CASES[case]
-        both = two_steps(MPI.COMM_WORLD, state, **settings), alone(lambda comm, settings=settings: two_steps(comm, state, **settings))
+        go_on = partial(two_steps, state=state, **settings)
+        both = go_on(MPI.COMM_WORLD), alone(go_on)
         here, there = ((table["position"], *np.split(table["velocity"], 2, axis=1)) for table in both)
         for name, one, other, limit in zip(("x", "v", "w"), here, there, limits):
             np.testing.assert_allclose(one, other, rtol=0, atol=limit, err_msg=f"{case}: {name} on {ranks} ranks")
