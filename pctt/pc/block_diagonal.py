@@ -39,7 +39,18 @@ def without_memory(P: PETSc.Mat, kind: str) -> PETSc.Mat | None:
     blocks of P that are no longer true; None where P itself will do. The caller destroys it."""
     if kind == "pbjacobi":
         return block_diagonal(P)
-    return P.duplicate(copy=True) if kind in BY_DIAGONAL_BLOCKS else None
+    return _copy(P) if kind == "sor" and P.getType() == "seqbaij" else None
+
+
+def _copy(P: PETSc.Mat) -> PETSc.Mat:
+    """Of a sequential BAIJ matrix; ``MatDuplicate`` makes one that has no SOR."""
+    copy = PETSc.Mat().create(P.comm)
+    copy.setSizes(P.getSizes())
+    copy.setBlockSize(P.getBlockSize())
+    copy.setType(P.getType())
+    copy.setPreallocationCSR(P.getRowIJ(compressed=True))
+    P.copy(copy, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+    return copy
 
 
 def inverse_diagonal_blocks(P: PETSc.Mat) -> np.ndarray:

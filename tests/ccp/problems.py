@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from pctt.blocks import square_block_matrix
 from pctt.ccp import BlockRows, ConeProblem
@@ -150,3 +151,11 @@ def heap(seed: int = 0, contacts: int = 40, bodies: int = 12, mu=None, **graph) 
     if mu is None:
         mu = np.random.default_rng(seed + 1).uniform(0.1, 1.0, contacts)
     return known_optimum(seed + 2, G @ G.T, np.array(np.broadcast_to(mu, contacts), float)), made
+
+
+def dense_of(mat: PETSc.Mat) -> np.ndarray:
+    """All of a sequential Mat."""
+    copy = mat.convert("dense", PETSc.Mat())
+    values = copy.getDenseArray().copy()
+    copy.destroy()
+    return values

@@ -11,7 +11,7 @@ import pytest
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
-from problems import SELF, Known, from_graph, from_matrix, heap, part
+from problems import SELF, Known, dense_of, from_graph, from_matrix, heap, part
 
 from pctt import blocks, ccp
 from pctt.ccp import ConeProblem, Limits, fclib, petsc_binary
@@ -76,7 +76,7 @@ def write_global(path: Path, kind: str = "csc", block_mass: bool = False) -> tup
 
 
 def dense(problem: ccp.ConeProblem) -> np.ndarray:
-    return problem.N.convert("dense").getDenseArray()
+    return dense_of(problem.N)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -421,7 +421,7 @@ def test_a_petsc_file_is_written_loaded_by_petsc_and_read_again(tmp_path):
     viewer = PETSc.Viewer().createBinary(str(path), "r", comm=PETSc.COMM_SELF)
     N = PETSc.Mat().create(PETSc.COMM_SELF).load(viewer)
     r, mu = (PETSc.Vec().create(PETSc.COMM_SELF).load(viewer) for _ in range(2))
-    assert np.allclose(N.convert("dense").getDenseArray(), known.N, atol=1e-14 * np.abs(known.N).max())
+    assert np.allclose(dense_of(N), known.N, atol=1e-14 * np.abs(known.N).max())
     assert np.array_equal(r.array, known.r.ravel())
     assert np.array_equal(mu.array, known.mu)
     stored = petsc_binary.load(path, SELF)
@@ -492,7 +492,7 @@ def test_files_written_and_read_by_several_ranks(tmp_path, monkeypatch):
     comm.Barrier()
     if comm.rank == 0:
         for alone in (fclib.read("local.h5", SELF), petsc_binary.load("local.petsc", SELF).problem):
-            assert np.allclose(dense(alone), known.N, atol=1e-13 * np.abs(known.N).max())
+            assert np.allclose(dense_of(alone), known.N, atol=1e-13 * np.abs(known.N).max())
             assert np.array_equal(alone.r, known.r)
 
 

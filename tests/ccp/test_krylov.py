@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from problems import SELF, from_graph, heap, matrix
+from problems import SELF, dense_of, from_graph, heap, matrix
 
 from pctt.ccp import ConeProblem, Limits, Newton
 from pctt.ccp.newton.asked_for import LADDER
@@ -176,11 +176,11 @@ def test_a_newton_system_is_n_plus_the_barrier_blocks():
         for c in range(40):
             S[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] += blocks[c]
         newton.update(blocks)
-        assert np.allclose(schur(newton).convert("dense").getDenseArray(), S)
+        assert np.allclose(dense_of(schur(newton)), S)
         assert np.allclose(solved(newton, rhs, 1e-10).ravel(), np.linalg.solve(S, rhs.ravel()), atol=1e-8)
     assert newton.fallbacks == 0
     newton.destroy()
-    assert np.allclose(problem.N.convert("dense").getDenseArray(), known.N)
+    assert np.allclose(dense_of(problem.N), known.N)
 
 
 @pytest.mark.parametrize("first", [None, *LADDER])
@@ -195,7 +195,7 @@ def test_the_ladder_is_climbed_down_until_a_rung_holds(first, database):
     blocks, rhs = spd_blocks(40), np.random.default_rng(1).normal(size=(40, 3))
     newton.update(blocks)
     x = solved(newton, rhs, 1e-8)
-    S = schur(newton).convert("dense").getDenseArray()
+    S = dense_of(schur(newton))
     assert np.linalg.norm(S @ x.ravel() - rhs.ravel()) <= 2e-8 * np.linalg.norm(rhs)
     assert newton.fallbacks == 1
     assert newton.ksp_its >= 1
@@ -214,7 +214,7 @@ def test_where_every_rung_fails_the_step_is_the_best_there_is(database):
     database["fallback_cholesky_pc_type"] = "none"
     newton = newton_of(problem)
     newton.update(blocks)
-    S = schur(newton).convert("dense").getDenseArray()
+    S = dense_of(schur(newton))
     residuals = []
     for prefix in ("", "fallback_pbjacobi_", "fallback_cholesky_"):
         x, b = schur(newton).createVecs()

@@ -41,7 +41,8 @@ def system(world, contacts):
 
 
 def dense(mat):
-    return mat.convert("dense").getDenseArray()
+    dense = mat.convert("dense")
+    return dense.getDenseArray().copy()
 
 
 def dense_g(system):

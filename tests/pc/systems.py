@@ -49,7 +49,8 @@ def contact_matrix(G: BlockRows, barrier: np.ndarray) -> PETSc.Mat:
 
 def dense(mat: PETSc.Mat) -> np.ndarray:
     """All of a sequential Mat."""
-    return mat.convert("dense", PETSc.Mat()).getDenseArray()
+    copy = mat.convert("dense", PETSc.Mat())
+    return copy.getDenseArray().copy()
 
 
 def spd(size: int, seed: int) -> np.ndarray:

@@ -50,49 +50,53 @@ def test_ilu_on_several_ranks_is_block_jacobi_with_ilu(database):
     assert to_enter("a_", {"ksp_type": "cg", "pc_type": "sor"}, ranks=1) == {"a_ksp_type": "cg"}
 
 
-SKEW = """
-import numpy as np
+PROGRAM = """
+import sys
 from mpi4py import MPI
 from petsc4py import PETSc
-from systems import contact_matrix, contacts
-from pctt.ccp.newton.krylov import Krylov
+from pctt.ccp.newton import krylov
 
 comm = MPI.COMM_WORLD
 PETSc.Options()["pc_type"] = "ilu"
 before = PETSc.Options().getAll()
-krylov = Krylov(comm)
+solver = krylov.Krylov(comm)
 A = PETSc.Mat().createAIJ((40, 40), nnz=1, comm=comm)
 for i in range(*A.getOwnershipRange()):
     A[i, i] = 2.0
 A.assemble()
 x, b = A.createVecs()
 b.set(1.0)
-assert krylov.solve(A, b, x).converged
-assert krylov.ksp.pc.getType() == "bjacobi"
+assert solver.solve(A, b, x).converged
+assert solver.ksp.pc.getType() == "bjacobi"
 assert PETSc.Options().getAll() == before, PETSc.Options().getAll()
-krylov.destroy()
+solver.destroy()
 
 
-class FailsAlone:
-    def setUp(self, pc):
-        if comm.rank == comm.size - 1:
-            raise PETSc.Error(76)
-
-    def apply(self, pc, x, y):
-        x.copy(y)
+def fails_alone(): # where the others go on to the end
+    if comm.rank == 1:
+        raise PETSc.Error(76)
 
 
-krylov = Krylov(comm, "alone_", {"pc_type": "python"})
-krylov.ksp.pc.setPythonContext(FailsAlone())
-done = krylov.solve(A, b, x)
-assert not done.converged
-assert done.reason.startswith("PETSc error"), done
-assert comm.allgather(done.reason) == [done.reason] * comm.size
-assert x.norm() == 0
-print("done", flush=True)
+assert krylov.together(comm, fails_alone) == 76
+print("agreed", flush=True)
+krylov.PATIENCE = 0.5
+
+
+def fails_amidst(): # where the others wait for it
+    fails_alone()
+    x.norm()
+
+
+krylov.together(comm, fails_amidst)
+print("not to be reached", flush=True)
 """
 
 
 @pytest.mark.mpi
 def test_the_users_options_and_an_error_on_one_rank(mpirun):
-    assert mpirun(SKEW, 2).count("done") == 2
+    with pytest.raises(AssertionError) as failure:
+        mpirun(PROGRAM, 2)
+    words = str(failure.value)
+    assert words.count("agreed") == 2
+    assert "rank 1 failed alone: error code 76" in words
+    assert "not to be reached" not in words

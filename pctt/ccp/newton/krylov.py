@@ -62,8 +62,10 @@ class Krylov:
         self.method, self.kind = options.getString("ksp_type"), options.getString("pc_type")
         within = {value for name, value in options.getAll().items() if name.endswith("_pc_type")}
         self._remembers_within = bool(BY_DIAGONAL_BLOCKS & within)
-        # block Gauss-Seidel over several ranks crashes in PETSc 3.18
-        self.scalar = self.kind in _SCALAR_FORMAT or (self.kind == "sor" and self.comm.size > 1)
+        # block Gauss-Seidel over several ranks crashes in PETSc 3.18, parts of a matrix of blocks have none
+        self.scalar = (
+            self.kind in _SCALAR_FORMAT or (self.kind == "sor" and self.comm.size > 1) or self._remembers_within
+        )
         if self.method in _RIGHT_SIDED:
             self.ksp.setPCSide(PETSc.PC.Side.RIGHT)
         prefer_mumps(self.ksp.pc, self.kind)
@@ -126,7 +128,9 @@ class Krylov:
 
     def _iterate(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         x.zeroEntries()
-        self.ksp.solve(b, x)
+        right_hand_side = b.copy()  # an error of PETSc may leave it locked
+        self.ksp.solve(right_hand_side, x)
+        right_hand_side.destroy()
 
     def _form(self, P: PETSc.Mat) -> PETSc.Mat:
         """P in the form that the preconditioner wants."""
@@ -137,8 +141,8 @@ class Krylov:
         return self._formed if self._formed is not None else P
 
     def _formed_anew(self, P: PETSc.Mat, old: PETSc.Mat | None) -> PETSc.Mat | None:
-        to_scalar = self.scalar and P.getType() not in ("seqaij", "mpiaij")
-        if self._remembers_within:  # and keeps parts of the matrix
+        to_scalar = self._remembers_within or (self.scalar and P.getType() not in ("seqaij", "mpiaij"))
+        if self._remembers_within:  # and the preconditioner keeps parts of the matrix
             self.ksp.reset()
         elif to_scalar and old is not None:
             return P.convert(PETSc.Mat.Type.AIJ, old)  # in place: a factorisation knows its structure
@@ -150,7 +154,7 @@ class Krylov:
             definite = self.kind not in ("cholesky", "lu")
             rows.setOption(PETSc.Mat.Option.SPD if definite else PETSc.Mat.Option.SYMMETRIC, True)
             return rows
-        return P.duplicate(copy=True) if self._remembers_within else without_memory(P, self.kind)
+        return without_memory(P, self.kind)
 
     def report(self) -> list[str]:
         """What a preconditioner of the project tells of itself and its fallbacks, as in ``-ksp_view``."""
