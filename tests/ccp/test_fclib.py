@@ -492,7 +492,7 @@ def test_files_written_and_read_by_several_ranks(tmp_path, monkeypatch):
     comm.Barrier()
     if comm.rank == 0:
         for alone in (fclib.read("local.h5", SELF), petsc_binary.load("local.petsc", SELF).problem):
-            assert np.allclose(dense_of(alone), known.N, atol=1e-13 * np.abs(known.N).max())
+            assert np.allclose(dense(alone), known.N, atol=1e-13 * np.abs(known.N).max())
             assert np.array_equal(alone.r, known.r)
 
 
