@@ -22,6 +22,7 @@ from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
+from mpi4py import MPI
 
 from pctt.ccp.cone import Array
 from pctt.ccp.first_order import apgd
@@ -79,7 +80,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Auto, new
     memory = _memory(newton) if options.remember else Memory()
     model = conic_cost(problem.size, problem.softness, limits.tol)
     cost = options.bias * memory.factor.get(decade(limits.tol), 1.0) * model
-    watch = Watch(limits.tol, cost, memory.needed.get(decade(limits.tol)))
+    watch = Watch(limits.tol, cost, memory.needed.get(decade(limits.tol)), problem.comm)
 
     start = perf_counter()
     limited = dataclasses.replace(limits, max_it=most)
@@ -110,12 +111,17 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Auto, new
 class Watch:
     """Looks at APGD's course, and says when to give it up."""
 
-    def __init__(self, tol: float, cost: float, last: Needed | None):
-        self.tol, self.cost, self.last = tol, cost, last
+    def __init__(self, tol: float, cost: float, last: Needed | None, comm: MPI.Comm = MPI.COMM_SELF):
+        self.tol, self.cost, self.last, self._comm = tol, cost, last, comm
         self.needed = np.inf  # the last forecast
         self._course: list[tuple[int, float]] = []
 
     def __call__(self, iterations: int, residual: float) -> str:
+        """Why APGD is to be given up, or "". The first rank decides: logarithms may differ in a last bit elsewhere."""
+        words, self.needed = self._comm.bcast((self._look(iterations, residual), self.needed))
+        return words
+
+    def _look(self, iterations: int, residual: float) -> str:
         if iterations > 0 and np.isfinite(residual):
             self._course.append((iterations, residual))
         if iterations < EARLIEST * self.cost or len(self._course) < LOOKS:

@@ -75,12 +75,11 @@ class PythonPC:
         """P, or a copy of it in AIJ where it is of another type."""
         if P.getType().startswith(("seqaij", "mpiaij", "seqbaij", "mpibaij")):
             return P
-        try:
-            sparse = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
-        except PETSc.Error:
+        if not P.getType().startswith(("seqsbaij", "mpisbaij", "seqdense", "mpidense")):
             raise ValueError(
                 f"{self.name}: a Mat of type {P.getType()} has no entries to read; allowed are aij, baij, sbaij, dense"
-            ) from None
+            )
+        sparse = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
         if sparse.getBlockSize() != P.getBlockSize():
             sparse.setBlockSize(P.getBlockSize())
         for attribute in ATTRIBUTES:

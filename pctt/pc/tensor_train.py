@@ -252,8 +252,9 @@ class TensorTrain(PythonPC):
     def _list_block_pairs(self, P: PETSc.Mat) -> None:
         assert self.slots is not None
         self.slots.list_blocks(P)
-        modes = self._modes(self.slots.size)
-        self.hierarchy = SparseHierarchy(self.slots.rows, self.slots.columns, modes, self.slots.block, self._add)
+        slots = self.slots
+        modes = self._modes(slots.size)
+        self.hierarchy = SparseHierarchy(slots.rows, slots.columns, modes, slots.block, self._add, self.comm.bcast)
 
     def _agree(self, here: bool) -> bool:
         return bool(self.comm.allreduce(here, op=MPI.LAND))

@@ -69,13 +69,13 @@ def compress(
     while True:
         cores = _passes(matrix, cores, rank, sweeps, rng)
         passes += 1 + sweeps
-        error = max(0.0, 1 - float(np.vdot(cores[-1], cores[-1])) / norm**2) ** 0.5
+        error = matrix.agree(max(0.0, 1 - float(np.vdot(cores[-1], cores[-1])) / norm**2) ** 0.5)
         if error <= eps or rank >= min(max_rank, full):
             break
         rank = min(2 * rank, max_rank)
     train = matrix_train(cores, matrix.modes)
     slack = (eps**2 - error**2) ** 0.5 if error < eps else eps
-    rounded = train.round(0.99 * slack)
+    rounded = matrix.agree(train.round(0.99 * slack))
     if rounded.ranks == train.ranks and error**2 > _certain(train):
         return Compression(train, error, passes)
     return Compression(rounded, relative_error(matrix, rounded), passes)

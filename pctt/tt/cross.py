@@ -80,14 +80,14 @@ def compress_cross(
     for count in range(1, sweeps + 1):
         suffixes = _backward(entries, prefixes, extra, max_rank, eps)
         cores, prefixes = _forward(entries, suffixes, extra, max_rank, eps)
-        train = matrix_train(cores, matrix.modes).round(0.3 * eps)
-        error = entries.error(train, validation)
+        train = matrix.agree(matrix_train(cores, matrix.modes).round(0.3 * eps))
+        error = matrix.agree(entries.error(train, validation))
         idle = 0 if best is None or error < WORTH * best.error else idle + 1
         if best is None or error < best.error:
             best = Cross(train, error, count, entries.evaluations, prefixes, suffixes)
         if error <= eps or idle == 2:
             break
-        extra = entries.worst(train, max_rank)
+        extra = matrix.agree(entries.worst(train, max_rank))
     assert best is not None, "there is at least one sweep"
     return replace(best, error=relative_error(matrix, best.train)) if measure else best
 
@@ -161,7 +161,7 @@ def _forward(
     for k in range(d - 1):
         columns = np.union1d(suffixes[k + 1], extra % entries.width[k + 1])
         C = entries.block(k, prefixes[k], columns)
-        U, pivots = _dominant(C.reshape(-1, len(columns)), max_rank, eps / d)
+        U, pivots = entries.matrix.agree(_dominant(C.reshape(-1, len(columns)), max_rank, eps / d))
         cores.append(U.reshape(len(prefixes[k]), -1, len(pivots)))
         prefixes.append(prefixes[k][pivots // entries.squares[k]] * entries.squares[k] + pivots % entries.squares[k])
     cores.append(entries.block(d - 1, prefixes[-1], np.zeros(1, np.int64)))
@@ -177,7 +177,7 @@ def _backward(
     for k in range(d - 1, 0, -1):
         rows = np.union1d(prefixes[k], extra // entries.width[k])
         C = entries.block(k, rows, suffixes[0])
-        pivots = _dominant(C.reshape(len(rows), -1).T, max_rank, eps / d)[1]
+        pivots = entries.matrix.agree(_dominant(C.reshape(len(rows), -1).T, max_rank, eps / d)[1])
         digits, old = pivots // len(suffixes[0]), pivots % len(suffixes[0])
         suffixes.insert(0, digits * entries.width[k + 1] + suffixes[0][old])
     return [np.zeros(1, np.int64), *suffixes]

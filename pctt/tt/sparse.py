@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -26,10 +27,11 @@ from pctt.tt.quantise import scalar_modes, slots_of
 from pctt.tt.train import Array
 
 Reduction = Callable[[Array], Array]
+Agreement = Callable[[Any], Any]
 
 
-def alone(x: Array) -> Array:
-    """The reduction of a single rank."""
+def alone(x: Any) -> Any:
+    """The reduction, and the agreement, of a single rank."""
     return x
 
 
@@ -41,6 +43,8 @@ class SparseHierarchy:
     modes : slot modes m_1, ..., m_d of rows and columns alike
     block : size of a block
     reduce : adds an array over the ranks (see the module)
+    agree : gives all ranks what the first one has: decisions and sizes that rest on rounding, which may differ
+        between processors
 
     The list is built once per pattern; `set_values` takes new blocks (nb, block, block) in the order of
     `rows` and `columns`.
@@ -53,12 +57,18 @@ class SparseHierarchy:
     """
 
     def __init__(
-        self, rows: Array, columns: Array, modes: Sequence[int], block: int = 1, reduce: Reduction = alone
+        self,
+        rows: Array,
+        columns: Array,
+        modes: Sequence[int],
+        block: int = 1,
+        reduce: Reduction = alone,
+        agree: Agreement = alone,
     ) -> None:
         self.slot_modes = tuple(int(m) for m in modes)
         self.modes = scalar_modes(self.slot_modes, block)
         self.block = int(block)
-        self.reduce = reduce
+        self.reduce, self.agree = reduce, agree
         keys = _hierarchical_keys(rows, columns, self.slot_modes)
         self._order = np.argsort(keys, kind="stable")
         keys = keys[self._order]

@@ -265,11 +265,12 @@ def test_on_several_ranks_factorisations_of_one_rank_work_within_each():
         assert comm.allgather((done.iterations, done.converged)) == [(done.iterations, done.converged)] * comm.size
         assert krylov.ksp.pc.getType() == ("bjacobi" if pc in ("ilu", "icc") else pc)
     # options of the factorisation reach those of the ranks: more fill, fewer iterations
-    N = matrix(comm, heap(contacts=200, bodies=150)[0].N + 0.01 * np.eye(600))
+    N = matrix(comm, heap(contacts=200, bodies=40)[0].N + np.eye(600))
     x, b = N.createVecs()
     b.array[:] = 1.0
     PETSc.Options()["filled_pc_factor_levels"] = 3
-    plain, filled = (Krylov(comm, prefix, {"pc_type": "ilu"}, 1e-7).solve(N, b, x) for prefix in ("plain_", "filled_"))
+    ilu = {"ksp_type": "gmres", "pc_type": "ilu"}
+    plain, filled = (Krylov(comm, prefix, ilu, 1e-7).solve(N, b, x) for prefix in ("plain_", "filled_"))
     assert plain.converged
     assert filled.converged
-    assert filled.iterations < plain.iterations, (filled, plain)
+    assert filled.iterations < 0.9 * plain.iterations, (filled, plain)

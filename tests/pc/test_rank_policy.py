@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from pctt.pc.rank_policy import BUDGET, RankPolicy
 
 
@@ -47,3 +49,76 @@ def test_rank_one_is_never_banned():
     policy = RankPolicy((10,))
     policy.report(1, 1.0, 0.0, sound=False)
     assert policy.choose() == 1
+
+
+SKEWED = """
+import dataclasses
+import time
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+import pctt.pc.tensor_train as module
+from pctt.pc import rank_policy
+from pctt.tt import cross
+from pctt.tt.train import Train
+from systems import poisson
+from test_tensor_train import context, solve, solver
+
+comm = MPI.COMM_WORLD
+
+
+class Clock: # one rank's goes faster, and jumps
+    def __init__(self):
+        self.calls = 0
+
+    def perf_counter(self):
+        self.calls += 1
+        return time.perf_counter() * (1 + 2 * comm.rank) + 0.02 * comm.rank * self.calls
+
+
+module.time = Clock()
+rank_policy.BUDGET = 0.5 # trials are frequent
+mat = poisson(24)
+chosen = set()
+for refuse in (False, True):
+    ksp = solver(mat, max_rank=6, rank="auto")
+    if refuse: # the train that is refused reports what the trial took
+        context(ksp)._invert = lambda rank, warm: (None, False)
+    for k in range(60):
+        ksp.setOperators(mat)
+        mat.stateIncrease()
+        assert solve(ksp)[1] < 1e-6
+        ranks = comm.allgather(context(ksp).rank)
+        assert len(set(ranks)) == 1, ranks
+        chosen.add(ranks[0])
+    policies = comm.allgather([(f.cost, f.uses) for f in context(ksp).policy.figures.values()])
+    assert policies == [policies[0]] * comm.size, policies
+    ksp.destroy()
+assert len(chosen) > 1, chosen
+
+# processors that round differently: ranks of trains, pivots of crosses, numbers of inverses
+mat.shift(4.0)
+round_here, dominant, invert = Train.round, cross._dominant, module.invert_by_als
+
+
+def invert_here(*arguments):
+    inverse, positive = invert(*arguments)
+    return dataclasses.replace(inverse, train=(1 + 1e-12 * comm.rank) * inverse.train), positive
+
+
+Train.round = lambda self, eps=1e-14, max_rank=None: round_here(self, max(eps, 0.3 * comm.rank), max_rank)
+cross._dominant = lambda C, most, eps: dominant(C, most if comm.rank == 0 else max(1, most - 1), eps)
+module.invert_by_als = invert_here
+for way in ("als", "cross"):
+    ksp = solver(mat, max_rank=6, rank="fixed", compress=way)
+    assert solve(ksp)[1] < 1e-6
+    trains = comm.allgather([core.tobytes() for core in context(ksp).inverse.train.cores])
+    assert trains == [trains[0]] * comm.size, way
+    ksp.destroy()
+print("done", flush=True)
+"""
+
+
+@pytest.mark.mpi
+def test_clocks_and_processors_that_differ_do_not_part_the_ranks(mpirun):
+    assert mpirun(SKEWED, 2).count("done") == 2

@@ -59,11 +59,10 @@ class Cheapest(KrylovFamily):
         bodies, ranks = system.matrix.getSize()[0] // 6, self.comm.size
         expected = self._hardness * self._growth
         costs = {rung: cost(rung, expected / FEWER[rung], bodies, ranks) for rung in RUNGS}
-        rung = min(costs, key=lambda name: costs[name])
-        self._keep = False
+        rung, keep = min(costs, key=lambda name: costs[name]), False
         if self._lagged is not None and solves_cost("cholesky", self._lagged, ranks) < min(costs.values()):
-            rung, self._keep = "cholesky", True
-        self._rung = rung
+            rung, keep = "cholesky", True
+        self._rung, self._keep = self.comm.bcast((rung, keep))  # costs may differ in a last bit between processors
         self._worst = 0
         self._fresh = True
 

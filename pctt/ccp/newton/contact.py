@@ -30,7 +30,7 @@ class ContactSystem:
         self._low_rank = problem.low_rank is not None
         if self._low_rank:
             self._sparse = problem.N.duplicate(copy=True)
-            self.matrix = PETSc.Mat().createLRC(self._sparse, problem.low_rank, None, problem.low_rank)
+            self.matrix = _with_low_rank(self._sparse, problem.low_rank)
         else:
             self._sparse = self.matrix = self.preconditioned
         for mat in (self._sparse, self.preconditioned):
@@ -47,7 +47,7 @@ class ContactSystem:
         if self._low_rank:
             problem.N.copy(self._sparse, same)
             self.matrix.destroy()
-            self.matrix = PETSc.Mat().createLRC(self._sparse, problem.low_rank, None, problem.low_rank)
+            self.matrix = _with_low_rank(self._sparse, problem.low_rank)
         describe(self.preconditioned, problem)
 
     def update(self, barrier: Array, inverse: Array | None = None) -> None:
@@ -76,10 +76,6 @@ class ContactSystem:
         """dv of a solution."""
         return self.problem.momentum(dg) - r_v
 
-    def rounding(self, x: Array, dg: Array, r_v: Array) -> Array | None:
-        """Nothing: the impulses are the unknowns."""
-        return None
-
     def tolerance(self, tol: float) -> float:
         """The norm of this system's residual that leaves velocities as wrong as momenta (sqrt J) by ``tol``."""
         return tol * float(np.sqrt(self.problem.mean_diagonal))
@@ -89,6 +85,15 @@ class ContactSystem:
         if self._low_rank:
             self._sparse.destroy()
             self.preconditioned.destroy()
+
+
+def _with_low_rank(A: PETSc.Mat, U: PETSc.Mat) -> PETSc.Mat:
+    """A + U U'."""
+    ones = U.createVecRight()  # petsc4py of 3.22 does not take None
+    ones.set(1.0)
+    mat = PETSc.Mat().createLRC(A, U, ones, U)
+    ones.destroy()
+    return mat
 
 
 def describe(mat: PETSc.Mat, problem: ConeProblem) -> None:

@@ -1,0 +1,166 @@
+"""The preconditioners with matrices of any kind, bad input, and programs that end in an error."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from petsc4py import PETSc
+from systems import contact_matrix, contacts, poisson
+from test_tensor_train import context, solve, solver
+
+from pctt.options import OptionError
+from pctt.pc.mat import is_symmetric
+
+
+def filled(kind: str) -> PETSc.Mat:
+    """A contact matrix as a Mat of this type."""
+    mat = contact_matrix(*contacts(40, 30))
+    points = np.random.default_rng(0).random((40, 3))
+    if kind == "sbaij":
+        mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    mat = mat if kind == "baij" else mat.convert(kind, PETSc.Mat())
+    if mat.getBlockSize() != 3:
+        mat.setBlockSize(3)
+    mat.setAttr("coordinates", points)
+    return mat
+
+
+@pytest.mark.parametrize("rank", ["1", "30"])
+def test_all_types_of_matrices_give_the_same_preconditioner(rank):
+    its = []
+    for kind in ("baij", "aij", "sbaij", "dense"):
+        ksp = solver(filled(kind), rank="fixed", max_rank=rank)
+        for _ in range(2):  # the second time with new values
+            count, left = solve(ksp)
+            assert left < 1e-7
+            mat = ksp.getOperators()[0]
+            mat.scale(2.0)
+            ksp.setOperators(mat)
+        its.append(count)
+    assert max(its) - min(its) <= 2
+
+
+def test_a_matrix_without_entries_or_of_another_shape_is_refused():
+    shell = PETSc.Mat().createPython((9, 9), type("Shell", (), {"mult": lambda *_: None})())
+    shell.setUp()
+    with pytest.raises(ValueError, match="type python has no entries to read; allowed are aij"):
+        solver(shell).setUp()
+    wide = PETSc.Mat().createAIJ((6, 9), nnz=1)
+    wide.assemble()
+    pc = PETSc.PC().create()
+    pc.setOperators(wide)
+    pc.setType("python")
+    pc.setPythonType("pctt.pc.TensorTrain")
+    with pytest.raises(ValueError, match="6 rows and 9 columns; allowed is a square one"):
+        pc.setUp()
+
+
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        (np.full((64, 2), np.nan), "have a NaN"),
+        (np.zeros((63, 2)), r"shape \(63, 2\)"),
+        (np.zeros((64, 4)), r"shape \(64, 4\)"),
+        (np.zeros(64), r"shape \(64,\)"),
+        ([["a"]] * 64, "are no numbers"),
+    ],
+)
+@pytest.mark.parametrize("name", ["TensorTrain", "TwoLevel"])
+def test_bad_coordinates_are_refused_at_set_up(name, points, words):
+    mat = poisson(8)
+    mat.setAttr("coordinates", points)
+    ksp = PETSc.KSP().create()
+    ksp.setOperators(mat)
+    ksp.pc.setType("python")
+    ksp.pc.setPythonType(f"pctt.pc.{name}")
+    with pytest.raises(ValueError, match=f"{words}.*allowed are finite numbers of shape"):
+        ksp.setUp()
+
+
+@pytest.mark.parametrize("modes", ["4,x", "2,2", "0,64", ","])
+@pytest.mark.parametrize("rank", ["auto", "fixed"])
+def test_bad_modes_are_refused_at_set_up(modes, rank):
+    with pytest.raises(OptionError, match=f"-pc_tt_modes {modes}: allowed are whole numbers.*at least 64"):
+        solver(poisson(8), modes=modes, rank=rank).setUp()
+
+
+def test_a_matrix_that_is_not_symmetric_is_said_to_be_so():
+    mat = poisson(8)
+    assert is_symmetric(mat)
+    mat[0, 1] = -3.0
+    mat.assemble()
+    assert not is_symmetric(mat)
+    with pytest.warns(UserWarning, match="not symmetric"):
+        ksp = solver(mat)
+        ksp.setUp()
+    assert "not symmetric" in " ".join(context(ksp).report())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        solver(poisson(8)).setUp()
+
+
+@pytest.mark.parametrize("method", ["cg", "bcgs", "minres"])
+def test_a_solve_that_a_train_has_spoilt_is_made_again(method):
+    """With a train of which half the entries have another sign: the solve at hand succeeds, and the next as well."""
+    mat = poisson(16)
+    ksp = solver(mat, method, rank="fixed", max_rank=6)
+    ksp.setUp()
+    assert context(ksp).rank == 6
+    spoil = context(ksp)._from_slots
+    sign = np.nan if method == "bcgs" else np.resize([1.0, -1.0], 256)
+    context(ksp)._from_slots = lambda z: sign * spoil(z)
+    for _ in range(2):
+        assert solve(ksp)[1] < 1e-6
+        assert ksp.getConvergedReason() > 0
+    assert "solved again" in " ".join(context(ksp).report())
+
+
+CRASH = """
+import sys
+import petsc4py
+petsc4py.init(sys.argv)
+from petsc4py import PETSc
+
+mat = PETSc.Mat().createAIJ((60, {columns}), nnz=1)
+for i in range(60):
+    mat[i, i] = 2.0
+mat.assemble()
+if "{matrix}" == "dense":
+    mat = mat.convert("dense", PETSc.Mat())
+ksp = PETSc.KSP().create()
+ksp.setOperators(mat)
+ksp.pc.setType("python")
+ksp.pc.setPythonType("pctt.pc.{name}")
+PETSc.Options()["pc_{option}"] = "7"
+ksp.setFromOptions()
+x, b = mat.createVecs()
+ksp.setUp()
+if "{name}" == "TensorTrain":
+    ksp.solve(b, x)
+held = [ksp, ksp.pc, ksp.pc.getPythonContext()]
+held.append(held)
+raise RuntimeError("the user's own error")
+"""
+ENDS = {
+    "after a solve": ({"name": "TensorTrain"}, "RuntimeError: the user's own error"),
+    "a bad option": ({"name": "TwoLevel", "option": "two_boxxes"}, "pc_two_boxxes: no such option"),
+    "no contact map": ({"name": "BodySchur"}, "no attribute contact_map"),
+    "a rectangular matrix": ({"name": "TwoLevel", "columns": 70}, "60 rows and 70 columns"),
+    "a dense matrix": ({"name": "TwoLevel", "matrix": "dense"}, "RuntimeError: the user's own error"),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_an_error_of_the_user_ends_in_its_own_words(end):
+    """And not in a crash of the interpreter that takes a living KSP with it."""
+    changes, words = ENDS[end]
+    source = CRASH.format(**{"columns": 60, "option": "unused", "matrix": "aij", **changes})
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1, done.stderr
+    assert words in done.stderr
+    assert "Traceback" in done.stderr
+    assert "Segmentation" not in done.stderr
