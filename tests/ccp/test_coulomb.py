@@ -11,7 +11,7 @@ from problems import SELF, from_graph, heap, matrix
 from several_ranks import alone
 
 from pctt import ccp
-from pctt.ccp import Coulomb, Limits, fclib
+from pctt.ccp import Coulomb, Limits, coulomb, fclib
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "fclib"
 SOLVERS = pytest.mark.parametrize("solver", ["apgd", "conic", "pdip", "auto"])
@@ -124,6 +124,27 @@ def test_published_problems(name, tol):
     if name.startswith("Spheres"):  # Siconos 4.4, nonsmooth Gauss-Seidel to 1e-6
         assert figures.velocity_norm == pytest.approx(2.63896, rel=1e-4)
         assert figures.objective == pytest.approx(-207.9015, rel=1e-5)
+
+
+@pytest.mark.parametrize(("growth", "forgets"), [(1.5, False), (5.0, True)])
+def test_what_was_learnt_is_forgotten_when_the_residual_grows(growth, forgets):
+    """A mass that slides with speed 3, with impulses and so residuals as we like: then the next opening is that of the
+    relaxed iteration without a memory."""
+    mu, r = 0.5, np.array([[-1.0, 3.0, 0.0]])
+    problem = ccp.ConeProblem(SELF, r.copy(), np.array([mu]), N=matrix(SELF, np.eye(3)))
+    openings, answers = [], [1 + error for error in (0.1, 0.02, 0.02 * growth, 0.0)]
+
+    def convex(shifted, guess, tol):
+        openings.append(shifted.r[0, 0] - r[0, 0])
+        g = answers[len(openings) - 1] * np.array([[1.0, -mu, 0.0]])
+        return ccp.Result(g, True, "", 0.0, 1, 0, 0, [0.0])
+
+    result = coulomb.solve(problem, np.zeros((1, 3)), 1e-6, Coulomb(), convex)
+    assert result.converged
+    assert result.history[2] == pytest.approx(growth * result.history[1], rel=0.1)
+    sliding = 3.0 - mu * answers[2]
+    relaxed = openings[2] + (mu * sliding - openings[2]) / (1 + mu**2)
+    assert (openings[3] == pytest.approx(relaxed, rel=1e-12)) == forgets
 
 
 def figures_of(comm, solver):

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from petsc4py import PETSc
 from systems import contact_matrix, contacts, dense, poisson
 
-from pctt.pc import TensorTrain
+from pctt.pc import TensorTrain, tensor_train
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -253,3 +254,25 @@ def test_any_number_of_ranks():
         ksp.getOperators()[0].scale(3.0)
         solve(ksp)
     assert context(ksp).account.kept == 2
+
+
+@pytest.mark.parallel(2, 3)
+@pytest.mark.parametrize("inverse", ["als", "root"])
+def test_all_ranks_have_the_inverse_of_one_also_where_they_round_otherwise(inverse, monkeypatch):
+    comm = MPI.COMM_WORLD
+    name = f"invert_by_{inverse}"
+    invert = getattr(tensor_train, name)
+
+    def rounded(*arguments):
+        found, positive = invert(*arguments)
+        for core in found.train.cores:
+            core *= 1 + 1e-7 * comm.rank
+        return found, positive
+
+    monkeypatch.setattr(tensor_train, name, rounded)
+    ksp = solver(poisson(16), rank="fixed", max_rank=6, inverse=inverse)
+    _, residual = solve(ksp)
+    assert residual < 1e-6
+    assert context(ksp).rank == 6
+    cores = comm.allgather(context(ksp).inverse.train.cores)
+    assert all(np.array_equal(core, first) for own in cores for core, first in zip(own, cores[0]))
