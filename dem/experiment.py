@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from dem import checks
 from dem.arrays import Floats
 from dem.scene import Scene
+from dem.together import told
 
 if TYPE_CHECKING:
     from dem.record import Step
@@ -101,7 +102,7 @@ def from_file(path: Path) -> type[Experiment]:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no text"
         raise SceneFileError(f"cannot be read ({reason})") from None
-    name = f"scene_file_{path.stem}"
+    name = f"scene_file_{path.stem}"  # by which `together` knows the code of a scene
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
@@ -109,11 +110,11 @@ def from_file(path: Path) -> type[Experiment]:
     sys.modules[name] = module  # dataclasses and type hints look their module up
     try:
         exec(compile(text, str(path), "exec"), module.__dict__)
-    except SyntaxError as error:
-        raise SceneFileError(f"line {error.lineno}: {error.msg}") from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         own = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
-        raise SceneFileError(f"line {own[-1] if own else '?'}: {type(error).__name__}: {error}") from None
+        if isinstance(error, SyntaxError) and error.filename == str(path):
+            raise SceneFileError(f"line {error.lineno}: {error.msg}") from None
+        raise SceneFileError(f"line {own[-1] if own else '?'}: {told(error)}") from None
     found = [
         item
         for item in vars(module).values()

@@ -19,6 +19,7 @@ from dem.bodies import COMPOUND, Bodies
 from dem.contact import Contacts
 from dem.experiment import Experiment
 from dem.system import ContactSystem
+from dem.together import SceneError, meet, together
 from dem.world import World
 
 #: A contact is active if its normal impulse exceeds this part of the mean: solvers leave small impulses at others.
@@ -52,7 +53,9 @@ class Step:
         return self.world.large.velocity[self.world.large_row(name)].copy()
 
     def total(self, values: ArrayLike) -> float:
-        """The sum over all grains, of values (grains,) of those in `world.grains`."""
+        """The sum over all grains, of values (grains,) of those in `world.grains`; collective, which the `record` of a
+        scene must therefore call on all ranks."""
+        meet(self.world.comm, "Step.total")
         return float(self.world.comm.allreduce(float(np.sum(values))))
 
     @cached_property
@@ -63,7 +66,8 @@ class Step:
 
 
 def row(step: Step, scene: Experiment) -> dict[str, float]:
-    """All quantities of a step by name, with units in brackets; ValueError for bad ones of the scene's own."""
+    """All quantities of a step by name, with units in brackets; SceneError if those of the scene's own fail or are
+    bad."""
     out = {"step": step.world.step, "time [s]": step.world.time}
     out |= energy_balance(step) | contact_statistics(step)
     if scene.domain is not None:
@@ -72,10 +76,23 @@ def row(step: Step, scene: Experiment) -> dict[str, float]:
         force = step.force_on(body.name)
         out |= {f"force_{body.name}_{axis} [N]": force[k] for k, axis in enumerate("xyz")}
         out |= {f"torque_{body.name}_{axis} [N m]": force[3 + k] for k, axis in enumerate("xyz")}
-    own = scene.record(step)
-    _refuse_bad_names(own, out)
-    out |= {name: float(value) for name, value in own.items()}
-    return out
+    return out | _own(step, scene, out)
+
+
+def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str, float]:
+    """The quantities of the scene's own."""
+    what = f"record of the scene {type(scene).__name__}"
+
+    def record() -> dict[str, float]:
+        own = scene.record(step)
+        _refuse_bad_names(own, taken)
+        return {name: float(value) for name, value in own.items()}
+
+    own = together(step.world.comm, what, record)
+    names = step.world.comm.allgather(list(own))
+    if any(other != names[0] for other in names):
+        raise SceneError(f"{what}: it must return the same names on all ranks, in the same order")
+    return own
 
 
 def _refuse_bad_names(own: Any, taken: Mapping[str, float]) -> None:

@@ -10,6 +10,7 @@ from dem import quaternion
 from dem.arrays import Floats
 from dem.bodies import Bodies
 from dem.motion import Dynamic
+from dem.together import together
 
 if TYPE_CHECKING:
     from dem.world import World
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 def advance(world: World, velocity: Floats, dt: float) -> None:
     """Take the velocities (owned, 6) of `ContactSystem.velocity` and move all bodies by dt [s]; collective.
 
-    x <- x + dt v, q <- exp(dt w) q. Prescribed motions are followed exactly, whatever dt.
+    x <- x + dt v, q <- exp(dt w) q. Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
     """
     count = len(world.grains)
     _move(world.grains, velocity[:count], dt)
@@ -28,6 +29,11 @@ def advance(world: World, velocity: Floats, dt: float) -> None:
     _move(world.large, large_velocity, dt)
     world.time += dt
     world.step += 1
+    together(world.comm, "motion of a large body", lambda: _follow_motions(world))
+
+
+def _follow_motions(world: World) -> None:
+    """Put the bodies of prescribed motion where they are to be now."""
     for row, body in enumerate(world.large_bodies):
         if not isinstance(body.motion, Dynamic):
             pose = body.motion.pose(world.time, body.position, body.quaternion)

@@ -106,7 +106,8 @@ class ContactSystem:
 
     @cached_property
     def D(self) -> PETSc.Mat:
-        """The map of impulses to generalised forces, MPIAIJ (6 M x 3 Nc), of all bodies; collective."""
+        """The map of impulses to generalised forces, MPIAIJ (6 M x 3 Nc), of all bodies; collective. `destroy` frees
+        it."""
         # A scalar row of D' has the entries of the first body, then those of the second: no row is
         # off-process.
         entries = self._blocks().transpose(0, 2, 1, 3)
@@ -120,6 +121,11 @@ class ContactSystem:
         mat = transposed.transpose(PETSc.Mat())
         transposed.destroy()
         return mat
+
+    def destroy(self) -> None:
+        """Free the matrix D, if it was asked for: PETSc keeps what is spread over ranks until it is told."""
+        if "D" in self.__dict__:
+            self.__dict__.pop("D").destroy()
 
     def velocity(self, impulse: Floats) -> Floats:
         """Velocities (owned, 6) after the step, v_free + M^-1 D g, for impulses (nc, 3); collective."""

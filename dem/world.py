@@ -15,6 +15,7 @@ from dem.contact import find_contacts
 from dem.motion import Dynamic, mean_velocity
 from dem.partition import redistribute
 from dem.scene import LargeBody, Scene
+from dem.together import together
 
 
 @dataclass
@@ -111,11 +112,16 @@ class World:
         return names.index(name)
 
     def prescribed_velocity(self, dt: float) -> Floats:
-        """Velocities (large bodies, 6) over the next step of `dt` [s]; dynamic bodies keep theirs."""
+        """Velocities (large bodies, 6) over the next step of `dt` [s]; dynamic bodies keep theirs; collective.
+        SceneError if a motion fails."""
         velocity = self.large.velocity.copy()
-        for row, body in enumerate(self.large_bodies):
-            if not isinstance(body.motion, Dynamic):
-                velocity[row] = mean_velocity(body.motion, self.time, dt, body.position, body.quaternion)
+
+        def follow() -> None:
+            for row, body in enumerate(self.large_bodies):
+                if not isinstance(body.motion, Dynamic):
+                    velocity[row] = mean_velocity(body.motion, self.time, dt, body.position, body.quaternion)
+
+        together(self.comm, "motion of a large body", follow)
         return velocity
 
 

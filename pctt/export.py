@@ -1,21 +1,27 @@
-"""``python -m pctt.export DIR``: the recorded steps of a run as time series for ParaView.
+"""``python -m pctt.export DIR``: the recorded steps of a run as time series for ParaView, or as one HDF5 file.
 
 Written are DIR/paraview/bodies.pvd, contacts.pvd and large.pvd, each a list of one .vtp file per step. Any number
 of ranks share the steps. These formats are read by every ParaView and VTK of the last fifteen years: a VTKHDF file
 of points that change in number needs ParaView 5.12, and a .pvd collection lists VTK's XML files only.
+
+With ``-single FILE.h5`` that file is written instead, by the first rank: what state.h5 links to, in the same groups.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from mpi4py import MPI
 
-from pctt.look.folder import Folder, Frame
+from pctt.disk import make_hdf5
+from pctt.look.folder import Folder, FolderError, Frame
 from pctt.look.program import add_steps, chosen, made_folder, parser, run, whole
 
 SERIES = ("bodies", "contacts", "large")
@@ -24,7 +30,9 @@ SERIES = ("bodies", "contacts", "large")
 def arguments() -> argparse.Namespace:
     line = parser("export", "the recorded steps of a run as time series for ParaView (.pvd of .vtp files)")
     add_steps(line)
-    line.add_argument("-output", metavar="DIR", help="where to write; none: paraview/ in the folder")
+    target = line.add_mutually_exclusive_group()
+    target.add_argument("-output", metavar="DIR", help="where to write; none: paraview/ in the folder")
+    target.add_argument("-single", metavar="FILE.h5", help="write one HDF5 file like state.h5 instead, with all in it")
     return line.parse_args()
 
 
@@ -33,6 +41,11 @@ def main(comm: MPI.Comm) -> None:
     folder = Folder(given.folder)
     folder.require_frames()
     steps = chosen(folder.steps, given)
+    if given.single:
+        if comm.rank == 0:
+            write_single(Path(given.single), folder, steps)
+            print(f"{len(steps)} steps: {given.single}")
+        return
     target = made_folder(Path(given.output) if given.output else folder.path / "paraview")
 
     from vtkmodules.vtkCommonCore import vtkLogger
@@ -53,6 +66,30 @@ def main(comm: MPI.Comm) -> None:
         for name in SERIES:
             write_pvd(target / f"{name}.pvd", {f"{name}_{step:06d}.vtp": together[step] for step in steps})
         print(f"{len(steps)} steps: {target}/" + ", ".join(f"{name}.pvd" for name in SERIES))
+
+
+def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
+    """Write one HDF5 file with all that state.h5 links to of these steps; FolderError if a file cannot be read or
+    written."""
+    groups = {"bodies": folder.bodies_path, **{f"steps/{step:06d}": folder.frame_path(step) for step in steps}}
+    with whole(path) as temporary:
+        make_hdf5(temporary, sum(source.stat().st_size for source in groups.values()), items=0)
+        with h5py.File(temporary, "r+") as file:
+            with _part(folder.path / "state.h5") as links:
+                file.attrs.update({name: value for name, value in links.attrs.items() if name != "links"})
+            for name, source in groups.items():
+                with _part(source) as part:
+                    file.copy(part["/"], name)
+
+
+@contextmanager
+def _part(path: Path) -> Iterator[h5py.File]:
+    """A file of a run, open to be copied; FolderError if it cannot be."""
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError) as error:
+        raise FolderError(f"{path}: cannot be copied ({error})") from None
 
 
 def bodies(folder: Folder, frame: Frame) -> Any:

@@ -31,6 +31,12 @@ def phase(name: str) -> Iterator[None]:
             _seconds[name] += time.perf_counter() - start
 
 
+def move_seconds(seconds: float, source: str, target: str) -> None:
+    """Move seconds from the account of one phase to that of another."""
+    _seconds[source] -= seconds
+    _seconds[target] += seconds
+
+
 def take_seconds(names: Iterable[str]) -> dict[str, float]:
     """Seconds on the accounts of the phases since they were last taken."""
     return {name: _seconds.pop(name, 0.0) for name in names}

@@ -42,8 +42,9 @@ def main(comm: MPI.Comm) -> None:
 
     with mpl.rc_context(figures.STYLE):  # type: ignore[arg-type]
         made = {}
-        if folder.summary.get("steps"):
-            made["steps"] = figures.steps(folder.summary["steps"])
+        lines = folder.lines()
+        if lines:
+            made["steps"] = figures.steps(lines)
         columns = folder.records()
         if columns:
             made.update(figures.records(columns))

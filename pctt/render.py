@@ -116,7 +116,10 @@ def write_mp4(path: Path, pictures: list[Path], fps: float) -> None:
     from PIL import Image
 
     with whole(path) as temporary, Image.open(pictures[0]) as first:
-        writer = imageio_ffmpeg.write_frames(str(temporary), first.size, fps=fps, quality=7, macro_block_size=2)
+        kind = ["-f", "mp4"]  # the temporary name does not end in .mp4
+        writer = imageio_ffmpeg.write_frames(
+            str(temporary), first.size, fps=fps, quality=7, macro_block_size=2, output_params=kind
+        )
         writer.send(None)
         for picture in pictures:
             with Image.open(picture) as image:

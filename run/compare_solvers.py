@@ -44,7 +44,8 @@ VARIANTS = {
 
 def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
     """The cone problem of the first step after the settled state of a mixer."""
-    database = {"scene": "mixer", "scene_n": str(n), "restart": "settled", "output": tempfile.gettempdir()}
+    database = {"scene": "mixer", "scene_n": str(n), "restart": "settled"}
+    database |= {"output": tempfile.gettempdir(), "overwrite": "true"}  # where nothing is written
     options = read_options(database, COMM)
     world, _ = first_state(options, COMM, Progress(True))
     grains = world.grains

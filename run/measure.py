@@ -33,13 +33,14 @@ def say_machine() -> dict[str, object]:
     return about
 
 
-def summary(ranks: int, *options: object) -> dict[str, Any]:
-    """Run pctt.run with these options; its summary.json."""
+def results(ranks: int, *options: object) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Run pctt.run with these options; its summary.json, and the lines of its steps.jsonl."""
     with tempfile.TemporaryDirectory() as folder:
         command = [".venv/bin/mpiexec", "-n", str(ranks), ".venv/bin/python", "-m", "pctt.run"]
         command += [*map(str, options), "-output", folder]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        return json.loads((Path(folder) / "summary.json").read_text())
+        lines = (Path(folder) / "steps.jsonl").read_text().splitlines()
+        return json.loads((Path(folder) / "summary.json").read_text()), [json.loads(line) for line in lines]
 
 
 def record(name: str, about: dict[str, object], rows: list[dict]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from measure import record, say_machine, summary
+from measure import record, results, say_machine
 
 NAMES = "none,ilu,ilu-shifted,pbjacobi,sor,icc-shifted,gamg,hypre,cholesky,body-ilu,tt"
 
@@ -12,13 +12,12 @@ NAMES = "none,ilu,ilu-shifted,pbjacobi,sor,icc-shifted,gamg,hypre,cholesky,body-
 def main(n: int, every: int, names: str, options: list[str]) -> None:
     about = say_machine()
     run = ["-scene_n", n, "-restart", "settled", "-steps", 1, "-compare", names, "-compare_every", every]
-    result = summary(1, *run, *options)
-    for step in result["steps"]:
-        print(
-            f"mixer n = {n}: {step['contacts']} contacts, {step['newton_its']} Newton steps to natural residual "
-            f"{step['natural_residual']:.1e}, every {every}. system, 1 rank"
-        )
-    rows = [{"name": name, **figures} for name, figures in result["compare"].items()]
+    summary, (step,) = results(1, *run, *options)
+    print(
+        f"mixer n = {n}: {step['contacts']} contacts, {step['newton_its']} Newton steps to natural residual "
+        f"{step['natural_residual']:.1e}, every {every}. system, 1 rank"
+    )
+    rows = [{"name": name, **figures, "solves": step["compare"][name]} for name, figures in summary["compare"].items()]
     base = next(row for row in rows if row["name"] == "pbjacobi")
     total = base["setup_s"] + base["solve_s"]
     heads = " ".join(f"{head:>9}" for head in ("its mean", "its max", "set-up s", "solve s", "total s", "/pbjacobi"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import sys
 
-from measure import record, say_machine, summary
+from measure import record, results, say_machine
 
 STEPS, RANKS = 3, (1, 2)
 PHASES = ("search", "assembly", "solve", "advance", "output")
@@ -19,7 +19,7 @@ def main(sizes: list[int]) -> None:
     rows: list[dict] = []
     for n in sizes:
         for ranks in RANKS:
-            steps = summary(ranks, "-scene_n", n, "-restart", "settled", "-steps", STEPS)["steps"]
+            _, steps = results(ranks, "-scene_n", n, "-restart", "settled", "-steps", STEPS)
             row: dict = {"n": n, "ranks": ranks}
             for name in ("contacts", "newton_its", "ksp_its", "seconds"):
                 row[name] = statistics.median(line[name] for line in steps)

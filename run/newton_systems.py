@@ -108,7 +108,7 @@ def replay_steps(
     database = {str(name)[1:]: str(value) for name, value in zip(words[::2], words[1::2])}
     comm = MPI.COMM_WORLD
     try:
-        options = read_options(database | {"output": "results"}, comm)
+        options = read_options(database | {"output": "results", "overwrite": "true"}, comm)
     except OptionError as error:
         sys.exit(str(error))
     world, memory = first_state(options, comm, Progress(False))

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
+
+from pctt.disk import whole
 
 
 def gather_rows(comm: MPI.Comm, local: np.ndarray) -> np.ndarray:
@@ -41,19 +41,13 @@ def write_whole(path: str | Path, comm: MPI.Comm, write: Callable[[Path], None])
 
     Raises OSError on all ranks if that fails; what stood under ``path`` is then untouched.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.tmp")
     failure = None
     if comm.rank == 0:
         try:
-            write(temporary)
-            with open(temporary, "rb") as file:
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
+            with whole(Path(path)) as temporary:
+                write(temporary)
         except (OSError, ValueError, RuntimeError) as error:  # h5py raises all three
             failure = f"{path}: cannot write ({error})"
-            with suppress(OSError):
-                temporary.unlink()
     failure = comm.bcast(failure)
     if failure:
         raise OSError(failure)

@@ -44,18 +44,19 @@ def write(path: str | Path, problem: ConeProblem) -> None:
         vectors.append(np.array([problem.softness]))
 
     def write_it(temporary: Path) -> None:
-        viewer = None
+        csr = (N.indptr.astype(PETSc.IntType), N.indices.astype(PETSc.IntType), N.data)
+        contents: list[PETSc.Object] = [PETSc.Mat().createAIJ(N.shape, csr=csr, comm=PETSc.COMM_SELF)]
+        contents += [PETSc.Vec().createWithArray(vector, comm=PETSc.COMM_SELF) for vector in vectors]
+        viewer = PETSc.Viewer()
         try:
-            viewer = PETSc.Viewer().createBinary(str(temporary), "w", comm=PETSc.COMM_SELF)
-            csr = (N.indptr.astype(PETSc.IntType), N.indices.astype(PETSc.IntType), N.data)
-            PETSc.Mat().createAIJ(N.shape, csr=csr, comm=PETSc.COMM_SELF).view(viewer)
-            for vector in vectors:
-                PETSc.Vec().createWithArray(vector, comm=PETSc.COMM_SELF).view(viewer)
+            viewer.createBinary(str(temporary), "w", comm=PETSc.COMM_SELF)
+            for thing in contents:
+                thing.view(viewer)
         except PETSc.Error as error:
             raise OSError(_reason(error)) from None
         finally:
-            if viewer is not None:
-                viewer.destroy()
+            for thing in (viewer, *contents):
+                thing.destroy()
             temporary.with_name(f"{temporary.name}.info").unlink(missing_ok=True)
 
     write_whole(path, problem.comm, write_it)

@@ -188,6 +188,12 @@ class ConeProblem:
     def norm(self, x: Array) -> float:
         return float(np.sqrt(self.dot(x, x)))
 
+    def __enter__(self) -> ConeProblem:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.destroy()
+
     def destroy(self) -> None:
         """Free the PETSc objects now, not when the garbage collector finds the cycle."""
         for name in ("_G", "_momentum", "_in", "_out"):

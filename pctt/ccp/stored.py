@@ -33,6 +33,7 @@ class Whole:
     solution, guess : (3 nc,) impulses (N s) or None
     point : (nc, 3) contact points (m) or None
     compliance : e of `ConeProblem`; the matrix is that of rigid contacts
+    note : what the reader had to make of the data, in words; mostly nothing
     """
 
     form: str
@@ -44,6 +45,7 @@ class Whole:
     guess: Array | None = None
     point: Array | None = None
     compliance: float = 0.0
+    note: str = ""
 
     def __post_init__(self) -> None:
         count = len(self.mu)
@@ -66,13 +68,15 @@ class Whole:
 
 @dataclass(frozen=True)
 class Stored:
-    """A problem from a file, and with it the impulses (nc, 3) of this rank's contacts that the file has."""
+    """A problem from a file, and with it the impulses (nc, 3) of this rank's contacts that the file has; ``note`` says
+    what the reader had to make of the data."""
 
     problem: ConeProblem
     form: str
     title: str
     solution: Array | None = None
     guess: Array | None = None
+    note: str = ""
 
 
 def symmetric_blocks(W: sp.spmatrix) -> sp.bsr_matrix:
@@ -132,6 +136,7 @@ class _Part:
     columns: int  # block columns that the rank owns
     contacts: int  # on all ranks
     compliance: float
+    note: str
 
     def stored(self, comm: MPI.Comm, compliance: float | None) -> Stored:
         """The problem of all parts; collective."""
@@ -146,7 +151,7 @@ class _Part:
         assert r is not None
         e = self.compliance if compliance is None else compliance
         problem = ConeProblem(comm, r, self.mu, G=G, N=N, point=point, compliance=e)
-        return Stored(problem, self.form, self.title, solution, guess)
+        return Stored(problem, self.form, self.title, solution, guess, self.note)
 
 
 def _part(whole: Whole, rank: int, ranks: int) -> _Part:
@@ -163,4 +168,5 @@ def _part(whole: Whole, rank: int, ranks: int) -> _Part:
         bodies * (rank + 1) // ranks - bodies * rank // ranks,
         contacts,
         whole.compliance,
+        whole.note,
     )

@@ -39,7 +39,7 @@ ALIKE = 5  # curves share axes if their greatest values differ by less than this
 
 
 def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
-    """Contacts, iterations, residual, peak memory and seconds of each step; ``lines``: the steps of summary.json."""
+    """Contacts, iterations, residual, peak memory and seconds of each step; ``lines``: those of steps.jsonl."""
     time = np.array([line["time"] for line in lines])
     figure = Figure(figsize=(12.5, 6.4))
     panels = figure.subplot_mosaic([["contacts", "its", "seconds"], ["residual", "memory", "seconds"]])

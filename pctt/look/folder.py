@@ -11,6 +11,8 @@ from typing import Any
 import h5py
 import numpy as np
 
+from pctt import disk
+
 
 class FolderError(RuntimeError):
     """A folder that lacks what is to be shown; the message names the folder and what to do."""
@@ -59,7 +61,7 @@ class Folder:
     """The output folder of ``python -m pctt.run``. Raises FolderError if it is none.
 
     Attributes: ``path``; ``summary`` (dict) is summary.json; ``steps`` (list) are the recorded steps, by which
-    ``frame`` reads them.
+    ``frame`` reads them. They are taken from frames/ itself: of a run that goes on state.h5 may lack the last.
     """
 
     def __init__(self, path: str | Path):
@@ -71,40 +73,54 @@ class Folder:
             self.summary: dict[str, Any] = json.loads(summary.read_text())
         except (OSError, ValueError) as error:
             raise FolderError(f"{path}: no output folder of python -m pctt.run (summary.json: {error})") from None
-        self._state = self.path / "state.h5"
-        self.steps: list[int] = []
-        if self._state.exists():
-            with self._open() as file:
-                self.steps = sorted(map(int, file.get("steps", ())))
+        self._frames = self.path / "frames"
+        self.steps = sorted(int(path.stem) for path in self._frames.glob("*.h5") if path.stem.isdigit())
 
     def require_frames(self) -> None:
         """FolderError unless there are recorded steps, with the shapes of the bodies."""
         if not self.steps:
             raise FolderError(f"{self.path}: no recorded steps; run with -output_every 1 or more")
         try:
-            with self._open() as file:
-                self.shape: np.ndarray = file["bodies/shape"][()]
-                self.size: np.ndarray = file["bodies/size"][()]
-                self.mass: np.ndarray = file["bodies/mass"][()]
-                self.material: np.ndarray = file["bodies/material"][()]
+            with h5py.File(self.bodies_path, "r") as file:
+                self.shape: np.ndarray = file["shape"][()]
+                self.size: np.ndarray = file["size"][()]
+                self.mass: np.ndarray = file["mass"][()]
+                self.material: np.ndarray = file["material"][()]
                 #: name and shapes of each large body, the rows after the grains
-                self.large: list[dict[str, Any]] = json.loads(file["bodies/large"][()])
+                self.large: list[dict[str, Any]] = json.loads(file["large"][()])
         except (KeyError, OSError) as error:
-            raise FolderError(f"{self.path}: state.h5 lacks the shapes of the bodies; run again ({error})") from None
+            raise FolderError(f"{self.bodies_path}: lacks the shapes of the bodies; run again ({error})") from None
         self.grains = len(self.shape) - len(self.large)
 
     def frame(self, step: int) -> Frame:
         """A recorded step; FolderError if its file is damaged."""
+        path = self.frame_path(step)
         try:
-            with self._open() as file:
-                group = file[f"steps/{step:06d}"]
+            with h5py.File(path, "r") as group:
                 contact = group["contact"]
                 columns = {name: contact[name][()] for name in ("body", "point", "frame", "gap", "impulse")}
                 contacts = Contacts(**columns, dt=float(contact.attrs["dt"]))
                 bodies = {name: group[name][()] for name in ("position", "quaternion", "velocity")}
                 return Frame(step, float(group.attrs["time"]), **bodies, contacts=contacts)
         except (KeyError, OSError) as error:
-            raise FolderError(f"{self.path}/frames/{step:06d}.h5: incomplete ({error})") from None
+            raise FolderError(f"{path}: incomplete ({error})") from None
+
+    @property
+    def bodies_path(self) -> Path:
+        """The file of what no step changes."""
+        return self._frames / "bodies.h5"
+
+    def frame_path(self, step: int) -> Path:
+        """The file of a recorded step."""
+        return self._frames / f"{step:06d}.h5"
+
+    def lines(self) -> list[dict[str, Any]]:
+        """The figures of each step, in their order, from steps.jsonl; none if there is no such file."""
+        path = self.path / "steps.jsonl"
+        try:
+            return [json.loads(line) for line in disk.lines(path)]
+        except (OSError, ValueError) as error:
+            raise FolderError(f"{path}: no list of steps ({error})") from None
 
     def records(self) -> dict[str, np.ndarray]:
         """Columns of records.csv by their heads, such as ``force_blade_x [N]``; none if there is no such file."""
@@ -120,8 +136,7 @@ class Folder:
         path = self.path / name
         if not path.exists():
             return {}
-        with path.open(newline="") as file:
-            rows = list(csv.reader(file))
+        rows = list(csv.reader(disk.lines(path)))
         try:
             head, table = rows[0], np.array([[float(cell or "nan") for cell in row] for row in rows[1:]])
             columns = dict(zip(head, table.reshape(-1, len(head)).T))
@@ -129,9 +144,3 @@ class Folder:
         except (IndexError, KeyError, ValueError) as error:
             raise FolderError(f"{path}: no table of numbers with a column time [s] ({error})") from None
         return columns
-
-    def _open(self) -> h5py.File:
-        try:
-            return h5py.File(self._state, "r")
-        except OSError as error:
-            raise FolderError(f"{self._state}: no readable HDF5 file ({error})") from None

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from mpi4py import MPI
 
+from pctt import disk
 from pctt.look.folder import FolderError
 
 LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")
@@ -92,12 +92,8 @@ def made_folder(path: Path) -> Path:
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A temporary name for a file that gets its own when the block ends; FolderError if it cannot be written."""
-    temporary = path.with_name(f".tmp.{path.name}")  # with the ending of the file, which tells some writers the format
     try:
-        yield temporary
-        os.replace(temporary, path)
+        with disk.whole(path) as temporary:
+            yield temporary
     except OSError as error:
         raise FolderError(f"{path}: cannot write ({error.strerror or error})") from None
-    finally:
-        with suppress(OSError):
-            temporary.unlink()

@@ -37,9 +37,10 @@ def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> dict[str, 
     kind = everything.get(prefix + "pc_type")
     if ranks > 1 and kind in ("ilu", "icc"):
         options |= {prefix + "pc_type": "bjacobi", prefix + "sub_pc_type": kind}
-        for name in [name for name in everything if name.startswith(prefix + "pc_factor_")]:
-            options[f"{prefix}sub_{name[len(prefix) :]}"] = everything[name]
-            PETSc.Options().hasName(name)  # PETSc is not to report it as unused
+        for name, value in everything.items():
+            if name.startswith(prefix + "pc_factor_"):
+                options[f"{prefix}sub_{name[len(prefix):]}"] = value
+                PETSc.Options().hasName(name)  # PETSc is not to report it as left over
     return options
 
 

@@ -14,6 +14,7 @@ from mpi4py import MPI
 from dem.bodies import Bodies
 from dem.experiment import Experiment
 from dem.impulses import ImpulseMemory
+from dem.scene import Scene
 from dem.world import World, restart_rows
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError, readable, write_text, written
@@ -53,9 +54,9 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
 
 
 def load(
-    path: Path, scene: Experiment, made_with: dict[str, Any], comm: MPI.Comm, changed_file: bool = False
+    path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm, changed_file: bool = False
 ) -> tuple[World, ImpulseMemory]:
-    """The world and the impulses of a checkpoint; collective.
+    """The world and the impulses of a checkpoint of the scene; collective.
 
     On the number of ranks that wrote it the world is the same to the last bit. Raises FileError if it is no
     checkpoint, OptionError if it is of another `origin`; with ``changed_file`` the scene file may be another.
@@ -80,7 +81,7 @@ def load(
             raise FileError(f"{path}: incomplete checkpoint ({failures[0]})")
     _refuse_other_origin(path, stored, made_with, changed_file)
     try:
-        world = World.restore(scene.build(), comm, local, replicated)
+        world = World.restore(scene, comm, local, replicated)
     except ValueError as error:  # another text of the scene file may build other bodies
         raise OptionError(f"-restart {path}: {error}") from None
     memory = ImpulseMemory(comm)

@@ -26,18 +26,17 @@ from pctt.ccp import fclib, petsc_binary
 from pctt.ccp.cone import Array
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError
+from pctt.run.place import HARD, Place
 
 if TYPE_CHECKING:
     from pctt.run.options import Options, Run
-
-HARD = "hard"  # folder of the hard problems within -output
 
 
 class Dump:
     """Writes the cone problems of a run's steps; raises OptionError for a step that the run does not make."""
 
-    def __init__(self, options: Options, world: World):
-        self._options, self._world = options, world
+    def __init__(self, options: Options, world: World, place: Place):
+        self._options, self._world, self._place = options, world, place
         run = self.run = options.run
         self._steps = dump_steps(run)
         outside = [step for step in self._steps if not world.step < step <= world.step + run.steps]
@@ -75,9 +74,8 @@ class Dump:
         if problem.size and hard:
             self._hard_left -= 1
             name = f"step{number:06d}_{problem.size}contacts_{asked.iterations}its.h5"
-            path = Path(self.run.output) / HARD / name
-            _write(path, comm, as_fclib)
-            files["hard_problem"] = str(path)
+            _write(self._place.now / HARD / name, comm, as_fclib)
+            files["hard_problem"] = str(self._place.folder / HARD / name)
         return files
 
     def _write_fclib(

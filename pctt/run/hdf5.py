@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from pctt.disk import reserve
+from pctt.disk import make_hdf5, temporary_name, whole
 from pctt.options import OptionError
 
 
@@ -85,70 +83,64 @@ def written(path: Path, comm: MPI.Comm) -> Iterator[RowWriter]:
     """
     contents = RowWriter()
     yield contents
-    temporary = path.with_name(f".{path.name}.tmp")
     numbers, items = contents.size(comm)
-    failure = None
-    if comm.rank == 0:
-        try:
-            reserve(temporary, numbers, items)
-        except OSError as error:
-            failure = error.strerror
-    _raise_together(path, temporary, failure, comm)
-    parallel = {"driver": "mpio", "comm": comm} if comm.size > 1 else {}
-    file = None
-    try:
-        file = h5py.File(temporary, "w", **parallel)
-    except OSError as error:
-        failure = str(error)
-    _raise_together(path, temporary, failure, comm)
-    assert file is not None
-    try:
-        contents.write(file, comm)
-        file.close()
+    with replaced(path) if comm.rank == 0 else nullcontext():
+        failure, file = None, None
         if comm.rank == 0:
-            _flush_to_disk(temporary)
-    except (OSError, RuntimeError) as error:  # h5py raises both
-        failure = str(error)
-        if comm.size > 1:  # the other ranks may be within a call that waits for this one
-            sys.stderr.write(f"pctt.run: {path}: cannot write ({failure})\n")
-            sys.stderr.flush()
-            comm.Abort(2)
-        with contextlib.suppress(OSError, RuntimeError):
+            try:
+                make_hdf5(temporary_name(path), numbers, items)
+            except OSError as error:
+                failure = error.strerror
+        _raise_together(path, failure, comm)
+        parallel = {"driver": "mpio", "comm": comm} if comm.size > 1 else {}
+        try:
+            file = h5py.File(temporary_name(path), "r+", **parallel)
+        except OSError as error:
+            failure = str(error)
+        _raise_together(path, failure, comm)
+        assert file is not None
+        try:
+            contents.write(file, comm)
             file.close()
-    _raise_together(path, temporary, failure, comm)
-    if comm.rank == 0:
-        os.replace(temporary, path)
+        except (OSError, RuntimeError) as error:  # h5py raises both
+            failure = str(error)
+            if comm.size > 1:  # the other ranks may be within a call that waits for this one
+                sys.stderr.write(f"pctt.run: {path}: cannot write ({failure})\n")
+                sys.stderr.flush()
+                comm.Abort(2)
+            with suppress(OSError, RuntimeError):
+                file.close()
+        _raise_together(path, failure, comm)
     comm.Barrier()
 
 
-def _raise_together(path: Path, temporary: Path, failure: str | None, comm: MPI.Comm) -> None:
+def _raise_together(path: Path, failure: str | None, comm: MPI.Comm) -> None:
     """FileError on all ranks if one failed."""
     failures = [text for text in comm.allgather(failure) if text]
     if failures:
-        if comm.rank == 0:
-            temporary.unlink(missing_ok=True)
         raise FileError(f"{path}: cannot write ({failures[0]})")
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """A temporary name for a file that takes the place of ``path``, as of `whole`; FileError if it cannot; one rank."""
+    with told(path), whole(path) as temporary:
+        yield temporary
+
+
+@contextmanager
+def told(path: Path) -> Iterator[None]:
+    """FileError for an OSError of the block, which writes ``path``; one rank."""
+    try:
+        yield
+    except OSError as error:
+        raise FileError(f"{path}: cannot write ({error.strerror or error})", alone=True) from error
 
 
 def write_text(path: Path, text: str) -> None:
     """Replace a text file at one stroke; one rank."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
+    with replaced(path) as temporary:
         temporary.write_text(text)
-        _flush_to_disk(temporary)
-        os.replace(temporary, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise FileError(f"{path}: cannot write ({error.strerror})", alone=True) from error
-
-
-def _flush_to_disk(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Optional
 
@@ -14,6 +14,7 @@ from petsc4py import PETSc
 
 from dem.experiment import Experiment, SceneFileError, from_file
 from dem.scenes import SCENES
+from dem.together import together
 from pctt import ccp
 from pctt.options import (
     AT_LEAST_ONE,
@@ -27,9 +28,23 @@ from pctt.options import (
     read,
     refuse_unknown,
 )
+from pctt.ccp.newton import DEFAULTS
+from pctt.ccp.newton.asked_for import LADDER
 from pctt.pc import PRECONDITIONERS
+from pctt.pc.ksp_options import entered, to_enter
 from pctt.run.dump import dump_folder
 from pctt.run.hdf5 import refuse_serial
+from pctt.run.leftovers import OF_SOLVERS, refuse_misspelt
+from pctt.run.place import held, is_checkpoint_of
+
+#: Options of simulations, beside those of the scene.
+OF_STEPS = {
+    "scene", "steps", "dt", "delta", "recovery_speed", "restart", "restart_changed_file", "settle", "settle_delta",
+    "settle_tol", "output_every", "checkpoint_every", "dump_problem", "dump_steps", "dump_hard", "monitor",
+}  # fmt: skip
+
+#: Options that settled states depend on, and -quiet.
+OF_SETTLING = {"settle", "scene", "dt", "delta", "recovery_speed", "settle_delta", "settle_tol", "quiet"}
 
 # what runs when no option is given
 DEMO = {
@@ -39,6 +54,8 @@ DEMO = {
     "steps": "5",
     "compare": "ilu,ilu-shifted,pbjacobi,none",
     "compare_every": "4",
+    "output": "results/demo",
+    "overwrite": "true",  # nothing but the demo writes to its folder
 }
 
 
@@ -70,7 +87,10 @@ class Run:
         check=NOT_NEGATIVE,
     )
     settle_tol: float = option(1e-3, "natural residual of the steps of -settle", check=POSITIVE)
-    output: str = option("results", "folder for state.h5, records.csv, summary.json, checkpoint.h5")
+    output: str = option("results", "folder for state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
+    overwrite: bool = option(
+        False, "let the run replace another one in the folder of -output, once its first step is written"
+    )
     output_every: int = option(1, "steps between two records in state.h5; 0: none", check=COUNT)
     checkpoint_every: int = option(1, "steps between two checkpoints", check=AT_LEAST_ONE)
     problem: str = option("", "FCLIB or PETSc binary file with a cone problem to solve instead of a scene")
@@ -138,35 +158,28 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     run = read(Run, database)
     solver = ccp.SOLVERS[run.ccp_type]
     prefix = f"ccp_{run.ccp_type}_"
-    scene_class = find_scene(run.scene)
+    scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in _groups(scene_class) for d in describe(group, start)]
-    refuse_unknown(database, known, prefixes=("compare_", "fallback_"))
+    refuse_unknown(database, known, prefixes=("compare_", "fallback_", "body_", "kkt_"))
     for name in known:
         PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
-    try:
-        scene = read(scene_class, database, "scene_")
-    except OptionError:
-        raise
-    except ValueError as error:  # the scene's message starts with the name of its field
-        raise OptionError(f"-scene_{error}") from None
-    if run.compare and not solver.newton:
-        newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
-        raise OptionError(
-            f"-compare {run.compare}: -ccp_type {run.ccp_type} solves no Newton systems; allowed is {newton}"
-        )
+    _refuse_without_effect(database, run)
+    what = f"options of the scene {scene_class.__name__}"
+    scene, dt, delta = together(comm, what, lambda: _read_scene(scene_class, database), own=(OptionError,))
     options = Options(
         run,
         scene,
-        run.dt if run.dt is not None else scene.dt,
-        run.delta if run.delta is not None else scene.delta,
+        run.dt if run.dt is not None else dt,
+        run.delta if run.delta is not None else delta,
         read(ccp.Limits, database, "ccp_"),
         read(solver.options, database, prefix),
         read(ccp.Coulomb, database, "ccp_coulomb_") if run.ccp_coulomb else None,
         demo,
     )
-    ccp.Comparison(comm, options.compare_names())  # refuses unknown names
-    if solver.newton:
-        _refuse_for_petsc(database, comm)
+    compare = ccp.Comparison(comm, options.compare_names())  # refuses unknown names
+    if solver.newton and not run.settle:
+        form = ccp.newton_for(comm, run.ccp_type, run.ccp_newton, compare).form
+        _refuse_for_petsc(database, form, comm)
     refuse_serial(comm)
     _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
     _refuse_missing("-problem", run.problem, comm)
@@ -175,7 +188,23 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         _refuse_unwritable("-output", Path(run.output), comm)
         if run.dump_problem:
             _refuse_unwritable("-dump_problem", problems, comm)
+        _refuse_occupied(run, comm)
     return options
+
+
+def _read_scene(scene_class: type[Experiment], database: Mapping[str, str]) -> tuple[Experiment, Any, Any]:
+    """The scene with the options of the database, its time step and its contact distance; OptionError for an option
+    that it refuses."""
+    try:
+        scene = read(scene_class, database, "scene_")
+    except OptionError:
+        raise
+    except ValueError as error:
+        if not str(error).startswith(tuple(field.name for field in dataclasses.fields(scene_class))):
+            raise
+        raise OptionError(f"-scene_{error}") from None
+    _ = scene.settling_time, scene.domain  # they may be properties too: what fails is to fail before any work
+    return scene, scene.dt, scene.delta
 
 
 def find_scene(name: str) -> type[Experiment]:
@@ -224,18 +253,80 @@ def help_text(database: Mapping[str, str]) -> str:
     return "\n".join(lines)
 
 
-def _refuse_for_petsc(database: Mapping[str, str], comm: MPI.Comm) -> None:
-    """OptionError for options of the KSP that PETSc refuses; it would do so at the first Newton system."""
-    given = [f"-{name} {value or ''}".strip() for name, value in database.items() if name.startswith(("ksp_", "pc_"))]
+def _refuse_without_effect(database: Mapping[str, str], run: Run) -> None:
+    """OptionError for the first option that means nothing beside the others."""
+    solver = ccp.SOLVERS[run.ccp_type]
+    newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
+    others = tuple(other.prefix for other in ccp.SOLVERS.values() if other is not solver)
+    compared = tuple(f"compare_{name}_" for name in run.compare.split(",") if name)
+    ladder = tuple(f"fallback_{name}_" for name in LADDER)
+    own = {field.name for field in dataclasses.fields(Run)}
+    rules: list[tuple[Any, Callable[[str], bool], str]] = [  # if, which options, why not
+        (
+            run.problem,
+            lambda name: name in OF_STEPS or name.startswith("scene_"),
+            f"-problem {run.problem} makes no steps; allowed is one of the two",
+        ),
+        (
+            run.settle,
+            lambda name: (name in own or name.startswith(("ccp_", *OF_SOLVERS))) and name not in OF_SETTLING,
+            "-settle makes its state with APGD and takes no notice of it; allowed is one of the two",
+        ),
+        (not run.problem, lambda name: name == "problem_guess", "allowed with -problem only"),
+        (
+            not run.settle and run.restart != "settled",
+            lambda name: name in ("settle_delta", "settle_tol"),
+            "allowed with -settle or -restart settled only",
+        ),
+        (
+            run.restart in ("", "settled"),
+            lambda name: name == "restart_changed_file",
+            "allowed with -restart FILE only",
+        ),
+        (run.quiet, lambda name: name == "monitor", "-quiet prints nothing; allowed is one of the two"),
+        (
+            not solver.newton,
+            lambda name: name in ("compare", "ccp_newton") or name.startswith(OF_SOLVERS),
+            f"-ccp_type {run.ccp_type} solves no Newton systems; allowed is {newton}",
+        ),
+        (not run.compare, lambda name: name == "compare_every", "allowed with -compare only"),
+        (
+            True,
+            lambda name: name.startswith("compare_") and name != "compare_every" and not name.startswith(compared),
+            f"its preconditioner is not compared; -compare lists {run.compare or 'none'}",
+        ),
+        (
+            True,
+            lambda name: name.startswith("fallback_") and not name.startswith(ladder),
+            f"no such fallback; there are {', '.join(LADDER)}",
+        ),
+        (True, lambda name: name.startswith(others), f"belongs to another -ccp_type than {run.ccp_type}"),
+        (not run.ccp_coulomb, lambda name: name.startswith("ccp_coulomb_"), "allowed with -ccp_coulomb only"),
+    ]
+    for applies, concerned, reason in rules:
+        for name, value in database.items():
+            if applies and concerned(name):
+                raise OptionError(f"{f'-{name} {value or str()}'.rstrip()}: {reason}")
+
+
+def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) -> None:
+    """OptionError for options of the KSP that PETSc refuses or does not know; it would do so at the first Newton
+    system, or never."""
+    given = {name: value for name, value in database.items() if name.startswith(("ksp_", "pc_"))}
+    known = PETSc.Options().getAll()
+    absent = {name: value for name, value in given.items() if name not in known}
     ksp = PETSc.KSP().create(comm)
     try:
-        ksp.setFromOptions()
+        with entered({**to_enter("", DEFAULTS[form], comm.size), **absent}):
+            ksp.setFromOptions()
+            refuse_misspelt(given)
     except OptionError:  # from a preconditioner of ours
         raise
     except Exception as error:  # PETSc's own, and whatever importing a -pc_python_type raises
         reason = str(error).splitlines()[-1]
         reason = reason.partition("] ")[2] or reason
-        raise OptionError(f"{', '.join(given)}: PETSc refuses: {reason}") from None
+        listed = ", ".join(f"-{name} {value or ''}".strip() for name, value in given.items())
+        raise OptionError(f"{listed}: PETSc refuses: {reason}") from None
     finally:
         ksp.destroy()
 
@@ -259,4 +350,19 @@ def _refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
     if error:
         raise OptionError(
             f"{name} {folder}: cannot write there ({error}); allowed is a folder that can be written"
+        )
+
+
+def _refuse_occupied(run: Run, comm: MPI.Comm) -> None:
+    """OptionError if the output folder holds a run that this one neither goes on with nor may replace."""
+    folder = Path(run.output)
+    there: list[str] = []
+    if comm.rank == 0 and not run.overwrite and not (is_checkpoint_of(folder, run.restart) and not run.problem):
+        there = held(folder)
+    there = comm.bcast(there)
+    if there:
+        goes_on = f", or -restart {folder / 'checkpoint.h5'} to go on with it" * ("checkpoint.h5" in there)
+        raise OptionError(
+            f"-output {folder}: holds a run ({', '.join(there)}); allowed is another folder, -overwrite to replace "
+            f"that run{goes_on}"
         )

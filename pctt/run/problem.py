@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
-from pctt import ccp
+from pctt import ccp, log
 from pctt.ccp import fclib, petsc_binary
 from pctt.ccp.cone import Array
+from pctt.run import leftovers
 from pctt.run.hdf5 import FileError, write_text
 from pctt.run.options import Options
+from pctt.run.place import Place
 from pctt.run.report import Progress, compare_table
 
 
@@ -21,28 +22,52 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
     """Solve, print the figures, and write them to summary.json in the output folder."""
     assert options.problem is not None
     stored = _load(options.problem, comm, options.run.ccp_compliance)
-    problem, guess = stored.problem, stored.guess if options.run.problem_guess else None
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
+    with stored.problem:
+        summary = _solve(stored, options, compare)
+    progress = Progress(comm.rank == 0 and not options.run.quiet)
+    width = max(map(len, summary))
+    for name, value in summary.items():
+        if not isinstance(value, dict) and value != "":
+            shown = f"{value:.12g}" if isinstance(value, float) else value
+            progress.say(f"{name:{width}}  {shown}")
+    for name, figures in summary["references"].items():
+        listed = ", ".join(f"{word} {figure:.6g}" for word, figure in figures.items())
+        progress.say(f"the file's {name}: {listed}")
+    if compare.names:
+        progress.say("\n" + compare_table(compare.summary(), compare.labels()))
+    if not summary["converged"]:
+        progress.say(f"NOT CONVERGED: {summary['reason']}")
+    if left := leftovers.remark():
+        progress.say(left)
+    place = Place(Path(options.run.output), comm)
+    place.make()
+    if comm.rank == 0:
+        write_text(place.now / "summary.json", json.dumps(summary, indent=1) + "\n")
+    place.take()
+
+
+def _solve(stored: fclib.Stored, options: Options, compare: ccp.Comparison) -> dict[str, Any]:
+    """The figures of solving a stored problem as the options say."""
+    problem, guess, comm = stored.problem, stored.guess if options.run.problem_guess else None, stored.problem.comm
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
-    start = time.perf_counter()
-    result = ccp.solve(
-        problem,
-        guess,
-        options.run.ccp_type,
-        options.limits,
-        options.solver,
-        newton,
-        options.coulomb,
-    )
-    seconds = time.perf_counter() - start
-    newton.destroy()
+    try:
+        with log.phase("solve"):
+            result = ccp.solve(
+                problem, guess, options.run.ccp_type, options.limits, options.solver, newton, options.coulomb
+            )
+    finally:
+        newton.destroy()
+    seconds = log.take_seconds(("solve", "compare"))
     accuracy = ccp.measure(problem, result.impulse)
     used = result.solver or options.run.ccp_type
+    solves = compare.take_solves()
     by_newton = ccp.SOLVERS[used].newton
-    summary = {
+    return {
         "problem": str(options.problem),
         "format": stored.form,
         "title": stored.title,
+        "note": stored.note,
         "start": "cold" if guess is None else "the guess in the file",
         "contacts": problem.size,
         "ranks": comm.size,
@@ -57,7 +82,8 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         "newton_its": result.iterations if by_newton else 0,
         "iterations": result.iterations,
         "ksp_its": result.ksp_its,
-        "seconds": seconds,
+        "seconds": seconds["solve"],
+        **({"compare_seconds": seconds["compare"]} if compare.names else {}),
         "converged": result.converged,
         "reason": result.reason,
         "cone_violation": accuracy.cone_violation,
@@ -69,23 +95,10 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
             for name, impulse in (("solution", stored.solution), ("guess", stored.guess))
             if impulse is not None
         },
-        "compare": compare.summary(),
+        "compare": {
+            name: {**figures, "solves": solves[name]} for name, figures in compare.summary().items()
+        },
     }
-    progress = Progress(comm.rank == 0 and not options.run.quiet)
-    width = max(map(len, summary))
-    for name, value in summary.items():
-        if not isinstance(value, dict) and value != "":
-            shown = f"{value:.12g}" if isinstance(value, float) else value
-            progress.say(f"{name:{width}}  {shown}")
-    for name, figures in summary["references"].items():
-        listed = ", ".join(f"{word} {figure:.6g}" for word, figure in figures.items())
-        progress.say(f"the file's {name}: {listed}")
-    if compare.names:
-        progress.say("\n" + compare_table(compare.summary(), compare.labels()))
-    if not result.converged:
-        progress.say(f"NOT CONVERGED: {result.reason}")
-    if comm.rank == 0:
-        write_text(Path(options.run.output) / "summary.json", json.dumps(summary, indent=1) + "\n")
 
 
 def _load(path: str, comm: MPI.Comm, compliance: float | None) -> fclib.Stored:

@@ -3,42 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
 
 from dem.experiment import Experiment
 from pctt.run.hdf5 import FileError, write_text
+from pctt.run.lines import StepLines
+from pctt.run.place import Place
 
 
 class Records:
-    """Writes records.csv, whole at every step; the first columns are the step and the time."""
+    """Writes records.csv, a row at every step; the first columns are the step and the time."""
 
-    def __init__(self, folder: Path, comm: MPI.Comm, kept_steps: int):
-        """Rows of earlier runs up to the step ``kept_steps`` stay, all others go; collective."""
-        self._folder, self._comm = folder, comm
-        self._lines: list[str] = []
+    def __init__(self, place: Place, comm: MPI.Comm, kept_steps: int):
+        """Rows of an earlier run in this place up to the step ``kept_steps`` stay; collective."""
+        self._place, self._comm = place, comm
         header, failure = None, None
         if comm.rank == 0:
-            (folder / "analysis.csv").unlink(missing_ok=True)
             try:
-                header = self._take_over(folder / "records.csv", kept_steps)
+                header = self._take_over(kept_steps)
             except (OSError, ValueError) as error:
                 failure = str(error)
         self._header, failure = comm.bcast((header, failure))
         if failure:
-            raise FileError(f"{folder}/records.csv: cannot be continued ({failure})")
+            raise FileError(f"{place.folder}/records.csv: cannot be continued ({failure})")
 
-    def _take_over(self, path: Path, kept_steps: int) -> str | None:
-        if not path.exists():
-            return None
-        header, *lines = path.read_text().splitlines() or [""]
-        if kept_steps:
-            self._lines = [line for line in lines if int(line.partition(",")[0]) <= kept_steps]
-        if self._lines:
+    def _take_over(self, kept_steps: int) -> str | None:
+        """The header, if rows stay."""
+        self._lines = StepLines(self._place, "records.csv", _step, kept_steps)
+        header, *rows = [*self._lines] or [None]
+        if rows:
             return header
-        path.unlink()
+        self._lines = StepLines(self._place, "records.csv", _step, last=-1)  # not even a header stays
         return None
 
     def add(self, row: Mapping[str, float]) -> None:
@@ -46,18 +43,19 @@ class Records:
         rows before."""
         header = ",".join(row)
         if self._header not in (None, header):
-            raise FileError(f"{self._folder}/records.csv: has other columns than this run, choose another -output")
-        self._header = header
+            path = self._place.folder / "records.csv"
+            raise FileError(f"{path}: has other columns than this run, choose another -output")
         if self._comm.rank == 0:
             step, *rest = row.values()
-            self._lines.append(",".join([str(int(step)), *(repr(float(value)) for value in rest)]))
-            write_text(self._folder / "records.csv", "\n".join([header, *self._lines]) + "\n")
+            line = ",".join([str(int(step)), *(repr(float(value)) for value in rest)])
+            self._lines.add(line if self._header else f"{header}\n{line}")
+        self._header = header
 
     def columns(self) -> dict[str, np.ndarray]:
         """All rows as arrays by name; rank 0."""
-        assert self._header is not None
-        table = np.array([[float(cell) for cell in line.split(",")] for line in self._lines])
-        return dict(zip(self._header.split(","), table.T))
+        header, *rows = self._lines
+        table = np.array([[float(cell) for cell in row.split(",")] for row in rows])
+        return dict(zip(header.split(","), table.T))
 
     def analyse(self, scene: Experiment) -> dict[str, float]:
         """The scene's analysis of all rows: writes its series to analysis.csv and returns its numbers; rank 0."""
@@ -67,8 +65,14 @@ class Records:
         series = {name: np.asarray(value) for name, value in found.items() if name not in figures}
         if series:
             leading = {name: records[name] for name in list(records)[:2]}
-            write_text(self._folder / "analysis.csv", _table({**leading, **series}))
+            write_text(self._place.now / "analysis.csv", _table({**leading, **series}))
         return figures
+
+
+def _step(line: str) -> int:
+    """The step of a row; 0 of the header."""
+    first = line.partition(",")[0]
+    return 0 if first == "step" else int(first)
 
 
 def _table(columns: Mapping[str, Sequence[float] | np.ndarray]) -> str:

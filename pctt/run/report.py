@@ -13,20 +13,25 @@ from typing import Any
 
 from pctt import log
 
-COLUMNS = (
-    "  step    time s  contacts  Newton  Krylov  residual"
-    "  seconds: total  search  assembly   solve  output"
-)
-
 #: Overlaps above this part of the radius of the smallest grain are worth a warning.
 LARGE_OVERLAP = 0.05
 
 
+def columns(compared: bool) -> str:
+    """The heads of the columns of `step_line`."""
+    compare = " compare" * compared
+    return (
+        "  step    time s  contacts  Newton  Krylov  residual"
+        f"  seconds: total  search  assembly   solve{compare}  output"
+    )
+
+
 def step_line(line: Mapping[str, Any]) -> str:
-    """One step as a row under COLUMNS, with a remark where its solver needed help."""
+    """One step as a row under `columns`, with a remark where its solver needed help."""
     phases = line["phases"]
     names = ("search", "assembly", "solve", "output")
     search, assembly, solve, output = (phases.get(name, 0.0) for name in names)
+    compare = f" {phases['compare']:7.2f}" if "compare" in phases else ""
     remark = "" if line["converged"] else f"  NOT CONVERGED: {line['reason']}"
     if line["fallbacks"]:
         remark += f"  ({line['fallbacks']} Newton systems by a fallback)"
@@ -39,7 +44,7 @@ def step_line(line: Mapping[str, Any]) -> str:
     return (
         f"{line['step']:6d} {line['time']:9.3f} {line['contacts']:9d} {line['iterations']:7d}"
         f" {line['ksp_its']:7d}  {line['natural_residual']:8.1e} {line['seconds']:15.2f} {search:7.2f}"
-        f" {assembly:9.2f} {solve:7.2f} {output:7.2f}{remark}"
+        f" {assembly:9.2f} {solve:7.2f}{compare} {output:7.2f}{remark}"
     )
 
 

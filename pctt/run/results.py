@@ -1,14 +1,16 @@
 """The output folder of a run.
 
     state.h5         group steps/000012 per recorded step, each a link to its own file in frames/
-    frames/          one file per recorded step, and bodies.h5 with what no step changes; state.h5 links to it
+    frames/          one file per recorded step, and bodies.h5 with what no step changes
     records.csv      a row per step, see ``dem.record`` and ``pctt.run.records``
-    analysis.csv     the series that the scene makes of them at the end
+    steps.jsonl      what each step took and how well it was solved, a JSON object per line
+    analysis.csv     the series that the scene makes of the records at the end
     checkpoint.h5    all that ``-restart`` needs
-    summary.json     figures per step, and of the compared preconditioners
+    summary.json     figures of the whole run, and of the compared preconditioners
     hard/            cone problems that the asked-for solver did not solve
 
-Every file is written under a temporary name and renamed, so that a killed run leaves whole files only.
+What a step writes does not grow with the steps before it. Tables get a line with one write; every other file is
+written under a temporary name and renamed. So a run that is killed leaves whole files.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,56 +31,56 @@ from dem.contact.search import Contacts
 from dem.exchange import exchange
 from dem.system import ContactSystem
 from dem.world import World
-from pctt.disk import reserve
-from pctt.run.dump import HARD
-from pctt.run.hdf5 import FileError, RowWriter, write_text, written
+from pctt import disk
+from pctt.run import totals
+from pctt.run.hdf5 import FileError, RowWriter, replaced, told, write_text, written
+from pctt.run.lines import StepLines
+from pctt.run.place import HARD, Place
 from pctt.run.records import Records
+
+#: state.h5 is written anew when this part of its links is missing: so many links a step, however many there are.
+LAG = 0.01
+
+CONTENTS = (
+    "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, by body id; "
+    "record: attributes as in records.csv; "
+    "contact: bodies a and b, point m, frame rows (normal from a to b, t1, t2), gap m, "
+    "impulse on b N s; attribute dt s. bodies: shape, size m, mass kg, material by body id; "
+    "large: names and shapes of the large bodies, the last of the ids, in their frames"
+)
+LINKS = (
+    "This file holds nothing but links to the folder frames beside it, and is empty without that folder. "
+    "python -m pctt.export FOLDER -single FILE.h5 makes one file of all."
+)
 
 
 class Results:
-    """Writes the output folder.
+    """Writes what a run leaves in its place.
 
-    A run that goes on from this folder's own checkpoint adds to what the earlier one left; any other replaces it.
+    A run that goes on from the folder's own checkpoint adds to what the earlier one left, any other replaces it: but
+    nothing of the earlier run goes before the first new step ``stands``.
     """
 
-    def __init__(self, folder: Path, comm: MPI.Comm, record: str, world: World, restart: str):
-        self.folder, self.comm, self.record = folder, comm, record
-        self.checkpoint = folder / "checkpoint.h5"
-        self._frames = folder / "frames"
-        self._described = False
-        self._recorded: list[int] = []
-        self._steps: list[dict[str, Any]] = []
+    def __init__(self, place: Place, comm: MPI.Comm, record: str, world: World):
+        self.place, self.comm, self.record = place, comm, record
+        self._kept_steps = world.step if place.goes_on else 0
+        self._links = self._unlinked = 0  # in state.h5, and recorded since it was written
+        self._first_frame: int | None = None
+        self._stands = False
         smallest = float(bodies.least_half_thickness(world.grains).min(initial=np.inf))
         self._smallest_radius = comm.allreduce(smallest, MPI.MIN)
-        goes_on = comm.bcast(bool(restart) and Path(restart).resolve() == self.checkpoint.resolve())
+        self.records = Records(place, comm, self._kept_steps)
+        self._steps = StepLines(place, "steps.jsonl", _step_of, self._kept_steps)
+        self._totals: totals.Totals = {}
         if comm.rank == 0:
             try:
-                self._frames.mkdir(parents=True, exist_ok=True)
-                self._take_over(world, goes_on)
-            except OSError as error:
-                raise FileError(f"{folder}: cannot write ({error.strerror})", alone=True) from None
-        comm.Barrier()
-        self.records = Records(folder, comm, kept_steps=world.step if goes_on else 0)
+                self._totals = totals.of(self.steps())
+            except (OSError, LookupError, ValueError) as error:
+                raise FileError(f"{self._steps.path}: cannot be continued ({error})", alone=True) from None
 
-    def _take_over(self, world: World, goes_on: bool) -> None:
-        """Keep what is there up to the step from which this run goes on, and remove the rest."""
-        try:
-            old = json.loads((self.folder / "summary.json").read_text()) if goes_on else {}
-        except (OSError, ValueError):
-            old = {}
-        self._steps = [line for line in old.get("steps", []) if line["step"] <= world.step]
-        frames = {int(path.stem): path for path in self._frames.glob("*.h5") if path.stem.isdigit()}
-        self._recorded = sorted(step for step in frames if goes_on and step <= world.step)
-        # first the links, then what they led to: a run killed in between leaves no link without a file
-        if self._recorded:
-            self._link_frames(world)
-        else:
-            (self.folder / "state.h5").unlink(missing_ok=True)
-        for step in frames.keys() - set(self._recorded):
-            frames[step].unlink()
-        for path in (self.folder / HARD).glob("step??????_*its.h5"):
-            if not goes_on or int(path.name[4:10]) > world.step:
-                path.unlink()
+    @property
+    def checkpoint(self) -> Path:
+        return self.place.now / "checkpoint.h5"
 
     def record_step(
         self, world: World, contacts: Contacts, system: ContactSystem, impulse: np.ndarray, row: dict[str, float]
@@ -88,12 +90,13 @@ class Results:
 
         Bodies are in the order of their ids (grains, then large bodies).
         """
-        if not self._described:
-            with written(self._frames / "bodies.h5", self.comm) as file:
+        frames = self.place.now / "frames"
+        if self._first_frame is None:
+            self.place.make("frames")
+            with written(frames / "bodies.h5", self.comm) as file:
                 _write_constants(file, world)
-            self._described = True
-        name = f"{world.step:06d}.h5"
-        with written(self._frames / name, self.comm) as file:
+            self._first_frame = world.step
+        with written(frames / f"{world.step:06d}.h5", self.comm) as file:
             file.attributes("/", {"step": world.step, "time": world.time})
             file.attributes("record", row)
             _write_bodies(file, world)
@@ -105,62 +108,91 @@ class Results:
             file.rows("contact/gap", contacts.gap)
             file.rows("contact/impulse", impulse)
             file.attributes("contact", {"dt": system.dt})
+        self._unlinked += 1
+        if self._unlinked >= LAG * self._links:
+            self.link(world)
+
+    def link(self, world: World) -> None:
+        """Let state.h5 lead to all recorded steps."""
+        if self._unlinked and self.comm.rank == 0:
+            self._link(world, [step for step in self._frames() if step <= world.step])
+        self._unlinked = 0
+
+    def _link(self, world: World, steps: list[int]) -> None:
+        path = self.place.now / "state.h5"
+        with replaced(path) as temporary:
+            disk.make_hdf5(temporary, numbers=4096 + 128 * len(steps), items=0)
+            with h5py.File(temporary, "r+") as file:
+                file.attrs["scene"] = self.record
+                file.attrs["large_bodies"] = [body.name for body in world.large_bodies]
+                file.attrs["contents"], file.attrs["links"] = CONTENTS, LINKS
+                file["bodies"] = h5py.ExternalLink("frames/bodies.h5", "/")
+                for step in steps:
+                    file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
+        self._links = len(steps)
+
+    def _frames(self) -> list[int]:
+        """The steps that are recorded in files."""
+        return sorted(int(path.stem) for path in (self.place.now / "frames").glob("*.h5") if path.stem.isdigit())
+
+    def add_step(self, world: World, line: dict[str, Any], compare: dict[str, Any]) -> None:
+        """Write the figures of a step, and the summary with them."""
         if self.comm.rank == 0:
-            self._recorded.append(world.step)
-            self._link_frames(world)
+            self._steps.add(json.dumps(_finite(line)))
+            self._totals = totals.add(self._totals, line)
+        self.write_summary(world, compare)
 
-    def _link_frames(self, world: World) -> None:
-        temporary = self.folder / ".state.h5.tmp"
-        try:
-            reserve(temporary, 1024, items=len(self._recorded))
-            self._write_links(temporary, world)
-            temporary.replace(self.folder / "state.h5")
-        except OSError as error:
-            temporary.unlink(missing_ok=True)
-            raise FileError(f"{self.folder / 'state.h5'}: cannot write ({error.strerror})", alone=True) from None
+    def steps(self) -> Iterator[dict[str, Any]]:
+        """The figures of the steps, also of those that an earlier run left for this one to go on from; on rank 0."""
+        return map(json.loads, self._steps)
 
-    def _write_links(self, path: Path, world: World) -> None:
-        with h5py.File(path, "w") as file:
-            file.attrs["scene"] = self.record
-            file.attrs["large_bodies"] = [body.name for body in world.large_bodies]
-            file.attrs["contents"] = (
-                "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, by body id; "
-                "record: attributes as in records.csv; "
-                "contact: bodies a and b, point m, frame rows (normal from a to b, t1, t2), gap m, "
-                "impulse on b N s; attribute dt s. bodies: shape, size m, mass kg, material by body id; "
-                "large: names and shapes of the large bodies, the last of the ids, in their frames"
-            )
-            file["bodies"] = h5py.ExternalLink("frames/bodies.h5", "/")
-            for step in self._recorded:
-                file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
+    def stands(self, world: World, line: dict[str, Any]) -> None:
+        """The step with these figures is written: after the first one, what it replaces may go; collective."""
+        if self._stands:
+            return
+        self.place.take()
+        if self.comm.rank == 0:
+            with told(self.place.folder):
+                self._remove_later(world, Path(line["hard_problem"]).name)
+        self._stands = True
+
+    def _remove_later(self, world: World, hard: str) -> None:
+        """Remove what an earlier run left of steps that this one makes again, but for what the first has written,
+        such as the file ``hard``."""
+        folder, kept = self.place.folder, self._kept_steps
+        (folder / "analysis.csv").unlink(missing_ok=True)
+        steps = self._frames()
+        stay = [step for step in steps if step <= kept or step == self._first_frame]
+        if stay != steps:
+            self._link(world, stay)  # before the files go, so that a run killed in between leaves no link without one
+        for step in set(steps) - set(stay):
+            (folder / "frames" / f"{step:06d}.h5").unlink()
+        for path in (folder / HARD).glob("step??????_*its.h5"):
+            if int(path.name[4:10]) > kept and path.name != hard:
+                path.unlink()
 
     def worst_overlap(self) -> dict[str, float]:
         """The deepest overlap at the start of a step so far, the step, and the radius of the smallest grain (half the
         least side of a box); on rank 0."""
-        deepest = max(self._steps, key=lambda line: line.get("worst_overlap", 0.0), default={})
-        return {
-            "overlap [m]": deepest.get("worst_overlap", 0.0),
-            "step": deepest.get("step", 0),
-            "smallest_radius [m]": self._smallest_radius,
-        }
+        return {**self._totals["worst_overlap"], "smallest_radius [m]": self._smallest_radius}
 
-    def write_summary(
-        self,
-        world: World,
-        compare: dict[str, Any],
-        line: dict[str, Any] | None = None,
-        analysis: dict[str, float] | None = None,
-    ) -> None:
-        """Write summary.json with what is known so far, the figures of a new step and those of the analysis."""
-        if self.comm.rank != 0:
-            return
-        if line is not None:
-            self._steps.append(line)
-        totals = {"bodies": world.body_count, "ranks": self.comm.size, "compare": compare}
-        totals["worst_overlap"] = self.worst_overlap()
-        scene = json.loads(self.record)
-        summary = {**totals, "scene": scene, "analysis": analysis or {}, "steps": self._steps}
-        write_text(self.folder / "summary.json", json.dumps(_finite(summary), indent=1) + "\n")
+    def write_summary(self, world: World, compare: dict[str, Any], analysis: dict[str, float] | None = None) -> None:
+        """Write summary.json with what is known so far, and the figures of the analysis."""
+        if self.comm.rank == 0:
+            summary = {
+                "scene": json.loads(self.record),
+                "bodies": world.body_count,
+                "ranks": self.comm.size,
+                **self._totals,
+                "worst_overlap": self.worst_overlap(),
+                "analysis": analysis or {},
+                "compare": compare,
+            }
+            write_text(self.place.now / "summary.json", json.dumps(_finite(summary), indent=1) + "\n")
+
+
+def _step_of(line: str) -> int:
+    return int(json.loads(line)["step"])
 
 
 def _finite(value: Any) -> Any:

@@ -15,22 +15,26 @@ from mpi4py import MPI
 
 from dem import record as recording
 from dem.contact import Contacts, find_contacts, find_overrun
+from dem.experiment import Experiment
 from dem.impulses import ImpulseMemory
 from dem.partition import rebalance
 from dem.scene import Scene
 from dem.stepper import advance
 from dem.system import ContactSystem
+from dem.together import SceneError, together
 from dem.world import World
 from pctt import ccp, log
 from pctt.options import OptionError
-from pctt.run import checkpoint, report
+from pctt.run import checkpoint, interrupt, leftovers, report
 from pctt.run.dump import Dump
-from pctt.run.options import Options, scene_name
+from pctt.run.hdf5 import FileError
+from pctt.run.options import DEMO, Options, scene_name
+from pctt.run.place import Place
 from pctt.run.results import Results
 
 
 def simulate(options: Options, comm: MPI.Comm) -> None:
-    """Run the scene of the options, or settle it with ``-settle``."""
+    """Run the scene of the options, or settle it with ``-settle``. InterruptError if a signal asks for the end."""
     progress = report.Progress(comm.rank == 0 and not options.run.quiet, options.run.monitor)
     if options.run.settle:
         path = settled_state(options, comm, progress, anew=True)
@@ -39,72 +43,86 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     if options.demo:
         progress.say("no options: the demo; -help lists the options")
     world, memory = first_state(options, comm, progress)
-    dump = Dump(options, world)
+    place = Place(Path(options.run.output), comm, options.run.restart)
+    dump = Dump(options, world, place)
     made_with = checkpoint.origin(scene_name(options.run.scene), options.scene, options.dt)
-    results = Results(Path(options.run.output), comm, made_with["scene"], world, options.run.restart)
+    results = Results(place, comm, made_with["scene"], world)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
-    stepper = Stepper(options, world, memory, newton, dump)
     method = f"{options.run.ccp_type} to {options.limits.tol:g}{' with Coulomb law' if options.coulomb else ''}"
     progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
-    progress.say(report.COLUMNS, level=1)
-    lines = []
+    progress.say(report.columns(bool(compare.names)), level=1)
+    start, end = world.step, world.step + options.run.steps
     progress.start(options.run.steps)
-    for k in range(1, options.run.steps + 1):
-        progress.doing(f"step {world.step + 1}, time {world.time:.3f} s")
-        line = stepper.step()
-        last = k == options.run.steps
-        lines.append(line)
-        with log.phase("output"):
-            row = stepper.records()
-            line["worst_overlap"] = row["worst_overlap [m]"]
-            results.records.add(row)
-            if options.run.output_every and (world.step % options.run.output_every == 0 or last):
-                results.record_step(world, stepper.contacts, stepper.system, stepper.impulse, row)
-        # before the checkpoint: a run that goes on from there must find the step in the summary
-        _count_output(line)
-        results.write_summary(world, compare.summary(), line)
-        with log.phase("output"):
-            if k % options.run.checkpoint_every == 0 or last:
-                checkpoint.save(results.checkpoint, made_with, world, memory)
-        _count_output(line)
-        progress.say(report.step_line(line), level=1)
-        progress.say(report.accuracy_lines(line, stepper.history), level=2)
-    if lines:
-        figures = _analyse(options.scene, results, comm)
-        results.write_summary(world, compare.summary(), analysis=figures)
-        progress.say("\n" + report.phase_table(lines))
-        if figures:
-            progress.say(report.figure_table(figures))
-        if comm.rank == 0:
-            progress.say(report.overlap_line(results.worst_overlap()))
-        if row.get("grains_outside"):
-            progress.say(f"{row['grains_outside']:.0f} grains have left the domain of the scene")
-    if compare.names:
-        progress.say("\n" + report.compare_table(compare.summary(), compare.labels()))
-    newton.destroy()
-    progress.say(f"\nresults: {results.folder}/state.h5, records.csv, summary.json, checkpoint.h5")
+    with Stepper(options, world, memory, newton, dump) as stepper:
+        while world.step < end:
+            progress.doing(f"step {world.step + 1}, time {world.time:.3f} s")
+            line = stepper.step()
+            interrupted = interrupt.asked(comm) and world.step < end
+            last = world.step == end or interrupted
+            with log.phase("output"):
+                row = stepper.records()
+                line["worst_overlap"] = row["worst_overlap [m]"]
+                results.records.add(row)
+                if options.run.output_every and (world.step % options.run.output_every == 0 or last):
+                    results.record_step(world, stepper.contacts, stepper.system, stepper.impulse, row)
+            _count_output(line)
+            with log.phase("output"):
+                # before the checkpoint: a run that goes on from there must find the step
+                results.add_step(world, line, compare.summary())
+                if (world.step - start) % options.run.checkpoint_every == 0 or last:
+                    checkpoint.save(results.checkpoint, made_with, world, memory)
+                results.stands(world, line)
+            progress.say(report.step_line(line), level=1)
+            progress.say(report.accuracy_lines(line, stepper.history), level=2)
+            if interrupted:
+                results.link(world)
+                raise interrupt.InterruptError(_how_to_go_on(options, world.step, results.checkpoint, end))
+        if world.step > start:
+            results.link(world)
+            figures = _analyse(options.scene, results, comm)
+            results.write_summary(world, compare.summary(), analysis=figures)
+            if comm.rank == 0:
+                lines = [line for line in results.steps() if line["step"] > start]
+                progress.say("\n" + report.phase_table(lines))
+            if figures:
+                progress.say(report.figure_table(figures))
+            if comm.rank == 0:
+                progress.say(report.overlap_line(results.worst_overlap()))
+            if row.get("grains_outside"):
+                progress.say(f"{row['grains_outside']:.0f} grains have left the domain of the scene")
+        if compare.names:
+            progress.say("\n" + report.compare_table(compare.summary(), compare.labels()))
+    if left := leftovers.remark():
+        progress.say(left)
+    if world.step > start:
+        progress.say(f"\nresults: {place.folder}/state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
 
 
-def _analyse(scene: Any, results: Results, comm: MPI.Comm) -> dict[str, float]:
+def _how_to_go_on(options: Options, step: int, state: Path, end: int) -> str:
+    """What a user who has interrupted a run before its end is told."""
+    words = f"-restart {state} -steps {end - step}"
+    if options.demo:
+        kept = {name: value for name, value in DEMO.items() if name not in ("restart", "steps", "overwrite")}
+        words = " ".join([*(f"-{name} {value}" for name, value in kept.items()), words])
+    return f"interrupted after step {step}; the same command with {words} at its end goes on"
+
+
+def _analyse(scene: Experiment, results: Results, comm: MPI.Comm) -> dict[str, float]:
     """The numbers that the scene finds in the records; SceneError if it fails on them."""
-    figures: dict[str, float] = {}
-    failure = None
-    if comm.rank == 0:
-        try:
-            figures = results.records.analyse(scene)
-        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-            failure = f"{type(error).__name__}: {error}"
-    figures, failure = comm.bcast((figures, failure))
-    if failure:
-        raise SceneError(f"analyse of the scene {type(scene).__name__}: {failure}")
-    return figures
+    what = f"analyse of the scene {type(scene).__name__}"
+
+    def analyse() -> dict[str, float]:
+        return results.records.analyse(scene) if comm.rank == 0 else {}
+
+    return comm.bcast(together(comm, what, analyse, own=(FileError,)))
 
 
 def _count_output(line: dict[str, Any]) -> None:
-    """Add the seconds of output since the last count to the figures of a step."""
+    """Add the seconds of output since the last count to the figures of a step: those of its checkpoint count in the
+    next step, as the figures are written before."""
     phases = line["phases"]
-    phases["output"] = phases.get("output", 0.0) + log.take_seconds(("output",))["output"]
+    phases |= log.take_seconds(("output",))
     line["seconds"] = sum(phases.values())
 
 
@@ -112,12 +130,11 @@ def _count_output(line: dict[str, Any]) -> None:
 OVERRUN = 0.01
 
 
-class SceneError(RuntimeError):
-    """A scene that cannot go on; raised on all ranks alike."""
-
-
 class Stepper:
-    """One time step after another of a world; keeps the last step's contacts and impulses for output."""
+    """One time step after another of a world; keeps the last step's contacts and impulses for output.
+
+    Owns what it is given as ``newton`` and the PETSc objects of the step under way, which `destroy` frees.
+    """
 
     contacts: Any
     system: ContactSystem
@@ -133,6 +150,25 @@ class Stepper:
         dump: Dump | None = None,
     ):
         self.options, self.world, self.memory, self.newton, self.dump = options, world, memory, newton, dump
+        self._problem: ccp.ConeProblem | None = None
+
+    def __enter__(self) -> Stepper:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.destroy()
+
+    def destroy(self) -> None:
+        self._release()
+        if self.newton is not None:
+            self.newton.destroy()
+
+    def _release(self) -> None:
+        """Free the PETSc objects of the present problem."""
+        if self._problem is not None:
+            self._problem.destroy()
+            self.system.destroy()
+            self._problem = None
 
     def step(self) -> dict[str, Any]:
         """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no
@@ -141,15 +177,14 @@ class Stepper:
         with log.phase("search"):
             rebalance(world)
             try:
-                self.contacts = find_contacts(world, options.delta, options.dt)
+                contacts = find_contacts(world, options.delta, options.dt)
             except FloatingPointError as error:  # raised on all ranks alike
                 raise SceneError(f"step {world.step + 1}: {error}") from None
-        problem, guess = self._assemble(self.contacts, self.memory)
+        problem, guess = self._assemble(contacts, self.memory)
         with log.phase("solve"):
             result, solver, newton_its = self.solve(problem, guess)
         while again := self._overrun(problem, result.impulse):
-            problem.destroy()
-            problem, guess = again
+            problem, guess = self._assemble(*again)
             with log.phase("solve"):
                 first, (result, solver, more_its) = result, self.solve(problem, guess)
             newton_its += more_its
@@ -164,13 +199,15 @@ class Stepper:
             self.impulse, self.history = result.impulse, result.history
             advance(world, self.system.velocity(self.impulse), options.dt)
             self.memory.remember(self.system.key, self.impulse, self.system.frame)
-        contacts = problem.size
-        problem.destroy()
-        pc_report = self.newton.pc_report if self.newton is not None else []
+        self._release()
+        newton = self.newton
+        pc_report = newton.pc_report if newton is not None else []
+        compare = newton.compare if newton is not None else None
+        phases = ("search", "assembly", "solve", *(["compare"] if compare else []), "advance")
         return {
             "step": world.step,
             "time": world.time,
-            "contacts": contacts,
+            "contacts": problem.size,
             "newton_its": newton_its,
             "iterations": result.iterations,
             "ksp_its": result.ksp_its,
@@ -183,23 +220,25 @@ class Stepper:
             "asked_solver": options.run.ccp_type,
             **({"pc_report": pc_report} if pc_report else {}),
             **files,
+            **({"compare": compare.take_solves()} if compare else {}),
             "peak_memory": _peak_memory(world.comm),
-            "phases": log.take_seconds(("search", "assembly", "solve", "advance")),
+            "phases": log.take_seconds(phases),
         }
 
     def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, np.ndarray]:
-        """The problem of these contacts, and the impulses remembered."""
+        """The problem of these contacts, which takes the place of the last, and the impulses remembered."""
         options = self.options
         with log.phase("assembly"):
+            self._release()
             self.contacts = contacts
             self.system = ContactSystem(self.world, contacts, options.dt, options.run.recovery_speed)
-            problem = cone_problem(self.system, self.world.comm, options.run.ccp_compliance or 0.0)
+            self._problem = cone_problem(self.system, self.world.comm, options.run.ccp_compliance or 0.0)
             guess, _ = memory.recall(self.system.key, self.system.frame)
-        return problem, guess
+        return self._problem, guess
 
-    def _overrun(self, problem: ccp.ConeProblem, impulse: np.ndarray) -> tuple[ccp.ConeProblem, np.ndarray] | None:
-        """The problem with the contacts that nobody foresaw, as impulses of the step sent a grain further than its
-        margin, and the impulses so far; None if it runs into nothing there."""
+    def _overrun(self, problem: ccp.ConeProblem, impulse: np.ndarray) -> tuple[Contacts, ImpulseMemory] | None:
+        """The contacts with those that nobody foresaw, as impulses of the step sent a grain further than its margin,
+        and the impulses so far; None if it runs into nothing there."""
         world, options = self.world, self.options
         with log.phase("search"):
             velocity = self.system.velocity(impulse)
@@ -209,24 +248,19 @@ class Stepper:
         with log.phase("assembly"):
             unseen = wider.take(~np.isin(wider.key, self.contacts.key))
             system = ContactSystem(world, unseen, options.dt, options.run.recovery_speed)
-            alone = cone_problem(system, world.comm)
-            opening = (alone.velocity_of(problem.momentum(impulse)) + alone.r)[:, 0]
-            closes = options.dt * alone.min(opening.min(initial=0.0)) < -OVERRUN * options.delta
-            alone.destroy()
+            with cone_problem(system, world.comm) as alone:
+                opening = (alone.velocity_of(problem.momentum(impulse)) + alone.r)[:, 0]
+                closes = options.dt * alone.min(opening.min(initial=0.0)) < -OVERRUN * options.delta
         if not closes:
             return None
         memory = ImpulseMemory(world.comm)
         memory.remember(self.system.key, impulse, self.system.frame)
-        return self._assemble(wider, memory)
+        return wider, memory
 
     def records(self) -> dict[str, float]:
         """What the last step shows, by name; collective. SceneError if the scene's own records are at fault."""
-        try:
-            step = recording.Step(self.world, self.contacts, self.system, self.impulse)
-            return recording.row(step, self.options.scene)
-        except (LookupError, TypeError, ValueError) as error:
-            scene = type(self.options.scene).__name__
-            raise SceneError(f"record of the scene {scene}: {type(error).__name__}: {error}") from None
+        step = recording.Step(self.world, self.contacts, self.system, self.impulse)
+        return recording.row(step, self.options.scene)
 
     def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> tuple[ccp.Result, str, int]:
         """Solve as asked; where that does not converge, go on with APGD from there and keep the better.
@@ -267,28 +301,37 @@ def first_state(options: Options, comm: MPI.Comm, progress: report.Progress) -> 
         return _new_world(scene, comm), ImpulseMemory(comm)
     path = settled_state(options, comm, progress) if run.restart == "settled" else Path(run.restart)
     made_with = checkpoint.origin(scene_name(run.scene), scene, options.dt)
-    world, memory = checkpoint.load(path, scene, made_with, comm, run.restart_changed_file)
+    world, memory = checkpoint.load(path, _built(scene, comm), made_with, comm, run.restart_changed_file)
     progress.say(f"from {path}: step {world.step}, time {world.time:g} s")
     return world, memory
 
 
-def _new_world(scene: Any, comm: MPI.Comm) -> World:
+def _new_world(scene: Experiment, comm: MPI.Comm) -> World:
     try:
-        built = scene.build()
-        if not isinstance(built, Scene):
-            raise ValueError(f"build must return a dem.scene.Scene, not {type(built).__name__}")
-        return World.from_scene(built, comm)
+        return World.from_scene(_built(scene, comm), comm)
     except ValueError as error:
         raise OptionError(f"scene {type(scene).__name__}: {error}") from None
+
+
+def _built(scene: Experiment, comm: MPI.Comm) -> Scene:
+    """What the scene builds; SceneError on all ranks if that fails on any."""
+
+    def build() -> Scene:
+        built = scene.build()
+        if not isinstance(built, Scene):
+            raise TypeError(f"build must return a dem.scene.Scene, not {type(built).__name__}")
+        return built
+
+    return together(comm, f"build of the scene {type(scene).__name__}", build)
 
 
 def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, anew: bool = False) -> Path:
     """The cached settled state of the scene, made if it is not there (or ``anew``): the scene's settling time
     with APGD, its last tenth with the contacts and ten times the accuracy, so that no overlap is left that
-    a first accurate step would have to push apart."""
+    a first accurate step would have to push apart. What an interrupted or killed settling has left is gone on from."""
     settling = dataclasses.replace(
         options,
-        run=dataclasses.replace(options.run, ccp_type="apgd"),
+        run=dataclasses.replace(options.run, ccp_type="apgd", ccp_compliance=None),
         delta=options.run.settle_delta,
         limits=ccp.Limits(tol=options.run.settle_tol),
         solver=ccp.SOLVERS["apgd"].options(),
@@ -309,27 +352,39 @@ def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, a
     if not anew and comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
         return path
     steps = math.ceil(options.scene.settling_time / options.dt * (1 - 1e-12))
+    tenth = max(1, steps // 10)
     progress.say(f"settling {options.run.scene}, {steps} steps with APGD to {options.run.settle_tol:g}:")
+    unfinished = path.with_suffix(".unfinished.h5")
     if comm.rank == 0:
         path.parent.mkdir(parents=True, exist_ok=True)
-    stepper = Stepper(settling, _new_world(options.scene, comm), ImpulseMemory(comm))
+    if comm.bcast(unfinished.exists()):
+        world, memory = checkpoint.load(unfinished, _built(options.scene, comm), made_with, comm)
+        progress.say(f"  goes on after step {world.step}, from {unfinished}")
+    else:
+        world, memory = _new_world(options.scene, comm), ImpulseMemory(comm)
     start = time.perf_counter()
-    progress.start(steps)
-    for k in range(1, steps + 1):
-        progress.doing(f"settling, time {stepper.world.time:.3f} s")
-        if k == steps - steps // 10:
-            limits = ccp.Limits(tol=0.1 * options.run.settle_tol)
-            stepper.options = dataclasses.replace(settling, delta=options.delta, limits=limits)
-        line = stepper.step()
-        if k % max(1, steps // 10) == 0 or k == steps:
-            spent = time.perf_counter() - start
-            progress.say(
-                f"  step {k:5d}  time {line['time']:6.2f} s  contacts {line['contacts']:8d}"
-                f"  residual {line['natural_residual']:.1e}  {spent:7.1f} s spent"
-            )
-    comm.Barrier()
-    checkpoint.save(path, made_with, stepper.world, stepper.memory)
+    progress.start(steps - world.step)
+    with Stepper(settling, world, memory) as stepper:
+        while world.step < steps:
+            progress.doing(f"settling, time {world.time:.3f} s")
+            if world.step + 1 >= steps - steps // 10:
+                limits = ccp.Limits(tol=0.1 * options.run.settle_tol)
+                stepper.options = dataclasses.replace(settling, delta=options.delta, limits=limits)
+            line = stepper.step()
+            interrupted = interrupt.asked(comm)
+            if world.step % tenth == 0 or world.step == steps or interrupted:
+                checkpoint.save(unfinished, made_with, world, memory)
+                spent = time.perf_counter() - start
+                progress.say(
+                    f"  step {world.step:5d}  time {line['time']:6.2f} s  contacts {line['contacts']:8d}"
+                    f"  residual {line['natural_residual']:.1e}  {spent:7.1f} s spent"
+                )
+            if interrupted:
+                words = f"settling interrupted after step {world.step} of {steps}; the same command goes on there"
+                raise interrupt.InterruptError(words)
+    checkpoint.save(path, made_with, world, memory)
     if comm.rank == 0:
         checkpoint.write_checksum(path)
+        unfinished.unlink(missing_ok=True)
     comm.Barrier()
     return path

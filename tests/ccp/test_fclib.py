@@ -125,6 +125,67 @@ def test_a_mass_matrix_that_couples_bodies_gives_the_matrix(tmp_path):
     assert np.allclose(problem.r.ravel(), w + H.T @ np.linalg.solve(M, f), atol=1e-12)
 
 
+def replace_mass(path: Path, change) -> np.ndarray:
+    """Write another M into a global problem, in triplets; what it was."""
+    with h5py.File(path, "a") as file:
+        M = _dense_triplets(file["fclib_global/M"])
+        del file["fclib_global/M"]
+        write_matrix(file["fclib_global"].create_group("M"), change(M), "triplets")
+    return M
+
+
+@pytest.mark.parametrize("triangle", [np.triu, np.tril])
+@pytest.mark.parametrize("coupled", [False, True], ids=["bodies", "coupled masses"])
+def test_one_triangle_of_the_mass_matrix_is_mirrored(tmp_path, triangle, coupled):
+    path, known, W = write_global(tmp_path / "global.hdf5", block_mass=True)
+    if coupled:
+        with h5py.File(path, "a") as file:
+            group = file["fclib_global"]
+            H, f, w = _dense_triplets(group["H"]), group["vectors/f"][:], group["vectors/w"][:]
+        M = 3.0 * np.eye(len(H)) + np.eye(len(H), k=1) + np.eye(len(H), k=-1)
+        replace_mass(path, lambda _: triangle(M))
+        W, r = H.T @ np.linalg.solve(M, H), w + H.T @ np.linalg.solve(M, f)
+    else:
+        replace_mass(path, triangle)
+        r = known.r.ravel()
+    stored = fclib.load(path, SELF)
+    assert (stored.problem.contact_map is None) == coupled
+    assert np.allclose(dense(stored.problem), W, atol=1e-12 * np.abs(W).max())
+    assert np.allclose(stored.problem.r.ravel(), r, atol=1e-12 * np.abs(r).max())
+    assert "one triangle" in stored.note
+
+
+def test_a_mass_matrix_that_is_not_symmetric_is_refused_but_for_rounding(tmp_path):
+    path, _, W = write_global(tmp_path / "global.hdf5", block_mass=True)
+    assert fclib.load(path, SELF).note == ""
+
+    def off(M: np.ndarray, part: float) -> np.ndarray:
+        M = M.copy()
+        M[0, 1] += part * np.sqrt(M[0, 0] * M[1, 1])
+        return M
+
+    M = replace_mass(path, lambda M: off(M, 1e-13))
+    stored = fclib.load(path, SELF)
+    assert stored.note == ""
+    assert np.allclose(dense(stored.problem), W, atol=1e-10 * np.abs(W).max())
+    for other in (off(M, 1e-5), np.where(np.tri(len(M), k=-1) * M != 0, 0.5 * M, M)):
+        replace_mass(path, lambda _, other=other: other)
+        with pytest.raises(FileFormatError, match=r"global\.hdf5.*mass matrix is not symmetric: M\[\d+, \d+\] = "):
+            fclib.read(path, SELF)
+
+
+def test_the_problem_of_lmgc_whose_mass_matrix_is_one_triangle():
+    """Half the sum of M and its mirror would give -0.47490006."""
+    path = FCLIB.parent / "problems" / "LMGC_GlobalFrictionContactProblem00046.hdf5"
+    if not path.exists():
+        pytest.skip(f"{path} is not here; PCTT_FCLIB names the folder beside it")
+    stored = fclib.load(path, SELF)
+    assert "one triangle" in stored.note
+    result = ccp.solve(stored.problem, limits=Limits(1e-8))
+    assert result.converged
+    assert ccp.measure(stored.problem, result.impulse).objective == pytest.approx(-0.44168753, abs=1e-8)
+
+
 def _dense_triplets(group: h5py.Group) -> np.ndarray:
     """A matrix in CSC or in triplets, by the definition of the formats."""
     m, n, nz = (int(group[name][0]) for name in ("m", "n", "nz"))

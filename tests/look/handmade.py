@@ -42,7 +42,7 @@ def write(path: Path, shapes: list[dict], steps: int = 1) -> Path:
                     file[f"contact/{name}"] = values
                 file["contact"].attrs["dt"] = DT
             state[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
-    (path / "summary.json").write_text(json.dumps({"steps": [], "compare": {}}))
+    (path / "summary.json").write_text(json.dumps({"steps": 0, "compare": {}}))
     return path
 
 

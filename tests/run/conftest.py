@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ from petsc4py import PETSc
 from program import SMALL, database, start
 
 from pctt.run.__main__ import run as run_program
+from pctt.run.interrupt import SIGNALS
 
 Program = Callable[..., "CompletedProcess[str]"]
 
@@ -44,9 +46,12 @@ def program(
             for name, value in database(words).items():
                 options.setValue(name, value)
             capfd.readouterr()
+            handlers = {number: signal.getsignal(number) for number in SIGNALS}
             try:
                 status = run_program()
             finally:
+                for number, handler in handlers.items():
+                    signal.signal(number, handler)
                 for name in options.getAll():
                     options.delValue(name)
                 said = comm.allgather(capfd.readouterr())

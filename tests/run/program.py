@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -58,6 +59,16 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
             else:
                 _collect({name: file[name]}, "", found)
     return found
+
+
+def steps_of(folder: Path) -> list[dict]:
+    """The figures of the steps in an output folder; what is no JSON fails."""
+    lines = (folder / "steps.jsonl").read_text().splitlines()
+    return [json.loads(line, parse_constant=_refuse) for line in lines]
+
+
+def _refuse(constant: str) -> None:
+    raise AssertionError(f"{constant} is not JSON")
 
 
 def table(path: Path) -> dict[str, np.ndarray]:

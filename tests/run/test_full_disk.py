@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 import resource
 import shutil
 import subprocess
@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from program import SMALL, arrays, command, environment, recorded_steps
+from program import SMALL, arrays, command, environment, recorded_steps, steps_of
 
 from pctt.ccp import ConeProblem, fclib, petsc_binary
-from pctt.run.hdf5 import FileError
+from pctt.run.hdf5 import FileError, RowWriter, written
+from pctt.run.lines import StepLines
 from pctt.run.options import read_options
+from pctt.run.place import Place
 from pctt.run.simulate import simulate
 
 LOOSE = ("-ccp_type", "apgd", "-ccp_tol", "1e-3")
@@ -25,7 +27,7 @@ SCENE = {"scene_n": "1", "scene_margin": "0.5", "output": "out", "ccp_type": "ap
 def check_whole(folder):
     """All that is there can be read and nothing else is there; the step of the checkpoint."""
     assert not list(folder.rglob("*.tmp"))
-    steps = [line["step"] for line in json.loads((folder / "summary.json").read_text())["steps"]]
+    steps = [line["step"] for line in steps_of(folder)]
     step = int(arrays(folder / "checkpoint.h5")["world/step"])
     assert set(steps) >= set(range(1, step + 1))
     if (folder / "state.h5").exists():  # not with -output_every 0
@@ -54,10 +56,9 @@ class Limit:
     [
         (40_000, "out/frames/000003.h5", {}),
         (1_000, "out/records.csv", {"output_every": "0"}),
-        (2_000, "out/summary.json", {"output_every": "0"}),
+        (2_000, "out/steps.jsonl", {"output_every": "0"}),
         (40_000, "out/checkpoint.h5", {"output_every": "0"}),
         (40_000, "problems/step000003_", {"dump_problem": "problems"}),
-        (10_000, "out/state.h5", {}),
     ],
 )
 def test_a_file_that_cannot_be_written_ends_the_run_and_spares_the_others(size, file, options, tmp_path, monkeypatch):
@@ -76,6 +77,84 @@ def test_a_file_that_cannot_be_written_ends_the_run_and_spares_the_others(size, 
     assert check_whole(tmp_path / "out") == 2
     run(**again, **options)  # the disk has room again
     assert check_whole(tmp_path / "out") == 3
+
+
+def test_a_run_that_cannot_write_its_first_step_leaves_the_one_that_it_was_to_replace(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run(**more):
+        simulate(read_options({**SCENE, "steps": "2", **more}, MPI.COMM_SELF), MPI.COMM_SELF)
+
+    def contents():
+        paths = [path for path in (tmp_path / "out").rglob("*") if path.is_file() and ".new" not in path.parts]
+        return {path: path.read_bytes() for path in paths}
+
+    run()
+    before = contents()
+    for size, every, file in ((40_000, "1", "frames/000001.h5"), (40_000, "0", "checkpoint.h5")):
+        with Limit(size), pytest.raises(FileError, match=rf"out/.new/{file}: cannot write \(File too large\)"):
+            run(overwrite="true", output_every=every)
+        assert contents() == before
+    run(overwrite="true", steps="3")
+    assert check_whole(tmp_path / "out") == 3
+    assert not (tmp_path / "out" / ".new").exists()
+
+
+def test_frames_stay_if_the_links_to_the_others_cannot_be_written(tmp_path, monkeypatch):
+    """Of a run that makes the third step again, and records nothing."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(**more):
+        simulate(read_options({**SCENE, "restart": "out/checkpoint.h5", **more}, MPI.COMM_SELF), MPI.COMM_SELF)
+
+    run(steps="2", restart="")
+    early = (tmp_path / "out" / "checkpoint.h5").read_bytes()
+    run(steps="1")
+    (tmp_path / "out" / "checkpoint.h5").write_bytes(early)
+    again = {"steps": "2", "checkpoint_every": "2", "output_every": "0"}
+    with Limit(15_000), pytest.raises(FileError, match=r"out/state.h5: cannot write \(File too large\)"):
+        run(**again)
+    assert check_whole(tmp_path / "out") == 2
+    assert recorded_steps(arrays(tmp_path / "out" / "state.h5")) == ["000001", "000002", "000003"]
+    run(**again)
+    assert recorded_steps(arrays(tmp_path / "out" / "state.h5")) == ["000001", "000002"]
+
+
+@pytest.mark.parametrize("old", ["", "1\n2\n"], ids=["first line", "third line"])
+def test_of_a_line_that_has_no_room_nothing_stays(old, tmp_path):
+    path = tmp_path / "lines"
+    lines = StepLines(Place(tmp_path, MPI.COMM_SELF), "lines", int, last=0)
+    for line in old.split():
+        lines.add(line)
+    with Limit(10), pytest.raises(FileError, match=r"lines: cannot write \(File too large\)"):
+        lines.add("3" * 20)
+    assert (path.read_text() if path.exists() else "") == old
+    lines.add("3")
+    assert path.read_text() == old + "3\n"
+    assert [p.name for p in tmp_path.iterdir()] == ["lines"]
+
+
+def test_the_room_of_a_file_is_taken_until_it_is_written(tmp_path, monkeypatch):
+    """Another program that fills the disk meanwhile does no harm."""
+    data, path, taken = np.ones(300_000), tmp_path / "rows.h5", []
+    probe = tmp_path / "probe"
+    with open(probe, "wb") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, data.nbytes)
+        except (AttributeError, OSError):
+            pytest.skip("this file system takes no room in advance")
+    write = RowWriter.write
+
+    def look(contents, file, comm):
+        taken.append(512 * os.stat(file.filename).st_blocks)
+        write(contents, file, comm)
+
+    monkeypatch.setattr(RowWriter, "write", look)
+    with written(path, MPI.COMM_SELF) as file:
+        file.rows("data", data)
+    assert taken[0] >= data.nbytes
+    np.testing.assert_array_equal(arrays(path)["data"], data)
+    assert path.stat().st_size < 1.01 * data.nbytes  # what was taken beyond need is given back
 
 
 @pytest.mark.parametrize("write", [fclib.write_local, petsc_binary.write], ids=["fclib", "petsc"])

@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
-from program import SETTLED, SMALL
+from program import SETTLED, SMALL, steps_of
 
 
 def steps(folder: Path) -> list[dict]:
-    return json.loads((folder / "results" / "summary.json").read_text())["steps"]
+    return steps_of(folder / "results")
 
 
 @pytest.mark.parallel(1, 2)
@@ -23,7 +23,7 @@ def test_steps_with_coulombs_law(program, settled, tmp_path):
         assert line["cone_problems"] > 1
         words = f"Coulomb residual {line['coulomb_residual']:.1e} by {line['cone_problems']} cone problems"
         assert words in done.stdout
-    program(*SETTLED, *options)
+    program(*SETTLED, *options, "-overwrite")
     assert all(line["natural_residual"] <= 1.01e-5 < line["coulomb_residual"] for line in steps(tmp_path))
 
 
@@ -35,7 +35,7 @@ def test_compliance_is_reported_and_goes_with_the_problem(program, settled, tmp_
     assert f"of rigid contacts {line['rigid_residual']:.1e}" in done.stdout
     for path in line["dumped"]:
         for options, compliance in (((), 1e-3), (("-ccp_compliance", 0), 0.0)):
-            program("-problem", path, "-ccp_type", "apgd", "-ccp_tol", 1e-6, *options, "-output", "again")
+            program("-problem", path, "-ccp_type", "apgd", "-ccp_tol", 1e-6, *options, "-output", "again", "-overwrite")
             again = json.loads((tmp_path / "again" / "summary.json").read_text())
             assert again["compliance"] == compliance
             assert (again["natural_residual"] == again["rigid_residual"]) == (compliance == 0)
@@ -51,7 +51,7 @@ def test_auto_says_what_it_picked(program, settled, tmp_path):
     assert "(by apgd)" in done.stdout
     # grains that fall into each other: APGD needs a while
     options = (*SMALL, "-dt", 0.1, "-steps", 7, "-ccp_type", "auto", "-ccp_auto_bias", 1e-6, "-ccp_tol", 1e-7)
-    program(*options)
+    program(*options, "-overwrite")
     line = steps(tmp_path)[-1]
     assert line["solver"] == "conic"
     assert line["reason"].startswith("apgd at ")

@@ -11,7 +11,7 @@ import subprocess
 import h5py
 import numpy as np
 import pytest
-from program import SETTLED, SMALL, arrays, command, environment, recorded_steps
+from program import SETTLED, SMALL, arrays, command, environment, recorded_steps, steps_of
 
 from dem.scenes import Mixer
 
@@ -27,14 +27,6 @@ STEP = {
 }
 
 
-def refuse(constant):
-    raise AssertionError(f"{constant} is not JSON")
-
-
-def summary_of(folder):
-    return json.loads((folder / "summary.json").read_text(), parse_constant=refuse)
-
-
 def frame(path, step):
     """The data sets of one step of a state.h5, and the attributes of the step."""
     with h5py.File(path, "r") as file:
@@ -42,14 +34,26 @@ def frame(path, step):
     return {n[7:]: a for n, a in arrays(path).items() if n.startswith(f"{step:06d}/")}, attributes
 
 
+def summary_of(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
 @pytest.mark.parametrize("solver", ["pdip", "apgd"])
 def test_the_summary_has_the_documented_fields(solver, program, settled, tmp_path):
     program(*SETTLED, "-steps", 3, "-ccp_type", solver)
-    summary = summary_of(tmp_path / "results")
-    assert {"bodies", "ranks", "steps", "compare"} <= set(summary)
+    summary, lines = summary_of(tmp_path / "results"), steps_of(tmp_path / "results")
     assert (summary["bodies"], summary["ranks"], summary["compare"]) == (29, 1, {})
-    first = summary["steps"][0]["step"]
-    for k, line in enumerate(summary["steps"]):
+    assert (summary["steps"], summary["not_converged"]) == (3, 0)
+    first = lines[0]["step"]
+    assert (summary["first_step"], summary["last_step"], summary["time"]) == (first, first + 2, lines[-1]["time"])
+    for name in ("newton_its", "ksp_its", "seconds"):
+        assert summary[name] == pytest.approx(sum(line[name] for line in lines))
+    assert summary["natural_residual"] == max(line["natural_residual"] for line in lines)
+    deepest = max(lines, key=lambda line: line["worst_overlap"])
+    assert summary["worst_overlap"] == {
+        "overlap [m]": deepest["worst_overlap"], "step": deepest["step"], "smallest_radius [m]": 0.1
+    }
+    for k, line in enumerate(lines):
         for name, kind in STEP.items():
             assert type(line[name]) is kind, f"{name}: {line[name]!r}"
         assert line["step"] == first + k
@@ -61,7 +65,8 @@ def test_the_summary_has_the_documented_fields(solver, program, settled, tmp_pat
         newton = solver == "pdip"
         assert (line["newton_its"] > 0) == newton
         assert (line["ksp_its"] >= line["newton_its"]) if newton else line["ksp_its"] == 0
-    assert len(summary["steps"]) == 3
+        assert sum(line["phases"].values()) == pytest.approx(line["seconds"])
+    assert len(lines) == 3
 
 
 @pytest.mark.parallel(1, 2)
@@ -70,7 +75,7 @@ def test_the_first_step_without_contacts_is_free_fall(program, tmp_path):
     options = ("-steps", 1, "-scene_gravity", 5.0, "-delta", 1e-6)
     done = program(*SMALL, *options)
     scene = Mixer(n=1, margin=0.7)
-    (line,) = summary_of(tmp_path / "results")["steps"]
+    (line,) = steps_of(tmp_path / "results")
     assert (line["contacts"], line["newton_its"], line["natural_residual"], line["objective"]) == (0, 0, 0, 0)
     assert "NOT CONVERGED" not in done.stdout
     data, attributes = frame(tmp_path / "results" / "state.h5", 1)
@@ -104,7 +109,7 @@ def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled,
     assert constant["size"].tolist() == [[radius, 0, 0]] * 27 + [[0, 0, 0]] * 2
     assert [body["name"] for body in json.loads(constant["large"])] == ["box", "mixer"]
     before = None
-    for line in summary["steps"]:
+    for line in steps_of(tmp_path / "results"):
         data, _ = frame(path, line["step"])
         shapes = {name: array.shape for name, array in data.items()}
         nc = line["contacts"]
@@ -150,7 +155,7 @@ def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled,
 
 def test_recorded_steps_are_every_kth_and_the_last(program, settled, tmp_path):
     program(*SETTLED, "-steps", 5, "-output_every", 2, "-checkpoint_every", 3, "-ccp_type", "apgd")
-    steps = [line["step"] for line in summary_of(tmp_path / "results")["steps"]]
+    steps = [line["step"] for line in steps_of(tmp_path / "results")]
     assert len(steps) == 5
     recorded = {int(name) for name in recorded_steps(arrays(tmp_path / "results" / "state.h5"))}
     assert recorded == {k for k in steps if k % 2 == 0} | {steps[-1]}
@@ -162,6 +167,7 @@ def test_no_state_is_written_if_none_is_wanted(program, settled, tmp_path):
     assert sorted(p.name for p in (tmp_path / "results").iterdir() if p.is_file()) == [
         "checkpoint.h5",
         "records.csv",
+        "steps.jsonl",
         "summary.json",
     ]
 
@@ -170,17 +176,17 @@ def test_the_same_run_again_writes_the_same_files_anew(program, settled, tmp_pat
     options = (*SETTLED, "-ccp_type", "apgd")
     program(*options, "-steps", 4)
     old = arrays(tmp_path / "results" / "state.h5")
-    program(*options, "-steps", 2)
+    program(*options, "-steps", 2, "-overwrite")
     new = arrays(tmp_path / "results" / "state.h5")
     assert 0 < len(new) < len(old)
     for name, array in new.items():
         assert array.tobytes() == old[name].tobytes()
-    assert len(summary_of(tmp_path / "results")["steps"]) == 2
+    assert len(steps_of(tmp_path / "results")) == 2
 
 
 def test_a_step_that_is_not_solved_says_so(program, settled, tmp_path):
     done = program(*SETTLED, "-steps", 1, "-ccp_type", "apgd", "-ccp_max_it", 3)
-    (line,) = summary_of(tmp_path / "results")["steps"]
+    (line,) = steps_of(tmp_path / "results")
     assert line["natural_residual"] > 1e-4
     assert "NOT CONVERGED" in done.stdout
 
@@ -222,14 +228,14 @@ def test_on_a_terminal_the_present_step_is_shown(settled, cache, tmp_path):
 def test_a_quiet_run_says_nothing_but_errors(program, settled, tmp_path):
     done = program(*SETTLED, "-steps", 1, "-ccp_type", "apgd", "-quiet")
     assert done.stdout == done.stderr == ""
-    assert len(summary_of(tmp_path / "results")["steps"]) == 1
+    assert len(steps_of(tmp_path / "results")) == 1
     done = program(*SETTLED, "-quiet", "-steps", -1, status=2)
     assert done.stdout == ""
     assert "-steps -1" in done.stderr
 
 
 def test_the_monitor_has_levels(program, settled):
-    said = [program(*SETTLED, "-steps", 2, "-ccp_type", "apgd", "-monitor", k).stdout for k in (0, 1, 2)]
+    said = [program(*SETTLED, "-steps", 2, "-ccp_type", "apgd", "-monitor", k, "-overwrite").stdout for k in (0, 1, 2)]
     steps = [sum(line.split()[:1] == ["step"] for line in text.splitlines()) for text in said]
     assert steps == [0, 1, 1]
     assert ["residual by iteration" in text for text in said] == [False, False, True]

@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from program import SETTLED, SMALL
+from program import SETTLED, SMALL, steps_of
 
 TOL = ("-ccp_tol", 1e-8)
 HARD = (*SETTLED, "-ccp_max_it", 2)  # no step is solved in two Newton steps
@@ -38,7 +38,7 @@ def test_the_problem_of_a_step_is_written_and_solved_again(program, settled, tmp
     """Steps one and three of three."""
     numbers = f"{first_step(settled)},{first_step(settled) + 2}"
     program(*SETTLED, *TOL, "-steps", 3, "-dump_problem", "problems", "-dump_steps", numbers)
-    first, second, third = summary(tmp_path / "results")["steps"]
+    first, second, third = steps_of(tmp_path / "results")
     assert second["dumped"] == []
     names = {f"problems/step{line['step']:06d}_{line['contacts']}contacts" for line in (first, third)}
     assert {name for line in (first, third) for name in line["dumped"]} == {
@@ -49,7 +49,7 @@ def test_the_problem_of_a_step_is_written_and_solved_again(program, settled, tmp
     }
     for path in third["dumped"]:
         # from the file's guess; PETSc's has none
-        done = program("-problem", path, *TOL, "-output", "again")
+        done = program("-problem", path, *TOL, "-output", "again", "-overwrite")
         again = summary(tmp_path / "again")
         assert again["converged"]
         assert again["contacts"] == third["contacts"]
@@ -97,27 +97,28 @@ def check_mechanics(line: dict, tmp_path: Path) -> None:
 
 def test_names_by_a_pattern_a_start_without_guess_and_a_broken_file(program, settled, tmp_path):
     program(*SETTLED, "-steps", 2, "-dump_problem", "all/{contacts}/{step:03d}.hdf5")
-    steps = summary(tmp_path / "results")["steps"]
+    steps = steps_of(tmp_path / "results")
     for line in steps:
         path = tmp_path / "all" / str(line["contacts"]) / f"{line['step']:03d}.hdf5"
         assert line["dumped"] == [str(p.relative_to(tmp_path)) for p in (path, path.with_suffix(".petsc"))]
         assert path.exists()
-    program("-problem", steps[1]["dumped"][0], "-problem_guess", "false", "-ccp_type", "apgd", "-ccp_tol", 1e-10)
-    cold = summary(tmp_path / "results")
+    cold = ("-problem_guess", "false", "-ccp_type", "apgd", "-ccp_tol", 1e-10, "-output", "cold")
+    program("-problem", steps[1]["dumped"][0], *cold)
+    cold = summary(tmp_path / "cold")
     assert cold["start"] == "cold"
     assert cold["converged"]
     assert cold["natural_residual"] <= 1.1e-10
     assert not (tmp_path / "results" / "hard").exists()  # no step was hard
     whole = (tmp_path / steps[1]["dumped"][1]).read_bytes()
     (tmp_path / "cut.petsc").write_bytes(whole[:1000])
-    done = program("-problem", "cut.petsc", status=2)
+    done = program("-problem", "cut.petsc", "-output", "cut", status=2)
     assert done.stderr == "pctt.run: cut.petsc: no PETSc binary problem: Read past end of file\n"
 
 
 @pytest.mark.parallel(1, 2)
 def test_hard_problems_are_kept_and_the_steps_say_so(program, settled, tmp_path):
     done = program(*HARD, "-steps", 3, "-dump_hard", 2)
-    steps = summary(tmp_path / "results")["steps"]
+    steps = steps_of(tmp_path / "results")
     kept = [f"results/hard/step{s['step']:06d}_{s['contacts']}contacts_2its.h5" for s in steps[:2]]
     assert [line["hard_problem"] for line in steps] == [*kept, ""]
     assert sorted(str(p.relative_to(tmp_path)) for p in (tmp_path / "results" / "hard").iterdir()) == kept
@@ -138,8 +139,10 @@ def test_hard_problems_of_another_run_are_replaced_and_of_this_one_kept(program,
     again = [*SMALL, "-ccp_max_it", 2, "-restart", "results/checkpoint.h5", "-steps", 1]
     program(*again)
     assert hard() == [first, first + 1, first + 2]
-    program(*HARD, "-steps", 1, "-dump_hard", 0)  # anew, and none wanted
-    assert hard() == []
+    program(*HARD, "-steps", 1, "-dump_hard", 1, "-overwrite")
+    assert hard() == [first]
+    program(*HARD, "-steps", 1, "-dump_hard", 0, "-overwrite")  # anew, and none wanted
+    assert not (tmp_path / "results" / "hard").exists()
 
 
 def test_a_step_that_the_run_does_not_make_is_refused(program, settled, tmp_path):

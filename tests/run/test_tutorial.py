@@ -134,9 +134,8 @@ FAULTS = {
 def test_faults_of_a_scene_end_the_run(message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(FAULTS[message])
-    words = {"scene": "mine.py", "steps": "1", "ccp_type": "apgd"}
-    if FAULTS[message] is GOOD:
-        words["settle"] = "true"
+    how = {"settle": "true"} if FAULTS[message] is GOOD else {"steps": "1", "ccp_type": "apgd"}
+    words = {"scene": "mine.py", **how}
     with pytest.raises((OptionError, SceneError), match=re.escape(message)):
         simulate(read_options(words, MPI.COMM_SELF), MPI.COMM_SELF)
 

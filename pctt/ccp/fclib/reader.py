@@ -14,6 +14,10 @@ from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.stored import FileFormatError, Stored, Whole, spread, symmetric_blocks
 
+#: M_ij and M_ji of a symmetric M differ by no more than this part of sqrt(M_ii M_jj), which bounds both.
+ROUNDING = 1e-8
+MIRRORED = "M is stored as one triangle, which was mirrored"
+
 
 def read(path: str | Path, comm: MPI.Comm) -> ConeProblem:
     """The cone problem of an FCLIB file, its contacts in equal parts over the ranks.
@@ -40,7 +44,7 @@ def _whole(path: str | Path) -> Whole:
         group = file[f"fclib_{form}"]
         if int(np.ravel(group["spacedim"][()])[0]) != 3:
             raise FileFormatError("its space dimension is not 3")
-        matrix, q = _local(group) if form == "local" else _global(group)
+        matrix, q, note = (*_local(group), "") if form == "local" else _global(group)
         point = file["pctt/point"][()] if "pctt/point" in file else None
         return Whole(
             f"FCLIB {form}",
@@ -52,6 +56,7 @@ def _whole(path: str | Path) -> Whole:
             _impulses(file, "guesses/1/r"),
             point,
             float(file["pctt/compliance"][()]) if "pctt/compliance" in file else 0.0,
+            note,
         )
 
 
@@ -62,8 +67,8 @@ def _local(group: h5py.Group) -> tuple[sp.bsr_matrix, Array]:
     return symmetric_blocks(_matrix(group["W"])), group["vectors/q"][:]
 
 
-def _global(group: h5py.Group) -> tuple[sp.bsr_matrix, Array]:
-    """G or N, and q = w + H' M^-1 f."""
+def _global(group: h5py.Group) -> tuple[sp.bsr_matrix, Array, str]:
+    """G or N, q = w + H' M^-1 f, and what was done to M in words."""
     if "G" in group:
         raise FileFormatError("it has bilateral constraints (G), which a cone problem has not")
     M, H = _matrix(group["M"]), _matrix(group["H"])
@@ -72,16 +77,34 @@ def _global(group: h5py.Group) -> tuple[sp.bsr_matrix, Array]:
         raise FileFormatError(f"M {M.shape}, H {H.shape}, f {f.shape} and w {w.shape} do not fit together")
     if not (np.isfinite(M.data).all() and (M.diagonal() > 0).all()):
         raise FileFormatError("its mass matrix is not positive")
-    M = (0.5 * (M + M.T)).tocsr()
+    M, note = _symmetric(M)
     roots = _inverse_roots(M)
     if roots is None:
         H_over_M = sp.csr_matrix(spsolve(M.tocsc(), H.tocsc())).reshape(H.shape)
-        return symmetric_blocks(H.T @ H_over_M), w + H_over_M.T @ f
+        return symmetric_blocks(H.T @ H_over_M), w + H_over_M.T @ f, note
     G = H.T.tocsr()
     G.sort_indices()
     G = G.tobsr((3, 6))
     G.data = G.data @ roots[G.indices].transpose(0, 2, 1)
-    return G, w + G @ (roots @ f.reshape(-1, 6, 1)).ravel()
+    return G, w + G @ (roots @ f.reshape(-1, 6, 1)).ravel(), note
+
+
+def _symmetric(M: sp.csr_matrix) -> tuple[sp.csr_matrix, str]:
+    """M made exactly symmetric, and MIRRORED if it was one triangle; FileFormatError if it is neither that nor
+    symmetric up to rounding. Half the sum of a triangle and its mirror would be another matrix."""
+    above, below = sp.triu(M, 1), sp.tril(M, -1)
+    if (above.count_nonzero() == 0) != (below.count_nonzero() == 0):
+        return (M + (above + below).T).tocsr(), MIRRORED
+    bound = np.sqrt(M.diagonal())
+    entries = abs(M - M.T).tocoo()
+    off = entries.data > ROUNDING * bound[entries.row] * bound[entries.col]
+    if off.any():
+        i, j = entries.row[off][0], entries.col[off][0]
+        raise FileFormatError(
+            f"its mass matrix is not symmetric: M[{i}, {j}] = {M[i, j]:.9g}, M[{j}, {i}] = {M[j, i]:.9g}; allowed is "
+            "one triangle, or both equal up to rounding"
+        )
+    return (0.5 * (M + M.T)).tocsr(), ""
 
 
 def _inverse_roots(M: sp.csr_matrix) -> Array | None:

@@ -20,7 +20,7 @@ from pctt.ccp.cone import Array
 from pctt.ccp.gather import gather_matrix, gather_rows, write_whole
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.stored import sparse_matrix
-from pctt.disk import reserve
+from pctt.disk import make_hdf5
 
 
 @dataclass(frozen=True)
@@ -112,8 +112,8 @@ def _write(
         arrays += [*whole_vectors.values(), *(x for state in whole_states.values() for x in state.values())]
         arrays += [] if points is None else [points]
         texts = sum(len(text.encode()) for text in vars(info or Info()).values())
-        reserve(temporary, sum(array.nbytes for array in arrays) + texts, len(arrays) + 30)
-        with h5py.File(temporary, "w") as file:
+        make_hdf5(temporary, sum(array.nbytes for array in arrays) + texts, len(arrays) + 30)
+        with h5py.File(temporary, "r+") as file:
             group = file.create_group(f"fclib_{form}")
             group["spacedim"] = _integers([3])
             for name, matrix in whole_matrices.items():

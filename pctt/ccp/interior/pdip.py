@@ -9,19 +9,20 @@ with the multipliers eliminated:
     S dg = -(N g + r + grad f / (-t f)),    S = N + lambda hess f + lambda/(-f) grad f grad f'.
 
 Where the paper's form creeps (134 Newton steps at 17,911 contacts, natural residual 6e-5), this one differs
-in three points, each measured in ``docs/ccp.md``: the constraint is the cone's perspective form
+in four points, each measured in ``docs/ccp.md``: the constraint is the cone's perspective form
 (``barrier.py``); steps end at 0.9 of the way to the boundary and inside a neighbourhood of the central
-path, rather than at 0.99 and where the multiplier residual falls; and the natural residual alone decides
-when to stop.
+path, rather than at 0.99 and where the multiplier residual falls; a direction that the cones' curvature cuts
+short is corrected; and the natural residual alone decides when to stop.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cone import Array, step_to_boundary, step_to_zero
+from pctt.ccp.cone import TINY, Array, step_to_boundary, step_to_zero, times
 from pctt.ccp.interior.barrier import CONSTRAINTS, Perspective, Quadratic
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
@@ -29,7 +30,11 @@ from pctt.ccp.result import Limits, Result
 from pctt.log import phase
 from pctt.options import FRACTION, POSITIVE, option
 
-PATIENCE = 5  # Newton steps that may go by without much progress before the linear solves are made more accurate
+RTOL = 1e-3  # of the linear solves, where ``-ksp_rtol`` does not say otherwise
+FORCING = 0.1  # and what they may leave of velocities, as a part of what the natural residual shows
+SHORT = 0.5  # a step after which the direction is corrected,
+FURTHER = 0.3  # for one that goes so much further
+LONGER = 1.2  # a corrected step that is worth taking, as a part of the other
 
 
 @dataclass(frozen=True)
@@ -61,10 +66,8 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     max_it = limits.max_it if limits.max_it >= 0 else 100
     cone = CONSTRAINTS[options.constraint](problem.mu)
     newton.begin(problem)
-    rtol = min(1e-3, 10 * limits.tol)  # of the linear solves, where ``-ksp_rtol`` does not say otherwise
     g, lam = _start(problem, guess, cone, options)
     history: list[float] = []
-    tightened = 0
     for iteration in range(max_it + 1):
         y = _velocity(problem, g)
         history.append(problem.natural_residual(g, y))
@@ -74,17 +77,19 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         if iteration == max_it:
             reason = f"{max_it} Newton steps"
             break
-        if _stalls(history, iteration - tightened):  # the Newton directions are too inexact
-            rtol, tightened = max(0.1 * rtol, 1e-12), iteration
-        f, df = cone.value(g), cone.gradient(g)
-        gap = problem.sum(-(lam @ f)) / problem.size
-        barrier = options.centering * gap  # 1/t
-        newton.update(_barrier_blocks(cone, g, lam, f, df))
-        q = -(y - (barrier / f)[:, None] * df)
-        dg, _ = newton.solve(q, rtol * problem.norm(q) / np.sqrt(problem.mean_diagonal))
-        dg[problem.mu == 0, 1:] = 0.0
-        dlam = -(lam + (barrier + lam * (df * dg).sum(1)) / f)
-        step = _step_length(problem, cone, g, lam, dg, dlam, options)
+        f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
+        barrier = options.centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
+        at = Linearised(g, lam, y, f, df, hessian, barrier)
+        newton.update(_barrier_blocks(cone, at))
+        tol = _accuracy(problem, at, history[-1])
+        dg, dlam, x = _direction(problem, newton, at, tol)
+        step = _step_length(problem, cone, at, dg, dlam, options)
+        if step < SHORT:
+            bend = _bend(at, dg, dlam, min(1.0, step + FURTHER))
+            other_dg, other_dlam, _ = _direction(problem, newton, at, tol, bend, x)
+            other = _step_length(problem, cone, at, other_dg, other_dlam, options)
+            if other > LONGER * step:
+                step, dg, dlam = other, other_dg, other_dlam
         if not step > 1e-10:
             reason = "steps became too short" if step == step else "not a number in the Newton step"
             break
@@ -94,10 +99,53 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     return Result(g, converged, reason, history[-1], iteration, newton.ksp_its, newton.fallbacks, history)
 
 
-def _stalls(history: list[float], since: int) -> bool:
-    """Whether PATIENCE steps together took less than a third off the natural residual (settled packings with
-    accurate solves: half or more); ``since``: steps to judge by."""
-    return since >= PATIENCE and history[-1] > 0.7 * history[-1 - PATIENCE]
+class Linearised(NamedTuple):
+    """What the directions of a Newton step share: impulses and multipliers, velocities, the constraints with their
+    first and second derivatives, and the complementarity 1/t that is aimed at."""
+
+    g: Array
+    lam: Array
+    y: Array
+    f: Array
+    df: Array
+    hessian: Array
+    barrier: float
+
+
+def _accuracy(problem: ConeProblem, at: Linearised, residual: float) -> float:
+    """How accurately to solve a Newton system (momenta, sqrt J).
+
+    What a solve leaves are velocities. They must not be more than a part of those that the natural residual stands for:
+    complementarity would fall without them, and near the boundary no step makes up for that."""
+    q = (at.barrier / at.f)[:, None] * at.df - at.y
+    shown = residual * problem.norm(at.g) * problem.mean_diagonal
+    return min(RTOL * problem.norm(q), FORCING * shown) / float(np.sqrt(problem.mean_diagonal))
+
+
+def _direction(
+    problem: ConeProblem,
+    newton: Newton,
+    at: Linearised,
+    tol: float,
+    bend: tuple[Array, Array] | None = None,
+    start: Array | None = None,
+) -> tuple[Array, Array, Array]:
+    """dg, dlam and the Newton system's solution, with the terms of second order ``bend``; ``start``: an earlier
+    solution."""
+    curved, missed = bend or (np.zeros_like(at.g), np.zeros_like(at.lam))
+    aim = (at.barrier + missed) / at.f
+    dg, x = newton.solve(aim[:, None] * at.df - at.y - curved, tol, start=start)
+    dg[problem.mu == 0, 1:] = 0.0
+    return dg, -(at.lam + aim + at.lam / at.f * (at.df * dg).sum(1)), x
+
+
+def _bend(at: Linearised, dg: Array, dlam: Array, reach: float) -> tuple[Array, Array]:
+    """What the linearised conditions miss, ``reach`` along a direction and divided by that: the terms of second order of
+    sum lambda_i grad f_i (without third derivatives) and of lambda_i f_i. A contact that slides has to turn its impulse
+    along the cone, and straight steps leave it soon."""
+    turned = times(at.hessian, dg)
+    missed = dlam * (at.df * dg).sum(1) + 0.5 * at.lam * (dg * turned).sum(1)
+    return reach * dlam[:, None] * turned, reach * missed
 
 
 def _velocity(problem: ConeProblem, g: Array) -> Array:
@@ -110,22 +158,25 @@ def _velocity(problem: ConeProblem, g: Array) -> Array:
 def _start(
     problem: ConeProblem, guess: Array, cone: Perspective | Quadratic, options: PDIP
 ) -> tuple[Array, Array]:
-    """Impulses on the cones' axes and multipliers of equal complementarity."""
+    """Impulses on the cones' axes and multipliers of equal complementarity. The guess is made smaller where that
+    lowers the objective: impulses of a jam that has come loose are too large by orders."""
     closing = problem.norm(_velocity(problem, np.zeros_like(problem.r))) / np.sqrt(problem.size)
     new = options.start * closing / problem.mean_diagonal
+    along, bent = problem.dot(problem.r, guess), problem.dot(problem.product(guess), guess)
+    known = min(max(-along / max(bent, TINY), 0.0), 1.0) * guess[:, 0]
     g = np.zeros_like(problem.r)
-    g[:, 0] = np.where(guess[:, 0] > 0, np.maximum(guess[:, 0], 0.1 * new), new)
+    g[:, 0] = np.where(known > 0, np.maximum(known, 0.1 * new), new)
     speed = problem.norm(_velocity(problem, g)) / np.sqrt(problem.size)
     mean_normal = problem.sum(g[:, 0].sum()) / problem.size
     mean_mu = problem.sum(problem.mu.sum()) / problem.size
     return g, 3 * speed * mean_normal * (mean_mu or 1.0) / -cone.value(g)
 
 
-def _barrier_blocks(cone: Perspective | Quadratic, g: Array, lam: Array, f: Array, df: Array) -> Array:
+def _barrier_blocks(cone: Perspective | Quadratic, at: Linearised) -> Array:
     """lambda hess f + lambda/(-f) grad f grad f' (nc, 3, 3), positive definite inside the cone."""
     with phase("CCPBarrier"):
-        blocks = lam[:, None, None] * cone.hessian(g)
-        blocks += (lam / -f)[:, None, None] * df[:, :, None] * df[:, None, :]
+        blocks = at.lam[:, None, None] * at.hessian
+        blocks += (at.lam / -at.f)[:, None, None] * at.df[:, :, None] * at.df[:, None, :]
         frictionless = cone.mu == 0
         if frictionless.any():  # hold the tangential impulses at zero
             stiff = 1e12 * np.maximum(blocks[frictionless, 0, 0], 1)
@@ -136,8 +187,7 @@ def _barrier_blocks(cone: Perspective | Quadratic, g: Array, lam: Array, f: Arra
 def _step_length(
     problem: ConeProblem,
     cone: Perspective | Quadratic,
-    g: Array,
-    lam: Array,
+    at: Linearised,
     dg: Array,
     dlam: Array,
     options: PDIP,
@@ -145,6 +195,7 @@ def _step_length(
     """Longest step, at most 1, inside the cones, near the central path; nan if the direction is no number."""
     if not np.isfinite(problem.sum(dg.sum() + dlam.sum())):
         return np.nan
+    g, lam = at.g, at.lam
     frictional = cone.mu > 0
     to_surface = step_to_boundary(g[frictional], dg[frictional], cone.mu[frictional])
     to_apex = step_to_zero(g[:, 0], dg[:, 0])

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt import log
 from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
 from pctt.options import OptionError
 
@@ -35,22 +35,42 @@ NAMED: dict[str, dict[str, str]] = {
 
 @dataclass
 class Record:
-    """What one preconditioner did over the systems of a run."""
+    """What one preconditioner did over the systems of a run: sums, and the solves since they were last taken."""
 
+    systems: int = 0
+    converged: int = 0
+    iterations: int = 0
+    most_iterations: int = 0
+    setup_s: float = 0.0
+    solve_s: float = 0.0
+    true_residual_max: float = 0.0
     solves: list[Solve] = field(default_factory=list)
 
+    def add(self, solve: Solve) -> None:
+        self.systems += 1
+        self.converged += solve.converged
+        self.iterations += solve.iterations
+        self.most_iterations = max(self.most_iterations, solve.iterations)
+        self.setup_s += solve.setup_s
+        self.solve_s += solve.solve_s
+        self.true_residual_max = max(self.true_residual_max, float(solve.true_residual))
+        self.solves.append(solve)
+
+    def take_solves(self) -> list[list[Any]]:
+        """Converged, iterations, seconds and true residual of each solve since this was last asked."""
+        solves, self.solves = self.solves, []
+        return [[s.converged, s.iterations, s.setup_s + s.solve_s, s.true_residual] for s in solves]
+
     def summary(self) -> dict[str, Any]:
-        """Figures over the systems; ``solves``: converged, iterations, seconds and true residual of each."""
-        its = [s.iterations for s in self.solves]
+        """Figures over the systems."""
         return {
-            "systems": len(self.solves),
-            "converged": sum(s.converged for s in self.solves),
-            "ksp_its_mean": float(np.mean(its)) if its else 0.0,
-            "ksp_its_max": max(its, default=0),
-            "setup_s": sum(s.setup_s for s in self.solves),
-            "solve_s": sum(s.solve_s for s in self.solves),
-            "true_residual_max": float(max((s.true_residual for s in self.solves), default=0.0)),
-            "solves": [[s.converged, s.iterations, s.setup_s + s.solve_s, s.true_residual] for s in self.solves],
+            "systems": self.systems,
+            "converged": self.converged,
+            "ksp_its_mean": self.iterations / max(self.systems, 1),
+            "ksp_its_max": self.most_iterations,
+            "setup_s": self.setup_s,
+            "solve_s": self.solve_s,
+            "true_residual_max": self.true_residual_max,
         }
 
 
@@ -75,15 +95,21 @@ class Comparison(KrylovFamily):
         return (self._seen - 1) % self.every == 0
 
     def run(self, A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: PETSc.Mat | None = None) -> Solve:
-        """All preconditioners on one system; x is of the first that converged, else of the best."""
+        """All preconditioners on one system; x is of the first that converged, else of the best.
+
+        What the others take counts as the phase `compare`, not as `solve`: a run that compares nothing is spared it.
+        """
         chosen: Solve | None = None
         kept = None
-        for name in self.names:
-            done = self._solver(name).solve(A, b, x, rtol, P)
-            self.records[name].solves.append(done)
-            if chosen is None or (not chosen.converged and _is_better(done, chosen)):
-                chosen, kept = done, x.array.copy()
+        with log.phase("CCPCompare"):
+            for name in self.names:
+                done = self._solver(name).solve(A, b, x, rtol, P)
+                self.records[name].add(done)
+                if chosen is None or (not chosen.converged and _is_better(done, chosen)):
+                    chosen, kept = done, x.array.copy()
         assert chosen is not None
+        spent = log.take_seconds(("CCPCompare",))["CCPCompare"]
+        log.move_seconds(spent - chosen.setup_s - chosen.solve_s, "solve", "compare")
         x.array[:] = kept
         return chosen
 
@@ -94,6 +120,10 @@ class Comparison(KrylovFamily):
             if lines := krylov.report():
                 figures[name]["pc_report"] = lines
         return figures
+
+    def take_solves(self) -> dict[str, list[list[Any]]]:
+        """The solves by name, as of `Record.take_solves`."""
+        return {name: record.take_solves() for name, record in self.records.items()}
 
     def labels(self) -> dict[str, str]:
         """What each name means on this number of ranks, where that is not plain from the name."""

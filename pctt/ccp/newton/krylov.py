@@ -14,6 +14,7 @@ from petsc4py import PETSc
 from pctt.pc.base import PythonPC
 from pctt.pc.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
 from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
+from pctt.petsc import own_errors
 
 # right preconditioning makes the residual that the method sees the true one
 _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
@@ -53,7 +54,7 @@ class Krylov:
         self.ksp = PETSc.KSP().create(comm)
         self.ksp.setOptionsPrefix(prefix)
         self.ksp.setTolerances(rtol=rtol, atol=1e-300, max_it=1000)
-        with entered(self._options):
+        with entered(self._options), own_errors():
             self._configure(PETSc.Options(prefix), rtol)
         self._formed: PETSc.Mat | None = None  # what the preconditioner is made from, if not P itself
         self._version: tuple[int, int] | None = None  # of P, when it was
@@ -227,7 +228,8 @@ def together(comm: MPI.Comm, work: Callable[[], None]) -> int:
     code = np.zeros(1, int)
     words = ""
     try:
-        work()
+        with own_errors():
+            work()
     except PETSc.Error as error:
         code[0], words = error.ierr, str(error)
     if comm.size == 1:

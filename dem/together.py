@@ -1,0 +1,78 @@
+"""Calls of the code of a scene, which end alike on all ranks.
+
+What a user has written runs on every rank and may raise on some of them only; the others would then wait for those in
+the next collective call for ever. So all ranks meet after each such call, and tell each other what went wrong.
+Collective functions that the code of a scene may itself call (`dem.record.Step.total`) begin with a meeting as well:
+ranks of which one is there, and another has failed or come to its end, learn of it.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from typing import TypeVar
+
+from mpi4py import MPI
+
+Result = TypeVar("Result")
+
+#: What the names of modules begin with that hold scenes: those of files, and those of the package.
+SCENE_MODULES = ("scene_file_", "dem.scenes.")
+
+
+class SceneError(RuntimeError):
+    """A scene that cannot go on; raised on all ranks alike."""
+
+
+def together(
+    comm: MPI.Comm, what: str, call: Callable[[], Result], own: tuple[type[Exception], ...] = ()
+) -> Result:
+    """What `call` returns on this rank; collective.
+
+    If it raised on any rank, all raise: SceneError, which says `what` was called, or an exception of the types `own`.
+    """
+    failure = None
+    try:
+        result = call()
+    except (SceneError, KeyboardInterrupt):  # the former from a meeting within the call: all ranks know
+        raise
+    except own as error:
+        failure = (type(error), str(error))
+    except BaseException as error:  # also SystemExit, which would end this rank alone
+        failure = (SceneError, f"{_place(error)}{what}: {told(error)}")
+    meet(comm, f"the end of the {what}", failure)
+    return result
+
+
+def meet(comm: MPI.Comm, where: str, failure: tuple[type[Exception], str] | None = None) -> None:
+    """Have all ranks meet at a place in the code of a scene; raises if one has failed, or has come elsewhere."""
+    places, failures = zip(*comm.allgather((where, failure)))
+    failed = [rank for rank in range(comm.size) if failures[rank]]
+    if failed:
+        kind, text = failures[failed[0]]
+        alike = [rank for rank in failed if failures[rank] == failures[failed[0]]]
+        remark = "" if len(alike) == comm.size else f" ({_ranks(alike)} of {comm.size})"
+        others = [rank for rank in failed if rank not in alike]
+        raise kind(text + remark + (f"; another failure on {_ranks(others)}" if others else ""))
+    if len(set(places)) > 1:
+        listed = ", ".join(f"rank {rank} at {place}" for rank, place in enumerate(places))
+        raise SceneError(f"the code of a scene must make the same calls on all ranks, but {listed}")
+
+
+def told(error: BaseException) -> str:
+    """The kind of an exception and its words."""
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
+def _place(error: BaseException) -> str:
+    """File and line of the innermost call in the code of a scene, with a colon after them; empty if it is in none."""
+    frames = [
+        (frame.f_code.co_filename, line)
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if frame.f_globals.get("__name__", "").startswith(SCENE_MODULES)
+    ]
+    return f"{frames[-1][0]}, line {frames[-1][1]}: " if frames else ""
+
+
+def _ranks(ranks: list[int]) -> str:
+    return f"rank{'s' if len(ranks) > 1 else ''} {', '.join(map(str, ranks))}"

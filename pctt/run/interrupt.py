@@ -1,0 +1,41 @@
+"""Ctrl-C and its like: a run ends after the step under way, with its checkpoint written, all ranks together.
+
+A signal comes to each rank at another moment, or to one rank only. So it is noted, and after every step the ranks tell
+each other. The same signal once more ends the rank at once.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from types import FrameType
+
+from mpi4py import MPI
+
+#: Ctrl-C; what mpiexec and batch systems send before they kill; what mpiexec passes on without killing.
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+
+_noted: list[int] = []
+
+
+class InterruptError(RuntimeError):
+    """A run that was asked to end; the message says how to go on. Raised on all ranks alike."""
+
+
+def heed(comm: MPI.Comm) -> None:
+    """From now on note signals instead of ending by them."""
+
+    def note(number: int, frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_DFL)
+        if comm.rank == 0 and not _noted:
+            sys.stderr.write("\npctt.run: will end after this step; once more, and it ends at once\n")
+            sys.stderr.flush()
+        _noted.append(number)
+
+    for number in SIGNALS:
+        signal.signal(number, note)
+
+
+def asked(comm: MPI.Comm) -> bool:
+    """Whether any rank was asked to end; collective."""
+    return comm.allreduce(bool(_noted), MPI.LOR)

@@ -1,0 +1,57 @@
+"""One file of all that state.h5 links to."""
+
+from __future__ import annotations
+
+import shutil
+
+import h5py
+import handmade
+import pytest
+
+
+def held(path):
+    """All data sets and attributes of a file by name, through its links."""
+    found = {}
+
+    def collect(group, prefix):
+        found.update({f"{prefix}@{name}": str(value) for name, value in group.attrs.items()})
+        for name in group:  # not visititems, which does not follow links
+            if isinstance(group[name], h5py.Group):
+                collect(group[name], f"{prefix}{name}/")
+            else:
+                found[prefix + name] = (group[name].dtype, group[name].shape, group[name][()].tobytes())
+
+    with h5py.File(path, "r") as file:
+        collect(file, "")
+    return found
+
+
+def test_one_file_holds_what_the_links_lead_to(folder, show, tmp_path):
+    done = show("export", "-single", tmp_path / "one.h5")
+    assert done.stdout == f"4 steps: {tmp_path}/one.h5\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["one.h5"]
+    linked = held(folder / "state.h5")
+    assert "frames" in linked.pop("@links")
+    assert held(tmp_path / "one.h5") == linked
+    assert {"@contents", "bodies/shape", "steps/000004/position", "steps/000004/record/@contacts"} < set(linked)
+    show("export", "-single", tmp_path / "some.h5", "-first", 2, "-every", 2)
+    with h5py.File(tmp_path / "some.h5") as file:
+        assert list(file["steps"]) == ["000002", "000004"]
+
+
+def test_a_copy_of_the_links_alone_says_that_it_is_empty(folder, tmp_path):
+    shutil.copy(folder / "state.h5", tmp_path)
+    with h5py.File(tmp_path / "state.h5") as file:
+        with pytest.raises((KeyError, OSError)):  # the link leads nowhere
+            file["steps/000004"]
+        assert "python -m pctt.export FOLDER -single FILE.h5" in file.attrs["links"]
+
+
+def test_what_cannot_be_read_or_written_is_named(show, tmp_path):
+    made = handmade.write(tmp_path / "made", handmade.FLOOR, steps=2)
+    assert "cannot write" in show("export", "-single", tmp_path / "no" / "one.h5", folder=made, status=2).stderr
+    (made / "frames" / "000002.h5").write_text("no HDF5 file")
+    assert "000002.h5" in show("export", "-single", tmp_path / "one.h5", folder=made, status=2).stderr
+    (made / "state.h5").unlink()
+    assert "state.h5" in show("export", "-single", tmp_path / "one.h5", "-last", 1, folder=made, status=2).stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]

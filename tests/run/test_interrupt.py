@@ -1,0 +1,97 @@
+"""Ctrl-C and its like end a run after a step, with a word on how to go on; what goes on is what would have been."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from program import SMALL, assert_same_bits, command, environment
+from test_killed import python_of
+
+OPTIONS = (*SMALL, "-ccp_type", "apgd", "-ccp_tol", 1e-3)
+RANKS = [1, pytest.param(2, marks=pytest.mark.mpi)]
+
+
+def interrupted(options, ranks, tmp_path, cache, ready, number, twice=False):
+    """Start a run, wait until `ready`, and send the signal: to the program, or to the mpiexec of run/setup, or where there
+    is another, to the last rank. Its exit status, and what it said to the standard error."""
+    with subprocess.Popen(
+        command(*options, ranks=ranks), cwd=tmp_path, env=environment(cache), stderr=subprocess.PIPE, text=True
+    ) as run:
+        end = time.monotonic() + 120
+        while not ready():
+            assert run.poll() is None, "the run ended too early"
+            assert time.monotonic() < end, "nothing to wait for came"
+            time.sleep(0.002)
+        ours = ranks == 1 or Path(sys.executable).with_name("mpiexec").exists()
+        target = run.pid if ours else max(python_of(run.pid))
+        os.kill(target, number)
+        if twice:
+            time.sleep(0.5)
+            os.kill(target, number)
+        _, said = run.communicate(timeout=120)
+    return run.returncode, said
+
+
+@pytest.mark.parametrize("ranks", RANKS)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+def test_an_interrupted_run_goes_on(number, ranks, program, tmp_path, cache):
+    steps = 400
+    late = ("-checkpoint_every", steps)  # so that no checkpoint is there but the one that an interrupted run writes
+    out = tmp_path / "out"
+    rows = out / "records.csv"
+    status, said = interrupted(
+        (*OPTIONS, *late, "-steps", steps, "-output", "out"), ranks, tmp_path, cache, rows.exists, number
+    )
+    assert status == 130, said
+    lines = [line for line in said.splitlines() if line.startswith("pctt.run: interrupted")]
+    assert len(lines) == 1, said
+    found = re.fullmatch(
+        r"pctt.run: interrupted after step (\d+); the same command with -restart out/checkpoint.h5 -steps (\d+) "
+        "at its end goes on",
+        lines[0],
+    )
+    done, left = map(int, found.groups())
+    assert done + left == steps
+    assert left > 0
+    assert len(rows.read_text().splitlines()) == 1 + done
+    more = min(left, 3)
+    program(*OPTIONS, "-output", "out", "-restart", "out/checkpoint.h5", "-steps", more, ranks=ranks)
+    program(*OPTIONS, "-output", "whole", "-steps", done + more, ranks=ranks)
+    assert_same_bits(out / "state.h5", tmp_path / "whole" / "state.h5")
+    assert_same_bits(out / "checkpoint.h5", tmp_path / "whole" / "checkpoint.h5")
+
+
+def test_the_same_signal_again_ends_a_run_at_once(program, tmp_path, cache):
+    """A sleeping scene: its step does not end."""
+    (tmp_path / "mine.py").write_text(
+        "import time\nfrom dem.scenes.mixer import *\n"
+        "@dataclass(frozen=True)\nclass Sleeper(Mixer):\n"
+        "    def record(self, step):\n        open('asleep', 'w').close()\n        time.sleep(100)\n        return {}\n"
+    )
+    options = ("-scene", "mine.py", *OPTIONS, "-steps", 5)
+    status, said = interrupted(options, 1, tmp_path, cache, (tmp_path / "asleep").exists, signal.SIGINT, twice=True)
+    assert status == -signal.SIGINT
+    assert "will end after this step" in said
+    assert "interrupted" not in said
+
+
+@pytest.mark.parametrize("ranks", RANKS)
+def test_a_cut_settling_goes_on_where_it_was(ranks, program, tmp_path):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    program(*SMALL, "-settle", ranks=ranks, cache=whole)
+    (path,) = whole.glob("pctt/*.h5")
+    unfinished = cut / "pctt" / path.name.replace(".h5", ".unfinished.h5")
+    status, said = interrupted((*SMALL, "-settle"), ranks, tmp_path, cut, unfinished.exists, signal.SIGINT)
+    assert status == 130, said
+    step = int(re.search(r"settling interrupted after step (\d+) of \d+; the same command goes on there", said)[1])
+    done = program(*SMALL, "-restart", "settled", "-steps", 0, ranks=ranks, cache=cut)
+    assert f"goes on after step {step}, from {unfinished}" in done.stdout
+    assert not unfinished.exists()
+    assert_same_bits(path, cut / "pctt" / path.name)

@@ -1,0 +1,171 @@
+"""A folder that holds a run is refused, or replaced with -overwrite: not before the first new step is written."""
+
+from __future__ import annotations
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+from mpi4py import MPI
+from program import arrays, recorded_steps, steps_of, table
+
+from pctt.ccp import BlockRows, ConeProblem, fclib
+from pctt.options import OptionError
+from pctt.run.options import DEMO, read_options
+from pctt.run.problem import solve_file
+from pctt.run.simulate import SceneError, simulate
+
+SELF = MPI.COMM_SELF
+DROP = """
+from dataclasses import dataclass
+from dem.experiment import Experiment
+from dem.scene import Scene
+from dem.shapes import Plane
+
+@dataclass(frozen=True)
+class Drop(Experiment):
+    def build(self):
+        scene = Scene(friction=0.3)
+        scene.add_body("floor", [Plane(normal=(0, 0, 1))])
+        scene.add_spheres([[0.05 * k, 0, 0.2 + 0.3 * k] for k in range(3)], radius=0.1, density=2500.0)
+        return scene
+
+    def record(self, step):
+        return {}
+
+    def analyse(self, records):
+        return {"twice": 2 * records["time [s]"]}
+"""
+FAILING = DROP.replace("return {}", "raise ValueError('no record')")
+UNBUILDABLE = DROP.replace("return scene", "raise ValueError('no scene')")
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """`run(options, text=DROP)` makes steps of a scene file with this text, into out."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(text=DROP, **options):
+        (tmp_path / "drop.py").write_text(text)
+        words = {"scene": "drop.py", "ccp_type": "apgd", "output": "out", "quiet": "true", **options}
+        simulate(read_options(words, SELF), SELF)
+
+    return run
+
+
+@pytest.fixture
+def problem(tmp_path, monkeypatch):
+    """A file with a problem of one contact."""
+    monkeypatch.chdir(tmp_path)
+    rows = np.zeros((1, 3, 6))
+    rows[0, :, :3] = np.eye(3)
+    G = BlockRows(np.array([0, 1]), np.array([0]), rows, 1)
+    fclib.write_local(tmp_path / "problem.hdf5", ConeProblem(SELF, np.array([[-1.0, 0, 0]]), np.array([0.3]), G=G))
+    return "problem.hdf5"
+
+
+def contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    "name", ["state.h5", "records.csv", "steps.jsonl", "summary.json", "checkpoint.h5", "frames/000001.h5"]
+)
+def test_a_folder_with_any_part_of_a_run_is_refused_before_any_work(name, run, problem, tmp_path):
+    (tmp_path / "out" / "frames").mkdir(parents=True)
+    (tmp_path / "out" / name).write_text("what was there")
+    before = contents(tmp_path / "out")
+    for options in ({}, {"steps": "0"}, {"problem": problem}, {"problem": problem, "restart": "out/checkpoint.h5"}):
+        if "restart" in options and name != "checkpoint.h5":
+            continue
+        with pytest.raises(OptionError) as refusal:
+            run(**options)
+        for word in ("-output out: holds a run", name.partition("/")[0], "-overwrite", "another folder"):
+            assert word in str(refusal.value)
+        assert ("-restart out/checkpoint.h5" in str(refusal.value)) == (name == "checkpoint.h5")
+    assert contents(tmp_path / "out") == before
+
+
+def test_a_run_that_fails_in_its_first_step_has_destroyed_nothing(run, tmp_path):
+    run(steps="3")
+    early = (tmp_path / "out" / "checkpoint.h5").read_bytes()
+    run(steps="3", restart="out/checkpoint.h5")
+    (tmp_path / "out" / "checkpoint.h5").write_bytes(early)  # as of a run that was killed between two checkpoints
+    before = contents(tmp_path / "out")
+    with pytest.raises(SceneError, match="no record"):
+        run(FAILING, overwrite="true")
+    assert contents(tmp_path / "out") == before
+    with pytest.raises(SceneError, match="no record"):
+        run(FAILING, restart="out/checkpoint.h5", restart_changed_file="true")
+    assert contents(tmp_path / "out") == before
+    with pytest.raises(OptionError, match="no scene"):
+        run(UNBUILDABLE, overwrite="true")
+    run(overwrite="true", steps="0")
+    run(restart="out/checkpoint.h5", steps="0")
+    assert contents(tmp_path / "out") == before
+
+
+def test_a_run_that_replaces_another_leaves_nothing_of_it(run, problem, tmp_path):
+    """But files that are of no run; and none of either when a problem of a file is solved there."""
+    run(steps="4", ccp_type="pdip", ccp_max_it="2", dump_hard="9", dt="0.1")
+    assert list((tmp_path / "out" / "hard").iterdir())
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    run(steps="2", overwrite="true", output_every="2")
+    assert (steps_of(tmp_path / "out")[-1]["step"], len(steps_of(tmp_path / "out"))) == (2, 2)
+    assert table(tmp_path / "out" / "analysis.csv")["twice"].tolist() == [0.02, 0.04]
+    run(steps="3", output="anew", output_every="2")
+    run(steps="3", overwrite="true", output_every="2")
+    there, alone = contents(tmp_path / "out"), contents(tmp_path / "anew")
+    assert there.pop("notes.txt") == b"mine"
+    assert set(there) == set(alone)
+    for name in ("records.csv", "analysis.csv"):
+        assert there[name] == alone[name]
+    assert recorded_steps(arrays(tmp_path / "out" / "state.h5")) == ["000002", "000003"]
+    solve_file(read_options({"problem": problem, "output": "out", "overwrite": "true", "quiet": "true"}, SELF), SELF)
+    assert set(contents(tmp_path / "out")) == {"summary.json", "notes.txt"}
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["problem"] == problem
+
+
+def test_a_run_that_goes_on_makes_anew_what_lies_behind_its_checkpoint(run, tmp_path):
+    """The steps after it go when the first new step is written, with the analysis and the links."""
+    run(steps="2")
+    early = (tmp_path / "out" / "checkpoint.h5").read_bytes()
+    run(steps="4", restart="out/checkpoint.h5")
+    whole = contents(tmp_path / "out")
+    (tmp_path / "out" / "checkpoint.h5").write_bytes(early)
+    run(steps="1", restart="out/checkpoint.h5", output_every="0", overwrite="true")
+    assert [line["step"] for line in steps_of(tmp_path / "out")] == [1, 2, 3]
+    assert recorded_steps(arrays(tmp_path / "out" / "state.h5")) == ["000001", "000002"]
+    assert sorted(path.stem for path in (tmp_path / "out" / "frames").iterdir()) == ["000001", "000002", "bodies"]
+    run(steps="3", restart="out/checkpoint.h5")
+    assert (tmp_path / "out" / "records.csv").read_bytes() == whole["records.csv"]
+    assert (tmp_path / "out" / "analysis.csv").read_bytes() == whole["analysis.csv"]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["steps"], summary["first_step"], summary["last_step"]) == (6, 1, 6)
+    text = DROP.replace('{"twice": 2 * records["time [s]"]}', "{}")
+    run(text, steps="1", restart="out/checkpoint.h5", restart_changed_file="true")
+    assert not (tmp_path / "out" / "analysis.csv").exists()
+
+
+@pytest.mark.mpi
+def test_two_ranks_replace_a_run(run, program, tmp_path):
+    run(steps="3")
+    words = ("-scene", "drop.py", "-ccp_type", "apgd", "-steps", 2, "-output", "out")
+    done = program(*words, ranks=2, status=2)
+    assert done.stderr.count("pctt.run: -output out: holds a run") == 1
+    program(*words, "-overwrite", ranks=2)
+    assert recorded_steps(arrays(tmp_path / "out" / "state.h5")) == ["000001", "000002"]
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["ranks"] == 2
+    assert not (tmp_path / "out" / ".new").exists()
+    with h5py.File(tmp_path / "out" / "checkpoint.h5") as file:
+        assert file["world/step"][()] == 2
+
+
+def test_the_demo_has_a_folder_of_its_own_that_it_replaces(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / DEMO["output"]).mkdir(parents=True)
+    (tmp_path / DEMO["output"] / "summary.json").write_text("of an earlier demo")
+    options = read_options({}, SELF)
+    assert (options.demo, options.run.overwrite, options.run.output) == (True, True, DEMO["output"])
+    assert read_options({"steps": "1"}, SELF).run.output == "results" != DEMO["output"]
