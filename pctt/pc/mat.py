@@ -9,8 +9,8 @@ ASYMMETRY = 1e-8  # ||A - A'|| / ||A|| that is put down to rounding
 
 
 def check_coordinates(P: PETSc.Mat) -> None:
-    """ValueError, on all ranks alike, unless the Mat's attribute ``coordinates`` is finite numbers, a row per local block row, or is
-    missing on all ranks; collective."""
+    """ValueError, on all ranks alike, unless the Mat's attribute ``coordinates`` holds finite numbers, a row per local
+    block row, or is missing on all ranks; collective."""
     points = P.getAttr("coordinates")
     count = P.getLocalSize()[0] // P.getBlockSize()
     wrong = ""

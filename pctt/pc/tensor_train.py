@@ -381,7 +381,8 @@ class TensorTrain(PythonPC):
         if spoilt:  # nor is another solve with this matrix to meet it
             self.rank = 1
             self._make_block_jacobi(self.P)
-            self.account.fallbacks.append(f"{ksp.getType()} broke down ({reason}) at rank {rank}, solved again at rank 1")
+            what = f"{ksp.getType()} broke down ({reason}) at rank {rank}"
+            self.account.fallbacks.append(f"{what}, solved again with block Jacobi")
         seconds = self._slowest(time.perf_counter() - self._solve_start)
         reference = b.norm()
         if reference == 0 or ksp.getIterationNumber() == 0:

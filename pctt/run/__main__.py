@@ -13,6 +13,13 @@ petsc4py.init([word for word in sys.argv if word not in ("-help", "--help", "-h"
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.petsc import require_real_double
+
+try:
+    require_real_double()
+except ImportError as error:
+    sys.exit(str(error))
+
 from dem.together import SceneError
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError

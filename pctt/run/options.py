@@ -16,6 +16,8 @@ from dem.experiment import Experiment, SceneFileError, from_file
 from dem.scenes import SCENES
 from dem.together import together
 from pctt import ccp
+from pctt.ccp.newton import DEFAULTS
+from pctt.ccp.newton.asked_for import LADDER
 from pctt.options import (
     AT_LEAST_ONE,
     COUNT,
@@ -28,10 +30,9 @@ from pctt.options import (
     read,
     refuse_unknown,
 )
-from pctt.ccp.newton import DEFAULTS
-from pctt.ccp.newton.asked_for import LADDER
 from pctt.pc import PRECONDITIONERS
 from pctt.pc.ksp_options import entered, to_enter
+from pctt.petsc import own_errors
 from pctt.run.dump import dump_folder
 from pctt.run.hdf5 import refuse_serial
 from pctt.run.leftovers import OF_SOLVERS, refuse_misspelt
@@ -317,7 +318,7 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) ->
     absent = {name: value for name, value in given.items() if name not in known}
     ksp = PETSc.KSP().create(comm)
     try:
-        with entered({**to_enter("", DEFAULTS[form], comm.size), **absent}):
+        with entered({**to_enter("", DEFAULTS[form], comm.size), **absent}), own_errors():
             ksp.setFromOptions()
             refuse_misspelt(given)
     except OptionError:  # from a preconditioner of ours
