@@ -15,7 +15,7 @@ from pctt.look.program import run as program_of_folder
 from pctt.run.options import read_options
 from pctt.run.simulate import simulate
 
-OPTIONS = {"scene_n": "2", "ccp_type": "pdip", "dt": "0.1", "compare": "pbjacobi,none", "compare_every": "8"}
+OPTIONS = {"scene_n": "2", "ccp_type": "pdip", "dt": "0.1", "compare": "pbjacobi,none", "compare_every": "40"}
 
 
 def start(*words: object) -> subprocess.CompletedProcess[str]:

@@ -202,7 +202,8 @@ def test_a_stray_word_is_refused(words, program, results):
 
 
 def test_numbers_below_zero_and_options_of_petsc_are_no_stray_words():
-    refuse_stray(["-steps", "-1", "-dt", "-.5e3", "--ksp_type", "cg", "-quiet", "-log_view", ":log.txt:ascii_xml", "-x", "-"])
+    words = "-steps -1 -dt -.5e3 --ksp_type cg -quiet -log_view :log.txt:ascii_xml -x -"
+    assert refuse_stray(words.split()) is None
 
 
 @pytest.mark.parallel(1, 2)
