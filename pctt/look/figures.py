@@ -69,7 +69,7 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
 
     values = np.array([line["natural_residual"] for line in lines])
     good = np.array([line["converged"] for line in lines])
-    positive = values > 0
+    positive = (values > 0) & np.isfinite(values)
     residual.semilogy(time[positive], values[positive], color="C0", **look)
     if not good.all():
         bad = positive & ~good

@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from pctt import disk
+from pctt import disk, figures_json
 
 
 class FolderError(RuntimeError):
@@ -115,10 +115,11 @@ class Folder:
         return self._frames / f"{step:06d}.h5"
 
     def lines(self) -> list[dict[str, Any]]:
-        """The figures of each step, in their order, from steps.jsonl; none if there is no such file."""
+        """The figures of each step, in their order, from steps.jsonl; none if there is no such file. Those that were
+        no numbers are infinite."""
         path = self.path / "steps.jsonl"
         try:
-            return [json.loads(line) for line in disk.lines(path)]
+            return [figures_json.loads(line) for line in disk.lines(path)]
         except (OSError, ValueError) as error:
             raise FolderError(f"{path}: no list of steps ({error})") from None
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
-from pctt import ccp, log
+from pctt import ccp, figures_json, log
 from pctt.ccp import fclib, petsc_binary
 from pctt.ccp.cone import Array
 from pctt.run import leftovers
@@ -43,7 +42,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
     place = Place(Path(options.run.output), comm)
     place.make()
     if comm.rank == 0:
-        write_text(place.now / "summary.json", json.dumps(summary, indent=1) + "\n")
+        write_text(place.now / "summary.json", figures_json.dumps(summary, indent=1) + "\n")
     place.take()
 
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ from dem.contact.search import Contacts
 from dem.exchange import exchange
 from dem.system import ContactSystem
 from dem.world import World
-from pctt import disk
+from pctt import disk, figures_json
 from pctt.run import totals
 from pctt.run.hdf5 import FileError, RowWriter, replaced, told, write_text, written
 from pctt.run.lines import StepLines
@@ -138,13 +137,13 @@ class Results:
     def add_step(self, world: World, line: dict[str, Any], compare: dict[str, Any]) -> None:
         """Write the figures of a step, and the summary with them."""
         if self.comm.rank == 0:
-            self._steps.add(json.dumps(_finite(line)))
+            self._steps.add(figures_json.dumps(line))
             self._totals = totals.add(self._totals, line)
         self.write_summary(world, compare)
 
     def steps(self) -> Iterator[dict[str, Any]]:
         """The figures of the steps, also of those that an earlier run left for this one to go on from; on rank 0."""
-        return map(json.loads, self._steps)
+        return map(figures_json.loads, self._steps)
 
     def stands(self, world: World, line: dict[str, Any]) -> None:
         """The step with these figures is written: after the first one, what it replaces may go; collective."""
@@ -188,20 +187,11 @@ class Results:
                 "analysis": analysis or {},
                 "compare": compare,
             }
-            write_text(self.place.now / "summary.json", json.dumps(_finite(summary), indent=1) + "\n")
+            write_text(self.place.now / "summary.json", figures_json.dumps(summary, indent=1) + "\n")
 
 
 def _step_of(line: str) -> int:
     return int(json.loads(line)["step"])
-
-
-def _finite(value: Any) -> Any:
-    """The same with null for numbers that JSON has no word for."""
-    if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _write_bodies(file: RowWriter, world: World) -> None:

@@ -191,3 +191,16 @@ def test_records_are_columns_of_numbers(tmp_path):
     table.write_text("step,force\n1,many\n")
     with pytest.raises(FolderError, match="records.csv"):
         read.records()
+
+
+def test_figures_of_steps_that_were_no_numbers_are_infinite(tmp_path):
+    read = Folder(handmade.write(tmp_path / "made", handmade.FLOOR))
+    assert read.lines() == []
+    table = tmp_path / "made" / "steps.jsonl"
+    table.write_text('{"step": 1, "natural_residual": null}\n{"step": 2, "natural_residual": 1e-5}\n{"step": 3, "nat')
+    assert read.lines() == [
+        {"step": 1, "natural_residual": float("inf")}, {"step": 2, "natural_residual": 1e-5}
+    ]  # the third is half a line
+    table.write_text("words\n")
+    with pytest.raises(FolderError, match="steps.jsonl"):
+        read.lines()

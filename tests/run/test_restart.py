@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 
 import h5py
 import numpy as np
@@ -194,3 +195,14 @@ def test_a_checkpoint_without_time_step_and_scene_file_is_taken(drop, tmp_path):
         del file.attrs["dt"], file.attrs["scene_file"]
     drop(DROP + "# changed", dt="0.02")
     assert step_of(tmp_path / "out" / "checkpoint.h5") == 4
+
+
+def test_figures_that_are_no_numbers_are_gone_on_with(drop, tmp_path):
+    """Such a step is told by null in steps.jsonl, and its residual is the worst."""
+    path = tmp_path / "out" / "steps.jsonl"
+    first, second = path.read_text().splitlines()
+    path.write_text("\n".join([json.dumps({**json.loads(first), "natural_residual": None}), second, ""]))
+    drop(DROP, quiet="false")
+    assert [line["natural_residual"] is None for line in steps_of(tmp_path / "out")] == [True, False, False, False]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["steps"], summary["natural_residual"]) == (4, None)
