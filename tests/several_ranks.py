@@ -27,7 +27,7 @@ import pytest
 T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[1]
 INSIDE = "--of-ranks"  # the option by which a pytest inside mpiexec knows the folder where it finds and leaves all
-ENDS = 6000  # characters of what mpiexec said that are shown of a rank that died
+ENDS = 12000  # characters of what mpiexec said that are shown of a rank that died
 
 
 def mpiexec(ranks: int) -> list[str]:
