@@ -45,7 +45,7 @@ def main(comm: MPI.Comm) -> None:
 
 
 #: Exit status by what ends a run; raised on all ranks alike, but for a FileError that says that it is `alone`.
-STATUS = {OptionError: 2, FileError: 2, SceneError: 1, InterruptError: 130}
+STATUS: dict[type[Exception], int] = {OptionError: 2, FileError: 2, SceneError: 1, InterruptError: 130}
 
 
 def run() -> int:

@@ -19,8 +19,8 @@ RANKS = [1, pytest.param(2, marks=pytest.mark.mpi)]
 
 
 def interrupted(options, ranks, tmp_path, cache, ready, number, twice=False):
-    """Start a run, wait until `ready`, and send the signal: to the program, or to the mpiexec of run/setup, or where there
-    is another, to the last rank. Its exit status, and what it said to the standard error."""
+    """Start a run, wait until `ready`, and send the signal: to the program, or to the mpiexec of run/setup, or where
+    there is another, to the last rank. Its exit status, and what it said to the standard error."""
     with subprocess.Popen(
         command(*options, ranks=ranks), cwd=tmp_path, env=environment(cache), stderr=subprocess.PIPE, text=True
     ) as run:

@@ -49,7 +49,8 @@ def run(tmp_path, monkeypatch):
     def run(text=DROP, **options):
         (tmp_path / "drop.py").write_text(text)
         words = {"scene": "drop.py", "ccp_type": "apgd", "output": "out", "quiet": "true", **options}
-        simulate(read_options(words, SELF), SELF)
+        given = {name: value for name, value in words.items() if value is not None}
+        simulate(read_options(given, SELF), SELF)
 
     return run
 

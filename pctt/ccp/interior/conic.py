@@ -26,6 +26,7 @@ import numpy as np
 
 from pctt.ccp.cone import Array, tangential, times
 from pctt.ccp.interior import lorentz
+from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.interior.lorentz import NesterovTodd
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
@@ -146,6 +147,7 @@ def _start(
     problem: ConeProblem, guess: Array, scale: Array, frictionless: Array, options: Conic
 ) -> tuple[Array, Array]:
     """A pair on the central path near the guess: s - tau z = s_0 - tau z_0."""
+    guess = no_larger_than_useful(problem, guess)
     s, z = guess * scale, _velocity(problem, guess, frictionless) / scale
     s[frictionless, 1:] = 0.0
     diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2

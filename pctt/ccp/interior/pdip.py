@@ -22,8 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cone import TINY, Array, step_to_boundary, step_to_zero, times
+from pctt.ccp.cone import Array, step_to_boundary, step_to_zero, times
 from pctt.ccp.interior.barrier import CONSTRAINTS, Perspective, Quadratic
+from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
@@ -34,6 +35,7 @@ RTOL = 1e-3  # of the linear solves, where ``-ksp_rtol`` does not say otherwise
 FORCING = 0.1  # and what they may leave of velocities, as a part of what the natural residual shows
 SHORT = 0.5  # a step after which the direction is corrected,
 FURTHER = 0.3  # for one that goes so much further
+BENT = 100.0  # unless the terms of second order enlarge the right-hand side so much: no correction then helps
 LONGER = 1.2  # a corrected step that is worth taking, as a part of the other
 
 
@@ -84,8 +86,8 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         tol = _accuracy(problem, at, history[-1])
         dg, dlam, x = _direction(problem, newton, at, tol)
         step = _step_length(problem, cone, at, dg, dlam, options)
-        if step < SHORT:
-            bend = _bend(at, dg, dlam, min(1.0, step + FURTHER))
+        bend = _bend(at, dg, dlam, min(1.0, step + FURTHER)) if step < SHORT else None
+        if bend is not None and problem.norm(_right_side(at, bend)) < BENT * problem.norm(_right_side(at)):
             other_dg, other_dlam, _ = _direction(problem, newton, at, tol, bend, x)
             other = _step_length(problem, cone, at, other_dg, other_dlam, options)
             if other > LONGER * step:
@@ -117,9 +119,14 @@ def _accuracy(problem: ConeProblem, at: Linearised, residual: float) -> float:
 
     What a solve leaves are velocities. They must not be more than a part of those that the natural residual stands for:
     complementarity would fall without them, and near the boundary no step makes up for that."""
-    q = (at.barrier / at.f)[:, None] * at.df - at.y
     shown = residual * problem.norm(at.g) * problem.mean_diagonal
-    return min(RTOL * problem.norm(q), FORCING * shown) / float(np.sqrt(problem.mean_diagonal))
+    return min(RTOL * problem.norm(_right_side(at)), FORCING * shown) / float(np.sqrt(problem.mean_diagonal))
+
+
+def _right_side(at: Linearised, bend: tuple[Array, Array] | None = None) -> Array:
+    """Of the Newton system, with the terms of second order ``bend``."""
+    curved, missed = bend or (0.0, 0.0)
+    return ((at.barrier + missed) / at.f)[:, None] * at.df - at.y - curved
 
 
 def _direction(
@@ -132,10 +139,9 @@ def _direction(
 ) -> tuple[Array, Array, Array]:
     """dg, dlam and the Newton system's solution, with the terms of second order ``bend``; ``start``: an earlier
     solution."""
-    curved, missed = bend or (np.zeros_like(at.g), np.zeros_like(at.lam))
-    aim = (at.barrier + missed) / at.f
-    dg, x = newton.solve(aim[:, None] * at.df - at.y - curved, tol, start=start)
+    dg, x = newton.solve(_right_side(at, bend), tol, start=start)
     dg[problem.mu == 0, 1:] = 0.0
+    aim = (at.barrier + (bend[1] if bend else 0.0)) / at.f
     return dg, -(at.lam + aim + at.lam / at.f * (at.df * dg).sum(1)), x
 
 
@@ -158,12 +164,10 @@ def _velocity(problem: ConeProblem, g: Array) -> Array:
 def _start(
     problem: ConeProblem, guess: Array, cone: Perspective | Quadratic, options: PDIP
 ) -> tuple[Array, Array]:
-    """Impulses on the cones' axes and multipliers of equal complementarity. The guess is made smaller where that
-    lowers the objective: impulses of a jam that has come loose are too large by orders."""
+    """Impulses on the cones' axes and multipliers of equal complementarity."""
     closing = problem.norm(_velocity(problem, np.zeros_like(problem.r))) / np.sqrt(problem.size)
     new = options.start * closing / problem.mean_diagonal
-    along, bent = problem.dot(problem.r, guess), problem.dot(problem.product(guess), guess)
-    known = min(max(-along / max(bent, TINY), 0.0), 1.0) * guess[:, 0]
+    known = no_larger_than_useful(problem, guess)[:, 0]
     g = np.zeros_like(problem.r)
     g[:, 0] = np.where(known > 0, np.maximum(known, 0.1 * new), new)
     speed = problem.norm(_velocity(problem, g)) / np.sqrt(problem.size)

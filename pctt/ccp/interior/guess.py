@@ -1,0 +1,15 @@
+"""The guess that an interior point method starts from: the last step's impulses, where they are of the right size."""
+
+from __future__ import annotations
+
+from pctt.ccp.cone import TINY, Array
+from pctt.ccp.problem import ConeProblem
+
+
+def no_larger_than_useful(problem: ConeProblem, guess: Array) -> Array:
+    """The part t guess, 0 <= t <= 1, of the guess (nc, 3) with the least objective.
+
+    The impulses of a jam that has come loose are too large by orders of magnitude, and an interior point method takes
+    dozens of steps to get rid of them, or stalls."""
+    along, bent = problem.dot(problem.r, guess), problem.dot(problem.product(guess), guess)
+    return min(max(-along / max(bent, TINY), 0.0), 1.0) * guess
