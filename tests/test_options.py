@@ -179,7 +179,7 @@ def test_a_name_like_none_of_ours_gets_a_pointer_to_the_help():
     ],
 )
 def test_petscs_own_names_pass(name):
-    refuse_unknown([name], KNOWN)
+    assert refuse_unknown([name], KNOWN) is None
 
 
 def test_known_names_and_those_of_further_prefixes_pass():

@@ -9,7 +9,7 @@ from pctt.petsc import require_real_double
 
 
 def test_real_double_precision_will_do():
-    require_real_double()
+    assert require_real_double() is None
 
 
 @pytest.mark.parametrize("scalar", [np.complex128, np.float32])

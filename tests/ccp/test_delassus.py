@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import SELF, Graph, from_graph, heap, matrix, random_graph
+from mpi4py import MPI
+from problems import SELF, Graph, from_graph, heap, matrix, part, random_graph
 
 from pctt.blocks import block_matrix, square_block_matrix
 from pctt.ccp import ConeProblem
@@ -145,70 +146,52 @@ def test_known_problems_are_what_they_say():
         assert known.objective == pytest.approx(0.5 * g @ known.N @ g + known.r.ravel() @ g)
 
 
-PROGRAM = """
-import numpy as np
-import scipy.sparse as sp
-from mpi4py import MPI
-from petsc4py import PETSc
-from problems import part, random_graph
-from pctt.blocks import block_matrix, square_block_matrix
-from pctt.ccp import ConeProblem
-from pctt.ccp.delassus import delassus
-
-comm = MPI.COMM_WORLD
-last = comm.size - 1
-def own(mat, block):
-    indptr, indices, values = mat.convert("aij").getValuesCSR()
-    return sp.csr_matrix((values, indices, indptr), shape=(len(indptr) - 1, mat.getSize()[1])).toarray()
-
-cases = 0
-for seed, arguments in enumerate([
-    dict(contacts=60, bodies=25),
-    dict(contacts=80, bodies=30, hub=True),
-    dict(contacts=40, bodies=6),
-    dict(contacts=30, bodies=12, one_body=1.0),
-    dict(contacts=3, bodies=2),
-    dict(contacts=0, bodies=4),
-]):
-    graph = random_graph(seed, **arguments)
-    G = graph.dense()
-    N = G @ G.T
-    scale = max(1.0, np.abs(N).max(initial=0.0))
-    nc, nb = graph.contacts, graph.bodies
-    rng = np.random.default_rng(seed)
-    partitions = [
-        (None, None),
-        ([0] * last + [nc], [nb] * comm.size),  # all contacts on the last rank, all bodies on the first
-        ([nc] * comm.size, [0] * last + [nb]),  # and the other way round
-        (None, [0] * last + [nb]),
-        ([*sorted(rng.integers(0, nc + 1, last)), nc], [*sorted(rng.integers(0, nb + 1, last)), nb]),
-    ]
-    for contact_ends, body_ends in partitions:
-        rows = part(comm, nc, contact_ends)
-        near = slice(3 * rows.start, 3 * rows.stop)
-        local = graph.part(comm, contact_ends, body_ends)
-        assert np.array_equal(own(block_matrix(comm, local), 6), G[near])
-        assert np.allclose(own(delassus(comm, local), 3), N[near], rtol=0, atol=1e-13 * scale)
-        count = rows.stop - rows.start
-        problem = ConeProblem(comm, np.ones((count, 3)), np.ones(count), G=local)
-        g = np.random.default_rng(1).normal(size=3 * nc)
-        y = problem.product(g[near].reshape(-1, 3))
-        assert np.allclose(y.ravel(), (N @ g)[near], rtol=0, atol=1e-12 * scale)
-        v = problem.N.createVecRight()
-        v.array[:] = g[near]
-        assert np.allclose((problem.N * v).array, (N @ g)[near], rtol=0, atol=1e-12 * scale)
-        blocks = N.reshape(nc, 3, nc, 3)[np.arange(nc), :, np.arange(nc)]
-        assert np.allclose(problem.diagonal_blocks, blocks[rows], rtol=0, atol=1e-13 * scale)
-        assert np.isclose(problem.mean_diagonal, np.diag(N).mean() if nc else 1.0)
-        assert problem.size == nc
-        cases += 1
-if comm.rank == 0:
-    print("cases", cases)
-"""
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize("ranks", [2, 3, 4])
-def test_delassus_over_the_ranks(mpirun, ranks):
+@pytest.mark.parallel(2, 3, 4)
+def test_delassus_over_the_ranks():
     """Ranks without contacts, ranks that own bodies that they do not touch, bodies all on one rank."""
-    assert mpirun(PROGRAM, ranks) == "cases 30\n"
+    comm = MPI.COMM_WORLD
+    last = comm.size - 1
+
+    def own(mat, block):
+        indptr, indices, values = mat.convert("aij").getValuesCSR()
+        return sp.csr_matrix((values, indices, indptr), shape=(len(indptr) - 1, mat.getSize()[1])).toarray()
+
+    for seed, arguments in enumerate([
+        {"contacts": 60, "bodies": 25},
+        {"contacts": 80, "bodies": 30, "hub": True},
+        {"contacts": 40, "bodies": 6},
+        {"contacts": 30, "bodies": 12, "one_body": 1.0},
+        {"contacts": 3, "bodies": 2},
+        {"contacts": 0, "bodies": 4},
+    ]):
+        graph = random_graph(seed, **arguments)
+        G = graph.dense()
+        N = G @ G.T
+        scale = max(1.0, np.abs(N).max(initial=0.0))
+        nc, nb = graph.contacts, graph.bodies
+        rng = np.random.default_rng(seed)
+        partitions = [
+            (None, None),
+            ([0] * last + [nc], [nb] * comm.size),  # all contacts on the last rank, all bodies on the first
+            ([nc] * comm.size, [0] * last + [nb]),  # and the other way round
+            (None, [0] * last + [nb]),
+            ([*sorted(rng.integers(0, nc + 1, last)), nc], [*sorted(rng.integers(0, nb + 1, last)), nb]),
+        ]
+        for contact_ends, body_ends in partitions:
+            rows = part(comm, nc, contact_ends)
+            near = slice(3 * rows.start, 3 * rows.stop)
+            local = graph.part(comm, contact_ends, body_ends)
+            assert np.array_equal(own(block_matrix(comm, local), 6), G[near])
+            assert np.allclose(own(delassus(comm, local), 3), N[near], rtol=0, atol=1e-13 * scale)
+            count = rows.stop - rows.start
+            problem = ConeProblem(comm, np.ones((count, 3)), np.ones(count), G=local)
+            g = np.random.default_rng(1).normal(size=3 * nc)
+            y = problem.product(g[near].reshape(-1, 3))
+            assert np.allclose(y.ravel(), (N @ g)[near], rtol=0, atol=1e-12 * scale)
+            v = problem.N.createVecRight()
+            v.array[:] = g[near]
+            assert np.allclose((problem.N * v).array, (N @ g)[near], rtol=0, atol=1e-12 * scale)
+            blocks = N.reshape(nc, 3, nc, 3)[np.arange(nc), :, np.arange(nc)]
+            assert np.allclose(problem.diagonal_blocks, blocks[rows], rtol=0, atol=1e-13 * scale)
+            assert np.isclose(problem.mean_diagonal, np.diag(N).mean() if nc else 1.0)
+            assert problem.size == nc

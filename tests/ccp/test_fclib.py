@@ -9,8 +9,9 @@ import h5py
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from mpi4py import MPI
 from petsc4py import PETSc
-from problems import SELF, Known, dense_of, from_graph, from_matrix, heap
+from problems import SELF, Known, dense_of, from_graph, from_matrix, heap, part
 
 from pctt import blocks, ccp
 from pctt.ccp import ConeProblem, Limits, fclib, petsc_binary
@@ -298,37 +299,21 @@ def test_what_is_no_hdf5_file_is_refused(tmp_path):
             fclib.read(path, SELF)
 
 
-PROGRAM = """
-import sys
-from mpi4py import MPI
-from pctt import ccp
-from pctt.ccp import Limits, fclib
-
-comm = MPI.COMM_WORLD
-problem = fclib.read(sys.argv[1], comm)
-assert sum(comm.allgather(len(problem.mu))) == problem.size
-result = ccp.solve(problem, limits=Limits(1e-6))
-figures = ccp.measure(problem, result.impulse)
-refused = 0
-try:
-    fclib.read("absent.hdf5", comm)
-except fclib.FileFormatError:
-    refused = 1
-assert comm.allreduce(refused) == comm.size
-if comm.rank == 0:
-    print(problem.size, repr(figures.objective))
-"""
-
-
-@pytest.mark.mpi
-def test_every_rank_gets_its_part_and_the_same_error(mpirun, tmp_path):
+@pytest.mark.parallel(4)
+@pytest.mark.parametrize("contacts", [12, 3])
+def test_every_rank_gets_its_part_and_the_same_error(contacts, tmp_path):
     """Four ranks: with more contacts than ranks, and with fewer."""
-    for contacts in (12, 3):
-        known, _ = heap(0, contacts, 8)
-        path = write_local(tmp_path / "local.hdf5", known)
-        size, objective = mpirun(PROGRAM, 4, path).split()
-        assert int(size) == contacts
-        assert float(objective) == pytest.approx(known.objective, rel=1e-5)
+    comm = MPI.COMM_WORLD
+    known, _ = heap(0, contacts, 8)
+    if comm.rank == 0:
+        write_local(tmp_path / "local.hdf5", known)
+    comm.Barrier()
+    problem = fclib.read(tmp_path / "local.hdf5", comm)
+    assert sum(comm.allgather(len(problem.mu))) == problem.size == contacts
+    result = ccp.solve(problem, limits=Limits(1e-6))
+    assert ccp.measure(problem, result.impulse).objective == pytest.approx(known.objective, rel=1e-5)
+    with pytest.raises(FileFormatError):
+        fclib.read(tmp_path / "absent.hdf5", comm)
 
 
 # -- writing -----------------------------------------------------------------------------------------------
@@ -522,67 +507,54 @@ def test_broken_petsc_files_are_refused_by_name(tmp_path):
         petsc_binary.load(broken, SELF)
 
 
-WRITER = """
-import sys
-import numpy as np
-from mpi4py import MPI
-from petsc4py import PETSc
-from problems import from_graph, heap, part
-from pctt.ccp import fclib, petsc_binary
+@pytest.mark.parallel(2, 4)
+def test_files_written_and_read_by_several_ranks(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    comm = MPI.COMM_WORLD
+    known, graph = heap(0, 12, 8)
+    problem = from_graph(known, graph, comm)
+    mine = part(comm, 12)
+    solution = Solution(known.g[mine], known.y[mine])
+    fclib.write_local("local.h5", problem, Info(), solution, solution)
+    petsc_binary.write("local.petsc", problem)
 
-comm = MPI.COMM_WORLD
-known, graph = heap(0, 12, 8)
-problem = from_graph(known, graph, comm)
-mine = part(comm, 12)
-solution = fclib.Solution(known.g[mine], known.y[mine])
-fclib.write_local("local.h5", problem, fclib.Info(), solution, solution)
-petsc_binary.write("local.petsc", problem)
+    H = graph.dense().T
+    rows, columns = part(comm, 8), part(comm, 12)
+    height, width = 6 * (rows.stop - rows.start), 3 * (columns.stop - columns.start)
+    M = PETSc.Mat().createAIJ(((height, None), (height, None)), nnz=1, comm=comm)
+    D = PETSc.Mat().createAIJ(((height, None), (width, None)), nnz=36, comm=comm)
+    for i in range(6 * rows.start, 6 * rows.stop):
+        M[i, i] = 1.0 + i
+        for j in np.flatnonzero(H[i]):
+            D[i, j] = H[i, j]
+    M.assemble()
+    D.assemble()
+    f = np.arange(48.0)[6 * rows.start : 6 * rows.stop]
+    fclib.write_global("global.h5", M, D, f, known.r[mine], known.mu[mine], point=known.g[mine])
+    with pytest.raises(OSError, match="nowhere"):
+        fclib.write_local("nowhere/local.h5", problem)
 
-H = graph.dense().T
-rows, columns = part(comm, 8), part(comm, 12)
-M, D = (PETSc.Mat().createAIJ(((6 * (rows.stop - rows.start), None), (width, None)), nnz=n, comm=comm)
-        for width, n in ((6 * (rows.stop - rows.start), 1), (3 * (columns.stop - columns.start), 36)))
-for i in range(6 * rows.start, 6 * rows.stop):
-    M[i, i] = 1.0 + i
-    for j in np.flatnonzero(H[i]):
-        D[i, j] = H[i, j]
-M.assemble()
-D.assemble()
-f = np.arange(48.0)[6 * rows.start : 6 * rows.stop]
-fclib.write_global("global.h5", M, D, f, known.r[mine], known.mu[mine], point=known.g[mine])
-failed = 0
-try:
-    fclib.write_local("nowhere/local.h5", problem)
-except OSError:
-    failed = 1
-assert comm.allreduce(failed) == comm.size
-
-for load, name in ((fclib.load, "local.h5"), (petsc_binary.load, "local.petsc"), (fclib.load, "global.h5")):
-    stored = load(name, comm)
-    assert np.array_equal(stored.problem.mu, known.mu[mine])
-    if name == "local.h5":
-        assert np.array_equal(stored.solution, known.g[mine]) and np.array_equal(stored.guess, known.g[mine])
-    g = known.g[mine]
-    if name == "global.h5":
-        assert stored.problem.contact_map is not None
-        assert np.array_equal(stored.problem.point, g)
-        W = H.T @ (H / (1.0 + np.arange(48))[:, None])
-        r = known.r.ravel() + H.T @ (np.arange(48.0) / (1.0 + np.arange(48)))
-    else:
-        W, r = known.N, known.r.ravel()
-    assert np.allclose(stored.problem.r, r.reshape(-1, 3)[mine], atol=1e-12)
-    assert np.allclose(stored.problem.product(g), (W @ known.g.ravel()).reshape(-1, 3)[mine], atol=1e-11)
-"""
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize("ranks", [2, 4])
-def test_files_written_and_read_by_several_ranks(mpirun, tmp_path, ranks):
-    mpirun(WRITER, ranks)
-    known, _ = heap(0, 12, 8)
-    for problem in (fclib.read(tmp_path / "local.h5", SELF), petsc_binary.load(tmp_path / "local.petsc", SELF).problem):
-        assert np.allclose(dense(problem), known.N, atol=1e-13 * np.abs(known.N).max())
-        assert np.array_equal(problem.r, known.r)
+    for load, name in ((fclib.load, "local.h5"), (petsc_binary.load, "local.petsc"), (fclib.load, "global.h5")):
+        stored = load(name, comm)
+        assert np.array_equal(stored.problem.mu, known.mu[mine])
+        if name == "local.h5":
+            assert np.array_equal(stored.solution, known.g[mine])
+            assert np.array_equal(stored.guess, known.g[mine])
+        g = known.g[mine]
+        if name == "global.h5":
+            assert stored.problem.contact_map is not None
+            assert np.array_equal(stored.problem.point, g)
+            W = H.T @ (H / (1.0 + np.arange(48))[:, None])
+            r = known.r.ravel() + H.T @ (np.arange(48.0) / (1.0 + np.arange(48)))
+        else:
+            W, r = known.N, known.r.ravel()
+        assert np.allclose(stored.problem.r, r.reshape(-1, 3)[mine], atol=1e-12)
+        assert np.allclose(stored.problem.product(g), (W @ known.g.ravel()).reshape(-1, 3)[mine], atol=1e-11)
+    comm.Barrier()
+    if comm.rank == 0:
+        for alone in (fclib.read("local.h5", SELF), petsc_binary.load("local.petsc", SELF).problem):
+            assert np.allclose(dense(alone), known.N, atol=1e-13 * np.abs(known.N).max())
+            assert np.array_equal(alone.r, known.r)
 
 
 # -- published problems ------------------------------------------------------------------------------------

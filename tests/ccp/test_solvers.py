@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from problems import SELF, Graph, Known, from_graph, from_matrix, heap, known_optimum, matrix, random_graph
 
 from pctt import ccp
@@ -28,6 +28,9 @@ PROBLEMS = {
     "one contact without friction": {"contacts": 1, "bodies": 1, "mu": 0.0, "seed": 3},
     "one dynamic body per contact": {"one_body": 1.0, "bodies": 20},
 }
+# every solver with every problem, and both with both ways to give it
+WAYS = ("by its map", "by its matrix")
+CASES = [(solver, name, WAYS[(i + k) % 2]) for i, solver in enumerate(ccp.SOLVERS) for k, name in enumerate(PROBLEMS)]
 TOL = 1e-7
 # methods without acceleration or with restarts at every new face: to a hundred times that, lest it takes minutes
 SLOW = ("barzilai_borwein", "spectral", "kucera", "gpminres", "gauss_seidel", "jacobi")
@@ -50,12 +53,10 @@ def check(known: Known, problem: ccp.ConeProblem, result: ccp.Result, tol: float
     assert np.linalg.norm(velocity - known.y) <= 1e3 * tol * np.linalg.norm(known.r)
 
 
-@EVERY
-@pytest.mark.parametrize("name", PROBLEMS)
-@pytest.mark.parametrize("given", [from_graph, from_matrix], ids=["by its map", "by its matrix"])
-def test_reaches_the_known_optimum(solver, name, given):
+@pytest.mark.parametrize(("solver", "name", "way"), CASES)
+def test_reaches_the_known_optimum(solver, name, way):
     known, graph = heap(**PROBLEMS[name])
-    problem = from_graph(known, graph) if given is from_graph else from_matrix(known)
+    problem = from_graph(known, graph) if way == "by its map" else from_matrix(known)
     tol = tolerance(solver)
     check(known, problem, ccp.solve(problem, type=solver, limits=Limits(tol)), tol)
 
@@ -329,64 +330,37 @@ def test_options_of_a_solver_are_used():
 
 # -- several ranks ------------------------------------------------------------------------------------------
 
-PROGRAM = """
-import json
-import numpy as np
-from mpi4py import MPI
-from problems import from_graph, from_matrix, heap
-from pctt import ccp
-from pctt.ccp import Limits
-
-SOLVERS = {SOLVERS}
-comm = MPI.COMM_WORLD
-last = comm.size - 1
-known, graph = heap(1, mu=np.arange(40) % 4 * 0.3)
-few, few_graph = heap(1, contacts=3, bodies=2)
-found = {}
-for name, problem in {
-    "even": from_graph(known, graph, comm),
-    "matrix": from_matrix(known, comm),
-    "uneven": from_graph(known, graph, comm, [0] * last + [40], [12] * comm.size),
-    "few": from_graph(few, few_graph, comm),
-}.items():
-    for solver in SOLVERS:
-        result = ccp.solve(problem, type=solver, limits=Limits(1e-6))
-        figures = ccp.measure(problem, result.impulse)
-        assert comm.allgather(figures) == [figures] * comm.size
-        assert comm.allgather((result.converged, result.reason, result.iterations, result.history)) == [
-            (result.converged, result.reason, result.iterations, result.history)
-        ] * comm.size
-        found[name + " " + solver] = [
-            result.converged, result.iterations, figures.objective, figures.velocity_norm, result.fallbacks
-        ]
-    problem.destroy()
-if comm.rank == 0:
-    print(json.dumps(found))
-"""
 
 
-@pytest.mark.mpi
-@pytest.mark.parametrize("ranks", [2, 3, 4])
-def test_the_answer_does_not_depend_on_the_ranks(mpirun, ranks):
+@pytest.mark.parallel(2, 3, 4)
+@pytest.mark.parametrize("solver", [solver for solver in ccp.SOLVERS if solver not in SLOW])
+def test_the_answer_does_not_depend_on_the_ranks(solver):
     """Also with ranks that have no contact: all but the last in "uneven", one or more in "few".
 
     The slow methods are compared after a number of iterations in test_first_order.py.
     """
-    solvers = [solver for solver in ccp.SOLVERS if solver not in SLOW]
-    found = json.loads(mpirun(PROGRAM.replace("{SOLVERS}", repr(solvers)), ranks))
-    known, _ = heap(1, mu=np.arange(40) % 4 * 0.3)
-    few, _ = heap(1, contacts=3, bodies=2)
-    assert len(found) == 4 * len(solvers)
-    for name, (converged, iterations, objective, velocity_norm, fallbacks) in found.items():
-        optimum = few if name.startswith("few") else known
-        solver = name.split()[1]
-        assert converged
-        assert objective == pytest.approx(optimum.objective, rel=1e-5)
-        assert velocity_norm == pytest.approx(np.linalg.norm(optimum.y), rel=1e-3)
-        assert fallbacks == 0
+    comm, limits = MPI.COMM_WORLD, Limits(1e-6)
+    last = comm.size - 1
+    known, graph = heap(1, mu=np.arange(40) % 4 * 0.3)
+    few, few_graph = heap(1, contacts=3, bodies=2)
+    for optimum, problem in (
+        (known, from_graph(known, graph, comm)),
+        (known, from_matrix(known, comm)),
+        (known, from_graph(known, graph, comm, [0] * last + [40], [12] * comm.size)),  # uneven
+        (few, from_graph(few, few_graph, comm)),
+    ):
+        result = ccp.solve(problem, type=solver, limits=limits)
+        figures = ccp.measure(problem, result.impulse)
+        said = (figures, result.converged, result.reason, result.iterations, result.history)
+        assert comm.allgather(said) == [said] * comm.size
+        assert result.converged
+        assert figures.objective == pytest.approx(optimum.objective, rel=1e-5)
+        assert figures.velocity_norm == pytest.approx(np.linalg.norm(optimum.y), rel=1e-3)
+        assert result.fallbacks == 0
         if solver == "pdip":  # an iteration more or less is rounding
-            alone = ccp.solve(from_matrix(optimum), type=solver, limits=Limits(1e-6))
-            assert abs(iterations - alone.iterations) <= 1
+            alone = ccp.solve(from_matrix(optimum), type=solver, limits=limits)
+            assert abs(result.iterations - alone.iterations) <= 1
+        problem.destroy()
 
 
 def test_known_optimum_has_contacts_of_all_kinds():

@@ -49,42 +49,39 @@ def test_in_a_turned_frame_the_world_vector_is_the_same():
     assert recalled[0, 0] == 2.0
 
 
-MEMORY = """
-import numpy as np
-from mpi4py import MPI
-from dem.impulses import ImpulseMemory
-comm = MPI.COMM_WORLD
-keys = 8 * np.random.default_rng(1).permutation(5000)[:1000]
-impulse = np.random.default_rng(2).normal(size=(1000, 3))
-frame = np.tile(np.eye(3), (1000, 1, 1))
-def part(seed):
-    return np.flatnonzero(np.random.default_rng(seed).integers(0, comm.size, 1000) == comm.rank)
-memory = ImpulseMemory(comm)
-mine = part(1)
-memory.remember(keys[mine], impulse[mine], frame[mine])
-stored, _ = memory.state()
-assert comm.allreduce(len(stored)) == 1000
-assert len(stored) < 1300 / comm.size  # spread over the ranks
-def check(memory, seed):
-    mine = part(seed)
-    asked = np.concatenate([keys[mine], [4, 12]])  # the last two are unknown
-    recalled, found = memory.recall(asked, np.tile(np.eye(3), (len(asked), 1, 1)))
-    assert found[:-2].all() and not found[-2:].any()
-    assert (recalled[:-2] == impulse[mine]).all() and not recalled[-2:].any()
-check(memory, 2)
-# A restart that hands the rows of all ranks to the last one.
-rows = comm.allgather(memory.state())
-key, values = (np.concatenate(column) for column in zip(*rows))
-take = slice(None) if comm.rank == comm.size - 1 else slice(0, 0)
-again = ImpulseMemory(comm)
-again.restore(key[take], values[take])
-check(again, 3)
-for one, other in zip(again.state(), memory.state()):
-    assert (one == other).all()
-"""
+@pytest.mark.parallel(1, 2, 3, 4)
+def test_memory_does_not_depend_on_who_asks():
+    comm = MPI.COMM_WORLD
+    keys = 8 * np.random.default_rng(1).permutation(5000)[:1000]
+    impulse = np.random.default_rng(2).normal(size=(1000, 3))
+    frame = np.tile(np.eye(3), (1000, 1, 1))
 
+    def part(seed):
+        return np.flatnonzero(np.random.default_rng(seed).integers(0, comm.size, 1000) == comm.rank)
 
-@pytest.mark.mpi
-@pytest.mark.parametrize("ranks", [1, 2, 3, 4])
-def test_memory_does_not_depend_on_who_asks(mpirun, ranks):
-    mpirun(MEMORY, ranks)
+    memory = ImpulseMemory(comm)
+    mine = part(1)
+    memory.remember(keys[mine], impulse[mine], frame[mine])
+    stored, _ = memory.state()
+    assert comm.allreduce(len(stored)) == 1000
+    assert len(stored) < 1300 / comm.size  # spread over the ranks
+
+    def check(memory, seed):
+        mine = part(seed)
+        asked = np.concatenate([keys[mine], [4, 12]])  # the last two are unknown
+        recalled, found = memory.recall(asked, np.tile(np.eye(3), (len(asked), 1, 1)))
+        assert found[:-2].all()
+        assert not found[-2:].any()
+        assert (recalled[:-2] == impulse[mine]).all()
+        assert not recalled[-2:].any()
+
+    check(memory, 2)
+    # A restart that hands the rows of all ranks to the last one.
+    rows = comm.allgather(memory.state())
+    key, values = (np.concatenate(column) for column in zip(*rows))
+    take = slice(None) if comm.rank == comm.size - 1 else slice(0, 0)
+    again = ImpulseMemory(comm)
+    again.restore(key[take], values[take])
+    check(again, 3)
+    for one, other in zip(again.state(), memory.state()):
+        assert (one == other).all()

@@ -2,8 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from cases import grains_by_id, heap, step
+from mpi4py import MPI
 
-from dem.partition import morton_codes
+from dem.bodies import Bodies
+from dem.contact import find_contacts
+from dem.partition import imbalance, morton_codes, rebalance, splitters
+from dem.world import World
 
 
 def interleave(x, y, z):
@@ -24,72 +29,51 @@ def test_morton_codes_of_one_point():
     assert morton_codes(np.ones((1, 3)), np.ones(3), np.ones(3)).tolist() == [0]
 
 
-SPLIT = """
-import numpy as np
-from mpi4py import MPI
-from dem.partition import splitters
-comm = MPI.COMM_WORLD
-rng = np.random.default_rng(comm.rank)
-codes = rng.integers(0, 2**63 - 1, 1000 * (comm.rank + 1)) >> rng.integers(0, 60)
-weights = rng.integers(1, 10, len(codes)).astype(float)
-cuts = splitters(comm, codes, weights)
-assert comm.bcast(cuts.tolist()) == cuts.tolist()
-everything = comm.allgather((codes, weights))
-codes, weights = (np.concatenate(part) for part in zip(*everything))
-below = np.array([weights[codes < cut].sum() for cut in cuts])
-up_to = np.array([weights[codes <= cut].sum() for cut in cuts])
-target = weights.sum() * np.arange(1, comm.size) / comm.size
-assert (below <= target).all() and (up_to > target).all(), (below, target, up_to)
-"""
+@pytest.mark.parallel(2, 3, 4)
+def test_splitters_cut_the_weight_evenly():
+    comm = MPI.COMM_WORLD
+    rng = np.random.default_rng(comm.rank)
+    codes = rng.integers(0, 2**63 - 1, 1000 * (comm.rank + 1)) >> rng.integers(0, 60)
+    weights = rng.integers(1, 10, len(codes)).astype(float)
+    cuts = splitters(comm, codes, weights)
+    assert comm.bcast(cuts.tolist()) == cuts.tolist()
+    everything = comm.allgather((codes, weights))
+    codes, weights = (np.concatenate(part) for part in zip(*everything))
+    below = np.array([weights[codes < cut].sum() for cut in cuts])
+    up_to = np.array([weights[codes <= cut].sum() for cut in cuts])
+    target = weights.sum() * np.arange(1, comm.size) / comm.size
+    assert (below <= target).all(), (below, target)
+    assert (up_to > target).all(), (up_to, target)
 
 
-@pytest.mark.mpi
-@pytest.mark.parametrize("ranks", [2, 3, 4])
-def test_splitters_cut_the_weight_evenly(mpirun, ranks):
-    mpirun(SPLIT, ranks)
+@pytest.mark.parallel(1, 2, 3, 4)
+def test_rebalancing_keeps_the_bodies_and_spreads_the_contacts():
+    comm = MPI.COMM_WORLD
+    world = World.from_scene(heap(1, side=8, boxes=False), comm)
+    for _ in range(3):
+        step(world)
+    before = grains_by_id(world)
 
+    # Unbalance: the first rank takes everything.
+    parts = comm.allgather(world.grains.columns())
+    whole = Bodies(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    world.set_grains(whole if comm.rank == 0 else whole.take(slice(0, 0)))
+    find_contacts(world, 0.05)
+    before.weight = grains_by_id(world).weight
+    if comm.size > 1:
+        assert imbalance(world) > 1.9
+        assert rebalance(world)
+    assert imbalance(world) < 1.05, imbalance(world)
+    assert not rebalance(world)
 
-REBALANCE = """
-import numpy as np
-from mpi4py import MPI
-from cases import grains_by_id, heap, step
-from dem.contact import find_contacts
-from dem.partition import imbalance, morton_codes, rebalance
-from dem.world import World
-comm = MPI.COMM_WORLD
-world = World.from_scene(heap(1, side=8, boxes=False), comm)
-for _ in range(3):
-    step(world)
-before = grains_by_id(world)
+    after = grains_by_id(world)
+    assert (after.id == np.arange(512)).all()
+    for name, column in after.columns().items():
+        assert (column == getattr(before, name)).all(), name
+    assert (world.slabs == np.cumsum([0] + comm.allgather(len(world.grains)))).all()
 
-# Unbalance: the first rank takes everything.
-parts = comm.allgather(world.grains.columns())
-from dem.bodies import Bodies
-whole = Bodies(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
-world.set_grains(whole if comm.rank == 0 else whole.take(slice(0, 0)))
-find_contacts(world, 0.05)
-before.weight = grains_by_id(world).weight
-if comm.size > 1:
-    assert imbalance(world) > 1.9
-    assert rebalance(world)
-assert imbalance(world) < 1.05, imbalance(world)
-assert not rebalance(world)
-
-after = grains_by_id(world)
-assert (after.id == np.arange(512)).all()
-for name, column in after.columns().items():
-    assert (column == getattr(before, name)).all(), name
-assert (world.slabs == np.cumsum([0] + comm.allgather(len(world.grains)))).all()
-
-# Sorted along one curve over all ranks.
-low, high = after.position.min(axis=0), after.position.max(axis=0)
-codes = np.concatenate(comm.allgather(morton_codes(world.grains.position, low, high)))
-if comm.size > 1:
-    assert (np.diff(codes) >= 0).all()
-"""
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize("ranks", [1, 2, 3, 4])
-def test_rebalancing_keeps_the_bodies_and_spreads_the_contacts(mpirun, ranks):
-    mpirun(REBALANCE, ranks)
+    # Sorted along one curve over all ranks.
+    low, high = after.position.min(axis=0), after.position.max(axis=0)
+    codes = np.concatenate(comm.allgather(morton_codes(world.grains.position, low, high)))
+    if comm.size > 1:
+        assert (np.diff(codes) >= 0).all()

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from cases import crude_impulse, heap
 from mpi4py import MPI
+from several_ranks import alone
 
 from dem import record
 from dem.bodies import COMPOUND
 from dem.contact import find_contacts
 from dem.experiment import Experiment
 from dem.motion import Glide
+from dem.partition import rebalance
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.stepper import advance
@@ -167,28 +168,19 @@ def test_a_row_has_the_forces_on_all_large_bodies_and_what_the_scene_adds():
     assert all(np.isfinite(value) for value in row.values())
 
 
-@pytest.mark.mpi
-def test_records_do_not_depend_on_the_number_of_ranks(mpirun):
-    program = """
-import json
-from cases import crude_impulse, heap
-from mpi4py import MPI
-from test_record import Here, made
-from dem import record
-from dem.partition import rebalance
-from dem.world import World
-world = World.from_scene(heap(), MPI.COMM_WORLD)
-rows = []
-for _ in range(5):
-    rebalance(world, 1.0)
-    rows.append({name: float(value) for name, value in record.row(made(world), Here()).items()})
-assert all(rows == other for other in world.comm.allgather(rows))
-if world.comm.rank == 0:
-    print(json.dumps(rows))
-"""
-    one, *others = (json.loads(mpirun(program, ranks)) for ranks in (1, 2, 3))
-    for rows in others:
-        for row, same in zip(rows, one):
-            assert list(row) == list(same)
-            for name, value in same.items():
-                np.testing.assert_allclose(row[name], value, rtol=1e-9, atol=1e-9, err_msg=name)
+def rows_of(comm):
+    world = World.from_scene(heap(), comm)
+    rows = []
+    for _ in range(5):
+        rebalance(world, 1.0)
+        rows.append({name: float(value) for name, value in record.row(made(world), Here()).items()})
+    assert all(rows == other for other in comm.allgather(rows))
+    return rows
+
+
+@pytest.mark.parallel(2, 3)
+def test_records_do_not_depend_on_the_number_of_ranks():
+    for row, same in zip(rows_of(MPI.COMM_WORLD), alone(rows_of)):
+        assert list(row) == list(same)
+        for name, value in same.items():
+            np.testing.assert_allclose(row[name], value, rtol=1e-9, atol=1e-9, err_msg=name)

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
-import os
+import importlib
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from mpi4py import MPI
+from several_ranks import environment
 
-ROOT = Path(__file__).resolve().parents[2]
-OPTIONS = ("-scene_n", "2", "-ccp_type", "pdip", "-dt", "0.1", "-compare", "pbjacobi,none", "-compare_every", "8")
+from pctt.look.program import run as program_of_folder
+from pctt.run.options import read_options
+from pctt.run.simulate import simulate
+
+OPTIONS = {"scene_n": "2", "ccp_type": "pdip", "dt": "0.1", "compare": "pbjacobi,none", "compare_every": "40"}
 
 
 def start(*words: object) -> subprocess.CompletedProcess[str]:
-    own = {name: value for name, value in os.environ.items() if not name.startswith(("PETSC_OPT", "DISPLAY"))}
-    environment = {**own, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     words = (sys.executable, *map(str, words))
-    return subprocess.run(words, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=120, check=False)
 
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four steps of a mixer of 125 spheres, coarse enough that the lowest have come to the paddle and the floor."""
     path = tmp_path_factory.mktemp("look") / "results"
-    done = start("-m", "pctt.run", *OPTIONS, "-quiet", "-steps", 4, "-output", path)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == ""
-    return path
+    options = {**OPTIONS, "quiet": "true", "steps": "4", "output": str(path)}
+    if MPI.COMM_WORLD.rank == 0:
+        simulate(read_options(options, MPI.COMM_SELF), MPI.COMM_SELF)
+    return MPI.COMM_WORLD.bcast(path)
 
 
 @pytest.fixture
@@ -37,11 +40,20 @@ def python():
 
 
 @pytest.fixture
-def show(folder: Path):
-    """`show(program, *options)` runs `python -m pctt.<program>` on the folder."""
+def show(folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
+    """`show(program, *options)` runs `python -m pctt.<program>` on the folder; in this process if it is refused."""
+
+    def refused(program: str, *words: object) -> subprocess.CompletedProcess[str]:
+        monkeypatch.setattr(sys, "argv", [program, *map(str, words)])
+        capfd.readouterr()
+        try:
+            status = program_of_folder(importlib.import_module(f"pctt.{program}").main, program)
+        except SystemExit as end:  # of argparse
+            status = end.code
+        return subprocess.CompletedProcess(sys.argv, status, *capfd.readouterr())
 
     def run(program: str, *options: object, status: int = 0, folder: Path = folder) -> subprocess.CompletedProcess[str]:
-        done = start("-m", f"pctt.{program}", folder, *options)
+        done = refused(program, folder, *options) if status else start("-m", f"pctt.{program}", folder, *options)
         assert done.returncode == status, done.stdout + done.stderr
         return done
 

@@ -6,41 +6,16 @@ tolerance also stop at other points within it.
 
 from __future__ import annotations
 
-import json
+from functools import partial
 
 import numpy as np
 import pytest
-from drive import steps
-from mpi4py import MPI
-
-from dem.scenes import Mixer
-from dem.world import World
-
-PROGRAM = """
-import json
-import sys
-
-import numpy as np
 from drive import by_id, steps
 from mpi4py import MPI
+from several_ranks import alone
 
 from dem.scenes import Mixer
 from dem.world import World, restart_rows
-
-folder, cases = sys.argv[1], json.loads(sys.argv[2])
-comm = MPI.COMM_WORLD
-state = np.load(f"{folder}/state.npz")
-rows = restart_rows(state["slabs"], comm)
-local = {name[6:]: state[name][rows] for name in state if name.startswith("local_")}
-for case, settings in cases.items():
-    world = World.restore(Mixer(n=2).build(), comm, local, state)
-    for step in steps(world, 2, 0.025, delta=0.02, recovery_speed=1.0, **settings):
-        pushing = comm.allreduce(int((step.impulse[:, 0] > 1e-3).sum()))
-        assert pushing > 200, pushing
-    table = by_id(world)
-    if comm.rank == 0:
-        np.savez(f"{folder}/{case} {comm.size}.npz", **table)
-"""
 
 # settings, and ten times what was measured between ranks: m, m/s, rad/s
 CASES = {
@@ -59,21 +34,25 @@ def fallen() -> dict[str, np.ndarray]:
     return {**replicated, **{f"local_{name}": column for name, column in local.items()}}
 
 
-@pytest.mark.mpi
+def two_steps(comm: MPI.Comm, state: dict[str, np.ndarray], **settings) -> dict[str, np.ndarray]:
+    rows = restart_rows(state["slabs"], comm)
+    local = {name[6:]: state[name][rows] for name in state if name.startswith("local_")}
+    world = World.restore(Mixer(n=2).build(), comm, local, state)
+    for step in steps(world, 2, 0.025, delta=0.02, recovery_speed=1.0, **settings):
+        assert comm.allreduce(int((step.impulse[:, 0] > 1e-3).sum())) > 200
+    return by_id(world)
+
+
+@pytest.mark.parallel(2, 3, 4)
 @pytest.mark.parametrize(
     "cases", [("given iterations", "pdip"), pytest.param(("apgd",), marks=pytest.mark.slow)], ids=" and ".join
 )
-def test_the_trajectory_does_not_depend_on_the_number_of_ranks(cases, mpirun, tmp_path):
-    np.savez(tmp_path / "state.npz", **fallen())
-    settings = json.dumps({case: CASES[case][0] for case in cases})
-    for ranks in (1, 2, 3, 4):
-        mpirun(PROGRAM, ranks, tmp_path, settings)
+def test_the_trajectory_does_not_depend_on_the_number_of_ranks(cases, ranks):
+    state = alone(lambda comm: fallen())
     for case in cases:
-        tables = {ranks: np.load(tmp_path / f"{case} {ranks}.npz") for ranks in (1, 2, 3, 4)}
-        for ranks in (2, 3, 4):
-            here, alone = (
-                (tables[k]["position"], *np.split(tables[k]["velocity"], 2, axis=1)) for k in (ranks, 1)
-            )
-            for name, one, other, limit in zip(("x", "v", "w"), here, alone, CASES[case][1]):
-                message = f"{case}: {name} on {ranks} ranks"
-                np.testing.assert_allclose(one, other, rtol=0, atol=limit, err_msg=message)
+        settings, limits = CASES[case]
+        go_on = partial(two_steps, state=state, **settings)
+        both = go_on(MPI.COMM_WORLD), alone(go_on)
+        here, there = ((table["position"], *np.split(table["velocity"], 2, axis=1)) for table in both)
+        for name, one, other, limit in zip(("x", "v", "w"), here, there, limits):
+            np.testing.assert_allclose(one, other, rtol=0, atol=limit, err_msg=f"{case}: {name} on {ranks} ranks")

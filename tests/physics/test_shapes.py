@@ -129,34 +129,20 @@ def test_a_box_bridges_two_lying_capsules():
     assert normal[x > 0].sum() == pytest.approx(2 * weight / 3, rel=1e-4)
 
 
-PRESS = """
-import sys
-import numpy as np
-from mpi4py import MPI
-from drive import G, make_steps
-from dem.motion import Dynamic
-from dem.scene import Scene
-from dem.shapes import Box, Plane
-from dem.world import World
-scene = Scene(0.3)
-scene.add_spheres([[x, y, 0.1] for x in (-0.3, 0.3) for y in (-0.3, 0.3)], 0.1, 1000.0)
-scene.add_body("floor", [Plane((0, 0, 1))])
-scene.add_body("block", [Box((0.1, 0.1, 0.1))], Dynamic(), density=1000.0, position=(0, 0, 0.1))
-scene.add_body("press", [Box((0.5, 0.5, 0.05))], Dynamic(), density=2000.0, position=(0, 0, 0.25))
-world = World.from_scene(scene, MPI.COMM_WORLD)
-step = make_steps(world, 5, 0.01)
-weight = G * (world.comm.allreduce(float(world.grains.mass.sum())) + world.large.mass[1:].sum())
-np.testing.assert_allclose(step.system.force_on("floor", step.impulse)[2], -weight, rtol=1e-5)
-np.testing.assert_allclose(step.system.force_on("press", step.impulse)[2], G * world.large.mass[2], rtol=1e-5)
-np.testing.assert_allclose(world.large.position[1:], [[0, 0, 0.1], [0, 0, 0.25]], atol=1e-6)
-assert world.comm.allreduce(len(step.contacts)) == 16
-"""
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize("ranks", [1, 3])
-def test_a_free_press_rests_on_grains_and_on_another_large_body(mpirun, ranks):
-    mpirun(PRESS, ranks)
+@pytest.mark.parallel(1, 3)
+def test_a_free_press_rests_on_grains_and_on_another_large_body():
+    scene = Scene(0.3)
+    scene.add_spheres([[x, y, 0.1] for x in (-0.3, 0.3) for y in (-0.3, 0.3)], 0.1, 1000.0)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_body("block", [Box((0.1, 0.1, 0.1))], Dynamic(), density=1000.0, position=(0, 0, 0.1))
+    scene.add_body("press", [Box((0.5, 0.5, 0.05))], Dynamic(), density=2000.0, position=(0, 0, 0.25))
+    world = World.from_scene(scene, MPI.COMM_WORLD)
+    step = make_steps(world, 5, 0.01)
+    weight = G * (world.comm.allreduce(float(world.grains.mass.sum())) + world.large.mass[1:].sum())
+    np.testing.assert_allclose(step.system.force_on("floor", step.impulse)[2], -weight, rtol=1e-5)
+    np.testing.assert_allclose(step.system.force_on("press", step.impulse)[2], G * world.large.mass[2], rtol=1e-5)
+    np.testing.assert_allclose(world.large.position[1:], [[0, 0, 0.1], [0, 0, 0.25]], atol=1e-6)
+    assert world.comm.allreduce(len(step.contacts)) == 16
 
 
 def test_a_free_large_box_falls_along_a_smooth_wall():

@@ -1,16 +1,15 @@
-"""The program as a user starts it, in a process of its own, and what it leaves in files."""
+"""The program as a user starts it, and what it leaves in files."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
+import subprocess
 import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
-import pytest
+import several_ranks
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -19,32 +18,34 @@ SMALL = ("-scene_n", "1", "-scene_margin", "0.7")  # narrower boxes jam, and pdi
 SETTLED = (*SMALL, "-restart", "settled")
 
 
+def database(words: list[str]) -> dict[str, str | None]:
+    """The options in the words of a command line, as PETSc takes them."""
+
+    def is_name(word: str) -> bool:
+        return word[:1] == "-" and not word[1:2].isdigit()
+
+    return {
+        name.lstrip("-"): None if is_name(value) else value
+        for name, value in zip(words, [*words[1:], "-"])
+        if is_name(name)
+    }
+
 
 def environment(cache: Path) -> dict[str, str]:
     """Variables of a run that keeps its settled states in `cache`."""
-    own = {name: value for name, value in os.environ.items() if not name.startswith(("PETSC_OPT", "OMPI_MCA_ess"))}
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    return {
-        **own,
-        "PYTHONPATH": path,
-        "XDG_CACHE_HOME": str(cache),
-        "OMP_NUM_THREADS": "1",
-        "OMPI_ALLOW_RUN_AS_ROOT": "1",
-        "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
-        "OMPI_MCA_rmaps_base_oversubscribe": "1",
-    }
+    return several_ranks.environment(XDG_CACHE_HOME=str(cache))
 
 
 def command(*options: object, ranks: int = 1) -> list[str]:
     """The command line of a run; one rank is started without mpiexec."""
     line = [sys.executable, "-m", "pctt.run", *map(str, options)]
-    if ranks == 1:
-        return line
-    beside = Path(sys.executable).with_name("mpiexec")
-    mpiexec = str(beside) if beside.exists() else shutil.which("mpiexec")
-    if mpiexec is None:
-        pytest.skip("no mpiexec")
-    return [mpiexec, "-n", str(ranks), *line]
+    return line if ranks == 1 else [*several_ranks.mpiexec(ranks), *line]
+
+
+def start(words: list[str], ranks: int, folder: Path, cache: Path) -> subprocess.CompletedProcess[str]:
+    """Run in a process of its own, or several, as a user does."""
+    line, env = command(*words, ranks=ranks), environment(cache)
+    return subprocess.run(line, cwd=folder, env=env, capture_output=True, text=True, timeout=300, check=False)
 
 
 def arrays(path: Path) -> dict[str, np.ndarray]:

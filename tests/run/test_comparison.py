@@ -21,8 +21,8 @@ FIELDS = {
 ACCURATE = ("-ksp_rtol", "1e-6", "-ksp_max_it", "2000", "-ccp_tol", "1e-4")
 
 
-def compared(program, folder, *options, ranks=1):
-    done = program(*SETTLED, *ACCURATE, "-steps", 3, "-overwrite", *options, ranks=ranks)
+def compared(program, folder, *options):
+    done = program(*SETTLED, *ACCURATE, "-steps", 3, "-overwrite", *options)
     summary = json.loads((folder / "results" / "summary.json").read_text())
     assert summary["newton_its"] == sum(line["newton_its"] for line in steps_of(folder / "results"))
     table = done.stdout.partition("preconditioner  ")[2].splitlines()
@@ -32,14 +32,15 @@ def compared(program, folder, *options, ranks=1):
 
 def test_all_see_the_same_systems_and_the_table_agrees_with_the_summary(program, settled, tmp_path):
     summary, table = compared(program, tmp_path, "-compare", "none,ilu,pbjacobi")
-    newton = summary["newton_its"]
+    count = summary["compare"]["pbjacobi"]["systems"]
+    assert count >= summary["newton_its"] > 20  # one system or more in a step
     solves = [line["compare"] for line in steps_of(tmp_path / "results")]
     assert list(summary["compare"]) == list(table) == ["none", "ilu", "pbjacobi"]
     for name, record in summary["compare"].items():
         for field, kind in FIELDS.items():
             assert type(record[field]) is kind, f"{field}: {record[field]!r}"
         assert set(record) == set(FIELDS)
-        assert record["systems"] == sum(len(step[name]) for step in solves) == newton > 20
+        assert record["systems"] == sum(len(step[name]) for step in solves) == count
         assert sum(converged for step in solves for converged, *_ in step[name]) == record["converged"]
         assert 0 <= record["converged"] <= record["systems"]
         assert 0 < record["ksp_its_mean"] <= record["ksp_its_max"] <= 2000
@@ -47,7 +48,7 @@ def test_all_see_the_same_systems_and_the_table_agrees_with_the_summary(program,
         assert record["setup_s"] >= 0
         assert record["solve_s"] > 0
         systems, converged, mean, most, _, _, worst = table[name]
-        assert (int(systems), int(converged), int(most)) == (newton, record["converged"], record["ksp_its_max"])
+        assert (int(systems), int(converged), int(most)) == (count, record["converged"], record["ksp_its_max"])
         assert float(mean) == pytest.approx(record["ksp_its_mean"], abs=0.06)
         assert float(worst) == pytest.approx(record["true_residual_max"], rel=0.06)
         if record["converged"] == record["systems"]:
@@ -56,16 +57,17 @@ def test_all_see_the_same_systems_and_the_table_agrees_with_the_summary(program,
     for line in steps_of(tmp_path / "results"):
         assert sum(line["phases"].values()) == pytest.approx(line["seconds"])
     assert summary["compare"]["pbjacobi"]["ksp_its_mean"] < summary["compare"]["none"]["ksp_its_mean"]
-    assert summary["compare"]["pbjacobi"]["converged"] == newton
+    assert summary["compare"]["pbjacobi"]["converged"] == count
 
 
 @pytest.mark.parametrize("every", [2, 7])
 def test_only_every_kth_system_is_compared_on(every, program, settled, tmp_path):
+    whole, _ = compared(program, tmp_path, "-compare", "pbjacobi")
+    expected = math.ceil(whole["compare"]["pbjacobi"]["systems"] / every)
     summary, table = compared(program, tmp_path, "-compare", "pbjacobi,sor", "-compare_every", every)
-    newton = summary["newton_its"]
     for name in ("pbjacobi", "sor"):
-        assert summary["compare"][name]["systems"] == math.ceil(newton / every)
-        assert int(table[name][0]) == math.ceil(newton / every)
+        assert summary["compare"][name]["systems"] == expected
+        assert int(table[name][0]) == expected
 
 
 def test_a_compared_preconditioner_takes_options_of_its_own(program, settled, tmp_path):
@@ -75,13 +77,13 @@ def test_a_compared_preconditioner_takes_options_of_its_own(program, settled, tm
     assert filled["compare"]["ilu"]["ksp_its_mean"] < plain["compare"]["ilu"]["ksp_its_mean"]
 
 
-@pytest.mark.mpi
+@pytest.mark.parallel(2)
 def test_on_two_ranks_ilu_is_said_to_work_within_each(program, settled, tmp_path):
-    summary, table = compared(program, tmp_path, "-compare", "none,ilu,pbjacobi", ranks=2)
+    summary, table = compared(program, tmp_path, "-compare", "none,ilu,pbjacobi")
     assert list(summary["compare"]) == ["none", "ilu", "pbjacobi"]
     assert list(table) == ["none", "ilu (within each rank)", "pbjacobi"]
-    newton = summary["newton_its"]
-    assert {record["systems"] for record in summary["compare"].values()} == {newton}
+    (systems,) = {record["systems"] for record in summary["compare"].values()}
+    assert systems >= summary["newton_its"]
 
 
 def test_a_failing_preconditioner_stays_in_the_table(program, settled, tmp_path):
@@ -110,7 +112,7 @@ def test_fallbacks_of_a_train_reach_the_summary(program, settled, tmp_path):
     assert "pc_report" not in summary["compare"]["pbjacobi"]
     report = summary["compare"]["tt"]["pc_report"]
     assert report[0].startswith("tensor train")
-    assert f"set-ups {summary['compare']['tt']['systems']} " in report[1]
+    assert f"set-ups {summary['newton_its']} " in report[1]
     assert all("pc_report" not in line for line in steps_of(tmp_path / "results"))
     train = ("-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")
     program(*SETTLED, "-steps", 1, *train, "-output", "train")

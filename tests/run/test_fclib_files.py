@@ -18,7 +18,7 @@ OPTIMA = {
 FIELDS = {"objective": float, "natural_residual": float, "newton_its": int, "seconds": float, "converged": bool}
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("solver", ["pdip", "apgd"])
 @pytest.mark.parametrize("name", OPTIMA)
 def test_the_known_optimum_is_found(name, solver, ranks, program, tmp_path):
@@ -26,7 +26,7 @@ def test_the_known_optimum_is_found(name, solver, ranks, program, tmp_path):
     if not path.exists():
         pytest.skip(f"no {path}")
     contacts, objective, speed = OPTIMA[name]
-    done = program("-problem", path, "-ccp_type", solver, "-ccp_tol", 1e-7, ranks=ranks)
+    done = program("-problem", path, "-ccp_type", solver, "-ccp_tol", 1e-7)
     summary = json.loads((tmp_path / "results" / "summary.json").read_text())
     for field, kind in FIELDS.items():
         assert type(summary[field]) is kind, f"{field}: {summary[field]!r}"

@@ -6,6 +6,7 @@ import dataclasses
 import re
 
 import pytest
+from mpi4py import MPI
 from program import SMALL
 
 from dem.scenes import Mixer
@@ -18,11 +19,10 @@ GROUPS += [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.item
 GROUPS += [(pc.options_class, pc.options_prefix) for pc in PRECONDITIONERS]
 
 
-@pytest.mark.parametrize(
-    ("ranks", "options"), [(1, ()), (1, (*SMALL, "-steps", "1")), pytest.param(2, (), marks=pytest.mark.mpi)]
-)
-def test_help_lists_every_option_and_runs_nothing(ranks, options, program, tmp_path):
-    done = program("-help", *options, ranks=ranks)
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("options", [(), (*SMALL, "-steps", "1")])
+def test_help_lists_every_option_and_runs_nothing(options, program, tmp_path):
+    done = program("-help", *options, own=MPI.COMM_WORLD.size == 1)
     assert not list(tmp_path.iterdir())
     listed = re.findall(r"^  -(\w+) <(.*?)>: (.+)$", done.stdout, re.MULTILINE)
     names = [name for name, _, _ in listed]

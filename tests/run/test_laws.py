@@ -13,17 +13,17 @@ def steps(folder: Path) -> list[dict]:
     return steps_of(folder / "results")
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
-def test_steps_with_coulombs_law(ranks, program, settled, tmp_path):
+@pytest.mark.parallel(1, 2)
+def test_steps_with_coulombs_law(program, settled, tmp_path):
     options = ("-ccp_type", "apgd", "-ccp_tol", 1e-5, "-steps", 2, "-monitor", 2)
-    done = program(*SETTLED, *options, "-ccp_coulomb", ranks=ranks)
+    done = program(*SETTLED, *options, "-ccp_coulomb")
     for line in steps(tmp_path):
         assert line["converged"], line["reason"]
         assert line["coulomb_residual"] <= 1.01e-5
         assert line["cone_problems"] > 1
         words = f"Coulomb residual {line['coulomb_residual']:.1e} by {line['cone_problems']} cone problems"
         assert words in done.stdout
-    program(*SETTLED, *options, "-overwrite", ranks=ranks)
+    program(*SETTLED, *options, "-overwrite")
     assert all(line["natural_residual"] <= 1.01e-5 < line["coulomb_residual"] for line in steps(tmp_path))
 
 

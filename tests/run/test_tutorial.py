@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import ROOT, table
+from program import ROOT, database, table
 
 from dem.experiment import from_file
 from dem.impulses import ImpulseMemory
@@ -52,18 +52,17 @@ def test_grains_flow_out_of_the_hopper_and_none_is_lost(hopper):
     assert scene.analyse(records)["mean_discharge_rate [1/s]"] == pytest.approx(out[-1] / 0.89)
 
 
-@pytest.mark.mpi
-def test_the_program_runs_the_file_on_any_number_of_ranks(hopper, program, tmp_path):
-    options = ("-scene", "hopper.py", "-scene_n", 4, "-scene_settling_time", 0.12)
-    close = ("-ccp_type", "apgd", "-ccp_tol", "1e-7")
-    first = None
-    for ranks in (1, 2):
-        run = (*options, *close, "-restart", "settled", "-steps", 4, "-overwrite")
-        done = program(*run, ranks=ranks, cache=tmp_path / "cache")
-        assert "mean_discharge_rate [1/s]" in done.stdout
-        rows = table(tmp_path / "results" / "records.csv")
-        if first is None:
-            first = rows
+@pytest.mark.parallel(2)
+def test_the_program_runs_the_file_on_any_number_of_ranks(hopper, program, tmp_path, monkeypatch):
+    options = ("-scene", "hopper.py", "-scene_n", "4", "-scene_settling_time", "0.12", "-ccp_type", "apgd")
+    options += ("-ccp_tol", "1e-7", "-restart", "settled", "-steps", "4")
+    done = program(*options, "-output", "both", cache=tmp_path / "cache")
+    assert "mean_discharge_rate [1/s]" in done.stdout
+    if MPI.COMM_WORLD.rank > 0:
+        return
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    simulate(read_options(database([*options, "-quiet", "-output", "alone"]), MPI.COMM_SELF), MPI.COMM_SELF)
+    first, rows = (table(tmp_path / name / "records.csv") for name in ("alone", "both"))
     assert list(first) == list(rows)
     assert list(first["step"]) == [13, 14, 15, 16]
     for name in ("contacts", "kinetic_energy [J]", "potential_energy [J]", "force_door_z [N]", "grains_out"):
@@ -141,10 +140,10 @@ def test_faults_of_a_scene_end_the_run(message, tmp_path, monkeypatch):
         simulate(read_options(words, MPI.COMM_SELF), MPI.COMM_SELF)
 
 
-@pytest.mark.mpi
+@pytest.mark.parallel(2)
 def test_two_ranks_speak_with_one_voice(program, tmp_path):
     (tmp_path / "mine.py").write_text("x = 1\n")
-    done = program("-scene", "mine.py", ranks=2, status=2)
+    done = program("-scene", "mine.py", status=2)
     assert done.stderr.count("pctt.run: -scene mine.py: must define one scene") == 1
 
 

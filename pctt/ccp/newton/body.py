@@ -67,11 +67,6 @@ class BodySystem:
     def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
         return x
 
-    def rounding(self, x: Array, dg: Array, r_v: Array) -> Array | None:
-        """dv - G' dg + r_v: the residual of K as the impulses see it. Late in an iteration it is larger than x's own,
-        as rounding in q - G dv comes back multiplied by the inverse of B."""
-        return x - self.problem.momentum(dg) + r_v
-
     def tolerance(self, tol: float) -> float:
         return tol
 

@@ -76,10 +76,6 @@ class ContactSystem:
         """dv of a solution."""
         return self.problem.momentum(dg) - r_v
 
-    def rounding(self, x: Array, dg: Array, r_v: Array) -> Array | None:
-        """Nothing: the impulses are the unknowns."""
-        return None
-
     def tolerance(self, tol: float) -> float:
         """The norm of this system's residual that leaves velocities as wrong as momenta (sqrt J) by ``tol``."""
         return tol * float(np.sqrt(self.problem.mean_diagonal))

@@ -82,10 +82,6 @@ class KKTSystem:
     def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
         return self.problem.momentum(dg) - r_v
 
-    def rounding(self, x: Array, dg: Array, r_v: Array) -> Array | None:
-        """Nothing: the impulses are the unknowns."""
-        return None
-
     def tolerance(self, tol: float) -> float:
         return tol * float(np.sqrt(self.problem.mean_diagonal))
 
