@@ -193,7 +193,7 @@ def test_a_preconditioners_own_options_act_on_it_alone(database):
         return [records[name].solves[0].iterations for name in ("ilu", "icc")]
 
     plain = iterations()
-    database["compare_ilu_pc_factor_levels"] = 1
+    database["compare_ilu_pc_factor_levels"] = 3
     filled = iterations()
     assert filled[0] < plain[0]
     assert filled[1] == plain[1]
@@ -221,7 +221,7 @@ def test_labels_say_what_a_name_means_here():
 @pytest.mark.parallel(2)
 def test_on_two_ranks_factorisations_work_within_each_rank_and_say_so(database):
     comm = MPI.COMM_WORLD
-    database["compare_ilu_pc_factor_levels"] = 1
+    database["compare_ilu_pc_factor_levels"] = 3
     comparison = Comparison(comm, ["ilu", "ilu-shifted", "icc", "pbjacobi", "python"])
     known, graph = heap(bodies=30)
     newton = ccp.newton_for(comm, "pdip", compare=comparison)

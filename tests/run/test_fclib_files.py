@@ -62,5 +62,5 @@ def test_preconditioners_are_compared_on_a_problem_from_a_file(program, tmp_path
     summary = json.loads((tmp_path / "results" / "summary.json").read_text())
     assert summary["converged"]
     for record in summary["compare"].values():
-        assert record["systems"] == summary["newton_its"]
+        assert summary["newton_its"] <= record["systems"] <= 2 * summary["newton_its"]
     assert "preconditioner" in done.stdout

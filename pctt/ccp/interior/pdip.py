@@ -32,7 +32,7 @@ from pctt.log import phase
 from pctt.options import FRACTION, POSITIVE, option
 
 RTOL = 1e-3  # of the linear solves, where ``-ksp_rtol`` does not say otherwise
-FORCING = 0.3  # and what they may leave of velocities, as a part of what the natural residual shows
+FORCING = 0.03  # and what they may leave of velocities, as a part of what the natural residual shows
 SHORT = 0.5  # a step after which the direction is corrected,
 FURTHER = 0.3  # for one that goes so much further
 BENT = 100.0  # unless the terms of second order enlarge the right-hand side so much: no correction then helps
