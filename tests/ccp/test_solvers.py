@@ -94,8 +94,9 @@ def test_contacts_that_share_no_body_are_solved_one_by_one():
     G = graph.dense()
     together = Known(G @ G.T, r, mu, g, y)
     for solver in ccp.SOLVERS:
-        result = ccp.solve(from_graph(together, graph), type=solver, limits=Limits(1e-9, 100_000))
-        check(together, from_graph(together, graph), result, 1e-9)
+        # what some processors reach of 1e-9 is 1.2e-9
+        result = ccp.solve(from_graph(together, graph), type=solver, limits=Limits(1e-8, 100_000))
+        check(together, from_graph(together, graph), result, 1e-8)
         assert np.allclose(result.impulse, g, atol=1e-5)  # every N is regular: the impulses are unique
 
 
