@@ -214,8 +214,8 @@ def test_an_accuracy_that_cannot_be_reached_ends_with_a_reason(method, monkeypat
     if not result.converged:  # a residual of exactly zero is no stagnation
         assert "no progress" in result.reason
     assert result.iterations < ccp.SOLVERS[method].iterations
-    # how near rounding lets a method come depends on the processor: 1e-15 to 3e-12
-    assert ccp.measure(problem, result.impulse).natural_residual < 5e-11
+    # a method that compares objectives sees no difference below the root of the machine precision
+    assert ccp.measure(problem, result.impulse).natural_residual < 1e-8
 
 
 @EVERY
