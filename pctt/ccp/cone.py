@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-TINY = np.finfo(float).tiny
+TINY = float(np.finfo(float).tiny)
 
 
 def project(x: Array, mu: Array, out: Array | None = None) -> Array:

@@ -14,4 +14,4 @@ def no_larger_than_useful(problem: ConeProblem, guess: Array) -> Array:
     The impulses of a jam that has come loose are too large by orders of magnitude, and an interior point method takes
     dozens of steps to get rid of them, or stalls."""
     along, bent = problem.dot(problem.r, guess), problem.dot(problem.product(guess), guess)
-    return float(np.clip(-along / max(float(bent), TINY), 0.0, 1.0)) * guess
+    return float(np.clip(-along / max(bent, TINY), 0.0, 1.0)) * guess
