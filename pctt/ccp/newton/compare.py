@@ -44,6 +44,7 @@ class Record:
     setup_s: float = 0.0
     solve_s: float = 0.0
     true_residual_max: float = 0.0
+    excess_max: float = 0.0
     solves: list[Solve] = field(default_factory=list)
 
     def add(self, solve: Solve) -> None:
@@ -54,6 +55,7 @@ class Record:
         self.setup_s += solve.setup_s
         self.solve_s += solve.solve_s
         self.true_residual_max = max(self.true_residual_max, float(solve.true_residual))
+        self.excess_max = max(self.excess_max, float(solve.true_residual) / solve.asked)
         self.solves.append(solve)
 
     def take_solves(self) -> list[list[Any]]:
@@ -62,7 +64,7 @@ class Record:
         return [[s.converged, s.iterations, s.setup_s + s.solve_s, s.true_residual] for s in solves]
 
     def summary(self) -> dict[str, Any]:
-        """Figures over the systems."""
+        """Figures over the systems; ``excess_max`` is the greatest true residual as a multiple of what was asked for."""
         return {
             "systems": self.systems,
             "converged": self.converged,
@@ -71,6 +73,7 @@ class Record:
             "setup_s": self.setup_s,
             "solve_s": self.solve_s,
             "true_residual_max": self.true_residual_max,
+            "excess_max": self.excess_max,
         }
 
 

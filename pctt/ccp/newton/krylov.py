@@ -26,7 +26,8 @@ _NOT_SUPPORTED = 56  # PETSC_ERR_SUP: this method has no code for block formats
 
 @dataclass(frozen=True)
 class Solve:
-    """One linear solve: ``true_residual`` is ||b - S x|| / ||b||, computed afterwards (1 after a breakdown)."""
+    """One linear solve: ``true_residual`` is ||b - S x|| / ||b||, computed afterwards (1 after a breakdown), ``asked``
+    what it was to be."""
 
     converged: bool
     reason: str
@@ -34,6 +35,7 @@ class Solve:
     setup_s: float
     solve_s: float
     true_residual: float
+    asked: float
 
 
 class Krylov:
@@ -109,7 +111,7 @@ class Krylov:
                 self.scalar = True
                 return self.solve(A, b, x, rtol, P)
             x.zeroEntries()
-            return Solve(False, f"PETSc error {error}", 0, 0.0, 0.0, 1.0)
+            return Solve(False, f"PETSc error {error}", 0, 0.0, 0.0, 1.0, self.rtol)
         reason, iterations = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
         end = _now(self.comm)
         if reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
@@ -118,7 +120,7 @@ class Krylov:
         # twice: BiCGStab's recursive residual may drift a little without harm
         converged = reason > 0 and true <= 2 * self.rtol
         words = _REASONS.get(reason, str(reason))
-        return Solve(converged, words, iterations, setup - start, end - setup, true)
+        return Solve(converged, words, iterations, setup - start, end - setup, true, self.rtol)
 
     def _set_up(self, A: PETSc.Mat, P: PETSc.Mat, keep: bool) -> None:
         self.ksp.pc.setReusePreconditioner(keep)
