@@ -111,7 +111,7 @@ def test_one_box_serves_many_spheres():
     shared = sphere_box(center, radius, place, turn[0], half)
     each = sphere_box(center, radius, np.tile(place, (30, 1)), np.repeat(turn, 30, 0), np.tile(half, (30, 1)))
     for one, other in zip(shared, each):
-        np.testing.assert_array_equal(one, other)
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-14)
 
 
 def test_corners_of_a_box_on_a_plane():
