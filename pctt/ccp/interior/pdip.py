@@ -33,6 +33,7 @@ from pctt.options import FRACTION, POSITIVE, option
 
 RTOL = 1e-3  # of the linear solves, where ``-ksp_rtol`` does not say otherwise
 FORCING = 0.03  # and what they may leave of velocities, as a part of what the natural residual shows
+STUCK = 0.1  # a step after which the next aims at the complementarity that there is: near the boundary none goes far
 SHORT = 0.5  # a step after which the direction is corrected,
 FURTHER = 0.3  # for one that goes so much further
 BENT = 100.0  # unless the terms of second order enlarge the right-hand side so much: no correction then helps
@@ -70,6 +71,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     newton.begin(problem)
     g, lam = _start(problem, guess, cone, options)
     history: list[float] = []
+    step = 1.0
     for iteration in range(max_it + 1):
         y = _velocity(problem, g)
         history.append(problem.natural_residual(g, y))
@@ -80,7 +82,8 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
             reason = f"{max_it} Newton steps"
             break
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
-        barrier = options.centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
+        centering = options.centering if step > STUCK else 1.0
+        barrier = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         at = Linearised(g, lam, y, f, df, hessian, barrier)
         newton.update(_barrier_blocks(cone, at))
         tol = _accuracy(problem, at, history[-1])
