@@ -113,14 +113,14 @@ def mpirun(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[..., str]
     This is for what needs a process of its own; a test marked `parallel` starts nothing.
     """
 
-    def run(source: str, ranks: int, *arguments: object) -> str:
+    def run(source: str, ranks: int, *arguments: object, seconds: float = 120) -> str:
         program = tmp_path / "program.py"
         program.write_text(source)
         command = [*mpiexec(ranks), sys.executable, "-m", "mpi4py", str(program), *map(str, arguments)]
         env = environment()
         env["PYTHONPATH"] += os.pathsep + str(request.path.parent)
         done = subprocess.run(
-            command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120, check=False
+            command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=seconds, check=False
         )
         assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
         return done.stdout
