@@ -9,8 +9,8 @@ import pytest
 
 STEPS, WARM = 100, 40
 
-#: Prints the growth of the resident memory of each rank, in MiB, in a run of the options that it is given. Files are not
-#: forced to the disk: it would take most of the time.
+#: Prints the growth of the resident memory of each rank, in MiB, in a run with the options that it is given. Files are
+#: not forced to the disk: it would take most of the time.
 PROGRAM = """
 import json, os, sys
 from pathlib import Path

@@ -64,7 +64,7 @@ class Record:
         return [[s.converged, s.iterations, s.setup_s + s.solve_s, s.true_residual] for s in solves]
 
     def summary(self) -> dict[str, Any]:
-        """Figures over the systems; ``excess_max`` is the greatest true residual as a multiple of what was asked for."""
+        """Figures over the systems; ``excess_max``: the greatest true residual, as a multiple of what was asked for."""
         return {
             "systems": self.systems,
             "converged": self.converged,
