@@ -44,6 +44,18 @@ def test_a_krylov_method_leaves_the_database_as_it_was(database):
         assert database.getAll() == before
 
 
+def test_inner_preconditioners_of_ours_leave_the_matrix_as_it_is(database):
+    """With what it is made of as attributes, which a matrix converted for PETSc's own has not."""
+    database["compare_other_pc_type"] = "sor"
+    database["body_pc_type"] = "pbjacobi"
+    mat = contact_matrix(*contacts(40, 12))
+    x, b = mat.createVecs()
+    b.set(1.0)
+    krylov = Krylov(MPI.COMM_SELF, "", {"pc_type": "python", "pc_python_type": "pctt.pc.BodySchur"})
+    assert krylov.solve(mat, b, x).converged
+    krylov.destroy()
+
+
 def test_ilu_on_several_ranks_is_block_jacobi_with_ilu(database):
     database["a_pc_type"] = "ilu"
     database["a_pc_factor_levels"] = "2"

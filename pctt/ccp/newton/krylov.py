@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -21,6 +22,8 @@ _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
 # what wants scalar rows; others switch when PETSc says so
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu", "eisenstat"}
 PATIENCE = 10.0  # seconds that a rank that has failed waits for the others
+# preconditioners of parts of the matrix; ours have inner ones too, but of other matrices
+_OF_PARTS = re.compile(r"(sub|mg|fieldsplit|composite|telescope)_.*pc_type")
 _NOT_SUPPORTED = 56  # PETSC_ERR_SUP: this method has no code for block formats
 
 
@@ -63,7 +66,7 @@ class Krylov:
 
     def _configure(self, options: PETSc.Options, rtol: float) -> None:
         self.method, self.kind = options.getString("ksp_type"), options.getString("pc_type")
-        within = {value for name, value in options.getAll().items() if name.endswith("_pc_type")}
+        within = {value for name, value in options.getAll().items() if _OF_PARTS.fullmatch(name)}
         self._remembers_within = bool(BY_DIAGONAL_BLOCKS & within)
         # block Gauss-Seidel over several ranks crashes in PETSc 3.18, parts of a matrix of blocks have none
         self.scalar = (
@@ -233,7 +236,7 @@ def together(comm: MPI.Comm, work: Callable[[], None]) -> int:
         with own_errors():
             work()
     except PETSc.Error as error:
-        code[0], words = error.ierr, str(error)
+        code[0], words = abs(error.ierr) or 1, str(error)
     if comm.size == 1:
         return int(code[0])
     worst = np.empty(1, int)
