@@ -12,7 +12,8 @@ Where the paper's form creeps (134 Newton steps at 17,911 contacts, natural resi
 in five points, each measured in ``docs/ccp.md``: the constraint is the cone's perspective form
 (``barrier.py``); steps end at 0.9 of the way to the boundary and inside a neighbourhood of the central
 path, rather than at 0.99 and where the multiplier residual falls; a direction that the cones' curvature cuts
-short is corrected; a very short step is followed by one that only centres; and the natural residual alone decides when to stop.
+short is corrected; a very short step is followed by one that only centres; and the natural residual alone decides
+when to stop.
 """
 
 from __future__ import annotations
