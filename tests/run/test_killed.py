@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
 import signal
 import subprocess
 import time
+from pathlib import Path
 
 import h5py
 import pytest
@@ -18,12 +20,11 @@ OPTIONS = ("-ccp_type", "apgd", "-ccp_tol", 1e-3)
 
 
 def processes(parent):
-    """Ids of all descendants of a process."""
-    try:
-        with open(f"/proc/{parent}/task/{parent}/children") as file:
-            children = [int(word) for word in file.read().split()]
-    except OSError:
-        return []
+    """Ids of all descendants of a process, whichever of its threads started them."""
+    children = []
+    for task in Path(f"/proc/{parent}/task").glob("*/children"):
+        with contextlib.suppress(OSError):
+            children += [int(word) for word in task.read_text().split()]
     return children + [late for child in children for late in processes(child)]
 
 
