@@ -67,6 +67,14 @@ def dense_columns(comm: MPI.Comm, G: BlockRows, bodies: np.ndarray) -> PETSc.Mat
     return mat
 
 
+def diagonal_blocks(G: BlockRows) -> NDArray[np.float64]:
+    """Diagonal 3 x 3 blocks of G G' (nc, 3, 3)."""
+    products = G.blocks @ G.blocks.transpose(0, 2, 1)
+    shape = (G.rows, len(products))
+    add = sp.csr_matrix((np.ones(len(products)), np.arange(len(products)), G.indptr), shape=shape)
+    return (add @ products.reshape(-1, 9)).reshape(-1, 3, 3)
+
+
 def block_matrix(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
     """G as a Mat (3Nc x 6M) of block size 3."""
     indices = (2 * G.indices[:, None] + [0, 1]).ravel()

@@ -56,7 +56,7 @@ def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
     contacts = find_contacts(world, options.delta, options.dt)
     system = ContactSystem(world, contacts, options.dt, options.run.recovery_speed)
     problem = cone_problem(system, COMM, compliance)
-    mu, G = problem.mu, problem.contact_map
+    mu, G = problem.mu, problem.contact_map.block_rows
     if variant == "friction":
         mu = np.full_like(mu, 0.8)
     if variant == "heavy":
@@ -71,7 +71,7 @@ def copied(problem: ccp.ConeProblem, count: int) -> ccp.ConeProblem:
     """Copies of a problem side by side, without contact between them."""
     if count == 1:
         return problem
-    G = problem.contact_map
+    G = problem.contact_map.block_rows
     which = np.arange(count)[:, None]
     pointers = np.append(0, (G.indptr[1:] + which * G.indptr[-1]).ravel())
     columns = (G.indices + which * G.columns).ravel()
@@ -86,7 +86,7 @@ def copied(problem: ccp.ConeProblem, count: int) -> ccp.ConeProblem:
 
 def write(path: Path, problem: ccp.ConeProblem) -> None:
     """As an FCLIB global problem of mass-scaled bodies: M = I, H = G'."""
-    G = block_matrix(COMM, problem.contact_map)
+    G = block_matrix(COMM, problem.contact_map.block_rows)
     H = G.transpose()
     size = H.getSize()[0]
     ones = np.ones(size)

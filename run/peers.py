@@ -41,7 +41,7 @@ class Peer:
 
 def _contact_rows(problem: ccp.ConeProblem) -> sp.csr_matrix:
     """G (3 nc x 6 M)."""
-    G = problem.contact_map
+    G = problem.contact_map.block_rows
     assert G is not None
     return sp.bsr_matrix((G.blocks, G.indices, G.indptr), shape=(3 * problem.size, 6 * G.columns)).tocsr()
 

@@ -18,14 +18,6 @@ from pctt.ccp.cone import Array
 from pctt.exchange import exchange, offsets
 
 
-def diagonal_blocks(G: BlockRows) -> Array:
-    """Diagonal 3 x 3 blocks of G G' (nc, 3, 3)."""
-    products = G.blocks @ G.blocks.transpose(0, 2, 1)
-    shape = (G.rows, len(products))
-    add = sp.csr_matrix((np.ones(len(products)), np.arange(len(products)), G.indptr), shape=shape)
-    return (add @ products.reshape(-1, 9)).reshape(-1, 3, 3)
-
-
 def local_blocks(N: PETSc.Mat) -> Array:
     """Diagonal 3 x 3 blocks of this rank's rows of a Mat (nc, 3, 3)."""
     first, last = N.getOwnershipRange()

@@ -8,9 +8,10 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, block_matrix, dense_columns, without_crowded
+from pctt.blocks import BlockRows, dense_columns, diagonal_blocks, without_crowded
 from pctt.ccp.cone import Array, project
-from pctt.ccp.delassus import delassus, diagonal_blocks, local_blocks
+from pctt.ccp.delassus import delassus, local_blocks
+from pctt.contact_map import CompactRows, ContactMap, contact_map
 
 
 class ConeProblem:
@@ -24,12 +25,14 @@ class ConeProblem:
     ----------
     r : (nc, 3) velocities of the contacts without impulses, plus gap/dt (m/s)
     mu : (nc,) friction coefficients
-    contact_map : the block rows of G, or None
+    contact_map : G with its products, or None
     point : (nc, 3) contact points (m) or None; orders the unknowns of hierarchical preconditioners
     key : (nc,) persistent names of the contacts or None
     compliance : (nc, 3) the diagonal of C
     softness : e, the same on all ranks; 0 for rigid contacts
     size : contacts on all ranks, Nc
+
+    ``operator`` is how products are made, of ``pctt.contact_map.OPERATORS``.
     """
 
     def __init__(
@@ -38,11 +41,12 @@ class ConeProblem:
         r: Array,
         mu: Array,
         *,
-        G: BlockRows | None = None,
+        G: BlockRows | CompactRows | None = None,
         N: PETSc.Mat | None = None,
         point: Array | None = None,
         key: np.ndarray | None = None,
         compliance: float = 0.0,
+        operator: str = "auto",
     ):
         if (G is None) == (N is None):
             raise ValueError("a cone problem is given by either the map G or the matrix N")
@@ -55,14 +59,10 @@ class ConeProblem:
         if self.sum(bad.sum()):
             raise ValueError(f"{self.sum(bad.sum())} contacts with a NaN, infinite or negative coefficient")
         self.size = self.sum(len(self.mu))
-        self.contact_map = G
+        self.contact_map: ContactMap | None = None if G is None else contact_map(comm, G, operator)
         self._given: PETSc.Mat = N  # where there is no G
         if N is not None:
             self._in, self._out = N.createVecs()
-        elif G is not None:
-            self._G = block_matrix(comm, G)
-            self._momentum, self._out = self._G.createVecs()
-            self._in = self._out.duplicate()
         self.softness = float(compliance)
         along_normal = np.where(self.mu > 0, self.mu**2, 1.0)
         ones = np.ones_like(along_normal)
@@ -73,29 +73,36 @@ class ConeProblem:
         given = "N" if self.contact_map is None else "G"
         return f"ConeProblem({self.size} contacts, {self.comm.size} ranks, given by {given})"
 
+    @property
+    def free(self) -> bool:
+        """Whether products are made without matrices."""
+        return self.contact_map is not None and self.contact_map.free
+
     # -- the operator ---------------------------------------------------------------------------------------
 
     def product(self, g: Array) -> Array:
         """N g for impulses g (nc, 3): velocities of the contacts (nc, 3)."""
-        return self.velocity_of(self.momentum(g)) + self.compliance * g
+        y: Array = self.compliance * g
+        if self.contact_map is None:
+            y += self._given_product(g)
+        else:
+            self.contact_map.add_delassus(g, y)
+        return y
 
     def momentum(self, g: Array) -> Array:
         """G' g (6m,): what impulses g (nc, 3) change in the mass-scaled velocities of this rank's bodies. Of a
         problem that is given by N, which knows no bodies, g itself."""
-        if self.contact_map is None:
-            return g.ravel().copy()
-        self._out.array[:] = g.ravel()
-        self._G.multTranspose(self._out, self._momentum)
-        return self._momentum.array.copy()
+        return g.ravel().copy() if self.contact_map is None else self.contact_map.momenta(g).ravel()
 
     def velocity_of(self, momentum: Array) -> Array:
         """G v: velocities of the contacts (nc, 3) for those of the bodies; N g where the problem is given by N."""
         if self.contact_map is None:
-            self._in.array[:] = momentum
-            self._given.mult(self._in, self._out)
-        else:
-            self._momentum.array[:] = momentum
-            self._G.mult(self._momentum, self._out)
+            return self._given_product(momentum)
+        return self.contact_map.velocities(momentum)
+
+    def _given_product(self, g: Array) -> Array:
+        self._in.array[:] = g.ravel()
+        self._given.mult(self._in, self._out)
         return self._out.array.reshape(-1, 3).copy()
 
     def natural_residual(self, g: Array, y: Array) -> float:
@@ -114,7 +121,7 @@ class ConeProblem:
         """N as a Mat of block size 3 (BAIJ), but for the low-rank term; built at its first use and kept."""
         N = self.rigid_matrix()
         if self.softness:
-            diagonal = self._out.duplicate()
+            diagonal = N.createVecLeft()
             diagonal.array[:] = self.compliance.ravel()
             N.setDiagonal(diagonal, PETSc.InsertMode.ADD_VALUES)
             diagonal.destroy()
@@ -129,12 +136,14 @@ class ConeProblem:
     def low_rank(self) -> PETSc.Mat | None:
         """The columns U (3Nc x 6 per body, dense) of G of bodies with more than MANY contacts, or None: they would
         fill N, which is ``N`` + U U'."""
-        return None if self.contact_map is None else dense_columns(self.comm, self.contact_map, self._split[1])
+        if self.contact_map is None:
+            return None
+        return dense_columns(self.comm, self.contact_map.block_rows, self._split[1])
 
     @cached_property
     def _split(self) -> tuple[BlockRows, np.ndarray]:
         assert self.contact_map is not None
-        return without_crowded(self.comm, self.contact_map)
+        return without_crowded(self.comm, self.contact_map.block_rows)
 
     @cached_property
     def diagonal_blocks(self) -> Array:
@@ -155,15 +164,16 @@ class ConeProblem:
 
     @cached_property
     def _rigid_blocks(self) -> Array:
-        return local_blocks(self._given) if self.contact_map is None else diagonal_blocks(self.contact_map)
+        return local_blocks(self._given) if self.contact_map is None else self.contact_map.contact_blocks()
 
     def structure(self) -> tuple[np.ndarray, ...]:
         """Arrays of this rank that are equal where contacts, their bodies and all sizes are."""
         key = np.zeros(0) if self.key is None else self.key
         if self.contact_map is None:
             return (key, np.array([self._given.handle, self.size]))
-        G = self.contact_map
-        return (key, G.indptr, G.indices, np.array([G.columns, self.size]))
+        G = self.contact_map.given
+        graph = (G.body,) if isinstance(G, CompactRows) else (G.indptr, G.indices)
+        return (key, *graph, np.array([G.columns, self.size]))
 
     @cached_property
     def mean_diagonal(self) -> float:
@@ -196,7 +206,9 @@ class ConeProblem:
 
     def destroy(self) -> None:
         """Free the PETSc objects now, not when the garbage collector finds the cycle."""
-        for name in ("_G", "_momentum", "_in", "_out"):
+        if self.contact_map is not None:
+            self.contact_map.destroy()
+        for name in ("_in", "_out"):
             if name in self.__dict__:
                 self.__dict__.pop(name).destroy()
         for name in ("N", "low_rank"):

@@ -102,11 +102,16 @@ def sparse_matrix(problem: ConeProblem) -> PETSc.Mat:
 
 
 def spread(
-    comm: MPI.Comm, path: str | Path, format: str, read: Callable[[], Whole], compliance: float | None = None
+    comm: MPI.Comm,
+    path: str | Path,
+    format: str,
+    read: Callable[[], Whole],
+    compliance: float | None = None,
+    operator: str = "auto",
 ) -> Stored:
     """The problem that ``read`` finds on rank 0, contacts (and bodies) in equal parts over the ranks; collective.
 
-    ``compliance`` takes the place of the file's.
+    ``compliance`` takes the place of the file's; ``operator`` is that of `ConeProblem`.
 
     Raises FileFormatError on every rank where ``read`` raises one, or what h5py, numpy and scipy raise for bad data.
     """
@@ -121,7 +126,7 @@ def spread(
     error = comm.bcast(error)
     if error:
         raise FileFormatError(error)
-    return comm.scatter(parts or []).stored(comm, compliance)
+    return comm.scatter(parts or []).stored(comm, compliance, operator)
 
 
 @dataclass(frozen=True)
@@ -138,7 +143,7 @@ class _Part:
     compliance: float
     note: str
 
-    def stored(self, comm: MPI.Comm, compliance: float | None) -> Stored:
+    def stored(self, comm: MPI.Comm, compliance: float | None, operator: str) -> Stored:
         """The problem of all parts; collective."""
         indptr, indices, blocks = self.rows
         G = N = None
@@ -150,7 +155,7 @@ class _Part:
         r, solution, guess, point = (self.triples[name] for name in ("r", "solution", "guess", "point"))
         assert r is not None
         e = self.compliance if compliance is None else compliance
-        problem = ConeProblem(comm, r, self.mu, G=G, N=N, point=point, compliance=e)
+        problem = ConeProblem(comm, r, self.mu, G=G, N=N, point=point, compliance=e, operator=operator)
         return Stored(problem, self.form, self.title, solution, guess, self.note)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from petsc4py import PETSc
 
+from pctt.shell import is_shell
 from pctt.options import describe, no_such_option, read
 
 
@@ -26,6 +27,7 @@ class PythonPC:
 
     options_class: type
     options_prefix: str
+    needs_entries = True  # of the matrix; without, one that is a function will do
 
     def create(self, pc: PETSc.PC) -> None:
         self.options: Any = self.options_class()
@@ -59,8 +61,10 @@ class PythonPC:
         if rows != columns:
             raise ValueError(f"{self.name}: the matrix has {rows} rows and {columns} columns; allowed is a square one")
         handle = P.handle
-        self.P = P = self._as_sparse(P)
-        structure = (handle, rows, P.getInfo()["nz_used"])
+        if self.needs_entries or not is_shell(P):
+            P = self._as_sparse(P)
+        self.P = P
+        structure = (handle, rows, 0 if is_shell(P) else P.getInfo()["nz_used"])
         if structure != self._structure:
             self.build(pc, P)
             self._structure = structure

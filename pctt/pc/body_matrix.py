@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 
 from pctt.blocks import BlockRows
+from pctt.contact_map import is_free
 from pctt.exchange import exchange, offsets
 from pctt.pc.block_diagonal import set_diagonal_blocks
 from pctt.pc.stiff_part import StiffPart
@@ -22,26 +23,26 @@ ADD = PETSc.InsertMode.ADD_VALUES
 class BodyMatrix:
     """K as a Mat of block size 6 (``mat``), and its ``stiff_part``, which is what factorisations are made of."""
 
-    def __init__(self, comm: PETSc.Comm, G: BlockRows):
+    def __init__(self, comm: PETSc.Comm, G: BlockRows, compiled: bool | None = None):
+        """``compiled``: whether its values are made by compiled loops; None: where numba is installed."""
         self.comm = comm.tompi4py() if isinstance(comm, PETSc.Comm) else comm
+        product = CompiledProduct if (is_free("auto") if compiled is None else compiled) else SparseProduct
+        # in 64 bits: pairs of bodies get a number each
+        self.bodies, column = np.unique(np.asarray(G.indices, np.int64), return_inverse=True)
+        self._product = product(G, column.ravel(), len(self.bodies))
         self.load(G)
         self._index(G)
 
     def load(self, G: BlockRows) -> None:
         """Take a G of the same structure."""
-        # in 64 bits: pairs of bodies get a number each
-        self.bodies, column = np.unique(np.asarray(G.indices, np.int64), return_inverse=True)
-        shape = (3 * G.rows, 6 * len(self.bodies))
-        self._rows = sp.bsr_matrix((G.blocks, column, G.indptr), shape=shape)
-        self._columns = self._rows.T.tobsr() if len(G.blocks) else None
+        self.G = G
+        self._product.load(G)
 
     def _index(self, G: BlockRows) -> None:
         """Who owns the blocks that this rank's contacts contribute to, and how those of a body's row are added up."""
         starts = offsets(self.comm, G.columns)
         first, own = int(starts[self.comm.rank]), G.columns
-        local = self._product(np.tile(np.eye(3), (G.rows, 1, 1)))
-        row = self.bodies[np.repeat(np.arange(len(self.bodies)), np.diff(local.indptr))] if G.rows else self.bodies[:0]
-        column = self.bodies[local.indices] if G.rows else self.bodies[:0]
+        row, column = self.bodies[self._product.row], self.bodies[self._product.column]
         self._owner = np.searchsorted(starts, row, side="right") - 1
         self._away = self._owner != self.comm.rank
         home = ~self._away
@@ -62,17 +63,9 @@ class BodyMatrix:
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self._stiff: dict[bool, StiffPart] = {}  # in scalar format or not
 
-    def _product(self, inverse: np.ndarray) -> sp.bsr_matrix:
-        """G' B^-1 G of this rank's contacts, between the bodies that they touch."""
-        if self._columns is None:
-            return sp.bsr_matrix((0, 0), blocksize=(6, 6))
-        count = len(inverse)
-        weight = sp.bsr_matrix((inverse, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
-        return self._columns @ (weight @ self._rows)
-
     def update(self, inverse: np.ndarray) -> None:
         """K for the blocks B^-1 (nc, 3, 3)."""
-        blocks = self._product(inverse).data.reshape(-1, 6, 6)
+        blocks = self._product.blocks(inverse)
         self._values = np.zeros((len(self._indices), 6, 6))
         self._values[self._own_places] = blocks[~self._away] if self._away.any() else blocks
         if self.comm.size > 1:
@@ -94,8 +87,8 @@ class BodyMatrix:
         sums = self.mat.createVecRight()
         counts = sums.duplicate()
         if len(points):
-            contact = np.repeat(np.arange(len(points)), np.diff(self._rows.indptr))
-            body = self.bodies[self._rows.indices]
+            contact = np.repeat(np.arange(len(points)), np.diff(self.G.indptr))
+            body = np.asarray(self.G.indices, np.int64)
             index = (6 * body[:, None] + np.arange(3)).astype(PETSc.IntType)
             sums.setValues(index.ravel(), points[contact].ravel(), ADD)
             counts.setValues(index.ravel(), np.ones(index.size), ADD)
@@ -113,9 +106,8 @@ class BodyMatrix:
         velocity z is the least squares solution of (block of G) z = F u over the contacts of the body, so that masses,
         inertias and places need not be known. F are the first three columns of the block, with rows made unit vectors.
         """
-        blocks = self._rows.data if self._rows is not None and len(points) else np.zeros((0, 3, 6))
-        contact = np.repeat(np.arange(len(points)), np.diff(self._rows.indptr)) if len(blocks) else np.zeros(0, int)
-        body = self.bodies[self._rows.indices] if len(blocks) else np.zeros(0, np.int64)
+        blocks, body = self.G.blocks, np.asarray(self.G.indices, np.int64)
+        contact = np.repeat(np.arange(len(points)), np.diff(self.G.indptr))
         centre = self.comm.allreduce(points.sum(axis=0)) / max(self.comm.allreduce(len(points)), 1)
         x, y, z = (points[contact] - centre).T
         zero = np.zeros_like(x)
@@ -142,6 +134,65 @@ class BodyMatrix:
         self.mat.destroy()
         for part in self._stiff.values():
             part.destroy()
+
+
+class CompiledProduct:
+    """The blocks of G' B^-1 G of a rank's contacts, between the bodies that they touch, by a loop over the contacts.
+
+    Attributes
+    ----------
+    row, column : (n,) bodies of each block, in the order of `blocks`
+    """
+
+    def __init__(self, G: BlockRows, body: np.ndarray, bodies: int):
+        """``body``: the columns of G among ``bodies``."""
+        start, count = np.asarray(G.indptr[:-1]), np.diff(G.indptr)
+        of_row = np.repeat(count, count)  # blocks beside each block
+        first = np.repeat(np.arange(len(body)), of_row)
+        second = np.arange(len(first)) - np.repeat(np.cumsum(of_row) - of_row, of_row) + np.repeat(start, count**2)
+        names, place = np.unique(body[first] * max(bodies, 1) + body[second], return_inverse=True)
+        self.row, self.column = np.divmod(names, max(bodies, 1))
+        self._place = place.ravel()
+
+    def load(self, G: BlockRows) -> None:
+        """Take a G of the same structure."""
+        self._start = np.ascontiguousarray(G.indptr, dtype=np.int64)
+        self._blocks = np.ascontiguousarray(G.blocks, dtype=float)
+
+    def blocks(self, inverse: np.ndarray) -> np.ndarray:
+        """(n, 6, 6) for the blocks B^-1 (nc, 3, 3)."""
+        from pctt.contact_map.block_loops import add_all_blocks  # compiled, takes half a second to come
+
+        out = np.zeros((len(self.row), 6, 6))
+        add_all_blocks(self._blocks, self._start, self._place, np.ascontiguousarray(inverse), out)
+        return out
+
+
+class SparseProduct:
+    """The same by scipy."""
+
+    def __init__(self, G: BlockRows, body: np.ndarray, bodies: int):
+        self._body, self._bodies = body, bodies
+        self.load(G)
+        local = self._product(np.tile(np.eye(3), (G.rows, 1, 1)))
+        self.row, self.column = np.repeat(np.arange(len(local.indptr) - 1), np.diff(local.indptr)), local.indices
+
+    def load(self, G: BlockRows) -> None:
+        """Take a G of the same structure."""
+        shape = (3 * G.rows, 6 * self._bodies)
+        self._rows = sp.bsr_matrix((G.blocks, self._body, G.indptr), shape=shape) if len(G.blocks) else None
+        self._columns = None if self._rows is None else self._rows.T.tobsr()
+
+    def blocks(self, inverse: np.ndarray) -> np.ndarray:
+        """(n, 6, 6) for the blocks B^-1 (nc, 3, 3)."""
+        return self._product(inverse).data.reshape(-1, 6, 6)
+
+    def _product(self, inverse: np.ndarray) -> sp.bsr_matrix:
+        if self._columns is None:
+            return sp.bsr_matrix((0, 0), blocksize=(6, 6))
+        count = len(inverse)
+        weight = sp.bsr_matrix((inverse, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
+        return self._columns @ (weight @ self._rows)
 
 
 def _put(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, blocks: np.ndarray) -> None:

@@ -9,8 +9,9 @@ stopped by what that leaves in S, is therefore safe, where a merely approximate 
 back multiplied by B^-1. So does rounding, where B is tiny: ``richardson`` refines what one solve leaves. K is smaller
 than S, and far better conditioned where contacts slide or open.
 
-The Mat S brings what it is made of as attributes: ``contact_map``, G as ``pctt.blocks.BlockRows``, and ``barrier``, the
-blocks of B (nc, 3, 3).
+The Mat S brings what it is made of as attributes: ``contact_map``, G as ``pctt.blocks.BlockRows``, as
+``pctt.contact_map.CompactRows`` or with its products, and ``barrier``, the blocks of B (nc, 3, 3). S itself may be a
+function.
 """
 
 from __future__ import annotations
@@ -20,15 +21,17 @@ from dataclasses import dataclass
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.blocks import block_matrix
+from pctt.blocks import BlockRows
+from pctt.contact_map import CompactRows, ContactMap, contact_map
 from pctt.options import NOT_NEGATIVE, option
 from pctt.pc.base import PythonPC
 from pctt.pc.block_diagonal import without_memory
-from pctt.pc.body_matrix import BodyMatrix
+from pctt.pc.body_operator import BodyOperator
 from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
 
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu"}  # these have no code for block formats
 _COARSE_SPACE = {"gamg", "python"}  # these use the rigid motions
+TINY = float(np.finfo(float).tiny)
 _FACTORS = {"ilu", "icc", "bjacobi", "cholesky", "lu"}
 
 
@@ -55,6 +58,7 @@ class BodySchur(PythonPC):
     options_class = Options
     options_prefix = "pc_body_"
     options: Options
+    needs_entries = False
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
@@ -68,10 +72,9 @@ class BodySchur(PythonPC):
         if G is None:
             raise ValueError("pctt.pc.BodySchur: the Mat has no attribute contact_map; see docs/preconditioners.md")
         self.release()
-        self.K = BodyMatrix(P.comm, G)
+        self._given, self._G = G, _as_map(P, G)
+        self.K = BodyOperator(self._G)
         points = P.getAttr("coordinates")
-        if points is not None:
-            self.K.mat.setAttr("coordinates", self.K.places(points))
         self._y, self._rhs = self.K.mat.createVecs()
         self.ksp = PETSc.KSP().create(P.comm)
         prefix = (pc.getOptionsPrefix() or "") + "body_"
@@ -83,15 +86,20 @@ class BodySchur(PythonPC):
         with entered(self._options):
             prefer_mumps(self.ksp.pc, PETSc.Options(prefix).getString("pc_type"))
             self.ksp.setFromOptions()
-        if points is not None and self.ksp.pc.getType() in _COARSE_SPACE:
-            self.K.set_rigid_modes(points)
-        self._G = block_matrix(P.comm, G)
-        self._contact = self._G.createVecLeft()
+        if points is not None:
+            self.K.whole.mat.setAttr("coordinates", self.K.whole.places(points))
+            if self.ksp.pc.getType() in _COARSE_SPACE:
+                self.K.whole.set_rigid_modes(points)
         # an inner residual enters that of S through G; twice, as the power method stays below
         self._gain = 2 * float(np.sqrt(_largest_eigenvalue(self._G)))
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """K for the present barrier blocks."""
+        given = P.getAttr("contact_map")
+        if given is not self._given:  # of the same structure
+            self._release_map()
+            self._given, self._G = given, _as_map(P, given)
+            self.K.load(self._G)
         barrier = P.getAttr("barrier")
         floor = 1e-14 * np.trace(barrier, axis1=1, axis2=2)  # a block that rounding has made singular
         self.inverse_barrier = np.linalg.inv(barrier + floor[:, None, None] * np.eye(3))
@@ -109,12 +117,13 @@ class BodySchur(PythonPC):
         assert self.ksp is not None
         kind = self.ksp.pc.getType()
         least = self.options.least if kind in _FACTORS else 0.0
-        P = self.K.stiff_part(least, self.options.shift, scalar=kind in _SCALAR_FORMAT)
+        entries = self.K.entries()
+        P = entries.stiff_part(least, self.options.shift, scalar=kind in _SCALAR_FORMAT)
         if kind in _COARSE_SPACE:
-            near = self.K.mat.getNearNullSpace()
+            near = entries.mat.getNearNullSpace()
             if near.handle:
                 P.setNearNullSpace(near)
-            P.setAttr("coordinates", self.K.mat.getAttr("coordinates"))
+            P.setAttr("coordinates", entries.mat.getAttr("coordinates"))
         return P
 
     def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
@@ -126,15 +135,12 @@ class BodySchur(PythonPC):
         """z = B^-1 (r - G K^-1 G' B^-1 r), K by the inner KSP."""
         assert self.ksp is not None
         r = x.array_r.reshape(-1, 3)
-        self._contact.array_w[:] = (self.inverse_barrier @ r[:, :, None]).ravel()
-        self._G.multTranspose(self._contact, self._rhs)
+        self._rhs.array_w[:] = self._G.momenta(times(self.inverse_barrier, r)).ravel()
         self.ksp.setTolerances(rtol=1e-14, atol=(self._atol or self._rtol * x.norm()) / self._gain)
         self.ksp.solve(self._rhs, self._y)
         self.solves += 1
         self.its += self.ksp.getIterationNumber()
-        self._G.mult(self._y, self._contact)
-        rest = r - self._contact.array_r.reshape(-1, 3)
-        y.array_w[:] = (self.inverse_barrier @ rest[:, :, None]).ravel()
+        y.array_w[:] = times(self.inverse_barrier, r - self._G.velocities(self._y.array_r)).ravel()
 
     def report(self) -> list[str]:
         inner = self.its / max(self.solves, 1)
@@ -142,22 +148,34 @@ class BodySchur(PythonPC):
 
     def release(self) -> None:
         if self.ksp is not None:
-            for thing in (self.ksp, self.K, self._G, self._y, self._rhs, self._contact, self._formed):
+            for thing in (self.ksp, self.K, self._y, self._rhs, self._formed):
                 if thing is not None:
                     thing.destroy()
+            self._release_map()
             self.ksp = self._formed = None
 
+    def _release_map(self) -> None:
+        if self._G is not self._given:
+            self._G.destroy()
 
-def _largest_eigenvalue(G: PETSc.Mat, iterations: int = 15) -> float:
+
+def times(blocks: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Products of blocks (nc, 3, 3) with rows (nc, 3)."""
+    return np.einsum("nij,nj->ni", blocks, x)
+
+
+def _as_map(P: PETSc.Mat, given: ContactMap | BlockRows | CompactRows) -> ContactMap:
+    """The contact map that a Mat brings, or one of the rows that it brings."""
+    return contact_map(P.comm.tompi4py(), given) if isinstance(given, (BlockRows, CompactRows)) else given
+
+
+def _largest_eigenvalue(G: ContactMap, iterations: int = 15) -> float:
     """Of G G', from below, by the power method."""
-    g, momentum = G.createVecLeft(), G.createVecRight()
-    g.setRandom()
+    g = np.random.default_rng(G.comm.rank).standard_normal((G.rows, 3))
     value = 1.0
     for _ in range(iterations):
-        g.normalize()
-        G.multTranspose(g, momentum)
-        value = momentum.norm() ** 2
-        G.mult(momentum, g)
-    g.destroy()
-    momentum.destroy()
-    return value
+        g /= max(np.sqrt(G.comm.allreduce(np.vdot(g, g))), TINY)
+        momenta = G.momenta(g)
+        value = G.comm.allreduce(np.vdot(momenta, momenta))
+        g = G.velocities(momenta)
+    return float(value)

@@ -18,6 +18,7 @@ from dem.together import together
 from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.asked_for import LADDER
+from pctt.contact_map import OPERATORS, is_free
 from pctt.options import (
     AT_LEAST_ONE,
     COUNT,
@@ -109,6 +110,12 @@ class Run:
     ccp_newton: str = option(
         "auto", "unknowns of the Newton systems; auto: contact for pdip, body for conic", choices=("auto", *ccp.FORMS)
     )
+    ccp_operator: str = option(
+        "auto",
+        "products with the contact map: free, by compiled loops without matrices, or assembled, by matrices of PETSc; "
+        "auto: free where numba is installed",
+        choices=OPERATORS,
+    )
     ccp_compliance: Optional[float] = option(
         None,
         "compliance of the contacts, as a part of mean diag N; none: 0, rigid, or that of the file of -problem",
@@ -181,6 +188,10 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     if solver.newton and not run.settle:
         form = ccp.newton_for(comm, run.ccp_type, run.ccp_newton, compare).form
         _refuse_for_petsc(database, form, comm)
+    try:
+        is_free(run.ccp_operator)
+    except ValueError as error:
+        raise OptionError(str(error)) from None
     refuse_serial(comm)
     _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
     _refuse_missing("-problem", run.problem, comm)

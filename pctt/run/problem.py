@@ -20,7 +20,7 @@ from pctt.run.report import Progress, compare_table
 def solve_file(options: Options, comm: MPI.Comm) -> None:
     """Solve, print the figures, and write them to summary.json in the output folder."""
     assert options.problem is not None
-    stored = _load(options.problem, comm, options.run.ccp_compliance)
+    stored = _load(options.problem, comm, options.run.ccp_compliance, options.run.ccp_operator)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     with stored.problem:
         summary = _solve(stored, options, compare)
@@ -100,12 +100,12 @@ def _solve(stored: fclib.Stored, options: Options, compare: ccp.Comparison) -> d
     }
 
 
-def _load(path: str, comm: MPI.Comm, compliance: float | None) -> fclib.Stored:
+def _load(path: str, comm: MPI.Comm, compliance: float | None, operator: str) -> fclib.Stored:
     """The problem in a file of either format, with another compliance if one is given; FileError on all ranks if it
     is none."""
     binary = comm.bcast(petsc_binary.is_one(path) if comm.rank == 0 else None)
     try:
-        return (petsc_binary if binary else fclib).load(path, comm, compliance)
+        return (petsc_binary if binary else fclib).load(path, comm, compliance, operator)
     except fclib.FileFormatError as error:
         raise FileError(str(error)) from None
 

@@ -232,7 +232,9 @@ class Stepper:
             self._release()
             self.contacts = contacts
             self.system = ContactSystem(self.world, contacts, options.dt, options.run.recovery_speed)
-            self._problem = cone_problem(self.system, self.world.comm, options.run.ccp_compliance or 0.0)
+            self._problem = cone_problem(
+                self.system, self.world.comm, options.run.ccp_compliance or 0.0, options.run.ccp_operator
+            )
             guess, _ = memory.recall(self.system.key, self.system.frame)
         return self._problem, guess
 
@@ -287,11 +289,20 @@ def _peak_memory(comm: MPI.Comm) -> int:
     return int(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit))
 
 
-def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0) -> ccp.ConeProblem:
+def cone_problem(
+    system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0, operator: str = "auto"
+) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
     G = ccp.BlockRows(*system.G, columns=system.owned_bodies)
     return ccp.ConeProblem(
-        comm, system.r, system.mu, G=G, point=system.point, key=system.key, compliance=compliance
+        comm,
+        system.r,
+        system.mu,
+        G=G,
+        point=system.point,
+        key=system.key,
+        compliance=compliance,
+        operator=operator,
     )
 
 

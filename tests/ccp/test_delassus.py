@@ -8,9 +8,9 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from problems import SELF, Graph, from_graph, heap, matrix, part, random_graph
 
-from pctt.blocks import block_matrix, square_block_matrix
+from pctt.blocks import block_matrix, diagonal_blocks, square_block_matrix
 from pctt.ccp import ConeProblem
-from pctt.ccp.delassus import delassus, diagonal_blocks, local_blocks
+from pctt.ccp.delassus import delassus, local_blocks
 
 GRAPHS = {
     "sparse": {"contacts": 30, "bodies": 25},

@@ -132,6 +132,6 @@ def test_sharpened_systems_are_of_one_problem_only():
 
 
 def test_few_contacts_are_never_kept_apart():
-    G, crowded = blocks.without_crowded(SELF, from_graph(*heap(3)).contact_map)
+    G, crowded = blocks.without_crowded(SELF, from_graph(*heap(3)).contact_map.given)
     assert len(crowded) == 0
     assert G.rows == 40

@@ -30,6 +30,8 @@ class ScaledProblem:
         self._shrink = 1.0 / self._scale
         self.mu = problem.mu * self._scale[:, 1] / self._scale[:, 0]
         self.b = problem.r * self._shrink
+        self._compliance = problem.compliance * self._shrink**2
+        self._map = None if problem.contact_map is None else problem.contact_map.scaled(self._shrink)
 
     def start(self, guess: Array) -> Array:
         """The scaled point of a first guess of the impulses (nc, 3), in the cones."""
@@ -40,14 +42,19 @@ class ScaledProblem:
 
     def product(self, x: Array) -> Array:
         """A x (nc, 3)."""
-        out = self.problem.product(x * self._shrink)
-        out *= self._shrink
+        if self._map is None:
+            return self.problem.product(x * self._shrink) * self._shrink
+        out = self._compliance * x
+        self._map.add_delassus(x, out)
         return out
 
     def gradient(self, x: Array) -> Array:
         """A x + b (nc, 3)."""
-        out = self.product(x)
+        if self._map is None:
+            return self.product(x) + self.b
+        out = self._compliance * x
         out += self.b
+        self._map.add_delassus(x, out)
         return out
 
     def project(self, x: Array) -> Array:

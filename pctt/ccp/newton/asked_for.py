@@ -42,7 +42,7 @@ class AskedFor(KrylovFamily):
 
     def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
         """x = A^-1 b to a relative residual of rtol; whether that was reached."""
-        A, P = self.system.matrix, self.system.preconditioned
+        A, P = self.system.matrix, self.system.entries
         if self.compare is not None and self.compare.due():
             done = self.compare.run(A, b, x, rtol, P)
         else:
@@ -64,7 +64,7 @@ class AskedFor(KrylovFamily):
 
     def _climb_down(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float, done: Solve) -> bool:
         """Try the ladder; keep in x what has the smallest true residual, or zero if nothing is below 1."""
-        A, P = self.system.matrix, self.system.preconditioned
+        A, P = self.system.matrix, self.system.entries
         best = min(done.true_residual, 1.0)
         kept = x.array.copy() if best < 1 else np.zeros(x.getLocalSize())
         for name in LADDER:

@@ -9,10 +9,11 @@ system and far better conditioned once contacts open or slide.
 from __future__ import annotations
 
 import numpy as np
+from petsc4py import PETSc
 
 from pctt.ccp.cone import Array, times
 from pctt.ccp.problem import ConeProblem
-from pctt.pc.body_matrix import BodyMatrix
+from pctt.pc.body_operator import BodyOperator
 
 LEAST = 0.1  # of the mass: entries of a block between bodies that a factor is better off without
 SHIFT = 0.03  # of the diagonal blocks, for incomplete factorisations
@@ -25,16 +26,15 @@ class BodySystem:
         if problem.contact_map is None:
             raise ValueError("-ccp_newton body: the problem is given by N alone; allowed are contact and kkt")
         self.problem = problem
-        self.body_matrix = BodyMatrix(problem.comm, problem.contact_map)
-        self.matrix = self.body_matrix.mat
-        if problem.point is not None:
-            self.matrix.setAttr("coordinates", self.body_matrix.places(problem.point))
-
+        self.operator = BodyOperator(problem.contact_map)
+        self.matrix = self.operator.mat
+        self._placed = False
     def load(self, problem: ConeProblem) -> None:
         """Take another problem with the same contacts between the same bodies."""
         assert problem.contact_map is not None
         self.problem = problem
-        self.body_matrix.load(problem.contact_map)
+        self.operator.load(problem.contact_map)
+        self._placed = False
 
     def update(self, barrier: Array, inverse: Array | None = None) -> None:
         """K for the barrier blocks B, or for ``inverse`` = (B + C)^-1 where the caller has it more accurately."""
@@ -43,16 +43,20 @@ class BodySystem:
             floor = 1e-14 * np.trace(whole, axis1=1, axis2=2)  # a block that rounding has made singular
             inverse = np.linalg.inv(whole + floor[:, None, None] * np.eye(3))
         self._inverse = inverse
-        self.body_matrix.update(inverse)
+        self.operator.update(inverse)
 
-    @property
-    def preconditioned(self):
-        return self.matrix
+    def entries(self) -> PETSc.Mat:
+        """K as a matrix that preconditioners can read; collective."""
+        entries = self.operator.entries()
+        if self.problem.point is not None and not self._placed:
+            entries.mat.setAttr("coordinates", entries.places(self.problem.point))
+            self._placed = True
+        return entries.mat
 
     def stiff_part(self, complete: bool):
         """What is worth factorising of K: completely, by a method of scalar rows, or incompletely in blocks of bodies,
         for which the diagonal blocks are enlarged (without, such a factorisation breaks down late in an iteration)."""
-        return self.body_matrix.stiff_part(LEAST, 0.0 if complete else SHIFT, scalar=complete)
+        return self.operator.entries().stiff_part(LEAST, 0.0 if complete else SHIFT, scalar=complete)
 
     def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
         """``alone`` is (B + C)^-1 q where the caller knows it better."""
@@ -71,4 +75,4 @@ class BodySystem:
         return tol
 
     def destroy(self) -> None:
-        self.body_matrix.destroy()
+        self.operator.destroy()

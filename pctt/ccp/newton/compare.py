@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -97,7 +98,7 @@ class Comparison(KrylovFamily):
         self._seen += 1
         return (self._seen - 1) % self.every == 0
 
-    def run(self, A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: PETSc.Mat | None = None) -> Solve:
+    def run(self, A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: PETSc.Mat | Callable[[], PETSc.Mat] | None = None) -> Solve:
         """All preconditioners on one system; x is of the first that converged, else of the best.
 
         What the others take counts as the phase `compare`, not as `solve`: a run that compares nothing is spared it.

@@ -1,8 +1,9 @@
 """The Newton system of the contacts, S = N + C + B (3Nc x 3Nc, block size 3): the paper's Schur complement.
 
-N's structure and values are copied once per cone problem; a Newton step writes the diagonal blocks alone. Bodies with
-very many contacts (a press, a drum) would fill N: they enter as a low-rank term U U' (``MATLRC``), and
-preconditioners get the sparse part with the full diagonal blocks.
+With compiled loops S is a function, S g = G G'g + (C + B) g, and its entries are made only for a preconditioner that
+reads them. Else N's structure and values are copied once per cone problem, and a Newton step writes the diagonal blocks
+alone. Bodies with very many contacts (a press, a drum) would fill N: they enter its product as a low-rank term U U'
+(``MATLRC``), and preconditioners get the sparse part with the full diagonal blocks.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from petsc4py import PETSc
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.pc.block_diagonal import set_diagonal_blocks
+from pctt.shell import symmetric_shell
 
 
 class ContactSystem:
@@ -21,49 +23,66 @@ class ContactSystem:
     Attributes
     ----------
     matrix : S
-    preconditioned : the Mat that preconditioners are made from; S itself but for a low-rank term
     """
 
     def __init__(self, problem: ConeProblem):
         self.problem = problem
-        self.preconditioned = problem.N.duplicate(copy=True)
-        self._low_rank = problem.low_rank is not None
-        if self._low_rank:
-            self._sparse = problem.N.duplicate(copy=True)
-            self.matrix = _with_low_rank(self._sparse, problem.low_rank)
+        self._entries: Entries | None = None
+        self._low_rank: PETSc.Mat | None = None
+        if problem.free:
+            self.matrix = symmetric_shell(problem.comm, problem.r.size, 3, self._product)
         else:
-            self._sparse = self.matrix = self.preconditioned
-        for mat in (self._sparse, self.preconditioned):
-            mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        describe(self.preconditioned, problem)
-        first, last = self.preconditioned.getOwnershipRange()
-        self._block_rows = np.arange(first // 3, last // 3, dtype=PETSc.IntType)[:, None]
+            self._take_entries()
+
+    def _take_entries(self) -> None:
+        """Have all of S as matrices."""
+        self._entries = Entries(self.problem)
+        self.matrix = self._entries.mat
+        if self.problem.low_rank is not None:
+            self._low_rank = self.problem.N.duplicate(copy=True)
+            self._low_rank.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            self.matrix = _with_low_rank(self._low_rank, self.problem.low_rank)
 
     def load(self, problem: ConeProblem) -> None:
         """Take another problem with the same contacts between the same bodies."""
         self.problem = problem
-        same = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
-        problem.N.copy(self.preconditioned, same)
-        if self._low_rank:
-            problem.N.copy(self._sparse, same)
+        if self._entries is not None:
+            self._entries.load(problem)
+        if self._low_rank is not None:
+            problem.N.copy(self._low_rank, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
             self.matrix.destroy()
-            self.matrix = _with_low_rank(self._sparse, problem.low_rank)
-        describe(self.preconditioned, problem)
+            self.matrix = _with_low_rank(self._low_rank, problem.low_rank)
 
     def update(self, barrier: Array, inverse: Array | None = None) -> None:
         """Put the barrier blocks (nc, 3, 3) in."""
-        self.preconditioned.setAttr("barrier", barrier + self.problem.compliance_blocks)
-        blocks = self.problem.diagonal_blocks + barrier
-        self._put(self.preconditioned, blocks)
-        set_diagonal_blocks(self.preconditioned, blocks)
-        if self._low_rank:
-            self._put(self._sparse, self.problem.sparse_diagonal_blocks + barrier)
+        self._barrier = barrier
+        self._made = False
+        if self.problem.free:
+            whole = barrier + self.problem.compliance_blocks
+            self._local = self.problem.contact_map.pack(whole)
+            describe(self.matrix, self.problem)
+            self.matrix.setAttr("barrier", whole)
+            set_diagonal_blocks(self.matrix, self.problem.diagonal_blocks + barrier)
+            self.matrix.stateIncrease()
+            return
+        self.entries()
+        if self._low_rank is not None:
+            _put(self._low_rank, self.problem.sparse_diagonal_blocks + barrier)
             self.matrix.assemble()
 
-    def _put(self, mat: PETSc.Mat, blocks: Array) -> None:
-        if len(blocks):  # petsc4py divides by their number
-            mat.setValuesBlockedRCV(self._block_rows, self._block_rows, blocks.reshape(-1, 9))
-        mat.assemble()
+    def _product(self, g: Array, out: Array) -> None:
+        g, out = g.reshape(-1, 3), out.reshape(-1, 3)
+        self.problem.contact_map.local_product(self._local, g, out)
+        self.problem.contact_map.add_delassus(g, out)
+
+    def entries(self) -> PETSc.Mat:
+        """S, or its sparse part, as a matrix that preconditioners can read; collective."""
+        if self._entries is None:
+            self._entries = Entries(self.problem)
+        if not self._made:
+            self._entries.update(self._barrier)
+            self._made = True
+        return self._entries.mat
 
     def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
         return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
@@ -82,9 +101,41 @@ class ContactSystem:
 
     def destroy(self) -> None:
         self.matrix.destroy()
-        if self._low_rank:
-            self._sparse.destroy()
-            self.preconditioned.destroy()
+        if self._entries is not None:
+            self._entries.mat.destroy()
+        if self._low_rank is not None:
+            self._low_rank.destroy()
+
+
+class Entries:
+    """S without its low-rank term, but for the diagonal blocks, as the BAIJ Mat ``mat``."""
+
+    def __init__(self, problem: ConeProblem):
+        self.problem = problem
+        self.mat = problem.N.duplicate(copy=True)
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+
+    def load(self, problem: ConeProblem) -> None:
+        """Take another problem with the same contacts between the same bodies."""
+        self.problem = problem
+        problem.N.copy(self.mat, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+
+    def update(self, barrier: Array) -> None:
+        """Put the barrier blocks (nc, 3, 3) in."""
+        describe(self.mat, self.problem)
+        self.mat.setAttr("barrier", barrier + self.problem.compliance_blocks)
+        blocks = self.problem.diagonal_blocks + barrier
+        _put(self.mat, blocks)
+        set_diagonal_blocks(self.mat, blocks)
+
+
+def _put(mat: PETSc.Mat, blocks: Array) -> None:
+    """Write diagonal blocks (nc, 3, 3)."""
+    first, last = mat.getOwnershipRange()
+    rows = np.arange(first // 3, last // 3, dtype=PETSc.IntType)[:, None]
+    if len(blocks):  # petsc4py divides by their number
+        mat.setValuesBlockedRCV(rows, rows, blocks.reshape(-1, 9))
+    mat.assemble()
 
 
 def _with_low_rank(A: PETSc.Mat, U: PETSc.Mat) -> PETSc.Mat:

@@ -34,7 +34,7 @@ class KKTSystem:
         shape = (len(indptr) - 1, 3 * problem.size)
         small = sp.csr_matrix((values, indices, indptr), shape=shape).tobsr((3, 3))
         self._indptr, self._indices = small.indptr, small.indices
-        self.matrix = self.preconditioned = square_block_matrix(problem.comm, self._padded(small.data))
+        self.matrix = square_block_matrix(problem.comm, self._padded(small.data))
         self.matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         if problem.point is not None:
             self.matrix.setAttr("coordinates", problem.point)
@@ -70,6 +70,9 @@ class KKTSystem:
             self.matrix.setValuesBlockedRCV(self._block_rows, self._block_rows, blocks.reshape(-1, 25))
         self.matrix.assemble()
         set_diagonal_blocks(self.matrix, blocks)
+
+    def entries(self) -> PETSc.Mat:
+        return self.matrix
 
     def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
         out = np.zeros((len(q), 5))

@@ -16,11 +16,13 @@ from pctt.pc.base import PythonPC
 from pctt.pc.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
 from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
 from pctt.petsc import own_errors
+from pctt.shell import is_shell
 
 # right preconditioning makes the residual that the method sees the true one
 _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
 # what wants scalar rows; others switch when PETSc says so
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu", "eisenstat"}
+_BY_PRODUCTS = {"none", "jacobi", "pbjacobi"}  # these need no entries beside the diagonal blocks
 PATIENCE = 10.0  # seconds that a rank that has failed waits for the others
 # preconditioners of parts of the matrix; ours have inner ones too, but of other matrices
 _OF_PARTS = re.compile(r"(sub|mg|fieldsplit|composite|telescope)_.*pc_type")
@@ -93,19 +95,20 @@ class Krylov:
         b: PETSc.Vec,
         x: PETSc.Vec,
         rtol: float | None = None,
-        P: PETSc.Mat | None = None,
+        P: PETSc.Mat | Callable[[], PETSc.Mat] | None = None,
         keep: bool = False,
     ) -> Solve:
         """x = A^-1 b from zero. A set-up or solve that breaks down, on whichever rank, is reported, never raised.
 
-        P : the Mat from which the preconditioner is made; none: A
+        P : the Mat from which the preconditioner is made, or a function that makes it where A is one and the
+            preconditioner reads entries; none: A
         keep : use the preconditioner of the last solve, whatever the matrix is now
         """
         if rtol is not None:
             self.set_rtol(float(rtol))
         start = _now(self.comm)
         with entered(self._options):
-            error = together(self.comm, lambda: self._set_up(A, P if P is not None else A, keep))
+            error = together(self.comm, lambda: self._set_up(A, P, keep))
             setup = _now(self.comm)
             error = error or together(self.comm, lambda: self._iterate(b, x))
         if error:
@@ -125,10 +128,10 @@ class Krylov:
         words = _REASONS.get(reason, str(reason))
         return Solve(converged, words, iterations, setup - start, end - setup, true, self.rtol)
 
-    def _set_up(self, A: PETSc.Mat, P: PETSc.Mat, keep: bool) -> None:
+    def _set_up(self, A: PETSc.Mat, P: PETSc.Mat | Callable[[], PETSc.Mat] | None, keep: bool) -> None:
         self.ksp.pc.setReusePreconditioner(keep)
         if not keep:
-            form = self._form(P)
+            form = self._form(self._source(A, P))
             self.ksp.setOperators(form if self.kind == "eisenstat" else A, form)
         self.ksp.setUp()
 
@@ -137,6 +140,19 @@ class Krylov:
         right_hand_side = b.copy()  # an error of PETSc may leave it locked
         self.ksp.solve(right_hand_side, x)
         right_hand_side.destroy()
+
+    def _source(self, A: PETSc.Mat, P: PETSc.Mat | Callable[[], PETSc.Mat] | None) -> PETSc.Mat:
+        """The Mat that the preconditioner is made from."""
+        if P is None or (is_shell(A) and not self.needs_entries):
+            return A
+        return P if isinstance(P, PETSc.Mat) else P()
+
+    @property
+    def needs_entries(self) -> bool:
+        """Whether the preconditioner reads entries beside the diagonal blocks."""
+        if self.kind == PETSc.PC.Type.PYTHON:
+            return getattr(self.ksp.pc.getPythonContext(), "needs_entries", True)
+        return self.kind not in _BY_PRODUCTS
 
     def _form(self, P: PETSc.Mat) -> PETSc.Mat:
         """P in the form that the preconditioner wants."""

@@ -1,0 +1,116 @@
+"""Compiled loops over contacts that are rows of 3 x 6 blocks (`BlockRows`); the functions of `compact_loops`, for mass-scaled
+velocities. Row c has the blocks ``start[c]`` to ``start[c + 1]``, in the columns of the bodies ``body`` (nb,).
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+loop = njit(cache=True, fastmath={"contract"})
+
+
+@loop
+def add_velocities(first, last, blocks, start, body, w, y):
+    """y += G w (nc, 3)."""
+    for c in range(first, last):
+        y0 = y1 = y2 = 0.0
+        for k in range(start[c], start[c + 1]):
+            i = body[k]
+            for n in range(6):
+                y0 += blocks[k, 0, n] * w[i, n]
+                y1 += blocks[k, 1, n] * w[i, n]
+                y2 += blocks[k, 2, n] * w[i, n]
+        y[c, 0] += y0
+        y[c, 1] += y1
+        y[c, 2] += y2
+
+
+@loop
+def add_momenta(first, last, blocks, start, body, g, m):
+    """m += G' g, of impulses g (nc, 3)."""
+    for c in range(first, last):
+        g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
+        for k in range(start[c], start[c + 1]):
+            i = body[k]
+            for n in range(6):
+                m[i, n] += blocks[k, 0, n] * g0 + blocks[k, 1, n] * g1 + blocks[k, 2, n] * g2
+
+
+@loop
+def add_through(first, last, blocks, start, body, weight, w, m):
+    """m += G' H G w; ``weight`` (nc, 6) is the upper triangle of H."""
+    for c in range(first, last):
+        y0 = y1 = y2 = 0.0
+        for k in range(start[c], start[c + 1]):
+            i = body[k]
+            for n in range(6):
+                y0 += blocks[k, 0, n] * w[i, n]
+                y1 += blocks[k, 1, n] * w[i, n]
+                y2 += blocks[k, 2, n] * w[i, n]
+        f0 = weight[c, 0] * y0 + weight[c, 1] * y1 + weight[c, 2] * y2
+        f1 = weight[c, 1] * y0 + weight[c, 3] * y1 + weight[c, 4] * y2
+        f2 = weight[c, 2] * y0 + weight[c, 4] * y1 + weight[c, 5] * y2
+        for k in range(start[c], start[c + 1]):
+            i = body[k]
+            for n in range(6):
+                m[i, n] += blocks[k, 0, n] * f0 + blocks[k, 1, n] * f1 + blocks[k, 2, n] * f2
+
+
+@loop
+def pack(H, weight):
+    """weight (nc, 6): the upper triangle of symmetric blocks H (nc, 3, 3)."""
+    for c in range(len(H)):
+        for i in range(3):
+            for j in range(i, 3):
+                weight[c, j if i == 0 else i + j + 1] = H[c, i, j]
+
+
+@loop
+def weights(blocks, start, body, H, weight):
+    """What `add_through` wants to know of H: its upper triangle."""
+    pack(H, weight)
+
+
+@loop
+def add_body_blocks(blocks, start, body, weight, out):
+    """out (bodies, 6, 6) += the diagonal blocks of G' H G."""
+    for c in range(len(start) - 1):
+        for k in range(start[c], start[c + 1]):
+            i = body[k]
+            for n in range(6):
+                b0, b1, b2 = blocks[k, 0, n], blocks[k, 1, n], blocks[k, 2, n]
+                h0 = weight[c, 0] * b0 + weight[c, 1] * b1 + weight[c, 2] * b2
+                h1 = weight[c, 1] * b0 + weight[c, 3] * b1 + weight[c, 4] * b2
+                h2 = weight[c, 2] * b0 + weight[c, 4] * b1 + weight[c, 5] * b2
+                for p in range(6):
+                    out[i, p, n] += blocks[k, 0, p] * h0 + blocks[k, 1, p] * h1 + blocks[k, 2, p] * h2
+
+
+@loop
+def add_all_blocks(blocks, start, place, H, out):
+    """out += the blocks G_p' H G_q of every contact and any two of its bodies p, q, at ``place`` in out (n, 6, 6).
+
+    A contact's places follow one another, p before q; H (nc, 3, 3)."""
+    at = 0
+    for c in range(len(start) - 1):
+        for p in range(start[c], start[c + 1]):
+            for q in range(start[c], start[c + 1]):
+                to = place[at]
+                at += 1
+                for n in range(6):
+                    b0, b1, b2 = blocks[q, 0, n], blocks[q, 1, n], blocks[q, 2, n]
+                    h0 = H[c, 0, 0] * b0 + H[c, 0, 1] * b1 + H[c, 0, 2] * b2
+                    h1 = H[c, 1, 0] * b0 + H[c, 1, 1] * b1 + H[c, 1, 2] * b2
+                    h2 = H[c, 2, 0] * b0 + H[c, 2, 1] * b1 + H[c, 2, 2] * b2
+                    for m in range(6):
+                        out[to, m, n] += blocks[p, 0, m] * h0 + blocks[p, 1, m] * h1 + blocks[p, 2, m] * h2
+
+
+@loop
+def local_product(weight, g, y):
+    """y = H g (nc, 3), H the symmetric blocks of ``weight`` (nc, 6)."""
+    for c in range(len(weight)):
+        g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
+        y[c, 0] = weight[c, 0] * g0 + weight[c, 1] * g1 + weight[c, 2] * g2
+        y[c, 1] = weight[c, 1] * g0 + weight[c, 3] * g1 + weight[c, 4] * g2
+        y[c, 2] = weight[c, 2] * g0 + weight[c, 4] * g1 + weight[c, 5] * g2

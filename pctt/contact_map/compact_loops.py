@@ -1,0 +1,167 @@
+"""Compiled loops over contacts that are frames and arms (`CompactRows`); importing this takes half a second.
+
+``first`` and ``last`` bound the contacts; ``body`` (nc, 2) are local numbers; w and m are (bodies, 6), physical velocities
+and momenta. The loops add to their last argument. ``contract`` lets the compiler fuse a product and a sum; it does
+not, as fastmath would, take for granted that there are no NaNs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+loop = njit(cache=True, fastmath={"contract"})
+
+
+@loop
+def add_velocities(first, last, frame, arm, body, w, y):
+    """y += D' w (nc, 3)."""
+    for c in range(first, last):
+        a, b = body[c, 0], body[c, 1]
+        r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
+        u0 = w[b, 0] - w[a, 0] + w[b, 4] * s2 - w[b, 5] * s1 - (w[a, 4] * r2 - w[a, 5] * r1)
+        u1 = w[b, 1] - w[a, 1] + w[b, 5] * s0 - w[b, 3] * s2 - (w[a, 5] * r0 - w[a, 3] * r2)
+        u2 = w[b, 2] - w[a, 2] + w[b, 3] * s1 - w[b, 4] * s0 - (w[a, 3] * r1 - w[a, 4] * r0)
+        y[c, 0] += frame[c, 0] * u0 + frame[c, 1] * u1 + frame[c, 2] * u2
+        y[c, 1] += frame[c, 3] * u0 + frame[c, 4] * u1 + frame[c, 5] * u2
+        y[c, 2] += frame[c, 6] * u0 + frame[c, 7] * u1 + frame[c, 8] * u2
+
+
+@loop
+def add_momenta(first, last, frame, arm, body, g, m):
+    """m += D g, of impulses g (nc, 3)."""
+    for c in range(first, last):
+        a, b = body[c, 0], body[c, 1]
+        g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
+        f0 = frame[c, 0] * g0 + frame[c, 3] * g1 + frame[c, 6] * g2
+        f1 = frame[c, 1] * g0 + frame[c, 4] * g1 + frame[c, 7] * g2
+        f2 = frame[c, 2] * g0 + frame[c, 5] * g1 + frame[c, 8] * g2
+        r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
+        m[a, 0] -= f0
+        m[a, 1] -= f1
+        m[a, 2] -= f2
+        m[a, 3] -= r1 * f2 - r2 * f1
+        m[a, 4] -= r2 * f0 - r0 * f2
+        m[a, 5] -= r0 * f1 - r1 * f0
+        m[b, 0] += f0
+        m[b, 1] += f1
+        m[b, 2] += f2
+        m[b, 3] += s1 * f2 - s2 * f1
+        m[b, 4] += s2 * f0 - s0 * f2
+        m[b, 5] += s0 * f1 - s1 * f0
+
+
+@loop
+def add_through(first, last, frame, arm, body, weight, w, m):
+    """m += D H D' w; ``weight`` (nc, 6) is F'HF, of `weights`: the frame itself is not needed."""
+    for c in range(first, last):
+        a, b = body[c, 0], body[c, 1]
+        r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
+        u0 = w[b, 0] - w[a, 0] + w[b, 4] * s2 - w[b, 5] * s1 - (w[a, 4] * r2 - w[a, 5] * r1)
+        u1 = w[b, 1] - w[a, 1] + w[b, 5] * s0 - w[b, 3] * s2 - (w[a, 5] * r0 - w[a, 3] * r2)
+        u2 = w[b, 2] - w[a, 2] + w[b, 3] * s1 - w[b, 4] * s0 - (w[a, 3] * r1 - w[a, 4] * r0)
+        f0 = weight[c, 0] * u0 + weight[c, 1] * u1 + weight[c, 2] * u2
+        f1 = weight[c, 1] * u0 + weight[c, 3] * u1 + weight[c, 4] * u2
+        f2 = weight[c, 2] * u0 + weight[c, 4] * u1 + weight[c, 5] * u2
+        m[a, 0] -= f0
+        m[a, 1] -= f1
+        m[a, 2] -= f2
+        m[a, 3] -= r1 * f2 - r2 * f1
+        m[a, 4] -= r2 * f0 - r0 * f2
+        m[a, 5] -= r0 * f1 - r1 * f0
+        m[b, 0] += f0
+        m[b, 1] += f1
+        m[b, 2] += f2
+        m[b, 3] += s1 * f2 - s2 * f1
+        m[b, 4] += s2 * f0 - s0 * f2
+        m[b, 5] += s0 * f1 - s1 * f0
+
+
+@loop
+def weights(frame, arm, body, H, weight):
+    """weight (nc, 6) = F'HF, the upper triangle, of symmetric blocks H (nc, 3, 3)."""
+    for c in range(len(frame)):
+        for i in range(3):
+            h0 = H[c, 0, 0] * frame[c, i] + H[c, 0, 1] * frame[c, 3 + i] + H[c, 0, 2] * frame[c, 6 + i]
+            h1 = H[c, 1, 0] * frame[c, i] + H[c, 1, 1] * frame[c, 3 + i] + H[c, 1, 2] * frame[c, 6 + i]
+            h2 = H[c, 2, 0] * frame[c, i] + H[c, 2, 1] * frame[c, 3 + i] + H[c, 2, 2] * frame[c, 6 + i]
+            for j in range(i, 3):
+                place = j if i == 0 else i + j + 1
+                weight[c, place] = h0 * frame[c, j] + h1 * frame[c, 3 + j] + h2 * frame[c, 6 + j]
+
+
+@loop
+def add_body_blocks(frame, arm, body, weight, blocks):
+    """blocks (bodies, 6, 6) += the diagonal blocks of D H D', for the ``weight`` of `weights`."""
+    turned = np.empty((3, 3))  # weight times (r x)'
+    for c in range(len(frame)):
+        for side in range(2):
+            i = body[c, side]
+            r0, r1, r2 = arm[c, 3 * side], arm[c, 3 * side + 1], arm[c, 3 * side + 2]
+            h00, h01, h02, h11, h12, h22 = (
+                weight[c, 0], weight[c, 1], weight[c, 2], weight[c, 3], weight[c, 4], weight[c, 5],
+            )  # fmt: skip
+            blocks[i, 0, 0] += h00
+            blocks[i, 0, 1] += h01
+            blocks[i, 0, 2] += h02
+            blocks[i, 1, 0] += h01
+            blocks[i, 1, 1] += h11
+            blocks[i, 1, 2] += h12
+            blocks[i, 2, 0] += h02
+            blocks[i, 2, 1] += h12
+            blocks[i, 2, 2] += h22
+            # row k of `turned` is r x (row k of the weight)
+            turned[0, 0], turned[0, 1], turned[0, 2] = r1 * h02 - r2 * h01, r2 * h00 - r0 * h02, r0 * h01 - r1 * h00
+            turned[1, 0], turned[1, 1], turned[1, 2] = r1 * h12 - r2 * h11, r2 * h01 - r0 * h12, r0 * h11 - r1 * h01
+            turned[2, 0], turned[2, 1], turned[2, 2] = r1 * h22 - r2 * h12, r2 * h02 - r0 * h22, r0 * h12 - r1 * h02
+            for k in range(3):
+                for n in range(3):
+                    blocks[i, k, 3 + n] += turned[k, n]
+                    blocks[i, 3 + n, k] += turned[k, n]
+            for n in range(3):
+                t0, t1, t2 = turned[0, n], turned[1, n], turned[2, n]
+                blocks[i, 3, 3 + n] += r1 * t2 - r2 * t1
+                blocks[i, 4, 3 + n] += r2 * t0 - r0 * t2
+                blocks[i, 5, 3 + n] += r0 * t1 - r1 * t0
+
+
+@loop
+def contact_blocks(frame, arm, body, mass, out):
+    """out (nc, 3, 3): the diagonal blocks of D' M^-1 D; ``mass`` (bodies, 12) is M^-1 in the form of `CompactRows.root`."""
+    J = np.empty((3, 6))
+    for c in range(len(frame)):
+        for i in range(3):
+            for j in range(3):
+                out[c, i, j] = 0.0
+        for side in range(2):
+            n = body[c, side]
+            r0, r1, r2 = arm[c, 3 * side], arm[c, 3 * side + 1], arm[c, 3 * side + 2]
+            for i in range(3):
+                f0, f1, f2 = frame[c, 3 * i], frame[c, 3 * i + 1], frame[c, 3 * i + 2]
+                J[i, 0], J[i, 1], J[i, 2] = f0, f1, f2
+                J[i, 3], J[i, 4], J[i, 5] = r1 * f2 - r2 * f1, r2 * f0 - r0 * f2, r0 * f1 - r1 * f0
+            for part in range(2):
+                p, q = 6 * part, 3 * part
+                for j in range(3):
+                    x, y, z = J[j, q], J[j, q + 1], J[j, q + 2]
+                    v0 = mass[n, p] * x + mass[n, p + 1] * y + mass[n, p + 2] * z
+                    v1 = mass[n, p + 1] * x + mass[n, p + 3] * y + mass[n, p + 4] * z
+                    v2 = mass[n, p + 2] * x + mass[n, p + 4] * y + mass[n, p + 5] * z
+                    for i in range(3):
+                        out[c, i, j] += J[i, q] * v0 + J[i, q + 1] * v1 + J[i, q + 2] * v2
+
+
+@loop
+def scale(root, v, out):
+    """out = R v, R block diagonal in the form of `CompactRows.root`; v and out (bodies, 6), out may have more rows."""
+    if root.shape[1] == 6:
+        for i in range(len(root)):
+            for k in range(6):
+                out[i, k] = root[i, k] * v[i, k]
+    else:
+        for i in range(len(root)):
+            for p in range(0, 6, 3):
+                x, y, z, q = v[i, p], v[i, p + 1], v[i, p + 2], 2 * p
+                out[i, p] = root[i, q] * x + root[i, q + 1] * y + root[i, q + 2] * z
+                out[i, p + 1] = root[i, q + 1] * x + root[i, q + 3] * y + root[i, q + 4] * z
+                out[i, p + 2] = root[i, q + 2] * x + root[i, q + 4] * y + root[i, q + 5] * z

@@ -1,0 +1,80 @@
+"""The bodies that a rank's contacts touch: its own, and ghosts, copies of bodies that other ranks own."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.exchange import offsets
+
+
+class Ghosts:
+    """Local numbers of bodies: own ones, then ghosts, then one number for all that is nobody's.
+
+    Values of bodies are arrays (nobody + 1, k): those of `nobody` are zero, or rubbish that nobody reads.
+
+    Attributes
+    ----------
+    own : number of own bodies
+    nobody : the local number of no body
+    body : local numbers, int32, in the shape of the global ones
+    """
+
+    def __init__(self, comm: MPI.Comm, own: int, body: np.ndarray):
+        """``body``: global indices, of any shape, -1 for none; collective."""
+        starts = offsets(comm, own)
+        first, last = starts[comm.rank], starts[comm.rank + 1]
+        here = (body >= first) & (body < last)
+        away = ~here & (body >= 0)
+        names, place = np.unique(body[away], return_inverse=True)
+        self.comm, self.own, self.nobody = comm, own, own + len(names)
+        self.body = np.full(body.shape, self.nobody, np.int32)
+        self.body[here] = body[here] - first
+        self.body[away] = own + place.ravel()
+        self._sf: PETSc.SF | None = None
+        self._units: dict[int, MPI.Datatype] = {}
+        if comm.size > 1:
+            owner = np.searchsorted(starts, names, side="right") - 1
+            remote = np.stack([owner, names - starts[owner]], axis=1)
+            self._sf = PETSc.SF().create(comm)
+            self._sf.setGraph(own, np.arange(len(names), dtype=PETSc.IntType), remote.astype(PETSc.IntType).ravel())
+            self._sf.setUp()
+
+    def update(self, values: np.ndarray) -> None:
+        """Give ghosts the values that their owners have."""
+        self.begin_update(values)
+        self.end_update(values)
+
+    def begin_update(self, values: np.ndarray) -> None:
+        if self._sf is not None:
+            self._sf.bcastBegin(*self._ends(values), MPI.REPLACE)
+
+    def end_update(self, values: np.ndarray) -> None:
+        if self._sf is not None:
+            self._sf.bcastEnd(*self._ends(values), MPI.REPLACE)
+
+    def begin_add(self, values: np.ndarray) -> None:
+        """Add the values of ghosts to those of their owners."""
+        if self._sf is not None:
+            unit, own, ghosts = self._ends(values)
+            self._sf.reduceBegin(unit, ghosts, own, MPI.SUM)
+
+    def end_add(self, values: np.ndarray) -> None:
+        if self._sf is not None:
+            unit, own, ghosts = self._ends(values)
+            self._sf.reduceEnd(unit, ghosts, own, MPI.SUM)
+
+    def _ends(self, values: np.ndarray) -> tuple[MPI.Datatype, np.ndarray, np.ndarray]:
+        width = values[0].size
+        if width not in self._units:
+            self._units[width] = MPI.DOUBLE.Create_contiguous(width).Commit()
+        return self._units[width], values[: self.own], values[self.own : self.nobody]
+
+    def destroy(self) -> None:
+        if self._sf is not None:
+            self._sf.destroy()
+            self._sf = None
+        for unit in self._units.values():
+            unit.Free()
+        self._units.clear()

@@ -1,0 +1,78 @@
+"""The rows of the contact map G = D' M^-1/2 that a rank has, in the storage in which they are given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from pctt.blocks import BlockRows
+from pctt.contact_map.ghosts import Ghosts
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CompactRows:
+    """Contacts of rigid bodies: 15 numbers where two 3 x 6 blocks have 36.
+
+    The velocity of body b seen from body a in the frame F of a contact is F (v_b + w_b x r_b - v_a - w_a x r_a).
+
+    Attributes
+    ----------
+    frame : (nc, 9) rows normal, tangent 1, tangent 2 of F
+    arm : (nc, 6) r_a and r_b, from the centres of the bodies to the contact point (m)
+    body : (nc, 2) global indices of a and b; -1 for a body that no impulse moves
+    root : (columns, 6) the diagonals of M^-1/2 of the bodies that this rank owns, or (columns, 12) its two symmetric
+        blocks, of translation and rotation, as (xx, xy, xz, yy, yz, zz) each; the same width on all ranks
+    columns : number of bodies that this rank owns
+
+    A contact of which both bodies are owned here does not wait for other ranks if it comes before the first one that
+    has to.
+    """
+
+    frame: Array
+    arm: Array
+    body: np.ndarray
+    root: Array
+    columns: int
+
+    @property
+    def rows(self) -> int:
+        return len(self.frame)
+
+    def block_rows(self, comm: MPI.Comm) -> BlockRows:
+        """The same as 3 x 6 blocks; collective."""
+        ghosts = Ghosts(comm, self.columns, self.body)
+        root = np.zeros((ghosts.nobody + 1, self.root.shape[1]))
+        root[: self.columns] = self.root
+        ghosts.update(root)
+        ghosts.destroy()
+        symmetric = np.zeros((2, len(root), 3, 3))
+        if self.root.shape[1] == 6:
+            for part in (0, 1):
+                symmetric[part][:, range(3), range(3)] = root[:, 3 * part : 3 * part + 3]
+        else:
+            places = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+            symmetric[:] = root.reshape(-1, 2, 6).transpose(1, 0, 2)[:, :, places].reshape(2, -1, 3, 3)
+        order = np.argsort(self.body, axis=1)
+        frame, arms = self.frame.reshape(-1, 1, 3, 3), self.arm.reshape(-1, 2, 1, 3)
+        blocks = np.concatenate(np.broadcast_arrays(frame, np.cross(arms, frame)), axis=3)
+        blocks *= np.array([-1.0, 1.0])[:, None, None]
+        blocks = np.take_along_axis(blocks, order[:, :, None, None], axis=1)
+        body = np.take_along_axis(self.body, order, axis=1)
+        moves = body >= 0
+        local = np.take_along_axis(ghosts.body, order, axis=1)[moves]
+        blocks = blocks[moves]
+        for part in (0, 1):
+            columns = slice(3 * part, 3 * part + 3)
+            blocks[:, :, columns] = blocks[:, :, columns] @ symmetric[part][local]
+        indptr = np.concatenate([[0], np.cumsum(moves.sum(axis=1))])
+        return BlockRows(indptr, body[moves], blocks, self.columns)
+
+
+def block_rows(comm: MPI.Comm, rows: BlockRows | CompactRows) -> BlockRows:
+    """The rows as 3 x 6 blocks; collective."""
+    return rows if isinstance(rows, BlockRows) else rows.block_rows(comm)

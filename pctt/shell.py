@@ -1,0 +1,44 @@
+"""Symmetric matrices that are a function: PETSc Mats of type python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+Array = NDArray[np.float64]
+
+
+def symmetric_shell(comm: MPI.Comm, rows: int, block: int, product: Callable[[Array, Array], None]) -> PETSc.Mat:
+    """A Mat of ``rows`` local rows in blocks, whose ``product(x, out)`` is a collective function of local flat arrays.
+
+    Its diagonal is that of the attribute ``diagonal_blocks`` (`pctt.pc.block_diagonal.set_diagonal_blocks`)."""
+    mat = PETSc.Mat().createPython(((rows, PETSc.DETERMINE), (rows, PETSc.DETERMINE)), Shell(product), comm=comm)
+    mat.setBlockSize(block)
+    mat.setUp()
+    mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    return mat
+
+
+class Shell:
+    """What PETSc calls for a matrix of `symmetric_shell`."""
+
+    def __init__(self, product: Callable[[Array, Array], None]):
+        self.product = product
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.product(x.array_r, y.array_w)
+
+    def multTranspose(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.product(x.array_r, y.array_w)
+
+    def getDiagonal(self, mat: PETSc.Mat, diagonal: PETSc.Vec) -> None:
+        blocks = mat.getAttr("diagonal_blocks")
+        diagonal.array_w[:] = np.diagonal(blocks, axis1=1, axis2=2).ravel()
+
+
+def is_shell(mat: PETSc.Mat) -> bool:
+    return bool(mat.getType() == PETSc.Mat.Type.PYTHON)
