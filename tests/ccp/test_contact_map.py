@@ -1,0 +1,160 @@
+"""Products with the contact map, in both storages and both ways, against dense algebra."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from problems import part, random_graph
+
+from pctt.blocks import BlockRows
+from pctt.contact_map import CompactRows, contact_map, is_free
+from pctt.pc.body_operator import BodyOperator
+
+WAYS = ["assembled", pytest.param("free", marks=pytest.mark.skipif(not is_free("auto"), reason="no numba"))]
+CLOSE = {"rtol": 1e-13, "atol": 1e-13}
+
+
+def random_contacts(seed: int, contacts: int, bodies: int, wide: bool) -> tuple[CompactRows, np.ndarray]:
+    """Rows of all contacts, with bodies that nothing moves among them, and G as a dense array by its definition."""
+    rng = np.random.default_rng(seed)
+    body = np.array([rng.choice(bodies, 2, replace=False) for _ in range(contacts)]).reshape(-1, 2)
+    body[rng.random(contacts) < 0.2, 1] = -1
+    body[rng.random(contacts) < 0.1, 0] = -1
+    frame = np.linalg.qr(rng.standard_normal((contacts, 3, 3)))[0]
+    arm = rng.standard_normal((contacts, 2, 3))
+    root = rng.standard_normal((bodies, 2, 3, 3))
+    root = root @ root.transpose(0, 1, 3, 2)
+    if not wide:
+        root *= np.eye(3)
+    G = np.zeros((contacts, 3, bodies + 1, 6))
+    for c in range(contacts):
+        for side, sign in ((0, -1.0), (1, 1.0)):
+            if body[c, side] >= 0:
+                place, turning = root[body[c, side]]
+                G[c, :, body[c, side], :3] = sign * frame[c] @ place
+                G[c, :, body[c, side], 3:] = sign * np.cross(arm[c, side], frame[c]) @ turning
+    kept = [0, 1, 2, 4, 5, 8] if wide else [0, 4, 8]
+    roots = root.reshape(bodies, 2, 9)[:, :, kept].reshape(bodies, -1)
+    rows = CompactRows(frame.reshape(-1, 9), arm.reshape(-1, 6), body, roots, bodies)
+    return rows, G[:, :, :bodies].reshape(3 * contacts, 6 * bodies)
+
+
+def own_part(whole: CompactRows, comm: MPI.Comm, ends=None, body_ends=None) -> CompactRows:
+    here, bodies = part(comm, whole.rows, ends), part(comm, whole.columns, body_ends)
+    near = (whole.frame[here], whole.arm[here], whole.body[here])
+    return CompactRows(*near, whole.root[bodies], bodies.stop - bodies.start)
+
+
+def check(comm: MPI.Comm, rows: CompactRows | BlockRows, G: np.ndarray, here: slice, way: str) -> None:
+    """All products and blocks of the map of these rows."""
+    rng = np.random.default_rng(1)
+    contacts, bodies = G.shape[0] // 3, G.shape[1] // 6
+    first = sum(comm.allgather(rows.columns)[: comm.rank])
+    own = slice(first, first + rows.columns)
+    v, g = rng.standard_normal((bodies, 6)), rng.standard_normal((contacts, 3))
+    H = rng.standard_normal((contacts, 3, 3))
+    H = H @ H.transpose(0, 2, 1)
+    product = contact_map(comm, rows, way)
+    np.testing.assert_allclose(product.velocities(v[own].ravel()), (G @ v.ravel()).reshape(-1, 3)[here], **CLOSE)
+    np.testing.assert_allclose(product.momenta(g[here]), (G.T @ g.ravel()).reshape(-1, 6)[own], **CLOSE)
+    y = g[here].copy()
+    product.add_delassus(g[here], y)
+    np.testing.assert_allclose(y - g[here], (G @ G.T @ g.ravel()).reshape(-1, 3)[here], rtol=1e-12, atol=1e-12)
+    N = (G @ G.T).reshape(contacts, 3, contacts, 3)[range(contacts), :, range(contacts)]
+    np.testing.assert_allclose(product.contact_blocks(), N[here], **CLOSE)
+    size = rng.uniform(0.5, 2.0, (contacts, 3))
+    y = np.zeros((here.stop - here.start, 3))
+    product.scaled(size[here]).add_delassus(g[here], y)
+    expected = size.ravel() * (G @ G.T @ (size * g).ravel())
+    np.testing.assert_allclose(y, expected.reshape(-1, 3)[here], rtol=1e-12, atol=1e-12)
+
+    K = np.eye(6 * bodies) + G.T @ np.einsum("cij,cjk->cik", H, G.reshape(contacts, 3, 6 * bodies)).reshape(G.shape)
+    operator = BodyOperator(product)
+    operator.update(H[here])
+    x, out = operator.mat.createVecs()
+    x.array[:] = v[own].ravel()
+    operator.mat.mult(x, out)
+    close = {"rtol": 1e-12, "atol": 1e-12 * np.abs(K).max()}
+    np.testing.assert_allclose(out.array.reshape(-1, 6), (K @ v.ravel()).reshape(-1, 6)[own], **close)
+    blocks = K.reshape(bodies, 6, bodies, 6)[range(bodies), :, range(bodies)][own]
+    np.testing.assert_allclose(operator.mat.getAttr("diagonal_blocks"), blocks, **close)
+    operator.entries().mat.mult(x, out)
+    np.testing.assert_allclose(out.array.reshape(-1, 6), (K @ v.ravel()).reshape(-1, 6)[own], **close)
+    for thing in (operator, product, x, out):
+        thing.destroy()
+
+
+@pytest.mark.parallel(1, 2, 3, 4)
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("wide", [False, True], ids=["diagonal roots", "full roots"])
+def test_frames_and_arms(wide, way):
+    comm = MPI.COMM_WORLD
+    rows, G = random_contacts(3, 40, 12, wide)
+    check(comm, own_part(rows, comm), G, part(comm, 40), way)
+
+
+@pytest.mark.parallel(1, 3)
+@pytest.mark.parametrize("way", WAYS)
+def test_blocks(way):
+    comm = MPI.COMM_WORLD
+    graph = random_graph(4, 30, 8, hub=True)
+    check(comm, graph.part(comm), graph.dense(), part(comm, 30), way)
+
+
+@pytest.mark.parallel(2, 3)
+@pytest.mark.parametrize("way", WAYS)
+def test_ranks_without_contacts_or_bodies(way):
+    comm = MPI.COMM_WORLD
+    rows, G = random_contacts(5, 10, 4, False)
+    all_last = [0] * (comm.size - 1)
+    ends, body_ends = [*all_last, 10], [*[4] * (comm.size - 1), 4]  # contacts on the last rank, bodies on the first
+    check(comm, own_part(rows, comm, ends, body_ends), G, part(comm, 10, ends), way)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_no_contacts_at_all(way):
+    rows, G = random_contacts(5, 0, 4, False)
+    check(MPI.COMM_SELF, rows, G, slice(0, 0), way)
+
+
+def test_a_number_that_is_none_comes_out():
+    """The compiler must not take for granted that there are none."""
+    rows, _ = random_contacts(6, 20, 5, False)
+    product = contact_map(MPI.COMM_SELF, rows)
+    v = np.zeros((5, 6))
+    v[rows.body[0].max(), 4] = np.nan
+    assert np.isnan(product.velocities(v)).any()
+    assert np.isfinite(product.velocities(np.zeros((5, 6)))).all()
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("compact", [True, False])
+def test_a_product_repeats_itself_bit_for_bit(compact, way):
+    rows, _ = random_contacts(7, 60, 9, True)
+    product = contact_map(MPI.COMM_SELF, rows if compact else rows.block_rows(MPI.COMM_SELF), way)
+    g = np.random.default_rng(0).standard_normal((60, 3))
+    first, second = np.zeros((2, 60, 3))
+    product.add_delassus(g, first)
+    product.add_delassus(g, second)
+    assert first.tobytes() == second.tobytes()
+
+
+def test_unknown_ways_are_refused(monkeypatch):
+    rows, _ = random_contacts(8, 3, 3, False)
+    with pytest.raises(ValueError, match=r"-ccp_operator quick: allowed are auto, free, assembled"):
+        contact_map(MPI.COMM_SELF, rows, "quick")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="numba is not installed"):
+        contact_map(MPI.COMM_SELF, rows, "free")
+    assert not is_free("auto")
+
+
+@pytest.mark.skipif(not is_free("auto"), reason="no numba")
+def test_flops_are_logged():
+    rows, _ = random_contacts(9, 20, 5, False)
+    product = contact_map(MPI.COMM_SELF, rows)
+    before = PETSc.Log.getFlops()
+    product.velocities(np.zeros((5, 6)))
+    assert PETSc.Log.getFlops() - before == 45 * 20 + 6 * 5
