@@ -24,15 +24,20 @@ from petsc4py import PETSc
 
 from dem import bodies
 from dem.arrays import Floats, Ints
-from dem.bodies import Bodies
 from dem.checks import positive
 from dem.contact import Contacts
 from dem.exchange import exchange
-from dem.free_motion import free_directions, free_velocities, project
+from dem.free_motion import free_directions, free_velocities
+from dem.loops import loops
 from dem.quaternion import cross
 
 if TYPE_CHECKING:
     from dem.world import World
+
+
+#: The entries (xx, xy, xz, yy, yz, zz) of a symmetric matrix, and the numbers (3, 3) of its entries among these.
+UPPER = np.triu_indices(3)
+SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 class BlockRows(NamedTuple):
@@ -41,6 +46,20 @@ class BlockRows(NamedTuple):
     indptr: Ints  #: (nc + 1,) where the blocks of each local contact start
     indices: Ints  #: (nb,) global body indices, ascending within a contact
     data: Floats  #: (nb, 3, 6)
+
+
+class CompactRows(NamedTuple):
+    """Local rows of G = D' M^-1/2 without its blocks; all arrays are C-contiguous.
+
+    A contact moves with the velocity F (v_b + w_b x r_b - v_a - w_a x r_a), F its frame, of its bodies a and b.
+    """
+
+    frame: Floats  #: (nc, 9) rows n, t1, t2 of F, n from a to b
+    arm: Floats  #: (nc, 6) r_a and r_b, from the centres of the bodies to the contact point [m]
+    body: Ints  #: (nc, 2) global indices of a and b; -1 for a body of prescribed motion
+    #: M^-1/2 of the bodies whose rows this rank owns: its diagonal (owned, 6) where that is all on all ranks; else
+    #: (owned, 12) two symmetric matrices (xx, xy, xz, yy, yz, zz), of translation and of rotation in world axes
+    root: Floats
 
 
 class ContactSystem:
@@ -68,23 +87,37 @@ class ContactSystem:
         self.local_contacts = len(contacts)
         self.owned_bodies, self.total_bodies = world.owned, world.body_count
         self._comm, self._slabs, self._large_row = world.comm, world.slabs, world.large_row
-        self._near = near
-
-        # The two bodies of each contact in the order of their columns: rows of the table, and -1 for a, +1
-        # for b.
-        order = np.argsort(contacts.body, axis=1)
-        self._body = np.take_along_axis(contacts.body, order, axis=1)
-        self._row = np.take_along_axis(np.stack([contacts.a, contacts.b], axis=1), order, axis=1)
-        self._sign = 2.0 * order - 1.0
+        self._near, self._body = near, contacts.body
+        self._row = np.stack([contacts.a, contacts.b], axis=1)
+        self._arm = (self.point[:, None] - near.bodies.position[self._row]).reshape(-1, 6)
 
         grains = near.grains + near.ghosts
+        self._owned = np.r_[: near.grains, grains : grains + world.owned - near.grains]
         self._free_directions = free_directions(world.large_bodies)
+        self._diagonal = world.only_spheres and not bodies.is_dynamic(world.large).any()
         free = free_velocities(world, near, dt)
-        owned_large = slice(grains, grains + world.owned - near.grains)
-        self.free_velocity = np.concatenate([free[: near.grains], free[owned_large]])
+        self.free_velocity = free[self._owned]
         self.b = np.zeros((len(contacts), 3))
         self.b[:, 0] = np.maximum(contacts.gap / dt, -recovery_speed)
-        self.r = self.b + self._relative_velocity(free)
+        self.r = self.b + relative_velocity(self.frame, self._arm, self._row, free)
+
+    @cached_property
+    def contact_map(self) -> CompactRows:
+        """The mass-scaled map G = D' M^-1/2 as frames, arms and bodies; of every solver that needs no blocks."""
+        body = np.where(bodies.is_dynamic(self._near.bodies)[self._row], self._body, -1)
+        return CompactRows(self.frame.reshape(-1, 9), self._arm, body, self._root)
+
+    @cached_property
+    def _root(self) -> Floats:
+        """M^-1/2 of the bodies whose rows this rank owns, as in `CompactRows`."""
+        owned = self._near.bodies.take(self._owned)
+        if self._diagonal:
+            return 1.0 / np.sqrt(np.column_stack([owned.mass, owned.mass, owned.mass, owned.inertia]))
+        translation = np.eye(3) / np.sqrt(owned.mass)[:, None, None]
+        guides = self._free_directions[: self.owned_bodies - self._near.grains]
+        translation[self._near.grains :] = translation[self._near.grains :] @ guides
+        both = np.stack([translation, bodies.inverse_root_inertia(owned)], axis=1)
+        return both[:, :, UPPER[0], UPPER[1]].reshape(-1, 12)
 
     @cached_property
     def G(self) -> BlockRows:
@@ -93,8 +126,9 @@ class ContactSystem:
         M^-1/2 of a body is diag(m^-1/2 E, I^-1/2), with the symmetric root of the inertia tensor; of a guided
         body diag(m^-1/2 d d', 0).
         """
-        table, row = self._near.bodies, self._row
-        blocks = self._blocks()
+        table = self._near.bodies
+        order, blocks = self._blocks()
+        row = np.take_along_axis(self._row, order, axis=1)
         blocks[..., :3] /= np.sqrt(table.mass)[row][:, :, None, None]
         blocks[..., 3:] = blocks[..., 3:] @ bodies.inverse_root_inertia(table)[row]
         first_large = len(table) - len(self._free_directions)
@@ -102,7 +136,7 @@ class ContactSystem:
         blocks[large, :, :3] = blocks[large, :, :3] @ self._free_directions[row[large] - first_large]
         dynamic = bodies.is_dynamic(table)[row]
         indptr = np.concatenate([[0], np.cumsum(dynamic.sum(axis=1))])
-        return BlockRows(indptr, self._body[dynamic], blocks[dynamic])
+        return BlockRows(indptr, np.take_along_axis(self._body, order, axis=1)[dynamic], blocks[dynamic])
 
     @cached_property
     def D(self) -> PETSc.Mat:
@@ -110,8 +144,10 @@ class ContactSystem:
         it."""
         # A scalar row of D' has the entries of the first body, then those of the second: no row is
         # off-process.
-        entries = self._blocks().transpose(0, 2, 1, 3)
-        columns = np.broadcast_to(6 * self._body[:, None, :, None] + np.arange(6), entries.shape)
+        order, blocks = self._blocks()
+        entries = blocks.transpose(0, 2, 1, 3)
+        body = np.take_along_axis(self._body, order, axis=1)
+        columns = np.broadcast_to(6 * body[:, None, :, None] + np.arange(6), entries.shape)
         indptr = 12 * np.arange(3 * self.local_contacts + 1)
         transposed = PETSc.Mat().createAIJ(
             ((3 * self.local_contacts, None), (6 * self.owned_bodies, None)),
@@ -129,15 +165,8 @@ class ContactSystem:
 
     def velocity(self, impulse: Floats) -> Floats:
         """Velocities (owned, 6) after the step, v_free + M^-1 D g, for impulses (nc, 3); collective."""
-        near = self._near
-        load, large_load = self.generalised_impulse(impulse)
-        grains, large = (
-            near.bodies.take(slice(0, near.grains)),
-            near.bodies.take(slice(near.grains + near.ghosts, None)),
-        )
-        change = np.concatenate([_accelerate(grains, load), _accelerate(large, large_load)])
-        change[near.grains :, :3] = project(self._free_directions, change[near.grains :, :3])
-        return self.free_velocity + change[: self.owned_bodies]  # only the last rank owns the large bodies
+        load = np.concatenate(self.generalised_impulse(impulse))[: self.owned_bodies]  # large bodies: the last rank's
+        return self.free_velocity + scaled(self._root, scaled(self._root, load))
 
     def force_on(self, name: str, impulse: Floats) -> Floats:
         """Contact force and torque (6,) [N, N m] on a large body, about its reference point, averaged over
@@ -145,44 +174,24 @@ class ContactSystem:
         row = self._large_row(name)
         return self.generalised_impulse(impulse)[1][row] / self.dt
 
-    def _arm(self, side: int) -> Floats:
-        """Vectors (nc, 3) from the centre of one of the two bodies to the contact point."""
-        return self.point - self._near.bodies.position[self._row[:, side]]
-
-    def _blocks(self) -> Floats:
-        """Blocks (nc, 2, 3, 6) of D': rows of the frame, and their moments about the centres of the two
-        bodies."""
-        blocks = np.empty((self.local_contacts, 2, 3, 6))
-        for side in (0, 1):
-            direction = self._sign[:, side, None, None] * self.frame
-            blocks[:, side, :, :3] = direction
-            blocks[:, side, :, 3:] = cross(self._arm(side)[:, None, :], direction)
-        return blocks
-
-    def _relative_velocity(self, velocity: Floats) -> Floats:
-        """D' v (nc, 3) for velocities (rows of the table, 6)."""
-        relative = np.zeros((self.local_contacts, 3))
-        for side in (0, 1):
-            moving = velocity[self._row[:, side]]
-            at_point = moving[:, :3] + cross(moving[:, 3:], self._arm(side))
-            relative += self._sign[:, side, None] * at_point
-        return (self.frame @ relative[:, :, None])[:, :, 0]
+    def _blocks(self) -> tuple[Ints, Floats]:
+        """The two bodies of each contact in the order of their global indices (nc, 2), 0 for a and 1 for b, and their
+        blocks (nc, 2, 3, 6) of D' in that order: rows of the frame, and their moments about the centres."""
+        order = np.argsort(self._body, axis=1)
+        direction = (2.0 * order - 1.0)[:, :, None, None] * self.frame[:, None]
+        arm = np.take_along_axis(self._arm.reshape(-1, 2, 3), order[:, :, None], axis=1)
+        return order, np.concatenate([direction, cross(arm[:, :, None], direction)], axis=3)
 
     def generalised_impulse(self, impulse: Floats) -> tuple[Floats, Floats]:
         """D g of the local grains (grains, 6), and of the large bodies (large, 6), the same on all ranks, from
         the impulses (nc, 3) of all ranks [N s, N m s]; collective."""
-        near, count = self._near, len(self._near.bodies)
-        push = (impulse[:, None, :] @ self.frame)[:, 0]
-        load = np.zeros((count, 6))
-        for side in (0, 1):
-            row, force = self._row[:, side], self._sign[:, side, None] * push
-            load[:, :3] += _sum_rows(row, force, count)
-            load[:, 3:] += _sum_rows(row, cross(self._arm(side), force), count)
+        near = self._near
+        load = sum_of_impulses(self.frame, self._arm, self._row, impulse, len(near.bodies))
         ghosts = slice(near.grains, near.grains + near.ghosts)
         index = near.index[ghosts]
         owner = np.searchsorted(self._slabs, index, side="right") - 1
         home = exchange(self._comm, {"row": index - self._slabs[owner], "load": load[ghosts]}, owner)
-        local = load[: near.grains] + _sum_rows(home["row"], home["load"], near.grains)
+        local = load[: near.grains] + sum_rows(home["row"], home["load"], near.grains)
         large = load[ghosts.stop :].copy()
         self._comm.Allreduce(MPI.IN_PLACE, large)
         return local, large
@@ -194,6 +203,8 @@ def contact_frames(normal: Floats) -> Floats:
     Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
     but where the sign of its z component changes.
     """
+    if compiled := loops():
+        return compiled.contact_frames(np.ascontiguousarray(normal))
     x, y, z = normal.T
     sign = np.copysign(1.0, z)
     p = -1.0 / (sign + z)
@@ -205,12 +216,33 @@ def contact_frames(normal: Floats) -> Floats:
     return frame
 
 
-def _accelerate(table: Bodies, load: Floats) -> Floats:
-    """M^-1 times impulses and angular impulses (n, 6)."""
-    angular = (bodies.inverse_inertia(table) @ load[:, 3:, None])[:, :, 0]
-    return np.hstack([load[:, :3] / table.mass[:, None], angular])
+def relative_velocity(frame: Floats, arm: Floats, row: Ints, velocity: Floats) -> Floats:
+    """D' v (nc, 3) for the velocities (rows, 6) of the bodies of a table, of which `row` (nc, 2) are those in contact,
+    with frames (nc, 3, 3) and arms (nc, 6)."""
+    if compiled := loops():
+        return compiled.relative_velocity(frame, arm, row, velocity)
+    at_point = [
+        velocity[rows, :3] + cross(velocity[rows, 3:], arms) for rows, arms in zip(row.T, (arm[:, :3], arm[:, 3:]))
+    ]
+    return np.einsum("cij,cj->ci", frame, at_point[1] - at_point[0])
 
 
-def _sum_rows(row: Ints, values: Floats, count: int) -> Floats:
-    """Sums (count, 3 or 6) of the values (n, 3 or 6) of equal row."""
+def sum_of_impulses(frame: Floats, arm: Floats, row: Ints, impulse: Floats, count: int) -> Floats:
+    """D g (count, 6) for the impulses (nc, 3) of contacts as in `relative_velocity`, on the bodies of a table."""
+    if compiled := loops():
+        return compiled.sum_of_impulses(frame, arm, row, np.ascontiguousarray(impulse, dtype=np.float64), count)
+    push = np.einsum("ci,cij->cj", impulse, frame)
+    a, b = (np.hstack([push, cross(arms, push)]) for arms in (arm[:, :3], arm[:, 3:]))
+    return sum_rows(row[:, 1], b, count) - sum_rows(row[:, 0], a, count)
+
+
+def sum_rows(row: Ints, values: Floats, count: int) -> Floats:
+    """Sums (count, 6) of the values (n, 6) of equal row."""
     return np.stack([np.bincount(row, column, minlength=count) for column in values.T], axis=1)
+
+
+def scaled(root: Floats, values: Floats) -> Floats:
+    """M^-1/2 times the values (n, 6), with its rows (n, 6) or (n, 12) as in `CompactRows`."""
+    if root.shape[1] == 6:
+        return root * values
+    return np.einsum("nbij,nbj->nbi", root.reshape(-1, 2, 6)[:, :, SYMMETRIC], values.reshape(-1, 2, 3)).reshape(-1, 6)

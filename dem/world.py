@@ -36,6 +36,7 @@ class World:
     time: float = 0.0  #: [s]
     step: int = 0  #: number of steps done
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
+    only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
 
     def __post_init__(self) -> None:
         self.set_grains(self.grains)
@@ -92,7 +93,9 @@ class World:
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
         self.grains = grains
-        self.slabs = np.concatenate([[0], np.cumsum(self.comm.allgather(len(grains)))]).astype(np.int64)
+        counts, spheres = zip(*self.comm.allgather((len(grains), bool((grains.shape == bodies.SPHERE).all()))))
+        self.slabs = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        self.only_spheres = all(spheres)
 
     @property
     def body_count(self) -> int:

@@ -1,0 +1,192 @@
+"""Loops over contacts, pairs and bodies, compiled by numba at their first call.
+
+Each does what the numpy code beside its caller does, in one pass over memory. Import it by `dem.loops.loops`.
+Arrays are C-contiguous, of float64 and int64.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+#: Fused multiply-adds are allowed; what else numba calls fast assumes that there are no NaNs.
+compiled = njit(cache=True, fastmath={"contract"})
+
+
+# -- the contact map ---------------------------------------------------------------------------------------------
+
+
+@compiled
+def contact_frames(normal):
+    """`dem.system.contact_frames`."""
+    frame = np.empty((len(normal), 3, 3))
+    for c in range(len(normal)):
+        x, y, z = normal[c, 0], normal[c, 1], normal[c, 2]
+        sign = np.copysign(1.0, z)
+        p = -1.0 / (sign + z)
+        q = x * y * p
+        frame[c, 0, 0], frame[c, 0, 1], frame[c, 0, 2] = x, y, z
+        frame[c, 1, 0], frame[c, 1, 1], frame[c, 1, 2] = 1.0 + sign * x * x * p, sign * q, -sign * x
+        frame[c, 2, 0], frame[c, 2, 1], frame[c, 2, 2] = q, sign + y * y * p, -y
+    return frame
+
+
+@compiled
+def relative_velocity(frame, arm, row, velocity):
+    """Velocities (nc, 3), in the contact frames, of the second bodies relative to the first at the contact points;
+    of bodies with velocities (rows, 6)."""
+    out = np.empty((len(frame), 3))
+    for c in range(len(frame)):
+        v, w, r = velocity[row[c, 0]], velocity[row[c, 1]], arm[c]
+        x = w[0] + w[4] * r[5] - w[5] * r[4] - (v[0] + v[4] * r[2] - v[5] * r[1])
+        y = w[1] + w[5] * r[3] - w[3] * r[5] - (v[1] + v[5] * r[0] - v[3] * r[2])
+        z = w[2] + w[3] * r[4] - w[4] * r[3] - (v[2] + v[3] * r[1] - v[4] * r[0])
+        for k in range(3):
+            out[c, k] = frame[c, k, 0] * x + frame[c, k, 1] * y + frame[c, k, 2] * z
+    return out
+
+
+@compiled
+def sum_of_impulses(frame, arm, row, impulse, count):
+    """Impulses and angular impulses (count, 6) on the bodies of `count` rows, from those of the contacts (nc, 3)."""
+    out = np.zeros((count, 6))
+    for c in range(len(frame)):
+        n, s, t = impulse[c, 0], impulse[c, 1], impulse[c, 2]
+        x = n * frame[c, 0, 0] + s * frame[c, 1, 0] + t * frame[c, 2, 0]
+        y = n * frame[c, 0, 1] + s * frame[c, 1, 1] + t * frame[c, 2, 1]
+        z = n * frame[c, 0, 2] + s * frame[c, 1, 2] + t * frame[c, 2, 2]
+        a, b, r = out[row[c, 0]], out[row[c, 1]], arm[c]
+        a[0] -= x
+        a[1] -= y
+        a[2] -= z
+        a[3] -= r[1] * z - r[2] * y
+        a[4] -= r[2] * x - r[0] * z
+        a[5] -= r[0] * y - r[1] * x
+        b[0] += x
+        b[1] += y
+        b[2] += z
+        b[3] += r[4] * z - r[5] * y
+        b[4] += r[5] * x - r[3] * z
+        b[5] += r[3] * y - r[4] * x
+    return out
+
+
+# -- the search --------------------------------------------------------------------------------------------------
+
+
+@compiled
+def _cell(center, width):
+    return int(np.floor(center[0] / width)), int(np.floor(center[1] / width)), int(np.floor(center[2] / width))
+
+
+@compiled
+def _bucket(x, y, z, buckets):
+    return (x * 73856093 ^ y * 19349663 ^ z * 83492791) & (buckets - 1)
+
+
+@compiled
+def pairs_in_cells(center, radius, first, second, alike, width, reach):
+    """Pairs (m, 2), the lower row first, of a sphere of the rows `first` and one of the rows `second` that come within
+    `reach`, or within rounding of it.
+
+    first, second: the same rows if `alike`, else without common ones. width: of the cells into which those of `second` are
+    sorted, no less than the distance of the centres of any pair. Cells share the buckets of a hash table, so that a
+    sphere far away costs nothing.
+    """
+    buckets = 1
+    while buckets < 2 * len(second):
+        buckets *= 2
+    cell = np.empty((len(second), 3), np.int64)
+    start = np.zeros(buckets + 1, np.int64)
+    for k in range(len(second)):
+        x, y, z = _cell(center[second[k]], width)
+        cell[k, 0], cell[k, 1], cell[k, 2] = x, y, z
+        start[_bucket(x, y, z, buckets) + 1] += 1
+    for k in range(buckets):
+        start[k + 1] += start[k]
+    free = start[:-1].copy()
+    member = np.empty(len(second), np.int64)
+    for k in range(len(second)):
+        bucket = _bucket(cell[k, 0], cell[k, 1], cell[k, 2], buckets)
+        member[free[bucket]] = k
+        free[bucket] += 1
+
+    pairs = np.empty((8 * len(first) + 8, 2), np.int64)
+    found = 0
+    for i in first:
+        here = _cell(center[i], width)
+        for step in range(27):
+            x, y, z = here[0] + step // 9 - 1, here[1] + step // 3 % 3 - 1, here[2] + step % 3 - 1
+            bucket = _bucket(x, y, z, buckets)
+            for place in range(start[bucket], start[bucket + 1]):
+                k = member[place]
+                j = second[k]
+                if cell[k, 0] != x or cell[k, 1] != y or cell[k, 2] != z or (alike and j <= i):
+                    continue
+                dx, dy, dz = center[j, 0] - center[i, 0], center[j, 1] - center[i, 1], center[j, 2] - center[i, 2]
+                most = (radius[i] + radius[j] + reach) * (1.0 + 1e-12)
+                if dx * dx + dy * dy + dz * dz <= most * most:
+                    if found == len(pairs):
+                        pairs = np.concatenate((pairs, np.empty_like(pairs)))
+                    pairs[found, 0], pairs[found, 1] = min(i, j), max(i, j)
+                    found += 1
+    return pairs[:found].copy()
+
+
+@compiled
+def sphere_sphere(center, size, i, j, delta):
+    """`dem.contact.narrow.sphere_sphere` of the pairs of rows i, j (m,) of which the gap is at most `delta` (m,): their
+    numbers, points, normals and gaps."""
+    pair = np.empty(len(i), np.int64)
+    point, normal, gap = np.empty((len(i), 3)), np.empty((len(i), 3)), np.empty(len(i))
+    found = 0
+    for k in range(len(i)):
+        p, q = center[i[k]], center[j[k]]
+        radius = size[i[k], 0]
+        x, y, z = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+        distance = np.sqrt(x * x + y * y + z * z)
+        apart = distance - radius - size[j[k], 0]
+        if apart <= delta[k]:
+            if distance > 0.0:
+                x, y, z = x / distance, y / distance, z / distance
+            else:
+                z = 1.0
+            middle = radius + 0.5 * apart
+            pair[found], gap[found] = k, apart
+            normal[found, 0], normal[found, 1], normal[found, 2] = x, y, z
+            point[found, 0], point[found, 1], point[found, 2] = p[0] + middle * x, p[1] + middle * y, p[2] + middle * z
+            found += 1
+    return pair[:found], point[:found], normal[:found], gap[:found]
+
+
+@compiled
+def lexsort(key, major, count):
+    """`numpy.lexsort((key, major))` of distinct keys (n,), with `major` (n,) in 0 ... count - 1."""
+    start = np.zeros(count + 1, np.int64)
+    for k in range(len(major)):
+        start[major[k] + 1] += 1
+    for k in range(count):
+        start[k + 1] += start[k]
+    order, free = np.empty(len(major), np.int64), start[:-1].copy()
+    for k in range(len(major)):
+        order[free[major[k]]] = k
+        free[major[k]] += 1
+    for m in range(count):
+        _shell_sort(order[start[m] : start[m + 1]], key)
+    return order
+
+
+@compiled
+def _shell_sort(rows, key):
+    """Sort a few rows by their keys, in place."""
+    gap = 1
+    while 3 * gap < len(rows):
+        gap = 3 * gap + 1
+    while gap > 0:
+        for k in range(gap, len(rows)):
+            row, place = rows[k], k
+            while place >= gap and key[rows[place - gap]] > key[row]:
+                rows[place] = rows[place - gap]
+                place -= gap
+            rows[place] = row
+        gap //= 3
