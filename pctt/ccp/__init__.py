@@ -28,6 +28,7 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.registry import SOLVERS, Solver
 from pctt.ccp.result import Limits, Result
 from pctt.ccp.unbounded import why_unbounded
+from pctt.contact_map import CompactRows
 from pctt.log import phase
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "SOLVERS",
     "Accuracy",
     "BlockRows",
+    "CompactRows",
     "Comparison",
     "ConeProblem",
     "Coulomb",

@@ -293,7 +293,7 @@ def cone_problem(
     system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0, operator: str = "auto"
 ) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
-    G = ccp.BlockRows(*system.G, columns=system.owned_bodies)
+    G = ccp.CompactRows(*system.contact_map, columns=system.owned_bodies)
     return ccp.ConeProblem(
         comm,
         system.r,

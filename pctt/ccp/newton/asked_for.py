@@ -13,7 +13,7 @@ CHOLESKY_LIMIT = 50_000  # contacts: above, a factor of the contact matrix takes
 
 # what solves a system of contacts when the asked-for KSP does not, in this order
 LADDER = {
-    "pbjacobi": {"pc_type": "pbjacobi"},
+    "cg": {"pc_type": "pbjacobi", "ksp_type": "cg", "ksp_norm_type": "unpreconditioned"},
     "cholesky": {"pc_type": "cholesky", "ksp_type": "gmres"},
 }
 
