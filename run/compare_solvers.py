@@ -7,6 +7,7 @@ process of its own on one core; what has not got there after --seconds is printe
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import subprocess
 import sys
@@ -15,16 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import solve_one
 from measure import record, say_machine
 from mpi4py import MPI
 from peers import PEERS
-from petsc4py import PETSc
 
 from dem.contact import find_contacts
 from dem.system import ContactSystem
 from pctt import ccp
-from pctt.blocks import BlockRows, block_matrix
-from pctt.ccp import fclib
 from pctt.run.options import read_options
 from pctt.run.report import Progress
 from pctt.run.simulate import cone_problem, first_state
@@ -56,14 +55,15 @@ def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
     contacts = find_contacts(world, options.delta, options.dt)
     system = ContactSystem(world, contacts, options.dt, options.run.recovery_speed)
     problem = cone_problem(system, COMM, compliance)
-    mu, G = problem.mu, problem.contact_map.block_rows
+    mu, G = problem.mu, problem.contact_map.given
     if variant == "friction":
         mu = np.full_like(mu, 0.8)
     if variant == "heavy":
-        touched = np.unique(G.indices)
+        touched = np.unique(G.body[G.body >= 0])
         top = touched[np.argmax(grains.position[touched[touched < len(grains)], 2])]
-        blocks = np.where((G.indices == top)[:, None, None], G.blocks / np.sqrt(HEAVIER), G.blocks)
-        G = BlockRows(G.indptr, G.indices, blocks, G.columns)
+        root = G.root.copy()
+        root[top] /= np.sqrt(HEAVIER)
+        G = dataclasses.replace(G, root=root)
     return ccp.ConeProblem(COMM, problem.r, mu, G=G, point=problem.point, compliance=compliance)
 
 
@@ -71,33 +71,24 @@ def copied(problem: ccp.ConeProblem, count: int) -> ccp.ConeProblem:
     """Copies of a problem side by side, without contact between them."""
     if count == 1:
         return problem
-    G = problem.contact_map.block_rows
-    which = np.arange(count)[:, None]
-    pointers = np.append(0, (G.indptr[1:] + which * G.indptr[-1]).ravel())
-    columns = (G.indices + which * G.columns).ravel()
-    G = BlockRows(pointers, columns, np.tile(G.blocks, (count, 1, 1)), count * G.columns)
-    points = None
-    if problem.point is not None:
-        points = np.tile(problem.point, (count, 1))
-        points[:, 0] += np.repeat(np.arange(count) * np.ptp(problem.point[:, 0]), problem.size)
+    G = problem.contact_map.given
+    which = np.repeat(np.arange(count), G.rows)[:, None]
+    body = np.tile(G.body, (count, 1))
+    body = np.where(body >= 0, body + which * G.columns, -1)
+    many = [np.tile(column, (count, 1)) for column in (G.frame, G.arm)]
+    G = ccp.CompactRows(*many, body, np.tile(G.root, (count, 1)), count * G.columns)
+    points = np.tile(problem.point, (count, 1))
+    points[:, 0] += which[:, 0] * np.ptp(problem.point[:, 0])
     r, mu = np.tile(problem.r, (count, 1)), np.tile(problem.mu, count)
     return ccp.ConeProblem(COMM, r, mu, G=G, point=points, compliance=problem.softness)
 
 
-def write(path: Path, problem: ccp.ConeProblem) -> None:
-    """As an FCLIB global problem of mass-scaled bodies: M = I, H = G'."""
-    G = block_matrix(COMM, problem.contact_map.block_rows)
-    H = G.transpose()
-    size = H.getSize()[0]
-    ones = np.ones(size)
-    index = np.arange(size + 1, dtype=PETSc.IntType)
-    M = PETSc.Mat().createAIJ((size, size), csr=(index, index[:-1], ones), comm=COMM)
-    fclib.write_global(path, M, H, 0 * ones, problem.r, problem.mu, point=problem.point, compliance=problem.softness)
-
-
 def run(path: Path, method: str, tol: float, seconds: float) -> dict[str, Any]:
-    """What solve_one.py says; {"reason": ...} alone where it was ended or failed."""
-    command = [sys.executable, str(Path(__file__).with_name("solve_one.py")), str(path), method, str(tol), str(seconds)]
+    """What solve_one.py says; {"reason": ...} alone where it was ended or failed. A METHOD that ends in ` assembled` has
+    its products made by matrices of PETSc."""
+    name = method.removesuffix(" assembled")
+    words = [str(path), name, str(tol), str(seconds), "auto" if name == method else "assembled"]
+    command = [sys.executable, str(Path(__file__).with_name("solve_one.py")), *words]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=seconds + 15, check=True)
         return json.loads(done.stdout.splitlines()[-1])
@@ -193,7 +184,8 @@ def main() -> None:
     parser.add_argument("--copies", type=int, default=1, help="of the problem, side by side: n = 32 has 8 of n = 16")
     words = parser.parse_args()
     everything = [*ccp.SOLVERS, *COULOMB, *(name for name, peer in PEERS.items() if peer.installed)]
-    methods = words.methods.split(",") if words.methods else everything
+    everything += [f"{name} assembled" for name in ccp.SOLVERS]
+    methods = words.methods.split(",") if words.methods else [m for m in everything if not m.endswith(" assembled")]
     variants = words.variants.split(",")
     for kind, given, allowed in (("--methods", methods, everything), ("--variants", variants, VARIANTS)):
         for name in given:
@@ -205,9 +197,9 @@ def main() -> None:
     cases = [(n, v, e) for n in words.n for e in compliances for v in variants if v == "settled" or e == compliances[0]]
     for n, variant, compliance in cases:
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "problem.h5"
+            path = Path(folder) / "problem.npz"
             problem = copied(step_problem(n, variant, compliance), words.copies)
-            write(path, problem)
+            solve_one.write(path, problem)
             title = f"mixer n = {n}, {problem.size} contacts, {VARIANTS[variant]}, compliance {compliance:g}"
             title += f", {words.copies} copies" * (words.copies > 1)
             heads = " ".join(f"{tol:9.0e}" for tol in TOLERANCES)
