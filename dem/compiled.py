@@ -75,61 +75,60 @@ def sum_of_impulses(frame, arm, row, impulse, count):
 
 
 @compiled
-def _cell(center, width):
-    return int(np.floor(center[0] / width)), int(np.floor(center[1] / width)), int(np.floor(center[2] / width))
-
-
-@compiled
-def _bucket(x, y, z, buckets):
-    return (x * 73856093 ^ y * 19349663 ^ z * 83492791) & (buckets - 1)
-
-
-@compiled
-def pairs_in_cells(center, radius, first, second, alike, width, reach):
+def pairs_in_cells(center, radius, first, second, alike, reach):
     """Pairs (m, 2), the lower row first, of a sphere of the rows `first` and one of the rows `second` that come within
     `reach`, or within rounding of it.
 
-    first, second: the same rows if `alike`, else without common ones. width: of the cells into which those of `second` are
-    sorted, no less than the distance of the centres of any pair. Cells share the buckets of a hash table, so that a
-    sphere far away costs nothing.
+    first, second: the same rows if `alike`, else without common ones. Those of `second` are sorted into cubic cells, so
+    wide that a pair is at most one cell apart. Cells share a cube of buckets, so that a sphere far away costs nothing;
+    four buckets a side are enough to tell neighbours apart.
     """
-    buckets = 1
-    while buckets < 2 * len(second):
-        buckets *= 2
-    cell = np.empty((len(second), 3), np.int64)
-    start = np.zeros(buckets + 1, np.int64)
+    largest = 0.0
+    for row in second:
+        largest = max(largest, radius[row])
+    width = largest + reach
+    for row in first:
+        width = max(width, (radius[row] + largest + reach) * (1.0 + 1e-6))
+    per = 1.0 / width
+    side = 4
+    while side * side * side < len(second):
+        side *= 2
+    last = side - 1
+    bucket, start = np.empty(len(second), np.int64), np.zeros(side * side * side + 1, np.int64)
     for k in range(len(second)):
-        x, y, z = _cell(center[second[k]], width)
-        cell[k, 0], cell[k, 1], cell[k, 2] = x, y, z
-        start[_bucket(x, y, z, buckets) + 1] += 1
-    for k in range(buckets):
+        x, y, z = center[second[k], 0] * per, center[second[k], 1] * per, center[second[k], 2] * per
+        bucket[k] = ((int(np.floor(x)) & last) * side + (int(np.floor(y)) & last)) * side + (int(np.floor(z)) & last)
+        start[bucket[k] + 1] += 1
+    for k in range(len(start) - 1):
         start[k + 1] += start[k]
-    free = start[:-1].copy()
-    member = np.empty(len(second), np.int64)
+    member, place, free = np.empty(len(second), np.int64), np.empty((len(second), 4)), start[:-1].copy()
     for k in range(len(second)):
-        bucket = _bucket(cell[k, 0], cell[k, 1], cell[k, 2], buckets)
-        member[free[bucket]] = k
-        free[bucket] += 1
+        to = free[bucket[k]]
+        free[bucket[k]] += 1
+        member[to], place[to, 3] = second[k], radius[second[k]]
+        place[to, 0], place[to, 1], place[to, 2] = center[second[k], 0], center[second[k], 1], center[second[k], 2]
 
+    # Alike, the rows are taken in the order of their cells, each with those behind it: every pair comes once.
+    rows = member if alike else first
     pairs = np.empty((8 * len(first) + 8, 2), np.int64)
     found = 0
-    for i in first:
-        here = _cell(center[i], width)
-        for step in range(27):
-            x, y, z = here[0] + step // 9 - 1, here[1] + step // 3 % 3 - 1, here[2] + step % 3 - 1
-            bucket = _bucket(x, y, z, buckets)
-            for place in range(start[bucket], start[bucket + 1]):
-                k = member[place]
-                j = second[k]
-                if cell[k, 0] != x or cell[k, 1] != y or cell[k, 2] != z or (alike and j <= i):
-                    continue
-                dx, dy, dz = center[j, 0] - center[i, 0], center[j, 1] - center[i, 1], center[j, 2] - center[i, 2]
-                most = (radius[i] + radius[j] + reach) * (1.0 + 1e-12)
-                if dx * dx + dy * dy + dz * dz <= most * most:
-                    if found == len(pairs):
-                        pairs = np.concatenate((pairs, np.empty_like(pairs)))
-                    pairs[found, 0], pairs[found, 1] = min(i, j), max(i, j)
-                    found += 1
+    for n in range(len(rows)):
+        i, behind = rows[n], n + 1 if alike else 0
+        a, b, c, r = center[i, 0], center[i, 1], center[i, 2], radius[i] + reach
+        out = (r + largest) * (1.0 + 1e-9)
+        for x in range(int(np.floor((a - out) * per)), int(np.floor((a + out) * per)) + 1):
+            for y in range(int(np.floor((b - out) * per)), int(np.floor((b + out) * per)) + 1):
+                for z in range(int(np.floor((c - out) * per)), int(np.floor((c + out) * per)) + 1):
+                    here = ((x & last) * side + (y & last)) * side + (z & last)
+                    begin, end = max(start[here], behind), start[here + 1]
+                    if found + end - begin > len(pairs):
+                        pairs = np.concatenate((pairs, np.empty((len(pairs) + end, 2), np.int64)))
+                    for k in range(begin, end):
+                        u, v, w = place[k, 0] - a, place[k, 1] - b, place[k, 2] - c
+                        most = (r + place[k, 3]) * (1.0 + 1e-12)
+                        if u * u + v * v + w * w <= most * most:
+                            pairs[found, 0], pairs[found, 1] = min(i, member[k]), max(i, member[k])
+                            found += 1
     return pairs[:found].copy()
 
 

@@ -28,7 +28,7 @@ class ImpulseMemory:
     def remember(self, key: Ints, impulse: Floats, frame: Floats) -> None:
         """Replace the memory by impulses (nc, 3) of contacts with keys (nc,) and frames (nc, 3, 3);
         collective."""
-        tangential = (impulse[:, None, 1:] @ frame[:, 1:])[:, 0]
+        tangential = impulse[:, 1:2] * frame[:, 1] + impulse[:, 2:] * frame[:, 2]
         self.restore(key, np.hstack([impulse[:, :1], tangential]))
 
     def recall(self, key: Ints, frame: Floats) -> tuple[Floats, Bools]:
@@ -46,7 +46,7 @@ class ImpulseMemory:
         answer = exchange(self._comm, answer, asked["rank"][known])
         stored, found = np.zeros((count, 4)), np.zeros(count, dtype=bool)
         stored[answer["row"]], found[answer["row"]] = answer["impulse"], True
-        tangential = (frame[:, 1:] @ stored[:, 1:, None])[:, :, 0]
+        tangential = np.einsum("cij,cj->ci", frame[:, 1:], stored[:, 1:])
         return np.hstack([stored[:, :1], tangential]), found
 
     def state(self) -> tuple[Ints, Floats]:
@@ -60,6 +60,8 @@ class ImpulseMemory:
         self._key, self._impulse = rows["key"][order], rows["impulse"][order]
 
     def _home(self, key: Ints) -> Ints:
+        if self._comm.size == 1:
+            return np.zeros(len(key), np.int64)
         # Fibonacci hashing: the low bits of keys are mostly zero and must not choose the rank.
         mixed = (key.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)
         return (mixed % np.uint64(self._comm.size)).astype(np.int64)

@@ -19,6 +19,11 @@ def cross(a: Floats, b: Floats) -> Floats:
     return out
 
 
+def length(v: Floats) -> Floats:
+    """Lengths (...,) of vectors (..., n); several times faster than `numpy.linalg.norm` on long arrays."""
+    return np.sqrt(np.einsum("...i,...i->...", v, v))
+
+
 def multiply(p: Floats, q: Floats) -> Floats:
     """Hamilton product (..., 4): the rotation `q` followed by the rotation `p`."""
     pw, pv = p[..., :1], p[..., 1:]
