@@ -71,6 +71,28 @@ def sum_of_impulses(frame, arm, row, impulse, count):
     return out
 
 
+@compiled
+def in_the_world(impulse, frame):
+    """`dem.impulses.in_the_world`."""
+    out = np.empty((len(frame), 4))
+    for c in range(len(frame)):
+        out[c, 0] = impulse[c, 0]
+        for k in range(3):
+            out[c, 1 + k] = impulse[c, 1] * frame[c, 1, k] + impulse[c, 2] * frame[c, 2, k]
+    return out
+
+
+@compiled
+def in_frames(stored, frame):
+    """`dem.impulses.in_frames`."""
+    out = np.empty((len(frame), 3))
+    for c in range(len(frame)):
+        out[c, 0] = stored[c, 0]
+        for i in range(1, 3):
+            out[c, i] = stored[c, 1] * frame[c, i, 0] + stored[c, 2] * frame[c, i, 1] + stored[c, 3] * frame[c, i, 2]
+    return out
+
+
 # -- the search --------------------------------------------------------------------------------------------------
 
 
@@ -110,26 +132,42 @@ def pairs_in_cells(center, radius, first, second, alike, reach):
 
     # Alike, the rows are taken in the order of their cells, each with those behind it: every pair comes once.
     rows = member if alike else first
-    pairs = np.empty((8 * len(first) + 8, 2), np.int64)
-    found = 0
-    for n in range(len(rows)):
-        i, behind = rows[n], n + 1 if alike else 0
+    pairs, found, done = np.empty((8 * len(first) + 8, 2), np.int64), 0, 0
+    while True:
+        done, found = _pairs_of_rows(
+            center, radius, rows, done, alike, largest, reach, per, side, start, place, member, pairs, found
+        )
+        if done == len(rows):
+            return pairs[:found].copy()
+        pairs = np.concatenate((pairs, np.empty((max(len(pairs), len(second)), 2), np.int64)))
+
+
+@compiled
+def _pairs_of_rows(center, radius, rows, done, alike, largest, reach, per, side, start, place, member, pairs, found):
+    """Add to the first pairs those of the rows that are not done, as long as there is room; new numbers of rows done
+    and pairs found. A loop that makes the room itself takes twice the time."""
+    last = side - 1
+    for n in range(done, len(rows)):
+        i, behind, before = rows[n], n + 1 if alike else 0, found
         a, b, c, r = center[i, 0], center[i, 1], center[i, 2], radius[i] + reach
         out = (r + largest) * (1.0 + 1e-9)
+        bottom, top = int(np.floor((c - out) * per)), int(np.floor((c + out) * per))
         for x in range(int(np.floor((a - out) * per)), int(np.floor((a + out) * per)) + 1):
             for y in range(int(np.floor((b - out) * per)), int(np.floor((b + out) * per)) + 1):
-                for z in range(int(np.floor((c - out) * per)), int(np.floor((c + out) * per)) + 1):
-                    here = ((x & last) * side + (y & last)) * side + (z & last)
-                    begin, end = max(start[here], behind), start[here + 1]
+                column, z = ((x & last) * side + (y & last)) * side, bottom
+                while z <= top:  # cells whose buckets follow each other at once
+                    until = min(z | last, top)
+                    begin, end = max(start[column + (z & last)], behind), start[column + (until & last) + 1]
+                    z = until + 1
                     if found + end - begin > len(pairs):
-                        pairs = np.concatenate((pairs, np.empty((len(pairs) + end, 2), np.int64)))
+                        return n, before
                     for k in range(begin, end):
                         u, v, w = place[k, 0] - a, place[k, 1] - b, place[k, 2] - c
                         most = (r + place[k, 3]) * (1.0 + 1e-12)
                         if u * u + v * v + w * w <= most * most:
                             pairs[found, 0], pairs[found, 1] = min(i, member[k]), max(i, member[k])
                             found += 1
-    return pairs[:found].copy()
+    return len(rows), found
 
 
 @compiled
@@ -189,3 +227,24 @@ def _shell_sort(rows, key):
                 place -= gap
             rows[place] = row
         gap //= 3
+
+
+# -- the motion --------------------------------------------------------------------------------------------------
+
+
+@compiled
+def integrate(quaternion, angular_velocity, dt):
+    """`dem.quaternion.integrate` of rows."""
+    out = np.empty((len(quaternion), 4))
+    for n in range(len(quaternion)):
+        x, y, z = dt * angular_velocity[n, 0], dt * angular_velocity[n, 1], dt * angular_velocity[n, 2]
+        angle = np.sqrt(x * x + y * y + z * z)
+        w = np.cos(0.5 * angle)
+        share = np.sin(0.5 * angle) / angle if angle > 0.0 else 0.5
+        x, y, z = share * x, share * y, share * z
+        a, b, c, d = quaternion[n, 0], quaternion[n, 1], quaternion[n, 2], quaternion[n, 3]
+        e, f = w * a - x * b - y * c - z * d, w * b + a * x + y * d - z * c
+        g, h = w * c + a * y + z * b - x * d, w * d + a * z + x * c - y * b
+        size = 1.0 / np.sqrt(e * e + f * f + g * g + h * h)
+        out[n, 0], out[n, 1], out[n, 2], out[n, 3] = size * e, size * f, size * g, size * h
+    return out

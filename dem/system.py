@@ -89,14 +89,14 @@ class ContactSystem:
         self._comm, self._slabs, self._large_row = world.comm, world.slabs, world.large_row
         self._near, self._body = near, contacts.body
         self._row = np.stack([contacts.a, contacts.b], axis=1)
-        self._arm = (self.point[:, None] - near.bodies.position[self._row]).reshape(-1, 6)
+        self._arm = (self.point[:, None] - near.bodies.position.take(self._row, axis=0)).reshape(-1, 6)
 
-        grains = near.grains + near.ghosts
-        self._owned = np.r_[: near.grains, grains : grains + world.owned - near.grains]
+        self._owned = np.arange(world.owned)
+        self._owned[near.grains :] += near.ghosts
         self._free_directions = free_directions(world.large_bodies)
         self._diagonal = world.only_spheres and not bodies.is_dynamic(world.large).any()
         free = free_velocities(world, near, dt)
-        self.free_velocity = free[self._owned]
+        self.free_velocity = free.take(self._owned, axis=0)
         self.b = np.zeros((len(contacts), 3))
         self.b[:, 0] = np.maximum(contacts.gap / dt, -recovery_speed)
         self.r = self.b + relative_velocity(self.frame, self._arm, self._row, free)
@@ -110,9 +110,10 @@ class ContactSystem:
     @cached_property
     def _root(self) -> Floats:
         """M^-1/2 of the bodies whose rows this rank owns, as in `CompactRows`."""
-        owned = self._near.bodies.take(self._owned)
         if self._diagonal:
-            return 1.0 / np.sqrt(np.column_stack([owned.mass, owned.mass, owned.mass, owned.inertia]))
+            mass, inertia = self._near.bodies.mass[self._owned], self._near.bodies.inertia[self._owned]
+            return 1.0 / np.sqrt(np.column_stack([mass, mass, mass, inertia]))
+        owned = self._near.bodies.take(self._owned)
         translation = np.eye(3) / np.sqrt(owned.mass)[:, None, None]
         guides = self._free_directions[: self.owned_bodies - self._near.grains]
         translation[self._near.grains :] = translation[self._near.grains :] @ guides

@@ -198,20 +198,27 @@ def _grains_beside_parts(
     count = alone.grains
     center, radius = table.center[:count], table.radius[:count]
     found = [_Beside(*(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0)))]
-    for part in range(count, len(table.number)):
-        offset = center - table.center[part]
-        if table.kind[part] == PLANE:
-            apart = offset @ table.size[part]
-        elif table.kind[part] == BOX:
-            local = offset @ quaternion.matrix(table.quaternion[part])
-            apart = length(np.maximum(np.abs(local) - table.size[part], 0.0))
-        else:
-            apart = length(offset) - table.radius[part]
-        margin = _part_margin(alone, table, np.array([part]), slice(count), delta, shift)
-        room = apart - radius - margin
-        rows = np.flatnonzero(room <= widest)
-        found.append(_Beside(rows, np.full(len(rows), part - count), np.broadcast_to(margin, count)[rows], room[rows]))
+    for body in np.unique(table.row[count:]):
+        margin = _part_margin(shift[[body - count]], alone.bodies.position[[body]], center, radius, delta)
+        beyond = margin + (1.0 + 1e-9) * radius  # where the rounding matters, the narrow phase is to decide
+        margin = np.broadcast_to(margin, count)
+        for part in count + np.flatnonzero(table.row[count:] == body):
+            room = _distance_at_least(table, part, center) - beyond
+            rows = np.flatnonzero(room <= widest)
+            found.append(_Beside(rows, np.full(len(rows), part - count), margin[rows], room[rows]))
     return _Beside(*(np.concatenate(columns) for columns in zip(*found)))
+
+
+def _distance_at_least(table: Primitives, part: int, points: Floats) -> Floats:
+    """A lower bound of the distances (m,) of points (m, 3) from the surface of a part [m]; of planes and boxes the
+    distance itself, as far as it is positive."""
+    place, size = table.center[part], table.size[part]
+    if table.kind[part] == PLANE:
+        return points @ size - place @ size
+    offset = points - place
+    if table.kind[part] == BOX:
+        return length(np.maximum(np.abs(offset @ quaternion.matrix(table.quaternion[part])) - size, 0.0))
+    return length(offset) - table.radius[part]
 
 
 def _large_pairs(
@@ -226,22 +233,23 @@ def _large_pairs(
     i, j = first + i[touch], first + j[touch]
     # Two half spaces never touch: the first is to be the one that has a centre.
     i, j = np.where(table.kind[i] == PLANE, j, i), np.where(table.kind[i] == PLANE, i, j)
-    margins = [_part_margin(near, table, part, i, delta, shift) for part in (i, j)]
+    at = table.center[i], table.radius[i]
+    rows = [table.row[part] for part in (i, j)]
+    margins = [_part_margin(shift[row - first], near.bodies.position[row], *at, delta) for row in rows]
     return np.stack([i, j], axis=1), margins[0] + margins[1]
 
 
-def _part_margin(
-    near: Neighbourhood, table: Primitives, part: Ints, other: Ints | slice, delta: float, shift: Floats
-) -> Floats:
-    """Margins of parts of large bodies at the surfaces of the primitives `other` (m,) [m]; `part` (m,), or (1,) of one
-    for all, and then the result may be so."""
-    row = table.row[part]
-    body_shift = shift[row - near.grains - near.ghosts]
-    move, turn = body_shift[:, :3], body_shift[:, 3:]
+def _part_margin(shift: Floats, pivot: Floats, center: Floats, radius: Floats, delta: float) -> Floats:
+    """Margins (m,) of the parts of large bodies that move by the first three and turn about the pivots (m, 3) by the last
+    of `shift` (m, 6), at the surfaces of primitives of centres (m, 3) and radii (m,) [m].
+
+    Of one body, with (1, 6) and (1, 3), a single margin (1,) if that is the same everywhere.
+    """
+    move, turn = shift[:, :3], shift[:, 3:]
     if not turn.any():
         return np.maximum(delta / 2, length(move))
-    at_center = move + cross(turn, table.center[other] - near.bodies.position[row])
-    return np.maximum(delta / 2, length(at_center) + table.radius[other] * length(turn))
+    way = length(move + cross(turn, center - pivot)) + radius * length(turn)
+    return np.maximum(delta / 2, way)
 
 
 def _gives_way(world: World, near: Neighbourhood, a: Ints, b: Ints, normal: Floats) -> np.ndarray:
