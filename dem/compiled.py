@@ -32,9 +32,19 @@ def contact_frames(normal):
 
 
 @compiled
+def contact_arms(point, position, row):
+    """`dem.system.contact_arms`."""
+    arm = np.empty((len(point), 6))
+    for c in range(len(point)):
+        a, b = row[c, 0], row[c, 1]
+        for k in range(3):
+            arm[c, k], arm[c, 3 + k] = point[c, k] - position[a, k], point[c, k] - position[b, k]
+    return arm
+
+
+@compiled
 def relative_velocity(frame, arm, row, velocity):
-    """Velocities (nc, 3), in the contact frames, of the second bodies relative to the first at the contact points;
-    of bodies with velocities (rows, 6)."""
+    """`dem.system.relative_velocity`."""
     out = np.empty((len(frame), 3))
     for c in range(len(frame)):
         v, w, r = velocity[row[c, 0]], velocity[row[c, 1]], arm[c]
@@ -48,7 +58,7 @@ def relative_velocity(frame, arm, row, velocity):
 
 @compiled
 def sum_of_impulses(frame, arm, row, impulse, count):
-    """Impulses and angular impulses (count, 6) on the bodies of `count` rows, from those of the contacts (nc, 3)."""
+    """`dem.system.sum_of_impulses`."""
     out = np.zeros((count, 6))
     for c in range(len(frame)):
         n, s, t = impulse[c, 0], impulse[c, 1], impulse[c, 2]

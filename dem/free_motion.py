@@ -25,10 +25,10 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
     Rows of bodies with prescribed motion come back as they are.
     """
     velocity = table.velocity.copy()
-    rows = np.flatnonzero(bodies.is_dynamic(table))
-    velocity[rows, :3] += dt * gravity
+    dynamic = bodies.is_dynamic(table)
+    velocity[:, :3] += np.outer(dynamic, dt * gravity)
     # The torque vanishes where all moments are equal, as for spheres.
-    rows = rows[table.shape[rows] != SPHERE]
+    rows = np.flatnonzero(dynamic & (table.shape != SPHERE))
     if not len(rows):
         return velocity
     rows = rows[np.isfinite(table.inertia[rows]).all(axis=1)]  # guided bodies do not turn
