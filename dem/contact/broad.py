@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import ModuleType
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,16 +20,20 @@ def close_pairs(position: Floats, radius: Floats, reach: float) -> Ints:
     """
     level = np.frexp(radius)[1]
     classes = [np.flatnonzero(level == size) for size in np.unique(level)]
-    pairs = _pairs_in_cells if loops() else _pairs_of_trees
-    return np.concatenate([np.zeros((0, 2), np.int64), *pairs(position, radius, classes, reach)])
+    if compiled := loops():
+        pairs = _pairs_in_cells(compiled, np.ascontiguousarray(position), radius, classes, float(reach))
+    else:
+        pairs = _pairs_of_trees(position, radius, classes, reach)
+    return np.concatenate([np.zeros((0, 2), np.int64), *pairs])
 
 
-def _pairs_in_cells(position: Floats, radius: Floats, classes: list[Ints], reach: float) -> Iterator[Ints]:
-    compiled, position = loops(), np.ascontiguousarray(position)
+def _pairs_in_cells(
+    compiled: ModuleType, position: Floats, radius: Floats, classes: list[Ints], reach: float
+) -> Iterator[Ints]:
     for k, rows in enumerate(classes):
         for others in classes[k:]:
             few, many = sorted((rows, others), key=len)
-            yield compiled.pairs_in_cells(position, radius, few, many, others is rows, float(reach))
+            yield compiled.pairs_in_cells(position, radius, few, many, others is rows, reach)
 
 
 def _pairs_of_trees(position: Floats, radius: Floats, classes: list[Ints], reach: float) -> Iterator[Ints]:

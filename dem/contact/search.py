@@ -153,7 +153,7 @@ class _Beside(NamedTuple):
     grain: Ints  #: (m,) row of the grain
     part: Ints  #: (m,) number of the part
     margin: Floats  #: (m,) of the part there [m]
-    room: Floats  #: (m,) between the grain and the margin of the part, at least: where the grain's is wider, they meet [m]
+    room: Floats  #: (m,) at least, between the grain and the margin of the part: a grain's wider margin meets that [m]
 
     def within(self, margin: Floats) -> _Beside:
         """Those for which the margins (grains,) of the grains suffice."""
@@ -166,6 +166,7 @@ class _Beside(NamedTuple):
 def _margins_of_struck(table: Primitives, margin: Floats, beside: _Beside, widest: Floats) -> Floats:
     """The margins (grains,) of the grains, those in reach of a large body at least as wide as its own there."""
     close = beside.within(margin)
+    close = close.take(close.margin > margin[close.grain])
     parts = len(margin) + close.part
     struck = close.take(touches(table, close.grain, parts, margin[close.grain] + close.margin).pair)
     margin = margin.copy()
@@ -240,8 +241,8 @@ def _large_pairs(
 
 
 def _part_margin(shift: Floats, pivot: Floats, center: Floats, radius: Floats, delta: float) -> Floats:
-    """Margins (m,) of the parts of large bodies that move by the first three and turn about the pivots (m, 3) by the last
-    of `shift` (m, 6), at the surfaces of primitives of centres (m, 3) and radii (m,) [m].
+    """Margins (m,) of the parts of large bodies at the surfaces of primitives of centres (m, 3) and radii (m,) [m]. The
+    bodies move and turn, about the pivots (m, 3), by `shift` (m, 6).
 
     Of one body, with (1, 6) and (1, 3), a single margin (1,) if that is the same everywhere.
     """
@@ -253,8 +254,8 @@ def _part_margin(shift: Floats, pivot: Floats, center: Floats, radius: Floats, d
 
 
 def _gives_way(world: World, near: Neighbourhood, a: Ints, b: Ints, normal: Floats) -> np.ndarray:
-    """Which contacts (nc,) of bodies in the rows a, b (nc,) a force can open: not those of a guided body with what holds
-    it across its guide.
+    """Which contacts (nc,) of bodies in the rows a, b (nc,) a force can open: not those of a guided body with what
+    holds it across its guide.
 
     Their normal impulse would change no velocity, and any friction with it.
     """
