@@ -78,7 +78,9 @@ def bounding_radius(bodies: Bodies) -> Floats:
 
 def enclosing_radius(kind: Ints, size: Floats) -> Floats:
     """Radius (n,) of the sphere about the centre that encloses a shape of kind (n,) and size (n, 3) [m]."""
-    return np.where(kind == CAPSULE, size.sum(axis=1), np.linalg.norm(size, axis=1))
+    radius, capsules = quaternion.length(size), np.flatnonzero(kind == CAPSULE)
+    radius[capsules] = size[capsules].sum(axis=1)
+    return radius
 
 
 def least_half_thickness(bodies: Bodies) -> Floats:

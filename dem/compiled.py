@@ -32,9 +32,19 @@ def contact_frames(normal):
 
 
 @compiled
+def contact_arms(point, position, row):
+    """`dem.system.contact_arms`."""
+    arm = np.empty((len(point), 6))
+    for c in range(len(point)):
+        a, b = row[c, 0], row[c, 1]
+        for k in range(3):
+            arm[c, k], arm[c, 3 + k] = point[c, k] - position[a, k], point[c, k] - position[b, k]
+    return arm
+
+
+@compiled
 def relative_velocity(frame, arm, row, velocity):
-    """Velocities (nc, 3), in the contact frames, of the second bodies relative to the first at the contact points;
-    of bodies with velocities (rows, 6)."""
+    """`dem.system.relative_velocity`."""
     out = np.empty((len(frame), 3))
     for c in range(len(frame)):
         v, w, r = velocity[row[c, 0]], velocity[row[c, 1]], arm[c]
@@ -48,7 +58,7 @@ def relative_velocity(frame, arm, row, velocity):
 
 @compiled
 def sum_of_impulses(frame, arm, row, impulse, count):
-    """Impulses and angular impulses (count, 6) on the bodies of `count` rows, from those of the contacts (nc, 3)."""
+    """`dem.system.sum_of_impulses`."""
     out = np.zeros((count, 6))
     for c in range(len(frame)):
         n, s, t = impulse[c, 0], impulse[c, 1], impulse[c, 2]
@@ -71,66 +81,103 @@ def sum_of_impulses(frame, arm, row, impulse, count):
     return out
 
 
+@compiled
+def in_the_world(impulse, frame):
+    """`dem.impulses.in_the_world`."""
+    out = np.empty((len(frame), 4))
+    for c in range(len(frame)):
+        out[c, 0] = impulse[c, 0]
+        for k in range(3):
+            out[c, 1 + k] = impulse[c, 1] * frame[c, 1, k] + impulse[c, 2] * frame[c, 2, k]
+    return out
+
+
+@compiled
+def in_frames(stored, frame):
+    """`dem.impulses.in_frames`."""
+    out = np.empty((len(frame), 3))
+    for c in range(len(frame)):
+        out[c, 0] = stored[c, 0]
+        for i in range(1, 3):
+            out[c, i] = stored[c, 1] * frame[c, i, 0] + stored[c, 2] * frame[c, i, 1] + stored[c, 3] * frame[c, i, 2]
+    return out
+
+
 # -- the search --------------------------------------------------------------------------------------------------
 
 
 @compiled
-def _cell(center, width):
-    return int(np.floor(center[0] / width)), int(np.floor(center[1] / width)), int(np.floor(center[2] / width))
-
-
-@compiled
-def _bucket(x, y, z, buckets):
-    return (x * 73856093 ^ y * 19349663 ^ z * 83492791) & (buckets - 1)
-
-
-@compiled
-def pairs_in_cells(center, radius, first, second, alike, width, reach):
+def pairs_in_cells(center, radius, first, second, alike, reach):
     """Pairs (m, 2), the lower row first, of a sphere of the rows `first` and one of the rows `second` that come within
     `reach`, or within rounding of it.
 
-    first, second: the same rows if `alike`, else without common ones. width: of the cells into which those of `second` are
-    sorted, no less than the distance of the centres of any pair. Cells share the buckets of a hash table, so that a
-    sphere far away costs nothing.
+    first, second: the same rows if `alike`, else without common ones. Those of `second` are sorted into cubic cells, so
+    wide that a pair is at most one cell apart. Cells share a cube of buckets, so that a sphere far away costs nothing;
+    four buckets a side are enough to tell neighbours apart.
     """
-    buckets = 1
-    while buckets < 2 * len(second):
-        buckets *= 2
-    cell = np.empty((len(second), 3), np.int64)
-    start = np.zeros(buckets + 1, np.int64)
+    largest = 0.0
+    for row in second:
+        largest = max(largest, radius[row])
+    width = largest + reach
+    for row in first:
+        width = max(width, (radius[row] + largest + reach) * (1.0 + 1e-6))
+    per = 1.0 / width
+    side = 4
+    while side * side * side < len(second):
+        side *= 2
+    last = side - 1
+    bucket, start = np.empty(len(second), np.int64), np.zeros(side * side * side + 1, np.int64)
     for k in range(len(second)):
-        x, y, z = _cell(center[second[k]], width)
-        cell[k, 0], cell[k, 1], cell[k, 2] = x, y, z
-        start[_bucket(x, y, z, buckets) + 1] += 1
-    for k in range(buckets):
+        x, y, z = center[second[k], 0] * per, center[second[k], 1] * per, center[second[k], 2] * per
+        bucket[k] = ((int(np.floor(x)) & last) * side + (int(np.floor(y)) & last)) * side + (int(np.floor(z)) & last)
+        start[bucket[k] + 1] += 1
+    for k in range(len(start) - 1):
         start[k + 1] += start[k]
-    free = start[:-1].copy()
-    member = np.empty(len(second), np.int64)
+    member, place, free = np.empty(len(second), np.int64), np.empty((len(second), 4)), start[:-1].copy()
     for k in range(len(second)):
-        bucket = _bucket(cell[k, 0], cell[k, 1], cell[k, 2], buckets)
-        member[free[bucket]] = k
-        free[bucket] += 1
+        to = free[bucket[k]]
+        free[bucket[k]] += 1
+        member[to], place[to, 3] = second[k], radius[second[k]]
+        place[to, 0], place[to, 1], place[to, 2] = center[second[k], 0], center[second[k], 1], center[second[k], 2]
 
-    pairs = np.empty((8 * len(first) + 8, 2), np.int64)
-    found = 0
-    for i in first:
-        here = _cell(center[i], width)
-        for step in range(27):
-            x, y, z = here[0] + step // 9 - 1, here[1] + step // 3 % 3 - 1, here[2] + step % 3 - 1
-            bucket = _bucket(x, y, z, buckets)
-            for place in range(start[bucket], start[bucket + 1]):
-                k = member[place]
-                j = second[k]
-                if cell[k, 0] != x or cell[k, 1] != y or cell[k, 2] != z or (alike and j <= i):
-                    continue
-                dx, dy, dz = center[j, 0] - center[i, 0], center[j, 1] - center[i, 1], center[j, 2] - center[i, 2]
-                most = (radius[i] + radius[j] + reach) * (1.0 + 1e-12)
-                if dx * dx + dy * dy + dz * dz <= most * most:
-                    if found == len(pairs):
-                        pairs = np.concatenate((pairs, np.empty_like(pairs)))
-                    pairs[found, 0], pairs[found, 1] = min(i, j), max(i, j)
-                    found += 1
-    return pairs[:found].copy()
+    # Alike, the rows are taken in the order of their cells, each with those behind it: every pair comes once.
+    rows = member if alike else first
+    pairs, found, done = np.empty((8 * len(first) + 8, 2), np.int64), 0, 0
+    while True:
+        done, found = _pairs_of_rows(
+            center, radius, rows, done, alike, largest, reach, per, side, start, place, member, pairs, found
+        )
+        if done == len(rows):
+            return pairs[:found].copy()
+        pairs = np.concatenate((pairs, np.empty((max(len(pairs), len(second)), 2), np.int64)))
+
+
+@compiled
+def _pairs_of_rows(center, radius, rows, done, alike, largest, reach, per, side, start, place, member, pairs, found):
+    """Add to the first pairs those of the rows that are not done, as long as there is room; new numbers of rows done
+    and pairs found. A loop that makes the room itself takes twice the time."""
+    last = side - 1
+    for n in range(done, len(rows)):
+        i, behind, before = rows[n], n + 1 if alike else 0, found
+        a, b, c, r = center[i, 0], center[i, 1], center[i, 2], radius[i] + reach
+        out = (r + largest) * (1.0 + 1e-9)
+        bottom, top = int(np.floor((c - out) * per)), int(np.floor((c + out) * per))
+        for x in range(int(np.floor((a - out) * per)), int(np.floor((a + out) * per)) + 1):
+            for y in range(int(np.floor((b - out) * per)), int(np.floor((b + out) * per)) + 1):
+                column, z = ((x & last) * side + (y & last)) * side, bottom
+                while z <= top:  # cells whose buckets follow each other at once
+                    until = min(z | last, top)
+                    begin, end = max(start[column + (z & last)], behind), start[column + (until & last) + 1]
+                    z = until + 1
+                    if found + end - begin > len(pairs):
+                        return n, before
+                    for k in range(begin, end):
+                        u, v, w = place[k, 0] - a, place[k, 1] - b, place[k, 2] - c
+                        most = (r + place[k, 3]) * (1.0 + 1e-12)
+                        if u * u + v * v + w * w <= most * most:
+                            pairs[found, 0], pairs[found, 1] = min(i, member[k]), max(i, member[k])
+                            found += 1
+    return len(rows), found
 
 
 @compiled
@@ -190,3 +237,24 @@ def _shell_sort(rows, key):
                 place -= gap
             rows[place] = row
         gap //= 3
+
+
+# -- the motion --------------------------------------------------------------------------------------------------
+
+
+@compiled
+def integrate(quaternion, angular_velocity, dt):
+    """`dem.quaternion.integrate` of rows."""
+    out = np.empty((len(quaternion), 4))
+    for n in range(len(quaternion)):
+        x, y, z = dt * angular_velocity[n, 0], dt * angular_velocity[n, 1], dt * angular_velocity[n, 2]
+        angle = np.sqrt(x * x + y * y + z * z)
+        w = np.cos(0.5 * angle)
+        share = np.sin(0.5 * angle) / angle if angle > 0.0 else 0.5
+        x, y, z = share * x, share * y, share * z
+        a, b, c, d = quaternion[n, 0], quaternion[n, 1], quaternion[n, 2], quaternion[n, 3]
+        e, f = w * a - x * b - y * c - z * d, w * b + a * x + y * d - z * c
+        g, h = w * c + a * y + z * b - x * d, w * d + a * z + x * c - y * b
+        size = 1.0 / np.sqrt(e * e + f * f + g * g + h * h)
+        out[n, 0], out[n, 1], out[n, 2], out[n, 3] = size * e, size * f, size * g, size * h
+    return out

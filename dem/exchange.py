@@ -16,9 +16,9 @@ def exchange(comm: MPI.Comm, columns: Mapping[str, np.ndarray], destination: Int
     columns: arrays (n, ...) of the same names, types and trailing shapes on every rank; destination: (n,).
     Rows arrive in the order of the sending ranks and, from one rank, in the order sent.
     """
-    order = np.argsort(destination, kind="stable")
     if comm.size == 1:
-        return {name: column[order] for name, column in columns.items()}
+        return dict(columns)
+    order = np.argsort(destination, kind="stable")
     # All columns travel as one message: each row is the bytes of its entries side by side.
     packed = np.concatenate([_as_bytes(column) for column in columns.values()], axis=1)[order]
     send = np.bincount(destination, minlength=comm.size)

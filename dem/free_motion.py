@@ -9,7 +9,7 @@ import numpy as np
 
 from dem import bodies, quaternion
 from dem.arrays import Floats
-from dem.bodies import Bodies
+from dem.bodies import SPHERE, Bodies
 from dem.motion import Dynamic
 from dem.quaternion import cross
 
@@ -25,9 +25,12 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
     Rows of bodies with prescribed motion come back as they are.
     """
     velocity = table.velocity.copy()
-    rows = np.flatnonzero(bodies.is_dynamic(table))
-    velocity[rows, :3] += dt * gravity
+    dynamic = bodies.is_dynamic(table)
+    velocity[:, :3] += np.outer(dynamic, dt * gravity)
     # The torque vanishes where all moments are equal, as for spheres.
+    rows = np.flatnonzero(dynamic & (table.shape != SPHERE))
+    if not len(rows):
+        return velocity
     rows = rows[np.isfinite(table.inertia[rows]).all(axis=1)]  # guided bodies do not turn
     rows = rows[np.ptp(table.inertia[rows], axis=1) > 0.0]
     turn, moments = table.quaternion[rows], table.inertia[rows]

@@ -11,6 +11,22 @@ from mpi4py import MPI
 
 from dem.arrays import Bools, Floats, Ints
 from dem.exchange import exchange
+from dem.loops import loops
+
+
+def in_the_world(impulse: Floats, frame: Floats) -> Floats:
+    """Normal impulses and tangential vectors in the world (nc, 4), of impulses (nc, 3) in frames (nc, 3, 3)."""
+    if compiled := loops():
+        return compiled.in_the_world(np.ascontiguousarray(impulse, dtype=np.float64), np.ascontiguousarray(frame))
+    tangential = impulse[:, 1:2] * frame[:, 1] + impulse[:, 2:] * frame[:, 2]
+    return np.hstack([impulse[:, :1], tangential])
+
+
+def in_frames(stored: Floats, frame: Floats) -> Floats:
+    """Impulses (nc, 3) in frames (nc, 3, 3) of what `in_the_world` returns (nc, 4), without what is normal to these."""
+    if compiled := loops():
+        return compiled.in_frames(stored, np.ascontiguousarray(frame))
+    return np.hstack([stored[:, :1], np.einsum("cij,cj->ci", frame[:, 1:], stored[:, 1:])])
 
 
 class ImpulseMemory:
@@ -28,8 +44,7 @@ class ImpulseMemory:
     def remember(self, key: Ints, impulse: Floats, frame: Floats) -> None:
         """Replace the memory by impulses (nc, 3) of contacts with keys (nc,) and frames (nc, 3, 3);
         collective."""
-        tangential = (impulse[:, None, 1:] @ frame[:, 1:])[:, 0]
-        self.restore(key, np.hstack([impulse[:, :1], tangential]))
+        self.restore(key, in_the_world(impulse, frame))
 
     def recall(self, key: Ints, frame: Floats) -> tuple[Floats, Bools]:
         """Impulses (nc, 3) in the given frames (nc, 3, 3), zero where unknown, and the mask (nc,) of those
@@ -42,12 +57,11 @@ class ImpulseMemory:
         place = np.searchsorted(self._key, asked["key"])
         known = place < len(self._key)
         known[known] = self._key[place[known]] == asked["key"][known]
-        answer = {"row": asked["row"][known], "impulse": self._impulse[place[known]]}
+        answer = {"row": asked["row"][known], "impulse": self._impulse.take(place[known], axis=0)}
         answer = exchange(self._comm, answer, asked["rank"][known])
         stored, found = np.zeros((count, 4)), np.zeros(count, dtype=bool)
         stored[answer["row"]], found[answer["row"]] = answer["impulse"], True
-        tangential = (frame[:, 1:] @ stored[:, 1:, None])[:, :, 0]
-        return np.hstack([stored[:, :1], tangential]), found
+        return in_frames(stored, frame), found
 
     def state(self) -> tuple[Ints, Floats]:
         """Keys (n,) and impulses (n, 4) (normal, tangential vector) that this rank stores, for `restore`."""
@@ -57,9 +71,11 @@ class ImpulseMemory:
         """Replace the memory by rows of `state`, distributed in any way; collective."""
         rows = exchange(self._comm, {"key": key, "impulse": stored}, self._home(key))
         order = np.argsort(rows["key"])
-        self._key, self._impulse = rows["key"][order], rows["impulse"][order]
+        self._key, self._impulse = rows["key"][order], rows["impulse"].take(order, axis=0)
 
     def _home(self, key: Ints) -> Ints:
+        if self._comm.size == 1:
+            return np.zeros(len(key), np.int64)
         # Fibonacci hashing: the low bits of keys are mostly zero and must not choose the rank.
         mixed = (key.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)
         return (mixed % np.uint64(self._comm.size)).astype(np.int64)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from types import ModuleType
-from typing import Optional
 
 
-@lru_cache(maxsize=None)
-def loops() -> Optional[ModuleType]:
+@cache
+def loops() -> ModuleType | None:
     """The module `dem.compiled`, or None without numba, or where numba can keep nothing: then the numpy code beside
     each caller does the same, to rounding."""
     try:

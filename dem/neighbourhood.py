@@ -78,17 +78,16 @@ def _chunk_boxes(position: Floats, radius: Floats) -> Floats:
         boxes[:] = np.nan  # seen by every rank, so that all of them stop
         return boxes
     cuts = np.linspace(0, len(position), BOXES + 1).astype(int)
-    for box, start, stop in zip(boxes, cuts[:-1], cuts[1:]):
-        if start < stop:
-            box[0] = (position[start:stop] - radius[start:stop, None]).min(axis=0)
-            box[1] = (position[start:stop] + radius[start:stop, None]).max(axis=0)
+    some = cuts[:-1] < cuts[1:]
+    boxes[some, 0] = np.minimum.reduceat(position - radius[:, None], cuts[:-1][some], axis=0)
+    boxes[some, 1] = np.maximum.reduceat(position + radius[:, None], cuts[:-1][some], axis=0)
     return boxes
 
 
 def _touched(position: Floats, radius: Floats, boxes: Floats) -> tuple[Ints, Ints]:
     """Pairs (row, rank) of the balls that touch a box of a rank; boxes (ranks, BOXES, 2, 3)."""
     rows, ranks = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    if len(position):
+    if len(position) and len(boxes):
         low, high = (position - radius[:, None]).min(axis=0), (position + radius[:, None]).max(axis=0)
         for rank, theirs in enumerate(boxes):
             near = theirs[((theirs[:, 0] <= high) & (theirs[:, 1] >= low)).all(axis=1)]

@@ -113,7 +113,8 @@ def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
 
 def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:
     """Kinetic and potential energy [J] of the bodies of a table that forces can move, the latter zero at the origin."""
-    table = table.take(bodies.is_dynamic(table))
+    dynamic = bodies.is_dynamic(table)
+    table = table if dynamic.all() else table.take(dynamic)
     spin = quaternion.rotate(quaternion.conjugate(table.quaternion), table.velocity[:, 3:])
     turns = np.isfinite(table.inertia)  # guided bodies do not
     rotational = np.where(turns, table.inertia, 0.0) * spin**2

@@ -89,14 +89,14 @@ class ContactSystem:
         self._comm, self._slabs, self._large_row = world.comm, world.slabs, world.large_row
         self._near, self._body = near, contacts.body
         self._row = np.stack([contacts.a, contacts.b], axis=1)
-        self._arm = (self.point[:, None] - near.bodies.position[self._row]).reshape(-1, 6)
+        self._arm = contact_arms(self.point, near.bodies.position, self._row)
 
-        grains = near.grains + near.ghosts
-        self._owned = np.r_[: near.grains, grains : grains + world.owned - near.grains]
+        self._owned = np.arange(world.owned)
+        self._owned[near.grains :] += near.ghosts
         self._free_directions = free_directions(world.large_bodies)
         self._diagonal = world.only_spheres and not bodies.is_dynamic(world.large).any()
         free = free_velocities(world, near, dt)
-        self.free_velocity = free[self._owned]
+        self.free_velocity = free.take(self._owned, axis=0)
         self.b = np.zeros((len(contacts), 3))
         self.b[:, 0] = np.maximum(contacts.gap / dt, -recovery_speed)
         self.r = self.b + relative_velocity(self.frame, self._arm, self._row, free)
@@ -110,9 +110,10 @@ class ContactSystem:
     @cached_property
     def _root(self) -> Floats:
         """M^-1/2 of the bodies whose rows this rank owns, as in `CompactRows`."""
-        owned = self._near.bodies.take(self._owned)
         if self._diagonal:
-            return 1.0 / np.sqrt(np.column_stack([owned.mass, owned.mass, owned.mass, owned.inertia]))
+            mass, inertia = self._near.bodies.mass[self._owned], self._near.bodies.inertia[self._owned]
+            return 1.0 / np.sqrt(np.column_stack([mass, mass, mass, inertia]))
+        owned = self._near.bodies.take(self._owned)
         translation = np.eye(3) / np.sqrt(owned.mass)[:, None, None]
         guides = self._free_directions[: self.owned_bodies - self._near.grains]
         translation[self._near.grains :] = translation[self._near.grains :] @ guides
@@ -191,7 +192,9 @@ class ContactSystem:
         index = near.index[ghosts]
         owner = np.searchsorted(self._slabs, index, side="right") - 1
         home = exchange(self._comm, {"row": index - self._slabs[owner], "load": load[ghosts]}, owner)
-        local = load[: near.grains] + sum_rows(home["row"], home["load"], near.grains)
+        local = load[: near.grains]
+        if len(home["row"]):
+            local = local + sum_rows(home["row"], home["load"], near.grains)
         large = load[ghosts.stop :].copy()
         self._comm.Allreduce(MPI.IN_PLACE, large)
         return local, large
@@ -214,6 +217,14 @@ def contact_frames(normal: Floats) -> Floats:
     frame[:, 1, 0], frame[:, 1, 1], frame[:, 1, 2] = 1.0 + sign * x * x * p, sign * q, -sign * x
     frame[:, 2, 0], frame[:, 2, 1], frame[:, 2, 2] = q, sign + y * y * p, -y
     return frame
+
+
+def contact_arms(point: Floats, position: Floats, row: Ints) -> Floats:
+    """Vectors (nc, 6) from the centres of the two bodies of each contact to its point (nc, 3); `row` (nc, 2) are the
+    bodies' rows in a table of positions (rows, 3)."""
+    if compiled := loops():
+        return compiled.contact_arms(point, position, row)
+    return (point[:, None] - position[row]).reshape(-1, 6)
 
 
 def relative_velocity(frame: Floats, arm: Floats, row: Ints, velocity: Floats) -> Floats:

@@ -38,6 +38,10 @@ class World:
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
     only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
 
+    _followed: tuple[tuple[float, float], dict[int, Floats]] = field(
+        init=False, repr=False, default_factory=lambda: ((np.nan, np.nan), {})
+    )  #: time and dt [s] of the last question for the velocities of prescribed motions, and the answer
+
     def __post_init__(self) -> None:
         self.set_grains(self.grains)
 
@@ -117,15 +121,20 @@ class World:
     def prescribed_velocity(self, dt: float) -> Floats:
         """Velocities (large bodies, 6) over the next step of `dt` [s]; dynamic bodies keep theirs; collective.
         SceneError if a motion fails."""
+        if self._followed[0] != (self.time, dt):  # a step asks several times
+            self._followed = (self.time, dt), together(self.comm, "motion of a large body", lambda: self._follow(dt))
         velocity = self.large.velocity.copy()
-
-        def follow() -> None:
-            for row, body in enumerate(self.large_bodies):
-                if not isinstance(body.motion, Dynamic):
-                    velocity[row] = mean_velocity(body.motion, self.time, dt, body.position, body.quaternion)
-
-        together(self.comm, "motion of a large body", follow)
+        for row, mean in self._followed[1].items():
+            velocity[row] = mean
         return velocity
+
+    def _follow(self, dt: float) -> dict[int, Floats]:
+        """The mean velocities (6,) of the bodies of prescribed motion over the next step, by row."""
+        return {
+            row: mean_velocity(body.motion, self.time, dt, body.position, body.quaternion)
+            for row, body in enumerate(self.large_bodies)
+            if not isinstance(body.motion, Dynamic)
+        }
 
 
 def restart_rows(slabs: Ints, comm: MPI.Comm) -> slice:

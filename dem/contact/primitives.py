@@ -23,6 +23,7 @@ from dem.contact.narrow import (
     sphere_plane,
     sphere_sphere,
 )
+from dem.loops import loops
 from dem.neighbourhood import Neighbourhood
 from dem.shapes import Box, Plane, Shape, Sphere
 
@@ -135,6 +136,13 @@ def _single(touch: Touch, delta: Floats) -> Manifold:
     return Manifold(pair, np.zeros_like(pair), Touch(*(values[pair] for values in touch)))
 
 
+def _spheres(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
+    if compiled := loops():
+        pair, *touch = compiled.sphere_sphere(table.center, table.size, i, j, delta)
+        return Manifold(pair, np.zeros_like(pair), Touch(*touch))
+    return _single(sphere_sphere(*table.sphere(i), *table.sphere(j)), delta)
+
+
 def _box_plane(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     corner = np.tile(np.arange(len(CORNERS)), len(i))
     pair = np.repeat(np.arange(len(i)), len(CORNERS))
@@ -143,7 +151,7 @@ def _box_plane(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
 
 
 _TOUCH: dict[tuple[int, int], Callable[[Primitives, Ints, Ints, Floats], Manifold]] = {
-    (SPHERE, SPHERE): lambda t, i, j, delta: _single(sphere_sphere(*t.sphere(i), *t.sphere(j)), delta),
+    (SPHERE, SPHERE): _spheres,
     (SPHERE, BOX): lambda t, i, j, delta: _single(sphere_box(*t.sphere(i), *t.box(j)), delta),
     (SPHERE, CAPSULE): lambda t, i, j, delta: _single(sphere_capsule(*t.sphere(i), *t.capsule(j)), delta),
     (SPHERE, PLANE): lambda t, i, j, delta: _single(sphere_plane(*t.sphere(i), *t.plane(j)), delta),

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies
+from dem import bodies, quaternion
 from dem.arrays import Floats, Ints
-from dem.bodies import SPHERE, Bodies
+from dem.bodies import BOX, SPHERE, Bodies
 from dem.checks import not_negative
 from dem.contact.broad import close_pairs
-from dem.contact.narrow import Touch, dot
 from dem.contact.primitives import FEATURES, PLANE, Primitives, primitives, touches
 from dem.free_motion import free_velocity, large_free_velocity
+from dem.loops import loops
 from dem.motion import Dynamic
 from dem.neighbourhood import Neighbourhood, neighbourhood, without_ghosts
-from dem.quaternion import cross
+from dem.quaternion import cross, length
 
 if TYPE_CHECKING:
     from dem.world import World
@@ -30,7 +30,8 @@ WIDEST = 2.0
 
 @dataclass(frozen=True)
 class Contacts:
-    """The contacts of this rank, ordered by the row of the body that owns them and then by key."""
+    """The contacts of this rank: first those that need no other rank, as it owns both bodies or their motion is
+    prescribed, then the others; each part ordered by the row of the body that owns the contact and then by key."""
 
     key: Ints  #: (nc,) the same for the same two shapes and feature at all times and on any number of ranks
     a: Ints  #: (nc,) row of the first body in `near.bodies`, the one of lower id
@@ -62,16 +63,20 @@ def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | 
     are left in `world.grains.weight`.
     """
     not_negative("contact distance delta", delta)
-    shapes = [body.shapes for body in world.large_bodies]
+    shapes, total = [body.shapes for body in world.large_bodies], int(world.slabs[-1])
     shift = dt * large_free_velocity(world, dt) if dt else np.zeros_like(world.large.velocity)
     way = _way(world.grains, free_velocity(world.grains, world.gravity, dt), dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
+    alone = without_ghosts(world, margin)
+    table = primitives(alone, shapes, total)
+    widest = np.maximum(margin, WIDEST * table.radius[: len(margin)])
+    beside = _grains_beside_parts(alone, table, delta, shift, widest)
     if dt:
-        alone = without_ghosts(world, margin)
-        margin = _margins_of_struck(alone, primitives(alone, shapes, int(world.slabs[-1])), delta, shift)
+        margin = _margins_of_struck(table, margin, beside, widest)
     near = neighbourhood(world, margin)
-    table = primitives(near, shapes, int(world.slabs[-1]))
-    found = [_grain_pairs(near, table), _grains_on_parts(near, table, delta, shift)]
+    if near.ghosts:
+        table = primitives(near, shapes, total)
+    found = [_grain_pairs(near, table), _grains_on_parts(near, beside)]
     if world.comm.rank == world.comm.size - 1:
         found.append(_large_pairs(world, near, table, delta, shift))
     pairs, reach = (np.concatenate(columns) for columns in zip(*found))
@@ -79,15 +84,14 @@ def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | 
     i, j = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
 
     pair, feature, touch = touches(table, i, j, reach)
-    gives = _gives_way(world, near, table, i[pair], j[pair], touch.normal)
-    pair, feature, touch = pair[gives], feature[gives], Touch(*(values[gives] for values in touch))
     i, j = i[pair], j[pair]
-    numbers = int(world.slabs[-1]) + len(table.number) - near.grains - near.ghosts
+    numbers = total + len(table.number) - near.grains - near.ghosts
     key = (table.number[i] * numbers + table.number[j]) * FEATURES + feature
     a, b = table.row[i], table.row[j]
-    owner = np.minimum(a, b)  # the local grains are the first rows, and ghosts come from higher ranks only
-    order = np.lexsort((key, owner))
+    order = _order(world, near, a, b, key)
+    order = order[_gives_way(world, near, a, b, touch.normal)[order]]
     a, b = a[order], b[order]
+    owner = np.minimum(a, b)
     world.grains.weight = np.bincount(owner, minlength=near.grains)[: near.grains].astype(np.float64)
     material = near.bodies.material
     return Contacts(
@@ -95,12 +99,27 @@ def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | 
         a=a,
         b=b,
         body=np.stack([near.index[a], near.index[b]], axis=1),
-        point=touch.point[order],
-        normal=touch.normal[order],
+        point=touch.point.take(order, axis=0),  # faster than an index
+        normal=touch.normal.take(order, axis=0),
         gap=touch.gap[order],
         friction=world.friction[material[a], material[b]],
         near=near,
     )
+
+
+def _order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints) -> Ints:
+    """The order of contacts of bodies in the rows a, b (nc,): first those whose solution needs no other rank, of bodies
+    that this rank owns or whose motion is prescribed; each part by the row of the owner and by key."""
+    rows = len(near.bodies)
+    foreign = np.zeros(rows, dtype=bool)
+    foreign[near.grains : near.grains + near.ghosts] = True
+    if world.comm.rank < world.comm.size - 1:
+        foreign[near.grains + near.ghosts :] = bodies.is_dynamic(world.large)
+    owner = np.minimum(a, b)  # the local grains are the first rows, and ghosts come from higher ranks only
+    major = owner + rows * (foreign[a] | foreign[b])
+    if compiled := loops():
+        return compiled.lexsort(key, major, 2 * rows)
+    return np.lexsort((key, major))
 
 
 def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Contacts | None:
@@ -114,7 +133,7 @@ def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: floa
     if not world.comm.allreduce(bool((ways > seen).any()), MPI.LOR):
         return None
     wider = find_contacts(world, delta, dt, np.maximum(seen, ways))
-    new = not np.isin(wider.key, contacts.key).all()
+    new = len(wider) > len(contacts) or not np.isin(wider.key, contacts.key, assume_unique=True).all()
     return wider if world.comm.allreduce(new, MPI.LOR) else None
 
 
@@ -122,18 +141,37 @@ def _way(grains: Bodies, velocity: Floats, dt: float) -> Floats:
     """How far (n,) a point of each grain goes in dt [s], about and at most WIDEST radii [m]; of spheres their centre,
     as turning brings their surface nowhere. NaN where the velocity is not finite."""
     radius = bodies.bounding_radius(grains)
-    turn = np.where(grains.shape == SPHERE, 0.0, radius) * np.linalg.norm(velocity[:, 3:], axis=1)
-    way = np.minimum(dt * (np.linalg.norm(velocity[:, :3], axis=1) + turn), WIDEST * radius)
-    return np.where(np.isfinite(velocity).all(axis=1), way, np.nan)
+    turn = np.where(grains.shape == SPHERE, 0.0, radius) * length(velocity[:, 3:])
+    way = np.minimum(dt * (length(velocity[:, :3]) + turn), WIDEST * radius)
+    finite = np.isfinite(velocity)
+    return way if finite.all() else np.where(finite.all(axis=1), way, np.nan)
 
 
-def _margins_of_struck(near: Neighbourhood, table: Primitives, delta: float, shift: Floats) -> Floats:
+class _Beside(NamedTuple):
+    """Local grains and parts of large bodies that come close."""
+
+    grain: Ints  #: (m,) row of the grain
+    part: Ints  #: (m,) number of the part
+    margin: Floats  #: (m,) of the part there [m]
+    room: Floats  #: (m,) at least, between the grain and the margin of the part: a grain's wider margin meets that [m]
+
+    def within(self, margin: Floats) -> _Beside:
+        """Those for which the margins (grains,) of the grains suffice."""
+        return self.take(self.room <= margin[self.grain])
+
+    def take(self, rows: np.ndarray) -> _Beside:
+        return _Beside(*(column[rows] for column in self))
+
+
+def _margins_of_struck(table: Primitives, margin: Floats, beside: _Beside, widest: Floats) -> Floats:
     """The margins (grains,) of the grains, those in reach of a large body at least as wide as its own there."""
-    pairs, reach = _grains_on_parts(near, table, delta, shift)
-    grain, part = pairs[touches(table, pairs[:, 0], pairs[:, 1], reach).pair].T
-    margin = near.margin.copy()
-    np.maximum.at(margin, grain, _part_margin(near, table, part, grain, delta, shift))
-    return np.minimum(margin, np.maximum(near.margin, WIDEST * table.radius[: near.grains]))
+    close = beside.within(margin)
+    close = close.take(close.margin > margin[close.grain])
+    parts = len(margin) + close.part
+    struck = close.take(touches(table, close.grain, parts, margin[close.grain] + close.margin).pair)
+    margin = margin.copy()
+    np.maximum.at(margin, struck.grain, struck.margin)
+    return np.minimum(margin, widest)
 
 
 def _grain_pairs(near: Neighbourhood, table: Primitives) -> tuple[Ints, Floats]:
@@ -143,24 +181,45 @@ def _grain_pairs(near: Neighbourhood, table: Primitives) -> tuple[Ints, Floats]:
     pairs = close_pairs(table.center[:count], table.radius[:count] + near.margin, 0.0)
     if near.ghosts:
         pairs = pairs[pairs[:, 0] < near.grains]
-    return pairs, near.margin[pairs].sum(axis=1)
+    return pairs, near.margin[pairs[:, 0]] + near.margin[pairs[:, 1]]
 
 
-def _grains_on_parts(near: Neighbourhood, table: Primitives, delta: float, shift: Floats) -> tuple[Ints, Floats]:
-    """The same for local grains and parts of large bodies, which move and turn by `shift` (large bodies, 6)."""
-    grains = np.arange(near.grains)
-    found = [(np.zeros((0, 2), np.int64), np.zeros(0))]
-    for part in range(near.grains + near.ghosts, len(table.number)):
-        parts = np.full(near.grains, part)
-        reach = near.margin[grains] + _part_margin(near, table, parts, grains, delta, shift)
-        offset = table.center[grains] - table.center[part]
-        if table.kind[part] == PLANE:
-            rows = np.flatnonzero(offset @ table.size[part] <= table.radius[grains] + reach)
-        else:
-            rows = np.flatnonzero(dot(offset, offset) <= (table.radius[grains] + reach + table.radius[part]) ** 2)
-        found.append((np.stack([rows, parts[rows]], axis=1), reach[rows]))
-    pairs, gaps = zip(*found)
-    return np.concatenate(pairs), np.concatenate(gaps)
+def _grains_on_parts(near: Neighbourhood, beside: _Beside) -> tuple[Ints, Floats]:
+    """The same for local grains and parts of large bodies."""
+    close = beside.within(near.margin)
+    pairs = np.stack([close.grain, near.grains + near.ghosts + close.part], axis=1)
+    return pairs, near.margin[close.grain] + close.margin
+
+
+def _grains_beside_parts(
+    alone: Neighbourhood, table: Primitives, delta: float, shift: Floats, widest: Floats
+) -> _Beside:
+    """The parts of large bodies, which move and turn by `shift` (large bodies, 6), whose margins the local grains might
+    meet with margins of at most `widest` (grains,)."""
+    count = alone.grains
+    center, radius = table.center[:count], table.radius[:count]
+    found = [_Beside(*(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0)))]
+    for body in np.unique(table.row[count:]):
+        margin = _part_margin(shift[[body - count]], alone.bodies.position[[body]], center, radius, delta)
+        beyond = margin + (1.0 + 1e-9) * radius  # where the rounding matters, the narrow phase is to decide
+        margin = np.broadcast_to(margin, count)
+        for part in count + np.flatnonzero(table.row[count:] == body):
+            room = _distance_at_least(table, part, center) - beyond
+            rows = np.flatnonzero(room <= widest)
+            found.append(_Beside(rows, np.full(len(rows), part - count), margin[rows], room[rows]))
+    return _Beside(*(np.concatenate(columns) for columns in zip(*found)))
+
+
+def _distance_at_least(table: Primitives, part: int, points: Floats) -> Floats:
+    """A lower bound of the distances (m,) of points (m, 3) from the surface of a part [m]; of planes and boxes the
+    distance itself, as far as it is positive."""
+    place, size = table.center[part], table.size[part]
+    if table.kind[part] == PLANE:
+        return points @ size - place @ size
+    offset = points - place
+    if table.kind[part] == BOX:
+        return length(np.maximum(np.abs(offset @ quaternion.matrix(table.quaternion[part])) - size, 0.0))
+    return length(offset) - table.radius[part]
 
 
 def _large_pairs(
@@ -175,32 +234,37 @@ def _large_pairs(
     i, j = first + i[touch], first + j[touch]
     # Two half spaces never touch: the first is to be the one that has a centre.
     i, j = np.where(table.kind[i] == PLANE, j, i), np.where(table.kind[i] == PLANE, i, j)
-    margins = [_part_margin(near, table, part, i, delta, shift) for part in (i, j)]
+    at = table.center[i], table.radius[i]
+    rows = [table.row[part] for part in (i, j)]
+    margins = [_part_margin(shift[row - first], near.bodies.position[row], *at, delta) for row in rows]
     return np.stack([i, j], axis=1), margins[0] + margins[1]
 
 
-def _part_margin(
-    near: Neighbourhood, table: Primitives, part: Ints, other: Ints, delta: float, shift: Floats
-) -> Floats:
-    """Margins (m,) of parts of large bodies at the surfaces of the primitives `other` (m,) [m]."""
-    row = table.row[part]
-    move, turn = np.split(shift[row - near.grains - near.ghosts], 2, axis=1)
-    at_center = move + cross(turn, table.center[other] - near.bodies.position[row])
-    way = np.linalg.norm(at_center, axis=1) + table.radius[other] * np.linalg.norm(turn, axis=1)
+def _part_margin(shift: Floats, pivot: Floats, center: Floats, radius: Floats, delta: float) -> Floats:
+    """Margins (m,) of the parts of large bodies at the surfaces of primitives of centres (m, 3) and radii (m,) [m]. The
+    bodies move and turn, about the pivots (m, 3), by `shift` (m, 6).
+
+    Of one body, with (1, 6) and (1, 3), a single margin (1,) if that is the same everywhere.
+    """
+    move, turn = shift[:, :3], shift[:, 3:]
+    if not turn.any():
+        return np.maximum(delta / 2, length(move))
+    way = length(move + cross(turn, center - pivot)) + radius * length(turn)
     return np.maximum(delta / 2, way)
 
 
-def _gives_way(world: World, near: Neighbourhood, table: Primitives, i: Ints, j: Ints, normal: Floats) -> np.ndarray:
-    """Which contacts (nc,) a force can open: not those of a guided body with what holds it across its guide.
+def _gives_way(world: World, near: Neighbourhood, a: Ints, b: Ints, normal: Floats) -> np.ndarray:
+    """Which contacts (nc,) of bodies in the rows a, b (nc,) a force can open: not those of a guided body with what
+    holds it across its guide.
 
     Their normal impulse would change no velocity, and any friction with it.
     """
     first = near.grains + near.ghosts
-    gives = np.ones(len(i), dtype=bool)
-    rows = np.flatnonzero((table.row[i] >= first) & (table.row[j] >= first))
+    gives = np.ones(len(a), dtype=bool)
+    rows = np.flatnonzero((a >= first) & (b >= first))
     if len(rows):
         motions = [body.motion for body in world.large_bodies]
         free = np.array([m.free_directions() if isinstance(m, Dynamic) else np.zeros((3, 3)) for m in motions])
-        both = free[table.row[i[rows]] - first] + free[table.row[j[rows]] - first]
+        both = free[a[rows] - first] + free[b[rows] - first]
         gives[rows] = np.einsum("ci,cij,cj->c", normal[rows], both, normal[rows]) > 1e-8
     return gives

@@ -10,6 +10,7 @@ from cases import contacts_by_key, crude_impulse, grains_by_id, heap, step
 from mpi4py import MPI
 from several_ranks import alone
 
+from dem import bodies
 from dem.contact import find_contacts
 from dem.partition import rebalance
 from dem.scene import Scene
@@ -69,10 +70,16 @@ def contacts_of(comm, delta, dt):
     owner = contacts.body.min(axis=1)
     end = world.slabs[comm.rank + 1] + (len(world.large) if comm.rank == comm.size - 1 else 0)
     assert ((world.slabs[comm.rank] <= owner) & (owner < end)).all()
-    assert (np.lexsort((contacts.key, owner)) == np.arange(len(contacts))).all()
+    # First those of which both bodies are of this rank or of prescribed motion.
+    large = np.maximum(contacts.body - world.slabs[-1], -1)
+    prescribed = (large >= 0) & ~bodies.is_dynamic(world.large)[large]
+    own = (world.slabs[comm.rank] <= contacts.body) & (contacts.body < end)
+    boundary = ~(own | prescribed).all(axis=1)
+    assert (np.lexsort((contacts.key, owner, boundary)) == np.arange(len(contacts))).all()
     assert (contacts.body[:, 0] == contacts.near.index[contacts.a]).all()
     if comm.size > 1:
         assert comm.allreduce(contacts.near.ghosts) > 10
+        assert comm.allreduce(int(boundary.sum())) > 10
     return contacts_by_key(contacts, comm)
 
 

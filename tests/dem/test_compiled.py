@@ -1,0 +1,99 @@
+"""The compiled loops against the numpy code that runs without numba."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cases import contacts_by_key, crude_impulse, heap, step
+from mpi4py import MPI
+
+from dem import system as contact_system
+from dem.contact import broad, find_contacts, primitives, search
+from dem.loops import loops
+from dem.scene import Scene
+from dem.system import ContactSystem
+from dem.world import World
+
+SELF = MPI.COMM_SELF
+
+pytestmark = pytest.mark.skipif(loops() is None, reason="no numba")
+
+
+@pytest.fixture
+def without_loops(monkeypatch):
+    """A function that calls another as if numba were not there."""
+
+    def call(work, *arguments):
+        with monkeypatch.context() as patch:
+            for module in (broad, contact_system, primitives, search):
+                patch.setattr(module, "loops", lambda: None)
+            return work(*arguments)
+
+    return call
+
+
+def sorted_rows(pairs):
+    return pairs[np.lexsort(pairs.T[::-1])]
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 50, 2000])
+@pytest.mark.parametrize("decades", [0, 2])
+def test_pairs_in_cells(count, decades):
+    rng = np.random.default_rng(count)
+    position, radius = rng.uniform(-1, 1, (count, 3)), 10.0 ** rng.uniform(-1.5 - decades, -1.0, count)
+    position[::7] *= 1e5  # some far away
+    pairs = sorted_rows(broad.close_pairs(position, radius, 0.01))
+    close = []
+    for i in range(count):
+        distance = np.linalg.norm(position[i + 1 :] - position[i], axis=1)
+        close += [(i, i + 1 + j) for j in np.flatnonzero(distance <= radius[i] + radius[i + 1 :] + 0.01)]
+    np.testing.assert_array_equal(pairs, np.array(close).reshape(-1, 2))
+
+
+def test_pairs_of_spheres_that_touch_to_rounding_and_of_concentric_ones():
+    grid = np.stack(np.meshgrid(*[0.2 * np.arange(6)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    assert len(broad.close_pairs(grid, np.full(len(grid), 0.1), 0.0)) == 3 * 5 * 36
+    assert len(broad.close_pairs(np.zeros((5, 3)), np.ones(5), 0.0)) == 10
+
+
+def test_order():
+    rng = np.random.default_rng(1)
+    for count, groups in ((0, 1), (1, 1), (500, 1), (500, 7), (500, 1000)):
+        key, major = rng.permutation(10**6)[:count], rng.integers(0, groups, count)
+        np.testing.assert_array_equal(loops().lexsort(key, major, groups), np.lexsort((key, major)))
+
+
+def run(capsules):
+    """Contacts, systems and velocities of some steps."""
+    world = World.from_scene(heap(5, side=4, capsules=capsules), SELF)
+    for _ in range(15):
+        step(world)
+    contacts = find_contacts(world, 0.03, 0.01)
+    system = ContactSystem(world, contacts, 0.01)
+    numbers = {"frame": system.frame, "r": system.r, "velocity": system.velocity(crude_impulse(system))}
+    return numbers | contacts_by_key(contacts, SELF)
+
+
+@pytest.mark.parametrize("capsules", [False, True])
+def test_steps_are_the_same(capsules, without_loops):
+    compiled, plain = run(capsules), without_loops(run, capsules)
+    assert len(plain["key"]) > 100
+    for name, value in plain.items():
+        np.testing.assert_allclose(compiled[name], value, rtol=0, atol=1e-9 * max(1.0, np.abs(value).max()))
+
+
+def test_contacts_of_equal_bodies_agree_to_rounding(without_loops):
+    """Frames, gaps and points of the same positions, of concentric spheres too."""
+    rng = np.random.default_rng(2)
+    scene = Scene(friction=0.2)
+    scene.add_spheres(rng.uniform(-0.4, 0.4, (200, 3)), rng.uniform(0.05, 0.1, 200), 1000.0)
+    scene.add_spheres([[2.0, 0, 0]] * 2, [0.1, 0.05], 1000.0)
+    world = World.from_scene(scene, SELF, overlap=np.inf)
+    compiled, plain = (contacts_by_key(call(find_contacts, world, 0.02), SELF) for call in (_call, without_loops))
+    assert len(plain["key"]) > 500
+    for name, value in plain.items():
+        np.testing.assert_allclose(compiled[name], value, rtol=1e-13, atol=1e-13)
+
+
+def _call(work, *arguments):
+    return work(*arguments)
