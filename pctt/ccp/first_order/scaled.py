@@ -38,21 +38,23 @@ class ScaledProblem:
     def impulse(self, x: Array) -> Array:
         return x * self._shrink
 
-    def product(self, x: Array) -> Array:
+    def product(self, x: Array, out: Array | None = None) -> Array:
         """A x (nc, 3)."""
-        out = self.problem.product(x * self._shrink)
-        out *= self._shrink
-        return out
+        return np.multiply(self.problem.product(x * self._shrink), self._shrink, out=out)
 
-    def gradient(self, x: Array) -> Array:
+    def gradient(self, x: Array, out: Array | None = None) -> Array:
         """A x + b (nc, 3)."""
-        out = self.product(x)
+        out = self.product(x, out)
         out += self.b
         return out
 
     def project(self, x: Array) -> Array:
         """x moved to the nearest point of the cones, in place."""
         return cone.project(x, self.mu, out=x)
+
+    def projected_move(self, x: Array, y: Array, step: float) -> Array:
+        """P(x - step y) - x (nc, 3)."""
+        return cone.projected_move(x, y, step, self.mu)
 
     def dots(self, *pairs: tuple[Array, Array]) -> Array:
         """Scalar products of pairs of arrays over all contacts, in one reduction over the ranks."""
