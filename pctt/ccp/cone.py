@@ -1,12 +1,15 @@
 """The friction cone |(g_1, g_2)| <= mu g_n and the arithmetic that the solvers need on it.
 
-Impulses are arrays (nc, 3), one row per contact in the order (normal, tangent 1, tangent 2); ``mu`` is (nc,).
+Impulses are arrays (nc, 3), one row per contact in the order (normal, tangent 1, tangent 2); ``mu`` is (nc,). What is
+``compiled`` is in ``cone_loops`` too.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pctt.compiled import compiled
 
 Array = NDArray[np.float64]
 TINY = float(np.finfo(float).tiny)
@@ -19,7 +22,11 @@ def project(x: Array, mu: Array, out: Array | None = None) -> Array:
     array([[1., 0., 1.],
            [0., 0., 0.]])
     """
-    out = np.empty_like(x) if out is None else out
+    return project_to(x, mu, np.empty_like(x) if out is None else out)
+
+
+@compiled
+def project_to(x: Array, mu: Array, out: Array) -> Array:
     normal, tangent_1, tangent_2 = x[:, 0], x[:, 1], x[:, 2]
     length = tangent_1 * tangent_1
     length += tangent_2 * tangent_2
@@ -35,6 +42,54 @@ def project(x: Array, mu: Array, out: Array | None = None) -> Array:
     shrink = np.divide(radius, np.maximum(np.maximum(length, radius), TINY), out=radius)  # 1 inside
     np.multiply(tangent_1, shrink, out=out[:, 1])
     np.multiply(tangent_2, shrink, out=out[:, 2])
+    return out
+
+
+@compiled
+def projected_move(x: Array, y: Array, step: float, mu: Array) -> Array:
+    """P(x - step y) - x."""
+    moved = y * -step
+    moved += x
+    project(moved, mu, out=moved)
+    moved -= x
+    return moved
+
+
+def projected_move_squares(x: Array, y: Array, step: float, mu: Array) -> tuple[float, float]:
+    """|P(x - step y) - x|^2 and |x|^2 on this rank."""
+    moved = projected_move(x, y, step, mu)
+    return float(np.vdot(moved, moved)), float(np.vdot(x, x))
+
+
+@compiled
+def accelerated_step(
+    x: Array, last_x: Array, y: Array, last_y: Array, beta: float, step: float, mu: Array, out: Array
+) -> tuple[float, float]:
+    """P(z - step y_z) for z = x + beta (x - last_x) and its gradient y_z = y + beta (y - last_y).
+
+    Returned are, for this rank, |out - z|^2 and y_z'(out - x); z and y_z themselves are nowhere stored."""
+    z, y_z = _extrapolated(x, last_x, beta), _extrapolated(y, last_y, beta)
+    np.multiply(y_z, -step, out=out)
+    out += z
+    project(out, mu, out=out)
+    z -= out
+    return float(np.vdot(z, z)), float(np.vdot(y_z, out - x))
+
+
+@compiled
+def accelerated_curvature(
+    new_x: Array, x: Array, last_x: Array, new_y: Array, y: Array, last_y: Array, beta: float
+) -> float:
+    """d'Ad of the step d = new_x - z, from the same z and y_z and the gradient new_y at new_x; on this rank."""
+    d, Ad = new_x - _extrapolated(x, last_x, beta), new_y - _extrapolated(y, last_y, beta)
+    return float(np.vdot(d, Ad))
+
+
+def _extrapolated(x: Array, last_x: Array, beta: float) -> Array:
+    """x + beta (x - last_x)."""
+    out = x - last_x
+    out *= beta
+    out += x
     return out
 
 
@@ -58,11 +113,13 @@ def dot(x: Array, y: Array) -> Array:
     return out
 
 
+@compiled
 def times(blocks: Array, x: Array) -> Array:
     """Products of blocks (nc, 3, 3) with rows. (Twice as fast as a batched matrix product.)"""
     return np.einsum("nij,nj->ni", blocks, x)
 
 
+@compiled
 def step_to_boundary(x: Array, dx: Array, mu: Array) -> float:
     """Largest a such that x + a dx is in the cones of this rank (inf where nothing limits it); x is inside.
 
@@ -80,6 +137,7 @@ def step_to_boundary(x: Array, dx: Array, mu: Array) -> float:
     return min(to_surface.min(initial=np.inf), step_to_zero(x[:, 0], dx[:, 0]))
 
 
+@compiled
 def step_to_zero(x: Array, dx: Array) -> float:
     """Largest a such that x + a dx >= 0 on this rank, x > 0."""
     return np.divide(-x, dx, out=np.full_like(x, np.inf), where=dx < 0).min(initial=np.inf)

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.blocks import BlockRows, dense_columns, diagonal_blocks, without_crowded
-from pctt.ccp.cone import Array, project
+from pctt.ccp.cone import Array, projected_move_squares
 from pctt.ccp.delassus import delassus, local_blocks
 from pctt.contact_map import CompactRows, ContactMap, contact_map
 
@@ -109,8 +109,8 @@ class ConeProblem:
         """||g - P(g - y / mean diag N)|| / ||g||, velocities y = N g + r: the stop test of every solver.
 
         inf where that is no number: for g = 0 that does not solve the problem, and where g or y is nan or inf."""
-        moved = project(g - y / self.mean_diagonal, self.mu)
-        distance, norm = np.sqrt(self.sum(np.array([np.vdot(g - moved, g - moved), np.vdot(g, g)])))
+        squares = projected_move_squares(g, y, 1.0 / self.mean_diagonal, self.mu)
+        distance, norm = np.sqrt(self.sum(np.array(squares)))
         if distance == 0:
             return 0.0
         residual = float(distance / norm) if norm > 0 else np.inf

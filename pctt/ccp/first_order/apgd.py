@@ -3,7 +3,8 @@
 Mazhar, Heyn, Negrut, Tasora, "Using Nesterov's method to accelerate multibody dynamics with friction and
 contact", ACM Trans. Graph. 34 (2015); restart by the gradient test of O'Donoghue and Candes (2015). N is
 applied once per iteration: the gradient at the extrapolated point follows from those at the last two
-iterates, and for a quadratic objective the line search is a Rayleigh quotient.
+iterates, and for a quadratic objective the line search is a Rayleigh quotient. The extrapolated point is formed where
+it is used, twice: reading the last two iterates costs less than writing and reading it.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import Array, accelerated_curvature, accelerated_step
 from pctt.ccp.first_order.progress import FirstOrder, GiveUp, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
@@ -32,32 +33,25 @@ def solve(
     progress = Progress(scaled, limits, options, give_up)
     x = scaled.start(guess)
     y = scaled.gradient(x)
-    z, y_z = x, y  # the extrapolated point
-    theta, lipschitz = 1.0, _first_lipschitz(scaled)
+    last_x, last_y, new_x, new_y = x.copy(), y.copy(), np.empty_like(x), np.empty_like(y)
+    theta, beta, lipschitz = 1.0, 0.0, _first_lipschitz(scaled)
     while progress.goes_on(x, y):
-        while True:
-            x_new = y_z * (-1 / lipschitz)
-            x_new += z
-            x_new = scaled.project(x_new)
-            y_new = scaled.gradient(x_new)
+        while True:  # a step from z = x + beta (x - last_x), where the gradient is y_z = y + beta (y - last_y)
+            length, uphill = accelerated_step(x, last_x, y, last_y, beta, 1 / lipschitz, scaled.mu, new_x)
+            scaled.gradient(new_x, out=new_y)
             progress.iterations += 1
-            d, step = x_new - z, x_new - x
-            curvature, length, uphill = scaled.dots((d, y_new - y_z), (d, d), (y_z, step))
+            curvature = accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta)
+            curvature, length, uphill = problem.sum(np.array([curvature, length, uphill]))
             if not curvature > lipschitz * length * (1 + 1e-12):  # also ends on a number that is none
                 break
             lipschitz = 1.1 * curvature / length
         if uphill > 0:  # the momentum points uphill: start it anew
-            theta, z, y_z = 1.0, x_new, y_new
+            theta, beta = 1.0, 0.0
         else:
-            theta_new = theta * (np.sqrt(theta**2 + 4) - theta) / 2
-            beta = theta * (1 - theta) / (theta**2 + theta_new)
-            theta = theta_new
-            z = np.multiply(step, beta, out=step)
-            z += x_new
-            y_z = np.subtract(y_new, y, out=d)
-            y_z *= beta
-            y_z += y_new
-        x, y = x_new, y_new
+            last_theta, theta = theta, theta * (np.sqrt(theta**2 + 4) - theta) / 2
+            beta = last_theta * (1 - last_theta) / (last_theta**2 + theta)
+        last_x, x, new_x = x, new_x, last_x
+        last_y, y, new_y = y, new_y, last_y
         lipschitz *= 0.95  # let the step grow again where the quotient allows it
     return progress.result()
 

@@ -61,11 +61,7 @@ class GradientProjection:
 
     def move(self, x: Array, y: Array) -> Array:
         """P(x - LENGTH / L y) - x."""
-        d = y * (-self.LENGTH / self.lipschitz)
-        d += x
-        d = self.problem.project(d)
-        d -= x
-        return d
+        return self.problem.projected_move(x, y, self.LENGTH / self.lipschitz)
 
     def step(self, x: Array, y: Array) -> tuple[Array, Array, int]:
         """The next point, its gradient, and the products with A that it took."""

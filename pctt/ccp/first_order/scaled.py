@@ -40,26 +40,32 @@ class ScaledProblem:
     def impulse(self, x: Array) -> Array:
         return x * self._shrink
 
-    def product(self, x: Array) -> Array:
+    def product(self, x: Array, out: Array | None = None) -> Array:
         """A x (nc, 3)."""
         if self._map is None:
-            return self.problem.product(x * self._shrink) * self._shrink
-        out = self._compliance * x
+            return np.multiply(self.problem.product(x * self._shrink), self._shrink, out=out)
+        out = np.multiply(self._compliance, x, out=out)
         self._map.add_delassus(x, out)
         return out
 
-    def gradient(self, x: Array) -> Array:
+    def gradient(self, x: Array, out: Array | None = None) -> Array:
         """A x + b (nc, 3)."""
-        if self._map is None:
-            return self.product(x) + self.b
-        out = self._compliance * x
-        out += self.b
+        if self._map is None or self.problem.softness:
+            out = self.product(x, out)
+            out += self.b
+            return out
+        out = np.empty_like(x) if out is None else out
+        out[:] = self.b
         self._map.add_delassus(x, out)
         return out
 
     def project(self, x: Array) -> Array:
         """x moved to the nearest point of the cones, in place."""
         return cone.project(x, self.mu, out=x)
+
+    def projected_move(self, x: Array, y: Array, step: float) -> Array:
+        """P(x - step y) - x (nc, 3)."""
+        return cone.projected_move(x, y, step, self.mu)
 
     def dots(self, *pairs: tuple[Array, Array]) -> Array:
         """Scalar products of pairs of arrays over all contacts, in one reduction over the ranks."""

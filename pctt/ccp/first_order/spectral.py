@@ -43,10 +43,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Spectral)
     step = 1.0  # A has a diagonal of about one
     rises = np.zeros(1)  # objectives of the last points, less that of x
     while progress.goes_on(x, y):
-        d = y * -step
-        d += x
-        d = scaled.project(d)
-        d -= x
+        d = scaled.projected_move(x, y, step)
         Ad = scaled.product(d)
         progress.iterations += 1
         slope, length, curvature, stretch = scaled.dots((y, d), (d, d), (d, Ad), (Ad, Ad))

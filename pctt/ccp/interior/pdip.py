@@ -23,7 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cone import Array, step_to_boundary, step_to_zero, times
+from pctt.ccp.cone import Array, dot, step_to_boundary, step_to_zero, times
+from pctt.ccp.interior import barrier
 from pctt.ccp.interior.barrier import CONSTRAINTS, Perspective, Quadratic
 from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.newton import Newton
@@ -84,8 +85,8 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
             break
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
         centering = options.centering if step > STUCK else 1.0
-        barrier = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
-        at = Linearised(g, lam, y, f, df, hessian, barrier)
+        aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
+        at = Linearised(g, lam, y, f, df, hessian, aim)
         newton.update(_barrier_blocks(cone, at))
         tol = _accuracy(problem, at, history[-1])
         dg, dlam, x = _direction(problem, newton, at, tol)
@@ -146,7 +147,7 @@ def _direction(
     dg, x = newton.solve(_right_side(at, bend), tol, start=start)
     dg[problem.mu == 0, 1:] = 0.0
     aim = (at.barrier + (bend[1] if bend else 0.0)) / at.f
-    return dg, -(at.lam + aim + at.lam / at.f * (at.df * dg).sum(1)), x
+    return dg, -(at.lam + aim + at.lam / at.f * dot(at.df, dg)), x
 
 
 def _bend(at: Linearised, dg: Array, dlam: Array, reach: float) -> tuple[Array, Array]:
@@ -154,7 +155,7 @@ def _bend(at: Linearised, dg: Array, dlam: Array, reach: float) -> tuple[Array, 
     of sum lambda_i grad f_i (without third derivatives) and of lambda_i f_i. A contact that slides has to turn its
     impulse along the cone, and straight steps leave it soon."""
     turned = times(at.hessian, dg)
-    missed = dlam * (at.df * dg).sum(1) + 0.5 * at.lam * (dg * turned).sum(1)
+    missed = dlam * dot(at.df, dg) + 0.5 * at.lam * dot(dg, turned)
     return reach * dlam[:, None] * turned, reach * missed
 
 
@@ -183,8 +184,7 @@ def _start(
 def _barrier_blocks(cone: Perspective | Quadratic, at: Linearised) -> Array:
     """lambda hess f + lambda/(-f) grad f grad f' (nc, 3, 3), positive definite inside the cone."""
     with phase("CCPBarrier"):
-        blocks = at.lam[:, None, None] * at.hessian
-        blocks += (at.lam / -at.f)[:, None, None] * at.df[:, :, None] * at.df[:, None, :]
+        blocks = barrier.blocks(at.lam, at.f, at.df, at.hessian)
         frictionless = cone.mu == 0
         if frictionless.any():  # hold the tangential impulses at zero
             stiff = 1e12 * np.maximum(blocks[frictionless, 0, 0], 1)
@@ -204,10 +204,7 @@ def _step_length(
     if not np.isfinite(problem.sum(dg.sum() + dlam.sum())):
         return np.nan
     g, lam = at.g, at.lam
-    frictional = cone.mu > 0
-    to_surface = step_to_boundary(g[frictional], dg[frictional], cone.mu[frictional])
-    to_apex = step_to_zero(g[:, 0], dg[:, 0])
-    step = min(1.0, options.boundary * problem.min(min(to_surface, to_apex, step_to_zero(lam, dlam))))
+    step = min(1.0, options.boundary * problem.min(min(step_to_boundary(g, dg, cone.mu), step_to_zero(lam, dlam))))
     while step > 1e-10:
         gap = -(lam + step * dlam) * cone.value(g + step * dg)
         mean = problem.sum(gap.sum()) / problem.size

@@ -1,0 +1,143 @@
+"""The functions of ``cone`` as loops over the contacts.
+
+Arrays of rows are taken flat: so the compiler sees the distance from one contact to the next, and works on several at
+once. Comparisons are written such that a number that is none stays none.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pctt.ccp.cone import TINY
+from pctt.compiled import loop
+
+STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to the next
+
+
+@loop
+def _nearest(n, t_1, t_2, mu):
+    """The nearest point of a cone, by selections rather than branches, which no processor could foresee."""
+    length = np.sqrt(t_1 * t_1 + t_2 * t_2)
+    height = (mu * length + n) * (1.0 / (1.0 + mu * mu))
+    height = n if height < n else height
+    height = 0.0 if height < 0.0 else height
+    radius = mu * height
+    reach = radius if length < radius else length
+    shrink = radius / (TINY if reach < TINY else reach)
+    return height, t_1 * shrink, t_2 * shrink
+
+
+@loop
+def project_to(x, mu, out):
+    flat, to = x.ravel(), out.ravel()
+    for c in range(len(mu)):
+        i = 3 * c
+        to[i], to[i + 1], to[i + 2] = _nearest(flat[i], flat[i + 1], flat[i + 2], mu[c])
+    return out
+
+
+@loop
+def projected_move(x, y, step, mu):
+    out = np.empty_like(x)
+    x, y, to = x.ravel(), y.ravel(), out.ravel()
+    for c in range(len(mu)):
+        i = 3 * c
+        n, t_1, t_2 = _nearest(x[i] - step * y[i], x[i + 1] - step * y[i + 1], x[i + 2] - step * y[i + 2], mu[c])
+        to[i], to[i + 1], to[i + 2] = n - x[i], t_1 - x[i + 1], t_2 - x[i + 2]
+    return out
+
+
+@loop
+def accelerated_step(x, last_x, y, last_y, beta, step, mu, out):
+    x, last_x, y, last_y, to = x.ravel(), last_x.ravel(), y.ravel(), last_y.ravel(), out.ravel()
+    z, y_z = np.empty(3 * STRIP), np.empty(3 * STRIP)
+    squares, products = np.zeros(3 * STRIP), np.zeros(3 * STRIP)
+    for first in range(0, len(mu), STRIP):
+        friction = mu[first : first + STRIP]
+        a, b = 3 * first, 3 * (first + len(friction))
+        _extrapolate(x[a:b], last_x[a:b], beta, z)
+        _extrapolate(y[a:b], last_y[a:b], beta, y_z)
+        _step(z, y_z, step, friction, to[a:b])
+        _add_squares(to[a:b], z, squares)
+        _add_products(to[a:b], x[a:b], y_z, products)
+    return squares.sum(), products.sum()
+
+
+@loop
+def _extrapolate(x, last_x, beta, out):
+    for k in range(len(x)):
+        out[k] = x[k] + beta * (x[k] - last_x[k])
+
+
+@loop
+def _step(x, y, step, mu, out):
+    for c in range(len(mu)):
+        i = 3 * c
+        n, t_1, t_2 = x[i] - step * y[i], x[i + 1] - step * y[i + 1], x[i + 2] - step * y[i + 2]
+        out[i], out[i + 1], out[i + 2] = _nearest(n, t_1, t_2, mu[c])
+
+
+@loop
+def _add_squares(x, y, sums):
+    for k in range(len(x)):
+        sums[k] += (x[k] - y[k]) ** 2
+
+
+@loop
+def _add_products(x, y, z, sums):
+    for k in range(len(x)):
+        sums[k] += (x[k] - y[k]) * z[k]
+
+
+@loop
+def accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta):
+    sum_0 = sum_1 = sum_2 = 0.0
+    for c in range(len(x)):
+        d_0 = new_x[c, 0] - (x[c, 0] + beta * (x[c, 0] - last_x[c, 0]))
+        d_1 = new_x[c, 1] - (x[c, 1] + beta * (x[c, 1] - last_x[c, 1]))
+        d_2 = new_x[c, 2] - (x[c, 2] + beta * (x[c, 2] - last_x[c, 2]))
+        sum_0 += d_0 * (new_y[c, 0] - (y[c, 0] + beta * (y[c, 0] - last_y[c, 0])))
+        sum_1 += d_1 * (new_y[c, 1] - (y[c, 1] + beta * (y[c, 1] - last_y[c, 1])))
+        sum_2 += d_2 * (new_y[c, 2] - (y[c, 2] + beta * (y[c, 2] - last_y[c, 2])))
+    return sum_0 + sum_1 + sum_2
+
+
+@loop
+def times(blocks, x):
+    out = np.empty_like(x)
+    for c in range(len(x)):
+        n, t_1, t_2 = x[c, 0], x[c, 1], x[c, 2]
+        for i in range(3):
+            out[c, i] = blocks[c, i, 0] * n + blocks[c, i, 1] * t_1 + blocks[c, i, 2] * t_2
+    return out
+
+
+@loop
+def step_to_boundary(x, dx, mu):
+    x, dx = x.ravel(), dx.ravel()
+    least = np.inf
+    for c in range(len(mu)):
+        i, m = 3 * c, mu[c]
+        n, t_1, t_2 = x[i], x[i + 1], x[i + 2]
+        dn, dt_1, dt_2 = dx[i], dx[i + 1], dx[i + 2]
+        size = np.sqrt(t_1 * t_1 + t_2 * t_2)
+        quadratic = dt_1 * dt_1 + dt_2 * dt_2 - (m * dn) ** 2
+        linear = t_1 * dt_1 + t_2 * dt_2 - m * m * n * dn
+        inside = (m * n - size) * (m * n + size)
+        discriminant = linear * linear + quadratic * inside
+        if linear > 0 and discriminant >= 0:
+            least = min(inside / (linear + np.sqrt(discriminant)), least)
+        elif linear <= 0 and quadratic > 0 and m > 0:
+            least = min((np.sqrt(max(discriminant, 0.0)) - linear) / quadratic, least)
+        if dn < 0:
+            least = min(-n / dn, least)
+    return least
+
+
+@loop
+def step_to_zero(x, dx):
+    least = np.inf
+    for c in range(len(x)):
+        if dx[c] < 0:
+            least = min(-x[c] / dx[c], least)
+    return least

@@ -1,0 +1,64 @@
+"""Loops that numba compiles, where it is installed: one pass over the memory for what numpy does in many.
+
+A function on arrays is then written twice. With numpy it is ``compiled`` and runs everywhere; the loop of the same name
+is in the module beside it, ``cone_loops`` for ``cone``, which is imported at the first call (numba takes half a second).
+tests/test_compiled.py calls both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, wraps
+from importlib import import_module
+from typing import Any, TypeVar
+
+import numpy as np
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+@cache
+def available() -> bool:
+    """Whether numba is here and works with this numpy; ``NUMBA_DISABLE_JIT=1`` says no."""
+    try:
+        import numba
+    except ImportError:
+        return False
+    return not numba.config.DISABLE_JIT
+
+
+def compiled(function: Function) -> Function:
+    """The loop in place of ``function``, where numba is available and all arrays are contiguous, of float64 and writable:
+    so there is one machine code for each loop. Arguments are arrays and numbers, in order; those without a default."""
+
+    @wraps(function)
+    def call(*arguments: Any) -> Any:
+        if available() and all(map(_fits, arguments)):
+            return loop_of(function)(*(a if isinstance(a, np.ndarray) else float(a) for a in arguments))
+        return function(*arguments)
+
+    return call  # type: ignore[return-value]
+
+
+def _fits(argument: Any) -> bool:
+    return not isinstance(argument, np.ndarray) or (argument.dtype == np.float64 and argument.flags.carray)
+
+
+@cache
+def loop_of(function: Callable[..., Any]) -> Callable[..., Any]:
+    return getattr(import_module(f"{function.__module__}_loops"), function.__name__)
+
+
+def loop(function: Function) -> Function:
+    """Compile at the first call and keep the machine code on disk. Products and sums may be fused, which numbers that are
+    none survive; a division by zero gives what it gives in numpy.
+
+    What is kept is thrown away when the file of ``function`` changes, and no other: a loop calls loops of its own file only.
+    """
+    import numba
+
+    options: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # there is no folder to keep it in
+        return numba.njit(**options)(function)
