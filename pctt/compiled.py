@@ -62,3 +62,23 @@ def loop(function: Function) -> Function:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # there is no folder to keep it in
         return numba.njit(**options)(function)
+
+
+def tell_first_compilation(say: Callable[[str], None]) -> None:
+    """Have ``say`` told, once, when numba compiles a loop of this program rather than reading what it kept."""
+    if not available():
+        return
+    from numba.core import event
+
+    class First(event.Listener):
+        told = False
+
+        def on_start(self, event: Any) -> None:
+            if not self.told:
+                self.told = True
+                say("compiling loops for this processor: some seconds, once")
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    event.register("numba:compile", First())

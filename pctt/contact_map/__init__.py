@@ -6,12 +6,12 @@ Two storages: frames and arms (`CompactRows`), or 3 x 6 blocks (`BlockRows`). Tw
 
 from __future__ import annotations
 
-import importlib.util
 from typing import Union
 
 from mpi4py import MPI
 
 from pctt.blocks import BlockRows
+from pctt.compiled import available
 from pctt.contact_map.assembled import AssembledMap
 from pctt.contact_map.ghosts import Ghosts
 from pctt.contact_map.rows import CompactRows, block_rows
@@ -26,12 +26,13 @@ def is_free(operator: str) -> bool:
     """Whether products are made by compiled loops.
 
     ValueError where the operator is not of OPERATORS, or asks for compiled loops and numba is missing."""
-    there = importlib.util.find_spec("numba") is not None
     if operator not in OPERATORS:
         raise ValueError(f"-ccp_operator {operator}: allowed are {', '.join(OPERATORS)}")
-    if operator == "free" and not there:
+    if operator == "assembled":
+        return False
+    if operator == "free" and not available():
         raise ValueError("-ccp_operator free: numba is not installed (python3-numba in Debian); allowed is assembled")
-    return there and operator != "assembled"
+    return available()
 
 
 def contact_map(comm: MPI.Comm, rows: BlockRows | CompactRows, operator: str = "auto") -> ContactMap:

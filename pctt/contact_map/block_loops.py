@@ -4,9 +4,7 @@ velocities. Row c has the blocks ``start[c]`` to ``start[c + 1]``, in the column
 
 from __future__ import annotations
 
-from numba import njit
-
-loop = njit(cache=True, fastmath={"contract"})
+from pctt.compiled import loop
 
 
 @loop

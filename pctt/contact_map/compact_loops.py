@@ -1,16 +1,13 @@
 """Compiled loops over contacts that are frames and arms (`CompactRows`); importing this takes half a second.
 
 ``first`` and ``last`` bound the contacts; ``body`` (nc, 2) are local numbers; w and m are (bodies, 6), physical velocities
-and momenta. The loops add to their last argument. ``contract`` lets the compiler fuse a product and a sum; it does
-not, as fastmath would, take for granted that there are no NaNs.
+and momenta. The loops add to their last argument.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
-
-loop = njit(cache=True, fastmath={"contract"})
+from pctt.compiled import loop
 
 
 @loop

@@ -188,10 +188,11 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     if solver.newton and not run.settle:
         form = ccp.newton_for(comm, run.ccp_type, run.ccp_newton, compare).form
         _refuse_for_petsc(database, form, comm)
-    try:
-        is_free(run.ccp_operator)
-    except ValueError as error:
-        raise OptionError(str(error)) from None
+    if run.ccp_operator == "free":
+        try:
+            is_free(run.ccp_operator)
+        except ValueError as error:
+            raise OptionError(str(error)) from None
     refuse_serial(comm)
     _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
     _refuse_missing("-problem", run.problem, comm)

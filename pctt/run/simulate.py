@@ -36,6 +36,7 @@ from pctt.run.results import Results
 def simulate(options: Options, comm: MPI.Comm) -> None:
     """Run the scene of the options, or settle it with ``-settle``. InterruptError if a signal asks for the end."""
     progress = report.Progress(comm.rank == 0 and not options.run.quiet, options.run.monitor)
+    tell_first_compilation(progress.say)
     if options.run.settle:
         path = settled_state(options, comm, progress, anew=True)
         progress.say(f"settled state: {path}")

@@ -16,7 +16,6 @@ from pctt.ccp.problem import ConeProblem
 from pctt.pc.body_operator import BodyOperator
 
 LEAST = 0.1  # of the mass: entries of a block between bodies that a factor is better off without
-SHIFT = 0.03  # of the diagonal blocks, for incomplete factorisations
 
 
 class BodySystem:
@@ -53,10 +52,9 @@ class BodySystem:
             self._placed = True
         return entries.mat
 
-    def stiff_part(self, complete: bool):
-        """What is worth factorising of K: completely, by a method of scalar rows, or incompletely in blocks of bodies,
-        for which the diagonal blocks are enlarged (without, such a factorisation breaks down late in an iteration)."""
-        return self.operator.entries().stiff_part(LEAST, 0.0 if complete else SHIFT, scalar=complete)
+    def stiff_part(self) -> PETSc.Mat:
+        """What is worth factorising of K, in scalar rows."""
+        return self.operator.entries().stiff_part(LEAST, scalar=True)
 
     def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
         """``alone`` is (B + C)^-1 q where the caller knows it better."""

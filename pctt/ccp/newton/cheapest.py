@@ -8,39 +8,30 @@ from petsc4py import PETSc
 
 from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
 
-RUNGS = {
-    "pbjacobi": {"pc_type": "pbjacobi"},
-    "ilu": {"pc_type": "ilu", "pc_factor_levels": "1", "pc_factor_mat_ordering_type": "rcm"},
-    "cholesky": {"pc_type": "cholesky"},
-}
-# on several ranks: the pieces of two ranks overlap by a body, which halves the iterations that block Jacobi would take
-OVERLAPPING = {"pc_type": "asm", "pc_asm_type": "basic", "pc_asm_overlap": "1"} | {
-    f"sub_{name}": value for name, value in RUNGS["ilu"].items()
-}
-CAP = {"pbjacobi": "1500", "ilu": "1000", "cholesky": "60"}
+RUNGS = {"pbjacobi": {"pc_type": "pbjacobi"}, "cholesky": {"pc_type": "cholesky"}}
+CAP = {"pbjacobi": "1500", "cholesky": "60"}
 
-FEWER = {"pbjacobi": 1.0, "ilu": 4.8, "cholesky": np.inf}  # block Jacobi's iterations / this one's
 SOLVES = 1.8  # iterations of predictor and correctors / those of the predictor
 OLD_FACTOR = 60.0  # iterations to expect with the factor of an earlier matrix
 
 
 def cost(rung: str, iterations: float, bodies: int, ranks: int) -> float:
-    """Of the systems with one matrix, the predictor's taking so many iterations, in products with K, measured at 700,
-    4,900 and 35,900 bodies (docs/ccp.md). On more ranks products take less time, factors hardly do."""
-    setup = {"pbjacobi": 3.0, "ilu": 45.0, "cholesky": 650.0 * (bodies / 5000.0) ** 0.4 * ranks}
+    """Of the systems with one matrix, the predictor's taking so many iterations, in iterations with block Jacobi, measured
+    at 700, 4,900 and 35,900 bodies (docs/ccp.md). On more ranks products take less time, factors hardly do."""
+    setup = {"pbjacobi": 5.0, "cholesky": 900.0 * (bodies / 5000.0) ** 0.4 * ranks}
     return setup[rung] + solves_cost(rung, iterations, ranks)
 
 
 def solves_cost(rung: str, iterations: float, ranks: int) -> float:
     """The same when the preconditioner is there already."""
-    iteration = {"pbjacobi": 1.3, "ilu": 2.8, "cholesky": 20.0 * ranks}
+    iteration = {"pbjacobi": 1.0, "cholesky": 35.0 * ranks}
     return SOLVES * iteration[rung] * max(1.0, iterations)
 
 
 class Cheapest(KrylovFamily):
     """Conjugate gradients on the body system, preconditioned by what is expected to cost least: block Jacobi while it
-    takes few iterations, then block ILU(1), then Cholesky factors, of its stiff part; a factor of an earlier
-    matrix is kept as long as iterating with it costs less than a new one.
+    takes few iterations, then Cholesky factors of its stiff part; a factor of an earlier matrix is kept as long as
+    iterating with it costs less than a new one. (Incomplete factors never pay: an iteration costs six times as much.)
 
     The choice rests on iteration counts and fixed costs, so that a repeated run repeats it.
     """
@@ -58,7 +49,7 @@ class Cheapest(KrylovFamily):
         self.system = system
         bodies, ranks = system.matrix.getSize()[0] // 6, self.comm.size
         expected = self._hardness * self._growth
-        costs = {rung: cost(rung, expected / FEWER[rung], bodies, ranks) for rung in RUNGS}
+        costs = {"pbjacobi": cost("pbjacobi", expected, bodies, ranks), "cholesky": cost("cholesky", 1, bodies, ranks)}
         rung, keep = min(costs, key=lambda name: costs[name]), False
         if self._lagged is not None and solves_cost("cholesky", self._lagged, ranks) < min(costs.values()):
             rung, keep = "cholesky", True
@@ -67,7 +58,6 @@ class Cheapest(KrylovFamily):
         self._fresh = True
 
     def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
-        rungs = list(RUNGS)
         while True:
             done = self._try(self._rung, b, x, rtol)
             if done.converged:
@@ -75,9 +65,7 @@ class Cheapest(KrylovFamily):
             if self._rung == "cholesky" and not self._keep:
                 self.fallbacks += 1
                 return False
-            if self._rung != "cholesky":
-                self._rung = rungs[rungs.index(self._rung) + 1]
-            self._keep, self._fresh = False, True
+            self._rung, self._keep, self._fresh = "cholesky", False, True
 
     def _try(self, rung: str, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
         krylov = self._solver(rung)
@@ -95,13 +83,13 @@ class Cheapest(KrylovFamily):
 
     def _approximate(self, rung: str) -> PETSc.Mat:
         """The matrix that a rung's preconditioner is made from."""
-        return self.system.matrix if rung == "pbjacobi" else self.system.stiff_part(complete=rung == "cholesky")
+        return self.system.matrix if rung == "pbjacobi" else self.system.stiff_part()
 
     def _learn(self, rung: str, iterations: int) -> None:
         if rung == "cholesky":
             self._lagged = 1.5 * iterations if self._keep else OLD_FACTOR
             return
-        hardness = max(10.0, iterations * FEWER[rung])
+        hardness = max(10.0, float(iterations))
         self._growth = min(max(hardness / self._hardness, 1.0), 2.0)
         self._hardness = hardness
 
@@ -121,8 +109,7 @@ class Cheapest(KrylovFamily):
 
     def _solver(self, rung: str) -> Krylov:
         if rung not in self._krylov:
-            pc = OVERLAPPING if rung == "ilu" and self.comm.size > 1 else RUNGS[rung]
-            defaults = {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "ksp_max_it": CAP[rung], **pc}
+            defaults = {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "ksp_max_it": CAP[rung], **RUNGS[rung]}
             if rung == "cholesky" and self.comm.size == 1 and PETSc.Sys.hasExternalPackage("suitesparse"):
                 defaults["pc_factor_mat_solver_type"] = "cholmod"  # 1.3 times faster than MUMPS, its solves twice
             self._krylov[rung] = Krylov(self.comm, f"body_{rung}_", defaults)

@@ -145,7 +145,7 @@ def test_unknown_ways_are_refused(monkeypatch):
     rows, _ = random_contacts(8, 3, 3, False)
     with pytest.raises(ValueError, match=r"-ccp_operator quick: allowed are auto, free, assembled"):
         contact_map(MPI.COMM_SELF, rows, "quick")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("pctt.contact_map.available", lambda: False)
     with pytest.raises(ValueError, match="numba is not installed"):
         contact_map(MPI.COMM_SELF, rows, "free")
     assert not is_free("auto")
