@@ -29,7 +29,8 @@ class Sample:
         self.x[::7] = 0.0
         self.x[3::7, 1:] = 0.0
         self.blocks = rng.normal(size=(count, 3, 3))
-        self.positive = rng.uniform(0.1, 2.0, (4, count))
+        self.positive = rng.uniform(0.1, 2.0, (3, count))
+        self.sizes = rng.uniform(0.1, 2.0, (count, 3))
         angle, depth = rng.uniform(0, 2 * np.pi, (2, count)), 1 - 10.0 ** -rng.uniform(0, 12, (2, count))
         unit = np.stack([np.ones_like(angle), depth * np.cos(angle), depth * np.sin(angle)], axis=2)
         self.s, self.t = unit * self.positive[:2, :, None]  # inside the cones of friction 1, some by little
@@ -54,7 +55,8 @@ class Sample:
             "lorentz.scaling": (self.s, self.t),
             "lorentz.scale": (self.x, a[0], self.y),
             "lorentz.unscale": (self.x, a[0], self.y),
-            "lorentz.blocks": (self.direction, a[0], a[1], a[2]),
+            "lorentz.barrier_blocks": (self.direction, a[0], 1 + a[1], self.sizes, a[2], 0.1),
+            "lorentz.towards_interval": (self.x, 0.1, 1.5),
             "barrier.perspective_value": (self.inside, self.mu),
             "barrier.perspective_gradient": (self.inside, self.mu),
             "barrier.perspective_hessian": (self.inside, self.mu),
