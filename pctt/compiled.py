@@ -2,7 +2,7 @@
 
 A function on arrays is then written twice. With numpy it is ``compiled`` and runs everywhere; the loop of the same name
 is in the module beside it, ``cone_loops`` for ``cone``, which is imported at the first call (numba takes half a second).
-tests/test_compiled.py calls both.
+tests/ccp/test_loops.py compares both.
 """
 
 from __future__ import annotations

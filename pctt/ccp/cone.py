@@ -134,7 +134,7 @@ def step_to_boundary(x: Array, dx: Array, mu: Array) -> float:
     to_surface = np.full_like(mu, np.inf)
     np.divide(inside, linear + root, out=to_surface, where=(linear > 0) & (discriminant >= 0))
     np.divide(root - linear, quadratic, out=to_surface, where=(linear <= 0) & (quadratic > 0) & (mu > 0))
-    return min(to_surface.min(initial=np.inf), step_to_zero(x[:, 0], dx[:, 0]))
+    return float(np.minimum(to_surface.min(initial=np.inf), step_to_zero(x[:, 0], dx[:, 0])))
 
 
 @compiled

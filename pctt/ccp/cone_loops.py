@@ -125,12 +125,17 @@ def step_to_boundary(x, dx, mu):
         linear = t_1 * dt_1 + t_2 * dt_2 - m * m * n * dn
         inside = (m * n - size) * (m * n + size)
         discriminant = linear * linear + quadratic * inside
+        step = np.inf
         if linear > 0 and discriminant >= 0:
-            least = min(inside / (linear + np.sqrt(discriminant)), least)
+            step = inside / (linear + np.sqrt(discriminant))
         elif linear <= 0 and quadratic > 0 and m > 0:
-            least = min((np.sqrt(max(discriminant, 0.0)) - linear) / quadratic, least)
-        if dn < 0:
-            least = min(-n / dn, least)
+            step = (np.sqrt(max(discriminant, 0.0)) - linear) / quadratic
+        if dn < 0 and not -n / dn >= step:
+            step = -n / dn
+        if not step >= least:
+            least = step
+            if step != step:  # no other is smaller
+                break
     return least
 
 
@@ -138,6 +143,8 @@ def step_to_boundary(x, dx, mu):
 def step_to_zero(x, dx):
     least = np.inf
     for c in range(len(x)):
-        if dx[c] < 0:
-            least = min(-x[c] / dx[c], least)
+        if dx[c] < 0 and not -x[c] / dx[c] >= least:
+            least = -x[c] / dx[c]
+            if least != least:
+                break
     return least

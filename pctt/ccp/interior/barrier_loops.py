@@ -40,6 +40,7 @@ def perspective_hessian(g, mu):
             out[c, 0, 1] = out[c, 1, 0] = -u * bend
             out[c, 0, 2] = out[c, 2, 0] = -v * bend
             out[c, 1, 1] = out[c, 2, 2] = bend
+            out[c, 1, 2] = out[c, 2, 1] = 0.0 * bend  # none where that is no number
     return out
 
 

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cone import Array, tangential, times
+from pctt.ccp.cone import Array, times
 from pctt.ccp.interior import lorentz
 from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.interior.lorentz import NesterovTodd
@@ -178,7 +178,9 @@ def _direction(
 ) -> tuple[Array, Array, Array, Array]:
     """ds, dz, dv and the Newton system's solution for the right-hand side w; ``start``: an earlier solution."""
     c = at.W.divide(w) - at.z
-    alone = times(at.yielding, at.W.times(w) - at.s) / at.scale - times(at.inverse, at.r_z * at.scale)
+    alone = times(at.yielding, at.W.times(w) - at.s)
+    alone /= at.scale
+    alone -= times(at.inverse, at.r_z * at.scale)
     dg, x = newton.solve((c - at.r_z) * at.scale, at.tol, at.r_v, start, alone)
     dv = newton.momentum(x, dg, at.r_v)
     ds = dg * at.scale
@@ -193,16 +195,11 @@ def _direction(
 def _barrier_blocks(
     problem: ConeProblem, W: NesterovTodd, scale: Array, frictionless: Array, proximal: float
 ) -> tuple[Array, Array, Array]:
-    """B, (B + C)^-1 and, in the scaled variables, (B + C)^-1 B (nc, 3, 3) from the spectral form of the scaled blocks:
-    no tiny block is inverted."""
+    """B, (B + C)^-1 and, in the scaled variables, (B + C)^-1 B (nc, 3, 3)."""
     with phase("CCPBarrier"):
-        squares = W.square_values()
         soft = proximal * problem.mean_diagonal
         give = problem.compliance[:, 1] + soft  # the same along all axes of the scaled variables
-        both = scale[:, :, None] * scale[:, None, :]
-        B = W.blocks(*(1.0 / k + soft for k in squares)) * both
-        inverse = W.blocks(*(k / (1.0 + give * k) for k in squares)) / both
-        yielding = W.blocks(*(1.0 / (1.0 + give * k) for k in squares))
+        B, inverse, yielding = W.barrier_blocks(scale, give, soft)
         if frictionless.any():
             stiff = 1e12 * np.maximum(B[frictionless, 0, 0], problem.mean_diagonal)
             B[frictionless, 1, 1] = B[frictionless, 2, 2] = stiff
@@ -224,14 +221,7 @@ def _towards_path(W: NesterovTodd, z: Array, ds: Array, dz: Array, reach: float,
     Source: Gondzio (1996), multiple centrality corrections; here with the eigenvalues of second-order cones."""
     centre = W.times(z)
     after = lorentz.product(centre + reach * W.divide(ds), centre + reach * W.times(dz))
-    size = tangential(after)
-    eigenvalues = after[:, 0] + np.stack([size, -size])
-    aim = np.clip(eigenvalues, NEAR[0] * target, NEAR[1] * target) - eigenvalues
-    larger, smaller = np.maximum(aim, -NEAR[1] * target)
-    change = np.empty_like(after)
-    change[:, 0] = 0.5 * (larger + smaller)
-    change[:, 1:] = (0.5 * (larger - smaller) / np.maximum(size, 1e-300))[:, None] * after[:, 1:]
-    return lorentz.divide(centre, change)
+    return lorentz.divide(centre, lorentz.towards_interval(after, NEAR[0] * target, NEAR[1] * target))
 
 
 def _centering(problem: ConeProblem, s: Array, z: Array) -> float:

@@ -136,7 +136,21 @@ def unscale(root: Array, eta: Array, x: Array) -> Array:
 
 
 @compiled
-def blocks(direction: Array, along: Array, against: Array, across: Array) -> Array:
+def barrier_blocks(
+    direction: Array, eta: Array, spread: Array, scale: Array, give: Array, soft: float
+) -> tuple[Array, Array, Array]:
+    """What the method of ``NesterovTodd`` returns."""
+    square = eta * eta
+    squares = square * spread**2, square / spread**2, square
+    both = scale[:, :, None] * scale[:, None, :]
+    B = _blocks(direction, *(1.0 / k + soft for k in squares))
+    B *= both
+    inverse = _blocks(direction, *(k / (1.0 + give * k) for k in squares))
+    inverse /= both
+    return B, inverse, _blocks(direction, *(1.0 / (1.0 + give * k) for k in squares))
+
+
+def _blocks(direction: Array, along: Array, against: Array, across: Array) -> Array:
     """Symmetric blocks (nc, 3, 3) with given eigenvalues for (1, u), (1, -u), (0, u')."""
     u, v = direction.T
     mean, half = 0.5 * (along + against), 0.5 * (along - against)
@@ -147,6 +161,18 @@ def blocks(direction: Array, along: Array, against: Array, across: Array) -> Arr
     out[:, 1, 1] = mean * u * u + across * v * v
     out[:, 2, 2] = mean * v * v + across * u * u
     out[:, 1, 2] = out[:, 2, 1] = (mean - across) * u * v
+    return out
+
+
+@compiled
+def towards_interval(x: Array, low: float, high: float) -> Array:
+    """What moves the spectral values of x into [low, high], but none by more than ``high`` downwards."""
+    size = tangential(x)
+    values = x[:, 0] + np.stack([size, -size])
+    larger, smaller = np.maximum(np.clip(values, low, high) - values, -high)
+    out = np.empty_like(x)
+    out[:, 0] = 0.5 * (larger + smaller)
+    out[:, 1:] = (0.5 * (larger - smaller) / np.maximum(size, 1e-300))[:, None] * x[:, 1:]
     return out
 
 
@@ -177,11 +203,10 @@ class NesterovTodd:
         """W^-1 x."""
         return unscale(self.root, self.eta, x)
 
-    def square_values(self) -> tuple[Array, Array, Array]:
-        """Eigenvalues of W^2 for (1, u), (1, -u), (0, u')."""
-        square = self.eta * self.eta
-        return square * self.spread**2, square / self.spread**2, square
+    def barrier_blocks(self, scale: Array, give: Array, soft: float) -> tuple[Array, Array, Array]:
+        """Of B = W^-2 + soft and the compliance C + soft = ``give``, a number per contact: with S = diag ``scale``
+        S B S, S^-1 (B + C)^-1 S^-1 and (B + C)^-1 B, (nc, 3, 3) each.
 
-    def blocks(self, along: Array, against: Array, across: Array) -> Array:
-        """Symmetric blocks (nc, 3, 3) with given eigenvalues for (1, u), (1, -u), (0, u')."""
-        return blocks(self.direction, along, against, across)
+        From the spectral form, W^2 having the eigenvalues (eta spread)^2, (eta / spread)^2 and eta^2 for (1, u), (1, -u)
+        and (0, u'): no tiny block is inverted."""
+        return barrier_blocks(self.direction, self.eta, self.spread, scale, give, soft)

@@ -107,15 +107,50 @@ def unscale(root, eta, x):
 
 
 @loop
-def blocks(direction, along, against, across):
-    out = np.empty((len(along), 3, 3))
-    for c in range(len(along)):
-        u, v, k = direction[c, 0], direction[c, 1], across[c]
-        mean, half = 0.5 * (along[c] + against[c]), 0.5 * (along[c] - against[c])
-        out[c, 0, 0] = mean
-        out[c, 0, 1] = out[c, 1, 0] = half * u
-        out[c, 0, 2] = out[c, 2, 0] = half * v
-        out[c, 1, 1] = mean * u * u + k * v * v
-        out[c, 2, 2] = mean * v * v + k * u * u
-        out[c, 1, 2] = out[c, 2, 1] = (mean - k) * u * v
+def barrier_blocks(direction, eta, spread, scale, give, soft):
+    count = len(eta)
+    B, inverse, yielding = np.empty((count, 3, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3))
+    for c in range(count):
+        square = eta[c] * eta[c]
+        along, against = square * (spread[c] * spread[c]), square / (spread[c] * spread[c])
+        u, v = direction[c, 0], direction[c, 1]
+        _block(u, v, 1.0 / along + soft, 1.0 / against + soft, 1.0 / square + soft, B[c])
+        yields = 1.0 / (1.0 + give[c] * along), 1.0 / (1.0 + give[c] * against), 1.0 / (1.0 + give[c] * square)
+        _block(u, v, along * yields[0], against * yields[1], square * yields[2], inverse[c])
+        _block(u, v, yields[0], yields[1], yields[2], yielding[c])
+        for i in range(3):
+            for j in range(3):
+                both = scale[c, i] * scale[c, j]
+                B[c, i, j] *= both
+                inverse[c, i, j] /= both
+    return B, inverse, yielding
+
+
+@loop
+def _block(u, v, along, against, across, out):
+    mean, half = 0.5 * (along + against), 0.5 * (along - against)
+    out[0, 0] = mean
+    out[0, 1] = out[1, 0] = half * u
+    out[0, 2] = out[2, 0] = half * v
+    out[1, 1] = mean * u * u + across * v * v
+    out[2, 2] = mean * v * v + across * u * u
+    out[1, 2] = out[2, 1] = (mean - across) * u * v
+
+
+@loop
+def towards_interval(x, low, high):
+    out = np.empty_like(x)
+    for c in range(len(x)):
+        size = np.sqrt(x[c, 1] * x[c, 1] + x[c, 2] * x[c, 2])
+        larger = _shift(x[c, 0] + size, low, high)
+        smaller = _shift(x[c, 0] - size, low, high)
+        turn = 0.5 * (larger - smaller) / (1e-300 if size < 1e-300 else size)
+        out[c, 0], out[c, 1], out[c, 2] = 0.5 * (larger + smaller), turn * x[c, 1], turn * x[c, 2]
     return out
+
+
+@loop
+def _shift(value, low, high):
+    aim = low if value < low else high if value > high else value
+    shift = aim - value
+    return -high if shift < -high else shift
