@@ -249,7 +249,10 @@ def sum_of_impulses(frame: Floats, arm: Floats, row: Ints, impulse: Floats, coun
 
 def sum_rows(row: Ints, values: Floats, count: int) -> Floats:
     """Sums (count, 6) of the values (n, 6) of equal row."""
-    return np.stack([np.bincount(row, column, minlength=count) for column in values.T], axis=1)
+    sums = np.empty((count, values.shape[1]))  # of no rows bincount makes integers
+    for k, column in enumerate(values.T):
+        sums[:, k] = np.bincount(row, column, minlength=count)
+    return sums
 
 
 def scaled(root: Floats, values: Floats) -> Floats:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cases import contacts_by_key, crude_impulse, heap, step
+from cases import contacts_by_key, crude_impulse, heap, random_quaternions, step
 from mpi4py import MPI
 
+from dem import impulses, quaternion
 from dem import system as contact_system
 from dem.contact import broad, find_contacts, primitives, search
 from dem.loops import loops
@@ -25,7 +26,7 @@ def without_loops(monkeypatch):
 
     def call(work, *arguments):
         with monkeypatch.context() as patch:
-            for module in (broad, contact_system, primitives, search):
+            for module in (broad, contact_system, impulses, primitives, quaternion, search):
                 patch.setattr(module, "loops", lambda: None)
             return work(*arguments)
 
@@ -93,6 +94,43 @@ def test_contacts_of_equal_bodies_agree_to_rounding(without_loops):
     assert len(plain["key"]) > 500
     for name, value in plain.items():
         np.testing.assert_allclose(compiled[name], value, rtol=1e-13, atol=1e-13)
+
+
+def test_no_contacts(without_loops):
+    """Every function of no contacts, with and without numba: shapes and types."""
+    none, rows = np.zeros((0, 3)), np.zeros((0, 2), np.int64)
+    frame, arm, position = np.zeros((0, 3, 3)), np.zeros((0, 6)), np.zeros((4, 3))
+    calls = {
+        (0, 3, 3): (contact_system.contact_frames, none),
+        (0, 6): (contact_system.contact_arms, none, position, rows),
+        (0, 3): (contact_system.relative_velocity, frame, arm, rows, np.zeros((4, 6))),
+        (4, 6): (contact_system.sum_of_impulses, frame, arm, rows, none, 4),
+        (0, 4): (impulses.in_the_world, none, frame),
+    }
+    for shape, (work, *arguments) in calls.items():
+        for result in (work(*arguments), without_loops(work, *arguments)):
+            assert result.shape == shape
+            assert result.dtype == np.float64
+            assert not result.any()
+
+
+def test_impulses_in_the_world_and_back(without_loops):
+    rng = np.random.default_rng(4)
+    normal, impulse = rng.normal(size=(50, 3)), rng.normal(size=(50, 3))
+    frame = contact_system.contact_frames(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    stored = impulses.in_the_world(impulse, frame)
+    np.testing.assert_allclose(stored, without_loops(impulses.in_the_world, impulse, frame), atol=1e-15)
+    np.testing.assert_allclose(impulses.in_frames(stored, frame), impulse, atol=1e-14)
+    np.testing.assert_allclose(without_loops(impulses.in_frames, stored, frame), impulse, atol=1e-14)
+
+
+def test_orientations(without_loops):
+    rng = np.random.default_rng(6)
+    turn, spin = random_quaternions(rng, 30), 20.0 * rng.normal(size=(30, 3))
+    spin[:3] = 0.0
+    spin[3:6] *= 1e-12
+    plain = without_loops(quaternion.integrate, turn, spin, 0.02)
+    np.testing.assert_allclose(quaternion.integrate(turn, spin, 0.02), plain, atol=1e-15)
 
 
 def _call(work, *arguments):
