@@ -66,7 +66,7 @@ class Replay:
 
     def matrix(self, system: System) -> PETSc.Mat:
         self._of.update(system.barrier)
-        return self._of.preconditioned
+        return self._of.entries()
 
     def destroy(self) -> None:
         self._of.destroy()
