@@ -1,7 +1,7 @@
 """Loops that numba compiles, where it is installed: one pass over the memory for what numpy does in many.
 
-A function on arrays is then written twice. With numpy it is ``compiled`` and runs everywhere. The loop of the same name is
-in the module beside it, ``cone_loops`` for ``cone``, which the first call imports: numba takes half a second to come.
+A function on arrays is then written twice. With numpy it is ``compiled`` and runs everywhere. The loop of the same name
+is in the module beside it (``cone_loops`` for ``cone``), which the first call imports: numba takes half a second to come.
 tests/ccp/test_loops.py compares both.
 """
 
@@ -28,8 +28,8 @@ def available() -> bool:
 
 
 def compiled(function: Function) -> Function:
-    """Have the loop run in place of ``function``, where numba is available and all arrays are of float64, contiguous and
-    writable: then one machine code per loop serves. All arguments are arrays or numbers, and are given in order."""
+    """Have the loop run in place of ``function``, where numba is available and all arrays are of float64, contiguous
+    and writable: then one machine code per loop serves. All arguments are arrays or numbers, given in order."""
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
@@ -52,8 +52,8 @@ def loop_of(function: Callable[..., Any]) -> Callable[..., Any]:
 def loop(function: Function) -> Function:
     """Compile at the first call and keep the machine code on disk.
 
-    Products and sums may be fused, and a division by zero gives inf or nan as in numpy. What is kept is made anew when the
-    file of ``function`` changes, that file alone: so a loop calls none of another file."""
+    Products and sums may be fused, and a division by zero gives inf or nan as in numpy. What is kept is made anew when
+    the file of ``function`` changes, that file alone: so a loop calls none of another file."""
     import numba
 
     options: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}

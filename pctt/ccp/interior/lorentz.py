@@ -25,8 +25,8 @@ ROUND = 1e-14  # tangential part of a unit scaling point below which it has no d
 def determinant(x: Array) -> Array:
     """x_0^2 - |x_1:|^2 (nc,) of points inside, kept positive where rounding would not.
 
-    Rounding near the boundary is at most 1.5 eps x_0^2: the first difference is exact there, and neither the product nor
-    the square is larger than x_0^2 / 2."""
+    Near the boundary rounding is at most 1.5 eps x_0^2: the first difference is exact, and neither the product nor the
+    square is larger than x_0^2 / 2."""
     one, two = np.abs(x[:, 1]), np.abs(x[:, 2])
     large, small = np.maximum(one, two), np.minimum(one, two)
     found = (x[:, 0] - large) * (x[:, 0] + large) - small * small
