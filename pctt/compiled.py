@@ -1,7 +1,7 @@
 """Loops that numba compiles, where it is installed: one pass over the memory for what numpy does in many.
 
 A function on arrays is then written twice. With numpy it is ``compiled`` and runs everywhere. The loop of the same name
-is in the module beside it (``cone_loops`` for ``cone``), which the first call imports: numba takes half a second to come.
+is in the module beside it (``cone_loops`` for ``cone``), which the first call imports (numba takes its time).
 tests/ccp/test_loops.py compares both.
 """
 
