@@ -59,7 +59,7 @@ class ScaledProblem:
 
     def dots(self, *pairs: tuple[Array, Array]) -> Array:
         """Scalar products of pairs of arrays over all contacts, in one reduction over the ranks."""
-        return self.sums(*(np.vdot(x, y) for x, y in pairs))
+        return self.sums(*(float(np.vdot(x, y)) for x, y in pairs))
 
     def sums(self, *parts: float) -> Array:
         """Sums of numbers over the ranks, in one reduction; of a buffer, which takes a tenth of the time of objects."""
