@@ -1,7 +1,7 @@
 """Loops that numba compiles, where it is installed: one pass over the memory for what numpy does in many.
 
-A function on arrays is then written twice. With numpy it is ``compiled`` and runs everywhere; the loop of the same name
-is in the module beside it, ``cone_loops`` for ``cone``, which is imported at the first call (numba takes half a second).
+A function on arrays is then written twice. With numpy it is ``compiled`` and runs everywhere. The loop of the same name
+is in the module beside it (``cone_loops`` for ``cone``), which the first call imports (numba takes its time).
 tests/ccp/test_loops.py compares both.
 """
 
@@ -28,8 +28,8 @@ def available() -> bool:
 
 
 def compiled(function: Function) -> Function:
-    """The loop in place of ``function``, where numba is available and all arrays are contiguous, of float64 and writable:
-    so there is one machine code for each loop. Arguments are arrays and numbers, in order; those without a default."""
+    """Have the loop run in place of ``function``, where numba is available and all arrays are of float64, contiguous
+    and writable: then one machine code per loop serves. All arguments are arrays or numbers, given in order."""
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
@@ -50,11 +50,10 @@ def loop_of(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def loop(function: Function) -> Function:
-    """Compile at the first call and keep the machine code on disk. Products and sums may be fused, which numbers that are
-    none survive; a division by zero gives what it gives in numpy.
+    """Compile at the first call and keep the machine code on disk.
 
-    What is kept is thrown away when the file of ``function`` changes, and no other: a loop calls loops of its own file only.
-    """
+    Products and sums may be fused, and a division by zero gives inf or nan as in numpy. What is kept is made anew when
+    the file of ``function`` changes, that file alone: so a loop calls none of another file."""
     import numba
 
     options: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}

@@ -41,7 +41,7 @@ def solve(
             scaled.gradient(new_x, out=new_y)
             progress.iterations += 1
             curvature = accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta)
-            curvature, length, uphill = problem.sum(np.array([curvature, length, uphill]))
+            curvature, length, uphill = scaled.sums(curvature, length, uphill)
             if not curvature > lipschitz * length * (1 + 1e-12):  # also ends on a number that is none
                 break
             lipschitz = 1.1 * curvature / length

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.ccp import cone
@@ -69,7 +70,13 @@ class ScaledProblem:
 
     def dots(self, *pairs: tuple[Array, Array]) -> Array:
         """Scalar products of pairs of arrays over all contacts, in one reduction over the ranks."""
-        return self.problem.sum(np.array([np.vdot(x, y) for x, y in pairs]))
+        return self.sums(*(float(np.vdot(x, y)) for x, y in pairs))
+
+    def sums(self, *parts: float) -> Array:
+        """Sums of numbers over the ranks, in one reduction; of a buffer, which takes a tenth of the time of objects."""
+        out = np.array(parts, dtype=float)
+        self.problem.comm.Allreduce(MPI.IN_PLACE, out)
+        return out
 
     def matrix(self) -> PETSc.Mat:
         """A as a Mat of its own."""

@@ -25,8 +25,8 @@ ROUND = 1e-14  # tangential part of a unit scaling point below which it has no d
 def determinant(x: Array) -> Array:
     """x_0^2 - |x_1:|^2 (nc,) of points inside, kept positive where rounding would not.
 
-    What is left near the boundary is what rounding leaves: at most 1.5 eps x_0^2, as the first difference is exact there
-    and the other terms are no larger than x_0^2 / 2."""
+    Near the boundary rounding is at most 1.5 eps x_0^2: the first difference is exact, and neither the product nor the
+    square is larger than x_0^2 / 2."""
     one, two = np.abs(x[:, 1]), np.abs(x[:, 2])
     large, small = np.maximum(one, two), np.minimum(one, two)
     found = (x[:, 0] - large) * (x[:, 0] + large) - small * small
@@ -207,6 +207,6 @@ class NesterovTodd:
         """Of B = W^-2 + soft and the compliance C + soft = ``give``, a number per contact: with S = diag ``scale``
         S B S, S^-1 (B + C)^-1 S^-1 and (B + C)^-1 B, (nc, 3, 3) each.
 
-        From the spectral form, W^2 having the eigenvalues (eta spread)^2, (eta / spread)^2 and eta^2 for (1, u), (1, -u)
-        and (0, u'): no tiny block is inverted."""
+        From the spectral form, no tiny block is inverted: W^2 has the eigenvalues (eta spread)^2, (eta / spread)^2 and
+        eta^2 for (1, u), (1, -u) and (0, u')."""
         return barrier_blocks(self.direction, self.eta, self.spread, scale, give, soft)
