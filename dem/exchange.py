@@ -14,7 +14,8 @@ def exchange(comm: MPI.Comm, columns: Mapping[str, np.ndarray], destination: Int
     """Send row i of every column to the rank destination[i]; collective.
 
     columns: arrays (n, ...) of the same names, types and trailing shapes on every rank; destination: (n,).
-    Rows arrive in the order of the sending ranks and, from one rank, in the order sent.
+    Rows arrive in the order of the sending ranks and, from one rank, in the order sent. A single rank gets the arrays
+    themselves, without a copy.
     """
     if comm.size == 1:
         return dict(columns)
