@@ -84,8 +84,8 @@ def copied(problem: ccp.ConeProblem, count: int) -> ccp.ConeProblem:
 
 
 def run(path: Path, method: str, tol: float, seconds: float) -> dict[str, Any]:
-    """What solve_one.py says; {"reason": ...} alone where it was ended or failed. A METHOD that ends in ` assembled` has
-    its products made by matrices of PETSc."""
+    """What solve_one.py says; {"reason": ...} alone where it was ended or failed. A method that ends in ` assembled`
+    has its products made by matrices of PETSc."""
     name = method.removesuffix(" assembled")
     words = [str(path), name, str(tol), str(seconds), "auto" if name == method else "assembled"]
     command = [sys.executable, str(Path(__file__).with_name("solve_one.py")), *words]

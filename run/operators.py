@@ -1,7 +1,7 @@
 """Products with the contact map, S and K, by compiled loops and by matrices of PETSc; see run/operators.
 
-Megabytes are what a product has to bring from memory at least once and to write back: the storage of the map, vectors of
-contacts and of bodies; what of it comes from a cache is not told apart. Medians of repetitions in turn.
+Megabytes are what a product has to bring from memory at least once and to write back: the storage of the map, vectors
+of contacts and of bodies; what of it comes from a cache is not told apart. Medians of repetitions in turn.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def ways(problem: ccp.ConeProblem) -> dict[str, ccp.ConeProblem]:
 
 def storage(problem: ccp.ConeProblem) -> float:
     """Bytes of the map's rows."""
-    if not problem.free or not isinstance(problem.contact_map.given, ccp.CompactRows):
+    if problem.free_map is None or not isinstance(problem.contact_map.given, ccp.CompactRows):
         G = problem.contact_map.block_rows
         return len(G.blocks) * (18 * NUMBER + 4) + 8 * G.rows
     given = problem.contact_map.given
@@ -63,7 +63,10 @@ def products(problem: ccp.ConeProblem) -> dict[str, tuple[Callable[[], Any], flo
     of_contacts, of_bodies = contact.matrix.createVecs(), body.matrix.createVecs()
     of_contacts[0].array[:], of_bodies[0].array[:] = g.ravel(), v.ravel()
     rows, contacts, bodies = storage(problem), g.nbytes, v.nbytes
-    S, K = (mat.getInfo()["nz_used"] * NUMBER * 1.05 if not problem.free else 0 for mat in (contact.matrix, body.matrix))
+    S, K = (
+        mat.getInfo()["nz_used"] * NUMBER * 1.05 if problem.free_map is None else 0
+        for mat in (contact.matrix, body.matrix)
+    )
     return {
         "G v": (lambda: G.velocities(v), rows + bodies + 2 * contacts),
         "G'g": (lambda: G.momenta(g), rows + 2 * bodies + contacts),
@@ -128,6 +131,7 @@ def main() -> None:
     for n in words.n:
         problem = step_problem(n, "settled", 0.0)
         print(f"\nmixer n = {n}, {problem.size} contacts, {problem.contact_map.columns} bodies")
+        case = {"n": n, "contacts": problem.size}
         table = {way: products(p) for way, p in ways(problem).items()}
         seconds: dict[tuple[str, str], list[float]] = {}
         for _ in range(REPEAT):
@@ -142,11 +146,11 @@ def main() -> None:
                 median = statistics.median(seconds[way, name]) / (50 if name.startswith("CG") else 1)
                 more = f" {size / 1e6:8.2f} {size / median / 1e9:8.1f}" if size else ""
                 print(f"  {name:24} {1e3 * median:8.3f}{more}", flush=True)
-                rows.append({"n": n, "contacts": problem.size, "way": way, "product": name, "seconds": median, "bytes": size})
+                rows.append(case | {"way": way, "product": name, "seconds": median, "bytes": size})
         for way, p in ways(problem).items():
             median = statistics.median(apgd_iteration(p) for _ in range(3))
             print(f"iteration of APGD, {way:24} {1e3 * median:8.3f} ms", flush=True)
-            rows.append({"n": n, "contacts": problem.size, "way": way, "product": "APGD", "seconds": median, "bytes": 0})
+            rows.append(case | {"way": way, "product": "APGD", "seconds": median, "bytes": 0})
     record("operators", about | {"memory GB/s": triad}, rows)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -12,6 +13,9 @@ from pctt.blocks import BlockRows, dense_columns, diagonal_blocks, without_crowd
 from pctt.ccp.cone import Array, projected_move_squares
 from pctt.ccp.delassus import delassus, local_blocks
 from pctt.contact_map import CompactRows, ContactMap, contact_map
+
+if TYPE_CHECKING:
+    from pctt.contact_map.free import FreeMap
 
 
 class ConeProblem:
@@ -74,9 +78,9 @@ class ConeProblem:
         return f"ConeProblem({self.size} contacts, {self.comm.size} ranks, given by {given})"
 
     @property
-    def free(self) -> bool:
-        """Whether products are made without matrices."""
-        return self.contact_map is not None and self.contact_map.free
+    def free_map(self) -> FreeMap | None:
+        """The contact map, if its products are made without matrices."""
+        return cast("FreeMap", self.contact_map) if self.contact_map is not None and self.contact_map.free else None
 
     # -- the operator ---------------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ Two storages: frames and arms (`CompactRows`), or 3 x 6 blocks (`BlockRows`). Tw
 
 from __future__ import annotations
 
-from typing import Union
+from typing import TYPE_CHECKING, Union
 
 from mpi4py import MPI
 
@@ -16,9 +16,12 @@ from pctt.contact_map.assembled import AssembledMap
 from pctt.contact_map.ghosts import Ghosts
 from pctt.contact_map.rows import CompactRows, block_rows
 
+if TYPE_CHECKING:
+    from pctt.contact_map.free import FreeMap
+
 __all__ = ["OPERATORS", "AssembledMap", "CompactRows", "ContactMap", "Ghosts", "block_rows", "contact_map", "is_free"]
 
-ContactMap = Union["FreeMap", AssembledMap]  # noqa: F821
+ContactMap = Union["FreeMap", AssembledMap]
 OPERATORS = ("auto", "free", "assembled")
 
 

@@ -1,5 +1,5 @@
-"""Compiled loops over contacts that are rows of 3 x 6 blocks (`BlockRows`); the functions of `compact_loops`, for mass-scaled
-velocities. Row c has the blocks ``start[c]`` to ``start[c + 1]``, in the columns of the bodies ``body`` (nb,).
+"""Compiled loops over contacts that are rows of 3 x 6 blocks (`BlockRows`): the functions of `compact_loops`, for
+mass-scaled velocities. Row c has the blocks ``start[c]`` to ``start[c + 1]``, in the columns of the bodies ``body`` (nb,).
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
 """Compiled loops over contacts that are frames and arms (`CompactRows`); importing this takes half a second.
 
-``first`` and ``last`` bound the contacts; ``body`` (nc, 2) are local numbers; w and m are (bodies, 6), physical velocities
-and momenta. The loops add to their last argument.
+``first`` and ``last`` bound the contacts; ``body`` (nc, 2) are local numbers; w and m are (bodies, 6), physical
+velocities and momenta. The loops add to their last argument.
 """
 
 from __future__ import annotations
 
 import numpy as np
+
 from pctt.compiled import loop
 
 
@@ -124,7 +125,7 @@ def add_body_blocks(frame, arm, body, weight, blocks):
 
 @loop
 def contact_blocks(frame, arm, body, mass, out):
-    """out (nc, 3, 3): the diagonal blocks of D' M^-1 D; ``mass`` (bodies, 12) is M^-1 in the form of `CompactRows.root`."""
+    """out (nc, 3, 3): the diagonal blocks of D' M^-1 D; ``mass`` (bodies, 12) is M^-1, as `CompactRows.root`."""
     J = np.empty((3, 6))
     for c in range(len(frame)):
         for i in range(3):

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cached_property
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -42,8 +44,10 @@ class FreeMap:
 
     def _take_compact(self, given: CompactRows, ghosts: Ghosts | None) -> None:
         self._ghosts = ghosts or Ghosts(self.comm, given.columns, given.body)
-        self._loops = compact_loops
-        self._arrays = (_floats(given.frame), _floats(given.arm), self._ghosts.body)
+        self._loops: ModuleType = compact_loops
+        self._arrays: Any = (_floats(given.frame), _floats(given.arm), self._ghosts.body)
+        self._root: Array | None
+        self._mass: Array | None
         self._root, self._mass = _floats(given.root), _square(given.root)
         self._first_away = _first(self._is_ghost(self._ghosts.body).any(axis=1))
         self._flops = {"single": 45 * self.rows + 6 * self.columns, "through": 72 * self.rows + 18 * self.columns}
@@ -154,6 +158,7 @@ class FreeMap:
         """The diagonal blocks of G G' (nc, 3, 3)."""
         if isinstance(self.given, BlockRows):
             return diagonal_blocks(self.given)
+        assert self._mass is not None
         out = np.empty((self.rows, 3, 3))
         mass = np.zeros((self._ghosts.nobody + 1, 12))
         mass[: self.columns] = _wide(self._mass)

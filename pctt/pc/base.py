@@ -15,8 +15,8 @@ from typing import Any
 
 from petsc4py import PETSc
 
-from pctt.shell import is_shell
 from pctt.options import describe, no_such_option, read
+from pctt.shell import is_shell
 
 
 class PythonPC:

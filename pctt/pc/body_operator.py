@@ -3,14 +3,18 @@ matrix for preconditioners that read entries."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, cast
+
 import numpy as np
 from numpy.typing import NDArray
-from petsc4py import PETSc
 
 from pctt.contact_map import ContactMap
 from pctt.pc.block_diagonal import set_diagonal_blocks
 from pctt.pc.body_matrix import BodyMatrix
 from pctt.shell import symmetric_shell
+
+if TYPE_CHECKING:
+    from pctt.contact_map.free import FreeMap
 
 Array = NDArray[np.float64]
 
@@ -51,12 +55,13 @@ class BodyOperator:
         if not self.contact_map.free:
             self.entries()
             return
-        self._weight = self.contact_map.weights(inverse)
-        set_diagonal_blocks(self.mat, self.contact_map.body_blocks(self._weight))
+        G = cast("FreeMap", self.contact_map)
+        self._weight = G.weights(inverse)
+        set_diagonal_blocks(self.mat, G.body_blocks(self._weight))
         self.mat.stateIncrease()
 
     def _product(self, v: Array, out: Array) -> None:
-        self.contact_map.through(self._weight, v, out)
+        cast("FreeMap", self.contact_map).through(self._weight, v, out)
 
     def entries(self) -> BodyMatrix:
         """The matrix of K with its present values; collective."""

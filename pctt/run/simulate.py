@@ -24,6 +24,7 @@ from dem.system import ContactSystem
 from dem.together import SceneError, together
 from dem.world import World
 from pctt import ccp, log
+from pctt.compiled import tell_first_compilation
 from pctt.options import OptionError
 from pctt.run import checkpoint, interrupt, leftovers, report
 from pctt.run.dump import Dump

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -16,8 +15,8 @@ OLD_FACTOR = 60.0  # iterations to expect with the factor of an earlier matrix
 
 
 def cost(rung: str, iterations: float, bodies: int, ranks: int) -> float:
-    """Of the systems with one matrix, the predictor's taking so many iterations, in iterations with block Jacobi, measured
-    at 700, 4,900 and 35,900 bodies (docs/ccp.md). On more ranks products take less time, factors hardly do."""
+    """Of the systems with one matrix, the predictor's taking so many iterations, in iterations with block Jacobi,
+    measured at 4,900 and 35,900 bodies (docs/ccp.md). On more ranks products take less time, factors hardly do."""
     setup = {"pbjacobi": 5.0, "cholesky": 900.0 * (bodies / 5000.0) ** 0.4 * ranks}
     return setup[rung] + solves_cost(rung, iterations, ranks)
 

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt import log
-from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
+from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve, Source
 from pctt.options import OptionError
 
 _BODY = {
@@ -98,7 +98,7 @@ class Comparison(KrylovFamily):
         self._seen += 1
         return (self._seen - 1) % self.every == 0
 
-    def run(self, A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: PETSc.Mat | Callable[[], PETSc.Mat] | None = None) -> Solve:
+    def run(self, A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: Source = None) -> Solve:
         """All preconditioners on one system; x is of the first that converged, else of the best.
 
         What the others take counts as the phase `compare`, not as `solve`: a run that compares nothing is spared it.

@@ -29,7 +29,7 @@ class ContactSystem:
         self.problem = problem
         self._entries: Entries | None = None
         self._low_rank: PETSc.Mat | None = None
-        if problem.free:
+        if problem.free_map is not None:
             self.matrix = symmetric_shell(problem.comm, problem.r.size, 3, self._product)
         else:
             self._take_entries()
@@ -57,9 +57,10 @@ class ContactSystem:
         """Put the barrier blocks (nc, 3, 3) in."""
         self._barrier = barrier
         self._made = False
-        if self.problem.free:
+        G = self.problem.free_map
+        if G is not None:
             whole = barrier + self.problem.compliance_blocks
-            self._local = self.problem.contact_map.pack(whole)
+            self._local = G.pack(whole)
             describe(self.matrix, self.problem)
             self.matrix.setAttr("barrier", whole)
             set_diagonal_blocks(self.matrix, self.problem.diagonal_blocks + barrier)
@@ -71,9 +72,11 @@ class ContactSystem:
             self.matrix.assemble()
 
     def _product(self, g: Array, out: Array) -> None:
+        G = self.problem.free_map
+        assert G is not None
         g, out = g.reshape(-1, 3), out.reshape(-1, 3)
-        self.problem.contact_map.local_product(self._local, g, out)
-        self.problem.contact_map.add_delassus(g, out)
+        G.local_product(self._local, g, out)
+        G.add_delassus(g, out)
 
     def entries(self) -> PETSc.Mat:
         """S, or its sparse part, as a matrix that preconditioners can read; collective."""

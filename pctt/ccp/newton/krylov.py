@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Union
 
 import numpy as np
 from mpi4py import MPI
@@ -18,6 +19,8 @@ from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
 from pctt.petsc import own_errors
 from pctt.shell import is_shell
 
+# the Mat from which a preconditioner is made, or a function that makes it, for those that read entries
+Source = Union[PETSc.Mat, Callable[[], PETSc.Mat], None]
 # right preconditioning makes the residual that the method sees the true one
 _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
 # what wants scalar rows; others switch when PETSc says so
@@ -95,7 +98,7 @@ class Krylov:
         b: PETSc.Vec,
         x: PETSc.Vec,
         rtol: float | None = None,
-        P: PETSc.Mat | Callable[[], PETSc.Mat] | None = None,
+        P: Source = None,
         keep: bool = False,
     ) -> Solve:
         """x = A^-1 b from zero. A set-up or solve that breaks down, on whichever rank, is reported, never raised.
@@ -128,7 +131,7 @@ class Krylov:
         words = _REASONS.get(reason, str(reason))
         return Solve(converged, words, iterations, setup - start, end - setup, true, self.rtol)
 
-    def _set_up(self, A: PETSc.Mat, P: PETSc.Mat | Callable[[], PETSc.Mat] | None, keep: bool) -> None:
+    def _set_up(self, A: PETSc.Mat, P: Source, keep: bool) -> None:
         self.ksp.pc.setReusePreconditioner(keep)
         if not keep:
             form = self._form(self._source(A, P))
@@ -141,7 +144,7 @@ class Krylov:
         self.ksp.solve(right_hand_side, x)
         right_hand_side.destroy()
 
-    def _source(self, A: PETSc.Mat, P: PETSc.Mat | Callable[[], PETSc.Mat] | None) -> PETSc.Mat:
+    def _source(self, A: PETSc.Mat, P: Source) -> PETSc.Mat:
         """The Mat that the preconditioner is made from."""
         if P is None or (is_shell(A) and not self.needs_entries):
             return A
