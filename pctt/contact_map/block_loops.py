@@ -1,5 +1,5 @@
 """Compiled loops over contacts that are rows of 3 x 6 blocks (`BlockRows`): the functions of `compact_loops`, for
-mass-scaled velocities. Row c has the blocks ``start[c]`` to ``start[c + 1]``, in the columns of the bodies ``body`` (nb,).
+mass-scaled velocities. Row c has the blocks ``start[c]`` to ``start[c + 1]``, in the columns ``body`` (nb,).
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from pctt.compiled import loop
 
 
 @loop
-def add_velocities(first, last, blocks, start, body, w, y):
+def add_velocities(blocks, start, body, w, y):
     """y += G w (nc, 3)."""
-    for c in range(first, last):
+    for c in range(len(start) - 1):
         y0 = y1 = y2 = 0.0
         for k in range(start[c], start[c + 1]):
             i = body[k]
@@ -24,9 +24,9 @@ def add_velocities(first, last, blocks, start, body, w, y):
 
 
 @loop
-def add_momenta(first, last, blocks, start, body, g, m):
+def add_momenta(blocks, start, body, g, m):
     """m += G' g, of impulses g (nc, 3)."""
-    for c in range(first, last):
+    for c in range(len(start) - 1):
         g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
         for k in range(start[c], start[c + 1]):
             i = body[k]
@@ -35,9 +35,9 @@ def add_momenta(first, last, blocks, start, body, g, m):
 
 
 @loop
-def add_through(first, last, blocks, start, body, weight, w, m):
+def add_through(blocks, start, body, weight, w, m):
     """m += G' H G w; ``weight`` (nc, 6) is the upper triangle of H."""
-    for c in range(first, last):
+    for c in range(len(start) - 1):
         y0 = y1 = y2 = 0.0
         for k in range(start[c], start[c + 1]):
             i = body[k]

@@ -1,7 +1,8 @@
 """Compiled loops over contacts that are frames and arms (`CompactRows`); importing this takes half a second.
 
-``first`` and ``last`` bound the contacts; ``body`` (nc, 2) are local numbers; w and m are (bodies, 6), physical
-velocities and momenta. The loops add to their last argument.
+``body`` (nc, 2) are local numbers; w and m are (bodies, 6), physical velocities and momenta. The loops add to their
+last argument. (They go over all contacts that they are given: between two bounds, or with signed numbers of bodies, every
+index might be one from the end, and the test for that costs a third of a product.)
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from pctt.compiled import loop
 
 
 @loop
-def add_velocities(first, last, frame, arm, body, w, y):
+def add_velocities(frame, arm, body, w, y):
     """y += D' w (nc, 3)."""
-    for c in range(first, last):
+    for c in range(len(body)):
         a, b = body[c, 0], body[c, 1]
         r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
         u0 = w[b, 0] - w[a, 0] + w[b, 4] * s2 - w[b, 5] * s1 - (w[a, 4] * r2 - w[a, 5] * r1)
@@ -26,9 +27,9 @@ def add_velocities(first, last, frame, arm, body, w, y):
 
 
 @loop
-def add_momenta(first, last, frame, arm, body, g, m):
+def add_momenta(frame, arm, body, g, m):
     """m += D g, of impulses g (nc, 3)."""
-    for c in range(first, last):
+    for c in range(len(body)):
         a, b = body[c, 0], body[c, 1]
         g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
         f0 = frame[c, 0] * g0 + frame[c, 3] * g1 + frame[c, 6] * g2
@@ -50,9 +51,9 @@ def add_momenta(first, last, frame, arm, body, g, m):
 
 
 @loop
-def add_through(first, last, frame, arm, body, weight, w, m):
+def add_through(frame, arm, body, weight, w, m):
     """m += D H D' w; ``weight`` (nc, 6) is F'HF, of `weights`: the frame itself is not needed."""
-    for c in range(first, last):
+    for c in range(len(body)):
         a, b = body[c, 0], body[c, 1]
         r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
         u0 = w[b, 0] - w[a, 0] + w[b, 4] * s2 - w[b, 5] * s1 - (w[a, 4] * r2 - w[a, 5] * r1)

@@ -41,6 +41,9 @@ class FreeMap:
         else:
             self._take_blocks(given, ghosts)
         self._w, self._m = np.zeros((2, self._ghosts.nobody + 1, 6))
+        # contacts that wait for no other rank, in two halves, and the others
+        ends = [0, self._first_away // 2, self._first_away, self.rows]
+        self._half, self._rest, self._away = (Contacts.of(self, *pair) for pair in zip(ends, ends[1:]))
 
     def _take_compact(self, given: CompactRows, ghosts: Ghosts | None) -> None:
         self._ghosts = ghosts or Ghosts(self.comm, given.columns, given.body)
@@ -63,6 +66,13 @@ class FreeMap:
         away[contact[self._is_ghost(self._ghosts.body)]] = True
         self._first_away = _first(away)
         self._flops = {"single": 36 * len(given.blocks), "through": 72 * len(given.blocks) + 15 * self.rows}
+
+    def _cut(self, first: int, last: int) -> Any:
+        """The arrays of the contacts from ``first`` to ``last``."""
+        if self._loops is compact_loops:
+            return tuple(array[first:last] for array in self._arrays)
+        blocks, start, body = self._arrays
+        return blocks, start[first : last + 1], body
 
     def _is_ghost(self, body: np.ndarray) -> np.ndarray:
         return (body >= self._ghosts.own) & (body < self._ghosts.nobody)
@@ -110,14 +120,13 @@ class FreeMap:
     def through(self, weight: Array, v: Array, out: Array) -> None:
         """out = v + G' H G v (columns, 6), C-contiguous."""
         v = v.reshape(-1, 6)
-        half = self._first_away // 2
         self._m[:] = 0.0
         self._enter(self._root, v)
-        self._loops.add_through(0, half, *self._arrays, weight, self._w, self._m)
+        self._half.add_through(weight, self._w, self._m)
         self._ghosts.end_update(self._w)
-        self._loops.add_through(self._first_away, self.rows, *self._arrays, weight, self._w, self._m)
+        self._away.add_through(weight, self._w, self._m)
         self._ghosts.begin_add(self._m)
-        self._loops.add_through(half, self._first_away, *self._arrays, weight, self._w, self._m)
+        self._rest.add_through(weight, self._w, self._m)
         self._ghosts.end_add(self._m)
         np.add(v, self._left(self._root), out=out.reshape(-1, 6))
         PETSc.Log.logFlops(self._flops["through"])
@@ -131,17 +140,19 @@ class FreeMap:
         self._ghosts.begin_update(self._w)
 
     def _add_velocities(self, y: Array) -> None:
-        self._loops.add_velocities(0, self._first_away, *self._arrays, self._w, y)
+        self._half.add_velocities(self._w, y)
+        self._rest.add_velocities(self._w, y)
         self._ghosts.end_update(self._w)
-        self._loops.add_velocities(self._first_away, self.rows, *self._arrays, self._w, y)
+        self._away.add_velocities(self._w, y)
 
     def _collect(self, g: Array) -> None:
         """The momenta that impulses give the bodies, without their masses."""
         g = _floats(g)
         self._m[:] = 0.0
-        self._loops.add_momenta(self._first_away, self.rows, *self._arrays, g, self._m)
+        self._away.add_momenta(g, self._m)
         self._ghosts.begin_add(self._m)
-        self._loops.add_momenta(0, self._first_away, *self._arrays, g, self._m)
+        self._half.add_momenta(g, self._m)
+        self._rest.add_momenta(g, self._m)
         self._ghosts.end_add(self._m)
 
     def _left(self, scale: Array | None) -> Array:
@@ -163,7 +174,7 @@ class FreeMap:
         mass = np.zeros((self._ghosts.nobody + 1, 12))
         mass[: self.columns] = _wide(self._mass)
         self._ghosts.update(mass)
-        compact_loops.contact_blocks(*self._arrays, mass, out)
+        self._loops.contact_blocks(*self._arrays, mass, out)
         return out
 
     def body_blocks(self, weight: Array) -> Array:
@@ -198,6 +209,31 @@ class FreeMap:
 
     def destroy(self) -> None:
         self._ghosts.destroy()
+
+
+@dataclasses.dataclass(frozen=True)
+class Contacts:
+    """Some contacts of a map, one after the other: the loops over them."""
+
+    loops: ModuleType
+    here: slice
+    arrays: tuple[np.ndarray, ...]
+
+    @classmethod
+    def of(cls, whole: FreeMap, first: int, last: int) -> Contacts:
+        return cls(whole._loops, slice(first, last), whole._cut(first, last))
+
+    def add_velocities(self, w: Array, y: Array) -> None:
+        if self.here.stop > self.here.start:
+            self.loops.add_velocities(*self.arrays, w, y[self.here])
+
+    def add_momenta(self, g: Array, m: Array) -> None:
+        if self.here.stop > self.here.start:
+            self.loops.add_momenta(*self.arrays, g[self.here], m)
+
+    def add_through(self, weight: Array, w: Array, m: Array) -> None:
+        if self.here.stop > self.here.start:
+            self.loops.add_through(*self.arrays, weight[self.here], w, m)
 
 
 _FULL = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # of (xx, xy, xz, yy, yz, zz), the nine of a matrix

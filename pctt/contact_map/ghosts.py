@@ -18,7 +18,7 @@ class Ghosts:
     ----------
     own : number of own bodies
     nobody : the local number of no body
-    body : local numbers, int32, in the shape of the global ones
+    body : local numbers, uint32, in the shape of the global ones
     """
 
     def __init__(self, comm: MPI.Comm, own: int, body: np.ndarray):
@@ -29,7 +29,7 @@ class Ghosts:
         away = ~here & (body >= 0)
         names, place = np.unique(body[away], return_inverse=True)
         self.comm, self.own, self.nobody = comm, own, own + len(names)
-        self.body = np.full(body.shape, self.nobody, np.int32)
+        self.body = np.full(body.shape, self.nobody, np.uint32)
         self.body[here] = body[here] - first
         self.body[away] = own + place.ravel()
         self._sf: PETSc.SF | None = None

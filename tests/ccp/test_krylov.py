@@ -209,7 +209,7 @@ def test_where_every_rung_fails_the_step_is_the_best_there_is(database):
     blocks, rhs = 1e-6 * spd_blocks(40), np.random.default_rng(1).normal(size=(40, 3))
     database["ksp_type"] = "cg"
     database["ksp_max_it"] = 2
-    database["fallback_pbjacobi_ksp_max_it"] = 20
+    database["fallback_cg_ksp_max_it"] = 20
     database["fallback_cholesky_ksp_type"] = "cg"
     database["fallback_cholesky_pc_type"] = "none"
     newton = newton_of(problem)
