@@ -16,14 +16,14 @@ OLD_FACTOR = 60.0  # iterations to expect with the factor of an earlier matrix
 
 def cost(rung: str, iterations: float, bodies: int, ranks: int) -> float:
     """Of the systems with one matrix, the predictor's taking so many iterations, in iterations with block Jacobi,
-    measured at 4,900 and 35,900 bodies (docs/ccp.md). On more ranks products take less time, factors hardly do."""
-    setup = {"pbjacobi": 5.0, "cholesky": 900.0 * (bodies / 5000.0) ** 0.4 * ranks}
-    return setup[rung] + solves_cost(rung, iterations, ranks)
+    measured at 5, 4,900 and 35,900 bodies (docs/ccp.md). On more ranks products take less time, factors hardly do."""
+    setup = {"pbjacobi": 5.0, "cholesky": 550.0 * (bodies / 5000.0) ** 0.4 * ranks}
+    return setup[rung] + solves_cost(rung, iterations, bodies, ranks)
 
 
-def solves_cost(rung: str, iterations: float, ranks: int) -> float:
+def solves_cost(rung: str, iterations: float, bodies: int, ranks: int) -> float:
     """The same when the preconditioner is there already."""
-    iteration = {"pbjacobi": 1.0, "cholesky": 35.0 * ranks}
+    iteration = {"pbjacobi": 1.0, "cholesky": 25.0 * (bodies / 5000.0) ** 0.3 * ranks}
     return SOLVES * iteration[rung] * max(1.0, iterations)
 
 
@@ -50,7 +50,7 @@ class Cheapest(KrylovFamily):
         expected = self._hardness * self._growth
         costs = {"pbjacobi": cost("pbjacobi", expected, bodies, ranks), "cholesky": cost("cholesky", 1, bodies, ranks)}
         rung, keep = min(costs, key=lambda name: costs[name]), False
-        if self._lagged is not None and solves_cost("cholesky", self._lagged, ranks) < min(costs.values()):
+        if self._lagged is not None and solves_cost("cholesky", self._lagged, bodies, ranks) < min(costs.values()):
             rung, keep = "cholesky", True
         self._rung, self._keep = self.comm.bcast((rung, keep))  # costs may differ in a last bit between processors
         self._worst = 0
