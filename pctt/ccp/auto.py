@@ -165,9 +165,8 @@ def expected(forecast: float, last: Needed | None, iterations: int, cost: float)
 
 def conic_cost(contacts: int, softness: float, tol: float) -> float:
     """What the conic method costs from a cold start, in iterations of APGD: as the cube root of the number of contacts,
-    measured on settled mixers of 2,640, 18,537 and 147,120 contacts (docs/measurements.md). Small problems have fixed
-    costs."""
-    accuracy, rigid, soft = [-8, -7, -6, -4, -2], [105, 90, 78, 50, 15], [95, 87, 75, 52, 15]
+    measured on settled mixers of 18,525 and 144,658 (docs/measurements.md). Small problems have fixed costs."""
+    accuracy, rigid, soft = [-8, -7, -6, -4, -2], [195, 160, 130, 82, 25], [165, 140, 118, 66, 22]
     per_root = np.interp(np.log10(tol), accuracy, soft if softness >= 1e-6 else rigid)
     return float(per_root * np.cbrt(max(contacts, 400)))
 

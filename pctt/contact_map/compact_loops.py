@@ -1,8 +1,8 @@
 """Compiled loops over contacts that are frames and arms (`CompactRows`); importing this takes half a second.
 
 ``body`` (nc, 2) are local numbers; w and m are (bodies, 6), physical velocities and momenta. The loops add to their
-last argument. (They go over all contacts that they are given: between two bounds, or with signed numbers of bodies, every
-index might be one from the end, and the test for that costs a third of a product.)
+last argument. (They go over all contacts that they are given: between two bounds, or with signed numbers of
+bodies, every index might be one from the end, and the test for that costs a third of a product.)
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from pctt.ccp import Comparison, Limits
 from pctt.ccp.newton.krylov import Krylov
 from pctt.options import OptionError
 
-FIELDS = {"systems", "converged", "ksp_its_mean", "ksp_its_max", "setup_s", "solve_s"}
+FIELDS = {"systems", "converged", "ksp_its_mean", "ksp_its_max", "setup_s", "solve_s", "entries_s"}
 FIELDS |= {"true_residual_max", "excess_max"}
 
 

@@ -83,10 +83,10 @@ def test_corrections_save_newton_steps(monkeypatch):
         monkeypatch.setattr(conic, "CORRECTIONS", corrections)
         results = [solve(ConeProblem(SELF, r, mu, G=G), 1e-6) for G, r, mu in (packing(8, seed) for seed in range(3))]
         assert all(result.converged for result in results)
-        steps[corrections] = sum(result.iterations for result in results), results[0].ksp_its
+        steps[corrections] = [sum(getattr(r, name) for r in results) for name in ("iterations", "ksp_its")]
     (plain, plain_its), (corrected, corrected_its) = steps[0], steps[max(steps)]
     assert corrected <= 0.9 * plain  # measured: 30 and 36
-    assert corrected_its <= 0.75 * plain_its  # 149 and 320
+    assert corrected_its <= plain_its  # measured: 1055 and 1181, of single packings .6 to 1.5 times
 
 
 def test_its_systems_climb_from_block_jacobi_to_factors():

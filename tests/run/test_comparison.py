@@ -17,6 +17,7 @@ FIELDS = {
     "solve_s": float,
     "true_residual_max": float,
     "excess_max": float,
+    "entries_s": float,
 }
 # accurate Newton steps, so that every cone problem is solved by PDIP alone
 ACCURATE = ("-ksp_rtol", "1e-6", "-ksp_max_it", "2000", "-ccp_tol", "1e-4")

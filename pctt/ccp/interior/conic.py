@@ -39,6 +39,8 @@ CENTERING = 0.02  # per deviation from the central path
 CLOSER = 0.01  # impulses as unknowns: what a linear solve leaves moves velocities, and they are compared with zero
 SHORT = 0.8  # a step after which the direction is corrected
 CORRECTIONS, FURTHER = 3, 0.3  # at most so many, for a step that goes so much further
+LATE = 1e-2  # natural residual below which second-order terms are renewed, after a step with progress: else that may
+# send impulses off where next to nothing bounds them
 LEAST = 0.01  # part of the complementarity to aim at
 NEAR = 0.1, 10.0  # the central path, in units of the complementarity that is aimed at
 PATIENCE = 3  # iterations without progress before the Newton systems are sharpened
@@ -99,7 +101,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, ne
                 short = step < SHORT
                 if short:
                     w = w + _towards_path(W, z, ds, dz, min(1.0, step + FURTHER), target)
-                elif newton.factored:  # another solve costs next to nothing
+                elif newton.factored and patience == 0 and history[-1] < LATE:  # another solve costs next to nothing
                     w = _centred(W, z, ds, dz, target)
                 else:
                     break

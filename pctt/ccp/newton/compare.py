@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +12,7 @@ from petsc4py import PETSc
 from pctt import log
 from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve, Source
 from pctt.options import OptionError
+from pctt.shell import is_shell
 
 _BODY = {
     "ksp_type": "richardson", "ksp_norm_type": "unpreconditioned", "ksp_max_it": "4", "pc_type": "python",
@@ -91,6 +93,7 @@ class Comparison(KrylovFamily):
         self.names, self.every = list(dict.fromkeys(names)), every
         self.records = {name: Record() for name in self.names}
         self._seen = 0
+        self._entries_s = 0.0
 
     def due(self) -> bool:
         """Whether the next system is one to compare on; counts it."""
@@ -105,6 +108,7 @@ class Comparison(KrylovFamily):
         chosen: Solve | None = None
         kept = None
         with log.phase("CCPCompare"):
+            self._make_entries(A, P)
             for name in self.names:
                 done = self._solver(name).solve(A, b, x, rtol, P)
                 self.records[name].add(done)
@@ -116,10 +120,21 @@ class Comparison(KrylovFamily):
         x.array[:] = kept
         return chosen
 
+    def _make_entries(self, A: PETSc.Mat, P: Source) -> None:
+        """Where S is a function, its entries, once for all that read them: no one's set-up."""
+        if not is_shell(A) or isinstance(P, PETSc.Mat) or P is None:
+            return
+        if any(self._solver(name).needs_entries for name in self.names):
+            start = time.perf_counter()
+            P()
+            self._entries_s += time.perf_counter() - start
+
     def summary(self) -> dict[str, dict[str, Any]]:
-        """Figures by name, and ``pc_report``, a list of lines, of the project's own preconditioners."""
+        """Figures by name. ``entries_s``: seconds that the matrix's entries took, of a preconditioner that reads them;
+        they are made once for all, and in no one's ``setup_s``. ``pc_report``: lines, of the project's own."""
         figures: dict[str, dict[str, Any]] = {name: record.summary() for name, record in self.records.items()}
         for name, krylov in self._krylov.items():
+            figures[name]["entries_s"] = self._entries_s if krylov.needs_entries else 0.0
             if lines := krylov.report():
                 figures[name]["pc_report"] = lines
         return figures
