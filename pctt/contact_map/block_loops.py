@@ -8,16 +8,32 @@ from pctt.compiled import loop
 
 
 @loop
+def velocity_at(c, blocks, start, body, w):
+    """G w at the contact c."""
+    y0 = y1 = y2 = 0.0
+    for k in range(start[c], start[c + 1]):
+        i = body[k]
+        for n in range(6):
+            y0 += blocks[k, 0, n] * w[i, n]
+            y1 += blocks[k, 1, n] * w[i, n]
+            y2 += blocks[k, 2, n] * w[i, n]
+    return y0, y1, y2
+
+
+@loop
+def push(c, blocks, start, body, g0, g1, g2, m):
+    """Add the momenta G'g of an impulse at the contact c."""
+    for k in range(start[c], start[c + 1]):
+        i = body[k]
+        for n in range(6):
+            m[i, n] += blocks[k, 0, n] * g0 + blocks[k, 1, n] * g1 + blocks[k, 2, n] * g2
+
+
+@loop
 def add_velocities(blocks, start, body, w, y):
     """y += G w (nc, 3)."""
     for c in range(len(start) - 1):
-        y0 = y1 = y2 = 0.0
-        for k in range(start[c], start[c + 1]):
-            i = body[k]
-            for n in range(6):
-                y0 += blocks[k, 0, n] * w[i, n]
-                y1 += blocks[k, 1, n] * w[i, n]
-                y2 += blocks[k, 2, n] * w[i, n]
+        y0, y1, y2 = velocity_at(c, blocks, start, body, w)
         y[c, 0] += y0
         y[c, 1] += y1
         y[c, 2] += y2
@@ -27,31 +43,18 @@ def add_velocities(blocks, start, body, w, y):
 def add_momenta(blocks, start, body, g, m):
     """m += G' g, of impulses g (nc, 3)."""
     for c in range(len(start) - 1):
-        g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
-        for k in range(start[c], start[c + 1]):
-            i = body[k]
-            for n in range(6):
-                m[i, n] += blocks[k, 0, n] * g0 + blocks[k, 1, n] * g1 + blocks[k, 2, n] * g2
+        push(c, blocks, start, body, g[c, 0], g[c, 1], g[c, 2], m)
 
 
 @loop
 def add_through(blocks, start, body, weight, w, m):
     """m += G' H G w; ``weight`` (nc, 6) is the upper triangle of H."""
     for c in range(len(start) - 1):
-        y0 = y1 = y2 = 0.0
-        for k in range(start[c], start[c + 1]):
-            i = body[k]
-            for n in range(6):
-                y0 += blocks[k, 0, n] * w[i, n]
-                y1 += blocks[k, 1, n] * w[i, n]
-                y2 += blocks[k, 2, n] * w[i, n]
+        y0, y1, y2 = velocity_at(c, blocks, start, body, w)
         f0 = weight[c, 0] * y0 + weight[c, 1] * y1 + weight[c, 2] * y2
         f1 = weight[c, 1] * y0 + weight[c, 3] * y1 + weight[c, 4] * y2
         f2 = weight[c, 2] * y0 + weight[c, 4] * y1 + weight[c, 5] * y2
-        for k in range(start[c], start[c + 1]):
-            i = body[k]
-            for n in range(6):
-                m[i, n] += blocks[k, 0, n] * f0 + blocks[k, 1, n] * f1 + blocks[k, 2, n] * f2
+        push(c, blocks, start, body, f0, f1, f2, m)
 
 
 @loop

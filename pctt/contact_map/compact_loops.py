@@ -13,14 +13,40 @@ from pctt.compiled import loop
 
 
 @loop
+def velocity_at(c, arm, body, w):
+    """Of the second body at the contact point c as seen from the first."""
+    a, b = body[c, 0], body[c, 1]
+    r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
+    u0 = w[b, 0] - w[a, 0] + w[b, 4] * s2 - w[b, 5] * s1 - (w[a, 4] * r2 - w[a, 5] * r1)
+    u1 = w[b, 1] - w[a, 1] + w[b, 5] * s0 - w[b, 3] * s2 - (w[a, 5] * r0 - w[a, 3] * r2)
+    u2 = w[b, 2] - w[a, 2] + w[b, 3] * s1 - w[b, 4] * s0 - (w[a, 3] * r1 - w[a, 4] * r0)
+    return u0, u1, u2
+
+
+@loop
+def push(c, arm, body, f0, f1, f2, m):
+    """Add an impulse at the contact point c to the second body's momenta, and take it from the first's."""
+    a, b = body[c, 0], body[c, 1]
+    r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
+    m[a, 0] -= f0
+    m[a, 1] -= f1
+    m[a, 2] -= f2
+    m[a, 3] -= r1 * f2 - r2 * f1
+    m[a, 4] -= r2 * f0 - r0 * f2
+    m[a, 5] -= r0 * f1 - r1 * f0
+    m[b, 0] += f0
+    m[b, 1] += f1
+    m[b, 2] += f2
+    m[b, 3] += s1 * f2 - s2 * f1
+    m[b, 4] += s2 * f0 - s0 * f2
+    m[b, 5] += s0 * f1 - s1 * f0
+
+
+@loop
 def add_velocities(frame, arm, body, w, y):
     """y += D' w (nc, 3)."""
     for c in range(len(body)):
-        a, b = body[c, 0], body[c, 1]
-        r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
-        u0 = w[b, 0] - w[a, 0] + w[b, 4] * s2 - w[b, 5] * s1 - (w[a, 4] * r2 - w[a, 5] * r1)
-        u1 = w[b, 1] - w[a, 1] + w[b, 5] * s0 - w[b, 3] * s2 - (w[a, 5] * r0 - w[a, 3] * r2)
-        u2 = w[b, 2] - w[a, 2] + w[b, 3] * s1 - w[b, 4] * s0 - (w[a, 3] * r1 - w[a, 4] * r0)
+        u0, u1, u2 = velocity_at(c, arm, body, w)
         y[c, 0] += frame[c, 0] * u0 + frame[c, 1] * u1 + frame[c, 2] * u2
         y[c, 1] += frame[c, 3] * u0 + frame[c, 4] * u1 + frame[c, 5] * u2
         y[c, 2] += frame[c, 6] * u0 + frame[c, 7] * u1 + frame[c, 8] * u2
@@ -30,50 +56,22 @@ def add_velocities(frame, arm, body, w, y):
 def add_momenta(frame, arm, body, g, m):
     """m += D g, of impulses g (nc, 3)."""
     for c in range(len(body)):
-        a, b = body[c, 0], body[c, 1]
         g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
         f0 = frame[c, 0] * g0 + frame[c, 3] * g1 + frame[c, 6] * g2
         f1 = frame[c, 1] * g0 + frame[c, 4] * g1 + frame[c, 7] * g2
         f2 = frame[c, 2] * g0 + frame[c, 5] * g1 + frame[c, 8] * g2
-        r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
-        m[a, 0] -= f0
-        m[a, 1] -= f1
-        m[a, 2] -= f2
-        m[a, 3] -= r1 * f2 - r2 * f1
-        m[a, 4] -= r2 * f0 - r0 * f2
-        m[a, 5] -= r0 * f1 - r1 * f0
-        m[b, 0] += f0
-        m[b, 1] += f1
-        m[b, 2] += f2
-        m[b, 3] += s1 * f2 - s2 * f1
-        m[b, 4] += s2 * f0 - s0 * f2
-        m[b, 5] += s0 * f1 - s1 * f0
+        push(c, arm, body, f0, f1, f2, m)
 
 
 @loop
 def add_through(frame, arm, body, weight, w, m):
     """m += D H D' w; ``weight`` (nc, 6) is F'HF, of `weights`: the frame itself is not needed."""
     for c in range(len(body)):
-        a, b = body[c, 0], body[c, 1]
-        r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
-        u0 = w[b, 0] - w[a, 0] + w[b, 4] * s2 - w[b, 5] * s1 - (w[a, 4] * r2 - w[a, 5] * r1)
-        u1 = w[b, 1] - w[a, 1] + w[b, 5] * s0 - w[b, 3] * s2 - (w[a, 5] * r0 - w[a, 3] * r2)
-        u2 = w[b, 2] - w[a, 2] + w[b, 3] * s1 - w[b, 4] * s0 - (w[a, 3] * r1 - w[a, 4] * r0)
+        u0, u1, u2 = velocity_at(c, arm, body, w)
         f0 = weight[c, 0] * u0 + weight[c, 1] * u1 + weight[c, 2] * u2
         f1 = weight[c, 1] * u0 + weight[c, 3] * u1 + weight[c, 4] * u2
         f2 = weight[c, 2] * u0 + weight[c, 4] * u1 + weight[c, 5] * u2
-        m[a, 0] -= f0
-        m[a, 1] -= f1
-        m[a, 2] -= f2
-        m[a, 3] -= r1 * f2 - r2 * f1
-        m[a, 4] -= r2 * f0 - r0 * f2
-        m[a, 5] -= r0 * f1 - r1 * f0
-        m[b, 0] += f0
-        m[b, 1] += f1
-        m[b, 2] += f2
-        m[b, 3] += s1 * f2 - s2 * f1
-        m[b, 4] += s2 * f0 - s0 * f2
-        m[b, 5] += s0 * f1 - s1 * f0
+        push(c, arm, body, f0, f1, f2, m)
 
 
 @loop
