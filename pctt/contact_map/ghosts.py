@@ -55,15 +55,17 @@ class Ghosts:
             self._sf.bcastEnd(*self._ends(values), MPI.REPLACE)
 
     def begin_add(self, values: np.ndarray) -> None:
-        """Add the values of ghosts to those of their owners."""
+        """Add the values of ghosts to those of their owners, which may go on changing their own until `end_add`."""
         if self._sf is not None:
             unit, own, ghosts = self._ends(values)
-            self._sf.reduceBegin(unit, ghosts, own, MPI.SUM)
+            self._arriving = np.zeros_like(own)
+            self._sf.reduceBegin(unit, ghosts, self._arriving, MPI.SUM)
 
     def end_add(self, values: np.ndarray) -> None:
         if self._sf is not None:
             unit, own, ghosts = self._ends(values)
-            self._sf.reduceEnd(unit, ghosts, own, MPI.SUM)
+            self._sf.reduceEnd(unit, ghosts, self._arriving, MPI.SUM)
+            own += self._arriving
 
     def _ends(self, values: np.ndarray) -> tuple[MPI.Datatype, np.ndarray, np.ndarray]:
         width = values[0].size

@@ -5,11 +5,14 @@ less room (W of a packing has four times the nonzeros of H), and W follows from 
 motion have no rows: their velocity is part of w. With v_free the velocities without contacts,
 
     f = M v_free,    H = D,    w = r - H' v_free    (gap/dt, and what the prescribed bodies move).
+
+A guided body has only the part of D along its guide, and nothing turns it: the moments that M has for it are any.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +22,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem import bodies
+from dem.free_motion import free_directions
+from dem.motion import Guided
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
@@ -89,7 +94,7 @@ class Dump:
     ) -> None:
         """The global problem, the guess if there is one, and the solution if the step has one."""
         dynamic, M = _mass(self._world)
-        H = _dynamic_rows(system, dynamic)
+        H = _dynamic_rows(system, dynamic, self._world)
         v_free = M.createVecLeft()
         v_free.array = system.free_velocity[dynamic].ravel()
         f, moved = M.createVecLeft(), H.createVecRight()
@@ -157,20 +162,26 @@ def _mass(world: World) -> tuple[np.ndarray, PETSc.Mat]:
     owned = bodies.concatenate(parts)
     dynamic = bodies.is_dynamic(owned)
     owned = owned.take(dynamic)
+    owned = replace(owned, inertia=np.where(np.isfinite(owned.inertia), owned.inertia, 1.0))
     blocks = np.zeros((len(owned), 6, 6))
     blocks[:, range(3), range(3)] = owned.mass[:, None]
     blocks[:, 3:, 3:] = np.linalg.inv(bodies.inverse_inertia(owned))
     alike = np.ptp(owned.inertia, axis=1) == 0  # exactly diagonal, as for spheres
     blocks[alike, 3:, 3:] = owned.inertia[alike, :, None] * np.eye(3)
-    count = len(owned)
-    first = sum(world.comm.allgather(count)[: world.comm.rank])
+    return dynamic, _block_diagonal(blocks, world.comm)
+
+
+def _block_diagonal(blocks: Array, comm: MPI.Comm) -> PETSc.Mat:
+    """Matrix of the diagonal blocks (n, 6, 6) of this rank's bodies, scalar by scalar."""
+    count = len(blocks)
+    first = sum(comm.allgather(count)[: comm.rank])
     rows = sp.bsr_matrix((blocks, np.arange(count), np.arange(count + 1)), shape=(6 * count, 6 * count)).tocsr()
     csr = (rows.indptr.astype(PETSc.IntType), (rows.indices + 6 * first).astype(PETSc.IntType), rows.data)
-    return dynamic, PETSc.Mat().createAIJ(((6 * count, None), (6 * count, None)), csr=csr, comm=world.comm)
+    return PETSc.Mat().createAIJ(((6 * count, None), (6 * count, None)), csr=csr, comm=comm)
 
 
-def _dynamic_rows(system: ContactSystem, dynamic: np.ndarray) -> PETSc.Mat:
-    """D of the dynamic bodies alone; collective."""
+def _dynamic_rows(system: ContactSystem, dynamic: np.ndarray, world: World) -> PETSc.Mat:
+    """D of the dynamic bodies alone, of guided ones along their guides; collective."""
     D = system.D
     first, _ = D.getOwnershipRange()
     rows = first + np.flatnonzero(np.repeat(dynamic, 6))
@@ -179,7 +190,18 @@ def _dynamic_rows(system: ContactSystem, dynamic: np.ndarray) -> PETSc.Mat:
     H = D.createSubMatrix(*index_sets)
     for index_set in index_sets:
         index_set.destroy()
-    return H
+    if not any(isinstance(body.motion, Guided) for body in world.large_bodies):
+        return H
+    blocks = np.tile(np.eye(6), (len(dynamic), 1, 1))
+    if world.comm.rank == world.comm.size - 1:
+        large = blocks[len(world.grains) :]
+        large[:, :3, :3] = free_directions(world.large_bodies)
+        large[~np.isfinite(world.large.inertia).all(axis=1), 3:, 3:] = 0.0
+    open_to = _block_diagonal(blocks[dynamic], world.comm)
+    projected = open_to.matMult(H)
+    H.destroy()
+    open_to.destroy()
+    return projected
 
 
 # -- options -------------------------------------------------------------------------------------------------

@@ -12,8 +12,7 @@ Where the paper's form creeps (134 Newton steps at 17,911 contacts, natural resi
 in five points, each measured in ``docs/ccp.md``: the constraint is the cone's perspective form
 (``barrier.py``); steps end at 0.9 of the way to the boundary and inside a neighbourhood of the central
 path, rather than at 0.99 and where the multiplier residual falls; a direction that the cones' curvature cuts
-short is corrected; a very short step is followed by one that only centres; and the natural residual alone decides
-when to stop.
+short is corrected; S gets a proximal term rho I after short steps; and the natural residual alone decides when to stop.
 """
 
 from __future__ import annotations
@@ -35,8 +34,11 @@ from pctt.options import FRACTION, POSITIVE, option
 
 RTOL = 1e-3  # of the linear solves, where ``-ksp_rtol`` does not say otherwise
 FORCING = 0.03  # and what they may leave of velocities, as a part of what the natural residual shows
-STUCK = 0.1  # a step after which the next aims at the complementarity that there is: near the boundary none goes far
-SHORT = 0.5  # a step after which the direction is corrected,
+CUT = 0.3  # a step after which the proximal term grows,
+WHOLE = 0.7  # and one after which it falls,
+FACTOR = 4.0  # by this factor,
+DAMPING = (1.0, 4.0)  # from and to this part of the natural residual, times mean diag N
+SHORT = 0.5  # a step whose direction is corrected,
 FURTHER = 0.3  # for one that goes so much further
 BENT = 100.0  # unless the terms of second order enlarge the right-hand side so much: no correction then helps
 LONGER = 1.2  # a corrected step that is worth taking, as a part of the other
@@ -73,7 +75,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     newton.begin(problem)
     g, lam = _start(problem, guess, cone, options)
     history: list[float] = []
-    step = 1.0
+    step, damping = 1.0, 0.0
     for iteration in range(max_it + 1):
         y = _velocity(problem, g)
         history.append(problem.natural_residual(g, y))
@@ -84,10 +86,10 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
             reason = f"{max_it} Newton steps"
             break
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
-        centering = options.centering if step > STUCK else 1.0
-        aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
+        aim = options.centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         at = Linearised(g, lam, y, f, df, hessian, aim)
-        newton.update(_barrier_blocks(cone, at))
+        damping = _next_damping(damping, step)
+        newton.update(_barrier_blocks(cone, at, damping * min(history[-1], 1.0) * problem.mean_diagonal))
         tol = _accuracy(problem, at, history[-1])
         dg, dlam, x = _direction(problem, newton, at, tol)
         step = _step_length(problem, cone, at, dg, dlam, options)
@@ -126,6 +128,17 @@ def _accuracy(problem: ConeProblem, at: Linearised, residual: float) -> float:
     complementarity would fall without them, and near the boundary no step makes up for that."""
     shown = residual * problem.norm(at.g) * problem.mean_diagonal
     return min(RTOL * problem.norm(_right_side(at)), FORCING * shown) / float(np.sqrt(problem.mean_diagonal))
+
+
+def _next_damping(damping: float, step: float) -> float:
+    """Of the proximal term, as a part of the natural residual, after a step of length ``step``.
+
+    Forces that hold each other move no body, so nothing but the barrier answers for them: directions along them are
+    long, leave the cones at once, and cut the rest of the step short. The proximal term makes those short; of
+    velocities it leaves rho dg, less than what the natural residual shows."""
+    if step < CUT:
+        return float(np.clip(FACTOR * damping, *DAMPING))
+    return damping / FACTOR if step > WHOLE else damping
 
 
 def _right_side(at: Linearised, bend: tuple[Array, Array] | None = None) -> Array:
@@ -181,10 +194,11 @@ def _start(
     return g, 3 * speed * mean_normal * (mean_mu or 1.0) / -cone.value(g)
 
 
-def _barrier_blocks(cone: Perspective | Quadratic, at: Linearised) -> Array:
-    """lambda hess f + lambda/(-f) grad f grad f' (nc, 3, 3), positive definite inside the cone."""
+def _barrier_blocks(cone: Perspective | Quadratic, at: Linearised, proximal: float) -> Array:
+    """lambda hess f + lambda/(-f) grad f grad f' + rho I (nc, 3, 3), positive definite inside the cone."""
     with phase("CCPBarrier"):
         blocks = barrier.blocks(at.lam, at.f, at.df, at.hessian)
+        blocks[:, [0, 1, 2], [0, 1, 2]] += proximal
         frictionless = cone.mu == 0
         if frictionless.any():  # hold the tangential impulses at zero
             stiff = 1e12 * np.maximum(blocks[frictionless, 0, 0], 1)
