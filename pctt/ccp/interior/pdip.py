@@ -12,7 +12,8 @@ Where the paper's form creeps (134 Newton steps at 17,911 contacts, natural resi
 in five points, each measured in ``docs/ccp.md``: the constraint is the cone's perspective form
 (``barrier.py``); steps end at 0.9 of the way to the boundary and inside a neighbourhood of the central
 path, rather than at 0.99 and where the multiplier residual falls; a direction that the cones' curvature cuts
-short is corrected; S gets a proximal term rho I after short steps; and the natural residual alone decides when to stop.
+short is corrected; after a step that went hardly anywhere the next only centres, and S gets a proximal term rho I; and
+the natural residual alone decides when to stop.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ from pctt.options import FRACTION, POSITIVE, option
 
 RTOL = 1e-3  # of the linear solves, where ``-ksp_rtol`` does not say otherwise
 FORCING = 0.03  # and what they may leave of velocities, as a part of what the natural residual shows
-CUT = 0.3  # a step after which the proximal term grows,
-WHOLE = 0.7  # and one after which it falls,
+STUCK = 0.1  # a step after which the next only centres, and after which the proximal term grows
+WHOLE = 0.7  # a step after which it falls,
 FACTOR = 4.0  # by this factor,
 DAMPING = (1.0, 4.0)  # from and to this part of the natural residual, times mean diag N
 SHORT = 0.5  # a step whose direction is corrected,
@@ -86,7 +87,8 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
             reason = f"{max_it} Newton steps"
             break
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
-        aim = options.centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
+        centering = options.centering if step > STUCK else 1.0
+        aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         at = Linearised(g, lam, y, f, df, hessian, aim)
         damping = _next_damping(damping, step)
         newton.update(_barrier_blocks(cone, at, damping * min(history[-1], 1.0) * problem.mean_diagonal))
@@ -136,7 +138,7 @@ def _next_damping(damping: float, step: float) -> float:
     Forces that hold each other move no body, so nothing but the barrier answers for them: directions along them are
     long, leave the cones at once, and cut the rest of the step short. The proximal term makes those short; of
     velocities it leaves rho dg, less than what the natural residual shows."""
-    if step < CUT:
+    if step <= STUCK:
         return float(np.clip(FACTOR * damping, *DAMPING))
     return damping / FACTOR if step > WHOLE else damping
 
