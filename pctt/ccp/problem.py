@@ -188,13 +188,22 @@ class ConeProblem:
     # -- reductions over all contacts -----------------------------------------------------------------------
 
     def sum(self, x):
-        return self.comm.allreduce(x)
+        """Over all ranks, of a number or an array."""
+        return self._reduced(x, MPI.SUM)
 
     def min(self, x: float) -> float:
-        return self.comm.allreduce(x, op=MPI.MIN)
+        return self._reduced(x, MPI.MIN)
 
     def max(self, x: float) -> float:
-        return self.comm.allreduce(x, op=MPI.MAX)
+        return self._reduced(x, MPI.MAX)
+
+    def _reduced(self, x, op: MPI.Op):
+        if self.comm.size == 1:
+            return x
+        here = np.array(x, order="C")
+        everywhere = np.empty_like(here)
+        self.comm.Allreduce(here, everywhere, op)
+        return everywhere if here.ndim else everywhere.item()
 
     def dot(self, x: Array, y: Array) -> float:
         return self.sum(float(np.vdot(x, y)))

@@ -12,8 +12,8 @@ Where the paper's form creeps (134 Newton steps at 17,911 contacts, natural resi
 in five points, each measured in ``docs/ccp.md``: the constraint is the cone's perspective form
 (``barrier.py``); steps end at 0.9 of the way to the boundary and inside a neighbourhood of the central
 path, rather than at 0.99 and where the multiplier residual falls; a direction that the cones' curvature cuts
-short is corrected; after a step that went hardly anywhere the next only centres, and S gets a proximal term rho I; and
-the natural residual alone decides when to stop.
+short is corrected, and short steps near the solution give S a proximal term rho I; and the natural residual alone
+decides when to stop.
 """
 
 from __future__ import annotations
@@ -35,8 +35,10 @@ from pctt.options import FRACTION, POSITIVE, option
 
 RTOL = 1e-3  # of the linear solves, where ``-ksp_rtol`` does not say otherwise
 FORCING = 0.03  # and what they may leave of velocities, as a part of what the natural residual shows
-STUCK = 0.1  # a step after which the next only centres, and after which the proximal term grows
-WHOLE = 0.7  # a step after which it falls,
+STUCK = 0.1  # a step after which the next only centres
+LATE = 1e-3  # natural residual below which S has a proximal term: before, impulses may have to grow by orders
+CUT = 0.3  # a step after which it grows,
+WHOLE = 0.7  # and one after which it falls,
 FACTOR = 4.0  # by this factor,
 DAMPING = (1.0, 4.0)  # from and to this part of the natural residual, times mean diag N
 SHORT = 0.5  # a step whose direction is corrected,
@@ -90,8 +92,8 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         centering = options.centering if step > STUCK else 1.0
         aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         at = Linearised(g, lam, y, f, df, hessian, aim)
-        damping = _next_damping(damping, step)
-        newton.update(_barrier_blocks(cone, at, damping * min(history[-1], 1.0) * problem.mean_diagonal))
+        damping = _next_damping(damping, step, history[-1])
+        newton.update(_barrier_blocks(cone, at, damping * history[-1] * problem.mean_diagonal if damping else 0.0))
         tol = _accuracy(problem, at, history[-1])
         dg, dlam, x = _direction(problem, newton, at, tol)
         step = _step_length(problem, cone, at, dg, dlam, options)
@@ -132,13 +134,15 @@ def _accuracy(problem: ConeProblem, at: Linearised, residual: float) -> float:
     return min(RTOL * problem.norm(_right_side(at)), FORCING * shown) / float(np.sqrt(problem.mean_diagonal))
 
 
-def _next_damping(damping: float, step: float) -> float:
+def _next_damping(damping: float, step: float, residual: float) -> float:
     """Of the proximal term, as a part of the natural residual, after a step of length ``step``.
 
     Forces that hold each other move no body, so nothing but the barrier answers for them: directions along them are
     long, leave the cones at once, and cut the rest of the step short. The proximal term makes those short; of
     velocities it leaves rho dg, less than what the natural residual shows."""
-    if step <= STUCK:
+    if residual > LATE:
+        return 0.0
+    if step < CUT:
         return float(np.clip(FACTOR * damping, *DAMPING))
     return damping / FACTOR if step > WHOLE else damping
 
