@@ -93,7 +93,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         at = Linearised(g, lam, y, f, df, hessian, aim)
         damping = _next_damping(damping, step, history[-1])
-        newton.update(_barrier_blocks(cone, at, damping * history[-1] * problem.mean_diagonal if damping else 0.0))
+        newton.update(_barrier_blocks(cone, at, damping * min(history[-1], LATE) * problem.mean_diagonal))
         tol = _accuracy(problem, at, history[-1])
         dg, dlam, x = _direction(problem, newton, at, tol)
         step = _step_length(problem, cone, at, dg, dlam, options)
