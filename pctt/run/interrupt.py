@@ -34,6 +34,7 @@ def heed(comm: MPI.Comm) -> None:
 
     for number in SIGNALS:
         signal.signal(number, note)
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it without a word; PETSc would print a page
 
 
 def asked(comm: MPI.Comm) -> bool:

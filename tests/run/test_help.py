@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import signal
+import subprocess
+import sys
 
 import pytest
 from mpi4py import MPI
-from program import SMALL
+from program import ROOT, SMALL
 
 from dem.scenes import Mixer
 from pctt import ccp
@@ -39,6 +42,15 @@ def test_help_lists_every_option_and_runs_nothing(options, program, tmp_path):
                 assert float(default.split()[0]) == field.default
             count += 1
     assert count == len(names)
+
+
+def test_a_reader_that_has_enough_ends_it_without_a_word():
+    """As `| head` does; PETSc would print a page about the signal."""
+    done = subprocess.Popen([sys.executable, "-m", "pctt.run", "-help"], stdout=-1, stderr=-1, text=True, cwd=ROOT)
+    assert done.stdout and done.stderr
+    done.stdout.close()
+    assert done.stderr.read() == ""
+    assert done.wait() == -signal.SIGPIPE
 
 
 def test_lengths_times_and_speeds_have_units():
