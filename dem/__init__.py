@@ -1,6 +1,6 @@
 """Mechanics of rigid grains with contact and friction, in non-smooth time stepping; no solver.
 
-The loop of a simulation, on any number of ranks:
+The loop of a simulation, on any number of ranks::
 
     world = World.from_scene(scene, comm)
     while world.time < end:

@@ -1,4 +1,4 @@
-"""What a scene is to the program: options, recommended numerics, bodies to build, quantities to record.
+"""What a scene is to the program: options, recommended numerics, bodies to build, quantities to record::
 
     @dataclass(frozen=True)
     class Drop(Experiment):

@@ -17,8 +17,10 @@ from pctt.ccp.problem import ConeProblem
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Figures of an impulse g with velocities y = N g + r (design: ``docs/ccp.md``).
+    """Figures of an impulse g with velocities y = N g + r (see ``docs/ccp.md``).
 
+    Attributes
+    ----------
     natural_residual : ||g - P(g - s y)|| / ||g||, s = 1 / mean(diag N)
     rigid_residual : the same of the problem without its compliance
     coulomb_residual : the same with y_n + mu |y_t| for y_n: zero where impulses obey Coulomb's law (``coulomb.py``)
