@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import platform
 import sys
 import traceback
+from contextlib import suppress
 
 import petsc4py
 
-# before anything else imports PETSc; -help is answered here, without PETSc's own hundred lines
-petsc4py.init([word for word in sys.argv if word not in ("-help", "--help", "-h")])
+HELP, VERSION = {"-help", "--help", "-h"}, {"-version", "--version"}
+# before anything else imports PETSc; these are answered here, without PETSc's own hundred lines
+petsc4py.init([word for word in sys.argv if word not in HELP | VERSION])
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -20,6 +23,7 @@ try:
 except ImportError as error:
     sys.exit(str(error))
 
+import pctt
 from dem.together import SceneError
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError
@@ -32,9 +36,14 @@ from pctt.run.simulate import simulate
 
 def main(comm: MPI.Comm) -> None:
     database = PETSc.Options().getAll()
-    if {"-help", "--help", "-h"} & set(sys.argv):
+    if HELP & set(sys.argv):
+        text = help_text(database, _topic(sys.argv))
         if comm.rank == 0:
-            print(help_text(database))
+            print(text)
+        return
+    if VERSION & set(sys.argv):
+        if comm.rank == 0:
+            print(versions())
         return
     refuse_stray(sys.argv[1:])
     options = read_options(database, comm)
@@ -42,6 +51,22 @@ def main(comm: MPI.Comm) -> None:
         solve_file(options, comm)
     else:
         simulate(options, comm)
+
+
+def _topic(words: list[str]) -> str:
+    """The word behind -help, if it is no option."""
+    after = words[next(i for i, word in enumerate(words) if word in HELP) + 1 :][:1]
+    return after[0] if after and not after[0].startswith("-") else ""
+
+
+def versions() -> str:
+    """This program and what it stands on."""
+    petsc = ".".join(map(str, PETSc.Sys.getVersion()))
+    with suppress(ImportError):
+        import numba
+
+        return f"pctt {pctt.__version__} (PETSc {petsc}, Python {platform.python_version()}, numba {numba.__version__})"
+    return f"pctt {pctt.__version__} (PETSc {petsc}, Python {platform.python_version()}, no numba)"
 
 
 #: Exit status by what ends a run; raised on all ranks alike, but for a FileError that says that it is `alone`.

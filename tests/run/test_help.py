@@ -10,8 +10,10 @@ import sys
 
 import pytest
 from mpi4py import MPI
+from petsc4py import PETSc
 from program import ROOT, SMALL
 
+import pctt
 from dem.scenes import Mixer
 from pctt import ccp
 from pctt.pc import PRECONDITIONERS
@@ -42,6 +44,26 @@ def test_help_lists_every_option_and_runs_nothing(options, program, tmp_path):
                 assert float(default.split()[0]) == field.default
             count += 1
     assert count == len(names)
+
+
+@pytest.mark.parametrize(("topic", "there", "missing"), [("scene", "-scene_n ", "-ccp_tol"), ("ccp", "-ccp_tol ", "-scene_n")])
+def test_help_on_one_topic(topic, there, missing, program):
+    text = program("-help", topic).stdout
+    assert f"  {there}" in text
+    assert missing not in text
+
+
+def test_an_unknown_topic_is_refused(program):
+    done = program("-help", "scnee", status=2)
+    assert done.stderr == (
+        "pctt.run: -help scnee: there is no such topic; allowed are run, scene, ccp, pc, ksp, or none for all\n"
+    )
+
+
+def test_the_version_names_petsc(program):
+    words = program("--version", own=True).stdout.split()
+    assert words[:2] == ["pctt", pctt.__version__]
+    assert f"(PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}," in " ".join(words)
 
 
 def test_a_reader_that_has_enough_ends_it_without_a_word():
