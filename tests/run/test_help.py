@@ -46,7 +46,9 @@ def test_help_lists_every_option_and_runs_nothing(options, program, tmp_path):
     assert count == len(names)
 
 
-@pytest.mark.parametrize(("topic", "there", "missing"), [("scene", "-scene_n ", "-ccp_tol"), ("ccp", "-ccp_tol ", "-scene_n")])
+@pytest.mark.parametrize(
+    ("topic", "there", "missing"), [("scene", "-scene_n ", "-ccp_tol"), ("ccp", "-ccp_tol ", "-scene_n")]
+)
 def test_help_on_one_topic(topic, there, missing, program):
     text = program("-help", topic).stdout
     assert f"  {there}" in text
@@ -69,7 +71,8 @@ def test_the_version_names_petsc(program):
 def test_a_reader_that_has_enough_ends_it_without_a_word():
     """As `| head` does; PETSc would print a page about the signal."""
     done = subprocess.Popen([sys.executable, "-m", "pctt.run", "-help"], stdout=-1, stderr=-1, text=True, cwd=ROOT)
-    assert done.stdout and done.stderr
+    assert done.stdout
+    assert done.stderr
     done.stdout.close()
     assert done.stderr.read() == ""
     assert done.wait() == -signal.SIGPIPE
