@@ -52,7 +52,7 @@ SOLVERS = {
                "symmetric cone interior point method, Nesterov-Todd scaling, Mehrotra's corrector",
                "Nesterov, Todd 1997; Acary et al. 2023", has_law=True),
         Solver("auto", auto.solve, auto.Auto, EITHER, 20_000,
-               "`apgd` as long as it is expected to be the faster, else `conic`", "`pctt/ccp/auto.py`"),
+               "`apgd` as long as it is expected to be the faster, else `conic`", "`pctt/ccp/auto.py`", has_law=True),
         Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
                "accelerated projected gradient descent with restart", "Mazhar et al. 2015", has_law=True),
         Solver("barzilai_borwein", barzilai_borwein.solve, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,

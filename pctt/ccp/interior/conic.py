@@ -52,6 +52,7 @@ LATE = 1e-2  # natural residual below which second-order terms are renewed, afte
 LEAST = 0.01  # part of the complementarity to aim at
 NEAR = 0.1, 10.0  # the central path, in units of the complementarity that is aimed at
 PATIENCE = 3  # iterations without progress before the Newton systems are sharpened
+LONG_PATIENCE, SHARPER = 8, 0.01  # for Coulomb's law: before it stalls; part of the forcing term
 LONGER, LESS = 1.02, 0.7  # a short step, or what a long one leaves of the complementarity, after a correction to keep
 
 
@@ -90,7 +91,7 @@ def solve(
         patience, last_gap = (0 if progress else patience + 1), gap
         if history[-1] <= limits.tol or iteration == max_it or why_unbounded(problem, g):
             break
-        if patience > PATIENCE:
+        if patience > (LONG_PATIENCE if coulomb else PATIENCE):
             if coulomb or not newton.sharpen():
                 break
             patience = 0
@@ -101,6 +102,7 @@ def solve(
         # a residual of v = G' g makes y wrong by G times that
         tol = options.forcing * history[-1] * problem.norm(g) * np.sqrt(problem.mean_diagonal)
         tol *= 1.0 if newton.primary == "momenta" else CLOSER
+        tol *= SHARPER if coulomb else 1.0
         local = Linearised(s, z, r_v, r_z, W, inverse, yielding, scale, frictionless, tol, slip)
 
         with phase("ConicPredictor"):
@@ -158,7 +160,7 @@ def _residuals(
     contacts slide."""
     y = problem.velocity_of(v) + problem.compliance * g + problem.r
     y[frictionless, 1:] = 0.0
-    u = y / np.maximum(tangential(y), TINY)[:, None]
+    u = y / np.maximum(np.maximum(tangential(y), z[:, 0]), TINY)[:, None]  # short where y_t may turn: a contact sticks
     u[:, 0] = 0.0
     if coulomb:
         add_opening(y, problem.mu)
