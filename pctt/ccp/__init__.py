@@ -80,7 +80,7 @@ def solve(
         return _once(problem, guess, solver, to, options or solver.options(), newton or own, law)
 
     try:
-        if coulomb is None or problem.size == 0:
+        if coulomb is None:
             return once(problem, guess, limits.tol)
         return coulombs_law.ladder(problem, guess, limits.tol, coulomb, once, solver.has_law)
     finally:

@@ -59,7 +59,7 @@ def ladder(
     ``once(problem, guess, tol, law)`` solves a cone problem, or with ``law`` Coulomb's, which ``has_law`` says it can.
     """
     tol, tried = options.tol or tol, []
-    if has_law:
+    if has_law or problem.size == 0:
         own = once(problem, guess, tol, law=True)
         own.law = COULOMB
         if own.converged or own.reason.startswith("unbounded"):
