@@ -98,7 +98,7 @@ def solve(
     solver = "conic"
     if not (second.converged or second.reason.startswith("unbounded") or most <= CONIC_IT):
         best = min(first, second, key=lambda result: result.natural_residual)
-        result = apgd.solve(problem, best.impulse, limited, apgd.APGD(), coulomb=coulomb)
+        result = apgd.solve(problem, best.impulse, limited, apgd.APGD(), None, coulomb)
         result.ksp_its, result.fallbacks = second.ksp_its, second.fallbacks
         result.history = second.history + result.history
         words, solver = f"{words}; apgd: {result.reason}", "apgd"

@@ -28,7 +28,7 @@ def law(coulomb: bool) -> str:
 
 def residual(line: Mapping[str, Any]) -> float:
     """Of the law that a step was solved for."""
-    return line["natural_residual" if line["law"] == RELAXATION else "coulomb_residual"]
+    return line["natural_residual" if line.get("law", RELAXATION) == RELAXATION else "coulomb_residual"]
 
 
 def columns(compared: bool) -> str:
@@ -49,7 +49,7 @@ def step_line(line: Mapping[str, Any]) -> str:
     remark = "" if line["converged"] else f"  NOT CONVERGED: {line['reason']}"
     if line["fallbacks"]:
         remark += f"  ({line['fallbacks']} Newton systems by a fallback)"
-    if line["law"] == FIXED_POINT:
+    if line.get("law") == FIXED_POINT:
         remark += f"  (Coulomb residual {line['coulomb_residual']:.1e} by {line['cone_problems']} cone problems)"
     if line["solver"] != line["asked_solver"]:
         remark += f"  (by {line['solver']})"
