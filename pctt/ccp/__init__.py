@@ -25,7 +25,7 @@ from pctt.ccp.coulomb import Coulomb
 from pctt.ccp.newton import FORMS, Newton
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.registry import SOLVERS, Solver
+from pctt.ccp.registry import NEWTON, SOLVERS, Solver
 from pctt.ccp.result import Limits, Result
 from pctt.ccp.unbounded import why_unbounded
 from pctt.contact_map import CompactRows
@@ -33,6 +33,7 @@ from pctt.log import phase
 
 __all__ = [
     "FORMS",
+    "NEWTON",
     "SOLVERS",
     "Accuracy",
     "BlockRows",

@@ -26,6 +26,14 @@ def law(coulomb: bool) -> str:
     return "Coulomb's law" if coulomb else "relaxation of Coulomb's law"
 
 
+def loose_line(tol: float) -> str:
+    """What a first-order method does at a tolerance above the default."""
+    return (
+        f"WARNING: -ccp_tol {tol:g}: first-order methods leave overlaps of millimetres above 1e-4, which are pushed apart: "
+        "a packing at rest is heated"
+    )
+
+
 def residual(line: Mapping[str, Any]) -> float:
     """Of the law that a step was solved for."""
     return line["natural_residual" if line.get("law", RELAXATION) == RELAXATION else "coulomb_residual"]

@@ -53,6 +53,8 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
     method = f"{options.run.ccp_type} to {options.limits.tol:g}, {report.law(options.coulomb is not None)}"
     progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
+    if ccp.SOLVERS[options.run.ccp_type].needs != ccp.NEWTON and options.limits.tol > ccp.Limits().tol:
+        progress.say(report.loose_line(options.limits.tol))
     progress.say(report.columns(bool(compare.names)), level=1)
     start, end = world.step, world.step + options.run.steps
     progress.start(options.run.steps)

@@ -31,6 +31,16 @@ def test_steps_with_coulombs_law(program, settled, tmp_path):
     assert "WARNING: law of contact: relaxation in 2 steps" in done.stdout
 
 
+def test_a_loose_tolerance_is_warned_of(program, settled):
+    for options, warned in (
+        (("-ccp_type", "apgd", "-ccp_tol", 1e-3), True),
+        (("-ccp_type", "apgd"), False),
+        (("-ccp_tol", 1e-3), False),
+    ):
+        done = program(*SETTLED, "-steps", 1, *options, "-overwrite")
+        assert ("WARNING: -ccp_tol 0.001" in done.stdout) == warned
+
+
 def test_the_law_that_holds_where_none_is_asked_for(program, settled, tmp_path):
     """Coulomb's where one run finds it at the price of the relaxation."""
     for options, law in (
