@@ -2,9 +2,9 @@
 
 A prescribed motion is a pose as a function of time. Over a time step the body has the *mean* velocity
 (x(t+dt) - x(t)) / dt, and the angular velocity that turns it from the one orientation to the other in dt the shortest
-way (so less than half a turn), so that the contacts see the velocity that takes it exactly to its next pose. Any object
-with the method `pose` of `Fixed` is one. If it has a method `angular_velocity()` too, a vector (3,) [rad/s], the contacts
-see that one instead, at all times.
+way (so less than half a turn), so that the contacts see the velocity that takes it exactly to its next pose. Any
+object with the method `pose` of `Fixed` is one. If it has a method `angular_velocity()` too, a vector (3,) [rad/s], the
+contacts see that one instead, at all times.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class Path:
     def read(cls, file: str | FilePath) -> Path:
         """From a text file with time [s] and x, y, z [m] in each line, between them commas or blanks; # begins a
         remark. ValueError, which names file and line, for what is no such line."""
-        rows = []
+        rows: list[tuple[float, ...]] = []
         for number, line in enumerate(FilePath(file).read_text().splitlines(), 1):
             words = line.partition("#")[0].replace(",", " ").split()
             try:

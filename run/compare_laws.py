@@ -27,7 +27,8 @@ DT = 0.01
 def main(sizes: list[int]) -> None:
     about = say_machine()
     rows: list[dict] = []
-    print("scene   n  method      law         seconds  solve s  iterations  overlap mm  Coulomb residual  not converged")
+    print("scene   n  method      law         seconds  solve s  iterations  overlap mm  Coulomb residual", end="")
+    print("  not converged")
     for n in sizes:
         for scene in SCENES:
             for (method, tol), count in METHODS.items():

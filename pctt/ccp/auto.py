@@ -77,7 +77,8 @@ class Memory:
 def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Auto, newton: Newton, coulomb: bool = False
 ) -> Result:
-    """Impulses, of the cone problem or of Coulomb's law, by the method that is expected to be faster; ``solver`` of the result names it, ``reason`` says why."""
+    """Impulses, of the cone problem or of Coulomb's law, by the method that is expected to be faster; ``solver`` of the
+    result names it, ``reason`` says why."""
     most = limits.max_it if limits.max_it >= 0 else 20_000
     memory = _memory(newton) if options.remember else Memory()
     model = conic_cost(problem.size, problem.softness, limits.tol)

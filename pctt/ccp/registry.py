@@ -24,8 +24,8 @@ class Solver:
     Newton systems.
 
     ``needs`` is PRODUCT, MATRIX, NEWTON or EITHER; ``iterations`` the default limit (``-ccp_max_it``). A method that
-    ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself, at tolerances from ``law_tol``
-    on for about what the relaxation costs.
+    ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself, at tolerances from
+    ``law_tol`` on for about what the relaxation costs.
     """
 
     name: str

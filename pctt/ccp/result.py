@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pctt.ccp.cone import Array
 from pctt.options import POSITIVE, option
 
-
 RELAXATION, COULOMB, FIXED_POINT = "relaxation", "Coulomb", "Coulomb by cone problems"
 LAWS = (RELAXATION, COULOMB, FIXED_POINT)
 

@@ -123,8 +123,8 @@ class Run:
     )
     ccp_coulomb: Optional[bool] = option(
         None,
-        "true: Coulomb's law; false: its relaxation by the cone problem, whose sliding contacts open; none: Coulomb's law "
-        "where that costs about the same, in scenes with apgd or auto at -ccp_tol 1e-4 and above (docs/ccp.md)",
+        "true: Coulomb's law; false: its relaxation by the cone problem, whose sliding contacts open; none: Coulomb's "
+        "law where that costs about the same, in scenes with apgd or auto at -ccp_tol 1e-4 and above (docs/ccp.md)",
     )
     compare: str = option("", "preconditioners, with commas between, that each solve the same Newton systems")
     compare_every: int = option(1, "compare on every k-th Newton system", check=AT_LEAST_ONE)

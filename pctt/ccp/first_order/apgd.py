@@ -6,8 +6,8 @@ applied once per iteration: the gradient at the extrapolated point follows from 
 iterates, and for a quadratic objective the line search is a Rayleigh quotient. The extrapolated point is formed where
 it is used, twice: reading the last two iterates costs less than writing and reading it.
 
-For Coulomb's law the gradient gets the opening mu |y_t| that it asks for itself, in every iteration, and momentum a bound
-(`Momentum`): the projected step then has Coulomb's law as its fixed point, and one run finds it.
+For Coulomb's law the gradient gets the opening mu |y_t| that it asks for itself, in every iteration, and momentum a
+bound (`Momentum`): the projected step then has Coulomb's law as its fixed point, and one run finds it.
 """
 
 from __future__ import annotations

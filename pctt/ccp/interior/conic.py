@@ -13,13 +13,13 @@ spoils v = G' g alone, which the next step mends. With W the scaling of the pair
 Late in an iteration W^2 is large along an impulse that slides, and W^2 z, which is s, drowns in rounding when it is
 multiplied out: what each contact would do alone, ds = W w - s, is formed from s instead.
 
-For Coulomb's law z is that of the De Saxce velocity, (y_n / mu + |y_t|, y_t). Newton's method takes the derivative of the
-opening along: with u = y_t / |y_t|,
+For Coulomb's law z is that of the De Saxce velocity, (y_n / mu + |y_t|, y_t). Newton's method takes the derivative of
+the opening along: with u = y_t / |y_t|,
 
     dz = T (G dv + C dg) + r_z,    T = 1 + e_n u',
 
 which adds a term of rank one per contact to the elimination of ds, and makes the Newton systems unsymmetric. (Openings
-that lag an iteration behind converge by a fifth per iteration, and need fifty to 1e-6.)
+that lag behind converge by a fifth per cone problem, each solved exactly.)
 
 Source: Nesterov and Todd (1997), Mehrotra (1992); Acary, Armand, Nguyen and Shpakovych, "Second-order cone
 programming for frictional contact mechanics using interior point algorithm", Optim. Methods Softw. (2023), for their
@@ -170,8 +170,8 @@ def _residuals(
 class Slip(NamedTuple):
     """What the derivative of the opening does to an iteration of Coulomb's law.
 
-    In the scaled variables ds = X (c - r_z - T G dv) with X^-1 = W^-2 + e T, e the compliance. With Y^-1 = W^-2 + e this
-    is X = (1 - e p u'/ d) Y and X T = Y + p (u - e Y u)' / d, where p = Y e_n, d = 1 + e u'p.
+    In the scaled variables ds = X (c - r_z - T G dv) with X^-1 = W^-2 + e T, e the compliance. With Y^-1 = W^-2 + e
+    this is X = (1 - e p u'/ d) Y and X T = Y + p (u - e Y u)' / d, where p = Y e_n, d = 1 + e u'p.
     """
 
     u: Array  #: (nc, 3) direction in which a contact slides
