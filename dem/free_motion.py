@@ -10,7 +10,7 @@ import numpy as np
 from dem import bodies, quaternion
 from dem.arrays import Floats
 from dem.bodies import SPHERE, Bodies
-from dem.motion import Dynamic
+from dem.motion import Dynamic, Guided
 from dem.quaternion import cross
 
 if TYPE_CHECKING:
@@ -46,9 +46,12 @@ def free_velocities(world: World, near: Neighbourhood, dt: float) -> Floats:
 
 
 def large_free_velocity(world: World, dt: float) -> Floats:
-    """Velocities (large bodies, 6) over a step of dt [s] without contacts: guided bodies along their guides,
-    prescribed ones on their paths."""
+    """Velocities (large bodies, 6) over a step of dt [s] without contacts: guided bodies along their guides with the
+    forces of their drives, prescribed ones on their paths."""
     free = free_velocity(world.large, world.gravity, dt)
+    for row, body in enumerate(world.large_bodies):
+        if isinstance(body.motion, Guided):
+            free[row, :3] += dt / body.mass * body.motion.force_at(world.time)
     free[:, :3] = project(free_directions(world.large_bodies), free[:, :3])
     prescribed = ~bodies.is_dynamic(world.large)
     free[prescribed] = world.prescribed_velocity(dt)[prescribed]

@@ -1,21 +1,24 @@
-"""Motions of large bodies: free, guided along a line, fixed, rotating, oscillating or gliding.
+"""Motions of large bodies: free, guided along a line, fixed, rotating, oscillating, gliding or along a path.
 
 A prescribed motion is a pose as a function of time. Over a time step the body has the *mean* velocity
-(x(t+dt) - x(t)) / dt, so that the contacts see the velocity that takes it exactly to its next pose. Any object with
-the methods `pose` and `angular_velocity` of `Fixed` is one.
+(x(t+dt) - x(t)) / dt, and the angular velocity that turns it from the one orientation to the other in dt the shortest
+way (so less than half a turn), so that the contacts see the velocity that takes it exactly to its next pose. Any
+object with the method `pose` of `Fixed` is one. If it has a method `angular_velocity()` too, a vector (3,) [rad/s], the
+contacts see that one instead, at all times.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path as FilePath
 from typing import Union
 
 import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
-from dem.checks import finite_vector, positive, unit_vector
+from dem.checks import finite, finite_vector, positive, unit_vector
 
 
 @dataclass(frozen=True)
@@ -32,16 +35,27 @@ class Guided(Dynamic):
     """Moved by forces along one direction of the world only, without turning: a piston, a press.
 
     The guide takes all other forces and all torques: the inverse mass of the other five degrees of freedom is zero.
+    A drive may push along it with a constant force, beside gravity, from one time to another: at rest the contacts
+    then bear that force, and the weight as far as it is along the guide.
     """
 
     direction: Sequence[float]  #: (3,), normalised
+    force: float = 0.0  #: along the direction [N]
+    start: float = 0.0  #: [s]
+    end: float = np.inf  #: [s]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "direction", unit_vector("direction of a guide", self.direction))
+        finite("force of a guide", self.force)
+        _ordered("force of a guide", self.start, self.end)
 
     def free_directions(self) -> Floats:
         """Projector (3, 3) on the direction of the guide."""
         return np.outer(self.direction, self.direction)
+
+    def force_at(self, time: float) -> Floats:
+        """Force of the drive (3,) over a step that begins at `time` [s]."""
+        return self.force * (self.start <= time < self.end) * np.array(self.direction)
 
 
 @dataclass(frozen=True)
@@ -52,59 +66,53 @@ class Fixed:
         """Position (3,) and quaternion (4,) at `time` [s] of a body with the given ones at time zero."""
         return position, orientation
 
-    def angular_velocity(self) -> Floats:
-        """World-frame angular velocity (3,) [rad/s]."""
-        return np.zeros(3)
-
 
 @dataclass(frozen=True)
 class Rotation:
-    """Constant rotation about an axis through a fixed point of the world."""
+    """Constant rotation about an axis through a fixed point of the world from one time to another; at rest before and
+    after."""
 
     velocity: Sequence[float]  #: angular velocity vector (3,) [rad/s]
     center: Sequence[float] = (0.0, 0.0, 0.0)  #: a point of the axis (3,) [m]
+    start: float = 0.0  #: [s]
+    end: float = np.inf  #: [s]
 
     def __post_init__(self) -> None:
+        _ordered("rotation", self.start, self.end)
         object.__setattr__(self, "velocity", finite_vector("angular velocity", self.velocity))
         object.__setattr__(self, "center", finite_vector("centre of rotation", self.center))
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) at `time` [s] of a body with the given ones at time zero."""
-        turn = quaternion.exponential(time * self.angular_velocity())
+        turn = quaternion.exponential(_gone(time, self.start, self.end) * np.array(self.velocity))
         center = np.array(self.center)
         turned = quaternion.normalized(quaternion.multiply(turn, orientation))
         return center + quaternion.rotate(turn, position - center), turned
-
-    def angular_velocity(self) -> Floats:
-        """World-frame angular velocity (3,) [rad/s]."""
-        return np.array(self.velocity)
 
 
 @dataclass(frozen=True)
 class Oscillation:
     """Sinusoidal translation: displacement amplitude * (sin(2 pi t / period + phase) - sin(phase)), where t is the
-    time since `start`; at rest before."""
+    time since `start`; at rest before, and from `end` on where it is then."""
 
     direction: Sequence[float]  #: (3,), normalised
     amplitude: float  #: [m]
     period: float  #: [s]
     phase: float = 0.0  #: [rad]
     start: float = 0.0  #: [s]
+    end: float = np.inf  #: [s]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "direction", unit_vector("direction of oscillation", self.direction))
+        _ordered("oscillation", self.start, self.end)
         finite_vector("amplitude, phase and start", (self.amplitude, self.phase, self.start))
         positive("period of oscillation", self.period)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) at `time` [s] of a body with the given ones at time zero."""
-        angle = 2.0 * np.pi * max(time - self.start, 0.0) / self.period
+        angle = 2.0 * np.pi * _gone(time, self.start, self.end) / self.period
         swing = np.sin(angle + self.phase) - np.sin(self.phase)
         return position + self.amplitude * swing * np.array(self.direction), orientation
-
-    def angular_velocity(self) -> Floats:
-        """World-frame angular velocity (3,) [rad/s]."""
-        return np.zeros(3)
 
 
 @dataclass(frozen=True)
@@ -117,21 +125,61 @@ class Glide:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "velocity", finite_vector("velocity of a glide", self.velocity))
-        if not self.start <= self.end:
-            raise ValueError(f"a glide cannot end at {self.end:g} s, before its start at {self.start:g} s")
+        _ordered("glide", self.start, self.end)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) at `time` [s] of a body with the given ones at time zero."""
-        gone = max(min(time, self.end) - self.start, 0.0)
-        return position + gone * np.array(self.velocity), orientation
+        return position + _gone(time, self.start, self.end) * np.array(self.velocity), orientation
 
-    def angular_velocity(self) -> Floats:
-        """World-frame angular velocity (3,) [rad/s]."""
-        return np.zeros(3)
+
+@dataclass(frozen=True)
+class Path:
+    """Translation through places that are given at some times, straight and at constant velocity between them; at rest
+    before the first and after the last. The first place is where the body is at time zero, whatever its numbers."""
+
+    times: Sequence[float]  #: (n,), ascending [s]
+    positions: Sequence[Sequence[float]]  #: (n, 3) [m]
+
+    def __post_init__(self) -> None:
+        times = tuple(float(time) for time in self.times)
+        if not times or not np.isfinite(times).all() or times[0] < 0.0 or (np.diff(times) <= 0.0).any():
+            listed = ", ".join(f"{time:g}" for time in times) or "none"
+            raise ValueError(f"times of a path must ascend from zero or later, got {listed}")
+        if len(self.positions) != len(times):
+            raise ValueError(f"a path has {len(times)} times but {len(self.positions)} positions")
+        object.__setattr__(self, "times", times)
+        places = tuple(finite_vector("position of a path", place) for place in self.positions)
+        object.__setattr__(self, "positions", places)
+
+    @classmethod
+    def read(cls, file: str | FilePath) -> Path:
+        """From a text file with time [s] and x, y, z [m] in each line, between them commas or blanks; # begins a
+        remark. ValueError, which names file and line, for what is no such line."""
+        rows: list[tuple[float, ...]] = []
+        for number, line in enumerate(FilePath(file).read_text().splitlines(), 1):
+            words = line.partition("#")[0].replace(",", " ").split()
+            try:
+                row = tuple(map(float, words))
+            except ValueError:
+                row = ()
+            if words and (len(row) != 4 or not np.isfinite(row).all()):
+                raise ValueError(f"{file}, line {number}: not a time and three coordinates: {line.strip()}")
+            if words and rows and row[0] <= rows[-1][0]:
+                raise ValueError(f"{file}, line {number}: time {row[0]:g} s does not come after {rows[-1][0]:g} s")
+            rows += [row] if words else []
+        if not rows:
+            raise ValueError(f"{file}: no line with a time and three coordinates")
+        return cls([row[0] for row in rows], [row[1:] for row in rows])
+
+    def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
+        """Position (3,) and quaternion (4,) at `time` [s] of a body with the given ones at time zero."""
+        places = np.array(self.positions)
+        place = np.array([np.interp(time, self.times, axis) for axis in places.T])
+        return position + place - places[0], orientation
 
 
 #: Motions that do not answer to forces.
-Prescribed = Union[Fixed, Rotation, Oscillation, Glide]
+Prescribed = Union[Fixed, Rotation, Oscillation, Glide, Path]
 Motion = Union[Dynamic, Prescribed]
 
 
@@ -139,6 +187,18 @@ def mean_velocity(
     motion: Prescribed, time: float, dt: float, position: Floats, orientation: Floats
 ) -> Floats:
     """Velocity (6,) from `time` to `time + dt` of a body with the given pose at time zero."""
-    start, _ = motion.pose(time, position, orientation)
-    end, _ = motion.pose(time + dt, position, orientation)
-    return np.concatenate([(end - start) / dt, motion.angular_velocity()])
+    start, before = motion.pose(time, position, orientation)
+    end, after = motion.pose(time + dt, position, orientation)
+    given = getattr(motion, "angular_velocity", None)
+    turning = quaternion.rotation_vector(before, after) / dt if given is None else given()
+    return np.concatenate([(end - start) / dt, turning])
+
+
+def _gone(time: float, start: float, end: float) -> float:
+    """How much of the time between start and end has gone by [s]."""
+    return max(min(time, end) - start, 0.0)
+
+
+def _ordered(what: str, start: float, end: float) -> None:
+    if not (np.isfinite(start) and start <= end):
+        raise ValueError(f"the {what} cannot begin at {start:g} s and end at {end:g} s")

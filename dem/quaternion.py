@@ -89,6 +89,16 @@ def exponential(rotation: Floats) -> Floats:
     return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * rotation], axis=-1)
 
 
+def rotation_vector(before: Floats, after: Floats) -> Floats:
+    """Rotation vectors (..., 3), angle [rad] times unit axis in the world frame, of the shortest turns from one
+    orientation (..., 4) to another; exact also for tiny angles."""
+    turn = multiply(after, conjugate(before))
+    turn = np.where(turn[..., :1] < 0.0, -turn, turn)
+    sine = length(turn[..., 1:])[..., None]
+    angle = 2.0 * np.arctan2(sine, turn[..., :1])
+    return turn[..., 1:] * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0.0)
+
+
 def integrate(q: Floats, angular_velocity: Floats, dt: float) -> Floats:
     """Orientations (..., 4) after the time `dt` [s] at a constant world-frame angular velocity (..., 3)
     [rad/s].

@@ -25,7 +25,7 @@ from pctt.ccp.coulomb import Coulomb
 from pctt.ccp.newton import FORMS, Newton
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.registry import SOLVERS, Solver
+from pctt.ccp.registry import NEWTON, SOLVERS, Solver
 from pctt.ccp.result import Limits, Result
 from pctt.ccp.unbounded import why_unbounded
 from pctt.contact_map import CompactRows
@@ -33,6 +33,7 @@ from pctt.log import phase
 
 __all__ = [
     "FORMS",
+    "NEWTON",
     "SOLVERS",
     "Accuracy",
     "BlockRows",
@@ -58,8 +59,11 @@ def solve(
     newton: Newton | None = None,
     coulomb: Coulomb | None = None,
 ) -> Result:
-    """Solve a cone problem by a method of SOLVERS, or with ``coulomb`` one cone problem after another until Coulomb's
-    law holds.
+    """Solve a cone problem by a method of SOLVERS; with ``coulomb`` find impulses of Coulomb's law.
+
+    Coulomb's law has a ladder: the method's own way if it has one (`Solver.has_law`); where that does not converge, or
+    there is none, one cone problem after another (`pctt.ccp.coulomb`); where that does not either, the best of both
+    and of the relaxation, by the Coulomb residual, not converged. ``law`` of the result says which it was.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an
     instance of the method's options class; ``newton``, for methods that solve Newton systems, keeps what serves one
@@ -72,31 +76,31 @@ def solve(
     guess = np.zeros_like(problem.r) if guess is None else guess
     own = newton_for(problem.comm, type) if solver.newton and newton is None else None
 
-    def convex(problem: ConeProblem, guess: Array, tol: float) -> Result:
+    def once(problem: ConeProblem, guess: Array, tol: float, law: bool = False) -> Result:
         to = dataclasses.replace(limits, tol=tol)
-        return _convex(problem, guess, solver, to, options or solver.options(), newton or own)
+        return _once(problem, guess, solver, to, options or solver.options(), newton or own, law)
 
     try:
-        if coulomb is None or problem.size == 0:
-            return convex(problem, guess, limits.tol)
-        return coulombs_law.solve(problem, guess, limits.tol, coulomb, convex)
+        if coulomb is None:
+            return once(problem, guess, limits.tol)
+        return coulombs_law.ladder(problem, guess, limits.tol, coulomb, once, solver.has_law)
     finally:
         if own is not None:
             own.destroy()
 
 
-def _convex(
-    problem: ConeProblem, guess: Array, solver: Solver, limits: Limits, options: Any, newton: Newton | None
+def _once(
+    problem: ConeProblem, guess: Array, solver: Solver, limits: Limits, options: Any, newton: Newton | None, law: bool
 ) -> Result:
-    """Solve the cone problem as it is."""
+    """Solve the cone problem as it is, or with ``law`` have the method find Coulomb's law."""
     nothing = np.zeros_like(problem.r)
     if problem.size == 0:
         return Result(nothing, True, "no contacts", 0.0, 0)
     if problem.natural_residual(nothing, problem.r) == 0:
         return Result(nothing, True, "no contact closes", 0.0, 0)
-    arguments = (problem, guess, limits, options)
+    arguments = (problem, guess, limits, options, *([newton] if solver.newton else []))
     with phase("CCPSolve"):
-        result = solver.function(*arguments, newton) if solver.newton else solver.function(*arguments)
+        result = solver.function(*arguments, **({"coulomb": True} if law else {}))
         unbounded = why_unbounded(problem, result.impulse)
         if unbounded:
             result.converged, result.reason = False, unbounded

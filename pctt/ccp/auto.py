@@ -74,8 +74,11 @@ class Memory:
         self.factor[decade(tol)] = float(np.clip(mean, 0.25, 4.0))
 
 
-def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Auto, newton: Newton) -> Result:
-    """Impulses by the method that is expected to be faster; ``solver`` of the result names it, ``reason`` says why."""
+def solve(
+    problem: ConeProblem, guess: Array, limits: Limits, options: Auto, newton: Newton, coulomb: bool = False
+) -> Result:
+    """Impulses, of the cone problem or of Coulomb's law, by the method that is expected to be faster; ``solver`` of the
+    result names it, ``reason`` says why."""
     most = limits.max_it if limits.max_it >= 0 else 20_000
     memory = _memory(newton) if options.remember else Memory()
     model = conic_cost(problem.size, problem.softness, limits.tol)
@@ -84,19 +87,19 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Auto, new
 
     start = perf_counter()
     limited = dataclasses.replace(limits, max_it=most)
-    first = apgd.solve(problem, guess, limited, apgd.APGD(), watch)
+    first = apgd.solve(problem, guess, limited, apgd.APGD(), watch, coulomb)
     switched = perf_counter()
     if first.converged or first.iterations >= most:
         memory.needed[decade(limits.tol)] = Needed(first.iterations, True)
         return _named(first, "apgd", f"{first.reason}; conic would have cost about {cost:.0f} iterations")
     inner = dataclasses.replace(limits, max_it=min(CONIC_IT, most))
     begin = conic.Conic(start=min(conic.Conic().start, START * first.natural_residual))
-    result = second = conic.solve(problem, first.impulse, inner, begin, newton)
+    result = second = conic.solve(problem, first.impulse, inner, begin, newton, coulomb)
     words = f"{first.reason}; conic: {second.reason}"
     solver = "conic"
     if not (second.converged or second.reason.startswith("unbounded") or most <= CONIC_IT):
         best = min(first, second, key=lambda result: result.natural_residual)
-        result = apgd.solve(problem, best.impulse, limited, apgd.APGD())
+        result = apgd.solve(problem, best.impulse, limited, apgd.APGD(), None, coulomb)
         result.ksp_its, result.fallbacks = second.ksp_its, second.fallbacks
         result.history = second.history + result.history
         words, solver = f"{words}; apgd: {result.reason}", "apgd"

@@ -63,12 +63,15 @@ def projected_move_squares(x: Array, y: Array, step: float, mu: Array) -> tuple[
 
 @compiled
 def accelerated_step(
-    x: Array, last_x: Array, y: Array, last_y: Array, beta: float, step: float, mu: Array, out: Array
+    x: Array, last_x: Array, y: Array, last_y: Array, beta: float, step: float, mu: Array, opening: float, out: Array
 ) -> tuple[float, float]:
-    """P(z - step y_z) for z = x + beta (x - last_x) and its gradient y_z = y + beta (y - last_y).
+    """P(z - step y_z) for z = x + beta (x - last_x) and its gradient y_z = y + beta (y - last_y), to which the opening
+    (mu |y_t|, 0, 0) is added once (``opening`` 1: Coulomb's law) or not (0).
 
     Returned are, for this rank, |out - z|^2 and y_z'(out - x); z and y_z themselves are nowhere stored."""
     z, y_z = _extrapolated(x, last_x, beta), _extrapolated(y, last_y, beta)
+    if opening:
+        add_opening(y_z, mu)
     np.multiply(y_z, -step, out=out)
     out += z
     project(out, mu, out=out)
@@ -91,6 +94,13 @@ def _extrapolated(x: Array, last_x: Array, beta: float) -> Array:
     out *= beta
     out += x
     return out
+
+
+def add_opening(y: Array, mu: Array) -> Array:
+    """y, in place, with mu |y_t| more in the normal direction: the velocity of De Saxce, for which a cone problem is
+    Coulomb's law."""
+    y[:, 0] += mu * tangential(y)
+    return y
 
 
 def margin(x: Array, mu: Array) -> Array:

@@ -48,7 +48,7 @@ def projected_move(x, y, step, mu):
 
 
 @loop
-def accelerated_step(x, last_x, y, last_y, beta, step, mu, out):
+def accelerated_step(x, last_x, y, last_y, beta, step, mu, opening, out):
     x, last_x, y, last_y, to = x.ravel(), last_x.ravel(), y.ravel(), last_y.ravel(), out.ravel()
     z, y_z = np.empty(3 * STRIP), np.empty(3 * STRIP)
     squares, products = np.zeros(3 * STRIP), np.zeros(3 * STRIP)
@@ -57,6 +57,8 @@ def accelerated_step(x, last_x, y, last_y, beta, step, mu, out):
         a, b = 3 * first, 3 * (first + len(friction))
         _extrapolate(x[a:b], last_x[a:b], beta, z)
         _extrapolate(y[a:b], last_y[a:b], beta, y_z)
+        if opening:
+            _add_opening(y_z, friction)
         _step(z, y_z, step, friction, to[a:b])
         _add_squares(to[a:b], z, squares)
         _add_products(to[a:b], x[a:b], y_z, products)
@@ -67,6 +69,13 @@ def accelerated_step(x, last_x, y, last_y, beta, step, mu, out):
 def _extrapolate(x, last_x, beta, out):
     for k in range(len(x)):
         out[k] = x[k] + beta * (x[k] - last_x[k])
+
+
+@loop
+def _add_opening(y, mu):
+    for c in range(len(mu)):
+        i = 3 * c
+        y[i] += mu[c] * np.sqrt(y[i + 1] * y[i + 1] + y[i + 2] * y[i + 2])
 
 
 @loop

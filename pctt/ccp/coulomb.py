@@ -1,4 +1,4 @@
-"""Coulomb's law, by a fixed-point iteration around the convex cone problem.
+"""Coulomb's law, by a fixed-point iteration around the convex cone problem; and the ladder of which that is a rung.
 
 The cone problem is a relaxation: a contact that slides with speed |y_t| gets the normal velocity mu |y_t|, it opens by
 dt mu |y_t| in a step. Coulomb's law has complementarity of g_n and y_n themselves, which the De Saxce velocity
@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pctt.ccp.cone import Array, tangential
+from pctt.ccp.cone import Array, add_opening, tangential
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.result import Result
+from pctt.ccp.result import COULOMB, FIXED_POINT, Result
 from pctt.options import AT_LEAST_ONE, COUNT, NOT_NEGATIVE, option
 
 INNER = 0.3  # accuracy of a cone problem, as a part of the Coulomb residual before it, or of the tolerance
@@ -38,14 +38,45 @@ class Coulomb:
 
 def residual(problem: ConeProblem, g: Array, y: Array) -> float:
     """The natural residual of g (nc, 3) with the De Saxce velocity of y = N g + r."""
-    shifted = y.copy()
-    shifted[:, 0] += opening(problem, y)
-    return problem.natural_residual(g, shifted)
+    return problem.natural_residual(g, add_opening(y.copy(), problem.mu))
 
 
 def opening(problem: ConeProblem, y: Array) -> Array:
     """mu |y_t| (nc,) of velocities y (nc, 3)."""
     return problem.mu * tangential(y)
+
+
+def ladder(
+    problem: ConeProblem,
+    guess: Array,
+    tol: float,
+    options: Coulomb,
+    once: Callable[..., Result],
+    has_law: bool,
+) -> Result:
+    """Impulses of Coulomb's law by the first rung that converges, or the best of all; see `pctt.ccp.solve`.
+
+    ``once(problem, guess, tol, law)`` solves a cone problem, or with ``law`` Coulomb's, which ``has_law`` says it can.
+    """
+    tol, tried = options.tol or tol, []
+    if has_law or problem.size == 0:
+        own = once(problem, guess, tol, law=True)
+        own.law = COULOMB
+        if own.converged or own.reason.startswith("unbounded"):
+            return own
+        tried.append(own)
+    start = tried[0].impulse if tried else guess
+    tried.append(solve(problem, start, tol, options, once))
+    if not tried[-1].converged and not tried[-1].reason.startswith("unbounded"):
+        plain = once(problem, guess, tol)
+        y = problem.product(plain.impulse) + problem.r
+        plain.natural_residual, plain.converged = residual(problem, plain.impulse, y), False
+        plain.reason = f"relaxation, as Coulomb's law was not met: {tried[-1].reason}"
+        tried.append(plain)
+    best = tried[-1] if tried[-1].converged else min(tried, key=lambda result: result.natural_residual)
+    for count in ("iterations", "ksp_its", "fallbacks"):
+        setattr(best, count, sum(getattr(result, count) for result in tried))
+    return best
 
 
 def solve(
@@ -60,7 +91,6 @@ def solve(
     The result's residual and history are those of Coulomb's law, one value per cone problem; its iterations are those
     of all cone problems. ``problem.r`` is another one while this works.
     """
-    tol = options.tol or tol
     # a lone contact that slides answers an opening s by -gain s: the step leads to its fixed point at once
     N = problem.diagonal_blocks
     gain = problem.mu**2 * 0.5 * (N[:, 1, 1] + N[:, 2, 2]) / np.where(N[:, 0, 0] > 0, N[:, 0, 0], np.inf)
@@ -98,7 +128,17 @@ def solve(
     if not converged and not inner.converged:
         words = inner.reason if inner.reason.startswith("unbounded") else f"{words}, the last: {inner.reason}"
     return Result(
-        best.impulse, converged, words, min(history), iterations, ksp_its, fallbacks, history, len(history), best.solver
+        best.impulse,
+        converged,
+        words,
+        min(history),
+        iterations,
+        ksp_its,
+        fallbacks,
+        history,
+        len(history),
+        best.solver,
+        FIXED_POINT,
     )
 
 

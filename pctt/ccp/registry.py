@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from pctt.ccp import auto
 from pctt.ccp.first_order import apgd, barzilai_borwein, gauss_seidel, gpminres, jacobi, kucera, spectral
 from pctt.ccp.interior import conic, pdip
@@ -13,6 +15,7 @@ from pctt.options import describe
 
 PRODUCT, MATRIX, NEWTON = "products with N", "rows of N", "Newton systems"
 EITHER = "products with N, or Newton systems"
+LAW_TOL = 1e-4
 
 
 @dataclass(frozen=True)
@@ -20,7 +23,9 @@ class Solver:
     """A method: ``function(problem, guess, limits, options)``, with a ``pctt.ccp.Newton`` after them if it solves
     Newton systems.
 
-    ``needs`` is PRODUCT, MATRIX, NEWTON or EITHER; ``iterations`` the default limit (``-ccp_max_it``).
+    ``needs`` is PRODUCT, MATRIX, NEWTON or EITHER; ``iterations`` the default limit (``-ccp_max_it``). A method that
+    ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself, at tolerances from
+    ``law_tol`` on for about what the relaxation costs.
     """
 
     name: str
@@ -30,6 +35,8 @@ class Solver:
     iterations: int
     help: str
     source: str
+    has_law: bool = False
+    law_tol: float = np.inf
 
     @property
     def newton(self) -> bool:
@@ -48,11 +55,13 @@ SOLVERS = {
                "the paper's primal-dual interior point method", "the paper, section 2.4"),
         Solver("conic", conic.solve, conic.Conic, NEWTON, 60,
                "symmetric cone interior point method, Nesterov-Todd scaling, Mehrotra's corrector",
-               "Nesterov, Todd 1997; Acary et al. 2023"),
+               "Nesterov, Todd 1997; Acary et al. 2023", has_law=True),
         Solver("auto", auto.solve, auto.Auto, EITHER, 20_000,
-               "`apgd` as long as it is expected to be the faster, else `conic`", "`pctt/ccp/auto.py`"),
+               "`apgd` as long as it is expected to be the faster, else `conic`", "`pctt/ccp/auto.py`",
+               has_law=True, law_tol=LAW_TOL),
         Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
-               "accelerated projected gradient descent with restart", "Mazhar et al. 2015"),
+               "accelerated projected gradient descent with restart", "Mazhar et al. 2015",
+               has_law=True, law_tol=LAW_TOL),
         Solver("barzilai_borwein", barzilai_borwein.solve, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,
                "projected Barzilai-Borwein steps with an adaptive nonmonotone line search", "Dai, Fletcher 2005"),
         Solver("spectral", spectral.solve, spectral.Spectral, PRODUCT, 20_000,

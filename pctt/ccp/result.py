@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from pctt.ccp.cone import Array
 from pctt.options import POSITIVE, option
 
+RELAXATION, COULOMB, FIXED_POINT = "relaxation", "Coulomb", "Coulomb by cone problems"
+LAWS = (RELAXATION, COULOMB, FIXED_POINT)
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -36,8 +39,9 @@ class Result:
     history : natural residual per iteration
     cone_problems : how many were solved for it: more than one for Coulomb's law
     solver : name of the method that found it, where that was chosen; "" otherwise
+    law : of LAWS, what the impulses obey and the residuals are those of
 
-    With Coulomb's law the residuals are those of that law, ``history`` has one per cone problem.
+    With FIXED_POINT ``history`` has one residual per cone problem.
     """
 
     impulse: Array
@@ -50,3 +54,4 @@ class Result:
     history: list[float] = field(default_factory=list)
     cone_problems: int = 1
     solver: str = ""
+    law: str = RELAXATION

@@ -58,6 +58,41 @@ def add_through(blocks, start, body, weight, w, m):
 
 
 @loop
+def add_any_through(blocks, start, body, weight, w, m):
+    """m += G' H G w; ``weight`` (nc, 9) is H, not symmetric."""
+    for c in range(len(start) - 1):
+        y0, y1, y2 = velocity_at(c, blocks, start, body, w)
+        f0 = weight[c, 0] * y0 + weight[c, 1] * y1 + weight[c, 2] * y2
+        f1 = weight[c, 3] * y0 + weight[c, 4] * y1 + weight[c, 5] * y2
+        f2 = weight[c, 6] * y0 + weight[c, 7] * y1 + weight[c, 8] * y2
+        push(c, blocks, start, body, f0, f1, f2, m)
+
+
+@loop
+def any_weights(blocks, start, body, H, weight):
+    """What `add_any_through` wants to know of H (nc, 3, 3)."""
+    for c in range(len(H)):
+        for i in range(3):
+            for j in range(3):
+                weight[c, 3 * i + j] = H[c, i, j]
+
+
+@loop
+def add_any_body_blocks(blocks, start, body, weight, out):
+    """out (bodies, 6, 6) += the diagonal blocks of G' H G."""
+    for c in range(len(start) - 1):
+        for k in range(start[c], start[c + 1]):
+            i = body[k]
+            for n in range(6):
+                b0, b1, b2 = blocks[k, 0, n], blocks[k, 1, n], blocks[k, 2, n]
+                h0 = weight[c, 0] * b0 + weight[c, 1] * b1 + weight[c, 2] * b2
+                h1 = weight[c, 3] * b0 + weight[c, 4] * b1 + weight[c, 5] * b2
+                h2 = weight[c, 6] * b0 + weight[c, 7] * b1 + weight[c, 8] * b2
+                for p in range(6):
+                    out[i, p, n] += blocks[k, 0, p] * h0 + blocks[k, 1, p] * h1 + blocks[k, 2, p] * h2
+
+
+@loop
 def pack(H, weight):
     """weight (nc, 6): the upper triangle of symmetric blocks H (nc, 3, 3)."""
     for c in range(len(H)):

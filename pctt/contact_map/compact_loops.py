@@ -75,6 +75,50 @@ def add_through(frame, arm, body, weight, w, m):
 
 
 @loop
+def add_any_through(frame, arm, body, weight, w, m):
+    """m += D H D' w for any H; ``weight`` (nc, 9) is F'HF, of `any_weights`."""
+    for c in range(len(body)):
+        u0, u1, u2 = velocity_at(c, arm, body, w)
+        f0 = weight[c, 0] * u0 + weight[c, 1] * u1 + weight[c, 2] * u2
+        f1 = weight[c, 3] * u0 + weight[c, 4] * u1 + weight[c, 5] * u2
+        f2 = weight[c, 6] * u0 + weight[c, 7] * u1 + weight[c, 8] * u2
+        push(c, arm, body, f0, f1, f2, m)
+
+
+@loop
+def any_weights(frame, arm, body, H, weight):
+    """weight (nc, 9) = F'HF of blocks H (nc, 3, 3) that need not be symmetric."""
+    for c in range(len(frame)):
+        for j in range(3):
+            f0, f1, f2 = frame[c, j], frame[c, 3 + j], frame[c, 6 + j]
+            h0 = H[c, 0, 0] * f0 + H[c, 0, 1] * f1 + H[c, 0, 2] * f2
+            h1 = H[c, 1, 0] * f0 + H[c, 1, 1] * f1 + H[c, 1, 2] * f2
+            h2 = H[c, 2, 0] * f0 + H[c, 2, 1] * f1 + H[c, 2, 2] * f2
+            for i in range(3):
+                weight[c, 3 * i + j] = frame[c, i] * h0 + frame[c, 3 + i] * h1 + frame[c, 6 + i] * h2
+
+
+@loop
+def add_any_body_blocks(frame, arm, body, weight, blocks):
+    """blocks (bodies, 6, 6) += the diagonal blocks of D H D', for the ``weight`` of `any_weights`."""
+    J = np.zeros((3, 6))  # velocity of the point by those of the body
+    J[0, 0] = J[1, 1] = J[2, 2] = 1.0
+    for c in range(len(frame)):
+        for side in range(2):
+            at = body[c, side]
+            r0, r1, r2 = arm[c, 3 * side], arm[c, 3 * side + 1], arm[c, 3 * side + 2]
+            J[0, 4], J[0, 5] = r2, -r1
+            J[1, 3], J[1, 5] = -r2, r0
+            J[2, 3], J[2, 4] = r1, -r0
+            for n in range(6):
+                h0 = weight[c, 0] * J[0, n] + weight[c, 1] * J[1, n] + weight[c, 2] * J[2, n]
+                h1 = weight[c, 3] * J[0, n] + weight[c, 4] * J[1, n] + weight[c, 5] * J[2, n]
+                h2 = weight[c, 6] * J[0, n] + weight[c, 7] * J[1, n] + weight[c, 8] * J[2, n]
+                for k in range(6):
+                    blocks[at, k, n] += J[0, k] * h0 + J[1, k] * h1 + J[2, k] * h2
+
+
+@loop
 def weights(frame, arm, body, H, weight):
     """weight (nc, 6) = F'HF, the upper triangle, of symmetric blocks H (nc, 3, 3)."""
     for c in range(len(frame)):

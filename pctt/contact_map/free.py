@@ -111,10 +111,11 @@ class FreeMap:
         block_loops.local_product(weight, g, y)
         PETSc.Log.logFlops(15 * self.rows)
 
-    def weights(self, H: Array) -> Array:
-        """What `through` wants to know of symmetric blocks H (nc, 3, 3)."""
-        weight = np.empty((self.rows, 6))
-        self._loops.weights(*self._arrays, _floats(H), weight)
+    def weights(self, H: Array, symmetric: bool = True) -> Array:
+        """What `through` wants to know of blocks H (nc, 3, 3): (nc, 6), or (nc, 9) of those that are not symmetric."""
+        weight = np.empty((self.rows, 6 if symmetric else 9))
+        loop = self._loops.weights if symmetric else self._loops.any_weights
+        loop(*self._arrays, _floats(H), weight)
         return weight
 
     def through(self, weight: Array, v: Array, out: Array) -> None:
@@ -180,7 +181,8 @@ class FreeMap:
     def body_blocks(self, weight: Array) -> Array:
         """The diagonal blocks of I + G' H G (columns, 6, 6)."""
         blocks = np.zeros((self._ghosts.nobody + 1, 6, 6))
-        self._loops.add_body_blocks(*self._arrays, weight, blocks)
+        loop = self._loops.add_body_blocks if weight.shape[1] == 6 else self._loops.add_any_body_blocks
+        loop(*self._arrays, weight, blocks)
         self._ghosts.begin_add(blocks)
         self._ghosts.end_add(blocks)
         own = blocks[: self.columns]
@@ -233,7 +235,8 @@ class Contacts:
 
     def add_through(self, weight: Array, w: Array, m: Array) -> None:
         if self.here.stop > self.here.start:
-            self.loops.add_through(*self.arrays, weight[self.here], w, m)
+            loop = self.loops.add_through if weight.shape[1] == 6 else self.loops.add_any_through
+            loop(*self.arrays, weight[self.here], w, m)
 
 
 _FULL = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # of (xx, xy, xz, yy, yz, zz), the nine of a matrix

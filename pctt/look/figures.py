@@ -67,7 +67,8 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
     if its.lines:
         its.legend()
 
-    values = np.array([line["natural_residual"] for line in lines])
+    relaxed = [line.get("law", "relaxation") == "relaxation" for line in lines]
+    values = np.array([line["natural_residual" if r else "coulomb_residual"] for line, r in zip(lines, relaxed)])
     good = np.array([line["converged"] for line in lines])
     positive = (values > 0) & np.isfinite(values)
     residual.semilogy(time[positive], values[positive], color="C0", **look)
@@ -79,7 +80,7 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
         middle = np.sqrt(values[positive].min() * values[positive].max())
         low, high = residual.get_ylim()
         residual.set_ylim(min(low, 0.3 * middle), max(high, 3 * middle))
-    residual.set_ylabel("natural residual")
+    residual.set_ylabel("natural residual" if all(relaxed) else "residual")
 
     used = np.array([line.get("peak_memory", np.nan) / 2**20 for line in lines])
     memory.plot(time, used, color="C0", **look)

@@ -61,7 +61,7 @@ class BodyMatrix:
         self.mat.setType(PETSc.Mat.Type.BAIJ)
         self.mat.setPreallocationCSR((self._indptr, self._indices))
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        self._stiff: dict[bool, StiffPart] = {}  # in scalar format or not
+        self._stiff: dict[tuple[bool, bool], StiffPart] = {}  # in scalar format or not, symmetric or not
 
     def update(self, inverse: np.ndarray) -> None:
         """K for the blocks B^-1 (nc, 3, 3)."""
@@ -75,12 +75,15 @@ class BodyMatrix:
         _put(self.mat, self._indptr, self._indices, self._values)
         set_diagonal_blocks(self.mat, self._values[self._diagonal_places])
 
-    def stiff_part(self, least: float, shift: float = 0.0, scalar: bool = False) -> PETSc.Mat:
+    def stiff_part(
+        self, least: float, shift: float = 0.0, scalar: bool = False, symmetric: bool = True
+    ) -> PETSc.Mat:
         """K without the blocks between bodies whose entries are all below ``least`` (of the mass), its diagonal blocks
         multiplied by 1 + shift; one Mat in block format and one in scalar format are kept and renewed."""
-        if scalar not in self._stiff:
-            self._stiff[scalar] = StiffPart(self.mat, self._indptr, self._indices, self._diagonal_places, scalar)
-        return self._stiff[scalar].update(self._values, least, shift)
+        form = (scalar, symmetric)
+        if form not in self._stiff:
+            self._stiff[form] = StiffPart(self.mat, self._indptr, self._indices, self._diagonal_places, *form)
+        return self._stiff[form].update(self._values, least, shift)
 
     def places(self, points: np.ndarray) -> np.ndarray:
         """Places of this rank's bodies (n, 3): the means of their contact points (nc, 3); collective."""

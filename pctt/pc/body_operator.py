@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from petsc4py import PETSc
 
 from pctt.contact_map import ContactMap
 from pctt.pc.block_diagonal import set_diagonal_blocks
@@ -49,14 +50,15 @@ class BodyOperator:
         self.contact_map = contact_map
         self._loaded = False
 
-    def update(self, inverse: Array) -> None:
-        """K for symmetric blocks H (nc, 3, 3)."""
+    def update(self, inverse: Array, symmetric: bool = True) -> None:
+        """K for blocks H (nc, 3, 3), which may be unsymmetric."""
         self._inverse, self._made = inverse, False
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         if not self.contact_map.free:
             self.entries()
             return
         G = cast("FreeMap", self.contact_map)
-        self._weight = G.weights(inverse)
+        self._weight = G.weights(inverse, symmetric)
         set_diagonal_blocks(self.mat, G.body_blocks(self._weight))
         self.mat.stateIncrease()
 

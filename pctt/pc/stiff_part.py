@@ -19,14 +19,22 @@ class StiffPart:
     indptr, indices : this rank's block rows of it
     diagonal : which blocks are diagonal ones
     scalar : make an AIJ Mat, for what has no code for blocks, else BAIJ
+    symmetric : whether the blocks are those of a symmetric matrix
     """
 
     def __init__(
-        self, whole: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, diagonal: np.ndarray, scalar: bool
+        self,
+        whole: PETSc.Mat,
+        indptr: np.ndarray,
+        indices: np.ndarray,
+        diagonal: np.ndarray,
+        scalar: bool,
+        symmetric: bool = True,
     ):
         self.comm: MPI.Comm = whole.comm.tompi4py()
         self._indptr, self._indices, self._diagonal = indptr, indices, diagonal
         self._size, self._sizes, self._scalar = whole.getBlockSize(), whole.getSizes(), scalar
+        self._symmetric = symmetric
         self.mat: PETSc.Mat | None = None
 
     def update(self, values: np.ndarray, least: float, shift: float = 0.0) -> PETSc.Mat:
@@ -67,7 +75,7 @@ class StiffPart:
             self.mat.setPreallocationCSR((rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType)))
         else:
             self.mat.setPreallocationCSR((self._kept_indptr, self._kept_indices))
-        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
 
     def _scalar_rows(self, blocks: np.ndarray) -> sp.csr_matrix:
         (own, _), (_, columns) = self._sizes

@@ -121,8 +121,10 @@ class Run:
         "compliance of the contacts, as a part of mean diag N; none: 0, rigid, or that of the file of -problem",
         check=NOT_NEGATIVE,
     )
-    ccp_coulomb: bool = option(
-        False, "Coulomb's law: no opening of sliding contacts, by several cone problems per step (docs/ccp.md)"
+    ccp_coulomb: Optional[bool] = option(
+        None,
+        "true: Coulomb's law; false: its relaxation by the cone problem, whose sliding contacts open; none: Coulomb's "
+        "law where that costs about the same, in scenes with apgd or auto at -ccp_tol 1e-4 and above (docs/ccp.md)",
     )
     compare: str = option("", "preconditioners, with commas between, that each solve the same Newton systems")
     compare_every: int = option(1, "compare on every k-th Newton system", check=AT_LEAST_ONE)
@@ -139,7 +141,7 @@ class Options:
     """Everything that a run needs to know, with the scene's own values filled in.
 
     ``scene`` is an instance of a class of ``dem.scenes.SCENES`` or of the user's; ``solver`` of the options class
-    of ``ccp_type``; ``coulomb`` is there with ``-ccp_coulomb``.
+    of ``ccp_type``; ``coulomb`` is there where Coulomb's law is to hold.
     """
 
     run: Run
@@ -171,7 +173,9 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     refuse_unknown(database, known, prefixes=("compare_", "fallback_", "body_", "kkt_"))
     for name in known:
         PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
-    _refuse_without_effect(database, run)
+    limits = read(ccp.Limits, database, "ccp_")
+    obeys_coulomb = _obeys_coulomb(run, limits)
+    _refuse_without_effect(database, run, obeys_coulomb)
     what = f"options of the scene {scene_class.__name__}"
     scene, dt, delta = together(comm, what, lambda: _read_scene(scene_class, database), own=(OptionError,))
     options = Options(
@@ -179,9 +183,9 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         scene,
         run.dt if run.dt is not None else dt,
         run.delta if run.delta is not None else delta,
-        read(ccp.Limits, database, "ccp_"),
+        limits,
         read(solver.options, database, prefix),
-        read(ccp.Coulomb, database, "ccp_coulomb_") if run.ccp_coulomb else None,
+        read(ccp.Coulomb, database, "ccp_coulomb_") if obeys_coulomb else None,
         demo,
     )
     compare = ccp.Comparison(comm, options.compare_names())  # refuses unknown names
@@ -270,7 +274,7 @@ def _help_sections(database: Mapping[str, str]) -> Iterator[tuple[str, str, str]
     """Topic, title and text of each section of the help."""
     scene = database.get("scene", "mixer")
     parts = ["run", "scene", "ccp", "ccp", *("ccp" for _ in ccp.SOLVERS)]
-    titles = ["Run", f"Scene {scene}", "Cone problem", "Coulomb's law, with -ccp_coulomb"]
+    titles = ["Run", f"Scene {scene}", "Cone problem", "Coulomb's law by cone problems, with -ccp_coulomb"]
     titles += [f"-ccp_type {name}: {solver.help}" for name, solver in ccp.SOLVERS.items()]
     for part, title, (group, prefix) in zip(parts, titles, _groups(find_scene(scene))):
         yield part, title, "\n".join(map(str, describe(group, prefix)))
@@ -280,7 +284,14 @@ def _help_sections(database: Mapping[str, str]) -> Iterator[tuple[str, str, str]
     yield "ksp", "Newton systems", NEWTON_HELP
 
 
-def _refuse_without_effect(database: Mapping[str, str], run: Run) -> None:
+def _obeys_coulomb(run: Run, limits: ccp.Limits) -> bool:
+    """Whether Coulomb's law is to hold; a file of ``-problem`` is solved as the cone problem that it is."""
+    if run.ccp_coulomb is not None:
+        return run.ccp_coulomb
+    return not run.problem and limits.tol >= ccp.SOLVERS[run.ccp_type].law_tol
+
+
+def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb: bool) -> None:
     """OptionError for the first option that means nothing beside the others."""
     solver = ccp.SOLVERS[run.ccp_type]
     newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
@@ -328,7 +339,7 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run) -> None:
             f"no such fallback; there are {', '.join(LADDER)}",
         ),
         (True, lambda name: name.startswith(others), f"belongs to another -ccp_type than {run.ccp_type}"),
-        (not run.ccp_coulomb, lambda name: name.startswith("ccp_coulomb_"), "allowed with -ccp_coulomb only"),
+        (not obeys_coulomb, lambda name: name.startswith("ccp_coulomb_"), "allowed with -ccp_coulomb only"),
     ]
     for applies, concerned, reason in rules:
         for name, value in database.items():

@@ -6,15 +6,37 @@ import os
 import shutil
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from pctt import log
+from pctt.ccp.result import FIXED_POINT, RELAXATION
 
+#: Coulomb residuals of the relaxation above this are worth a warning.
+LARGE_OPENING = 1e-3
 #: Overlaps above this part of the radius of the smallest grain are worth a warning.
 LARGE_OVERLAP = 0.05
+
+
+def law(coulomb: bool) -> str:
+    """Which law of contact a run obeys."""
+    return "Coulomb's law" if coulomb else "relaxation of Coulomb's law"
+
+
+def loose_line(tol: float) -> str:
+    """What a first-order method does at a tolerance above the default."""
+    return (
+        f"WARNING: -ccp_tol {tol:g}: first-order methods leave overlaps of millimetres above 1e-4, which are pushed "
+        "apart: a packing at rest is heated"
+    )
+
+
+def residual(line: Mapping[str, Any]) -> float:
+    """Of the law that a step was solved for."""
+    return line["natural_residual" if line.get("law", RELAXATION) == RELAXATION else "coulomb_residual"]
 
 
 def columns(compared: bool) -> str:
@@ -35,7 +57,7 @@ def step_line(line: Mapping[str, Any]) -> str:
     remark = "" if line["converged"] else f"  NOT CONVERGED: {line['reason']}"
     if line["fallbacks"]:
         remark += f"  ({line['fallbacks']} Newton systems by a fallback)"
-    if line["cone_problems"] > 1:
+    if line.get("law") == FIXED_POINT:
         remark += f"  (Coulomb residual {line['coulomb_residual']:.1e} by {line['cone_problems']} cone problems)"
     if line["solver"] != line["asked_solver"]:
         remark += f"  (by {line['solver']})"
@@ -43,7 +65,7 @@ def step_line(line: Mapping[str, Any]) -> str:
         remark += f"  (hard problem kept: {line['hard_problem']})"
     return (
         f"{line['step']:6d} {line['time']:9.3f} {line['contacts']:9d} {line['iterations']:7d}"
-        f" {line['ksp_its']:7d}  {line['natural_residual']:8.1e} {line['seconds']:15.2f} {search:7.2f}"
+        f" {line['ksp_its']:7d}  {residual(line):8.1e} {line['seconds']:15.2f} {search:7.2f}"
         f" {assembly:9.2f} {solve:7.2f}{compare} {output:7.2f}{remark}"
     )
 
@@ -175,10 +197,21 @@ def phase_table(steps: Sequence[Mapping[str, Any]]) -> str:
         f"{min(contacts)} to {max(contacts)} contacts",
         f"{sum(line['newton_its'] for line in steps)} Newton steps",
         f"{sum(line['ksp_its'] for line in steps)} Krylov iterations",
-        f"worst residual {max(line['natural_residual'] for line in steps):.1e}",
+        f"worst residual {max(map(residual, steps)):.1e}",
         f"{failed} NOT CONVERGED" if failed else "all converged",
     ]
     return "\n".join([head, "-" * len(head), *rows, ", ".join(figures)])
+
+
+def law_line(steps: Sequence[Mapping[str, Any]], tol: float) -> str:
+    """Which law the steps obey and how well, with a warning where the relaxation is far from Coulomb's."""
+    laws = Counter(line["law"] for line in steps)
+    counted = ", ".join(f"{name} in {count} steps" for name, count in laws.most_common())
+    worst = max(line["coulomb_residual"] for line in steps)
+    said = f"law of contact: {counted}; Coulomb residual at most {worst:.1e}"
+    if RELAXATION not in laws or worst <= max(LARGE_OPENING, 10 * tol):
+        return said
+    return f"WARNING: {said}: sliding contacts open by dt mu |v_t|; -ccp_coulomb keeps them closed (docs/ccp.md)"
 
 
 def overlap_line(worst: Mapping[str, float]) -> str:

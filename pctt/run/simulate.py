@@ -51,8 +51,10 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     results = Results(place, comm, made_with["scene"], world)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
-    method = f"{options.run.ccp_type} to {options.limits.tol:g}{' with Coulomb law' if options.coulomb else ''}"
+    method = f"{options.run.ccp_type} to {options.limits.tol:g}, {report.law(options.coulomb is not None)}"
     progress.say(f"{world.body_count} bodies on {comm.size} ranks, {method}")
+    if ccp.SOLVERS[options.run.ccp_type].needs != ccp.NEWTON and options.limits.tol > ccp.Limits().tol:
+        progress.say(report.loose_line(options.limits.tol))
     progress.say(report.columns(bool(compare.names)), level=1)
     start, end = world.step, world.step + options.run.steps
     progress.start(options.run.steps)
@@ -87,6 +89,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
             if comm.rank == 0:
                 lines = [line for line in results.steps() if line["step"] > start]
                 progress.say("\n" + report.phase_table(lines))
+                progress.say(report.law_line(lines, options.limits.tol))
             if figures:
                 progress.say(report.figure_table(figures))
             if comm.rank == 0:
@@ -219,6 +222,7 @@ class Stepper:
             "reason": result.reason,
             "fallbacks": result.fallbacks,
             "solver": solver,
+            "law": result.law,
             "asked_solver": options.run.ccp_type,
             **({"pc_report": pc_report} if pc_report else {}),
             **files,

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from functools import reduce
 from typing import Any
 
+MAXIMA = ("natural_residual", "coulomb_residual", "peak_memory")
 Totals = dict[str, Any]  #: empty before the first step
 
 
@@ -28,7 +29,7 @@ def add(before: Totals, line: Mapping[str, Any]) -> Totals:
         "contacts": [min(least, contacts), max(most, contacts)],
         **{name: before.get(name, 0) + line[name] for name in ("newton_its", "ksp_its", "fallbacks", "seconds")},
         "not_converged": before.get("not_converged", 0) + (not line["converged"]),
-        **{name: max(before.get(name, 0), line[name]) for name in ("natural_residual", "peak_memory")},
+        **{name: max(before.get(name, 0), line[name]) for name in MAXIMA},
         "worst_overlap": max(before.get("worst_overlap", overlap), overlap, key=lambda worst: worst["overlap [m]"]),
         "phases": {name: spent.get(name, 0.0) + phases.get(name, 0.0) for name in {**spent, **phases}},
     }

@@ -35,7 +35,7 @@ def test_conic_where_apgd_is_expected_to_take_longer():
 def test_back_to_apgd_where_conic_stalls(monkeypatch):
     conic = auto.conic.solve
 
-    def stalls(problem, guess, limits, options, newton):
+    def stalls(problem, guess, limits, options, newton, coulomb):
         return conic(problem, guess, dataclasses.replace(limits, max_it=3), options, newton)
 
     monkeypatch.setattr(auto.conic, "solve", stalls)

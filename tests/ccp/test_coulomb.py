@@ -21,6 +21,16 @@ def solve(problem, solver="apgd", tol=1e-8, guess=None, **options):
     return ccp.solve(problem, guess, solver, Limits(tol), coulomb=Coulomb(**options))
 
 
+def by_cone_problems(problem, tol=1e-8, guess=None, **options):
+    """The second rung alone, with APGD inside."""
+    guess = np.zeros_like(problem.r) if guess is None else guess
+
+    def convex(problem, guess, tol):
+        return ccp.solve(problem, guess, "apgd", Limits(tol))
+
+    return coulomb.solve(problem, guess, tol, Coulomb(**options), convex)
+
+
 @SOLVERS
 @pytest.mark.parametrize("mu", [0.2, 0.5, 1.5])
 def test_one_contact_worked_out_by_hand(solver, mu):
@@ -50,7 +60,9 @@ def test_contacts_obey_coulombs_law(solver):
     problem = sliding_heap(0.3)
     result = solve(problem, solver, 1e-8 if solver == "apgd" else 1e-6)
     assert result.converged, result.reason
-    assert len(result.history) == result.cone_problems > 2
+    own_way = ccp.SOLVERS[solver].has_law
+    assert result.law == ("Coulomb" if own_way else "Coulomb by cone problems")
+    assert own_way or len(result.history) == result.cone_problems > 2
     g, y = result.impulse, problem.product(result.impulse) + problem.r
     slack = 1e-4
     sliding, used = np.hypot(*y.T[1:]), np.hypot(*g.T[1:])
@@ -72,19 +84,59 @@ def test_all_solvers_find_the_same():
     assert problem.product(found[0]) == pytest.approx(problem.product(found[1]), abs=1e-5)
 
 
+@pytest.mark.parametrize("mu", [0.8, 1.5])
+def test_one_run_finds_it_at_high_friction(mu):
+    """Where the opening follows the sliding in every iteration, momentum has to be bounded: the bound is found."""
+    for seed in range(3):
+        result = solve(sliding_heap(mu, seed), tol=1e-6)
+        assert result.converged, result.reason
+        assert (result.law, result.cone_problems) == ("Coulomb", 1)
+        assert result.iterations < 2500
+
+
+def test_the_newton_steps_of_conic_end_fast():
+    """The derivative of the opening is that: the last five steps take three digits off the residual."""
+    result = solve(sliding_heap(0.3, seed=1), "conic", tol=1e-9)
+    assert result.converged, result.reason
+    assert (result.law, result.cone_problems) == ("Coulomb", 1)
+    assert result.iterations < 20
+    assert result.history[-1] < 1e-3 * result.history[-6]
+
+
+def test_the_last_rung_is_the_relaxation(monkeypatch):
+    """Where nothing finds Coulomb's law the best is handed back, and named."""
+    problem = sliding_heap(0.3)
+
+    def failing(law):
+        def once(problem, guess, tol, law=False):
+            g = np.full_like(guess, 1e-3) if law else ccp.solve(problem, guess, "apgd", Limits(tol)).impulse
+            return ccp.Result(g, not law, "as it happens", 1.0, 7)
+
+        return once
+
+    monkeypatch.setattr(coulomb, "solve", lambda problem, guess, *rest: ccp.Result(guess, False, "not met", 0.9, 5))
+    guess = np.zeros_like(problem.r)
+    result = coulomb.ladder(problem, guess, 1e-8, Coulomb(), failing(True), has_law=True)
+    assert not result.converged
+    assert result.law == "relaxation"
+    assert result.reason.startswith("relaxation, as Coulomb's law was not met")
+    assert result.iterations == 7 + 5 + 7
+    assert result.natural_residual == pytest.approx(ccp.measure(problem, result.impulse).coulomb_residual, rel=1e-6)
+
+
 def test_acceleration_and_a_warm_start_save_cone_problems():
     problem = sliding_heap(0.8)
-    plain, fast = (solve(problem, tol=1e-4, memory=memory) for memory in (0, 5))
+    plain, fast = (by_cone_problems(problem, tol=1e-4, memory=memory) for memory in (0, 5))
     assert fast.converged
     assert fast.cone_problems < plain.cone_problems
-    again = solve(problem, tol=1e-4, guess=fast.impulse)
+    again = by_cone_problems(problem, tol=1e-4, guess=fast.impulse)
     assert again.cone_problems <= 2
 
 
 def test_giving_up_is_said():
     problem = sliding_heap(0.8)
     r = problem.r.copy()
-    result = solve(problem, tol=1e-9, max_it=3)
+    result = by_cone_problems(problem, tol=1e-9, max_it=3)
     assert not result.converged
     assert (result.cone_problems, len(result.history)) == (3, 3)
     assert result.reason == f"Coulomb's law not met: residual {min(result.history):.1e} at best in 3 cone problems"
@@ -119,6 +171,7 @@ def test_published_problems(name, tol):
     problem = fclib.read(SHARED / f"{name}.hdf5", SELF)
     result = solve(problem, "apgd", tol)
     assert result.converged, result.reason
+    assert result.law == "Coulomb"
     figures = ccp.measure(problem, result.impulse)
     assert figures.coulomb_residual <= 1.01 * tol
     if name.startswith("Spheres"):  # Siconos 4.4, nonsmooth Gauss-Seidel to 1e-6

@@ -54,8 +54,8 @@ def check(comm: MPI.Comm, rows: CompactRows | BlockRows, G: np.ndarray, here: sl
     first = sum(comm.allgather(rows.columns)[: comm.rank])
     own = slice(first, first + rows.columns)
     v, g = rng.standard_normal((bodies, 6)), rng.standard_normal((contacts, 3))
-    H = rng.standard_normal((contacts, 3, 3))
-    H = H @ H.transpose(0, 2, 1)
+    any_H = rng.standard_normal((contacts, 3, 3))
+    H = any_H @ any_H.transpose(0, 2, 1)
     product = contact_map(comm, rows, way)
     np.testing.assert_allclose(product.velocities(v[own].ravel()), (G @ v.ravel()).reshape(-1, 3)[here], **CLOSE)
     np.testing.assert_allclose(product.momenta(g[here]), (G.T @ g.ravel()).reshape(-1, 6)[own], **CLOSE)
@@ -70,18 +70,20 @@ def check(comm: MPI.Comm, rows: CompactRows | BlockRows, G: np.ndarray, here: sl
     expected = size.ravel() * (G @ G.T @ (size * g).ravel())
     np.testing.assert_allclose(y, expected.reshape(-1, 3)[here], rtol=1e-12, atol=1e-12)
 
-    K = np.eye(6 * bodies) + G.T @ np.einsum("cij,cjk->cik", H, G.reshape(contacts, 3, 6 * bodies)).reshape(G.shape)
     operator = BodyOperator(product)
-    operator.update(H[here])
     x, out = operator.mat.createVecs()
     x.array[:] = v[own].ravel()
-    operator.mat.mult(x, out)
-    close = {"rtol": 1e-12, "atol": 1e-12 * np.abs(K).max()}
-    np.testing.assert_allclose(out.array.reshape(-1, 6), (K @ v.ravel()).reshape(-1, 6)[own], **close)
-    blocks = K.reshape(bodies, 6, bodies, 6)[range(bodies), :, range(bodies)][own]
-    np.testing.assert_allclose(operator.mat.getAttr("diagonal_blocks"), blocks, **close)
-    operator.entries().mat.mult(x, out)
-    np.testing.assert_allclose(out.array.reshape(-1, 6), (K @ v.ravel()).reshape(-1, 6)[own], **close)
+    for blocks, symmetric in ((H, True), (any_H, False), (H, True)):
+        through = np.einsum("cij,cjk->cik", blocks, G.reshape(contacts, 3, 6 * bodies)).reshape(G.shape)
+        K = np.eye(6 * bodies) + G.T @ through
+        operator.update(blocks[here], symmetric)
+        operator.mat.mult(x, out)
+        close = {"rtol": 1e-12, "atol": 1e-12 * np.abs(K).max()}
+        np.testing.assert_allclose(out.array.reshape(-1, 6), (K @ v.ravel()).reshape(-1, 6)[own], **close)
+        diagonal = K.reshape(bodies, 6, bodies, 6)[range(bodies), :, range(bodies)][own]
+        np.testing.assert_allclose(operator.mat.getAttr("diagonal_blocks"), diagonal, **close)
+        operator.entries().mat.mult(x, out)
+        np.testing.assert_allclose(out.array.reshape(-1, 6), (K @ v.ravel()).reshape(-1, 6)[own], **close)
     for thing in (operator, product, x, out):
         thing.destroy()
 

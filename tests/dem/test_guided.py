@@ -72,6 +72,21 @@ def test_the_mass_scaled_map_is_consistent_with_the_velocities(direction):
     assert np.linalg.matrix_rank(dense[:, -6:]) == 1
 
 
+@pytest.mark.parametrize("direction", [(0, 0, 1), SLANT])
+def test_the_force_of_a_drive_acts_while_it_lasts(direction):
+    unit = np.array(direction) / np.linalg.norm(direction)
+    world = pressed(Guided(direction, force=50.0, start=0.005, end=0.015), mass=40.0)
+    weight = unit @ [0, 0, -9.81]
+    for force in (0.0, 50.0, 0.0):  # steps that begin at 0, .01 and .02 s
+        before = world.large.velocity[1] @ [*unit, 0, 0, 0]
+        system = system_of(world)
+        velocity = system.free_velocity[5] @ [*unit, 0, 0, 0]
+        assert velocity == pytest.approx(before + 0.01 * (weight + force / 40.0), abs=1e-12)
+        advance(world, system.free_velocity, 0.01)
+    with pytest.raises(ValueError, match="force of a guide"):
+        Guided(direction, force=np.nan)
+
+
 def test_a_free_press_differs_from_a_guided_one():
     free, guided = pressed(Dynamic(), density=500.0), pressed(Guided((0, 0, 1)), density=500.0)
     velocity = [system_of(world).velocity(crude_impulse(system_of(world)))[5] for world in (free, guided)]

@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 
 from dem import quaternion
-from dem.motion import Fixed, Glide, Oscillation, Rotation, mean_velocity
+from dem.motion import Fixed, Glide, Oscillation, Path, Rotation, mean_velocity
 
 PLACE, TURN = np.array([1.0, 2.0, 3.0]), quaternion.normalized(np.array([1.0, 0.5, 0.0, 0.2]))
 MOTIONS = [Fixed(), Rotation((0.1, 0.0, 1.0), (2.0, 0.0, 0.0)), Oscillation((1.0, 2.0, 0.0), 0.3, 4.0, 0.7)]
 MOTIONS += [Oscillation((1.0, 2.0, 0.0), 0.3, 4.0, 0.7, start=1.4), Glide((1.0, -2.0, 0.5), start=0.3, end=1.4)]
+MOTIONS += [Rotation((0.1, 0.0, 1.0), start=1.4), Rotation((0.1, 0.0, 1.0), end=1.4)]
+MOTIONS += [Oscillation((1, 0, 0), 1, 1, end=1.4)]
+MOTIONS += [Path((0.5, 1.4, 2.0), ((1, 1, 1), (2, 0, 1), (2, 0, 3)))]
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
@@ -47,6 +50,60 @@ def test_motions_with_a_start_rest_until_then():
     np.testing.assert_allclose(later.pose(3.1, PLACE, TURN)[0], at_once.pose(0.6, PLACE, TURN)[0], atol=1e-14)
 
 
+def test_rotation_and_oscillation_rest_before_and_after():
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    turning = Rotation((0, 0, np.pi), start=1.0, end=1.5)
+    swinging = Oscillation((1, 0, 0), 0.3, 2.0, start=1.0, end=1.5)
+    for time, quarter, gone in ((0.0, 0, 0.0), (0.9, 0, 0.0), (1.25, 0.5, 0.3 * np.sin(np.pi / 4)), (7.0, 1, 0.3)):
+        place, turn = turning.pose(time, PLACE, upright)
+        expected = quaternion.exponential(np.array([0, 0, quarter * np.pi / 2]))
+        np.testing.assert_allclose(turn, expected, atol=1e-15)
+        np.testing.assert_allclose(place, quaternion.rotate(expected, PLACE), atol=1e-15)
+        np.testing.assert_allclose(swinging.pose(time, PLACE, TURN)[0] - PLACE, [gone, 0, 0], atol=1e-15)
+    assert not mean_velocity(turning, 0.5, 0.25, PLACE, TURN).any()  # nothing is dragged before it turns
+    np.testing.assert_allclose(mean_velocity(turning, 1.1, 0.25, 0 * PLACE, TURN), [0, 0, 0, 0, 0, np.pi], atol=1e-14)
+    np.testing.assert_allclose(mean_velocity(turning, 0.9, 0.2, 0 * PLACE, TURN)[5], np.pi / 2, atol=1e-14)
+
+
+def test_a_motion_of_ones_own_is_a_pose_alone():
+    class Rocking:
+        def pose(self, time, position, orientation):
+            turn = quaternion.exponential(np.array([0.3 * np.sin(time), 0, 0]))
+            return position, quaternion.multiply(turn, orientation)
+
+    class Belt(Rocking):
+        def angular_velocity(self):
+            return np.array([0, 7.0, 0])
+
+    turning = mean_velocity(Rocking(), 0.4, 1e-4, PLACE, TURN)[3:]
+    np.testing.assert_allclose(turning, [0.3 * np.cos(0.4), 0, 0], atol=1e-4)
+    np.testing.assert_array_equal(mean_velocity(Belt(), 0.4, 0.1, PLACE, TURN), [0, 0, 0, 0, 7, 0])
+
+
+def test_a_path_goes_straight_from_place_to_place():
+    motion = Path((1, 2, 4), ((1, 1, 1), (1, 3, 1), (2, 3, 1)))
+    for time, gone in ((0.0, (0, 0, 0)), (1.5, (0, 1, 0)), (3.0, (0.5, 2, 0)), (9.0, (1, 2, 0))):
+        np.testing.assert_allclose(motion.pose(time, PLACE, TURN)[0] - PLACE, gone, atol=1e-15)
+    np.testing.assert_allclose(mean_velocity(motion, 2.0, 0.5, PLACE, TURN), [0.5, 0, 0, 0, 0, 0], atol=1e-14)
+
+
+def test_a_path_from_a_file(tmp_path):
+    file = tmp_path / "path.csv"
+    file.write_text("# t, x, y, z\n0, 0, 0, 0\n\n1.5  0 1 0  # up\n")
+    assert Path.read(file) == Path((0, 1.5), ((0, 0, 0), (0, 1, 0)))
+    for text, words in (
+        ("0 0 0 0\n1 2 3\n", "line 2: not a time and three coordinates: 1 2 3"),
+        ("0 0 0 x\n", "line 1: not a time"),
+        ("0 0 0 nan\n", "line 1: not a time"),
+        ("0 0 0 0\n0 1 1 1\n", "line 2: time 0 s does not come after 0 s"),
+        ("# nothing\n", "no line with"),
+    ):
+        file.write_text(text)
+        with pytest.raises(ValueError, match=words) as error:
+            Path.read(file)
+        assert str(file) in str(error.value)
+
+
 def test_a_glide_rests_before_and_after():
     motion = Glide((1.0, 0.0, -2.0), start=0.5, end=1.5)
     for time, gone in ((0.2, 0.0), (0.75, 0.25), (1.5, 1.0), (9.0, 1.0)):
@@ -54,8 +111,13 @@ def test_a_glide_rests_before_and_after():
 
 
 def test_bad_motions_are_refused():
-    with pytest.raises(ValueError, match="cannot end"):
-        Glide((1, 0, 0), start=2.0, end=1.0)
+    for kind in (Glide, Rotation):
+        with pytest.raises(ValueError, match="cannot begin at 2 s and end at 1 s"):
+            kind((1, 0, 0), start=2.0, end=1.0)
+    with pytest.raises(ValueError, match="must ascend from zero or later, got 0, 2, 1"):
+        Path((0, 2, 1), np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="2 times but 3 positions"):
+        Path((0, 2), np.zeros((3, 3)))
     with pytest.raises(ValueError, match="period"):
         Oscillation((1, 0, 0), 0.1, 0.0)
     with pytest.raises(ValueError, match="zero vector"):

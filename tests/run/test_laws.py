@@ -15,16 +15,45 @@ def steps(folder: Path) -> list[dict]:
 
 @pytest.mark.parallel(1, 2)
 def test_steps_with_coulombs_law(program, settled, tmp_path):
-    options = ("-ccp_type", "apgd", "-ccp_tol", 1e-5, "-steps", 2, "-monitor", 2)
-    done = program(*SETTLED, *options, "-ccp_coulomb")
+    """Which is the default with apgd; the relaxation says how far off it is."""
+    options = ("-ccp_type", "apgd", "-steps", 2, "-monitor", 2)
+    done = program(*SETTLED, *options)
+    assert "apgd to 0.0001, Coulomb's law" in done.stdout
+    worst = max(line["coulomb_residual"] for line in steps(tmp_path))
+    assert f"law of contact: Coulomb in 2 steps; Coulomb residual at most {worst:.1e}\n" in done.stdout
     for line in steps(tmp_path):
         assert line["converged"], line["reason"]
-        assert line["coulomb_residual"] <= 1.01e-5
-        assert line["cone_problems"] > 1
+        assert line["law"] == "Coulomb"
+        assert line["coulomb_residual"] <= 1.01e-4
+    done = program(*SETTLED, *options, "-ccp_coulomb", "false", "-overwrite")
+    assert "apgd to 0.0001, relaxation of Coulomb's law" in done.stdout
+    assert all(line["natural_residual"] <= 1.01e-4 < line["coulomb_residual"] for line in steps(tmp_path))
+    assert "WARNING: law of contact: relaxation in 2 steps" in done.stdout
+
+
+def test_a_loose_tolerance_is_warned_of(program, settled):
+    for options, warned in (
+        (("-ccp_type", "apgd", "-ccp_tol", 1e-3), True),
+        (("-ccp_type", "apgd"), False),
+        (("-ccp_tol", 1e-3), False),
+    ):
+        done = program(*SETTLED, "-steps", 1, *options, "-overwrite")
+        assert ("WARNING: -ccp_tol 0.001" in done.stdout) == warned
+
+
+def test_the_law_that_holds_where_none_is_asked_for(program, settled, tmp_path):
+    """Coulomb's where one run finds it at the price of the relaxation."""
+    for options, law in (
+        (("-ccp_type", "auto"), "Coulomb"),
+        (("-ccp_type", "apgd", "-ccp_tol", 1e-5), "relaxation"),
+        (("-ccp_type", "conic"), "relaxation"),
+        (("-ccp_type", "barzilai_borwein", "-ccp_coulomb"), "Coulomb by cone problems"),
+    ):
+        done = program(*SETTLED, "-steps", 1, *options, "-overwrite")
+        (line,) = steps(tmp_path)
+        assert line["law"] == law
         words = f"Coulomb residual {line['coulomb_residual']:.1e} by {line['cone_problems']} cone problems"
-        assert words in done.stdout
-    program(*SETTLED, *options, "-overwrite")
-    assert all(line["natural_residual"] <= 1.01e-5 < line["coulomb_residual"] for line in steps(tmp_path))
+        assert (words in done.stdout) == (law == "Coulomb by cone problems")
 
 
 def test_compliance_is_reported_and_goes_with_the_problem(program, settled, tmp_path):

@@ -29,9 +29,6 @@ class Motion:
             fail("motion")
         return position, orientation
 
-    def angular_velocity(self):
-        return Fixed().angular_velocity()
-
 @dataclass(frozen=True)
 class One(Experiment):
     height: float = 1.0

@@ -5,6 +5,9 @@ contact", ACM Trans. Graph. 34 (2015); restart by the gradient test of O'Donoghu
 applied once per iteration: the gradient at the extrapolated point follows from those at the last two
 iterates, and for a quadratic objective the line search is a Rayleigh quotient. The extrapolated point is formed where
 it is used, twice: reading the last two iterates costs less than writing and reading it.
+
+For Coulomb's law the gradient gets the opening mu |y_t| that it asks for itself, in every iteration, and momentum a
+bound (`Momentum`): the projected step then has Coulomb's law as its fixed point, and one run finds it.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pctt.ccp.cone import Array, accelerated_curvature, accelerated_step
+from pctt.ccp.first_order.momentum import Momentum
 from pctt.ccp.first_order.progress import FirstOrder, GiveUp, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
@@ -26,18 +30,26 @@ class APGD(FirstOrder):
 
 
 def solve(
-    problem: ConeProblem, guess: Array, limits: Limits, options: APGD, give_up: GiveUp | None = None
+    problem: ConeProblem,
+    guess: Array,
+    limits: Limits,
+    options: APGD,
+    give_up: GiveUp | None = None,
+    coulomb: bool = False,
 ) -> Result:
-    """Impulses from a first guess (nc, 3)."""
-    scaled = ScaledProblem(problem)
+    """Impulses from a first guess (nc, 3): of the cone problem, or of Coulomb's law."""
+    scaled = ScaledProblem(problem, coulomb)
     progress = Progress(scaled, limits, options, give_up)
+    momentum = Momentum(bounded=coulomb)
     x = scaled.start(guess)
     y = scaled.gradient(x)
     last_x, last_y, new_x, new_y = x.copy(), y.copy(), np.empty_like(x), np.empty_like(y)
-    theta, beta, lipschitz = 1.0, 0.0, _first_lipschitz(scaled)
+    lipschitz = _first_lipschitz(scaled)
     while progress.goes_on(x, y):
+        momentum.look(progress.iterations, progress.history)
+        beta, mu = momentum.beta, scaled.mu
         while True:  # a step from z = x + beta (x - last_x), where the gradient is y_z = y + beta (y - last_y)
-            length, uphill = accelerated_step(x, last_x, y, last_y, beta, 1 / lipschitz, scaled.mu, new_x)
+            length, uphill = accelerated_step(x, last_x, y, last_y, beta, 1 / lipschitz, mu, scaled.opening, new_x)
             scaled.gradient(new_x, out=new_y)
             progress.iterations += 1
             curvature = accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta)
@@ -45,11 +57,7 @@ def solve(
             if not curvature > lipschitz * length * (1 + 1e-12):  # also ends on a number that is none
                 break
             lipschitz = 1.1 * curvature / length
-        if uphill > 0:  # the momentum points uphill: start it anew
-            theta, beta = 1.0, 0.0
-        else:
-            last_theta, theta = theta, theta * (np.sqrt(theta**2 + 4) - theta) / 2
-            beta = last_theta * (1 - last_theta) / (last_theta**2 + theta)
+        momentum.advance(uphill > 0)
         last_x, x, new_x = x, new_x, last_x
         last_y, y, new_y = y, new_y, last_y
         lipschitz *= 0.95  # let the step grow again where the quotient allows it

@@ -14,6 +14,7 @@ from pctt.options import AT_LEAST_ONE, option
 
 GiveUp = Callable[[int, float], str]  # from iterations and natural residual: why not to go on, or ""
 PATIENCE = 5000  # iterations that may go by without a new best natural residual, by one per cent
+PATIENCE_WITH_LAW = 1500  # the same for Coulomb's law, which has a ladder of methods
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Progress:
         self.history: list[float] = []
         self.reason = ""
         self._best = np.inf
+        self._patience = PATIENCE_WITH_LAW if problem.opening else PATIENCE
         self._next_look = 0
         self._gain = (np.inf, 0)  # natural residual and iteration of the last progress
 
@@ -78,6 +80,6 @@ class Progress:
             return f"{self.iterations} iterations"
         if residual < 0.99 * self._gain[0]:
             self._gain = (residual, self.iterations)
-        if self.iterations - self._gain[1] >= PATIENCE:
-            return f"no progress in the last {PATIENCE} of {self.iterations} iterations"
+        if self.iterations - self._gain[1] >= self._patience:
+            return f"no progress in the last {self._patience} of {self.iterations} iterations"
         return self.give_up(self.iterations, residual) if self.give_up else ""

@@ -19,10 +19,13 @@ class ScaledProblem:
     x = S g, A = S^-1 N S^-1, b = S^-1 r. The diagonal S has two values per contact, the roots of its normal and
     of its mean tangential entry of diag N: the cones stay friction cones, of friction mu s_t / s_n. This is
     diagonal preconditioning by a metric in which the projection is still exact.
+
+    With ``coulomb`` it is Coulomb's law, in the same variables: x is a solution where the projected step from x along
+    the gradient *with its opening* (mu |y_t|, 0, 0) leads back to x, and that is what the natural residual measures.
     """
 
-    def __init__(self, problem: ConeProblem):
-        self.problem = problem
+    def __init__(self, problem: ConeProblem, coulomb: bool = False):
+        self.problem, self.opening = problem, float(coulomb)
         diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2)
         size = np.empty_like(problem.r)
         size[:, 0] = diagonal[:, 0]
@@ -99,7 +102,10 @@ class ScaledProblem:
 
     def natural_residual(self, x: Array, gradient: Array) -> float:
         """That of the impulse of x, in its own units."""
-        return self.problem.natural_residual(self.impulse(x), gradient * self._scale)
+        y = gradient * self._scale
+        if self.opening:
+            cone.add_opening(y, self.problem.mu)
+        return self.problem.natural_residual(self.impulse(x), y)
 
     def largest_curvature(self, steps: int = 10) -> float:
         """Estimate from below of the largest eigenvalue of A: ``steps`` power iterations from b."""

@@ -13,6 +13,14 @@ spoils v = G' g alone, which the next step mends. With W the scaling of the pair
 Late in an iteration W^2 is large along an impulse that slides, and W^2 z, which is s, drowns in rounding when it is
 multiplied out: what each contact would do alone, ds = W w - s, is formed from s instead.
 
+For Coulomb's law z is that of the De Saxce velocity, (y_n / mu + |y_t|, y_t). Newton's method takes the derivative of
+the opening along: with u = y_t / |y_t|,
+
+    dz = T (G dv + C dg) + r_z,    T = 1 + e_n u',
+
+which adds a term of rank one per contact to the elimination of ds, and makes the Newton systems unsymmetric. (Openings
+that lag behind converge by a fifth per cone problem, each solved exactly.)
+
 Source: Nesterov and Todd (1997), Mehrotra (1992); Acary, Armand, Nguyen and Shpakovych, "Second-order cone
 programming for frictional contact mechanics using interior point algorithm", Optim. Methods Softw. (2023), for their
 use with friction."""
@@ -24,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cone import Array, times
+from pctt.ccp.cone import TINY, Array, add_opening, dot, tangential, times
 from pctt.ccp.interior import lorentz
 from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.interior.lorentz import NesterovTodd
@@ -44,6 +52,7 @@ LATE = 1e-2  # natural residual below which second-order terms are renewed, afte
 LEAST = 0.01  # part of the complementarity to aim at
 NEAR = 0.1, 10.0  # the central path, in units of the complementarity that is aimed at
 PATIENCE = 3  # iterations without progress before the Newton systems are sharpened
+LONG_PATIENCE, SHARPER = 8, 0.01  # for Coulomb's law: before it stalls; part of the forcing term
 LONGER, LESS = 1.02, 0.7  # a short step, or what a long one leaves of the complementarity, after a correction to keep
 
 
@@ -59,35 +68,42 @@ class Conic:
     boundary: float = option(0.99, "part of the way to the cone's boundary that a step may go", check=FRACTION)
 
 
-def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Conic, newton: Newton) -> Result:
-    """Impulses; ``guess`` (nc, 3) holds those of the last step. Default iteration limit 60."""
+def solve(
+    problem: ConeProblem, guess: Array, limits: Limits, options: Conic, newton: Newton, coulomb: bool = False
+) -> Result:
+    """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step. Default
+    iteration limit 60."""
     max_it = limits.max_it if limits.max_it >= 0 else 60
     newton.begin(problem)
+    if coulomb and not newton.takes_any:
+        return Result(guess, False, "Coulomb's law needs -ccp_newton body and its own linear solver", np.inf, 0)
     scale, frictionless = _cone_scale(problem.mu)
-    s, z = _start(problem, guess, scale, frictionless, options)
+    s, z = _start(problem, guess, scale, frictionless, options, coulomb)
     v = problem.momentum(s / scale)
     best, history, patience, last_gap = s / scale, [], 0, np.inf
     for iteration in range(max_it + 1):
         g = s / scale
-        r_v, r_z = _residuals(problem, g, z, v, scale, frictionless)
+        r_v, r_z, u = _residuals(problem, g, z, v, scale, frictionless, coulomb)
         gap = problem.dot(s, z)
-        history.append(problem.natural_residual(g, _velocity(problem, g, frictionless)))
+        history.append(problem.natural_residual(g, _velocity(problem, g, frictionless, coulomb)))
         best = g if history[-1] <= min(history) else best
         progress = history[-1] <= 0.9 * min(history[:-1], default=np.inf) or gap <= 0.5 * last_gap
         patience, last_gap = (0 if progress else patience + 1), gap
         if history[-1] <= limits.tol or iteration == max_it or why_unbounded(problem, g):
             break
-        if patience > PATIENCE:
-            if not newton.sharpen():
+        if patience > (LONG_PATIENCE if coulomb else PATIENCE):
+            if coulomb or not newton.sharpen():
                 break
             patience = 0
         W = NesterovTodd.of(s, z)
         B, inverse, yielding = _barrier_blocks(problem, W, scale, frictionless, options.proximal)
-        newton.update(B, inverse)
+        slip = _slip(problem, inverse, u, scale, options.proximal) if coulomb else None
+        newton.update(B, inverse if slip is None else inverse + slip.blocks, symmetric=slip is None)
         # a residual of v = G' g makes y wrong by G times that
         tol = options.forcing * history[-1] * problem.norm(g) * np.sqrt(problem.mean_diagonal)
         tol *= 1.0 if newton.primary == "momenta" else CLOSER
-        local = Linearised(s, z, r_v, r_z, W, inverse, yielding, scale, frictionless, tol)
+        tol *= SHARPER if coulomb else 1.0
+        local = Linearised(s, z, r_v, r_z, W, inverse, yielding, scale, frictionless, tol, slip)
 
         with phase("ConicPredictor"):
             ds, dz, dv, x = _direction(problem, newton, local, np.zeros_like(z))
@@ -129,28 +145,55 @@ def _cone_scale(mu: Array) -> tuple[Array, Array]:
     return scale, frictionless
 
 
-def _velocity(problem: ConeProblem, g: Array, frictionless: Array) -> Array:
-    """y = N g + r but for the sliding of contacts without friction, which no impulse answers."""
+def _velocity(problem: ConeProblem, g: Array, frictionless: Array, coulomb: bool) -> Array:
+    """y = N g + r but for the sliding of contacts without friction, which no impulse answers; for Coulomb's law with
+    its opening."""
     y = problem.product(g) + problem.r
     y[frictionless, 1:] = 0.0
-    return y
+    return add_opening(y, problem.mu) if coulomb else y
 
 
 def _residuals(
-    problem: ConeProblem, g: Array, z: Array, v: Array, scale: Array, frictionless: Array
-) -> tuple[Array, Array]:
-    """r_v = v - G' g and r_z = y / scale - z."""
-    r_z = (problem.velocity_of(v) + problem.compliance * g + problem.r) / scale - z
-    r_z[frictionless, 1:] = 0.0
-    return v - problem.momentum(g), r_z
+    problem: ConeProblem, g: Array, z: Array, v: Array, scale: Array, frictionless: Array, coulomb: bool
+) -> tuple[Array, Array, Array]:
+    """r_v = v - G' g, r_z = y / scale - z, y with its opening for Coulomb's law, and the directions (nc, 3) in which
+    contacts slide."""
+    y = problem.velocity_of(v) + problem.compliance * g + problem.r
+    y[frictionless, 1:] = 0.0
+    u = y / np.maximum(np.maximum(tangential(y), z[:, 0]), TINY)[:, None]  # short where y_t may turn: a contact sticks
+    u[:, 0] = 0.0
+    if coulomb:
+        add_opening(y, problem.mu)
+    return v - problem.momentum(g), y / scale - z, u
+
+
+class Slip(NamedTuple):
+    """What the derivative of the opening does to an iteration of Coulomb's law.
+
+    In the scaled variables ds = X (c - r_z - T G dv) with X^-1 = W^-2 + e T, e the compliance. With Y^-1 = W^-2 + e
+    this is X = (1 - e p u'/ d) Y and X T = Y + p (u - e Y u)' / d, where p = Y e_n, d = 1 + e u'p.
+    """
+
+    u: Array  #: (nc, 3) direction in which a contact slides
+    p: Array  #: (nc, 3)
+    less: Array  #: (nc, 1) e / d
+    blocks: Array  #: (nc, 3, 3) X T - Y
+
+
+def _slip(problem: ConeProblem, inverse: Array, u: Array, scale: Array, proximal: float) -> Slip:
+    give = problem.compliance[:, 1:2] + proximal * problem.mean_diagonal
+    p = scale[:, :1] * inverse[:, :, 0]
+    d = 1.0 + give * dot(u, p)[:, None]
+    q = (u - give * times(inverse, u)) / d
+    return Slip(u, p, give / d, p[:, :, None] * q[:, None, :])
 
 
 def _start(
-    problem: ConeProblem, guess: Array, scale: Array, frictionless: Array, options: Conic
+    problem: ConeProblem, guess: Array, scale: Array, frictionless: Array, options: Conic, coulomb: bool
 ) -> tuple[Array, Array]:
     """A pair on the central path near the guess: s - tau z = s_0 - tau z_0."""
     guess = no_larger_than_useful(problem, guess)
-    s, z = guess * scale, _velocity(problem, guess, frictionless) / scale
+    s, z = guess * scale, _velocity(problem, guess, frictionless, coulomb) / scale
     s[frictionless, 1:] = 0.0
     diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2
     tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
@@ -161,7 +204,7 @@ def _start(
 
 class Linearised(NamedTuple):
     """What the directions of an iteration share: the pair, its residuals and scaling, (B + C)^-1 and, in the scaled
-    variables, (B + C)^-1 B, the cones' scale, and how accurately to solve."""
+    variables, (B + C)^-1 B, the cones' scale, how accurately to solve, and what Coulomb's law adds."""
 
     s: Array
     z: Array
@@ -173,6 +216,7 @@ class Linearised(NamedTuple):
     scale: Array
     frictionless: Array
     tol: float
+    slip: Slip | None
 
 
 def _direction(
@@ -183,11 +227,16 @@ def _direction(
     alone = times(at.yielding, at.W.times(w) - at.s)
     alone /= at.scale
     alone -= times(at.inverse, at.r_z * at.scale)
+    if at.slip is not None:
+        alone -= at.slip.p * (at.slip.less * dot(at.slip.u, alone)[:, None])
     dg, x = newton.solve((c - at.r_z) * at.scale, at.tol, at.r_v, start, alone)
     dv = newton.momentum(x, dg, at.r_v)
     ds = dg * at.scale
     if newton.primary == "momenta":  # r_z vanishes, r_v takes the error of the linear solve
-        dz = (problem.velocity_of(dv) + problem.compliance * dg) / at.scale + at.r_z
+        dz = (problem.velocity_of(dv) + problem.compliance * dg) / at.scale
+        if at.slip is not None:
+            dz[:, 0] += dot(at.slip.u, dz)
+        dz += at.r_z
     else:  # r_v vanishes, r_z takes it
         dz = c - at.W.divide(at.W.divide(ds))
     dz[at.frictionless, 1:] = ds[at.frictionless, 1:] = 0.0

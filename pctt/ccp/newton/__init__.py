@@ -124,11 +124,21 @@ class Newton:
         """What the preconditioner tells of itself and its fallbacks so far, if it is one of the project's."""
         return [line for linear in self._linear.values() for line in linear.report()]
 
-    def update(self, barrier: Array, inverse: Array | None = None) -> None:
-        """New barrier blocks B (nc, 3, 3); ``inverse`` is (B + C)^-1 where the caller knows it better."""
+    @property
+    def takes_any(self) -> bool:
+        """Whether the present systems may be unsymmetric."""
+        return self._present == "body" and isinstance(self.linear, Cheapest)
+
+    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
+        """New barrier blocks B (nc, 3, 3); ``inverse`` is (B + C)^-1 where the caller knows it better. Blocks that are
+        not ``symmetric`` are for systems that take any (`takes_any`)."""
         with phase("CCPUpdate"):
             assert self.system is not None
-            self.system.update(barrier, inverse)
+            if symmetric:
+                self.system.update(barrier, inverse)
+            else:
+                assert isinstance(self.system, BodySystem)
+                self.system.update(barrier, inverse, symmetric=False)
             self.linear.new_matrix(self.system)
 
     def solve(

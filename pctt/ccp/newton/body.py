@@ -4,6 +4,8 @@
 
 What an inexact solve leaves in K stays in the momenta: it is not multiplied by anything. K is smaller than the contact
 system and far better conditioned once contacts open or slide.
+
+For Coulomb's law (B + C)^-1 is not symmetric, and K is not either.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ class BodySystem:
         self.operator = BodyOperator(problem.contact_map)
         self.matrix = self.operator.mat
         self._placed = False
+        self.symmetric = True
+
     def load(self, problem: ConeProblem) -> None:
         """Take another problem with the same contacts between the same bodies."""
         assert problem.contact_map is not None
@@ -35,14 +39,15 @@ class BodySystem:
         self.operator.load(problem.contact_map)
         self._placed = False
 
-    def update(self, barrier: Array, inverse: Array | None = None) -> None:
-        """K for the barrier blocks B, or for ``inverse`` = (B + C)^-1 where the caller has it more accurately."""
+    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
+        """K for the barrier blocks B, or for ``inverse`` = (B + C)^-1 where the caller has it more accurately;
+        ``symmetric`` says whether that is."""
         if inverse is None:
             whole = barrier + self.problem.compliance_blocks
             floor = 1e-14 * np.trace(whole, axis1=1, axis2=2)  # a block that rounding has made singular
             inverse = np.linalg.inv(whole + floor[:, None, None] * np.eye(3))
-        self._inverse = inverse
-        self.operator.update(inverse)
+        self._inverse, self.symmetric = inverse, symmetric
+        self.operator.update(inverse, symmetric)
 
     def entries(self) -> PETSc.Mat:
         """K as a matrix that preconditioners can read; collective."""
@@ -54,7 +59,7 @@ class BodySystem:
 
     def stiff_part(self) -> PETSc.Mat:
         """What is worth factorising of K, in scalar rows."""
-        return self.operator.entries().stiff_part(LEAST, scalar=True)
+        return self.operator.entries().stiff_part(LEAST, scalar=True, symmetric=self.symmetric)
 
     def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
         """``alone`` is (B + C)^-1 q where the caller knows it better."""

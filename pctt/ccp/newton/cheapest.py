@@ -9,6 +9,10 @@ from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
 
 RUNGS = {"pbjacobi": {"pc_type": "pbjacobi"}, "cholesky": {"pc_type": "cholesky"}}
 CAP = {"pbjacobi": "1500", "cholesky": "60"}
+UNSYMMETRIC = {  # systems of Coulomb's law
+    "pbjacobi": {"ksp_type": "bcgs"},
+    "cholesky": {"ksp_type": "gmres", "ksp_gmres_restart": "100", "pc_type": "lu"},
+}
 
 SOLVES = 1.8  # iterations of predictor and correctors / those of the predictor
 OLD_FACTOR = 60.0  # iterations to expect with the factor of an earlier matrix
@@ -107,9 +111,13 @@ class Cheapest(KrylovFamily):
         self._hardness, self._growth, self._lagged = 20.0, 1.0, None
 
     def _solver(self, rung: str) -> Krylov:
-        if rung not in self._krylov:
+        unsymmetric = not self.system.symmetric
+        name = rung + "_any" * unsymmetric
+        if name not in self._krylov:
             defaults = {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "ksp_max_it": CAP[rung], **RUNGS[rung]}
+            defaults |= UNSYMMETRIC[rung] if unsymmetric else {}
             if rung == "cholesky" and self.comm.size == 1 and PETSc.Sys.hasExternalPackage("suitesparse"):
-                defaults["pc_factor_mat_solver_type"] = "cholmod"  # 1.3 times faster than MUMPS, its solves twice
-            self._krylov[rung] = Krylov(self.comm, f"body_{rung}_", defaults)
-        return self._krylov[rung]
+                # 1.3 times faster than MUMPS, its solves twice
+                defaults["pc_factor_mat_solver_type"] = "umfpack" if unsymmetric else "cholmod"
+            self._krylov[name] = Krylov(self.comm, f"body_{name}_", defaults)
+        return self._krylov[name]

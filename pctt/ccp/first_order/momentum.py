@@ -1,0 +1,47 @@
+"""Nesterov's momentum, started anew where it points uphill, and bounded for Coulomb's law."""
+
+from __future__ import annotations
+
+import numpy as np
+
+DAMPING = 0.05  # 1 - the greatest momentum, at first
+WINDOW = 100  # iterations after which it is looked at
+LITTLE, MUCH = 0.8, 0.6  # what is left of the residual after a window with too much momentum, or with room for more
+HEAVIER, LIGHTER = 2.0, 0.9  # factors on the damping then
+
+
+class Momentum:
+    """beta, the momentum of the next step.
+
+    For a convex problem it may come as near to 1 as it likes. The projected step of Coulomb's law is no gradient step:
+    the opening mu |y_t| follows the sliding, which no function of the impulses has as its derivative. So it is,
+    linearised, an unsymmetric map with complex eigenvalues a + ib; momentum makes growing oscillations of those with
+    1 - beta < |b| / sqrt(a), and without a bound the method ends in a cycle at a residual of some 1e-4. How large b is
+    depends on friction and on what slides. The bound is found on the way: more damping where a window of iterations
+    has brought little, less where it has brought much."""
+
+    def __init__(self, bounded: bool):
+        self.bounded, self.damping = bounded, DAMPING if bounded else 0.0
+        self._end, self._looks, self._last = WINDOW, 0, np.inf
+        self.restart()
+
+    def restart(self) -> None:
+        self._theta, self.beta = 1.0, 0.0
+
+    def advance(self, uphill: bool) -> None:
+        """Of the next step, after one that has gone uphill or not."""
+        if uphill:
+            self.restart()
+            return
+        last, self._theta = self._theta, self._theta * (np.sqrt(self._theta**2 + 4) - self._theta) / 2
+        self.beta = min(last * (1 - last) / (last**2 + self._theta), 1.0 - self.damping)
+
+    def look(self, iterations: int, residuals: list[float]) -> None:
+        """Choose the damping by the residuals that were looked at; nothing happens within a window."""
+        if not self.bounded or iterations < self._end:
+            return
+        least = min(residuals[self._looks :], default=self._last)
+        self._end, self._looks = iterations + WINDOW, len(residuals)
+        left = least / self._last
+        self.damping *= HEAVIER if left > LITTLE else LIGHTER if left < MUCH else 1.0
+        self.damping, self._last = min(self.damping, 1.0), least
