@@ -52,8 +52,8 @@ def record(name: str, about: dict[str, object], rows: list[dict]) -> None:
 
 
 @contextmanager
-def figure(name: str, panels: int) -> Iterator[Any]:
-    """Axes side by side, saved as results/NAME.png; without matplotlib nothing is drawn."""
+def figure(name: str, panels: int, rows: int = 1) -> Iterator[Any]:
+    """Axes side by side, row by row, saved as results/NAME.png; without matplotlib nothing is drawn."""
     try:
         import matplotlib as mpl
     except ImportError:
@@ -63,8 +63,9 @@ def figure(name: str, panels: int) -> Iterator[Any]:
     mpl.use("agg")
     from matplotlib import pyplot
 
-    drawing, axes = pyplot.subplots(1, panels, figsize=(6.4 * panels, 4.8), layout="constrained", squeeze=False)
-    yield axes[0]
+    size = 6.4 * panels, 4.8 * rows
+    drawing, axes = pyplot.subplots(rows, panels, figsize=size, layout="constrained", squeeze=False)
+    yield axes.ravel()
     path = Path("results") / f"{name}.png"
     drawing.savefig(path, dpi=150)
     pyplot.close(drawing)

@@ -6,7 +6,7 @@ the Coulomb residual. `clarabel` is an interior point method for any conic progr
 
     min 1/2 v'v + 1/2 w'w    subject to    G v + C^1/2 w + r in the dual cones,
 
-whose multipliers are the impulses. One thread each; their own stop tests, tightened until ours is met.
+whose multipliers are the impulses, or, where the problem is given by N, ours as it is. One thread each; their own stop tests, tightened until ours is met.
 """
 
 from __future__ import annotations
@@ -46,13 +46,20 @@ def _contact_rows(problem: ccp.ConeProblem) -> sp.csr_matrix:
     return sp.bsr_matrix((G.blocks, G.indices, G.indptr), shape=(3 * problem.size, 6 * G.columns)).tocsr()
 
 
+def _delassus(problem: ccp.ConeProblem) -> sp.csr_matrix:
+    """All of N, which for bodies with many contacts is more than problem.N."""
+    if problem.contact_map is None:
+        indptr, indices, values = problem.N.getValuesCSR()
+        return sp.csr_matrix((values, indices, indptr), shape=problem.N.getSize())
+    G = _contact_rows(problem)
+    return (G @ G.T + sp.diags(problem.compliance.ravel())).tocsr()
+
+
 def _siconos(solver: str, internal: bool = False) -> Callable[[ccp.ConeProblem, float, float], Found]:
     def solve(problem: ccp.ConeProblem, tol: float, seconds: float) -> Found:
         import siconos.numerics as numerics
 
-        # all of N, which for bodies with many contacts is more than problem.N
-        G = _contact_rows(problem)
-        W = (G @ G.T + sp.diags(problem.compliance.ravel())).tocoo()
+        W = _delassus(problem).tocoo()
         W.row, W.col = W.row.astype(np.int64), W.col.astype(np.int64)
         count = problem.size
         with warnings.catch_warnings(), _no_output():
@@ -86,20 +93,25 @@ def _no_output() -> Iterator[None]:
 def _clarabel(problem: ccp.ConeProblem, tol: float, seconds: float) -> Found:
     import clarabel
 
-    rows = _contact_rows(problem)
-    if problem.softness:
-        rows = sp.hstack([rows, sp.diags(np.sqrt(problem.compliance.ravel()))])
+    # its tolerances are absolute: velocities in units of rms(r), N in units of its mean diagonal
+    speed, mean = float(np.sqrt(np.mean(problem.r**2))) or 1.0, problem.mean_diagonal
     scale = np.ones((problem.size, 3))
     scale[:, 1:] = problem.mu[:, None]  # (y_n, mu y_t) is in a second-order cone, (z_n, mu z_t) are the impulses
-    A = sp.csc_matrix(-sp.diags(scale.ravel()) @ rows)
+    S, r = sp.diags(scale.ravel()), (scale * problem.r / speed).ravel()
+    if problem.contact_map is None:
+        P, q, A, b = S @ _delassus(problem) @ S / mean, r, -sp.identity(len(r)), np.zeros(len(r))
+    else:
+        rows = _contact_rows(problem)
+        if problem.softness:
+            rows = sp.hstack([rows, sp.diags(np.sqrt(problem.compliance.ravel()))])
+        P, q, A, b = sp.identity(rows.shape[1]), np.zeros(rows.shape[1]), -S @ rows / np.sqrt(mean), r
     settings = clarabel.DefaultSettings()
     settings.verbose, settings.max_threads, settings.max_iter, settings.time_limit = False, 1, 1000, seconds
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tol
     cones = [clarabel.SecondOrderConeT(3)] * problem.size
-    unknowns = A.shape[1]
-    program = sp.identity(unknowns, format="csc"), np.zeros(unknowns), A, (scale * problem.r).ravel()
-    found = clarabel.DefaultSolver(*program, cones, settings).solve()
-    return np.array(found.z).reshape(-1, 3) * scale, f"{found.status}, {found.iterations} iterations"
+    found = clarabel.DefaultSolver(sp.csc_matrix(sp.triu(P)), q, sp.csc_matrix(A), b, cones, settings).solve()
+    impulse = np.array(found.x if problem.contact_map is None else found.z).reshape(-1, 3)
+    return impulse * scale * (speed / mean), f"{found.status}, {found.iterations} iterations"
 
 
 PEERS = {

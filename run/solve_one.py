@@ -17,7 +17,7 @@ import peers
 from mpi4py import MPI
 
 from pctt import ccp
-from pctt.ccp import fclib
+from pctt.ccp import files
 
 
 class OutOfTimeError(Exception):
@@ -86,9 +86,9 @@ def write(path: Path, problem: ccp.ConeProblem) -> None:
 
 
 def read(path: str, operator: str) -> ccp.ConeProblem:
-    """The problem in a file of `write`, or in FCLIB's format."""
+    """The problem in a file of `write`, or in any format of `pctt.ccp.files`."""
     if not path.endswith(".npz"):
-        return fclib.load(path, MPI.COMM_SELF, operator=operator).problem
+        return files.load(path, MPI.COMM_SELF, operator=operator).problem
     with np.load(path) as file:
         G = ccp.CompactRows(*(file[name] for name in ("frame", "arm", "body", "root")), int(file["columns"]))
         rest = {"point": file["point"], "compliance": float(file["compliance"]), "operator": operator}

@@ -90,7 +90,8 @@ def _whole(path: str | Path) -> Whole:
             viewer.destroy()
     if len(compliance) != 1:
         raise FileFormatError(f"a vector of length {len(compliance)} follows mu; allowed is its compliance, a number")
-    return Whole("PETSc binary", "", symmetric_blocks(W), r, mu, compliance=float(compliance[0]))
+    matrix, note = symmetric_blocks(W)
+    return Whole("PETSc binary", "", matrix, r, mu, compliance=float(compliance[0]), note=note)
 
 
 def _bytes(r: int, mu: int, nonzeros: int, rows_and_one: int) -> int:

@@ -15,6 +15,8 @@ from pctt.blocks import MANY, BlockRows, square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 
+MIRRORED = "{} is stored as one triangle, which was mirrored"
+
 
 class FileFormatError(ValueError):
     """A file that is no cone problem in a format known here; raised on all ranks alike."""
@@ -79,13 +81,24 @@ class Stored:
     note: str = ""
 
 
-def symmetric_blocks(W: sp.spmatrix) -> sp.bsr_matrix:
-    """(W + W') / 2 in 3 x 3 blocks: matrices in files are symmetric up to the rounding of their writers."""
+def symmetric_blocks(W: sp.spmatrix) -> tuple[sp.bsr_matrix, str]:
+    """(W + W') / 2 in 3 x 3 blocks: matrices in files are symmetric up to the rounding of their writers. One triangle
+    is mirrored; the words say so."""
     if W.shape[0] != W.shape[1] or W.shape[0] % 3:
         raise FileFormatError(f"its matrix {W.shape} is not square with three rows per contact")
-    symmetric = (0.5 * (W + W.T)).tocsr()
+    whole = mirrored(W)
+    symmetric = (0.5 * (W + W.T)).tocsr() if whole is None else whole
     symmetric.sort_indices()
-    return symmetric.tobsr((3, 3))
+    return symmetric.tobsr((3, 3)), "" if whole is None else MIRRORED.format("W")
+
+
+def mirrored(A: sp.spmatrix) -> sp.csr_matrix | None:
+    """A square matrix of one triangle with the triangle's mirror; None for one with entries on both sides of its
+    diagonal, or on none. Half the sum of a triangle and its mirror would be another matrix."""
+    above, below = sp.triu(A, 1), sp.tril(A, -1)
+    if (above.count_nonzero() == 0) == (below.count_nonzero() == 0):
+        return None
+    return (A + (above + below).T).tocsr()
 
 
 def sparse_matrix(problem: ConeProblem) -> PETSc.Mat:

@@ -95,7 +95,7 @@ class Run:
     )
     output_every: int = option(1, "steps between two records in state.h5; 0: none", check=COUNT)
     checkpoint_every: int = option(1, "steps between two checkpoints", check=AT_LEAST_ONE)
-    problem: str = option("", "FCLIB or PETSc binary file with a cone problem to solve instead of a scene")
+    problem: str = option("", "FCLIB, PETSc binary or Siconos file with a cone problem to solve instead of a scene")
     problem_guess: bool = option(True, "start -problem from the guess in the file, if there is one")
     dump_problem: str = option(
         "",

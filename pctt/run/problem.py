@@ -1,4 +1,4 @@
-"""Solve the cone problem of an FCLIB or PETSc binary file: ``python -m pctt.run -problem FILE``."""
+"""Solve the cone problem of an FCLIB, PETSc binary or Siconos file: ``python -m pctt.run -problem FILE``."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any
 from mpi4py import MPI
 
 from pctt import ccp, figures_json, log
-from pctt.ccp import fclib, petsc_binary
+from pctt.ccp import files
 from pctt.ccp.cone import Array
+from pctt.ccp.stored import FileFormatError, Stored
 from pctt.run import leftovers
 from pctt.run.hdf5 import FileError, write_text
 from pctt.run.options import Options
@@ -46,7 +47,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
     place.take()
 
 
-def _solve(stored: fclib.Stored, options: Options, compare: ccp.Comparison) -> dict[str, Any]:
+def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[str, Any]:
     """The figures of solving a stored problem as the options say."""
     problem, guess, comm = stored.problem, stored.guess if options.run.problem_guess else None, stored.problem.comm
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
@@ -100,13 +101,11 @@ def _solve(stored: fclib.Stored, options: Options, compare: ccp.Comparison) -> d
     }
 
 
-def _load(path: str, comm: MPI.Comm, compliance: float | None, operator: str) -> fclib.Stored:
-    """The problem in a file of either format, with another compliance if one is given; FileError on all ranks if it
-    is none."""
-    binary = comm.bcast(petsc_binary.is_one(path) if comm.rank == 0 else None)
+def _load(path: str, comm: MPI.Comm, compliance: float | None, operator: str) -> Stored:
+    """The problem in a file, with another compliance if one is given; FileError on all ranks if it is none."""
     try:
-        return (petsc_binary if binary else fclib).load(path, comm, compliance, operator)
-    except fclib.FileFormatError as error:
+        return files.load(path, comm, compliance, operator)
+    except FileFormatError as error:
         raise FileError(str(error)) from None
 
 

@@ -163,6 +163,22 @@ def test_hard_problems_of_another_run_are_replaced_and_of_this_one_kept(program,
     assert not (tmp_path / "results" / "hard").exists()
 
 
+@pytest.mark.parallel(1, 2)
+def test_a_problem_of_siconos_is_solved_and_a_broken_one_refused(program, tmp_path):
+    """Two contacts apart: one is pressed and slides, one opens. The projection of (1, -2, 0) on the cone."""
+    text = "3\n2\n0\n6\n6\n6 6\n" + " ".join("1" if i == j else "0" for i in range(6) for j in range(6))
+    text += "\n-1 2 0  1 0 0\n0.3 0.3\n1\n"
+    (tmp_path / "two.dat").write_text(text)
+    program("-problem", "two.dat", *TOL)
+    found = summary(tmp_path / "results")
+    assert (found["format"], found["contacts"]) == ("Siconos local", 2)
+    assert found["objective"] == pytest.approx(-0.5 * (1 + 0.3 * 2) ** 2 / 1.09, rel=1e-7)
+    (tmp_path / "cut.dat").write_text(text[:60])
+    done = program("-problem", "cut.dat", "-output", "cut", status=2)
+    assert "cut.dat: no Siconos problem: line 7: it ends too early" in done.stderr
+    assert not list((tmp_path / "cut").glob("*"))
+
+
 def test_a_step_that_the_run_does_not_make_is_refused(program, settled, tmp_path):
     first = first_step(settled)
     done = program(*SETTLED, "-steps", 2, "-dump_problem", "d", "-dump_steps", f"{first},1", status=2)

@@ -8,15 +8,11 @@ import h5py
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
-from scipy.sparse.linalg import spsolve
 
 from pctt.ccp.cone import Array
+from pctt.ccp.global_form import without_velocities
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.stored import FileFormatError, Stored, Whole, spread, symmetric_blocks
-
-#: M_ij and M_ji of a symmetric M differ by no more than this part of sqrt(M_ii M_jj), which bounds both.
-ROUNDING = 1e-8
-MIRRORED = "M is stored as one triangle, which was mirrored"
 
 
 def read(path: str | Path, comm: MPI.Comm) -> ConeProblem:
@@ -44,7 +40,7 @@ def _whole(path: str | Path) -> Whole:
         group = file[f"fclib_{form}"]
         if int(np.ravel(group["spacedim"][()])[0]) != 3:
             raise FileFormatError("its space dimension is not 3")
-        matrix, q, note = (*_local(group), "") if form == "local" else _global(group)
+        matrix, q, note = (_local if form == "local" else _global)(group)
         point = file["pctt/point"][()] if "pctt/point" in file else None
         return Whole(
             f"FCLIB {form}",
@@ -60,67 +56,19 @@ def _whole(path: str | Path) -> Whole:
         )
 
 
-def _local(group: h5py.Group) -> tuple[sp.bsr_matrix, Array]:
-    """N = W and q."""
+def _local(group: h5py.Group) -> tuple[sp.bsr_matrix, Array, str]:
+    """N = W, q, and what was done to W in words."""
     if "V" in group or "R" in group:
         raise FileFormatError("it has bilateral constraints (V, R), which a cone problem has not")
-    return symmetric_blocks(_matrix(group["W"])), group["vectors/q"][:]
+    matrix, note = symmetric_blocks(_matrix(group["W"]))
+    return matrix, group["vectors/q"][:], note
 
 
 def _global(group: h5py.Group) -> tuple[sp.bsr_matrix, Array, str]:
     """G or N, q = w + H' M^-1 f, and what was done to M in words."""
     if "G" in group:
         raise FileFormatError("it has bilateral constraints (G), which a cone problem has not")
-    M, H = _matrix(group["M"]), _matrix(group["H"])
-    f, w = group["vectors/f"][:], group["vectors/w"][:]
-    if M.shape != (len(f), len(f)) or H.shape != (len(f), len(w)) or len(w) % 3:
-        raise FileFormatError(f"M {M.shape}, H {H.shape}, f {f.shape} and w {w.shape} do not fit together")
-    if not (np.isfinite(M.data).all() and (M.diagonal() > 0).all()):
-        raise FileFormatError("its mass matrix is not positive")
-    M, note = _symmetric(M)
-    roots = _inverse_roots(M)
-    if roots is None:
-        H_over_M = sp.csr_matrix(spsolve(M.tocsc(), H.tocsc())).reshape(H.shape)
-        return symmetric_blocks(H.T @ H_over_M), w + H_over_M.T @ f, note
-    G = H.T.tocsr()
-    G.sort_indices()
-    G = G.tobsr((3, 6))
-    G.data = G.data @ roots[G.indices].transpose(0, 2, 1)
-    return G, w + G @ (roots @ f.reshape(-1, 6, 1)).ravel(), note
-
-
-def _symmetric(M: sp.csr_matrix) -> tuple[sp.csr_matrix, str]:
-    """M made exactly symmetric, and MIRRORED if it was one triangle; FileFormatError if it is neither that nor
-    symmetric up to rounding. Half the sum of a triangle and its mirror would be another matrix."""
-    above, below = sp.triu(M, 1), sp.tril(M, -1)
-    if (above.count_nonzero() == 0) != (below.count_nonzero() == 0):
-        return (M + (above + below).T).tocsr(), MIRRORED
-    bound = np.sqrt(M.diagonal())
-    entries = abs(M - M.T).tocoo()
-    off = entries.data > ROUNDING * bound[entries.row] * bound[entries.col]
-    if off.any():
-        i, j = entries.row[off][0], entries.col[off][0]
-        raise FileFormatError(
-            f"its mass matrix is not symmetric: M[{i}, {j}] = {M[i, j]:.9g}, M[{j}, {i}] = {M[j, i]:.9g}; allowed is "
-            "one triangle, or both equal up to rounding"
-        )
-    return (0.5 * (M + M.T)).tocsr(), ""
-
-
-def _inverse_roots(M: sp.csr_matrix) -> Array | None:
-    """L^-1 of the 6 x 6 diagonal blocks L L' of M (bodies, 6, 6); None if M is not made of such blocks."""
-    if M.shape[0] % 6:
-        return None
-    entries = M.tocoo()
-    entries.eliminate_zeros()
-    if (entries.row // 6 != entries.col // 6).any():
-        return None
-    blocks = np.zeros((M.shape[0] // 6, 6, 6))
-    blocks[entries.row // 6, entries.row % 6, entries.col % 6] = entries.data
-    try:
-        return np.linalg.inv(np.linalg.cholesky(blocks))
-    except np.linalg.LinAlgError:
-        raise FileFormatError("its mass matrix is not positive") from None
+    return without_velocities(_matrix(group["M"]), _matrix(group["H"]), group["vectors/f"][:], group["vectors/w"][:])
 
 
 def _matrix(group: h5py.Group) -> sp.csr_matrix:

@@ -1,0 +1,27 @@
+"""Cone problems in files of any format that is known here: FCLIB, PETSc binary, Siconos' text."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mpi4py import MPI
+
+from pctt.ccp import fclib, petsc_binary, siconos
+from pctt.ccp.stored import Stored
+
+FORMATS = {"PETSc binary": petsc_binary, "Siconos": siconos, "FCLIB": fclib}
+
+
+def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None, operator: str = "auto") -> Stored:
+    """The cone problem of a file, its contacts in equal parts over the ranks; collective. ``compliance`` takes the
+    place of the file's.
+
+    Raises FileFormatError on every rank where the file cannot be read in the format that it seems to have.
+    """
+    format = comm.bcast(_format(path) if comm.rank == 0 else None)
+    return FORMATS[format].load(path, comm, compliance, operator)
+
+
+def _format(path: str | Path) -> str:
+    """The format that a file begins as, FCLIB where it is none of the others."""
+    return next((name for name, module in FORMATS.items() if name != "FCLIB" and module.is_one(path)), "FCLIB")

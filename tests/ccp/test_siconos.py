@@ -1,0 +1,259 @@
+"""Cone problems in the text files of Siconos: every storage against dense algebra, broken files, published problems."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from mpi4py import MPI
+from problems import SELF, Known, dense_of, heap, part
+
+from pctt import ccp
+from pctt.ccp import files, siconos
+from pctt.ccp.stored import FileFormatError
+
+STORAGES = ["dense", "blocks", "triplets", "columns"]
+PROBLEMS = Path(__file__).resolve().parents[3] / "shared" / "problems"
+TITLE = "CSparse Version 3.1.9, May 4, 2016.  Copyright (c) Timothy A. Davis, 2006-2016"
+
+
+def numbers(x) -> str:
+    return "".join(f"{value:32.24e} " for value in np.ravel(x)) + "\n"
+
+
+def matrix(A: np.ndarray, storage: str, block: int = 3) -> str:
+    """A matrix as Siconos writes it; ``block``: rows and columns of sparse blocks, the last ones smaller."""
+    m, n = A.shape
+    head = f"{STORAGES.index(storage) if storage in STORAGES[:2] else 2}\n{m}\n{n}\n"
+    if storage == "dense":
+        return f"{head}{m}\t{n}\n{numbers(A.T)}"
+    if storage == "blocks":
+        return head + sparse_blocks(A, block)
+    if storage == "triplets":
+        i, j = np.nonzero(A)
+        lines = [f"    {r} {c} : {A[r, c]:.17g}" for r, c in zip(i, j)]
+        return f"{head}1\n{TITLE}\ntriplet: {m}-by-{n}, nzmax: {len(i) + 3} nnz: {len(i)}\n" + "\n".join(lines) + "\n"
+    C = sp.csc_matrix(A)
+    lines = []
+    for j in range(n):
+        begin, end = C.indptr[j : j + 2]
+        lines.append(f"    col {j} : locations {begin} to {end - 1}")
+        lines += [f"      {C.indices[k]} : {C.data[k]:.17g}" for k in range(begin, end)]
+    return f"{head}2\n{TITLE}\n{m}-by-{n}, nzmax: {C.nnz} nnz: {C.nnz}, 1-norm: 7.5\n" + "\n".join(lines) + "\n"
+
+
+def sparse_blocks(A: np.ndarray, size: int) -> str:
+    ends = [[*range(size, length, size), length] for length in A.shape]
+    begins = [[0, *e[:-1]] for e in ends]
+    columns, pointers, blocks = [], [0], []
+    for i, last in zip(begins[0], ends[0]):
+        for k, (j, end) in enumerate(zip(begins[1], ends[1])):
+            if A[i:last, j:end].any():
+                values = "".join(f"{value:32.24e}\n" for value in A[i:last, j:end].T.ravel())
+                blocks.append(f"{len(blocks)}\n{values}")
+                columns.append(k)
+        pointers.append(len(blocks))
+    lists = ("".join(f"{value}\t" for value in values) for values in (*ends, pointers, columns))
+    row_ends, column_ends, index1, index2 = lists
+    head = f"{len(blocks)}\n{len(ends[0])}\n{len(ends[1])}\n{row_ends}\n{column_ends}\n"
+    return f"{head}{len(pointers)}\n{len(columns)}\n{index1}\n{index2}\n" + "".join(blocks)
+
+
+def local(known: Known, storage: str = "dense", W: np.ndarray | None = None, more: str = "") -> str:
+    W = matrix(known.N if W is None else W, storage)
+    return f"3\n{len(known.mu)}\n{W}{numbers(known.r)}{numbers(known.mu)}{more}"
+
+
+def global_(M: np.ndarray, H: np.ndarray, f, w, mu, storage: str, block: int = 6) -> str:
+    matrices = (matrix(A, storage, block) for A in (M, H))
+    return f"3\n{len(mu)}\n{''.join(matrices)}{numbers(f)}{numbers(w)}{numbers(mu)}1\n"
+
+
+def written(path: Path, text: str, comm: MPI.Comm = SELF) -> Path:
+    if comm.rank == 0:
+        path.write_text(text)
+    comm.Barrier()
+    return path
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parallel(1, 2)
+def test_a_local_problem_is_read(tmp_path, monkeypatch, storage):
+    monkeypatch.chdir(tmp_path)
+    comm = MPI.COMM_WORLD
+    known, _ = heap(0, 12, 8)
+    mine = part(comm, 12)
+    with files.load(written(Path("local.dat"), local(known, storage, more="0\n"), comm), comm).problem as problem:
+        assert np.array_equal(problem.r, known.r[mine])
+        assert np.array_equal(problem.mu, known.mu[mine])
+        product = (known.N @ known.g.ravel()).reshape(-1, 3)
+        np.testing.assert_allclose(problem.product(known.g[mine]), product[mine], atol=1e-12)
+        result = ccp.solve(problem, None, "conic", ccp.Limits(1e-8))
+        assert result.converged
+        assert ccp.measure(problem, result.impulse).objective == pytest.approx(known.objective, rel=1e-7)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("masses", ["bodies", "coupled", "one triangle"])
+@pytest.mark.parallel(1, 2)
+def test_a_global_problem_is_read(tmp_path, monkeypatch, storage, masses):
+    """M of bodies keeps the map of the bodies; M that couples them gives N."""
+    monkeypatch.chdir(tmp_path)
+    comm = MPI.COMM_WORLD
+    rng = np.random.default_rng(3)
+    known, graph = heap(2, 15, 6)
+    H = graph.dense().T
+    M = np.diag(rng.uniform(0.5, 2.0, len(H)))
+    if masses != "bodies":
+        M += 0.2 * (np.eye(len(H), k=1) + np.eye(len(H), k=-1))
+    f, w = rng.normal(size=len(H)), rng.normal(size=H.shape[1])
+    W, q = H.T @ np.linalg.solve(M, H), w + H.T @ np.linalg.solve(M, f)
+    text = global_(np.tril(M) if masses == "one triangle" else M, H, f, w, known.mu, storage)
+    stored = files.load(written(Path("global.txt"), text, comm), comm)
+    assert stored.form == "Siconos global"
+    assert ("one triangle" in stored.note) == (masses == "one triangle")
+    mine = part(comm, 15)
+    with stored.problem as problem:
+        assert (problem.contact_map is not None) == (masses == "bodies")
+        np.testing.assert_allclose(problem.r, q.reshape(-1, 3)[mine], atol=1e-12 * np.abs(q).max())
+        product = (W @ known.g.ravel()).reshape(-1, 3)
+        np.testing.assert_allclose(problem.product(known.g[mine]), product[mine], atol=1e-11)
+
+
+@pytest.mark.parametrize("block", [4, 9, 45])
+def test_blocks_of_any_size_in_a_matrix_that_is_not_square(block):
+    A = np.random.default_rng(0).normal(size=(17, 45))
+    A[:4, :9] = A[8:, 20:] = 0.0
+    found = siconos._matrix(siconos._Words(matrix(A, "blocks", block).encode()), "A")
+    assert np.array_equal(found.toarray(), A)
+
+
+def test_the_two_forms_of_few_contacts_are_told_apart(tmp_path):
+    """M and W of one contact are both 3 x 3; numbers may be written as whole ones."""
+    W = np.diag([2.0, 3.0, 5.0])
+    alone = "3 1 0 3 3 3 3 2 0 0 0 3 0 0 0 5 -1 3 3 1 0"
+    stored = files.load(written(tmp_path / "alone.dat", alone), SELF)
+    assert stored.form == "Siconos local"
+    assert np.array_equal(dense_of(stored.problem.N), W)
+    assert np.array_equal(stored.problem.r, [[-1.0, 3.0, 3.0]])
+    body = "3 1 0 3 3 3 3 2 0 0 0 3 0 0 0 5  0 3 3 3 3 1 0 0 0 1 0 0 0 1  4 6 10  -1 0 0  0.5"
+    stored = files.load(written(tmp_path / "body.dat", body), SELF)
+    assert stored.form == "Siconos global"
+    np.testing.assert_allclose(dense_of(stored.problem.N), np.diag([1 / 2, 1 / 3, 1 / 5]), rtol=1e-15)
+    np.testing.assert_allclose(stored.problem.r, [[1.0, 2.0, 2.0]], rtol=1e-15)
+
+
+def test_a_triangle_of_W_is_mirrored_and_a_rough_W_made_symmetric(tmp_path):
+    known, _ = heap(0, 12, 8)
+    stored = files.load(written(tmp_path / "one.dat", local(known, "triplets", np.tril(known.N))), SELF)
+    assert "W is stored as one triangle" in stored.note
+    np.testing.assert_allclose(dense_of(stored.problem.N), known.N, atol=1e-13)
+    W = known.N + 1e-3 * np.random.default_rng(0).normal(size=known.N.shape)
+    stored = files.load(written(tmp_path / "rough.dat", local(known, "dense", W)), SELF)
+    assert stored.note == ""
+    np.testing.assert_allclose(dense_of(stored.problem.N), 0.5 * (W + W.T), atol=1e-13)
+
+
+def test_without_contacts(tmp_path):
+    text = "3\n0\n" + matrix(np.eye(6), "triplets") + matrix(np.zeros((6, 0)), "columns") + numbers(np.ones(6))
+    problem = files.load(written(tmp_path / "nothing.dat", text), SELF).problem
+    assert problem.size == 0
+
+
+SMALL = heap(0, 4, 3)[0]
+TEXT = {storage: local(SMALL, storage) for storage in STORAGES}
+M6 = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+GLOBAL = global_(M6, np.ones((6, 12)), np.ones(6), np.ones(12), np.ones(4), "dense")
+
+
+def word(text: str, index: int, other: str) -> str:
+    """Another word in the place of one."""
+    at = [found.span() for found in re.finditer(r"\S+", text)][index]
+    return text[: at[0]] + other + text[at[1] :]
+
+
+BROKEN = {
+    "nothing": ("", r"line 1: it ends too early, after 0 of 1 words of the dimension"),
+    "a poem": ("Mary had\na little lamb", r"line 1: 'Mary' in the dimension; allowed is a whole number"),
+    "in the plane": (word(TEXT["dense"], 0, "2"), r"line 1: dimension 2 \(contacts in the plane\); allowed is 3"),
+    "rolling": (word(TEXT["dense"], 0, "5"), r"line 1: dimension 5 \(rolling friction\); allowed is 3"),
+    "contacts below zero": (word(TEXT["dense"], 1, "-4"), r"line 2: -4 for the number of contacts"),
+    "half a contact": (word(TEXT["dense"], 1, "4.5"), r"line 2: '4\.5' in the number of contacts"),
+    "more contacts": (word(TEXT["dense"], 1, "5"), r"line 8: a matrix \(12, 12\) alone, for 5 contacts; allowed"),
+    "very many contacts": (word(TEXT["dense"], 1, "9" * 18), r"allowed is W \(2999999999999999997"),
+    "no such number": (word(TEXT["dense"], 1, "9" * 30), r"line 2: '9+' in the number of contacts"),
+    "an unknown storage": (word(TEXT["dense"], 2, "7"), r"line 3: storage 7 of W or M; allowed are 0 \(dense\), 1"),
+    "other rows": (word(TEXT["dense"], 5, "11"), r"line 3: W or M has the size \(12, 12\), then \(11, 12\)"),
+    "letters in W": (word(TEXT["dense"], 20, "1.0x"), r"line 7: '1\.0x' in W or M; allowed is a finite number"),
+    "NaN in W": (word(TEXT["dense"], 20, "nan"), r"line 7: 'nan' in W or M"),
+    "infinite q": (word(TEXT["dense"], -8, "-inf"), r"line 8: '-inf' in q"),
+    "negative friction": (word(TEXT["dense"], -1, "-0.1"), r"negative friction"),
+    "cut": (TEXT["dense"][:-60], r"line 9: it ends too early, after [123] of 4 words of mu"),
+    "words after the end": (TEXT["dense"] + "0.5 0.5", r"line 10: '0\.5' and 1 words more after the friction"),
+    "another end": (TEXT["dense"] + "7", r"line 10: '7' after the friction coefficients; allowed is 0 or 1"),
+    "cut within blocks": (TEXT["blocks"][:2000], r"it ends too early"),
+    "a large block": (word(TEXT["blocks"], 11, "9" * 17), r"has the size \(12, 12\), its blocks \(9+, 12\)"),
+    "blocks out of turn": (word(TEXT["blocks"], 39, "3"), r"line \d+: block 3 of W or M; allowed is block 0 here"),
+    "a block outside": (word(TEXT["blocks"], 24, "4"), r"do not fit together"),
+    "indices of another length": (word(TEXT["blocks"], 16, "6"), r"indices of lengths 6 and"),
+    "an unknown kind": (word(TEXT["triplets"], 5, "3"), r"line 6: kind 3 of W or M; allowed are 1 \(triplets\) and 2"),
+    "columns called triplets": (word(TEXT["columns"], 5, "1"), r"line 7: what CSparse prints of W or M is missing"),
+    "a triplet outside": (word(TEXT["triplets"], -19, "12"), r"entries outside its rows and columns"),
+    "letters for a row": (word(TEXT["triplets"], -20, "x"), r"'x' in the places of W or M"),
+    "more columns": (TEXT["columns"].replace("12-by-12", "12-by-11"), r"columns in W or M|has the size|words of W"),
+    "cut columns": (TEXT["columns"][:1500], r"it ends too early"),
+    "a global problem without q": (GLOBAL[:-700], r"it ends too early"),
+    "a light body": (word(GLOBAL, 7, "-1"), r"mass matrix is not positive"),
+    "a coupled one way": (word(word(GLOBAL, 8, "0.5"), 13, "0.4"), r"mass matrix is not symmetric"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_broken_file_is_refused_with_its_line(tmp_path, what):
+    text, said = BROKEN[what]
+    with pytest.raises(FileFormatError, match=rf"bad\.dat: no Siconos problem: .*(?:{said})") as error:
+        files.load(written(tmp_path / "bad.dat", text), SELF)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parallel(2)
+def test_a_broken_file_is_refused_on_all_ranks(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    comm = MPI.COMM_WORLD
+    with pytest.raises(FileFormatError, match=r"bad\.dat: no Siconos problem: line 9"):
+        files.load(written(Path("bad.dat"), BROKEN["cut"][0], comm), comm)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_file_cut_anywhere_or_with_another_word_anywhere_ends_in_one_error_or_is_read(tmp_path, storage):
+    rng = np.random.default_rng(5)
+    text = TEXT[storage]
+    count = len(text.split())
+    for _ in range(60):
+        cut = text[: rng.integers(len(text) - 2)].rstrip("0123456789.e+-")
+        with pytest.raises(FileFormatError):
+            files.load(written(tmp_path / "cut.dat", cut), SELF)
+        other = rng.choice(["-1", "0", "99999999999", "1e400", "x", "nan", "2", "13"])
+        changed = written(tmp_path / "changed.dat", word(text, int(rng.integers(count)), other))
+        try:
+            files.load(changed, SELF).problem.destroy()
+        except FileFormatError as error:
+            assert "changed.dat: no Siconos problem: " in str(error)  # noqa: PT017
+
+
+# -- published problems ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["GFC3D_TwoRods1", "Rover1040", "NESpheres_10_1", "OneObject-i1028-138.hdf5"])
+def test_published_problems_have_one_optimum(name):
+    path = PROBLEMS / f"{name}.dat"
+    if not path.exists():
+        pytest.skip(f"{path} is not here")
+    with files.load(path, SELF).problem as problem:
+        found = [ccp.solve(problem, None, solver, ccp.Limits(1e-8)) for solver in ("conic", "apgd")]
+        assert all(result.converged for result in found)
+        one, other = (ccp.measure(problem, result.impulse).objective for result in found)
+        assert one == pytest.approx(other, rel=1e-6)
