@@ -50,7 +50,7 @@ def compress_cross(
     eps: float = 1e-2,
     start: Cross | None = None,
     sweeps: int = 10,
-    measure: bool = True,
+    measure: bool | None = None,
     rng: np.random.Generator | None = None,
 ) -> Cross:
     """Train of ranks at most `max_rank` from entries of the matrix, within about eps if the rank allows.
@@ -58,7 +58,8 @@ def compress_cross(
     start : the result for a similar matrix, whose index sets are the first ones
     sweeps : the most; the estimated error ends them when it is below eps or falls by less than a tenth
         in two sweeps running
-    measure : measure the error at last, at a cost linear in the nonzeros; without, all is sublinear
+    measure : measure the error at last, at a cost linear in the nonzeros, by default that of a sparse matrix; without,
+        it is estimated from fresh samples, and all is sublinear
     rng : must give the same numbers on all ranks
 
     >>> i = np.arange(63)
@@ -72,7 +73,7 @@ def compress_cross(
     if entries.norm == 0:
         nothing = [np.zeros(1, np.int64)] * len(entries.width)
         return Cross(zeros(matrix.modes, matrix.modes, matrix.dtype), 0.0, 0, 0, nothing, nothing)
-    validation = np.concatenate((entries.stored(SAMPLES), entries.anywhere(SAMPLES)))
+    validation = entries.validation()
     extra = entries.stored(max_rank)
     prefixes, suffixes = (start.prefixes, start.suffixes) if start else entries.split(extra)
     best: Cross | None = None
@@ -81,7 +82,7 @@ def compress_cross(
         suffixes = _backward(entries, prefixes, extra, max_rank, eps)
         cores, prefixes = _forward(entries, suffixes, extra, max_rank, eps)
         train = matrix.agree(matrix_train(cores, matrix.modes).round(0.3 * eps))
-        error = matrix.agree(entries.error(train, validation))
+        error = matrix.agree(entries.error(train, *validation))
         idle = 0 if best is None or error < WORTH * best.error else idle + 1
         if best is None or error < best.error:
             best = Cross(train, error, count, entries.evaluations, prefixes, suffixes)
@@ -89,7 +90,10 @@ def compress_cross(
             break
         extra = matrix.agree(entries.worst(train, max_rank))
     assert best is not None, "there is at least one sweep"
-    return replace(best, error=relative_error(matrix, best.train)) if measure else best
+    measured = isinstance(matrix, SparseHierarchy) if measure is None else measure
+    if measured:
+        return replace(best, error=relative_error(matrix, best.train))
+    return replace(best, error=matrix.agree(entries.error(best.train, *entries.validation())))
 
 
 class _Entries:
@@ -106,7 +110,6 @@ class _Entries:
         for square in self.squares[::-1]:
             self.width.insert(0, self.width[0] * square)
         self.norm = matrix.norm()
-        self.tiny = float(np.finfo(matrix.dtype).tiny)
         self.evaluations = 0
 
     def at(self, keys: Array) -> Array:
@@ -128,21 +131,18 @@ class _Entries:
         """Keys of up to `count` stored entries, in random rows."""
         return self.matrix.sample(count, self.rng)
 
-    def anywhere(self, count: int) -> Array:
-        """Keys of `count` random entries."""
-        return self.rng.integers(0, self.width[0], count)
+    def validation(self) -> tuple[Array, Array]:
+        """Fresh keys, and weights with which a sum of squares over them estimates that over all entries."""
+        return self.matrix.validation(SAMPLES, self.rng)
 
     def of_train(self, train: Train, keys: Array) -> Array:
         digits = np.stack([keys // w % square for w, square in zip(self.width[1:], self.squares)])
         return train.at(digits)
 
-    def error(self, train: Train, keys: Array) -> float:
-        """Estimate of the relative error from stored entries and SAMPLES random ones after them."""
-        values = self.at(keys)
-        square = (values - self.of_train(train, keys)) ** 2
-        stored = float(square[:-SAMPLES].sum()) / max(float((values[:-SAMPLES] ** 2).sum()), self.tiny)
-        others = float(square[-SAMPLES:].mean()) * self.width[0] / self.norm**2
-        return float((stored + others) ** 0.5)
+    def error(self, train: Train, keys: Array, weights: Array) -> float:
+        """Estimate of the relative error."""
+        square = (self.at(keys) - self.of_train(train, keys)) ** 2
+        return float(weights @ square) ** 0.5 / self.norm
 
     def worst(self, train: Train, count: int) -> Array:
         """Keys of the stored entries, out of a sample, where the train is worst."""

@@ -8,8 +8,11 @@ cores the best core solves
 
 with the same symmetric positive definite M for all columns: one Cholesky factorisation, or, where that costs
 more, conjugate gradients that never form M. The condition of S is not squared, as it is where ||S X - B|| is
-minimised. (Alternating energy minimisation: Oseledets & Dolgov,
-SIAM J. Sci. Comput. 34, 2012; Dolgov & Savostyanov, ibid. 36, 2014.)
+minimised. (Alternating energy minimisation: Oseledets & Dolgov, SIAM J. Sci. Comput. 34, 2012.)
+
+The ranks grow on the way: every core gets, beside its own columns, those of the residual B - S X, seen through the
+interfaces of a train Z near it that is renewed with every core (AMEn: Dolgov & Savostyanov, ibid. 36, 2014). Each pass
+over the cores doubles the ranks, until the residual is small enough or the cap is reached.
 """
 
 from __future__ import annotations
@@ -20,15 +23,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from pctt.tt.apply import Apply
-from pctt.tt.train import Array, Train, identity, random
+from pctt.tt.train import Array, Train, full_ranks, identity, random
 
-SMALL = 1e-3  # of the norm of a start: the random directions that fill up its ranks
 LARGEST = 12_000  # unknowns of a local system that is factorised: 1.2 GB
-LOCAL_TOL, LOCAL_ITS = 1e-2, 30  # of conjugate gradients on a local system
+LOCAL_GAIN, LOCAL_ITS = 0.1, 60  # what conjugate gradients leave of the residual of a local system, and their most
+LOCAL_EPS = 0.1  # of the residual that is asked for: all that a local system needs
 EXPECTED_ITS = 10  # of them
-HIGH = 1000  # product of ranks of S and X from which a residual is estimated
-PROBES = 16  # random vectors for that
+LEAST_GROWTH, MOST_GROWTH = 4, 16  # of a rank in a pass
+IDLE = 0.9  # a sweep at full rank that leaves more than this of the residual is the last
+ENOUGH = 0.5  # part of eps at which the residual, estimated on the way, is worth measuring
+SKETCH = 64  # rank of the random train with which a residual of high rank is estimated
+HIGH = 300  # product of ranks of S and X from which that is done
 
 
 @dataclass(frozen=True)
@@ -36,15 +41,15 @@ class Inverse:
     """A train X of the inverse of S, symmetric up to rounding.
 
     correction : Z = X - I where that is what was computed (`invert_near_identity`)
-    residual : ||I - S X||_F / ||I||_F, or NaN where it was not asked for
-    energy : (tr(X' S X) / 2 - tr(X' B)) / n after every sweep
+    residual : ||I - S X||_F / ||I||_F, with a correction ||I - S X||_F / ||S - I||_F; NaN where it was not asked for
+    sweeps : there and back over the cores
     repaired : local systems that were not positive definite (S was not, or nearly) and had modes left out
     """
 
     train: Train
     correction: Train | None
     residual: float
-    energy: tuple[float, ...]
+    sweeps: int
     repaired: int
 
 
@@ -59,21 +64,21 @@ def invert(
 ) -> Inverse:
     """Inverse of a symmetric positive definite S with ranks at most `max_rank`.
 
-    start : a train near the inverse, by default the identity; its ranks are filled up with small random
-        directions
-    sweeps : there and back over the cores, at most; by default 2 from scratch, 1 from a start
-    eps : a sweep that lowers the energy by less than eps times its value is the last
+    start : a train near the inverse, by default a multiple of the identity
+    sweeps : there and back over the cores, at most; by default 1 from a start, else as many as the ranks need to reach
+        the cap, and two more
+    eps : the residual at which the ranks need not grow
     measure : compute the residual
 
     >>> from pctt.tt.train import decompose_matrix
     >>> A = 3 * np.eye(64) - np.diag(np.ones(63), 1) - np.diag(np.ones(63), -1)
-    >>> X = invert(decompose_matrix(A, [4, 4, 4]), max_rank=8, sweeps=4)
-    >>> X.train.ranks, X.residual < 1e-5
+    >>> X = invert(decompose_matrix(A, [4, 4, 4]), max_rank=8, eps=1e-6)
+    >>> X.train.ranks, X.residual < 1e-6
     ((1, 5, 5, 1), True)
     """
     unit = identity(S.rows, S.dtype)
-    X, energy, repaired = _solve(S, unit, unit if start is None else start, max_rank, start is None, sweeps, eps, rng)
-    return Inverse(X, None, residual(S, X) if measure else np.nan, energy, repaired)
+    X, left, count, repaired = _solve(S, unit, start, max_rank, sweeps, eps, measure, rng)
+    return Inverse(X, None, left, count, repaired)
 
 
 def invert_near_identity(
@@ -91,12 +96,10 @@ def invert_near_identity(
     Z is cheaper to apply than X: `Apply(Z)` and one addition.
     """
     unit = identity(T.rows, T.dtype)
-    if max_rank <= 1:
-        return Inverse(unit, 0 * unit, residual(unit + T, unit) if measure else np.nan, (), 0)
-    guess = -T if start is None else start
-    Z, energy, repaired = _solve(unit + T, -T, guess, max_rank - 1, start is None, sweeps, eps, rng)
-    X = unit + Z
-    return Inverse(X, Z, residual(unit + T, X) if measure else np.nan, energy, repaired)
+    if max_rank <= 1 or T.norm() == 0:
+        return Inverse(unit, 0 * unit, float(max_rank <= 1) if T.norm() else 0.0, 0, 0)
+    Z, left, count, repaired = _solve(unit + T, -T, start, max_rank - 1, sweeps, eps, measure, rng)
+    return Inverse(unit + Z, Z, left, count, repaired)
 
 
 def symmetrise(X: Train, max_rank: int | None = None, eps: float = 1e-12) -> Train:
@@ -104,23 +107,36 @@ def symmetrise(X: Train, max_rank: int | None = None, eps: float = 1e-12) -> Tra
     return (0.5 * (X + X.T)).round(eps, max_rank)
 
 
-def residual(S: Train, X: Train) -> float:
-    """||I - S X||_F / ||I||_F, in train arithmetic: of the cost of a product of both ranks. Where that is high, the
-    root mean square of ||v - S X v|| / ||v|| over random signs v."""
-    size = S.shape[0]
+def residual(S: Train, X: Train, B: Train | None = None) -> float:
+    """||B - S X||_F / ||B||_F, B the identity by default, in train arithmetic: of the cost of a product of both ranks.
+    Where that is high, an estimate from products with random trains, off by a third or so."""
+    B = identity(S.rows, S.dtype) if B is None else B
     if max(S.ranks) * max(X.ranks) > HIGH:
-        V = np.random.default_rng(0).choice([-1.0, 1.0], (PROBES, size))
-        apply_S, apply_X = Apply(S), Apply(X)
-        rest = [v - apply_S(apply_X(v)) for v in V]
-        return float(np.linalg.norm(rest) / (PROBES * size) ** 0.5)
+        return _sketched(S, X, B) / B.norm()
     SX = S @ X
-    square = 1 - 2 * SX.trace() / size + SX.inner(SX) / size
+    scale = B.norm() ** 2
+    square = 1 - 2 * SX.inner(B) / scale + SX.inner(SX) / scale
     if square > 1e4 * float(np.finfo(SX.dtype).eps):
         return float(square**0.5)
-    return (identity(S.rows, S.dtype) - SX).norm() / size**0.5  # what rounding left of the difference of squares
+    return float((B - SX).norm() / scale**0.5)  # what rounding left of the difference of squares
 
 
-def lowest(X: Train, rank: int = 2, sweeps: int = 2, rng: np.random.Generator | None = None) -> float:
+def _sketched(S: Train, X: Train, B: Train) -> float:
+    """Estimate of ||B - S X||_F: the root mean square of inner products with random trains that share all cores but
+    the last (Feldman et al., "Tensor train sketching", have the variance)."""
+    rng = np.random.default_rng(0)
+    sketch = Projection(S, B, len(X))
+    sketch.left[0] = np.ones((1, 1, 1))
+    for k, x in enumerate(X.cores):
+        width = len(sketch.left[k])
+        y = rng.standard_normal((width, *x.shape[1:3], SKETCH)) / width**0.5
+        sketch.step_right(k, y, x)
+    d = len(X)
+    products = sketch.left_B[d][:, 0] - sketch.left[d][:, 0, 0]
+    return float(np.linalg.norm(products) / SKETCH**0.5)
+
+
+def lowest(X: Train, rank: int = 4, sweeps: int = 4, rng: np.random.Generator | None = None) -> float:
     """An upper bound of the least eigenvalue of a symmetric X: the least v'Xv / v'v that an alternating search over
     trains v of the given rank finds. A negative value proves that X is not positive definite.
 
@@ -128,44 +144,72 @@ def lowest(X: Train, rank: int = 2, sweeps: int = 2, rng: np.random.Generator | 
     1.0
     """
     rng = np.random.default_rng(0) if rng is None else rng
-    environment = Environment(X, random(X.rows, rank, [1] * len(X), rng, X.dtype))
+    v = list(random(X.rows, rank, [1] * len(X), rng, X.dtype).right_orthogonal().cores)
+    galerkin = Projection.around(X, None, v, v)
     value = np.inf
 
-    def solve(k: int) -> Array:
+    def lowest_core(k: int) -> None:
         nonlocal value
-        w, v = linalg.eigh(environment.projected(k), subset_by_index=[0, 0], check_finite=False)
+        w, y = linalg.eigh(galerkin.matrix(k), subset_by_index=[0, 0], check_finite=False)
         value = float(w[0])
-        return v.reshape(environment.x[k].shape)
+        v[k] = y.reshape(v[k].shape)
 
     for _ in range(sweeps):
-        environment.sweep(solve)
+        before = value
+        for k in range(len(v) - 1):
+            lowest_core(k)
+            _push_right(v, k)
+            galerkin.step_right(k, v[k], v[k])
+        for k in range(len(v) - 1, 0, -1):
+            lowest_core(k)
+            _push_left(v, k)
+            galerkin.step_left(k, v[k], v[k])
+        lowest_core(0)
+        if value < 0 or abs(value - before) <= 1e-3 * abs(value):
+            break
     return value
 
 
-class Environment:
-    """A train x of orthonormal interfaces around the core at hand, with S and B projected on them from both sides.
+class Projection:
+    """y' S x and y' B contracted over the cores before and after the one at hand, for trains y and x of matrices whose
+    columns are spectators.
 
-    S : matrix train, cores (R, m, m, R')
-    x : matrix train whose column modes are spectators, cores (a, m, n, b)
-    B : matrix train like x, or None
-    left[k], right[k] : x' S x contracted over the cores before and after k, (a, R, a) and (b, R', b)
-    left_B[k], right_B[k] : the same of x' B, (a, R) and (b, R')
+    left[k], right[k] : y' S x over the cores before and after k, (c, R, a) and (c', R', a')
+    left_B[k], right_B[k] : the same of y' B, (c, R) and (c', R')
     """
 
-    def __init__(self, S: Train, x: Train, B: Train | None = None) -> None:
+    def __init__(self, S: Train, B: Train | None, length: int) -> None:
         self.S = S.cores
         self.B = None if B is None else B.cores
-        self.x = list(x.right_orthogonal().cores)
-        d = len(self.x)
-        self.left = [np.ones((1, 1, 1), S.dtype)] * d
-        self.right = list(self.left)
-        self.left_B = [np.ones((1, 1), S.dtype)] * d
-        self.right_B = list(self.left_B)
-        for k in range(d - 1, 0, -1):
-            self._pass_left(k)
+        one, one_B = np.ones((1, 1, 1), S.dtype), np.ones((1, 1), S.dtype)
+        self.left, self.right = [one] * (length + 1), [one] * length
+        self.left_B, self.right_B = [one_B] * (length + 1), [one_B] * length
 
-    def projected(self, k: int) -> Array:
-        """M = P' S P (a m b, a m b), symmetric, with P the interfaces around core k."""
+    @classmethod
+    def around(cls, S: Train, B: Train | None, y: list[Array], x: list[Array]) -> Projection:
+        """With all that is right of the first core."""
+        new = cls(S, B, len(x))
+        for k in range(len(x) - 1, 0, -1):
+            new.step_left(k, y[k], x[k])
+        return new
+
+    def step_right(self, k: int, y: Array, x: Array) -> None:
+        T = np.tensordot(self.left[k], x, (2, 0))  # (c, R, i', j, b)
+        T = np.tensordot(self.S[k], T, ((0, 2), (1, 2)))  # (i, R', c, j, b)
+        self.left[k + 1] = np.tensordot(y, T, ((0, 1, 2), (2, 0, 3)))
+        if self.B is not None:
+            self.left_B[k + 1] = np.tensordot(y, np.tensordot(self.left_B[k], self.B[k], 1), ((0, 1, 2), (0, 1, 2)))
+
+    def step_left(self, k: int, y: Array, x: Array) -> None:
+        T = np.tensordot(x, self.right[k], (3, 2))  # (a, i', j, c, R)
+        T = np.tensordot(self.S[k], T, ((2, 3), (1, 4)))  # (R, i, a, j, c)
+        self.right[k - 1] = np.tensordot(y, T, ((1, 2, 3), (1, 3, 4)))
+        if self.B is not None:
+            T = np.tensordot(self.B[k], self.right_B[k], (3, 1))  # (R, i, j, c)
+            self.right_B[k - 1] = np.tensordot(y, T, ((1, 2, 3), (1, 2, 3)))
+
+    def matrix(self, k: int) -> Array:
+        """M = P' S P (a m b, a m b), symmetric, for y = x, P the interfaces around core k."""
         S, left, right = self.S[k], self.left[k], self.right[k]
         T = np.tensordot(np.tensordot(left, S, (1, 0)), right, (4, 1))  # (a, a', i, i', b, b')
         n = left.shape[0] * S.shape[1] * right.shape[0]
@@ -173,11 +217,8 @@ class Environment:
         return 0.5 * (M + M.T)
 
     def times(self, k: int, x: Array) -> Array:
-        """(M + M') x / 2 for x (a, m, n, b), M = P' S P, without M."""
-        S, left, right = self.S[k], self.left[k], self.right[k]
-        one = _local_product(left, S, right, x)
-        other = _local_product(left.transpose(2, 1, 0), S.transpose(0, 2, 1, 3), right.transpose(2, 1, 0), x)
-        return 0.5 * (one + other)
+        """M x for x (a, m, n, b), without M."""
+        return _local_product(self.left[k], self.S[k], self.right[k], x)
 
     def diagonal(self, k: int) -> Array:
         """Diagonal of M, (a, m, 1, b)."""
@@ -188,85 +229,174 @@ class Environment:
         return T[:, :, None, :]
 
     def right_side(self, k: int) -> Array:
-        """P' B (a m b, n): a column for every index of the spectator."""
+        """P' B (a, m, n, b)."""
+        return self._of_B(k, self.left_B[k], self.right_B[k])
+
+    def rest(self, k: int, x: Array) -> Array:
+        """P' (B - S x) between my interfaces, for the core x."""
+        return self.right_side(k) - self.times(k, x)
+
+    def rest_left(self, other: Projection, k: int, x: Array) -> Array:
+        """The same with my interfaces on the left, those of another test train on the right."""
+        return self._of_B(k, self.left_B[k], other.right_B[k]) - _local_product(
+            self.left[k], self.S[k], other.right[k], x
+        )
+
+    def rest_right(self, other: Projection, k: int, x: Array) -> Array:
+        return other.rest_left(self, k, x)
+
+    def _of_B(self, k: int, left: Array, right: Array) -> Array:
         assert self.B is not None
-        T = np.tensordot(np.tensordot(self.left_B[k], self.B[k], 1), self.right_B[k], (3, 1))  # (a, i, j, b)
-        return T.transpose(0, 1, 3, 2).reshape(-1, T.shape[2])
+        return np.tensordot(np.tensordot(left, self.B[k], 1), right, (3, 1))
 
-    def sweep(self, solve: Callable[[int], Array]) -> None:
-        """Replaces core after core by `solve(k)`, from the first to the last and back; the last only once."""
-        d = len(self.x)
-        for k in range(d - 1):
-            self.x[k] = solve(k)
-            a, m, n, b = self.x[k].shape
-            Q, R = np.linalg.qr(self.x[k].reshape(-1, b))
-            self.x[k] = Q.reshape(a, m, n, -1)
-            self.x[k + 1] = np.tensordot(R, self.x[k + 1], 1)
-            self._pass_right(k)
-        for k in range(d - 1, 0, -1):
-            self.x[k] = solve(k)
-            a, m, n, b = self.x[k].shape
-            Q, R = np.linalg.qr(self.x[k].reshape(a, -1).T)
-            self.x[k] = Q.T.reshape(-1, m, n, b)
-            self.x[k - 1] = np.tensordot(self.x[k - 1], R.T, 1)
-            self._pass_left(k)
-        self.x[0] = solve(0)
 
-    def _pass_right(self, k: int) -> None:
-        x = self.x[k]
-        T = np.tensordot(self.left[k], x, (2, 0))  # (a, R, i', j, b')
-        T = np.tensordot(self.S[k], T, ((0, 2), (1, 2)))  # (i, R', a, j, b')
-        self.left[k + 1] = np.tensordot(x, T, ((0, 1, 2), (2, 0, 3)))  # (b, R', b')
-        if self.B is not None:
-            self.left_B[k + 1] = np.tensordot(x, np.tensordot(self.left_B[k], self.B[k], 1), ((0, 1, 2), (0, 1, 2)))
+class Growing:
+    """The train x of the inverse while its cores are solved for one by one, and a train z near its residual.
 
-    def _pass_left(self, k: int) -> None:
-        x = self.x[k]
-        T = np.tensordot(x, self.right[k], (3, 2))  # (a', i', j, b, R')
-        T = np.tensordot(self.S[k], T, ((2, 3), (1, 4)))  # (R, i, a', j, b)
-        self.right[k - 1] = np.tensordot(x, T, ((1, 2, 3), (1, 3, 4)))  # (a, R, a')
-        if self.B is not None:
-            T = np.tensordot(self.B[k], self.right_B[k], (3, 1))  # (R, i, j, b)
-            self.right_B[k - 1] = np.tensordot(x, T, ((1, 2, 3), (1, 2, 3)))
+    estimate : of ||B - S x||, what z has seen of it in the last pass
+    """
+
+    def __init__(self, S: Train, B: Train, x: Train, most: list[int], eps: float, rng: np.random.Generator) -> None:
+        self.x = list(x.right_orthogonal().cores)
+        self.most, self.goal = most, LOCAL_EPS * eps
+        width = min(MOST_GROWTH, max(most, default=1))
+        self.z = list(random(S.rows, width, S.columns, rng, S.dtype).right_orthogonal().cores)
+        self.galerkin = Projection.around(S, B, self.x, self.x)
+        self.residual = Projection.around(S, B, self.z, self.x)
+        self.repaired = 0
+        self.estimate = 0.0
+
+    def forward(self) -> None:
+        x, z = self.x, self.z
+        for k in range(len(x) - 1):
+            self._solve(k)
+            new = self.galerkin.rest_left(self.residual, k, x[k])  # (a, m, n, z)
+            z[k] = self.residual.rest(k, x[k])
+            _truncate_right(x, k, self.most[k])
+            _push_right(x, k, new[..., : self._room(k, x[k].shape[3])])
+            _push_right(z, k)
+            self.galerkin.step_right(k, x[k], x[k])
+            self.residual.step_right(k, z[k], x[k])
+
+    def backward(self) -> None:
+        x, z = self.x, self.z
+        for k in range(len(x) - 1, 0, -1):
+            self._solve(k)
+            new = self.galerkin.rest_right(self.residual, k, x[k])  # (z, m, n, b)
+            z[k] = self.residual.rest(k, x[k])
+            _truncate_left(x, k, self.most[k - 1])
+            _push_left(x, k, new[: self._room(k - 1, x[k].shape[0])])
+            _push_left(z, k)
+            self.galerkin.step_left(k, x[k], x[k])
+            self.residual.step_left(k, z[k], x[k])
+        self._solve(0)
+        z[0] = self.residual.rest(0, x[0])
+        self.estimate = float(np.linalg.norm(z[0]))
+
+    def _room(self, bond: int, rank: int) -> int:
+        return max(0, min(max(LEAST_GROWTH, rank), self.most[bond] - rank))
+
+    def _solve(self, k: int) -> None:
+        a, m, n, b = self.x[k].shape
+        f = self.galerkin.right_side(k)
+        if _large(a, m, n, b, *self.galerkin.S[k].shape[::3]):
+            self.x[k], whole = _conjugate_gradients(self.galerkin, k, self.x[k], f, self.goal)
+        else:
+            y, whole = _solve_positive(self.galerkin.matrix(k), f.transpose(0, 1, 3, 2).reshape(-1, n))
+            self.x[k] = y.reshape(a, m, b, n).transpose(0, 1, 3, 2)
+        self.repaired += not whole
 
 
 def _solve(
     S: Train,
     B: Train,
-    start: Train,
+    start: Train | None,
     max_rank: int,
-    cold: bool,
     sweeps: int | None,
     eps: float,
+    measure: bool,
     rng: np.random.Generator | None,
-) -> tuple[Train, tuple[float, ...], int]:
-    """The symmetric solution of S X = B, the energy per unknown after every sweep, the local systems repaired."""
+) -> tuple[Train, float, int, int]:
+    """The symmetric solution of S X = B, its relative residual, the sweeps made, the local systems repaired."""
     if S.rows != S.columns:
         raise ValueError("only a square matrix has an inverse")
     rng = np.random.default_rng(0) if rng is None else rng
-    environment = Environment(S, _fill(start.astype(S.dtype), max_rank, rng), B)
-    energy: list[float] = []
-    local, repaired = 0.0, 0
-
-    def solve(k: int) -> Array:
-        nonlocal local, repaired
-        a, m, n, b = environment.x[k].shape
-        f = environment.right_side(k)
-        if _large(a, m, n, b, *S.cores[k].shape[::3]):
-            f = f.reshape(a, m, b, n).transpose(0, 1, 3, 2)
-            y, whole = _conjugate_gradients(environment, k, f)
-        else:
-            y, whole = _solve_positive(environment.projected(k), f)
-        repaired += not whole
-        local = -0.5 * float(np.vdot(f, y)) / S.shape[0]
-        return y if y.ndim == 4 else y.reshape(a, m, b, n).transpose(0, 1, 3, 2)
-
-    for _ in range((2 if cold else 1) if sweeps is None else sweeps):
-        environment.sweep(solve)
-        energy.append(local)
-        if len(energy) > 1 and abs(energy[-1] - energy[-2]) <= eps * abs(energy[-1]):
+    most = [min(max_rank, r) for r in full_ranks([m * m for m in S.rows])]
+    if sweeps is None:
+        sweeps = 1 if start is not None else 2 + int(np.ceil(0.5 * np.log2(max(1.0, max(most, default=1)))))
+    first = B if start is None else start.astype(S.dtype)
+    growing = Growing(S, B, first.round(0.0, max_rank), most, eps, rng)
+    norm, count, before, enough = B.norm(), 0, np.inf, ENOUGH * eps
+    while count < sweeps:
+        growing.forward()
+        growing.backward()
+        count += 1
+        if growing.estimate <= enough * norm:
+            X = symmetrise(Train(growing.x), max_rank)
+            left = residual(S, X, B) if measure else eps
+            if left <= eps:
+                return *(_rounded(S, B, X, left, eps) if measure else (X, np.nan)), count, growing.repaired
+            enough *= 0.5 * eps / left  # it sees a part of the residual
+        full = all(x.shape[3] >= r for x, r in zip(growing.x, most))
+        if full and growing.estimate > IDLE * before:
             break
-    return symmetrise(Train(environment.x), max_rank), tuple(energy), repaired
+        before = growing.estimate if full else np.inf
+    X = symmetrise(Train(growing.x), max_rank)
+    return X, residual(S, X, B) if measure else np.nan, count, growing.repaired
+
+
+def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Train, float]:
+    """X of the least ranks that a few trials find to leave the residual below eps, and the residual."""
+    for part in (1.0, 0.3, 0.1, 0.03):
+        smaller = X.round(part * eps)
+        if smaller.ranks == X.ranks:
+            break
+        found = residual(S, smaller, B)
+        if found <= eps:
+            return smaller, found
+    return X, left
+
+
+def _push_right(x: list[Array], k: int, more: Array | None = None) -> None:
+    """Core k with orthonormal columns, seen as (a m n, b), and room for more of them; the rest goes to core k + 1."""
+    a, m, n, b = x[k].shape
+    columns = x[k].reshape(-1, b)
+    if more is not None and more.shape[3]:
+        columns = np.hstack((columns, _scaled(more.reshape(len(columns), -1))))
+    Q, R = np.linalg.qr(columns)
+    x[k] = Q.reshape(a, m, n, -1)
+    x[k + 1] = np.tensordot(R[:, :b], x[k + 1], 1)
+
+
+def _push_left(x: list[Array], k: int, more: Array | None = None) -> None:
+    """Core k with orthonormal rows, seen as (a, m n b), and room for more of them; the rest goes to core k - 1."""
+    a, m, n, b = x[k].shape
+    rows = x[k].reshape(a, -1)
+    if more is not None and len(more):
+        rows = np.vstack((rows, _scaled(more.reshape(-1, rows.shape[1]))))
+    Q, R = np.linalg.qr(rows.T)
+    x[k] = np.ascontiguousarray(Q.T).reshape(-1, m, n, b)
+    x[k - 1] = np.tensordot(x[k - 1], R[:, :a].T, 1)
+
+
+def _scaled(x: Array) -> Array:
+    return x / (np.linalg.norm(x) or 1.0)
+
+
+def _truncate_right(x: list[Array], k: int, most: int) -> None:
+    if x[k].shape[3] > most:
+        a, m, n, b = x[k].shape
+        U, s, V = np.linalg.svd(x[k].reshape(-1, b), full_matrices=False)
+        x[k] = U[:, :most].reshape(a, m, n, -1)
+        x[k + 1] = np.tensordot(s[:most, None] * V[:most], x[k + 1], 1)
+
+
+def _truncate_left(x: list[Array], k: int, most: int) -> None:
+    if x[k].shape[0] > most:
+        a, m, n, b = x[k].shape
+        U, s, V = np.linalg.svd(x[k].reshape(a, -1), full_matrices=False)
+        x[k] = V[:most].reshape(-1, m, n, b)
+        x[k - 1] = np.tensordot(x[k - 1], U[:, :most] * s[:most], 1)
 
 
 def _solve_positive(M: Array, f: Array) -> tuple[Array, bool]:
@@ -288,21 +418,21 @@ def _large(a: int, m: int, n: int, b: int, R: int, R_next: int) -> bool:
     return size > LARGEST or EXPECTED_ITS * iteration < forming + size**3 / 3 + 2 * size * size * n
 
 
-def _conjugate_gradients(environment: Environment, k: int, f: Array) -> tuple[Array, bool]:
-    """Solution of M y = f (a, m, n, b) to LOCAL_TOL, all columns as one system, from the core that is there, scaled by
-    the diagonal; False, and y as far as it got, where M is not positive definite."""
-    weight = environment.diagonal(k)
+def _conjugate_gradients(galerkin: Projection, k: int, x: Array, f: Array, goal: float) -> tuple[Array, bool]:
+    """Solution of M y = f (a, m, n, b), all columns as one system, from x, scaled by the diagonal, until LOCAL_GAIN of
+    the first residual or `goal` times f is left; False, and y as far as it got, where M is not positive definite."""
+    weight = galerkin.diagonal(k)
     if weight.min() <= 0:
         weight = np.ones_like(weight)
-    y = environment.x[k].copy()
-    r = f - environment.times(k, y)
+    y = x.copy()
+    r = f - galerkin.times(k, y)
     z = r / weight
     p, rz = z, float(np.vdot(r, z))
-    goal = LOCAL_TOL * float(np.linalg.norm(f))
+    enough = max(LOCAL_GAIN * float(np.linalg.norm(r)), goal * float(np.linalg.norm(f)))
     for _ in range(LOCAL_ITS):
-        if np.linalg.norm(r) <= goal:
+        if np.linalg.norm(r) <= enough:
             break
-        q = environment.times(k, p)
+        q = galerkin.times(k, p)
         curvature = float(np.vdot(p, q))
         if curvature <= 0:
             return y, False
@@ -319,14 +449,3 @@ def _local_product(left: Array, S: Array, right: Array, x: Array) -> Array:
     T = np.tensordot(left, x, 1)  # (a, R, j, n, b')
     T = np.tensordot(T, S, ((1, 2), (0, 2)))  # (a, n, b', i, R')
     return np.tensordot(T, right, ((2, 4), (2, 1))).transpose(0, 2, 1, 3)  # (a, i, n, b)
-
-
-def _fill(X: Train, max_rank: int, rng: np.random.Generator) -> Train:
-    """X rounded to `max_rank`, lower ranks filled up by small random directions."""
-    X = X.round(0.0, max_rank) if max(X.ranks) > max_rank else X
-    missing = [max_rank - r for r in X.ranks[1:-1]]
-    if not any(missing):
-        return X
-    small = random(X.rows, [max(1, r) for r in missing], X.columns, rng, X.dtype)
-    scale = SMALL * (X.norm() or 1.0) / max(small.norm(), float(np.finfo(X.dtype).tiny))
-    return X + small * scale
