@@ -17,7 +17,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, OptionError, option
-from pctt.pc.approximate_inverse import ApproximateInverse, invert_by_als, invert_by_root
+from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
 from pctt.pc.base import PythonPC
 from pctt.pc.block_diagonal import block_diagonal
 from pctt.pc.mat import check_coordinates, is_symmetric
@@ -47,10 +47,6 @@ class Options:
     compress: str = option(
         "als", "als: alternating least squares over the nonzeros; cross: AMEn cross (the paper)",
         choices=("als", "cross"),
-    )
-    inverse: str = option(
-        "als", "als: alternating minimisation; root: Z Z', always positive, Z near the inverse square root",
-        choices=("als", "root"),
     )
     scaling: str = option(
         "block", "block: by Cholesky factors of the diagonal blocks; none: the matrix as it is (the paper)",
@@ -273,9 +269,7 @@ class TensorTrain(PythonPC):
         assert self.compression is not None
         options, rng = self.options, np.random.default_rng(self.options.seed)
         start = self.inverse.train if warm and self.inverse is not None else None
-        if options.inverse == "root":
-            return invert_by_root(self.compression, rank, options.scaling == "block")
-        return invert_by_als(self.compression, rank, options.scaling == "block", start, rng)
+        return approximate_inverse(self.compression, rank, options.eps, options.scaling == "block", start, rng)
 
     def _modes(self, slots: int) -> tuple[int, ...]:
         return self._check_modes(slots) or choose_modes(slots, self.options.leaf)
@@ -301,15 +295,11 @@ class TensorTrain(PythonPC):
             rows = (slots.first * bs, (slots.first + slots.capacity) * bs)
             dtype = np.float32 if self.options.precision == "single" and not self._double else np.float64
             self._apply = Apply(train, slots.size * bs, rows, dtype)
-            if self.options.inverse == "root":
-                self._apply_transposed = Apply(train.T, slots.size * bs, rows, dtype)
             self._local = np.empty((slots.capacity, bs))
             self._scaled = np.empty((slots.capacity, bs, 1))
             self._whole = np.empty(slots.size * bs)
         else:
             self._apply.set_train(train)
-            if self.options.inverse == "root":
-                self._apply_transposed.set_train(train.T)
 
     def _refuse(self, why: str) -> bool:
         self.account.fallbacks.append(why)
@@ -356,8 +346,6 @@ class TensorTrain(PythonPC):
     def _inverse_times(self, x: np.ndarray) -> np.ndarray:
         """This rank's part of X x in slot order, from its part of x."""
         assert self.inverse is not None
-        if self.inverse.squared:
-            return self._times(self._apply, self._times(self._apply_transposed, x).copy())
         product = self._times(self._apply, x)
         return x + product if self.inverse.identity else product
 
@@ -435,7 +423,7 @@ class TensorTrain(PythonPC):
             return f"rank 1 (block Jacobi), set up in {self._setup_seconds:.2e} s"
         compression, X = self.inverse.of, self.inverse.train
         T = compression.train
-        form = "I + Z" if self.inverse.identity else "Z Z'" if self.inverse.squared else "X"
+        form = "I + Z" if self.inverse.identity else "X"
         return (
             f"modes {'x'.join(map(str, T.rows))}, matrix ranks {T.ranks} error {compression.error:.2g}, inverse "
             f"{form} ranks {X.ranks} residual {self.inverse.residual:.2g}, {X.storage} numbers, "

@@ -18,7 +18,8 @@ from pctt.tt.apply import Apply
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.entries import EntryMatrix
 from pctt.tt.grid import GridDigits
-from pctt.tt.inverse import Inverse, invert, invert_near_identity, lowest, residual, symmetrise
+from pctt.tt.inverse import Inverse, invert, invert_near_identity, residual
+from pctt.tt.lowest import lowest
 from pctt.tt.quantise import binary_modes, check_modes, choose_modes, merge, scalar_modes, slots_of
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Train, decompose, decompose_matrix, identity, matrix_train, random, zeros
@@ -50,6 +51,5 @@ __all__ = [
     "residual",
     "scalar_modes",
     "slots_of",
-    "symmetrise",
     "zeros",
 ]

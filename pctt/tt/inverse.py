@@ -17,21 +17,19 @@ over the cores doubles the ranks, until the residual is small enough or the cap 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
+from pctt.tt.projection import Projection, columns, rows
 from pctt.tt.train import Array, Train, full_ranks, identity, random
 
-LARGEST = 12_000  # unknowns of a local system that is factorised: 1.2 GB
-LOCAL_GAIN, LOCAL_ITS = 0.1, 60  # what conjugate gradients leave of the residual of a local system, and their most
+LOCAL_GAIN, LOCAL_ITS = 0.1, 20  # what conjugate gradients leave of the residual of a local system, and their most
 LOCAL_EPS = 0.1  # of the residual that is asked for: all that a local system needs
-EXPECTED_ITS = 10  # of them
 LEAST_GROWTH, MOST_GROWTH = 4, 16  # of a rank in a pass
-IDLE = 0.9  # a sweep at full rank that leaves more than this of the residual is the last
+IDLE = 0.8  # a sweep that leaves more than this of the residual is the last, or, if ranks can grow, drops too much
 ENOUGH = 0.5  # part of eps at which the residual, estimated on the way, is worth measuring
+DROP = 0.1  # of that residual: what a core may leave out of the inverse
 SKETCH = 64  # rank of the random train with which a residual of high rank is estimated
 HIGH = 300  # product of ranks of S and X from which that is done
 
@@ -102,11 +100,6 @@ def invert_near_identity(
     return Inverse(unit + Z, Z, left, count, repaired)
 
 
-def symmetrise(X: Train, max_rank: int | None = None, eps: float = 1e-12) -> Train:
-    """(X + X') / 2, rounded."""
-    return (0.5 * (X + X.T)).round(eps, max_rank)
-
-
 def residual(S: Train, X: Train, B: Train | None = None) -> float:
     """||B - S X||_F / ||B||_F, B the identity by default, in train arithmetic: of the cost of a product of both ranks.
     Where that is high, an estimate from products with random trains, off by a third or so."""
@@ -136,133 +129,23 @@ def _sketched(S: Train, X: Train, B: Train) -> float:
     return float(np.linalg.norm(products) / SKETCH**0.5)
 
 
-def lowest(X: Train, rank: int = 4, sweeps: int = 4, rng: np.random.Generator | None = None) -> float:
-    """An upper bound of the least eigenvalue of a symmetric X: the least v'Xv / v'v that an alternating search over
-    trains v of the given rank finds. A negative value proves that X is not positive definite.
-
-    >>> round(lowest(identity([4, 4, 4])), 12)
-    1.0
-    """
-    rng = np.random.default_rng(0) if rng is None else rng
-    v = list(random(X.rows, rank, [1] * len(X), rng, X.dtype).right_orthogonal().cores)
-    galerkin = Projection.around(X, None, v, v)
-    value = np.inf
-
-    def lowest_core(k: int) -> None:
-        nonlocal value
-        w, y = linalg.eigh(galerkin.matrix(k), subset_by_index=[0, 0], check_finite=False)
-        value = float(w[0])
-        v[k] = y.reshape(v[k].shape)
-
-    for _ in range(sweeps):
-        before = value
-        for k in range(len(v) - 1):
-            lowest_core(k)
-            _push_right(v, k)
-            galerkin.step_right(k, v[k], v[k])
-        for k in range(len(v) - 1, 0, -1):
-            lowest_core(k)
-            _push_left(v, k)
-            galerkin.step_left(k, v[k], v[k])
-        lowest_core(0)
-        if value < 0 or abs(value - before) <= 1e-3 * abs(value):
-            break
-    return value
-
-
-class Projection:
-    """y' S x and y' B contracted over the cores before and after the one at hand, for trains y and x of matrices whose
-    columns are spectators.
-
-    left[k], right[k] : y' S x over the cores before and after k, (c, R, a) and (c', R', a')
-    left_B[k], right_B[k] : the same of y' B, (c, R) and (c', R')
-    """
-
-    def __init__(self, S: Train, B: Train | None, length: int) -> None:
-        self.S = S.cores
-        self.B = None if B is None else B.cores
-        one, one_B = np.ones((1, 1, 1), S.dtype), np.ones((1, 1), S.dtype)
-        self.left, self.right = [one] * (length + 1), [one] * length
-        self.left_B, self.right_B = [one_B] * (length + 1), [one_B] * length
-
-    @classmethod
-    def around(cls, S: Train, B: Train | None, y: list[Array], x: list[Array]) -> Projection:
-        """With all that is right of the first core."""
-        new = cls(S, B, len(x))
-        for k in range(len(x) - 1, 0, -1):
-            new.step_left(k, y[k], x[k])
-        return new
-
-    def step_right(self, k: int, y: Array, x: Array) -> None:
-        T = np.tensordot(self.left[k], x, (2, 0))  # (c, R, i', j, b)
-        T = np.tensordot(self.S[k], T, ((0, 2), (1, 2)))  # (i, R', c, j, b)
-        self.left[k + 1] = np.tensordot(y, T, ((0, 1, 2), (2, 0, 3)))
-        if self.B is not None:
-            self.left_B[k + 1] = np.tensordot(y, np.tensordot(self.left_B[k], self.B[k], 1), ((0, 1, 2), (0, 1, 2)))
-
-    def step_left(self, k: int, y: Array, x: Array) -> None:
-        T = np.tensordot(x, self.right[k], (3, 2))  # (a, i', j, c, R)
-        T = np.tensordot(self.S[k], T, ((2, 3), (1, 4)))  # (R, i, a, j, c)
-        self.right[k - 1] = np.tensordot(y, T, ((1, 2, 3), (1, 3, 4)))
-        if self.B is not None:
-            T = np.tensordot(self.B[k], self.right_B[k], (3, 1))  # (R, i, j, c)
-            self.right_B[k - 1] = np.tensordot(y, T, ((1, 2, 3), (1, 2, 3)))
-
-    def matrix(self, k: int) -> Array:
-        """M = P' S P (a m b, a m b), symmetric, for y = x, P the interfaces around core k."""
-        S, left, right = self.S[k], self.left[k], self.right[k]
-        T = np.tensordot(np.tensordot(left, S, (1, 0)), right, (4, 1))  # (a, a', i, i', b, b')
-        n = left.shape[0] * S.shape[1] * right.shape[0]
-        M = T.transpose(0, 2, 4, 1, 3, 5).reshape(n, n)
-        return 0.5 * (M + M.T)
-
-    def times(self, k: int, x: Array) -> Array:
-        """M x for x (a, m, n, b), without M."""
-        return _local_product(self.left[k], self.S[k], self.right[k], x)
-
-    def diagonal(self, k: int) -> Array:
-        """Diagonal of M, (a, m, 1, b)."""
-        left = np.diagonal(self.left[k], axis1=0, axis2=2)  # (R, a)
-        middle = np.diagonal(self.S[k], axis1=1, axis2=2)  # (R, R', m)
-        right = np.diagonal(self.right[k], axis1=0, axis2=2)  # (R', b)
-        T = np.tensordot(np.tensordot(left, middle, (0, 0)), right, (1, 0))  # (a, m, b)
-        return T[:, :, None, :]
-
-    def right_side(self, k: int) -> Array:
-        """P' B (a, m, n, b)."""
-        return self._of_B(k, self.left_B[k], self.right_B[k])
-
-    def rest(self, k: int, x: Array) -> Array:
-        """P' (B - S x) between my interfaces, for the core x."""
-        return self.right_side(k) - self.times(k, x)
-
-    def rest_left(self, other: Projection, k: int, x: Array) -> Array:
-        """The same with my interfaces on the left, those of another test train on the right."""
-        return self._of_B(k, self.left_B[k], other.right_B[k]) - _local_product(
-            self.left[k], self.S[k], other.right[k], x
-        )
-
-    def rest_right(self, other: Projection, k: int, x: Array) -> Array:
-        return other.rest_left(self, k, x)
-
-    def _of_B(self, k: int, left: Array, right: Array) -> Array:
-        assert self.B is not None
-        return np.tensordot(np.tensordot(left, self.B[k], 1), right, (3, 1))
-
-
 class Growing:
-    """The train x of the inverse while its cores are solved for one by one, and a train z near its residual.
+    """The symmetric train x of the inverse while its cores are solved for one by one, and a train z near its residual.
+
+    Both are symmetric by structure: a basis vector of a bond is a matrix that is its own transpose, or minus that, by
+    the bond's signs; a core (a, i, j, b) then is its transpose in i and j times the signs of a and b.
 
     estimate : of ||B - S x||, what z has seen of it in the last pass
     """
 
     def __init__(self, S: Train, B: Train, x: Train, most: list[int], eps: float, rng: np.random.Generator) -> None:
-        self.x = list(x.right_orthogonal().cores)
         self.most, self.goal = most, LOCAL_EPS * eps
         width = min(MOST_GROWTH, max(most, default=1))
+        self.x, self.signs = _with_signs(x, most)
         self.z = list(random(S.rows, width, S.columns, rng, S.dtype).right_orthogonal().cores)
         self.galerkin = Projection.around(S, B, self.x, self.x)
         self.residual = Projection.around(S, B, self.z, self.x)
+        self.drop = DROP * eps / len(x) ** 0.5
         self.repaired = 0
         self.estimate = 0.0
 
@@ -272,9 +155,8 @@ class Growing:
             self._solve(k)
             new = self.galerkin.rest_left(self.residual, k, x[k])  # (a, m, n, z)
             z[k] = self.residual.rest(k, x[k])
-            _truncate_right(x, k, self.most[k])
-            _push_right(x, k, new[..., : self._room(k, x[k].shape[3])])
-            _push_right(z, k)
+            _push_right(x, self.signs, k, self.most[k], self.drop, new)
+            z[k] = columns(z[k])
             self.galerkin.step_right(k, x[k], x[k])
             self.residual.step_right(k, z[k], x[k])
 
@@ -284,27 +166,46 @@ class Growing:
             self._solve(k)
             new = self.galerkin.rest_right(self.residual, k, x[k])  # (z, m, n, b)
             z[k] = self.residual.rest(k, x[k])
-            _truncate_left(x, k, self.most[k - 1])
-            _push_left(x, k, new[: self._room(k - 1, x[k].shape[0])])
-            _push_left(z, k)
+            _push_left(x, self.signs, k, self.most[k - 1], self.drop, new)
+            z[k] = rows(z[k])
             self.galerkin.step_left(k, x[k], x[k])
             self.residual.step_left(k, z[k], x[k])
         self._solve(0)
         z[0] = self.residual.rest(0, x[0])
         self.estimate = float(np.linalg.norm(z[0]))
 
-    def _room(self, bond: int, rank: int) -> int:
-        return max(0, min(max(LEAST_GROWTH, rank), self.most[bond] - rank))
-
     def _solve(self, k: int) -> None:
-        a, m, n, b = self.x[k].shape
-        f = self.galerkin.right_side(k)
-        if _large(a, m, n, b, *self.galerkin.S[k].shape[::3]):
-            self.x[k], whole = _conjugate_gradients(self.galerkin, k, self.x[k], f, self.goal)
-        else:
-            y, whole = _solve_positive(self.galerkin.matrix(k), f.transpose(0, 1, 3, 2).reshape(-1, n))
-            self.x[k] = y.reshape(a, m, b, n).transpose(0, 1, 3, 2)
-        self.repaired += not whole
+        """The symmetric core of least energy, nearly, by conjugate gradients from the one that is there, scaled by the
+        diagonal, until LOCAL_GAIN of the first residual or `goal` times the right side is left."""
+        signs = self.signs[k : k + 2]
+
+        def symmetric(y: Array) -> Array:
+            return 0.5 * (y + _transpose(y, *signs))
+
+        galerkin, y = self.galerkin, self.x[k]
+        weight = galerkin.diagonal(k)
+        weight = weight + weight.transpose(0, 2, 1, 3)
+        if weight.min() <= 0:
+            weight = np.ones_like(weight)
+        f = symmetric(galerkin.right_side(k))
+        r = f - symmetric(galerkin.times(k, y))
+        z = r / weight
+        p, rz = z, float(np.vdot(r, z))
+        enough = max(LOCAL_GAIN * float(np.linalg.norm(r)), self.goal * float(np.linalg.norm(f)))
+        for _ in range(LOCAL_ITS):
+            if np.linalg.norm(r) <= enough:
+                break
+            q = symmetric(galerkin.times(k, p))
+            curvature = float(np.vdot(p, q))
+            if curvature <= 0:
+                self.repaired += 1
+                break
+            y = y + rz / curvature * p
+            r -= rz / curvature * q
+            z = r / weight
+            rz, last = float(np.vdot(r, z)), rz
+            p = z + rz / last * p
+        self.x[k] = y
 
 
 def _solve(
@@ -332,16 +233,17 @@ def _solve(
         growing.backward()
         count += 1
         if growing.estimate <= enough * norm:
-            X = symmetrise(Train(growing.x), max_rank)
+            X = Train(growing.x)
             left = residual(S, X, B) if measure else eps
             if left <= eps:
                 return *(_rounded(S, B, X, left, eps) if measure else (X, np.nan)), count, growing.repaired
             enough *= 0.5 * eps / left  # it sees a part of the residual
-        full = all(x.shape[3] >= r for x, r in zip(growing.x, most))
-        if full and growing.estimate > IDLE * before:
-            break
-        before = growing.estimate if full else np.inf
-    X = symmetrise(Train(growing.x), max_rank)
+        if growing.estimate > IDLE * before:
+            if all(x.shape[3] >= r for x, r in zip(growing.x, most)):
+                break
+            growing.drop *= 0.3
+        before = growing.estimate
+    X = Train(growing.x)
     return X, residual(S, X, B) if measure else np.nan, count, growing.repaired
 
 
@@ -357,95 +259,85 @@ def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Tra
     return X, left
 
 
-def _push_right(x: list[Array], k: int, more: Array | None = None) -> None:
-    """Core k with orthonormal columns, seen as (a m n, b), and room for more of them; the rest goes to core k + 1."""
+def _transpose(x: Array, left: Array, right: Array) -> Array:
+    """The core of the transposed train, for interfaces of these signs."""
+    return x.transpose(0, 2, 1, 3) * np.multiply.outer(left, right)[:, None, None, :]
+
+
+def _with_signs(X: Train, most: list[int]) -> tuple[list[Array], list[Array]]:
+    """(X + X') / 2 with orthonormal right interfaces, of ranks at most `most`, and the signs of all bonds."""
+    x = list(X.left_orthogonal().cores)
+    signs = [np.ones(1, X.dtype)] * (len(x) + 1)
+    for k in range(len(x) - 1, 0, -1):
+        signs[k] = np.zeros(len(x[k]), X.dtype)  # neither
+        _push_left(x, signs, k, most[k - 1], 0.0)
+    x[0] = 0.5 * (x[0] + _transpose(x[0], signs[0], signs[1]))
+    return x, signs
+
+
+def _push_right(
+    x: list[Array], signs: list[Array], k: int, most: int, drop: float, more: Array | None = None
+) -> None:
+    """Core k with at most so many orthonormal columns, seen as (a m n, b), and room for more; the rest goes to the
+    next core."""
     a, m, n, b = x[k].shape
-    columns = x[k].reshape(-1, b)
-    if more is not None and more.shape[3]:
-        columns = np.hstack((columns, _scaled(more.reshape(len(columns), -1))))
-    Q, R = np.linalg.qr(columns)
+    Q, R, new = _basis(x[k], signs[k], signs[k + 1], most, drop, more)
     x[k] = Q.reshape(a, m, n, -1)
-    x[k + 1] = np.tensordot(R[:, :b], x[k + 1], 1)
+    x[k + 1] = np.tensordot(R, x[k + 1], 1)
+    signs[k + 1] = new
 
 
-def _push_left(x: list[Array], k: int, more: Array | None = None) -> None:
-    """Core k with orthonormal rows, seen as (a, m n b), and room for more of them; the rest goes to core k - 1."""
+def _push_left(
+    x: list[Array], signs: list[Array], k: int, most: int, drop: float, more: Array | None = None
+) -> None:
+    """Core k with at most so many orthonormal rows, seen as (a, m n b), and room for more; the rest goes to the core
+    before."""
     a, m, n, b = x[k].shape
-    rows = x[k].reshape(a, -1)
-    if more is not None and len(more):
-        rows = np.vstack((rows, _scaled(more.reshape(-1, rows.shape[1]))))
-    Q, R = np.linalg.qr(rows.T)
-    x[k] = np.ascontiguousarray(Q.T).reshape(-1, m, n, b)
-    x[k - 1] = np.tensordot(x[k - 1], R[:, :a].T, 1)
+    turned = None if more is None else more.transpose(3, 1, 2, 0)
+    Q, R, new = _basis(x[k].transpose(3, 1, 2, 0), signs[k + 1], signs[k], most, drop, turned)
+    x[k] = np.ascontiguousarray(Q.reshape(b, m, n, -1).transpose(3, 1, 2, 0))
+    x[k - 1] = np.tensordot(x[k - 1], R, (3, 1))
+    signs[k] = new
 
 
-def _scaled(x: Array) -> Array:
-    return x / (np.linalg.norm(x) or 1.0)
+def _basis(
+    x: Array, left: Array, right: Array, most: int, drop: float, more: Array | None
+) -> tuple[Array, Array, Array]:
+    """Orthonormal columns Q for a core x (a, m, n, b) = Q R with bonds of these signs, at most `most`, up to `room` for
+    the residual `more` (a, m, n, c) beside them; and the signs of the columns."""
+    size = len(x) * x.shape[1] * x.shape[2]
+    parts = []
+    for sign in (1.0, -1.0):
+        half = x if right.any() else 0.5 * (x + sign * _transpose(x, left, np.ones(x.shape[3], x.dtype)))
+        mine = np.flatnonzero(right != -sign)
+        U, s, V = np.linalg.svd(half[..., mine].reshape(size, -1), full_matrices=False)
+        R = np.zeros((len(s), len(right)), x.dtype)
+        R[:, mine] = s[:, None] * V
+        parts.append((U, s, R))
+    keep = _largest([s for _, s, _ in parts], most, drop)
+    Q = [U[:, :r] for (U, _, _), r in zip(parts, keep)]
+    R = [R[:r] for (_, _, R), r in zip(parts, keep)]
+    room = min(most - sum(keep), max(LEAST_GROWTH, sum(keep)))
+    if more is not None and room > 0:
+        extra = []
+        for sign, known in zip((1.0, -1.0), Q):
+            half = 0.5 * (more + sign * _transpose(more, left, np.ones(more.shape[3], x.dtype))).reshape(size, -1)
+            half = half - known @ (known.T @ half)
+            extra.append(np.linalg.svd(half, full_matrices=False)[:2])
+        new = _largest([s for _, s in extra], room, 0.1)
+        for part, (U, _) in enumerate(extra):
+            U = U[:, : new[part]]
+            Q[part] = np.hstack((Q[part], np.linalg.qr(U - Q[part] @ (Q[part].T @ U))[0]))
+            R[part] = np.vstack((R[part], np.zeros((new[part], len(right)), x.dtype)))
+    return np.hstack(Q), np.vstack(R), np.repeat(np.array([1, -1], x.dtype), [len(r) for r in R])
 
 
-def _truncate_right(x: list[Array], k: int, most: int) -> None:
-    if x[k].shape[3] > most:
-        a, m, n, b = x[k].shape
-        U, s, V = np.linalg.svd(x[k].reshape(-1, b), full_matrices=False)
-        x[k] = U[:, :most].reshape(a, m, n, -1)
-        x[k + 1] = np.tensordot(s[:most, None] * V[:most], x[k + 1], 1)
-
-
-def _truncate_left(x: list[Array], k: int, most: int) -> None:
-    if x[k].shape[0] > most:
-        a, m, n, b = x[k].shape
-        U, s, V = np.linalg.svd(x[k].reshape(a, -1), full_matrices=False)
-        x[k] = V[:most].reshape(-1, m, n, b)
-        x[k - 1] = np.tensordot(x[k - 1], U[:, :most] * s[:most], 1)
-
-
-def _solve_positive(M: Array, f: Array) -> tuple[Array, bool]:
-    """Solution of M y = f for a symmetric M; where M is not positive definite, in its clearly positive modes."""
-    try:
-        factor = linalg.cho_factor(M, lower=True, check_finite=False)
-        return linalg.cho_solve(factor, f, check_finite=False), True
-    except linalg.LinAlgError:
-        w, V = linalg.eigh(M, check_finite=False)
-        w = np.where(w > 1e-3 * w[-1], w, np.inf)
-        return V @ ((V.T @ f) / w[:, None]), False
-
-
-def _large(a: int, m: int, n: int, b: int, R: int, R_next: int) -> bool:
-    """Whether a local system costs more operations to form, factorise and solve than to iterate on."""
-    size = a * m * b
-    forming = 2 * a * a * m * m * R_next * (R + b * b)
-    iteration = 4 * n * (a * m * b * (a * R + b * R_next) + a * b * m * m * R * R_next)
-    return size > LARGEST or EXPECTED_ITS * iteration < forming + size**3 / 3 + 2 * size * size * n
-
-
-def _conjugate_gradients(galerkin: Projection, k: int, x: Array, f: Array, goal: float) -> tuple[Array, bool]:
-    """Solution of M y = f (a, m, n, b), all columns as one system, from x, scaled by the diagonal, until LOCAL_GAIN of
-    the first residual or `goal` times f is left; False, and y as far as it got, where M is not positive definite."""
-    weight = galerkin.diagonal(k)
-    if weight.min() <= 0:
-        weight = np.ones_like(weight)
-    y = x.copy()
-    r = f - galerkin.times(k, y)
-    z = r / weight
-    p, rz = z, float(np.vdot(r, z))
-    enough = max(LOCAL_GAIN * float(np.linalg.norm(r)), goal * float(np.linalg.norm(f)))
-    for _ in range(LOCAL_ITS):
-        if np.linalg.norm(r) <= enough:
-            break
-        q = galerkin.times(k, p)
-        curvature = float(np.vdot(p, q))
-        if curvature <= 0:
-            return y, False
-        y += rz / curvature * p
-        r -= rz / curvature * q
-        z = r / weight
-        rz, last = float(np.vdot(r, z)), rz
-        p = z + rz / last * p
-    return y, True
-
-
-def _local_product(left: Array, S: Array, right: Array, x: Array) -> Array:
-    """left (a, R, a'), S (R, i, j, R'), right (b, R', b') on x (a', j, n, b')."""
-    T = np.tensordot(left, x, 1)  # (a, R, j, n, b')
-    T = np.tensordot(T, S, ((1, 2), (0, 2)))  # (a, n, b', i, R')
-    return np.tensordot(T, right, ((2, 4), (2, 1))).transpose(0, 2, 1, 3)  # (a, i, n, b)
+def _largest(values: list[Array], most: int, drop: float) -> list[int]:
+    """How many of each of two descending lists are kept: at most so many, at least one, and of these as few as leave out
+    no more than `drop` times the norm of all."""
+    both = np.sort(np.concatenate(values))[::-1]
+    tail = np.sqrt(np.cumsum(both[::-1].astype(float) ** 2))[::-1]
+    floor = max(drop, float(np.finfo(both.dtype).eps)) * tail[0]
+    rank = max(1, min(most, int(np.count_nonzero(tail > floor))))
+    first = int(np.count_nonzero(values[0] > both[rank])) if len(both) > rank else len(values[0])
+    return [first, min(rank - first, len(values[1]))]

@@ -98,7 +98,7 @@ assert len(chosen) > 1, chosen
 
 # processors that round differently: ranks of trains, pivots of crosses, numbers of inverses
 mat.shift(4.0)
-round_here, dominant, invert = Train.round, cross._dominant, module.invert_by_als
+round_here, dominant, invert = Train.round, cross._dominant, module.approximate_inverse
 
 
 def invert_here(*arguments):
@@ -108,7 +108,7 @@ def invert_here(*arguments):
 
 Train.round = lambda self, eps=1e-14, max_rank=None: round_here(self, max(eps, 0.3 * comm.rank), max_rank)
 cross._dominant = lambda C, most, eps: dominant(C, most if comm.rank == 0 else max(1, most - 1), eps)
-module.invert_by_als = invert_here
+module.approximate_inverse = invert_here
 for way in ("als", "cross"):
     ksp = solver(mat, max_rank=6, rank="fixed", compress=way)
     assert solve(ksp)[1] < 1e-6
