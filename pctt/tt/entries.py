@@ -20,12 +20,17 @@ NORM_SAMPLES = 4096
 
 
 class EntryMatrix:
-    """The matrix A(i, j) = entries(i, j) of the points of a grid; padding stands for rows of the identity.
+    """T = (A - c I) / c of the matrix A(i, j) = entries(i, j) of the points of a grid, c the mean of A's diagonal (T = A
+    where that is not positive); padding stands for rows of c I.
+
+    Errors are relative to T: the identity, whose norm grows with the number of points, does not hide them.
 
     entries : takes rows and columns (p,), integers, and gives (p,) numbers
     digits : of the grid
     order : (rows,) the row at each point of the grid, where that is not its number
     agree : as in `SparseHierarchy`
+
+    shift, scale : c and 1 / c
     """
 
     dtype = np.dtype(float)
@@ -39,9 +44,9 @@ class EntryMatrix:
         row, column = digits.pair(keys)
         self.shift, self.scale = 0.0, 1.0
         values = self.lookup(keys)
-        self.shift = self.agree(float(values[row == column].mean()))
-        if self.shift > 0:
-            self.scale = 1 / self.shift
+        mean = self.agree(float(values[row == column].mean()))
+        if mean > 0:
+            self.shift, self.scale = mean, 1 / mean
         self._norm = self.agree(float(weights @ self.lookup(keys) ** 2) ** 0.5)
 
     def norm(self) -> float:
