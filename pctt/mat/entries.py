@@ -21,8 +21,10 @@ class EntriesError(ValueError):
 
 
 def has_entries(P: PETSc.Mat) -> bool:
-    """Whether P's entries are looked up one by one: P has the attribute ``entries`` or is dense."""
-    return P.getAttr("entries") is not None or P.getType() in DENSE
+    """Whether P's entries are looked up one by one: P has the attribute ``entries``, or is dense and on a grid or without
+    blocks."""
+    dense = P.getType() in DENSE and (P.getBlockSize() == 1 or P.getAttr("grid") is not None)
+    return dense or P.getAttr("entries") is not None
 
 
 class Entries:

@@ -24,6 +24,8 @@ from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Array, Train, low_rank, matrix_train, zeros
 
 SAMPLES = 1024  # stored entries, and as many others, on which a train is validated
+EXTRA = 32  # of the stored entries where the train is worst: what enriches the next sweep, at most
+TIGHTER = 0.5  # what the accuracy of the single cores is multiplied by where a sweep has missed eps
 WORTH = 0.9  # a sweep that leaves more than this of the error was idle
 
 
@@ -74,13 +76,14 @@ def compress_cross(
         nothing = [np.zeros(1, np.int64)] * len(entries.width)
         return Cross(zeros(matrix.modes, matrix.modes, matrix.dtype), 0.0, 0, 0, nothing, nothing)
     validation = entries.validation()
-    extra = entries.stored(max_rank)
+    most = min(max_rank, EXTRA)
+    extra = entries.stored(most)
     prefixes, suffixes = (start.prefixes, start.suffixes) if start else entries.split(extra)
     best: Cross | None = None
-    idle = 0
+    idle, inner = 0, eps
     for count in range(1, sweeps + 1):
-        suffixes = _backward(entries, prefixes, extra, max_rank, eps)
-        cores, prefixes = _forward(entries, suffixes, extra, max_rank, eps)
+        suffixes = _backward(entries, prefixes, extra, max_rank, inner)
+        cores, prefixes = _forward(entries, suffixes, extra, max_rank, inner)
         train = matrix.agree(matrix_train(cores, matrix.modes).round(0.3 * eps))
         error = matrix.agree(entries.error(train, *validation))
         idle = 0 if best is None or error < WORTH * best.error else idle + 1
@@ -88,7 +91,8 @@ def compress_cross(
             best = Cross(train, error, count, entries.evaluations, prefixes, suffixes)
         if error <= eps or idle == 2:
             break
-        extra = matrix.agree(entries.worst(train, max_rank))
+        inner *= TIGHTER
+        extra = matrix.agree(entries.worst(train, most))
     assert best is not None, "there is at least one sweep"
     measured = isinstance(matrix, SparseHierarchy) if measure is None else measure
     if measured:
@@ -119,9 +123,9 @@ class _Entries:
 
     def block(self, k: int, prefixes: Array, suffixes: Array) -> Array:
         """Entries (prefixes, m_k^2, suffixes) around digit k."""
-        digits = np.arange(self.squares[k])
-        keys = prefixes[:, None, None] * self.width[k] + digits[:, None] * self.width[k + 1] + suffixes
-        return self.at(keys)
+        self.evaluations += len(prefixes) * self.squares[k] * len(suffixes)
+        digits = np.arange(self.squares[k]) * self.width[k + 1]
+        return self.matrix.crosses(prefixes * self.width[k], digits, suffixes)
 
     def split(self, keys: Array) -> tuple[list[Array], list[Array]]:
         """The distinct prefixes and suffixes of keys for every bond."""

@@ -41,7 +41,7 @@ class EntryMatrix:
         self.entries, self.digits, self.order, self.agree = entries, digits, order, agree
         self.modes = digits.modes
         keys, weights = self.validation(NORM_SAMPLES, np.random.default_rng(1))
-        row, column = digits.pair(keys)
+        row, column = np.divmod(digits.pair(keys), digits.size)
         self.shift, self.scale = 0.0, 1.0
         values = self.lookup(keys)
         mean = self.agree(float(values[row == column].mean()))
@@ -55,8 +55,16 @@ class EntryMatrix:
 
     def lookup(self, keys: Array) -> Array:
         """Entries by keys of any shape."""
+        return self._at(self.digits.pair(keys))
+
+    def crosses(self, prefixes: Array, digits: Array, suffixes: Array) -> Array:
+        """Entries (p, m, s) by the sums of keys that share no digit."""
+        pair = self.digits.pair
+        return self._at(pair(prefixes)[:, None, None] + pair(digits)[:, None] + pair(suffixes))
+
+    def _at(self, pairs: Array) -> Array:
         digits = self.digits
-        row, column = digits.pair(keys.ravel())
+        row, column = np.divmod(pairs.ravel(), digits.size)
         out = np.zeros(row.shape)
         (i, there), (j, also) = digits.within(row), digits.within(column)
         inside = slice(None) if digits.padded == digits.shape else np.flatnonzero(there & also)
@@ -64,7 +72,7 @@ class EntryMatrix:
         if self.order is not None:
             i, j = self.order[i], self.order[j]
         out[inside] = self.scale * (self.entries(i, j) - np.where(i == j, self.shift, 0.0))
-        return out.reshape(keys.shape)
+        return out.reshape(pairs.shape)
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Keys of pairs of points, near on all scales."""

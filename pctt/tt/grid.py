@@ -94,14 +94,14 @@ class GridDigits:
             out = out + self.row_key[a][row[a]] + self.column_key[a][column[a]]
         return out
 
-    def pair(self, keys: Array) -> tuple[Array, Array]:
-        """Rows and columns (padded) of keys: digits i_k m_k + j_k of base m_k^2."""
+    def pair(self, keys: Array) -> Array:
+        """Pairs row * size + column (padded) of keys, digits i_k m_k + j_k of base m_k^2: the pair of a sum of keys that
+        share no digit is the sum of their pairs."""
         pair = np.zeros(keys.shape, np.int64)
         for table, square in zip(self._pairs, self._square):
             digit, keys = np.divmod(keys, square)
             pair += table[digit]
-        row, column = np.divmod(pair, self.size)
-        return row, column
+        return pair
 
     def within(self, padded: Array) -> tuple[Array, Array]:
         """Rows of the matrix of padded rows, and which of them there are; the others' numbers mean nothing."""

@@ -30,6 +30,7 @@ LEAST_GROWTH, MOST_GROWTH = 4, 16  # of a rank in a pass
 IDLE = 0.8  # a sweep that leaves more than this of the residual is the last, or, if ranks can grow, drops too much
 ENOUGH = 0.5  # part of eps at which the residual, estimated on the way, is worth measuring
 DROP = 0.1  # of that residual: what a core may leave out of the inverse
+NOISE = 1e-7  # part of the residual that is taken for rounding
 SKETCH = 64  # rank of the random train with which a residual of high rank is estimated
 HIGH = 300  # product of ranks of S and X from which that is done
 
@@ -315,7 +316,7 @@ def _basis(
         R[:, mine] = s[:, None] * V
         parts.append((U, s, R))
     keep = _largest([s for _, s, _ in parts], most, drop)
-    Q = [U[:, :r] for (U, _, _), r in zip(parts, keep)]
+    Q = [_own_transposes(U[:, :r], sign, left, x.shape) for sign, (U, _, _), r in zip((1.0, -1.0), parts, keep)]
     R = [R[:r] for (_, _, R), r in zip(parts, keep)]
     room = min(most - sum(keep), max(LEAST_GROWTH, sum(keep)))
     if more is not None and room > 0:
@@ -324,12 +325,25 @@ def _basis(
             half = 0.5 * (more + sign * _transpose(more, left, np.ones(more.shape[3], x.dtype))).reshape(size, -1)
             half = half - known @ (known.T @ half)
             extra.append(np.linalg.svd(half, full_matrices=False)[:2])
+        floor = NOISE * float(np.linalg.norm(more))  # what is left of directions that are known has no sign
         new = _largest([s for _, s in extra], room, 0.1)
+        new = [min(n, int(np.count_nonzero(s > floor))) for n, (_, s) in zip(new, extra)]
         for part, (U, _) in enumerate(extra):
             U = U[:, : new[part]]
             Q[part] = np.hstack((Q[part], np.linalg.qr(U - Q[part] @ (Q[part].T @ U))[0]))
             R[part] = np.vstack((R[part], np.zeros((new[part], len(right)), x.dtype)))
     return np.hstack(Q), np.vstack(R), np.repeat(np.array([1, -1], x.dtype), [len(r) for r in R])
+
+
+def _own_transposes(U: Array, sign: float, left: Array, shape: tuple[int, ...]) -> Array:
+    """Orthonormal columns U that are their own transposes times a sign, those too that singular values near zero have
+    left to rounding."""
+    core = U.reshape(*shape[:3], -1)
+    half = 0.5 * (core + sign * _transpose(core, left, np.ones(U.shape[1], U.dtype))).reshape(U.shape)
+    if np.linalg.norm(half - U) <= NOISE * U.shape[1] ** 0.5:
+        return U
+    Q, R = np.linalg.qr(half)
+    return Q * np.where(np.diagonal(R) < 0, -1, 1).astype(U.dtype)
 
 
 def _largest(values: list[Array], most: int, drop: float) -> list[int]:

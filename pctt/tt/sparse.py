@@ -162,6 +162,10 @@ class SparseHierarchy:
             out[found] = self.values[place[found], s[found], t[found]]
         return self.reduce(out)
 
+    def crosses(self, prefixes: Array, digits: Array, suffixes: Array) -> Array:
+        """Entries (p, m, s) by the sums of keys."""
+        return self.lookup(prefixes[:, None, None] + digits[:, None] + suffixes)
+
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Scalar keys of `count` stored entries (none where there are none), the same on all ranks if `rng` is.
 
