@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import warnings
+import weakref
 from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import replace
 
 import numpy as np
 from mpi4py import MPI
@@ -43,6 +47,14 @@ class CompressedEntries:
         self.found: Cross = compress_cross(matrix, max_rank, eps, known, rng=np.random.default_rng(seed))
         self.symmetric = is_symmetric(self.entries, self.digits.rows)
 
+    def rounded(self, eps: float, max_rank: int) -> CompressedEntries:
+        """The same of lower rank and accuracy, without looking at an entry."""
+        coarse = copy(self)
+        train = self.train.round(eps, max_rank)
+        left = float((train - self.train).norm() / (self.train.norm() or 1.0))
+        coarse.found = replace(self.found, train=train, error=float(np.hypot(self.error, left)))
+        return coarse
+
     @property
     def train(self) -> Train:
         return self.found.train
@@ -75,6 +87,21 @@ class TensorTrain:
     def __init__(self, eps: float = 1e-8, max_rank: int = MAX_RANK) -> None:
         self.eps, self.max_rank = eps, max_rank
         self.compressed: CompressedEntries | None = None
+
+    def create(self, mat: PETSc.Mat) -> None:
+        mat.decRef()  # a reference that does not keep the Mat alive; `destroy` gives it back
+        self._mat: PETSc.Mat | None = mat
+        _living.add(self)
+
+    def destroy(self, mat: PETSc.Mat) -> None:
+        if self._mat is not None:
+            self._mat.incRef()
+            self._mat = None
+
+    def leave(self) -> None:
+        """Have the Mat go on without it, as an empty one."""
+        if self._mat is not None:
+            self._mat.setType(PETSc.Mat.Type.AIJ)
 
     def setUp(self, mat: PETSc.Mat) -> None:
         self.compressed = CompressedEntries(mat, self.eps, self.max_rank)
@@ -115,6 +142,12 @@ class TensorTrain:
             viewer.printfASCII(f"  tensor train: {self.compressed.words()}\n")
 
 
+def compressed(P: PETSc.Mat) -> CompressedEntries | None:
+    """What P multiplies with, if it is a Mat of this module."""
+    context = P.getPythonContext() if P.getType() == PETSc.Mat.Type.PYTHON else None
+    return context.compressed if isinstance(context, TensorTrain) else None
+
+
 def from_entries(
     entries: Callable[[Array, Array], Array],
     grid: Sequence[int],
@@ -148,3 +181,13 @@ def from_entries(
     mat.setAttr("grid", shape)
     mat.setUp()
     return mat
+
+
+_living: weakref.WeakSet[TensorTrain] = weakref.WeakSet()
+
+
+@atexit.register
+def _leave_mats() -> None:
+    """What PETSc destroys after Python's end must not be written in Python, as in `pctt.pc.base`."""
+    for living in list(_living):
+        living.leave()

@@ -7,7 +7,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.mat.product import TrainProduct
-from pctt.mat.tensor_train import CompressedEntries
+from pctt.mat.tensor_train import CompressedEntries, compressed
 from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
 from pctt.pc.train_options import Account, Options
 
@@ -33,9 +33,7 @@ class EntriesTrain:
         for eps in (self.options.eps, TIGHTER * self.options.eps):
             warm = self.compressed is not None and self.options.reuse != "none"
             with PETSc.Log.Event("TTCompress"):
-                name = f"-{self.prefix}pc_tt_order"
-                start = self.compressed if warm else None
-                self.compressed = CompressedEntries(P, eps, rank, self.options.order, name, start, self.options.seed)
+                self.compressed = self._compress(P, rank, eps, self.compressed if warm else None)
             if self.compressed.shift <= 0:
                 return self._refuse("the mean of the diagonal is not positive")
             self.account.reused += warm
@@ -46,6 +44,13 @@ class EntriesTrain:
                 self._product = self._prepare()
                 return True
         return self._refuse(f"the inverse of rank {rank} is not positive")
+
+    def _compress(self, P: PETSc.Mat, rank: int, eps: float, start: CompressedEntries | None) -> CompressedEntries:
+        known = compressed(P)
+        if known is not None and known.error <= eps and self.options.order in ("auto", known.order):
+            return known.rounded(0.5 * eps, rank)
+        name = f"-{self.prefix}pc_tt_order"
+        return CompressedEntries(P, eps, rank, self.options.order, name, start, self.options.seed)
 
     def _invert(self, rank: int, eps: float) -> tuple[ApproximateInverse, bool]:
         assert self.compressed is not None
