@@ -190,7 +190,7 @@ def _backward(
 def _dominant(C: Array, max_rank: int, eps: float) -> tuple[Array, Array]:
     """U (n, r) and rows with U[rows] = I that interpolate the dominant columns of C (n, m) well; r >= 1."""
     Q = low_rank(C, eps * float(np.linalg.norm(C)), max_rank)[0]
-    rows = linalg.qr(Q.T, mode="r", pivoting=True, check_finite=False)[1][: Q.shape[1]]
+    rows = linalg.qr(Q.T, mode="r", pivoting=True, check_finite=False)[1][: Q.shape[1]].astype(np.int64)
     for _ in range(100):  # towards maximal volume, one exchange of rows at a time
         U = linalg.solve(Q[rows].T, Q.T, check_finite=False).T
         worst = int(np.abs(U).argmax())
