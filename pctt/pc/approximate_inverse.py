@@ -11,16 +11,16 @@ import numpy as np
 
 from pctt.tt.als import Compression
 from pctt.tt.cross import Cross
-from pctt.tt.inverse import invert, invert_near_identity, lowest, residual
-from pctt.tt.root import inverse_root
-from pctt.tt.train import Train, identity
+from pctt.tt.inverse import invert, invert_near_identity
+from pctt.tt.lowest import lowest
+from pctt.tt.train import Train
 
 
 @dataclass(frozen=True)
 class ApproximateInverse:
-    """The trains of an inverse: X, or I + Z with ``identity``, or Z Z' with ``squared``.
+    """The train of an inverse: X, or Z with X = I + Z where ``identity``.
 
-    residual : of the inverse of the train of the matrix
+    residual : of the inverse of the train of the matrix, see `pctt.tt.Inverse`
     of : the compression that was inverted
     cap : of the ranks
     """
@@ -30,25 +30,20 @@ class ApproximateInverse:
     of: Compression | Cross
     cap: int
     identity: bool = False
-    squared: bool = False
 
 
-def invert_by_als(
-    of: Compression | Cross, cap: int, scaled: bool, start: Train | None, rng: np.random.Generator
+def approximate_inverse(
+    of: Compression | Cross,
+    cap: int,
+    eps: float,
+    near_identity: bool,
+    start: Train | None = None,
+    rng: np.random.Generator | None = None,
 ) -> tuple[ApproximateInverse, bool]:
-    """X or I + Z by alternating minimisation, from a start if there is one, and whether no direction was found in
-    which it is negative."""
-    if not scaled:
-        found = invert(of.train, cap, start, rng=rng)
+    """X or I + Z, from a start if there is one, and whether no direction was found in which it is negative."""
+    if not near_identity:
+        found = invert(of.train, cap, start, eps=eps, rng=rng)
         return ApproximateInverse(found.train, found.residual, of, cap), lowest(found.train) > 0
-    found = invert_near_identity(of.train, cap, start, rng=rng)
+    found = invert_near_identity(of.train, cap, start, eps=eps, rng=rng)
     assert found.correction is not None
-    inverse = ApproximateInverse(found.correction, found.residual, of, cap, identity=True)
-    return inverse, lowest(found.train) > 0
-
-
-def invert_by_root(of: Compression | Cross, cap: int, scaled: bool) -> tuple[ApproximateInverse, bool]:
-    """Z Z', Z near the inverse square root: always positive."""
-    S = identity(of.train.rows) + of.train if scaled else of.train
-    Z, _ = inverse_root(S, cap)
-    return ApproximateInverse(Z, residual(S, Z @ Z.T), of, cap, squared=True), True
+    return ApproximateInverse(found.correction, found.residual, of, cap, identity=True), lowest(found.train) > 0

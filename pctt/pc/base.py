@@ -61,14 +61,18 @@ class PythonPC:
         if rows != columns:
             raise ValueError(f"{self.name}: the matrix has {rows} rows and {columns} columns; allowed is a square one")
         handle = P.handle
-        if self.needs_entries or not is_shell(P):
+        if not self.takes(P) and (self.needs_entries or not is_shell(P)):
             P = self._as_sparse(P)
         self.P = P
-        structure = (handle, rows, 0 if is_shell(P) else P.getInfo()["nz_used"])
+        structure = (handle, rows, 0 if is_shell(P) or self.takes(P) else P.getInfo()["nz_used"])
         if structure != self._structure:
             self.build(pc, P)
             self._structure = structure
         self.update(pc, P)
+
+    def takes(self, P: PETSc.Mat) -> bool:
+        """Whether P is taken as it is, of whatever type."""
+        return False
 
     @property
     def name(self) -> str:
@@ -141,7 +145,7 @@ class PythonPC:
 
 
 #: What a user's Mat may bring, see docs/preconditioners.md.
-ATTRIBUTES = ("coordinates", "key", "contact_map", "barrier")
+ATTRIBUTES = ("coordinates", "grid", "key", "contact_map", "barrier")
 _living: weakref.WeakSet[PythonPC] = weakref.WeakSet()
 
 

@@ -22,11 +22,11 @@ def set_diagonal_blocks(P: PETSc.Mat, blocks: np.ndarray) -> None:
     P.setAttr("diagonal_blocks", blocks)
 
 
-def block_diagonal(P: PETSc.Mat) -> PETSc.Mat:
+def block_diagonal(P: PETSc.Mat, blocks: np.ndarray | None = None) -> PETSc.Mat:
     """A new Mat with the diagonal blocks of P, which is all that ``pbjacobi`` asks of it; the caller destroys it.
 
-    Of a P that does not say what they are, a copy of P."""
-    blocks = P.getAttr("diagonal_blocks")
+    Where they are not given, and P does not say what they are, a copy of P."""
+    blocks = P.getAttr("diagonal_blocks") if blocks is None else blocks
     if blocks is None:
         return P.duplicate(copy=True)
     first, last = (row // P.getBlockSize() for row in P.getOwnershipRange())

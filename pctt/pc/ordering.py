@@ -2,67 +2,67 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from petsc4py import PETSc
 
-_BITS = 21  # per axis: three of them fill a signed 64 bit integer
+from pctt.mat.order import grid_of
+from pctt.morton import morton_codes
+from pctt.tt.apply import group_modes
+from pctt.tt.grid import GridDigits
+
+ENDS = 16  # slots in the first and last mode of a grid, at most
 
 
-def block_order(P: PETSc.Mat) -> np.ndarray:
+def block_order(P: PETSc.Mat, order: str = "auto") -> np.ndarray:
     """Place of each local block row of P among this rank's (n,), a permutation of 0 ... n-1.
 
-    Along a Morton curve through the points that the Mat's attribute ``coordinates`` holds, an array (n, 3), (n, 2) or
-    (n, 1) with a row per local block row (``P.setAttr("coordinates", points)``); without points, by reverse
-    Cuthill-McKee of this rank's part.
+    morton : along a Morton curve through the points that the Mat's attribute ``coordinates`` holds, an array (n, 3),
+        (n, 2) or (n, 1) with a row per local block row (``P.setAttr("coordinates", points)``)
+    rcm : by reverse Cuthill-McKee of this rank's part
+    natural : as they are
+    auto : morton where there are points, else rcm
+
+    ValueError where there are no points for morton.
     """
     bs = P.getBlockSize()
     count = P.getLocalSize()[0] // bs
-    if count == 0:  # a rank without rows
-        return np.empty(0, np.int64)
-    points = P.getAttr("coordinates")
-    if points is not None:
+    points = P.getAttr("coordinates")  # on all ranks or on none
+    if order == "morton" and points is None:
+        raise ValueError("-pc_tt_order morton: the Mat has no coordinates; allowed without is auto, rcm or natural")
+    if order == "natural" or count == 0:
+        return np.arange(count)
+    if points is not None and order != "rcm":
         codes = morton_codes(np.asarray(points, dtype=float).reshape(count, -1))
-        order = np.argsort(codes, kind="stable")
+        rows = np.argsort(codes, kind="stable")
     else:
-        rows, _ = P.getDiagonalBlock().getOrdering(PETSc.Mat.OrderingType.RCM)
-        order = rows.getIndices().astype(np.int64)
-        if len(order) != count:  # scalar rows: a block goes where its first row goes
-            order = order[order % bs == 0] // bs
+        given, _ = P.getDiagonalBlock().getOrdering(PETSc.Mat.OrderingType.RCM)
+        rows = given.getIndices().astype(np.int64)
+        if len(rows) != count:  # scalar rows: a block goes where its first row goes
+            rows = rows[rows % bs == 0] // bs
     place = np.empty(count, np.int64)
-    place[order] = np.arange(count)
+    place[rows] = np.arange(count)
     return place
 
 
-@dataclass(frozen=True)
-class Frame:
-    """A cube that points are placed in before they are numbered."""
+def grid_slots(P: PETSc.Mat, order: str) -> tuple[np.ndarray, int, tuple[int, ...]] | None:
+    """Slot of each local block row among this rank's, their number, and the slot modes, in the order of a grid; None
+    where P has no grid, or none is asked for; collective.
 
-    low: np.ndarray
-    extent: float
-
-    @classmethod
-    def of(cls, points: np.ndarray) -> Frame:
-        """The bounding cube of points (n, d)."""
-        if len(points) == 0:
-            return cls(np.zeros(1), 1.0)
-        points = np.asarray(points, dtype=float).reshape(len(points), -1)
-        low = points.min(axis=0)
-        return cls(low, max(float((points.max(axis=0) - low).max()), float(np.finfo(float).tiny)))
-
-
-def morton_codes(points: np.ndarray, frame: Frame | None = None) -> np.ndarray:
-    """Interleaved bits of the coordinates (n, up to 3) on a grid over a cube, by default their bounding cube (n,).
-
-    >>> morton_codes(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])).argsort()
-    array([0, 1, 2, 3])
+    ValueError, on all ranks alike, for a grid that does not fit, and where one is asked for that is not there or whose
+    points are spread over the ranks in another order.
     """
-    codes = np.zeros(len(points), np.int64)
-    frame = Frame.of(points) if frame is None else frame
-    place = np.clip((points - frame.low) / frame.extent, 0.0, 1.0)
-    grid = (place * (2**_BITS - 1)).astype(np.int64)
-    for bit in range(_BITS):
-        for axis in range(grid.shape[1]):
-            codes |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return codes
+    if order not in ("auto", "grid") or (order == "auto" and P.getAttr("key") is not None):
+        return None
+    grid = grid_of(P)
+    if grid is None or grid[1] is not None:
+        if order == "auto":
+            return None
+        lacks = "grid (its shape), or a DMDA" if grid is None else "rows in the order of its grid"
+        raise ValueError(f"-pc_tt_order grid: the Mat has no {lacks}; allowed without is auto, morton, rcm or natural")
+    digits = GridDigits(grid[0])
+    first, last = (row // P.getBlockSize() for row in P.getOwnershipRange())
+    places = np.append(digits.places, digits.size)
+    start, end = (int(places[row]) if row else 0 for row in (first, last))
+    groups = np.cumsum([0, *group_modes(digits.modes, ENDS)])
+    modes = tuple(int(np.prod(digits.modes[a:b])) for a, b in zip(groups[:-1], groups[1:]))
+    return places[first:last] - start, end - start, modes

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from petsc4py import PETSc
+from collections.abc import Callable
 
-from pctt.pc.block_diagonal import block_diagonal
+from petsc4py import PETSc
 
 _Reason = PETSc.KSP.ConvergedReason
 #: Ends of a Krylov method that a preconditioner which is not positive definite brings about.
@@ -20,7 +20,9 @@ SPOILT = frozenset(
 )
 
 
-def solve_again(ksp: PETSc.KSP, P: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> bool:
+def solve_again(
+    ksp: PETSc.KSP, block_diagonal: Callable[[PETSc.Mat], PETSc.Mat], P: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec
+) -> bool:
     """Within ``postSolve`` of a preconditioner: where its KSP has broken down, solve by the same method with block
     Jacobi of P from zero, and give the KSP the outcome. Whether that was done."""
     if ksp.getConvergedReason() not in SPOILT:

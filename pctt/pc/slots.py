@@ -13,7 +13,8 @@ from collections.abc import Callable
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.pc.ordering import Frame, block_order, morton_codes
+from pctt.morton import Frame, morton_codes
+from pctt.pc.ordering import block_order, grid_slots
 
 SPARE = 0.06  # part of the slots that is empty at first
 NEAR = 1  # boxes by which a row may be off without being moved
@@ -21,8 +22,11 @@ REACH = 12  # boxes within which an empty slot is looked for
 FAR = 0.02  # part of the rows that may be put further away
 
 
-def capacity(P: PETSc.Mat, box: int) -> int:
-    """Slots that this rank's block rows get."""
+def capacity(P: PETSc.Mat, box: int, order: str = "auto") -> int:
+    """Slots that this rank's block rows get; collective, ValueError as of `grid_slots`."""
+    grid = grid_slots(P, order)
+    if grid is not None:
+        return grid[1]
     count = P.getLocalSize()[0] // P.getBlockSize()
     if P.getAttr("key") is None or P.getAttr("coordinates") is None:
         return count
@@ -36,25 +40,32 @@ class Slots:
     ----------
     place : (n,) slot of each block row of the present matrix
     capacity : slots of this rank
+    modes : slot modes of a grid, else none
     moved, entered, left : rows that got another slot, a first one, or were gone at the last `follow`
     """
 
-    def __init__(self, P: PETSc.Mat, box: int):
-        """Rows along the curve, evenly spread; ``box`` slots make a box."""
+    def __init__(self, P: PETSc.Mat, box: int, order: str = "auto"):
+        """Rows in the order of a grid, or evenly spread along the curve, where ``box`` slots make a box."""
         count = P.getLocalSize()[0] // P.getBlockSize()
         keys, points = P.getAttr("key"), P.getAttr("coordinates")
         self.box = box
-        self.evolving = keys is not None and points is not None
-        order = np.argsort(block_order(P), kind="stable")
-        self.capacity = capacity(P, box)
-        self.place = np.empty(count, np.int64)
-        self.place[order] = np.arange(count) * self.capacity // max(count, 1)
+        self.modes: tuple[int, ...] = ()
         self.moved = self.entered = self.left = 0
+        self.evolving = False
+        grid = grid_slots(P, order)
+        if grid is not None:
+            self.place, self.capacity, self.modes = grid
+            return
+        self.evolving = keys is not None and points is not None and order in ("auto", "morton")
+        rows = np.argsort(block_order(P, order), kind="stable")
+        self.capacity = capacity(P, box, order)
+        self.place = np.empty(count, np.int64)
+        self.place[rows] = np.arange(count) * self.capacity // max(count, 1)
         if self.evolving:
             self._frame = Frame.of(points)
-            codes = morton_codes(points, self._frame)[order]
+            codes = morton_codes(points, self._frame)[rows]
             boxes = np.arange(self.capacity // box) * box
-            first = np.searchsorted(self.place[order], boxes)  # the first row at or after each box's start
+            first = np.searchsorted(self.place[rows], boxes)  # the first row at or after each box's start
             self._starts = np.append(codes, np.iinfo(np.int64).max)[first]
             self._remember(keys)
 

@@ -205,7 +205,7 @@ class TwoLevel(PythonPC):
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """A solve that a train has spoilt is made again with block Jacobi; from now on there are Cholesky factors in
         its place."""
-        if self._by_train and solve_again(ksp, self.P, b, x):
+        if self._by_train and solve_again(ksp, block_diagonal, self.P, b, x):
             self._indefinite = True
             if self.coarse is not None:
                 self.coarse.destroy()

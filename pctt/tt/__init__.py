@@ -16,9 +16,11 @@ from __future__ import annotations
 from pctt.tt.als import Compression, compress, relative_error
 from pctt.tt.apply import Apply
 from pctt.tt.cross import Cross, compress_cross
-from pctt.tt.inverse import Inverse, invert, invert_near_identity, lowest, residual, symmetrise
+from pctt.tt.entries import EntryMatrix
+from pctt.tt.grid import GridDigits
+from pctt.tt.inverse import Inverse, invert, invert_near_identity, residual
+from pctt.tt.lowest import lowest
 from pctt.tt.quantise import binary_modes, check_modes, choose_modes, merge, scalar_modes, slots_of
-from pctt.tt.root import inverse_root
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Train, decompose, decompose_matrix, identity, matrix_train, random, zeros
 
@@ -26,6 +28,8 @@ __all__ = [
     "Apply",
     "Compression",
     "Cross",
+    "EntryMatrix",
+    "GridDigits",
     "Inverse",
     "SparseHierarchy",
     "Train",
@@ -37,7 +41,6 @@ __all__ = [
     "decompose",
     "decompose_matrix",
     "identity",
-    "inverse_root",
     "invert",
     "invert_near_identity",
     "lowest",
@@ -48,6 +51,5 @@ __all__ = [
     "residual",
     "scalar_modes",
     "slots_of",
-    "symmetrise",
     "zeros",
 ]

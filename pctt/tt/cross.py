@@ -24,6 +24,8 @@ from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Array, Train, low_rank, matrix_train, zeros
 
 SAMPLES = 1024  # stored entries, and as many others, on which a train is validated
+EXTRA = 32  # of the stored entries where the train is worst: what enriches the next sweep, at most
+TIGHTER = 0.5  # what the accuracy of the single cores is multiplied by where a sweep has missed eps
 WORTH = 0.9  # a sweep that leaves more than this of the error was idle
 
 
@@ -50,7 +52,7 @@ def compress_cross(
     eps: float = 1e-2,
     start: Cross | None = None,
     sweeps: int = 10,
-    measure: bool = True,
+    measure: bool | None = None,
     rng: np.random.Generator | None = None,
 ) -> Cross:
     """Train of ranks at most `max_rank` from entries of the matrix, within about eps if the rank allows.
@@ -58,7 +60,8 @@ def compress_cross(
     start : the result for a similar matrix, whose index sets are the first ones
     sweeps : the most; the estimated error ends them when it is below eps or falls by less than a tenth
         in two sweeps running
-    measure : measure the error at last, at a cost linear in the nonzeros; without, all is sublinear
+    measure : measure the error at last, at a cost linear in the nonzeros, by default that of a sparse matrix; without,
+        it is estimated from fresh samples, and all is sublinear
     rng : must give the same numbers on all ranks
 
     >>> i = np.arange(63)
@@ -72,24 +75,29 @@ def compress_cross(
     if entries.norm == 0:
         nothing = [np.zeros(1, np.int64)] * len(entries.width)
         return Cross(zeros(matrix.modes, matrix.modes, matrix.dtype), 0.0, 0, 0, nothing, nothing)
-    validation = np.concatenate((entries.stored(SAMPLES), entries.anywhere(SAMPLES)))
-    extra = entries.stored(max_rank)
+    validation = entries.validation()
+    most = min(max_rank, EXTRA)
+    extra = entries.stored(most)
     prefixes, suffixes = (start.prefixes, start.suffixes) if start else entries.split(extra)
     best: Cross | None = None
-    idle = 0
+    idle, inner = 0, eps
     for count in range(1, sweeps + 1):
-        suffixes = _backward(entries, prefixes, extra, max_rank, eps)
-        cores, prefixes = _forward(entries, suffixes, extra, max_rank, eps)
+        suffixes = _backward(entries, prefixes, extra, max_rank, inner)
+        cores, prefixes = _forward(entries, suffixes, extra, max_rank, inner)
         train = matrix.agree(matrix_train(cores, matrix.modes).round(0.3 * eps))
-        error = matrix.agree(entries.error(train, validation))
+        error = matrix.agree(entries.error(train, *validation))
         idle = 0 if best is None or error < WORTH * best.error else idle + 1
         if best is None or error < best.error:
             best = Cross(train, error, count, entries.evaluations, prefixes, suffixes)
         if error <= eps or idle == 2:
             break
-        extra = matrix.agree(entries.worst(train, max_rank))
+        inner *= TIGHTER
+        extra = matrix.agree(entries.worst(train, most))
     assert best is not None, "there is at least one sweep"
-    return replace(best, error=relative_error(matrix, best.train)) if measure else best
+    measured = isinstance(matrix, SparseHierarchy) if measure is None else measure
+    if measured:
+        return replace(best, error=relative_error(matrix, best.train))
+    return replace(best, error=matrix.agree(entries.error(best.train, *entries.validation())))
 
 
 class _Entries:
@@ -106,7 +114,6 @@ class _Entries:
         for square in self.squares[::-1]:
             self.width.insert(0, self.width[0] * square)
         self.norm = matrix.norm()
-        self.tiny = float(np.finfo(matrix.dtype).tiny)
         self.evaluations = 0
 
     def at(self, keys: Array) -> Array:
@@ -116,9 +123,9 @@ class _Entries:
 
     def block(self, k: int, prefixes: Array, suffixes: Array) -> Array:
         """Entries (prefixes, m_k^2, suffixes) around digit k."""
-        digits = np.arange(self.squares[k])
-        keys = prefixes[:, None, None] * self.width[k] + digits[:, None] * self.width[k + 1] + suffixes
-        return self.at(keys)
+        self.evaluations += len(prefixes) * self.squares[k] * len(suffixes)
+        digits = np.arange(self.squares[k]) * self.width[k + 1]
+        return self.matrix.crosses(prefixes * self.width[k], digits, suffixes)
 
     def split(self, keys: Array) -> tuple[list[Array], list[Array]]:
         """The distinct prefixes and suffixes of keys for every bond."""
@@ -128,21 +135,18 @@ class _Entries:
         """Keys of up to `count` stored entries, in random rows."""
         return self.matrix.sample(count, self.rng)
 
-    def anywhere(self, count: int) -> Array:
-        """Keys of `count` random entries."""
-        return self.rng.integers(0, self.width[0], count)
+    def validation(self) -> tuple[Array, Array]:
+        """Fresh keys, and weights with which a sum of squares over them estimates that over all entries."""
+        return self.matrix.validation(SAMPLES, self.rng)
 
     def of_train(self, train: Train, keys: Array) -> Array:
         digits = np.stack([keys // w % square for w, square in zip(self.width[1:], self.squares)])
         return train.at(digits)
 
-    def error(self, train: Train, keys: Array) -> float:
-        """Estimate of the relative error from stored entries and SAMPLES random ones after them."""
-        values = self.at(keys)
-        square = (values - self.of_train(train, keys)) ** 2
-        stored = float(square[:-SAMPLES].sum()) / max(float((values[:-SAMPLES] ** 2).sum()), self.tiny)
-        others = float(square[-SAMPLES:].mean()) * self.width[0] / self.norm**2
-        return float((stored + others) ** 0.5)
+    def error(self, train: Train, keys: Array, weights: Array) -> float:
+        """Estimate of the relative error."""
+        square = (self.at(keys) - self.of_train(train, keys)) ** 2
+        return float(weights @ square) ** 0.5 / self.norm
 
     def worst(self, train: Train, count: int) -> Array:
         """Keys of the stored entries, out of a sample, where the train is worst."""
@@ -186,7 +190,7 @@ def _backward(
 def _dominant(C: Array, max_rank: int, eps: float) -> tuple[Array, Array]:
     """U (n, r) and rows with U[rows] = I that interpolate the dominant columns of C (n, m) well; r >= 1."""
     Q = low_rank(C, eps * float(np.linalg.norm(C)), max_rank)[0]
-    rows = linalg.qr(Q.T, mode="r", pivoting=True, check_finite=False)[1][: Q.shape[1]]
+    rows = linalg.qr(Q.T, mode="r", pivoting=True, check_finite=False)[1][: Q.shape[1]].astype(np.int64)
     for _ in range(100):  # towards maximal volume, one exchange of rows at a time
         U = linalg.solve(Q[rows].T, Q.T, check_finite=False).T
         worst = int(np.abs(U).argmax())

@@ -8,27 +8,31 @@ cores the best core solves
 
 with the same symmetric positive definite M for all columns: one Cholesky factorisation, or, where that costs
 more, conjugate gradients that never form M. The condition of S is not squared, as it is where ||S X - B|| is
-minimised. (Alternating energy minimisation: Oseledets & Dolgov,
-SIAM J. Sci. Comput. 34, 2012; Dolgov & Savostyanov, ibid. 36, 2014.)
+minimised. (Alternating energy minimisation: Oseledets & Dolgov, SIAM J. Sci. Comput. 34, 2012.)
+
+The ranks grow on the way: every core gets, beside its own columns, those of the residual B - S X, seen through the
+interfaces of a train Z near it that is renewed with every core (AMEn: Dolgov & Savostyanov, ibid. 36, 2014). Each pass
+over the cores doubles the ranks, until the residual is small enough or the cap is reached.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
-from pctt.tt.apply import Apply
-from pctt.tt.train import Array, Train, identity, random
+from pctt.tt.projection import Projection, columns, rows
+from pctt.tt.train import Array, Train, full_ranks, identity, random
 
-SMALL = 1e-3  # of the norm of a start: the random directions that fill up its ranks
-LARGEST = 12_000  # unknowns of a local system that is factorised: 1.2 GB
-LOCAL_TOL, LOCAL_ITS = 1e-2, 30  # of conjugate gradients on a local system
-EXPECTED_ITS = 10  # of them
-HIGH = 1000  # product of ranks of S and X from which a residual is estimated
-PROBES = 16  # random vectors for that
+LOCAL_GAIN, LOCAL_ITS = 0.1, 20  # what conjugate gradients leave of the residual of a local system, and their most
+LOCAL_EPS = 0.1  # of the residual that is asked for: all that a local system needs
+LEAST_GROWTH, MOST_GROWTH = 4, 16  # of a rank in a pass
+IDLE = 0.8  # a sweep that leaves more than this of the residual is the last, or, if ranks can grow, drops too much
+ENOUGH = 0.5  # part of eps at which the residual, estimated on the way, is worth measuring
+DROP = 0.1  # of that residual: what a core may leave out of the inverse
+NOISE = 1e-7  # part of the residual that is taken for rounding
+SKETCH = 64  # rank of the random train with which a residual of high rank is estimated
+HIGH = 300  # product of ranks of S and X from which that is done
 
 
 @dataclass(frozen=True)
@@ -36,15 +40,15 @@ class Inverse:
     """A train X of the inverse of S, symmetric up to rounding.
 
     correction : Z = X - I where that is what was computed (`invert_near_identity`)
-    residual : ||I - S X||_F / ||I||_F, or NaN where it was not asked for
-    energy : (tr(X' S X) / 2 - tr(X' B)) / n after every sweep
+    residual : ||I - S X||_F / ||I||_F, with a correction ||I - S X||_F / ||S - I||_F; NaN where it was not asked for
+    sweeps : there and back over the cores
     repaired : local systems that were not positive definite (S was not, or nearly) and had modes left out
     """
 
     train: Train
     correction: Train | None
     residual: float
-    energy: tuple[float, ...]
+    sweeps: int
     repaired: int
 
 
@@ -59,21 +63,21 @@ def invert(
 ) -> Inverse:
     """Inverse of a symmetric positive definite S with ranks at most `max_rank`.
 
-    start : a train near the inverse, by default the identity; its ranks are filled up with small random
-        directions
-    sweeps : there and back over the cores, at most; by default 2 from scratch, 1 from a start
-    eps : a sweep that lowers the energy by less than eps times its value is the last
+    start : a train near the inverse, by default a multiple of the identity
+    sweeps : there and back over the cores, at most; by default 1 from a start, else as many as the ranks need to reach
+        the cap, and two more
+    eps : the residual at which the ranks need not grow
     measure : compute the residual
 
     >>> from pctt.tt.train import decompose_matrix
     >>> A = 3 * np.eye(64) - np.diag(np.ones(63), 1) - np.diag(np.ones(63), -1)
-    >>> X = invert(decompose_matrix(A, [4, 4, 4]), max_rank=8, sweeps=4)
-    >>> X.train.ranks, X.residual < 1e-5
+    >>> X = invert(decompose_matrix(A, [4, 4, 4]), max_rank=8, eps=1e-6)
+    >>> X.train.ranks, X.residual < 1e-6
     ((1, 5, 5, 1), True)
     """
     unit = identity(S.rows, S.dtype)
-    X, energy, repaired = _solve(S, unit, unit if start is None else start, max_rank, start is None, sweeps, eps, rng)
-    return Inverse(X, None, residual(S, X) if measure else np.nan, energy, repaired)
+    X, left, count, repaired = _solve(S, unit, start, max_rank, sweeps, eps, measure, rng)
+    return Inverse(X, None, left, count, repaired)
 
 
 def invert_near_identity(
@@ -91,242 +95,263 @@ def invert_near_identity(
     Z is cheaper to apply than X: `Apply(Z)` and one addition.
     """
     unit = identity(T.rows, T.dtype)
-    if max_rank <= 1:
-        return Inverse(unit, 0 * unit, residual(unit + T, unit) if measure else np.nan, (), 0)
-    guess = -T if start is None else start
-    Z, energy, repaired = _solve(unit + T, -T, guess, max_rank - 1, start is None, sweeps, eps, rng)
-    X = unit + Z
-    return Inverse(X, Z, residual(unit + T, X) if measure else np.nan, energy, repaired)
+    if max_rank <= 1 or T.norm() == 0:
+        return Inverse(unit, 0 * unit, float(max_rank <= 1) if T.norm() else 0.0, 0, 0)
+    Z, left, count, repaired = _solve(unit + T, -T, start, max_rank - 1, sweeps, eps, measure, rng)
+    return Inverse(unit + Z, Z, left, count, repaired)
 
 
-def symmetrise(X: Train, max_rank: int | None = None, eps: float = 1e-12) -> Train:
-    """(X + X') / 2, rounded."""
-    return (0.5 * (X + X.T)).round(eps, max_rank)
-
-
-def residual(S: Train, X: Train) -> float:
-    """||I - S X||_F / ||I||_F, in train arithmetic: of the cost of a product of both ranks. Where that is high, the
-    root mean square of ||v - S X v|| / ||v|| over random signs v."""
-    size = S.shape[0]
+def residual(S: Train, X: Train, B: Train | None = None) -> float:
+    """||B - S X||_F / ||B||_F, B the identity by default, in train arithmetic: of the cost of a product of both ranks.
+    Where that is high, an estimate from products with random trains, off by a third or so."""
+    B = identity(S.rows, S.dtype) if B is None else B
     if max(S.ranks) * max(X.ranks) > HIGH:
-        V = np.random.default_rng(0).choice([-1.0, 1.0], (PROBES, size))
-        apply_S, apply_X = Apply(S), Apply(X)
-        rest = [v - apply_S(apply_X(v)) for v in V]
-        return float(np.linalg.norm(rest) / (PROBES * size) ** 0.5)
+        return _sketched(S, X, B) / B.norm()
     SX = S @ X
-    square = 1 - 2 * SX.trace() / size + SX.inner(SX) / size
+    scale = B.norm() ** 2
+    square = 1 - 2 * SX.inner(B) / scale + SX.inner(SX) / scale
     if square > 1e4 * float(np.finfo(SX.dtype).eps):
         return float(square**0.5)
-    return (identity(S.rows, S.dtype) - SX).norm() / size**0.5  # what rounding left of the difference of squares
+    return float((B - SX).norm() / scale**0.5)  # what rounding left of the difference of squares
 
 
-def lowest(X: Train, rank: int = 2, sweeps: int = 2, rng: np.random.Generator | None = None) -> float:
-    """An upper bound of the least eigenvalue of a symmetric X: the least v'Xv / v'v that an alternating search over
-    trains v of the given rank finds. A negative value proves that X is not positive definite.
-
-    >>> round(lowest(identity([4, 4, 4])), 12)
-    1.0
-    """
-    rng = np.random.default_rng(0) if rng is None else rng
-    environment = Environment(X, random(X.rows, rank, [1] * len(X), rng, X.dtype))
-    value = np.inf
-
-    def solve(k: int) -> Array:
-        nonlocal value
-        w, v = linalg.eigh(environment.projected(k), subset_by_index=[0, 0], check_finite=False)
-        value = float(w[0])
-        return v.reshape(environment.x[k].shape)
-
-    for _ in range(sweeps):
-        environment.sweep(solve)
-    return value
+def _sketched(S: Train, X: Train, B: Train) -> float:
+    """Estimate of ||B - S X||_F: the root mean square of inner products with random trains that share all cores but
+    the last (Feldman et al., "Tensor train sketching", have the variance)."""
+    rng = np.random.default_rng(0)
+    sketch = Projection(S, B, len(X))
+    sketch.left[0] = np.ones((1, 1, 1))
+    for k, x in enumerate(X.cores):
+        width = len(sketch.left[k])
+        y = rng.standard_normal((width, *x.shape[1:3], SKETCH)) / width**0.5
+        sketch.step_right(k, y, x)
+    d = len(X)
+    products = sketch.left_B[d][:, 0] - sketch.left[d][:, 0, 0]
+    return float(np.linalg.norm(products) / SKETCH**0.5)
 
 
-class Environment:
-    """A train x of orthonormal interfaces around the core at hand, with S and B projected on them from both sides.
+class Growing:
+    """The symmetric train x of the inverse while its cores are solved for one by one, and a train z near its residual.
 
-    S : matrix train, cores (R, m, m, R')
-    x : matrix train whose column modes are spectators, cores (a, m, n, b)
-    B : matrix train like x, or None
-    left[k], right[k] : x' S x contracted over the cores before and after k, (a, R, a) and (b, R', b)
-    left_B[k], right_B[k] : the same of x' B, (a, R) and (b, R')
+    Both are symmetric by structure: a basis vector of a bond is a matrix that is its own transpose, or minus that, by
+    the bond's signs; a core (a, i, j, b) then is its transpose in i and j times the signs of a and b.
+
+    estimate : of ||B - S x||, what z has seen of it in the last pass
     """
 
-    def __init__(self, S: Train, x: Train, B: Train | None = None) -> None:
-        self.S = S.cores
-        self.B = None if B is None else B.cores
-        self.x = list(x.right_orthogonal().cores)
-        d = len(self.x)
-        self.left = [np.ones((1, 1, 1), S.dtype)] * d
-        self.right = list(self.left)
-        self.left_B = [np.ones((1, 1), S.dtype)] * d
-        self.right_B = list(self.left_B)
-        for k in range(d - 1, 0, -1):
-            self._pass_left(k)
+    def __init__(self, S: Train, B: Train, x: Train, most: list[int], eps: float, rng: np.random.Generator) -> None:
+        self.most, self.goal = most, LOCAL_EPS * eps
+        width = min(MOST_GROWTH, max(most, default=1))
+        self.x, self.signs = _with_signs(x, most)
+        self.z = list(random(S.rows, width, S.columns, rng, S.dtype).right_orthogonal().cores)
+        self.galerkin = Projection.around(S, B, self.x, self.x)
+        self.residual = Projection.around(S, B, self.z, self.x)
+        self.drop = DROP * eps / len(x) ** 0.5
+        self.repaired = 0
+        self.estimate = 0.0
 
-    def projected(self, k: int) -> Array:
-        """M = P' S P (a m b, a m b), symmetric, with P the interfaces around core k."""
-        S, left, right = self.S[k], self.left[k], self.right[k]
-        T = np.tensordot(np.tensordot(left, S, (1, 0)), right, (4, 1))  # (a, a', i, i', b, b')
-        n = left.shape[0] * S.shape[1] * right.shape[0]
-        M = T.transpose(0, 2, 4, 1, 3, 5).reshape(n, n)
-        return 0.5 * (M + M.T)
+    def forward(self) -> None:
+        x, z = self.x, self.z
+        for k in range(len(x) - 1):
+            self._solve(k)
+            new = self.galerkin.rest_left(self.residual, k, x[k])  # (a, m, n, z)
+            z[k] = self.residual.rest(k, x[k])
+            _push_right(x, self.signs, k, self.most[k], self.drop, new)
+            z[k] = columns(z[k])
+            self.galerkin.step_right(k, x[k], x[k])
+            self.residual.step_right(k, z[k], x[k])
 
-    def times(self, k: int, x: Array) -> Array:
-        """(M + M') x / 2 for x (a, m, n, b), M = P' S P, without M."""
-        S, left, right = self.S[k], self.left[k], self.right[k]
-        one = _local_product(left, S, right, x)
-        other = _local_product(left.transpose(2, 1, 0), S.transpose(0, 2, 1, 3), right.transpose(2, 1, 0), x)
-        return 0.5 * (one + other)
+    def backward(self) -> None:
+        x, z = self.x, self.z
+        for k in range(len(x) - 1, 0, -1):
+            self._solve(k)
+            new = self.galerkin.rest_right(self.residual, k, x[k])  # (z, m, n, b)
+            z[k] = self.residual.rest(k, x[k])
+            _push_left(x, self.signs, k, self.most[k - 1], self.drop, new)
+            z[k] = rows(z[k])
+            self.galerkin.step_left(k, x[k], x[k])
+            self.residual.step_left(k, z[k], x[k])
+        self._solve(0)
+        z[0] = self.residual.rest(0, x[0])
+        self.estimate = float(np.linalg.norm(z[0]))
 
-    def diagonal(self, k: int) -> Array:
-        """Diagonal of M, (a, m, 1, b)."""
-        left = np.diagonal(self.left[k], axis1=0, axis2=2)  # (R, a)
-        middle = np.diagonal(self.S[k], axis1=1, axis2=2)  # (R, R', m)
-        right = np.diagonal(self.right[k], axis1=0, axis2=2)  # (R', b)
-        T = np.tensordot(np.tensordot(left, middle, (0, 0)), right, (1, 0))  # (a, m, b)
-        return T[:, :, None, :]
+    def _solve(self, k: int) -> None:
+        """The symmetric core of least energy, nearly, by conjugate gradients from the one that is there, scaled by the
+        diagonal, until LOCAL_GAIN of the first residual or `goal` times the right side is left."""
+        signs = self.signs[k : k + 2]
 
-    def right_side(self, k: int) -> Array:
-        """P' B (a m b, n): a column for every index of the spectator."""
-        assert self.B is not None
-        T = np.tensordot(np.tensordot(self.left_B[k], self.B[k], 1), self.right_B[k], (3, 1))  # (a, i, j, b)
-        return T.transpose(0, 1, 3, 2).reshape(-1, T.shape[2])
+        def symmetric(y: Array) -> Array:
+            return 0.5 * (y + _transpose(y, *signs))
 
-    def sweep(self, solve: Callable[[int], Array]) -> None:
-        """Replaces core after core by `solve(k)`, from the first to the last and back; the last only once."""
-        d = len(self.x)
-        for k in range(d - 1):
-            self.x[k] = solve(k)
-            a, m, n, b = self.x[k].shape
-            Q, R = np.linalg.qr(self.x[k].reshape(-1, b))
-            self.x[k] = Q.reshape(a, m, n, -1)
-            self.x[k + 1] = np.tensordot(R, self.x[k + 1], 1)
-            self._pass_right(k)
-        for k in range(d - 1, 0, -1):
-            self.x[k] = solve(k)
-            a, m, n, b = self.x[k].shape
-            Q, R = np.linalg.qr(self.x[k].reshape(a, -1).T)
-            self.x[k] = Q.T.reshape(-1, m, n, b)
-            self.x[k - 1] = np.tensordot(self.x[k - 1], R.T, 1)
-            self._pass_left(k)
-        self.x[0] = solve(0)
-
-    def _pass_right(self, k: int) -> None:
-        x = self.x[k]
-        T = np.tensordot(self.left[k], x, (2, 0))  # (a, R, i', j, b')
-        T = np.tensordot(self.S[k], T, ((0, 2), (1, 2)))  # (i, R', a, j, b')
-        self.left[k + 1] = np.tensordot(x, T, ((0, 1, 2), (2, 0, 3)))  # (b, R', b')
-        if self.B is not None:
-            self.left_B[k + 1] = np.tensordot(x, np.tensordot(self.left_B[k], self.B[k], 1), ((0, 1, 2), (0, 1, 2)))
-
-    def _pass_left(self, k: int) -> None:
-        x = self.x[k]
-        T = np.tensordot(x, self.right[k], (3, 2))  # (a', i', j, b, R')
-        T = np.tensordot(self.S[k], T, ((2, 3), (1, 4)))  # (R, i, a', j, b)
-        self.right[k - 1] = np.tensordot(x, T, ((1, 2, 3), (1, 3, 4)))  # (a, R, a')
-        if self.B is not None:
-            T = np.tensordot(self.B[k], self.right_B[k], (3, 1))  # (R, i, j, b)
-            self.right_B[k - 1] = np.tensordot(x, T, ((1, 2, 3), (1, 2, 3)))
+        galerkin, y = self.galerkin, self.x[k]
+        weight = galerkin.diagonal(k)
+        weight = weight + weight.transpose(0, 2, 1, 3)
+        if weight.min() <= 0:
+            weight = np.ones_like(weight)
+        f = symmetric(galerkin.right_side(k))
+        r = f - symmetric(galerkin.times(k, y))
+        z = r / weight
+        p, rz = z, float(np.vdot(r, z))
+        enough = max(LOCAL_GAIN * float(np.linalg.norm(r)), self.goal * float(np.linalg.norm(f)))
+        for _ in range(LOCAL_ITS):
+            if np.linalg.norm(r) <= enough:
+                break
+            q = symmetric(galerkin.times(k, p))
+            curvature = float(np.vdot(p, q))
+            if curvature <= 0:
+                self.repaired += 1
+                break
+            y = y + rz / curvature * p
+            r -= rz / curvature * q
+            z = r / weight
+            rz, last = float(np.vdot(r, z)), rz
+            p = z + rz / last * p
+        self.x[k] = y
 
 
 def _solve(
     S: Train,
     B: Train,
-    start: Train,
+    start: Train | None,
     max_rank: int,
-    cold: bool,
     sweeps: int | None,
     eps: float,
+    measure: bool,
     rng: np.random.Generator | None,
-) -> tuple[Train, tuple[float, ...], int]:
-    """The symmetric solution of S X = B, the energy per unknown after every sweep, the local systems repaired."""
+) -> tuple[Train, float, int, int]:
+    """The symmetric solution of S X = B, its relative residual, the sweeps made, the local systems repaired."""
     if S.rows != S.columns:
         raise ValueError("only a square matrix has an inverse")
     rng = np.random.default_rng(0) if rng is None else rng
-    environment = Environment(S, _fill(start.astype(S.dtype), max_rank, rng), B)
-    energy: list[float] = []
-    local, repaired = 0.0, 0
+    most = [min(max_rank, r) for r in full_ranks([m * m for m in S.rows])]
+    if sweeps is None:
+        sweeps = 1 if start is not None else 2 + int(np.ceil(0.5 * np.log2(max(1.0, max(most, default=1)))))
+    first = B if start is None else start.astype(S.dtype)
+    growing = Growing(S, B, first.round(0.0, max_rank), most, eps, rng)
+    norm, count, before, enough = B.norm(), 0, np.inf, ENOUGH * eps
+    while count < sweeps:
+        growing.forward()
+        growing.backward()
+        count += 1
+        if growing.estimate <= enough * norm:
+            X = Train(growing.x)
+            left = residual(S, X, B) if measure else eps
+            if left <= eps:
+                return *(_rounded(S, B, X, left, eps) if measure else (X, np.nan)), count, growing.repaired
+            enough *= 0.5 * eps / left  # it sees a part of the residual
+        if growing.estimate > IDLE * before:
+            if all(x.shape[3] >= r for x, r in zip(growing.x, most)):
+                break
+            growing.drop *= 0.3
+        before = growing.estimate
+    X = Train(growing.x)
+    return X, residual(S, X, B) if measure else np.nan, count, growing.repaired
 
-    def solve(k: int) -> Array:
-        nonlocal local, repaired
-        a, m, n, b = environment.x[k].shape
-        f = environment.right_side(k)
-        if _large(a, m, n, b, *S.cores[k].shape[::3]):
-            f = f.reshape(a, m, b, n).transpose(0, 1, 3, 2)
-            y, whole = _conjugate_gradients(environment, k, f)
-        else:
-            y, whole = _solve_positive(environment.projected(k), f)
-        repaired += not whole
-        local = -0.5 * float(np.vdot(f, y)) / S.shape[0]
-        return y if y.ndim == 4 else y.reshape(a, m, b, n).transpose(0, 1, 3, 2)
 
-    for _ in range((2 if cold else 1) if sweeps is None else sweeps):
-        environment.sweep(solve)
-        energy.append(local)
-        if len(energy) > 1 and abs(energy[-1] - energy[-2]) <= eps * abs(energy[-1]):
+def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Train, float]:
+    """X of the least ranks that a few trials find to leave the residual below eps, and the residual."""
+    for part in (1.0, 0.3, 0.1, 0.03):
+        smaller = X.round(part * eps)
+        if smaller.ranks == X.ranks:
             break
-    return symmetrise(Train(environment.x), max_rank), tuple(energy), repaired
+        found = residual(S, smaller, B)
+        if found <= eps:
+            return smaller, found
+    return X, left
 
 
-def _solve_positive(M: Array, f: Array) -> tuple[Array, bool]:
-    """Solution of M y = f for a symmetric M; where M is not positive definite, in its clearly positive modes."""
-    try:
-        factor = linalg.cho_factor(M, lower=True, check_finite=False)
-        return linalg.cho_solve(factor, f, check_finite=False), True
-    except linalg.LinAlgError:
-        w, V = linalg.eigh(M, check_finite=False)
-        w = np.where(w > 1e-3 * w[-1], w, np.inf)
-        return V @ ((V.T @ f) / w[:, None]), False
+def _transpose(x: Array, left: Array, right: Array) -> Array:
+    """The core of the transposed train, for interfaces of these signs."""
+    return x.transpose(0, 2, 1, 3) * np.multiply.outer(left, right)[:, None, None, :]
 
 
-def _large(a: int, m: int, n: int, b: int, R: int, R_next: int) -> bool:
-    """Whether a local system costs more operations to form, factorise and solve than to iterate on."""
-    size = a * m * b
-    forming = 2 * a * a * m * m * R_next * (R + b * b)
-    iteration = 4 * n * (a * m * b * (a * R + b * R_next) + a * b * m * m * R * R_next)
-    return size > LARGEST or EXPECTED_ITS * iteration < forming + size**3 / 3 + 2 * size * size * n
+def _with_signs(X: Train, most: list[int]) -> tuple[list[Array], list[Array]]:
+    """(X + X') / 2 with orthonormal right interfaces, of ranks at most `most`, and the signs of all bonds."""
+    x = list(X.left_orthogonal().cores)
+    signs = [np.ones(1, X.dtype)] * (len(x) + 1)
+    for k in range(len(x) - 1, 0, -1):
+        signs[k] = np.zeros(len(x[k]), X.dtype)  # neither
+        _push_left(x, signs, k, most[k - 1], 0.0)
+    x[0] = 0.5 * (x[0] + _transpose(x[0], signs[0], signs[1]))
+    return x, signs
 
 
-def _conjugate_gradients(environment: Environment, k: int, f: Array) -> tuple[Array, bool]:
-    """Solution of M y = f (a, m, n, b) to LOCAL_TOL, all columns as one system, from the core that is there, scaled by
-    the diagonal; False, and y as far as it got, where M is not positive definite."""
-    weight = environment.diagonal(k)
-    if weight.min() <= 0:
-        weight = np.ones_like(weight)
-    y = environment.x[k].copy()
-    r = f - environment.times(k, y)
-    z = r / weight
-    p, rz = z, float(np.vdot(r, z))
-    goal = LOCAL_TOL * float(np.linalg.norm(f))
-    for _ in range(LOCAL_ITS):
-        if np.linalg.norm(r) <= goal:
-            break
-        q = environment.times(k, p)
-        curvature = float(np.vdot(p, q))
-        if curvature <= 0:
-            return y, False
-        y += rz / curvature * p
-        r -= rz / curvature * q
-        z = r / weight
-        rz, last = float(np.vdot(r, z)), rz
-        p = z + rz / last * p
-    return y, True
+def _push_right(
+    x: list[Array], signs: list[Array], k: int, most: int, drop: float, more: Array | None = None
+) -> None:
+    """Core k with at most so many orthonormal columns, seen as (a m n, b), and room for more; the rest goes to the
+    next core."""
+    a, m, n, b = x[k].shape
+    Q, R, new = _basis(x[k], signs[k], signs[k + 1], most, drop, more)
+    x[k] = Q.reshape(a, m, n, -1)
+    x[k + 1] = np.tensordot(R, x[k + 1], 1)
+    signs[k + 1] = new
 
 
-def _local_product(left: Array, S: Array, right: Array, x: Array) -> Array:
-    """left (a, R, a'), S (R, i, j, R'), right (b, R', b') on x (a', j, n, b')."""
-    T = np.tensordot(left, x, 1)  # (a, R, j, n, b')
-    T = np.tensordot(T, S, ((1, 2), (0, 2)))  # (a, n, b', i, R')
-    return np.tensordot(T, right, ((2, 4), (2, 1))).transpose(0, 2, 1, 3)  # (a, i, n, b)
+def _push_left(
+    x: list[Array], signs: list[Array], k: int, most: int, drop: float, more: Array | None = None
+) -> None:
+    """Core k with at most so many orthonormal rows, seen as (a, m n b), and room for more; the rest goes to the core
+    before."""
+    a, m, n, b = x[k].shape
+    turned = None if more is None else more.transpose(3, 1, 2, 0)
+    Q, R, new = _basis(x[k].transpose(3, 1, 2, 0), signs[k + 1], signs[k], most, drop, turned)
+    x[k] = np.ascontiguousarray(Q.reshape(b, m, n, -1).transpose(3, 1, 2, 0))
+    x[k - 1] = np.tensordot(x[k - 1], R, (3, 1))
+    signs[k] = new
 
 
-def _fill(X: Train, max_rank: int, rng: np.random.Generator) -> Train:
-    """X rounded to `max_rank`, lower ranks filled up by small random directions."""
-    X = X.round(0.0, max_rank) if max(X.ranks) > max_rank else X
-    missing = [max_rank - r for r in X.ranks[1:-1]]
-    if not any(missing):
-        return X
-    small = random(X.rows, [max(1, r) for r in missing], X.columns, rng, X.dtype)
-    scale = SMALL * (X.norm() or 1.0) / max(small.norm(), float(np.finfo(X.dtype).tiny))
-    return X + small * scale
+def _basis(
+    x: Array, left: Array, right: Array, most: int, drop: float, more: Array | None
+) -> tuple[Array, Array, Array]:
+    """Orthonormal columns Q for a core x (a, m, n, b) = Q R with bonds of these signs, at most `most`, up to `room` for
+    the residual `more` (a, m, n, c) beside them; and the signs of the columns."""
+    size = len(x) * x.shape[1] * x.shape[2]
+    parts = []
+    for sign in (1.0, -1.0):
+        half = x if right.any() else 0.5 * (x + sign * _transpose(x, left, np.ones(x.shape[3], x.dtype)))
+        mine = np.flatnonzero(right != -sign)
+        U, s, V = np.linalg.svd(half[..., mine].reshape(size, -1), full_matrices=False)
+        R = np.zeros((len(s), len(right)), x.dtype)
+        R[:, mine] = s[:, None] * V
+        parts.append((U, s, R))
+    keep = _largest([s for _, s, _ in parts], most, drop)
+    Q = [_own_transposes(U[:, :r], sign, left, x.shape) for sign, (U, _, _), r in zip((1.0, -1.0), parts, keep)]
+    R = [R[:r] for (_, _, R), r in zip(parts, keep)]
+    room = min(most - sum(keep), max(LEAST_GROWTH, sum(keep)))
+    if more is not None and room > 0:
+        extra = []
+        for sign, known in zip((1.0, -1.0), Q):
+            half = 0.5 * (more + sign * _transpose(more, left, np.ones(more.shape[3], x.dtype))).reshape(size, -1)
+            half = half - known @ (known.T @ half)
+            extra.append(np.linalg.svd(half, full_matrices=False)[:2])
+        floor = NOISE * float(np.linalg.norm(more))  # what is left of directions that are known has no sign
+        new = _largest([s for _, s in extra], room, 0.1)
+        new = [min(n, int(np.count_nonzero(s > floor))) for n, (_, s) in zip(new, extra)]
+        for part, (U, _) in enumerate(extra):
+            U = U[:, : new[part]]
+            Q[part] = np.hstack((Q[part], np.linalg.qr(U - Q[part] @ (Q[part].T @ U))[0]))
+            R[part] = np.vstack((R[part], np.zeros((new[part], len(right)), x.dtype)))
+    return np.hstack(Q), np.vstack(R), np.repeat(np.array([1, -1], x.dtype), [len(r) for r in R])
+
+
+def _own_transposes(U: Array, sign: float, left: Array, shape: tuple[int, ...]) -> Array:
+    """Orthonormal columns U that are their own transposes times a sign, those too that singular values near zero have
+    left to rounding."""
+    core = U.reshape(*shape[:3], -1)
+    half = 0.5 * (core + sign * _transpose(core, left, np.ones(U.shape[1], U.dtype))).reshape(U.shape)
+    if np.linalg.norm(half - U) <= NOISE * U.shape[1] ** 0.5:
+        return U
+    Q, R = np.linalg.qr(half)
+    return Q * np.where(np.diagonal(R) < 0, -1, 1).astype(U.dtype)
+
+
+def _largest(values: list[Array], most: int, drop: float) -> list[int]:
+    """How many of each of two descending lists are kept: at most so many, at least one, and of these as few as leave out
+    no more than `drop` times the norm of all."""
+    both = np.sort(np.concatenate(values))[::-1]
+    tail = np.sqrt(np.cumsum(both[::-1].astype(float) ** 2))[::-1]
+    floor = max(drop, float(np.finfo(both.dtype).eps)) * tail[0]
+    rank = max(1, min(most, int(np.count_nonzero(tail > floor))))
+    first = int(np.count_nonzero(values[0] > both[rank])) if len(both) > rank else len(values[0])
+    return [first, min(rank - first, len(values[1]))]

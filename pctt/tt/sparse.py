@@ -162,6 +162,10 @@ class SparseHierarchy:
             out[found] = self.values[place[found], s[found], t[found]]
         return self.reduce(out)
 
+    def crosses(self, prefixes: Array, digits: Array, suffixes: Array) -> Array:
+        """Entries (p, m, s) by the sums of keys."""
+        return self.lookup(prefixes[:, None, None] + digits[:, None] + suffixes)
+
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Scalar keys of `count` stored entries (none where there are none), the same on all ranks if `rng` is.
 
@@ -185,6 +189,17 @@ class SparseHierarchy:
         found = np.zeros(count, np.int64)
         found[mine] = self._scalar_key(self.keys[by_row[(start + column)[mine]]], *place[:, mine])
         return self.reduce(found)
+
+    def validation(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Keys of `count` stored entries and as many others, and weights with which a sum of squares over them estimates
+        that over all entries."""
+        stored = self.sample(count, rng)
+        size = float(self.size) ** 2
+        others = rng.integers(0, slots_of(self.modes) ** 2, count)
+        values = self.lookup(stored)
+        seen = max(float(values @ values), float(np.finfo(self.dtype).tiny))
+        weights = np.repeat([self.norm() ** 2 / seen, size / count], [len(stored), count])
+        return np.concatenate((stored, others)), weights
 
     def _scalar_key(self, key: Array, s: Array, t: Array) -> Array:
         """Scalar keys of the entries (s, t) of blocks given by their keys."""

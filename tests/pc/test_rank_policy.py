@@ -57,7 +57,8 @@ import time
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-import pctt.pc.tensor_train as module
+import pctt.pc.sparse_train as module
+import pctt.pc.tensor_train as shell
 from pctt.pc import rank_policy
 from pctt.tt import cross
 from pctt.tt.train import Train
@@ -76,14 +77,15 @@ class Clock: # one rank's goes faster, and jumps
         return time.perf_counter() * (1 + 2 * comm.rank) + 0.02 * comm.rank * self.calls
 
 
-module.time = Clock()
+shell.time = Clock()
 rank_policy.BUDGET = 0.5 # trials are frequent
 mat = poisson(24)
 chosen = set()
 for refuse in (False, True):
     ksp = solver(mat, max_rank=6, rank="auto")
+    ksp.setUp()
     if refuse: # the train that is refused reports what the trial took
-        context(ksp)._invert = lambda rank, warm: (None, False)
+        context(ksp).made._invert = lambda rank, warm: (None, False)
     for k in range(60):
         ksp.setOperators(mat)
         mat.stateIncrease()
@@ -98,7 +100,7 @@ assert len(chosen) > 1, chosen
 
 # processors that round differently: ranks of trains, pivots of crosses, numbers of inverses
 mat.shift(4.0)
-round_here, dominant, invert = Train.round, cross._dominant, module.invert_by_als
+round_here, dominant, invert = Train.round, cross._dominant, module.approximate_inverse
 
 
 def invert_here(*arguments):
@@ -108,11 +110,11 @@ def invert_here(*arguments):
 
 Train.round = lambda self, eps=1e-14, max_rank=None: round_here(self, max(eps, 0.3 * comm.rank), max_rank)
 cross._dominant = lambda C, most, eps: dominant(C, most if comm.rank == 0 else max(1, most - 1), eps)
-module.invert_by_als = invert_here
+module.approximate_inverse = invert_here
 for way in ("als", "cross"):
     ksp = solver(mat, max_rank=6, rank="fixed", compress=way)
     assert solve(ksp)[1] < 1e-6
-    trains = comm.allgather([core.tobytes() for core in context(ksp).inverse.train.cores])
+    trains = comm.allgather([core.tobytes() for core in context(ksp).made.inverse.train.cores])
     assert trains == [trains[0]] * comm.size, way
     ksp.destroy()
 print("done", flush=True)

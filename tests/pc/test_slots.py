@@ -170,7 +170,7 @@ def test_empty_slots_leave_the_preconditioner_as_it_is(block, scaling):
         ksp.setUp()
         pc = context(ksp)
         assert pc.rank == 400, pc.account.fallbacks
-        assert (pc.slots.size > 40) == (names is not None)
+        assert (pc.made.slots.size > 40) == (names is not None)
         A = dense(mat)
         assert np.linalg.norm(operator(ksp) @ A - identity) < 0.05 * np.linalg.norm(identity)
 
@@ -196,15 +196,15 @@ def test_the_next_structure_starts_from_the_last_train():
     options = {"rank": "fixed", "max_rank": 8, "keep": "false"}
     warm = solver(first, **options)
     warm.setUp()
-    cold_passes = context(warm).compression.passes
+    cold_passes = context(warm).made.compression.passes
     follow_up(warm, second)
     assert context(warm).account.reused == 1
     assert context(warm).account.resets == 0
-    assert context(warm).compression.passes < cold_passes
+    assert context(warm).made.compression.passes < cold_passes
     cold = solver(second, **options)
     cold.setUp()
-    assert context(warm).compression.error <= 1.02 * context(cold).compression.error
-    assert context(warm).inverse.residual <= 1.5 * context(cold).inverse.residual
+    assert context(warm).made.compression.error <= 1.02 * context(cold).made.compression.error
+    assert context(warm).made.inverse.residual <= 1.5 * context(cold).made.inverse.residual
     warm_its, warm_residual = solve(warm)
     cold_its, _ = solve(cold)
     assert warm_residual < 1e-7
@@ -226,10 +226,10 @@ def test_the_train_of_the_first_matrix_of_a_structure_opens_the_next():
     first, second = contact_steps(600)
     ksp = solver(first, rank="fixed", max_rank=4)
     ksp.setUp()
-    opening = context(ksp).inverse
+    opening = context(ksp).made.inverse
     follow_up(ksp, second)
-    assert context(ksp).inverse is opening
-    assert context(ksp).hierarchy is None  # block pairs are not listed for nothing
+    assert context(ksp).made.inverse is opening
+    assert context(ksp).made.hierarchy is None  # block pairs are not listed for nothing
     its, residual = solve(ksp)
     assert residual < 1e-7
     cold_its, _ = solve(solver(second, rank="fixed", max_rank=4))
@@ -243,7 +243,7 @@ def test_an_overflow_makes_a_new_tree():
     follow_up(ksp, second)
     assert context(ksp).account.resets == 1
     assert context(ksp).account.reused == 0
-    assert context(ksp).slots.size >= 800
+    assert context(ksp).made.slots.size >= 800
     _, residual = solve(ksp)
     assert residual < 1e-7
 
@@ -277,7 +277,7 @@ def test_rows_that_change_ranks(ranks):
         assert pc.rank == 6, pc.account.fallbacks
         assert its < 70
         assert residual < 1e-6
-        trains = comm.allgather([core.sum() for core in pc.inverse.train.cores])
+        trains = comm.allgather([core.sum() for core in pc.made.inverse.train.cores])
         assert all(np.array_equal(train, trains[0]) for train in trains)
     # for the last matrix the first rank of several has no room for all
     assert (pc.account.resets, pc.account.reused) == ((0, 3) if ranks == 1 else (1, 2))

@@ -1,0 +1,135 @@
+"""The entries of a Mat on several ranks: those of a function that the user gives, or of a dense Mat."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.tt.train import Array
+
+DENSE = ("dense", "seqdense", "mpidense")
+CHECKS = 256  # pairs of entries that are compared with those across the diagonal
+ASYMMETRY = 1e-8  # of these that is put down to rounding
+
+
+class EntriesError(ValueError):
+    """Entries that are no numbers, or a function for them that fails; raised on all ranks alike."""
+
+
+def has_entries(P: PETSc.Mat) -> bool:
+    """Whether P's entries are looked up one by one: P has the attribute ``entries``, or is dense and on a grid or without
+    blocks."""
+    dense = P.getType() in DENSE and (P.getBlockSize() == 1 or P.getAttr("grid") is not None)
+    return dense or P.getAttr("entries") is not None
+
+
+class Entries:
+    """Values at rows i and columns j, the same (p,) integers on all ranks: each evaluates its share; collective.
+
+    function : takes i and j (p,) and gives (p,) numbers
+
+    The error of one rank is raised on all.
+    """
+
+    def __init__(self, comm: MPI.Comm, function: Callable[[Array, Array], Array]) -> None:
+        self.comm, self.function = comm, function
+
+    @classmethod
+    def of(cls, P: PETSc.Mat) -> Entries:
+        """Those of a Mat for which `has_entries`."""
+        comm, function = P.comm.tompi4py(), P.getAttr("entries")
+        given = comm.allgather(None if function is None else callable(function))
+        if len(set(given)) > 1 or given[0] is False:
+            raise EntriesError(
+                f"the attribute entries of the Mat is {given} by rank (None: missing, False: no function); allowed is a "
+                "function of two integer arrays, on all ranks"
+            )
+        return cls(comm, function) if given[0] else DenseEntries(P)
+
+    def __call__(self, i: Array, j: Array) -> Array:
+        size, rank = self.comm.size, self.comm.rank
+        share = slice(len(i) * rank // size, len(i) * (rank + 1) // size)
+        values = self.own(i[share], j[share])
+        if size == 1:
+            return values
+        out = np.zeros(len(i))
+        out[share] = values
+        self.comm.Allreduce(MPI.IN_PLACE, out)
+        return out
+
+    def own(self, i: Array, j: Array) -> Array:
+        """Values at a rank's own rows and columns, of which other ranks know nothing; collective."""
+        try:
+            values, wrong = self._evaluate(i, j), ""
+        except Exception as error:  # of any kind: it is the user's code
+            values, wrong = np.zeros(len(i)), _words(error)
+        if self.comm.size > 1 and not self.comm.allreduce(bool(wrong), op=MPI.LOR):
+            return values
+        found = self.comm.allgather(wrong)
+        for rank, wrong in enumerate(found):
+            if wrong:
+                raise EntriesError(
+                    f"entries of the Mat: {wrong}, on rank {rank}; allowed are finite real numbers, as many as indices"
+                )
+        return values
+
+    def _evaluate(self, i: Array, j: Array) -> Array:
+        if len(i) == 0:
+            return np.zeros(0)
+        raw = np.asarray(self.function(i, j))
+        if raw.shape != i.shape:
+            raise EntriesError(f"an array of shape {raw.shape} for {len(i)} indices")
+        if raw.dtype.kind not in "fiub":
+            raise EntriesError(f"an array of type {raw.dtype}")
+        values = raw.astype(float)
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            k = int(bad[0])
+            raise EntriesError(f"{values[k]} at row {i[k]}, column {j[k]}")
+        return values
+
+
+def _words(error: Exception) -> str:
+    if isinstance(error, EntriesError):
+        return str(error)
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({frame.filename}:{frame.lineno})"
+
+
+class DenseEntries(Entries):
+    """Those of a dense Mat, of which each rank has its rows."""
+
+    def __init__(self, P: PETSc.Mat) -> None:
+        self.comm = P.comm.tompi4py()
+        self.first, self.last = P.getOwnershipRange()
+        self.local = P.getDenseArray()
+
+    def __call__(self, i: Array, j: Array) -> Array:
+        mine = np.flatnonzero((i >= self.first) & (i < self.last))
+        out = np.zeros(len(i))
+        out[mine] = self.own(i[mine], j[mine])
+        if self.comm.size > 1:
+            self.comm.Allreduce(MPI.IN_PLACE, out)
+        return out
+
+    def function(self, i: Array, j: Array) -> Array:
+        return self.local[i - self.first, j]
+
+
+def is_symmetric(entries: Entries, rows: int) -> bool:
+    """Whether entries are those across the diagonal, at some random places; collective."""
+    i, j = np.random.default_rng(0).integers(0, rows, (2, CHECKS))
+    here, there = entries(i, j), entries(j, i)
+    return entries.comm.bcast(bool(np.linalg.norm(here - there) <= ASYMMETRY * np.linalg.norm(here)))
+
+
+def diagonal_blocks(P: PETSc.Mat) -> Array:
+    """The diagonal blocks (n, bs, bs) of this rank's block rows of a Mat for which `has_entries`; collective."""
+    bs = P.getBlockSize()
+    rows = np.arange(*P.getOwnershipRange()).reshape(-1, bs, 1)
+    i, j = np.broadcast_arrays(rows, rows.transpose(0, 2, 1))
+    return Entries.of(P).own(i.ravel(), j.ravel()).reshape(i.shape)

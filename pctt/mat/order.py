@@ -1,0 +1,90 @@
+"""The grid that the rows of a Mat belong to, and the order in which a train sees them.
+
+    grid      the attribute ``grid`` = (n_1, n_2, ...), the shape of a vector as an array (row i at
+              numpy.unravel_index(i, grid)), or the DMDA of the Mat: one axis after the other
+    morton    along a space-filling curve through the points of the attribute ``coordinates``
+    natural   as the rows are numbered
+"""
+
+from __future__ import annotations
+
+import numbers
+from math import prod
+
+import numpy as np
+from petsc4py import PETSc
+
+from pctt.morton import morton_codes
+from pctt.tt.grid import GridDigits
+from pctt.tt.train import Array
+
+
+def grid_of(P: PETSc.Mat) -> tuple[tuple[int, ...], Array | None] | None:
+    """Shape of the grid of P's block rows and the block row at each of its points (None: its number), or None where
+    there is no grid; ValueError, on all ranks alike, for one that does not fit; collective."""
+    count = P.getSize()[0] // P.getBlockSize()
+    comm = P.comm.tompi4py()
+    given = P.getAttr("grid")
+    words = comm.allgather(None if given is None else repr(given))
+    if any(word != words[0] for word in words):
+        raise ValueError(f"the attribute grid of the Mat differs between ranks: {', '.join(map(str, words))}")
+    if given is not None:
+        try:
+            shape = tuple(int(n) for n in given if isinstance(n, numbers.Integral))
+            fits = len(shape) == len(tuple(given)) > 0 and min(shape) >= 1 and prod(shape) == count
+        except TypeError:
+            fits = False
+        if not fits:
+            raise ValueError(
+                f"the attribute grid of the Mat is {given!r}; allowed are whole numbers whose product is the number of "
+                f"block rows, {count}"
+            )
+        return shape, None
+    dm = P.getDM()
+    if not dm.handle or dm.getType() != PETSc.DM.Type.DA or dm.getDof() != P.getBlockSize():
+        return None
+    shape = tuple(dm.getSizes())[::-1]  # the first coordinate is the fastest
+    if comm.size == 1:
+        return shape, None
+    return shape, _natural_order(dm, P.getBlockSize())
+
+
+def _natural_order(dm: PETSc.DM, block: int) -> Array:
+    """Block row of each point of a distributed DMDA in the natural order, on all ranks."""
+    own, natural = dm.createGlobalVec(), dm.createNaturalVec()
+    first, last = own.getOwnershipRange()
+    own.array_w[:] = np.arange(first, last)
+    dm.globalToNatural(own, natural)
+    parts = dm.comm.tompi4py().allgather(natural.array_r[::block].copy())
+    for vec in (own, natural):
+        vec.destroy()
+    return (np.concatenate(parts) / block).round().astype(np.int64)
+
+
+def digits_of(P: PETSc.Mat, order: str, name: str) -> tuple[GridDigits, Array | None, str]:
+    """Digits of P's rows, the row at each of the points (None: its number), and the order that was taken.
+
+    order : auto, grid, morton or natural; auto takes the first of these for which P has what it needs
+    name : of the option, for the ValueError where P lacks that
+    """
+    block = P.getBlockSize()
+    grid = grid_of(P) if order in ("auto", "grid") else None
+    if grid is not None:
+        shape, rows = grid
+        return GridDigits(shape, block=block), _scalar(rows, block), "grid"
+    count = P.getSize()[0] // block
+    points = P.getAttr("coordinates")  # checked: on all ranks or on none
+    if points is not None and order in ("auto", "morton"):
+        parts = P.comm.tompi4py().allgather(np.asarray(points, dtype=float).reshape(-1, np.shape(points)[-1]))
+        codes = morton_codes(np.concatenate(parts))
+        return GridDigits((count,), block=block), _scalar(np.argsort(codes, kind="stable"), block), "morton"
+    if order in ("auto", "natural"):
+        return GridDigits((count,), block=block), None, "natural"
+    lacks = {"grid": "grid (its shape), or a DMDA", "morton": "coordinates", "rcm": "entries that are stored"}
+    raise ValueError(f"{name} {order}: the Mat has no {lacks[order]}; allowed without is auto or natural")
+
+
+def _scalar(rows: Array | None, block: int) -> Array | None:
+    if rows is None or block == 1:
+        return rows
+    return np.add.outer(rows * block, np.arange(block)).ravel()

@@ -1,0 +1,72 @@
+"""Product of a train, whose cores all ranks have, with a vector that is spread over them."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import DTypeLike
+
+from pctt.tt.apply import Apply
+from pctt.tt.grid import GridDigits
+from pctt.tt.train import Array, Train
+
+MANY = 1_000_000  # rows from which a vector that is gathered on each of several ranks is worth a warning
+
+
+class TrainProduct:
+    """y = T x for the rows of this rank, from those of x.
+
+    train : matrix train of the modes of `digits`
+    counts : rows of each rank
+    order : row at each point of the grid, or None
+
+    Every rank gathers x, multiplies with its part of the train's rows, and the parts are gathered where the ranks' rows
+    are not the train's.
+    """
+
+    def __init__(
+        self, comm: MPI.Comm, counts: Array, digits: GridDigits, order: Array | None, train: Train,
+        dtype: DTypeLike = float,
+    ) -> None:  # fmt: skip
+        self.comm, self.counts = comm, np.asarray(counts)
+        rows = digits.rows
+        if comm.size > 1 and rows > MANY and comm.rank == 0:
+            warnings.warn(f"pctt: each of {comm.size} ranks gathers whole vectors of {rows} numbers", stacklevel=2)
+        places = digits.places
+        if order is not None:
+            of_row = np.empty(rows, np.int64)
+            of_row[order] = places
+            places = of_row
+        first = int(self.counts[: comm.rank].sum())
+        self.mine = slice(first, first + int(self.counts[comm.rank]))
+        ranks = np.linspace(0, digits.size, comm.size + 1).astype(int)
+        self.same = bool((np.diff(places) == 1).all()) and digits.size == rows
+        if self.same:
+            bounds = (self.mine.start, self.mine.stop)
+        else:
+            bounds = (int(ranks[comm.rank]), int(ranks[comm.rank + 1]))
+            self.places, self.places_here = places, places[self.mine]
+        self.parts = np.diff(ranks)
+        self.whole = np.empty(rows)
+        self.product = np.empty(digits.size)
+        self.apply = Apply(train, digits.size, bounds, dtype)
+
+    def set_train(self, train: Train) -> None:
+        self.apply.set_train(train)
+
+    def __call__(self, x: Array) -> Array:
+        """Valid until the next call."""
+        if self.comm.size > 1:
+            self.comm.Allgatherv(np.ascontiguousarray(x), [self.whole, self.counts])
+            x = self.whole
+        if self.same:
+            self.apply.x[:] = x
+            return self.apply.product()
+        self.apply.x[self.places] = x
+        y = self.apply.product()
+        if self.comm.size == 1:
+            return y[self.places]
+        self.comm.Allgatherv(np.ascontiguousarray(y, dtype=float), [self.product, self.parts])
+        return self.product[self.places_here]

@@ -1,0 +1,93 @@
+"""The train of the inverse of a matrix that is given by its entries: compressed by cross alone, nothing is scaled."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.mat.product import TrainProduct
+from pctt.mat.tensor_train import CompressedEntries, compressed
+from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
+from pctt.pc.train_options import Account, Options
+
+TIGHTER = 0.1  # of the accuracy with which an inverse that was not positive is tried again
+
+
+class EntriesTrain:
+    """`make` a train for a matrix, multiply with it by `times`.
+
+    compressed, inverse : of the present matrix; None before, and after a failure
+    """
+
+    def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
+        self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
+        self._double = False
+        self.compressed: CompressedEntries | None = None
+        self.inverse: ApproximateInverse | None = None
+
+    def make(self, P: PETSc.Mat, rank: int) -> bool:
+        """Make a train; False, with the reason on the account, if there is no positive inverse.
+
+        EntriesError, ValueError, on all ranks alike, for entries or a grid that are not as they should be."""
+        for eps in (self.options.eps, TIGHTER * self.options.eps):
+            warm = self.compressed is not None and self.options.reuse != "none"
+            with PETSc.Log.Event("TTCompress"):
+                self.compressed = self._compress(P, rank, eps, self.compressed if warm else None)
+            if self.compressed.shift <= 0:
+                return self._refuse("the mean of the diagonal is not positive")
+            self.account.reused += warm
+            with PETSc.Log.Event("TTInvert"):
+                # every rank inverts the same train; a last bit of difference must not part their ways
+                self.inverse, positive = self.comm.bcast(self._invert(rank, eps))
+            if positive:
+                self._product = self._prepare()
+                return True
+        return self._refuse(f"the inverse of rank {rank} is not positive")
+
+    def _compress(self, P: PETSc.Mat, rank: int, eps: float, start: CompressedEntries | None) -> CompressedEntries:
+        known = compressed(P)
+        if known is not None and known.error <= eps and self.options.order in ("auto", known.order):
+            return known.rounded(0.5 * eps, rank)
+        name = f"-{self.prefix}pc_tt_order"
+        return CompressedEntries(P, eps, rank, self.options.order, name, start, self.options.seed)
+
+    def _invert(self, rank: int, eps: float) -> tuple[ApproximateInverse, bool]:
+        assert self.compressed is not None
+        rng = np.random.default_rng(self.options.seed)
+        return approximate_inverse(self.compressed.found, rank, eps, True, None, rng)
+
+    def _prepare(self) -> TrainProduct:
+        assert self.compressed is not None
+        assert self.inverse is not None
+        single = self.options.precision == "single" and not self._double
+        return self.compressed.product(self.inverse.train, np.float32 if single else np.float64)
+
+    def _refuse(self, why: str) -> bool:
+        self.account.fallbacks.append(why)
+        self.compressed = self.inverse = None
+        return False
+
+    def double(self) -> bool:
+        """Apply in double precision from now on; False where that is done already."""
+        if self._double or self.options.precision == "double" or self.inverse is None:
+            return False
+        self._double = True
+        self._product = self._prepare()
+        return True
+
+    def lose_patience(self) -> bool:
+        """Every matrix has a train of its own."""
+        return False
+
+    def times(self, x: np.ndarray) -> np.ndarray:
+        """(x + Z x) / c, this rank's part from its part."""
+        assert self.compressed is not None
+        return (x + self._product(x)) / self.compressed.shift
+
+    def words(self) -> str:
+        """Ranks, errors and sizes."""
+        if self.inverse is None or self.compressed is None:
+            return ""
+        X = self.inverse.train
+        return f"{self.compressed.words()}; inverse I + Z ranks {X.ranks} residual {self.inverse.residual:.2g}"

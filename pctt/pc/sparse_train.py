@@ -1,0 +1,275 @@
+"""The train of a sparse matrix's inverse, from one matrix to the next.
+
+The block rows are put into slots, scaled by the Cholesky factors of the diagonal blocks, the off-diagonal part is
+compressed into a train T (paper, section 3), and I + T is inverted as a train. Slots, cores and whole trains of one
+matrix serve the next.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.options import OptionError
+from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
+from pctt.pc.patience import Patience
+from pctt.pc.slots import Slots, capacity
+from pctt.pc.slotted import SlottedMatrix
+from pctt.pc.train_options import Account, Options
+from pctt.tt.als import Compression, compress
+from pctt.tt.apply import Apply
+from pctt.tt.cross import Cross, compress_cross
+from pctt.tt.quantise import check_modes, choose_modes
+from pctt.tt.sparse import SparseHierarchy
+from pctt.tt.train import Train
+
+
+class SparseTrain:
+    """`make` a train for a matrix, multiply with it by `times`.
+
+    inverse, compression : what is in use, and the newest train of a matrix; None before, and after a failure
+    slots, hierarchy : of the present structure
+    tree : slots that live from structure to structure
+    """
+
+    def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
+        self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
+        self._double = False  # single precision was found wanting
+        self._forget_structure()
+        self._forget_trains()
+
+    def _forget_structure(self) -> None:
+        self.slots: SlottedMatrix | None = None
+        self.hierarchy: SparseHierarchy | None = None
+
+    def _forget_trains(self) -> None:
+        self.tree: Slots | None = None
+        self.compression: Compression | Cross | None = None
+        self.inverse: ApproximateInverse | None = None
+        self._opening: ApproximateInverse | None = None  # the inverse for the first matrix of a structure
+        self._patience = Patience()
+        self._apply: Apply | None = None
+
+    def begin(self, P: PETSc.Mat) -> None:
+        """A new structure; ValueError, on all ranks alike, for modes or a grid that do not fit it."""
+        slots = self.comm.allreduce(capacity(P, self.options.leaf, self.options.order))
+        self._check_modes(slots)
+        self._forget_structure()
+        if self.options.reuse != "steps":
+            self._forget_trains()
+
+    def make(self, P: PETSc.Mat, rank: int) -> bool:
+        """Keep the train or make one; False, with the reason on the account, if there is no positive inverse."""
+        if self.options.reuse == "none":
+            self._forget_structure()
+            self._forget_trains()
+        first = self.slots is None
+        if first:
+            self._take_slots(P)
+        assert self.slots is not None
+        try:
+            self.slots.scale(P)
+            singular = False
+        except np.linalg.LinAlgError:
+            singular = True
+        if self.comm.allreduce(singular, op=MPI.LOR):
+            return self._refuse("a diagonal block is not positive definite")
+        if self.inverse is not None and self.inverse.cap != rank:
+            self.compression = self.inverse = self._opening = None
+        kept = (self._opening if first else self.inverse) if self.options.keep else None
+        if kept is not None and not self._patience.over():
+            self._use(kept)
+            self.account.kept += 1
+        elif not self._try_new(P, rank, kept):
+            return False
+        if first:
+            self._opening = self.inverse
+        return True
+
+    def _try_new(self, P: PETSc.Mat, rank: int, kept: ApproximateInverse | None) -> bool:
+        """Make a train for P and use it, or the kept one where that is as good; False without a positive one."""
+        assert self.slots is not None
+        if self.hierarchy is None:
+            with PETSc.Log.Event("TTBuild"):
+                self._list_block_pairs(P)
+        assert self.hierarchy is not None
+        self.hierarchy.set_values(self.slots.load(P))
+        warm = self.compression is not None
+        with PETSc.Log.Event("TTCompress"):
+            self.compression = self._compress(rank, warm)
+        with PETSc.Log.Event("TTInvert"):
+            # every rank inverts the same train; a last bit of difference must not part their ways
+            new, positive = self.comm.bcast(self._invert(rank, warm))
+        self.account.reused += warm
+        if kept is None:
+            if not positive:
+                return self._refuse(f"the inverse of rank {rank} is not positive")
+            self._patience = Patience()
+            self._use(new)
+            return True
+        left = []
+        for inverse in (kept, new):
+            self._use(inverse)
+            left.append(self._left(P) if positive or inverse is kept else np.inf)
+        if not self._patience.decide(*self.comm.bcast(left)):
+            self._use(kept)
+            self.account.kept += 1
+        return True
+
+    def _use(self, inverse: ApproximateInverse) -> None:
+        self.inverse = inverse
+        self._prepare_apply(inverse.train)
+
+    def _left(self, P: PETSc.Mat) -> float:
+        """||w - S X w|| / ||w|| of a random vector w, S the scaled matrix."""
+        assert self.slots is not None
+        slots = self.slots
+        w = np.zeros((slots.capacity, slots.block))
+        w[slots.place] = np.random.default_rng(self.options.seed).standard_normal((len(slots.place), slots.block))
+        x, y = P.createVecs()
+        x.array_w[:] = self._from_slots(self._inverse_times(w.ravel()))
+        P.mult(x, y)
+        left = w.ravel() - self._to_slots(y.array_r)
+        squares = self.comm.allreduce(np.array([left @ left, w.ravel() @ w.ravel()]))
+        x.destroy()
+        y.destroy()
+        return float(np.sqrt(squares[0] / squares[1]))
+
+    def _take_slots(self, P: PETSc.Mat) -> None:
+        """The slots of P's block rows, those of the last structure where they fit."""
+        if self.tree is not None and not self.tree.follow(P, self._agree):
+            self.account.resets += 1
+            self._forget_trains()
+        if self.tree is None:
+            self.tree = Slots(P, self.options.leaf, self.options.order)
+        self.slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaling == "block")
+
+    def _list_block_pairs(self, P: PETSc.Mat) -> None:
+        assert self.slots is not None
+        self.slots.list_blocks(P)
+        slots = self.slots
+        modes = self._modes(slots.size)
+        self.hierarchy = SparseHierarchy(slots.rows, slots.columns, modes, slots.block, self._add, self.comm.bcast)
+
+    def _agree(self, here: bool) -> bool:
+        return bool(self.comm.allreduce(here, op=MPI.LAND))
+
+    def _compress(self, rank: int, warm: bool) -> Compression | Cross:
+        assert self.hierarchy is not None
+        options, rng = self.options, np.random.default_rng(self.options.seed)
+        if options.compress == "cross":
+            start = self.compression if warm and isinstance(self.compression, Cross) else None
+            return compress_cross(self.hierarchy, rank, options.eps, start, rng=rng)
+        train = self.compression.train if warm and self.compression is not None else None
+        return compress(self.hierarchy, rank, options.eps, train, rng=rng)
+
+    def _invert(self, rank: int, warm: bool) -> tuple[ApproximateInverse, bool]:
+        """The inverse and whether no direction was found in which it is negative."""
+        assert self.compression is not None
+        options, rng = self.options, np.random.default_rng(self.options.seed)
+        start = self.inverse.train if warm and self.inverse is not None else None
+        return approximate_inverse(self.compression, rank, options.eps, options.scaling == "block", start, rng)
+
+    def _modes(self, slots: int) -> tuple[int, ...]:
+        assert self.tree is not None
+        return self._check_modes(slots) or self.tree.modes or choose_modes(slots, self.options.leaf)
+
+    def _check_modes(self, slots: int) -> tuple[int, ...]:
+        """The modes that the user gave, none if none; OptionError if they are no numbers or too few."""
+        text = self.options.modes
+        if not text:
+            return ()
+        try:
+            return check_modes([int(word) for word in text.split(",")], slots)
+        except ValueError:
+            raise OptionError(
+                f"-{self.prefix}pc_tt_modes {text}: allowed are whole numbers >= 1 with commas between, whose product "
+                f"is at least {slots}"
+            ) from None
+
+    def _refuse(self, why: str) -> bool:
+        self.account.fallbacks.append(why)
+        self.compression = self.inverse = None
+        return False
+
+    # -- application ----------------------------------------------------------------------------------------
+
+    def _prepare_apply(self, train: Train) -> None:
+        assert self.slots is not None
+        slots = self.slots
+        if self._apply is None:
+            bs = slots.block
+            rows = (slots.first * bs, (slots.first + slots.capacity) * bs)
+            dtype = np.float32 if self.options.precision == "single" and not self._double else np.float64
+            self._apply = Apply(train, slots.size * bs, rows, dtype)
+            self._local = np.empty((slots.capacity, bs))
+            self._scaled = np.empty((slots.capacity, bs, 1))
+            self._whole = np.empty(slots.size * bs)
+        else:
+            self._apply.set_train(train)
+
+    def double(self) -> bool:
+        """Apply in double precision from now on; False where that is done already."""
+        if self._double or self.options.precision == "double" or self.inverse is None:
+            return False
+        self._double, self._apply = True, None
+        self._prepare_apply(self.inverse.train)
+        return True
+
+    def lose_patience(self) -> bool:
+        """Whether a train of an earlier matrix is in use: the next set-up then tries another."""
+        if self._patience.served:
+            self._patience.lose()
+            return True
+        return False
+
+    def times(self, x: np.ndarray) -> np.ndarray:
+        """L^-T X L^-1 x, this rank's part from its part."""
+        return self._from_slots(self._inverse_times(self._to_slots(x)))
+
+    def _to_slots(self, x: np.ndarray) -> np.ndarray:
+        """L^-1 x in slot order, (capacity bs,), in a buffer that the next call reuses."""
+        assert self.slots is not None
+        slots = self.slots
+        if slots.capacity > len(slots.place):
+            self._local[:] = 0.0
+        self._local[slots.place] = x.reshape(-1, slots.block)
+        np.matmul(slots.root, self._local[:, :, None], out=self._scaled)
+        return self._scaled.ravel()
+
+    def _from_slots(self, z: np.ndarray) -> np.ndarray:
+        """L^-T z in the order of the block rows."""
+        assert self.slots is not None
+        slots = self.slots
+        np.matmul(slots.root.transpose(0, 2, 1), z.reshape(self._scaled.shape), out=self._scaled)
+        return self._scaled[slots.place].ravel()
+
+    def _inverse_times(self, x: np.ndarray) -> np.ndarray:
+        """This rank's part of X x in slot order, from its part of x."""
+        assert self.inverse is not None
+        assert self.slots is not None
+        assert self._apply is not None
+        self.slots.gather_slots(x, self._whole)
+        self._apply.x[: self._apply.n] = self._whole
+        product = self._apply.product()
+        return x + product if self.inverse.identity else product
+
+    def _add(self, x: np.ndarray) -> np.ndarray:
+        if self.comm.size > 1:
+            out = np.empty_like(x)
+            self.comm.Allreduce(np.ascontiguousarray(x), out)
+            return out
+        return x
+
+    def words(self) -> str:
+        """Ranks, errors and sizes."""
+        if self.inverse is None:
+            return ""
+        compression, X = self.inverse.of, self.inverse.train
+        T = compression.train
+        form = "I + Z" if self.inverse.identity else "X"
+        return (
+            f"modes {'x'.join(map(str, T.rows))}, matrix ranks {T.ranks} error {compression.error:.2g}, inverse "
+            f"{form} ranks {X.ranks} residual {self.inverse.residual:.2g}, {X.storage} numbers"
+        )

@@ -1,0 +1,67 @@
+"""Options and account of ``pctt.pc.TensorTrain``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Optional
+
+from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, option
+
+SPARSE_RANK, ENTRIES_RANK = 10, 100  # the cap where none is given
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options ``-pc_tt_*``, behind the prefix of the PC."""
+
+    eps: float = option(
+        1e-2, "relative Frobenius error at which a compression ends, and residual at which an inverse does",
+        check=FRACTION,
+    )
+    max_rank: Optional[int] = option(
+        None, f"cap of the ranks of matrix and inverse; none: {SPARSE_RANK}, {ENTRIES_RANK} for a matrix given by its "
+        "entries", check=AT_LEAST_ONE,
+    )
+    rank: str = option("auto", "auto: the rank that pays, 1 included; fixed: max_rank", choices=("auto", "fixed"))
+    compress: str = option(
+        "als", "of a sparse matrix; als: alternating least squares over the nonzeros; cross: AMEn cross (the paper)",
+        choices=("als", "cross"),
+    )
+    scaling: str = option(
+        "block", "block: by Cholesky factors of the diagonal blocks; none: the matrix as it is (the paper)",
+        choices=("block", "none"),
+    )
+    order: str = option(
+        "auto", "of the rows; grid: of the attribute grid or the DMDA, one axis after the other; morton: along a curve "
+        "through the attribute coordinates; rcm: reverse Cuthill-McKee; natural: as numbered; auto: the first that the "
+        "matrix has what it needs for (with names of rows morton)", choices=("auto", "grid", "morton", "rcm", "natural"),
+    )
+    leaf: int = option(16, "least number of blocks in the first and last mode", check=AT_LEAST_ONE)
+    modes: str = option("", "modes of the blocks with commas between; none: chosen for little padding")
+    precision: str = option("double", "of the application; single is watched", choices=("double", "single"))
+    reuse: str = option(
+        "steps",
+        "newton: cores, index sets and block pairs of the last matrix of the same structure; steps: also its slots and "
+        "cores for the next structure; none: everything anew",
+        choices=("none", "newton", "steps"),
+    )
+    keep: bool = option(
+        True, "keep a train, with the new matrix's scaling, while new trains are hardly better; not with reuse none"
+    )
+    seed: int = option(0, "seed of the random starts", check=COUNT)
+    monitor: bool = option(False, "print a line per set-up")
+
+    def cap(self, default: int) -> int:
+        return self.max_rank or default
+
+
+@dataclass
+class Account:
+    """What the preconditioner did so far, for ``-ksp_view`` and the run's summary."""
+
+    setups: int = 0
+    reused: int = 0
+    kept: int = 0
+    resets: int = 0
+    setup_s: float = 0.0
+    fallbacks: list[str] = field(default_factory=list)

@@ -1,0 +1,133 @@
+"""Digits of the points of a grid, the order in which a train sees them.
+
+A coordinate 0 <= c_a < n_a is written in digits whose bases, all small primes, have a product p_a >= n_a with little
+padding. The modes of a train are the digits of one axis after the other, or those of all axes level by level
+(interleaved, as along a Morton curve). Row numbers, places in the train and keys of pairs of points are all sums of one
+number per axis, which small tables hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import prod
+
+import numpy as np
+
+from pctt.tt.quantise import scalar_modes, slots_of
+from pctt.tt.train import Array
+
+PRIMES = (2, 3, 5, 7)  # bases of digits
+
+
+class GridDigits:
+    """The digits of a grid of shape (n_1, ..., n_D), its points numbered as numpy numbers an array of this shape.
+
+    interleaved : level by level instead of axis after axis
+    block : unknowns per point, the fastest digit of a row
+
+    modes : of the train, row and column alike
+    places : (n_1 ... n_D block,) place of each row among those of the train (`slots_of(modes)` of them)
+
+    >>> GridDigits((8, 6)).modes, GridDigits((8, 6), interleaved=True).modes
+    ((2, 2, 2, 3, 2), (2, 6, 4))
+    """
+
+    def __init__(self, shape: Sequence[int], interleaved: bool = False, block: int = 1) -> None:
+        self.shape, self.block = tuple(int(n) for n in shape), int(block)
+        axes = [bases(n) for n in self.shape]
+        if interleaved:
+            depth = max(map(len, axes))
+            levels = [[(a, level - depth + len(digits)) for a, digits in enumerate(axes)] for level in range(depth)]
+            groups = [[(a, k) for a, k in level if k >= 0] for level in levels]
+        else:
+            groups = [[(a, k)] for a, digits in enumerate(axes) for k in range(len(digits))]
+        modes = [prod(axes[a][k] for a, k in group) for group in groups] or [1]
+        self.modes = scalar_modes(modes, self.block)
+        self._tables(axes, groups)
+
+    def _tables(self, axes: list[list[int]], groups: list[list[tuple[int, int]]]) -> None:
+        """Per axis what its coordinate adds to a place in the train and to the two halves of a key; per mode what a
+        pair of digits adds to the pair of padded rows."""
+        self.padded = tuple(prod(digits) for digits in axes)
+        self.size = slots_of(self.modes)
+        if self.size >= 2**31:
+            raise ValueError(f"too many points for a train: a grid of shape {self.shape}")
+        width = np.cumprod([1, *self.modes[::-1]])[-2::-1]  # of a digit in a place
+        square = np.cumprod([1.0, *(float(m) ** 2 for m in self.modes[::-1])])[-2::-1].astype(np.int64)
+        points = [np.arange(p) for p in self.padded]
+        self.place = [np.zeros(p, np.int64) for p in self.padded]
+        self.row_key = [np.zeros(p, np.int64) for p in self.padded]
+        self.column_key = [np.zeros(p, np.int64) for p in self.padded]
+        stride = np.cumprod([1, *self.padded[::-1]])[-2::-1]
+        row_of = [np.zeros(m, np.int64) for m in self.modes]
+        for k, group in enumerate(groups):
+            below = self.block if k == len(groups) - 1 else 1  # of a digit within its mode
+            for a, level in group[::-1]:
+                base, weight = axes[a][level], prod(axes[a][level + 1 :])
+                digit = points[a] // weight % base
+                self.place[a] += digit * below * width[k]
+                self.row_key[a] += digit * below * self.modes[k] * square[k]
+                self.column_key[a] += digit * below * square[k]
+                row_of[k] += np.arange(self.modes[k]) // below % base * (weight * stride[a] * self.block)
+                below *= base
+        row_of[-1] += np.arange(self.modes[-1]) % self.block
+        self._pairs = [(row[:, None] * self.size + row).ravel() for row in row_of]
+        self._square = square
+        self._inner = self.modes[-1], 1  # what an unknown of a block adds to the halves of a key
+
+    @property
+    def rows(self) -> int:
+        """Rows of the matrix: those of points in the grid."""
+        return prod(self.shape) * self.block
+
+    @property
+    def places(self) -> Array:
+        out = np.zeros(1, np.int64)
+        for table, n in zip(self.place, self.shape):
+            out = np.add.outer(out, table[:n]).ravel()
+        return np.add.outer(out, np.arange(self.block)).ravel()
+
+    def key(self, row: Array, column: Array) -> Array:
+        """Keys of pairs of points given by coordinates (D + 1, ...), the last the unknown of the block."""
+        out = row[-1] * self._inner[0] + column[-1] * self._inner[1]
+        for a in range(len(self.shape)):
+            out = out + self.row_key[a][row[a]] + self.column_key[a][column[a]]
+        return out
+
+    def pair(self, keys: Array) -> Array:
+        """Pairs row * size + column (padded) of keys, digits i_k m_k + j_k of base m_k^2: the pair of a sum of keys that
+        share no digit is the sum of their pairs."""
+        pair = np.zeros(keys.shape, np.int64)
+        for table, square in zip(self._pairs, self._square):
+            digit, keys = np.divmod(keys, square)
+            pair += table[digit]
+        return pair
+
+    def within(self, padded: Array) -> tuple[Array, Array]:
+        """Rows of the matrix of padded rows, and which of them there are; the others' numbers mean nothing."""
+        if self.padded == self.shape:
+            return padded, np.ones(padded.shape, bool)
+        *coordinates, inner = np.unravel_index(padded, (*self.padded, self.block))
+        inside = np.ones(padded.shape, bool)
+        row = np.zeros(padded.shape, np.int64)
+        for c, n in zip(coordinates, self.shape):
+            inside &= c < n
+            row = row * n + c
+        return row * self.block + inner, inside
+
+
+def bases(n: int) -> list[int]:
+    """Bases of the digits of 0, ..., n - 1: primes up to 7 with the least product that is at least n, largest first.
+
+    >>> bases(64), bases(100), bases(97), bases(1)
+    ([2, 2, 2, 2, 2, 2], [5, 5, 2, 2], [7, 7, 2], [])
+    """
+    while True:
+        rest, found = n, []
+        for p in PRIMES:
+            while rest % p == 0:
+                rest //= p
+                found.insert(0, p)
+        if rest == 1:
+            return found
+        n += 1

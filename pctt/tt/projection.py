@@ -1,0 +1,104 @@
+"""Equations S x = B between the interfaces of trains: what alternating methods solve core after core."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pctt.tt.train import Array, Train
+
+
+class Projection:
+    """y' S x and y' B contracted over the cores before and after the one at hand, for trains y and x of matrices whose
+    columns are spectators.
+
+    left[k], right[k] : y' S x over the cores before and after k, (c, R, a) and (c', R', a')
+    left_B[k], right_B[k] : the same of y' B, (c, R) and (c', R')
+    """
+
+    def __init__(self, S: Train, B: Train | None, length: int) -> None:
+        self.S = S.cores
+        self.B = None if B is None else B.cores
+        one, one_B = np.ones((1, 1, 1), S.dtype), np.ones((1, 1), S.dtype)
+        self.left, self.right = [one] * (length + 1), [one] * length
+        self.left_B, self.right_B = [one_B] * (length + 1), [one_B] * length
+
+    @classmethod
+    def around(cls, S: Train, B: Train | None, y: list[Array], x: list[Array]) -> Projection:
+        """With all that is right of the first core."""
+        new = cls(S, B, len(x))
+        for k in range(len(x) - 1, 0, -1):
+            new.step_left(k, y[k], x[k])
+        return new
+
+    def step_right(self, k: int, y: Array, x: Array) -> None:
+        T = np.tensordot(self.left[k], x, (2, 0))  # (c, R, i', j, b)
+        T = np.tensordot(self.S[k], T, ((0, 2), (1, 2)))  # (i, R', c, j, b)
+        self.left[k + 1] = np.tensordot(y, T, ((0, 1, 2), (2, 0, 3)))
+        if self.B is not None:
+            self.left_B[k + 1] = np.tensordot(y, np.tensordot(self.left_B[k], self.B[k], 1), ((0, 1, 2), (0, 1, 2)))
+
+    def step_left(self, k: int, y: Array, x: Array) -> None:
+        T = np.tensordot(x, self.right[k], (3, 2))  # (a, i', j, c, R)
+        T = np.tensordot(self.S[k], T, ((2, 3), (1, 4)))  # (R, i, a, j, c)
+        self.right[k - 1] = np.tensordot(y, T, ((1, 2, 3), (1, 3, 4)))
+        if self.B is not None:
+            T = np.tensordot(self.B[k], self.right_B[k], (3, 1))  # (R, i, j, c)
+            self.right_B[k - 1] = np.tensordot(y, T, ((1, 2, 3), (1, 2, 3)))
+
+    def matrix(self, k: int) -> Array:
+        """M = P' S P (a m b, a m b), symmetric, for y = x, P the interfaces around core k."""
+        S, left, right = self.S[k], self.left[k], self.right[k]
+        T = np.tensordot(np.tensordot(left, S, (1, 0)), right, (4, 1))  # (a, a', i, i', b, b')
+        n = left.shape[0] * S.shape[1] * right.shape[0]
+        M = T.transpose(0, 2, 4, 1, 3, 5).reshape(n, n)
+        return 0.5 * (M + M.T)
+
+    def times(self, k: int, x: Array) -> Array:
+        """M x for x (a, m, n, b), without M."""
+        return local_product(self.left[k], self.S[k], self.right[k], x)
+
+    def diagonal(self, k: int) -> Array:
+        """Diagonal of M, (a, m, 1, b)."""
+        left = np.diagonal(self.left[k], axis1=0, axis2=2)  # (R, a)
+        middle = np.diagonal(self.S[k], axis1=1, axis2=2)  # (R, R', m)
+        right = np.diagonal(self.right[k], axis1=0, axis2=2)  # (R', b)
+        T = np.tensordot(np.tensordot(left, middle, (0, 0)), right, (1, 0))  # (a, m, b)
+        return T[:, :, None, :]
+
+    def right_side(self, k: int) -> Array:
+        """P' B (a, m, n, b)."""
+        return self._of_B(k, self.left_B[k], self.right_B[k])
+
+    def rest(self, k: int, x: Array) -> Array:
+        """P' (B - S x) between my interfaces, for the core x."""
+        return self.right_side(k) - self.times(k, x)
+
+    def rest_left(self, other: Projection, k: int, x: Array) -> Array:
+        """The same with my interfaces on the left, those of another test train on the right."""
+        return self._of_B(k, self.left_B[k], other.right_B[k]) - local_product(
+            self.left[k], self.S[k], other.right[k], x
+        )
+
+    def rest_right(self, other: Projection, k: int, x: Array) -> Array:
+        return other.rest_left(self, k, x)
+
+    def _of_B(self, k: int, left: Array, right: Array) -> Array:
+        assert self.B is not None
+        return np.tensordot(np.tensordot(left, self.B[k], 1), right, (3, 1))
+
+
+def local_product(left: Array, S: Array, right: Array, x: Array) -> Array:
+    """left (a, R, a'), S (R, i, j, R'), right (b, R', b') on x (a', j, n, b')."""
+    T = np.tensordot(left, x, 1)  # (a, R, j, n, b')
+    T = np.tensordot(T, S, ((1, 2), (0, 2)))  # (a, n, b', i, R')
+    return np.tensordot(T, right, ((2, 4), (2, 1))).transpose(0, 2, 1, 3)  # (a, i, n, b)
+
+
+def columns(x: Array) -> Array:
+    """A core (a, m, n, b) with orthonormal columns that span those of the given one."""
+    return np.linalg.qr(x.reshape(-1, x.shape[3]))[0].reshape(*x.shape[:3], -1)
+
+
+def rows(x: Array) -> Array:
+    """A core (a, m, n, b) with orthonormal rows that span those of the given one."""
+    return np.ascontiguousarray(columns(x.transpose(3, 1, 2, 0)).transpose(3, 1, 2, 0))
