@@ -19,6 +19,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem import bodies
+from dem.free_motion import free_directions
+from dem.motion import Guided
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
@@ -89,7 +91,7 @@ class Dump:
     ) -> None:
         """The global problem, the guess if there is one, and the solution if the step has one."""
         dynamic, M = _mass(self._world)
-        H = _dynamic_rows(system, dynamic)
+        H = _dynamic_rows(system, self._world, dynamic)
         v_free = M.createVecLeft()
         v_free.array = system.free_velocity[dynamic].ravel()
         f, moved = M.createVecLeft(), H.createVecRight()
@@ -151,7 +153,8 @@ def _write(path: Path, comm: MPI.Comm, write: Callable[[Path], None]) -> None:
 
 
 def _mass(world: World) -> tuple[np.ndarray, PETSc.Mat]:
-    """Mask of the bodies of this rank's rows that are dynamic, and the mass matrix (6 n x 6 n) of those."""
+    """Mask of the bodies of this rank's rows that are dynamic, and the mass matrix (6 n x 6 n) of those; what a guide
+    does not let move has no entries in D and the mass of the body here, for the matrix to be regular."""
     last = world.comm.rank == world.comm.size - 1
     parts = [world.grains, world.large] if last else [world.grains]
     owned = bodies.concatenate(parts)
@@ -159,18 +162,27 @@ def _mass(world: World) -> tuple[np.ndarray, PETSc.Mat]:
     owned = owned.take(dynamic)
     blocks = np.zeros((len(owned), 6, 6))
     blocks[:, range(3), range(3)] = owned.mass[:, None]
-    blocks[:, 3:, 3:] = np.linalg.inv(bodies.inverse_inertia(owned))
-    alike = np.ptp(owned.inertia, axis=1) == 0  # exactly diagonal, as for spheres
+    turns = np.isfinite(owned.inertia).all(axis=1)
+    blocks[turns, 3:, 3:] = np.linalg.inv(bodies.inverse_inertia(owned.take(turns)))
+    blocks[~turns, 3:, 3:] = owned.mass[~turns, None, None] * np.eye(3)
+    alike = turns.copy()
+    alike[turns] = np.ptp(owned.inertia[turns], axis=1) == 0  # exactly diagonal, as for spheres
     blocks[alike, 3:, 3:] = owned.inertia[alike, :, None] * np.eye(3)
     count = len(owned)
-    first = sum(world.comm.allgather(count)[: world.comm.rank])
+    return dynamic, _block_diagonal(blocks, world.comm)
+
+
+def _block_diagonal(blocks: np.ndarray, comm: MPI.Comm) -> PETSc.Mat:
+    """The matrix with these blocks (n, 6, 6) of this rank."""
+    count = len(blocks)
+    first = sum(comm.allgather(count)[: comm.rank])
     rows = sp.bsr_matrix((blocks, np.arange(count), np.arange(count + 1)), shape=(6 * count, 6 * count)).tocsr()
     csr = (rows.indptr.astype(PETSc.IntType), (rows.indices + 6 * first).astype(PETSc.IntType), rows.data)
-    return dynamic, PETSc.Mat().createAIJ(((6 * count, None), (6 * count, None)), csr=csr, comm=world.comm)
+    return PETSc.Mat().createAIJ(((6 * count, None), (6 * count, None)), csr=csr, comm=comm)
 
 
-def _dynamic_rows(system: ContactSystem, dynamic: np.ndarray) -> PETSc.Mat:
-    """D of the dynamic bodies alone; collective."""
+def _dynamic_rows(system: ContactSystem, world: World, dynamic: np.ndarray) -> PETSc.Mat:
+    """D of the dynamic bodies alone, without what the guides of some take; collective."""
     D = system.D
     first, _ = D.getOwnershipRange()
     rows = first + np.flatnonzero(np.repeat(dynamic, 6))
@@ -179,7 +191,19 @@ def _dynamic_rows(system: ContactSystem, dynamic: np.ndarray) -> PETSc.Mat:
     H = D.createSubMatrix(*index_sets)
     for index_set in index_sets:
         index_set.destroy()
-    return H
+    guided = [isinstance(body.motion, Guided) for body in world.large_bodies]
+    if not any(guided):
+        return H
+    free = np.tile(np.eye(6), (len(dynamic), 1, 1))
+    if len(dynamic) > len(world.grains):  # this rank has the rows of the large bodies
+        large = free[len(world.grains) :]
+        large[:, :3, :3] = free_directions(world.large_bodies)
+        large[guided, 3:] = 0.0
+    P = _block_diagonal(free[dynamic], world.comm)
+    projected = P.matMult(H)
+    for matrix in (P, H):
+        matrix.destroy()
+    return projected
 
 
 # -- options -------------------------------------------------------------------------------------------------
