@@ -168,7 +168,6 @@ def _mass(world: World) -> tuple[np.ndarray, PETSc.Mat]:
     alike = turns.copy()
     alike[turns] = np.ptp(owned.inertia[turns], axis=1) == 0  # exactly diagonal, as for spheres
     blocks[alike, 3:, 3:] = owned.inertia[alike, :, None] * np.eye(3)
-    count = len(owned)
     return dynamic, _block_diagonal(blocks, world.comm)
 
 

@@ -45,7 +45,7 @@ class Press(Experiment):
         scene = Scene(friction=0.3)
         scene.add_body("floor", [Box((2, 2, 0.1))], position=(0, 0, -0.1))
         scene.add_spheres([(x, y, 0.1) for x in (-0.5, 0.5) for y in (-0.5, 0.5)], 0.1, 1000.0)
-        scene.add_body("press", [Box((2, 2, 0.1))], Guided((1, 0, 2), force=-100.0), position=(0, 0, 0.3), density=500.0)
+        scene.add_body("press", [Box((2, 2, 0.1))], Guided((1, 0, 2), -100.0), position=(0, 0, 0.3), density=500.0)
         return scene
 """
 
