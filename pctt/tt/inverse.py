@@ -317,7 +317,7 @@ def _basis(
         parts.append((U, s, R))
     keep = _largest([s for _, s, _ in parts], most, drop)
     Q = [_own_transposes(U[:, :r], sign, left, x.shape) for sign, (U, _, _), r in zip((1.0, -1.0), parts, keep)]
-    R = [R[:r] for (_, _, R), r in zip(parts, keep)]
+    coefficients = [R[:r] for (_, _, R), r in zip(parts, keep)]
     room = min(most - sum(keep), max(LEAST_GROWTH, sum(keep)))
     if more is not None and room > 0:
         extra = []
@@ -331,8 +331,9 @@ def _basis(
         for part, (U, _) in enumerate(extra):
             U = U[:, : new[part]]
             Q[part] = np.hstack((Q[part], np.linalg.qr(U - Q[part] @ (Q[part].T @ U))[0]))
-            R[part] = np.vstack((R[part], np.zeros((new[part], len(right)), x.dtype)))
-    return np.hstack(Q), np.vstack(R), np.repeat(np.array([1, -1], x.dtype), [len(r) for r in R])
+            coefficients[part] = np.vstack((coefficients[part], np.zeros((new[part], len(right)), x.dtype)))
+    signs = np.repeat(np.array([1, -1], x.dtype), [len(R) for R in coefficients])
+    return np.hstack(Q), np.vstack(coefficients), signs
 
 
 def _own_transposes(U: Array, sign: float, left: Array, shape: tuple[int, ...]) -> Array:
@@ -347,8 +348,8 @@ def _own_transposes(U: Array, sign: float, left: Array, shape: tuple[int, ...]) 
 
 
 def _largest(values: list[Array], most: int, drop: float) -> list[int]:
-    """How many of each of two descending lists are kept: at most so many, at least one, and of these as few as leave out
-    no more than `drop` times the norm of all."""
+    """How many of each of two descending lists are kept: at most so many, at least one, and of these as few as leave
+    out no more than `drop` times the norm of all."""
     both = np.sort(np.concatenate(values))[::-1]
     tail = np.sqrt(np.cumsum(both[::-1].astype(float) ** 2))[::-1]
     floor = max(drop, float(np.finfo(both.dtype).eps)) * tail[0]
