@@ -7,6 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,7 @@ def crosses(name: str, problem: Any, eps: float) -> list[dict[str, Any]]:
 
 
 def main(given: argparse.Namespace) -> None:
-    print(f"torchTT {torchtt.__version__ if hasattr(torchtt, '__version__') else ''}, torch {torch.__version__}, one thread")
+    print(f"torchTT {version('torchTT')}, torch {torch.__version__}, one thread, CPU seconds")
     rows: list[dict[str, Any]] = []
     every = (1e-2, 1e-4, 1e-6) if given.full else (1e-2, 1e-4)
     for name, problem in (("Gauss 512^2", fredholm(512)), ("1/r 64^3", potential(64))):

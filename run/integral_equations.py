@@ -85,15 +85,16 @@ def main(given: argparse.Namespace) -> None:
     for problem, setup, its in ((fredholm(512), 0.5, 4), (potential(64), 2.0, 6)):
         row = solved(problem)
         rows.append(row)
-        print(f"{problem.name}: CG + train {row['setup_s']:.2f} + {row['solve_s']:.2f} s, {row['iterations']} iterations; "
-              f"CG alone {row['plain_s']:.2f} s, {row['without']} iterations (both with products by FFT)")  # fmt: skip
+        print(f"{problem.name}, products by FFT: CG + train {row['setup_s']:.2f} + {row['solve_s']:.2f} s, "
+              f"{row['iterations']} iterations; CG alone {row['plain_s']:.2f} s, {row['without']} iterations")  # fmt: skip
         rows.append(say(f"{problem.name}: set-up", row["setup_s"], setup, "s"))
         rows.append(say(f"{problem.name}: iterations to 1e-8", row["iterations"], its))
     growth = {}
     for name, (make, sizes) in GROWTH.items():
         growth[name] = [engine(make(n)) for n in (sizes[:-1] if given.quick else sizes)]
         for row in growth[name]:
-            print(f"{row['problem']}: cross {row['cross_s']:.3f} s, inverse {row['inverse_s']:.3f} s, ranks {row['ranks']}")
+            figures = f"cross {row['cross_s']:.3f} s, inverse {row['inverse_s']:.3f} s, ranks {row['ranks']}"
+            print(f"{row['problem']}: {figures}", flush=True)
         rows += growth[name]
         if name == "Fredholm":
             rows += [say(f"{name}: exponent of {part}", exponent(growth[name], f"{part}_s"), 0.2)
@@ -114,7 +115,8 @@ def main(given: argparse.Namespace) -> None:
     with figure("integral_equations", 1) as (axes,):
         for name, found in growth.items():
             for part, line in (("cross", "-"), ("inverse", "--")):
-                axes.loglog([r["unknowns"] for r in found], [r[f"{part}_s"] for r in found], line + "o", label=f"{name}, {part}")
+                x, y = ([row[key] for row in found] for key in ("unknowns", f"{part}_s"))
+                axes.loglog(x, y, line + "o", label=f"{name}, {part}")
         axes.set_xlabel("unknowns")
         axes.set_ylabel("CPU seconds")
         axes.legend()

@@ -1,4 +1,5 @@
-"""Scattering of a screened potential by a smooth ball, 64^3 and 128^3: .venv/bin/python docs/examples/lippmann_schwinger.py"""
+"""Scattering of a screened potential by a smooth ball, 64^3 and 128^3:
+.venv/bin/python docs/examples/lippmann_schwinger.py"""
 
 from comparison import compare
 from problems import lippmann_schwinger

@@ -70,8 +70,8 @@ def potential(n: int) -> Problem:
 
 
 def lippmann_schwinger(n: int, screening: float = 5.0) -> Problem:
-    """Scattering of a screened potential, (-laplace + k^2 + q) u = f: u + G (q u) = G f with G = exp(-k r) / 4 pi r, made
-    symmetric with s = sqrt(q); q = 400 within a smooth ball."""
+    """Scattering of a screened potential, (-laplace + k^2 + q) u = f: u + G (q u) = G f with G = exp(-k r) / 4 pi r,
+    made symmetric with s = sqrt(q); q = 400 within a smooth ball."""
 
     def kernel(r: Array) -> Array:
         return np.exp(-screening * r) / (4 * np.pi) / n**3 * np.where(r > 0, 1 / np.maximum(r, 1 / n), 2.38 * n)

@@ -13,7 +13,7 @@ from pctt.pc.train_options import Account, Options
 from pctt.tt.lowest import lowest
 from pctt.tt.train import identity
 
-TIGHTER, TRIES = 0.05, 4  # where the train of the matrix or of its inverse is not positive, eps is lowered and tried again
+TIGHTER, TRIES = 0.05, 4  # eps is lowered where the train of the matrix or of its inverse is not positive
 
 
 class EntriesTrain:

@@ -20,8 +20,8 @@ NORM_SAMPLES = 4096
 
 
 class EntryMatrix:
-    """T = (A - c I) / c of the matrix A(i, j) = entries(i, j) of the points of a grid, c the mean of A's diagonal (T = A
-    where that is not positive); padding stands for rows of c I.
+    """T = (A - c I) / c of the matrix A(i, j) = entries(i, j) of the points of a grid, c the mean of A's diagonal
+    (T = A where that is not positive); padding stands for rows of c I.
 
     Errors are relative to T: the identity, whose norm grows with the number of points, does not hide them.
 

@@ -86,8 +86,8 @@ class GridDigits:
         return out
 
     def pair(self, keys: Array) -> Array:
-        """Pairs row * size + column (padded) of keys, digits i_k m_k + j_k of base m_k^2: the pair of a sum of keys that
-        share no digit is the sum of their pairs."""
+        """Pairs row * size + column (padded) of keys, digits i_k m_k + j_k of base m_k^2: the pair of a sum of keys
+        that share no digit is the sum of their pairs."""
         pair = np.zeros(keys.shape, np.int64)
         for table, square in zip(self._pairs, self._square):
             digit, keys = np.divmod(keys, square)

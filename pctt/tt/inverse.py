@@ -31,6 +31,7 @@ IDLE = 0.8  # a sweep that leaves more than this of the residual is the last, or
 ENOUGH = 0.5  # part of eps at which the residual, estimated on the way, is worth measuring
 DROP = 0.1  # of that residual: what a core may leave out of the inverse
 NOISE = 1e-7  # part of the residual that is taken for rounding
+ROUNDINGS = 8  # trials of a rounding that the residual allows, each three times as exact as the last
 SKETCH = 64  # rank of the random train with which a residual of high rank is estimated
 HIGH = 300  # product of ranks of S and X from which that is done
 
@@ -250,8 +251,8 @@ def _solve(
 
 def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Train, float]:
     """X of the least ranks that a few trials find to leave the residual below eps, and the residual."""
-    for part in (1.0, 0.3, 0.1, 0.03):
-        smaller = X.round(part * eps)
+    for tries in range(ROUNDINGS):
+        smaller = X.round(eps / 3**tries)
         if smaller.ranks == X.ranks:
             break
         found = residual(S, smaller, B)
