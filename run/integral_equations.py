@@ -28,6 +28,7 @@ def solved(problem: Problem) -> dict[str, Any]:
     true, mat = problem.product(), operator(problem)
     rows = [cg(mat, "train", True, true) for _ in range(REPEAT)]
     plain = cg(mat, "plain", False, true)
+    mat.destroy()
     row = {"problem": problem.name, "unknowns": problem.size, "iterations": rows[0].iterations}
     row |= {"without": plain.iterations, "setup_s": statistics.median(r.setup_s for r in rows)}
     row |= {"solve_s": statistics.median(r.solve_s for r in rows), "plain_s": plain.solve_s}
@@ -86,7 +87,8 @@ def main(given: argparse.Namespace) -> None:
         row = solved(problem)
         rows.append(row)
         print(f"{problem.name}, products by FFT: CG + train {row['setup_s']:.2f} + {row['solve_s']:.2f} s, "
-              f"{row['iterations']} iterations; CG alone {row['plain_s']:.2f} s, {row['without']} iterations")  # fmt: skip
+              f"{row['iterations']} iterations; CG alone {row['plain_s']:.2f} s, "
+              f"{row['without']} iterations")  # fmt: skip
         rows.append(say(f"{problem.name}: set-up", row["setup_s"], setup, "s"))
         rows.append(say(f"{problem.name}: iterations to 1e-8", row["iterations"], its))
     growth = {}

@@ -161,5 +161,7 @@ def compare(problem: Problem, eps: float = 1e-6) -> list[Row]:
     plain = add(cg(fast, "CG, FFT products", False, true))
     add(dense_products(problem, plain.iterations))
     add(cholesky(problem, true))
+    fast.destroy()
+    slow.destroy()
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
     return rows

@@ -71,13 +71,13 @@ def potential(n: int) -> Problem:
 
 def lippmann_schwinger(n: int, screening: float = 5.0) -> Problem:
     """Scattering of a screened potential, (-laplace + k^2 + q) u = f: u + G (q u) = G f with G = exp(-k r) / 4 pi r,
-    made symmetric with s = sqrt(q); q = 400 within a smooth ball."""
+    made symmetric with s = sqrt(q); q = 10,000 at the heart of a smooth ball."""
 
     def kernel(r: Array) -> Array:
         return np.exp(-screening * r) / (4 * np.pi) / n**3 * np.where(r > 0, 1 / np.maximum(r, 1 / n), 2.38 * n)
 
     def weight(x: Array) -> Array:
-        return 20.0 * np.exp(-((x - 0.5) ** 2).sum(axis=0) / (2 * 0.15**2) / 2)
+        return 100.0 * np.exp(-((x - 0.5) ** 2).sum(axis=0) / (2 * 0.15**2) / 2)
 
     return Problem(f"Lippmann-Schwinger {n}^3", n, 3, kernel, weight=weight)
 

@@ -142,7 +142,7 @@ def raises_on_the_last(i: np.ndarray, j: np.ndarray) -> np.ndarray:
 
 
 WRONG = {
-    "raises": (raises_on_the_last, "KeyError: \"the user's own\".*test_tensor_train"),
+    "raises": (raises_on_the_last, "KeyError: \"the user's own\".*test_entries_of_mats"),
     "a wrong shape": (lambda i, j: kernel(i, j)[:-1], "array of shape"),
     "NaN": (lambda i, j: np.where(i == 50, np.nan, kernel(i, j)), "nan at row 50, column"),
     "complex": (lambda i, j: 1j * kernel(i, j), "array of type complex128"),
