@@ -114,14 +114,20 @@ def main(given: argparse.Namespace) -> None:
         row = beside_best(problem)
         rows += [row, say(f"{problem.name}: residual over the best of that rank", max(row["ratios"]), 3)]
     record("integral_equations", about, rows)
-    with figure("integral_equations", 1) as (axes,):
-        for name, found in growth.items():
-            for part, line in (("cross", "-"), ("inverse", "--")):
-                x, y = ([row[key] for row in found] for key in ("unknowns", f"{part}_s"))
-                axes.loglog(x, y, line + "o", label=f"{name}, {part}")
-        axes.set_xlabel("unknowns")
-        axes.set_ylabel("CPU seconds")
-        axes.legend()
+    draw(growth)
+
+
+def draw(growth: dict[str, list[dict[str, Any]]]) -> None:
+    """Seconds of cross and inverse against the unknowns."""
+    with figure("integral_equations", 1) as panels:
+        for axes in panels:
+            for name, found in growth.items():
+                for part, line in (("cross", "-"), ("inverse", "--")):
+                    x, y = ([row[key] for row in found] for key in ("unknowns", f"{part}_s"))
+                    axes.loglog(x, y, line + "o", label=f"{name}, {part}")
+            axes.set_xlabel("unknowns")
+            axes.set_ylabel("CPU seconds")
+            axes.legend()
 
 
 if __name__ == "__main__":
