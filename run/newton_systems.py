@@ -23,6 +23,7 @@ from pctt import ccp
 from pctt.ccp.newton.contact import ContactSystem
 from pctt.options import OptionError
 from pctt.pc import TensorTrain
+from pctt.pc.sparse_train import SparseTrain
 from pctt.run.options import Options, read_options
 from pctt.run.report import Progress
 from pctt.run.simulate import Stepper, first_state
@@ -124,24 +125,10 @@ def settled(n: int, *more: Any) -> list[Any]:
     return ["-scene", "mixer", "-scene_n", n, "-restart", "settled", *more]
 
 
-class WatchedTrain(TensorTrain):
-    """A tensor train whose set-ups are timed phase by phase; a rank that failed is tried again at the next matrix.
+class WatchedSparseTrain(SparseTrain):
+    """Whose phases are timed into ``rows[-1]``, the list of its `WatchedTrain`."""
 
-    Attributes
-    ----------
-    rows : a dict of figures per set-up; ``rank`` is 1 where no positive inverse came of it
-    """
-
-    def create(self, pc: PETSc.PC) -> None:
-        super().create(pc)
-        self.rows: list[dict[str, Any]] = []
-
-    def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        assert self.policy is not None
-        self.policy.forgive()
-        self.rows.append({})
-        super().update(pc, P)
-        self.rows[-1] |= {"setup_s": self._setup_seconds, "rank": self.rank}
+    rows: list[dict[str, Any]]
 
     def _compress(self, rank: int, warm: bool):
         start = time.perf_counter()
@@ -158,6 +145,30 @@ class WatchedTrain(TensorTrain):
         rank = mean_rank(inverse.train.ranks) + inverse.identity
         self.rows[-1] |= {"inverse_rank": rank, "positive": positive}
         return inverse, positive
+
+
+class WatchedTrain(TensorTrain):
+    """A tensor train whose set-ups are timed phase by phase; a rank that failed is tried again at the next matrix.
+
+    Attributes
+    ----------
+    rows : a dict of figures per set-up; ``rank`` is 1 where no positive inverse came of it
+    """
+
+    sparse_train = WatchedSparseTrain
+
+    def create(self, pc: PETSc.PC) -> None:
+        super().create(pc)
+        self.rows: list[dict[str, Any]] = []
+
+    def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
+        assert self.policy is not None
+        assert isinstance(self.made, WatchedSparseTrain)
+        self.made.rows = self.rows
+        self.policy.forgive()
+        self.rows.append({})
+        super().update(pc, P)
+        self.rows[-1] |= {"setup_s": self._setup_seconds, "rank": self.rank}
 
 
 def mean_rank(ranks: tuple[int, ...]) -> float:

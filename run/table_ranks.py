@@ -48,7 +48,7 @@ def uncapped(replay: Replay, scaling: str) -> list[dict[str, Any]]:
     matrix = replay.matrix(replay.systems[len(replay.systems) // 2])
     pc, train = train_pc(MPI.COMM_WORLD, max_rank=2, scaling=scaling, keep=False)
     set_up(pc, matrix)
-    slots, hierarchy = train.slots, train.hierarchy
+    slots, hierarchy = train.made.slots, train.made.hierarchy
     assert slots is not None
     assert hierarchy is not None
     size, block = slots.size, slots.block

@@ -21,8 +21,8 @@ class EntriesError(ValueError):
 
 
 def has_entries(P: PETSc.Mat) -> bool:
-    """Whether P's entries are looked up one by one: P has the attribute ``entries``, or is dense and on a grid or without
-    blocks."""
+    """Whether P's entries are looked up one by one: P has the attribute ``entries``, or is dense and on a grid or
+    without blocks."""
     dense = P.getType() in DENSE and (P.getBlockSize() == 1 or P.getAttr("grid") is not None)
     return dense or P.getAttr("entries") is not None
 
@@ -45,8 +45,8 @@ class Entries:
         given = comm.allgather(None if function is None else callable(function))
         if len(set(given)) > 1 or given[0] is False:
             raise EntriesError(
-                f"the attribute entries of the Mat is {given} by rank (None: missing, False: no function); allowed is a "
-                "function of two integer arrays, on all ranks"
+                f"the attribute entries of the Mat is {given} by rank (None: missing, False: no function); allowed is "
+                "a function of two integer arrays, on all ranks"
             )
         return cls(comm, function) if given[0] else DenseEntries(P)
 

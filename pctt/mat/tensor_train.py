@@ -18,7 +18,6 @@ from pctt.mat.order import digits_of
 from pctt.mat.product import TrainProduct
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.entries import EntryMatrix
-from pctt.tt.grid import GridDigits
 from pctt.tt.train import Array, Train
 
 MAX_RANK = 200
@@ -120,10 +119,9 @@ class TensorTrain:
 
     def multTranspose(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         assert self.compressed is not None
-        if self.compressed.symmetric:
-            return self.mult(mat, x, y)
         if self._transposed is None:
-            self._transposed = self.compressed.product(self.compressed.train.T)
+            symmetric = self.compressed.symmetric
+            self._transposed = self._product if symmetric else self.compressed.product(self.compressed.train.T)
         self._times(self._transposed, x, y)
 
     def _times(self, product: TrainProduct, x: PETSc.Vec, y: PETSc.Vec) -> None:

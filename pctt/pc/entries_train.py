@@ -10,8 +10,10 @@ from pctt.mat.product import TrainProduct
 from pctt.mat.tensor_train import CompressedEntries, compressed
 from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
 from pctt.pc.train_options import Account, Options
+from pctt.tt.lowest import lowest
+from pctt.tt.train import identity
 
-TIGHTER = 0.1  # of the accuracy with which an inverse that was not positive is tried again
+TIGHTER, TRIES = 0.05, 4  # eps is lowered where the train of the matrix or of its inverse is not positive
 
 
 class EntriesTrain:
@@ -30,7 +32,7 @@ class EntriesTrain:
         """Make a train; False, with the reason on the account, if there is no positive inverse.
 
         EntriesError, ValueError, on all ranks alike, for entries or a grid that are not as they should be."""
-        for eps in (self.options.eps, TIGHTER * self.options.eps):
+        for eps in self.options.eps * TIGHTER ** np.arange(TRIES):
             warm = self.compressed is not None and self.options.reuse != "none"
             with PETSc.Log.Event("TTCompress"):
                 self.compressed = self._compress(P, rank, eps, self.compressed if warm else None)
@@ -43,6 +45,8 @@ class EntriesTrain:
             if positive:
                 self._product = self._prepare()
                 return True
+            if self.inverse is not None and self.inverse.residual > eps:
+                break  # the rank does not reach this accuracy, let alone a higher one
         return self._refuse(f"the inverse of rank {rank} is not positive")
 
     def _compress(self, P: PETSc.Mat, rank: int, eps: float, start: CompressedEntries | None) -> CompressedEntries:
@@ -52,8 +56,11 @@ class EntriesTrain:
         name = f"-{self.prefix}pc_tt_order"
         return CompressedEntries(P, eps, rank, self.options.order, name, start, self.options.seed)
 
-    def _invert(self, rank: int, eps: float) -> tuple[ApproximateInverse, bool]:
+    def _invert(self, rank: int, eps: float) -> tuple[ApproximateInverse | None, bool]:
         assert self.compressed is not None
+        T = self.compressed.train
+        if lowest(identity(T.rows) + T) <= 0:
+            return None, False
         rng = np.random.default_rng(self.options.seed)
         return approximate_inverse(self.compressed.found, rank, eps, True, None, rng)
 

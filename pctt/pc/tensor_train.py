@@ -1,7 +1,7 @@
 """``-pc_type python -pc_python_type pctt.pc.TensorTrain``: a tensor train as approximate inverse.
 
-Of a sparse matrix: its blocks are ordered, scaled, compressed and inverted as in ``sparse_train.py``; at rank 1 there is
-no train but the scaled diagonal alone, which is block Jacobi, and by default the rank is the one that has paid in
+Of a sparse matrix: its blocks are ordered, scaled, compressed and inverted as in ``sparse_train.py``; at rank 1 there
+is no train but the scaled diagonal alone, which is block Jacobi, and by default the rank is the one that has paid in
 measured seconds per digit (``rank_policy.py``). Of a matrix that is given by its entries (the attribute ``entries``, or
 a dense Mat): compressed by cross and inverted, ``entries_train.py``.
 """

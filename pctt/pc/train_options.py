@@ -32,9 +32,11 @@ class Options:
         choices=("block", "none"),
     )
     order: str = option(
-        "auto", "of the rows; grid: of the attribute grid or the DMDA, one axis after the other; morton: along a curve "
-        "through the attribute coordinates; rcm: reverse Cuthill-McKee; natural: as numbered; auto: the first that the "
-        "matrix has what it needs for (with names of rows morton)", choices=("auto", "grid", "morton", "rcm", "natural"),
+        "auto",
+        "of the rows; grid: of the attribute grid or the DMDA, one axis after the other; morton: along a curve through "
+        "the attribute coordinates; rcm: reverse Cuthill-McKee; natural: as numbered; auto: the first that the matrix "
+        "has what it needs for (with names of rows morton)",
+        choices=("auto", "grid", "morton", "rcm", "natural"),
     )
     leaf: int = option(16, "least number of blocks in the first and last mode", check=AT_LEAST_ONE)
     modes: str = option("", "modes of the blocks with commas between; none: chosen for little padding")

@@ -20,6 +20,7 @@ import numpy as np
 from scipy import linalg
 
 from pctt.tt.als import relative_error
+from pctt.tt.entries import EntryMatrix
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Array, Train, low_rank, matrix_train, zeros
 
@@ -47,12 +48,12 @@ class Cross:
 
 
 def compress_cross(
-    matrix: SparseHierarchy,
+    matrix: SparseHierarchy | EntryMatrix,
     max_rank: int = 10,
     eps: float = 1e-2,
     start: Cross | None = None,
     sweeps: int = 10,
-    measure: bool | None = None,
+    measure: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Cross:
     """Train of ranks at most `max_rank` from entries of the matrix, within about eps if the rank allows.
@@ -60,8 +61,8 @@ def compress_cross(
     start : the result for a similar matrix, whose index sets are the first ones
     sweeps : the most; the estimated error ends them when it is below eps or falls by less than a tenth
         in two sweeps running
-    measure : measure the error at last, at a cost linear in the nonzeros, by default that of a sparse matrix; without,
-        it is estimated from fresh samples, and all is sublinear
+    measure : measure the error of a sparse matrix at last, at a cost linear in the nonzeros; without, and of a matrix
+        that is a function, it is estimated from fresh samples, and all is sublinear
     rng : must give the same numbers on all ranks
 
     >>> i = np.arange(63)
@@ -94,8 +95,7 @@ def compress_cross(
         inner *= TIGHTER
         extra = matrix.agree(entries.worst(train, most))
     assert best is not None, "there is at least one sweep"
-    measured = isinstance(matrix, SparseHierarchy) if measure is None else measure
-    if measured:
+    if isinstance(matrix, SparseHierarchy) and measure:
         return replace(best, error=relative_error(matrix, best.train))
     return replace(best, error=matrix.agree(entries.error(best.train, *entries.validation())))
 
@@ -106,7 +106,7 @@ class _Entries:
     A prefix of length k and a suffix are the keys of their own digits: key = prefix * width[k] + suffix.
     """
 
-    def __init__(self, matrix: SparseHierarchy, rng: np.random.Generator) -> None:
+    def __init__(self, matrix: SparseHierarchy | EntryMatrix, rng: np.random.Generator) -> None:
         self.matrix = matrix
         self.rng = rng
         self.squares = [m * m for m in matrix.modes]

@@ -20,8 +20,8 @@ NORM_SAMPLES = 4096
 
 
 class EntryMatrix:
-    """T = (A - c I) / c of the matrix A(i, j) = entries(i, j) of the points of a grid, c the mean of A's diagonal (T = A
-    where that is not positive); padding stands for rows of c I.
+    """T = (A - c I) / c of the matrix A(i, j) = entries(i, j) of the points of a grid, c the mean of A's diagonal
+    (T = A where that is not positive); padding stands for rows of c I.
 
     Errors are relative to T: the identity, whose norm grows with the number of points, does not hide them.
 
@@ -100,8 +100,7 @@ class EntryMatrix:
             columns.append(column)
         offset = np.abs(np.subtract(rows, columns))
         weight /= self._chance(offset, sizes)
-        rows, columns = np.array(rows)[:, inside], np.array(columns)[:, inside]
-        return self.digits.key(rows, columns), weight[inside]
+        return self.digits.key(np.array(rows)[:, inside], np.array(columns)[:, inside]), weight[inside]
 
     def _chance(self, offset: Array, sizes: list[int]) -> Array:
         """Chance of offsets (D + 1, p), given the row: one half of a product over the axes, one half of an average over
@@ -120,7 +119,7 @@ class EntryMatrix:
             part = np.full(offset.shape[1], high - low)
             for n, off in zip(sizes, offset):
                 scales = int(np.ceil(np.log2(n))) + 1
-                reach = (1 << int(0.5 * (low + high) * scales)) - 1
-                part *= np.where(off <= reach, 1.0 / (2 * reach + 1), 0.0)
+                far = (1 << int(0.5 * (low + high) * scales)) - 1
+                part *= np.where(off <= far, 1.0 / (2 * far + 1), 0.0)
             together += part
         return 0.5 * (apart + together)

@@ -22,54 +22,45 @@ PRIMES = (2, 3, 5, 7)  # bases of digits
 class GridDigits:
     """The digits of a grid of shape (n_1, ..., n_D), its points numbered as numpy numbers an array of this shape.
 
-    interleaved : level by level instead of axis after axis
     block : unknowns per point, the fastest digit of a row
 
     modes : of the train, row and column alike
     places : (n_1 ... n_D block,) place of each row among those of the train (`slots_of(modes)` of them)
 
-    >>> GridDigits((8, 6)).modes, GridDigits((8, 6), interleaved=True).modes
-    ((2, 2, 2, 3, 2), (2, 6, 4))
+    >>> GridDigits((8, 6)).modes
+    (2, 2, 2, 3, 2)
     """
 
-    def __init__(self, shape: Sequence[int], interleaved: bool = False, block: int = 1) -> None:
+    def __init__(self, shape: Sequence[int], block: int = 1) -> None:
         self.shape, self.block = tuple(int(n) for n in shape), int(block)
         axes = [bases(n) for n in self.shape]
-        if interleaved:
-            depth = max(map(len, axes))
-            levels = [[(a, level - depth + len(digits)) for a, digits in enumerate(axes)] for level in range(depth)]
-            groups = [[(a, k) for a, k in level if k >= 0] for level in levels]
-        else:
-            groups = [[(a, k)] for a, digits in enumerate(axes) for k in range(len(digits))]
-        modes = [prod(axes[a][k] for a, k in group) for group in groups] or [1]
+        modes = [base for digits in axes for base in digits] or [1]
         self.modes = scalar_modes(modes, self.block)
-        self._tables(axes, groups)
+        self._tables(axes)
 
-    def _tables(self, axes: list[list[int]], groups: list[list[tuple[int, int]]]) -> None:
+    def _tables(self, axes: list[list[int]]) -> None:
         """Per axis what its coordinate adds to a place in the train and to the two halves of a key; per mode what a
         pair of digits adds to the pair of padded rows."""
         self.padded = tuple(prod(digits) for digits in axes)
         self.size = slots_of(self.modes)
         if self.size >= 2**31:
             raise ValueError(f"too many points for a train: a grid of shape {self.shape}")
-        width = np.cumprod([1, *self.modes[::-1]])[-2::-1]  # of a digit in a place
-        square = np.cumprod([1.0, *(float(m) ** 2 for m in self.modes[::-1])])[-2::-1].astype(np.int64)
-        points = [np.arange(p) for p in self.padded]
-        self.place = [np.zeros(p, np.int64) for p in self.padded]
-        self.row_key = [np.zeros(p, np.int64) for p in self.padded]
-        self.column_key = [np.zeros(p, np.int64) for p in self.padded]
-        stride = np.cumprod([1, *self.padded[::-1]])[-2::-1]
+        width = [int(w) for w in np.cumprod([1, *self.modes[::-1]])[-2::-1]]  # of a digit in a place
+        square = [w * w for w in width]  # and of a pair of digits in a key
+        stride = np.cumprod([1, *self.padded[::-1]])[-2::-1] * self.block
+        self.place, self.row_key, self.column_key = ([np.zeros(p, np.int64) for p in self.padded] for _ in range(3))
         row_of = [np.zeros(m, np.int64) for m in self.modes]
-        for k, group in enumerate(groups):
-            below = self.block if k == len(groups) - 1 else 1  # of a digit within its mode
-            for a, level in group[::-1]:
-                base, weight = axes[a][level], prod(axes[a][level + 1 :])
-                digit = points[a] // weight % base
-                self.place[a] += digit * below * width[k]
-                self.row_key[a] += digit * below * self.modes[k] * square[k]
-                self.column_key[a] += digit * below * square[k]
-                row_of[k] += np.arange(self.modes[k]) // below % base * (weight * stride[a] * self.block)
-                below *= base
+        k = 0
+        for a, bases_of_axis in enumerate(axes):
+            for level, base in enumerate(bases_of_axis):
+                weight = prod(bases_of_axis[level + 1 :])
+                below = self.modes[k] // base  # the block, in the last mode
+                digit = np.arange(self.padded[a]) // weight % base * below
+                self.place[a] += digit * width[k]
+                self.row_key[a] += digit * self.modes[k] * square[k]
+                self.column_key[a] += digit * square[k]
+                row_of[k] += np.arange(self.modes[k]) // below * (weight * int(stride[a]))
+                k += 1
         row_of[-1] += np.arange(self.modes[-1]) % self.block
         self._pairs = [(row[:, None] * self.size + row).ravel() for row in row_of]
         self._square = square
@@ -95,8 +86,8 @@ class GridDigits:
         return out
 
     def pair(self, keys: Array) -> Array:
-        """Pairs row * size + column (padded) of keys, digits i_k m_k + j_k of base m_k^2: the pair of a sum of keys that
-        share no digit is the sum of their pairs."""
+        """Pairs row * size + column (padded) of keys, digits i_k m_k + j_k of base m_k^2: the pair of a sum of keys
+        that share no digit is the sum of their pairs."""
         pair = np.zeros(keys.shape, np.int64)
         for table, square in zip(self._pairs, self._square):
             digit, keys = np.divmod(keys, square)
@@ -123,7 +114,8 @@ def bases(n: int) -> list[int]:
     ([2, 2, 2, 2, 2, 2], [5, 5, 2, 2], [7, 7, 2], [])
     """
     while True:
-        rest, found = n, []
+        rest = n
+        found: list[int] = []
         for p in PRIMES:
             while rest % p == 0:
                 rest //= p

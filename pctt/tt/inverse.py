@@ -31,6 +31,7 @@ IDLE = 0.8  # a sweep that leaves more than this of the residual is the last, or
 ENOUGH = 0.5  # part of eps at which the residual, estimated on the way, is worth measuring
 DROP = 0.1  # of that residual: what a core may leave out of the inverse
 NOISE = 1e-7  # part of the residual that is taken for rounding
+ROUNDINGS = 8  # trials of a rounding that the residual allows, each three times as exact as the last
 SKETCH = 64  # rank of the random train with which a residual of high rank is estimated
 HIGH = 300  # product of ranks of S and X from which that is done
 
@@ -250,8 +251,8 @@ def _solve(
 
 def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Train, float]:
     """X of the least ranks that a few trials find to leave the residual below eps, and the residual."""
-    for part in (1.0, 0.3, 0.1, 0.03):
-        smaller = X.round(part * eps)
+    for tries in range(ROUNDINGS):
+        smaller = X.round(eps / 3**tries)
         if smaller.ranks == X.ranks:
             break
         found = residual(S, smaller, B)
@@ -317,7 +318,7 @@ def _basis(
         parts.append((U, s, R))
     keep = _largest([s for _, s, _ in parts], most, drop)
     Q = [_own_transposes(U[:, :r], sign, left, x.shape) for sign, (U, _, _), r in zip((1.0, -1.0), parts, keep)]
-    R = [R[:r] for (_, _, R), r in zip(parts, keep)]
+    coefficients = [R[:r] for (_, _, R), r in zip(parts, keep)]
     room = min(most - sum(keep), max(LEAST_GROWTH, sum(keep)))
     if more is not None and room > 0:
         extra = []
@@ -331,8 +332,9 @@ def _basis(
         for part, (U, _) in enumerate(extra):
             U = U[:, : new[part]]
             Q[part] = np.hstack((Q[part], np.linalg.qr(U - Q[part] @ (Q[part].T @ U))[0]))
-            R[part] = np.vstack((R[part], np.zeros((new[part], len(right)), x.dtype)))
-    return np.hstack(Q), np.vstack(R), np.repeat(np.array([1, -1], x.dtype), [len(r) for r in R])
+            coefficients[part] = np.vstack((coefficients[part], np.zeros((new[part], len(right)), x.dtype)))
+    signs = np.repeat(np.array([1, -1], x.dtype), [len(R) for R in coefficients])
+    return np.hstack(Q), np.vstack(coefficients), signs
 
 
 def _own_transposes(U: Array, sign: float, left: Array, shape: tuple[int, ...]) -> Array:
@@ -347,8 +349,8 @@ def _own_transposes(U: Array, sign: float, left: Array, shape: tuple[int, ...]) 
 
 
 def _largest(values: list[Array], most: int, drop: float) -> list[int]:
-    """How many of each of two descending lists are kept: at most so many, at least one, and of these as few as leave out
-    no more than `drop` times the norm of all."""
+    """How many of each of two descending lists are kept: at most so many, at least one, and of these as few as leave
+    out no more than `drop` times the norm of all."""
     both = np.sort(np.concatenate(values))[::-1]
     tail = np.sqrt(np.cumsum(both[::-1].astype(float) ** 2))[::-1]
     floor = max(drop, float(np.finfo(both.dtype).eps)) * tail[0]

@@ -11,7 +11,8 @@ from pctt.tt.train import Array, Train, random
 
 def lowest(X: Train, rank: int | None = None, sweeps: int = 4, rng: np.random.Generator | None = None) -> float:
     """An upper bound of the least eigenvalue of a symmetric X: the least v'Xv / v'v that an alternating search over
-    trains v of the given rank (by default 8, with modes above 8, which cost more, 4) finds. A negative value proves that X is not positive definite.
+    trains v of the given rank finds, by default 8, or 4 with modes above 8, which cost more. A negative value proves
+    that X is not positive definite.
 
     >>> from pctt.tt.train import identity
     >>> round(lowest(identity([4, 4, 4])), 12)

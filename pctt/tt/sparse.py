@@ -191,8 +191,8 @@ class SparseHierarchy:
         return self.reduce(found)
 
     def validation(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Keys of `count` stored entries and as many others, and weights with which a sum of squares over them estimates
-        that over all entries."""
+        """Keys of `count` stored entries and as many others, and weights with which a sum of squares over them
+        estimates that over all entries."""
         stored = self.sample(count, rng)
         size = float(self.size) ** 2
         others = rng.integers(0, slots_of(self.modes) ** 2, count)

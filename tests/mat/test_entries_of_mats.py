@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -142,7 +148,7 @@ def raises_on_the_last(i: np.ndarray, j: np.ndarray) -> np.ndarray:
 
 
 WRONG = {
-    "raises": (raises_on_the_last, "KeyError: \"the user's own\".*test_tensor_train"),
+    "raises": (raises_on_the_last, "KeyError: \"the user's own\".*test_entries_of_mats"),
     "a wrong shape": (lambda i, j: kernel(i, j)[:-1], "array of shape"),
     "NaN": (lambda i, j: np.where(i == 50, np.nan, kernel(i, j)), "nan at row 50, column"),
     "complex": (lambda i, j: 1j * kernel(i, j), "array of type complex128"),
@@ -208,3 +214,23 @@ def test_new_values_make_a_new_train():
     ksp.setUp()
     assert ksp.pc.getPythonContext().account.reused == 1
     assert ksp.pc.getPythonContext().made.compressed.shift == pytest.approx(4.4)
+
+
+def test_the_example_of_the_documentation_runs():
+    text = (Path(__file__).resolve().parents[2] / "docs" / "trains.md").read_text()
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "times less than dense" in done.stdout
+    assert "inverse I + Z ranks" in done.stdout
+
+
+def test_the_examples_multiply_with_their_entries():
+    """Products by FFT are those of the entries, and a train solves each with few iterations."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
+    problems = importlib.import_module("problems")
+    for problem in (problems.fredholm(9), problems.lippmann_schwinger(5), problems.gaussian_process(8)):
+        i = np.arange(problem.size)
+        A = problem.entries(*(k.ravel() for k in np.meshgrid(i, i, indexing="ij"))).reshape(len(i), -1)
+        v = np.random.default_rng(0).standard_normal(len(i))
+        np.testing.assert_allclose(problem.product()(v), A @ v)
