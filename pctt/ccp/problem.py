@@ -201,6 +201,8 @@ class ConeProblem:
         if self.comm.size == 1:
             return x
         here = np.array(x, order="C")
+        if here.dtype == bool:  # MPI has no maximum of these
+            here = here.astype(int)
         everywhere = np.empty_like(here)
         self.comm.Allreduce(here, everywhere, op)
         return everywhere if here.ndim else everywhere.item()

@@ -30,7 +30,7 @@ def loose_line(tol: float) -> str:
     """What a first-order method does at a tolerance above the default."""
     return (
         f"WARNING: -ccp_tol {tol:g}: first-order methods leave overlaps of millimetres above 1e-4, which are pushed "
-        "apart: a packing at rest is heated"
+        "apart: a packing may not come to rest"
     )
 
 

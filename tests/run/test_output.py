@@ -6,6 +6,7 @@ import json
 import math
 import os
 import pty
+import re
 import subprocess
 
 import h5py
@@ -59,7 +60,8 @@ def test_the_summary_has_the_documented_fields(solver, program, settled, tmp_pat
         assert line["step"] == first + k
         assert line["time"] == pytest.approx(Mixer.dt * line["step"])
         assert line["contacts"] > 40
-        assert 0 < line["natural_residual"] <= 1e-4
+        of_the_law = "coulomb_residual" if line["law"] == "Coulomb" else "natural_residual"
+        assert 0 < line[of_the_law] <= 1e-4
         assert line["objective"] < 0
         assert 0 < line["seconds"] < 100
         newton = solver == "pdip"
@@ -221,7 +223,7 @@ def test_on_a_terminal_the_present_step_is_shown(settled, cache, tmp_path):
     assert f"step {first}, time".encode() in said
     assert b"\r\033[K" in said
     assert b"(2 of 2)" in said
-    assert b"about 0 s left" in said
+    assert re.search(rb"about \d+ s left", said)
     assert b"solve" in said
 
 
