@@ -45,6 +45,8 @@ def compress(
 ) -> Compression:
     """Train of ranks at most `max_rank`, within eps where the rank allows.
 
+    Parameters
+    ----------
     start : warm start; its ranks are filled up with random directions
     sweeps : there and back after the first pass, per rank that is tried; by default 0 from a start, 1 from
         scratch. From scratch the start for a matrix of more than MANY slots comes from a part of it.

@@ -58,6 +58,8 @@ def compress_cross(
 ) -> Cross:
     """Train of ranks at most `max_rank` from entries of the matrix, within about eps if the rank allows.
 
+    Parameters
+    ----------
     start : the result for a similar matrix, whose index sets are the first ones
     sweeps : the most; the estimated error ends them when it is below eps or falls by less than a tenth
         in two sweeps running

@@ -64,6 +64,8 @@ def invert(
 ) -> Inverse:
     """Inverse of a symmetric positive definite S with ranks at most `max_rank`.
 
+    Parameters
+    ----------
     start : a train near the inverse, by default a multiple of the identity
     sweeps : there and back over the cores, at most; by default 1 from a start, else as many as the ranks need to reach
         the cap, and two more

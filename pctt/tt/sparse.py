@@ -38,6 +38,8 @@ def alone(x: Any) -> Any:
 class SparseHierarchy:
     """The nonzero blocks of a sparse matrix, sorted into the hierarchy of the modes of a train.
 
+    Parameters
+    ----------
     rows, columns : (nb,) slots of the blocks; the same slot pair may come several times (its blocks are
         added)
     modes : slot modes m_1, ..., m_d of rows and columns alike
