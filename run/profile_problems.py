@@ -186,12 +186,13 @@ def plot(rows: Rows) -> None:
     with figure("profile", len(TOLERANCES), len(laws)) as panels:
         for axes, (law, tol) in zip(panels, [(law, tol) for law in laws for tol in TOLERANCES]):
             solvers, ratio = ratios(rows, law, tol)
+            colours = {name: f"C{k % 10}" for k, name in enumerate(dict.fromkeys(row["method"] for row in rows))}
             finite = ratio[np.isfinite(ratio)]
             end = 2 * finite.max(initial=2.0)
             for k, solver in enumerate(solvers):
                 x = np.sort(ratio[k][np.isfinite(ratio[k])])
                 x, part = np.append(x, end), np.append(np.arange(1, len(x) + 1), len(x)) / max(1, ratio.shape[1])
-                style = {"color": f"C{k % 10}", "ls": "--" if solver in PEERS else "-", "lw": 1.4}
+                style = {"color": colours[solver], "ls": "--" if solver in PEERS else "-", "lw": 1.4}
                 axes.step(np.insert(x, 0, 1.0), np.insert(part, 0, 0.0), where="post", label=solver, **style)
             axes.set(xscale="log", xlim=(1, end), ylim=(0, 1.02), title=f"{LAWS[law]}, {tol:.0e}")
             axes.set(xlabel="seconds over the fastest's", ylabel="part of the problems")
