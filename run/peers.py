@@ -6,7 +6,8 @@ the Coulomb residual. `clarabel` is an interior point method for any conic progr
 
     min 1/2 v'v + 1/2 w'w    subject to    G v + C^1/2 w + r in the dual cones,
 
-whose multipliers are the impulses, or, where the problem is given by N, ours as it is. One thread each; their own stop tests, tightened until ours is met.
+whose multipliers are the impulses, or, where the problem is given by N, ours as it is. One thread each; their own stop
+tests, tightened until ours is met.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ SUFFIXES = (".dat", ".hdf5", ".h5", ".petsc")
 TOLERANCES = (1e-4, 1e-6, 1e-8)
 ROUNDING = 1.01  # of a residual that another formula finds
 AGAIN, TIMES = 2.0, 5  # seconds up to which a solve is repeated, and how often at most
-STARTUP = 20.0  # seconds that a process may take beside its solves
+STARTUP = 30.0  # seconds that a process may take beside its solves
 LAWS = {"convex": "the convex problem", "coulomb": "Coulomb's law"}
 OWN = {"convex": list(ccp.SOLVERS), "coulomb": ["conic", "pdip", "auto", "apgd"]}
 WITHIN = (1.0, 2.0, 10.0)  # times the fastest, columns of the table
@@ -48,16 +48,20 @@ def solve(path: str, law: str, solver: str, seconds: float) -> Iterator[dict[str
     for tol in TOLERANCES:
         if solver in PEERS:  # their own stop tests, tightened until ours is met
             runs: Rows = []
-            while not runs or (runs[-1]["residual"] > ROUNDING * tol and theirs > 1e-13 and runs[-1]["seconds"] < seconds):
+            while not runs or (not _reached(runs[-1], tol) and theirs > 1e-13 and runs[-1]["seconds"] < seconds):
                 theirs *= 0.1
                 runs.append(fastest(path, law, solver, theirs, seconds))
             found = min(runs, key=lambda run: run["residual"])
         else:
             found = fastest(path, law, solver, tol, seconds)
-        reached = bool(found["residual"] <= ROUNDING * tol) and not found["reason"].startswith("unbounded")
+        reached = _reached(found, tol) and found["seconds"] <= seconds  # peers do not always end in time
         yield {"tol": tol, "reached": reached, **found}
         if not reached:
             return
+
+
+def _reached(found: dict[str, Any], tol: float) -> bool:
+    return bool(found["residual"] <= ROUNDING * tol) and not found["reason"].startswith("unbounded")
 
 
 def fastest(path: str, law: str, solver: str, tol: float, seconds: float) -> dict[str, Any]:
@@ -80,7 +84,7 @@ def once(path: str, law: str, solver: str, tol: float, seconds: float) -> dict[s
             run = solve_one.own(problem, solver, tol, seconds, law == "coulomb")
             impulse = run["impulse"]
             found = {name: run[name] for name in ("seconds", "reason", "solver", "products", "ksp_its")}
-        residual, objective = np.inf, None
+        residual, objective = np.inf, None  # of a solve that is out of time the best that it looked at is not known
         if impulse is not None and np.isfinite(impulse).all():
             accuracy = ccp.measure(problem, impulse)
             residual = accuracy.coulomb_residual if law == "coulomb" else accuracy.natural_residual
@@ -115,14 +119,13 @@ def problems(folders: list[Path]) -> tuple[list[tuple[Path, int]], list[str]]:
         try:
             with files.load(path, MPI.COMM_SELF).problem as problem:
                 found.append((path, problem.size))
-        except FileFormatError as error:
+        except FileFormatError as error:  # noqa: PERF203 - as many files as a folder has
             refused.append(str(error))
     return found, refused
 
 
 def ratios(rows: Rows, law: str, tol: float) -> tuple[list[str], np.ndarray]:
-    """Solvers, and their seconds over those of the fastest (solvers, problems), inf where they failed. A problem that no
-    solver solved is left out."""
+    """Solvers, and their seconds over those of the fastest (solvers, problems), inf where they failed."""
     mine = [row for row in rows if (row["law"], row["tol"]) == (law, tol)]
     solvers = list(dict.fromkeys(row["method"] for row in mine))
     names = list(dict.fromkeys(row["problem"] for row in mine))
@@ -131,8 +134,7 @@ def ratios(rows: Rows, law: str, tol: float) -> tuple[list[str], np.ndarray]:
         if row["reached"]:
             seconds[solvers.index(row["method"]), names.index(row["problem"])] = row["seconds"]
     best = seconds.min(axis=0, initial=np.inf)
-    solved = np.isfinite(best)
-    return solvers, seconds[:, solved] / best[solved]
+    return solvers, np.where(np.isfinite(seconds), seconds / np.where(np.isfinite(best), best, 1.0), np.inf)
 
 
 def tables(rows: Rows) -> str:
@@ -143,16 +145,16 @@ def tables(rows: Rows) -> str:
         if not mine:
             continue
         names = list(dict.fromkeys(row["problem"] for row in mine))
-        lines += [f"**{words[0].upper()}{words[1:]}**: problems of {len(names)} solved, and for how many of them the solver"]
-        lines += ["was the fastest / within 2 / within 10 times the fastest", ""]
+        lines += [f"**{words[0].upper()}{words[1:]}**, {len(names)} problems. Each cell: how many were solved; how"]
+        lines += ["many of them in the least time, in at most twice and in at most ten times the least time.", ""]
         lines += [f"| | {' | '.join(f'{tol:.0e}' for tol in TOLERANCES)} |", "|" + "---|" * (len(TOLERANCES) + 1)]
         profiles = {tol: ratios(rows, law, tol) for tol in TOLERANCES}
         for k, solver in enumerate(profiles[TOLERANCES[0]][0]):
             cells = []
             for tol in TOLERANCES:
                 ratio = profiles[tol][1][k]
-                counts = " / ".join(str(int((ratio <= within).sum())) for within in WITHIN)
-                cells.append(f"{np.isfinite(ratio).sum()}: {counts}")
+                counts = ", ".join(str(int((ratio <= within).sum())) for within in WITHIN)
+                cells.append(f"{np.isfinite(ratio).sum()}; {counts}")
             lines.append(f"| `{solver}` | {' | '.join(cells)} |")
         lines += ["", f"Seconds to {TOLERANCES[-1]:.0e}; where that was not reached, the residual in brackets:", ""]
         solvers = profiles[TOLERANCES[0]][0]
@@ -166,7 +168,10 @@ def tables(rows: Rows) -> str:
 
 
 def _seconds(row: dict[str, Any]) -> str:
-    return f"{row['seconds']:.2g}" if row["reached"] else f"({row['residual']:.0e})"
+    """Of a solve; where it failed, the residual that it stopped at in brackets, if there is one."""
+    if row["reached"]:
+        return f"{row['seconds']:.2g}"
+    return f"({row['residual']:.1e})" if np.isfinite(row["residual"]) else "-"
 
 
 def _failures(rows: Rows) -> list[str]:
@@ -181,13 +186,14 @@ def plot(rows: Rows) -> None:
     with figure("profile", len(TOLERANCES), len(laws)) as panels:
         for axes, (law, tol) in zip(panels, [(law, tol) for law in laws for tol in TOLERANCES]):
             solvers, ratio = ratios(rows, law, tol)
+            colours = {name: f"C{k % 10}" for k, name in enumerate(dict.fromkeys(row["method"] for row in rows))}
             finite = ratio[np.isfinite(ratio)]
             end = 2 * finite.max(initial=2.0)
             for k, solver in enumerate(solvers):
                 x = np.sort(ratio[k][np.isfinite(ratio[k])])
                 x, part = np.append(x, end), np.append(np.arange(1, len(x) + 1), len(x)) / max(1, ratio.shape[1])
-                axes.step(np.insert(x, 0, 1.0), np.insert(part, 0, 0.0), where="post", label=solver,
-                          color=f"C{k % 10}", ls="--" if solver in PEERS else ":" if k > 9 else "-", lw=1.4)  # fmt: skip
+                style = {"color": colours[solver], "ls": "--" if solver in PEERS else "-", "lw": 1.4}
+                axes.step(np.insert(x, 0, 1.0), np.insert(part, 0, 0.0), where="post", label=solver, **style)
             axes.set(xscale="log", xlim=(1, end), ylim=(0, 1.02), title=f"{LAWS[law]}, {tol:.0e}")
             axes.set(xlabel="seconds over the fastest's", ylabel="part of the problems")
             axes.grid(alpha=0.3)
@@ -201,15 +207,15 @@ def read_words() -> tuple[list[Path], dict[str, list[str]], float]:
         for law in LAWS
     }
     parser = argparse.ArgumentParser(prog="run/profile", description=__doc__)
-    parser.add_argument("words", nargs="+", metavar="DIR or SOLVER", help="folders of problems; solvers, none: all")
+    parser.add_argument("words", nargs="*", metavar="DIR or SOLVER", help="folders of problems; solvers, none: all")
     parser.add_argument("--seconds", type=float, default=20.0, help="limit of a solve (20)")
     parser.add_argument("--laws", default=",".join(LAWS), help=f"of {', '.join(LAWS)}, with commas between (both)")
     parser.add_argument("--from", dest="place", default=".", help=argparse.SUPPRESS)
     words = parser.parse_args()
     allowed = sorted({name for names in everything.values() for name in names})
-    asked = [name for word in words.words if word.replace(",", "") and not _folder(words.place, word).is_dir()
-             for name in word.split(",")]  # fmt: skip
-    folders = [_folder(words.place, word) for word in words.words if _folder(words.place, word).is_dir()]
+    paths = {word: Path(os.path.normpath(Path(words.place) / word)) for word in words.words}
+    folders = [path for path in paths.values() if path.is_dir()]
+    asked = [name for word, path in paths.items() if not path.is_dir() for name in word.split(",")]
     for name in asked:
         if name not in allowed:
             parser.error(f"{name}: no folder, and no solver; allowed are {', '.join(allowed)}")
@@ -218,15 +224,10 @@ def read_words() -> tuple[list[Path], dict[str, list[str]], float]:
         if law not in LAWS:
             parser.error(f"--laws {law}: allowed are {', '.join(LAWS)}")
     if not folders:
-        parser.error("no folder with problems given")
+        parser.error("no folder with problems given; allowed is run/profile DIR [DIR ...] [SOLVER ...]")
     if not words.seconds > 0:
         parser.error(f"--seconds {words.seconds:g}: allowed is a number > 0")
     return folders, {law: [s for s in everything[law] if not asked or s in asked] for law in laws}, words.seconds
-
-
-def _folder(place: str, word: str) -> Path:
-    """A folder as the one who calls names it."""
-    return Path(os.path.normpath(Path(place) / word))
 
 
 def main() -> None:
@@ -235,7 +236,8 @@ def main() -> None:
     for error in refused:
         print(f"left out: {error}")
     if not found:
-        raise SystemExit(f"run/profile: no problems in {', '.join(map(str, folders))}; allowed are {', '.join(SUFFIXES)}")
+        places, allowed = ", ".join(map(str, folders)), ", ".join(SUFFIXES)
+        raise SystemExit(f"run/profile: no problems in {places}; allowed are files that end in {allowed}")
     about = say_machine() | {"limit": seconds, "refused": refused}
     rows: Rows = []
     for law, names in solvers.items():
@@ -249,6 +251,11 @@ def main() -> None:
                 print(f"{solver:18}{''.join(f'{_seconds(row):>10}' for row in mine)}"
                       f"{'' if mine[-1]['reached'] else '  ' + mine[-1]['reason']}", flush=True)  # fmt: skip
             record("profile", about, rows)
+    show(rows)
+
+
+def show(rows: Rows) -> None:
+    """The figure and the tables."""
     plot(rows)
     text = tables(rows)
     Path("results/profile.md").write_text(text + "\n")
@@ -256,7 +263,9 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--one"]:
+    if sys.argv[1:] == ["--show"]:
+        show(json.loads(Path("results/profile.json").read_text())["rows"])
+    elif sys.argv[1:2] == ["--one"]:
         path, law, solver, limit = sys.argv[2:]
         for line in solve(path, law, solver, float(limit)):
             print(json.dumps(line), flush=True)
