@@ -26,7 +26,7 @@ from pctt.ccp.newton import FORMS, Newton
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.registry import NEWTON, SOLVERS, Solver
-from pctt.ccp.result import Limits, Result
+from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.contact_map import CompactRows
 from pctt.log import phase
@@ -44,6 +44,7 @@ __all__ = [
     "Limits",
     "Newton",
     "Result",
+    "Status",
     "measure",
     "newton_for",
     "solve",
@@ -67,7 +68,7 @@ def solve(
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an
     instance of the method's options class; ``newton``, for methods that solve Newton systems, keeps what serves one
-    problem after another. A problem without a solution is not converged, for a reason that begins with "unbounded".
+    problem after another. A problem without a solution has the status UNBOUNDED.
     """
     solver = SOLVERS[type]
     limits = limits or Limits()
@@ -95,15 +96,15 @@ def _once(
     """Solve the cone problem as it is, or with ``law`` have the method find Coulomb's law."""
     nothing = np.zeros_like(problem.r)
     if problem.size == 0:
-        return Result(nothing, True, "no contacts", 0.0, 0)
+        return Result(nothing, Status.CONVERGED, "no contacts", 0.0, 0)
     if problem.natural_residual(nothing, problem.r) == 0:
-        return Result(nothing, True, "no contact closes", 0.0, 0)
+        return Result(nothing, Status.CONVERGED, "no contact closes", 0.0, 0)
     arguments = (problem, guess, limits, options, *([newton] if solver.newton else []))
     with phase("CCPSolve"):
         result = solver.function(*arguments, **({"coulomb": True} if law else {}))
         unbounded = why_unbounded(problem, result.impulse)
         if unbounded:
-            result.converged, result.reason = False, unbounded
+            result.status, result.reason = Status.UNBOUNDED, unbounded
         return result
 
 

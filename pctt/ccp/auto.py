@@ -97,7 +97,7 @@ def solve(
     result = second = conic.solve(problem, first.impulse, inner, begin, newton, coulomb)
     words = f"{first.reason}; conic: {second.reason}"
     solver = "conic"
-    if not (second.converged or second.reason.startswith("unbounded") or most <= CONIC_IT):
+    if not (second.final or most <= CONIC_IT):
         best = min(first, second, key=lambda result: result.natural_residual)
         result = apgd.solve(problem, best.impulse, limited, apgd.APGD(), None, coulomb)
         result.ksp_its, result.fallbacks = second.ksp_its, second.fallbacks

@@ -19,7 +19,7 @@ import numpy as np
 
 from pctt.ccp.cone import Array, add_opening, tangential
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.result import COULOMB, FIXED_POINT, Result
+from pctt.ccp.result import COULOMB, FIXED_POINT, Result, Status
 from pctt.options import AT_LEAST_ONE, COUNT, NOT_NEGATIVE, option
 
 INNER = 0.3  # accuracy of a cone problem, as a part of the Coulomb residual before it, or of the tolerance
@@ -62,15 +62,15 @@ def ladder(
     if has_law or problem.size == 0:
         own = once(problem, guess, tol, law=True)
         own.law = COULOMB
-        if own.converged or own.reason.startswith("unbounded"):
+        if own.final:
             return own
         tried.append(own)
     start = tried[0].impulse if tried else guess
     tried.append(solve(problem, start, tol, options, once))
-    if not tried[-1].converged and not tried[-1].reason.startswith("unbounded"):
+    if not tried[-1].final:
         plain = once(problem, guess, tol)
         y = problem.product(plain.impulse) + problem.r
-        plain.natural_residual, plain.converged = residual(problem, plain.impulse, y), False
+        plain.natural_residual, plain.status = residual(problem, plain.impulse, y), Status.STALLED
         plain.reason = f"relaxation, as Coulomb's law was not met: {tried[-1].reason}"
         tried.append(plain)
     best = tried[-1] if tried[-1].converged else min(tried, key=lambda result: result.natural_residual)
@@ -114,22 +114,22 @@ def solve(
         history.append(residual(problem, g, y))
         if best is None or history[-1] <= min(history):
             best = inner
-        if history[-1] <= tol or failed > 1 or inner.reason.startswith("unbounded"):
+        if history[-1] <= tol or failed > 1 or inner.status is Status.UNBOUNDED:
             break
         if history[-1] > RESTART * min(history):
             anderson.forget()
         accuracy = min(accuracy, INNER * max(tol, history[-1]))
         s = np.maximum(anderson.next(s, opening(problem, y) - s), 0.0)
     assert best is not None
-    converged = min(history) <= tol
-    words = "Coulomb residual below the tolerance"
-    if not converged:
+    status, words = Status.CONVERGED, "Coulomb residual below the tolerance"
+    if min(history) > tol:
+        status = inner.status if not inner.converged else Status.ITERATION_LIMIT
         words = f"Coulomb's law not met: residual {min(history):.1e} at best in {len(history)} cone problems"
-    if not converged and not inner.converged:
-        words = inner.reason if inner.reason.startswith("unbounded") else f"{words}, the last: {inner.reason}"
+        if not inner.converged:
+            words = inner.reason if inner.status is Status.UNBOUNDED else f"{words}, the last: {inner.reason}"
     return Result(
         best.impulse,
-        converged,
+        status,
         words,
         min(history),
         iterations,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 
 from pctt.ccp.cone import Array
 from pctt.options import POSITIVE, option
@@ -23,6 +24,17 @@ class Limits:
     )
 
 
+class Status(Enum):
+    """How a solver ended; code looks at this, people at the ``reason`` beside it."""
+
+    CONVERGED = "converged"
+    ITERATION_LIMIT = "iteration limit"
+    STALLED = "stalled"  #: no progress, or steps too short
+    UNBOUNDED = "unbounded"  #: the problem has no solution
+    BREAKDOWN = "breakdown"  #: something is no number
+    GIVEN_UP = "given up"  #: its caller expects another method to be faster
+
+
 @dataclass
 class Result:
     """Impulses of a cone problem and how they were found.
@@ -30,7 +42,7 @@ class Result:
     Attributes
     ----------
     impulse : (nc, 3) impulses of this rank's contacts (N s)
-    converged : whether the natural residual fell below the tolerance
+    status : CONVERGED where the natural residual fell below the tolerance, else why not
     reason : why the iteration ended, in words
     natural_residual : the solver's own last value
     iterations : Newton steps, or steps of a first-order method
@@ -45,7 +57,7 @@ class Result:
     """
 
     impulse: Array
-    converged: bool
+    status: Status
     reason: str
     natural_residual: float
     iterations: int
@@ -55,3 +67,12 @@ class Result:
     cone_problems: int = 1
     solver: str = ""
     law: str = RELAXATION
+
+    @property
+    def converged(self) -> bool:
+        return self.status is Status.CONVERGED
+
+    @property
+    def final(self) -> bool:
+        """Whether no other solver would do better."""
+        return self.status in (Status.CONVERGED, Status.UNBOUNDED)

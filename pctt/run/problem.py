@@ -85,6 +85,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
         "seconds": seconds["solve"],
         **({"compare_seconds": seconds["compare"]} if compare.names else {}),
         "converged": result.converged,
+        "status": result.status.value,
         "reason": result.reason,
         "cone_violation": accuracy.cone_violation,
         "dual_violation": accuracy.dual_violation,

@@ -219,6 +219,7 @@ class Stepper:
             "cone_problems": result.cone_problems,
             **dataclasses.asdict(accuracy),
             "converged": result.converged,
+            "status": result.status.value,
             "reason": result.reason,
             "fallbacks": result.fallbacks,
             "solver": solver,
@@ -279,7 +280,7 @@ class Stepper:
         result = ccp.solve(problem, guess, asked, options.limits, options.solver, self.newton, options.coulomb)
         self._asked, used = result, result.solver or asked
         newton_its = result.iterations if ccp.SOLVERS[used].newton else 0
-        if result.converged or used == "apgd" or result.reason.startswith("unbounded"):
+        if result.final or used == "apgd":
             return result, used, newton_its
         limits = dataclasses.replace(options.limits, max_it=-1)
         second = ccp.solve(problem, result.impulse, "apgd", limits, coulomb=options.coulomb)

@@ -11,7 +11,7 @@ from problems import SELF, from_graph, heap, matrix
 from several_ranks import alone
 
 from pctt import ccp
-from pctt.ccp import Coulomb, Limits, coulomb, fclib
+from pctt.ccp import Coulomb, Limits, Status, coulomb, fclib
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "fclib"
 SOLVERS = pytest.mark.parametrize("solver", ["apgd", "conic", "pdip", "auto"])
@@ -110,11 +110,12 @@ def test_the_last_rung_is_the_relaxation(monkeypatch):
     def failing(law):
         def once(problem, guess, tol, law=False):
             g = np.full_like(guess, 1e-3) if law else ccp.solve(problem, guess, "apgd", Limits(tol)).impulse
-            return ccp.Result(g, not law, "as it happens", 1.0, 7)
+            return ccp.Result(g, Status.STALLED if law else Status.CONVERGED, "as it happens", 1.0, 7)
 
         return once
 
-    monkeypatch.setattr(coulomb, "solve", lambda problem, guess, *rest: ccp.Result(guess, False, "not met", 0.9, 5))
+    not_met = Status.STALLED, "not met", 0.9, 5
+    monkeypatch.setattr(coulomb, "solve", lambda problem, guess, *rest: ccp.Result(guess, *not_met))
     guess = np.zeros_like(problem.r)
     result = coulomb.ladder(problem, guess, 1e-8, Coulomb(), failing(True), has_law=True)
     assert not result.converged
@@ -190,7 +191,7 @@ def test_what_was_learnt_is_forgotten_when_the_residual_grows(growth, forgets):
     def convex(shifted, guess, tol):
         openings.append(shifted.r[0, 0] - r[0, 0])
         g = answers[len(openings) - 1] * np.array([[1.0, -mu, 0.0]])
-        return ccp.Result(g, True, "", 0.0, 1, 0, 0, [0.0])
+        return ccp.Result(g, Status.CONVERGED, "", 0.0, 1, 0, 0, [0.0])
 
     result = coulomb.solve(problem, np.zeros((1, 3)), 1e-6, Coulomb(), convex)
     assert result.converged

@@ -47,7 +47,7 @@ def test_the_default_limit_is_that_of_the_registry(name, monkeypatch):
 
     def function(problem, guess, limits, options, *newton):
         seen.append(limits.max_it)
-        return ccp.Result(np.zeros_like(guess), False, "nothing done", 1.0, 0)
+        return ccp.Result(np.zeros_like(guess), ccp.Status.STALLED, "nothing done", 1.0, 0)
 
     solver = ccp.SOLVERS[name]
     monkeypatch.setitem(ccp.SOLVERS, name, type(solver)(**{**vars(solver), "function": function}))

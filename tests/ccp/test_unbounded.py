@@ -8,7 +8,7 @@ from mpi4py import MPI
 from problems import SELF, from_graph, from_matrix, heap, matrix
 
 from pctt import ccp
-from pctt.ccp import BlockRows, Limits
+from pctt.ccp import BlockRows, Limits, Status
 from pctt.ccp.unbounded import why_unbounded
 
 SOLVERS = pytest.mark.parametrize("solver", ["conic", "pdip", "apgd", "auto"])
@@ -44,6 +44,7 @@ def test_a_sphere_that_cannot_get_out_of_closing_walls(solver, closing, angle, m
         problem = squeezed(np.multiply(closing, units), angle, mu)
         result = ccp.solve(problem, type=solver, limits=Limits(1e-6))
         assert not result.converged
+        assert result.status is Status.UNBOUNDED
         assert result.reason.startswith("unbounded: ")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from pctt.ccp.cone import Array
 from pctt.ccp.first_order.scaled import ScaledProblem
-from pctt.ccp.result import Limits, Result
+from pctt.ccp.result import Limits, Result, Status
 from pctt.options import AT_LEAST_ONE, option
 
 GiveUp = Callable[[int, float], str]  # from iterations and natural residual: why not to go on, or ""
@@ -35,7 +35,7 @@ class Progress:
         self.problem, self.limits, self.check, self.give_up = problem, limits, options.check, give_up
         self.iterations = 0
         self.history: list[float] = []
-        self.reason = ""
+        self.status, self.reason = Status.STALLED, ""
         self._best = np.inf
         self._patience = PATIENCE_WITH_LAW if problem.opening else PATIENCE
         self._next_look = 0
@@ -52,13 +52,13 @@ class Progress:
         self.history.append(residual)
         if residual < self._best or len(self.history) == 1:
             self._best, self._point = residual, x.copy()
-        self.reason = self._why_stop(residual)
+        self.status, self.reason = self._why_stop(residual)
         return not self.reason
 
     def result(self) -> Result:
-        converged = self._best <= self.limits.tol
+        status = Status.CONVERGED if self._best <= self.limits.tol else self.status
         impulse = self.problem.impulse(self._point)
-        return Result(impulse, converged, self.reason, self._best, self.iterations, history=self.history)
+        return Result(impulse, status, self.reason, self._best, self.iterations, history=self.history)
 
     def _residual(self, x: Array, gradient: Array | None) -> float:
         """The natural residual; nan where x or its gradient is no number."""
@@ -71,15 +71,16 @@ class Progress:
         finite = np.isfinite(self.problem.dots((x, gradient))[0])
         return self.problem.natural_residual(x, gradient) if finite else np.nan
 
-    def _why_stop(self, residual: float) -> str:
+    def _why_stop(self, residual: float) -> tuple[Status, str]:
+        """The reason is empty as long as there is none."""
         if residual <= self.limits.tol:
-            return "natural residual below the tolerance"
+            return Status.CONVERGED, "natural residual below the tolerance"
         if np.isnan(residual):
-            return f"not a number after {self.iterations} iterations"
+            return Status.BREAKDOWN, f"not a number after {self.iterations} iterations"
         if self.iterations >= self.limits.max_it:
-            return f"{self.iterations} iterations"
+            return Status.ITERATION_LIMIT, f"{self.iterations} iterations"
         if residual < 0.99 * self._gain[0]:
             self._gain = (residual, self.iterations)
         if self.iterations - self._gain[1] >= self._patience:
-            return f"no progress in the last {self._patience} of {self.iterations} iterations"
-        return self.give_up(self.iterations, residual) if self.give_up else ""
+            return Status.STALLED, f"no progress in the last {self._patience} of {self.iterations} iterations"
+        return Status.GIVEN_UP, self.give_up(self.iterations, residual) if self.give_up else ""

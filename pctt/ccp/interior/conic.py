@@ -38,7 +38,7 @@ from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.interior.lorentz import NesterovTodd
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.result import Limits, Result
+from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.log import phase
 from pctt.options import FRACTION, NOT_NEGATIVE, POSITIVE, option
@@ -76,7 +76,8 @@ def solve(
     max_it = limits.max_it if limits.max_it >= 0 else 60
     newton.begin(problem)
     if coulomb and not newton.takes_any:
-        return Result(guess, False, "Coulomb's law needs -ccp_newton body and its own linear solver", np.inf, 0)
+        words = "Coulomb's law needs -ccp_newton body and its own linear solver"
+        return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
     scale, frictionless = _cone_scale(problem.mu)
     s, z = _start(problem, guess, scale, frictionless, options, coulomb)
     v = problem.momentum(s / scale)
@@ -130,10 +131,12 @@ def solve(
                 step, (ds, dz, dv, x) = longer, again
         if step > 0:
             s, z, v = s + step * ds, z + step * dz, v + step * dv
-    converged = history[-1] <= limits.tol
-    words = f"{max_it} iterations" if iteration == max_it else f"stalled after {iteration} iterations"
-    words = "natural residual below the tolerance" if converged else words
-    return Result(best, converged, words, min(history), iteration, newton.ksp_its, newton.fallbacks, history)
+    status, words = Status.STALLED, f"stalled after {iteration} iterations"
+    if history[-1] <= limits.tol:
+        status, words = Status.CONVERGED, "natural residual below the tolerance"
+    elif iteration == max_it:
+        status, words = Status.ITERATION_LIMIT, f"{max_it} iterations"
+    return Result(best, status, words, min(history), iteration, newton.ksp_its, newton.fallbacks, history)
 
 
 def _cone_scale(mu: Array) -> tuple[Array, Array]:

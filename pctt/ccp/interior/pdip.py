@@ -29,7 +29,7 @@ from pctt.ccp.interior.barrier import CONSTRAINTS, Perspective, Quadratic
 from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.result import Limits, Result
+from pctt.ccp.result import Limits, Result, Status
 from pctt.log import phase
 from pctt.options import FRACTION, POSITIVE, option
 
@@ -83,10 +83,10 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         y = _velocity(problem, g)
         history.append(problem.natural_residual(g, y))
         if history[-1] <= limits.tol:
-            reason = "natural residual below the tolerance"
+            status, reason = Status.CONVERGED, "natural residual below the tolerance"
             break
         if iteration == max_it:
-            reason = f"{max_it} Newton steps"
+            status, reason = Status.ITERATION_LIMIT, f"{max_it} Newton steps"
             break
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
         centering = options.centering if step > STUCK else 1.0
@@ -104,12 +104,13 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
             if other > LONGER * step:
                 step, dg, dlam = other, other_dg, other_dlam
         if not step > 1e-10:
-            reason = "steps became too short" if step == step else "not a number in the Newton step"
+            status, reason = Status.STALLED, "steps became too short"
+            if step != step:
+                status, reason = Status.BREAKDOWN, "not a number in the Newton step"
             break
         g = g + step * dg
         lam = lam + step * dlam
-    converged = history[-1] <= limits.tol
-    return Result(g, converged, reason, history[-1], iteration, newton.ksp_its, newton.fallbacks, history)
+    return Result(g, status, reason, history[-1], iteration, newton.ksp_its, newton.fallbacks, history)
 
 
 class Linearised(NamedTuple):
