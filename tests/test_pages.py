@@ -1,0 +1,107 @@
+"""The programs in README and docs run as they are printed; what a page presumes is given to them here."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from dem.experiment import Experiment, option
+from dem.scene import Scene
+from dem.shapes import Plane
+from pctt import ccp
+from pctt.ccp import fclib
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def blocks(page: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
+
+
+def stored_problem(path: Path) -> ccp.ConeProblem:
+    """A file with a problem of three contacts."""
+    rng = np.random.default_rng(0)
+    W = rng.standard_normal((9, 9))
+    N = PETSc.Mat().createDense((9, 9), array=W @ W.T + 9 * np.eye(9), comm=MPI.COMM_SELF)
+    problem = ccp.ConeProblem(MPI.COMM_SELF, rng.standard_normal((3, 3)) - [1, 0, 0], np.full(3, 0.5), N=N)
+    fclib.write_local(path, problem, fclib.Info("three contacts"))
+    return problem
+
+
+@pytest.fixture
+def in_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_scene_of_the_readme_is_one(in_folder):
+    names: dict[str, Any] = dict(
+        globals(), dataclass=dataclass, Experiment=Experiment, option=option, Scene=Scene, Plane=Plane
+    )
+    exec(blocks("README.md")[0], names)
+    scene = names["Drop"](height=2.0).build()
+    assert scene.grains().position.tolist() == [[0, 0, 2]]
+    assert [body.name for body in scene.large_bodies] == ["floor"]
+
+
+def test_the_preconditioner_of_the_readme_solves(in_folder):
+    n = 50
+    mat = PETSc.Mat().createAIJ((n, n), nnz=3, comm=MPI.COMM_SELF)
+    for i in range(n):
+        near = [j for j in (i - 1, i, i + 1) if 0 <= j < n]
+        mat.setValues(i, near, [4.0 if j == i else -1.0 for j in near])
+    mat.assemble()
+    ksp = PETSc.KSP().create(MPI.COMM_SELF)
+    ksp.setType("cg")
+    exec(blocks("README.md")[1], {"ksp": ksp, "mat": mat, "points": np.arange(3.0 * n).reshape(n, 3)})
+    x, b = mat.createVecs()
+    b.set(1.0)
+    ksp.solve(b, x)
+    assert ksp.getConvergedReason() > 0
+    assert ksp.pc.getPythonContext().name == "pctt.pc.TensorTrain"
+    ksp.destroy()
+
+
+def test_the_cone_problem_of_the_readme_is_solved(in_folder, capsys):
+    stored_problem(in_folder / "problem.hdf5")
+    names: dict[str, Any] = {}
+    exec(blocks("README.md")[2], names)
+    assert names["result"].converged
+    assert "natural residual below the tolerance" in capsys.readouterr().out
+
+
+def test_the_matrix_by_its_entries(in_folder, capfd):
+    names: dict[str, Any] = {}
+    exec(blocks("docs/trains.md")[0], names)
+    residual = names["b"].duplicate()
+    names["A"].mult(names["x"], residual)
+    residual.aypx(-1.0, names["b"])
+    assert names["ksp"].getConvergedReason() > 0
+    assert residual.norm() < 1e-4 * names["b"].norm()
+    names["ksp"].destroy()
+    names["A"].destroy()
+
+
+def test_poisson_with_a_train(in_folder, capfd):
+    before = PETSc.Options().getAll()
+    names: dict[str, Any] = {}
+    exec(blocks("docs/preconditioners.md")[0], names)
+    assert names["ksp"].getConvergedReason() > 0
+    names["ksp"].destroy()
+    for name in set(PETSc.Options().getAll()) - set(before):
+        PETSc.Options().delValue(name)
+
+
+def test_a_problem_is_copied_as_on_the_page_of_files(in_folder):
+    stored_problem(in_folder / "problem.hdf5")
+    lines = [line for line in blocks("docs/files.md")[0].splitlines() if "write_global" not in line]
+    exec("\n".join(lines), {"comm": MPI.COMM_SELF})
+    copy = fclib.load(in_folder / "copy.hdf5", MPI.COMM_SELF)
+    assert (copy.title, copy.problem.size) == ("a title", 3)
