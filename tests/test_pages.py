@@ -77,18 +77,6 @@ def test_the_cone_problem_of_the_readme_is_solved(in_folder, capsys):
     assert "natural residual below the tolerance" in capsys.readouterr().out
 
 
-def test_the_matrix_by_its_entries(in_folder, capfd):
-    names: dict[str, Any] = {}
-    exec(blocks("docs/trains.md")[0], names)
-    residual = names["b"].duplicate()
-    names["A"].mult(names["x"], residual)
-    residual.aypx(-1.0, names["b"])
-    assert names["ksp"].getConvergedReason() > 0
-    assert residual.norm() < 1e-4 * names["b"].norm()
-    names["ksp"].destroy()
-    names["A"].destroy()
-
-
 def test_poisson_with_a_train(in_folder, capfd):
     before = PETSc.Options().getAll()
     names: dict[str, Any] = {}

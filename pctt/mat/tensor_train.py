@@ -16,6 +16,7 @@ from petsc4py import PETSc
 from pctt.mat.entries import Entries, is_symmetric
 from pctt.mat.order import digits_of
 from pctt.mat.product import TrainProduct
+from pctt.petsc import own_errors
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.entries import EntryMatrix
 from pctt.tt.train import Array, Train
@@ -177,7 +178,8 @@ def from_entries(
     mat.setPythonContext(TensorTrain(eps, max_rank))
     mat.setAttr("entries", entries)
     mat.setAttr("grid", shape)
-    mat.setUp()
+    with own_errors():
+        mat.setUp()
     return mat
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import re
 import subprocess
 import sys
@@ -227,8 +227,12 @@ def test_the_example_of_the_documentation_runs():
 
 def test_the_examples_multiply_with_their_entries():
     """Products by FFT are those of the entries, and a train solves each with few iterations."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
-    problems = importlib.import_module("problems")
+    path = Path(__file__).resolve().parents[2] / "docs" / "examples" / "problems.py"
+    spec = importlib.util.spec_from_file_location("examples_problems", path)
+    assert spec is not None
+    assert spec.loader is not None
+    problems = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # dataclasses look for their module
+    spec.loader.exec_module(problems)
     for problem in (problems.fredholm(9), problems.lippmann_schwinger(5), problems.gaussian_process(8)):
         i = np.arange(problem.size)
         A = problem.entries(*(k.ravel() for k in np.meshgrid(i, i, indexing="ij"))).reshape(len(i), -1)
