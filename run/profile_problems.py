@@ -34,6 +34,7 @@ AGAIN, TIMES = 2.0, 5  # seconds up to which a solve is repeated, and how often 
 STARTUP = 30.0  # seconds that a process may take beside its solves
 LAWS = {"convex": "the convex problem", "coulomb": "Coulomb's law"}
 OWN = {"convex": list(ccp.SOLVERS), "coulomb": ["conic", "pdip", "auto", "apgd"]}
+TABLEAU = ("blue", "orange", "green", "red", "purple", "brown", "pink", "gray", "olive", "cyan")
 WITHIN = (1.0, 2.0, 10.0)  # times the fastest, columns of the table
 
 Rows = list[dict[str, Any]]
@@ -186,7 +187,8 @@ def plot(rows: Rows) -> None:
     with figure("profile", len(TOLERANCES), len(laws)) as panels:
         for axes, (law, tol) in zip(panels, [(law, tol) for law in laws for tol in TOLERANCES]):
             solvers, ratio = ratios(rows, law, tol)
-            colours = {name: f"C{k % 10}" for k, name in enumerate(dict.fromkeys(row["method"] for row in rows))}
+            names = dict.fromkeys(row["method"] for row in rows)
+            colours = {name: f"tab:{TABLEAU[k % len(TABLEAU)]}" for k, name in enumerate(names)}
             finite = ratio[np.isfinite(ratio)]
             end = 2 * finite.max(initial=2.0)
             for k, solver in enumerate(solvers):
