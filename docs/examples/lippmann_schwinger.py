@@ -5,5 +5,5 @@ from comparison import compare
 from problems import lippmann_schwinger
 
 if __name__ == "__main__":
-    for n in (64, 128):
-        compare(lippmann_schwinger(n), eps=1e-5)
+    compare(lippmann_schwinger(64), eps=1e-5)
+    compare(lippmann_schwinger(128), eps=None)  # as operator a train of rank 122 takes seconds per product
