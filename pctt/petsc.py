@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -22,11 +23,16 @@ def require_real_double(scalar: type = PETSc.ScalarType) -> None:
 @contextmanager
 def own_errors() -> Iterator[None]:
     """Have what our Python raises when PETSc calls it come out as it was raised. petsc4py does so up to 3.18; newer
-    releases make it the cause of an error of PETSc."""
+    releases make it the cause of an error of PETSc, and forget it where a dead python PC is collected on the way."""
+    collects = gc.isenabled()
+    gc.disable()
     try:
         yield
     except PETSc.Error as error:
         raise origin(error) from None
+    finally:
+        if collects:
+            gc.enable()
 
 
 def origin(error: BaseException) -> BaseException:
