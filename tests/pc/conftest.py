@@ -1,19 +1,3 @@
 """Every test starts from an empty PETSc options database."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-
-import pytest
-from petsc4py import PETSc
-
-
-@pytest.fixture(autouse=True)
-def database() -> Iterator[PETSc.Options]:
-    """The options database, emptied before and after."""
-    options = PETSc.Options()
-    for name in options.getAll():
-        options.delValue(name)
-    yield options
-    for name in options.getAll():
-        options.delValue(name)
+from empty_options import database as database
