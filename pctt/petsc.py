@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -20,19 +19,28 @@ def require_real_double(scalar: type = PETSc.ScalarType) -> None:
         )
 
 
+_raised: list[BaseException] | None = None  # by contexts, since the innermost `own_errors` began
+
+
 @contextmanager
 def own_errors() -> Iterator[None]:
     """Have what our Python raises when PETSc calls it come out as it was raised. petsc4py does so up to 3.18; newer
-    releases make it the cause of an error of PETSc, and forget it where a dead python PC is collected on the way."""
-    collects = gc.isenabled()
-    gc.disable()
+    releases make it the cause of an error of PETSc, or forget it where a dead python PC is collected on the way."""
+    global _raised
+    before, _raised = _raised, []
     try:
         yield
     except PETSc.Error as error:
-        raise origin(error) from None
+        first = origin(error)
+        raise _raised[0] if isinstance(first, PETSc.Error) and _raised else first from None
     finally:
-        if collects:
-            gc.enable()
+        _raised = before
+
+
+def remember(error: BaseException) -> None:
+    """Keep an error until the `own_errors` around it ends."""
+    if _raised is not None:
+        _raised.append(error)
 
 
 def origin(error: BaseException) -> BaseException:

@@ -1,11 +1,12 @@
-"""Builds of PETSc that will not do are named at once."""
+"""Builds of PETSc that will not do are named at once; errors of contexts keep their words, ends of programs end."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from petsc4py import PETSc
 
-from pctt.petsc import require_real_double
+from pctt.petsc import own_errors, remember, require_real_double
 
 
 def test_real_double_precision_will_do():
@@ -16,3 +17,41 @@ def test_real_double_precision_will_do():
 def test_other_scalars_are_named(scalar):
     with pytest.raises(ImportError, match=f"are {np.dtype(scalar).name}; allowed is a build with real scalars"):
         require_real_double(scalar)
+
+
+def test_an_error_that_petsc_forgets_is_remembered():
+    def forgets() -> None:
+        remember(KeyError("the user's own"))
+        raise PETSc.Error(101)
+
+    with pytest.raises(KeyError, match="the user's own"), own_errors():
+        forgets()
+
+
+def test_an_error_of_petsc_itself_stays():
+    remember(KeyError("of another time"))
+    with pytest.raises(PETSc.Error), own_errors():
+        raise PETSc.Error(77)
+
+
+PROGRAM = """
+from petsc4py import PETSc
+mat = PETSc.Mat().createAIJ(((2, None), (2, None)), nnz=1)
+for row in range(*mat.getOwnershipRange()):
+    mat[row, row] = 2.0
+mat.assemble()
+ksp = PETSc.KSP().create()
+ksp.setOperators(mat)
+ksp.pc.setType("python")
+ksp.pc.setPythonType("pctt.pc.TensorTrain")
+ksp.setUp()
+if ksp.comm.rank == 1:
+    ksp.destroy()
+    mat.destroy()
+print("the end")
+"""
+
+
+@pytest.mark.mpi
+def test_a_program_ends_where_one_rank_has_no_object_left(mpirun):
+    assert mpirun(PROGRAM, 2, seconds=30).count("the end") == 2

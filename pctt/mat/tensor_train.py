@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import atexit
 import warnings
-import weakref
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
@@ -13,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.context import Context
 from pctt.mat.entries import Entries, is_symmetric
 from pctt.mat.order import digits_of
 from pctt.mat.product import TrainProduct
@@ -77,31 +76,18 @@ class CompressedEntries:
         )
 
 
-class TensorTrain:
+class TensorTrain(Context):
     """Context of a Mat whose products are those of a train; see `from_entries`.
 
     A Mat that is made by hand, of type python and ``pctt.mat.TensorTrain``, needs the attribute ``entries``, and
     ``grid`` or ``coordinates``, before ``setUp``.
     """
 
+    without = PETSc.Mat.Type.AIJ
+
     def __init__(self, eps: float = 1e-8, max_rank: int = MAX_RANK) -> None:
         self.eps, self.max_rank = eps, max_rank
         self.compressed: CompressedEntries | None = None
-
-    def create(self, mat: PETSc.Mat) -> None:
-        mat.decRef()  # a reference that does not keep the Mat alive; `destroy` gives it back
-        self._mat: PETSc.Mat | None = mat
-        _living.add(self)
-
-    def destroy(self, mat: PETSc.Mat) -> None:
-        if self._mat is not None:
-            self._mat.incRef()
-            self._mat = None
-
-    def leave(self) -> None:
-        """Have the Mat go on without it, as an empty one."""
-        if self._mat is not None:
-            self._mat.setType(PETSc.Mat.Type.AIJ)
 
     def setUp(self, mat: PETSc.Mat) -> None:
         self.compressed = CompressedEntries(mat, self.eps, self.max_rank)
@@ -181,13 +167,3 @@ def from_entries(
     with own_errors():
         mat.setUp()
     return mat
-
-
-_living: weakref.WeakSet[TensorTrain] = weakref.WeakSet()
-
-
-@atexit.register
-def _leave_mats() -> None:
-    """What PETSc destroys after Python's end must not be written in Python, as in `pctt.pc.base`."""
-    for living in list(_living):
-        living.leave()

@@ -8,18 +8,16 @@ into ``build`` (a matrix of a new structure), ``update`` (new values in the same
 
 from __future__ import annotations
 
-import atexit
-import gc
-import weakref
 from typing import Any
 
 from petsc4py import PETSc
 
+from pctt.context import Context
 from pctt.options import describe, no_such_option, read
 from pctt.shell import is_shell
 
 
-class PythonPC:
+class PythonPC(Context):
     """Base class; subclasses set ``options_class`` and ``options_prefix`` and define build, update, apply.
 
     The preconditioner is taken to be symmetric. Matrices of other types than AIJ and BAIJ are converted.
@@ -27,17 +25,16 @@ class PythonPC:
 
     options_class: type
     options_prefix: str
+    without = PETSc.PC.Type.NONE
     needs_entries = True  # of the matrix; without, one that is a function will do
 
     def create(self, pc: PETSc.PC) -> None:
+        super().create(pc)
         self.options: Any = self.options_class()
         self.prefix = ""
         self._structure: tuple | None = None
         self.P: PETSc.Mat | None = None  # what it is made from, in AIJ or BAIJ
         self._converted: PETSc.Mat | None = None
-        pc.decRef()  # a reference that does not keep the PC alive; `destroy` gives it back
-        self._pc: PETSc.PC | None = pc
-        _living.add(self)
 
     def setFromOptions(self, pc: PETSc.PC) -> None:
         """Read the options behind the PC's prefix; OptionError for a bad one, or a misspelt one."""
@@ -125,14 +122,7 @@ class PythonPC:
         if self._converted is not None:
             self._converted.destroy()
             self._converted = None
-        if self._pc is not None:
-            self._pc.incRef()
-            self._pc = None
-
-    def leave(self) -> None:
-        """Have the PC that this belongs to go on without it, as ``-pc_type none``."""
-        if self._pc is not None:
-            self._pc.setType(PETSc.PC.Type.NONE)
+        super().destroy(pc)
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer | None = None) -> None:
         if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII:
@@ -146,14 +136,3 @@ class PythonPC:
 
 #: What a user's Mat may bring, see docs/preconditioners.md.
 ATTRIBUTES = ("coordinates", "grid", "key", "contact_map", "barrier")
-_living: weakref.WeakSet[PythonPC] = weakref.WeakSet()
-
-
-@atexit.register
-def _leave_pcs() -> None:
-    """What PETSc destroys after Python's end must not be written in Python: take our preconditioners out of PCs that
-    are still there, say in the traceback of an error, and let PETSc destroy what petsc4py has let go of."""
-    for living in list(_living):
-        living.leave()
-    gc.collect()
-    PETSc.garbage_cleanup()
