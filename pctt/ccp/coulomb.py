@@ -73,7 +73,7 @@ def ladder(
         plain.natural_residual, plain.status = residual(problem, plain.impulse, y), Status.STALLED
         plain.reason = f"relaxation, as Coulomb's law was not met: {tried[-1].reason}"
         tried.append(plain)
-    best = tried[-1] if tried[-1].converged else min(tried, key=lambda result: result.natural_residual)
+    best = tried[-1] if tried[-1].final else min(tried, key=lambda result: result.natural_residual)
     for count in ("iterations", "ksp_its", "fallbacks"):
         setattr(best, count, sum(getattr(result, count) for result in tried))
     return best

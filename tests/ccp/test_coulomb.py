@@ -125,6 +125,19 @@ def test_the_last_rung_is_the_relaxation(monkeypatch):
     assert result.natural_residual == pytest.approx(ccp.measure(problem, result.impulse).coulomb_residual, rel=1e-6)
 
 
+def test_a_problem_without_solution_stays_one(monkeypatch):
+    """However small a residual an earlier rung has left."""
+    problem = sliding_heap(0.3)
+    none = ccp.Result(np.ones_like(problem.r), Status.UNBOUNDED, "no solution", 0.9, 5)
+    monkeypatch.setattr(coulomb, "solve", lambda *arguments: none)
+
+    def once(problem, guess, tol, law=False):
+        return ccp.Result(guess, Status.STALLED, "as it happens", 1e-3, 7)
+
+    result = coulomb.ladder(problem, np.zeros_like(problem.r), 1e-8, Coulomb(), once, has_law=True)
+    assert (result.status, result.reason, result.iterations) == (Status.UNBOUNDED, "no solution", 12)
+
+
 def test_acceleration_and_a_warm_start_save_cone_problems():
     problem = sliding_heap(0.8)
     plain, fast = (by_cone_problems(problem, tol=1e-4, memory=memory) for memory in (0, 5))
