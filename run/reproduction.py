@@ -10,7 +10,7 @@ from measure import figure, record, results, say_machine
 SCENES = ("mixer", "blade", "shear")
 METHODS = {"none": "tab:red", "ilu": "tab:green", "ilu-shifted": "tab:olive", "pbjacobi": "tab:gray", "tt": "tab:blue"}
 EVERY = {8: 4, 16: 8}  # Newton systems are sampled at these n, where without a preconditioner one takes up to a minute
-HEAD = ["scene", "n", "contacts", "Newton", "measured", "method", "solved", "iterations", "set-up s", "solve s", "PDIP s", "/ tt"]
+HEAD = "| scene | n | contacts | Newton | measured | method | solved | iterations | set-up s | solve s | PDIP s | / tt |"
 
 
 def measure(scene: str, n: int) -> list[dict[str, Any]]:
@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("-large", type=int, nargs="*", default=[16], help="sizes of the mixer alone")
     options = parser.parse_args()
     about, rows = say_machine(), list[dict[str, Any]]()
-    print("| " + " | ".join(HEAD) + " |\n" + "|---" * len(HEAD) + "|", flush=True)
+    print(HEAD + "\n" + "|---" * (HEAD.count("|") - 1) + "|", flush=True)
     for scene, n in [(scene, n) for n in options.n for scene in SCENES] + [("mixer", n) for n in options.large]:
         new = measure(scene, n)
         print("\n".join(map(line, new)), flush=True)
