@@ -43,7 +43,7 @@ def columns(compared: bool) -> str:
     """The heads of the columns of `step_line`."""
     compare = " compare" * compared
     return (
-        "  step    time s  contacts  Newton  Krylov  residual"
+        "  step    time s  contacts   iters  Krylov  residual"
         f"  seconds: total  search  assembly   solve{compare}  output"
     )
 
