@@ -19,6 +19,8 @@ COLOURS: dict[str, tuple[str, str, tuple[float, float]]] = {
     "speed": ("speed\n[m/s]", "viridis", (0.12, 1.0)),
     "force": ("contact\nforce [N]", "YlOrRd", (0.0, 0.95)),
     "id": ("body id", "turbo", (0.05, 0.95)),
+    "size": ("diameter\n[m]", "viridis", (0.12, 1.0)),
+    "material": ("material", "turbo", (0.05, 0.95)),
 }
 
 
@@ -88,15 +90,27 @@ def main(comm: MPI.Comm) -> None:
 
 def _value(colour: str, folder: Folder, frame: Frame) -> np.ndarray:
     """What colours the grains (grains,)."""
-    values = {"speed": lambda: frame.speed, "force": frame.load, "id": lambda: np.arange(len(frame.position))}
+    from pctt.look import surfaces
+
+    values = {
+        "speed": lambda: frame.speed,
+        "force": frame.load,
+        "id": lambda: np.arange(folder.grains),
+        "size": lambda: 2 * surfaces.enclosing_radius(folder),
+        "material": lambda: folder.material,
+    }
     return values[colour]()[: folder.grains].astype(float)
 
 
 def _range(colour: str, values: list[np.ndarray]) -> tuple[float, float]:
-    """From 0 to what one grain in a hundred exceeds, so that a few fast ones do not leave the others in one colour."""
+    """Of numbers and materials all; of sizes from the least to the greatest; else from 0 to what one grain in a
+    hundred exceeds, so that a few fast ones do not leave the others in one colour."""
     together = np.concatenate(values)
-    if colour == "id":
-        return 0.0, max(together.max(), 1.0)
+    if colour in ("id", "material"):
+        return 0.0, max(together.max(initial=0.0), 1.0)
+    if colour == "size":
+        low, high = float(together.min(initial=np.inf)), float(together.max(initial=0.0))
+        return (low, high) if low < 0.999 * high else (0.0, high or 1.0)
     high = float(np.quantile(together, 0.99)) or 1.0
     step = 10 ** np.floor(np.log10(high))
     return 0.0, step * min(k for k in (1, 2, 4, 6, 8, 10) if k * step >= high)  # four equal parts are short numbers
