@@ -1,8 +1,9 @@
 """``python -m pctt.export DIR``: the recorded steps of a run as time series for ParaView, or as one HDF5 file.
 
 Written are DIR/paraview/bodies.pvd, contacts.pvd and large.pvd, each a list of one .vtp file per step. Any number
-of ranks share the steps. These formats are read by every ParaView and VTK of the last fifteen years: a VTKHDF file
-of points that change in number needs ParaView 5.12, and a .pvd collection lists VTK's XML files only.
+of ranks share the steps. These formats are read by every ParaView and VTK of the last fifteen years. With
+``-format vtkhdf`` the first rank writes bodies.vtkhdf, contacts.vtkhdf and large.vtkhdf instead, all steps in each,
+for ParaView 5.12 or newer.
 
 With ``-single FILE.h5`` that file is written instead, by the first rank: what state.h5 links to, in the same groups.
 """
@@ -25,11 +26,13 @@ from pctt.look.folder import Folder, FolderError, Frame
 from pctt.look.program import add_steps, chosen, made_folder, parser, run, whole
 
 SERIES = ("bodies", "contacts", "large")
+FORMATS = ("vtp", "vtkhdf")
 
 
 def arguments() -> argparse.Namespace:
     line = parser("export", "the recorded steps of a run as time series for ParaView (.pvd of .vtp files)")
     add_steps(line)
+    line.add_argument("-format", choices=FORMATS, default="vtp", help="a .vtp file per step, or one .vtkhdf of all")
     target = line.add_mutually_exclusive_group()
     target.add_argument("-output", metavar="DIR", help="where to write; none: paraview/ in the folder")
     target.add_argument("-single", metavar="FILE.h5", help="write one HDF5 file like state.h5 instead, with all in it")
@@ -54,18 +57,41 @@ def main(comm: MPI.Comm) -> None:
 
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # what fails is told by write_vtp
     box = surfaces.bounds(folder, [folder.frame(step) for step in {steps[0], steps[-1]}])
+    if given.format == "vtkhdf":
+        if comm.rank == 0:
+            write_vtkhdf(target, folder, steps, box)
+        return
     times = {}
     for step in steps[comm.rank :: comm.size]:
         frame = folder.frame(step)
         times[step] = frame.time
-        for name, data in zip(SERIES, (bodies(folder, frame), contacts(folder, frame), large(folder, frame, box))):
-            write_vtp(target / f"{name}_{step:06d}.vtp", data, frame.time)
+        for name in SERIES:
+            write_vtp(target / f"{name}_{step:06d}.vtp", series(name, folder, frame, box), frame.time)
     shared = comm.gather(times)
     if comm.rank == 0:
         together = {step: time for part in shared or [] for step, time in part.items()}
         for name in SERIES:
             write_pvd(target / f"{name}.pvd", {f"{name}_{step:06d}.vtp": together[step] for step in steps})
         print(f"{len(steps)} steps: {target}/" + ", ".join(f"{name}.pvd" for name in SERIES))
+
+
+def series(name: str, folder: Folder, frame: Frame, box: np.ndarray) -> Any:
+    """One step of one of SERIES as vtkPolyData."""
+    if name == "large":
+        return large(folder, frame, box)
+    return bodies(folder, frame) if name == "bodies" else contacts(folder, frame)
+
+
+def write_vtkhdf(target: Path, folder: Folder, steps: list[int], box: np.ndarray) -> None:
+    """Write the series, a file each; FolderError if one cannot be written."""
+    from pctt.look import vtkhdf
+
+    times = [folder.frame(step).time for step in steps]
+    for name in SERIES:
+        with whole(target / f"{name}.vtkhdf") as temporary:
+            frames = map(folder.frame, steps)
+            vtkhdf.write(temporary, times, (series(name, folder, frame, box) for frame in frames))
+    print(f"{len(steps)} steps: {target}/" + ", ".join(f"{name}.vtkhdf" for name in SERIES))
 
 
 def write_single(path: Path, folder: Folder, steps: list[int]) -> None:

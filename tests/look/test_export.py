@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ElementTree
 import handmade
 import numpy as np
 import pytest
+from mpi4py import MPI
 
 from pctt import export
 from pctt.look import program
@@ -16,6 +17,7 @@ from pctt.look.folder import Folder
 pytest.importorskip("vtkmodules", reason="vtk is not installed (extra `pictures`)")
 
 from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonCore import vtkVersion
 from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
 SERIES = ("bodies", "contacts", "large")
@@ -48,6 +50,7 @@ def test_the_series_hold_what_the_run_recorded(folder, tmp_path, monkeypatch):
     words = ["export", str(folder), "-output", str(tmp_path / "series"), "-first", "2"]
     monkeypatch.setattr(sys, "argv", words)
     assert program.run(export.main, "export") == 0
+    MPI.COMM_WORLD.Barrier()  # the first rank writes the collections
     run = Folder(folder)
     run.require_frames()
     for name in SERIES:
@@ -65,6 +68,33 @@ def test_the_series_hold_what_the_run_recorded(folder, tmp_path, monkeypatch):
     data, _, arrays, _ = read(tmp_path / "series" / "contacts_000004.vtp")
     assert data.GetNumberOfLines() == len(frame.contacts.gap) > 10
     np.testing.assert_array_equal(arrays["normal_impulse"], frame.contacts.impulse[:, 0])
+
+
+def test_all_steps_in_one_file(show, folder, tmp_path):
+    hdf = pytest.importorskip("vtkmodules.vtkIOHDF")
+    if vtkVersion.GetVTKMajorVersion() * 100 + vtkVersion.GetVTKMinorVersion() < 904:
+        pytest.skip("vtk before 9.4 reads no VTKHDF of polygons in time")
+    show("export", "-output", tmp_path, "-format", "vtkhdf", folder=folder)
+    run = Folder(folder)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f"{name}.vtkhdf" for name in SERIES)
+    reader = hdf.vtkHDFReader()
+    for name in SERIES:
+        reader.SetFileName(str(tmp_path / f"{name}.vtkhdf"))
+        reader.UpdateInformation()
+        assert reader.GetNumberOfSteps() == len(run.steps)
+        for k, step in enumerate(run.steps):
+            reader.SetStep(k)
+            reader.Update()
+            data, frame = reader.GetOutputDataObject(0), run.frame(step)
+            assert reader.GetTimeValue() == pytest.approx(frame.time)
+            if name == "bodies":
+                np.testing.assert_array_equal(points(data), frame.position[:125])
+                velocity = vtk_to_numpy(data.GetPointData().GetArray("velocity"))
+                np.testing.assert_array_equal(velocity, frame.velocity[:125, :3])
+            elif name == "contacts":
+                assert data.GetNumberOfLines() == len(frame.contacts.gap)
+            else:
+                assert data.GetNumberOfPolys() > 0
 
 
 def test_force_chains_join_centres_and_end_at_large_bodies(show, tmp_path):
