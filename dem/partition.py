@@ -6,17 +6,13 @@ its share of the contacts. Nothing of the size of the whole system is gathered f
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.exchange import exchange
-
-if TYPE_CHECKING:
-    from dem.world import World
+from dem.world import World
 
 #: Bits of a Morton code per axis; three of them fill a signed 64 bit integer.
 BITS = 21

@@ -12,6 +12,7 @@ from dem.contact import find_contacts
 from dem.motion import Rotation
 from dem.scene import Scene
 from dem.shapes import Box
+from dem.start import new_world
 from dem.stepper import advance
 from dem.system import ContactSystem
 from dem.world import World
@@ -74,7 +75,7 @@ def box() -> World:
     scene = Scene(friction=0.5)
     scene.add_body("floor", [Box((2, 2, 0.1))], position=(0, 0, -0.1))
     scene.add_boxes([0, 0, 0.1], (0.1, 0.1, 0.1), 1000.0, velocity=(2, 0, 0))
-    return World.from_scene(scene, MPI.COMM_SELF)
+    return new_world(scene, MPI.COMM_SELF)
 
 
 def sphere() -> World:
@@ -82,7 +83,7 @@ def sphere() -> World:
     scene = Scene(friction=0.5)
     scene.add_body("table", [Box((2, 2, 0.1))], Rotation((0, 0, 6.2832)), position=(0, 0, -0.1))
     scene.add_spheres([0.5, 0, 0.1], 0.1, 1000.0)
-    return World.from_scene(scene, MPI.COMM_SELF)
+    return new_world(scene, MPI.COMM_SELF)
 
 
 def lift(world: World, coulomb: ccp.Coulomb | None, count: int = 30) -> float:

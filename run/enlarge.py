@@ -12,7 +12,7 @@ from mpi4py import MPI
 from dem.arrays import Floats
 from dem.impulses import ImpulseMemory
 from dem.scenes import Mixer
-from dem.world import World
+from dem.start import new_world
 from pctt.run import checkpoint
 
 
@@ -48,7 +48,7 @@ def main(n: int) -> None:
         bed = file["grains/position"][:]
     places = copies(bed, small.radius, small.width)
     places = spread(places[fits(places, large)], (4 * n + 1) ** 3, large)
-    world = World.from_scene(large.build(), MPI.COMM_SELF)
+    world = new_world(large.build(), MPI.COMM_SELF)
     world.grains.position[:] = places
     path = Path("results") / f"mixer_n{2 * n}.h5"
     path.parent.mkdir(exist_ok=True)

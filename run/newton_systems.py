@@ -24,8 +24,9 @@ from pctt.ccp.newton.contact import ContactSystem
 from pctt.options import OptionError
 from pctt.pc import TensorTrain
 from pctt.pc.sparse_train import SparseTrain
-from pctt.run.options import Options, read_options
+from pctt.run.options import read_options
 from pctt.run.report import Progress
+from pctt.run.settings import Options
 from pctt.run.simulate import Stepper, first_state
 
 

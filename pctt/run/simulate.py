@@ -19,6 +19,7 @@ from dem.experiment import Experiment
 from dem.impulses import ImpulseMemory
 from dem.partition import rebalance
 from dem.scene import Scene
+from dem.start import new_world
 from dem.stepper import advance
 from dem.system import ContactSystem
 from dem.together import SceneError, together
@@ -29,9 +30,9 @@ from pctt.options import OptionError
 from pctt.run import checkpoint, interrupt, leftovers, report
 from pctt.run.dump import Dump
 from pctt.run.hdf5 import FileError
-from pctt.run.options import DEMO, Options, scene_name
 from pctt.run.place import Place
 from pctt.run.results import Results
+from pctt.run.settings import DEMO, Options, scene_name
 
 
 def simulate(options: Options, comm: MPI.Comm) -> None:
@@ -172,7 +173,6 @@ class Stepper:
         """Free the PETSc objects of the present problem."""
         if self._problem is not None:
             self._problem.destroy()
-            self.system.destroy()
             self._problem = None
 
     def step(self) -> dict[str, Any]:
@@ -326,7 +326,7 @@ def first_state(options: Options, comm: MPI.Comm, progress: report.Progress) -> 
 
 def _new_world(scene: Experiment, comm: MPI.Comm) -> World:
     try:
-        return World.from_scene(_built(scene, comm), comm)
+        return new_world(_built(scene, comm), comm)
     except ValueError as error:
         raise OptionError(f"scene {type(scene).__name__}: {error}") from None
 

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from dem.bodies import Bodies
 from dem.contact import find_contacts
 from dem.partition import imbalance, morton_codes, rebalance, splitters
-from dem.world import World
+from dem.start import new_world
 
 
 def interleave(x, y, z):
@@ -49,7 +49,7 @@ def test_splitters_cut_the_weight_evenly():
 @pytest.mark.parallel(1, 2, 3, 4)
 def test_rebalancing_keeps_the_bodies_and_spreads_the_contacts():
     comm = MPI.COMM_WORLD
-    world = World.from_scene(heap(1, side=8, boxes=False), comm)
+    world = new_world(heap(1, side=8, boxes=False), comm)
     for _ in range(3):
         step(world)
     before = grains_by_id(world)
