@@ -21,7 +21,7 @@ BITS = 21
 DIGIT = 9
 
 
-def morton_codes(points: Floats, low: Floats, high: Floats) -> Ints:
+def curve_codes(points: Floats, low: Floats, high: Floats) -> Ints:
     """Morton codes (n,) of points (n, 3) on an integer grid over the box from `low` (3,) to `high` (3,)."""
     # One cell size for all axes: a flat box must not get flat cells.
     cell = max(float((high - low).max()), np.finfo(float).tiny) / (2**BITS - 1)
@@ -67,11 +67,11 @@ def redistribute(world: World) -> None:
     comm.Allreduce(MPI.IN_PLACE, low, MPI.MIN)
     comm.Allreduce(MPI.IN_PLACE, high, MPI.MAX)
     if comm.size > 1:
-        codes = morton_codes(grains.position, low, high)
+        codes = curve_codes(grains.position, low, high)
         cuts = splitters(comm, codes, grains.weight + 1.0)
         owner = np.searchsorted(cuts, codes, side="right")
         grains = Bodies(**exchange(comm, grains.columns(), owner))
-    codes = morton_codes(grains.position, low, high)
+    codes = curve_codes(grains.position, low, high)
     world.set_grains(grains.take(np.lexsort((grains.id, codes))))
 
 

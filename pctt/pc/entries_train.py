@@ -83,7 +83,7 @@ class EntriesTrain:
         self._product = self._prepare()
         return True
 
-    def lose_patience(self) -> bool:
+    def distrust(self) -> bool:
         """Every matrix has a train of its own."""
         return False
 

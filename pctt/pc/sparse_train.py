@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from pctt.options import OptionError
 from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
-from pctt.pc.patience import Patience
+from pctt.pc.refresh_schedule import RefreshSchedule
 from pctt.pc.slots import Slots, capacity
 from pctt.pc.slotted import SlottedMatrix
 from pctt.pc.train_options import Account, Options
@@ -48,7 +48,7 @@ class SparseTrain:
         self.compression: Compression | Cross | None = None
         self.inverse: ApproximateInverse | None = None
         self._opening: ApproximateInverse | None = None  # the inverse for the first matrix of a structure
-        self._patience = Patience()
+        self._schedule = RefreshSchedule()
         self._apply: Apply | None = None
 
     def begin(self, P: PETSc.Mat) -> None:
@@ -78,7 +78,7 @@ class SparseTrain:
         if self.inverse is not None and self.inverse.cap != rank:
             self.compression = self.inverse = self._opening = None
         kept = (self._opening if first else self.inverse) if self.options.keep else None
-        if kept is not None and not self._patience.over():
+        if kept is not None and not self._schedule.over():
             self._use(kept)
             self.account.kept += 1
         elif not self._try_new(P, rank, kept):
@@ -105,14 +105,14 @@ class SparseTrain:
         if kept is None:
             if not positive:
                 return self._refuse(f"the inverse of rank {rank} is not positive")
-            self._patience = Patience()
+            self._schedule = RefreshSchedule()
             self._use(new)
             return True
         left = []
         for inverse in (kept, new):
             self._use(inverse)
             left.append(self._left(P) if positive or inverse is kept else np.inf)
-        if not self._patience.decide(*self.comm.bcast(left)):
+        if not self._schedule.decide(*self.comm.bcast(left)):
             self._use(kept)
             self.account.kept += 1
         return True
@@ -217,10 +217,10 @@ class SparseTrain:
         self._prepare_apply(self.inverse.train)
         return True
 
-    def lose_patience(self) -> bool:
+    def distrust(self) -> bool:
         """Whether a train of an earlier matrix is in use: the next set-up then tries another."""
-        if self._patience.served:
-            self._patience.lose()
+        if self._schedule.served:
+            self._schedule.lose()
             return True
         return False
 

@@ -15,9 +15,9 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.block_diagonal import block_diagonal
 from pctt.mat.entries import diagonal_blocks, has_entries
 from pctt.pc.base import PythonPC
-from pctt.pc.block_diagonal import block_diagonal
 from pctt.pc.entries_train import EntriesTrain
 from pctt.pc.mat import check_coordinates, is_symmetric
 from pctt.pc.rank_policy import RankPolicy
@@ -175,7 +175,7 @@ class TensorTrain(PythonPC):
         if stalled and rank > 1 and not spoilt:
             self.account.fallbacks.append(f"{ksp.getType()} stalled at rank {rank}")
         sound = not (spoilt or stalled)
-        if not sound and self.made.lose_patience():  # a train of an earlier matrix: one made for the next may do
+        if not sound and self.made.distrust():  # a train of an earlier matrix: one made for the next may do
             sound = True
         self.policy.report(rank, self._setup_seconds + seconds, max(digits, 0.0), sound)
         self._setup_seconds = 0.0  # a second solve with the same matrix has no set-up

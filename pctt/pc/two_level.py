@@ -20,10 +20,10 @@ import numpy as np
 import scipy.sparse as sp
 from petsc4py import PETSc
 
+from pctt.block_diagonal import block_diagonal
+from pctt.ksp_options import entered, prefer_mumps, to_enter
 from pctt.options import AT_LEAST_ONE, option
 from pctt.pc.base import PythonPC
-from pctt.pc.block_diagonal import block_diagonal
-from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
 from pctt.pc.mat import check_coordinates
 from pctt.pc.ordering import block_order
 from pctt.pc.second_solve import solve_again

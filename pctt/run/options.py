@@ -16,11 +16,11 @@ from dem.experiment import Experiment
 from dem.together import together
 from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
-from pctt.ccp.newton.asked_for import LADDER
+from pctt.ccp.newton.users_solver import LADDER
 from pctt.contact_map import is_free
+from pctt.ksp_options import entered, to_enter
 from pctt.options import OptionError, describe, read, refuse_unknown
 from pctt.pc import PRECONDITIONERS
-from pctt.pc.ksp_options import entered, to_enter
 from pctt.petsc import own_errors
 from pctt.run.dump import dump_folder
 from pctt.run.hdf5 import refuse_serial

@@ -31,12 +31,12 @@ class Run:
 
     scene: str = option("mixer", f"what to simulate: {', '.join(SCENES)}, or a file FILE.py with a scene of your own")
     steps: int = option(5, "time steps to make", check=COUNT)
-    dt: Optional[float] = option(None, "time step; none: the scene's own", "s", check=POSITIVE)
+    dt: Optional[float] = option(None, "time step; none: the scene's own", unit="s", check=POSITIVE)
     delta: Optional[float] = option(
-        None, "gap below which a pair of bodies is a contact; none: the scene's own", "m", check=NOT_NEGATIVE
+        None, "gap below which a pair of bodies is a contact; none: the scene's own", unit="m", check=NOT_NEGATIVE
     )
     recovery_speed: float = option(
-        1.0, "greatest speed at which bodies that overlap are pushed apart", "m/s", check=NOT_NEGATIVE
+        1.0, "greatest speed at which bodies that overlap are pushed apart", unit="m/s", check=NOT_NEGATIVE
     )
     restart: str = option(
         "",
@@ -49,7 +49,7 @@ class Run:
     settle_delta: float = option(
         0.1,
         "-delta while settling: falling bodies come closer within a step than bodies at rest",
-        "m",
+        unit="m",
         check=NOT_NEGATIVE,
     )
     settle_tol: float = option(1e-3, "natural residual of the steps of -settle", check=POSITIVE)

@@ -257,9 +257,9 @@ class Stepper:
         with log.phase("assembly"):
             unseen = wider.take(~np.isin(wider.key, self.contacts.key))
             system = ContactSystem(world, unseen, options.dt, options.run.recovery_speed)
-            with cone_problem(system, world.comm) as alone:
-                opening = (alone.velocity_of(problem.momentum(impulse)) + alone.r)[:, 0]
-                closes = options.dt * alone.min(opening.min(initial=0.0)) < -OVERRUN * options.delta
+            with cone_problem(system, world.comm) as beyond:
+                opening = (beyond.velocity_of(problem.momentum(impulse)) + beyond.r)[:, 0]
+                closes = options.dt * beyond.min(opening.min(initial=0.0)) < -OVERRUN * options.delta
         if not closes:
             return None
         memory = ImpulseMemory(world.comm)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pctt.tt.quantise import slots_of
-from pctt.tt.sparse import SparseHierarchy, alone
+from pctt.tt.sparse import SparseHierarchy, on_one_rank
 from pctt.tt.train import Array, Train, full_ranks, matrix_train, zeros
 
 FIRST_RANK = 16  # a larger cap is approached by doubling
@@ -144,7 +144,7 @@ def relative_error(matrix: SparseHierarchy, train: Train) -> float:
         return train.norm()
     square = 1 - 2 * matrix.inner(train.flat()) / norm**2 + (train.norm() / norm) ** 2
     certain = _certain(train)
-    if square > certain or matrix.reduce is not alone:
+    if square > certain or matrix.reduce is not on_one_rank:
         return float(max(square, certain) ** 0.5)
     return _sum_of_errors(matrix, train) ** 0.5 / norm
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from pctt.tt.quantise import merge, slots_of
-from pctt.tt.sparse import Reduction, alone
+from pctt.tt.sparse import Reduction, on_one_rank
 from pctt.tt.train import Array, Train
 
 WORK = 1 << 22  # bytes of the first intermediate that are made at a time
@@ -51,7 +51,7 @@ class Apply:
         n: int | None = None,
         rows: tuple[int, int] | None = None,
         dtype: DTypeLike = None,
-        reduce: Reduction = alone,
+        reduce: Reduction = on_one_rank,
     ) -> None:
         size = slots_of(train.columns)
         self.n = size if n is None else n
@@ -104,7 +104,7 @@ class Apply:
     def __call__(self, x: Array, out: Array | None = None) -> Array:
         """My rows of T x, from my rows of x."""
         start, stop = self.rows
-        if self.reduce is not alone:
+        if self.reduce is not on_one_rank:
             self.x[:] = 0
             self.x[start:stop] = x
             self.x[:] = self.reduce(self.x)

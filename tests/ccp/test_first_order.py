@@ -126,9 +126,9 @@ def test_the_line_search_takes_the_whole_step_where_it_may():
 # -- colours and sweeps -------------------------------------------------------------------------------------
 
 
-def neighbourhood(known) -> colouring.Neighbourhood:
+def neighbourhood(known) -> colouring.Adjacency:
     blocks = sp.csr_matrix(known.N).tobsr((3, 3))
-    return colouring.Neighbourhood(SELF, blocks.indptr, blocks.indices.copy())
+    return colouring.Adjacency(SELF, blocks.indptr, blocks.indices.copy())
 
 
 @pytest.mark.parametrize("hub", [False, True])

@@ -10,10 +10,10 @@ from petsc4py import PETSc
 from systems import contact_matrix, dense, poisson
 
 from pctt.blocks import BlockRows
+from pctt.body_matrix import BodyMatrix
 from pctt.ccp.newton.compare import NAMED
 from pctt.ccp.newton.krylov import Krylov
 from pctt.options import OptionError
-from pctt.pc.body_matrix import BodyMatrix
 from pctt.pc.two_level import bisect
 
 

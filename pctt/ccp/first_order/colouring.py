@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from pctt.ccp.delassus import offsets
 
 
-class Neighbourhood:
+class Adjacency:
     """This rank's contacts and the contacts of other ranks (ghosts) that share a body with them.
 
     ``indptr``, ``columns``: block rows of N, columns local: below ``own`` this rank's contacts, then the ghosts;
@@ -62,7 +62,7 @@ class Halo:
 _last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # indptr, columns, colours
 
 
-def colours(graph: Neighbourhood) -> np.ndarray:
+def colours(graph: Adjacency) -> np.ndarray:
     """Colour of each own contact and ghost; that of the last call while the graph is the same on all ranks."""
     global _last
     same = _last is not None and np.array_equal(_last[0], graph.indptr) and np.array_equal(_last[1], graph.columns)
@@ -74,7 +74,7 @@ def colours(graph: Neighbourhood) -> np.ndarray:
     return found
 
 
-def _jones_plassmann(graph: Neighbourhood) -> np.ndarray:
+def _jones_plassmann(graph: Adjacency) -> np.ndarray:
     priority = _hash(graph.names)
     row = np.repeat(np.arange(graph.own), np.diff(graph.indptr))
     waits = priority[graph.columns] > priority[row]  # edges to neighbours that choose before

@@ -20,10 +20,10 @@ import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 
-from pctt.blocks import MANY
+from pctt.blocks import HUB
 from pctt.ccp import cone
 from pctt.ccp.cone import Array
-from pctt.ccp.first_order.colouring import Halo, Neighbourhood, colours
+from pctt.ccp.first_order.colouring import Adjacency, Halo, colours
 from pctt.ccp.first_order.progress import FirstOrder, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
@@ -47,7 +47,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: GaussSeid
     """Impulses from a first guess (nc, 3)."""
     if problem.low_rank is not None:
         raise OptionError(
-            f"-ccp_type gauss_seidel: a body has more than {MANY} contacts, whose rows of N would be full; "
+            f"-ccp_type gauss_seidel: a body has more than {HUB} contacts, whose rows of N would be full; "
             "allowed are the others"
         )
     scaled = ScaledProblem(problem)
@@ -81,7 +81,7 @@ class Sweep:
     def __init__(self, problem: ScaledProblem, relaxation: float):
         comm = problem.problem.comm
         rows = _block_rows(problem)
-        graph = Neighbourhood(comm, rows.indptr, rows.indices)
+        graph = Adjacency(comm, rows.indptr, rows.indices)
         colour = colours(graph)
         own, ghost = colour[: graph.own], colour[graph.own :]
         self._order = np.argsort(own, kind="stable")

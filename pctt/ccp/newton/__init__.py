@@ -19,18 +19,18 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.ccp.cone import Array
-from pctt.ccp.newton.asked_for import AskedFor
-from pctt.ccp.newton.body import BodySystem
-from pctt.ccp.newton.cheapest import Cheapest
+from pctt.ccp.newton.body import BodyForm
+from pctt.ccp.newton.body_ladder import BodyLadder
 from pctt.ccp.newton.compare import Comparison
-from pctt.ccp.newton.contact import ContactSystem
-from pctt.ccp.newton.kkt import KKTSystem
+from pctt.ccp.newton.contact import ContactForm
+from pctt.ccp.newton.kkt import KKTForm
+from pctt.ccp.newton.users_solver import UsersSolver
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase
 
-Linear = Union[AskedFor, Cheapest]
-System = Union[ContactSystem, KKTSystem, BodySystem]
-FORMS: dict[str, type[System]] = {"contact": ContactSystem, "kkt": KKTSystem, "body": BodySystem}
+Linear = Union[UsersSolver, BodyLadder]
+System = Union[ContactForm, KKTForm, BodyForm]
+FORMS: dict[str, type[System]] = {"contact": ContactForm, "kkt": KKTForm, "body": BodyForm}
 _ASKED = {"pc_type", "ksp_type"}  # options that say how a system is to be solved
 SHARP_LIMIT = 50_000  # contacts: above, factors of the kkt system take too much memory
 DEFAULTS = {
@@ -48,7 +48,7 @@ class Newton:
 
     Attributes
     ----------
-    ksp_its, fallbacks : of the present problem: Krylov iterations, systems not solved as asked for
+    ksp_its, fallbacks : of the present problem: Krylov iterations, systems not solved by the user's KSP
     memory : what a method keeps here for the next problem (`auto`); None at first
     """
 
@@ -97,8 +97,8 @@ class Newton:
         if form not in self._linear:
             own_ladder = form == "body" and self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
             prefix = "" if form == self.form else f"{form}_"
-            asked = AskedFor(self.comm, DEFAULTS[form], self.compare if form == self.form else None, prefix)
-            self._linear[form] = Cheapest(self.comm) if own_ladder else asked
+            asked = UsersSolver(self.comm, DEFAULTS[form], self.compare if form == self.form else None, prefix)
+            self._linear[form] = BodyLadder(self.comm) if own_ladder else asked
         return self._linear[form]
 
     @property
@@ -127,7 +127,7 @@ class Newton:
     @property
     def takes_any(self) -> bool:
         """Whether the present systems may be unsymmetric."""
-        return self._present == "body" and isinstance(self.linear, Cheapest)
+        return self._present == "body" and isinstance(self.linear, BodyLadder)
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
         """New barrier blocks B (nc, 3, 3); ``inverse`` is (B + C)^-1 where the caller knows it better. Blocks that are
@@ -137,7 +137,7 @@ class Newton:
             if symmetric:
                 self.system.update(barrier, inverse)
             else:
-                assert isinstance(self.system, BodySystem)
+                assert isinstance(self.system, BodyForm)
                 self.system.update(barrier, inverse, symmetric=False)
             self.linear.new_matrix(self.system)
 
@@ -147,14 +147,14 @@ class Newton:
         tol: float,
         r_v: Array | None = None,
         start: Array | None = None,
-        alone: Array | None = None,
+        uncoupled: Array | None = None,
     ) -> tuple[Array, Array]:
         """dg (nc, 3) and the system's solution x, to a residual of ``tol`` (sqrt J: of momenta; of velocities times
-        the root of the mean diagonal of N). ``start`` is an earlier x to begin from; ``alone`` is (B + C)^-1 q where
-        the caller knows it better."""
+        the root of the mean diagonal of N). ``start`` is an earlier x to begin from; ``uncoupled`` is (B + C)^-1 q,
+        what each contact would do without the others, where the caller knows it better."""
         with phase("CCPKrylov"):
             assert self.system is not None
-            b = self.system.right_hand_side(q, r_v, alone)
+            b = self.system.right_hand_side(q, r_v, uncoupled)
             x = np.zeros_like(b)
             if start is not None:
                 self._x.array[:] = x = start.copy()
@@ -162,7 +162,7 @@ class Newton:
                 b = b - self._b.array
             wanted = self.system.tolerance(tol)
             x += self._solve(b, wanted)
-            return self.system.impulses(x, q, alone), x
+            return self.system.impulses(x, q, uncoupled), x
 
     def _solve(self, b: Array, wanted: float) -> Array:
         """x with a residual of norm ``wanted``."""

@@ -11,13 +11,13 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
+from pctt.block_diagonal import set_diagonal_blocks
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
-from pctt.pc.block_diagonal import set_diagonal_blocks
 from pctt.shell import symmetric_shell
 
 
-class ContactSystem:
+class ContactForm:
     """S dg = q + G r_v, dv = G' dg - r_v.
 
     Attributes
@@ -87,10 +87,10 @@ class ContactSystem:
             self._made = True
         return self._entries.mat
 
-    def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
         return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
 
-    def impulses(self, x: Array, q: Array, alone: Array | None = None) -> Array:
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None = None) -> Array:
         """dg (nc, 3) of a solution."""
         return x.reshape(-1, 3).copy()
 

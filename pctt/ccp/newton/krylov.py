@@ -13,9 +13,9 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
+from pctt.ksp_options import entered, prefer_mumps, to_enter
 from pctt.pc.base import PythonPC
-from pctt.pc.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
-from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
 from pctt.petsc import own_errors
 from pctt.shell import is_shell
 
@@ -111,9 +111,9 @@ class Krylov:
             self.set_rtol(float(rtol))
         start = _now(self.comm)
         with entered(self._options):
-            error = together(self.comm, lambda: self._set_up(A, P, keep))
+            error = on_all_ranks(self.comm, lambda: self._set_up(A, P, keep))
             setup = _now(self.comm)
-            error = error or together(self.comm, lambda: self._iterate(b, x))
+            error = error or on_all_ranks(self.comm, lambda: self._iterate(b, x))
         if error:
             self.forget()
             if error == _NOT_SUPPORTED and not self.scalar:
@@ -244,7 +244,7 @@ def _now(comm: MPI.Comm) -> float:
     return time.perf_counter()
 
 
-def together(comm: MPI.Comm, work: Callable[[], None]) -> int:
+def on_all_ranks(comm: MPI.Comm, work: Callable[[], None]) -> int:
     """Do some work on all ranks: 0, or, alike on all of them, PETSc's error code where it failed on one or more.
 
     A rank that has failed alone cannot call back the others from a collective call of PETSc: where they do not come
