@@ -28,7 +28,8 @@ from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.exchange import offsets
 from pctt.run.options import read_options
 from pctt.run.report import Progress
-from pctt.run.simulate import cone_problem, first_state
+from pctt.run.simulate import first_state
+from pctt.run.stepper import cone_problem
 
 TOL = 1e-6
 SOLVERS = ("apgd", "conic")

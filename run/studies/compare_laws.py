@@ -19,7 +19,7 @@ from dem.stepper import advance
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
-from pctt.run.simulate import cone_problem
+from pctt.run.stepper import cone_problem
 
 SCENES = ("mixer", "blade", "shear")
 METHODS = {("apgd", "1e-4"): 20, ("conic", "1e-6"): 3}  # and how many steps

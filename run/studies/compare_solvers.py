@@ -29,7 +29,8 @@ from dem.system import ContactSystem
 from pctt import ccp
 from pctt.run.options import read_options
 from pctt.run.report import Progress
-from pctt.run.simulate import cone_problem, first_state
+from pctt.run.simulate import first_state
+from pctt.run.stepper import cone_problem
 
 COMM = MPI.COMM_SELF
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8)

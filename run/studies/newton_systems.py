@@ -27,7 +27,8 @@ from pctt.pc.sparse_train import SparseTrain
 from pctt.run.options import read_options
 from pctt.run.report import Progress
 from pctt.run.settings import Options
-from pctt.run.simulate import Stepper, first_state
+from pctt.run.simulate import first_state
+from pctt.run.stepper import Solved, Stepper
 
 
 @dataclass
@@ -87,7 +88,7 @@ class ReplayingStepper(Stepper):
         super().__init__(options, world, memory, Recorder(world.comm))
         self.look, self.newton_steps = look, newton_steps
 
-    def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> tuple[ccp.Result, str, int]:
+    def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> Solved:
         assert isinstance(self.newton, Recorder)
         options = self.options
         limits = options.limits if self.newton_steps is None else replace(options.limits, max_it=self.newton_steps)
@@ -97,7 +98,7 @@ class ReplayingStepper(Stepper):
         replay.destroy()
         if self.newton_steps is not None:
             result = ccp.solve(problem, guess, "apgd", options.limits)
-        return result, "pdip" if self.newton_steps is None else "apgd", result.iterations
+        return Solved(result, result, "pdip" if self.newton_steps is None else "apgd", result.iterations)
 
 
 def replay_steps(

@@ -22,7 +22,7 @@ from dem.stepper import advance
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
-from pctt.run.simulate import cone_problem
+from pctt.run.stepper import cone_problem
 
 Triple = tuple[float, float, float]
 

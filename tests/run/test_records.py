@@ -18,7 +18,7 @@ from pctt.run.hdf5 import FileError
 from pctt.run.options import read_options
 from pctt.run.place import Place
 from pctt.run.records import Records
-from pctt.run.simulate import Stepper
+from pctt.run.stepper import Stepper
 
 APGD = ("-ccp_type", "apgd")
 

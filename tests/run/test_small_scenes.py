@@ -13,9 +13,10 @@ from dem.scene import Scene
 from dem.scenes import Mixer
 from dem.shapes import Box, Plane
 from dem.start import new_world
+from dem.together import SceneError
 from pctt import ccp
 from pctt.run.options import read_options
-from pctt.run.simulate import SceneError, Stepper
+from pctt.run.stepper import Stepper
 
 
 def stepper_of(scene, **options):

@@ -12,10 +12,12 @@ from program import ROOT, database, table
 from dem.experiment import from_file
 from dem.impulses import ImpulseMemory
 from dem.start import new_world
+from dem.together import SceneError
 from pctt.options import OptionError
 from pctt.run.options import read_options
 from pctt.run.settings import find_scene
-from pctt.run.simulate import SceneError, Stepper, simulate
+from pctt.run.simulate import simulate
+from pctt.run.stepper import Stepper
 
 LOOSE = ("-ccp_type", "apgd", "-ccp_tol", "1e-3")
 
