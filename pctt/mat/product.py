@@ -6,7 +6,6 @@ import warnings
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import DTypeLike
 
 from pctt.tt.apply import Apply
 from pctt.tt.grid import GridDigits
@@ -28,7 +27,6 @@ class TrainProduct:
 
     def __init__(
         self, comm: MPI.Comm, counts: Array, digits: GridDigits, order: Array | None, train: Train,
-        dtype: DTypeLike = float,
     ) -> None:  # fmt: skip
         self.comm, self.counts = comm, np.asarray(counts)
         rows = digits.rows
@@ -51,7 +49,7 @@ class TrainProduct:
         self.parts = np.diff(ranks)
         self.whole = np.empty(rows)
         self.product = np.empty(digits.size)
-        self.apply = Apply(train, digits.size, bounds, dtype)
+        self.apply = Apply(train, digits.size, bounds)
 
     def set_train(self, train: Train) -> None:
         self.apply.set_train(train)

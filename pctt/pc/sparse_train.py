@@ -35,7 +35,6 @@ class SparseTrain:
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
         self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
-        self._double = False  # single precision was found wanting
         self._forget_structure()
         self._forget_trains()
 
@@ -201,21 +200,12 @@ class SparseTrain:
         if self._apply is None:
             bs = slots.block
             rows = (slots.first * bs, (slots.first + slots.capacity) * bs)
-            dtype = np.float32 if self.options.precision == "single" and not self._double else np.float64
-            self._apply = Apply(train, slots.size * bs, rows, dtype)
+            self._apply = Apply(train, slots.size * bs, rows)
             self._local = np.empty((slots.capacity, bs))
             self._scaled = np.empty((slots.capacity, bs, 1))
             self._whole = np.empty(slots.size * bs)
         else:
             self._apply.set_train(train)
-
-    def double(self) -> bool:
-        """Apply in double precision from now on; False where that is done already."""
-        if self._double or self.options.precision == "double" or self.inverse is None:
-            return False
-        self._double, self._apply = True, None
-        self._prepare_apply(self.inverse.train)
-        return True
 
     def distrust(self) -> bool:
         """Whether a train of an earlier matrix is in use: the next set-up then tries another."""

@@ -75,11 +75,10 @@ def measure(first: PETSc.Mat, second: PETSc.Mat, rank: int) -> dict[str, Any]:
         pc.destroy()
         runs.append(run)
     row: dict[str, Any] = {name: statistics.median(run[name] for run in runs) for name in runs[0]}
-    for precision in ("double", "single"):
-        pc, _ = train_pc(MPI.COMM_WORLD, precision=precision, max_rank=rank, eps=1e-2)
-        if set_up(pc, work)["rank"] == rank:
-            row[f"apply {precision}"] = median_seconds(lambda pc=pc: pc.apply(x, y))
-        pc.destroy()
+    pc, _ = train_pc(MPI.COMM_WORLD, max_rank=rank, eps=1e-2)
+    if set_up(pc, work)["rank"] == rank:
+        row["apply"] = median_seconds(lambda: pc.apply(x, y))
+    pc.destroy()
     row["product"] = median_seconds(lambda: work.mult(x, y))
     work.destroy()
     return row
@@ -105,7 +104,7 @@ def main(given: argparse.Namespace) -> None:
                 matrix.destroy()
             rows.append(row)
             cells = " ".join(f"{row.get(phase, np.nan):12.4f}" for phase in PHASES)
-            products = row.get("apply double", np.nan) / row["product"]
+            products = row.get("apply", np.nan) / row["product"]
             print(f"{n:3d} {copies:6d} {row['contacts']:9d} {cells} {products:14.1f}", flush=True)
 
     for n in given.n:
