@@ -12,7 +12,7 @@ preconditioners stay from one cone problem to the next, and matrices too where t
 
 from __future__ import annotations
 
-from typing import Union
+from collections.abc import Callable
 
 import numpy as np
 from mpi4py import MPI
@@ -24,13 +24,12 @@ from pctt.ccp.newton.body_ladder import BodyLadder
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.contact import ContactForm
 from pctt.ccp.newton.kkt import KKTForm
+from pctt.ccp.newton.protocols import LinearSolver, NewtonForm
 from pctt.ccp.newton.users_solver import UsersSolver
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase
 
-Linear = Union[UsersSolver, BodyLadder]
-System = Union[ContactForm, KKTForm, BodyForm]
-FORMS: dict[str, type[System]] = {"contact": ContactForm, "kkt": KKTForm, "body": BodyForm}
+FORMS: dict[str, Callable[[ConeProblem], NewtonForm]] = {"contact": ContactForm, "kkt": KKTForm, "body": BodyForm}
 _ASKED = {"pc_type", "ksp_type"}  # options that say how a system is to be solved
 SHARP_LIMIT = 50_000  # contacts: above, factors of the kkt system take too much memory
 DEFAULTS = {
@@ -55,10 +54,10 @@ class Newton:
     def __init__(self, comm: MPI.Comm, form: str = "contact", compare: Comparison | None = None):
         self.comm, self.form, self.compare = comm, form, compare
         self.memory: object = None
-        self.system: System | None = None
+        self.system: NewtonForm | None = None
         self._present = form
         self._structure: tuple | None = None
-        self._linear: dict[str, Linear] = {}
+        self._linear: dict[str, LinearSolver] = {}
 
     def begin(self, problem: ConeProblem) -> None:
         """Take the next problem; its structure is kept where contacts and bodies are those of the last."""
@@ -91,14 +90,14 @@ class Newton:
         self._x, self._b = self.system.matrix.createVecs()
 
     @property
-    def linear(self) -> Linear:
+    def linear(self) -> LinearSolver:
         """What solves the systems of the present form."""
         form = self._present
         if form not in self._linear:
             own_ladder = form == "body" and self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
             prefix = "" if form == self.form else f"{form}_"
-            asked = UsersSolver(self.comm, DEFAULTS[form], self.compare if form == self.form else None, prefix)
-            self._linear[form] = BodyLadder(self.comm) if own_ladder else asked
+            users = UsersSolver(self.comm, DEFAULTS[form], self.compare if form == self.form else None, prefix)
+            self._linear[form] = BodyLadder(self.comm) if own_ladder else users
         return self._linear[form]
 
     @property
@@ -127,18 +126,14 @@ class Newton:
     @property
     def takes_any(self) -> bool:
         """Whether the present systems may be unsymmetric."""
-        return self._present == "body" and isinstance(self.linear, BodyLadder)
+        return self._present == "body" and self.linear.takes_any
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
         """New barrier blocks B (nc, 3, 3); ``inverse`` is (B + C)^-1 where the caller knows it better. Blocks that are
         not ``symmetric`` are for systems that take any (`takes_any`)."""
         with phase("CCPUpdate"):
             assert self.system is not None
-            if symmetric:
-                self.system.update(barrier, inverse)
-            else:
-                assert isinstance(self.system, BodyForm)
-                self.system.update(barrier, inverse, symmetric=False)
+            self.system.update(barrier, inverse, symmetric)
             self.linear.new_matrix(self.system)
 
     def solve(

@@ -21,7 +21,7 @@ LEAST = 0.1  # of the mass: entries of a block between bodies that a factor is b
 
 
 class BodyForm:
-    """See the module; the same members as `ContactForm`."""
+    """The `NewtonForm` of the module."""
 
     def __init__(self, problem: ConeProblem):
         if problem.contact_map is None:
@@ -62,7 +62,6 @@ class BodyForm:
         return self.operator.entries().stiff_part(LEAST, scalar=True, symmetric=self.symmetric)
 
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
-        """``uncoupled`` is (B + C)^-1 q where the caller knows it better."""
         push = self.problem.momentum(times(self._inverse, q) if uncoupled is None else uncoupled)
         return push if r_v is None else push - r_v
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
+from pctt.ccp.newton.protocols import NewtonForm
 
 RUNGS = {"pbjacobi": {"pc_type": "pbjacobi"}, "cholesky": {"pc_type": "cholesky"}}
 CAP = {"pbjacobi": "1500", "cholesky": "60"}
@@ -39,6 +41,8 @@ class BodyLadder(KrylovFamily):
     The choice rests on iteration counts and fixed costs, so that a repeated run repeats it.
     """
 
+    takes_any = True
+
     def __init__(self, comm: MPI.Comm):
         super().__init__(comm)
         self._hardness = 20.0  # expected iterations with block Jacobi
@@ -48,7 +52,8 @@ class BodyLadder(KrylovFamily):
         self.iterations = self.fallbacks = 0
         self.used: dict[str, int] = {}
 
-    def new_matrix(self, system) -> None:
+    def new_matrix(self, system: NewtonForm) -> None:
+        assert isinstance(system, BodyForm)
         self.system = system
         bodies, ranks = system.matrix.getSize()[0] // 6, self.comm.size
         expected = self._hardness * self._growth
@@ -98,7 +103,6 @@ class BodyLadder(KrylovFamily):
 
     @property
     def factored(self) -> bool:
-        """Whether the present matrix has factors of its own."""
         return self._rung == "cholesky" and not self._keep
 
     def report(self) -> list[str]:
@@ -106,9 +110,8 @@ class BodyLadder(KrylovFamily):
         return []
 
     def begin(self) -> None:
-        """Another problem: its first systems are easy ones."""
         self.iterations = self.fallbacks = 0
-        self._hardness, self._growth, self._lagged = 20.0, 1.0, None
+        self._hardness, self._growth, self._lagged = 20.0, 1.0, None  # a problem's first systems are easy ones
 
     def _solver(self, rung: str) -> Krylov:
         unsymmetric = not self.system.symmetric

@@ -24,7 +24,9 @@ from pctt.options import OptionError
 
 
 class KKTForm:
-    """See the module; the same members as `ContactForm`."""
+    """The `NewtonForm` of the module."""
+
+    symmetric = True
 
     def __init__(self, problem: ConeProblem):
         if problem.low_rank is not None:
@@ -54,7 +56,7 @@ class KKTForm:
         other.destroy()
         self.problem = problem
 
-    def update(self, barrier: Array, inverse: Array | None = None) -> None:
+    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
         """Put the barrier blocks (nc, 3, 3) in."""
         k, V = np.linalg.eigh(barrier)
         scale = np.sqrt(self.problem.mean_diagonal)

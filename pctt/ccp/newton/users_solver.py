@@ -8,6 +8,7 @@ from petsc4py import PETSc
 
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
+from pctt.ccp.newton.protocols import NewtonForm
 
 CHOLESKY_LIMIT = 50_000  # contacts: above, a factor of the contact matrix takes more than the rest of the step
 
@@ -19,7 +20,8 @@ LADDER = {
 
 
 class UsersSolver(KrylovFamily):
-    """The KSP without prefix, as the options have it; what it does not solve goes down the ladder.
+    """The `LinearSolver` that is the KSP without prefix, as the options have it; what it does not solve goes down the
+    ladder.
 
     Attributes
     ----------
@@ -27,21 +29,20 @@ class UsersSolver(KrylovFamily):
     fallbacks : systems that the user's KSP did not solve to twice the tolerance
     """
 
+    takes_any = False
+
     def __init__(self, comm: MPI.Comm, defaults: dict[str, str], compare: Comparison | None = None, prefix: str = ""):
         super().__init__(comm)
         self.defaults, self.compare, self.prefix = defaults, compare, prefix
         self.iterations = self.fallbacks = 0
 
     def begin(self) -> None:
-        """Another problem."""
         self.iterations = self.fallbacks = 0
 
-    def new_matrix(self, system) -> None:
-        """The system has new values."""
+    def new_matrix(self, system: NewtonForm) -> None:
         self.system = system
 
     def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
-        """x = A^-1 b to a relative residual of rtol; whether that was reached."""
         A, P = self.system.matrix, self.system.entries
         if self.compare is not None and self.compare.due():
             done = self.compare.run(A, b, x, rtol, P)
@@ -55,11 +56,9 @@ class UsersSolver(KrylovFamily):
 
     @property
     def factored(self) -> bool:
-        """Whether the preconditioner is a factorisation of the present matrix."""
         return "" in self._krylov and self._krylov[""].ksp.pc.getType() in ("cholesky", "lu")
 
     def report(self) -> list[str]:
-        """What the user's preconditioner tells of itself, if it is one of the project's."""
         return self._krylov[""].report() if "" in self._krylov else []
 
     def _climb_down(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float, done: Solve) -> bool:
