@@ -36,7 +36,7 @@ UPPER = np.triu_indices(3)
 SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
-class CompactRows(NamedTuple):
+class ScaledMap(NamedTuple):
     """Local rows of G = D' M^-1/2 without its blocks; all arrays are C-contiguous.
 
     A contact moves with the velocity F (v_b + w_b x r_b - v_a - w_a x r_a), F its frame, of its bodies a and b.
@@ -90,14 +90,14 @@ class ContactSystem:
         self.r = self.b + relative_velocity(self.frame, self._arm, self._row, free)
 
     @cached_property
-    def contact_map(self) -> CompactRows:
+    def contact_map(self) -> ScaledMap:
         """The mass-scaled map G = D' M^-1/2 as frames, arms and bodies; of every solver that needs no blocks."""
         body = np.where(bodies.is_dynamic(self._near.bodies)[self._row], self._body, -1)
-        return CompactRows(self.frame.reshape(-1, 9), self._arm, body, self._root)
+        return ScaledMap(self.frame.reshape(-1, 9), self._arm, body, self._root)
 
     @cached_property
     def _root(self) -> Floats:
-        """M^-1/2 of the bodies whose rows this rank owns, as in `CompactRows`."""
+        """M^-1/2 of the bodies whose rows this rank owns, as in `ScaledMap`."""
         if self._diagonal:
             mass, inertia = self._near.bodies.mass[self._owned], self._near.bodies.inertia[self._owned]
             return 1.0 / np.sqrt(np.column_stack([mass, mass, mass, inertia]))
@@ -201,7 +201,7 @@ def sum_rows(row: Ints, values: Floats, count: int) -> Floats:
 
 
 def scaled(root: Floats, values: Floats) -> Floats:
-    """M^-1/2 times the values (n, 6), with its rows (n, 6) or (n, 12) as in `CompactRows`."""
+    """M^-1/2 times the values (n, 6), with its rows (n, 6) or (n, 12) as in `ScaledMap`."""
     if root.shape[1] == 6:
         return root * values
     return np.einsum("nbij,nbj->nbi", root.reshape(-1, 2, 6)[:, :, SYMMETRIC], values.reshape(-1, 2, 3)).reshape(-1, 6)

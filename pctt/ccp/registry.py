@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pctt.ccp import auto
-from pctt.ccp.first_order import apgd, barzilai_borwein, gauss_seidel, gpminres, jacobi, kucera, spectral
+from pctt.ccp.first_order import apgd, barzilai_borwein, spectral
+from pctt.ccp.first_order.compared import gauss_seidel, gpminres, jacobi, kucera
 from pctt.ccp.interior import conic, pdip
 from pctt.ccp.result import Result
 from pctt.options import describe

@@ -23,7 +23,7 @@ from mpi4py import MPI
 from pctt.blocks import HUB
 from pctt.ccp import cone
 from pctt.ccp.cone import Array
-from pctt.ccp.first_order.colouring import Adjacency, Halo, colours
+from pctt.ccp.first_order.compared.colouring import Adjacency, Halo, colours
 from pctt.ccp.first_order.progress import FirstOrder, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem

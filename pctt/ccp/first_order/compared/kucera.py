@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pctt.ccp.cone import Array
-from pctt.ccp.first_order.faces import Face, GradientProjection
+from pctt.ccp.first_order.compared.faces import Face, GradientProjection
 from pctt.ccp.first_order.progress import FirstOrder, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
