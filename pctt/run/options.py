@@ -46,7 +46,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     prefix = f"ccp_{run.ccp_type}_"
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in _groups(scene_class) for d in describe(group, start)]
-    refuse_unknown(database, known, prefixes=("compare_", "fallback_", "body_", "kkt_"))
+    refuse_unknown(database, known, prefixes=OF_SOLVERS)
     for name in known:
         PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
     limits = read(ccp.Limits, database, "ccp_")

@@ -21,7 +21,7 @@ NEWTON = 6  # Newton systems of a step until the two that are measured: costs ha
 REPEAT = 3
 PHASES = (
     "als cold", "als warm", "cross cold", "cross warm", "invert cold", "invert warm", "set-up cold", "set-up warm",
-    "set-up kept", "apply double", "apply single", "product",
+    "set-up kept", "apply", "product",
 )  # fmt: skip
 
 
