@@ -11,7 +11,7 @@ from pctt.tt.apply import Apply
 from pctt.tt.grid import GridDigits
 from pctt.tt.train import Array, Train
 
-MANY = 1_000_000  # rows from which a vector that is gathered on each of several ranks is worth a warning
+LONG = 1_000_000  # rows from which a vector that is gathered on each of several ranks is worth a warning
 
 
 class TrainProduct:
@@ -30,7 +30,7 @@ class TrainProduct:
     ) -> None:  # fmt: skip
         self.comm, self.counts = comm, np.asarray(counts)
         rows = digits.rows
-        if comm.size > 1 and rows > MANY and comm.rank == 0:
+        if comm.size > 1 and rows > LONG and comm.rank == 0:
             warnings.warn(f"pctt: each of {comm.size} ranks gathers whole vectors of {rows} numbers", stacklevel=2)
         places = digits.places
         if order is not None:

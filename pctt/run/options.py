@@ -37,6 +37,7 @@ OF_STEPS = {
 #: Options that settled states depend on, and -quiet.
 OF_SETTLING = {"settle", "scene", "dt", "delta", "recovery_speed", "settle_delta", "settle_tol", "quiet"}
 
+
 def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     """The options of the database; raises OptionError, the same on every rank, before any work."""
     demo = not database

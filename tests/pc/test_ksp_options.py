@@ -95,7 +95,7 @@ def fails_alone(): # where the others go on to the end
 
 assert krylov.on_all_ranks(comm, fails_alone) == 76
 print("agreed", flush=True)
-krylov.PATIENCE = 0.5
+krylov.WAIT_FOR_OTHERS = 0.5
 
 
 def fails_amidst(): # where the others wait for it
