@@ -10,8 +10,6 @@ which gives the same iterates for a semidefinite matrix. PETSc's TAOGPCG is for 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pctt.ccp.cone import Array
@@ -20,19 +18,13 @@ from pctt.ccp.first_order.progress import FirstOrder, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
-from pctt.options import AT_LEAST_ONE, FRACTION, option
+
+PROJECTIONS = 10  # most gradient projections in a row
+KRYLOV = 10  # most MINRES iterations in a row,
+REDUCTION = 0.3  # and the reduction of the residual in the face at which it ends
 
 
-@dataclass(frozen=True)
-class GPMINRES(FirstOrder):
-    """Options ``-ccp_gpminres_*``."""
-
-    projections: int = option(10, "most gradient projections in a row", check=AT_LEAST_ONE)
-    krylov: int = option(10, "most MINRES iterations in a row", check=AT_LEAST_ONE)
-    reduction: float = option(0.3, "reduction of the residual in the face at which MINRES ends", check=FRACTION)
-
-
-def solve(problem: ConeProblem, guess: Array, limits: Limits, options: GPMINRES) -> Result:
+def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder) -> Result:
     """Impulses from a first guess (nc, 3)."""
     scaled = ScaledProblem(problem)
     progress = Progress(scaled, limits, options)
@@ -41,7 +33,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: GPMINRES)
     y = scaled.gradient(x)
     face = Face(x, scaled.mu)
     while progress.goes_on(x, y):
-        for _ in range(options.projections):
+        for _ in range(PROJECTIONS):
             before = face
             x, y, products = projection.step(x, y)
             progress.iterations += products
@@ -50,20 +42,20 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: GPMINRES)
                 break
         if progress.reason:
             break
-        w = _minres(scaled, face, -face.part(y), options, progress)
+        w = _minres(scaled, face, -face.part(y), progress)
         x, y = _projected_search(scaled, x, y, w, progress)
         face = Face(x, scaled.mu)
     return progress.result()
 
 
-def _minres(problem: ScaledProblem, face: Face, r: Array, options: GPMINRES, progress: Progress) -> Array:
+def _minres(problem: ScaledProblem, face: Face, r: Array, progress: Progress) -> Array:
     """w in the face with A w = r there, approximately."""
     w = np.zeros_like(r)
     Ar = face.part(problem.product(r))
     progress.iterations += 1
     p, Ap = r, Ar
     rAr, first = problem.dots((r, Ar), (r, r))
-    for _ in range(options.krylov):
+    for _ in range(KRYLOV):
         squared = problem.dots((Ap, Ap))[0]
         if not (rAr > 0 and squared > 0):
             break
@@ -74,7 +66,7 @@ def _minres(problem: ScaledProblem, face: Face, r: Array, options: GPMINRES, pro
         progress.iterations += 1
         before = rAr
         rAr, now = problem.dots((r, Ar), (r, r))
-        if now <= options.reduction**2 * first or progress.iterations >= progress.limits.max_it:
+        if now <= REDUCTION**2 * first or progress.iterations >= progress.limits.max_it:
             break
         p = r + rAr / before * p
         Ap = Ar + rAr / before * Ap

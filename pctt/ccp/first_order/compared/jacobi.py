@@ -11,8 +11,6 @@ search on the direction to the block minimisers is Bertsekas, Nonlinear Programm
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from pctt.ccp.cone import Array
 from pctt.ccp.first_order.progress import FirstOrder, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
@@ -20,12 +18,7 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 
 
-@dataclass(frozen=True)
-class Jacobi(FirstOrder):
-    """Options ``-ccp_jacobi_*``."""
-
-
-def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Jacobi) -> Result:
+def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder) -> Result:
     """Impulses from a first guess (nc, 3)."""
     scaled = ScaledProblem(problem)
     progress = Progress(scaled, limits, options)

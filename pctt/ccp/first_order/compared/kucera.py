@@ -14,8 +14,6 @@ this family (TAOGPCG, TAOBNCG) for bounds only, not for cones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pctt.ccp.cone import Array
@@ -24,19 +22,11 @@ from pctt.ccp.first_order.progress import FirstOrder, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
-from pctt.options import POSITIVE, option
+
+PROPORTION = 1.0  # descent across the face, in units of that along it, up to which conjugate gradients go on
 
 
-@dataclass(frozen=True)
-class Kucera(FirstOrder):
-    """Options ``-ccp_kucera_*``."""
-
-    proportion: float = option(
-        1.0, "descent across the face, in units of that along it, up to which conjugate gradients go on", check=POSITIVE
-    )
-
-
-def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Kucera) -> Result:
+def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder) -> Result:
     """Impulses from a first guess (nc, 3)."""
     scaled = ScaledProblem(problem)
     progress = Progress(scaled, limits, options)
@@ -51,7 +41,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Kucera) -
         gradient = face.part(y)
         descent, along = scaled.dots((y, d), (gradient, d))
         leaves = True
-        if descent >= (1 + options.proportion) * along:
+        if descent >= (1 + PROPORTION) * along:
             p = gradient if fresh else gradient - scaled.dots((gradient, Ap))[0] / curvature * p
             Ap = scaled.product(p)
             progress.iterations += 1
