@@ -30,3 +30,5 @@ def test_pages_name_studies_that_there_are():
     for page in [ROOT / "README.md", ROOT / "CHANGELOG.md", *ROOT.glob("docs/*.md")]:
         for name in re.findall(r"run/study ([a-z_]+)", page.read_text()):
             assert (STUDIES / f"{name}.py").is_file(), f"{page}: run/study {name}"
+        for name in re.findall(r"\brun/([a-z_]+)", page.read_text()):
+            assert (ROOT / "run" / name).exists() or (ROOT / "pctt" / "run" / name).exists(), f"{page}: run/{name}"

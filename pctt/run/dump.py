@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem import bodies
+from dem import bodies, quaternion
 from dem.free_motion import free_directions
 from dem.system import ContactSystem
 from dem.world import World
@@ -178,13 +178,15 @@ def _block_diagonal(blocks: Array, comm: MPI.Comm) -> PETSc.Mat:
 
 
 def _map(system: ContactSystem, world: World, dynamic: np.ndarray) -> PETSc.Mat:
-    """D of the dynamic bodies alone, of guided ones along their guides, (6 n x 3 nc); collective."""
+    """D of the dynamic bodies alone, of those that are guided as far as they can move, (6 n x 3 nc); collective."""
     body, blocks = system.blocks()
     grains = world.slabs[-1]
     large = body >= grains
     row = body[large] - grains
     blocks[large, :, :3] = blocks[large, :, :3] @ free_directions(world.large_bodies)[row]
-    blocks[large, :, 3:] *= np.isfinite(world.large.inertia).all(axis=1)[row, None, None]  # guided bodies do not turn
+    axes = quaternion.matrix(world.large.quaternion)
+    turns = np.isfinite(world.large.inertia)  # about which of its axes a body does
+    blocks[large, :, 3:] = blocks[large, :, 3:] @ ((axes * turns[:, None, :]) @ axes.transpose(0, 2, 1))[row]
     moves = np.concatenate([np.ones(grains, dtype=bool), bodies.is_dynamic(world.large)])
     count = np.repeat(6 * moves[body].sum(axis=1), 3)
     kept = np.broadcast_to(moves[body][:, None, :, None], (len(body), 3, 2, 6))
