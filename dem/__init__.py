@@ -2,7 +2,7 @@
 
 The loop of a simulation, on any number of ranks::
 
-    world = World.from_scene(scene, comm)
+    world = new_world(scene, comm)
     while world.time < end:
         contacts = find_contacts(world, delta, dt)
         system = ContactSystem(world, contacts, dt, recovery_speed)
@@ -10,7 +10,7 @@ The loop of a simulation, on any number of ranks::
         advance(world, system.velocity(impulse), dt)
         rebalance(world)
 
-Import from the modules: `dem.scene`, `dem.shapes`, `dem.motion` describe what there is; `dem.world`,
+Import from the modules: `dem.scene`, `dem.shapes`, `dem.motion` describe what there is; `dem.start`, `dem.world`,
 `dem.bodies`, `dem.partition` and `dem.neighbourhood` hold it on the ranks; `dem.contact`, `dem.system`,
 `dem.stepper` and `dem.impulses` are the time step; `dem.experiment` is what the program needs of a scene, and
 `dem.scenes` has ready-made ones; `dem.record` and `dem.analysis` say what steps and runs show. All quantities are in

@@ -27,15 +27,13 @@ import traceback
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from dem import checks
 from dem.arrays import Floats
 from dem.scene import Scene
+from dem.step import Step
 from dem.together import told
-
-if TYPE_CHECKING:
-    from dem.record import Step
 
 #: Types that an option can have.
 KINDS = (int, float, bool, str)

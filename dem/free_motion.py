@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,12 +10,10 @@ from dem import bodies, quaternion
 from dem.arrays import Floats
 from dem.bodies import SPHERE, Bodies
 from dem.motion import Dynamic, Guided
+from dem.neighbourhood import Neighbourhood
 from dem.quaternion import cross
-
-if TYPE_CHECKING:
-    from dem.neighbourhood import Neighbourhood
-    from dem.scene import LargeBody
-    from dem.world import World
+from dem.scene import LargeBody
+from dem.world import World
 
 
 def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:

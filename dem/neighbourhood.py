@@ -6,7 +6,6 @@ A contact belongs to the rank of the lower global body index: ghosts only travel
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +13,7 @@ from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.exchange import exchange
-
-if TYPE_CHECKING:
-    from dem.world import World
+from dem.world import World
 
 #: Boxes by which a rank tells the others where its grains are.
 BOXES = 8

@@ -6,17 +6,13 @@ its share of the contacts. Nothing of the size of the whole system is gathered f
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.exchange import exchange
-
-if TYPE_CHECKING:
-    from dem.world import World
+from dem.world import World
 
 #: Bits of a Morton code per axis; three of them fill a signed 64 bit integer.
 BITS = 21
@@ -25,7 +21,7 @@ BITS = 21
 DIGIT = 9
 
 
-def morton_codes(points: Floats, low: Floats, high: Floats) -> Ints:
+def curve_codes(points: Floats, low: Floats, high: Floats) -> Ints:
     """Morton codes (n,) of points (n, 3) on an integer grid over the box from `low` (3,) to `high` (3,)."""
     # One cell size for all axes: a flat box must not get flat cells.
     cell = max(float((high - low).max()), np.finfo(float).tiny) / (2**BITS - 1)
@@ -71,11 +67,11 @@ def redistribute(world: World) -> None:
     comm.Allreduce(MPI.IN_PLACE, low, MPI.MIN)
     comm.Allreduce(MPI.IN_PLACE, high, MPI.MAX)
     if comm.size > 1:
-        codes = morton_codes(grains.position, low, high)
+        codes = curve_codes(grains.position, low, high)
         cuts = splitters(comm, codes, grains.weight + 1.0)
         owner = np.searchsorted(cuts, codes, side="right")
         grains = Bodies(**exchange(comm, grains.columns(), owner))
-    codes = morton_codes(grains.position, low, high)
+    codes = curve_codes(grains.position, low, high)
     world.set_grains(grains.take(np.lexsort((grains.id, codes))))
 
 

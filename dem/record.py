@@ -6,8 +6,6 @@ All functions are collective, and their results are the same on all ranks and, t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,53 +14,15 @@ from mpi4py import MPI
 from dem import bodies, quaternion
 from dem.arrays import ArrayLike, Floats
 from dem.bodies import COMPOUND, Bodies
-from dem.contact import Contacts
 from dem.experiment import Experiment
-from dem.system import ContactSystem
-from dem.together import SceneError, meet, together
-from dem.world import World
+from dem.step import Step
+from dem.together import SceneError, together
 
 #: A contact is active if its normal impulse exceeds this part of the mean: solvers leave small impulses at others.
 ACTIVE = 0.01
 
 #: A contact slides if its tangential impulse exceeds this part of what friction can bear.
 SLIDING = 0.99
-
-
-@dataclass(frozen=True)
-class Step:
-    """A step that was just made: `advance` was called, the grains are not yet balanced anew."""
-
-    world: World  #: at the end of the step
-    contacts: Contacts
-    system: ContactSystem
-    impulse: Floats  #: (nc, 3) of the local contacts: normal, t1, t2 [N s]
-
-    def force_on(self, name: str) -> Floats:
-        """Contact force and torque (6,) [N, N m] on a large body, about its reference point, averaged over the step."""
-        row = self.world.large_row(name)
-        normal, tangential = self._impulses
-        return (normal[1][row] + tangential[1][row]) / self.system.dt
-
-    def position(self, name: str) -> Floats:
-        """Position (3,) of a large body [m]."""
-        return self.world.large.position[self.world.large_row(name)].copy()
-
-    def velocity(self, name: str) -> Floats:
-        """Linear and angular velocity (6,) of a large body [m/s, rad/s]."""
-        return self.world.large.velocity[self.world.large_row(name)].copy()
-
-    def total(self, values: ArrayLike) -> float:
-        """The sum over all grains, of values (grains,) of those in `world.grains`; collective, which the `record` of a
-        scene must therefore call on all ranks."""
-        meet(self.world.comm, "Step.total")
-        return float(self.world.comm.allreduce(float(np.sum(values))))
-
-    @cached_property
-    def _impulses(self) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-        """Generalised impulses on grains and large bodies by the normal and by the tangential impulses."""
-        normal = self.impulse * [1.0, 0.0, 0.0]
-        return self.system.generalised_impulse(normal), self.system.generalised_impulse(self.impulse - normal)
 
 
 def row(step: Step, scene: Experiment) -> dict[str, float]:
@@ -145,8 +105,8 @@ def energy_balance(step: Step) -> dict[str, float]:
 
     was = sums(*(energy(table, world.gravity) for table in before))
     now = sums(*(energy(table, world.gravity) for table in after))
-    normal, tangential = ((sums(*map(np.vdot, load, mean))) for load in step._impulses)
-    received = np.vdot((step._impulses[0][1] + step._impulses[1][1])[~moves], mean[1][~moves])
+    normal, tangential = ((sums(*map(np.vdot, load, mean))) for load in step.generalised_impulses)
+    received = np.vdot((step.generalised_impulses[0][1] + step.generalised_impulses[1][1])[~moves], mean[1][~moves])
     whole = comm.allreduce(np.array([*was, *now, normal, tangential]))
     change = whole[2] + whole[3] - whole[0] - whole[1]
     return {

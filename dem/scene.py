@@ -1,11 +1,11 @@
 """Description of a scene: what there is at time zero.
 
-A scene is the same on every rank and knows nothing of ranks; `dem.world.World.from_scene` distributes it.
+A scene is the same on every rank and knows nothing of ranks; `dem.start.new_world` distributes it.
 
     scene = Scene(friction=0.3)
     scene.add_body("floor", [Plane(normal=(0, 0, 1))])
     scene.add_spheres(positions, radius=0.1, density=2500.0)
-    world = World.from_scene(scene, MPI.COMM_WORLD)
+    world = new_world(scene, MPI.COMM_WORLD)
 """
 
 from __future__ import annotations

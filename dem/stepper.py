@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from dem import quaternion
@@ -11,9 +9,7 @@ from dem.arrays import Floats
 from dem.bodies import Bodies
 from dem.motion import Dynamic
 from dem.together import together
-
-if TYPE_CHECKING:
-    from dem.world import World
+from dem.world import World
 
 
 def advance(world: World, velocity: Floats, dt: float) -> None:

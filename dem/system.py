@@ -16,11 +16,10 @@ Source: Anitescu and Hart (2004), Tasora and Anitescu (2011): the cone complemen
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from dem import bodies
 from dem.arrays import Floats, Ints
@@ -30,25 +29,14 @@ from dem.exchange import exchange
 from dem.free_motion import free_directions, free_velocities
 from dem.loops import loops
 from dem.quaternion import cross
-
-if TYPE_CHECKING:
-    from dem.world import World
-
+from dem.world import World
 
 #: The entries (xx, xy, xz, yy, yz, zz) of a symmetric matrix, and the numbers (3, 3) of its entries among these.
 UPPER = np.triu_indices(3)
 SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
-class BlockRows(NamedTuple):
-    """Local block rows of a distributed matrix in block-CSR form, one 3 x 6 block per contact and body."""
-
-    indptr: Ints  #: (nc + 1,) where the blocks of each local contact start
-    indices: Ints  #: (nb,) global body indices, ascending within a contact
-    data: Floats  #: (nb, 3, 6)
-
-
-class CompactRows(NamedTuple):
+class ScaledMap(NamedTuple):
     """Local rows of G = D' M^-1/2 without its blocks; all arrays are C-contiguous.
 
     A contact moves with the velocity F (v_b + w_b x r_b - v_a - w_a x r_a), F its frame, of its bodies a and b.
@@ -102,14 +90,14 @@ class ContactSystem:
         self.r = self.b + relative_velocity(self.frame, self._arm, self._row, free)
 
     @cached_property
-    def contact_map(self) -> CompactRows:
+    def contact_map(self) -> ScaledMap:
         """The mass-scaled map G = D' M^-1/2 as frames, arms and bodies; of every solver that needs no blocks."""
         body = np.where(bodies.is_dynamic(self._near.bodies)[self._row], self._body, -1)
-        return CompactRows(self.frame.reshape(-1, 9), self._arm, body, self._root)
+        return ScaledMap(self.frame.reshape(-1, 9), self._arm, body, self._root)
 
     @cached_property
     def _root(self) -> Floats:
-        """M^-1/2 of the bodies whose rows this rank owns, as in `CompactRows`."""
+        """M^-1/2 of the bodies whose rows this rank owns, as in `ScaledMap`."""
         if self._diagonal:
             mass, inertia = self._near.bodies.mass[self._owned], self._near.bodies.inertia[self._owned]
             return 1.0 / np.sqrt(np.column_stack([mass, mass, mass, inertia]))
@@ -119,50 +107,6 @@ class ContactSystem:
         translation[self._near.grains :] = translation[self._near.grains :] @ guides
         both = np.stack([translation, bodies.inverse_root_inertia(owned)], axis=1)
         return both[:, :, UPPER[0], UPPER[1]].reshape(-1, 12)
-
-    @cached_property
-    def G(self) -> BlockRows:
-        """Mass-scaled map D' M^-1/2, local block rows; bodies of prescribed motion have no blocks.
-
-        M^-1/2 of a body is diag(m^-1/2 E, I^-1/2), with the symmetric root of the inertia tensor; of a guided
-        body diag(m^-1/2 d d', 0).
-        """
-        table = self._near.bodies
-        order, blocks = self._blocks()
-        row = np.take_along_axis(self._row, order, axis=1)
-        blocks[..., :3] /= np.sqrt(table.mass)[row][:, :, None, None]
-        blocks[..., 3:] = blocks[..., 3:] @ bodies.inverse_root_inertia(table)[row]
-        first_large = len(table) - len(self._free_directions)
-        large = row >= first_large
-        blocks[large, :, :3] = blocks[large, :, :3] @ self._free_directions[row[large] - first_large]
-        dynamic = bodies.is_dynamic(table)[row]
-        indptr = np.concatenate([[0], np.cumsum(dynamic.sum(axis=1))])
-        return BlockRows(indptr, np.take_along_axis(self._body, order, axis=1)[dynamic], blocks[dynamic])
-
-    @cached_property
-    def D(self) -> PETSc.Mat:
-        """The map of impulses to generalised forces, MPIAIJ (6 M x 3 Nc), of all bodies; collective. `destroy` frees
-        it."""
-        # A scalar row of D' has the entries of the first body, then those of the second: no row is
-        # off-process.
-        order, blocks = self._blocks()
-        entries = blocks.transpose(0, 2, 1, 3)
-        body = np.take_along_axis(self._body, order, axis=1)
-        columns = np.broadcast_to(6 * body[:, None, :, None] + np.arange(6), entries.shape)
-        indptr = 12 * np.arange(3 * self.local_contacts + 1)
-        transposed = PETSc.Mat().createAIJ(
-            ((3 * self.local_contacts, None), (6 * self.owned_bodies, None)),
-            csr=(indptr.astype(PETSc.IntType), columns.astype(PETSc.IntType).ravel(), entries.ravel()),
-            comm=self._comm,
-        )
-        mat = transposed.transpose(PETSc.Mat())
-        transposed.destroy()
-        return mat
-
-    def destroy(self) -> None:
-        """Free the matrix D, if it was asked for: PETSc keeps what is spread over ranks until it is told."""
-        if "D" in self.__dict__:
-            self.__dict__.pop("D").destroy()
 
     def velocity(self, impulse: Floats) -> Floats:
         """Velocities (owned, 6) after the step, v_free + M^-1 D g, for impulses (nc, 3); collective."""
@@ -175,13 +119,14 @@ class ContactSystem:
         row = self._large_row(name)
         return self.generalised_impulse(impulse)[1][row] / self.dt
 
-    def _blocks(self) -> tuple[Ints, Floats]:
-        """The two bodies of each contact in the order of their global indices (nc, 2), 0 for a and 1 for b, and their
-        blocks (nc, 2, 3, 6) of D' in that order: rows of the frame, and their moments about the centres."""
+    def blocks(self) -> tuple[Ints, Floats]:
+        """D' of all bodies: the global indices (nc, 2) of the two bodies of each contact, ascending, and their blocks
+        (nc, 2, 3, 6) in that order: rows of the frame, and their moments about the centres."""
         order = np.argsort(self._body, axis=1)
         direction = (2.0 * order - 1.0)[:, :, None, None] * self.frame[:, None]
         arm = np.take_along_axis(self._arm.reshape(-1, 2, 3), order[:, :, None], axis=1)
-        return order, np.concatenate([direction, cross(arm[:, :, None], direction)], axis=3)
+        blocks = np.concatenate([direction, cross(arm[:, :, None], direction)], axis=3)
+        return np.take_along_axis(self._body, order, axis=1), blocks
 
     def generalised_impulse(self, impulse: Floats) -> tuple[Floats, Floats]:
         """D g of the local grains (grains, 6), and of the large bodies (large, 6), the same on all ranks, from
@@ -256,7 +201,7 @@ def sum_rows(row: Ints, values: Floats, count: int) -> Floats:
 
 
 def scaled(root: Floats, values: Floats) -> Floats:
-    """M^-1/2 times the values (n, 6), with its rows (n, 6) or (n, 12) as in `CompactRows`."""
+    """M^-1/2 times the values (n, 6), with its rows (n, 6) or (n, 12) as in `ScaledMap`."""
     if root.shape[1] == 6:
         return root * values
     return np.einsum("nbij,nbj->nbi", root.reshape(-1, 2, 6)[:, :, SYMMETRIC], values.reshape(-1, 2, 3)).reshape(-1, 6)

@@ -34,23 +34,23 @@ class BlockRows:
         return len(self.indptr) - 1
 
 
-MANY = 500  # contacts of a body above which its columns of G are kept apart
+HUB = 500  # contacts of a body above which its columns of G are kept apart
 
 
-def without_crowded(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, np.ndarray]:
-    """G without the columns of bodies with more than MANY contacts, and these bodies (global block columns)."""
+def without_hubs(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, np.ndarray]:
+    """G without the columns of bodies with more than HUB contacts, and these bodies (global block columns)."""
     bodies, count = np.unique(G.indices, return_counts=True)
     columns = comm.allreduce(G.columns)
-    # a body with more than MANY contacts has more than MANY / ranks on some rank
-    often = comm.allreduce(set(bodies[count > MANY / comm.size].tolist()), op=operator.or_)
+    # a body with more than HUB contacts has more than HUB / ranks on some rank
+    often = comm.allreduce(set(bodies[count > HUB / comm.size].tolist()), op=operator.or_)
     candidates = np.array(sorted(often), dtype=np.int64)
     here = np.bincount(G.indices, minlength=columns)[candidates] if len(candidates) else np.zeros(0, np.int64)
-    crowded = candidates[comm.allreduce(here) > MANY] if len(candidates) else candidates
-    if len(crowded) == 0:
-        return G, crowded
-    kept = ~np.isin(G.indices, crowded)
+    hubs = candidates[comm.allreduce(here) > HUB] if len(candidates) else candidates
+    if len(hubs) == 0:
+        return G, hubs
+    kept = ~np.isin(G.indices, hubs)
     before = np.concatenate([[0], np.cumsum(kept)])
-    return BlockRows(before[G.indptr], G.indices[kept], G.blocks[kept], G.columns), crowded
+    return BlockRows(before[G.indptr], G.indices[kept], G.blocks[kept], G.columns), hubs
 
 
 def dense_columns(comm: MPI.Comm, G: BlockRows, bodies: np.ndarray) -> PETSc.Mat | None:

@@ -11,7 +11,7 @@ def offsets(comm: MPI.Comm, count: int) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(comm.allgather(count))])
 
 
-def exchange(
+def send_rows(
     comm: MPI.Comm, arrays: list[np.ndarray], rank: np.ndarray
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Send row i of each array to ``rank[i]``; the rows received and the ranks that they came from."""

@@ -209,5 +209,10 @@ def write_pvd(path: Path, files: dict[str, float]) -> None:
         temporary.write_text("\n".join([head, *lines, "  </Collection>", "</VTKFile>", ""]))
 
 
+def program() -> int:
+    """The command pctt-export: its exit status."""
+    return run(main, "export")
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, "export"))
+    sys.exit(program())

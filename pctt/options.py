@@ -23,6 +23,7 @@ class OptionError(ValueError):
 def option(
     default: Any,
     help: str,
+    *,
     unit: str = "",
     choices: Iterable[str] | None = None,
     check: tuple[str, Callable[[Any], bool]] | None = None,

@@ -75,5 +75,10 @@ def _frame(folder: Folder, step: int | None):
     return None
 
 
+def program() -> int:
+    """The command pctt-plot: its exit status."""
+    return run(main, "plot")
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, "plot"))
+    sys.exit(program())

@@ -152,5 +152,10 @@ def write_gif(path: Path, pictures: list[Path], fps: float) -> None:
         first.save(temporary, format="gif", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
 
 
+def program() -> int:
+    """The command pctt-render: its exit status."""
+    return run(main, "render")
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, "render"))
+    sys.exit(program())

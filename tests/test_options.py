@@ -28,11 +28,11 @@ class Group:
     count: int = option(3, "bodies along a side", check=COUNT)
     every: int = option(1, "steps between two records", check=AT_LEAST_ONE)
     number: int = option(-1, "any whole number")
-    dt: float = option(0.025, "time step", "s", check=POSITIVE)
-    gap: float = option(0.0, "gap", "m", check=NOT_NEGATIVE)
+    dt: float = option(0.025, "time step", unit="s", check=POSITIVE)
+    gap: float = option(0.0, "gap", unit="m", check=NOT_NEGATIVE)
     part: float = option(0.5, "part", check=FRACTION)
-    angle: float = option(1.0, "any finite number", "rad")
-    maybe: Optional[float] = option(None, "none: the scene's own", "s", check=POSITIVE)
+    angle: float = option(1.0, "any finite number", unit="rad")
+    maybe: Optional[float] = option(None, "none: the scene's own", unit="s", check=POSITIVE)
     steps: Optional[int] = option(None, "none: all")
     on: bool = option(False, "whether")
     off: bool = option(True, "whether not")
@@ -214,7 +214,7 @@ def test_every_option_is_described_with_default_unit_and_meaning():
 def test_described_defaults_pass_their_own_checks():
     """Of the groups of the project: what -help shows as a default can be given as a value."""
     from pctt import ccp
-    from pctt.run.options import Run
+    from pctt.run.settings import Run
 
     groups = [(Run, ""), (ccp.Limits, "ccp_"), *((s.options, f"ccp_{n}_") for n, s in ccp.SOLVERS.items())]
     for group, prefix in groups:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -19,10 +19,7 @@ from dem.loops import loops
 from dem.motion import Dynamic
 from dem.neighbourhood import Neighbourhood, neighbourhood, without_ghosts
 from dem.quaternion import cross, length
-
-if TYPE_CHECKING:
-    from dem.world import World
-
+from dem.world import World
 
 #: The margin of a grain is at most so many of its radii, whatever its speed.
 WIDEST = 2.0

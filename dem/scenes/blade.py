@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -16,9 +16,7 @@ from dem.motion import Oscillation
 from dem.scene import Scene
 from dem.scenes.lattice import check_room, perturbed, rest_after_fall
 from dem.shapes import Box, Plane
-
-if TYPE_CHECKING:
-    from dem.record import Step
+from dem.step import Step
 
 
 @dataclass(frozen=True)

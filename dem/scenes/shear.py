@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -16,9 +16,7 @@ from dem.motion import Guided, Oscillation
 from dem.scene import Scene
 from dem.scenes.lattice import check_room, perturbed, rest_after_fall
 from dem.shapes import Box, Plane, Shape
-
-if TYPE_CHECKING:
-    from dem.record import Step
+from dem.step import Step
 
 #: Share of the volume that spheres take in the bed, by which the plane between the halves is placed in its middle.
 PACKING = 0.6

@@ -32,13 +32,6 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 from pctt.options import POSITIVE, option
 
-CONIC_IT = 60
-EARLIEST = 0.1  # of the conic method's cost, and
-LOOKS = 8  # looks at the natural residual, before the first forecast
-SAVED = 0.3  # of the conic method's cost, at most, by beginning at APGD's point
-FAR = 4.0  # times that cost: more iterations of APGD than this need not be told apart
-START = 3e4  # complementarity of the conic method's start, by APGD's natural residual; its own default at most
-
 
 @dataclass(frozen=True)
 class Auto:
@@ -48,6 +41,22 @@ class Auto:
         1.0, "factor on the cost of the conic method: above 1, APGD is given more time", check=POSITIVE
     )
     remember: bool = option(True, "use what the last cone problems have cost, by the clock")
+
+
+@dataclass(frozen=True)
+class Steering:
+    """Numbers that steer the choice; costs are in iterations of APGD (docs/ccp.md has what was measured)."""
+
+    conic_it: int = 60  #: limit of the conic method's iterations
+    earliest: float = 0.1  #: the first forecast comes after this part of the conic method's cost, and
+    looks: int = 8  #: so many looks at the natural residual
+    saved: float = 0.3  #: part of the conic method's cost, at most, by beginning at APGD's point
+    far: float = 4.0  #: times that cost: more iterations of APGD than this need not be told apart
+    #: complementarity of the conic method's start, by APGD's natural residual; its own default at most
+    start: float = 3e4
+
+
+STEERING = Steering()
 
 
 class Needed(NamedTuple):
@@ -92,12 +101,12 @@ def solve(
     if first.converged or first.iterations >= most:
         memory.needed[decade(limits.tol)] = Needed(first.iterations, True)
         return _named(first, "apgd", f"{first.reason}; conic would have cost about {cost:.0f} iterations")
-    inner = dataclasses.replace(limits, max_it=min(CONIC_IT, most))
-    begin = conic.Conic(start=min(conic.Conic().start, START * first.natural_residual))
+    inner = dataclasses.replace(limits, max_it=min(STEERING.conic_it, most))
+    begin = conic.Conic(start=min(conic.Conic().start, STEERING.start * first.natural_residual))
     result = second = conic.solve(problem, first.impulse, inner, begin, newton, coulomb)
     words = f"{first.reason}; conic: {second.reason}"
     solver = "conic"
-    if not (second.final or most <= CONIC_IT):
+    if not (second.final or most <= STEERING.conic_it):
         best = min(first, second, key=lambda result: result.natural_residual)
         result = apgd.solve(problem, best.impulse, limited, apgd.APGD(), None, coulomb)
         result.ksp_its, result.fallbacks = second.ksp_its, second.fallbacks
@@ -107,7 +116,7 @@ def solve(
     before, after = (problem.max(s) for s in (switched - start, perf_counter() - switched))
     done = first.iterations
     memory.needed[decade(limits.tol)] = Needed(watch.needed, False)
-    memory.keep_cost(limits.tol, (after * max(done, 1) / before + min(done, SAVED * model)) / model)
+    memory.keep_cost(limits.tol, (after * max(done, 1) / before + min(done, STEERING.saved * model)) / model)
     return _named(result, solver, words)
 
 
@@ -127,11 +136,11 @@ class Watch:
     def _look(self, iterations: int, residual: float) -> str:
         if iterations > 0 and np.isfinite(residual):
             self._course.append((iterations, residual))
-        if iterations < EARLIEST * self.cost or len(self._course) < LOOKS:
+        if iterations < STEERING.earliest * self.cost or len(self._course) < STEERING.looks:
             return ""
         k, rho = np.array(self._course).T
         self.needed = expected(forecast(k, rho, self.tol), self.last, iterations, self.cost)
-        rest = self.cost - min(iterations, SAVED * self.cost)
+        rest = self.cost - min(iterations, STEERING.saved * self.cost)
         if self.needed - iterations <= rest:
             return ""
         learnt = "" if self.last is None else f" (the last problem {self.last.iterations:.0f})"
@@ -158,12 +167,12 @@ def expected(forecast: float, last: Needed | None, iterations: int, cost: float)
 
     What was counted is believed: steps differ little, and courses from a warm start have plateaus. Where the last was
     a forecast too, the geometric mean of both; and the forecast alone once APGD has made more than that."""
-    forecast = min(forecast, iterations + FAR * cost)
+    forecast = min(forecast, iterations + STEERING.far * cost)
     if last is None or iterations >= last.iterations:
         return forecast
     if last.counted:
         return last.iterations
-    return float(np.sqrt(forecast * min(last.iterations, FAR * cost)))
+    return float(np.sqrt(forecast * min(last.iterations, STEERING.far * cost)))
 
 
 def conic_cost(contacts: int, softness: float, tol: float) -> float:

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 
 from pctt.blocks import BlockRows, block_csr_matrix, square_block_matrix
 from pctt.ccp.cone import Array
-from pctt.exchange import exchange, offsets
+from pctt.exchange import offsets, send_rows
 
 
 def local_blocks(N: PETSc.Mat) -> Array:
@@ -73,7 +73,7 @@ def _neighbours(
     away = owner != comm.rank
     entries = (contact, G.indices, G.blocks)
     # to the owners of the bodies ...
-    (contact_in, body_in, blocks_in), source_in = exchange(comm, [e[away] for e in entries], owner[away])
+    (contact_in, body_in, blocks_in), source_in = send_rows(comm, [e[away] for e in entries], owner[away])
     # ... who hold all blocks of a column, and answer each rank that touches it with those of the others
     home = ~away
     all_contact = np.concatenate([contact[home], contact_in])
@@ -90,7 +90,7 @@ def _neighbours(
     asking = np.repeat(asked[:, 1], count)
     useful = source[pick] != asking
     pick, asking = pick[useful], asking[useful]
-    answer, _ = exchange(comm, [all_contact[pick], all_body[pick], all_blocks[pick]], asking)
+    answer, _ = send_rows(comm, [all_contact[pick], all_body[pick], all_blocks[pick]], asking)
     touched = np.isin(body_in, bodies)  # an owner may have no contact of its own at a body
     own = (contact_in[touched], body_in[touched], blocks_in[touched])
     return tuple(np.concatenate(pair) for pair in zip(answer, own))  # type: ignore[return-value]

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, dense_columns, diagonal_blocks, without_crowded
+from pctt.blocks import BlockRows, dense_columns, diagonal_blocks, without_hubs
 from pctt.ccp.cone import Array, projected_move_squares
 from pctt.ccp.delassus import delassus, local_blocks
 from pctt.contact_map import CompactRows, ContactMap, contact_map
@@ -138,7 +138,7 @@ class ConeProblem:
 
     @cached_property
     def low_rank(self) -> PETSc.Mat | None:
-        """The columns U (3Nc x 6 per body, dense) of G of bodies with more than MANY contacts, or None: they would
+        """The columns U (3Nc x 6 per body, dense) of G of bodies with more than HUB contacts, or None: they would
         fill N, which is ``N`` + U U'."""
         if self.contact_map is None:
             return None
@@ -147,7 +147,7 @@ class ConeProblem:
     @cached_property
     def _split(self) -> tuple[BlockRows, np.ndarray]:
         assert self.contact_map is not None
-        return without_crowded(self.comm, self.contact_map.block_rows)
+        return without_hubs(self.comm, self.contact_map.block_rows)
 
     @cached_property
     def diagonal_blocks(self) -> Array:

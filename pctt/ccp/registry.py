@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pctt.ccp import auto
-from pctt.ccp.first_order import apgd, barzilai_borwein, gauss_seidel, gpminres, jacobi, kucera, spectral
+from pctt.ccp.first_order import apgd, barzilai_borwein, spectral
+from pctt.ccp.first_order.compared import gauss_seidel, gpminres, jacobi, kucera
+from pctt.ccp.first_order.progress import FirstOrder
 from pctt.ccp.interior import conic, pdip
 from pctt.ccp.result import Result
 from pctt.options import describe
@@ -62,20 +64,20 @@ SOLVERS = {
         Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
                "accelerated projected gradient descent with restart", "Mazhar et al. 2015",
                has_law=True, law_tol=LAW_TOL),
-        Solver("barzilai_borwein", barzilai_borwein.solve, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,
+        Solver("barzilai_borwein", barzilai_borwein.solve, FirstOrder, PRODUCT, 20_000,
                "projected Barzilai-Borwein steps with an adaptive nonmonotone line search", "Dai, Fletcher 2005"),
-        Solver("spectral", spectral.solve, spectral.Spectral, PRODUCT, 20_000,
+        Solver("spectral", spectral.solve, FirstOrder, PRODUCT, 20_000,
                "preconditioned spectral projected gradient with fallback (P-SPG-FB)",
                "Heyn et al. 2013; Birgin, Martinez, Raydan 2000"),
-        Solver("kucera", kucera.solve, kucera.Kucera, PRODUCT, 20_000,
+        Solver("kucera", kucera.solve, FirstOrder, PRODUCT, 20_000,
                "conjugate gradients in the faces of the cones, gradient projection between them",
                "Kucera 2007, 2008"),
-        Solver("gpminres", gpminres.solve, gpminres.GPMINRES, PRODUCT, 20_000,
+        Solver("gpminres", gpminres.solve, FirstOrder, PRODUCT, 20_000,
                "gradient projection alternating with MINRES in a face", "Heyn et al. 2013"),
         Solver("gauss_seidel", gauss_seidel.solve, gauss_seidel.GaussSeidel, MATRIX, 20_000,
                "projected block Gauss-Seidel over the colours of the contact graph",
                "Tasora, Anitescu 2011; Jones, Plassmann 1993"),
-        Solver("jacobi", jacobi.solve, jacobi.Jacobi, PRODUCT, 50_000,
+        Solver("jacobi", jacobi.solve, FirstOrder, PRODUCT, 50_000,
                "projected block Jacobi, relaxed by an exact line search", "Tasora, Anitescu 2011"),
     )
 }  # fmt: skip

@@ -47,7 +47,7 @@ class Result:
     natural_residual : the solver's own last value
     iterations : Newton steps, or steps of a first-order method
     ksp_its : Krylov iterations in all Newton steps
-    fallbacks : Newton systems that the asked-for KSP did not solve
+    fallbacks : Newton systems that the user's KSP did not solve
     history : natural residual per iteration
     cone_problems : how many were solved for it: more than one for Coulomb's law
     solver : name of the method that found it, where that was chosen; "" otherwise

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import MANY, BlockRows, square_block_matrix
+from pctt.blocks import HUB, BlockRows, square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 
@@ -108,7 +108,7 @@ def sparse_matrix(problem: ConeProblem) -> PETSc.Mat:
     """
     if problem.low_rank is not None:
         raise ValueError(
-            f"a body has more than {MANY} contacts and would fill N; allowed is a format of masses and contact map "
+            f"a body has more than {HUB} contacts and would fill N; allowed is a format of masses and contact map "
             "(fclib.write_global)"
         )
     return problem.rigid_matrix()

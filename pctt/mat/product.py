@@ -6,13 +6,12 @@ import warnings
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import DTypeLike
 
 from pctt.tt.apply import Apply
 from pctt.tt.grid import GridDigits
 from pctt.tt.train import Array, Train
 
-MANY = 1_000_000  # rows from which a vector that is gathered on each of several ranks is worth a warning
+LONG = 1_000_000  # rows from which a vector that is gathered on each of several ranks is worth a warning
 
 
 class TrainProduct:
@@ -28,11 +27,10 @@ class TrainProduct:
 
     def __init__(
         self, comm: MPI.Comm, counts: Array, digits: GridDigits, order: Array | None, train: Train,
-        dtype: DTypeLike = float,
     ) -> None:  # fmt: skip
         self.comm, self.counts = comm, np.asarray(counts)
         rows = digits.rows
-        if comm.size > 1 and rows > MANY and comm.rank == 0:
+        if comm.size > 1 and rows > LONG and comm.rank == 0:
             warnings.warn(f"pctt: each of {comm.size} ranks gathers whole vectors of {rows} numbers", stacklevel=2)
         places = digits.places
         if order is not None:
@@ -51,7 +49,7 @@ class TrainProduct:
         self.parts = np.diff(ranks)
         self.whole = np.empty(rows)
         self.product = np.empty(digits.size)
-        self.apply = Apply(train, digits.size, bounds, dtype)
+        self.apply = Apply(train, digits.size, bounds)
 
     def set_train(self, train: Train) -> None:
         self.apply.set_train(train)

@@ -62,9 +62,9 @@ class CompressedEntries:
     def error(self) -> float:
         return self.found.error
 
-    def product(self, train: Train, dtype: type = float) -> TrainProduct:
+    def product(self, train: Train) -> TrainProduct:
         """With the rows in the order of the Mat's."""
-        return TrainProduct(self.comm, self.counts, self.digits, self.rows, train, dtype)
+        return TrainProduct(self.comm, self.counts, self.digits, self.rows, train)
 
     def words(self) -> str:
         """Ranks, bytes, compression, error."""

@@ -21,13 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 from petsc4py import PETSc
 
+from pctt.block_diagonal import without_memory
 from pctt.blocks import BlockRows
+from pctt.body_matrix import BodyOperator
 from pctt.contact_map import CompactRows, ContactMap, contact_map
+from pctt.ksp_options import entered, prefer_mumps, to_enter
 from pctt.options import NOT_NEGATIVE, option
 from pctt.pc.base import PythonPC
-from pctt.pc.block_diagonal import without_memory
-from pctt.pc.body_operator import BodyOperator
-from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
 
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu"}  # these have no code for block formats
 _COARSE_SPACE = {"gamg", "python"}  # these use the rigid motions

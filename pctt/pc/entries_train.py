@@ -24,7 +24,6 @@ class EntriesTrain:
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
         self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
-        self._double = False
         self.compressed: CompressedEntries | None = None
         self.inverse: ApproximateInverse | None = None
 
@@ -67,23 +66,14 @@ class EntriesTrain:
     def _prepare(self) -> TrainProduct:
         assert self.compressed is not None
         assert self.inverse is not None
-        single = self.options.precision == "single" and not self._double
-        return self.compressed.product(self.inverse.train, np.float32 if single else np.float64)
+        return self.compressed.product(self.inverse.train)
 
     def _refuse(self, why: str) -> bool:
         self.account.fallbacks.append(why)
         self.compressed = self.inverse = None
         return False
 
-    def double(self) -> bool:
-        """Apply in double precision from now on; False where that is done already."""
-        if self._double or self.options.precision == "double" or self.inverse is None:
-            return False
-        self._double = True
-        self._product = self._prepare()
-        return True
-
-    def lose_patience(self) -> bool:
+    def distrust(self) -> bool:
         """Every matrix has a train of its own."""
         return False
 

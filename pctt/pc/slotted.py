@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.pc.block_diagonal import inverse_diagonal_blocks
+from pctt.block_diagonal import inverse_diagonal_blocks
 from pctt.pc.slots import Slots
 
 

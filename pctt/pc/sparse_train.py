@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from pctt.options import OptionError
 from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
-from pctt.pc.patience import Patience
+from pctt.pc.refresh_schedule import RefreshSchedule
 from pctt.pc.slots import Slots, capacity
 from pctt.pc.slotted import SlottedMatrix
 from pctt.pc.train_options import Account, Options
@@ -35,7 +35,6 @@ class SparseTrain:
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
         self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
-        self._double = False  # single precision was found wanting
         self._forget_structure()
         self._forget_trains()
 
@@ -48,7 +47,7 @@ class SparseTrain:
         self.compression: Compression | Cross | None = None
         self.inverse: ApproximateInverse | None = None
         self._opening: ApproximateInverse | None = None  # the inverse for the first matrix of a structure
-        self._patience = Patience()
+        self._schedule = RefreshSchedule()
         self._apply: Apply | None = None
 
     def begin(self, P: PETSc.Mat) -> None:
@@ -78,7 +77,7 @@ class SparseTrain:
         if self.inverse is not None and self.inverse.cap != rank:
             self.compression = self.inverse = self._opening = None
         kept = (self._opening if first else self.inverse) if self.options.keep else None
-        if kept is not None and not self._patience.over():
+        if kept is not None and not self._schedule.over():
             self._use(kept)
             self.account.kept += 1
         elif not self._try_new(P, rank, kept):
@@ -105,14 +104,14 @@ class SparseTrain:
         if kept is None:
             if not positive:
                 return self._refuse(f"the inverse of rank {rank} is not positive")
-            self._patience = Patience()
+            self._schedule = RefreshSchedule()
             self._use(new)
             return True
         left = []
         for inverse in (kept, new):
             self._use(inverse)
             left.append(self._left(P) if positive or inverse is kept else np.inf)
-        if not self._patience.decide(*self.comm.bcast(left)):
+        if not self._schedule.decide(*self.comm.bcast(left)):
             self._use(kept)
             self.account.kept += 1
         return True
@@ -201,26 +200,17 @@ class SparseTrain:
         if self._apply is None:
             bs = slots.block
             rows = (slots.first * bs, (slots.first + slots.capacity) * bs)
-            dtype = np.float32 if self.options.precision == "single" and not self._double else np.float64
-            self._apply = Apply(train, slots.size * bs, rows, dtype)
+            self._apply = Apply(train, slots.size * bs, rows)
             self._local = np.empty((slots.capacity, bs))
             self._scaled = np.empty((slots.capacity, bs, 1))
             self._whole = np.empty(slots.size * bs)
         else:
             self._apply.set_train(train)
 
-    def double(self) -> bool:
-        """Apply in double precision from now on; False where that is done already."""
-        if self._double or self.options.precision == "double" or self.inverse is None:
-            return False
-        self._double, self._apply = True, None
-        self._prepare_apply(self.inverse.train)
-        return True
-
-    def lose_patience(self) -> bool:
+    def distrust(self) -> bool:
         """Whether a train of an earlier matrix is in use: the next set-up then tries another."""
-        if self._patience.served:
-            self._patience.lose()
+        if self._schedule.served:
+            self._schedule.lose()
             return True
         return False
 

@@ -15,9 +15,9 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.block_diagonal import block_diagonal
 from pctt.mat.entries import diagonal_blocks, has_entries
 from pctt.pc.base import PythonPC
-from pctt.pc.block_diagonal import block_diagonal
 from pctt.pc.entries_train import EntriesTrain
 from pctt.pc.mat import check_coordinates, is_symmetric
 from pctt.pc.rank_policy import RankPolicy
@@ -166,16 +166,12 @@ class TensorTrain(PythonPC):
         residual.aypx(-1.0, b)
         true = self.comm.bcast(residual.norm() / reference)
         residual.destroy()
-        rtol = ksp.getTolerances()[0]
         stalled = ksp.getConvergedReason() < 0 and ksp.getType() not in ("preonly", "richardson")
-        drifted = not stalled and true > 10 * rtol
-        if drifted and self.rank > 1 and self.made.double():
-            self.account.fallbacks.append(f"single precision left a true residual of {true:.1e}: double from now on")
         digits = -np.log10(max(true, 1e-16)) if np.isfinite(true) else 0.0
         if stalled and rank > 1 and not spoilt:
             self.account.fallbacks.append(f"{ksp.getType()} stalled at rank {rank}")
         sound = not (spoilt or stalled)
-        if not sound and self.made.lose_patience():  # a train of an earlier matrix: one made for the next may do
+        if not sound and self.made.distrust():  # a train of an earlier matrix: one made for the next may do
             sound = True
         self.policy.report(rank, self._setup_seconds + seconds, max(digits, 0.0), sound)
         self._setup_seconds = 0.0  # a second solve with the same matrix has no set-up
@@ -191,7 +187,7 @@ class TensorTrain(PythonPC):
             f"tensor train: {self._line()}",
             f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, kept {a.kept} times, "
             f"trees made anew {a.resets}",
-            f"scaling {self.options.scaling}, precision {self.options.precision}",
+            f"scaling {self.options.scaling}",
         ]
         lines += [] if self.symmetric else [NOT_SYMMETRIC]
         lines += [f"fell back: {why} ({a.fallbacks.count(why)} times)" for why in dict.fromkeys(a.fallbacks)]

@@ -40,7 +40,6 @@ class Options:
     )
     leaf: int = option(16, "least number of blocks in the first and last mode", check=AT_LEAST_ONE)
     modes: str = option("", "modes of the blocks with commas between; none: chosen for little padding")
-    precision: str = option("double", "of the application; single is watched", choices=("double", "single"))
     reuse: str = option(
         "steps",
         "newton: cores, index sets and block pairs of the last matrix of the same structure; steps: also its slots and "

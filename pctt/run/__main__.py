@@ -69,7 +69,7 @@ def versions() -> str:
     return f"pctt {pctt.__version__} (PETSc {petsc}, Python {platform.python_version()}, no numba)"
 
 
-#: Exit status by what ends a run; raised on all ranks alike, but for a FileError that says that it is `alone`.
+#: Exit status by what ends a run; raised on all ranks alike, but for a FileError of `one_rank`.
 STATUS: dict[type[Exception], int] = {OptionError: 2, FileError: 2, SceneError: 1, InterruptError: 130}
 
 
@@ -84,7 +84,7 @@ def run() -> int:
         status = STATUS[type(error)]
         if comm.rank == 0:
             print(f"pctt.run: {error}", file=sys.stderr, flush=True)
-        if comm.size > 1 and getattr(error, "alone", False):  # the others wait for this rank
+        if comm.size > 1 and getattr(error, "one_rank", False):  # the others wait for this rank
             comm.Abort(status)
         keep_from_petsc(PETSc.Options().getAll())
         return status

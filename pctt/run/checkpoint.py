@@ -15,7 +15,8 @@ from dem.bodies import Bodies
 from dem.experiment import Experiment
 from dem.impulses import ImpulseMemory
 from dem.scene import Scene
-from dem.world import World, restart_rows
+from dem.start import restart_rows, restored_world
+from dem.world import World
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError, readable, write_text, written
 
@@ -81,7 +82,7 @@ def load(
             raise FileError(f"{path}: incomplete checkpoint ({failures[0]})")
     _refuse_other_origin(path, stored, made_with, changed_file)
     try:
-        world = World.restore(scene, comm, local, replicated)
+        world = restored_world(scene, comm, local, replicated)
     except ValueError as error:  # another text of the scene file may build other bodies
         raise OptionError(f"-restart {path}: {error}") from None
     memory = ImpulseMemory(comm)

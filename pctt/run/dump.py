@@ -14,16 +14,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem import bodies
+from dem import bodies, quaternion
 from dem.free_motion import free_directions
-from dem.motion import Guided
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
@@ -32,9 +31,7 @@ from pctt.ccp.cone import Array
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError
 from pctt.run.place import HARD, Place
-
-if TYPE_CHECKING:
-    from pctt.run.options import Options, Run
+from pctt.run.settings import Options, Run
 
 
 class Dump:
@@ -94,7 +91,7 @@ class Dump:
     ) -> None:
         """The global problem, the guess if there is one, and the solution if the step has one."""
         dynamic, M = _mass(self._world)
-        H = _dynamic_rows(system, dynamic, self._world)
+        H = _map(system, self._world, dynamic)
         v_free = M.createVecLeft()
         v_free.array = system.free_velocity[dynamic].ravel()
         f, moved = M.createVecLeft(), H.createVecRight()
@@ -180,28 +177,33 @@ def _block_diagonal(blocks: Array, comm: MPI.Comm) -> PETSc.Mat:
     return PETSc.Mat().createAIJ(((6 * count, None), (6 * count, None)), csr=csr, comm=comm)
 
 
-def _dynamic_rows(system: ContactSystem, dynamic: np.ndarray, world: World) -> PETSc.Mat:
-    """D of the dynamic bodies alone, of guided ones along their guides; collective."""
-    D = system.D
-    first, _ = D.getOwnershipRange()
-    rows = first + np.flatnonzero(np.repeat(dynamic, 6))
-    columns = np.arange(*D.getOwnershipRangeColumn())
-    index_sets = [PETSc.IS().createGeneral(x.astype(PETSc.IntType), comm=D.comm) for x in (rows, columns)]
-    H = D.createSubMatrix(*index_sets)
-    for index_set in index_sets:
-        index_set.destroy()
-    if not any(isinstance(body.motion, Guided) for body in world.large_bodies):
-        return H
-    blocks = np.tile(np.eye(6), (len(dynamic), 1, 1))
-    if world.comm.rank == world.comm.size - 1:
-        large = blocks[len(world.grains) :]
-        large[:, :3, :3] = free_directions(world.large_bodies)
-        large[~np.isfinite(world.large.inertia).all(axis=1), 3:, 3:] = 0.0
-    open_to = _block_diagonal(blocks[dynamic], world.comm)
-    projected = open_to.matMult(H)
-    H.destroy()
-    open_to.destroy()
-    return projected
+def _map(system: ContactSystem, world: World, dynamic: np.ndarray) -> PETSc.Mat:
+    """D of the dynamic bodies alone, of those that are guided as far as they can move, (6 n x 3 nc); collective."""
+    body, blocks = system.blocks()
+    grains = world.slabs[-1]
+    large = body >= grains
+    row = body[large] - grains
+    blocks[large, :, :3] = blocks[large, :, :3] @ free_directions(world.large_bodies)[row]
+    axes = quaternion.matrix(world.large.quaternion)
+    turns = np.isfinite(world.large.inertia)  # about which of its axes a body does
+    blocks[large, :, 3:] = blocks[large, :, 3:] @ ((axes * turns[:, None, :]) @ axes.transpose(0, 2, 1))[row]
+    moves = np.concatenate([np.ones(grains, dtype=bool), bodies.is_dynamic(world.large)])
+    count = np.repeat(6 * moves[body].sum(axis=1), 3)
+    kept = np.broadcast_to(moves[body][:, None, :, None], (len(body), 3, 2, 6))
+    columns = 6 * (np.cumsum(moves) - 1)[body][:, None, :, None] + np.arange(6)
+    entries = blocks.transpose(0, 2, 1, 3)
+    transposed = PETSc.Mat().createAIJ(  # a row of D' has all its entries here
+        ((3 * len(body), None), (6 * int(dynamic.sum()), None)),
+        csr=(
+            np.concatenate([[0], np.cumsum(count)]).astype(PETSc.IntType),
+            np.broadcast_to(columns, kept.shape)[kept].astype(PETSc.IntType),
+            entries[kept],
+        ),
+        comm=world.comm,
+    )
+    H = transposed.transpose(PETSc.Mat())
+    transposed.destroy()
+    return H
 
 
 # -- options -------------------------------------------------------------------------------------------------

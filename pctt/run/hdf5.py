@@ -17,11 +17,11 @@ from pctt.options import OptionError
 
 
 class FileError(RuntimeError):
-    """A file that cannot be read or written; raised on all ranks alike, or by the first rank `alone`."""
+    """A file that cannot be read or written; raised on all ranks alike, or by the first rank only, `one_rank`."""
 
-    def __init__(self, text: str, alone: bool = False):
+    def __init__(self, text: str, one_rank: bool = False):
         super().__init__(text)
-        self.alone = alone
+        self.one_rank = one_rank
 
 
 def refuse_serial(comm: MPI.Comm) -> None:
@@ -134,7 +134,7 @@ def told(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise FileError(f"{path}: cannot write ({error.strerror or error})", alone=True) from error
+        raise FileError(f"{path}: cannot write ({error.strerror or error})", one_rank=True) from error
 
 
 def write_text(path: Path, text: str) -> None:

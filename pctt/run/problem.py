@@ -13,9 +13,9 @@ from pctt.ccp.cone import Array
 from pctt.ccp.stored import FileFormatError, Stored
 from pctt.run import leftovers
 from pctt.run.hdf5 import FileError, write_text
-from pctt.run.options import Options
 from pctt.run.place import Place
 from pctt.run.report import Progress, compare_table
+from pctt.run.settings import Options
 
 
 def solve_file(options: Options, comm: MPI.Comm) -> None:

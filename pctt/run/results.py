@@ -75,7 +75,7 @@ class Results:
             try:
                 self._totals = totals.of(self.steps())
             except (OSError, LookupError, ValueError) as error:
-                raise FileError(f"{self._steps.path}: cannot be continued ({error})", alone=True) from None
+                raise FileError(f"{self._steps.path}: cannot be continued ({error})", one_rank=True) from None
 
     @property
     def checkpoint(self) -> Path:

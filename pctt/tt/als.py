@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pctt.tt.quantise import slots_of
-from pctt.tt.sparse import SparseHierarchy, alone
+from pctt.tt.sparse import SparseHierarchy, on_one_rank
 from pctt.tt.train import Array, Train, full_ranks, matrix_train, zeros
 
 FIRST_RANK = 16  # a larger cap is approached by doubling
-MANY, PART = 1 << 15, 8  # slots from which one node of the last bond in PART is enough for a start
+LARGE, PART = 1 << 15, 8  # slots from which one node of the last bond in PART is enough for a start
 LEAF_CHUNK = 1 << 21  # entries of leaves that are compared at a time
 
 
@@ -49,7 +49,7 @@ def compress(
     ----------
     start : warm start; its ranks are filled up with random directions
     sweeps : there and back after the first pass, per rank that is tried; by default 0 from a start, 1 from
-        scratch. From scratch the start for a matrix of more than MANY slots comes from a part of it.
+        scratch. From scratch the start for a matrix of more than LARGE slots comes from a part of it.
 
     >>> i = np.arange(63)
     >>> A = SparseHierarchy(np.r_[i, i + 1], np.r_[i + 1, i], [4, 4, 4])
@@ -64,7 +64,7 @@ def compress(
     full = max(full_ranks([m * m for m in matrix.modes]))
     rank = min(max_rank, FIRST_RANK if start is None else max(FIRST_RANK, *start.ranks))
     cores = [] if start is None else start.astype(matrix.dtype).flat()
-    if start is None and slots_of(matrix.slot_modes) > MANY:
+    if start is None and slots_of(matrix.slot_modes) > LARGE:
         cores = _passes(matrix.thinned(PART), [], rank, 1, rng)
     sweeps = (0 if cores else 1) if sweeps is None else sweeps
     passes = 0
@@ -144,7 +144,7 @@ def relative_error(matrix: SparseHierarchy, train: Train) -> float:
         return train.norm()
     square = 1 - 2 * matrix.inner(train.flat()) / norm**2 + (train.norm() / norm) ** 2
     certain = _certain(train)
-    if square > certain or matrix.reduce is not alone:
+    if square > certain or matrix.reduce is not on_one_rank:
         return float(max(square, certain) ** 0.5)
     return _sum_of_errors(matrix, train) ** 0.5 / norm
 

@@ -11,8 +11,8 @@ in which nothing is transposed. Two work arrays are reused. Cost for ranks r: ab
 
 On several ranks each owns a range of rows and computes only these: its share of the boxes i_1, wholly local.
 It needs all of x, because every box of a train couples with every other; n numbers gathered once are the
-least that any exchange costs (reducing the z of each rank's own columns would send r n). `Apply` takes the
-gathered x, or gathers it from each rank's part with the injected reduction of the padded vector.
+least that any exchange costs (reducing the z of each rank's own columns would send r n). Who calls `product` has
+gathered it.
 """
 
 from __future__ import annotations
@@ -20,10 +20,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from pctt.tt.quantise import merge, slots_of
-from pctt.tt.sparse import Reduction, alone
 from pctt.tt.train import Array, Train
 
 WORK = 1 << 22  # bytes of the first intermediate that are made at a time
@@ -35,8 +33,6 @@ class Apply:
     train : square matrix train; `set_train` takes another one of the same modes
     n : length of the vectors
     rows : the rows (start, stop) that this rank owns, by default all
-    dtype : of the arithmetic, by default that of the train; vectors of other types are converted
-    reduce : adds an array over the ranks, see `__call__`
 
     >>> from pctt.tt.train import random
     >>> T = random([3, 2, 4], 5, [3, 2, 4])
@@ -50,14 +46,11 @@ class Apply:
         train: Train,
         n: int | None = None,
         rows: tuple[int, int] | None = None,
-        dtype: DTypeLike = None,
-        reduce: Reduction = alone,
     ) -> None:
         size = slots_of(train.columns)
         self.n = size if n is None else n
         self.rows = (0, self.n) if rows is None else rows
-        self.dtype = np.dtype(train.dtype if dtype is None else dtype)
-        self.reduce = reduce
+        self.dtype = train.dtype
         self.x = np.zeros(size, self.dtype)
         self.set_train(train)
 
@@ -102,14 +95,8 @@ class Apply:
         self._outputs = list(self._y.reshape(len(self._boxes), box // modes[-1], modes[-1]))
 
     def __call__(self, x: Array, out: Array | None = None) -> Array:
-        """My rows of T x, from my rows of x."""
-        start, stop = self.rows
-        if self.reduce is not alone:
-            self.x[:] = 0
-            self.x[start:stop] = x
-            self.x[:] = self.reduce(self.x)
-        else:
-            self.x[: self.n] = x
+        """My rows of T x, for the whole x."""
+        self.x[: self.n] = x
         y = self.product()
         if out is None:
             return y.astype(np.result_type(x), copy=True)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pctt.tt.grid import GridDigits
-from pctt.tt.sparse import Agreement, alone
+from pctt.tt.sparse import Agreement, on_one_rank
 from pctt.tt.train import Array
 
 Function = Callable[[Array, Array], Array]
@@ -36,7 +36,7 @@ class EntryMatrix:
     dtype = np.dtype(float)
 
     def __init__(
-        self, entries: Function, digits: GridDigits, order: Array | None = None, agree: Agreement = alone
+        self, entries: Function, digits: GridDigits, order: Array | None = None, agree: Agreement = on_one_rank
     ) -> None:
         self.entries, self.digits, self.order, self.agree = entries, digits, order, agree
         self.modes = digits.modes

@@ -44,16 +44,6 @@ def choose_modes(n: int, leaf: int = 16, middle: int = 4) -> tuple[int, ...]:
     return best
 
 
-def binary_modes(n: int, leaf: int = 1) -> tuple[int, ...]:
-    """Modes [2, ..., 2, leaf] of the least power of two times `leaf` that holds n slots: the QTT of the paper.
-
-    >>> binary_modes(100, leaf=16)
-    (2, 2, 2, 16)
-    """
-    levels = max(0, int(np.ceil(np.log2(max(1.0, n / leaf)))))
-    return (2,) * levels + ((leaf,) if leaf > 1 or levels == 0 else ())
-
-
 def check_modes(modes: Sequence[int], n: int) -> tuple[int, ...]:
     """Modes that a user gave, as a tuple; raises ValueError if they do not hold n slots."""
     if not modes or min(modes) < 1 or slots_of(modes) < n:
@@ -83,13 +73,6 @@ def digits(index: Array, modes: Sequence[int]) -> Array:
 def linear(multi: Array, modes: Sequence[int]) -> Array:
     """Linear indices (...) of multi-indices (d, ...): the inverse of `digits`."""
     return np.ravel_multi_index(tuple(multi), tuple(modes))
-
-
-def pad(x: Array, size: int, value: float = 0.0) -> Array:
-    """x (n, ...) lengthened to (size, ...) with a constant."""
-    out = np.full((size, *x.shape[1:]), value, x.dtype)
-    out[: len(x)] = x
-    return out
 
 
 def merge(train: Train, groups: Sequence[int]) -> Train:

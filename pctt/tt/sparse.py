@@ -30,7 +30,7 @@ Reduction = Callable[[Array], Array]
 Agreement = Callable[[Any], Any]
 
 
-def alone(x: Any) -> Any:
+def on_one_rank(x: Any) -> Any:
     """The reduction, and the agreement, of a single rank."""
     return x
 
@@ -64,8 +64,8 @@ class SparseHierarchy:
         columns: Array,
         modes: Sequence[int],
         block: int = 1,
-        reduce: Reduction = alone,
-        agree: Agreement = alone,
+        reduce: Reduction = on_one_rank,
+        agree: Agreement = on_one_rank,
     ) -> None:
         self.slot_modes = tuple(int(m) for m in modes)
         self.modes = scalar_modes(self.slot_modes, block)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from problems import SELF, Graph, Known, from_graph, from_matrix, heap, known_optimum, matrix
@@ -10,7 +12,7 @@ from pctt import ccp
 from pctt.blocks import BlockRows
 from pctt.ccp import ConeProblem, Limits, newton_for
 from pctt.ccp.interior import conic
-from pctt.ccp.newton.cheapest import Cheapest
+from pctt.ccp.newton.body_ladder import BodyLadder
 
 FORMS = pytest.mark.parametrize("form", ccp.FORMS)
 
@@ -79,8 +81,8 @@ def test_a_packing_to_high_accuracy(form, tol):
 def test_corrections_save_newton_steps(monkeypatch):
     """Each step costs the assembly and a preconditioner of a system. In Krylov iterations it may cost more or less."""
     steps = {}
-    for corrections in (0, conic.CORRECTIONS):
-        monkeypatch.setattr(conic, "CORRECTIONS", corrections)
+    for corrections in (0, conic.STEERING.corrections):
+        monkeypatch.setattr(conic, "STEERING", replace(conic.STEERING, corrections=corrections))
         results = [solve(ConeProblem(SELF, r, mu, G=G), 1e-6) for G, r, mu in (packing(8, seed) for seed in range(6))]
         assert all(result.converged for result in results)
         steps[corrections] = [sum(getattr(r, name) for r in results) for name in ("iterations", "ksp_its")]
@@ -93,7 +95,7 @@ def test_its_systems_climb_from_block_jacobi_to_factors():
     G, r, mu = packing(8)
     newton = newton_for(SELF, "conic")
     assert ccp.solve(ConeProblem(SELF, r, mu, G=G), None, "conic", Limits(1e-6), newton=newton).converged
-    assert isinstance(newton.linear, Cheapest)
+    assert isinstance(newton.linear, BodyLadder)
     assert list(newton.linear.used) == ["pbjacobi", "cholesky"]  # in the order of their first use
     for rung in newton.linear.used:
         ksp = newton.linear._solver(rung).ksp

@@ -436,7 +436,7 @@ def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path, write):
 @pytest.fixture
 def crowded(monkeypatch):
     """A problem with a body of 11 contacts and more, where N has a low-rank term, and its N."""
-    monkeypatch.setattr(blocks, "MANY", 10)
+    monkeypatch.setattr(blocks, "HUB", 10)
     known, graph = heap(1, 30, 12, hub=True)
     problem = ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF), compliance=1e-3)
     assert problem.low_rank is not None

@@ -12,8 +12,9 @@ from problems import SELF, from_graph, from_matrix, heap, matrix
 from pctt import ccp
 from pctt.ccp import Limits
 from pctt.ccp.cone import margin, project
-from pctt.ccp.first_order import colouring, gauss_seidel, progress, spectral
-from pctt.ccp.first_order.faces import Face, GradientProjection
+from pctt.ccp.first_order import progress, spectral
+from pctt.ccp.first_order.compared import colouring, gauss_seidel
+from pctt.ccp.first_order.compared.faces import Face, GradientProjection
 from pctt.ccp.first_order.scaled import ScaledProblem
 
 METHODS = [name for name, solver in ccp.SOLVERS.items() if not solver.newton]
@@ -126,9 +127,9 @@ def test_the_line_search_takes_the_whole_step_where_it_may():
 # -- colours and sweeps -------------------------------------------------------------------------------------
 
 
-def neighbourhood(known) -> colouring.Neighbourhood:
+def neighbourhood(known) -> colouring.Adjacency:
     blocks = sp.csr_matrix(known.N).tobsr((3, 3))
-    return colouring.Neighbourhood(SELF, blocks.indptr, blocks.indices.copy())
+    return colouring.Adjacency(SELF, blocks.indptr, blocks.indices.copy())
 
 
 @pytest.mark.parametrize("hub", [False, True])

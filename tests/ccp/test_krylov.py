@@ -9,8 +9,8 @@ from petsc4py import PETSc
 from problems import SELF, dense_of, from_graph, heap, matrix
 
 from pctt.ccp import ConeProblem, Limits, Newton
-from pctt.ccp.newton.asked_for import LADDER
 from pctt.ccp.newton.krylov import Krylov
+from pctt.ccp.newton.users_solver import LADDER
 
 
 def system(seed: int = 0, size: int = 60, shift: float = 1.0):

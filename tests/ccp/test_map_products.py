@@ -9,8 +9,8 @@ from petsc4py import PETSc
 from problems import part, random_graph
 
 from pctt.blocks import BlockRows
+from pctt.body_matrix import BodyOperator
 from pctt.contact_map import CompactRows, contact_map, is_free
-from pctt.pc.body_operator import BodyOperator
 
 WAYS = ["assembled", pytest.param("free", marks=pytest.mark.skipif(not is_free("auto"), reason="no numba"))]
 CLOSE = {"rtol": 1e-13, "atol": 1e-13}

@@ -1,4 +1,4 @@
-"""Newton systems in their three forms against dense linear algebra, with crowded bodies, on several ranks."""
+"""Newton systems in their three forms against dense linear algebra, with hubs bodies, on several ranks."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from mpi4py import MPI
 from problems import SELF, from_graph, from_matrix, heap
 
 from pctt import blocks, ccp
-from pctt.ccp.newton.body import BodySystem
-from pctt.ccp.newton.kkt import KKTSystem
+from pctt.ccp.newton.body import BodyForm
+from pctt.ccp.newton.kkt import KKTForm
 
 FORMS = pytest.mark.parametrize("form", ccp.FORMS)
 
@@ -17,7 +17,7 @@ FORMS = pytest.mark.parametrize("form", ccp.FORMS)
 @pytest.mark.parametrize("many", [20, 1000])
 def test_the_forms_agree_with_dense_algebra(many, monkeypatch):
     """Also where a body has more contacts than N is filled with."""
-    monkeypatch.setattr(blocks, "MANY", many)
+    monkeypatch.setattr(blocks, "HUB", many)
     forms = [form for form in ccp.FORMS if form != "kkt" or many == 1000]
     comm = MPI.COMM_WORLD
     contacts, bodies = 120, 30
@@ -111,11 +111,11 @@ def test_a_problem_without_bodies_is_solved_in_the_form_with_multipliers():
     known, graph = heap(3)
     newton = ccp.Newton(SELF, "body")
     newton.begin(from_graph(known, graph))
-    assert isinstance(newton.system, BodySystem)
+    assert isinstance(newton.system, BodyForm)
     newton.begin(from_matrix(known))
-    assert isinstance(newton.system, KKTSystem)
+    assert isinstance(newton.system, KKTForm)
     newton.begin(from_graph(known, graph))
-    assert isinstance(newton.system, BodySystem)
+    assert isinstance(newton.system, BodyForm)
     newton.destroy()
 
 
@@ -124,14 +124,14 @@ def test_sharpened_systems_are_of_one_problem_only():
     newton = ccp.Newton(SELF, "body")
     newton.begin(from_graph(known, graph))
     assert newton.sharpen()
-    assert isinstance(newton.system, KKTSystem)
+    assert isinstance(newton.system, KKTForm)
     assert not newton.sharpen()
     newton.begin(from_graph(known, graph))
-    assert isinstance(newton.system, BodySystem)
+    assert isinstance(newton.system, BodyForm)
     newton.destroy()
 
 
 def test_few_contacts_are_never_kept_apart():
-    G, crowded = blocks.without_crowded(SELF, from_graph(*heap(3)).contact_map.given)
-    assert len(crowded) == 0
+    G, hubs = blocks.without_hubs(SELF, from_graph(*heap(3)).contact_map.given)
+    assert len(hubs) == 0
     assert G.rows == 40

@@ -15,6 +15,7 @@ from dem.shapes import Box, Plane, Sphere
 from dem.stepper import advance
 from dem.system import ContactSystem
 from dem.world import World
+from pctt.contact_map import CompactRows
 
 
 def random_quaternions(rng: np.random.Generator, count: int) -> Floats:
@@ -114,3 +115,21 @@ def contacts_by_key(contacts: Contacts, comm: MPI.Comm) -> dict[str, np.ndarray]
     whole = {name: np.concatenate([part[name] for part in parts]) for name in mine}
     order = np.argsort(whole["key"])
     return {name: column[order] for name, column in whole.items()}
+
+
+def dense_map(system: ContactSystem) -> Floats:
+    """D' (3 nc, 6 bodies) of the local contacts."""
+    body, blocks = system.blocks()
+    dense = np.zeros((system.local_contacts, 3, system.total_bodies, 6))
+    for c, both in enumerate(body):
+        dense[c][:, both] = blocks[c].transpose(1, 0, 2)
+    return dense.reshape(3 * system.local_contacts, 6 * system.total_bodies)
+
+
+def dense_scaled_map(system: ContactSystem, comm: MPI.Comm) -> Floats:
+    """G = D' M^-1/2 (3 nc, 6 bodies) of the local contacts, from the blocks that solvers make of it; collective."""
+    G = CompactRows(*system.contact_map, columns=system.owned_bodies).block_rows(comm)
+    dense = np.zeros((system.local_contacts, 3, system.total_bodies, 6))
+    contact = np.repeat(np.arange(system.local_contacts), np.diff(G.indptr))
+    dense[contact, :, G.indices] = G.blocks
+    return dense.reshape(3 * system.local_contacts, 6 * system.total_bodies)

@@ -12,8 +12,8 @@ from dem import system as contact_system
 from dem.contact import broad, find_contacts, primitives, search
 from dem.loops import loops
 from dem.scene import Scene
+from dem.start import new_world
 from dem.system import ContactSystem
-from dem.world import World
 
 SELF = MPI.COMM_SELF
 
@@ -66,7 +66,7 @@ def test_order():
 
 def run(capsules):
     """Contacts, systems and velocities of some steps."""
-    world = World.from_scene(heap(5, side=4, capsules=capsules), SELF)
+    world = new_world(heap(5, side=4, capsules=capsules), SELF)
     for _ in range(15):
         step(world)
     contacts = find_contacts(world, 0.03, 0.01)
@@ -89,7 +89,7 @@ def test_contacts_of_equal_bodies_agree_to_rounding(without_loops):
     scene = Scene(friction=0.2)
     scene.add_spheres(rng.uniform(-0.4, 0.4, (200, 3)), rng.uniform(0.05, 0.1, 200), 1000.0)
     scene.add_spheres([[2.0, 0, 0]] * 2, [0.1, 0.05], 1000.0)
-    world = World.from_scene(scene, SELF, overlap=np.inf)
+    world = new_world(scene, SELF, overlap=np.inf)
     compiled, plain = (contacts_by_key(call(find_contacts, world, 0.02), SELF) for call in (_call, without_loops))
     assert len(plain["key"]) > 500
     for name, value in plain.items():

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cases import heap, step
+from cases import dense_scaled_map, heap, step
 from mpi4py import MPI
 
 from dem.contact import find_contacts
 from dem.motion import Dynamic, Guided, Oscillation
 from dem.scene import Scene
 from dem.shapes import Box, Plane
+from dem.start import new_world
 from dem.system import SYMMETRIC, ContactSystem
-from dem.world import World
 
 
 def cross_matrix(vector):
@@ -45,17 +45,9 @@ def from_compact(system, comm):
     return blocks.reshape(3 * system.local_contacts, -1)
 
 
-def from_blocks(system):
-    dense = np.zeros((system.local_contacts, 3, system.total_bodies, 6))
-    for c in range(system.local_contacts):
-        for k in range(system.G.indptr[c], system.G.indptr[c + 1]):
-            dense[c, :, system.G.indices[k]] = system.G.data[k]
-    return dense.reshape(3 * system.local_contacts, -1)
-
-
 def mixed(comm):
     """All shapes, with prescribed bodies and a dynamic large one."""
-    world = World.from_scene(heap(3, side=4, capsules=True), comm)
+    world = new_world(heap(3, side=4, capsules=True), comm)
     for _ in range(20):
         step(world)
     return world
@@ -69,7 +61,7 @@ def pressed(motion, comm):
     scene.add_spheres(grid, 0.1, 1000.0, velocity=(0.3, 0.1, 0.4), angular_velocity=(1.0, 2.0, 3.0))
     weight = {"density": 500.0} if isinstance(motion, Dynamic) else {}
     scene.add_body("plate", [Box((0.6, 0.6, 0.05))], motion, position=(0.4, 0.4, 0.25), **weight)
-    return World.from_scene(scene, comm)
+    return new_world(scene, comm)
 
 
 def spheres(comm):
@@ -99,13 +91,13 @@ def test_compact_rows_are_g(case):
         assert array.shape[1:] == shape
         assert array.dtype == np.dtype(f"{kind}8")
         assert array.flags.c_contiguous
-    dense = from_blocks(system)
+    dense = dense_scaled_map(system, comm)
     np.testing.assert_allclose(from_compact(system, comm), dense, atol=1e-13 * np.abs(dense).max(initial=1.0))
 
 
 def test_without_contacts():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 5]], 0.1, 1000.0)
-    world = World.from_scene(scene, MPI.COMM_SELF)
+    world = new_world(scene, MPI.COMM_SELF)
     rows = ContactSystem(world, find_contacts(world, 0.01), 0.01).contact_map
     assert [array.shape for array in rows] == [(0, 9), (0, 6), (0, 2), (1, 6)]

@@ -1,4 +1,4 @@
-"""The scene run/crystal.py: every sphere touches its neighbours, none overlaps."""
+"""The scene run/studies/crystal.py: every sphere touches its neighbours, none overlaps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from dem.experiment import from_file
 
-SCENE = Path(__file__).resolve().parents[2] / "run" / "crystal.py"
+SCENE = Path(__file__).resolve().parents[2] / "run" / "studies" / "crystal.py"
 
 
 @pytest.mark.parametrize(("lattice", "neighbours"), [("fcc", 12), ("cubic", 6)])

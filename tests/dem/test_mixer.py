@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from dem.contact import find_contacts
 from dem.scenes import SCENES, Mixer
-from dem.world import World
+from dem.start import new_world
 
 SELF = MPI.COMM_SELF
 
@@ -23,7 +23,7 @@ def test_every_option_has_help_unit_and_default():
 
 @pytest.mark.parametrize("n", [1, 2, 4])
 def test_bodies_of_the_paper(n):
-    world = World.from_scene(Mixer(n=n).build(), SELF)
+    world = new_world(Mixer(n=n).build(), SELF)
     assert world.body_count == (2 * n + 1) ** 3 + 2
     assert [body.name for body in world.large_bodies] == ["box", "mixer"]
     assert set(world.grains.size[:, 0]) == {0.1}
@@ -37,7 +37,7 @@ def test_particle_density_does_not_depend_on_n():
 
 def test_spheres_start_inside_the_box_above_the_paddle_without_contact():
     scene = Mixer(n=3, perturbation=0.024)
-    world = World.from_scene(scene.build(), SELF)
+    world = new_world(scene.build(), SELF)
     assert (find_contacts(world, 0.02).gap > 0).all()
     paddle_top = scene.clearance + scene.paddle_height * scene.width
     assert (world.grains.position[:, 2] - scene.radius > paddle_top).all()

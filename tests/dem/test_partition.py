@@ -7,8 +7,8 @@ from mpi4py import MPI
 
 from dem.bodies import Bodies
 from dem.contact import find_contacts
-from dem.partition import imbalance, morton_codes, rebalance, splitters
-from dem.world import World
+from dem.partition import curve_codes, imbalance, rebalance, splitters
+from dem.start import new_world
 
 
 def interleave(x, y, z):
@@ -19,14 +19,14 @@ def test_morton_codes_interleave_the_bits():
     rng = np.random.default_rng(1)
     cells = rng.integers(0, 2**21, (200, 3))
     cells[0], cells[1] = 0, 2**21 - 1
-    codes = morton_codes(cells.astype(float), np.zeros(3), np.full(3, 2.0**21 - 1))
+    codes = curve_codes(cells.astype(float), np.zeros(3), np.full(3, 2.0**21 - 1))
     assert codes.tolist() == [interleave(*map(int, cell)) for cell in cells]
     assert codes.min() == 0
     assert codes.max() == 2**63 - 1
 
 
 def test_morton_codes_of_one_point():
-    assert morton_codes(np.ones((1, 3)), np.ones(3), np.ones(3)).tolist() == [0]
+    assert curve_codes(np.ones((1, 3)), np.ones(3), np.ones(3)).tolist() == [0]
 
 
 @pytest.mark.parallel(2, 3, 4)
@@ -49,7 +49,7 @@ def test_splitters_cut_the_weight_evenly():
 @pytest.mark.parallel(1, 2, 3, 4)
 def test_rebalancing_keeps_the_bodies_and_spreads_the_contacts():
     comm = MPI.COMM_WORLD
-    world = World.from_scene(heap(1, side=8, boxes=False), comm)
+    world = new_world(heap(1, side=8, boxes=False), comm)
     for _ in range(3):
         step(world)
     before = grains_by_id(world)
@@ -74,6 +74,6 @@ def test_rebalancing_keeps_the_bodies_and_spreads_the_contacts():
 
     # Sorted along one curve over all ranks.
     low, high = after.position.min(axis=0), after.position.max(axis=0)
-    codes = np.concatenate(comm.allgather(morton_codes(world.grains.position, low, high)))
+    codes = np.concatenate(comm.allgather(curve_codes(world.grains.position, low, high)))
     if comm.size > 1:
         assert (np.diff(codes) >= 0).all()

@@ -18,9 +18,9 @@ from dem.motion import Glide
 from dem.partition import rebalance
 from dem.scene import Scene
 from dem.shapes import Plane
+from dem.start import new_world
 from dem.stepper import advance
 from dem.system import ContactSystem
-from dem.world import World
 
 SELF = MPI.COMM_SELF
 DT = 0.01
@@ -45,7 +45,7 @@ def energy_error(balance, before):
 def test_a_sphere_in_free_fall_loses_only_what_the_time_stepping_takes():
     scene = Scene(0.3)
     scene.add_spheres([0, 0, 2.0], 0.1, 1000.0, angular_velocity=(0, 3.0, 0))
-    world = World.from_scene(scene, SELF)
+    world = new_world(scene, SELF)
     mass = world.grains.mass[0]
     before = mass * 9.81 * 2.0 + 0.2 * mass * 0.01 * 9.0
     for k in range(1, 21):
@@ -62,7 +62,7 @@ def test_an_impact_without_bounce_takes_the_whole_kinetic_energy():
     scene = Scene(0.0, gravity=(0, 0, 0))
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_spheres([0, 0, 0.1], 0.1, 1000.0, velocity=(0, 0, -2.0))
-    world = World.from_scene(scene, SELF)
+    world = new_world(scene, SELF)
     mass = world.grains.mass[0]
     balance = record.energy_balance(made(world, lambda system: np.array([[2.0 * mass, 0, 0]])))
     assert balance["kinetic_energy [J]"] == pytest.approx(0.0, abs=1e-12)
@@ -76,7 +76,7 @@ def test_a_moving_floor_does_work_through_friction():
     scene = Scene(0.3, gravity=(0, 0, 0))
     scene.add_spheres([0, 0, 0.1], 0.1, 1000.0)
     scene.add_body("floor", [Plane((0, 0, 1))], Glide((2.0, 0, 0)))
-    world = World.from_scene(scene, SELF)
+    world = new_world(scene, SELF)
     mass = world.grains.mass[0]
     pull = 0.1 * mass  # impulse on the sphere along x
 
@@ -96,7 +96,7 @@ def test_a_moving_floor_does_work_through_friction():
 
 
 def test_the_balance_of_a_heap_closes_whatever_the_impulses():
-    world = World.from_scene(heap(boxes=False), SELF)
+    world = new_world(heap(boxes=False), SELF)
     dt = 0.005
     before = sum(sum(record.energy(table, world.gravity)) for table in (world.grains, world.large))
     for _ in range(10):
@@ -118,7 +118,7 @@ def test_contact_statistics_count_what_the_impulses_say():
     scene = Scene(0.5)
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_spheres([[0, 0, 0.0999], [0.2, 0, 0.1], [0.41, 0, 0.1]], 0.1, 1000.0)
-    world = World.from_scene(scene, SELF)
+    world = new_world(scene, SELF)
 
     def solve(system):
         impulse = np.zeros((system.local_contacts, 3))
@@ -141,7 +141,7 @@ def test_contact_statistics_count_what_the_impulses_say():
 def test_a_scene_without_contacts_has_statistics():
     scene = Scene(0.5)
     scene.add_spheres([0, 0, 0], 0.1, 1000.0)
-    found = record.contact_statistics(made(World.from_scene(scene, SELF)))
+    found = record.contact_statistics(made(new_world(scene, SELF)))
     assert set(found.values()) == {0.0}
 
 
@@ -154,7 +154,7 @@ class Here(Experiment):
 
 
 def test_a_row_has_the_forces_on_all_large_bodies_and_what_the_scene_adds():
-    world = World.from_scene(heap(), SELF)
+    world = new_world(heap(), SELF)
     step = made(world)
     row = record.row(step, Here())
     assert list(row)[:2] == ["step", "time [s]"]
@@ -169,7 +169,7 @@ def test_a_row_has_the_forces_on_all_large_bodies_and_what_the_scene_adds():
 
 
 def rows_of(comm):
-    world = World.from_scene(heap(), comm)
+    world = new_world(heap(), comm)
     rows = []
     for _ in range(5):
         rebalance(world, 1.0)

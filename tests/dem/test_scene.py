@@ -10,7 +10,7 @@ from dem.bodies import bounding_radius
 from dem.motion import Dynamic
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere
-from dem.world import World
+from dem.start import new_world
 
 SELF = MPI.COMM_SELF
 
@@ -95,28 +95,28 @@ def test_an_empty_scene_is_refused():
     scene = Scene(friction=0.3)
     scene.add_body("floor", [Plane((0, 0, 1))])
     with pytest.raises(ValueError, match="empty scene: there is no grain"):
-        World.from_scene(scene, SELF)
+        new_world(scene, SELF)
 
 
 def test_an_overlapping_start_names_the_worst_pair_and_its_depth():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 1], [0, 0, 1.15], [0, 0, 1.25], [3, 0, 1]], 0.1, 1000.0)
     with pytest.raises(ValueError, match="grain 1 and grain 2 overlap by 0.1 m"):
-        World.from_scene(scene, SELF)
+        new_world(scene, SELF)
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 1], [0, 0, 0.06]], 0.1, 1000.0)
     scene.add_body("ceiling", [Plane((0, 0, -1), (0, 0, 2))])
     scene.add_body("floor", [Plane((0, 0, 1))])
     with pytest.raises(ValueError, match="grain 1 and body 'floor' overlap by 0.04 m"):
-        World.from_scene(scene, SELF)
-    assert World.from_scene(scene, SELF, overlap=0.5).body_count == 4
+        new_world(scene, SELF)
+    assert new_world(scene, SELF, overlap=0.5).body_count == 4
 
 
 def test_a_touch_that_is_overlapping_by_rounding_is_accepted():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 0.1 * (2 * k + 1)] for k in range(5)], 0.1, 1000.0)
     scene.add_body("floor", [Plane((0, 0, 1))])
-    assert World.from_scene(scene, SELF).body_count == 6
+    assert new_world(scene, SELF).body_count == 6
 
 
 def test_ids_materials_mass_and_inertia():

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from dem.contact import find_contacts
 from dem.motion import Guided
 from dem.scenes import Blade, Mixer, Shear
-from dem.world import World
+from dem.start import new_world
 
 SELF = MPI.COMM_SELF
 SMALL = [Blade(n=2), Shear(n=1), Shear(n=2), Mixer(n=2)]
@@ -29,7 +29,7 @@ def test_bodies_of_the_paper(scene, count):
 
 @pytest.mark.parametrize("scene", SMALL, ids=repr)
 def test_spheres_start_inside_without_contact(scene):
-    world = World.from_scene(scene.build(), SELF)
+    world = new_world(scene.build(), SELF)
     assert (find_contacts(world, 0.02).gap > 0).all()
     low, high = scene.domain
     assert (world.grains.position > np.array(low) + scene.radius).all()
@@ -38,7 +38,7 @@ def test_spheres_start_inside_without_contact(scene):
 
 @pytest.mark.parametrize("scene", SMALL[:3], ids=repr)
 def test_nothing_moves_before_the_end_of_settling(scene):
-    world = World.from_scene(scene.build(), SELF)
+    world = new_world(scene.build(), SELF)
     world.time = scene.settling_time - scene.dt
     np.testing.assert_allclose(world.prescribed_velocity(scene.dt), 0.0, atol=1e-12)
     world.time = scene.settling_time + scene.period / 4 - scene.dt / 2

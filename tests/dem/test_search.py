@@ -17,8 +17,8 @@ from dem.contact.broad import close_pairs
 from dem.motion import Dynamic, Fixed, Glide, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Capsule, Plane, Sphere
+from dem.start import new_world
 from dem.system import ContactSystem
-from dem.world import World
 
 SELF = MPI.COMM_SELF
 
@@ -88,7 +88,7 @@ def found_pairs(world, delta):
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_search_finds_what_all_pairs_have(seed):
-    world = World.from_scene(heap(seed, side=4), SELF)
+    world = new_world(heap(seed, side=4), SELF)
     for _ in range(30):
         step(world)
     expected, found = all_pairs(world, 0.03), found_pairs(world, 0.03)
@@ -107,7 +107,7 @@ def test_search_next_to_a_turned_box_with_spheres_at_faces_edges_corners_and_ins
     scene.add_spheres(rng.uniform(-1.5, 1.5, (150, 3)), 0.1, 1000.0)
     shapes = [Box((0.8, 0.1, 0.6), (0.1, 0.2, 0.3), tuple(rng.normal(size=4)))]
     scene.add_body("blade", shapes, Rotation((0.2, 1.0, 0.0)), quaternion=tuple(rng.normal(size=4)))
-    world = World.from_scene(scene, SELF, overlap=np.inf)
+    world = new_world(scene, SELF, overlap=np.inf)
     blade = {pair: gaps for pair, gaps in all_pairs(world, 0.4).items() if pair[1] == 150}
     assert len(blade) > 10
     assert min(blade.values())[0] < -0.1  # a centre inside
@@ -130,7 +130,7 @@ def test_broad_phase_with_radii_over_three_decades():
 
 
 def test_normals_point_from_the_first_to_the_second_body():
-    world = World.from_scene(heap(2, side=3), SELF)
+    world = new_world(heap(2, side=3), SELF)
     for _ in range(10):
         step(world)
     contacts = find_contacts(world, 0.03)
@@ -153,12 +153,12 @@ def test_friction_is_that_of_the_pair_of_materials():
     scene.add_body("floor", [Plane((0, 0, 1))], material="wood")
     scene.set_friction(0.7, "steel", "glass")
     scene.set_friction(0.5, "wood", "glass")
-    found = contacts_by_key(find_contacts(World.from_scene(scene, SELF), 0.01), SELF)
+    found = contacts_by_key(find_contacts(new_world(scene, SELF), 0.01), SELF)
     assert list(zip(found["a"], found["b"], found["friction"])) == [(0, 2, 0.7), (0, 3, 0.5), (1, 3, 0.5)]
 
 
 def test_keys_are_unique_and_persist_while_contacts_do():
-    world = World.from_scene(heap(4), SELF)
+    world = new_world(heap(4), SELF)
     known = {}
     kept = 0
     for _ in range(20):
@@ -174,7 +174,7 @@ def test_corner_contacts_of_one_box_have_distinct_persistent_keys():
     scene = Scene(friction=0.3)
     scene.add_boxes([[0, 0, 0.1]], (0.3, 0.2, 0.1), 1000.0)
     scene.add_body("floor", [Plane((0, 0, 1))])
-    world = World.from_scene(scene, SELF)
+    world = new_world(scene, SELF)
     flat = find_contacts(world, 0.01)
     assert len(flat) == 4
     assert set(find_contacts(world, 0.3).key) > set(flat.key)
@@ -187,7 +187,7 @@ def test_corner_contacts_of_one_box_have_distinct_persistent_keys():
 
 
 def test_contacts_are_ordered_by_owner_and_key():
-    world = World.from_scene(heap(6), SELF)
+    world = new_world(heap(6), SELF)
     contacts = step(world)
     owner = contacts.body.min(axis=1)
     assert (np.lexsort((contacts.key, owner)) == np.arange(len(contacts))).all()
@@ -197,7 +197,7 @@ def test_contacts_are_ordered_by_owner_and_key():
 @pytest.mark.parametrize("seed", [1, 2])
 def test_search_sees_what_may_touch_within_the_step(seed):
     """Against a search far beyond all that a step can bring."""
-    world, delta, dt = World.from_scene(heap(seed, side=4, capsules=True), SELF), 0.01, 0.05
+    world, delta, dt = new_world(heap(seed, side=4, capsules=True), SELF), 0.01, 0.05
     far = find_contacts(world, 1.0)
     system, table = ContactSystem(world, far, dt), far.near.bodies
     found = find_contacts(world, delta, dt)
@@ -220,7 +220,7 @@ def test_margins_of_two_bodies_meet():
     velocity = [[0, 0, 0], [3.0, 0, 0], [0, 0, 0], [0, 0, 0]]
     scene.add_spheres([[0, 0, 0], [0.25, 0, 0], [0, 1, 0], [0.25, 1, 0]], 0.1, 1000.0, velocity=velocity)
     scene.add_body("tool", [Box((0.01, 0.1, 0.1))], Glide((-3.0, 0, 0)), position=(0.4, 1, 0))
-    world = World.from_scene(scene, SELF)
+    world = new_world(scene, SELF)
 
     def pairs(delta, dt):
         found = contacts_by_key(find_contacts(world, delta, dt), SELF)
@@ -234,7 +234,7 @@ def test_margins_of_two_bodies_meet():
 def test_threshold_is_inclusive_and_gap_is_signed():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 0], [0, 0, 2.5], [5, 0, 0], [5, 0, 1.99]], 1.0, 1000.0)
-    world = World.from_scene(scene, SELF, overlap=0.1)
+    world = new_world(scene, SELF, overlap=0.1)
     np.testing.assert_allclose(np.sort(find_contacts(world, 0.5).gap), [-0.01, 0.5])
     np.testing.assert_allclose(find_contacts(world, 0.49).gap, [-0.01])
     with pytest.raises(ValueError, match="delta"):
@@ -244,7 +244,7 @@ def test_threshold_is_inclusive_and_gap_is_signed():
 def test_no_contact_and_one_body():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 0]], 1.0, 1000.0)
-    contacts = find_contacts(World.from_scene(scene, SELF), 0.5)
+    contacts = find_contacts(new_world(scene, SELF), 0.5)
     assert len(contacts) == 0
     assert contacts.body.shape == (0, 2)
     assert contacts.normal.shape == (0, 3)
@@ -292,7 +292,7 @@ def crowd(seed, side=4):
         ("side", (0.3, 1.0, 0.9), Fixed(), None),
     ):
         scene.add_body(name, [*parts, Sphere(0.1, (0.2, 0.2, 0))], motion, position=place, density=density)
-    return World.from_scene(scene, SELF, overlap=np.inf)
+    return new_world(scene, SELF, overlap=np.inf)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -322,7 +322,7 @@ def test_pairs_of_any_shapes_touch_where_optimisation_says(seed):
 
 
 def test_keys_of_all_shapes_are_unique():
-    world = World.from_scene(heap(4, capsules=True), SELF)
+    world = new_world(heap(4, capsules=True), SELF)
     for _ in range(20):
         contacts = step(world, delta=0.05)
         assert len(np.unique(contacts.key)) == len(contacts)
@@ -335,7 +335,7 @@ def press_scene(motion):
     mass = {"density": 500.0} if isinstance(motion, Dynamic) else {}
     scene.add_body("press", [Box((0.995, 0.5, 0.2)), Sphere(0.1, (0, 0, 0.4))], motion, position=(0, 0, 0.2), **mass)
     scene.add_body("ram", [Capsule(0.1, 0.5, (0, 0, 1.3))])
-    return World.from_scene(scene, SELF)
+    return new_world(scene, SELF)
 
 
 def test_a_free_large_body_touches_other_large_bodies():
@@ -355,7 +355,7 @@ def test_large_bodies_that_are_not_free_do_not_touch_each_other():
 
 
 def test_a_lost_grain_is_an_error():
-    world = World.from_scene(heap(1, side=3), SELF)
+    world = new_world(heap(1, side=3), SELF)
     world.grains.position[4, 1] = np.nan
     with pytest.raises(FloatingPointError, match="no finite position or velocity at step 0"):
         find_contacts(world, 0.02)

@@ -9,9 +9,9 @@ from dem.contact import find_contacts
 from dem.motion import Rotation
 from dem.scene import Scene
 from dem.shapes import Box
+from dem.start import new_world
 from dem.stepper import advance
 from dem.system import ContactSystem
-from dem.world import World
 
 SELF = MPI.COMM_SELF
 
@@ -25,7 +25,7 @@ def fly(world, dt, steps):
 def test_free_fall_is_the_semi_implicit_sum():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 0]], 0.1, 1000.0, velocity=(1.0, 0, 5.0))
-    world = World.from_scene(scene, SELF)
+    world = new_world(scene, SELF)
     dt, k = 0.025, 40
     fly(world, dt, k)
     assert world.step == k
@@ -39,7 +39,7 @@ def test_free_fall_is_the_semi_implicit_sum():
 def test_a_free_sphere_keeps_its_spin():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 0]], 0.1, 1000.0, angular_velocity=(1.0, 2.0, -3.0))
-    world = World.from_scene(scene, SELF)
+    world = new_world(scene, SELF)
     fly(world, 0.01, 200)
     np.testing.assert_array_equal(world.grains.velocity[0, 3:], [1, 2, -3])
     expected = quaternion.exponential(2.0 * np.array([[1.0, 2, -3]]))
@@ -51,7 +51,7 @@ def test_a_free_box_tumbles_with_a_drift_of_angular_momentum_of_first_order():
     scene.add_boxes([[0, 0, 0]], (0.1, 0.2, 0.3), 1000.0, angular_velocity=(0.5, 3.0, 0.2))
 
     def drift(dt):
-        world = World.from_scene(scene, SELF)
+        world = new_world(scene, SELF)
         fly(world, dt, round(1.0 / dt))
         turn = quaternion.matrix(world.grains.quaternion[0])
         spin = turn @ np.diag(world.grains.inertia[0]) @ turn.T @ world.grains.velocity[0, 3:]
@@ -69,7 +69,7 @@ def test_prescribed_bodies_follow_their_motion_exactly_at_any_step():
         scene.add_spheres([[0, 0, 5]], 0.1, 1000.0)
         motion = Rotation((0.0, 0.2, 1.0), (0.5, 0.0, 0.0))
         scene.add_body("blade", [Box((0.1, 0.1, 0.1))], motion, position=(2, 0, 0))
-        world = World.from_scene(scene, SELF)
+        world = new_world(scene, SELF)
         start = world.large.position[0].copy()
         fly(world, dt, steps)
         position, turn = motion.pose(1.0, start, np.array([1.0, 0, 0, 0]))
@@ -79,7 +79,7 @@ def test_prescribed_bodies_follow_their_motion_exactly_at_any_step():
 
 
 def test_a_step_changes_no_array_of_the_step_before():
-    world = World.from_scene(heap(1, side=3), SELF)
+    world = new_world(heap(1, side=3), SELF)
     before = world.grains
     kept = {name: (column, column.copy()) for name, column in before.columns().items() if name != "weight"}
     contacts = step(world)

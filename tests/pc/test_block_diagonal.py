@@ -8,10 +8,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from systems import contact_matrix, contacts, dense, spd
 
+from pctt.block_diagonal import block_diagonal, inverse_diagonal_blocks, set_diagonal_blocks
 from pctt.blocks import block_csr_matrix
+from pctt.body_matrix import BodyMatrix
 from pctt.ccp.newton.krylov import Krylov
-from pctt.pc.block_diagonal import block_diagonal, inverse_diagonal_blocks, set_diagonal_blocks
-from pctt.pc.body_matrix import BodyMatrix
 
 COUNT, BLOCK = 5, 3
 

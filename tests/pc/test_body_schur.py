@@ -8,7 +8,7 @@ from petsc4py import PETSc
 from systems import contact_matrix, contacts, dense, poisson
 
 from pctt.blocks import BlockRows
-from pctt.pc.body_matrix import BodyMatrix
+from pctt.body_matrix import BodyMatrix
 
 
 def solve(mat: PETSc.Mat, ksp_type: str, rtol: float, **options: object) -> tuple[float, np.ndarray, np.ndarray]:

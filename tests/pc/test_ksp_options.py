@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from systems import contact_matrix, contacts
 
 from pctt.ccp.newton.krylov import Krylov
-from pctt.pc.ksp_options import entered, to_enter
+from pctt.ksp_options import entered, to_enter
 
 
 def test_options_stand_within_the_block_only(database):
@@ -93,9 +93,9 @@ def fails_alone(): # where the others go on to the end
         raise PETSc.Error(76)
 
 
-assert krylov.together(comm, fails_alone) == 76
+assert krylov.on_all_ranks(comm, fails_alone) == 76
 print("agreed", flush=True)
-krylov.PATIENCE = 0.5
+krylov.WAIT_FOR_OTHERS = 0.5
 
 
 def fails_amidst(): # where the others wait for it
@@ -103,7 +103,7 @@ def fails_amidst(): # where the others wait for it
     x.norm()
 
 
-krylov.together(comm, fails_amidst)
+krylov.on_all_ranks(comm, fails_amidst)
 print("not to be reached", flush=True)
 """
 

@@ -206,15 +206,6 @@ def test_a_diagonal_that_is_not_positive_falls_back_to_block_jacobi(entry):
     assert any("not positive definite" in why for why in context(ksp).account.fallbacks)
 
 
-def test_single_precision_is_given_up_where_it_is_not_enough():
-    ksp = solver(poisson(24), "bcgs", rank="fixed", max_rank=4, precision="single")
-    ksp.setTolerances(rtol=1e-13)
-    ksp.setPCSide(PETSc.PC.Side.RIGHT)
-    solve(ksp)
-    _, residual = solve(ksp)
-    assert residual < 1e-10 or context(ksp).rank == 1
-
-
 def test_auto_keeps_to_block_jacobi_until_a_trial_can_be_paid_for():
     ksp = solver(poisson(16), rank="auto")
     solve(ksp)

@@ -10,10 +10,10 @@ from petsc4py import PETSc
 from systems import contact_matrix, dense, poisson
 
 from pctt.blocks import BlockRows
+from pctt.body_matrix import BodyMatrix
 from pctt.ccp.newton.compare import NAMED
 from pctt.ccp.newton.krylov import Krylov
 from pctt.options import OptionError
-from pctt.pc.body_matrix import BodyMatrix
 from pctt.pc.two_level import bisect
 
 
@@ -113,33 +113,32 @@ def test_bisection_makes_boxes_of_equal_number():
     assert bisect(points[:3], 64).max() == 1
 
 
-@pytest.mark.parametrize("correction", ["additive", "balanced"])
-def test_is_the_formula(correction):
+def test_is_the_formula():
     mat = poisson(8)
-    ksp = solver(mat, boxes=8, coarse="lu", correction=correction)
+    ksp = solver(mat, boxes=8)
     A = dense(mat)
     box = bisect(np.asarray(mat.getAttr("coordinates"), float), 8)
     Z = (box[:, None] == np.arange(8)).astype(float)
     Q = Z @ np.linalg.solve(Z.T @ A @ Z, Z.T)
     D = np.diag(1 / np.diag(A))
-    one = np.eye(len(A))
-    expected = D + Q if correction == "additive" else Q + (one - Q @ A) @ D @ (one - A @ Q)
-    assert np.allclose(matrix_of(ksp), expected)
+    assert np.allclose(matrix_of(ksp), D + Q)
 
 
-@pytest.mark.parametrize("coarse", ["lu", "tt"])
-@pytest.mark.parametrize("correction", ["additive", "balanced"])
-def test_is_symmetric_and_positive(coarse, correction):
-    M = matrix_of(solver(chain(12)[0].mat, boxes=16, coarse=coarse, correction=correction, rank=4))
+@pytest.mark.parametrize("options", [{}, {"pc_mg_type": "multiplicative", "mg_levels_ksp_type": "chebyshev"}])
+def test_is_symmetric_and_positive(options):
+    for name, value in options.items():
+        PETSc.Options()["two_" + name] = value
+    M = matrix_of(solver(chain(12)[0].mat, boxes=16))
     assert np.allclose(M, M.T, atol=1e-10 * abs(M).max())
     assert np.linalg.eigvalsh(M).min() > 0
 
 
-@pytest.mark.parametrize(("coarse", "rank"), [("lu", 1), ("tt", 17)])
-def test_takes_fewer_iterations_than_block_jacobi(coarse, rank):
+def test_takes_fewer_iterations_than_block_jacobi():
+    """With PETSc's own cycles, by its options."""
+    PETSc.Options()["two_pc_mg_type"] = "multiplicative"
+    PETSc.Options()["two_mg_levels_ksp_type"] = "chebyshev"
     mat = chain(20)[0].mat
-    two = iterations(solver(mat, boxes=64, coarse=coarse, rank=rank, correction="balanced"))
-    assert two < 0.7 * iterations(block_jacobi(mat))
+    assert iterations(solver(mat, boxes=64)) < 0.7 * iterations(block_jacobi(mat))
 
 
 def test_scalar_matrices_with_and_without_places():
@@ -147,16 +146,16 @@ def test_scalar_matrices_with_and_without_places():
         mat = poisson(24)
         if not attribute:
             mat.setAttr("coordinates", None)
-        assert iterations(solver(mat, boxes=64, coarse="lu")) < 0.8 * iterations(block_jacobi(mat))
+        assert iterations(solver(mat, boxes=64)) < 0.8 * iterations(block_jacobi(mat))
 
 
 def test_follows_new_values():
     K, point = chain(12)
-    ksp = solver(K.mat, boxes=16, coarse="lu", correction="balanced")
+    ksp = solver(K.mat, boxes=16)
     before = matrix_of(ksp)
     K.update(7.0 * np.tile(np.eye(3), (len(point), 1, 1)))
     ksp.setUp()
-    anew = solver(chain(12, stiffness=7.0)[0].mat, boxes=16, coarse="lu", correction="balanced")
+    anew = solver(chain(12, stiffness=7.0)[0].mat, boxes=16)
     assert np.allclose(matrix_of(ksp), matrix_of(anew))
     assert not np.allclose(matrix_of(ksp), before)
 
@@ -168,14 +167,12 @@ def test_rows_that_have_no_modes():
     mode.array[:32] = 1.0
     mode.normalize()
     mat.setNearNullSpace(PETSc.NullSpace().create(constant=False, vectors=[mode], comm=mat.comm))
-    M = matrix_of(solver(mat, boxes=4, coarse="lu"))
+    M = matrix_of(solver(mat, boxes=4))
     assert np.allclose(M[32:, 32:], np.eye(32) / 4)
     assert not np.allclose(M[:32, :32], np.eye(32) / 4)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("boxes", "0"), ("coarse", "ilu"), ("rank", "-1"), ("correction", "none"), ("box", "3")]
-)
+@pytest.mark.parametrize(("name", "value"), [("boxes", "0"), ("box", "3")])
 def test_bad_options(name, value):
     with pytest.raises((OptionError, PETSc.Error)) as error:
         solver(poisson(4), **{name: value})
@@ -183,45 +180,21 @@ def test_bad_options(name, value):
 
 
 @pytest.mark.parallel(2, 3)
-@pytest.mark.parametrize("coarse", ["lu", "tt"])
-def test_any_number_of_ranks(coarse):
-    options = {"boxes": 16, "coarse": coarse, "rank": 6, "correction": "balanced"}
+def test_any_number_of_ranks():
     mats = (chain(12, comm, stiffness=1.0)[0].mat for comm in (MPI.COMM_WORLD, MPI.COMM_SELF))
-    here, alone = (iterations(solver(mat, **options)) for mat in mats)
+    here, alone = (iterations(solver(mat, boxes=16)) for mat in mats)
     assert abs(here - alone) <= 1
 
 
 def test_system_with_gamg_and_two_levels_inside_body_schur():
-    """The inner preconditioners that -compare knows as body-tt, body-two-lu and body-gamg."""
+    """The inner preconditioners that -compare knows as body-two and body-gamg."""
     K, point = chain(12)
     S = contact_matrix(K.G, np.tile(0.01 * np.eye(3), (len(point), 1, 1)))
     S.setAttr("coordinates", point)
     x, b = S.createVecs()
     b.array[:] = sp.random(1, b.getLocalSize(), 1.0, random_state=0).toarray().ravel()
-    for name in ("body-tt", "body-two-lu", "body-gamg"):
+    for name in ("body-two", "body-gamg"):
         krylov = Krylov(MPI.COMM_SELF, f"compare_{name}_", NAMED[name])
         done = krylov.solve(S, b, x, 1e-6)
         assert done.converged, (name, done)
         krylov.destroy()
-
-
-class Negative:
-    """A PC of the wrong sign."""
-
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        x.copy(y)
-        y.scale(-1e3)
-
-
-def test_an_indefinite_train_is_replaced_by_factors():
-    """The solve that it has spoilt is made again."""
-    mat = poisson(12)
-    ksp = solver(mat, boxes=16, coarse="tt")
-    ksp.pc.getPythonContext().coarse.setPythonContext(Negative())
-    for _ in range(2):
-        x, b = mat.createVecs()
-        b.set(1.0)
-        ksp.solve(b, x)
-        assert ksp.getConvergedReason() > 0
-        assert (mat * x - b).norm() <= 1e-6 * b.norm()
-    assert "fell back" in " ".join(ksp.pc.getPythonContext().report())

@@ -17,11 +17,12 @@ from dem.contact import Contacts, find_contacts
 from dem.partition import rebalance
 from dem.scene import Scene
 from dem.shapes import Plane
+from dem.start import new_world
 from dem.stepper import advance
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
-from pctt.run.simulate import cone_problem
+from pctt.run.stepper import cone_problem
 
 Triple = tuple[float, float, float]
 
@@ -94,7 +95,7 @@ def on_incline(slope: float, friction: float) -> Scene:
 def block(scene: Scene, lift: float = 0.0, velocity: Triple = (0.0, 0.0, 0.0)) -> World:
     """The scene with one block at the height `lift` above the plane z = 0."""
     scene.add_boxes([0.0, 0.0, HALF[2] + lift], HALF, 1000.0, velocity=velocity)
-    return World.from_scene(scene, MPI.COMM_SELF)
+    return new_world(scene, MPI.COMM_SELF)
 
 
 def sphere(
@@ -102,7 +103,7 @@ def sphere(
 ) -> World:
     """The scene with one sphere at the height `lift` above the plane z = 0."""
     scene.add_spheres([0.0, 0.0, RADIUS + lift], RADIUS, 1000.0, velocity=velocity, angular_velocity=spin)
-    return World.from_scene(scene, MPI.COMM_SELF)
+    return new_world(scene, MPI.COMM_SELF)
 
 
 def momentum(world: World) -> Floats:

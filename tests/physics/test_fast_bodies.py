@@ -11,7 +11,7 @@ from dem.motion import Glide, Rotation
 from dem.scene import Scene
 from dem.scenes.mixer import Mixer
 from dem.shapes import Box, Plane
-from dem.world import World
+from dem.start import new_world
 
 DT, DELTA = 0.025, 0.01  #: at 4 m/s a body moves ten times the contact distance in a step
 
@@ -39,13 +39,13 @@ def test_a_fast_sphere_stops_on_the_floor(speed, lift):
 def test_a_tumbling_box_stops_on_the_floor():
     scene = floor()
     scene.add_boxes([0, 0, 0.4], HALF, 1000.0, velocity=(1.0, 0.0, -6.0), angular_velocity=(5.0, 20.0, 3.0))
-    assert worst_overlap(World.from_scene(scene, MPI.COMM_SELF), 6, tol=1e-6) < 0.1 * min(HALF)
+    assert worst_overlap(new_world(scene, MPI.COMM_SELF), 6, tol=1e-6) < 0.1 * min(HALF)
 
 
 def test_two_fast_spheres_meet_and_go_on_together():
     scene = Scene(0.3, gravity=(0, 0, 0))
     scene.add_spheres([[0, 0, 0], [0.35, 0, 0]], RADIUS, 1000.0, velocity=[[3.0, 0, 0], [-4.0, 0, 0]])
-    world = World.from_scene(scene, MPI.COMM_SELF)
+    world = new_world(scene, MPI.COMM_SELF)
     assert worst_overlap(world, 3) < 1e-9
     np.testing.assert_allclose(world.grains.velocity[:, 0], -0.5, atol=1e-8)
 
@@ -53,7 +53,7 @@ def test_two_fast_spheres_meet_and_go_on_together():
 def test_spheres_that_pass_each_other_are_left_alone():
     scene = Scene(0.0, gravity=(0, 0, 0))  # with friction, they are kept apart by dt mu |u_t|
     scene.add_spheres([[-1.0, 0, 0], [0.0, 2.2 * RADIUS, 0]], RADIUS, 1000.0, velocity=[[2.0, 0, 0], [0, 0, 0]])
-    world = World.from_scene(scene, MPI.COMM_SELF)
+    world = new_world(scene, MPI.COMM_SELF)
     for _ in steps(world, 40, DT, delta=DELTA):
         pass
     order = np.argsort(world.grains.id)
@@ -69,7 +69,7 @@ def test_a_fast_tool_does_not_run_into_spheres_at_rest(motion, spheres):
     scene = Scene(0.0, gravity=(0, 0, 0))
     scene.add_body("tool", [Box((0.02, 0.3, 0.3))], motion)
     scene.add_spheres([[0.06 + RADIUS, 0, 0], [0.10 + 3 * RADIUS, 0, 0]][:spheres], RADIUS, 1000.0)
-    world = World.from_scene(scene, MPI.COMM_SELF)
+    world = new_world(scene, MPI.COMM_SELF)
     assert worst_overlap(world, 6) < 2e-3  # a turning face is straightened over the step
 
 
@@ -77,9 +77,9 @@ def test_spheres_that_fall_together_do_not_run_into_the_one_that_is_stopped():
     scene = floor()
     height = RADIUS + 0.03 + np.arange(4) * (2 * RADIUS + 0.05)
     scene.add_spheres(height[:, None] * [0, 0, 1], RADIUS, 1000.0, velocity=np.tile([0, 0, -4.0], (4, 1)))
-    assert worst_overlap(World.from_scene(scene, MPI.COMM_SELF), 6) < 1e-6
+    assert worst_overlap(new_world(scene, MPI.COMM_SELF), 6) < 1e-6
 
 
 def test_spheres_poured_onto_a_turning_paddle_do_not_overlap():
-    world = World.from_scene(Mixer(n=1).build(), MPI.COMM_SELF)
+    world = new_world(Mixer(n=1).build(), MPI.COMM_SELF)
     assert worst_overlap(world, 20, tol=1e-4) < 0.01 * RADIUS

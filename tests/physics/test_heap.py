@@ -10,7 +10,7 @@ from mpi4py import MPI
 from dem.motion import Dynamic, Fixed, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Plane
-from dem.world import World
+from dem.start import new_world
 
 DT = 0.01
 LOOSE = 1e-3  #: the balances hold for any impulses, solved well or not
@@ -32,7 +32,7 @@ def heap(layers, motion, lid=False):
         parts = [Box((width / 2, width / 2, 0.05))]
         position = (width / 2, width / 2, 0.23 * layers + 0.25)
         scene.add_body("lid", parts, Dynamic(), density=500.0, position=position)
-    return World.from_scene(scene, MPI.COMM_SELF)
+    return new_world(scene, MPI.COMM_SELF)
 
 
 @pytest.mark.parametrize(("solver", "tol"), [("apgd", LOOSE), ("pdip", LOOSE), ("apgd", 0.5)])

@@ -13,7 +13,7 @@ from drive import RADIUS, SOLVERS, make_steps, momentum
 from mpi4py import MPI
 
 from dem.scene import Scene
-from dem.world import World
+from dem.start import new_world
 
 MASSES = [(1000.0, 1000.0), (500.0, 4000.0)]
 RUBS = [(0.5, 1.0), (0.3, 1.9), (0.3, 4.0), (0.1, 2.0), (0.0, 1.0)]  #: friction coefficient, sliding speed
@@ -29,7 +29,7 @@ def pair(closing, sliding, densities, friction, gap=0.0, axis=(1.0, 0.0, 0.0)):
     both = np.stack([place, place + (2 * RADIUS + gap) * normal])
     velocity = np.stack([closing * normal + sliding * tangent, np.zeros(3)])
     scene.add_spheres(both, RADIUS, densities, velocity=velocity)
-    return World.from_scene(scene, MPI.COMM_SELF), normal, tangent
+    return new_world(scene, MPI.COMM_SELF), normal, tangent
 
 
 def in_order(world):

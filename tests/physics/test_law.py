@@ -10,6 +10,7 @@ from mpi4py import MPI
 from dem.motion import Rotation
 from dem.scene import Scene
 from dem.shapes import Box
+from dem.start import new_world
 from dem.world import World
 from pctt import ccp
 
@@ -20,7 +21,7 @@ def sliding_box(friction: float = 0.5, speed: float = 2.0) -> World:
     """A cube of half extent .1 m flush on a floor."""
     scene = on_incline(0.0, friction)
     scene.add_boxes([0.0, 0.0, 0.1], (0.1, 0.1, 0.1), 1000.0, velocity=(speed, 0.0, 0.0))
-    return World.from_scene(scene, MPI.COMM_SELF)
+    return new_world(scene, MPI.COMM_SELF)
 
 
 @pytest.mark.parametrize(("solver", "dt"), [("apgd", 0.01), ("apgd", 0.0025), ("conic", 0.02), ("auto", 0.02)])
@@ -59,7 +60,7 @@ def table(turning: float, spin: float = 0.0, speed: float = 0.0) -> World:
     scene = Scene(friction=0.5)
     scene.add_body("table", [Box((2, 2, 0.1))], Rotation((0, 0, turning)), position=(0, 0, -0.1))
     scene.add_spheres([0.5, 0, 0.1], 0.1, 1000.0, velocity=(0, speed, 0), angular_velocity=(spin, 0, 0))
-    return World.from_scene(scene, MPI.COMM_SELF)
+    return new_world(scene, MPI.COMM_SELF)
 
 
 @pytest.mark.parametrize("solver", ["apgd", "conic"])

@@ -11,7 +11,7 @@ from dem import quaternion
 from dem.motion import Oscillation, Rotation, mean_velocity
 from dem.scene import Scene
 from dem.shapes import Box, Plane
-from dem.world import World
+from dem.start import new_world
 
 HALF = (0.04, 0.03, 0.02)  #: of the block that rides on the turntable
 
@@ -26,7 +26,7 @@ def riding_block(speed, friction, radius):
     scene = turntable(speed, friction)
     velocity = (0, speed * radius, 0)
     scene.add_boxes([radius, 0, HALF[2]], HALF, 1000.0, velocity=velocity, angular_velocity=(0, 0, speed))
-    return World.from_scene(scene, MPI.COMM_SELF)
+    return new_world(scene, MPI.COMM_SELF)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -73,7 +73,7 @@ def test_a_sphere_on_a_turntable_circles_at_two_sevenths_of_its_speed():
         scene = turntable(speed, 0.5)
         motion = {"velocity": (0, speed * radius, 0), "angular_velocity": (0, 0, speed)}
         scene.add_spheres([radius, 0, RADIUS], RADIUS, 1000.0, **motion)
-        world = World.from_scene(scene, MPI.COMM_SELF)
+        world = new_world(scene, MPI.COMM_SELF)
         for _ in steps(world, round(time / dt), dt):
             assert world.grains.position[0, 2] == pytest.approx(RADIUS, abs=1e-8)
         errors.append(np.linalg.norm(world.grains.position[0, :2] - expected))
@@ -89,7 +89,7 @@ def test_a_paddle_gives_a_sphere_its_velocity(solver, friction):
     scene = Scene(friction, gravity=(0, 0, 0))
     scene.add_body("paddle", [Box((0.6, 0.02, 0.2))], Rotation((0, 0, speed)))
     scene.add_spheres([arm, 0.02 + RADIUS, 0], RADIUS, 1000.0)
-    world = World.from_scene(scene, MPI.COMM_SELF)
+    world = new_world(scene, MPI.COMM_SELF)
     step = make_steps(world, 1, dt, solver)
     assert len(step.contacts) == 1
     sliding = speed * 0.02  # of the paddle's face at the point of contact, in the direction -x
@@ -116,7 +116,7 @@ def test_a_sphere_in_the_pocket_of_a_turning_paddle_is_carried_along():
     scene.add_body("paddle", [face, end], Rotation((0, 0, speed)))
     velocity = (0, speed * reach, 0)
     scene.add_spheres([reach, 0, 0], RADIUS, 1000.0, velocity=velocity, angular_velocity=(0, 0, speed))
-    world = World.from_scene(scene, MPI.COMM_SELF)
+    world = new_world(scene, MPI.COMM_SELF)
     weight = world.grains.mass[0] * speed**2 * reach
     change = speed**2 * reach * dt  # of the velocity in a step; the sphere touches every other step
     pushes = []
@@ -139,7 +139,7 @@ def test_an_oscillating_wall_pushes_a_sphere_and_lets_it_go_at_its_greatest_spee
     scene = Scene(0.3, gravity=(0, 0, 0))
     scene.add_body("wall", [Plane((1, 0, 0))], motion)
     scene.add_spheres([RADIUS, 0.2, 0.1], RADIUS, 1000.0)
-    world = World.from_scene(scene, MPI.COMM_SELF)
+    world = new_world(scene, MPI.COMM_SELF)
     origin, upright = np.zeros(3), np.array([1.0, 0, 0, 0])
     wall = [mean_velocity(motion, k * dt, dt, origin, upright)[0] for k in range(40)]
     for k, _ in enumerate(steps(world, 40, dt, solver)):

@@ -9,13 +9,13 @@ from mpi4py import MPI
 
 from dem.scene import Scene
 from dem.shapes import Plane
-from dem.world import World
+from dem.start import new_world
 
 
 def overlapping_pair(depth):
     scene = Scene(0.3, gravity=(0, 0, 0))
     scene.add_spheres([[0, 0, 0], [2 * RADIUS - depth, 0, 0]], RADIUS, [1000.0, 3000.0])
-    return World.from_scene(scene, MPI.COMM_SELF, overlap=0.5)
+    return new_world(scene, MPI.COMM_SELF, overlap=0.5)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -47,7 +47,7 @@ def test_a_sphere_sunk_into_the_floor_comes_up_at_the_recovery_speed_and_rests(s
     scene = Scene(0.3)
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_spheres([0, 0, RADIUS - depth], RADIUS, 1000.0)
-    world = World.from_scene(scene, MPI.COMM_SELF, overlap=0.5)
+    world = new_world(scene, MPI.COMM_SELF, overlap=0.5)
     for _ in steps(world, 30, dt, solver, recovery_speed=speed):
         rising = world.grains.velocity[0, 2]
         assert rising <= speed + 1e-6

@@ -11,7 +11,7 @@ from dem import quaternion
 from dem.motion import Dynamic
 from dem.scene import Scene
 from dem.shapes import Box, Plane
-from dem.world import World
+from dem.start import new_world
 
 DT = 0.01
 LYING = tuple(quaternion.exponential(np.array([0.0, np.pi / 2, 0.0])))  #: the axis of a capsule along x
@@ -25,7 +25,7 @@ def floor(friction, slope=0.0):
 
 
 def world_of(scene):
-    return World.from_scene(scene, MPI.COMM_SELF)
+    return new_world(scene, MPI.COMM_SELF)
 
 
 def load_on_floor(step):
@@ -136,7 +136,7 @@ def test_a_free_press_rests_on_grains_and_on_another_large_body():
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_body("block", [Box((0.1, 0.1, 0.1))], Dynamic(), density=1000.0, position=(0, 0, 0.1))
     scene.add_body("press", [Box((0.5, 0.5, 0.05))], Dynamic(), density=2000.0, position=(0, 0, 0.25))
-    world = World.from_scene(scene, MPI.COMM_WORLD)
+    world = new_world(scene, MPI.COMM_WORLD)
     step = make_steps(world, 5, 0.01)
     weight = G * (world.comm.allreduce(float(world.grains.mass.sum())) + world.large.mass[1:].sum())
     np.testing.assert_allclose(step.system.force_on("floor", step.impulse)[2], -weight, rtol=1e-5)

@@ -8,8 +8,8 @@ from mpi4py import MPI
 
 from dem.free_motion import free_velocity
 from dem.scene import Scene
+from dem.start import new_world
 from dem.stepper import advance
-from dem.world import World
 
 
 def test_quaternions_stay_unit_quaternions_over_ten_thousand_steps():
@@ -19,7 +19,7 @@ def test_quaternions_stay_unit_quaternions_over_ten_thousand_steps():
     spin = 6.0 * rng.normal(size=(4, 3))
     turns = rng.normal(size=(4, 4))
     scene.add_boxes(place, (0.2, 0.1, 0.05), 1000.0, quaternions=turns, angular_velocity=spin)
-    world = World.from_scene(scene, MPI.COMM_SELF)
+    world = new_world(scene, MPI.COMM_SELF)
     dt, worst = 1e-3, 0.0
     for _ in range(10_000):
         advance(world, free_velocity(world.grains, world.gravity, dt), dt)

@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from dem.scene import Scene
 from dem.shapes import Plane
-from dem.world import World
+from dem.start import new_world
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -19,7 +19,7 @@ def test_a_stack_stands_and_each_contact_carries_what_is_above(solver):
     scene = Scene(0.3)
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_spheres(start, RADIUS, 2500.0)
-    world = World.from_scene(scene, MPI.COMM_SELF)
+    world = new_world(scene, MPI.COMM_SELF)
     dt, count = 0.01, 150
     weight = world.grains.mass[0] * G
     for step in steps(world, count, dt, solver):

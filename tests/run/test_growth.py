@@ -10,12 +10,13 @@ import pytest
 from mpi4py import MPI
 from program import arrays, recorded_steps, steps_of
 
+from dem.together import SceneError
 from pctt.look.folder import Folder
 from pctt.run.lines import StepLines
 from pctt.run.options import read_options
 from pctt.run.place import Place
 from pctt.run.results import Results
-from pctt.run.simulate import SceneError, simulate
+from pctt.run.simulate import simulate
 
 STEPS = 200
 SCENE = """

@@ -17,7 +17,7 @@ import pctt
 from dem.scenes import Mixer
 from pctt import ccp
 from pctt.pc import PRECONDITIONERS
-from pctt.run.options import Run
+from pctt.run.settings import Run
 
 GROUPS = [(Run, ""), (Mixer, "scene_"), (ccp.Limits, "ccp_"), (ccp.Coulomb, "ccp_coulomb_")]
 GROUPS += [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]

@@ -10,11 +10,13 @@ import pytest
 from mpi4py import MPI
 from program import arrays, recorded_steps, steps_of, table
 
+from dem.together import SceneError
 from pctt.ccp import BlockRows, ConeProblem, fclib
 from pctt.options import OptionError
-from pctt.run.options import DEMO, read_options
+from pctt.run.options import read_options
 from pctt.run.problem import solve_file
-from pctt.run.simulate import SceneError, simulate
+from pctt.run.settings import DEMO
+from pctt.run.simulate import simulate
 
 SELF = MPI.COMM_SELF
 DROP = """

@@ -1,4 +1,4 @@
-"""Performance profiles over folders of problems (run/profile)."""
+"""Performance profiles over folders of problems (run/study profile_problems)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SLIDES = "3 1 0 3 3 3 3  1 0 0  0 1 0  0 0 1  -1 2 0  0.3"  # the impulse is the
 
 @pytest.fixture(scope="module")
 def profile() -> ModuleType:
-    sys.path.insert(0, str(ROOT / "run"))
+    sys.path.insert(0, str(ROOT / "run" / "studies"))
     try:
         import profile_problems
     finally:

@@ -13,12 +13,12 @@ from program import SETTLED, SMALL, steps_of, table
 
 from dem.impulses import ImpulseMemory
 from dem.scenes import Shear
-from dem.world import World
+from dem.start import new_world
 from pctt.run.hdf5 import FileError
 from pctt.run.options import read_options
 from pctt.run.place import Place
 from pctt.run.records import Records
-from pctt.run.simulate import Stepper
+from pctt.run.stepper import Stepper
 
 APGD = ("-ccp_type", "apgd")
 
@@ -101,7 +101,7 @@ def test_the_series_of_the_analysis_go_to_a_file(program, tmp_path):
 def test_the_settled_press_is_carried_and_smooth_walls_leave_its_whole_weight_to_the_floor(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scene = Shear(n=1, wall_friction=0.0)
-    world = World.from_scene(scene.build(), MPI.COMM_SELF)
+    world = new_world(scene.build(), MPI.COMM_SELF)
     words = {"scene": "shear", "scene_n": "1", "scene_wall_friction": "0", "ccp_type": "apgd", "ccp_tol": "1e-3"}
     words["dt"] = "0.02"
     stepper = Stepper(read_options(words, MPI.COMM_SELF), world, ImpulseMemory(MPI.COMM_SELF))

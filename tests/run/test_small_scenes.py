@@ -12,16 +12,17 @@ from dem.motion import Glide
 from dem.scene import Scene
 from dem.scenes import Mixer
 from dem.shapes import Box, Plane
-from dem.world import World
+from dem.start import new_world
+from dem.together import SceneError
 from pctt import ccp
 from pctt.run.options import read_options
-from pctt.run.simulate import SceneError, Stepper
+from pctt.run.stepper import Stepper
 
 
 def stepper_of(scene, **options):
     """The time stepper of the program for a scene of our own."""
     words = {"scene_n": "1", **{name: str(value) for name, value in options.items()}}
-    world = World.from_scene(scene, MPI.COMM_SELF)
+    world = new_world(scene, MPI.COMM_SELF)
     return Stepper(read_options(words, MPI.COMM_SELF), world, ImpulseMemory(MPI.COMM_SELF))
 
 
@@ -88,14 +89,14 @@ def test_an_empty_scene_is_refused():
     scene = Scene(0.3)
     scene.add_body("floor", [Plane((0, 0, 1))])
     with pytest.raises(ValueError, match="empty scene"):
-        World.from_scene(scene, MPI.COMM_SELF)
+        new_world(scene, MPI.COMM_SELF)
 
 
 def test_an_overlapping_start_names_the_bodies_and_the_depth():
     scene = Scene(0.3)
     scene.add_spheres([[0, 0, 0], [1, 0, 0], [1.15, 0, 0]], 0.1, 1000.0)
     with pytest.raises(ValueError, match=r"grain 1 and grain 2 overlap by 0\.05 m"):
-        World.from_scene(scene, MPI.COMM_SELF)
+        new_world(scene, MPI.COMM_SELF)
 
 
 @pytest.mark.parametrize("name", ["radius", "density", "friction", "pitch", "gravity", "angular_velocity"])

@@ -11,10 +11,13 @@ from program import ROOT, database, table
 
 from dem.experiment import from_file
 from dem.impulses import ImpulseMemory
-from dem.world import World
+from dem.start import new_world
+from dem.together import SceneError
 from pctt.options import OptionError
-from pctt.run.options import find_scene, read_options
-from pctt.run.simulate import SceneError, Stepper, simulate
+from pctt.run.options import read_options
+from pctt.run.settings import find_scene
+from pctt.run.simulate import simulate
+from pctt.run.stepper import Stepper
 
 LOOSE = ("-ccp_type", "apgd", "-ccp_tol", "1e-3")
 
@@ -31,7 +34,7 @@ def hopper(tmp_path, monkeypatch):
 
 def test_grains_flow_out_of_the_hopper_and_none_is_lost(hopper):
     scene = from_file(hopper)(n=4, settling_time=0.3)
-    world = World.from_scene(scene.build(), MPI.COMM_SELF)
+    world = new_world(scene.build(), MPI.COMM_SELF)
     words = {"scene": str(hopper), "scene_n": "4", "scene_settling_time": "0.3", "ccp_type": "apgd", "ccp_tol": "1e-3"}
     options = read_options(words, MPI.COMM_SELF)
     assert repr(options.scene) == repr(scene)
@@ -86,6 +89,7 @@ GOOD = """
 from dataclasses import dataclass
 from dem.experiment import Experiment, option
 from dem.scene import Scene
+from dem.start import new_world
 @dataclass(frozen=True)
 class One(Experiment):
     height: float = 1.0

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pctt import tt
-from pctt.tt.quantise import digits, linear, pad
+from pctt.tt.quantise import digits, linear
 
 
 @given(st.integers(1, 10**7))
@@ -18,13 +18,6 @@ def test_chosen_modes_pad_little(n: int) -> None:
     assert slots >= n
     assert slots <= 1.07 * n + (20 if n < 1000 else 0)
     assert all(m <= 64 for m in modes)
-
-
-@given(st.integers(1, 5000), st.integers(1, 40))
-def test_binary_modes(n: int, leaf: int) -> None:
-    modes = tt.binary_modes(n, leaf)
-    assert tt.slots_of(modes) >= n
-    assert n <= leaf or tt.slots_of(modes) < 2 * n
 
 
 @given(st.lists(st.integers(1, 6), min_size=1, max_size=5))
@@ -50,4 +43,3 @@ def test_user_modes() -> None:
     assert tt.scalar_modes((4, 5), 3) == (4, 15)
     with pytest.raises(ValueError, match="hold 16 slots, but 17"):
         tt.check_modes([4, 4], 17)
-    np.testing.assert_array_equal(pad(np.ones(2), 4, 7.0), [1, 1, 7, 7])

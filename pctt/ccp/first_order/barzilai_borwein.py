@@ -9,8 +9,6 @@ over when MEMORY steps have brought no new best. One product with N per iteratio
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pctt.ccp.cone import Array
@@ -22,12 +20,7 @@ from pctt.ccp.result import Limits, Result
 MEMORY = 10
 
 
-@dataclass(frozen=True)
-class BarzilaiBorwein(FirstOrder):
-    """Options ``-ccp_barzilai_borwein_*``."""
-
-
-def solve(problem: ConeProblem, guess: Array, limits: Limits, options: BarzilaiBorwein) -> Result:
+def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder) -> Result:
     """Impulses from a first guess (nc, 3)."""
     scaled = ScaledProblem(problem)
     progress = Progress(scaled, limits, options)

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-DAMPING = 0.05  # 1 - the greatest momentum, at first
-WINDOW = 100  # iterations after which it is looked at
-LITTLE, MUCH = 0.8, 0.6  # what is left of the residual after a window with too much momentum, or with room for more
-HEAVIER, LIGHTER = 2.0, 0.9  # factors on the damping then
+
+@dataclass(frozen=True)
+class Steering:
+    """How the bound of momentum is found; without unit but where one is given (docs/ccp.md has what was measured)."""
+
+    damping: float = 0.05  #: 1 - the greatest momentum, at first
+    window: int = 100  #: after which it is looked at [iterations]
+    little: float = 0.8  #: what is left of the residual after a window with too much momentum,
+    much: float = 0.6  #: or with room for more
+    heavier: float = 2.0  #: factors on the damping then
+    lighter: float = 0.9
+
+
+STEERING = Steering()
 
 
 class Momentum:
@@ -21,8 +33,8 @@ class Momentum:
     has brought little, less where it has brought much."""
 
     def __init__(self, bounded: bool):
-        self.bounded, self.damping = bounded, DAMPING if bounded else 0.0
-        self._end, self._looks, self._last = WINDOW, 0, np.inf
+        self.bounded, self.damping = bounded, STEERING.damping if bounded else 0.0
+        self._end, self._looks, self._last = STEERING.window, 0, np.inf
         self.restart()
 
     def restart(self) -> None:
@@ -41,7 +53,10 @@ class Momentum:
         if not self.bounded or iterations < self._end:
             return
         least = min(residuals[self._looks :], default=self._last)
-        self._end, self._looks = iterations + WINDOW, len(residuals)
+        self._end, self._looks = iterations + STEERING.window, len(residuals)
         left = least / self._last
-        self.damping *= HEAVIER if left > LITTLE else LIGHTER if left < MUCH else 1.0
-        self.damping, self._last = min(self.damping, 1.0), least
+        if left > STEERING.little:
+            self.damping = min(STEERING.heavier * self.damping, 1.0)
+        elif left < STEERING.much:
+            self.damping *= STEERING.lighter
+        self._last = least

@@ -13,8 +13,6 @@ a nonmonotone method needs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pctt.ccp.cone import Array
@@ -29,12 +27,7 @@ SUFFICIENT = 1e-4  # part of the descent that the slope promises
 SHORTEN = (0.1, 0.9)  # a refused step is shortened by a factor between these
 
 
-@dataclass(frozen=True)
-class Spectral(FirstOrder):
-    """Options ``-ccp_spectral_*``."""
-
-
-def solve(problem: ConeProblem, guess: Array, limits: Limits, options: Spectral) -> Result:
+def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder) -> Result:
     """Impulses from a first guess (nc, 3)."""
     scaled = ScaledProblem(problem)
     progress = Progress(scaled, limits, options)

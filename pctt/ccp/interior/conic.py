@@ -11,15 +11,9 @@ spoils v = G' g alone, which the next step mends. With W the scaling of the pair
     dz = G dv + C dg + r_z,    dv = G' dg - r_v,    W^-1 ds + W dz = w - W z.
 
 Late in an iteration W^2 is large along an impulse that slides, and W^2 z, which is s, drowns in rounding when it is
-multiplied out: what each contact would do alone, ds = W w - s, is formed from s instead.
+multiplied out: what each contact would do without the others, ds = W w - s, is formed from s instead.
 
-For Coulomb's law z is that of the De Saxce velocity, (y_n / mu + |y_t|, y_t). Newton's method takes the derivative of
-the opening along: with u = y_t / |y_t|,
-
-    dz = T (G dv + C dg) + r_z,    T = 1 + e_n u',
-
-which adds a term of rank one per contact to the elimination of ds, and makes the Newton systems unsymmetric. (Openings
-that lag behind converge by a fifth per cone problem, each solved exactly.)
+For Coulomb's law z is that of the De Saxce velocity, (y_n / mu + |y_t|, y_t); `slip` has what that adds.
 
 Source: Nesterov and Todd (1997), Mehrotra (1992); Acary, Armand, Nguyen and Shpakovych, "Second-order cone
 programming for frictional contact mechanics using interior point algorithm", Optim. Methods Softw. (2023), for their
@@ -32,28 +26,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cone import TINY, Array, add_opening, dot, tangential, times
+from pctt.ccp.cone import Array, add_opening, times
 from pctt.ccp.interior import lorentz
 from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.interior.lorentz import NesterovTodd
+from pctt.ccp.interior.slip import Slip, sliding_directions
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.log import phase
-from pctt.options import FRACTION, NOT_NEGATIVE, POSITIVE, option
-
-CENTERING = 0.02  # per deviation from the central path
-CLOSER = 0.01  # impulses as unknowns: what a linear solve leaves moves velocities, and they are compared with zero
-SHORT = 0.8  # a step after which the direction is corrected
-CORRECTIONS, FURTHER = 3, 0.3  # at most so many, for a step that goes so much further
-LATE = 1e-2  # natural residual below which second-order terms are renewed, after a step with progress: else that may
-# send impulses off where next to nothing bounds them
-LEAST = 0.01  # part of the complementarity to aim at
-NEAR = 0.1, 10.0  # the central path, in units of the complementarity that is aimed at
-PATIENCE = 3  # iterations without progress before the Newton systems are sharpened
-LONG_PATIENCE, SHARPER = 8, 0.01  # for Coulomb's law: before it stalls; part of the forcing term
-LONGER, LESS = 1.02, 0.7  # a short step, or what a long one leaves of the complementarity, after a correction to keep
+from pctt.options import FRACTION, POSITIVE, option
 
 
 @dataclass(frozen=True)
@@ -62,10 +45,33 @@ class Conic:
 
     start: float = option(30.0, "complementarity of the start, in units of mean(r^2) / mean diag N", check=POSITIVE)
     forcing: float = option(0.3, "residual of a linear solve, as a part of the natural residual", check=POSITIVE)
-    proximal: float = option(
-        1e-9, "compliance within a step, in units of mean diag N; the answer does not have it", check=NOT_NEGATIVE
-    )
     boundary: float = option(0.99, "part of the way to the cone's boundary that a step may go", check=FRACTION)
+
+
+@dataclass(frozen=True)
+class Steering:
+    """Numbers that steer the method; without unit but where one is given. docs/ccp.md has what was measured."""
+
+    proximal: float = 1e-9  #: compliance within a step [mean diag N]: it bounds (B + C)^-1; the answer does not have it
+    #: part of the forcing where impulses are the unknowns: what a solve leaves moves velocities, compared with zero
+    closer: float = 0.01
+    sharper: float = 0.01  #: part of the forcing for Coulomb's law, whose systems are not symmetric
+    centering: float = 0.02  #: part of the complementarity to aim at, per deviation from the central path
+    least: float = 0.01  #: part of the complementarity to aim at in any case
+    near: tuple[float, float] = (0.1, 10.0)  #: what counts as near the central path [complementarity aimed at]
+    short: float = 0.8  #: length of a step whose direction is corrected,
+    corrections: int = 3  #: at most so many times,
+    further: float = 0.3  #: for a step that goes so much further
+    longer: float = 1.02  #: a corrected short step is kept if it is so many times as long,
+    less: float = 0.7  #: a corrected long one if it leaves this part of the complementarity
+    #: natural residual below which long steps are corrected too, after a step with progress: before, that may send
+    #: impulses off where next to nothing bounds them
+    late: float = 1e-2
+    patience: int = 3  #: iterations without progress before the Newton systems are sharpened;
+    patience_with_law: int = 8  #: for Coulomb's law, before the method gives up
+
+
+STEERING = Steering()
 
 
 def solve(
@@ -73,226 +79,287 @@ def solve(
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step. Default
     iteration limit 60."""
-    max_it = limits.max_it if limits.max_it >= 0 else 60
     newton.begin(problem)
     if coulomb and not newton.takes_any:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
-    scale, frictionless = _cone_scale(problem.mu)
-    s, z = _start(problem, guess, scale, frictionless, options, coulomb)
-    v = problem.momentum(s / scale)
-    best, history, patience, last_gap = s / scale, [], 0, np.inf
-    for iteration in range(max_it + 1):
-        g = s / scale
-        r_v, r_z, u = _residuals(problem, g, z, v, scale, frictionless, coulomb)
-        gap = problem.dot(s, z)
-        history.append(problem.natural_residual(g, _velocity(problem, g, frictionless, coulomb)))
-        best = g if history[-1] <= min(history) else best
-        progress = history[-1] <= 0.9 * min(history[:-1], default=np.inf) or gap <= 0.5 * last_gap
-        patience, last_gap = (0 if progress else patience + 1), gap
-        if history[-1] <= limits.tol or iteration == max_it or why_unbounded(problem, g):
-            break
-        if patience > (LONG_PATIENCE if coulomb else PATIENCE):
-            if coulomb or not newton.sharpen():
-                break
-            patience = 0
-        W = NesterovTodd.of(s, z)
-        B, inverse, yielding = _barrier_blocks(problem, W, scale, frictionless, options.proximal)
-        slip = _slip(problem, inverse, u, scale, options.proximal) if coulomb else None
-        newton.update(B, inverse if slip is None else inverse + slip.blocks, symmetric=slip is None)
-        # a residual of v = G' g makes y wrong by G times that
-        tol = options.forcing * history[-1] * problem.norm(g) * np.sqrt(problem.mean_diagonal)
-        tol *= 1.0 if newton.primary == "momenta" else CLOSER
-        tol *= SHARPER if coulomb else 1.0
-        local = Linearised(s, z, r_v, r_z, W, inverse, yielding, scale, frictionless, tol, slip)
-
+    cones = Cones.of(problem, coulomb)
+    at = _start(cones, guess, options)
+    course = Course(cones, limits.tol, limits.max_it if limits.max_it >= 0 else 60)
+    while not course.ends(at, newton):
+        scaled = Scaled.of(cones, at, newton, options, course)
         with phase("ConicPredictor"):
-            ds, dz, dv, x = _direction(problem, newton, local, np.zeros_like(z))
-            reach = min(1.0, _step(problem, s, z, ds, dz))
-            target = max((1.0 - reach) ** 3, _centering(problem, s, z), LEAST) * gap / problem.size
+            predictor = scaled.direction(np.zeros_like(at.z))
+            target = scaled.target(predictor)
         with phase("ConicCorrector"):
-            w = _centred(W, z, ds, dz, target)
-            ds, dz, dv, x = _direction(problem, newton, local, w, x)
-            step = min(1.0, options.boundary * _step(problem, s, z, ds, dz))
-            for _ in range(CORRECTIONS):
-                short = step < SHORT
-                if short:
-                    w = w + _towards_path(W, z, ds, dz, min(1.0, step + FURTHER), target)
-                elif newton.factored and patience == 0 and history[-1] < LATE:  # another solve costs next to nothing
-                    w = _centred(W, z, ds, dz, target)
-                else:
-                    break
-                again = _direction(problem, newton, local, w, x)
-                longer = min(1.0, options.boundary * _step(problem, s, z, *again[:2]))
-                if short and longer < LONGER * step:
-                    break
-                if not short and _left(problem, s, z, longer, *again) > LESS * _left(problem, s, z, step, ds, dz):
-                    break
-                step, (ds, dz, dv, x) = longer, again
+            direction, step = _corrected(scaled, predictor, target, course)
         if step > 0:
-            s, z, v = s + step * ds, z + step * dz, v + step * dv
-    status, words = Status.STALLED, f"stalled after {iteration} iterations"
-    if history[-1] <= limits.tol:
-        status, words = Status.CONVERGED, "natural residual below the tolerance"
-    elif iteration == max_it:
-        status, words = Status.ITERATION_LIMIT, f"{max_it} iterations"
-    return Result(best, status, words, min(history), iteration, newton.ksp_its, newton.fallbacks, history)
+            at = at.moved(direction, step)
+    return course.result(newton)
 
 
-def _cone_scale(mu: Array) -> tuple[Array, Array]:
-    """(mu, 1, 1) per contact (nc, 3), and which contacts have no friction: their normal is kept as it is, and their
-    tangential part, which the problem does not have, is held at zero."""
-    scale = np.ones((len(mu), 3))
-    frictionless = mu == 0
-    scale[:, 0] = np.where(frictionless, 1.0, mu)
-    return scale, frictionless
-
-
-def _velocity(problem: ConeProblem, g: Array, frictionless: Array, coulomb: bool) -> Array:
-    """y = N g + r but for the sliding of contacts without friction, which no impulse answers; for Coulomb's law with
-    its opening."""
-    y = problem.product(g) + problem.r
-    y[frictionless, 1:] = 0.0
-    return add_opening(y, problem.mu) if coulomb else y
-
-
-def _residuals(
-    problem: ConeProblem, g: Array, z: Array, v: Array, scale: Array, frictionless: Array, coulomb: bool
-) -> tuple[Array, Array, Array]:
-    """r_v = v - G' g, r_z = y / scale - z, y with its opening for Coulomb's law, and the directions (nc, 3) in which
-    contacts slide."""
-    y = problem.velocity_of(v) + problem.compliance * g + problem.r
-    y[frictionless, 1:] = 0.0
-    u = y / np.maximum(np.maximum(tangential(y), z[:, 0]), TINY)[:, None]  # short where y_t may turn: a contact sticks
-    u[:, 0] = 0.0
-    if coulomb:
-        add_opening(y, problem.mu)
-    return v - problem.momentum(g), y / scale - z, u
-
-
-class Slip(NamedTuple):
-    """What the derivative of the opening does to an iteration of Coulomb's law.
-
-    In the scaled variables ds = X (c - r_z - T G dv) with X^-1 = W^-2 + e T, e the compliance. With Y^-1 = W^-2 + e
-    this is X = (1 - e p u'/ d) Y and X T = Y + p (u - e Y u)' / d, where p = Y e_n, d = 1 + e u'p.
-    """
-
-    u: Array  #: (nc, 3) direction in which a contact slides
-    p: Array  #: (nc, 3)
-    less: Array  #: (nc, 1) e / d
-    blocks: Array  #: (nc, 3, 3) X T - Y
-
-
-def _slip(problem: ConeProblem, inverse: Array, u: Array, scale: Array, proximal: float) -> Slip:
-    give = problem.compliance[:, 1:2] + proximal * problem.mean_diagonal
-    p = scale[:, :1] * inverse[:, :, 0]
-    d = 1.0 + give * dot(u, p)[:, None]
-    q = (u - give * times(inverse, u)) / d
-    return Slip(u, p, give / d, p[:, :, None] * q[:, None, :])
-
-
-def _start(
-    problem: ConeProblem, guess: Array, scale: Array, frictionless: Array, options: Conic, coulomb: bool
-) -> tuple[Array, Array]:
-    """A pair on the central path near the guess: s - tau z = s_0 - tau z_0."""
-    guess = no_larger_than_useful(problem, guess)
-    s, z = guess * scale, _velocity(problem, guess, frictionless, coulomb) / scale
-    s[frictionless, 1:] = 0.0
-    diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2
-    tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
-    closing = problem.dot(problem.r, problem.r) / problem.size
-    amount = options.start * closing / problem.mean_diagonal
-    return lorentz.central_pair(s - tau[:, None] * z, tau, amount)
-
-
-class Linearised(NamedTuple):
-    """What the directions of an iteration share: the pair, its residuals and scaling, (B + C)^-1 and, in the scaled
-    variables, (B + C)^-1 B, the cones' scale, how accurately to solve, and what Coulomb's law adds."""
+class Point(NamedTuple):
+    """An iterate: scaled impulses and velocities (nc, 3) inside the cones, mass-scaled momenta."""
 
     s: Array
     z: Array
+    v: Array
+
+    def moved(self, d: Direction, step: float) -> Point:
+        return Point(self.s + step * d.ds, self.z + step * d.dz, self.v + step * d.dv)
+
+
+class Direction(NamedTuple):
+    """A change of a `Point`, and the Newton system's solution ``x`` that it was made from."""
+
+    ds: Array
+    dz: Array
+    dv: Array
+    x: Array
+
+
+@dataclass(frozen=True)
+class Cones:
+    """The problem in the scaled variables s = scale g, z = y / scale.
+
+    scale : (nc, 3) mu, 1, 1 per contact; 1, 1, 1 without friction
+    frictionless : (nc,) contacts whose tangential part, which the problem does not have, is held at zero
+    coulomb : whether velocities have the opening of Coulomb's law
+    """
+
+    problem: ConeProblem
+    scale: Array
+    frictionless: Array
+    coulomb: bool
+
+    @classmethod
+    def of(cls, problem: ConeProblem, coulomb: bool) -> Cones:
+        scale, frictionless = np.ones((problem.mu.size, 3)), problem.mu == 0
+        scale[:, 0] = np.where(frictionless, 1.0, problem.mu)
+        return cls(problem, scale, frictionless, coulomb)
+
+    def velocity(self, g: Array) -> Array:
+        """y = N g + r but for the sliding of contacts without friction, which no impulse answers; for Coulomb's law
+        with its opening."""
+        y = self.problem.product(g) + self.problem.r
+        y[self.frictionless, 1:] = 0.0
+        return add_opening(y, self.problem.mu) if self.coulomb else y
+
+    def residuals(self, at: Point) -> tuple[Array, Array, Array]:
+        """r_v = v - G' g, r_z = y / scale - z with y from v, and the directions (nc, 3) in which contacts slide."""
+        problem, g = self.problem, at.s / self.scale
+        y = problem.velocity_of(at.v) + problem.compliance * g + problem.r
+        y[self.frictionless, 1:] = 0.0
+        u = sliding_directions(y, at.z[:, 0])
+        if self.coulomb:
+            add_opening(y, problem.mu)
+        return at.v - problem.momentum(g), y / self.scale - at.z, u
+
+
+class Course:
+    """What is known of the iterations so far, and when they end.
+
+    history : natural residual of every iterate
+    waited : iterations without progress
+    """
+
+    def __init__(self, cones: Cones, tol: float, max_it: int):
+        self._cones, self._tol, self._max_it = cones, tol, max_it
+        self._patience = STEERING.patience_with_law if cones.coulomb else STEERING.patience
+        self.history: list[float] = []
+        self.waited, self._last_gap = 0, np.inf
+
+    @property
+    def residual(self) -> float:
+        return self.history[-1]
+
+    def ends(self, at: Point, newton: Newton) -> bool:
+        """Note an iterate; whether it is the last. Without progress the Newton systems are sharpened, once."""
+        problem, g = self._cones.problem, at.s / self._cones.scale
+        gap = problem.dot(at.s, at.z)
+        residual = problem.natural_residual(g, self._cones.velocity(g))
+        if not self.history or residual <= min(self.history):
+            self._best = g
+        progress = residual <= 0.9 * min(self.history, default=np.inf) or gap <= 0.5 * self._last_gap
+        self.waited, self._last_gap = (0 if progress else self.waited + 1), gap
+        self.history.append(residual)
+        if residual <= self._tol or len(self.history) > self._max_it or why_unbounded(problem, g):
+            return True
+        if self.waited > self._patience:
+            if self._cones.coulomb or not newton.sharpen():
+                return True
+            self.waited = 0
+        return False
+
+    def result(self, newton: Newton) -> Result:
+        """The best iterate, and why it was the last."""
+        iterations = len(self.history) - 1
+        status, words = Status.STALLED, f"stalled after {iterations} iterations"
+        if self.residual <= self._tol:
+            status, words = Status.CONVERGED, "natural residual below the tolerance"
+        elif iterations == self._max_it:
+            status, words = Status.ITERATION_LIMIT, f"{self._max_it} iterations"
+        least = min(self.history)
+        return Result(self._best, status, words, least, iterations, newton.ksp_its, newton.fallbacks, self.history)
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """An iteration's linear equations, which all its directions share.
+
+    at, r_v, r_z : the iterate and its residuals
+    W : scaling of the pair
+    inverse, barrier_share : (nc, 3, 3) (B + C)^-1 and, in the scaled variables, (B + C)^-1 B
+    slip : what Coulomb's law adds
+    tol : residual to which Newton systems are solved
+    boundary : part of the way to the boundary that a step may go
+    """
+
+    cones: Cones
+    newton: Newton
+    at: Point
     r_v: Array
     r_z: Array
     W: NesterovTodd
     inverse: Array
-    yielding: Array
-    scale: Array
-    frictionless: Array
-    tol: float
+    barrier_share: Array
     slip: Slip | None
+    tol: float
+    boundary: float
+
+    @classmethod
+    def of(cls, cones: Cones, at: Point, newton: Newton, options: Conic, course: Course) -> Scaled:
+        """Scaling and residuals of an iterate; the Newton systems get its matrix."""
+        problem = cones.problem
+        r_v, r_z, u = cones.residuals(at)
+        W = NesterovTodd.of(at.s, at.z)
+        B, inverse, barrier_share = _barrier_blocks(cones, W)
+        slip = None
+        if cones.coulomb:
+            compliance = problem.compliance[:, 1:2] + STEERING.proximal * problem.mean_diagonal
+            slip = Slip.of(inverse, u, cones.scale, compliance)
+        newton.update(B, inverse if slip is None else inverse + slip.blocks, symmetric=slip is None)
+        # a residual of v = G' g makes y wrong by G times that
+        tol = options.forcing * course.residual * problem.norm(at.s / cones.scale) * np.sqrt(problem.mean_diagonal)
+        tol *= 1.0 if newton.primary == "momenta" else STEERING.closer
+        tol *= STEERING.sharper if cones.coulomb else 1.0
+        return cls(cones, newton, at, r_v, r_z, W, inverse, barrier_share, slip, tol, options.boundary)
+
+    def direction(self, w: Array, start: Array | None = None) -> Direction:
+        """The direction of the right-hand side w; ``start``: an earlier solution of the Newton system."""
+        problem, newton, scale = self.cones.problem, self.newton, self.cones.scale
+        c = self.W.divide(w) - self.at.z
+        uncoupled = times(self.barrier_share, self.W.times(w) - self.at.s)
+        uncoupled /= scale
+        uncoupled -= times(self.inverse, self.r_z * scale)
+        if self.slip is not None:
+            self.slip.reduce(uncoupled)
+        dg, x = newton.solve((c - self.r_z) * scale, self.tol, self.r_v, start, uncoupled)
+        dv = newton.momentum(x, dg, self.r_v)
+        ds = dg * scale
+        if newton.primary == "momenta":  # r_z vanishes, r_v takes the error of the linear solve
+            dz = (problem.velocity_of(dv) + problem.compliance * dg) / scale
+            if self.slip is not None:
+                self.slip.open(dz)
+            dz += self.r_z
+        else:  # r_v vanishes, r_z takes it
+            dz = c - self.W.divide(self.W.divide(ds))
+        dz[self.cones.frictionless, 1:] = ds[self.cones.frictionless, 1:] = 0.0
+        return Direction(ds, dz, dv, x)
+
+    def reach(self, d: Direction) -> float:
+        """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""
+        problem = self.cones.problem
+        here = min(lorentz.step_to_boundary(self.at.s, d.ds), lorentz.step_to_boundary(self.at.z, d.dz))
+        longest = problem.min(here)
+        return longest if np.isfinite(problem.sum(float(d.ds.sum() + d.dz.sum()))) else 0.0
+
+    def step(self, d: Direction) -> float:
+        """The step to take, at most 1 and not up to the boundary."""
+        return min(1.0, self.boundary * self.reach(d))
+
+    def left(self, d: Direction, step: float) -> float:
+        """Complementarity after a step."""
+        return self.cones.problem.dot(self.at.s + step * d.ds, self.at.z + step * d.dz)
+
+    def target(self, predictor: Direction) -> float:
+        """The complementarity of a contact to aim at: the further the predictor may go, the less (Mehrotra)."""
+        problem = self.cones.problem
+        part = max((1.0 - min(1.0, self.reach(predictor))) ** 3, _centering(problem, self.at), STEERING.least)
+        return part * problem.dot(self.at.s, self.at.z) / problem.size
+
+    def centred(self, d: Direction, target: float) -> Array:
+        """The w of a direction that aims at s o z = target e, with the second-order term of the last direction."""
+        aim = -lorentz.product(self.W.divide(d.ds), self.W.times(d.dz))
+        aim[:, 0] += target
+        return lorentz.divide(self.W.times(self.at.z), aim)
+
+    def towards_path(self, d: Direction, reach: float, target: float) -> Array:
+        """What to add to w so that the eigenvalues of s o z, ``reach`` along the direction, come near the target.
+
+        Source: Gondzio (1996), multiple centrality corrections; here with the eigenvalues of second-order cones."""
+        centre = self.W.times(self.at.z)
+        after = lorentz.product(centre + reach * self.W.divide(d.ds), centre + reach * self.W.times(d.dz))
+        low, high = STEERING.near
+        return lorentz.divide(centre, lorentz.towards_interval(after, low * target, high * target))
 
 
-def _direction(
-    problem: ConeProblem, newton: Newton, at: Linearised, w: Array, start: Array | None = None
-) -> tuple[Array, Array, Array, Array]:
-    """ds, dz, dv and the Newton system's solution for the right-hand side w; ``start``: an earlier solution."""
-    c = at.W.divide(w) - at.z
-    alone = times(at.yielding, at.W.times(w) - at.s)
-    alone /= at.scale
-    alone -= times(at.inverse, at.r_z * at.scale)
-    if at.slip is not None:
-        alone -= at.slip.p * (at.slip.less * dot(at.slip.u, alone)[:, None])
-    dg, x = newton.solve((c - at.r_z) * at.scale, at.tol, at.r_v, start, alone)
-    dv = newton.momentum(x, dg, at.r_v)
-    ds = dg * at.scale
-    if newton.primary == "momenta":  # r_z vanishes, r_v takes the error of the linear solve
-        dz = (problem.velocity_of(dv) + problem.compliance * dg) / at.scale
-        if at.slip is not None:
-            dz[:, 0] += dot(at.slip.u, dz)
-        dz += at.r_z
-    else:  # r_v vanishes, r_z takes it
-        dz = c - at.W.divide(at.W.divide(ds))
-    dz[at.frictionless, 1:] = ds[at.frictionless, 1:] = 0.0
-    return ds, dz, dv, x
+def _corrected(scaled: Scaled, predictor: Direction, target: float, course: Course) -> tuple[Direction, float]:
+    """Mehrotra's corrector and the length of its step; then further corrections, as long as they pay: of a direction
+    that the cones cut short, and late of a long one, where another solve costs next to nothing."""
+    w = scaled.centred(predictor, target)
+    direction = scaled.direction(w, predictor.x)
+    step = scaled.step(direction)
+    for _ in range(STEERING.corrections):
+        short = step < STEERING.short
+        if short:
+            w = w + scaled.towards_path(direction, min(1.0, step + STEERING.further), target)
+        elif scaled.newton.factored and course.waited == 0 and course.residual < STEERING.late:
+            w = scaled.centred(direction, target)
+        else:
+            break
+        other = scaled.direction(w, direction.x)
+        longer = scaled.step(other)
+        if short and longer < STEERING.longer * step:
+            break
+        if not short and scaled.left(other, longer) > STEERING.less * scaled.left(direction, step):
+            break
+        direction, step = other, longer
+    return direction, step
 
 
-def _barrier_blocks(
-    problem: ConeProblem, W: NesterovTodd, scale: Array, frictionless: Array, proximal: float
-) -> tuple[Array, Array, Array]:
+def _start(cones: Cones, guess: Array, options: Conic) -> Point:
+    """A pair on the central path near the guess: s - tau z = s_0 - tau z_0."""
+    problem, scale = cones.problem, cones.scale
+    guess = no_larger_than_useful(problem, guess)
+    s, z = guess * scale, cones.velocity(guess) / scale
+    s[cones.frictionless, 1:] = 0.0
+    diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2
+    tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
+    closing = problem.dot(problem.r, problem.r) / problem.size
+    amount = options.start * closing / problem.mean_diagonal
+    s, z = lorentz.central_pair(s - tau[:, None] * z, tau, amount)
+    return Point(s, z, problem.momentum(s / scale))
+
+
+def _barrier_blocks(cones: Cones, W: NesterovTodd) -> tuple[Array, Array, Array]:
     """B, (B + C)^-1 and, in the scaled variables, (B + C)^-1 B (nc, 3, 3)."""
     with phase("CCPBarrier"):
-        soft = proximal * problem.mean_diagonal
-        give = problem.compliance[:, 1] + soft  # the same along all axes of the scaled variables
-        B, inverse, yielding = W.barrier_blocks(scale, give, soft)
-        if frictionless.any():
-            stiff = 1e12 * np.maximum(B[frictionless, 0, 0], problem.mean_diagonal)
-            B[frictionless, 1, 1] = B[frictionless, 2, 2] = stiff
-            for blocks in (inverse, yielding):
-                blocks[frictionless, 1:] = blocks[frictionless, :, 1:] = 0.0
-        return B, inverse, yielding
+        problem, free = cones.problem, cones.frictionless
+        proximal = STEERING.proximal * problem.mean_diagonal
+        compliance = problem.compliance[:, 1] + proximal  # the same along all axes of the scaled variables
+        B, inverse, barrier_share = W.barrier_blocks(cones.scale, compliance, proximal)
+        if free.any():
+            B[free, 1, 1] = B[free, 2, 2] = 1e12 * np.maximum(B[free, 0, 0], problem.mean_diagonal)
+            for blocks in (inverse, barrier_share):
+                blocks[free, 1:] = blocks[free, :, 1:] = 0.0
+        return B, inverse, barrier_share
 
 
-def _centred(W: NesterovTodd, z: Array, ds: Array, dz: Array, target: float) -> Array:
-    """The w of a direction that aims at s o z = target e, with the second-order term of the last direction."""
-    aim = -lorentz.product(W.divide(ds), W.times(dz))
-    aim[:, 0] += target
-    return lorentz.divide(W.times(z), aim)
-
-
-def _towards_path(W: NesterovTodd, z: Array, ds: Array, dz: Array, reach: float, target: float) -> Array:
-    """What to add to w so that the eigenvalues of s o z, ``reach`` along the direction, come near the target.
-
-    Source: Gondzio (1996), multiple centrality corrections; here with the eigenvalues of second-order cones."""
-    centre = W.times(z)
-    after = lorentz.product(centre + reach * W.divide(ds), centre + reach * W.times(dz))
-    return lorentz.divide(centre, lorentz.towards_interval(after, NEAR[0] * target, NEAR[1] * target))
-
-
-def _centering(problem: ConeProblem, s: Array, z: Array) -> float:
+def _centering(problem: ConeProblem, at: Point) -> float:
     """The least part of the complementarity to aim at: more, the further the pair is off the central path. On it s o
     z has no tangential part; off it the sliding directions of impulse and velocity differ by an angle that falls like
     the root of the complementarity only."""
-    turned = lorentz.product(s, z)
+    turned = lorentz.product(at.s, at.z)
     off = problem.norm(turned[:, 1:]) / max(problem.norm(turned[:, 0]), 1e-300)
-    return min(CENTERING * off, 0.5)
-
-
-def _left(problem: ConeProblem, s: Array, z: Array, step: float, ds: Array, dz: Array, *_: Array) -> float:
-    """Complementarity after a step."""
-    return problem.dot(s + step * ds, z + step * dz)
-
-
-def _step(problem: ConeProblem, s: Array, z: Array, ds: Array, dz: Array) -> float:
-    """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""
-    longest = problem.min(min(lorentz.step_to_boundary(s, ds), lorentz.step_to_boundary(z, dz)))
-    return longest if np.isfinite(problem.sum(float(ds.sum() + dz.sum()))) else 0.0
+    return min(STEERING.centering * off, 0.5)

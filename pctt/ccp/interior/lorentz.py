@@ -137,17 +137,17 @@ def unscale(root: Array, eta: Array, x: Array) -> Array:
 
 @compiled
 def barrier_blocks(
-    direction: Array, eta: Array, spread: Array, scale: Array, give: Array, soft: float
+    direction: Array, eta: Array, spread: Array, scale: Array, compliance: Array, proximal: float
 ) -> tuple[Array, Array, Array]:
     """What the method of ``NesterovTodd`` returns."""
     square = eta * eta
     squares = square * spread**2, square / spread**2, square
     both = scale[:, :, None] * scale[:, None, :]
-    B = _blocks(direction, *(1.0 / k + soft for k in squares))
+    B = _blocks(direction, *(1.0 / k + proximal for k in squares))
     B *= both
-    inverse = _blocks(direction, *(k / (1.0 + give * k) for k in squares))
+    inverse = _blocks(direction, *(k / (1.0 + compliance * k) for k in squares))
     inverse /= both
-    return B, inverse, _blocks(direction, *(1.0 / (1.0 + give * k) for k in squares))
+    return B, inverse, _blocks(direction, *(1.0 / (1.0 + compliance * k) for k in squares))
 
 
 def _blocks(direction: Array, along: Array, against: Array, across: Array) -> Array:
@@ -203,10 +203,10 @@ class NesterovTodd:
         """W^-1 x."""
         return unscale(self.root, self.eta, x)
 
-    def barrier_blocks(self, scale: Array, give: Array, soft: float) -> tuple[Array, Array, Array]:
-        """Of B = W^-2 + soft and the compliance C + soft = ``give``, a number per contact: with S = diag ``scale``
-        S B S, S^-1 (B + C)^-1 S^-1 and (B + C)^-1 B, (nc, 3, 3) each.
+    def barrier_blocks(self, scale: Array, compliance: Array, proximal: float) -> tuple[Array, Array, Array]:
+        """Of B = W^-2 + ``proximal`` and C + ``proximal``, which is ``compliance``, a number per contact: S B S,
+        S^-1 (B + C)^-1 S^-1 and (B + C)^-1 B, (nc, 3, 3) each, with S = diag ``scale``.
 
         From the spectral form, no tiny block is inverted: W^2 has the eigenvalues (eta spread)^2, (eta / spread)^2 and
         eta^2 for (1, u), (1, -u) and (0, u')."""
-        return barrier_blocks(self.direction, self.eta, self.spread, scale, give, soft)
+        return barrier_blocks(self.direction, self.eta, self.spread, scale, compliance, proximal)

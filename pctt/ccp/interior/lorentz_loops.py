@@ -107,23 +107,24 @@ def unscale(root, eta, x):
 
 
 @loop
-def barrier_blocks(direction, eta, spread, scale, give, soft):
+def barrier_blocks(direction, eta, spread, scale, compliance, proximal):
     count = len(eta)
-    B, inverse, yielding = np.empty((count, 3, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3))
+    B, inverse, share = np.empty((count, 3, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3))
     for c in range(count):
         square = eta[c] * eta[c]
         along, against = square * (spread[c] * spread[c]), square / (spread[c] * spread[c])
         u, v = direction[c, 0], direction[c, 1]
-        _block(u, v, 1.0 / along + soft, 1.0 / against + soft, 1.0 / square + soft, B[c])
-        yields = 1.0 / (1.0 + give[c] * along), 1.0 / (1.0 + give[c] * against), 1.0 / (1.0 + give[c] * square)
-        _block(u, v, along * yields[0], against * yields[1], square * yields[2], inverse[c])
-        _block(u, v, yields[0], yields[1], yields[2], yielding[c])
+        _block(u, v, 1.0 / along + proximal, 1.0 / against + proximal, 1.0 / square + proximal, B[c])
+        e = compliance[c]
+        shares = 1.0 / (1.0 + e * along), 1.0 / (1.0 + e * against), 1.0 / (1.0 + e * square)
+        _block(u, v, along * shares[0], against * shares[1], square * shares[2], inverse[c])
+        _block(u, v, shares[0], shares[1], shares[2], share[c])
         for i in range(3):
             for j in range(3):
                 both = scale[c, i] * scale[c, j]
                 B[c, i, j] *= both
                 inverse[c, i, j] /= both
-    return B, inverse, yielding
+    return B, inverse, share
 
 
 @loop

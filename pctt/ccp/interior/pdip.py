@@ -33,19 +33,6 @@ from pctt.ccp.result import Limits, Result, Status
 from pctt.log import phase
 from pctt.options import FRACTION, POSITIVE, option
 
-RTOL = 1e-3  # of the linear solves, where ``-ksp_rtol`` does not say otherwise
-FORCING = 0.03  # and what they may leave of velocities, as a part of what the natural residual shows
-STUCK = 0.1  # a step after which the next only centres
-LATE = 1e-3  # natural residual below which S has a proximal term: before, impulses may have to grow by orders
-CUT = 0.3  # a step after which it grows,
-WHOLE = 0.7  # and one after which it falls,
-FACTOR = 4.0  # by this factor,
-DAMPING = (1.0, 4.0)  # from and to this part of the natural residual, times mean diag N
-SHORT = 0.5  # a step whose direction is corrected,
-FURTHER = 0.3  # for one that goes so much further
-BENT = 100.0  # unless the terms of second order enlarge the right-hand side so much: no correction then helps
-LONGER = 1.2  # a corrected step that is worth taking, as a part of the other
-
 
 @dataclass(frozen=True)
 class PDIP:
@@ -66,6 +53,29 @@ class PDIP:
     start: float = option(
         10.0, "normal impulse of new contacts, in units of rms(r) / mean diag N", check=POSITIVE
     )
+
+
+@dataclass(frozen=True)
+class Steering:
+    """Numbers that steer the method, without unit; docs/ccp.md has what was measured."""
+
+    rtol: float = 1e-3  #: of the linear solves, where ``-ksp_rtol`` does not say otherwise,
+    forcing: float = 0.03  #: and what they may leave of velocities, as a part of what the natural residual shows
+    stuck: float = 0.1  #: a step after which the next only centres
+    #: natural residual below which S has a proximal term: before, impulses may have to grow by orders
+    late: float = 1e-3
+    cut: float = 0.3  #: a step after which it grows,
+    whole: float = 0.7  #: and one after which it falls,
+    factor: float = 4.0  #: by this factor,
+    damping: tuple[float, float] = (1.0, 4.0)  #: from and to this part of the natural residual, times mean diag N
+    short: float = 0.5  #: a step whose direction is corrected,
+    further: float = 0.3  #: for one that goes so much further
+    #: unless the terms of second order enlarge the right-hand side so much: no correction then helps
+    bent: float = 100.0
+    longer: float = 1.2  #: a corrected step that is worth taking, as a part of the other
+
+
+STEERING = Steering()
 
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, newton: Newton) -> Result:
@@ -89,20 +99,12 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
             status, reason = Status.ITERATION_LIMIT, f"{max_it} Newton steps"
             break
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
-        centering = options.centering if step > STUCK else 1.0
+        centering = options.centering if step > STEERING.stuck else 1.0
         aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         at = Linearised(g, lam, y, f, df, hessian, aim)
         damping = _next_damping(damping, step, history[-1])
-        newton.update(_barrier_blocks(cone, at, damping * min(history[-1], LATE) * problem.mean_diagonal))
-        tol = _accuracy(problem, at, history[-1])
-        dg, dlam, x = _direction(problem, newton, at, tol)
-        step = _step_length(problem, cone, at, dg, dlam, options)
-        bend = _bend(at, dg, dlam, min(1.0, step + FURTHER)) if step < SHORT else None
-        if bend is not None and problem.norm(_right_side(at, bend)) < BENT * problem.norm(_right_side(at)):
-            other_dg, other_dlam, _ = _direction(problem, newton, at, tol, bend, x)
-            other = _step_length(problem, cone, at, other_dg, other_dlam, options)
-            if other > LONGER * step:
-                step, dg, dlam = other, other_dg, other_dlam
+        newton.update(_barrier_blocks(cone, at, damping * min(history[-1], STEERING.late) * problem.mean_diagonal))
+        step, dg, dlam = _corrected(problem, newton, cone, at, _accuracy(problem, at, history[-1]), options)
         if not step > 1e-10:
             status, reason = Status.STALLED, "steps became too short"
             if step != step:
@@ -132,7 +134,8 @@ def _accuracy(problem: ConeProblem, at: Linearised, residual: float) -> float:
     What a solve leaves are velocities. They must not be more than a part of those that the natural residual stands for:
     complementarity would fall without them, and near the boundary no step makes up for that."""
     shown = residual * problem.norm(at.g) * problem.mean_diagonal
-    return min(RTOL * problem.norm(_right_side(at)), FORCING * shown) / float(np.sqrt(problem.mean_diagonal))
+    left = min(STEERING.rtol * problem.norm(_right_side(at)), STEERING.forcing * shown)
+    return left / float(np.sqrt(problem.mean_diagonal))
 
 
 def _next_damping(damping: float, step: float, residual: float) -> float:
@@ -141,17 +144,35 @@ def _next_damping(damping: float, step: float, residual: float) -> float:
     Forces that hold each other move no body, so nothing but the barrier answers for them: directions along them are
     long, leave the cones at once, and cut the rest of the step short. The proximal term makes those short; of
     velocities it leaves rho dg, less than what the natural residual shows."""
-    if residual > LATE:
+    if residual > STEERING.late:
         return 0.0
-    if step < CUT:
-        return float(np.clip(FACTOR * damping, *DAMPING))
-    return damping / FACTOR if step > WHOLE else damping
+    if step < STEERING.cut:
+        return float(np.clip(STEERING.factor * damping, *STEERING.damping))
+    return damping / STEERING.factor if step > STEERING.whole else damping
 
 
 def _right_side(at: Linearised, bend: tuple[Array, Array] | None = None) -> Array:
     """Of the Newton system, with the terms of second order ``bend``."""
     curved, missed = bend or (0.0, 0.0)
     return ((at.barrier + missed) / at.f)[:, None] * at.df - at.y - curved
+
+
+def _corrected(
+    problem: ConeProblem, newton: Newton, cone: Perspective | Quadratic, at: Linearised, tol: float, options: PDIP
+) -> tuple[float, Array, Array]:
+    """The step to take, and the direction dg, dlam: Newton's, corrected once where the cones' curvature cuts it short
+    and that pays."""
+    dg, dlam, x = _direction(problem, newton, at, tol)
+    step = _step_length(problem, cone, at, dg, dlam, options)
+    if not step < STEERING.short:
+        return step, dg, dlam
+    bend = _bend(at, dg, dlam, min(1.0, step + STEERING.further))
+    if problem.norm(_right_side(at, bend)) < STEERING.bent * problem.norm(_right_side(at)):
+        other_dg, other_dlam, _ = _direction(problem, newton, at, tol, bend, x)
+        other = _step_length(problem, cone, at, other_dg, other_dlam, options)
+        if other > STEERING.longer * step:
+            return other, other_dg, other_dlam
+    return step, dg, dlam
 
 
 def _direction(

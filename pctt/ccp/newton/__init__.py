@@ -12,25 +12,24 @@ preconditioners stay from one cone problem to the next, and matrices too where t
 
 from __future__ import annotations
 
-from typing import Union
+from collections.abc import Callable
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.ccp.cone import Array
-from pctt.ccp.newton.asked_for import AskedFor
-from pctt.ccp.newton.body import BodySystem
-from pctt.ccp.newton.cheapest import Cheapest
+from pctt.ccp.newton.body import BodyForm
+from pctt.ccp.newton.body_ladder import BodyLadder
 from pctt.ccp.newton.compare import Comparison
-from pctt.ccp.newton.contact import ContactSystem
-from pctt.ccp.newton.kkt import KKTSystem
+from pctt.ccp.newton.contact import ContactForm
+from pctt.ccp.newton.kkt import KKTForm
+from pctt.ccp.newton.protocols import LinearSolver, NewtonForm
+from pctt.ccp.newton.users_solver import UsersSolver
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase
 
-Linear = Union[AskedFor, Cheapest]
-System = Union[ContactSystem, KKTSystem, BodySystem]
-FORMS: dict[str, type[System]] = {"contact": ContactSystem, "kkt": KKTSystem, "body": BodySystem}
+FORMS: dict[str, Callable[[ConeProblem], NewtonForm]] = {"contact": ContactForm, "kkt": KKTForm, "body": BodyForm}
 _ASKED = {"pc_type", "ksp_type"}  # options that say how a system is to be solved
 SHARP_LIMIT = 50_000  # contacts: above, factors of the kkt system take too much memory
 DEFAULTS = {
@@ -48,17 +47,17 @@ class Newton:
 
     Attributes
     ----------
-    ksp_its, fallbacks : of the present problem: Krylov iterations, systems not solved as asked for
+    ksp_its, fallbacks : of the present problem: Krylov iterations, systems not solved by the user's KSP
     memory : what a method keeps here for the next problem (`auto`); None at first
     """
 
     def __init__(self, comm: MPI.Comm, form: str = "contact", compare: Comparison | None = None):
         self.comm, self.form, self.compare = comm, form, compare
         self.memory: object = None
-        self.system: System | None = None
+        self.system: NewtonForm | None = None
         self._present = form
         self._structure: tuple | None = None
-        self._linear: dict[str, Linear] = {}
+        self._linear: dict[str, LinearSolver] = {}
 
     def begin(self, problem: ConeProblem) -> None:
         """Take the next problem; its structure is kept where contacts and bodies are those of the last."""
@@ -91,14 +90,14 @@ class Newton:
         self._x, self._b = self.system.matrix.createVecs()
 
     @property
-    def linear(self) -> Linear:
+    def linear(self) -> LinearSolver:
         """What solves the systems of the present form."""
         form = self._present
         if form not in self._linear:
             own_ladder = form == "body" and self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
             prefix = "" if form == self.form else f"{form}_"
-            asked = AskedFor(self.comm, DEFAULTS[form], self.compare if form == self.form else None, prefix)
-            self._linear[form] = Cheapest(self.comm) if own_ladder else asked
+            users = UsersSolver(self.comm, DEFAULTS[form], self.compare if form == self.form else None, prefix)
+            self._linear[form] = BodyLadder(self.comm) if own_ladder else users
         return self._linear[form]
 
     @property
@@ -127,18 +126,14 @@ class Newton:
     @property
     def takes_any(self) -> bool:
         """Whether the present systems may be unsymmetric."""
-        return self._present == "body" and isinstance(self.linear, Cheapest)
+        return self._present == "body" and self.linear.takes_any
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
         """New barrier blocks B (nc, 3, 3); ``inverse`` is (B + C)^-1 where the caller knows it better. Blocks that are
         not ``symmetric`` are for systems that take any (`takes_any`)."""
         with phase("CCPUpdate"):
             assert self.system is not None
-            if symmetric:
-                self.system.update(barrier, inverse)
-            else:
-                assert isinstance(self.system, BodySystem)
-                self.system.update(barrier, inverse, symmetric=False)
+            self.system.update(barrier, inverse, symmetric)
             self.linear.new_matrix(self.system)
 
     def solve(
@@ -147,14 +142,14 @@ class Newton:
         tol: float,
         r_v: Array | None = None,
         start: Array | None = None,
-        alone: Array | None = None,
+        uncoupled: Array | None = None,
     ) -> tuple[Array, Array]:
         """dg (nc, 3) and the system's solution x, to a residual of ``tol`` (sqrt J: of momenta; of velocities times
-        the root of the mean diagonal of N). ``start`` is an earlier x to begin from; ``alone`` is (B + C)^-1 q where
-        the caller knows it better."""
+        the root of the mean diagonal of N). ``start`` is an earlier x to begin from; ``uncoupled`` is (B + C)^-1 q,
+        what each contact would do without the others, where the caller knows it better."""
         with phase("CCPKrylov"):
             assert self.system is not None
-            b = self.system.right_hand_side(q, r_v, alone)
+            b = self.system.right_hand_side(q, r_v, uncoupled)
             x = np.zeros_like(b)
             if start is not None:
                 self._x.array[:] = x = start.copy()
@@ -162,7 +157,7 @@ class Newton:
                 b = b - self._b.array
             wanted = self.system.tolerance(tol)
             x += self._solve(b, wanted)
-            return self.system.impulses(x, q, alone), x
+            return self.system.impulses(x, q, uncoupled), x
 
     def _solve(self, b: Array, wanted: float) -> Array:
         """x with a residual of norm ``wanted``."""

@@ -13,15 +13,15 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
+from pctt.body_matrix import BodyOperator
 from pctt.ccp.cone import Array, times
 from pctt.ccp.problem import ConeProblem
-from pctt.pc.body_operator import BodyOperator
 
 LEAST = 0.1  # of the mass: entries of a block between bodies that a factor is better off without
 
 
-class BodySystem:
-    """See the module; the same members as `ContactSystem`."""
+class BodyForm:
+    """The `NewtonForm` of the module."""
 
     def __init__(self, problem: ConeProblem):
         if problem.contact_map is None:
@@ -61,15 +61,14 @@ class BodySystem:
         """What is worth factorising of K, in scalar rows."""
         return self.operator.entries().stiff_part(LEAST, scalar=True, symmetric=self.symmetric)
 
-    def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
-        """``alone`` is (B + C)^-1 q where the caller knows it better."""
-        push = self.problem.momentum(times(self._inverse, q) if alone is None else alone)
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
+        push = self.problem.momentum(times(self._inverse, q) if uncoupled is None else uncoupled)
         return push if r_v is None else push - r_v
 
-    def impulses(self, x: Array, q: Array, alone: Array | None = None) -> Array:
-        if alone is None:
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None = None) -> Array:
+        if uncoupled is None:
             return times(self._inverse, q - self.problem.velocity_of(x))
-        return alone - times(self._inverse, self.problem.velocity_of(x))
+        return uncoupled - times(self._inverse, self.problem.velocity_of(x))
 
     def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
         return x

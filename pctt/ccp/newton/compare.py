@@ -18,7 +18,6 @@ _BODY = {
     "ksp_type": "richardson", "ksp_norm_type": "unpreconditioned", "ksp_max_it": "4", "pc_type": "python",
     "pc_python_type": "pctt.pc.BodySchur",
 }  # fmt: skip
-_TWO = {"body_pc_type": "python", "body_pc_python_type": "pctt.pc.TwoLevel", "pc_body_shift": "0"}
 
 # names beside PETSc's own PC types: options that make them
 NAMED: dict[str, dict[str, str]] = {
@@ -28,8 +27,9 @@ NAMED: dict[str, dict[str, str]] = {
     "tt": {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain"},
     "body-pbjacobi": _BODY,
     "body-ilu": {**_BODY, "body_pc_type": "ilu", "body_pc_factor_levels": "1"},
-    "body-tt": {**_BODY, **_TWO, "body_pc_two_coarse": "tt"},
-    "body-two-lu": {**_BODY, **_TWO, "body_pc_two_coarse": "lu"},
+    "body-two": {
+        **_BODY, "body_pc_type": "python", "body_pc_python_type": "pctt.pc.TwoLevel", "pc_body_shift": "0",
+    },
     "body-gamg": {**_BODY, "body_pc_type": "gamg", "pc_body_shift": "0"},
     "body-cholesky": {**_BODY, "body_pc_type": "cholesky", "pc_body_shift": "0"},
 }

@@ -11,19 +11,16 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
+from pctt.block_diagonal import set_diagonal_blocks
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
-from pctt.pc.block_diagonal import set_diagonal_blocks
 from pctt.shell import symmetric_shell
 
 
-class ContactSystem:
-    """S dg = q + G r_v, dv = G' dg - r_v.
+class ContactForm:
+    """The `NewtonForm` S dg = q + G r_v, dv = G' dg - r_v."""
 
-    Attributes
-    ----------
-    matrix : S
-    """
+    symmetric = True
 
     def __init__(self, problem: ConeProblem):
         self.problem = problem
@@ -53,7 +50,7 @@ class ContactSystem:
             self.matrix.destroy()
             self.matrix = _with_low_rank(self._low_rank, problem.low_rank)
 
-    def update(self, barrier: Array, inverse: Array | None = None) -> None:
+    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
         """Put the barrier blocks (nc, 3, 3) in."""
         self._barrier = barrier
         self._made = False
@@ -87,19 +84,16 @@ class ContactSystem:
             self._made = True
         return self._entries.mat
 
-    def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
         return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
 
-    def impulses(self, x: Array, q: Array, alone: Array | None = None) -> Array:
-        """dg (nc, 3) of a solution."""
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None = None) -> Array:
         return x.reshape(-1, 3).copy()
 
     def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
-        """dv of a solution."""
         return self.problem.momentum(dg) - r_v
 
     def tolerance(self, tol: float) -> float:
-        """The norm of this system's residual that leaves velocities as wrong as momenta (sqrt J) by ``tol``."""
         return tol * float(np.sqrt(self.problem.mean_diagonal))
 
     def destroy(self) -> None:

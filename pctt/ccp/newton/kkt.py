@@ -16,15 +16,17 @@ import numpy as np
 import scipy.sparse as sp
 from petsc4py import PETSc
 
+from pctt.block_diagonal import set_diagonal_blocks
 from pctt.blocks import square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.options import OptionError
-from pctt.pc.block_diagonal import set_diagonal_blocks
 
 
-class KKTSystem:
-    """See the module; the same members as `ContactSystem`."""
+class KKTForm:
+    """The `NewtonForm` of the module."""
+
+    symmetric = True
 
     def __init__(self, problem: ConeProblem):
         if problem.low_rank is not None:
@@ -49,19 +51,19 @@ class KKTSystem:
 
     def load(self, problem: ConeProblem) -> None:
         """Take another problem with the same contacts between the same bodies."""
-        other = KKTSystem(problem)
+        other = KKTForm(problem)
         other.matrix.copy(self.matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         other.destroy()
         self.problem = problem
 
-    def update(self, barrier: Array, inverse: Array | None = None) -> None:
+    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
         """Put the barrier blocks (nc, 3, 3) in."""
         k, V = np.linalg.eigh(barrier)
         scale = np.sqrt(self.problem.mean_diagonal)
         blocks = np.zeros((len(barrier), 5, 5))
-        soft = V[:, :, 0]
+        weakest = V[:, :, 0]
         blocks[:, :3, :3] = self.problem.diagonal_blocks
-        blocks[:, :3, :3] += np.maximum(k[:, 0], 0.0)[:, None, None] * soft[:, :, None] * soft[:, None, :]
+        blocks[:, :3, :3] += np.maximum(k[:, 0], 0.0)[:, None, None] * weakest[:, :, None] * weakest[:, None, :]
         blocks[:, :3, 3:] = scale * V[:, :, 1:]
         blocks[:, 3:, :3] = scale * V[:, :, 1:].transpose(0, 2, 1)
         tiny = np.finfo(float).tiny
@@ -74,12 +76,12 @@ class KKTSystem:
     def entries(self) -> PETSc.Mat:
         return self.matrix
 
-    def right_hand_side(self, q: Array, r_v: Array | None, alone: Array | None = None) -> Array:
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
         out = np.zeros((len(q), 5))
         out[:, :3] = q if r_v is None else q + self.problem.velocity_of(r_v)
         return out.ravel()
 
-    def impulses(self, x: Array, q: Array, alone: Array | None = None) -> Array:
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None = None) -> Array:
         return np.ascontiguousarray(x.reshape(-1, 5)[:, :3])
 
     def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:

@@ -13,9 +13,9 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
+from pctt.ksp_options import entered, prefer_mumps, to_enter
 from pctt.pc.base import PythonPC
-from pctt.pc.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
-from pctt.pc.ksp_options import entered, prefer_mumps, to_enter
 from pctt.petsc import own_errors
 from pctt.shell import is_shell
 
@@ -26,7 +26,7 @@ _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
 # what wants scalar rows; others switch when PETSc says so
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu", "eisenstat"}
 _BY_PRODUCTS = {"none", "jacobi", "pbjacobi"}  # these need no entries beside the diagonal blocks
-PATIENCE = 10.0  # seconds that a rank that has failed waits for the others
+WAIT_FOR_OTHERS = 10.0  # seconds that a rank that has failed waits for the others
 # preconditioners of parts of the matrix; ours have inner ones too, but of other matrices
 _OF_PARTS = re.compile(r"(sub|mg|fieldsplit|composite|telescope)_.*pc_type")
 _NOT_SUPPORTED = 56  # PETSC_ERR_SUP: this method has no code for block formats
@@ -111,9 +111,9 @@ class Krylov:
             self.set_rtol(float(rtol))
         start = _now(self.comm)
         with entered(self._options):
-            error = together(self.comm, lambda: self._set_up(A, P, keep))
+            error = on_all_ranks(self.comm, lambda: self._set_up(A, P, keep))
             setup = _now(self.comm)
-            error = error or together(self.comm, lambda: self._iterate(b, x))
+            error = error or on_all_ranks(self.comm, lambda: self._iterate(b, x))
         if error:
             self.forget()
             if error == _NOT_SUPPORTED and not self.scalar:
@@ -244,11 +244,11 @@ def _now(comm: MPI.Comm) -> float:
     return time.perf_counter()
 
 
-def together(comm: MPI.Comm, work: Callable[[], None]) -> int:
+def on_all_ranks(comm: MPI.Comm, work: Callable[[], None]) -> int:
     """Do some work on all ranks: 0, or, alike on all of them, PETSc's error code where it failed on one or more.
 
     A rank that has failed alone cannot call back the others from a collective call of PETSc: where they do not come
-    within PATIENCE, it ends the run, with a word."""
+    within WAIT_FOR_OTHERS, it ends the run, with a word."""
     code = np.zeros(1, int)
     words = ""
     try:
@@ -260,7 +260,7 @@ def together(comm: MPI.Comm, work: Callable[[], None]) -> int:
         return int(code[0])
     worst = np.empty(1, int)
     meeting = comm.Iallreduce(code, worst, op=MPI.MAX)
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + WAIT_FOR_OTHERS
     while code[0] and not meeting.Test():
         if time.monotonic() > deadline:
             sys.stderr.write(f"pctt: rank {comm.rank} failed alone: {words}\n")

@@ -1,0 +1,205 @@
+"""The Newton matrix in the bodies' velocities, K = I + G' B^-1 G, a 6 x 6 block per body and per pair in contact.
+
+G is the mass-scaled contact map (3Nc x 6M) in block rows (``pctt.blocks.BlockRows``), B block diagonal with a 3 x 3
+block per contact. Each rank multiplies its own contacts' rows; blocks of bodies that other ranks own go to these, by
+a pattern found once, and are added in an order that does not change.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from petsc4py import PETSc
+
+from pctt.block_diagonal import set_diagonal_blocks
+from pctt.blocks import BlockRows
+from pctt.body_matrix.stiff_part import StiffPart
+from pctt.contact_map import is_free
+from pctt.exchange import offsets, send_rows
+
+ADD = PETSc.InsertMode.ADD_VALUES
+
+
+class BodyMatrix:
+    """K as a Mat of block size 6 (``mat``), and its ``stiff_part``, which is what factorisations are made of."""
+
+    def __init__(self, comm: PETSc.Comm, G: BlockRows, compiled: bool | None = None):
+        """``compiled``: whether its values are made by compiled loops; None: where numba is installed."""
+        self.comm = comm.tompi4py() if isinstance(comm, PETSc.Comm) else comm
+        product = CompiledProduct if (is_free("auto") if compiled is None else compiled) else SparseProduct
+        # in 64 bits: pairs of bodies get a number each
+        self.bodies, column = np.unique(np.asarray(G.indices, np.int64), return_inverse=True)
+        self._product = product(G, column.ravel(), len(self.bodies))
+        self.load(G)
+        self._index(G)
+
+    def load(self, G: BlockRows) -> None:
+        """Take a G of the same structure."""
+        self.G = G
+        self._product.load(G)
+
+    def _index(self, G: BlockRows) -> None:
+        """Who owns the blocks that this rank's contacts contribute to, and how those of a body's row are added up."""
+        starts = offsets(self.comm, G.columns)
+        first, own = int(starts[self.comm.rank]), G.columns
+        row, column = self.bodies[self._product.row], self.bodies[self._product.column]
+        self._owner = np.searchsorted(starts, row, side="right") - 1
+        self._away = self._owner != self.comm.rank
+        home = ~self._away
+        received, _ = send_rows(self.comm, [row[self._away], column[self._away]], self._owner[self._away])
+        diagonal = np.arange(first, first + own)
+        total = max(int(starts[-1]), 1)
+        names = [r * total + c for r, c in ((row[home], column[home]), received, (diagonal, diagonal))]
+        every = np.unique(np.concatenate(names))
+        self._own_places, self._received_places, self._diagonal_places = (np.searchsorted(every, n) for n in names)
+        row, column = np.divmod(every, total)
+        indptr = np.searchsorted(row, np.arange(first, first + own + 1))
+        self._indptr, self._indices = indptr.astype(PETSc.IntType), column.astype(PETSc.IntType)
+        self.mat = PETSc.Mat().create(self.comm)
+        self.mat.setSizes(((6 * own, PETSc.DETERMINE), (6 * own, PETSc.DETERMINE)))
+        self.mat.setBlockSize(6)
+        self.mat.setType(PETSc.Mat.Type.BAIJ)
+        self.mat.setPreallocationCSR((self._indptr, self._indices))
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self._stiff: dict[tuple[bool, bool], StiffPart] = {}  # in scalar format or not, symmetric or not
+
+    def update(self, inverse: np.ndarray) -> None:
+        """K for the blocks B^-1 (nc, 3, 3)."""
+        blocks = self._product.blocks(inverse)
+        self._values = np.zeros((len(self._indices), 6, 6))
+        self._values[self._own_places] = blocks[~self._away] if self._away.any() else blocks
+        if self.comm.size > 1:
+            (received,), _ = send_rows(self.comm, [blocks[self._away]], self._owner[self._away])
+            np.add.at(self._values, self._received_places, received)
+        self._values[self._diagonal_places] += np.eye(6)
+        _put(self.mat, self._indptr, self._indices, self._values)
+        set_diagonal_blocks(self.mat, self._values[self._diagonal_places])
+
+    def stiff_part(
+        self, least: float, shift: float = 0.0, scalar: bool = False, symmetric: bool = True
+    ) -> PETSc.Mat:
+        """K without the blocks between bodies whose entries are all below ``least`` (of the mass), its diagonal blocks
+        multiplied by 1 + shift; one Mat in block format and one in scalar format are kept and renewed."""
+        form = (scalar, symmetric)
+        if form not in self._stiff:
+            self._stiff[form] = StiffPart(self.mat, self._indptr, self._indices, self._diagonal_places, *form)
+        return self._stiff[form].update(self._values, least, shift)
+
+    def places(self, points: np.ndarray) -> np.ndarray:
+        """Places of this rank's bodies (n, 3): the means of their contact points (nc, 3); collective."""
+        sums = self.mat.createVecRight()
+        counts = sums.duplicate()
+        if len(points):
+            contact = np.repeat(np.arange(len(points)), np.diff(self.G.indptr))
+            body = np.asarray(self.G.indices, np.int64)
+            index = (6 * body[:, None] + np.arange(3)).astype(PETSc.IntType)
+            sums.setValues(index.ravel(), points[contact].ravel(), ADD)
+            counts.setValues(index.ravel(), np.ones(index.size), ADD)
+        for vec in (sums, counts):
+            vec.assemble()
+        places = sums.array_r.reshape(-1, 6)[:, :3] / np.maximum(counts.array_r.reshape(-1, 6)[:, :3], 1)
+        sums.destroy()
+        counts.destroy()
+        return places
+
+    def set_rigid_modes(self, points: np.ndarray) -> None:
+        """Give ``mat`` the six rigid motions as near null space; points (nc, 3) of contact; collective.
+
+        A motion u(p) = t + w x p moves the contact point p of a body by F u in the contact frame F. Its mass-scaled
+        velocity z is the least squares solution of (block of G) z = F u over the contacts of the body, so that masses,
+        inertias and places need not be known. F are the first three columns of the block, with rows made unit vectors.
+        """
+        blocks, body = self.G.blocks, np.asarray(self.G.indices, np.int64)
+        contact = np.repeat(np.arange(len(points)), np.diff(self.G.indptr))
+        centre = self.comm.allreduce(points.sum(axis=0)) / max(self.comm.allreduce(len(points)), 1)
+        x, y, z = (points[contact] - centre).T
+        zero = np.zeros_like(x)
+        turn = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)  # w -> w x p
+        frame = blocks[:, :, :3] / np.linalg.norm(blocks[:, :, :3], axis=2, keepdims=True)
+        motion = frame @ np.concatenate([np.tile(np.eye(3), (len(x), 1, 1)), turn], axis=2)
+        both = blocks.transpose(0, 2, 1) @ np.concatenate([blocks, motion], axis=2)  # (n, 6, 12)
+        starts = offsets(self.comm, self.mat.getLocalSize()[0] // 6)
+        (own, both), _ = send_rows(self.comm, [body, both], np.searchsorted(starts, body, side="right") - 1)
+        sums = np.zeros((self.mat.getLocalSize()[0] // 6, 6, 12))
+        np.add.at(sums, own - starts[self.comm.rank], both)
+        size = np.trace(sums[:, :, :6], axis1=1, axis2=2)
+        normal = sums[:, :, :6] + np.where(size > 0, 1e-10 * size, 1.0)[:, None, None] * np.eye(6)
+        modes = np.linalg.solve(normal, sums[:, :, 6:]).reshape(-1, 6)
+        values, vectors = np.linalg.eigh(self.comm.allreduce(modes.T @ modes))
+        kept = values > 1e-12 * values[-1]
+        modes = modes @ (vectors[:, kept] / np.sqrt(values[kept]))
+        columns = [self.mat.createVecRight() for _ in range(modes.shape[1])]
+        for vec, mode in zip(columns, modes.T):
+            vec.array_w[:] = mode
+        self.mat.setNearNullSpace(PETSc.NullSpace().create(constant=False, vectors=columns, comm=self.comm))
+
+    def destroy(self) -> None:
+        self.mat.destroy()
+        for part in self._stiff.values():
+            part.destroy()
+
+
+class CompiledProduct:
+    """The blocks of G' B^-1 G of a rank's contacts, between the bodies that they touch, by a loop over the contacts.
+
+    Attributes
+    ----------
+    row, column : (n,) bodies of each block, in the order of `blocks`
+    """
+
+    def __init__(self, G: BlockRows, body: np.ndarray, bodies: int):
+        """``body``: the columns of G among ``bodies``."""
+        start, count = np.asarray(G.indptr[:-1]), np.diff(G.indptr)
+        of_row = np.repeat(count, count)  # blocks beside each block
+        first = np.repeat(np.arange(len(body)), of_row)
+        second = np.arange(len(first)) - np.repeat(np.cumsum(of_row) - of_row, of_row) + np.repeat(start, count**2)
+        names, place = np.unique(body[first] * max(bodies, 1) + body[second], return_inverse=True)
+        self.row, self.column = np.divmod(names, max(bodies, 1))
+        self._place = place.ravel()
+
+    def load(self, G: BlockRows) -> None:
+        """Take a G of the same structure."""
+        self._start = np.ascontiguousarray(G.indptr, dtype=np.int64)
+        self._blocks = np.ascontiguousarray(G.blocks, dtype=float)
+
+    def blocks(self, inverse: np.ndarray) -> np.ndarray:
+        """(n, 6, 6) for the blocks B^-1 (nc, 3, 3)."""
+        from pctt.contact_map.block_loops import add_all_blocks  # compiled, takes half a second to come
+
+        out = np.zeros((len(self.row), 6, 6))
+        add_all_blocks(self._blocks, self._start, self._place, np.ascontiguousarray(inverse), out)
+        return out
+
+
+class SparseProduct:
+    """The same by scipy."""
+
+    def __init__(self, G: BlockRows, body: np.ndarray, bodies: int):
+        self._body, self._bodies = body, bodies
+        self.load(G)
+        local = self._product(np.tile(np.eye(3), (G.rows, 1, 1)))
+        self.row, self.column = np.repeat(np.arange(len(local.indptr) - 1), np.diff(local.indptr)), local.indices
+
+    def load(self, G: BlockRows) -> None:
+        """Take a G of the same structure."""
+        shape = (3 * G.rows, 6 * self._bodies)
+        self._rows = sp.bsr_matrix((G.blocks, self._body, G.indptr), shape=shape) if len(G.blocks) else None
+        self._columns = None if self._rows is None else self._rows.T.tobsr()
+
+    def blocks(self, inverse: np.ndarray) -> np.ndarray:
+        """(n, 6, 6) for the blocks B^-1 (nc, 3, 3)."""
+        return self._product(inverse).data.reshape(-1, 6, 6)
+
+    def _product(self, inverse: np.ndarray) -> sp.bsr_matrix:
+        if self._columns is None:
+            return sp.bsr_matrix((0, 0), blocksize=(6, 6))
+        count = len(inverse)
+        weight = sp.bsr_matrix((inverse, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
+        return self._columns @ (weight @ self._rows)
+
+
+def _put(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, blocks: np.ndarray) -> None:
+    """All block rows of this rank."""
+    if len(indices):
+        mat.setValuesBlockedCSR(indptr, indices, blocks.ravel())
+    mat.assemble()

@@ -1,0 +1,82 @@
+"""The Newton operator in the bodies' velocities, K = I + G' H G: a function where products are compiled loops, and its
+matrix for preconditioners that read entries."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from pctt.block_diagonal import set_diagonal_blocks
+from pctt.body_matrix.entries import BodyMatrix
+from pctt.contact_map import ContactMap
+from pctt.shell import symmetric_shell
+
+if TYPE_CHECKING:
+    from pctt.contact_map.free import FreeMap
+
+Array = NDArray[np.float64]
+
+
+class BodyOperator:
+    """K of one contact map after another of the same structure.
+
+    Attributes
+    ----------
+    mat : K as a Mat of block size 6, a shell where the map is free of matrices
+    """
+
+    def __init__(self, contact_map: ContactMap):
+        self.contact_map = contact_map
+        self._matrix: BodyMatrix | None = None
+        if contact_map.free:
+            self.mat = symmetric_shell(contact_map.comm, 6 * contact_map.columns, 6, self._product)
+        else:
+            self.mat = self.whole.mat
+
+    @property
+    def whole(self) -> BodyMatrix:
+        """The matrix of K, its values perhaps not yet made; collective at its first use."""
+        if self._matrix is None:
+            G = self.contact_map.block_rows
+            self._matrix = BodyMatrix(self.contact_map.comm, G, compiled=self.contact_map.free)
+            self._loaded, self._made = True, False
+        return self._matrix
+
+    def load(self, contact_map: ContactMap) -> None:
+        """Take another map of the same structure."""
+        self.contact_map = contact_map
+        self._loaded = False
+
+    def update(self, inverse: Array, symmetric: bool = True) -> None:
+        """K for blocks H (nc, 3, 3), which may be unsymmetric."""
+        self._inverse, self._made = inverse, False
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+        if not self.contact_map.free:
+            self.entries()
+            return
+        G = cast("FreeMap", self.contact_map)
+        self._weight = G.weights(inverse, symmetric)
+        set_diagonal_blocks(self.mat, G.body_blocks(self._weight))
+        self.mat.stateIncrease()
+
+    def _product(self, v: Array, out: Array) -> None:
+        cast("FreeMap", self.contact_map).through(self._weight, v, out)
+
+    def entries(self) -> BodyMatrix:
+        """The matrix of K with its present values; collective."""
+        matrix = self.whole
+        if not self._loaded:
+            matrix.load(self.contact_map.block_rows)
+            self._loaded = True
+        if not self._made:
+            matrix.update(self._inverse)
+            self._made = True
+        return matrix
+
+    def destroy(self) -> None:
+        self.mat.destroy()
+        if self._matrix is not None:
+            self._matrix.destroy()

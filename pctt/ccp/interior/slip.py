@@ -1,0 +1,55 @@
+"""What Coulomb's law adds to an iteration of `conic`: the derivative of the opening.
+
+The velocity of a contact has the opening mu |y_t| added to its normal part. Newton's method takes its derivative along:
+with u = y_t / |y_t|,
+
+    dz = T (G dv + C dg) + r_z,    T = 1 + e_n u',
+
+which adds a term of rank one per contact to the elimination of ds, and makes the Newton systems unsymmetric. (Openings
+that lag behind converge by a fifth per cone problem, each solved exactly.)
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pctt.ccp.cone import TINY, Array, dot, tangential, times
+
+
+def sliding_directions(y: Array, z_n: Array) -> Array:
+    """The directions (nc, 3) in which contacts with velocities y (nc, 3) slide; shorter than 1 where z_n, the scaled
+    normal velocity (nc,) of the iterate, is more than |y_t|: a contact sticks, and y_t may turn."""
+    u = y / np.maximum(np.maximum(tangential(y), z_n), TINY)[:, None]
+    u[:, 0] = 0.0
+    return u
+
+
+class Slip(NamedTuple):
+    """The rank-one terms of all contacts.
+
+    In the scaled variables ds = X (c - r_z - T G dv) with X^-1 = W^-2 + e T, e the compliance. With Y^-1 = W^-2 + e
+    this is X = (1 - e p u'/ d) Y and X T = Y + p (u - e Y u)' / d, where p = Y e_n, d = 1 + e u'p.
+    """
+
+    u: Array  #: (nc, 3) direction in which a contact slides
+    p: Array  #: (nc, 3)
+    less: Array  #: (nc, 1) e / d
+    blocks: Array  #: (nc, 3, 3) X T - Y
+
+    @classmethod
+    def of(cls, inverse: Array, u: Array, scale: Array, compliance: Array) -> Slip:
+        """``inverse`` is Y in the unscaled variables, (nc, 3, 3); ``compliance`` (nc, 1) is e."""
+        p = scale[:, :1] * inverse[:, :, 0]
+        d = 1.0 + compliance * dot(u, p)[:, None]
+        q = (u - compliance * times(inverse, u)) / d
+        return cls(u, p, compliance / d, p[:, :, None] * q[:, None, :])
+
+    def reduce(self, uncoupled: Array) -> None:
+        """Y c becomes X c, in place."""
+        uncoupled -= self.p * (self.less * dot(self.u, uncoupled)[:, None])
+
+    def open(self, dz: Array) -> None:
+        """G dv + C dg becomes T times that, in place."""
+        dz[:, 0] += dot(self.u, dz)

@@ -1,0 +1,126 @@
+"""The body system's own ladder: what solves its systems for the least expected cost."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.ccp.newton.body import BodyForm
+from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
+from pctt.ccp.newton.protocols import NewtonForm
+
+RUNGS = {"pbjacobi": {"pc_type": "pbjacobi"}, "cholesky": {"pc_type": "cholesky"}}
+CAP = {"pbjacobi": "1500", "cholesky": "60"}
+UNSYMMETRIC = {  # systems of Coulomb's law
+    "pbjacobi": {"ksp_type": "bcgs"},
+    "cholesky": {"ksp_type": "gmres", "ksp_gmres_restart": "100", "pc_type": "lu"},
+}
+
+SOLVES = 1.8  # iterations of predictor and correctors / those of the predictor
+OLD_FACTOR = 60.0  # iterations to expect with the factor of an earlier matrix
+
+
+def cost(rung: str, iterations: float, bodies: int, ranks: int) -> float:
+    """Of the systems with one matrix, the predictor's taking so many iterations, in iterations with block Jacobi,
+    measured at 5, 4,900 and 35,900 bodies (docs/ccp.md). On more ranks products take less time, factors hardly do."""
+    setup = {"pbjacobi": 5.0, "cholesky": 550.0 * (bodies / 5000.0) ** 0.4 * ranks}
+    return setup[rung] + solves_cost(rung, iterations, bodies, ranks)
+
+
+def solves_cost(rung: str, iterations: float, bodies: int, ranks: int) -> float:
+    """The same when the preconditioner is there already."""
+    iteration = {"pbjacobi": 1.0, "cholesky": 25.0 * (bodies / 5000.0) ** 0.3 * ranks}
+    return SOLVES * iteration[rung] * max(1.0, iterations)
+
+
+class BodyLadder(KrylovFamily):
+    """Conjugate gradients on the body system, preconditioned by what is expected to cost least: block Jacobi while it
+    takes few iterations, then Cholesky factors of its stiff part; a factor of an earlier matrix is kept as long as
+    iterating with it costs less than a new one. (Incomplete factors never pay: an iteration costs six times as much.)
+
+    The choice rests on iteration counts and fixed costs, so that a repeated run repeats it.
+    """
+
+    takes_any = True
+
+    def __init__(self, comm: MPI.Comm):
+        super().__init__(comm)
+        self._hardness = 20.0  # expected iterations with block Jacobi
+        self._growth = 1.0
+        self._lagged: float | None = None  # expected iterations with the factor that is there
+        self._approximation: PETSc.Mat | None = None
+        self.iterations = self.fallbacks = 0
+        self.used: dict[str, int] = {}
+
+    def new_matrix(self, system: NewtonForm) -> None:
+        assert isinstance(system, BodyForm)
+        self.system = system
+        bodies, ranks = system.matrix.getSize()[0] // 6, self.comm.size
+        expected = self._hardness * self._growth
+        costs = {"pbjacobi": cost("pbjacobi", expected, bodies, ranks), "cholesky": cost("cholesky", 1, bodies, ranks)}
+        rung, keep = min(costs, key=lambda name: costs[name]), False
+        if self._lagged is not None and solves_cost("cholesky", self._lagged, bodies, ranks) < min(costs.values()):
+            rung, keep = "cholesky", True
+        self._rung, self._keep = self.comm.bcast((rung, keep))  # costs may differ in a last bit between processors
+        self._worst = 0
+        self._fresh = True
+
+    def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
+        while True:
+            done = self._try(self._rung, b, x, rtol)
+            if done.converged:
+                return True
+            if self._rung == "cholesky" and not self._keep:
+                self.fallbacks += 1
+                return False
+            self._rung, self._keep, self._fresh = "cholesky", False, True
+
+    def _try(self, rung: str, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
+        krylov = self._solver(rung)
+        if self._fresh and not self._keep:
+            self._approximation = self._approximate(rung)
+        P = self._approximation
+        done = krylov.solve(self.system.matrix, b, x, rtol, P, keep=self._keep)
+        self._fresh = False
+        self.iterations += done.iterations
+        self.used[rung] = self.used.get(rung, 0) + done.iterations
+        if done.iterations > self._worst:
+            self._worst = done.iterations
+            self._learn(rung, done.iterations)
+        return done
+
+    def _approximate(self, rung: str) -> PETSc.Mat:
+        """The matrix that a rung's preconditioner is made from."""
+        return self.system.matrix if rung == "pbjacobi" else self.system.stiff_part()
+
+    def _learn(self, rung: str, iterations: int) -> None:
+        if rung == "cholesky":
+            self._lagged = 1.5 * iterations if self._keep else OLD_FACTOR
+            return
+        hardness = max(10.0, float(iterations))
+        self._growth = min(max(hardness / self._hardness, 1.0), 2.0)
+        self._hardness = hardness
+
+    @property
+    def factored(self) -> bool:
+        return self._rung == "cholesky" and not self._keep
+
+    def report(self) -> list[str]:
+        """Nothing: its rungs are PETSc's own."""
+        return []
+
+    def begin(self) -> None:
+        self.iterations = self.fallbacks = 0
+        self._hardness, self._growth, self._lagged = 20.0, 1.0, None  # a problem's first systems are easy ones
+
+    def _solver(self, rung: str) -> Krylov:
+        unsymmetric = not self.system.symmetric
+        name = rung + "_any" * unsymmetric
+        if name not in self._krylov:
+            defaults = {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "ksp_max_it": CAP[rung], **RUNGS[rung]}
+            defaults |= UNSYMMETRIC[rung] if unsymmetric else {}
+            if rung == "cholesky" and self.comm.size == 1 and PETSc.Sys.hasExternalPackage("suitesparse"):
+                # 1.3 times faster than MUMPS, its solves twice
+                defaults["pc_factor_mat_solver_type"] = "umfpack" if unsymmetric else "cholmod"
+            self._krylov[name] = Krylov(self.comm, f"body_{name}_", defaults)
+        return self._krylov[name]

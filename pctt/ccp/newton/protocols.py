@@ -1,0 +1,84 @@
+"""What `Newton` asks of a form of its systems, and of what solves them."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from petsc4py import PETSc
+
+from pctt.ccp.cone import Array
+from pctt.ccp.problem import ConeProblem
+
+
+class NewtonForm(Protocol):
+    """The Newton system in certain unknowns x, for one set of barrier blocks after another.
+
+    Attributes
+    ----------
+    problem : the cone problem
+    matrix : the system's matrix; it may be a function
+    symmetric : whether the present matrix is
+    """
+
+    problem: ConeProblem
+    matrix: PETSc.Mat
+    symmetric: bool
+
+    def load(self, problem: ConeProblem) -> None:
+        """Take another problem with the same contacts between the same bodies."""
+
+    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
+        """The matrix for the barrier blocks B (nc, 3, 3); ``inverse`` is (B + C)^-1 where the caller has it more
+        accurately, ``symmetric`` says whether that is."""
+
+    def entries(self) -> PETSc.Mat:
+        """The matrix, or its sparse part, as one that preconditioners can read; collective."""
+
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
+        """Of the unknowns; ``uncoupled`` is (B + C)^-1 q where the caller knows it better."""
+
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None = None) -> Array:
+        """dg (nc, 3) of a solution."""
+
+    def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
+        """dv of a solution."""
+
+    def tolerance(self, tol: float) -> float:
+        """The norm of this system's residual that leaves velocities as wrong as momenta (sqrt J) by ``tol``."""
+
+    def destroy(self) -> None: ...
+
+
+class LinearSolver(Protocol):
+    """Solves the systems of a form.
+
+    Attributes
+    ----------
+    iterations, fallbacks : of the present problem: Krylov iterations, systems not solved in the first way
+    takes_any : whether matrices need not be symmetric
+    """
+
+    iterations: int
+    fallbacks: int
+    takes_any: bool
+
+    @property
+    def factored(self) -> bool:
+        """Whether the present matrix has been factorised, and another solve costs little."""
+
+    def begin(self) -> None:
+        """Another problem."""
+
+    def new_matrix(self, system: NewtonForm) -> None:
+        """The system has new values."""
+
+    def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
+        """x = A^-1 b to a relative residual of rtol; whether that was reached."""
+
+    def report(self) -> list[str]:
+        """What the preconditioner tells of itself, if it is one of the project's."""
+
+    def forget(self) -> None:
+        """The next matrix has another structure."""
+
+    def destroy(self) -> None: ...

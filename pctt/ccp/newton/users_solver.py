@@ -1,0 +1,85 @@
+"""The user's solver of Newton systems: the KSP of the options, with a ladder behind it."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.ccp.newton.compare import Comparison
+from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
+from pctt.ccp.newton.protocols import NewtonForm
+
+CHOLESKY_LIMIT = 50_000  # contacts: above, a factor of the contact matrix takes more than the rest of the step
+
+# what solves a system of contacts when the user's KSP does not, in this order
+LADDER = {
+    "cg": {"pc_type": "pbjacobi", "ksp_type": "cg", "ksp_norm_type": "unpreconditioned"},
+    "cholesky": {"pc_type": "cholesky", "ksp_type": "gmres"},
+}
+
+
+class UsersSolver(KrylovFamily):
+    """The `LinearSolver` that is the KSP without prefix, as the options have it; what it does not solve goes down the
+    ladder.
+
+    Attributes
+    ----------
+    iterations : Krylov iterations so far
+    fallbacks : systems that the user's KSP did not solve to twice the tolerance
+    """
+
+    takes_any = False
+
+    def __init__(self, comm: MPI.Comm, defaults: dict[str, str], compare: Comparison | None = None, prefix: str = ""):
+        super().__init__(comm)
+        self.defaults, self.compare, self.prefix = defaults, compare, prefix
+        self.iterations = self.fallbacks = 0
+
+    def begin(self) -> None:
+        self.iterations = self.fallbacks = 0
+
+    def new_matrix(self, system: NewtonForm) -> None:
+        self.system = system
+
+    def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
+        A, P = self.system.matrix, self.system.entries
+        if self.compare is not None and self.compare.due():
+            done = self.compare.run(A, b, x, rtol, P)
+        else:
+            done = self._solver("").solve(A, b, x, rtol, P)
+        self.iterations += done.iterations
+        if done.converged:
+            return True
+        self.fallbacks += 1
+        return self._climb_down(b, x, rtol, done)
+
+    @property
+    def factored(self) -> bool:
+        return "" in self._krylov and self._krylov[""].ksp.pc.getType() in ("cholesky", "lu")
+
+    def report(self) -> list[str]:
+        return self._krylov[""].report() if "" in self._krylov else []
+
+    def _climb_down(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float, done: Solve) -> bool:
+        """Try the ladder; keep in x what has the smallest true residual, or zero if nothing is below 1."""
+        A, P = self.system.matrix, self.system.entries
+        best = min(done.true_residual, 1.0)
+        kept = x.array.copy() if best < 1 else np.zeros(x.getLocalSize())
+        for name in LADDER:
+            if name == "cholesky" and self.system.problem.size > CHOLESKY_LIMIT:
+                break
+            done = self._solver(name).solve(A, b, x, rtol, P)
+            self.iterations += done.iterations
+            if done.true_residual < best:
+                best, kept = done.true_residual, x.array.copy()
+            if done.converged:
+                break
+        x.array[:] = kept
+        return done.converged
+
+    def _solver(self, name: str) -> Krylov:
+        if name not in self._krylov:
+            prefix = f"fallback_{name}_" if name else self.prefix
+            self._krylov[name] = Krylov(self.comm, prefix, LADDER.get(name, self.defaults))
+        return self._krylov[name]

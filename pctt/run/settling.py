@@ -1,0 +1,121 @@
+"""Settled states of scenes, made by simulation and kept in the cache."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from dem.experiment import Experiment
+from dem.impulses import ImpulseMemory
+from dem.scene import Scene
+from dem.start import new_world
+from dem.together import together
+from dem.world import World
+from pctt import ccp
+from pctt.options import OptionError
+from pctt.run import checkpoint, interrupt, report
+from pctt.run.settings import Options, scene_name
+from pctt.run.stepper import Stepper
+
+
+def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, anew: bool = False) -> Path:
+    """The cached settled state of the scene, made if it is not there (or ``anew``): the scene's settling time
+    with APGD, its last tenth with the contacts and ten times the accuracy, so that no overlap is left that
+    a first accurate step would have to push apart. What an interrupted or killed settling has left is gone on from."""
+    if not options.scene.settling_time:
+        raise OptionError(f"-scene {options.run.scene}: has no settling_time and so no settled state")
+    made_with = checkpoint.origin(scene_name(options.run.scene), options.scene, options.dt)
+    settings: dict[str, Any] = {
+        "dt": options.dt,
+        "delta": [options.run.settle_delta, options.delta],
+        "recovery_speed": options.run.recovery_speed,
+        "tol": options.run.settle_tol,
+    }
+    if options.scene.digest:
+        settings["file"] = options.scene.digest  # a file that was changed may build another scene
+    path = checkpoint.settled_path(made_with["scene"], settings)
+    if not anew and comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
+        return path
+    steps = math.ceil(options.scene.settling_time / options.dt * (1 - 1e-12))
+    progress.say(f"settling {options.run.scene}, {steps} steps with APGD to {options.run.settle_tol:g}:")
+    unfinished = path.with_suffix(".unfinished.h5")
+    if comm.rank == 0:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    if comm.bcast(unfinished.exists()):
+        world, memory = checkpoint.load(unfinished, built(options.scene, comm), made_with, comm)
+        progress.say(f"  goes on after step {world.step}, from {unfinished}")
+    else:
+        world, memory = world_at_start(options.scene, comm), ImpulseMemory(comm)
+    _settle(options, world, memory, steps, unfinished, made_with, progress)
+    checkpoint.save(path, made_with, world, memory)
+    if comm.rank == 0:
+        checkpoint.write_checksum(path)
+        unfinished.unlink(missing_ok=True)
+    comm.Barrier()
+    return path
+
+
+def _settle(
+    options: Options,
+    world: World,
+    memory: ImpulseMemory,
+    steps: int,
+    unfinished: Path,
+    made_with: dict[str, str],
+    progress: report.Progress,
+) -> None:
+    """The steps of settling, with a checkpoint ``unfinished`` after every tenth of them."""
+    settling = dataclasses.replace(
+        options,
+        run=dataclasses.replace(options.run, ccp_type="apgd", ccp_compliance=None),
+        delta=options.run.settle_delta,
+        limits=ccp.Limits(tol=options.run.settle_tol),
+        solver=ccp.SOLVERS["apgd"].options(),
+        coulomb=None,
+    )
+    tenth = max(1, steps // 10)
+    start = time.perf_counter()
+    progress.start(steps - world.step)
+    with Stepper(settling, world, memory) as stepper:
+        while world.step < steps:
+            progress.doing(f"settling, time {world.time:.3f} s")
+            if world.step + 1 >= steps - steps // 10:
+                limits = ccp.Limits(tol=0.1 * options.run.settle_tol)
+                stepper.options = dataclasses.replace(settling, delta=options.delta, limits=limits)
+            line = stepper.step()
+            interrupted = interrupt.asked(world.comm)
+            if world.step % tenth == 0 or world.step == steps or interrupted:
+                checkpoint.save(unfinished, made_with, world, memory)
+                spent = time.perf_counter() - start
+                progress.say(
+                    f"  step {world.step:5d}  time {line['time']:6.2f} s  contacts {line['contacts']:8d}"
+                    f"  residual {line['natural_residual']:.1e}  {spent:7.1f} s spent"
+                )
+            if interrupted:
+                words = f"settling interrupted after step {world.step} of {steps}; the same command goes on there"
+                raise interrupt.InterruptError(words)
+
+
+def world_at_start(scene: Experiment, comm: MPI.Comm) -> World:
+    """The scene at time zero; OptionError if it cannot start so."""
+    try:
+        return new_world(built(scene, comm), comm)
+    except ValueError as error:
+        raise OptionError(f"scene {type(scene).__name__}: {error}") from None
+
+
+def built(scene: Experiment, comm: MPI.Comm) -> Scene:
+    """What the scene builds; SceneError on all ranks if that fails on any."""
+
+    def build() -> Scene:
+        built = scene.build()
+        if not isinstance(built, Scene):
+            raise TypeError(f"build must return a dem.scene.Scene, not {type(built).__name__}")
+        return built
+
+    return together(comm, f"build of the scene {type(scene).__name__}", build)

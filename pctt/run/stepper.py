@@ -1,0 +1,223 @@
+"""One time step after another: search contacts, assemble and solve the cone problem, move the bodies."""
+
+from __future__ import annotations
+
+import dataclasses
+import resource
+import sys
+from typing import Any, NamedTuple
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import record as recording
+from dem.contact import Contacts, find_contacts, find_overrun
+from dem.impulses import ImpulseMemory
+from dem.partition import rebalance
+from dem.step import Step
+from dem.stepper import advance
+from dem.system import ContactSystem
+from dem.together import SceneError
+from dem.world import World
+from pctt import ccp, log
+from pctt.run.dump import Dump
+from pctt.run.settings import Options
+
+#: An overlap by a contact that the search did not foresee is solved for if it would be deeper than this part of delta.
+OVERRUN = 0.01
+
+
+class Solved(NamedTuple):
+    """A step's cone problem, solved."""
+
+    result: ccp.Result  #: with which the step goes on
+    asked: ccp.Result  #: what the solver of the options made of it
+    solver: str  #: the method that ``result`` is of
+    newton_its: int  #: Newton steps made
+
+    def after(self, first: Solved) -> Solved:
+        """With what solving the step's first problem took, which lacked a contact."""
+        self.result.iterations += first.result.iterations
+        self.result.ksp_its += first.result.ksp_its
+        self.result.fallbacks += first.result.fallbacks
+        return self._replace(newton_its=self.newton_its + first.newton_its)
+
+
+class Stepper:
+    """One time step after another of a world; keeps the last step's contacts and impulses for output.
+
+    Owns what it is given as ``newton`` and the PETSc objects of the step under way, which `destroy` frees.
+    """
+
+    contacts: Any
+    system: ContactSystem
+    impulse: np.ndarray
+    history: list[float]  #: natural residual by iteration
+
+    def __init__(
+        self,
+        options: Options,
+        world: World,
+        memory: ImpulseMemory,
+        newton: ccp.Newton | None = None,
+        dump: Dump | None = None,
+    ):
+        self.options, self.world, self.memory, self.newton, self.dump = options, world, memory, newton, dump
+        self._problem: ccp.ConeProblem | None = None
+
+    def __enter__(self) -> Stepper:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.destroy()
+
+    def destroy(self) -> None:
+        self._release()
+        if self.newton is not None:
+            self.newton.destroy()
+
+    def _release(self) -> None:
+        """Free the PETSc objects of the present problem."""
+        if self._problem is not None:
+            self._problem.destroy()
+            self._problem = None
+
+    def step(self) -> dict[str, Any]:
+        """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no
+        number)."""
+        problem, guess = self._assemble(self._search(), self.memory)
+        with log.phase("solve"):
+            solved = self.solve(problem, guess)
+        while again := self._overrun(problem, solved.result.impulse):
+            problem, guess = self._assemble(*again)
+            with log.phase("solve"):
+                solved = self.solve(problem, guess).after(solved)
+        result = solved.result
+        with log.phase("solve"):
+            accuracy = ccp.measure(problem, result.impulse)
+        with log.phase("output"):
+            files = self.dump.step(self.system, problem, guess, result, solved.asked) if self.dump else {}
+        with log.phase("advance"):
+            self.impulse, self.history = result.impulse, result.history
+            advance(self.world, self.system.velocity(self.impulse), self.options.dt)
+            self.memory.remember(self.system.key, self.impulse, self.system.frame)
+        self._release()
+        return self._figures(problem.size, solved, accuracy, files)
+
+    def _search(self) -> Contacts:
+        """The contacts of the step."""
+        with log.phase("search"):
+            rebalance(self.world)
+            try:
+                return find_contacts(self.world, self.options.delta, self.options.dt)
+            except FloatingPointError as error:  # raised on all ranks alike
+                raise SceneError(f"step {self.world.step + 1}: {error}") from None
+
+    def _figures(
+        self, contacts: int, solved: Solved, accuracy: ccp.Accuracy, files: dict[str, Any]
+    ) -> dict[str, Any]:
+        """The line of a step in steps.jsonl."""
+        newton, result = self.newton, solved.result
+        pc_report = newton.pc_report if newton is not None else []
+        compare = newton.compare if newton is not None else None
+        phases = ("search", "assembly", "solve", *(["compare"] if compare else []), "advance")
+        return {
+            "step": self.world.step,
+            "time": self.world.time,
+            "contacts": contacts,
+            "newton_its": solved.newton_its,
+            "iterations": result.iterations,
+            "ksp_its": result.ksp_its,
+            "cone_problems": result.cone_problems,
+            **dataclasses.asdict(accuracy),
+            "converged": result.converged,
+            "status": result.status.value,
+            "reason": result.reason,
+            "fallbacks": result.fallbacks,
+            "solver": solved.solver,
+            "law": result.law,
+            "asked_solver": self.options.run.ccp_type,
+            **({"pc_report": pc_report} if pc_report else {}),
+            **files,
+            **({"compare": compare.take_solves()} if compare else {}),
+            "peak_memory": _peak_memory(self.world.comm),
+            "phases": log.take_seconds(phases),
+        }
+
+    def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, np.ndarray]:
+        """The problem of these contacts, which takes the place of the last, and the impulses remembered."""
+        options = self.options
+        with log.phase("assembly"):
+            self._release()
+            self.contacts = contacts
+            self.system = ContactSystem(self.world, contacts, options.dt, options.run.recovery_speed)
+            self._problem = cone_problem(
+                self.system, self.world.comm, options.run.ccp_compliance or 0.0, options.run.ccp_operator
+            )
+            guess, _ = memory.recall(self.system.key, self.system.frame)
+        return self._problem, guess
+
+    def _overrun(self, problem: ccp.ConeProblem, impulse: np.ndarray) -> tuple[Contacts, ImpulseMemory] | None:
+        """The contacts with those that nobody foresaw, as impulses of the step sent a grain further than its margin,
+        and the impulses so far; None if it runs into nothing there."""
+        world, options = self.world, self.options
+        with log.phase("search"):
+            velocity = self.system.velocity(impulse)
+            wider = find_overrun(world, self.contacts, velocity, options.delta, options.dt)
+        if wider is None:
+            return None
+        with log.phase("assembly"):
+            unseen = wider.take(~np.isin(wider.key, self.contacts.key))
+            system = ContactSystem(world, unseen, options.dt, options.run.recovery_speed)
+            with cone_problem(system, world.comm) as beyond:
+                opening = (beyond.velocity_of(problem.momentum(impulse)) + beyond.r)[:, 0]
+                closes = options.dt * beyond.min(opening.min(initial=0.0)) < -OVERRUN * options.delta
+        if not closes:
+            return None
+        memory = ImpulseMemory(world.comm)
+        memory.remember(self.system.key, impulse, self.system.frame)
+        return wider, memory
+
+    def records(self) -> dict[str, float]:
+        """What the last step shows, by name; collective. SceneError if the scene's own records are at fault."""
+        step = Step(self.world, self.contacts, self.system, self.impulse)
+        return recording.row(step, self.options.scene)
+
+    def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> Solved:
+        """Solve as asked; where that does not converge, go on with APGD from there and keep the better."""
+        options = self.options
+        wanted = options.run.ccp_type
+        asked = ccp.solve(problem, guess, wanted, options.limits, options.solver, self.newton, options.coulomb)
+        used = asked.solver or wanted
+        newton_its = asked.iterations if ccp.SOLVERS[used].newton else 0
+        if asked.final or used == "apgd":
+            return Solved(asked, asked, used, newton_its)
+        limits = dataclasses.replace(options.limits, max_it=-1)
+        second = ccp.solve(problem, asked.impulse, "apgd", limits, coulomb=options.coulomb)
+        if second.natural_residual < asked.natural_residual:
+            second.ksp_its, second.fallbacks = asked.ksp_its, asked.fallbacks
+            return Solved(second, asked, "apgd", newton_its)
+        return Solved(asked, asked, used, newton_its)
+
+
+def cone_problem(
+    system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0, operator: str = "auto"
+) -> ccp.ConeProblem:
+    """The cone problem of a step's contacts."""
+    G = ccp.CompactRows(*system.contact_map, columns=system.owned_bodies)
+    return ccp.ConeProblem(
+        comm,
+        system.r,
+        system.mu,
+        G=G,
+        point=system.point,
+        key=system.key,
+        compliance=compliance,
+        operator=operator,
+    )
+
+
+def _peak_memory(comm: MPI.Comm) -> int:
+    """The most memory that the ranks have had so far, their sum [bytes]; collective."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return int(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit))

@@ -1,0 +1,257 @@
+"""What a time step would take on a cluster: run/study cluster_model [N] [-ranks 1,2,4,8,16] [-latency S] [-bandwidth
+B], default the settled mixer of n = 8. Contacts, bodies, ghosts, messages and bytes per product and reductions
+per iteration are counted on so many ranks of this machine, more than it has cores; seconds are a model of them.
+docs/cluster.md explains. Writes results/cluster_model_nN.json."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from measure import record, say_machine
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from dem.contact import find_contacts
+from dem.partition import imbalance, rebalance
+from dem.system import ContactSystem
+from pctt import ccp
+from pctt.ccp.first_order.scaled import ScaledProblem
+from pctt.exchange import offsets
+from pctt.run.options import read_options
+from pctt.run.report import Progress
+from pctt.run.simulate import first_state
+from pctt.run.stepper import cone_problem
+
+TOL = 1e-6
+SOLVERS = ("apgd", "conic")
+BODY = 6 * 8  # bytes of a body's velocity or momentum
+SIZES = {8: (4_915, 18_500), 16: (35_939, 144_700), 32: (274_627, 1_150_000)}  # bodies, contacts of settled mixers
+SOLVED = 4  # ranks up to which the step is solved: more wait for each other on few cores, and do the same
+SMALL, LARGE = 8, 2**20  # bytes of the messages that latency and bandwidth are measured with
+
+# -- on many ranks: counts ----------------------------------------------------------------------------------
+
+
+class Counter:
+    """Counts the calls of methods of a class while it is entered."""
+
+    def __init__(self, of: type, *names: str):
+        self.of, self.calls, self.originals = of, 0, {name: getattr(of, name) for name in names}
+
+    def __enter__(self) -> Counter:
+        for name, original in self.originals.items():
+            setattr(self.of, name, self._counted(original))
+        return self
+
+    def _counted(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def method(*arguments: Any) -> Any:
+            self.calls += 1
+            return original(*arguments)
+
+        return method
+
+    def __exit__(self, *exception: object) -> None:
+        for name, original in self.originals.items():
+            setattr(self.of, name, original)
+
+
+def count(n: int) -> dict[str, Any]:
+    """The figures of the first step after the settled state of a mixer; collective."""
+    comm = MPI.COMM_WORLD
+    database = {"scene": "mixer", "scene_n": str(n), "restart": "settled"}
+    for name, value in {"ksp_type": "cg", "pc_type": "pbjacobi"}.items():  # factors are another story
+        PETSc.Options().setValue(name, value)
+    options = read_options(database | {"output": tempfile.gettempdir(), "overwrite": "true"}, comm)
+    world, _ = first_state(options, comm, Progress(False))
+    contacts = find_contacts(world, options.delta, options.dt)
+    if rebalance(world):
+        contacts = find_contacts(world, options.delta, options.dt)
+    system = ContactSystem(world, contacts, options.dt, options.run.recovery_speed)
+    with cone_problem(system, comm) as problem:
+        row = {"ranks": comm.size, "imbalance": imbalance(world), **shares(problem)}
+        for solver in SOLVERS if comm.size <= SOLVED else ():
+            row |= {f"{solver} {name}": value for name, value in solved(problem, solver).items()}
+        row["product_s"] = seconds_of_product(problem)
+    return row
+
+
+def shares(problem: ccp.ConeProblem) -> dict[str, Any]:
+    """What each rank has: contacts, bodies, ghosts, and the ranks that it hears from and speaks to."""
+    G, comm = problem.contact_map.given, problem.comm
+    starts = offsets(comm, G.columns)
+    away = np.unique(G.body[(G.body >= 0) & ((G.body < starts[comm.rank]) | (G.body >= starts[comm.rank + 1]))])
+    asked = np.bincount(np.searchsorted(starts, away, side="right") - 1, minlength=comm.size)  # ghosts by owner
+    given = np.array(comm.alltoall(asked.tolist()))
+    mine = {
+        "contacts": len(problem.mu),
+        "bodies": G.columns,
+        "ghosts": len(away),
+        "neighbours": int(((asked > 0) | (given > 0)).sum()),
+        # G' g sends the momenta of ghosts, G v the velocities of bodies that are ghosts elsewhere
+        "messages": int((asked > 0).sum() + (given > 0).sum()),
+        "bytes": BODY * int(asked.sum() + given.sum()),
+    }
+    everyone = comm.allgather(mine)
+    return {
+        name: {"most": max(values), "mean": statistics.mean(values)}
+        for name, values in ((name, [each[name] for each in everyone]) for name in mine)
+    }
+
+
+def solved(problem: ccp.ConeProblem, solver: str) -> dict[str, Any]:
+    """Iterations, products and reductions of a cold start, rank 0's."""
+    krylov = ccp.newton_for(problem.comm, solver) if ccp.SOLVERS[solver].newton else None
+    ccp.solve(problem, None, solver, ccp.Limits(0.1), newton=krylov)  # loads compiled loops
+    before, start = _petsc_reductions(), time.perf_counter()
+    with (
+        Counter(type(problem.contact_map), "add_delassus", "through") as products,
+        Counter(ccp.ConeProblem, "sum", "min", "max") as reductions,
+        Counter(ScaledProblem, "sums") as first_order,
+    ):
+        result = ccp.solve(problem, None, solver, ccp.Limits(TOL), newton=krylov)
+    seconds, of_petsc = time.perf_counter() - start, _petsc_reductions() - before
+    if krylov is not None:
+        krylov.destroy()
+    count = reductions.calls + first_order.calls + of_petsc
+    return {"its": result.iterations, "products": products.calls, "reductions": count, "seconds": seconds,
+            "converged": result.converged}  # fmt: skip
+
+
+def _petsc_reductions() -> float:
+    return PETSc.Log.Event("CCPSolve").getPerfInfo()["numReductions"]
+
+
+def seconds_of_product(problem: ccp.ConeProblem) -> float:
+    """Of y += N g, median."""
+    g, y, spent = np.ones_like(problem.r), np.zeros_like(problem.r), []
+    for _ in range(50):
+        start = time.perf_counter()
+        problem.contact_map.add_delassus(g, y)
+        spent.append(time.perf_counter() - start)
+    return statistics.median(spent)
+
+
+def ping_pong() -> tuple[float, float]:
+    """Seconds of a short message and bytes per second of long ones, from rank 0 to 1 and back; medians."""
+    comm, took = MPI.COMM_WORLD, {}
+    for size in (SMALL, LARGE):
+        buffer, spent = np.zeros(size, np.uint8), []
+        for _ in range(1000 if size == SMALL else 100):
+            start = time.perf_counter()
+            if comm.rank == 0:
+                comm.Send(buffer, 1)
+                comm.Recv(buffer, 1)
+            elif comm.rank == 1:
+                comm.Recv(buffer, 0)
+                comm.Send(buffer, 0)
+            spent.append(0.5 * (time.perf_counter() - start))
+        took[size] = statistics.median(spent)
+    return took[SMALL], LARGE / max(took[LARGE] - took[SMALL], 1e-9)
+
+
+# -- the model ----------------------------------------------------------------------------------------------
+
+
+def modelled(rows: list[dict[str, Any]], ranks: int, bodies: int, contacts: int, latency: float, bandwidth: float,
+             solver: str) -> float:  # fmt: skip
+    """Seconds of a solve on so many ranks: what one rank takes, in parts, and what travels.
+
+    The work of a rank is its share of that of one rank times the worst load; every product exchanges velocities and
+    momenta of ghosts, whose number grows as the surface of a rank's share; every reduction is a tree of messages.
+    """
+    one, most = rows[0], rows[-1]
+    reductions = [row[f"{solver} reductions"] for row in rows if f"{solver} reductions" in row][-1]
+    work = one[f"{solver} seconds"] * contacts / one["contacts"]["most"] / ranks
+    if ranks == 1:
+        return work
+    load = max(row["contacts"]["most"] / row["contacts"]["mean"] for row in rows)
+    surface = most["bytes"]["most"] / (most["bodies"]["mean"]) ** (2 / 3)
+    messages = min(most["messages"]["most"], 2 * (ranks - 1))
+    product = messages * latency + surface * (bodies / ranks) ** (2 / 3) / bandwidth
+    reduction = 2 * np.ceil(np.log2(ranks)) * latency
+    return work * load + one[f"{solver} products"] * product + reductions * reduction
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """What was counted, of the rank that has the most of it."""
+    heads = ["ranks", "contacts, most / mean", "bodies", "ghosts", "ghosts / bodies^(2/3)", "neighbours"]
+    heads += ["messages, kB per product", *(f"{solver}: iterations, products, reductions" for solver in SOLVERS)]
+    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    for row in rows:
+        surface = row["ghosts"]["most"] / row["bodies"]["mean"] ** (2 / 3)
+        cells = [
+            str(row["ranks"]),
+            f"{row['contacts']['most']:,} / {row['contacts']['most'] / row['contacts']['mean']:.2f}",
+            f"{row['bodies']['most']:,}", f"{row['ghosts']['most']:,}", f"{surface:.1f}",
+            str(row["neighbours"]["most"]), f"{row['messages']['most']}, {row['bytes']['most'] / 1e3:.0f}",
+        ]  # fmt: skip
+        for solver in SOLVERS:
+            counts = (row.get(f"{solver} {name}") for name in ("its", "products", "reductions"))
+            cells.append(", ".join("" if count is None else f"{count:,.0f}" for count in counts).strip(", "))
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="run/study cluster_model", description=__doc__)
+    parser.add_argument("n", type=int, nargs="?", default=8, help="size of the mixer")
+    parser.add_argument("-ranks", default="1,2,4,8,16", help="of this machine, with commas between; 1 is the first")
+    parser.add_argument("-latency", type=float, default=2e-6, help="seconds of a message between nodes, assumed")
+    parser.add_argument("-bandwidth", type=float, default=1e9, help="bytes per second of a rank between nodes, assumed")
+    words = parser.parse_args()
+    if words.n < 1 or not words.latency > 0 or not words.bandwidth > 0:
+        parser.error("n, -latency, -bandwidth: allowed are numbers > 0")
+    ranks = [int(word) if word.isdigit() else 0 for word in words.ranks.split(",")]
+    if ranks[0] != 1 or len(ranks) < 2 or sorted(set(ranks)) != ranks:
+        parser.error(f"-ranks {words.ranks}: allowed are whole numbers that grow, the first of them 1")
+    about = say_machine() | {"latency": words.latency, "bandwidth": words.bandwidth}
+    about["here"] = dict(zip(("latency", "bandwidth"), start(2, "--ping")))
+    print(f"a message here takes {about['here']['latency'] * 1e6:.1f} us, {about['here']['bandwidth'] / 1e9:.1f} GB/s")
+    rows = []
+    for count_ in ranks:
+        rows.append(start(count_, "--count", str(words.n)))
+        milliseconds = 1e3 * rows[-1]["product_s"]
+        print(f"{count_} ranks: product {milliseconds:.2f} ms, load {rows[-1]['imbalance']:.3f}", flush=True)
+    print("\n" + table(rows))
+    about["model"] = models = {}
+    for n, (bodies, contacts) in SIZES.items():
+        print(f"\nmixer n = {n}, {bodies:,} bodies, to {TOL:g}, modelled: seconds (efficiency)")
+        for solver in SOLVERS:
+            given = bodies, contacts, words.latency, words.bandwidth, solver
+            seconds = {r: modelled(rows, r, *given) for r in 2 ** np.arange(13)}
+            models[f"{n} {solver}"] = {int(r): s for r, s in seconds.items()}
+            good = [int(r) for r, s in seconds.items() if seconds[1] / (r * s) >= 0.5]
+            cells = ", ".join(f"{r}: {s:.2g} ({seconds[1] / (r * s):.2f})" for r, s in seconds.items())
+            print(f"{solver:6} {cells}; half of the ranks' time is work up to {max(good)} ranks")
+    record(f"cluster_model_n{words.n}", about, rows)
+
+
+def start(ranks: int, *words: str) -> Any:
+    """What rank 0 of this script says on so many ranks."""
+    command = [".venv/bin/mpiexec", "-n", str(ranks), sys.executable, __file__, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"run/study cluster_model: {' '.join(command)} failed:\n{done.stderr}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--count"]:
+        PETSc.Log.begin()
+        found: Any = count(int(sys.argv[2]))
+    elif sys.argv[1:2] == ["--ping"]:
+        found = ping_pong()
+    else:
+        main()
+        raise SystemExit
+    if MPI.COMM_WORLD.rank == 0:
+        print(json.dumps(found))

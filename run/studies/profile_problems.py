@@ -1,0 +1,278 @@
+"""All problems in folders of files (docs/files.md) by all solvers: run/study profile_problems DIR [DIR ...] [SOLVER
+...] [options]; --help lists the options. Seconds to 1e-4, 1e-6 and 1e-8 of the convex problem and of Coulomb's
+law, performance profiles, failures counted. Peers (Siconos, Clarabel) are in it where they are installed: apt-get
+install python3-siconos, .venv/bin/pip install -e '.[peers]'. Writes results/profile.json, results/profile.md and
+results/profile.png.
+
+A solver works on a problem in a process of its own, cold and on one core, to one tolerance after the other. A
+tolerance counts as reached where `pctt.ccp.measure`, which shares no code with any solver, finds the natural
+residual (for Coulomb's law: its residual) below it. Fast solves are repeated, the fastest counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import solve_one
+from measure import figure, record, say_machine
+from mpi4py import MPI
+from peers import PEERS
+
+from pctt import ccp
+from pctt.ccp import files
+from pctt.ccp.stored import FileFormatError
+
+SUFFIXES = (".dat", ".hdf5", ".h5", ".petsc")
+TOLERANCES = (1e-4, 1e-6, 1e-8)
+ROUNDING = 1.01  # of a residual that another formula finds
+AGAIN, TIMES = 2.0, 5  # seconds up to which a solve is repeated, and how often at most
+STARTUP = 30.0  # seconds that a process may take beside its solves
+LAWS = {"convex": "the convex problem", "coulomb": "Coulomb's law"}
+OWN = {"convex": list(ccp.SOLVERS), "coulomb": ["conic", "pdip", "auto", "apgd"]}
+TABLEAU = ("blue", "orange", "green", "red", "purple", "brown", "pink", "gray", "olive", "cyan")
+WITHIN = (1.0, 2.0, 10.0)  # times the fastest, columns of the table
+
+Rows = list[dict[str, Any]]
+
+
+# -- one solver on one problem, in the process of its own ---------------------------------------------------
+
+
+def solve(path: str, law: str, solver: str, seconds: float) -> Iterator[dict[str, Any]]:
+    """What it takes to each tolerance, until the first that is not reached."""
+    theirs = 1.0
+    for tol in TOLERANCES:
+        if solver in PEERS:  # their own stop tests, tightened until ours is met
+            runs: Rows = []
+            while not runs or (not _reached(runs[-1], tol) and theirs > 1e-13 and runs[-1]["seconds"] < seconds):
+                theirs *= 0.1
+                runs.append(fastest(path, law, solver, theirs, seconds))
+            found = min(runs, key=lambda run: run["residual"])
+        else:
+            found = fastest(path, law, solver, tol, seconds)
+        reached = _reached(found, tol) and found["seconds"] <= seconds  # peers do not always end in time
+        yield {"tol": tol, "reached": reached, **found}
+        if not reached:
+            return
+
+
+def _reached(found: dict[str, Any], tol: float) -> bool:
+    return bool(found["residual"] <= ROUNDING * tol) and "unbounded" not in found["reason"]
+
+
+def fastest(path: str, law: str, solver: str, tol: float, seconds: float) -> dict[str, Any]:
+    """The fastest of several solves, each of a problem that was read anew."""
+    runs = [once(path, law, solver, tol, seconds)]
+    while len(runs) < TIMES and sum(run["seconds"] for run in runs) < AGAIN:
+        runs.append(once(path, law, solver, tol, seconds))
+    return min(runs, key=lambda run: run["seconds"])
+
+
+def once(path: str, law: str, solver: str, tol: float, seconds: float) -> dict[str, Any]:
+    with solve_one.read(path, "auto") as problem:
+        if solver in PEERS:
+            start = time.perf_counter()
+            impulse, reason = PEERS[solver].solve(problem, tol, seconds)
+            found: dict[str, Any] = {"seconds": time.perf_counter() - start, "reason": reason}
+            if found["seconds"] > seconds:
+                found["reason"] = f"{seconds:g} s"
+        else:
+            run = solve_one.own(problem, solver, tol, seconds, law == "coulomb")
+            impulse = run["impulse"]
+            found = {name: run[name] for name in ("seconds", "reason", "solver", "products", "ksp_its")}
+        residual, objective = np.inf, None  # of a solve that is out of time the best that it looked at is not known
+        if impulse is not None and np.isfinite(impulse).all():
+            accuracy = ccp.measure(problem, impulse)
+            residual = accuracy.coulomb_residual if law == "coulomb" else accuracy.natural_residual
+            objective = accuracy.objective
+        return {**found, "residual": float(residual), "objective": objective}
+
+
+# -- all of them --------------------------------------------------------------------------------------------
+
+
+def run(path: Path, law: str, solver: str, seconds: float) -> Rows:
+    """A row per tolerance, of a process that is ended when its time is over."""
+    words = [sys.executable, __file__, "--one", str(path), law, solver, str(seconds)]
+    limit = seconds * (len(TOLERANCES) + (solver in PEERS)) + STARTUP
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=limit, check=False)
+        said, failed = done.stdout, done.stderr.strip().splitlines()[-1:] if done.returncode else []
+        reason = f"failed: {failed[0]}" if failed else "failed" if done.returncode else ""
+    except subprocess.TimeoutExpired as over:
+        said, reason = (over.stdout or b"").decode(), f"{seconds:g} s"
+    rows = [json.loads(line) for line in said.splitlines() if line.startswith("{")]
+    reason = reason or (rows[-1]["reason"] if rows else "failed")
+    residual = rows[-1]["residual"] if rows else np.inf
+    missing = {"reached": False, "seconds": None, "residual": residual, "reason": reason}
+    return rows + [{"tol": tol, **missing} for tol in TOLERANCES[len(rows) :]]
+
+
+def problems(folders: list[Path]) -> tuple[list[tuple[Path, int]], list[str]]:
+    """The files of these folders that are problems, with their contacts, and what is wrong with the others."""
+    found, refused = [], []
+    for path in sorted(path for folder in folders for path in folder.iterdir() if path.suffix in SUFFIXES):
+        try:
+            with files.load(path, MPI.COMM_SELF).problem as problem:
+                found.append((path, problem.size))
+        except FileFormatError as error:  # noqa: PERF203 - as many files as a folder has
+            refused.append(str(error))
+    return found, refused
+
+
+def ratios(rows: Rows, law: str, tol: float) -> tuple[list[str], np.ndarray]:
+    """Solvers, and their seconds over those of the fastest (solvers, problems), inf where they failed."""
+    mine = [row for row in rows if (row["law"], row["tol"]) == (law, tol)]
+    solvers = list(dict.fromkeys(row["method"] for row in mine))
+    names = list(dict.fromkeys(row["problem"] for row in mine))
+    seconds = np.full((len(solvers), len(names)), np.inf)
+    for row in mine:
+        if row["reached"]:
+            seconds[solvers.index(row["method"]), names.index(row["problem"])] = row["seconds"]
+    best = seconds.min(axis=0, initial=np.inf)
+    return solvers, np.where(np.isfinite(seconds), seconds / np.where(np.isfinite(best), best, 1.0), np.inf)
+
+
+def tables(rows: Rows) -> str:
+    """What the profiles show, failures with their reasons, and the seconds of every solve, as Markdown."""
+    lines: list[str] = []
+    for law, words in LAWS.items():
+        mine = [row for row in rows if row["law"] == law]
+        if not mine:
+            continue
+        names = list(dict.fromkeys(row["problem"] for row in mine))
+        lines += [f"**{words[0].upper()}{words[1:]}**, {len(names)} problems. Each cell: how many were solved; how"]
+        lines += ["many of them in the least time, in at most twice and in at most ten times the least time.", ""]
+        lines += [f"| | {' | '.join(f'{tol:.0e}' for tol in TOLERANCES)} |", "|" + "---|" * (len(TOLERANCES) + 1)]
+        profiles = {tol: ratios(rows, law, tol) for tol in TOLERANCES}
+        for k, solver in enumerate(profiles[TOLERANCES[0]][0]):
+            cells = []
+            for tol in TOLERANCES:
+                ratio = profiles[tol][1][k]
+                counts = ", ".join(str(int((ratio <= within).sum())) for within in WITHIN)
+                cells.append(f"{np.isfinite(ratio).sum()}; {counts}")
+            lines.append(f"| `{solver}` | {' | '.join(cells)} |")
+        lines += ["", f"Seconds to {TOLERANCES[-1]:.0e}; where that was not reached, the residual in brackets:", ""]
+        solvers = profiles[TOLERANCES[0]][0]
+        lines += [f"| | contacts | {' | '.join(solvers)} |", "|" + "---|" * (len(solvers) + 2)]
+        last = {(row["problem"], row["method"]): row for row in mine if row["tol"] == TOLERANCES[-1]}
+        for name in names:
+            row = [last[name, solver] for solver in solvers]
+            lines.append(f"| {name} | {row[0]['contacts']} | {' | '.join(map(_seconds, row))} |")
+        lines += ["", *_failures(mine), ""]
+    return "\n".join(lines)
+
+
+def _seconds(row: dict[str, Any]) -> str:
+    """Of a solve; where it failed, the residual that it stopped at in brackets, if there is one."""
+    if row["reached"]:
+        return f"{row['seconds']:.2g}"
+    return f"({row['residual']:.1e})" if np.isfinite(row["residual"]) else "-"
+
+
+def _failures(rows: Rows) -> list[str]:
+    """Why solvers did not reach the tightest tolerance, a line for each."""
+    failed = [row for row in rows if row["tol"] == TOLERANCES[-1] and not row["reached"]]
+    return [f"- `{row['method']}`, {row['problem']}: {row['reason']}" for row in failed]
+
+
+def plot(rows: Rows) -> None:
+    """A panel per law and tolerance: the part of the problems solved within so many times the fastest's seconds."""
+    laws = [law for law in LAWS if any(row["law"] == law for row in rows)]
+    with figure("profile", len(TOLERANCES), len(laws)) as panels:
+        for axes, (law, tol) in zip(panels, [(law, tol) for law in laws for tol in TOLERANCES]):
+            solvers, ratio = ratios(rows, law, tol)
+            names = dict.fromkeys(row["method"] for row in rows)
+            colours = {name: f"tab:{TABLEAU[k % len(TABLEAU)]}" for k, name in enumerate(names)}
+            finite = ratio[np.isfinite(ratio)]
+            end = 2 * finite.max(initial=2.0)
+            for k, solver in enumerate(solvers):
+                x = np.sort(ratio[k][np.isfinite(ratio[k])])
+                x, part = np.append(x, end), np.append(np.arange(1, len(x) + 1), len(x)) / max(1, ratio.shape[1])
+                style = {"color": colours[solver], "ls": "--" if solver in PEERS else "-", "lw": 1.4}
+                axes.step(np.insert(x, 0, 1.0), np.insert(part, 0, 0.0), where="post", label=solver, **style)
+            axes.set(xscale="log", xlim=(1, end), ylim=(0, 1.02), title=f"{LAWS[law]}, {tol:.0e}")
+            axes.set(xlabel="seconds over the fastest's", ylabel="part of the problems")
+            axes.grid(alpha=0.3)
+            axes.legend(fontsize=7, loc="lower right")
+
+
+def read_words() -> tuple[list[Path], dict[str, list[str]], float]:
+    """Folders, solvers by law and seconds of the command line."""
+    everything = {
+        law: OWN[law] + [name for name, peer in PEERS.items() if peer.installed and peer.coulomb == (law == "coulomb")]
+        for law in LAWS
+    }
+    parser = argparse.ArgumentParser(prog="run/study profile_problems", description=__doc__)
+    parser.add_argument("words", nargs="*", metavar="DIR or SOLVER", help="folders of problems; solvers, none: all")
+    parser.add_argument("--seconds", type=float, default=20.0, help="limit of a solve (20)")
+    parser.add_argument("--laws", default=",".join(LAWS), help=f"of {', '.join(LAWS)}, with commas between (both)")
+    words = parser.parse_args()
+    allowed = sorted({name for names in everything.values() for name in names})
+    paths = {word: Path(os.path.normpath(Path(os.environ.get("CALLED_FROM", ".")) / word)) for word in words.words}
+    folders = [path for path in paths.values() if path.is_dir()]
+    asked = [name for word, path in paths.items() if not path.is_dir() for name in word.split(",")]
+    for name in asked:
+        if name not in allowed:
+            parser.error(f"{name}: no folder, and no solver; allowed are {', '.join(allowed)}")
+    laws = words.laws.split(",")
+    for law in laws:
+        if law not in LAWS:
+            parser.error(f"--laws {law}: allowed are {', '.join(LAWS)}")
+    if not folders:
+        parser.error("no folder with problems given; allowed is run/study profile_problems DIR [DIR ...] [SOLVER ...]")
+    if not words.seconds > 0:
+        parser.error(f"--seconds {words.seconds:g}: allowed is a number > 0")
+    return folders, {law: [s for s in everything[law] if not asked or s in asked] for law in laws}, words.seconds
+
+
+def main() -> None:
+    folders, solvers, seconds = read_words()
+    found, refused = problems(folders)
+    for error in refused:
+        print(f"left out: {error}")
+    if not found:
+        places, allowed = ", ".join(map(str, folders)), ", ".join(SUFFIXES)
+        raise SystemExit(f"run/study profile_problems: no problems in {places}; allowed are files ending in {allowed}")
+    about = say_machine() | {"limit": seconds, "refused": refused}
+    rows: Rows = []
+    for law, names in solvers.items():
+        for path, contacts in found:
+            print(f"\n{path.name}, {contacts} contacts, {LAWS[law]}; limit {seconds:g} s\n{'':18}"
+                  + "".join(f"{tol:>10.0e}" for tol in TOLERANCES), flush=True)  # fmt: skip
+            for solver in names:
+                mine = run(path, law, solver, seconds)
+                case = {"law": law, "problem": path.name, "contacts": contacts, "method": solver}
+                rows += [case | row for row in mine]
+                print(f"{solver:18}{''.join(f'{_seconds(row):>10}' for row in mine)}"
+                      f"{'' if mine[-1]['reached'] else '  ' + mine[-1]['reason']}", flush=True)  # fmt: skip
+            record("profile", about, rows)
+    show(rows)
+
+
+def show(rows: Rows) -> None:
+    """The figure and the tables."""
+    plot(rows)
+    text = tables(rows)
+    Path("results/profile.md").write_text(text + "\n")
+    print("\n" + text)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["--show"]:
+        show(json.loads(Path("results/profile.json").read_text())["rows"])
+    elif sys.argv[1:2] == ["--one"]:
+        path, law, solver, limit = sys.argv[2:]
+        for line in solve(path, law, solver, float(limit)):
+            print(json.dumps(line), flush=True)
+    else:
+        main()

@@ -1,0 +1,133 @@
+"""One solver on one cone problem, in a process of its own so that its time and memory can be limited and measured:
+run/studies/solve_one.py FILE METHOD TOL SECONDS prints a JSON object. METHOD is of pctt.ccp.SOLVERS, `coulomb
+NAME` for one of them within -ccp_coulomb, or of peers.PEERS."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import peers
+from mpi4py import MPI
+
+from pctt import ccp
+from pctt.ccp import files
+
+
+class OutOfTimeError(Exception):
+    """The solver has had its seconds."""
+
+
+class Watch:
+    """The course of a solver: what every look at the natural residual found, and what had been done until then."""
+
+    def __init__(self, problem: ccp.ConeProblem, newton: ccp.Newton | None, seconds: float):
+        self.newton, self.seconds = newton, seconds
+        self.course: list[tuple[float, float, int, int]] = []
+        self.products = 0
+        self._look, self._map = problem.natural_residual, problem.contact_map
+        problem.natural_residual = self.look  # type: ignore[method-assign]
+        self._of = type(self._map)
+        self._product = self._of.add_delassus if self._of is not type(None) else None
+        if self._product is not None:
+            self._of.add_delassus = self._counted()  # type: ignore[method-assign]
+        self.start = time.perf_counter()
+
+    def look(self, g: np.ndarray, y: np.ndarray) -> float:
+        residual = self._look(g, y)
+        spent = time.perf_counter() - self.start
+        self.course.append((spent, residual, self.products, self.newton.ksp_its if self.newton else 0))
+        if spent > self.seconds:
+            raise OutOfTimeError
+        return residual
+
+    def _counted(self) -> Callable[..., None]:
+        def add_delassus(*arguments: Any) -> None:
+            self.products += 1
+            self._product(*arguments)
+
+        return add_delassus
+
+    def stop(self, problem: ccp.ConeProblem) -> None:
+        del problem.natural_residual
+        if self._product is not None:
+            self._of.add_delassus = self._product  # type: ignore[method-assign]
+
+
+def own(problem: ccp.ConeProblem, name: str, tol: float, seconds: float, coulomb: bool) -> dict[str, Any]:
+    """A solver of the registry from a cold start."""
+    newton = ccp.newton_for(problem.comm, name) if ccp.SOLVERS[name].newton else None
+    watch = Watch(problem, newton, seconds)
+    limits = ccp.Limits(tol, 10_000_000 if not newton else -1)
+    law = ccp.Coulomb() if coulomb else None
+    impulse = None
+    try:
+        result = ccp.solve(problem, None, name, limits, None, newton, law)
+        impulse, reason, solver = result.impulse, result.reason, result.solver or name
+    except OutOfTimeError:
+        reason, solver = f"{seconds:g} s", name
+    spent = time.perf_counter() - watch.start
+    watch.stop(problem)
+    ksp_its = newton.ksp_its if newton else 0
+    found = {"seconds": spent, "reason": reason, "solver": solver, "products": watch.products, "ksp_its": ksp_its}
+    return {**found, "course": watch.course[1:], "impulse": impulse}
+
+
+def write(path: Path, problem: ccp.ConeProblem) -> None:
+    """A problem of frames and arms on one rank, for `read`."""
+    G = vars(problem.contact_map.given)
+    np.savez(path, r=problem.r, mu=problem.mu, point=problem.point, compliance=problem.softness, **G)
+
+
+def read(path: str, operator: str) -> ccp.ConeProblem:
+    """The problem in a file of `write`, or in any format of `pctt.ccp.files`."""
+    if not path.endswith(".npz"):
+        return files.load(path, MPI.COMM_SELF, operator=operator).problem
+    with np.load(path) as file:
+        G = ccp.CompactRows(*(file[name] for name in ("frame", "arm", "body", "root")), int(file["columns"]))
+        rest = {"point": file["point"], "compliance": float(file["compliance"]), "operator": operator}
+        return ccp.ConeProblem(MPI.COMM_SELF, file["r"], file["mu"], G=G, **rest)
+
+
+def warm_up(method: str, operator: str) -> None:
+    """Have compiled loops come before the clock runs: solve a chain of five spheres."""
+    name = method.rpartition(" ")[2]
+    if name not in ccp.SOLVERS:
+        return
+    normal = np.tile(np.eye(3).ravel(), (4, 1))
+    arm = np.tile([0.1, 0.0, 0.0, -0.1, 0.0, 0.0], (4, 1))
+    pairs = np.arange(4)[:, None] + [0, 1]
+    G = ccp.CompactRows(normal, arm, pairs, np.ones((5, 6)), 5)
+    r = np.tile([-1.0, 0.1, 0.0], (4, 1))
+    with ccp.ConeProblem(MPI.COMM_SELF, r, np.full(4, 0.3), G=G, operator=operator) as problem:
+        ccp.solve(problem, None, name, ccp.Limits(1e-8))
+
+
+def main(path: str, method: str, tol: float, seconds: float, operator: str = "auto") -> None:
+    problem = read(path, operator)
+    warm_up(method, operator)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if method in peers.PEERS:
+        start = time.perf_counter()
+        impulse, reason = peers.PEERS[method].solve(problem, tol, seconds)
+        found: dict[str, Any] = {"seconds": time.perf_counter() - start, "reason": reason, "impulse": impulse}
+    else:
+        law, _, name = method.rpartition(" ")
+        found = own(problem, name, tol, seconds, law == "coulomb")
+    found["memory_mb"] = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    impulse = found.pop("impulse")
+    if impulse is not None and np.isfinite(impulse).all():
+        accuracy = ccp.measure(problem, impulse)
+        found |= {name: getattr(accuracy, name) for name in ("natural_residual", "coulomb_residual", "objective")}
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    path, method, tol, seconds, *operator = sys.argv[1:]
+    main(path, method, float(tol), float(seconds), *operator)

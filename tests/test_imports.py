@@ -1,0 +1,90 @@
+"""Who imports whom: no circles, and what each package may know of."""
+
+from __future__ import annotations
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def modules():
+    """The files of dem and pctt by the names of their modules."""
+    found = {}
+    for path in sorted([*ROOT.glob("dem/**/*.py"), *ROOT.glob("pctt/**/*.py")]):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imported(path):
+    """All names that a file imports: anywhere in it, also in functions and for type checkers only."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def longest_known(name, known):
+    """The module that a dotted name is, or lies in; None for those of others."""
+    while name and name not in known:
+        name = name.rpartition(".")[0]
+    return name or None
+
+
+@pytest.fixture(scope="module")
+def graph():
+    known = modules()
+    return {name: {longest_known(n, known) for n in imported(path)} - {None, name} for name, path in known.items()}
+
+
+def test_no_module_imports_itself_in_a_circle(graph):
+    order = list(TopologicalSorter(graph).static_order())  # a CycleError names the circle
+    assert order.index("dem.world") < order.index("dem.contact") < order.index("dem.start")
+
+
+#: The parts of the house, each with those whose modules it may import.
+BELOW = {
+    "dem": {},
+    "pctt.tt": {"pctt.compiled"},
+    "pctt.contact_map": {"pctt.blocks", "pctt.compiled", "pctt.exchange", "pctt.petsc"},
+    "pctt.body_matrix": {"pctt.block_diagonal", "pctt.blocks", "pctt.contact_map", "pctt.exchange", "pctt.shell"},
+    "pctt.mat": {"pctt.exchange", "pctt.morton", "pctt.petsc", "pctt.shell", "pctt.tt"},
+    "pctt.look": {"dem", "pctt.disk", "pctt.figures_json", "pctt.petsc"},
+}
+
+
+def within(name, part):
+    return name == part or name.startswith(part + ".")
+
+
+@pytest.mark.parametrize("part", BELOW)
+def test_a_part_knows_only_of_those_below_it(graph, part):
+    for name in graph:
+        if within(name, part):
+            others = {other for other in graph[name] if not any(within(other, low) for low in {part, *BELOW[part]})}
+            assert others <= {"pctt"}, name
+
+
+@pytest.mark.parametrize(("part", "above"), [
+    ("pctt.pc", ("dem", "pctt.ccp", "pctt.run", "pctt.look")),
+    ("pctt.ccp", ("dem", "pctt.run", "pctt.look")),
+])  # fmt: skip
+def test_a_part_does_not_know_of_those_above_it(graph, part, above):
+    for name in graph:
+        if within(name, part):
+            assert not {other for other in graph[name] if any(within(other, high) for high in above)}, name
+
+
+def test_mechanics_and_trains_know_nothing_of_petsc():
+    for name, path in modules().items():
+        if name.startswith(("dem", "pctt.tt")):
+            assert not any(other.startswith("petsc4py") for other in imported(path)), name
+
