@@ -44,7 +44,7 @@ def main(comm: MPI.Comm) -> None:
         made = {}
         lines = folder.lines()
         if lines:
-            made["steps"] = figures.steps(lines, folder.summary.get("tolerance"))
+            made["steps"] = figures.steps(lines)
         columns = folder.records()
         if columns:
             made.update(figures.records(columns))

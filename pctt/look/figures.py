@@ -38,9 +38,8 @@ NEIGHBOURS = 12  # of a grain, in an example
 ALIKE = 5  # curves share axes if their greatest values differ by less than this factor
 
 
-def steps(lines: Sequence[Mapping[str, Any]], tolerance: float | None = None) -> Figure:
-    """Contacts, iterations, residual, peak memory and seconds of each step; ``lines``: those of steps.jsonl,
-    ``tolerance``: of the residual."""
+def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
+    """Contacts, iterations, residual, peak memory and seconds of each step; ``lines``: those of steps.jsonl."""
     time = np.array([line["time"] for line in lines])
     figure = Figure(figsize=(12.5, 6.4))
     panels = figure.subplot_mosaic([["contacts", "its", "seconds"], ["residual", "memory", "seconds"]])
@@ -76,8 +75,8 @@ def steps(lines: Sequence[Mapping[str, Any]], tolerance: float | None = None) ->
     if not good.all():
         bad = positive & ~good
         residual.semilogy(time[bad], values[bad], "x", color="C3", label="not converged")
-    if tolerance is not None:
-        residual.axhline(tolerance, color="black", linewidth=0.8, linestyle="--", label="tolerance")
+    asked = np.array([line.get("tolerance", np.nan) for line in lines])
+    residual.plot(time, asked, color="black", linewidth=0.8, linestyle="--", label="tolerance")
     if residual.get_legend_handles_labels()[0]:
         residual.legend(fontsize="small")
     if positive.any():  # a decade at least, or the labels of the axis say little
@@ -211,8 +210,7 @@ def _with_unit(axes: Axes, name: str, unit: str) -> None:
 
 
 def energy(columns: Mapping[str, np.ndarray]) -> Figure:
-    """Energies, and the work and the losses up to the time; below, larger, the energies; at the foot, on a scale of its
-    own, the drift of the balance,
+    """Energies, and the work and the losses up to the time; below, on a scale of its own, the drift of the balance,
 
         kinetic + potential + losses - work - what it was before the first step,
 
@@ -227,14 +225,13 @@ def energy(columns: Mapping[str, np.ndarray]) -> Figure:
         "impact loss, sum": np.cumsum(impact),
     }
     total = kinetic + curves["potential energy, change"] + np.cumsum(friction + impact - work)
-    figure = Figure(figsize=(9.5, 8.4))
-    above, middle, below = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
+    figure = Figure(figsize=(9.5, 6.4))
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for k, (label, values) in enumerate(curves.items()):
-        for axes in (above, middle)[: 2 if k < 2 else 1]:
-            axes.plot(time, values, ("-", "-", "--", "-.", ":")[k], color=f"C{k}", label=label, linewidth=1.5)
+        above.plot(time, values, ("-", "-", "--", "-.", ":")[k], color=f"C{k}", label=label, linewidth=1.5)
     above.plot(time, total, color="black", linewidth=1.8, label="kinetic + potential + losses - work")
     below.plot(time, total - (total[0] - stepping[0]), color="black", linewidth=1.2, label="drift of the sum above")
-    for axes, name in ((above, "energy"), (middle, "the same, larger"), (below, "drift")):
+    for axes, name in ((above, "energy"), (below, "drift")):
         _with_unit(axes, name, "J")
         axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     below.set_xlabel("time [s]")

@@ -137,6 +137,7 @@ class Stepper:
             "solver": solved.solver,
             "law": result.law,
             "asked_solver": self.options.run.ccp_type,
+            "tolerance": self.options.limits.tol,
             **({"pc_report": pc_report} if pc_report else {}),
             **files,
             **({"compare": compare.take_solves()} if compare else {}),
