@@ -18,8 +18,9 @@ import numpy as np
 from dem import bodies, checks, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.bodies import BOX, CAPSULE, COMPOUND, SPHERE, Bodies
+from dem.mesh import Mesh
 from dem.motion import Dynamic, Fixed, Guided, Motion
-from dem.shapes import Shape
+from dem.shapes import Box, Shape
 
 
 @dataclass(frozen=True)
@@ -189,9 +190,11 @@ class Scene:
         return table
 
     def grains(self) -> Bodies:
-        """All grains, in the order of their ids. ValueError if there is none."""
+        """All grains, in the order of their ids. ValueError if there is none, or if there are boxes or meshes beside a
+        mesh that they cannot touch."""
         if sum(len(part) for part in self._grains) == 0:
             raise ValueError("empty scene: there is no grain")
+        _refuse_beside_meshes(self.large_bodies, any((part.shape == BOX).any() for part in self._grains))
         return bodies.concatenate(self._grains)
 
     def large(self) -> Bodies:
@@ -244,6 +247,23 @@ class Scene:
             )
         )
         return ids
+
+
+def _refuse_beside_meshes(members: Sequence[LargeBody], box_grains: bool) -> None:
+    """ValueError for pairs of a mesh and a box or another mesh that might meet: they have no contacts."""
+    for body in members:
+        if not any(isinstance(shape, Mesh) for shape in body.shapes):
+            continue
+        if box_grains:
+            raise ValueError(f"grains that are boxes cannot touch the mesh of {body.name!r}: take spheres or capsules")
+        for other in members:
+            moves = isinstance(body.motion, Dynamic) or isinstance(other.motion, Dynamic)
+            kinds = [type(shape).__name__ for shape in other.shapes if isinstance(shape, (Box, Mesh))]
+            if other is not body and moves and kinds:
+                raise ValueError(
+                    f"the {kinds[0].lower()} of {other.name!r} cannot touch the mesh of {body.name!r}, of which one is "
+                    "dynamic: make the other of planes, spheres or capsules"
+                )
 
 
 def _points(name: str, values: ArrayLike) -> Floats:

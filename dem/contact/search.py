@@ -13,7 +13,7 @@ from dem.arrays import Floats, Ints
 from dem.bodies import BOX, SPHERE, Bodies
 from dem.checks import not_negative
 from dem.contact.broad import close_pairs
-from dem.contact.primitives import FEATURES, PLANE, Primitives, primitives, touches
+from dem.contact.primitives import MESH, PLANE, Primitives, primitives, touches
 from dem.free_motion import free_velocity, large_free_velocity
 from dem.loops import loops
 from dem.motion import Dynamic
@@ -85,8 +85,7 @@ def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | 
 
     pair, feature, touch = touches(table, i, j, reach)
     i, j = i[pair], j[pair]
-    numbers = total + len(table.number) - near.grains - near.ghosts
-    key = (table.number[i] * numbers + table.number[j]) * FEATURES + feature
+    key = table.keys(i, j, feature)
     a, b = table.row[i], table.row[j]
     order = _order(world, near, a, b, key)
     order = order[_gives_way(world, near, a, b, touch.normal)[order]]
@@ -212,12 +211,12 @@ def _grains_beside_parts(
 
 def _distance_at_least(table: Primitives, part: int, points: Floats) -> Floats:
     """A lower bound of the distances (m,) of points (m, 3) from the surface of a part [m]; of planes and boxes the
-    distance itself, as far as it is positive."""
+    distance itself, as far as it is positive; of meshes that of the box about them."""
     place, size = table.center[part], table.size[part]
     if table.kind[part] == PLANE:
         return points @ size - place @ size
     offset = points - place
-    if table.kind[part] == BOX:
+    if table.kind[part] in (BOX, MESH):
         return length(np.maximum(np.abs(offset @ quaternion.matrix(table.quaternion[part])) - size, 0.0))
     return length(offset) - table.radius[part]
 
