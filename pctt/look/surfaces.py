@@ -6,25 +6,27 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkPoints
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
 from vtkmodules.vtkCommonTransforms import vtkTransform
-from vtkmodules.vtkFiltersCore import vtkAppendPolyData
+from vtkmodules.vtkFiltersCore import vtkAppendPolyData, vtkTriangleFilter
 from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
 from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSphereSource
 
 from dem import quaternion
 from dem.bodies import BOX, CAPSULE, SPHERE
+from dem.mesh import Surface
 from pctt.look.folder import Folder, FolderError, Frame
 
 MARGIN = 0.06  # how far walls go beyond the grains, in diagonals of the scene
+HOLLOW = 0.3  # of the way from the middle of a shell to its bounds, which is empty
 
 
 def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
     """Lowest and highest corner (2, 3) of the scene in these frames [m]: of the grains, and of the large bodies among
-    them that are no walls."""
+    or around them that are no walls."""
     radius = enclosing_radius(folder)[:, None]
     places = [frame.position[: folder.grains] for frame in frames]
     low = np.min([(place - radius).min(axis=0) for place in places], axis=0)
@@ -33,9 +35,9 @@ def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
     corners = [low, high]
     for frame in frames:
         for row in range(len(folder.large)):
-            solid = finite(folder, frame, row, box)
-            if solid.GetNumberOfPoints():
-                corners += list(np.reshape(solid.GetBounds(), (3, 2)).T)
+            for solid in (finite(folder, frame, row, box), shell(folder, frame, row, box)):
+                if solid.GetNumberOfPoints():
+                    corners += list(np.reshape(solid.GetBounds(), (3, 2)).T)
     return np.array([np.min(corners, axis=0), np.max(corners, axis=0)])
 
 
@@ -98,10 +100,13 @@ def cylinder() -> vtkPolyData:
 
 
 def finite(folder: Folder, frame: Frame, row: int, box: np.ndarray | None = None) -> vtkPolyData:
-    """The surface of the large body `row`, but for its planes; with a box (2, 3), also but for its walls about it."""
+    """The surface of the large body `row`, but for its planes; with a box (2, 3), also but for its walls about it, and
+    nothing of a body that is a `shell` around it."""
     place, turn = _pose(folder, frame, row)
-    parts = []
+    parts: list[vtkPolyData] = []
     shapes = folder.large[row]["shapes"]
+    if box is not None and len(_shell(folder, frame, row, box)):
+        return joined(parts)
     for shape in shapes:
         if shape["kind"] != "Plane":
             part = _placed(_surface(shape), shape, place, turn)
@@ -118,6 +123,61 @@ def _is_wall(solid: vtkPolyData, box: np.ndarray) -> bool:
     beside = (middle < box[0]) | (middle > box[1])
     along = np.minimum(high, box[1]) - np.maximum(low, box[0]) > 0.8 * (box[1] - box[0])
     return bool(beside.any() and along.any())
+
+
+def shell(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> vtkPolyData:
+    """The triangles of the large body `row` if it is a shell around the box (2, 3), such as a drum or a silo: as they
+    are seen from inside."""
+    triangles = _shell(folder, frame, row, box)
+    if not len(triangles):
+        return vtkPolyData()
+    middle = 0.5 * (triangles.min(axis=(0, 1)) + triangles.max(axis=(0, 1)))
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    away = np.einsum("mi,mi->m", normal, triangles.mean(axis=1) - middle) > 0.0
+    if any(shape["kind"] == "Box" for shape in folder.large[row]["shapes"]):
+        triangles = triangles[~away]  # of thick walls only the inside
+    else:
+        triangles[away] = triangles[away, ::-1]
+    return polydata(triangles.reshape(-1, 3), "polys", 3 * np.arange(1, len(triangles) + 1))
+
+
+def _shell(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> np.ndarray:
+    """The triangles (m, 3, 3) of the large body `row` if it is hollow and around the box (2, 3); none if it is not.
+
+    A body is that if it is made of meshes or of boxes that stand obliquely, reaches around the middle of the box and
+    along two of its axes, and if the middle of the body is empty.
+    """
+    none = np.zeros((0, 3, 3))
+    shapes = folder.large[row]["shapes"]
+    solid = [shape for shape in shapes if shape["kind"] != "Plane"]
+    meshes = any(shape["kind"] == "Mesh" for shape in solid)
+    if not solid or {shape["kind"] for shape in solid} - {"Box", "Mesh"} or not (meshes or len(solid) > 2):
+        return none
+    place, turn = _pose(folder, frame, row)
+    turns = quaternion.matrix(quaternion.multiply(turn, np.array([shape["quaternion"] for shape in solid])))
+    if not meshes and (np.abs(turns).max(axis=2) > 1.0 - 1e-9).all():
+        return none
+    triangles = _triangles(joined([_placed(_surface(shape), shape, place, turn) for shape in solid]))
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    around = ((low < box.mean(axis=0)) & (box.mean(axis=0) < high)).all()
+    long = np.minimum(high, box[1]) - np.maximum(low, box[0]) > 0.8 * (box[1] - box[0])
+    if not around or np.count_nonzero(long) < 2:
+        return none
+    corners = (triangles.reshape(-1, 3) - 0.5 * (low + high)) / (0.5 * (high - low))
+    surface = Surface(corners, np.arange(len(corners)).reshape(-1, 3))
+    middle = np.broadcast_to(-surface.middle, (len(triangles), 3))
+    hollow = surface.closest(middle, np.arange(len(triangles))).distance.min() > HOLLOW
+    return triangles if hollow else none
+
+
+def _triangles(surface: vtkPolyData) -> np.ndarray:
+    """The corners (m, 3, 3) of the triangles of a surface."""
+    source = vtkTriangleFilter()
+    source.SetInputData(surface)
+    source.Update()
+    data = source.GetOutput()
+    cells = vtk_to_numpy(data.GetPolys().GetData()).reshape(-1, 4)[:, 1:]
+    return vtk_to_numpy(data.GetPoints().GetData()).astype(float)[cells]
 
 
 def joined(parts: Sequence[vtkPolyData]) -> vtkPolyData:
@@ -158,9 +218,8 @@ def walls(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.nd
     place, turn = _pose(folder, frame, row)
     middle = box.mean(axis=0)
     shapes = folder.large[row]["shapes"]
-    for shape in shapes:
-        if len(shapes) == 1 or shape["kind"] != "Box":
-            continue
+    boxes = [shape for shape in shapes if shape["kind"] == "Box" and len(shapes) > 1]
+    for shape in [] if boxes and len(_shell(folder, frame, row, box)) else boxes:
         if _is_wall(_placed(_surface(shape), shape, place, turn), box):
             center = place + quaternion.rotate(turn, np.array(shape["center"]))
             axes = quaternion.matrix(quaternion.multiply(turn, np.array(shape["quaternion"]))).T
@@ -241,6 +300,9 @@ def _surface(shape: Mapping[str, Any]) -> vtkPolyData:
         block.SetZLength(z)
         block.Update()
         return block.GetOutput()
+    if shape["kind"] == "Mesh":
+        corners = np.array(shape["vertices"])[np.array(shape["triangles"])]
+        return polydata(corners.reshape(-1, 3), "polys", 3 * np.arange(1, len(corners) + 1))
     if shape["kind"] == "Capsule":
         core = vtkCylinderSource()
         core.SetRadius(shape["radius"])
