@@ -34,8 +34,8 @@ class Silo(Experiment):
     out onto a floor.
 
     Cylinder and cone are one mesh, of flat sides. With `half_angle` 90 the bottom is flat. What is recorded is the mass
-    below the outlet, of which the flow is the slope while a fifth to three fifths of the mass runs out. Beside it
-    stands the flow by Beverloo's law, for the bulk density of a packing fraction of 0.58.
+    below the outlet, of which the flow is the slope while a tenth to a half of the mass runs out. Beside it stands the
+    flow by Beverloo's law, for the bulk density of a packing fraction of 0.58.
     """
 
     n: int = option(6, "", "size: radius of the cylinder in diameters of a sphere")
@@ -93,7 +93,8 @@ class Silo(Experiment):
     @property
     def cone_height(self) -> float:
         """Height of the cone [m]."""
-        return 0.0 if self.half_angle == 90.0 else (self.silo_radius - self.outlet_radius) / tan(radians(self.half_angle))
+        wider = self.silo_radius - self.outlet_radius
+        return 0.0 if self.half_angle == 90.0 else wider / tan(radians(self.half_angle))
 
     @property
     def floor(self) -> float:
@@ -157,10 +158,10 @@ class Silo(Experiment):
         return {"discharged [kg]": step.total(grains.mass[grains.position[:, 2] < 0.0])}
 
     def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
-        """The flow between a fifth and three fifths of the mass, and that of Beverloo's law."""
+        """The flow while a tenth to a half of the mass runs out, and that of Beverloo's law."""
         time, out = records["time [s]"], records["discharged [kg]"]
         total = self.spheres * self.density * 4 / 3 * pi * self.radius**3
-        steady = (out > 0.2 * total) & (out < 0.6 * total)
+        steady = (out > 0.1 * total) & (out < 0.5 * total)
         if np.count_nonzero(steady) < 3:
             return {}
         flow = float(np.polyfit(time[steady], out[steady], 1)[0])

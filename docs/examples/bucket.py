@@ -1,6 +1,6 @@
 """A bucket from an STL file goes round and scoops spheres out of a tray::
 
-    python docs/examples/bucket.py bucket.stl        # writes the file, in millimetres; a drawing of your own does as well
+    python docs/examples/bucket.py bucket.stl  # writes the file, in millimetres; a drawing of your own does as well
     python -m pctt.run -scene docs/examples/bucket.py -scene_file bucket.stl -ccp_type apgd -steps 400 -output_every 4
 """
 
@@ -20,7 +20,7 @@ from dem.scenes.lattice import perturbed
 from dem.shapes import Plane
 
 RADIUS = 0.004  # of a sphere [m]
-ARM = 0.1  # from the axis to the middle of the bucket's bottom [m]
+ARM = 0.072  # from the axis to the middle of the bucket's bottom [m]
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ class Stage:
             surfaces.joined([surfaces.finite(folder, frame, row, self.box) for row in large])
         )
         self._shells.GetMapper().SetInputDataObject(
-            surfaces.joined([surfaces.shell(folder, frame, row, self.box) for row in large])
+            surfaces.joined([surfaces.shell(folder, frame, row) for row in large])
         )
         self._stamp.SetInput(f"t = {frame.time:.3f} s")
         self._renderer.ResetCameraClippingRange()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
     corners = [low, high]
     for frame in frames:
         for row in range(len(folder.large)):
-            for solid in (finite(folder, frame, row, box), shell(folder, frame, row, box)):
+            for solid in (finite(folder, frame, row, box), shell(folder, frame, row)):
                 if solid.GetNumberOfPoints():
                     corners += list(np.reshape(solid.GetBounds(), (3, 2)).T)
     return np.array([np.min(corners, axis=0), np.max(corners, axis=0)])
@@ -101,11 +102,11 @@ def cylinder() -> vtkPolyData:
 
 def finite(folder: Folder, frame: Frame, row: int, box: np.ndarray | None = None) -> vtkPolyData:
     """The surface of the large body `row`, but for its planes; with a box (2, 3), also but for its walls about it, and
-    nothing of a body that is a `shell` around it."""
+    nothing of a body that is a `shell`."""
     place, turn = _pose(folder, frame, row)
     parts: list[vtkPolyData] = []
     shapes = folder.large[row]["shapes"]
-    if box is not None and len(_shell(folder, frame, row, box)):
+    if box is not None and is_shell(folder, row):
         return joined(parts)
     for shape in shapes:
         if shape["kind"] != "Plane":
@@ -125,12 +126,11 @@ def _is_wall(solid: vtkPolyData, box: np.ndarray) -> bool:
     return bool(beside.any() and along.any())
 
 
-def shell(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> vtkPolyData:
-    """The triangles of the large body `row` if it is a shell around the box (2, 3), such as a drum or a silo: as they
-    are seen from inside."""
-    triangles = _shell(folder, frame, row, box)
-    if not len(triangles):
+def shell(folder: Folder, frame: Frame, row: int) -> vtkPolyData:
+    """The triangles of the large body `row` if it is a shell, such as a drum or a silo, as seen from inside."""
+    if not is_shell(folder, row):
         return vtkPolyData()
+    triangles = _solid(folder, frame, row)
     middle = 0.5 * (triangles.min(axis=(0, 1)) + triangles.max(axis=(0, 1)))
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     away = np.einsum("mi,mi->m", normal, triangles.mean(axis=1) - middle) > 0.0
@@ -141,33 +141,40 @@ def shell(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> vtkPolyDat
     return polydata(triangles.reshape(-1, 3), "polys", 3 * np.arange(1, len(triangles) + 1))
 
 
-def _shell(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> np.ndarray:
-    """The triangles (m, 3, 3) of the large body `row` if it is hollow and around the box (2, 3); none if it is not.
-
-    A body is that if it is made of meshes or of boxes that stand obliquely, reaches around the middle of the box and
-    along two of its axes, and if the middle of the body is empty.
-    """
-    none = np.zeros((0, 3, 3))
-    shapes = folder.large[row]["shapes"]
-    solid = [shape for shape in shapes if shape["kind"] != "Plane"]
+@lru_cache(maxsize=256)
+def is_shell(folder: Folder, row: int) -> bool:
+    """Whether the large body `row` is hollow, made of meshes or of boxes that stand obliquely to each other, and has
+    half of the grains inside at the first or at the last recorded step."""
+    solid = [shape for shape in folder.large[row]["shapes"] if shape["kind"] != "Plane"]
     meshes = any(shape["kind"] == "Mesh" for shape in solid)
     if not solid or {shape["kind"] for shape in solid} - {"Box", "Mesh"} or not (meshes or len(solid) > 2):
-        return none
-    place, turn = _pose(folder, frame, row)
-    turns = quaternion.matrix(quaternion.multiply(turn, np.array([shape["quaternion"] for shape in solid])))
-    if not meshes and (np.abs(turns).max(axis=2) > 1.0 - 1e-9).all():
-        return none
-    triangles = _triangles(joined([_placed(_surface(shape), shape, place, turn) for shape in solid]))
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-    around = ((low < box.mean(axis=0)) & (box.mean(axis=0) < high)).all()
-    long = np.minimum(high, box[1]) - np.maximum(low, box[0]) > 0.8 * (box[1] - box[0])
-    if not around or np.count_nonzero(long) < 2:
-        return none
+        return False
+    turns = quaternion.matrix(np.array([shape["quaternion"] for shape in solid]))
+    if not meshes and (np.abs(turns[0].T @ turns).max(axis=2) > 1.0 - 1e-9).all():
+        return False
+    for frame in (folder.frame(step) for step in {folder.steps[0], folder.steps[-1]}):
+        triangles = _solid(folder, frame, row)
+        low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+        grains = frame.position[: folder.grains]
+        within = ((low <= grains) & (grains <= high)).all(axis=1)
+        if 2 * np.count_nonzero(within) >= folder.grains and (high > low).all() and _is_hollow(triangles, low, high):
+            return True
+    return False
+
+
+def _is_hollow(triangles: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool:
+    """Whether there is nothing of the triangles (m, 3, 3) about the middle of their bounds."""
     corners = (triangles.reshape(-1, 3) - 0.5 * (low + high)) / (0.5 * (high - low))
     surface = Surface(corners, np.arange(len(corners)).reshape(-1, 3))
     middle = np.broadcast_to(-surface.middle, (len(triangles), 3))
-    hollow = surface.closest(middle, np.arange(len(triangles))).distance.min() > HOLLOW
-    return triangles if hollow else none
+    return bool(surface.closest(middle, np.arange(len(triangles))).distance.min() > HOLLOW)
+
+
+def _solid(folder: Folder, frame: Frame, row: int) -> np.ndarray:
+    """The corners (m, 3, 3) of the triangles of the large body `row` but for its planes."""
+    place, turn = _pose(folder, frame, row)
+    shapes = [shape for shape in folder.large[row]["shapes"] if shape["kind"] != "Plane"]
+    return _triangles(joined([_placed(_surface(shape), shape, place, turn) for shape in shapes]))
 
 
 def _triangles(surface: vtkPolyData) -> np.ndarray:
@@ -176,7 +183,7 @@ def _triangles(surface: vtkPolyData) -> np.ndarray:
     source.SetInputData(surface)
     source.Update()
     data = source.GetOutput()
-    cells = vtk_to_numpy(data.GetPolys().GetData()).reshape(-1, 4)[:, 1:]
+    cells = vtk_to_numpy(data.GetPolys().GetConnectivityArray()).reshape(-1, 3)
     return vtk_to_numpy(data.GetPoints().GetData()).astype(float)[cells]
 
 
@@ -219,7 +226,7 @@ def walls(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.nd
     middle = box.mean(axis=0)
     shapes = folder.large[row]["shapes"]
     boxes = [shape for shape in shapes if shape["kind"] == "Box" and len(shapes) > 1]
-    for shape in [] if boxes and len(_shell(folder, frame, row, box)) else boxes:
+    for shape in [] if boxes and is_shell(folder, row) else boxes:
         if _is_wall(_placed(_surface(shape), shape, place, turn), box):
             center = place + quaternion.rotate(turn, np.array(shape["center"]))
             axes = quaternion.matrix(quaternion.multiply(turn, np.array(shape["quaternion"]))).T

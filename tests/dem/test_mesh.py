@@ -6,7 +6,7 @@ import builtins
 
 import numpy as np
 import pytest
-from cases import advance, crude_impulse, random_quaternions
+from cases import advance, contacts_by_key, crude_impulse, random_quaternions, step
 from convex import distance
 from mpi4py import MPI
 
@@ -367,3 +367,37 @@ def test_keys_of_meshes_are_distinct():
     system = ContactSystem(world, contacts, 1e-9)
     advance(world, system.velocity(crude_impulse(system)), 1e-9)
     np.testing.assert_array_equal(np.sort(find_contacts(world, 0.05).key), np.sort(contacts.key))
+
+
+def tumbler():
+    """Spheres and capsules in a turning drum with a wheel that turns, and a ball that is free to move."""
+    rng = np.random.default_rng(9)
+    scene = Scene(friction=0.4)
+    profile = [(0.0, -0.49), (0.7, -0.49), (0.7, 0.49), (0.0, 0.49)]
+    scene.add_body("drum", [Mesh.revolved(profile, 12)], Rotation((0.3, 1.0, 0)))
+    wheel = Mesh.revolved([(0, -0.05), (0.19, -0.05), (0.19, 0.05), (0, 0.05)], 9)
+    scene.add_body("wheel", [wheel], Rotation((1.0, 2.0, 3.0), (0, 0, 0.35)), position=(0, 0, 0.35))
+    scene.add_body("ball", [Sphere(0.1)], Dynamic(), density=500.0, position=(0.57, 0, 0), velocity=(1, 0, 0))
+    grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    places = 0.22 * (grid - 1.5) + rng.uniform(-0.01, 0.01, grid.shape) - [0, 0, 0.05]
+    places = places[np.linalg.norm(places - [0, 0, 0.35], axis=1) > 0.27]
+    speeds = rng.normal(size=places.shape)
+    scene.add_spheres(places[::2], 0.09, 1000.0, velocity=speeds[::2])
+    turns = random_quaternions(rng, len(places[1::2]))
+    scene.add_capsules(places[1::2], 0.05, 0.04, 1000.0, quaternions=turns, velocity=speeds[1::2])
+    return scene
+
+
+@pytest.mark.parallel(2, 4)
+def test_on_several_ranks_meshes_have_the_contacts_that_they_have_on_one():
+    worlds = [World.from_scene(tumbler(), comm) for comm in (SELF, MPI.COMM_WORLD)]
+    touched = np.zeros(3)
+    for _ in range(6):
+        one, many = (contacts_by_key(step(world, delta=0.03), world.comm) for world in worlds)
+        np.testing.assert_array_equal(one["key"], many["key"])
+        for name in ("a", "b"):
+            np.testing.assert_array_equal(one[name], many[name])
+        for name in ("point", "normal", "gap"):
+            np.testing.assert_allclose(one[name], many[name], atol=1e-8)
+        touched += [np.count_nonzero(one["b"] == len(worlds[0].grains) + k) for k in range(3)]  # drum, wheel, ball
+    assert (touched > 0).all()
