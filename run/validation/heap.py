@@ -12,7 +12,8 @@ from dem.scene import Scene
 from dem.scenes.lattice import perturbed
 from dem.shapes import Box, Plane
 
-RADIUS = 0.005  # of a sphere [m]
+RADIUS = 0.005  # of the greatest spheres [m]
+SMALLEST = 0.65  # of them; equal spheres between plane walls make a crystal, whose slopes are steep
 
 
 @dataclass(frozen=True)
@@ -21,8 +22,8 @@ class Heap(Experiment):
 
     friction: float = option(0.5, "", "friction coefficient between spheres, and of shelf and lip")
     columns: int = option(18, "", "spheres of the lattice along the shelf")
-    rows: int = option(4, "", "across")
-    layers: int = option(8, "", "above each other")
+    rows: int = option(5, "", "across")
+    layers: int = option(9, "", "above each other")
     gate_speed: float = option(0.1, "m/s", "of the gate, upwards")
     dt = 0.005
     delta = 0.001
@@ -40,7 +41,9 @@ class Heap(Experiment):
         x = -(np.arange(self.columns) + 0.6) * self.pitch
         y = (np.arange(self.rows) - (self.rows - 1) / 2) * self.pitch
         z = 1.5 * RADIUS + (np.arange(self.layers) + 0.6) * self.pitch
-        scene.add_spheres(perturbed(x, y, z, 0.1 * RADIUS, 1), RADIUS, 2500.0, material="spheres")
+        places = perturbed(x, y, z, 0.1 * RADIUS, 1)
+        radii = RADIUS * np.random.default_rng(2).uniform(SMALLEST, 1.0, len(places))
+        scene.add_spheres(places, radii, 2500.0, material="spheres")
         length, half, tall = (self.columns + 0.2) * self.pitch, (self.rows + 0.1) * self.pitch / 2, 0.2
         sides = [Plane((0, -side, 0), (0, side * half, 0)) for side in (-1, 1)]
         scene.add_body("walls", [*sides, Plane((1, 0, 0), (-length, 0, 0))], material="walls")

@@ -375,7 +375,7 @@ def tumbler():
     scene = Scene(friction=0.4)
     profile = [(0.0, -0.49), (0.7, -0.49), (0.7, 0.49), (0.0, 0.49)]
     scene.add_body("drum", [Mesh.revolved(profile, 12)], Rotation((0.3, 1.0, 0)))
-    wheel = Mesh.revolved([(0, -0.05), (0.19, -0.05), (0.19, 0.05), (0, 0.05)], 9)
+    wheel = Mesh.revolved([(0, -0.05), (0.23, -0.05), (0.23, 0.05), (0, 0.05)], 9)
     scene.add_body("wheel", [wheel], Rotation((1.0, 2.0, 3.0), (0, 0, 0.35)), position=(0, 0, 0.35))
     scene.add_body("ball", [Sphere(0.1)], Dynamic(), density=500.0, position=(0.57, 0, 0), velocity=(1, 0, 0))
     grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
