@@ -289,7 +289,7 @@ class Mesh:
         try:
             import trimesh
         except ImportError:
-            raise ValueError(f"{file}: meshes are read by trimesh, which is not there: pip install trimesh") from None
+            raise ValueError(f"{file}: meshes are read by trimesh, which is not there: pip install 'pctt[meshes]', or trimesh") from None
         if not Path(file).is_file():
             raise ValueError(f"{file}: no such file")
         try:

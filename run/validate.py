@@ -31,7 +31,7 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
     },
     "drum": {"drum": ("drum", "-steps", 700)},
     "heap": {
-        f"heap_{friction:g}": ("run/validation/heap.py", "-scene_friction", friction, "-steps", 480)
+        f"heap_{friction:g}": ("run/validation/heap.py", "-scene_friction", friction, "-steps", 470)
         for friction in FRICTIONS
     },
     "column": {"column": ("run/validation/column.py", "-steps", 240)},

@@ -74,6 +74,11 @@ class Drum(Experiment):
         return 0.2 * self.radius
 
     @property
+    def settle_delta(self) -> float:
+        """Contact distance while settling [m]."""
+        return self.radius
+
+    @property
     def pitch(self) -> float:
         """Spacing of the lattice on which the spheres start [m]."""
         return 2.3 * self.radius

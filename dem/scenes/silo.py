@@ -76,6 +76,11 @@ class Silo(Experiment):
         return 0.2 * self.radius
 
     @property
+    def settle_delta(self) -> float:
+        """Contact distance while settling [m]."""
+        return self.radius
+
+    @property
     def pitch(self) -> float:
         """Spacing of the lattice on which the spheres start [m]."""
         return 2.3 * self.radius

@@ -13,7 +13,7 @@ from dem.scenes.lattice import perturbed
 from dem.shapes import Box, Plane
 
 RADIUS = 0.005  # of the greatest spheres [m]
-SMALLEST = 0.65  # of them; equal spheres between plane walls make a crystal, whose slopes are steep
+SMALLEST = 0.8  # of them; equal spheres between plane walls make a crystal, whose slopes are steep
 
 
 @dataclass(frozen=True)
@@ -21,13 +21,13 @@ class Heap(Experiment):
     """Spheres on a shelf between two frictionless walls; a lip holds the lowest layer."""
 
     friction: float = option(0.5, "", "friction coefficient between spheres, and of shelf and lip")
-    columns: int = option(18, "", "spheres of the lattice along the shelf")
-    rows: int = option(5, "", "across")
-    layers: int = option(9, "", "above each other")
+    columns: int = option(11, "", "spheres of the lattice along the shelf")
+    rows: int = option(4, "", "across")
+    layers: int = option(22, "", "above each other")
     gate_speed: float = option(0.1, "m/s", "of the gate, upwards")
     dt = 0.005
     delta = 0.001
-    settling_time = 0.5
+    settling_time = 0.6
 
     @property
     def pitch(self) -> float:
@@ -44,7 +44,7 @@ class Heap(Experiment):
         places = perturbed(x, y, z, 0.1 * RADIUS, 1)
         radii = RADIUS * np.random.default_rng(2).uniform(SMALLEST, 1.0, len(places))
         scene.add_spheres(places, radii, 2500.0, material="spheres")
-        length, half, tall = (self.columns + 0.2) * self.pitch, (self.rows + 0.1) * self.pitch / 2, 0.2
+        length, half, tall = (self.columns + 0.2) * self.pitch, (self.rows + 0.1) * self.pitch / 2, 0.3
         sides = [Plane((0, -side, 0), (0, side * half, 0)) for side in (-1, 1)]
         scene.add_body("walls", [*sides, Plane((1, 0, 0), (-length, 0, 0))], material="walls")
         shelf = Box((length, half + 0.01, 0.01), (-length, 0, -0.01))

@@ -60,8 +60,8 @@ def heap(folders: Mapping[float, Path]) -> tuple[list[Row], dict]:
 
 
 def profile(folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
-    """Height of the surface over the distance from the edge, in bins a diameter wide [m], and its angle [degrees]: of
-    the line through the slope, which ends where the surface is level at nine tenths of its greatest height."""
+    """Height of the surface over the distance from the edge, in bins a diameter wide [m], and the angle of the line
+    through them [degrees]; the bins at the lip and at the wall do not count."""
     run = Folder(folder)
     run.require_frames()
     place = run.frame(run.steps[-1]).position[: run.grains]
@@ -72,9 +72,7 @@ def profile(folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
     columns = np.arange(1, column.max())
     height = np.array([top[column == k].max(initial=0.0) for k in columns])
     x = (columns + 0.5) * DIAMETER
-    level = np.flatnonzero(height > 0.9 * height.max())[0]
-    part = slice(0, max(int(level) + 1, 3))
-    slope = np.polyfit(x[part], height[part], 1)[0]
+    slope = np.polyfit(x, height, 1)[0]
     return x, height, float(np.degrees(np.arctan(slope)))
 
 
