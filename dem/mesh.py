@@ -289,7 +289,8 @@ class Mesh:
         try:
             import trimesh
         except ImportError:
-            raise ValueError(f"{file}: meshes are read by trimesh, which is not there: pip install 'pctt[meshes]', or trimesh") from None
+            remedy = "pip install 'pctt[meshes]', or trimesh"
+            raise ValueError(f"{file}: meshes are read by trimesh, which is not there: {remedy}") from None
         if not Path(file).is_file():
             raise ValueError(f"{file}: no such file")
         try:

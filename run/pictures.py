@@ -1,4 +1,4 @@
-"""Draws the pictures of the scenes in README and docs anew; see run/pictures."""
+"""Draws the README's pictures of the three scenes anew; see run/pictures."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ PICTURES = {
     "mixer": (1, ("-color", "force", "-range", "0", "20000", "-cut", "-size", "960x720")),
     "blade": (10, ("-color", "speed", "-size", "800x560")),
     "shear": (10, ("-color", "speed", "-size", "800x560")),
-    "drum": (240, ("-color", "speed", "-size", "800x640", "-azimuth", "-70")),
-    "silo": (60, ("-color", "speed", "-size", "560x800", "-elevation", "15")),
 }
 
 

@@ -21,9 +21,9 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem import bodies
+from dem import bodies, quaternion
 from dem.free_motion import free_directions
-from dem.motion import Guided
+from dem.motion import Guided, Hinged
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
@@ -181,7 +181,7 @@ def _block_diagonal(blocks: Array, comm: MPI.Comm) -> PETSc.Mat:
 
 
 def _dynamic_rows(system: ContactSystem, dynamic: np.ndarray, world: World) -> PETSc.Mat:
-    """D of the dynamic bodies alone, of guided ones along their guides; collective."""
+    """D of the dynamic bodies alone, of guided and hinged ones as far as they can move; collective."""
     D = system.D
     first, _ = D.getOwnershipRange()
     rows = first + np.flatnonzero(np.repeat(dynamic, 6))
@@ -190,13 +190,14 @@ def _dynamic_rows(system: ContactSystem, dynamic: np.ndarray, world: World) -> P
     H = D.createSubMatrix(*index_sets)
     for index_set in index_sets:
         index_set.destroy()
-    if not any(isinstance(body.motion, Guided) for body in world.large_bodies):
+    if not any(isinstance(body.motion, (Guided, Hinged)) for body in world.large_bodies):
         return H
     blocks = np.tile(np.eye(6), (len(dynamic), 1, 1))
     if world.comm.rank == world.comm.size - 1:
         large = blocks[len(world.grains) :]
         large[:, :3, :3] = free_directions(world.large_bodies)
-        large[~np.isfinite(world.large.inertia).all(axis=1), 3:, 3:] = 0.0
+        axes = quaternion.matrix(world.large.quaternion)
+        large[:, 3:, 3:] = (axes * np.isfinite(world.large.inertia)[:, None, :]) @ axes.transpose(0, 2, 1)
     open_to = _block_diagonal(blocks[dynamic], world.comm)
     projected = open_to.matMult(H)
     H.destroy()

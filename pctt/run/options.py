@@ -223,7 +223,8 @@ def _read_scene(scene_class: type[Experiment], database: Mapping[str, str]) -> t
         if not str(error).startswith(tuple(field.name for field in dataclasses.fields(scene_class))):
             raise
         raise OptionError(f"-scene_{error}") from None
-    _ = scene.settling_time, scene.settle_delta, scene.domain  # they may be properties too: what fails is to fail before any work
+    # They may be properties too: what fails is to fail before any work.
+    _ = scene.settling_time, scene.settle_delta, scene.domain
     return scene, scene.dt, scene.delta
 
 
