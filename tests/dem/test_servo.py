@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from dem import quaternion
 from dem.contact import find_contacts
 from dem.mesh import Mesh
 from dem.motion import Glide, Guided, Hinged
 from dem.scene import Scene
-from dem.shapes import Box, Capsule, Plane, Sphere
+from dem.shapes import Box, Capsule, Plane, Sphere, mass_properties
 from dem.stepper import advance
 from dem.system import ContactSystem
 from dem.world import World
@@ -52,14 +53,8 @@ def test_a_wheel_on_a_hinge_turns_by_its_torque_and_stays_in_its_place():
     np.testing.assert_allclose(np.cross(speed, AXIS), 0.0, atol=1e-12)
     turn = np.linalg.norm(speed)
     np.testing.assert_allclose(world.large.position[0], [1, 2, 3], atol=1e-12)
-    direction = np.array([0.0, 0, 1.0])
-    local = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], float).T @ AXIS  # the axis in the frame of the mesh
-    solid = 100.0 * 60 / 2 * 0.25 * np.sin(2 * np.pi / 60) * 0.2
-    disc = solid * 0.25 * (2 + np.cos(2 * np.pi / 60)) / 6
-    moments = np.array([disc / 2 + solid * 0.04 / 12] * 2 + [disc])
-    known = [3.0 * 0.2 / (moments @ (axis**2)) for axis in (local, np.abs(local)[[2, 0, 1]], np.abs(local)[[1, 2, 0]])]
-    assert min(abs(turn - value) for value in known) < 1e-9 * turn
-    assert direction @ direction == 1.0
+    local = quaternion.rotate(quaternion.conjugate(np.array(tilt)), AXIS)
+    assert turn == pytest.approx(3.0 * 0.2 / (local @ mass_properties([wheel], 100.0)[2] @ local))
 
 
 def test_a_servo_keeps_its_speed_as_far_as_its_torque_goes():
@@ -130,6 +125,20 @@ def test_a_drum_on_a_hinge_is_turned_back_by_its_bed():
         step(world, 1e-7)
     assert world.large.velocity[0, 4] > 1e-3  # down on the side of the sphere
     np.testing.assert_allclose(world.large.velocity[0, [0, 1, 2, 3, 5]], 0.0, atol=1e-12)
+
+
+def test_the_mass_scaled_map_of_a_hinged_body_has_one_direction():
+    scene = Scene(0.3)
+    scene.add_body("tool", [Sphere(0.5)], Hinged(AXIS), density=100.0)
+    scene.add_spheres([[0.6, 0, 0], [0, 0.601, 0]], 0.1, 1000.0)
+    world = World.from_scene(scene, SELF)
+    system = ContactSystem(world, find_contacts(world, 0.01), DT)
+    blocks = system.G.data[system.G.indices == 2].reshape(-1, 6)
+    np.testing.assert_array_equal(blocks[:, :3], 0.0)
+    np.testing.assert_allclose(np.cross(blocks[:, 3:], AXIS), 0.0, atol=1e-15)
+    compact = system.contact_map.root[-1, 6:]
+    moment = 0.4 * 0.25 * 100.0 * 4 / 3 * np.pi * 0.125
+    np.testing.assert_allclose(compact, (np.outer(AXIS, AXIS) / np.sqrt(moment))[np.triu_indices(3)], atol=1e-15)
 
 
 def test_bad_drives_are_refused():
