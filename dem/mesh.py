@@ -15,12 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, cKDTree
-
-try:
-    from scipy.spatial import QhullError
-except ImportError:  # before SciPy 1.8
-    from scipy.spatial.qhull import QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.checks import finite, finite_vector, positive, unit_quaternions

@@ -335,6 +335,26 @@ def test_a_ball_that_rolls_over_edges_goes_straight_on_as_on_a_plane():
     np.testing.assert_allclose(mesh[-1, 3], 2.5 * 5 / 7, rtol=1e-6)  # slides, then rolls
 
 
+@pytest.mark.parametrize("shape", ["sphere", "capsule"])
+def test_fast_grains_do_not_fly_through_a_sheet(shape):
+    """They go two radii in a step; from below as from above."""
+    scene = Scene(friction=0.5, gravity=(0, 0, 0))
+    scene.add_body("sheet", [sheet(5)])
+    places, velocity = [[0.03, 0.04, 0.4], [0.5, 0.2, -0.55]], np.array([[0, 0, -20.0], [0, 1.0, 20.0]])
+    if shape == "sphere":
+        scene.add_spheres(places, 0.1, 1000.0, velocity=velocity)
+    else:
+        scene.add_capsules(places, 0.1, 0.1, 1000.0, quaternions=(0.5, 0.5, 0.5, 0.5), velocity=velocity)
+    world = World.from_scene(scene, SELF)
+    order = np.argsort(world.grains.id)
+    for _ in range(5):
+        system = ContactSystem(world, find_contacts(world, 0.01, 0.01), 0.01)
+        with cone_problem(system, SELF) as problem:
+            result = ccp.solve(problem, None, "apgd", ccp.Limits(1e-8), coulomb=ccp.Coulomb())
+        advance(world, system.velocity(result.impulse), 0.01)
+    np.testing.assert_allclose(world.grains.position[order, 2], [0.1, -0.1], atol=1e-3)
+
+
 def test_a_solid_of_triangles_falls_and_rests_on_a_plane():
     scene = Scene(friction=0.5)
     scene.add_body("floor", [Plane((0, 0, 1))])
