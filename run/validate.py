@@ -29,7 +29,7 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
         )
         for outlet, steps in zip(OUTLETS, (520, 350, 280))
     },
-    "drum": {"drum": ("drum", "-steps", 700)},
+    "drum": {"drum": ("drum", "-scene_n", 8, "-steps", 640)},
     "heap": {
         f"heap_{friction:g}": ("run/validation/heap.py", "-scene_friction", friction, "-steps", 470)
         for friction in FRICTIONS

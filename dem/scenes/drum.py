@@ -26,7 +26,7 @@ ALONG_Y = (sqrt(0.5), -sqrt(0.5), 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Drum(Experiment):
-    """Spheres fall into a drum of radius 2 n sphere radii; when they are at rest it begins to turn about its axis.
+    """Spheres fall into a drum of radius n sphere diameters; when they are at rest it begins to turn about its axis.
 
     The drum is a mesh of flat sides with a horizontal axis, along y; its ends are discs, without friction unless
     `end_friction` says otherwise, so that a short drum stands for a piece of a long one. The angle of the bed is that
@@ -35,16 +35,17 @@ class Drum(Experiment):
     """
 
     n: int = option(8, "", "size: radius of the drum in diameters of a sphere")
-    length: float = option(5.0, "sphere diameters", "length of the drum")
-    fill: float = option(0.35, "", "part of the drum that the settled bed fills, at most about a half")
-    radius: float = option(0.005, "m", "radius of the spheres")
+    length: float = option(6.0, "sphere diameters", "length of the drum")
+    fill: float = option(0.3, "", "part of the drum that the settled bed fills, at most about a third")
+    radius: float = option(0.005, "m", "radius of the greatest spheres")
+    spread: float = option(0.2, "", "part by which the smallest spheres are smaller; equal ones make crystals")
     density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
     friction: float = option(0.5, "", "friction coefficient between spheres")
     wall_friction: float = option(0.9, "", "friction coefficient on the side of the drum")
     end_friction: float = option(0.0, "", "friction coefficient on the ends of the drum")
     froude: float = option(0.01, "", "speed: Froude number omega^2 R / g")
     sides: int = option(48, "", "flat sides of the drum")
-    perturbation: float = option(0.0005, "m", "greatest displacement of a sphere from its lattice point, per axis")
+    perturbation: float = option(0.0004, "m", "greatest displacement of a sphere from its lattice point, per axis")
     seed: int = option(1, "", "seed of the perturbation")
     gravity: float = option(9.81, "m/s^2", "gravity, downwards")
 
@@ -58,8 +59,10 @@ class Drum(Experiment):
             raise ValueError(f"sides must be at least 12, got {self.sides}")
         for name in ("length", "fill", "radius", "density", "froude", "gravity"):
             checks.positive(name, getattr(self, name))
-        for name in ("friction", "wall_friction", "end_friction"):
+        for name in ("friction", "wall_friction", "end_friction", "spread"):
             checks.not_negative(name, getattr(self, name))
+        if self.spread >= 1.0:
+            raise ValueError(f"spread must be below 1, got {self.spread:g}")
         if self.length < 2.0:
             raise ValueError(f"length must be at least 2 sphere diameters, got {self.length:g}")
         check_room(self.radius, self.pitch, self.perturbation)
@@ -81,7 +84,7 @@ class Drum(Experiment):
     @property
     def pitch(self) -> float:
         """Spacing of the lattice on which the spheres start [m]."""
-        return 2.3 * self.radius
+        return 2.2 * self.radius
 
     @property
     def drum_radius(self) -> float:
@@ -102,7 +105,9 @@ class Drum(Experiment):
     def spheres(self) -> int:
         """Number of the spheres: with a packing fraction of 0.58 they fill their part of the drum."""
         area = 0.5 * self.sides * self.drum_radius**2 * sin(2 * pi / self.sides)
-        return ceil(0.58 * self.fill * area * self.width / (4 / 3 * pi * self.radius**3))
+        s = self.spread
+        mean_cube = 1 - 3 / 2 * s + s**2 - s**3 / 4  # of radii from 1 - s to 1
+        return ceil(0.58 * self.fill * area * self.width / (4 / 3 * pi * self.radius**3 * mean_cube))
 
     @property
     def settling_time(self) -> float:
@@ -135,7 +140,8 @@ class Drum(Experiment):
         scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
         scene.set_friction(self.wall_friction, "spheres", "side")
         scene.set_friction(self.end_friction, "spheres", "ends")
-        scene.add_spheres(self.positions(), self.radius, self.density, material="spheres")
+        radii = self.radius * np.random.default_rng(self.seed).uniform(1.0 - self.spread, 1.0, self.spheres)
+        scene.add_spheres(self.positions(), radii, self.density, material="spheres")
         half, wide = self.width / 2, self.drum_radius
         turning = Rotation((0.0, self.speed, 0.0), start=self.settling_time)
         side = Mesh.revolved([(wide, -half), (wide, half)], self.sides, quaternion=ALONG_Y)

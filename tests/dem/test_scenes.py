@@ -98,6 +98,7 @@ def test_walls_of_the_halves_cover_each_other_at_the_greatest_displacement():
         (Shear, {"period": 0.0}, "period must be positive"),
         (Drum, {"n": 2}, "n must be at least 3"),
         (Drum, {"fill": 0.9}, "fill 0.9: .* spheres, but only"),
+        (Drum, {"spread": 1.0}, "spread must be below 1"),
         (Drum, {"sides": 3}, "sides must be at least 12"),
         (Drum, {"froude": 0.0}, "froude must be positive"),
         (Drum, {"length": 1.0}, "length must be at least 2"),
@@ -112,7 +113,7 @@ def test_bad_options(scene, options, message):
         scene(**options)
 
 
-@pytest.mark.parametrize("scene", [Drum(n=4), Drum(n=5, length=3.0, fill=0.2), Silo(n=3), Silo(n=3, half_angle=90.0)])
+@pytest.mark.parametrize("scene", [Drum(n=5), Drum(n=4, length=3.0, fill=0.2), Silo(n=3), Silo(n=3, half_angle=90.0)])
 def test_spheres_start_inside_drum_and_silo_without_contact(scene):
     world = World.from_scene(scene.build(), SELF)
     contacts = find_contacts(world, 0.0)
@@ -124,7 +125,7 @@ def test_spheres_start_inside_drum_and_silo_without_contact(scene):
 
 
 def test_the_drum_turns_at_its_froude_number_after_settling():
-    scene = Drum(n=4, froude=0.04)
+    scene = Drum(n=5, froude=0.04)
     world = World.from_scene(scene.build(), SELF)
     np.testing.assert_array_equal(world.prescribed_velocity(scene.dt), 0.0)
     world.time = scene.settling_time
