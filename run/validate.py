@@ -46,22 +46,26 @@ CHECKS: dict[str, Callable[[], tuple[list[Row], dict[str, Any]]]] = {
 }
 
 def run(name: str, options: Sequence[object]) -> None:
-    """Make a run in its folder, unless it is there already with the same options."""
-    folder, mark = RUNS / name, RUNS / f"{name}.options"
+    """Make a run in its folder, unless it is there already with the same options; keep its seconds of processor."""
+    folder, mark = RUNS / name, RUNS / f"{name}.json"
     words = " ".join(map(str, options))
-    if mark.exists() and mark.read_text() == words:
+    if mark.exists() and json.loads(mark.read_text())["options"] == words:
         print(f"{name}: kept as it is in {folder}", flush=True)
         return
     command = [".venv/bin/python", "-m", "pctt.run", "-scene", *map(str, options), "-ccp_type", "apgd"]
     command += ["-output", str(folder), "-overwrite", "-output_every", "5", "-checkpoint_every", "1000", "-quiet"]
-    subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    mark.write_text(words)
-    print(f"{name}: {_seconds(folder):.0f} s", flush=True)
+    started = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    _, status, used = os.wait4(started.pid, 0)
+    if status:
+        raise subprocess.CalledProcessError(os.waitstatus_to_exitcode(status), command)
+    seconds = used.ru_utime + used.ru_stime
+    mark.write_text(json.dumps({"options": words, "seconds": round(seconds)}) + "\n")
+    print(f"{name}: {seconds:.0f} s", flush=True)
 
 
-def _seconds(folder: Path) -> float:
-    """Seconds of the steps of a run."""
-    return sum(json.loads(line)["seconds"] for line in (folder / "steps.jsonl").read_text().splitlines())
+def _seconds(name: str) -> float:
+    """Seconds of processor that a run took."""
+    return json.loads((RUNS / f"{name}.json").read_text())["seconds"]
 
 
 def table(rows: list[Row]) -> str:
@@ -100,7 +104,7 @@ def draw(shown: dict[str, dict[str, Any]]) -> None:
         two.plot(1e3 * x, 1e3 * z, "o-", markersize=3, label=f"friction {mu:g}: {angle:.0f} degrees")
     two.set_xlabel("distance from the edge [mm]")
     two.set_ylabel("surface of the heap [mm]")
-    two.set_aspect("equal")
+    two.set_ylim(0.0, None)
     three.plot(drum["time"], drum["angle"], linewidth=0.9, label="drum")
     three.axhspan(20.9, 32.8, color="C7", alpha=0.25, label="glass beads, mu(I)")
     three.axhline(drum["mean"], color="C0", linestyle=":", label=f"mean, {drum['mean']:.1f} degrees")
@@ -143,7 +147,7 @@ def main(names: Sequence[str]) -> None:
     record("validate", about, rows)
     if chosen is known:
         draw(shown)
-        seconds = sum(_seconds(RUNS / name) for jobs in JOBS.values() for name in jobs)
+        seconds = sum(_seconds(name) for jobs in JOBS.values() for name in jobs)
         about["minutes"] = seconds / 60 / min(2, os.cpu_count() or 1)
         PAGE.write_text(
             TEXT.read_text().format(
