@@ -55,6 +55,8 @@ class Experiment:
     dt: ClassVar[Any] = 0.01
     #: Recommended contact distance: pairs with smaller gaps are contacts [m].
     delta: ClassVar[Any] = 0.02
+    #: Contact distance while settling: falling bodies come closer within a step than bodies at rest [m].
+    settle_delta: ClassVar[Any] = 0.1
     #: Time after which the start may be taken as settled [s]. A motion that is to begin then has it as its `start`.
     settling_time: ClassVar[Any] = 0.0
     #: Lower and upper corner of the box that no centre of a grain should leave [m]; None: there is none.

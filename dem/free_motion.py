@@ -9,7 +9,7 @@ import numpy as np
 from dem import bodies, quaternion
 from dem.arrays import Floats
 from dem.bodies import SPHERE, Bodies
-from dem.motion import Dynamic, Guided
+from dem.motion import Dynamic, Guided, Hinged
 from dem.neighbourhood import Neighbourhood
 from dem.quaternion import cross
 from dem.scene import LargeBody
@@ -44,11 +44,17 @@ def free_velocities(world: World, near: Neighbourhood, dt: float) -> Floats:
 
 def large_free_velocity(world: World, dt: float) -> Floats:
     """Velocities (large bodies, 6) over a step of dt [s] without contacts: guided bodies along their guides with the
-    forces of their drives, prescribed ones on their paths."""
+    forces of their drives, hinged ones with their torques, prescribed ones on their paths."""
     free = free_velocity(world.large, world.gravity, dt)
     for row, body in enumerate(world.large_bodies):
-        if isinstance(body.motion, Guided):
-            free[row, :3] += dt / body.mass * body.motion.force_at(world.time)
+        motion = body.motion
+        if isinstance(motion, Guided):
+            lack = body.mass / dt * ((motion.speed or 0.0) - float(free[row, :3] @ motion.direction))
+            free[row, :3] += dt / body.mass * motion.force_at(world.time, lack)
+        elif isinstance(motion, Hinged):
+            moment = body.inertia[2]
+            lack = moment / dt * ((motion.speed or 0.0) - float(free[row, 3:] @ motion.axis))
+            free[row, 3:] += dt / moment * motion.torque_at(world.time, lack)
     free[:, :3] = project(free_directions(world.large_bodies), free[:, :3])
     prescribed = ~bodies.is_dynamic(world.large)
     free[prescribed] = world.prescribed_velocity(dt)[prescribed]

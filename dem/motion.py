@@ -1,4 +1,4 @@
-"""Motions of large bodies: free, guided along a line, fixed, rotating, oscillating, gliding or along a path.
+"""Motions of large bodies: free, guided along a line, hinged, fixed, rotating, oscillating, gliding or along a path.
 
 A prescribed motion is a pose as a function of time. Over a time step the body has the *mean* velocity
 (x(t+dt) - x(t)) / dt, and the angular velocity that turns it from the one orientation to the other in dt the shortest
@@ -36,26 +36,62 @@ class Guided(Dynamic):
 
     The guide takes all other forces and all torques: the inverse mass of the other five degrees of freedom is zero.
     A drive may push along it with a constant force, beside gravity, from one time to another: at rest the contacts
-    then bear that force, and the weight as far as it is along the guide.
+    then bear that force, and the weight as far as it is along the guide. With a `speed` the drive is a servo: it
+    pushes, either way, with what would bring the body to that speed at the end of the step if nothing touched it, and
+    with `force` at most. A load L makes it slower than that by dt L / mass.
     """
 
     direction: Sequence[float]  #: (3,), normalised
-    force: float = 0.0  #: along the direction [N]
+    force: float = 0.0  #: along the direction; of a servo the greatest one [N]
     start: float = 0.0  #: [s]
     end: float = np.inf  #: [s]
+    speed: float | None = None  #: along the direction, that a servo keeps [m/s]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "direction", unit_vector("direction of a guide", self.direction))
         finite("force of a guide", self.force)
         _ordered("force of a guide", self.start, self.end)
+        _servo("guide", "force", self.force, self.speed)
 
     def free_directions(self) -> Floats:
         """Projector (3, 3) on the direction of the guide."""
         return np.outer(self.direction, self.direction)
 
-    def force_at(self, time: float) -> Floats:
-        """Force of the drive (3,) over a step that begins at `time` [s]."""
-        return self.force * (self.start <= time < self.end) * np.array(self.direction)
+    def force_at(self, time: float, lack: float = 0.0) -> Floats:
+        """Force of the drive (3,) over a step that begins at `time` [s]. `lack` [N] is what would take the body from
+        its speed at the end of the step without the drive to the speed of the servo."""
+        force = self.force if self.speed is None else min(max(lack, -self.force), self.force)
+        return force * (self.start <= time < self.end) * np.array(self.direction)
+
+
+@dataclass(frozen=True)
+class Hinged(Dynamic):
+    """Moved by torques about one axis of the world only, on which its centre of mass is: a wheel, a roller, a stirrer.
+
+    The bearing takes all forces and all other torques. A drive may turn it with a constant torque, or as a servo with
+    the torque that keeps a `speed`, and `torque` at most, as the force of `Guided`.
+    """
+
+    axis: Sequence[float]  #: (3,), normalised
+    torque: float = 0.0  #: about the axis; of a servo the greatest one [N m]
+    start: float = 0.0  #: [s]
+    end: float = np.inf  #: [s]
+    speed: float | None = None  #: about the axis, that a servo keeps [rad/s]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "axis", unit_vector("axis of a hinge", self.axis))
+        finite("torque of a hinge", self.torque)
+        _ordered("torque of a hinge", self.start, self.end)
+        _servo("hinge", "torque", self.torque, self.speed)
+
+    def free_directions(self) -> Floats:
+        """Projector (3, 3) on nothing: the axis stays where it is."""
+        return np.zeros((3, 3))
+
+    def torque_at(self, time: float, lack: float = 0.0) -> Floats:
+        """Torque of the drive (3,) over a step that begins at `time` [s]; `lack` [N m] as of `Guided.force_at`."""
+        torque = self.torque if self.speed is None else min(max(lack, -self.torque), self.torque)
+        return torque * (self.start <= time < self.end) * np.array(self.axis)
 
 
 @dataclass(frozen=True)
@@ -202,3 +238,11 @@ def _gone(time: float, start: float, end: float) -> float:
 def _ordered(what: str, start: float, end: float) -> None:
     if not (np.isfinite(start) and start <= end):
         raise ValueError(f"the {what} cannot begin at {start:g} s and end at {end:g} s")
+
+
+def _servo(what: str, strength: str, most: float, speed: float | None) -> None:
+    if speed is None:
+        return
+    finite(f"speed of a {what}", speed)
+    if most <= 0.0:
+        raise ValueError(f"a {what} with a speed needs the greatest {strength} of its servo, above zero, got {most:g}")

@@ -18,8 +18,10 @@ import numpy as np
 from dem import bodies, checks, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.bodies import BOX, CAPSULE, COMPOUND, SPHERE, Bodies
-from dem.motion import Dynamic, Fixed, Guided, Motion
-from dem.shapes import Shape
+from dem.mesh import Mesh
+from dem.motion import Dynamic, Fixed, Guided, Hinged, Motion
+from dem.quaternion import length
+from dem.shapes import Box, Shape
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,8 @@ class Scene:
 
         The pose and the velocities are those of time zero. A dynamic body needs either `density` [kg/m^3],
         and its frame is then moved to the centre of mass and the principal axes, or `mass` [kg] with the
-        principal moments `inertia` (3,) [kg m^2] of a frame that is there already; a guided one needs no moments.
+        principal moments `inertia` (3,) [kg m^2] of a frame that is there already; a guided one needs no moments. The
+        frame of a hinged one is turned until its z axis is that of the hinge, and its centre of mass must be on it.
         Two large bodies touch if at least one of them is dynamic.
         """
         if not name or name in (body.name for body in self.large_bodies):
@@ -173,6 +176,14 @@ class Scene:
             if speed[3:].any() or np.linalg.norm(across) > 1e-12 * np.linalg.norm(speed):
                 raise ValueError(f"{name!r} is guided: its initial velocity must be along the guide")
             moments = np.full(3, np.inf)
+        if isinstance(motion, Hinged):
+            along = np.array(motion.axis)
+            if speed[:3].any() or length(np.cross(along, speed[3:])) > 1e-12 * length(speed[3:]):
+                raise ValueError(f"{name!r} is hinged: its initial velocity must be an angular one about the hinge")
+            arm = place - np.array(checks.finite_vector(f"position of {name!r}", position))
+            if length(np.cross(along, arm)) > 1e-6 * max(length(arm), np.sqrt(moments.max() / weight)):
+                raise ValueError(f"{name!r} is hinged: its centre of mass must be on the axis through its position")
+            parts, turn, moments = _on_hinge(parts, turn, moments, along)
         number = self._material(material)
         self.large_bodies.append(LargeBody(name, parts, motion, number, place, turn, speed, weight, moments))
 
@@ -189,9 +200,11 @@ class Scene:
         return table
 
     def grains(self) -> Bodies:
-        """All grains, in the order of their ids. ValueError if there is none."""
+        """All grains, in the order of their ids. ValueError if there is none, or if there are boxes or meshes beside a
+        mesh that they cannot touch."""
         if sum(len(part) for part in self._grains) == 0:
             raise ValueError("empty scene: there is no grain")
+        _refuse_beside_meshes(self.large_bodies, any((part.shape == BOX).any() for part in self._grains))
         return bodies.concatenate(self._grains)
 
     def large(self) -> Bodies:
@@ -244,6 +257,36 @@ class Scene:
             )
         )
         return ids
+
+
+def _on_hinge(
+    parts: tuple[Shape, ...], turn: Floats, moments: Floats, axis: Floats
+) -> tuple[tuple[Shape, ...], Floats, Floats]:
+    """The same body in a frame whose z axis is the axis (3,) of its hinge, and its moments: infinite but about that."""
+    moment = float(moments @ quaternion.rotate(quaternion.conjugate(turn), axis) ** 2)
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    across /= np.linalg.norm(across)
+    upright = quaternion.from_matrix(np.stack([across, np.cross(axis, across), axis], axis=1))
+    inner = quaternion.multiply(quaternion.conjugate(turn), upright)
+    moved = tuple(shapes.moved(part, np.zeros(3), inner) for part in parts)
+    return moved, upright, np.array([np.inf, np.inf, moment])
+
+
+def _refuse_beside_meshes(members: Sequence[LargeBody], box_grains: bool) -> None:
+    """ValueError for pairs of a mesh and a box or another mesh that might meet: they have no contacts."""
+    for body in members:
+        if not any(isinstance(shape, Mesh) for shape in body.shapes):
+            continue
+        if box_grains:
+            raise ValueError(f"grains that are boxes cannot touch the mesh of {body.name!r}: take spheres or capsules")
+        for other in members:
+            moves = isinstance(body.motion, Dynamic) or isinstance(other.motion, Dynamic)
+            kinds = [type(shape).__name__ for shape in other.shapes if isinstance(shape, (Box, Mesh))]
+            if other is not body and moves and kinds:
+                raise ValueError(
+                    f"the {kinds[0].lower()} of {other.name!r} cannot touch the mesh of {body.name!r}, of which one is "
+                    "dynamic: make the other of planes, spheres or capsules"
+                )
 
 
 def _points(name: str, values: ArrayLike) -> Floats:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Union
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Union
 
 import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
 from dem.checks import finite_vector, positive, unit_quaternions, unit_vector
+from dem.mesh import Mesh
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,15 @@ class Capsule:
         object.__setattr__(self, "quaternion", tuple(turn.tolist()))
 
 
-Shape = Union[Plane, Box, Sphere, Capsule]
+Shape = Union[Plane, Box, Sphere, Capsule, Mesh]
+
+
+def described(shape: Shape) -> dict[str, Any]:
+    """The kind of a shape and what it was made of, by name."""
+    if isinstance(shape, Mesh):
+        names = ("vertices", "triangles", "center", "quaternion")
+        return {"kind": "Mesh", **{name: np.asarray(getattr(shape, name)).tolist() for name in names}}
+    return {"kind": type(shape).__name__, **asdict(shape)}
 
 
 def sphere_mass(radius: Floats, density: Floats) -> tuple[Floats, Floats]:
@@ -98,15 +107,36 @@ def capsule_mass(radius: Floats, half_length: Floats, density: Floats) -> tuple[
     return cylinder + ball, np.stack([lateral, lateral, axial], axis=1)
 
 
+def mesh_mass(shape: Mesh, density: float) -> tuple[float, Floats, Floats]:
+    """Mass, centre of mass (3,) and inertia tensor (3, 3) about it of a solid mesh, in the body frame. ValueError
+    unless it is closed and its normals point outwards."""
+    shape.surface.refuse_unless_solid()
+    volume, first, second = shape.surface.integrals()
+    center = first / volume
+    spread = second - volume * np.outer(center, center)
+    turn = quaternion.matrix(np.array(shape.quaternion))
+    tensor = density * turn @ (np.trace(spread) * np.eye(3) - spread) @ turn.T
+    return density * volume, np.array(shape.center) + turn @ (shape.surface.middle + center), tensor
+
+
 def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Floats, Floats]:
     """Mass, centre of mass (3,) and inertia tensor (3, 3) about it, in the body frame.
 
-    Volumes that shapes share count once for each of them. ValueError for half spaces: they have no mass.
+    Volumes that shapes share count once for each of them. ValueError for half spaces and for meshes that are open or
+    have their normals inwards: they have no mass.
     """
-    masses, centers, tensors = [], [], []
+    masses: list[float] = []
+    centers: list[Sequence[float] | Floats] = []
+    tensors: list[Floats] = []
     for shape in shapes:
         if isinstance(shape, Plane):
             raise ValueError("a half space has no finite mass: give mass and inertia, or a prescribed motion")
+        if isinstance(shape, Mesh):
+            weight, middle, tensor = mesh_mass(shape, density)
+            masses.append(weight)
+            centers.append(middle)
+            tensors.append(tensor)
+            continue
         turn, solid = np.eye(3), np.array([density])
         if isinstance(shape, Sphere):
             mass, moments = sphere_mass(np.array([shape.radius]), solid)

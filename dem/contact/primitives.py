@@ -12,6 +12,7 @@ from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, SPHERE, enclosing_radius
 from dem.contact.box_box import BOX_FEATURES, box_box
 from dem.contact.capsules import capsule_box, capsule_capsule, capsule_plane
+from dem.contact.meshes import PARTS, capsule_mesh, mesh_plane, sphere_mesh
 from dem.contact.narrow import (
     CORNERS,
     Manifold,
@@ -24,26 +25,31 @@ from dem.contact.narrow import (
     sphere_sphere,
 )
 from dem.loops import loops
+from dem.mesh import Mesh, Surface
 from dem.neighbourhood import Neighbourhood
 from dem.shapes import Box, Plane, Shape, Sphere
 
-#: Kind of the half spaces; those of the others are the kinds of grains.
-PLANE = 4
+#: Kinds of the half spaces and of the meshes; those of the others are the kinds of grains.
+PLANE, MESH = 4, 5
 
-#: Features that the contacts of one pair of primitives can have.
+#: Features that the contacts of one pair of primitives without meshes can have. A mesh has as many numbers as its
+#: features need.
 FEATURES = BOX_FEATURES
 
 
 class Primitives(NamedTuple):
-    """Spheres, boxes, capsules and half spaces in the world frame; first all grains, then parts of large bodies."""
+    """Spheres, boxes, capsules, half spaces and meshes in the world frame; first all grains, then parts of large
+    bodies."""
 
     number: Ints  #: (n,) of the grain its id, of parts the numbers that follow: the same at all times
     row: Ints  #: (n,) row of the body
-    kind: Ints  #: (n,) SPHERE, BOX, CAPSULE or PLANE
-    center: Floats  #: (n, 3); a point of the surface of a half space [m]
+    kind: Ints  #: (n,) SPHERE, BOX, CAPSULE, PLANE or MESH
+    center: Floats  #: (n, 3); a point of the surface of a half space, the middle of a mesh [m]
     quaternion: Floats  #: (n, 4)
-    size: Floats  #: (n, 3) as of `Bodies` [m]; the outward normal of a half space
+    size: Floats  #: (n, 3) as of `Bodies` [m]; the outward normal of a half space; of a mesh half its extents
     radius: Floats  #: (n,) of the sphere about the centre that encloses it, without meaning for half spaces [m]
+    surfaces: dict[int, Surface]  #: of the meshes, by row
+    numbers: int  #: more than any of `number`, and those that meshes take after theirs
 
     def sphere(self, rows: Ints) -> tuple[Floats, Floats]:
         """Centres and radii."""
@@ -62,27 +68,48 @@ class Primitives(NamedTuple):
         """Outward normals and points of the surfaces."""
         return self.size[rows], self.center[rows]
 
+    def mesh(self, row: int) -> tuple[Surface, Floats, Floats]:
+        """Surface, its middle and frame (3, 3), of one mesh."""
+        return self.surfaces[row], self.center[row], quaternion.matrix(self.quaternion[row])
+
+    def keys(self, i: Ints, j: Ints, feature: Ints) -> Ints:
+        """Numbers (m,) of the features of pairs of rows i, j (m,), distinct and the same at all times."""
+        further, feature = np.divmod(feature, FEATURES)
+        first = self.number[i] + np.where(self.kind[i] == MESH, further, 0)
+        second = self.number[j] + np.where(self.kind[i] == MESH, 0, further)
+        return (first * self.numbers + second) * FEATURES + feature
+
 
 def primitives(near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int) -> Primitives:
     """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies; `grains` is the number of
     grains on all ranks."""
     table, count = near.bodies, near.grains + near.ghosts
     row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
-    parts = [_placed(shape) for body in shapes for shape in body]
+    members = [shape for body in shapes for shape in body]
+    parts = [_placed(shape) for shape in members]
+    surfaces = {count + n: shape.surface for n, shape in enumerate(members) if isinstance(shape, Mesh)}
+    spans = [_numbers_of(shape) for shape in members]
     kind, center, turn, size = (np.array(column) for column in zip(*parts)) if parts else _NOTHING
     body_turn = table.quaternion[row]
     size = np.where((kind == PLANE)[:, None], quaternion.rotate(body_turn, size), size)
     sizes, kinds = np.concatenate([table.size[:count], size]), np.concatenate([table.shape[:count], kind])
     center = table.position[row] + quaternion.rotate(body_turn, center)
     return Primitives(
-        number=np.concatenate([table.id[:count], grains + np.arange(len(row))]),
+        number=np.concatenate([table.id[:count], grains + np.cumsum([0, *spans[:-1]])[: len(row)]]).astype(np.int64),
         row=np.concatenate([np.arange(count), row]),
         kind=kinds,
         center=np.concatenate([table.position[:count], center]),
         quaternion=np.concatenate([table.quaternion[:count], quaternion.multiply(body_turn, turn)]),
         size=sizes,
         radius=enclosing_radius(kinds, sizes),
+        surfaces=surfaces,
+        numbers=grains + sum(spans),
     )
+
+
+def _numbers_of(shape: Shape) -> int:
+    """How many numbers a part takes, that its features may be distinct."""
+    return 1 + (PARTS * shape.surface.features - 1) // FEATURES if isinstance(shape, Mesh) else 1
 
 
 _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -99,13 +126,15 @@ def _placed(shape: Shape) -> tuple[int, Floats, Floats, Floats]:
     turn = np.array(shape.quaternion)
     if isinstance(shape, Box):
         return BOX, center, turn, np.array(shape.half_extents)
+    if isinstance(shape, Mesh):
+        return MESH, center + quaternion.rotate(turn, shape.surface.middle), turn, shape.surface.half
     return CAPSULE, center, turn, np.array([shape.radius, shape.half_length, 0.0])
 
 
 def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     """All contacts of gap at most `delta` (m,) [m] of the pairs of rows i, j (m,); normals point from i to j.
 
-    Two half spaces have none.
+    Two half spaces have none, nor have meshes with boxes or meshes: `dem.scene` refuses those.
     """
     found = [Manifold(*_no_rows, Touch(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))]
     code = 8 * table.kind[i] + table.kind[j]
@@ -119,12 +148,7 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
         else:
             continue
         found.append(Manifold(rows[pair], feature, touch))
-    pairs, features, geometry = zip(*found)
-    return Manifold(
-        np.concatenate(pairs),
-        np.concatenate(features),
-        Touch(*(np.concatenate(values) for values in zip(*geometry))),
-    )
+    return _joined(found)
 
 
 _no_rows = np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -150,6 +174,49 @@ def _box_plane(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     return Manifold(pair[manifold.pair], corner[manifold.pair], manifold.touch)
 
 
+def _spheres_mesh(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
+    def touch(rows: Ints, mesh: int) -> Manifold:
+        center, radius = table.sphere(i[rows])
+        return sphere_mesh(center, radius, *table.mesh(mesh), delta[rows])
+
+    return _by_mesh(j, touch)
+
+
+def _capsules_mesh(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
+    def touch(rows: Ints, mesh: int) -> Manifold:
+        center, axis, half_length, radius = table.capsule(i[rows])
+        return capsule_mesh(center, axis, half_length, radius, *table.mesh(mesh), delta[rows])
+
+    return _by_mesh(j, touch)
+
+
+def _by_mesh(j: Ints, touch: Callable[[Ints, int], Manifold]) -> Manifold:
+    """The manifolds of pairs whose second shapes are the meshes of rows j (m,), mesh by mesh."""
+    found = []
+    for mesh in np.unique(j):
+        rows = np.flatnonzero(j == mesh)
+        manifold = touch(rows, int(mesh))
+        found.append(manifold._replace(pair=rows[manifold.pair]))
+    return _joined(found)
+
+
+def _meshes_plane(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
+    found = []
+    for pair, (mesh, plane) in enumerate(zip(i.tolist(), j.tolist())):
+        feature, touch = mesh_plane(*table.mesh(mesh), *table.plane(plane), delta[pair])
+        found.append(Manifold(np.full(len(feature), pair), feature, touch))
+    return _joined(found)
+
+
+def _joined(found: list[Manifold]) -> Manifold:
+    pairs, features, geometry = zip(*found)
+    return Manifold(
+        np.concatenate(pairs),
+        np.concatenate(features),
+        Touch(*(np.concatenate(values) for values in zip(*geometry))),
+    )
+
+
 _TOUCH: dict[tuple[int, int], Callable[[Primitives, Ints, Ints, Floats], Manifold]] = {
     (SPHERE, SPHERE): _spheres,
     (SPHERE, BOX): lambda t, i, j, delta: _single(sphere_box(*t.sphere(i), *t.box(j)), delta),
@@ -160,4 +227,7 @@ _TOUCH: dict[tuple[int, int], Callable[[Primitives, Ints, Ints, Floats], Manifol
     (CAPSULE, PLANE): lambda t, i, j, delta: capsule_plane(*t.capsule(i), *t.plane(j), delta),
     (BOX, BOX): lambda t, i, j, delta: box_box(*t.box(i), *t.box(j), delta),
     (BOX, PLANE): _box_plane,
+    (SPHERE, MESH): _spheres_mesh,
+    (CAPSULE, MESH): _capsules_mesh,
+    (MESH, PLANE): _meshes_plane,
 }

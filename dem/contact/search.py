@@ -13,10 +13,11 @@ from dem.arrays import Floats, Ints
 from dem.bodies import BOX, SPHERE, Bodies
 from dem.checks import not_negative
 from dem.contact.broad import close_pairs
-from dem.contact.primitives import FEATURES, PLANE, Primitives, primitives, touches
+from dem.contact.narrow import Touch
+from dem.contact.primitives import MESH, PLANE, Primitives, primitives, touches
 from dem.free_motion import free_velocity, large_free_velocity
 from dem.loops import loops
-from dem.motion import Dynamic
+from dem.motion import Dynamic, Hinged
 from dem.neighbourhood import Neighbourhood, neighbourhood, without_ghosts
 from dem.quaternion import cross, length
 from dem.world import World
@@ -82,11 +83,10 @@ def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | 
 
     pair, feature, touch = touches(table, i, j, reach)
     i, j = i[pair], j[pair]
-    numbers = total + len(table.number) - near.grains - near.ghosts
-    key = (table.number[i] * numbers + table.number[j]) * FEATURES + feature
+    key = table.keys(i, j, feature)
     a, b = table.row[i], table.row[j]
     order = _order(world, near, a, b, key)
-    order = order[_gives_way(world, near, a, b, touch.normal)[order]]
+    order = order[_gives_way(world, near, a, b, touch)[order]]
     a, b = a[order], b[order]
     owner = np.minimum(a, b)
     world.grains.weight = np.bincount(owner, minlength=near.grains)[: near.grains].astype(np.float64)
@@ -209,12 +209,12 @@ def _grains_beside_parts(
 
 def _distance_at_least(table: Primitives, part: int, points: Floats) -> Floats:
     """A lower bound of the distances (m,) of points (m, 3) from the surface of a part [m]; of planes and boxes the
-    distance itself, as far as it is positive."""
+    distance itself, as far as it is positive; of meshes that of the box about them."""
     place, size = table.center[part], table.size[part]
     if table.kind[part] == PLANE:
         return points @ size - place @ size
     offset = points - place
-    if table.kind[part] == BOX:
+    if table.kind[part] in (BOX, MESH):
         return length(np.maximum(np.abs(offset @ quaternion.matrix(table.quaternion[part])) - size, 0.0))
     return length(offset) - table.radius[part]
 
@@ -250,9 +250,9 @@ def _part_margin(shift: Floats, pivot: Floats, center: Floats, radius: Floats, d
     return np.maximum(delta / 2, way)
 
 
-def _gives_way(world: World, near: Neighbourhood, a: Ints, b: Ints, normal: Floats) -> np.ndarray:
+def _gives_way(world: World, near: Neighbourhood, a: Ints, b: Ints, touch: Touch) -> np.ndarray:
     """Which contacts (nc,) of bodies in the rows a, b (nc,) a force can open: not those of a guided body with what
-    holds it across its guide.
+    holds it across its guide, nor of a hinged one with what does not turn it.
 
     Their normal impulse would change no velocity, and any friction with it.
     """
@@ -262,6 +262,12 @@ def _gives_way(world: World, near: Neighbourhood, a: Ints, b: Ints, normal: Floa
     if len(rows):
         motions = [body.motion for body in world.large_bodies]
         free = np.array([m.free_directions() if isinstance(m, Dynamic) else np.zeros((3, 3)) for m in motions])
-        both = free[a[rows] - first] + free[b[rows] - first]
-        gives[rows] = np.einsum("ci,cij,cj->c", normal[rows], both, normal[rows]) > 1e-8
+        axis = np.array([m.axis if isinstance(m, Hinged) else np.zeros(3) for m in motions])
+        normal, opens = touch.normal[rows], np.zeros(len(rows))
+        for body in (a[rows], b[rows]):
+            arm = touch.point[rows] - near.bodies.position[body]
+            lever = cross(axis[body - first], arm / np.maximum(length(arm), 1e-300)[:, None])
+            opens += np.einsum("ci,cij,cj->c", normal, free[body - first], normal)
+            opens += np.einsum("ci,ci->c", lever, normal) ** 2
+        gives[rows] = opens > 1e-8
     return gives

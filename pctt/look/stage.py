@@ -37,6 +37,7 @@ from pctt.look.folder import Folder, FolderError, Frame
 WALL = (0.88, 0.89, 0.91)
 EDGE = (0.50, 0.52, 0.55)
 TOOL = (0.58, 0.63, 0.70)
+SHELL = (0.72, 0.75, 0.80)
 STAGE = 0.86  # part of the width that the scene has; the rest is the colour bar's
 
 
@@ -67,7 +68,8 @@ class Paint:
 class Stage:
     """Draws frames of one folder, all seen in the same way; ``box`` (2, 3) is the part of space that is shown [m].
 
-    Of the planes only the side of the grains is drawn, so that walls between them and the camera hide nothing.
+    Of planes, and of drums and other shells, only the side of the grains is drawn, so that walls between them and the
+    camera hide nothing.
     """
 
     def __init__(self, folder: Folder, box: np.ndarray, view: View, paint: Paint):
@@ -87,9 +89,11 @@ class Stage:
         self._boxes, self._cylinders = _glyphs(surfaces.cube()), _glyphs(surfaces.cylinder())
         for mapper in (self._spheres, self._boxes, self._cylinders):
             self._add_grains(mapper, colours)
-        self._walls, self._edges, self._tools = (self._add_surface(rgb) for rgb in (WALL, EDGE, TOOL))
+        self._walls, self._edges, self._tools, self._shells = map(self._add_surface, (WALL, EDGE, TOOL, SHELL))
         walls, edges, tools = (actor.GetProperty() for actor in (self._walls, self._edges, self._tools))
         walls.BackfaceCullingOn()
+        self._shells.GetProperty().BackfaceCullingOn()
+        self._shells.GetProperty().SetAmbient(0.3)
         self._walls.GetMapper().SetRelativeCoincidentTopologyPolygonOffsetParameters(4, 8)  # behind their edges
         walls.SetAmbient(0.75)
         walls.SetDiffuse(0.25)
@@ -127,6 +131,9 @@ class Stage:
         self._edges.GetMapper().SetInputDataObject(surfaces.outlines(polygons))
         self._tools.GetMapper().SetInputDataObject(
             surfaces.joined([surfaces.finite(folder, frame, row, self.box) for row in large])
+        )
+        self._shells.GetMapper().SetInputDataObject(
+            surfaces.joined([surfaces.shell(folder, frame, row) for row in large])
         )
         self._stamp.SetInput(f"t = {frame.time:.3f} s")
         self._renderer.ResetCameraClippingRange()

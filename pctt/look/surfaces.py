@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkPoints
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
 from vtkmodules.vtkCommonTransforms import vtkTransform
-from vtkmodules.vtkFiltersCore import vtkAppendPolyData
+from vtkmodules.vtkFiltersCore import vtkAppendPolyData, vtkTriangleFilter
 from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
 from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSphereSource
 
 from dem import quaternion
 from dem.bodies import BOX, CAPSULE, SPHERE
+from dem.mesh import Surface
 from pctt.look.folder import Folder, FolderError, Frame
 
 MARGIN = 0.06  # how far walls go beyond the grains, in diagonals of the scene
+HOLLOW = 0.3  # of the way from the middle of a shell to its bounds, which is empty
 
 
 def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
     """Lowest and highest corner (2, 3) of the scene in these frames [m]: of the grains, and of the large bodies among
-    them that are no walls."""
+    or around them that are no walls."""
     radius = enclosing_radius(folder)[:, None]
     places = [frame.position[: folder.grains] for frame in frames]
     low = np.min([(place - radius).min(axis=0) for place in places], axis=0)
@@ -33,9 +36,9 @@ def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
     corners = [low, high]
     for frame in frames:
         for row in range(len(folder.large)):
-            solid = finite(folder, frame, row, box)
-            if solid.GetNumberOfPoints():
-                corners += list(np.reshape(solid.GetBounds(), (3, 2)).T)
+            for solid in (finite(folder, frame, row, box), shell(folder, frame, row)):
+                if solid.GetNumberOfPoints():
+                    corners += list(np.reshape(solid.GetBounds(), (3, 2)).T)
     return np.array([np.min(corners, axis=0), np.max(corners, axis=0)])
 
 
@@ -98,10 +101,13 @@ def cylinder() -> vtkPolyData:
 
 
 def finite(folder: Folder, frame: Frame, row: int, box: np.ndarray | None = None) -> vtkPolyData:
-    """The surface of the large body `row`, but for its planes; with a box (2, 3), also but for its walls about it."""
+    """The surface of the large body `row`, but for its planes; with a box (2, 3), also but for its walls about it, and
+    nothing of a body that is a `shell`."""
     place, turn = _pose(folder, frame, row)
-    parts = []
+    parts: list[vtkPolyData] = []
     shapes = folder.large[row]["shapes"]
+    if box is not None and is_shell(folder, row):
+        return joined(parts)
     for shape in shapes:
         if shape["kind"] != "Plane":
             part = _placed(_surface(shape), shape, place, turn)
@@ -118,6 +124,67 @@ def _is_wall(solid: vtkPolyData, box: np.ndarray) -> bool:
     beside = (middle < box[0]) | (middle > box[1])
     along = np.minimum(high, box[1]) - np.maximum(low, box[0]) > 0.8 * (box[1] - box[0])
     return bool(beside.any() and along.any())
+
+
+def shell(folder: Folder, frame: Frame, row: int) -> vtkPolyData:
+    """The triangles of the large body `row` if it is a shell, such as a drum or a silo, as seen from inside."""
+    if not is_shell(folder, row):
+        return vtkPolyData()
+    triangles = _solid(folder, frame, row)
+    middle = 0.5 * (triangles.min(axis=(0, 1)) + triangles.max(axis=(0, 1)))
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    away = np.einsum("mi,mi->m", normal, triangles.mean(axis=1) - middle) > 0.0
+    if any(shape["kind"] == "Box" for shape in folder.large[row]["shapes"]):
+        triangles = triangles[~away]  # of thick walls only the inside
+    else:
+        triangles[away] = triangles[away, ::-1]
+    return polydata(triangles.reshape(-1, 3), "polys", 3 * np.arange(1, len(triangles) + 1))
+
+
+@lru_cache(maxsize=256)
+def is_shell(folder: Folder, row: int) -> bool:
+    """Whether the large body `row` is hollow, made of meshes or of boxes that stand obliquely to each other, and has
+    half of the grains inside at the first or at the last recorded step."""
+    solid = [shape for shape in folder.large[row]["shapes"] if shape["kind"] != "Plane"]
+    meshes = any(shape["kind"] == "Mesh" for shape in solid)
+    if not solid or {shape["kind"] for shape in solid} - {"Box", "Mesh"} or not (meshes or len(solid) > 2):
+        return False
+    turns = quaternion.matrix(np.array([shape["quaternion"] for shape in solid]))
+    if not meshes and (np.abs(turns[0].T @ turns).max(axis=2) > 1.0 - 1e-9).all():
+        return False
+    for frame in (folder.frame(step) for step in {folder.steps[0], folder.steps[-1]}):
+        triangles = _solid(folder, frame, row)
+        low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+        grains = frame.position[: folder.grains]
+        within = ((low <= grains) & (grains <= high)).all(axis=1)
+        if 2 * np.count_nonzero(within) >= folder.grains and (high > low).all() and _is_hollow(triangles, low, high):
+            return True
+    return False
+
+
+def _is_hollow(triangles: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool:
+    """Whether there is nothing of the triangles (m, 3, 3) about the middle of their bounds."""
+    corners = (triangles.reshape(-1, 3) - 0.5 * (low + high)) / (0.5 * (high - low))
+    surface = Surface(corners, np.arange(len(corners)).reshape(-1, 3))
+    middle = np.broadcast_to(-surface.middle, (len(triangles), 3))
+    return bool(surface.closest(middle, np.arange(len(triangles))).distance.min() > HOLLOW)
+
+
+def _solid(folder: Folder, frame: Frame, row: int) -> np.ndarray:
+    """The corners (m, 3, 3) of the triangles of the large body `row` but for its planes."""
+    place, turn = _pose(folder, frame, row)
+    shapes = [shape for shape in folder.large[row]["shapes"] if shape["kind"] != "Plane"]
+    return _triangles(joined([_placed(_surface(shape), shape, place, turn) for shape in shapes]))
+
+
+def _triangles(surface: vtkPolyData) -> np.ndarray:
+    """The corners (m, 3, 3) of the triangles of a surface."""
+    source = vtkTriangleFilter()
+    source.SetInputData(surface)
+    source.Update()
+    data = source.GetOutput()
+    cells = vtk_to_numpy(data.GetPolys().GetConnectivityArray()).reshape(-1, 3)
+    return vtk_to_numpy(data.GetPoints().GetData()).astype(float)[cells]
 
 
 def joined(parts: Sequence[vtkPolyData]) -> vtkPolyData:
@@ -158,9 +225,8 @@ def walls(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.nd
     place, turn = _pose(folder, frame, row)
     middle = box.mean(axis=0)
     shapes = folder.large[row]["shapes"]
-    for shape in shapes:
-        if len(shapes) == 1 or shape["kind"] != "Box":
-            continue
+    boxes = [shape for shape in shapes if shape["kind"] == "Box" and len(shapes) > 1]
+    for shape in [] if boxes and is_shell(folder, row) else boxes:
         if _is_wall(_placed(_surface(shape), shape, place, turn), box):
             center = place + quaternion.rotate(turn, np.array(shape["center"]))
             axes = quaternion.matrix(quaternion.multiply(turn, np.array(shape["quaternion"]))).T
@@ -241,6 +307,9 @@ def _surface(shape: Mapping[str, Any]) -> vtkPolyData:
         block.SetZLength(z)
         block.Update()
         return block.GetOutput()
+    if shape["kind"] == "Mesh":
+        corners = np.array(shape["vertices"])[np.array(shape["triangles"])]
+        return polydata(corners.reshape(-1, 3), "polys", 3 * np.arange(1, len(corners) + 1))
     if shape["kind"] == "Capsule":
         core = vtkCylinderSource()
         core.SetRadius(shape["radius"])

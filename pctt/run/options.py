@@ -55,6 +55,8 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     _refuse_without_effect(database, run, obeys_coulomb)
     what = f"options of the scene {scene_class.__name__}"
     scene, dt, delta = together(comm, what, lambda: _read_scene(scene_class, database), own=(OptionError,))
+    if "settle_delta" not in database:
+        run = dataclasses.replace(run, settle_delta=scene.settle_delta)
     options = Options(
         run,
         scene,
@@ -97,7 +99,8 @@ def _read_scene(scene_class: type[Experiment], database: Mapping[str, str]) -> t
         if not str(error).startswith(tuple(field.name for field in dataclasses.fields(scene_class))):
             raise
         raise OptionError(f"-scene_{error}") from None
-    _ = scene.settling_time, scene.domain  # they may be properties too: what fails is to fail before any work
+    # They may be properties too: what fails is to fail before any work.
+    _ = scene.settling_time, scene.settle_delta, scene.domain
     return scene, scene.dt, scene.delta
 
 

@@ -15,7 +15,6 @@ written under a temporary name and renamed. So a run that is killed leaves whole
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -28,6 +27,7 @@ from mpi4py import MPI
 from dem import bodies
 from dem.contact.search import Contacts
 from dem.exchange import exchange
+from dem.shapes import described
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import disk, figures_json
@@ -202,7 +202,7 @@ def _write_constants(file: RowWriter, world: World) -> None:
     """What no step changes: columns of the table of bodies, and the shapes of the large ones as JSON."""
     _write_by_id(file, world, ("shape", "size", "mass", "material"))
     large = [
-        {"name": body.name, "shapes": [{"kind": type(s).__name__, **dataclasses.asdict(s)} for s in body.shapes]}
+        {"name": body.name, "shapes": [described(shape) for shape in body.shapes]}
         for body in world.large_bodies
     ]
     file.whole("large", np.bytes_(json.dumps(large, default=list)))  # arrays as lists

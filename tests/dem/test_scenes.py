@@ -1,4 +1,4 @@
-"""The scenes blade and shear; see test_mixer for the mixer."""
+"""The scenes blade, shear, drum and silo; see test_mixer for the mixer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from dem.contact import find_contacts
 from dem.motion import Guided
-from dem.scenes import Blade, Mixer, Shear
+from dem.scenes import Blade, Drum, Mixer, Shear, Silo
 from dem.start import new_world
 
 SELF = MPI.COMM_SELF
@@ -96,8 +96,60 @@ def test_walls_of_the_halves_cover_each_other_at_the_greatest_displacement():
         (Shear, {"split": 1.0}, "split 1 bed depths"),
         (Shear, {"wall_friction": -0.1}, "wall_friction must not be negative"),
         (Shear, {"period": 0.0}, "period must be positive"),
+        (Drum, {"n": 2}, "n must be at least 3"),
+        (Drum, {"fill": 0.9}, "fill 0.9: .* spheres, but only"),
+        (Drum, {"spread": 1.0}, "spread must be below 1"),
+        (Drum, {"sides": 3}, "sides must be at least 12"),
+        (Drum, {"froude": 0.0}, "froude must be positive"),
+        (Drum, {"length": 1.0}, "length must be at least 2"),
+        (Silo, {"n": 1}, "n must be at least 3"),
+        (Silo, {"outlet": 12.0}, "outlet 12 must be between 1 sphere diameter and the 12"),
+        (Silo, {"half_angle": 100.0}, "half_angle must be between 5 and 90 degrees, got 100"),
+        (Silo, {"filling": 0.0}, "filling must be positive"),
     ],
 )
 def test_bad_options(scene, options, message):
     with pytest.raises(ValueError, match=message):
         scene(**options)
+
+
+@pytest.mark.parametrize("scene", [Drum(n=5), Drum(n=4, length=3.0, fill=0.2), Silo(n=3), Silo(n=3, half_angle=90.0)])
+def test_spheres_start_inside_drum_and_silo_without_contact(scene):
+    world = new_world(scene.build(), SELF)
+    contacts = find_contacts(world, 0.0)
+    assert len(contacts) == 0
+    assert len(world.grains) == scene.spheres
+    across = world.grains.position[:, [0, 2] if isinstance(scene, Drum) else [0, 1]]
+    radius = scene.drum_radius if isinstance(scene, Drum) else scene.silo_radius
+    assert np.hypot(*across.T).max() < radius - scene.radius
+
+
+def test_the_drum_turns_at_its_froude_number_after_settling():
+    scene = Drum(n=5, froude=0.04)
+    world = new_world(scene.build(), SELF)
+    np.testing.assert_array_equal(world.prescribed_velocity(scene.dt), 0.0)
+    world.time = scene.settling_time
+    velocity = world.prescribed_velocity(scene.dt)
+    np.testing.assert_allclose(velocity[:, 4] ** 2 * scene.drum_radius / 9.81, 0.04)
+
+
+def test_the_gate_of_the_silo_is_away_soon_and_closes_the_outlet_before():
+    scene = Silo(n=4)
+    world = new_world(scene.build(), SELF)
+    silo, gate = (body.shapes[0].surface for body in world.large_bodies[:2])
+    assert gate.half[0] == pytest.approx(scene.outlet_radius)
+    assert silo.half[0] == pytest.approx(scene.silo_radius)
+    motion, body = world.large_bodies[1].motion, world.large_bodies[1]
+    far = motion.pose(scene.settling_time + 0.1, body.position, body.quaternion)[0]
+    np.testing.assert_allclose(far, [2 * scene.outlet_radius, 0, 0], atol=1e-12)
+
+
+def test_the_flow_of_the_silo_is_the_slope_of_its_records():
+    scene = Silo(n=3)
+    time = np.arange(200) * scene.dt
+    total = scene.spheres * scene.density * 4 / 3 * np.pi * scene.radius**3
+    out = np.clip(0.8 * (time - 0.3), 0.0, total)
+    found = scene.analyse({"time [s]": time, "discharged [kg]": out})
+    assert found["mass_flow [kg/s]"] == pytest.approx(0.8)
+    assert found["beverloo_flow [kg/s]"] == pytest.approx(0.58 * 0.58 * 2500 * 9.81**0.5 * (0.05 - 0.015) ** 2.5)
+    assert scene.analyse({"time [s]": time, "discharged [kg]": 0.0 * out}) == {}

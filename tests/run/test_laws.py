@@ -34,25 +34,26 @@ def test_steps_with_coulombs_law(program, settled, tmp_path):
 PRESS = """
 from dataclasses import dataclass
 from dem.experiment import Experiment
-from dem.motion import Guided
+from dem.motion import Guided, Hinged
 from dem.scene import Scene
 from dem.shapes import Box
 
 @dataclass(frozen=True)
 class Press(Experiment):
-    '''Spheres under a press on an oblique guide.'''
+    '''Spheres under a press on an oblique guide, or on a hinge.'''
     def build(self):
         scene = Scene(friction=0.3)
         scene.add_body("floor", [Box((2, 2, 0.1))], position=(0, 0, -0.1))
         scene.add_spheres([(x, y, 0.1) for x in (-0.5, 0.5) for y in (-0.5, 0.5)], 0.1, 1000.0)
-        scene.add_body("press", [Box((2, 2, 0.1))], Guided((1, 0, 2), -100.0), position=(0, 0, 0.3), density=500.0)
+        scene.add_body("press", [Box((2, 2, 0.1))], MOTION, position=(0, 0, 0.3), density=500.0)
         return scene
 """
 
 
 @pytest.mark.parallel(1, 2)
-def test_a_problem_with_a_guided_body_is_written_as_it_is(program, tmp_path):
-    (tmp_path / "press.py").write_text(PRESS)
+@pytest.mark.parametrize("motion", ["Guided((1, 0, 2), -100.0)", "Hinged((1, 2, 0), 500.0)"])
+def test_a_problem_with_a_guided_or_hinged_body_is_written_as_it_is(program, tmp_path, motion):
+    (tmp_path / "press.py").write_text(PRESS.replace("MOTION", motion))
     options = ("-ccp_type", "apgd", "-ccp_tol", 1e-8)
     program("-scene", "press.py", "-steps", 1, *options, "-dump_problem", "problems")
     (line,) = steps(tmp_path)

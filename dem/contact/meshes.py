@@ -1,0 +1,229 @@
+"""Narrow phase of surfaces made of triangles.
+
+The contacts of a ball are the places of the surface where the distance from its centre is least among the places
+around them: over a face, on an edge or at a vertex, each once, however many triangles share it. A ball that rolls over
+a flat surface of many triangles has one contact, and one in a groove has two. In the words of Ericson (2005),
+"Real-Time Collision Detection", section 5.1: the centre is in the Voronoi region of the feature with respect to each
+of its faces.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dem.arrays import Bools, Floats, Ints
+from dem.contact.narrow import Manifold, Touch, closest_on_lines, dot
+from dem.mesh import Surface, spread
+from dem.quaternion import length
+
+#: Sine of the angle by which a direction may leave those in which an edge or a vertex is closest, for rounding.
+ROUNDING = 1e-6
+
+#: The same for the side of a capsule on an edge: one that rocks a little on two edges keeps the contacts of both.
+ROCKING = 0.1
+
+#: Places that are closer to each other than this share of the radius are one contact.
+SAME = 1e-4
+
+#: Features of a capsule on a surface: those of the surface for each end ball, and for the core between.
+PARTS = 3
+
+
+def sphere_mesh(
+    center: Floats, radius: Floats, surface: Surface, place: Floats, turn: Floats, delta: Floats
+) -> Manifold:
+    """Spheres of centres (m, 3) and radii (m,), and one surface: its middle (3,) and frame (3, 3)."""
+    local = (center - place) @ turn
+    row, feature, point, away, distance = _feet(local, radius, radius + delta, surface)
+    return _placed(row, feature, point, away, distance - radius[row], place, turn)
+
+
+def capsule_mesh(
+    center: Floats,
+    axis: Floats,
+    half_length: Floats,
+    radius: Floats,
+    surface: Surface,
+    place: Floats,
+    turn: Floats,
+    delta: Floats,
+) -> Manifold:
+    """Capsules and one surface as in `sphere_mesh`: the end balls, and the core between them on edges and vertices.
+
+    A core that goes through a face is pushed back across it the shorter way.
+    """
+    local, axis, reach = (center - place) @ turn, axis @ turn, radius + delta
+    found = []
+    for end, side in enumerate((-1.0, 1.0)):
+        ball = local + (side * half_length)[:, None] * axis
+        row, feature, point, away, distance = _feet(ball, radius, reach, surface)
+        # Where the side of the capsule is clearly closer to an edge than its end is, the end is no contact.
+        beyond = side * dot(away, axis[row]) <= ROCKING
+        kept = (feature < len(surface.triangle)) | beyond
+        found.append((row, feature + end * surface.features, point, away, distance - radius[row], kept))
+    row, triangle = surface.near(local, half_length + reach)
+    core = local, axis, half_length, radius
+    found += [_across_edges(row, triangle, core, reach, surface), _over_vertices(row, triangle, core, reach, surface)]
+    through = _through_faces(row, triangle, core, surface)
+    found.append(through)
+    row, feature, point, away, gap, kept = (np.concatenate([part[k] for part in found]) for k in range(6))
+    # The end on the wrong side of a face that the core goes through would be held there.
+    stuck = np.isin(row * PARTS * surface.features + feature, _short_ends(through, core, surface))
+    kept &= ~stuck
+    return _placed(row[kept], feature[kept], point[kept], away[kept], gap[kept], place, turn)
+
+
+def mesh_plane(
+    surface: Surface, place: Floats, turn: Floats, outward: Floats, origin: Floats, delta: float
+) -> tuple[Ints, Touch]:
+    """One surface as in `sphere_mesh` and a half space, normal (3,) and point (3,): features and contacts."""
+    tip = place + surface.vertex[surface.hull] @ turn.T
+    gap = (tip - origin) @ outward
+    near = np.flatnonzero(gap <= delta)
+    point = tip[near] - 0.5 * gap[near, None] * outward
+    return surface.hull[near], Touch(point, np.broadcast_to(-outward, point.shape), gap[near])
+
+
+def _feet(center: Floats, radius: Floats, reach: Floats, surface: Surface) -> tuple[Ints, Ints, Floats, Floats, Floats]:
+    """The places of the surface at distances from centres (m, 3) that are least around them and within reach (m,): rows
+    of the centres, features, points, unit vectors from there to the centre, distances."""
+    row, triangle = surface.near(center, reach)
+    point, feature, distance = surface.closest(center[row], triangle)
+    close = np.flatnonzero(distance <= reach[row])
+    row, triangle, feature = row[close], triangle[close], feature[close]
+    point, distance = point[close], distance[close]
+    _, first = np.unique(row * surface.features + feature, return_index=True)  # triangles share edges and vertices
+    away = center[row[first]] - point[first]
+    size = distance[first, None]
+    away = np.where(size > 0.0, away / np.where(size > 0.0, size, 1.0), surface.normal[triangle[first]])
+    least = first[_within_cone(surface, feature[first], point[first], np.where(size > 0.0, away, 0.0), ROUNDING)]
+    away = away[np.isin(first, least)]
+    chosen = _one_for_each(row, triangle, point, feature, distance, least, radius, surface)
+    return row[least][chosen], feature[least][chosen], point[least][chosen], away[chosen], distance[least][chosen]
+
+
+def _within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, slack: float) -> Bools:
+    """Which points (k, 3) of features (k,) are closest, among those of the surface around them, to what is in the
+    direction `away` (k, 3) from them; always those over faces."""
+    inside = np.ones(len(feature), dtype=bool)
+    rim = np.flatnonzero(feature >= len(surface.triangle))
+    start, vertex = surface.around
+    row, entry = spread(start, feature[rim] - len(surface.triangle))
+    way = surface.vertex[vertex[entry]] - point[rim[row]]
+    inside[rim[row[dot(way, away[rim[row]]) > slack * length(way)]]] = False
+    return inside
+
+
+def _one_for_each(
+    row: Ints,
+    triangle: Ints,
+    point: Floats,
+    feature: Ints,
+    distance: Floats,
+    least: Ints,
+    radius: Floats,
+    surface: Surface,
+) -> Ints:
+    """Which of the entries `least` are contacts of their own: not those that rounding made twice, nor places of edges
+    that lie in another triangle, as where the corners of one meet the side of another."""
+    count = np.bincount(row[least], minlength=len(radius))
+    several = np.flatnonzero(count[row[least]] > 1)
+    if not len(several):
+        return np.arange(len(least))
+    entry = least[several]
+    order = np.lexsort((feature[entry], distance[entry], row[entry]))
+    entry, several = entry[order], several[order]
+    dropped = np.zeros(len(least), dtype=bool)
+
+    start = np.concatenate([[0], np.cumsum(np.where(count > 1, count, 0))])
+    one, two = spread(start, row[entry])
+    pair = np.flatnonzero(two < one)  # the closer one stays
+    one, two = one[pair], two[pair]
+    same = length(point[entry[one]] - point[entry[two]]) <= SAME * radius[row[entry[one]]]
+    dropped[several[one[same]]] = True
+
+    edge = np.flatnonzero(feature[entry] >= len(surface.triangle))
+    by_row = np.argsort(row, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(radius)))])
+    one, two = spread(start, row[entry[edge]])
+    one, two = entry[edge[one]], by_row[two]
+    closer = np.flatnonzero(distance[two] < distance[one] * (1.0 - 1e-9))
+    at = surface.closest(point[one[closer]], triangle[two[closer]]).distance
+    inside = one[closer[at <= 1e-2 * SAME * radius[row[one[closer]]]]]
+    dropped[np.isin(least, inside)] = True
+    return np.flatnonzero(~dropped)
+
+
+_Core = tuple[Floats, Floats, Floats, Floats]  # centres, axes, half lengths and radii in the frame of the surface
+_Found = tuple[Ints, Ints, Floats, Floats, Floats, Bools]  # rows, features, points, directions, gaps, which are kept
+
+
+def _across_edges(row: Ints, triangle: Ints, core: _Core, reach: Floats, surface: Surface) -> _Found:
+    """Where cores pass over edges, each between its ends."""
+    center, axis, half_length, radius = core
+    side = surface.side[triangle]
+    row, edge = np.divmod(np.unique((row[:, None] * len(surface.edge) + side)[surface.ridges[side]]), len(surface.edge))
+    start, end = surface.vertex[surface.edge[edge, 0]], surface.vertex[surface.edge[edge, 1]]
+    size = length(end - start)
+    along = (end - start) / size[:, None]
+    s, t = closest_on_lines(center[row], axis[row], start, along)
+    over = (np.abs(s) < half_length[row]) & (t > 0.0) & (t < size) & (np.abs(dot(along, axis[row])) < 1.0 - 1e-9)
+    feature, point = len(surface.triangle) + edge[over], (start + t[:, None] * along)[over]
+    return _from_core(row[over], feature, point, s[over], ROCKING, core, reach, surface)
+
+
+def _over_vertices(row: Ints, triangle: Ints, core: _Core, reach: Floats, surface: Surface) -> _Found:
+    """Vertices that are beside cores, between their ends."""
+    center, axis, half_length, radius = core
+    sharp = np.zeros(len(surface.vertex), dtype=bool)
+    sharp[surface.edge[surface.ridges]] = True
+    corner = surface.triangle[triangle]
+    row, vertex = np.divmod(np.unique((row[:, None] * len(sharp) + corner)[sharp[corner]]), len(sharp))
+    point = surface.vertex[vertex]
+    s = dot(point - center[row], axis[row])
+    beside = np.abs(s) < half_length[row]
+    feature = len(surface.triangle) + len(surface.edge) + vertex
+    return _from_core(row[beside], feature[beside], point[beside], s[beside], ROUNDING, core, reach, surface)
+
+
+def _from_core(
+    row: Ints, feature: Ints, point: Floats, s: Floats, slack: float, core: _Core, reach: Floats, surface: Surface
+) -> _Found:
+    """The contacts of points of edges and vertices with the places `s` [m] of the cores, where these are closest."""
+    center, axis, _, radius = core
+    away = center[row] + s[:, None] * axis[row] - point
+    distance = length(away)
+    away = away / np.where(distance > 0.0, distance, 1.0)[:, None]
+    kept = (distance > 0.0) & (distance <= reach[row])
+    kept[kept] = _within_cone(surface, feature[kept], point[kept], away[kept], slack)
+    return row, feature + 2 * surface.features, point, away, distance - radius[row], kept
+
+
+def _through_faces(row: Ints, triangle: Ints, core: _Core, surface: Surface) -> _Found:
+    """Where cores go through faces."""
+    center, axis, half_length, radius = core
+    normal, corner = surface.normal[triangle], surface.corner[triangle]
+    height, slope = dot(center[row] - corner[:, 0], normal), half_length[row] * dot(axis[row], normal)
+    through = np.abs(height) < np.abs(slope)
+    row, triangle, normal, height, slope = (values[through] for values in (row, triangle, normal, height, slope))
+    point = center[row] - (height / slope * half_length[row])[:, None] * axis[row]
+    in_face = surface.closest(point, triangle).feature == triangle
+    depth = np.abs(slope) - np.abs(height)
+    away = np.copysign(1.0, height)[:, None] * normal
+    return row, triangle + 2 * surface.features, point, away, -depth - radius[row], in_face
+
+
+def _short_ends(through: _Found, core: _Core, surface: Surface) -> Ints:
+    """Numbers, of the row and the feature, of the contacts of ends beyond faces that their cores go through."""
+    row, feature, _, away, _, kept = through
+    row, triangle, away = row[kept], feature[kept] - 2 * surface.features, away[kept]
+    end = (dot(away, core[1][row]) < 0.0).astype(np.int64)  # the first end is at the start of the axis
+    return row * PARTS * surface.features + end * surface.features + triangle
+
+
+def _placed(
+    row: Ints, feature: Ints, point: Floats, away: Floats, gap: Floats, place: Floats, turn: Floats
+) -> Manifold:
+    """The manifold of contacts in the frame of the surface: its points, and unit vectors from there."""
+    middle = point + 0.5 * gap[:, None] * away
+    return Manifold(row, feature, Touch(place + middle @ turn.T, -away @ turn.T, gap))

@@ -1,0 +1,168 @@
+"""Rotating drum: the angle at which a bed of spheres flows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import atan2, ceil, degrees, pi, sin, sqrt
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from dem import checks
+from dem.arrays import Floats
+from dem.experiment import Experiment, option
+from dem.mesh import Mesh
+from dem.motion import Rotation
+from dem.scene import Scene
+from dem.scenes.lattice import check_room, perturbed, rest_after_fall
+
+if TYPE_CHECKING:
+    from dem.record import Step
+
+#: The z axis turned to the y axis.
+ALONG_Y = (sqrt(0.5), -sqrt(0.5), 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Drum(Experiment):
+    """Spheres fall into a drum of radius n sphere diameters; when they are at rest it begins to turn about its axis.
+
+    The drum is a mesh of flat sides with a horizontal axis, along y; its ends are discs, without friction unless
+    `end_friction` says otherwise, so that a short drum stands for a piece of a long one. The angle of the bed is that
+    of its centre of mass about the axis, which is the slope of a plane surface. The torque of the bed's weight is that
+    of the drum.
+    """
+
+    n: int = option(8, "", "size: radius of the drum in diameters of a sphere")
+    length: float = option(6.0, "sphere diameters", "length of the drum")
+    fill: float = option(0.3, "", "part of the drum that the settled bed fills, at most about a third")
+    radius: float = option(0.005, "m", "radius of the greatest spheres")
+    spread: float = option(0.2, "", "part by which the smallest spheres are smaller; equal ones make crystals")
+    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
+    friction: float = option(0.5, "", "friction coefficient between spheres")
+    wall_friction: float = option(0.9, "", "friction coefficient on the side of the drum")
+    end_friction: float = option(0.0, "", "friction coefficient on the ends of the drum")
+    froude: float = option(0.01, "", "speed: Froude number omega^2 R / g")
+    sides: int = option(48, "", "flat sides of the drum")
+    perturbation: float = option(0.0004, "m", "greatest displacement of a sphere from its lattice point, per axis")
+    seed: int = option(1, "", "seed of the perturbation")
+    gravity: float = option(9.81, "m/s^2", "gravity, downwards")
+
+    dt: ClassVar[float] = 0.005
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.n < 3:
+            raise ValueError(f"n must be at least 3, got {self.n}")
+        if self.sides < 12:
+            raise ValueError(f"sides must be at least 12, got {self.sides}")
+        for name in ("length", "fill", "radius", "density", "froude", "gravity"):
+            checks.positive(name, getattr(self, name))
+        for name in ("friction", "wall_friction", "end_friction", "spread"):
+            checks.not_negative(name, getattr(self, name))
+        if self.spread >= 1.0:
+            raise ValueError(f"spread must be below 1, got {self.spread:g}")
+        if self.length < 2.0:
+            raise ValueError(f"length must be at least 2 sphere diameters, got {self.length:g}")
+        check_room(self.radius, self.pitch, self.perturbation)
+        if self.spheres > len(self._lattice()):
+            raise ValueError(
+                f"fill {self.fill:g}: {self.spheres} spheres, but only {len(self._lattice())} have room at the start"
+            )
+
+    @property
+    def delta(self) -> float:
+        """Contact distance [m]."""
+        return 0.2 * self.radius
+
+    @property
+    def settle_delta(self) -> float:
+        """Contact distance while settling [m]."""
+        return self.radius
+
+    @property
+    def pitch(self) -> float:
+        """Spacing of the lattice on which the spheres start [m]."""
+        return 2.2 * self.radius
+
+    @property
+    def drum_radius(self) -> float:
+        """Radius of the drum, to the corners between its sides [m]."""
+        return 2 * self.n * self.radius
+
+    @property
+    def width(self) -> float:
+        """Length of the drum [m]."""
+        return 2 * self.length * self.radius
+
+    @property
+    def speed(self) -> float:
+        """Angular velocity of the drum [rad/s]."""
+        return sqrt(self.froude * self.gravity / self.drum_radius)
+
+    @property
+    def spheres(self) -> int:
+        """Number of the spheres: with a packing fraction of 0.58 they fill their part of the drum."""
+        area = 0.5 * self.sides * self.drum_radius**2 * sin(2 * pi / self.sides)
+        s = self.spread
+        mean_cube = 1 - 3 / 2 * s + s**2 - s**3 / 4  # of radii from 1 - s to 1
+        return ceil(0.58 * self.fill * area * self.width / (4 / 3 * pi * self.radius**3 * mean_cube))
+
+    @property
+    def settling_time(self) -> float:
+        """Time [s] after which the drum starts."""
+        return rest_after_fall(2 * self.drum_radius, self.gravity) - 1.5
+
+    @property
+    def domain(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """The box around the drum [m]."""
+        high = (self.drum_radius, self.width / 2, self.drum_radius)
+        return (-high[0], -high[1], -high[2]), high
+
+    def positions(self) -> Floats:
+        """Centres (spheres, 3) of the spheres at the start [m], the lowest of a lattice in the drum."""
+        return self._lattice()[: self.spheres]
+
+    def _lattice(self) -> Floats:
+        """All places of the lattice in the drum, the lowest first."""
+        room = self.drum_radius - self.radius - 2 * self.perturbation - 0.02 * self.drum_radius
+        count = int(room / self.pitch)
+        across = np.arange(-count, count + 1) * self.pitch
+        slots = max(int((self.width - 2 * self.radius - 2 * self.perturbation) / self.pitch) + 1, 1)
+        along = (np.arange(slots) - (slots - 1) / 2) * self.pitch
+        places = perturbed(across, along, across, self.perturbation, self.seed)
+        places = places[np.hypot(places[:, 0], places[:, 2]) <= room]
+        return places[np.argsort(places[:, 2], kind="stable")]
+
+    def build(self) -> Scene:
+        """The scene, with the large bodies "drum" and "ends"."""
+        scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
+        scene.set_friction(self.wall_friction, "spheres", "side")
+        scene.set_friction(self.end_friction, "spheres", "ends")
+        radii = self.radius * np.random.default_rng(self.seed).uniform(1.0 - self.spread, 1.0, self.spheres)
+        scene.add_spheres(self.positions(), radii, self.density, material="spheres")
+        half, wide = self.width / 2, self.drum_radius
+        turning = Rotation((0.0, self.speed, 0.0), start=self.settling_time)
+        side = Mesh.revolved([(wide, -half), (wide, half)], self.sides, quaternion=ALONG_Y)
+        ends = [Mesh.revolved([(0.0, z), (wide, z)], self.sides, quaternion=ALONG_Y) for z in (-half, half)]
+        scene.add_body("drum", [side], turning, material="side")
+        scene.add_body("ends", ends, turning, material="ends")
+        return scene
+
+    def record(self, step: Step) -> dict[str, float]:
+        """Angle of the bed's centre of mass about the axis, from the vertical, and the torque on the drum."""
+        grains = step.world.grains
+        x, z = (step.total(grains.mass * grains.position[:, k]) for k in (0, 2))
+        return {"bed_angle [degrees]": degrees(atan2(-x, -z)), "drum_torque [N m]": step.force_on("drum")[4]}
+
+    def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
+        """Mean and standard deviation of the angle after the drum has turned by 90 degrees."""
+        time, angle = records["time [s]"], records["bed_angle [degrees]"]
+        steady = time > self.settling_time + 0.5 * pi / self.speed
+        if not steady.any():
+            return {}
+        return {
+            "dynamic_angle [degrees]": float(angle[steady].mean()),
+            "angle_deviation [degrees]": float(angle[steady].std()),
+        }

@@ -1,0 +1,173 @@
+"""Silo with a conical outlet: how fast it empties."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import ceil, pi, radians, sqrt, tan
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from dem import checks
+from dem.arrays import Floats
+from dem.experiment import Experiment, option
+from dem.mesh import Mesh
+from dem.motion import Glide
+from dem.scene import Scene
+from dem.scenes.lattice import check_room, perturbed, rest_after_fall
+from dem.shapes import Plane
+
+if TYPE_CHECKING:
+    from dem.record import Step
+
+#: Constants of Beverloo, Leniger and van de Velde (1961): of the flow, and diameters of a grain that the outlet lacks.
+BEVERLOO_C, BEVERLOO_K = 0.58, 1.5
+
+#: Share of the volume that settled spheres take.
+PACKING = 0.58
+
+
+@dataclass(frozen=True)
+class Silo(Experiment):
+    """Spheres settle in a cylinder with a cone below, whose outlet is shut; then the gate is drawn aside, and they flow
+    out onto a floor.
+
+    Cylinder and cone are one mesh, of flat sides. With `half_angle` 90 the bottom is flat. What is recorded is the mass
+    below the outlet, of which the flow is the slope while a tenth to a half of the mass runs out. Beside it stands the
+    flow by Beverloo's law, for the bulk density of a packing fraction of 0.58.
+    """
+
+    n: int = option(6, "", "size: radius of the cylinder in diameters of a sphere")
+    filling: float = option(1.5, "silo diameters", "height of the settled bed if it were all in the cylinder")
+    outlet: float = option(5.0, "sphere diameters", "diameter of the outlet")
+    half_angle: float = option(30.0, "degrees", "of the cone, from the vertical; 90: flat bottom")
+    drop: float = option(1.0, "silo diameters", "height of the outlet above the floor")
+    radius: float = option(0.005, "m", "radius of the spheres")
+    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
+    friction: float = option(0.5, "", "friction coefficient of all contacts")
+    sides: int = option(32, "", "flat sides of the silo")
+    perturbation: float = option(0.0005, "m", "greatest displacement of a sphere from its lattice point, per axis")
+    seed: int = option(1, "", "seed of the perturbation")
+    gravity: float = option(9.81, "m/s^2", "gravity, downwards")
+
+    dt: ClassVar[float] = 0.005
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.n < 3:
+            raise ValueError(f"n must be at least 3, got {self.n}")
+        if self.sides < 12:
+            raise ValueError(f"sides must be at least 12, got {self.sides}")
+        for name in ("filling", "outlet", "drop", "radius", "density", "gravity"):
+            checks.positive(name, getattr(self, name))
+        checks.not_negative("friction", self.friction)
+        check_room(self.radius, self.pitch, self.perturbation)
+        if not 1.0 < self.outlet < 2 * self.n:
+            raise ValueError(
+                f"outlet {self.outlet:g} must be between 1 sphere diameter and the {2 * self.n} of the silo"
+            )
+        if not 5.0 <= self.half_angle <= 90.0:
+            raise ValueError(f"half_angle must be between 5 and 90 degrees, got {self.half_angle:g}")
+
+    @property
+    def delta(self) -> float:
+        """Contact distance [m]."""
+        return 0.2 * self.radius
+
+    @property
+    def settle_delta(self) -> float:
+        """Contact distance while settling [m]."""
+        return self.radius
+
+    @property
+    def pitch(self) -> float:
+        """Spacing of the lattice on which the spheres start [m]."""
+        return 2.3 * self.radius
+
+    @property
+    def silo_radius(self) -> float:
+        """Radius of the cylinder, to the corners between its sides [m]."""
+        return 2 * self.n * self.radius
+
+    @property
+    def outlet_radius(self) -> float:
+        """Radius of the outlet, which is at z = 0 [m]."""
+        return self.outlet * self.radius
+
+    @property
+    def cone_height(self) -> float:
+        """Height of the cone [m]."""
+        wider = self.silo_radius - self.outlet_radius
+        return 0.0 if self.half_angle == 90.0 else wider / tan(radians(self.half_angle))
+
+    @property
+    def floor(self) -> float:
+        """Height of the floor, below zero [m]."""
+        return -2 * self.drop * self.silo_radius
+
+    @property
+    def spheres(self) -> int:
+        """Number of the spheres."""
+        bed = pi * self.silo_radius**2 * 2 * self.filling * self.silo_radius
+        return ceil(PACKING * bed / (4 / 3 * pi * self.radius**3))
+
+    @property
+    def top(self) -> float:
+        """Height of the cylinder's rim, above all spheres at the start [m]."""
+        return float(self.positions()[:, 2].max()) + 2 * self.radius
+
+    @property
+    def settling_time(self) -> float:
+        """Time [s] after which the gate opens."""
+        return rest_after_fall(2 * self.filling * self.silo_radius, self.gravity) - 1.4
+
+    @property
+    def beverloo(self) -> float:
+        """Flow by Beverloo's law [kg/s]: C rho_bulk sqrt(g) (D - k d)^(5/2)."""
+        opening = max(2 * self.outlet_radius - 2 * BEVERLOO_K * self.radius, 0.0)
+        return BEVERLOO_C * PACKING * self.density * sqrt(self.gravity) * opening**2.5
+
+    def positions(self) -> Floats:
+        """Centres (spheres, 3) of the spheres at the start [m], a lattice in the cylinder above the cone."""
+        room = self.silo_radius * np.cos(pi / self.sides) - self.radius - 2 * self.perturbation
+        count = int(room / self.pitch)
+        across = np.arange(-count, count + 1) * self.pitch
+        per_layer = int((np.hypot(*np.meshgrid(across, across)) <= room).sum())
+        layers = ceil(self.spheres / per_layer)
+        up = self.cone_height + (np.arange(layers) + 0.6) * self.pitch
+        # Of the lattice before it is perturbed, those in the cylinder.
+        places = perturbed(across, across, up, 0.0, self.seed)
+        places = places[np.hypot(places[:, 0], places[:, 1]) <= room]
+        places = places[np.argsort(places[:, 2], kind="stable")][: self.spheres]
+        noise = np.random.default_rng(self.seed).uniform(-1.0, 1.0, places.shape)
+        return places + self.perturbation * noise
+
+    def build(self) -> Scene:
+        """The scene, with the large bodies "silo", "gate" and "floor"."""
+        scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
+        scene.add_spheres(self.positions(), self.radius, self.density)
+        wide, hole = self.silo_radius, self.outlet_radius
+        profile = [(hole, 0.0), (wide, self.cone_height), (wide, self.top)]
+        scene.add_body("silo", [Mesh.revolved(profile, self.sides)])
+        # Out of the way within a twentieth of a second, and no further.
+        away = Glide((40 * hole, 0.0, 0.0), self.settling_time, self.settling_time + 0.05)
+        disc = Mesh.revolved([(0.0, 0.0), (hole, 0.0)], self.sides)
+        scene.add_body("gate", [disc], away, position=(0.0, 0.0, 0.0))
+        scene.add_body("floor", [Plane((0, 0, 1))], position=(0.0, 0.0, self.floor))
+        return scene
+
+    def record(self, step: Step) -> dict[str, float]:
+        """The mass below the outlet."""
+        grains = step.world.grains
+        return {"discharged [kg]": step.total(grains.mass[grains.position[:, 2] < 0.0])}
+
+    def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
+        """The flow while a tenth to a half of the mass runs out, and that of Beverloo's law."""
+        time, out = records["time [s]"], records["discharged [kg]"]
+        total = self.spheres * self.density * 4 / 3 * pi * self.radius**3
+        steady = (out > 0.1 * total) & (out < 0.5 * total)
+        if np.count_nonzero(steady) < 3:
+            return {}
+        flow = float(np.polyfit(time[steady], out[steady], 1)[0])
+        return {"mass_flow [kg/s]": flow, "beverloo_flow [kg/s]": self.beverloo}

@@ -1,0 +1,166 @@
+"""Checks against closed forms and published laws; see run/validate."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measure import record, say_machine
+from validation import laws
+from validation.rows import Row
+
+RUNS, PAGE, PICTURE = Path("results/validation"), Path("docs/validation.md"), Path("docs/validation.png")
+TEXT = Path("run/validation/page.md")  # of the page, with the places of the figures
+OUTLETS, FRICTIONS = (4.5, 5.5, 6.5), (0.1, 0.3, 0.6)
+
+#: The runs of each check, the longest first: names and options of ``python -m pctt.run``.
+JOBS: dict[str, dict[str, Sequence[object]]] = {
+    "silo": {
+        f"silo_{outlet:g}": (
+            *("silo", "-scene_n", 6, "-scene_filling", 0.7, "-scene_half_angle", 90, "-scene_outlet", outlet),
+            *("-steps", steps),
+        )
+        for outlet, steps in zip(OUTLETS, (520, 350, 280))
+    },
+    "drum": {"drum": ("drum", "-scene_n", 8, "-steps", 640)},
+    "heap": {
+        f"heap_{friction:g}": ("run/validation/heap.py", "-scene_friction", friction, "-steps", 470)
+        for friction in FRICTIONS
+    },
+    "column": {"column": ("run/validation/column.py", "-steps", 240)},
+}
+
+#: What reads the runs of each check: rows of the table, and what the figure shows.
+CHECKS: dict[str, Callable[[], tuple[list[Row], dict[str, Any]]]] = {
+    "silo": lambda: laws.silo({outlet: RUNS / f"silo_{outlet:g}" for outlet in OUTLETS}),
+    "drum": lambda: laws.drum(RUNS / "drum"),
+    "heap": lambda: laws.heap({friction: RUNS / f"heap_{friction:g}" for friction in FRICTIONS}),
+    "column": lambda: laws.column(RUNS / "column"),
+}
+
+def run(name: str, options: Sequence[object]) -> None:
+    """Make a run in its folder, unless it is there already with the same options; keep its seconds of processor."""
+    folder, mark = RUNS / name, RUNS / f"{name}.json"
+    words = " ".join(map(str, options))
+    if mark.exists() and json.loads(mark.read_text())["options"] == words:
+        print(f"{name}: kept as it is in {folder}", flush=True)
+        return
+    command = [".venv/bin/python", "-m", "pctt.run", "-scene", *map(str, options), "-ccp_type", "apgd"]
+    command += ["-output", str(folder), "-overwrite", "-output_every", "5", "-checkpoint_every", "1000", "-quiet"]
+    started = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    _, status, used = os.wait4(started.pid, 0)
+    if status:
+        raise subprocess.CalledProcessError(os.waitstatus_to_exitcode(status), command)
+    seconds = used.ru_utime + used.ru_stime
+    mark.write_text(json.dumps({"options": words, "seconds": round(seconds)}) + "\n")
+    print(f"{name}: {seconds:.0f} s", flush=True)
+
+
+def _seconds(name: str) -> float:
+    """Seconds of processor that a run took."""
+    return json.loads((RUNS / f"{name}.json").read_text())["seconds"]
+
+
+def table(rows: list[Row]) -> str:
+    """The rows in Markdown."""
+    lines = ["| | quantity | reference | found | deviation | source |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        reference, unit = row["reference"], f" {row['unit']}" if row["unit"] else ""
+        two = isinstance(reference, list)
+        expected = f"[{reference[0]:g}, {reference[1]:g}]{unit}" if two else f"{reference:.4g}{unit}"
+        off = f"{row['deviation']:.1e}" if reference == 0.0 else f"{100 * row['deviation']:+.2g} %"
+        off = "inside" if two and row["agrees"] else off
+        words = [row["check"], row["quantity"], expected, f"{row['found']:.4g}{unit}"]
+        lines.append("| " + " | ".join([*words, off if row["agrees"] else f"**{off}**", row["source"]]) + " |")
+    return "\n".join(lines)
+
+
+def draw(shown: dict[str, dict[str, Any]]) -> None:
+    """A panel for each check."""
+    try:
+        import matplotlib as mpl
+    except ImportError:
+        print("no matplotlib: the picture stays as it is")
+        return
+    mpl.use("agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(2, 2, figsize=(10, 7.6), layout="constrained")
+    silo, heap, drum, column = (shown[name] for name in ("silo", "heap", "drum", "column"))
+    (one, two), (three, four) = axes
+    wide = np.linspace(-silo["level"] / silo["slope"], 7.0)
+    one.plot(wide, silo["slope"] * wide + silo["level"], color="C7", label="Beverloo's law, fitted")
+    one.plot(silo["outlet"], silo["flow"] ** 0.4, "o", label="silo")
+    one.set_xlabel("outlet [sphere diameters]")
+    one.set_ylabel("flow$^{2/5}$ [(kg/s)$^{2/5}$]")
+    for (x, z), mu, angle in zip(heap["profiles"], heap["friction"], heap["angle"]):
+        two.plot(1e3 * x, 1e3 * z, "o-", markersize=3, label=f"friction {mu:g}: {angle:.0f} degrees")
+    two.set_xlabel("distance from the edge [mm]")
+    two.set_ylabel("surface of the heap [mm]")
+    two.set_ylim(0.0, None)
+    three.plot(drum["time"], drum["angle"], linewidth=0.9, label="drum")
+    three.axhspan(20.9, 32.8, color="C7", alpha=0.25, label="glass beads, mu(I)")
+    three.axhline(drum["mean"], color="C0", linestyle=":", label=f"mean, {drum['mean']:.1f} degrees")
+    three.set_xlabel("time [s]")
+    three.set_ylabel("angle of the bed [degrees]")
+    four.plot(column["weight"], 1e3 * column["height"], color="C7", linestyle="--", label="weight above")
+    four.plot(column["law"], 1e3 * column["height"], color="C0", label="vertical stress, Janssen")
+    four.plot(column["vertical"], 1e3 * column["height"], "o", color="C0", label="vertical stress")
+    four.plot(column["ratio"] * column["law"], 1e3 * column["height"], color="C1", label="wall's pressure, Janssen")
+    four.plot(column["pressure"], 1e3 * column["height"], "o", color="C1", label="wall's pressure")
+    four.set_xlabel("stress [Pa]")
+    four.set_ylabel("height [mm]")
+    for panel in axes.flat:
+        panel.grid(alpha=0.3)
+        panel.legend(fontsize="small", frameon=False)
+    figure.savefig(PICTURE, dpi=110)
+    pyplot.close(figure)
+
+
+def main(names: Sequence[str]) -> None:
+    known = ("closed_forms", *JOBS)
+    if unknown := set(names) - set(known):
+        sys.exit(f"run/validate: {unknown.pop()}: allowed are {', '.join(known)}")
+    chosen = names or known
+    about = say_machine()
+    RUNS.mkdir(parents=True, exist_ok=True)
+    jobs = [job for name in chosen for job in JOBS.get(name, {}).items()]
+    with ThreadPoolExecutor(max(1, min(len(jobs), os.cpu_count() or 1))) as pool:
+        list(pool.map(lambda job: run(*job), jobs))
+    rows: list[Row] = []
+    if "closed_forms" in chosen:
+        from validation import closed_forms
+
+        rows += closed_forms.rows()
+    shown = {}
+    for name in [name for name in chosen if name in CHECKS]:
+        found, shown[name] = CHECKS[name]()
+        rows += found
+    print(table(rows))
+    record("validate", about, rows)
+    if chosen is known:
+        draw(shown)
+        seconds = sum(_seconds(name) for jobs in JOBS.values() for name in jobs)
+        about["minutes"] = seconds / 60 / min(2, os.cpu_count() or 1)
+        PAGE.write_text(
+            TEXT.read_text().format(
+                minutes=about["minutes"],
+                cores=min(2, os.cpu_count() or 1),
+                cpu=about["cpu"],
+                table=table(rows),
+                rubs=shown["column"]["rubs"],
+                outlets=", ".join(f"{outlet:g}" for outlet in OUTLETS),
+            )
+        )
+        print(PAGE)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,137 @@
+"""Runs of silo, heap, drum and column against published laws; each function reads folders of ``python -m pctt.run``."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from validation.rows import Row, band, row
+
+from pctt.look.folder import Folder
+
+BEVERLOO = "Beverloo, Leniger, van de Velde 1961; Mankoc et al. 2007 (arXiv:0707.4550)"
+JOP = "Jop, Forterre, Pouliquen 2006: glass beads, mu(I) from tan 20.9 to tan 32.8 degrees"
+ZHOU = "Zhou, Xu, Yu, Zulli 2001: the angle grows with the friction"
+ROUX = "Peyneau, Roux 2008: 5.76 degrees without friction; Jop et al. 2006: 20.9 to 32.8 for glass beads"
+JANSSEN = "Janssen 1895 (Sperl 2006)"
+RANKINE = "Rankine's active state of 20.9 degrees, and equal stresses"
+
+DIAMETER, DENSITY, GRAVITY, PACKING, WALL_FRICTION = 0.01, 2500.0, 9.81, 0.58, 0.5
+
+
+def records(folder: Path) -> dict[str, np.ndarray]:
+    """Columns of records.csv."""
+    with (folder / "records.csv").open() as file:
+        lines = list(csv.reader(file))
+    return dict(zip(lines[0], np.array(lines[1:], dtype=float).T))
+
+
+def silo(folders: Mapping[float, Path]) -> tuple[list[Row], dict]:
+    """Flow against the diameter of the outlet [sphere diameters]."""
+    outlet = np.array(list(folders))
+    read = [json.loads((folder / "summary.json").read_text())["analysis"] for folder in folders.values()]
+    flow = np.array([figures["mass_flow [kg/s]"] for figures in read])
+    slope, level = np.polyfit(outlet, flow**0.4, 1)
+    k, unit = -level / slope, PACKING * DENSITY * np.sqrt(GRAVITY) * DIAMETER**2.5
+    exponent = float(np.polyfit(np.log(outlet - 1.4), np.log(flow), 1)[0])
+    straight = float(np.abs((slope * outlet + level) ** 2.5 / flow - 1.0).max())
+    found = [
+        row("silo", "exponent of the flow in D - 1.4 d", 2.5, exponent, BEVERLOO, "", 0.1),
+        row("silo", "worst deviation of a flow from the fitted law (D - k d)^5/2", 0.0, straight, BEVERLOO, "", 0.1),
+        band("silo", "k of the fitted law", 1.0, 2.0, float(k), BEVERLOO, ""),
+        band("silo", "C of the fitted law", 0.55, 0.65, float(slope**2.5 / unit), BEVERLOO, ""),
+    ]
+    return found, {"outlet": outlet, "flow": flow, "slope": slope, "level": level}
+
+
+def heap(folders: Mapping[float, Path]) -> tuple[list[Row], dict]:
+    """Slope of what rests, against friction."""
+    friction, shapes = np.array(list(folders)), [profile(folder) for folder in folders.values()]
+    angle = np.array([slope for _, _, slope in shapes])
+    rising = float((np.diff(angle) > 0.0).mean())
+    found = [row("heap", "share of the steps of friction in which the angle grows", 1.0, rising, ZHOU, "", 0.0)]
+    for mu, degrees in zip(friction, angle):
+        what = f"angle of repose at friction {mu:g}, spheres without rolling resistance"
+        found.append(band("heap", what, 5.76, 20.9 if mu < 0.3 else 32.8, float(degrees), ROUX, "degrees"))
+    return found, {"friction": friction, "angle": angle, "profiles": [(x, z) for x, z, _ in shapes]}
+
+
+def profile(folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
+    """Height of the surface over the distance from the edge, in bins a diameter wide [m], and the angle of the line
+    through them [degrees]; the bins at the lip and at the wall do not count."""
+    run = Folder(folder)
+    run.require_frames()
+    place = run.frame(run.steps[-1]).position[: run.grains]
+    top = place[:, 2] + run.size[: run.grains, 0]
+    rests = (place[:, 0] < 0.0) & (place[:, 2] > 0.0)
+    place, top = place[rests], top[rests]
+    column = (-place[:, 0] / DIAMETER).astype(int)
+    columns = np.arange(1, column.max())
+    height = np.array([top[column == k].max(initial=0.0) for k in columns])
+    x = (columns + 0.5) * DIAMETER
+    slope = np.polyfit(x, height, 1)[0]
+    return x, height, float(np.degrees(np.arctan(slope)))
+
+
+def drum(folder: Path) -> tuple[list[Row], dict]:
+    """Angle of the flowing bed."""
+    figures = json.loads((folder / "summary.json").read_text())["analysis"]
+    angle = figures["dynamic_angle [degrees]"]
+    columns = records(folder)
+    found = [band("drum", "dynamic angle at Froude number .01, friction .5", 20.9, 32.8, angle, JOP, "degrees")]
+    return found, {"time": columns["time [s]"], "angle": columns["bed_angle [degrees]"], "mean": angle}
+
+
+def column(folder: Path, radius: float = 0.04, bins: int = 8) -> tuple[list[Row], dict]:
+    """Stresses on the wall and the bottom of a column whose bottom has been lowered, mean of the last steps."""
+    run = Folder(folder)
+    run.require_frames()
+    frames = [run.frame(step) for step in run.steps if step >= 0.66 * run.steps[-1]]
+    wall, bottom = run.grains, run.grains + 1
+    height = float(np.mean([frame.position[:wall, 2].max() for frame in frames])) + 0.5 * DIAMETER
+    edges = np.linspace(0.0, height, bins + 1)
+    normal, upwards, borne = np.zeros(bins), np.zeros(bins), 0.0
+    for frame in frames:
+        contact = frame.contacts
+        on = (contact.body == wall).any(axis=1)
+        part = np.clip(np.digitize(contact.point[on, 2], edges) - 1, 0, bins - 1)
+        on_grain = np.where(contact.body[on, 1] == wall, -1.0, 1.0) * contact.force[on, 2]
+        normal += np.bincount(part, contact.impulse[on, 0] / contact.dt, bins) / len(frames)
+        upwards += np.bincount(part, on_grain, bins) / len(frames)
+        borne += np.abs(contact.force[(contact.body == bottom).any(axis=1), 2]).sum() / len(frames)
+    weight = float(run.mass[:wall].sum()) * GRAVITY
+    area, side = np.pi * radius**2, 2.0 * np.pi * radius * height / bins
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    above = weight * (1.0 - middle / height) - (np.cumsum(upwards[::-1])[::-1] - 0.5 * upwards)
+    vertical, pressure = above / area, normal / side
+    deep = slice(0, bins - 2)  # near the surface there is little of either
+    ratio = float(pressure[deep].sum() / vertical[deep].sum())
+    rubs = float(upwards[deep].sum() / normal[deep].sum())
+    length = radius / (2.0 * ratio * rubs)
+
+    def janssen(friction: float) -> float:
+        """Force on the bottom by Janssen's law with this friction of the wall [N]."""
+        length = radius / (2.0 * ratio * friction)
+        return weight / height * length * (1.0 - np.exp(-height / length))
+
+    law = weight / height / area * length * (1.0 - np.exp(-(height - middle) / length))
+    off = float(np.abs(pressure[deep] / (ratio * law[deep]) - 1.0).max())
+    found = [
+        row("column", "force on the bottom, by K and friction of the run", janssen(rubs), borne, JANSSEN, "N", 0.1),
+        row("column", "the same, by the coefficient of friction", janssen(WALL_FRICTION), borne, JANSSEN, "N", 0.1),
+        row("column", "worst deviation of the wall's pressure from Janssen's profile", 0.0, off, JANSSEN, "", 0.2),
+        band("column", "K, wall's pressure over vertical stress", 0.474, 1.0, ratio, RANKINE, ""),
+    ]
+    weight_only = weight / area * (1.0 - middle / height)
+    return found, {
+        "height": middle,
+        "pressure": pressure,
+        "vertical": vertical,
+        "law": law,
+        "ratio": ratio,
+        "weight": weight_only,
+        "rubs": rubs,
+    }

@@ -1,0 +1,37 @@
+"""The rows of the table of a validation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+Row = dict[str, Any]
+
+
+def row(check: str, quantity: str, reference: float, found: float, source: str, unit: str, allowed: float) -> Row:
+    """What is compared; `allowed` is the deviation that is fine, relative, or absolute where the reference is zero."""
+    deviation = found - reference if reference == 0.0 else found / reference - 1.0
+    return {
+        "check": check,
+        "quantity": quantity,
+        "reference": reference,
+        "found": found,
+        "unit": unit,
+        "deviation": deviation,
+        "agrees": bool(abs(deviation) <= allowed),
+        "source": source,
+    }
+
+
+def band(check: str, quantity: str, low: float, high: float, found: float, source: str, unit: str) -> Row:
+    """What is to lie in a published band; the deviation is that from its nearer end, relative, zero inside."""
+    nearer = min(max(found, low), high)
+    return {
+        "check": check,
+        "quantity": quantity,
+        "reference": [low, high],
+        "found": found,
+        "unit": unit,
+        "deviation": found / nearer - 1.0,
+        "agrees": bool(low <= found <= high),
+        "source": source,
+    }

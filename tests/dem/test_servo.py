@@ -1,0 +1,156 @@
+"""Drives: hinged bodies, and servos that keep a speed with a bounded force or torque."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dem import quaternion
+from dem.contact import find_contacts
+from dem.mesh import Mesh
+from dem.motion import Glide, Guided, Hinged
+from dem.scene import Scene
+from dem.shapes import Box, Capsule, Plane, Sphere, mass_properties
+from dem.start import new_world
+from dem.stepper import advance
+from dem.system import ContactSystem
+from pctt import ccp
+from pctt.run.stepper import cone_problem
+
+SELF, DT = MPI.COMM_SELF, 0.01
+AXIS = np.array([1.0, 2.0, 2.0]) / 3.0
+
+
+def world_of(shapes, motion, gravity=(0, 0, -9.81), **options):
+    """A body with a drive, and a sphere far away, without which there is no scene."""
+    scene = Scene(0.5, gravity)
+    scene.add_body("tool", shapes, motion, **options)
+    scene.add_spheres([0, 0, 100.0], 0.1, 1000.0)
+    return new_world(scene, SELF)
+
+
+def step(world, tol=1e-9):
+    """One time step by Coulomb's law; the force on the tool."""
+    system = ContactSystem(world, find_contacts(world, 0.01, DT), DT)
+    with cone_problem(system, SELF) as problem:
+        impulse = ccp.solve(problem, None, "apgd", ccp.Limits(tol), coulomb=ccp.Coulomb()).impulse
+    advance(world, system.velocity(impulse), DT)
+    return system.force_on("tool", impulse)
+
+
+def test_a_wheel_on_a_hinge_turns_by_its_torque_and_stays_in_its_place():
+    wheel = Mesh.revolved([(0, -0.1), (0.5, -0.1), (0.5, 0.1), (0, 0.1)], 60)
+    tilt = (0.5, 0.5, -0.5, 0.5)
+    world = world_of([wheel], Hinged(AXIS, torque=3.0, end=0.2), density=100.0, position=(1, 2, 3), quaternion=tilt)
+    sphere = world_of([Sphere(0.5)], Hinged(AXIS, torque=3.0), density=100.0, position=(1, 2, 3))
+    for _ in range(30):
+        step(world)
+        step(sphere)
+    moment = 0.4 * 0.25 * 100.0 * 4 / 3 * np.pi * 0.125
+    np.testing.assert_allclose(sphere.large.velocity[0], [0, 0, 0, *(3.0 * 0.3 / moment * AXIS)], atol=1e-12)
+    speed = world.large.velocity[0, 3:]
+    np.testing.assert_allclose(np.cross(speed, AXIS), 0.0, atol=1e-12)
+    turn = np.linalg.norm(speed)
+    np.testing.assert_allclose(world.large.position[0], [1, 2, 3], atol=1e-12)
+    local = quaternion.rotate(quaternion.conjugate(np.array(tilt)), AXIS)
+    assert turn == pytest.approx(3.0 * 0.2 / (local @ mass_properties([wheel], 100.0)[2] @ local))
+
+
+def test_a_servo_keeps_its_speed_as_far_as_its_torque_goes():
+    world = world_of([Capsule(0.1, 0.3)], Hinged((0, 0, 1), torque=0.5, speed=4.0), density=1000.0)
+    moment, speeds = world.large.inertia[0, 2], []
+    for _ in range(200):
+        step(world)
+        speeds.append(world.large.velocity[0, 5])
+    assert speeds[0] == pytest.approx(0.5 * DT / moment)
+    assert speeds[-1] == pytest.approx(4.0, rel=1e-12)
+    assert max(speeds) <= 4.0 + 1e-12
+    assert (np.diff(speeds) >= -1e-12).all()
+
+
+@pytest.mark.parametrize(("force", "speed"), [(2000.0, 0.2), (800.0, 0.0)])
+def test_a_press_with_a_servo_rises_if_it_is_strong_enough(force, speed):
+    """It weighs 981 N and stands on the floor: with 2 kN it rises at its speed, with 800 N the floor bears the rest."""
+    scene = Scene(0.5)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    press = Guided((0, 0, 1), force=force, speed=0.2)
+    scene.add_body("tool", [Box((0.1, 0.1, 0.1))], press, mass=100.0, position=(0, 0, 0.1))
+    scene.add_spheres([0, 5, 0.1], 0.1, 1000.0)
+    world = new_world(scene, SELF)
+    for _ in range(20):
+        borne = step(world)
+    assert world.large.velocity[1, 2] == pytest.approx(speed, abs=1e-6)
+    assert borne[2] == pytest.approx(0.0 if speed else 981.0 - 800.0, abs=1e-3)
+
+
+def test_a_bearing_bears_what_presses_on_the_axis():
+    """A roller on a moving belt: neither can give way along the normal, so that there is no contact between them."""
+    scene = Scene(0.5)
+    scene.add_body("belt", [Plane((0, 0, 1))], Glide((1.0, 0, 0)))
+    roller = Hinged((0, 1, 0), torque=50.0, speed=2.0)
+    scene.add_body("tool", [Sphere(0.5)], roller, density=100.0, position=(0, 0, 0.5))
+    scene.add_spheres([0, 5, 0.1], 0.1, 1000.0)
+    world = new_world(scene, SELF)
+    assert len(find_contacts(world, 0.01)) == 1  # the small sphere on the belt
+    for _ in range(25):
+        step(world)
+    assert world.large.velocity[1, 4] == pytest.approx(2.0, rel=1e-9)
+
+
+def test_a_load_slows_a_servo_by_what_it_takes_away_in_a_step():
+    """A bar that turns pushes a ball before it: the torque of that makes the bar slower in the step."""
+    scene = Scene(0.3)
+    bar = Hinged((0, 0, 1), torque=1e5, speed=1.0)
+    scene.add_body("tool", [Capsule(0.2, 1.0, (0, 0, 0), (np.sqrt(0.5), 0, np.sqrt(0.5), 0))], bar, density=100.0)
+    scene.add_body("floor", [Plane((0, 0, 1), (0, 0, -0.2))])
+    scene.add_spheres([0.8, 0.35, -0.1], 0.1, 5000.0)
+    world = new_world(scene, SELF)
+    moment = world.large.inertia[0, 2]
+    torques = []
+    for _ in range(30):
+        torques.append(step(world)[5])
+        assert world.large.velocity[0, 5] == pytest.approx(1.0 + DT * torques[-1] / moment, abs=1e-9)
+    assert min(torques) < -1.0
+
+
+def test_a_drum_on_a_hinge_is_turned_back_by_its_bed():
+    """Without drive: a sphere on the side of a free drum turns it by its weight."""
+    scene = Scene(0.8)
+    drum = Mesh.revolved([(1.0, -0.3), (1.0, 0.3)], 96, quaternion=(np.sqrt(0.5), -np.sqrt(0.5), 0, 0))
+    scene.add_body("tool", [drum], Hinged((0, 1, 0)), mass=50.0, inertia=(50.0, 50.0, 50.0))
+    scene.add_spheres([0.899 * np.sin(0.5), 0, -0.896 * np.cos(0.5)], 0.1, 1000.0)
+    world = new_world(scene, SELF)
+    for _ in range(15):
+        step(world, 1e-7)
+    assert world.large.velocity[0, 4] > 1e-3  # down on the side of the sphere
+    np.testing.assert_allclose(world.large.velocity[0, [0, 1, 2, 3, 5]], 0.0, atol=1e-12)
+
+
+def test_the_mass_scaled_map_of_a_hinged_body_has_one_direction():
+    scene = Scene(0.3)
+    scene.add_body("tool", [Sphere(0.5)], Hinged(AXIS), density=100.0)
+    scene.add_spheres([[0.6, 0, 0], [0, 0.601, 0]], 0.1, 1000.0)
+    world = new_world(scene, SELF)
+    system = ContactSystem(world, find_contacts(world, 0.01), DT)
+    blocks = system.G.data[system.G.indices == 2].reshape(-1, 6)
+    np.testing.assert_array_equal(blocks[:, :3], 0.0)
+    np.testing.assert_allclose(np.cross(blocks[:, 3:], AXIS), 0.0, atol=1e-15)
+    compact = system.contact_map.root[-1, 6:]
+    moment = 0.4 * 0.25 * 100.0 * 4 / 3 * np.pi * 0.125
+    np.testing.assert_allclose(compact, (np.outer(AXIS, AXIS) / np.sqrt(moment))[np.triu_indices(3)], atol=1e-15)
+
+
+def test_bad_drives_are_refused():
+    with pytest.raises(ValueError, match="a guide with a speed needs the greatest force of its servo"):
+        Guided((0, 0, 1), speed=1.0)
+    with pytest.raises(ValueError, match="a hinge with a speed needs the greatest torque of its servo"):
+        Hinged((0, 0, 1), torque=-1.0, speed=1.0)
+    with pytest.raises(ValueError, match="axis of a hinge is the zero vector"):
+        Hinged((0, 0, 0))
+    with pytest.raises(ValueError, match="speed of a hinge: NaN"):
+        Hinged((0, 0, 1), torque=1.0, speed=np.nan)
+    with pytest.raises(ValueError, match="'tool' is hinged: its centre of mass must be on the axis"):
+        world_of([Sphere(0.5, (0.1, 0, 0))], Hinged((0, 0, 1)), density=100.0)
+    with pytest.raises(ValueError, match="'tool' is hinged: its initial velocity must be an angular one"):
+        world_of([Sphere(0.5)], Hinged((0, 0, 1)), density=100.0, velocity=(0, 0, 1))

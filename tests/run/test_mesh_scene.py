@@ -1,0 +1,35 @@
+"""A scene with meshes through the whole program: steps, checkpoint, dumped problems, the shapes in the output."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from program import assert_same_bits
+
+from dem.scenes import Drum
+from pctt.look.folder import Folder
+
+DRUM = ("-scene", "drum", "-scene_n", 4, "-scene_length", 2, "-scene_fill", 0.2, "-ccp_type", "apgd", "-delta", 0.003)
+
+
+@pytest.mark.parallel(1, 2)
+def test_a_drum_runs_goes_on_and_is_written(program, tmp_path):
+    program(*DRUM, "-steps", 6, "-output", "whole", "-dump_problem", "problems", "-dump_steps", "6")
+    program(*DRUM, "-steps", 3, "-output", "parts")
+    program(*DRUM, "-steps", 3, "-output", "parts", "-restart", "parts/checkpoint.h5")
+    MPI.COMM_WORLD.Barrier()
+    for name in ("state.h5", "checkpoint.h5"):
+        assert_same_bits(tmp_path / "whole" / name, tmp_path / "parts" / name)
+    folder = Folder(tmp_path / "whole")
+    folder.require_frames()
+    drum, ends = folder.large
+    assert [shape["kind"] for shape in drum["shapes"] + ends["shapes"]] == ["Mesh"] * 3
+    assert np.shape(drum["shapes"][0]["vertices"]) == (2 * Drum.sides, 3)
+    assert np.shape(drum["shapes"][0]["triangles"]) == (2 * Drum.sides, 3)
+    assert (folder.frame(6).contacts.body >= folder.grains).any()
+    files = sorted(path.name for path in (tmp_path / "problems").iterdir())
+    assert files
+    if MPI.COMM_WORLD.size == 1:
+        file = next(path for path in (tmp_path / "problems").iterdir() if path.suffix in (".hdf5", ".h5"))
+        program("-problem", file, "-ccp_type", "apgd", "-output", "solved")
