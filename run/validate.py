@@ -20,7 +20,7 @@ RUNS, PAGE, PICTURE = Path("results/validation"), Path("docs/validation.md"), Pa
 TEXT = Path("run/validation/page.md")  # of the page, with the places of the figures
 OUTLETS, FRICTIONS = (4.5, 5.5, 6.5), (0.1, 0.3, 0.6)
 
-#: The runs of each check, the longest first: names and options of ``python -m pctt.run``.
+#: The runs of each check: names and options of ``python -m pctt.run``.
 JOBS: dict[str, dict[str, Sequence[object]]] = {
     "silo": {
         f"silo_{outlet:g}": (
@@ -44,6 +44,7 @@ CHECKS: dict[str, Callable[[], tuple[list[Row], dict[str, Any]]]] = {
     "heap": lambda: laws.heap({friction: RUNS / f"heap_{friction:g}" for friction in FRICTIONS}),
     "column": lambda: laws.column(RUNS / "column"),
 }
+
 
 def run(name: str, options: Sequence[object], keep: bool) -> None:
     """Make a run in its folder, and a note of its seconds of processor; or `keep` one of the same options."""

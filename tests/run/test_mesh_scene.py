@@ -10,7 +10,7 @@ from program import assert_same_bits
 from dem.scenes import Drum
 from pctt.look.folder import Folder
 
-DRUM = ("-scene", "drum", "-scene_n", 4, "-scene_length", 2, "-scene_fill", 0.2, "-ccp_type", "apgd", "-delta", 0.003)
+DRUM = ("-scene", "drum", "-scene_n", 4, "-scene_length", 2, "-scene_fill", 0.15, "-ccp_type", "apgd", "-delta", 0.003)
 
 
 @pytest.mark.parallel(1, 2)
