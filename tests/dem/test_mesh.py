@@ -406,7 +406,7 @@ def tumbler():
     return scene
 
 
-@pytest.mark.parallel(2, 4)
+@pytest.mark.parallel(3)
 def test_on_several_ranks_meshes_have_the_contacts_that_they_have_on_one():
     worlds = [World.from_scene(tumbler(), comm) for comm in (SELF, MPI.COMM_WORLD)]
     touched = np.zeros(3)
