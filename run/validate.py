@@ -20,7 +20,7 @@ RUNS, PAGE, PICTURE = Path("results/validation"), Path("docs/validation.md"), Pa
 TEXT = Path("run/validation/page.md")  # of the page, with the places of the figures
 OUTLETS, FRICTIONS = (4.5, 5.5, 6.5), (0.1, 0.3, 0.6)
 
-#: The runs of each check, the longest first: names and options of ``python -m pctt.run``.
+#: The runs of each check: names and options of ``python -m pctt.run``.
 JOBS: dict[str, dict[str, Sequence[object]]] = {
     "silo": {
         f"silo_{outlet:g}": (
@@ -29,11 +29,11 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
         )
         for outlet, steps in zip(OUTLETS, (520, 350, 280))
     },
-    "drum": {"drum": ("drum", "-scene_n", 8, "-steps", 640)},
     "heap": {
         f"heap_{friction:g}": ("run/validation/heap.py", "-scene_friction", friction, "-steps", 470)
         for friction in FRICTIONS
     },
+    "drum": {"drum": ("drum", "-scene_n", 8, "-steps", 640)},
     "column": {"column": ("run/validation/column.py", "-steps", 240)},
 }
 
@@ -45,11 +45,12 @@ CHECKS: dict[str, Callable[[], tuple[list[Row], dict[str, Any]]]] = {
     "column": lambda: laws.column(RUNS / "column"),
 }
 
-def run(name: str, options: Sequence[object]) -> None:
-    """Make a run in its folder, unless it is there already with the same options; keep its seconds of processor."""
+
+def run(name: str, options: Sequence[object], keep: bool) -> None:
+    """Make a run in its folder, and a note of its seconds of processor; or `keep` one of the same options."""
     folder, mark = RUNS / name, RUNS / f"{name}.json"
     words = " ".join(map(str, options))
-    if mark.exists() and json.loads(mark.read_text())["options"] == words:
+    if keep and mark.exists() and json.loads(mark.read_text())["options"] == words:
         print(f"{name}: kept as it is in {folder}", flush=True)
         return
     command = [".venv/bin/python", "-m", "pctt.run", "-scene", *map(str, options), "-ccp_type", "apgd"]
@@ -126,14 +127,15 @@ def draw(shown: dict[str, dict[str, Any]]) -> None:
 
 def main(names: Sequence[str]) -> None:
     known = ("closed_forms", *JOBS)
+    keep, names = "-keep" in names, [name for name in names if name != "-keep"]
     if unknown := set(names) - set(known):
-        sys.exit(f"run/validate: {unknown.pop()}: allowed are {', '.join(known)}")
+        sys.exit(f"run/validate: {unknown.pop()}: allowed are -keep, {', '.join(known)}")
     chosen = names or known
     about = say_machine()
     RUNS.mkdir(parents=True, exist_ok=True)
     jobs = [job for name in chosen for job in JOBS.get(name, {}).items()]
     with ThreadPoolExecutor(max(1, min(len(jobs), os.cpu_count() or 1))) as pool:
-        list(pool.map(lambda job: run(*job), jobs))
+        list(pool.map(lambda job: run(*job, keep), jobs))
     rows: list[Row] = []
     if "closed_forms" in chosen:
         from validation import closed_forms

@@ -74,9 +74,10 @@ class Primitives(NamedTuple):
 
     def keys(self, i: Ints, j: Ints, feature: Ints) -> Ints:
         """Numbers (m,) of the features of pairs of rows i, j (m,), distinct and the same at all times."""
-        further, feature = np.divmod(feature, FEATURES)
-        first = self.number[i] + np.where(self.kind[i] == MESH, further, 0)
-        second = self.number[j] + np.where(self.kind[i] == MESH, 0, further)
+        first, second = self.number[i], self.number[j]
+        if self.surfaces:
+            further, feature = np.divmod(feature, FEATURES)
+            first, second = first + further * (self.kind[i] == MESH), second + further * (self.kind[i] != MESH)
         return (first * self.numbers + second) * FEATURES + feature
 
 

@@ -22,6 +22,7 @@ from pctt.run.stepper import cone_problem
 G, DT = 9.81, 0.002
 RADIUS = 0.1
 
+
 def tilted(degrees: float, friction: float, floor: Shape) -> Scene:
     """A scene whose floor z = 0 is an incline that falls towards x: gravity is tilted."""
     angle = np.radians(degrees)

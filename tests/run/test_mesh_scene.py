@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -9,8 +11,9 @@ from program import assert_same_bits
 
 from dem.scenes import Drum
 from pctt.look.folder import Folder
+from pctt.run.options import read_options
 
-DRUM = ("-scene", "drum", "-scene_n", 4, "-scene_length", 2, "-scene_fill", 0.2, "-ccp_type", "apgd", "-delta", 0.003)
+DRUM = ("-scene", "drum", "-scene_n", 4, "-scene_length", 2, "-scene_fill", 0.15, "-ccp_type", "apgd", "-delta", 0.003)
 
 
 @pytest.mark.parallel(1, 2)
@@ -33,3 +36,19 @@ def test_a_drum_runs_goes_on_and_is_written(program, tmp_path):
     if MPI.COMM_WORLD.size == 1:
         file = next(path for path in (tmp_path / "problems").iterdir() if path.suffix in (".hdf5", ".h5"))
         program("-problem", file, "-ccp_type", "apgd", "-output", "solved")
+
+
+def test_the_contact_distance_of_settling_is_the_scenes_own():
+    for options, distance in (({"scene": "drum"}, 0.005), ({"scene": "mixer"}, 0.1), ({"settle_delta": "0.03"}, 0.03)):
+        words = {"scene": "drum", "restart": "settled", **options}
+        assert read_options(words, MPI.COMM_SELF).run.settle_delta == distance
+
+
+def test_a_file_that_is_not_there_ends_a_run_before_any_work(program, tmp_path):
+    scene = Path(__file__).resolve().parents[2] / "docs" / "examples" / "bucket.py"
+    pytest.importorskip("trimesh")
+    done = program("-scene", scene, "-scene_file", "pail.stl", "-steps", 1, "-output", "out", status=None)
+    assert done.returncode
+    assert "bucket.py, line" in done.stderr
+    assert "pail.stl: no such file" in done.stderr
+    assert not list((tmp_path / "out").glob("*"))
