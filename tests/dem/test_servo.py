@@ -133,7 +133,8 @@ def test_the_mass_scaled_map_of_a_hinged_body_has_one_direction():
     scene.add_spheres([[0.6, 0, 0], [0, 0.601, 0]], 0.1, 1000.0)
     world = new_world(scene, SELF)
     system = ContactSystem(world, find_contacts(world, 0.01), DT)
-    blocks = system.G.data[system.G.indices == 2].reshape(-1, 6)
+    rows = system.contact_map.block_rows(SELF)
+    blocks = rows.blocks[rows.indices == 2].reshape(-1, 6)
     np.testing.assert_array_equal(blocks[:, :3], 0.0)
     np.testing.assert_allclose(np.cross(blocks[:, 3:], AXIS), 0.0, atol=1e-15)
     compact = system.contact_map.root[-1, 6:]
