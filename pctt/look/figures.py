@@ -76,7 +76,8 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
         bad = positive & ~good
         residual.semilogy(time[bad], values[bad], "x", color="C3", label="not converged")
     asked = np.array([line.get("tolerance", np.nan) for line in lines])
-    residual.plot(time, asked, color="black", linewidth=0.8, linestyle="--", label="tolerance")
+    if np.isfinite(asked).any():
+        residual.plot(time, asked, color="black", linewidth=0.8, linestyle="--", label="tolerance")
     if residual.get_legend_handles_labels()[0]:
         residual.legend(fontsize="small")
     if positive.any():  # a decade at least, or the labels of the axis say little
