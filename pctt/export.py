@@ -73,6 +73,7 @@ def main(comm: MPI.Comm) -> None:
         for name in SERIES:
             write_pvd(target / f"{name}.pvd", {f"{name}_{step:06d}.vtp": together[step] for step in steps})
         print(f"{len(steps)} steps: {target}/" + ", ".join(f"{name}.pvd" for name in SERIES))
+    comm.Barrier()  # all files are there when any rank goes on
 
 
 def series(name: str, folder: Folder, frame: Frame, box: np.ndarray) -> Any:

@@ -150,6 +150,8 @@ def main(names: Sequence[str]) -> None:
     if chosen is known:
         draw(shown)
         seconds = sum(_seconds(name) for jobs in JOBS.values() for name in jobs)
+        files = [RUNS / name / "steps.jsonl" for jobs in JOBS.values() for name in jobs]
+        lines = [json.loads(line) for file in files for line in file.read_text().splitlines()]
         about["minutes"] = seconds / 60 / min(2, os.cpu_count() or 1)
         PAGE.write_text(
             TEXT.read_text().format(
@@ -158,6 +160,8 @@ def main(names: Sequence[str]) -> None:
                 cpu=about["cpu"],
                 table=table(rows),
                 rubs=shown["column"]["rubs"],
+                unsolved=sum(not line["converged"] for line in lines),
+                steps=len(lines),
                 outlets=", ".join(f"{outlet:g}" for outlet in OUTLETS),
             )
         )

@@ -38,7 +38,7 @@ class Drum(Experiment):
     length: float = option(6.0, "sphere diameters", "length of the drum")
     fill: float = option(0.3, "", "part of the drum that the settled bed fills, at most about a third")
     radius: float = option(0.005, "m", "radius of the greatest spheres")
-    spread: float = option(0.2, "", "part by which the smallest spheres are smaller; equal ones make crystals")
+    spread: float = option(0.2, "", "part by which the smallest spheres are smaller; equal ones order themselves")
     density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
     friction: float = option(0.5, "", "friction coefficient between spheres")
     wall_friction: float = option(0.9, "", "friction coefficient on the side of the drum")

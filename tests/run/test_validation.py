@@ -53,7 +53,9 @@ def test_a_band_tells_how_far_off_a_figure_is(laws):
 
 def test_the_page_has_all_that_it_shows(laws):
     text = (RUN / "validation" / "page.md").read_text()
-    filled = text.format(minutes=9.0, cores=2, cpu="a processor", table="", outlets="4.5", rubs=0.24)
+    filled = text.format(
+        minutes=9.0, cores=2, cpu="a processor", table="", outlets="4.5", rubs=0.24, unsolved=1, steps=9
+    )
     assert "about 9 minutes on 2 cores with nothing else to do (a processor)" in filled
 
 
