@@ -11,7 +11,7 @@ import pytest
 
 from dem.experiment import from_file
 
-RUN = Path(__file__).resolve().parents[2] / "run"
+RUN = Path(__file__).resolve().parents[2] / "run" / "studies"
 
 
 @pytest.fixture

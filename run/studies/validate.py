@@ -17,7 +17,7 @@ from validation import laws
 from validation.rows import Row
 
 RUNS, PAGE, PICTURE = Path("results/validation"), Path("docs/validation.md"), Path("docs/validation.png")
-TEXT = Path("run/validation/page.md")  # of the page, with the places of the figures
+TEXT = Path("run/studies/validation/page.md")  # of the page, with the places of the figures
 OUTLETS, FRICTIONS = (4.5, 5.5, 6.5), (0.1, 0.3, 0.6)
 
 #: The runs of each check: names and options of ``python -m pctt.run``.
@@ -30,11 +30,11 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
         for outlet, steps in zip(OUTLETS, (520, 350, 280))
     },
     "heap": {
-        f"heap_{friction:g}": ("run/validation/heap.py", "-scene_friction", friction, "-steps", 470)
+        f"heap_{friction:g}": ("run/studies/validation/heap.py", "-scene_friction", friction, "-steps", 470)
         for friction in FRICTIONS
     },
     "drum": {"drum": ("drum", "-scene_n", 8, "-steps", 640)},
-    "column": {"column": ("run/validation/column.py", "-steps", 240)},
+    "column": {"column": ("run/studies/validation/column.py", "-steps", 240)},
 }
 
 #: What reads the runs of each check: rows of the table, and what the figure shows.
