@@ -59,6 +59,7 @@ def _remembering(method: Callable[..., Any]) -> Callable[..., Any]:
             return method(*arguments)
         except BaseException as error:
             remember(error)
+            gc.collect()  # not on the error's way through PETSc, where a dead context cannot be destroyed
             raise
 
     return called

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -25,9 +26,12 @@ _raised: list[BaseException] | None = None  # by contexts, since the innermost `
 @contextmanager
 def own_errors() -> Iterator[None]:
     """Have what our Python raises when PETSc calls it come out as it was raised. petsc4py does so up to 3.18; newer
-    releases make it the cause of an error of PETSc, or forget it where a dead python PC is collected on the way."""
+    releases make it the cause of an error of PETSc, or forget it, or crash, where the collector meets a dead python PC
+    on the way: it rests."""
     global _raised
     before, _raised = _raised, []
+    collects = gc.isenabled()
+    gc.disable()
     try:
         yield
     except PETSc.Error as error:
@@ -35,6 +39,8 @@ def own_errors() -> Iterator[None]:
         raise _raised[0] if isinstance(first, PETSc.Error) and _raised else first from None
     finally:
         _raised = before
+        if collects:
+            gc.enable()
 
 
 def remember(error: BaseException) -> None:
