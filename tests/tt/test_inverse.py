@@ -60,8 +60,9 @@ def test_ranks_grow_until_the_residual_is_small_enough(n: int, dimensions: int, 
     found = tt.invert(S, 60, sweeps=20, eps=eps)
     assert found.residual <= eps
     assert max(found.train.ranks) < 60
-    best = tt.decompose_matrix(np.linalg.inv(dense), S.rows, max_rank=max(found.train.ranks))
-    assert found.residual <= 3 * tt.residual(S, best)
+    trains = (tt.decompose_matrix(np.linalg.inv(dense), S.rows, max_rank=rank) for rank in range(60, 1, -1))
+    best = next(train for train in trains if train.storage <= found.train.storage)
+    assert found.residual <= tt.residual(S, best)  # as many numbers, the same rank in all bonds
 
 
 def test_more_rank_leaves_less() -> None:
