@@ -22,8 +22,7 @@ OLD_FACTOR = 60.0  # iterations to expect with the factor of an earlier matrix
 
 def cost(rung: str, iterations: float, bodies: int, ranks: int) -> float:
     """Of the systems with one matrix, the predictor's taking so many iterations, in iterations with block Jacobi,
-    measured at 5, 4,900 and 35,900 bodies (docs/notebook_ccp.md). On more ranks products take less time, factors hardly
-    do."""
+    measured at 5, 4,900 and 35,900 bodies (docs/ccp.md). On more ranks products take less time, factors hardly do."""
     setup = {"pbjacobi": 5.0, "cholesky": 550.0 * (bodies / 5000.0) ** 0.4 * ranks}
     return setup[rung] + solves_cost(rung, iterations, bodies, ranks)
 
