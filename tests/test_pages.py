@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem.experiment import Experiment, option
-from dem.scene import Scene
-from dem.shapes import Plane
+from dem.experiment import from_file
 from pctt import ccp
 from pctt.ccp import fclib
 
@@ -42,12 +39,10 @@ def in_folder(tmp_path, monkeypatch):
 
 
 def test_the_scene_of_the_readme_is_one(in_folder):
-    names: dict[str, Any] = dict(
-        globals(), dataclass=dataclass, Experiment=Experiment, option=option, Scene=Scene, Plane=Plane
-    )
-    exec(blocks("README.md")[0], names)
-    scene = names["Drop"](height=2.0).build()
-    assert scene.grains().position.tolist() == [[0, 0, 2]]
+    (in_folder / "column.py").write_text(blocks("README.md")[0])
+    scene = from_file(in_folder / "column.py")(n=2).build()
+    assert len(scene.grains()) == 24
+    assert scene.grains().position.min() > 0.1  # no sphere touches the floor at the start
     assert [body.name for body in scene.large_bodies] == ["floor"]
 
 
@@ -58,21 +53,17 @@ def test_the_preconditioner_of_the_readme_solves(in_folder):
         near = [j for j in (i - 1, i, i + 1) if 0 <= j < n]
         mat.setValues(i, near, [4.0 if j == i else -1.0 for j in near])
     mat.assemble()
-    ksp = PETSc.KSP().create(MPI.COMM_SELF)
-    ksp.setType("cg")
-    exec(blocks("README.md")[1], {"ksp": ksp, "mat": mat, "points": np.arange(3.0 * n).reshape(n, 3)})
-    x, b = mat.createVecs()
-    b.set(1.0)
-    ksp.solve(b, x)
-    assert ksp.getConvergedReason() > 0
-    assert ksp.pc.getPythonContext().name == "pctt.pc.TensorTrain"
-    ksp.destroy()
+    names: dict[str, Any] = {"PETSc": PETSc, "mat": mat, "points": np.arange(3.0 * n).reshape(n, 3)}
+    exec(blocks("README.md")[1], names)
+    assert names["ksp"].getConvergedReason() > 0
+    assert names["ksp"].pc.getPythonContext().name == "pctt.pc.TensorTrain"
+    names["ksp"].destroy()
 
 
-def test_the_cone_problem_of_the_readme_is_solved(in_folder, capsys):
+def test_the_cone_problem_of_its_page_is_solved(in_folder, capsys):
     stored_problem(in_folder / "problem.hdf5")
     names: dict[str, Any] = {}
-    exec(blocks("README.md")[2], names)
+    exec(blocks("docs/ccp.md")[0], names)
     assert names["result"].converged
     assert "natural residual below the tolerance" in capsys.readouterr().out
 

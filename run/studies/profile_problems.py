@@ -151,7 +151,8 @@ def tables(rows: Rows) -> str:
             continue
         names = list(dict.fromkeys(row["problem"] for row in mine))
         lines += [f"**{words[0].upper()}{words[1:]}**, {len(names)} problems. Each cell: how many were solved; how"]
-        lines += ["many of them in the least time, in at most twice and in at most ten times the least time.", ""]
+        lines += ["many of these in the shortest time of all solvers, in at most twice, and in at most ten times the"]
+        lines += ["shortest time.", ""]
         lines += [f"| | {' | '.join(f'{tol:.0e}' for tol in TOLERANCES)} |", "|" + "---|" * (len(TOLERANCES) + 1)]
         profiles = {tol: ratios(rows, law, tol) for tol in TOLERANCES}
         for k, solver in enumerate(profiles[TOLERANCES[0]][0]):
@@ -161,7 +162,7 @@ def tables(rows: Rows) -> str:
                 counts = ", ".join(str(int((ratio <= within).sum())) for within in WITHIN)
                 cells.append(f"{np.isfinite(ratio).sum()}; {counts}")
             lines.append(f"| `{solver}` | {' | '.join(cells)} |")
-        lines += ["", f"Seconds to {TOLERANCES[-1]:.0e}; where that was not reached, the residual in brackets:", ""]
+        lines += ["", f"Seconds to {TOLERANCES[-1]:.0e}. If that was not reached, the residual stands in brackets:", ""]
         solvers = profiles[TOLERANCES[0]][0]
         lines += [f"| | contacts | {' | '.join(solvers)} |", "|" + "---|" * (len(solvers) + 2)]
         last = {(row["problem"], row["method"]): row for row in mine if row["tol"] == TOLERANCES[-1]}

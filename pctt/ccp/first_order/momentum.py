@@ -9,7 +9,8 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Steering:
-    """How the bound of momentum is found; without unit but where one is given (docs/ccp.md has what was measured)."""
+    """How the bound of momentum is found; without unit but where one is given. docs/notebook_ccp.md has what was
+    measured."""
 
     damping: float = 0.05  #: 1 - the greatest momentum, at first
     window: int = 100  #: after which it is looked at [iterations]

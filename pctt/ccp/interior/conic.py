@@ -50,7 +50,7 @@ class Conic:
 
 @dataclass(frozen=True)
 class Steering:
-    """Numbers that steer the method; without unit but where one is given. docs/ccp.md has what was measured."""
+    """Numbers that steer the method, without unit but where one is given; docs/notebook_ccp.md has the measurements."""
 
     proximal: float = 1e-9  #: compliance within a step [mean diag N]: it bounds (B + C)^-1; the answer does not have it
     #: part of the forcing where impulses are the unknowns: what a solve leaves moves velocities, compared with zero

@@ -9,7 +9,7 @@ with the multipliers eliminated:
     S dg = -(N g + r + grad f / (-t f)),    S = N + lambda hess f + lambda/(-f) grad f grad f'.
 
 Where the paper's form creeps (134 Newton steps at 17,911 contacts, natural residual 6e-5), this one differs
-in five points, each measured in ``docs/ccp.md``: the constraint is the cone's perspective form
+in five points, each measured in ``docs/notebook_ccp.md``: the constraint is the cone's perspective form
 (``barrier.py``); steps end at 0.9 of the way to the boundary and inside a neighbourhood of the central
 path, rather than at 0.99 and where the multiplier residual falls; a direction that the cones' curvature cuts
 short is corrected, and short steps near the solution give S a proximal term rho I; and the natural residual alone
@@ -57,7 +57,7 @@ class PDIP:
 
 @dataclass(frozen=True)
 class Steering:
-    """Numbers that steer the method, without unit; docs/ccp.md has what was measured."""
+    """Numbers that steer the method, without unit; docs/notebook_ccp.md has what was measured."""
 
     rtol: float = 1e-3  #: of the linear solves, where ``-ksp_rtol`` does not say otherwise,
     forcing: float = 0.03  #: and what they may leave of velocities, as a part of what the natural residual shows
