@@ -6,15 +6,20 @@ import dataclasses
 import hashlib
 import json
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 
+from dem.arrays import Floats
 from dem.bodies import Bodies
 from dem.experiment import Experiment
 from dem.impulses import ImpulseMemory
-from dem.scene import Scene
+from dem.mesh import Mesh
+from dem.quaternion import cross
+from dem.scene import LargeBody, Scene
 from dem.start import restart_rows, restored_world
 from dem.world import World
 from pctt.options import OptionError
@@ -39,6 +44,27 @@ def origin(name: str, scene: Experiment, dt: float) -> dict[str, Any]:
     return {"scene": scene_record(name, scene), "dt": dt, "scene_file": scene.digest}
 
 
+def surfaces(large_bodies: Iterable[LargeBody]) -> dict[str, list[float]]:
+    """What tells the surfaces of large bodies apart, by the names of the bodies that have triangles: the number of
+    triangles, their area [m2], their centroid [m] (3) and the root mean squares of their places [m] (3).
+
+    Not the digest of the vertices: those of a turned profile differ between processors in their last bits."""
+
+    def figures(corners: Floats) -> list[float]:
+        twice = np.linalg.norm(cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        middle, weight = corners.mean(axis=1), twice / twice.sum()
+        spread = np.sqrt(weight @ middle**2)
+        return [float(len(corners)), float(0.5 * twice.sum()), *(weight @ middle).tolist(), *spread.tolist()]
+
+    found = {}
+    for body in large_bodies:
+        meshes = [shape for shape in body.shapes if isinstance(shape, Mesh)]
+        if meshes:
+            corners = [np.asarray(mesh.vertices)[np.asarray(mesh.triangles)] for mesh in meshes]
+            found[body.name] = figures(np.concatenate(corners))
+    return found
+
+
 def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMemory) -> None:
     """Write a checkpoint with its `origin`; collective. The previous one under this name stays until this one is
     complete."""
@@ -51,7 +77,10 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
             file.whole(f"world/{name}", array)
         file.rows("contacts/key", key)
         file.rows("contacts/impulse", impulse)
-        file.attributes("/", {"format": FORMAT, **made_with})
+        about = {"format": FORMAT, **made_with}
+        if triangles := surfaces(world.large_bodies):
+            about["surfaces"] = json.dumps(triangles, sort_keys=True)
+        file.attributes("/", about)
 
 
 def load(
@@ -60,7 +89,8 @@ def load(
     """The world and the impulses of a checkpoint of the scene; collective.
 
     On the number of ranks that wrote it the world is the same to the last bit. Raises FileError if it is no
-    checkpoint, OptionError if it is of another `origin`; with ``changed_file`` the scene file may be another.
+    checkpoint, OptionError if it is of another `origin` or a large body has other triangles; with ``changed_file`` the
+    scene file and the triangles may be others.
     """
     with readable(path, comm) as file:
         if file.attrs.get("format") != FORMAT:
@@ -68,6 +98,7 @@ def load(
         failure = None
         try:
             json.loads(file.attrs["scene"])
+            triangles = json.loads(file.attrs.get("surfaces", "{}"))
             stored = {name: file.attrs[name] for name in made_with if name in file.attrs}
             replicated = {n: file[f"world/{n}"][()] for n in (*_LARGE, "slabs", "time", "step")}
             rows = restart_rows(replicated["slabs"], comm)
@@ -81,6 +112,8 @@ def load(
         if failures:
             raise FileError(f"{path}: incomplete checkpoint ({failures[0]})")
     _refuse_other_origin(path, stored, made_with, changed_file)
+    if not changed_file:
+        _refuse_other_surfaces(path, triangles, surfaces(scene.large_bodies))
     try:
         world = restored_world(scene, comm, local, replicated)
     except ValueError as error:  # another text of the scene file may build other bodies
@@ -109,6 +142,17 @@ def _refuse_other_origin(path: Path, old: dict[str, Any], new: dict[str, Any], c
             raise OptionError(f"{now}: {path} was made with {was}; allowed is the same")
     if old.get("dt", new["dt"]) != new["dt"]:
         raise OptionError(f"-dt {new['dt']}: {path} was made with -dt {old['dt']}; allowed is the same")
+
+
+def _refuse_other_surfaces(path: Path, old: dict[str, list[float]], new: dict[str, list[float]]) -> None:
+    """OptionError for the first body whose `surfaces` differ; checkpoints of earlier versions know none."""
+    for name in sorted(old.keys() & new.keys()):
+        if not np.allclose(old[name], new[name], rtol=1e-6, atol=1e-6 * max(new[name][-3:])):
+            was, now = (f"{triangles:.0f} triangles, {area:.6g} m2" for triangles, area, *_ in (old[name], new[name]))
+            raise OptionError(
+                f"-restart {path}: body {name!r} has another surface ({now}) than when it was made ({was}); allowed is "
+                "the same, or another with -restart_changed_file"
+            )
 
 
 # -- settled states, outside the project's folder ------------------------------------------------------------

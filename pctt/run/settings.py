@@ -43,7 +43,9 @@ class Run:
         "file to start from: checkpoint.h5 of a run; settled: the scene's settled state, made at first use",
     )
     restart_changed_file: bool = option(
-        False, "let -restart go on from a state that another text of the scene file made; its options must be the same"
+        False,
+        "let -restart go on from a state that another text of the scene file, or another surface of a tool, made; the "
+        "options of the scene must be the same",
     )
     settle: bool = option(False, "make the scene's settled state with APGD, keep it in the cache, and stop")
     settle_delta: float = option(

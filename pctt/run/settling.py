@@ -38,6 +38,8 @@ def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, a
     }
     if options.scene.digest:
         settings["file"] = options.scene.digest  # a file that was changed may build another scene
+    if triangles := checkpoint.surfaces(built(options.scene, comm).large_bodies):
+        settings["surfaces"] = {name: [f"{value:.5g}" for value in figures] for name, figures in triangles.items()}
     path = checkpoint.settled_path(made_with["scene"], settings)
     if not anew and comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
         return path

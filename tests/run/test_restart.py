@@ -149,7 +149,7 @@ def drop(tmp_path, monkeypatch):
     run(DROP)
 
     def go_on(text, **options):
-        return run(text, restart="out/checkpoint.h5", **options)
+        return run(text, **{"restart": "out/checkpoint.h5", **options})
 
     return go_on
 
@@ -181,6 +181,25 @@ def test_other_bodies_or_options_of_a_changed_scene_file_are_refused(drop):
             drop(text, restart_changed_file="true")
         for word in words:
             assert word in str(refusal.value)
+
+
+def test_another_surface_of_a_tool_is_refused_unless_asked_for(drop, tmp_path):
+    """The text of the scene file is the same, the file with the triangles is not."""
+    tool = DROP.replace("import Plane", "import Mesh, Plane").replace("from dem.scene", "import numpy\nfrom dem.scene")
+    body = 'scene.add_body("tool", [Mesh(numpy.load("tool.npy"), [[0, 1, 2]])], position=(3, 0, 1))'
+    tool = tool.replace("        return scene", f"        {body}\n        return scene")
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    np.save("tool.npy", corners)
+    drop(tool, restart="", overwrite="true")
+    drop(tool)
+    np.save("tool.npy", 2.0 * corners)
+    with pytest.raises(OptionError) as refusal:
+        drop(tool)
+    for word in ("-restart out/checkpoint.h5", "'tool'", "1 triangles, 2 m2", "(1 triangles, 0.5 m2)"):
+        assert word in str(refusal.value)
+    assert step_of(tmp_path / "out" / "checkpoint.h5") == 4
+    drop(tool, restart_changed_file="true")
+    assert step_of(tmp_path / "out" / "checkpoint.h5") == 6
 
 
 def test_options_of_the_solver_may_change(drop, tmp_path):
