@@ -112,8 +112,8 @@ def _materials(folder: Folder) -> np.ndarray:
 
 def _range(colour: str, values: list[np.ndarray]) -> tuple[float, float]:
     """The ends of the colours: for numbers all of them, for materials an equal part each, for sizes the least and the
-    greatest. Speeds and forces begin at 0 and end where one grain in a hundred is beyond, so that a few fast ones do not
-    leave the others in one colour."""
+    greatest. Speeds and forces begin at 0 and end where one grain in a hundred is beyond: a few fast ones do not leave
+    the others in one colour."""
     together = np.concatenate(values)
     if colour == "material":
         return -0.5, together.max(initial=0.0) + 0.5

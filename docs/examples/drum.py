@@ -1,7 +1,7 @@
 """The two halves of a bed, of equal spheres, mix in a turning drum::
 
     python -m pctt.run -scene docs/examples/drum.py -ccp_type apgd -steps 500 -output_every 4 -output drum
-    python -m pctt.render drum -color material -azimuth -75 -elevation 12
+    python -m pctt.render drum -color material -azimuth -75 -elevation 12 -size 640x480
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Grains of rice, which are capsules, flow out of a hopper::
 
-    python -m pctt.run -scene docs/examples/hopper.py -ccp_type apgd -steps 300 -output_every 4 -output hopper
-    python -m pctt.render hopper -color speed -elevation 12
+    python -m pctt.run -scene docs/examples/hopper.py -ccp_type apgd -steps 360 -output_every 4 -output hopper
+    python -m pctt.render hopper -color speed -elevation 12 -size 640x480
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from dem.shapes import Plane
 class Hopper(Experiment):
     """Capsules settle in a cylinder with a conical outlet; then the gate slides away."""
 
-    layers: int = option(14, "", "layers of grains")
+    layers: int = option(10, "", "layers of grains")
     outlet: float = option(0.024, "m", "diameter of the outlet")
     angle: float = option(35.0, "degrees", "of the cone, from the vertical")
     friction: float = option(0.4, "", "friction coefficient of all contacts")
-    settling_time: float = option(0.35, "s", "when the gate opens")
-    dt = 0.005
+    settling_time: float = option(0.3, "s", "when the gate opens")
+    dt = 0.0025
     delta = 0.0005
     radius, half_length, wide = 0.0025, 0.0025, 0.04  # m; of the core of a grain, and the radius of the cylinder
 

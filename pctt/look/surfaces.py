@@ -224,9 +224,9 @@ def planes(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.n
 
 
 def walls(folder: Folder, frame: Frame, box: np.ndarray) -> list[np.ndarray]:
-    """What bounds the grains, as polygons (k, 3) seen from inside: the planes of all large bodies, and the faces towards
-    the middle of `box` (2, 3) of those of their boxes that stand beside it. They are cut as `planes` are, also by those
-    of other bodies."""
+    """What bounds the grains, as polygons (k, 3) seen from inside: the planes of all large bodies; and of their boxes
+    that stand beside the scene, `box` (2, 3), the faces towards its middle. They are cut as `planes` are, also where
+    those of other bodies are before them."""
     rows = range(len(folder.large))
     return _cut([wall for kind in (_planes, _box_walls) for row in rows for wall in kind(folder, frame, row, box)], box)
 

@@ -45,8 +45,8 @@ CONTENTS = (
     "record: attributes as in records.csv; "
     "contact: bodies a and b, point m, frame rows (normal from a to b, t1, t2), gap m, "
     "impulse on b N s; attribute dt s. bodies: shape, size m, mass kg, material by body id; "
-    "materials: the names of the materials, of which material is the index; large: names and shapes of the large bodies, "
-    "the last of the ids, in their frames"
+    "materials: the names of the materials, of which material is the index; "
+    "large: names and shapes of the large bodies, the last of the ids, in their frames"
 )
 LINKS = (
     "This file holds nothing but links to the folder frames beside it, and is empty without that folder. "

@@ -66,6 +66,8 @@ class BodyLadder(KrylovFamily):
 
     def __init__(self, comm: MPI.Comm):
         super().__init__(comm)
+        self._hardness = self._growth = 0.0
+        self._lagged: float | None = None
         self._forget()
         self._approximation: PETSc.Mat | None = None
         self.iterations = self.fallbacks = 0
@@ -134,7 +136,7 @@ class BodyLadder(KrylovFamily):
 
     def _forget(self) -> None:
         self._hardness, self._growth = STEERING.hardness, 1.0  # expected iterations with block Jacobi
-        self._lagged: float | None = None  # expected iterations with the factor that is there
+        self._lagged = None  # expected iterations with the factor that is there
 
     def _solver(self, rung: str) -> Krylov:
         unsymmetric = not self.system.symmetric
