@@ -192,6 +192,11 @@ class Scene:
         pair = sorted((self._material(material), self._material(other)))
         self._pairs[pair[0], pair[1]] = float(checks.not_negative("friction", friction))
 
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """The names of the materials, in the order of their numbers."""
+        return tuple(self._materials)
+
     def friction_table(self) -> Floats:
         """Friction coefficients (materials, materials), symmetric."""
         table = np.full((len(self._materials), len(self._materials)), self._friction)

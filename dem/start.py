@@ -66,7 +66,8 @@ def _even_slice(count: int, comm: MPI.Comm) -> slice:
 
 
 def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
-    return World(comm, tuple(scene.large_bodies), scene.gravity, scene.friction_table(), grains, scene.large())
+    friction, names = scene.friction_table(), scene.materials
+    return World(comm, tuple(scene.large_bodies), scene.gravity, friction, names, grains, scene.large())
 
 
 def _refuse_overlap(world: World, overlap: float) -> None:

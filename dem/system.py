@@ -74,7 +74,7 @@ class ContactSystem:
         self.frame = contact_frames(contacts.normal)
         self.local_contacts = len(contacts)
         self.owned_bodies, self.total_bodies = world.owned, world.body_count
-        self._comm, self._slabs, self._large_row = world.comm, world.slabs, world.large_row
+        self._comm, self._slabs = world.comm, world.slabs
         self._near, self._body = near, contacts.body
         self._row = np.stack([contacts.a, contacts.b], axis=1)
         self._arm = contact_arms(self.point, near.bodies.position, self._row)
@@ -112,12 +112,6 @@ class ContactSystem:
         """Velocities (owned, 6) after the step, v_free + M^-1 D g, for impulses (nc, 3); collective."""
         load = np.concatenate(self.generalised_impulse(impulse))[: self.owned_bodies]  # large bodies: the last rank's
         return self.free_velocity + scaled(self._root, scaled(self._root, load))
-
-    def force_on(self, name: str, impulse: Floats) -> Floats:
-        """Contact force and torque (6,) [N, N m] on a large body, about its reference point, averaged over
-        the step, from the impulses (nc, 3) of all ranks; collective. KeyError if there is no such body."""
-        row = self._large_row(name)
-        return self.generalised_impulse(impulse)[1][row] / self.dt
 
     def blocks(self) -> tuple[Ints, Floats]:
         """D' of all bodies: the global indices (nc, 2) of the two bodies of each contact, ascending, and their blocks

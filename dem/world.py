@@ -28,6 +28,7 @@ class World:
     large_bodies: tuple[LargeBody, ...]
     gravity: Floats  #: (3,) [m/s^2]
     friction: Floats  #: (materials, materials)
+    materials: tuple[str, ...]  #: their names; the column `material` of a table of bodies is an index into them
     grains: Bodies  #: the slab of this rank; replace it by `set_grains` only
     large: Bodies  #: one row per large body
     time: float = 0.0  #: [s]

@@ -14,7 +14,7 @@ import petsc4py
 petsc4py.init([])  # before modules of pctt take what the command line of sphinx-build says
 
 import pctt
-from pctt.run.options import help_text
+from pctt.run.help import help_text
 
 project = "pctt"
 author = copyright = "The pctt developers"

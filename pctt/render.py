@@ -20,7 +20,7 @@ COLOURS: dict[str, tuple[str, str, tuple[float, float]]] = {
     "force": ("contact\nforce [N]", "YlOrRd", (0.0, 0.95)),
     "id": ("body id", "turbo", (0.05, 0.95)),
     "size": ("diameter\n[m]", "viridis", (0.12, 1.0)),
-    "material": ("material", "turbo", (0.05, 0.95)),
+    "material": ("material", "turbo", (0.1, 0.85)),
 }
 
 
@@ -45,6 +45,8 @@ def arguments() -> argparse.Namespace:
         line.error(f"argument -elevation: {given.elevation:g}: allowed is a number between -90 and 90")
     if not 0 <= given.opacity <= 1:
         line.error(f"argument -opacity: {given.opacity:g}: allowed is a number from 0 to 1")
+    if given.range and given.color == "material":
+        line.error("argument -range: allowed with -color speed, force, size and id, not with material")
     if given.range and not given.range[0] < given.range[1]:
         line.error(f"argument -range: {given.range[0]:g} {given.range[1]:g}: allowed are two numbers that rise")
     return given
@@ -67,14 +69,15 @@ def main(comm: MPI.Comm) -> None:
     steps = chosen(folder.steps, given)
     target = made_folder(Path(given.output) if given.output else folder.path / "pictures")
 
-    from pctt.look import stage, surfaces  # they need vtk, which asking for help does not
+    from pctt.look import stage  # it needs vtk, which asking for help does not
 
     sample = [folder.frame(steps[k]) for k in np.unique(np.linspace(0, len(steps) - 1, SAMPLE).astype(int))]
     title, name, ends = COLOURS[given.color]
     low, high = given.range or _range(given.color, [_value(given.color, folder, frame) for frame in sample])
+    names = [folder.materials[k] for k in _materials(folder)] if given.color == "material" else []
     width, height = given.size
     view = stage.View(given.azimuth, given.elevation, given.zoom, width, height, given.opacity, given.cut)
-    theatre = stage.Stage(folder, surfaces.bounds(folder, sample), view, stage.Paint(title, low, high, name, ends))
+    theatre = stage.Stage(folder, sample, view, stage.Paint(title, low, high, name, ends, names))
     pictures = [target / f"{step:06d}.png" for step in steps]
     for step, picture in list(zip(steps, pictures))[comm.rank :: comm.size]:
         frame = folder.frame(step)
@@ -97,16 +100,24 @@ def _value(colour: str, folder: Folder, frame: Frame) -> np.ndarray:
         "force": frame.load,
         "id": lambda: np.arange(folder.grains),
         "size": lambda: 2 * surfaces.enclosing_radius(folder),
-        "material": lambda: folder.material,
+        "material": lambda: np.searchsorted(_materials(folder), folder.material),
     }
     return values[colour]()[: folder.grains].astype(float)
 
 
+def _materials(folder: Folder) -> np.ndarray:
+    """The numbers of the materials of the grains, rising."""
+    return np.unique(folder.material[: folder.grains])
+
+
 def _range(colour: str, values: list[np.ndarray]) -> tuple[float, float]:
-    """Of numbers and materials all; of sizes from the least to the greatest; else from 0 to what one grain in a
-    hundred exceeds, so that a few fast ones do not leave the others in one colour."""
+    """The ends of the colours: for numbers all of them, for materials an equal part each, for sizes the least and the
+    greatest. Speeds and forces begin at 0 and end where one grain in a hundred is beyond: a few fast ones do not leave
+    the others in one colour."""
     together = np.concatenate(values)
-    if colour in ("id", "material"):
+    if colour == "material":
+        return -0.5, together.max(initial=0.0) + 0.5
+    if colour == "id":
         return 0.0, max(together.max(initial=0.0), 1.0)
     if colour == "size":
         low, high = float(together.min(initial=np.inf)), float(together.max(initial=0.0))

@@ -11,11 +11,11 @@ import numpy as np
 
 from dem import checks
 from dem.arrays import Floats
-from dem.experiment import Experiment, option
+from dem.experiment import option
 from dem.mesh import Mesh
 from dem.motion import Rotation
 from dem.scene import Scene
-from dem.scenes.lattice import check_room, perturbed, rest_after_fall
+from dem.scenes.lattice import SmallSpheres, check_room, perturbed, rest_after_fall
 
 if TYPE_CHECKING:
     from dem.record import Step
@@ -25,7 +25,7 @@ ALONG_Y = (sqrt(0.5), -sqrt(0.5), 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Drum(Experiment):
+class Drum(SmallSpheres):
     """Spheres fall into a drum of radius n sphere diameters; when they are at rest it begins to turn about its axis.
 
     The drum is a mesh of flat sides with a horizontal axis, along y; its ends are discs, without friction unless
@@ -72,24 +72,9 @@ class Drum(Experiment):
             )
 
     @property
-    def delta(self) -> float:
-        """Contact distance [m]."""
-        return 0.2 * self.radius
-
-    @property
-    def settle_delta(self) -> float:
-        """Contact distance while settling [m]."""
-        return self.radius
-
-    @property
     def pitch(self) -> float:
         """Spacing of the lattice on which the spheres start [m]."""
         return 2.2 * self.radius
-
-    @property
-    def drum_radius(self) -> float:
-        """Radius of the drum, to the corners between its sides [m]."""
-        return 2 * self.n * self.radius
 
     @property
     def width(self) -> float:
@@ -99,12 +84,12 @@ class Drum(Experiment):
     @property
     def speed(self) -> float:
         """Angular velocity of the drum [rad/s]."""
-        return sqrt(self.froude * self.gravity / self.drum_radius)
+        return sqrt(self.froude * self.gravity / self.container_radius)
 
     @property
     def spheres(self) -> int:
         """Number of the spheres: with a packing fraction of 0.58 they fill their part of the drum."""
-        area = 0.5 * self.sides * self.drum_radius**2 * sin(2 * pi / self.sides)
+        area = 0.5 * self.sides * self.container_radius**2 * sin(2 * pi / self.sides)
         s = self.spread
         mean_cube = 1 - 3 / 2 * s + s**2 - s**3 / 4  # of radii from 1 - s to 1
         return ceil(0.58 * self.fill * area * self.width / (4 / 3 * pi * self.radius**3 * mean_cube))
@@ -112,12 +97,12 @@ class Drum(Experiment):
     @property
     def settling_time(self) -> float:
         """Time [s] after which the drum starts."""
-        return rest_after_fall(2 * self.drum_radius, self.gravity) - 1.5
+        return rest_after_fall(2 * self.container_radius, self.gravity) - 1.5
 
     @property
     def domain(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
         """The box around the drum [m]."""
-        high = (self.drum_radius, self.width / 2, self.drum_radius)
+        high = (self.container_radius, self.width / 2, self.container_radius)
         return (-high[0], -high[1], -high[2]), high
 
     def positions(self) -> Floats:
@@ -126,7 +111,7 @@ class Drum(Experiment):
 
     def _lattice(self) -> Floats:
         """All places of the lattice in the drum, the lowest first."""
-        room = self.drum_radius - self.radius - 2 * self.perturbation - 0.02 * self.drum_radius
+        room = self.container_radius - self.radius - 2 * self.perturbation - 0.02 * self.container_radius
         count = int(room / self.pitch)
         across = np.arange(-count, count + 1) * self.pitch
         slots = max(int((self.width - 2 * self.radius - 2 * self.perturbation) / self.pitch) + 1, 1)
@@ -142,7 +127,7 @@ class Drum(Experiment):
         scene.set_friction(self.end_friction, "spheres", "ends")
         radii = self.radius * np.random.default_rng(self.seed).uniform(1.0 - self.spread, 1.0, self.spheres)
         scene.add_spheres(self.positions(), radii, self.density, material="spheres")
-        half, wide = self.width / 2, self.drum_radius
+        half, wide = self.width / 2, self.container_radius
         turning = Rotation((0.0, self.speed, 0.0), start=self.settling_time)
         side = Mesh.revolved([(wide, -half), (wide, half)], self.sides, quaternion=ALONG_Y)
         ends = [Mesh.revolved([(0.0, z), (wide, z)], self.sides, quaternion=ALONG_Y) for z in (-half, half)]

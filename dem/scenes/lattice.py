@@ -1,4 +1,4 @@
-"""The perturbed cubic lattice on which the spheres of the scenes start."""
+"""What the scenes share: the perturbed cubic lattice on which spheres start, and the lengths of the small ones."""
 
 from __future__ import annotations
 
@@ -8,6 +8,29 @@ import numpy as np
 
 from dem import checks
 from dem.arrays import Floats
+from dem.experiment import Experiment
+
+
+class SmallSpheres(Experiment):
+    """Lengths of scenes whose container is round, with a radius of n sphere diameters."""
+
+    n: int
+    radius: float  #: of the greatest spheres [m]
+
+    @property
+    def delta(self) -> float:
+        """Contact distance [m]."""
+        return 0.2 * self.radius
+
+    @property
+    def settle_delta(self) -> float:
+        """Contact distance while settling [m]."""
+        return self.radius
+
+    @property
+    def container_radius(self) -> float:
+        """Radius of the container, to the corners between its sides [m]."""
+        return 2 * self.n * self.radius
 
 
 def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -> Floats:

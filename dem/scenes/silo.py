@@ -11,11 +11,11 @@ import numpy as np
 
 from dem import checks
 from dem.arrays import Floats
-from dem.experiment import Experiment, option
+from dem.experiment import option
 from dem.mesh import Mesh
 from dem.motion import Glide
 from dem.scene import Scene
-from dem.scenes.lattice import check_room, perturbed, rest_after_fall
+from dem.scenes.lattice import SmallSpheres, check_room, perturbed, rest_after_fall
 from dem.shapes import Plane
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ PACKING = 0.58
 
 
 @dataclass(frozen=True)
-class Silo(Experiment):
+class Silo(SmallSpheres):
     """Spheres settle in a cylinder with a cone below, whose outlet is shut; then the gate is drawn aside, and they flow
     out onto a floor.
 
@@ -71,24 +71,9 @@ class Silo(Experiment):
             raise ValueError(f"half_angle must be between 5 and 90 degrees, got {self.half_angle:g}")
 
     @property
-    def delta(self) -> float:
-        """Contact distance [m]."""
-        return 0.2 * self.radius
-
-    @property
-    def settle_delta(self) -> float:
-        """Contact distance while settling [m]."""
-        return self.radius
-
-    @property
     def pitch(self) -> float:
         """Spacing of the lattice on which the spheres start [m]."""
         return 2.3 * self.radius
-
-    @property
-    def silo_radius(self) -> float:
-        """Radius of the cylinder, to the corners between its sides [m]."""
-        return 2 * self.n * self.radius
 
     @property
     def outlet_radius(self) -> float:
@@ -98,18 +83,18 @@ class Silo(Experiment):
     @property
     def cone_height(self) -> float:
         """Height of the cone [m]."""
-        wider = self.silo_radius - self.outlet_radius
+        wider = self.container_radius - self.outlet_radius
         return 0.0 if self.half_angle == 90.0 else wider / tan(radians(self.half_angle))
 
     @property
     def floor(self) -> float:
         """Height of the floor, below zero [m]."""
-        return -2 * self.drop * self.silo_radius
+        return -2 * self.drop * self.container_radius
 
     @property
     def spheres(self) -> int:
         """Number of the spheres."""
-        bed = pi * self.silo_radius**2 * 2 * self.filling * self.silo_radius
+        bed = pi * self.container_radius**2 * 2 * self.filling * self.container_radius
         return ceil(PACKING * bed / (4 / 3 * pi * self.radius**3))
 
     @property
@@ -120,7 +105,7 @@ class Silo(Experiment):
     @property
     def settling_time(self) -> float:
         """Time [s] after which the gate opens."""
-        return rest_after_fall(2 * self.filling * self.silo_radius, self.gravity) - 1.4
+        return rest_after_fall(2 * self.filling * self.container_radius, self.gravity) - 1.4
 
     @property
     def beverloo(self) -> float:
@@ -130,7 +115,7 @@ class Silo(Experiment):
 
     def positions(self) -> Floats:
         """Centres (spheres, 3) of the spheres at the start [m], a lattice in the cylinder above the cone."""
-        room = self.silo_radius * np.cos(pi / self.sides) - self.radius - 2 * self.perturbation
+        room = self.container_radius * np.cos(pi / self.sides) - self.radius - 2 * self.perturbation
         count = int(room / self.pitch)
         across = np.arange(-count, count + 1) * self.pitch
         per_layer = int((np.hypot(*np.meshgrid(across, across)) <= room).sum())
@@ -147,7 +132,7 @@ class Silo(Experiment):
         """The scene, with the large bodies "silo", "gate" and "floor"."""
         scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
         scene.add_spheres(self.positions(), self.radius, self.density)
-        wide, hole = self.silo_radius, self.outlet_radius
+        wide, hole = self.container_radius, self.outlet_radius
         profile = [(hole, 0.0), (wide, self.cone_height), (wide, self.top)]
         scene.add_body("silo", [Mesh.revolved(profile, self.sides)])
         # Out of the way within a twentieth of a second, and no further.

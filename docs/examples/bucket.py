@@ -1,7 +1,9 @@
 """A bucket from an STL file goes round and scoops spheres out of a tray::
 
     python docs/examples/bucket.py bucket.stl  # writes the file, in millimetres; a drawing of your own does as well
-    python -m pctt.run -scene docs/examples/bucket.py -scene_file bucket.stl -ccp_type apgd -steps 400 -output_every 4
+    python -m pctt.run -scene docs/examples/bucket.py -scene_file bucket.stl -ccp_type apgd -steps 400 \
+        -output_every 4 -output bucket
+    python -m pctt.render bucket -size 640x480
 """
 
 from __future__ import annotations

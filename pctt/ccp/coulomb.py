@@ -22,9 +22,20 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import COULOMB, FIXED_POINT, Result, Status
 from pctt.options import AT_LEAST_ONE, COUNT, NOT_NEGATIVE, option
 
-INNER = 0.3  # accuracy of a cone problem, as a part of the Coulomb residual before it, or of the tolerance
-FIRST = 1e-2  # that of the first
-RESTART = 3.0  # growth of the residual at which what was learnt of the map is forgotten
+
+@dataclass(frozen=True)
+class Steering:
+    """Numbers that steer the fixed-point iteration."""
+
+    #: accuracy of a cone problem, as a part of the Coulomb residual before it, or of the tolerance: more exact ones
+    #: cost iterations without saving a cone problem, less exact ones hide from Anderson what the opening has changed
+    inner: float = 0.3
+    first: float = 1e-2  #: accuracy of the first cone problem, whose opening is a guess [natural residual]
+    restart: float = 3.0  #: growth of the residual over its best at which Anderson's earlier openings are forgotten
+    singular: float = 1e-12  #: singular values of Anderson's system below this part of the largest count as zero
+
+
+STEERING = Steering()
 
 
 @dataclass(frozen=True)
@@ -99,7 +110,7 @@ def solve(
     best: Result | None = None
     history: list[float] = []
     iterations = ksp_its = fallbacks = failed = 0
-    accuracy, g, r = max(FIRST, INNER * tol), guess, problem.r
+    accuracy, g, r = max(STEERING.first, STEERING.inner * tol), guess, problem.r
     anderson = Anderson(problem, relaxation, options.memory)
     while len(history) < options.max_it:
         problem.r = r + np.stack([s, 0 * s, 0 * s], axis=1)
@@ -116,9 +127,9 @@ def solve(
             best = inner
         if history[-1] <= tol or failed > 1 or inner.status is Status.UNBOUNDED:
             break
-        if history[-1] > RESTART * min(history):
+        if history[-1] > STEERING.restart * min(history):
             anderson.forget()
-        accuracy = min(accuracy, INNER * max(tol, history[-1]))
+        accuracy = min(accuracy, STEERING.inner * max(tol, history[-1]))
         s = np.maximum(anderson.next(s, opening(problem, y) - s), 0.0)
     assert best is not None
     status, words = Status.CONVERGED, "Coulomb residual below the tolerance"
@@ -167,7 +178,7 @@ class Anderson:
             return best
         changes = np.stack([df for _, df in self._steps])
         normal, right = self.problem.sum(changes @ changes.T), self.problem.sum(changes @ f)
-        weights = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
+        weights = np.linalg.lstsq(normal, right, rcond=STEERING.singular)[0]
         for weight, (ds, df) in zip(weights, self._steps):
             best = best - weight * (ds + self.relaxation * df)
         return best

@@ -86,6 +86,9 @@ class Folder:
                 self.size: np.ndarray = file["size"][()]
                 self.mass: np.ndarray = file["mass"][()]
                 self.material: np.ndarray = file["material"][()]
+                #: names of the materials by their numbers; folders of earlier versions have none
+                names = file["materials"][()] if "materials" in file else np.arange(self.material.max() + 1).astype("S")
+                self.materials: list[str] = [name.decode() for name in names]
                 #: name and shapes of each large body, the rows after the grains
                 self.large: list[dict[str, Any]] = json.loads(file["large"][()])
         except (KeyError, OSError) as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from ctypes.util import find_library
 from dataclasses import dataclass
 
@@ -63,18 +63,19 @@ class Paint:
     high: float
     map: str  #: name of a colour map of matplotlib
     ends: tuple[float, float] = (0.0, 1.0)  #: the part of the map that is used
+    names: Sequence[str] = ()  #: of the values 0, 1, ...: if there are any, a legend takes the place of the bar
 
 
 class Stage:
-    """Draws frames of one folder, all seen in the same way; ``box`` (2, 3) is the part of space that is shown [m].
+    """Draws frames of one folder, all seen in the same way, from where all of the ``frames`` given at first fits in.
 
     Of planes, and of drums and other shells, only the side of the grains is drawn, so that walls between them and the
     camera hide nothing.
     """
 
-    def __init__(self, folder: Folder, box: np.ndarray, view: View, paint: Paint):
+    def __init__(self, folder: Folder, frames: Sequence[Frame], view: View, paint: Paint):
         self._window = _window(view)
-        self.folder, self.box, self.view = folder, box, view
+        self.folder, self.box, self.view = folder, surfaces.bounds(folder, frames), view
         self._renderer, margin = vtkRenderer(), vtkRenderer()
         self._renderer.SetViewport(0, 0, STAGE, 1)
         margin.SetViewport(STAGE, 0, 1, 1)
@@ -90,21 +91,23 @@ class Stage:
         for mapper in (self._spheres, self._boxes, self._cylinders):
             self._add_grains(mapper, colours)
         self._walls, self._edges, self._tools, self._shells = map(self._add_surface, (WALL, EDGE, TOOL, SHELL))
-        walls, edges, tools = (actor.GetProperty() for actor in (self._walls, self._edges, self._tools))
-        walls.BackfaceCullingOn()
+        faces, edges, tools = (actor.GetProperty() for actor in (self._walls, self._edges, self._tools))
+        faces.BackfaceCullingOn()
         self._shells.GetProperty().BackfaceCullingOn()
         self._shells.GetProperty().SetAmbient(0.3)
         self._walls.GetMapper().SetRelativeCoincidentTopologyPolygonOffsetParameters(4, 8)  # behind their edges
-        walls.SetAmbient(0.75)
-        walls.SetDiffuse(0.25)
+        faces.SetAmbient(0.75)
+        faces.SetDiffuse(0.25)
         edges.LightingOff()
         edges.SetLineWidth(view.height / 600)
         tools.SetOpacity(view.opacity)
         tools.SetAmbient(0.3)
         self._stamp = _stamp(view)
         self._renderer.AddViewProp(self._stamp)
-        margin.AddViewProp(_colour_bar(colours, paint.title, view))
-        self._aim()
+        for prop in _legend(colours, paint, view) if paint.names else [_colour_bar(colours, paint.title, view)]:
+            margin.AddViewProp(prop)
+        walls = [polygon for frame in frames for polygon in surfaces.walls(folder, frame, self.box)]
+        self._aim(np.concatenate([np.stack(np.meshgrid(*self.box.T), axis=-1).reshape(-1, 3), *walls]))
         self._window.AddRenderer(self._renderer)
         self._window.AddRenderer(margin)
 
@@ -126,7 +129,7 @@ class Stage:
         for mapper, rows, widths in ((self._boxes, block, extent), (self._cylinders, long, core)):
             _show(mapper, place[rows], {"value": value[rows], "extent": widths[rows], "turn": turn[rows]})
         large = range(len(folder.large))
-        polygons = [polygon for row in large for polygon in surfaces.walls(folder, frame, row, self.box)]
+        polygons = surfaces.walls(folder, frame, self.box)
         self._walls.GetMapper().SetInputDataObject(surfaces.polygon_data(polygons))
         self._edges.GetMapper().SetInputDataObject(surfaces.outlines(polygons))
         self._tools.GetMapper().SetInputDataObject(
@@ -160,12 +163,11 @@ class Stage:
         self._renderer.AddActor(actor)
         return actor
 
-    def _aim(self) -> None:
-        """Put the camera as near as all corners of the box, and what planes go beyond it, allow."""
+    def _aim(self, points: np.ndarray) -> None:
+        """Put the camera as near as all points (n, 3) allow."""
         camera = self._renderer.GetActiveCamera()
         center = self.box.mean(axis=0)
-        half = (0.5 + surfaces.MARGIN) * (self.box[1] - self.box[0])
-        corners = half * np.stack(np.meshgrid(*[(-1, 1)] * 3), axis=-1).reshape(-1, 3)
+        corners = points - center
         ahead = _towards_camera(self.view)
         right = np.cross((0, 0, 1), ahead)
         right /= np.linalg.norm(right)
@@ -174,7 +176,7 @@ class Stage:
         wide = slope * STAGE * self.view.width / self.view.height
         for _ in range(5):  # perspective moves the middle of the picture away from the middle of the box
             x, y, depth = corners @ right, corners @ up, corners @ ahead
-            distance = 1.03 * (depth + np.maximum(np.abs(x) / wide, np.abs(y) / slope)).max()
+            distance = 1.05 * (depth + np.maximum(np.abs(x) / wide, np.abs(y) / slope)).max()
             across, upright = x * distance / (distance - depth), y * distance / (distance - depth)
             shift = 0.5 * ((across.min() + across.max()) * right + (upright.min() + upright.max()) * up)
             corners, center = corners - shift, center + shift
@@ -236,7 +238,7 @@ def _towards_camera(view: View, level: bool = False) -> np.ndarray:
 
 def _lookup_table(paint: Paint) -> vtkLookupTable:
     table = vtkLookupTable()
-    colours = matplotlib.colormaps[paint.map](np.linspace(*paint.ends, 256), bytes=True)
+    colours = matplotlib.colormaps[paint.map](np.linspace(*paint.ends, len(paint.names) or 256), bytes=True)
     table.SetTable(numpy_to_vtk(np.ascontiguousarray(colours), deep=True))
     table.SetTableRange(paint.low, paint.high)
     return table
@@ -257,6 +259,26 @@ def _colour_bar(colours: vtkLookupTable, title: str, view: View) -> vtkScalarBar
     bar.SetHeight(0.6)
     bar.SetBarRatio(0.25)
     return bar
+
+
+def _legend(colours: vtkLookupTable, paint: Paint, view: View) -> list[vtkTextActor]:
+    """The title and below it each name on its colour, all in letters so small that the longest name has room."""
+    size = min(view.height / 36, 1.6 * (1 - STAGE) * view.width / max(map(len, paint.names)))
+    lines = []
+    for row, text in enumerate([paint.title, *paint.names]):
+        line = vtkTextActor()
+        line.SetInput(text if row == 0 else f" {text} ")
+        style = line.GetTextProperty()
+        _plain(style, view)
+        style.SetFontSize(max(round(size), 1))
+        line.SetPosition(0.0, 0.75 * view.height - 2.2 * row * size)
+        if row > 0:
+            rgb = np.array(colours.GetTableValue(row - 1)[:3])
+            style.SetBackgroundColor(rgb)
+            style.SetBackgroundOpacity(1.0)
+            style.SetColor(np.full(3, 0.1 if rgb @ (0.3, 0.6, 0.1) > 0.45 else 1.0))
+        lines.append(line)
+    return lines
 
 
 def _stamp(view: View) -> vtkTextActor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -196,66 +197,102 @@ def joined(parts: Sequence[vtkPolyData]) -> vtkPolyData:
     return whole.GetOutput()
 
 
+@dataclass(frozen=True)
+class Wall:
+    """A rectangle that bounds the grains; of a plane, one that is larger than the scene."""
+
+    center: np.ndarray  #: (3,) [m]
+    normal: np.ndarray  #: (3,) unit vector to the side of the grains
+    first: np.ndarray  #: (3,) half of one edge [m]; normal, first and second are right-handed
+    second: np.ndarray  #: (3,) half of the other
+
+    def corners(self) -> np.ndarray:
+        """(4, 3), counterclockwise as seen from the side of the grains."""
+        first, second = self.first, self.second
+        return self.center + np.array([first + second, second - first, -first - second, first - second])
+
+    def covers(self, points: np.ndarray) -> bool:
+        """Whether points (k, 3) all lie in the prism that stands on the rectangle."""
+        away = points - self.center
+        return all((np.abs(away @ half) <= (1 + 1e-9) * (half @ half)).all() for half in (self.first, self.second))
+
+
 def planes(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.ndarray]:
     """The planes of the large body `row` as polygons (k, 3) seen from their open side, cut where another plane of the
-    body is before them and at MARGIN beyond `box`."""
+    body is before them and at `room` of the box (2, 3)."""
+    return _cut(_planes(folder, frame, row, box), box)
+
+
+def walls(folder: Folder, frame: Frame, box: np.ndarray) -> list[np.ndarray]:
+    """What bounds the grains, as polygons (k, 3) seen from inside: the planes of all large bodies; and of their boxes
+    that stand beside the scene, `box` (2, 3), the faces towards its middle. They are cut as `planes` are, also where
+    those of other bodies are before them."""
+    rows = range(len(folder.large))
+    return _cut([wall for kind in (_planes, _box_walls) for row in rows for wall in kind(folder, frame, row, box)], box)
+
+
+def room(box: np.ndarray) -> np.ndarray:
+    """The part of space (2, 3) in which walls are drawn: MARGIN beyond the scene on all sides [m]."""
+    beyond = MARGIN * float(np.linalg.norm(box[1] - box[0]))
+    return box + np.array([[-beyond], [beyond]])
+
+
+def _planes(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[Wall]:
     place, turn = _pose(folder, frame, row)
-    halves = [
-        (quaternion.rotate(turn, np.array(shape["normal"])), place + quaternion.rotate(turn, np.array(shape["center"])))
-        for shape in folder.large[row]["shapes"]
-        if shape["kind"] == "Plane"
-    ]
     size = 4 * float(np.linalg.norm(box[1] - box[0]))
-    polygons = []
-    for normal, point in halves:
-        first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-        first /= np.linalg.norm(first)
-        second = np.cross(normal, first)
-        center = box.mean(axis=0)
-        center = center - normal * (normal @ (center - point))
-        square = center + size * np.array([first + second, second - first, -first - second, first - second])
-        polygons.append(_clipped(square, normal, [*halves, *_sides(box)]))
-    return [polygon for polygon in polygons if len(polygon)]
+    found = []
+    for shape in folder.large[row]["shapes"]:
+        if shape["kind"] == "Plane":
+            normal = quaternion.rotate(turn, np.array(shape["normal"]))
+            point = place + quaternion.rotate(turn, np.array(shape["center"]))
+            first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+            first *= size / np.linalg.norm(first)
+            center = box.mean(axis=0) - normal * (normal @ (box.mean(axis=0) - point))
+            found.append(Wall(center, normal, first, np.cross(normal, first)))
+    return found
 
 
-def walls(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.ndarray]:
-    """What bounds the grains of the large body `row`, as polygons (k, 3) seen from inside: its planes, and of its boxes
-    beside `box` (2, 3) the faces towards its middle."""
-    polygons = planes(folder, frame, row, box)
+def _box_walls(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[Wall]:
     place, turn = _pose(folder, frame, row)
-    middle = box.mean(axis=0)
     shapes = folder.large[row]["shapes"]
     boxes = [shape for shape in shapes if shape["kind"] == "Box" and len(shapes) > 1]
+    found = []
     for shape in [] if boxes and is_shell(folder, row) else boxes:
         if _is_wall(_placed(_surface(shape), shape, place, turn), box):
             center = place + quaternion.rotate(turn, np.array(shape["center"]))
             axes = quaternion.matrix(quaternion.multiply(turn, np.array(shape["quaternion"]))).T
             half = np.array(shape["half_extents"])
-            way = axes @ (middle - center)
+            way = axes @ (box.mean(axis=0) - center)
             k = int(np.argmax(np.abs(way) - half))
             normal = np.sign(way[k]) * axes[k]
             first, second = half[k - 2] * axes[k - 2], np.sign(way[k]) * half[k - 1] * axes[k - 1]
-            corners = np.array([first + second, second - first, -first - second, first - second])
-            polygons.append(_clipped(center + half[k] * normal + corners, normal, _sides(box)))
+            found.append(Wall(center + half[k] * normal, normal, first, second))
+    return found
+
+
+def _cut(found: Sequence[Wall], box: np.ndarray) -> list[np.ndarray]:
+    """The polygons (k, 3) that are left of walls within the `room` of a box (2, 3) where no other wall hides them."""
+    low, high = room(box)
+    sides = [(axis, low) for axis in np.eye(3)] + [(-axis, high) for axis in np.eye(3)]
+    polygons = []
+    for wall in found:
+        polygon = wall.corners()
+        for normal, point in sides:
+            polygon = _before(polygon, normal, point)
+        for other in found:
+            behind = _clip(polygon, -other.normal, other.center)
+            if other is not wall and len(behind) and other.covers(behind):
+                polygon = _before(polygon, other.normal, other.center)
+        polygons.append(polygon)
     return [polygon for polygon in polygons if len(polygon)]
 
 
-def _sides(box: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Inward normals and points of the six planes at MARGIN beyond a box (2, 3)."""
-    beyond = MARGIN * float(np.linalg.norm(box[1] - box[0]))
-    return [(axis, box[0] - beyond) for axis in np.eye(3)] + [(-axis, box[1] + beyond) for axis in np.eye(3)]
-
-
-def _clipped(
-    polygon: np.ndarray, normal: np.ndarray, halves: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> np.ndarray:
-    """The part of a convex polygon (k, 3) of this normal that is before all planes (normal, point)."""
-    for other, through in halves:
-        if abs(other @ normal) < 1 - 1e-9:
-            polygon = _clip(polygon, other, through)
-        elif len(polygon) and (polygon[0] - through) @ other < -1e-9 * np.ptp(polygon):
-            return polygon[:0]
-    return polygon
+def _before(polygon: np.ndarray, normal: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """The part of a convex polygon (k, 3) before a plane; all of one that rounding alone puts behind it."""
+    height = (polygon - point) @ normal
+    if len(polygon) and np.ptp(height) < 1e-9 * np.ptp(polygon):
+        return polygon if height[0] >= -1e-9 * np.ptp(polygon) else polygon[:0]
+    return _clip(polygon, normal, point)
 
 
 def polygon_data(polygons: Sequence[np.ndarray]) -> vtkPolyData:

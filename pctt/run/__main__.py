@@ -27,9 +27,10 @@ import pctt
 from dem.together import SceneError
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError
+from pctt.run.help import help_text
 from pctt.run.interrupt import InterruptError, heed
 from pctt.run.leftovers import keep_from_petsc, refuse_stray
-from pctt.run.options import help_text, read_options
+from pctt.run.options import read_options
 from pctt.run.problem import solve_file
 from pctt.run.simulate import simulate
 

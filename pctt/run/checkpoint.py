@@ -75,6 +75,7 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
             file.rows(f"grains/{name}", column)
         for name, array in replicated.items():
             file.whole(f"world/{name}", array)
+        file.texts("world/materials", world.materials)
         file.rows("contacts/key", key)
         file.rows("contacts/impulse", impulse)
         about = {"format": FORMAT, **made_with}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,12 @@ class RowWriter:
     def whole(self, name: str, array: Any) -> None:
         """A dataset of the array that every rank holds."""
         self._whole[name] = np.asarray(array)
+
+    def texts(self, name: str, texts: Sequence[str]) -> None:
+        """A dataset of texts (n,), in UTF-8, the same on every rank."""
+        encoded = [text.encode() for text in texts]
+        width = max(map(len, encoded), default=1) or 1
+        self._whole[name] = np.array(encoded, dtype=h5py.string_dtype("utf-8", width))
 
     def attributes(self, name: str, values: Mapping[str, Any]) -> None:
         """Attributes of a group ('/' the file), which is made if it is not there."""

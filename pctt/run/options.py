@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from pctt.ccp.newton.users_solver import LADDER
 from pctt.contact_map import is_free
 from pctt.ksp_options import entered, to_enter
 from pctt.options import OptionError, describe, read, refuse_unknown
-from pctt.pc import PRECONDITIONERS
 from pctt.petsc import own_errors
 from pctt.run.dump import dump_folder
 from pctt.run.hdf5 import refuse_serial
@@ -46,7 +45,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     solver = ccp.SOLVERS[run.ccp_type]
     prefix = f"ccp_{run.ccp_type}_"
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
-    known = [d.name for group, start in _groups(scene_class) for d in describe(group, start)]
+    known = [d.name for group, start in option_groups(scene_class) for d in describe(group, start)]
     refuse_unknown(database, known, prefixes=OF_SOLVERS)
     for name in known:
         PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
@@ -104,46 +103,11 @@ def _read_scene(scene_class: type[Experiment], database: Mapping[str, str]) -> t
     return scene, scene.dt, scene.delta
 
 
-def _groups(scene: type[Experiment]) -> list[tuple[type, str]]:
+def option_groups(scene: type[Experiment]) -> list[tuple[type, str]]:
+    """The classes whose fields are options, with their prefixes."""
     solvers = [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
     laws: list[tuple[type, str]] = [(ccp.Limits, "ccp_"), (ccp.Coulomb, "ccp_coulomb_")]
     return [(Run, ""), (scene, "scene_"), *laws, *solvers]
-
-
-NEWTON_HELP = """\
-  The KSP without prefix, e.g. -ksp_type bcgs -ksp_rtol 1e-3 -ksp_max_it 1000 -ksp_pc_side right -pc_type pbjacobi
-  (the defaults; rtol is 10 ccp_tol where that is smaller), -ksp_monitor, -ksp_view, -log_view. A compared
-  preconditioner NAME has the prefix -compare_NAME_, e.g. -compare_ilu_pc_factor_levels 1. On several ranks ilu and
-  icc work within each rank."""
-TOPICS = {"run": "the run itself", "scene": "the scene of -scene", "ccp": "cone problems and their solvers",
-          "pc": "preconditioners of this package", "ksp": "Newton systems"}  # fmt: skip
-
-
-def help_text(database: Mapping[str, str], topic: str = "") -> str:
-    """Options with default, unit and meaning, of one of TOPICS or of all; OptionError for another topic."""
-    if topic and topic not in TOPICS:
-        raise OptionError(f"-help {topic}: there is no such topic; allowed are {', '.join(TOPICS)}, or none for all")
-    lines = ["Options of pctt.run (names <default unit>: meaning); without any, it runs the demo:"]
-    lines += ["  " + " ".join(f"-{name} {value}" for name, value in DEMO.items())]
-    lines += ["Of one topic: " + ", ".join(f"-help {name} ({text})" for name, text in TOPICS.items()), ""]
-    for part, title, text in _help_sections(database):
-        if topic in ("", part):
-            lines += [title, text, ""]
-    return "\n".join(lines[:-1] if not topic else lines[4:-1])
-
-
-def _help_sections(database: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
-    """Topic, title and text of each section of the help."""
-    scene = database.get("scene", "mixer")
-    parts = ["run", "scene", "ccp", "ccp", *("ccp" for _ in ccp.SOLVERS)]
-    titles = ["Run", f"Scene {scene}", "Cone problem", "Coulomb's law by cone problems, with -ccp_coulomb"]
-    titles += [f"-ccp_type {name}: {solver.help}" for name, solver in ccp.SOLVERS.items()]
-    for part, title, (group, prefix) in zip(parts, titles, _groups(find_scene(scene))):
-        yield part, title, "\n".join(map(str, describe(group, prefix)))
-    for pc in PRECONDITIONERS:
-        title = f"-pc_type python -pc_python_type pctt.pc.{pc.__name__}"
-        yield "pc", title, "\n".join(map(str, describe(pc.options_class, pc.options_prefix)))
-    yield "ksp", "Newton systems", NEWTON_HELP
 
 
 def _obeys_coulomb(run: Run, limits: ccp.Limits) -> bool:

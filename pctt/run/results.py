@@ -45,6 +45,7 @@ CONTENTS = (
     "record: attributes as in records.csv; "
     "contact: bodies a and b, point m, frame rows (normal from a to b, t1, t2), gap m, "
     "impulse on b N s; attribute dt s. bodies: shape, size m, mass kg, material by body id; "
+    "materials: the names of the materials, of which material is the index; "
     "large: names and shapes of the large bodies, the last of the ids, in their frames"
 )
 LINKS = (
@@ -199,12 +200,14 @@ def _write_bodies(file: RowWriter, world: World) -> None:
 
 
 def _write_constants(file: RowWriter, world: World) -> None:
-    """What no step changes: columns of the table of bodies, and the shapes of the large ones as JSON."""
+    """What no step changes: columns of the table of bodies, the names of the materials, and the shapes of the large
+    bodies as JSON."""
     _write_by_id(file, world, ("shape", "size", "mass", "material"))
     large = [
         {"name": body.name, "shapes": [described(shape) for shape in body.shapes]}
         for body in world.large_bodies
     ]
+    file.texts("materials", world.materials)
     file.whole("large", np.bytes_(json.dumps(large, default=list)))  # arrays as lists
 
 

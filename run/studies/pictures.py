@@ -1,15 +1,25 @@
-"""Draws the README's pictures of the three scenes anew, from their settled states: run/study pictures [mixer blade
-shear] [-n N] [-output DIR], default all three, 8 and docs. Writes DIR/NAME.png; needs no display. A settled state
-that is not in ~/.cache/pctt is made first, which takes minutes."""
+"""Draws the pictures of README and docs anew; needs no display, but the extra `pictures`.
+
+    run/study pictures [mixer blade shear] [-n N] [-output DIR]    # from their settled states: DIR/NAME.png
+    run/study pictures examples                                    # docs/examples/*.png, by the commands in the files
+
+Default are the three scenes, 8 and docs. A settled state that is not in ~/.cache/pctt is made first, which takes
+minutes. $RANKS (2) is the number of ranks.
+"""
 
 from __future__ import annotations
 
 import argparse
+import ast
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
 from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = ROOT / "docs" / "examples"
 
 # steps from the settled state to the picture, and options of pctt.render
 PICTURES = {
@@ -17,35 +27,77 @@ PICTURES = {
     "blade": (10, ("-color", "speed", "-size", "800x560")),
     "shear": (10, ("-color", "speed", "-size", "800x560")),
 }
+# the step that is drawn of an example with a film
+STEPS = {"drum": 240, "hopper": 120, "incline": 60, "blade": 160, "bucket": 260}
+COLOURS = 128  # of an example's picture, which makes it small
 
 
 def draw(scene: str, n: int, target: Path) -> None:
-    """Simulate the steps of a scene on $RANKS ranks (2) and draw the last."""
+    """Simulate the steps of a scene and draw the last."""
     steps, look = PICTURES[scene]
     with tempfile.TemporaryDirectory() as folder:
         run = ["-scene", scene, "-scene_n", n, "-restart", "settled", "-ccp_type", "apgd", "-steps", steps]
-        mpiexec = [".venv/bin/mpiexec", "-n", os.environ.get("RANKS", "2")]
         # the last step is recorded always, and no other is a multiple of so many
-        python(*run, "-output_every", 10**7, "-output", folder, module="run", before=mpiexec)
-        python(folder, *look, module="render")
+        python("-m", "pctt.run", *run, "-output_every", 10**7, "-output", folder)
+        python("-m", "pctt.render", folder, *look)
         (picture,) = Path(folder, "pictures").glob("*.png")
         shutil.copyfile(picture, target)
     print(target, flush=True)
 
 
-def python(*words: object, module: str, before: list[str] | None = None) -> None:
-    subprocess.run([*(before or []), ".venv/bin/python", "-m", f"pctt.{module}", *map(str, words)], check=True)
+def commands(example: Path) -> list[list[str]]:
+    """The commands that the head of an example tells, as words."""
+    text = ast.get_docstring(ast.parse(example.read_text())) or ""
+    lines = [line.strip() for line in text.splitlines() if line.strip().startswith("python ")]
+    return [shlex.split(line, comments=True)[1:] for line in lines]
+
+
+def draw_example(name: str) -> None:
+    """Run the commands of an example in a folder of their own, and keep its picture."""
+    with tempfile.TemporaryDirectory() as folder:
+        for words in commands(EXAMPLES / f"{name}.py"):
+            if words[1] == "pctt.render":
+                words += ["-first", str(STEPS[name]), "-last", str(STEPS[name])]
+            python(*(word.replace("docs/examples", str(EXAMPLES)) for word in words), folder=folder)
+        picture = Path(folder, f"{name}.png")
+        if name in STEPS:
+            picture = Path(folder, name, "pictures", f"{STEPS[name]:06d}.png")
+        from PIL import Image
+
+        with Image.open(picture) as image:
+            image.convert("RGB").quantize(COLOURS).save(EXAMPLES / f"{name}.png", optimize=True)
+    print(EXAMPLES / f"{name}.png", flush=True)
+
+
+def python(*words: object, folder: str | Path = ROOT) -> None:
+    """Run Python with these words, simulations on $RANKS ranks."""
+    line = [str(ROOT / ".venv/bin/python"), *map(str, words)]
+    if words[1] == "pctt.run":
+        line = [str(ROOT / ".venv/bin/mpiexec"), "-n", os.environ.get("RANKS", "2"), *line]
+    subprocess.run(line, check=True, cwd=folder)
+
+
+def pictured() -> list[str]:
+    """The examples whose heads tell how to make a picture."""
+    return sorted(path.stem for path in EXAMPLES.glob("*.py") if path.stem in STEPS or commands(path))
 
 
 if __name__ == "__main__":
-    words = argparse.ArgumentParser("run/study pictures", description=__doc__)
-    words.add_argument("scenes", nargs="*", metavar="SCENE", help=f"of {', '.join(PICTURES)}; none: all")
+    words = argparse.ArgumentParser(
+        "run/study pictures", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    known = [*PICTURES, "examples"]
+    words.add_argument("scenes", nargs="*", metavar="WHAT", help=f"of {', '.join(known)}; none: all scenes")
     words.add_argument("-n", type=int, default=8, help="size of the scenes (8)")
-    words.add_argument("-output", type=Path, default=Path("docs"), metavar="DIR", help="where to write (docs)")
+    words.add_argument("-output", type=Path, default=ROOT / "docs", metavar="DIR", help="where to write scenes (docs)")
     given = words.parse_args()
-    unknown = set(given.scenes) - set(PICTURES)
+    unknown = set(given.scenes) - set(known)
     if unknown:
-        words.error(f"{' '.join(sorted(unknown))}: allowed is {', '.join(PICTURES)}")
+        words.error(f"{' '.join(sorted(unknown))}: allowed is {', '.join(known)}")
     given.output.mkdir(parents=True, exist_ok=True)
     for name in given.scenes or PICTURES:
-        draw(name, given.n, given.output / f"{name}.png")
+        if name == "examples":
+            for example in pictured():
+                draw_example(example)
+        else:
+            draw(name, given.n, given.output / f"{name}.png")

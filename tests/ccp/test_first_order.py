@@ -208,7 +208,7 @@ def test_the_point_handed_back_is_the_best_that_was_looked_at(method):
 
 @EVERY
 def test_an_accuracy_that_cannot_be_reached_ends_with_a_reason(method, monkeypatch):
-    monkeypatch.setattr(progress, "PATIENCE", 150)
+    monkeypatch.setattr(progress, "STEERING", progress.Steering(patience=150))
     known, graph = heap(bodies=60, contacts=10)
     problem = from_graph(known, graph)
     result = ccp.solve(problem, type=method, limits=Limits(1e-30))

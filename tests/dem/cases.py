@@ -18,6 +18,11 @@ from dem.world import World
 from pctt.contact_map import CompactRows
 
 
+def force_on(world: World, system: ContactSystem, name: str, impulse: np.ndarray) -> np.ndarray:
+    """Contact force and torque (6,) [N, N m] on a large body, from the impulses (nc, 3) of all ranks; collective."""
+    return system.generalised_impulse(impulse)[1][world.large_row(name)] / system.dt
+
+
 def random_quaternions(rng: np.random.Generator, count: int) -> Floats:
     return quaternion.normalized(rng.normal(size=(count, 4)))
 

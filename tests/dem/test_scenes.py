@@ -120,7 +120,7 @@ def test_spheres_start_inside_drum_and_silo_without_contact(scene):
     assert len(contacts) == 0
     assert len(world.grains) == scene.spheres
     across = world.grains.position[:, [0, 2] if isinstance(scene, Drum) else [0, 1]]
-    radius = scene.drum_radius if isinstance(scene, Drum) else scene.silo_radius
+    radius = scene.container_radius
     assert np.hypot(*across.T).max() < radius - scene.radius
 
 
@@ -130,7 +130,7 @@ def test_the_drum_turns_at_its_froude_number_after_settling():
     np.testing.assert_array_equal(world.prescribed_velocity(scene.dt), 0.0)
     world.time = scene.settling_time
     velocity = world.prescribed_velocity(scene.dt)
-    np.testing.assert_allclose(velocity[:, 4] ** 2 * scene.drum_radius / 9.81, 0.04)
+    np.testing.assert_allclose(velocity[:, 4] ** 2 * scene.container_radius / 9.81, 0.04)
 
 
 def test_the_gate_of_the_silo_is_away_soon_and_closes_the_outlet_before():
@@ -138,7 +138,7 @@ def test_the_gate_of_the_silo_is_away_soon_and_closes_the_outlet_before():
     world = new_world(scene.build(), SELF)
     silo, gate = (body.shapes[0].surface for body in world.large_bodies[:2])
     assert gate.half[0] == pytest.approx(scene.outlet_radius)
-    assert silo.half[0] == pytest.approx(scene.silo_radius)
+    assert silo.half[0] == pytest.approx(scene.container_radius)
     motion, body = world.large_bodies[1].motion, world.large_bodies[1]
     far = motion.pose(scene.settling_time + 0.1, body.position, body.quaternion)[0]
     np.testing.assert_allclose(far, [2 * scene.outlet_radius, 0, 0], atol=1e-12)

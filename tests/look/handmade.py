@@ -30,7 +30,7 @@ def write(path: Path, shapes: list[dict], steps: int = 1) -> Path:
     (path / "frames").mkdir(parents=True)
     with h5py.File(path / "frames" / "bodies.h5", "w") as file:
         file["shape"], file["size"], file["mass"] = SHAPE, SIZE, np.array([1.0, 1, 1, np.inf])
-        file["material"] = np.zeros(4, int)
+        file["material"], file["materials"] = np.array([2, 0, 2, 1]), np.array([b"steel", b"floor", b"glass"])
         file["large"] = np.bytes_(json.dumps([{"name": "floor", "shapes": shapes}]))
     with h5py.File(path / "state.h5", "w") as state:
         state["bodies"] = h5py.ExternalLink("frames/bodies.h5", "/")

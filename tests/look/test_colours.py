@@ -13,7 +13,7 @@ def test_outliers_do_not_leave_the_others_in_one_colour():
     assert _range("speed", [speeds]) == (0.0, 2.0)
 
 
-@pytest.mark.parametrize(("colour", "ends"), [("size", (0.1, 0.4)), ("material", (0.0, 1.0)), ("id", (0.0, 1.0))])
+@pytest.mark.parametrize(("colour", "ends"), [("size", (0.1, 0.4)), ("material", (-0.5, 0.9)), ("id", (0.0, 1.0))])
 def test_sizes_reach_from_the_least_to_the_greatest(colour, ends):
     assert _range(colour, [np.array([0.1, 0.2]), np.array([0.4])]) == ends
 

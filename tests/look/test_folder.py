@@ -22,6 +22,7 @@ def test_a_run_tells_the_shapes_of_its_bodies(folder):
     assert (read.shape[:125] == 0).all()
     assert (read.size[:125] == [0.1, 0, 0]).all()
     np.testing.assert_allclose(read.mass, [*[2500 * 4 / 3 * np.pi * 0.1**3] * 125, np.inf, np.inf])
+    assert [read.materials[k] for k in read.material] == ["default"] * 127
     scene = Mixer(n=2).build()
     assert [body["name"] for body in read.large] == ["box", "mixer"]
     for stored, made in zip(read.large, scene.large_bodies):
@@ -78,6 +79,7 @@ def test_a_run_without_recorded_steps_is_refused(program, show, tmp_path):
         ("export", ("-every", 0), ("-every", "positive")),
         ("render", ("-color", "heat"), ("-color", "speed")),
         ("render", ("-size", "3x5"), ("-size", "3x5")),
+        ("render", ("-color", "material", "-range", 0, 1), ("-range", "material")),
         ("render", ("-elevation", 95), ("-elevation", "95")),
     ],
 )

@@ -53,7 +53,7 @@ def test_a_drum_around_the_grains_is_seen_from_inside(tmp_path):
 
 def test_a_drum_of_boxes_is_no_container(tmp_path):
     folder, frame, box = scene(tmp_path, *planks(12, 3.0, 2.5))
-    assert surfaces.walls(folder, frame, 0, box) == []
+    assert surfaces.walls(folder, frame, box) == []
     assert surfaces.finite(folder, frame, 0, box).GetNumberOfPoints() == 0
     shell = surfaces._triangles(surfaces.shell(folder, frame, 0))
     assert len(shell) >= 12 * 2
@@ -80,7 +80,7 @@ def test_a_container_of_boxes_keeps_its_walls(tmp_path):
     sides += [Box((2, 0.1, 2), (0.75, y, 0.5)) for y in (-1.1, 2.6)]
     folder, frame, box = scene(tmp_path, *sides)
     assert triangles(surfaces.shell(folder, frame, 0)) == 0
-    assert len(surfaces.walls(folder, frame, 0, box)) == 4
+    assert len(surfaces.walls(folder, frame, box)) == 4
 
 
 def test_meshes_are_exported_whole(tmp_path):

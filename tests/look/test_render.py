@@ -90,6 +90,43 @@ def test_walls_before_the_grains_hide_nothing(render, tmp_path):
     assert ((picture[..., 2] < 100) & (picture[..., :2].min(axis=2) > 120)).sum() > 300
 
 
+def test_materials_have_a_legend_with_their_names(render, tmp_path):
+    """Those of the grains: the box is of steel, sphere and capsule are of glass; nobody sees the floor's."""
+    from pctt import render as program
+
+    made = handmade.write(tmp_path / "made", handmade.FLOOR)
+    read = Folder(made)
+    read.require_frames()
+    assert [read.materials[k] for k in program._materials(read)] == ["steel", "glass"]
+    assert program._value("material", read, read.frame(1)).tolist() == [1, 0, 1]
+    render("-color", "material", "-elevation", 89, folder=made)
+    legend = pixels(made / "pictures" / "000001.png")[:, 276:]
+    coloured = (np.ptp(legend, axis=2) > 60).any(axis=1)
+    assert np.count_nonzero(np.diff(coloured.astype(int)) == 1) == 2  # two labels, one below the other
+
+
+def test_boxes_about_the_scene_end_where_they_meet(tmp_path):
+    """The ends are wider than the room between the sides, and a low wall of another body does not cut them."""
+    from pctt.look import surfaces
+
+    def wall(half, center):
+        return {"kind": "Box", "half_extents": half, "center": center, "quaternion": [1, 0, 0, 0]}
+
+    ends = [wall([0.5, 3, 1], [x, 0, 1]) for x in (-1.6, 2.6)]
+    sides = [wall([1.6, 0.5, high / 2], [0.5, y, high / 2]) for y, high in ((-1.6, 2), (1.6, 0.5))]
+    read = Folder(handmade.write(tmp_path / "made", [*ends, *sides]))
+    read.require_frames()
+    box = np.array([[-1.0, -1, 0], [2, 1, 1]])
+    beyond = surfaces.MARGIN * np.linalg.norm(box[1] - box[0])
+    polygons = surfaces.walls(read, read.frame(1), box)
+    for end, x in zip(polygons[:2], (-1.1, 2.1)):
+        np.testing.assert_allclose(end.min(axis=0), [x, -1.1, 0], atol=1e-12)
+        np.testing.assert_allclose(end.max(axis=0), [x, 1 + beyond, 1 + beyond], atol=1e-12)
+    for side, y in zip(polygons[2:], (-1.1, 1.1)):
+        np.testing.assert_allclose(side.min(axis=0), [-1.1, y, 0], atol=1e-12)
+        np.testing.assert_allclose(side[:, 0].max(), 2.1, atol=1e-12)
+
+
 def test_planes_are_cut_by_each_other_and_to_the_scene(tmp_path):
     from pctt.look import surfaces
 

@@ -7,13 +7,13 @@ gap/dt + the normal velocity. A contact that slides with speed s keeps a gap of 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
 
+import dem.step
 from dem.arrays import Floats
-from dem.contact import Contacts, find_contacts
+from dem.contact import find_contacts
 from dem.partition import rebalance
 from dem.scene import Scene
 from dem.shapes import Plane
@@ -34,13 +34,8 @@ HALF = (0.2, 0.15, 0.05)  #: half extents of single blocks [m]
 SOLVERS = {"pdip": 1e-8, "apgd": 1e-10}
 
 
-@dataclass
-class Step:
+class Step(dem.step.Step):
     """What one step did."""
-
-    contacts: Contacts
-    system: ContactSystem
-    impulse: Floats  #: (nc, 3) normal, t1, t2 [N s]
 
     def impulse_on_b(self) -> Floats:
         """Impulses (nc, 3) on the second bodies, in the world frame [N s]."""
@@ -77,7 +72,7 @@ def steps(
         reached = f"{result.reason}, residual {result.natural_residual:.1e}"
         assert result.converged or iterations, f"step {world.step + 1}: {reached}"
         advance(world, system.velocity(result.impulse), dt)
-        yield Step(contacts, system, result.impulse)
+        yield Step(world, contacts, system, result.impulse)
 
 
 def make_steps(world: World, count: int, dt: float, *args, **options) -> Step:

@@ -107,7 +107,8 @@ def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled,
     assert summary["ranks"] == ranks
     radius, friction = 0.1, 0.25
     constant = {name[7:]: array for name, array in arrays(path).items() if name.startswith("bodies/")}
-    assert set(constant) == {"shape", "size", "mass", "material", "large"}
+    assert set(constant) == {"shape", "size", "mass", "material", "materials", "large"}
+    assert (constant["materials"].tolist(), set(constant["material"])) == ([b"default"], {0})
     assert constant["size"].tolist() == [[radius, 0, 0]] * 27 + [[0, 0, 0]] * 2
     assert [body["name"] for body in json.loads(constant["large"])] == ["box", "mixer"]
     before = None

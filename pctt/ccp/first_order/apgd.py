@@ -25,6 +25,19 @@ from pctt.ccp.result import Limits, Result
 
 
 @dataclass(frozen=True)
+class Steering:
+    """How the estimate L of the curvature, whose inverse is the length of a step, follows what steps show of it."""
+
+    margin: float = 1.1  #: L of a repeated step, over the curvature found: the next step need not be repeated too
+    decay: float = 0.95  #: factor on L after each step, so that steps grow again where the curvature allows it
+    rounding: float = 1e-12  #: part of L by which the curvature may exceed it
+    least: float = 1e-3  #: the first L at least; A has a diagonal of about one
+
+
+STEERING = Steering()
+
+
+@dataclass(frozen=True)
 class APGD(FirstOrder):
     """Options ``-ccp_apgd_*``."""
 
@@ -54,13 +67,13 @@ def solve(
             progress.iterations += 1
             curvature = accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta)
             curvature, length, uphill = scaled.sums(curvature, length, uphill)
-            if not curvature > lipschitz * length * (1 + 1e-12):  # also ends on a number that is none
+            if not curvature > lipschitz * length * (1 + STEERING.rounding):  # also ends on a number that is none
                 break
-            lipschitz = 1.1 * curvature / length
+            lipschitz = STEERING.margin * curvature / length
         momentum.advance(uphill > 0)
         last_x, x, new_x = x, new_x, last_x
         last_y, y, new_y = y, new_y, last_y
-        lipschitz *= 0.95  # let the step grow again where the quotient allows it
+        lipschitz *= STEERING.decay
     return progress.result()
 
 
@@ -68,4 +81,4 @@ def _first_lipschitz(problem: ScaledProblem) -> float:
     ones = np.ones_like(problem.b)
     Ax = problem.product(ones)
     length, size = problem.dots((Ax, Ax), (ones, ones))
-    return max(float(np.sqrt(length / max(size, 1.0))), 1e-3)
+    return max(float(np.sqrt(length / max(size, 1.0))), STEERING.least)

@@ -4,10 +4,12 @@ Dai and Fletcher, "Projected Barzilai-Borwein methods for large-scale box-constr
 Numer. Math. 100 (2005); on cones because the method asks for nothing but the projection. Steps alternate
 between the two Barzilai-Borwein lengths. A step is shortened, to the exact minimiser on its segment, only
 where the objective would rise above a reference value: the worst of the values since the best one, taken
-over when MEMORY steps have brought no new best. One product with N per iteration.
+over when `Steering.memory` steps have brought no new best. One product with N per iteration.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +19,16 @@ from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 
-MEMORY = 10
+
+@dataclass(frozen=True)
+class Steering:
+    """Numbers that steer the method."""
+
+    memory: int = 10  #: steps without a new best objective after which the reference value falls; Dai and Fletcher's L
+    flat: float = 1e-14  #: curvature over squared length of a step below which rounding decides its sign
+
+
+STEERING = Steering()
 
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder) -> Result:
@@ -48,7 +59,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrde
             best, worst, since = 0.0, 0.0, 0
         else:
             worst, since = max(worst, 0.0), since + 1
-            if since == MEMORY:
+            if since == STEERING.memory:
                 reference, worst, since = worst, 0.0, 0
         step = barzilai_borwein_step(length, curvature, stretch, progress.iterations)
     return progress.result()
@@ -56,6 +67,6 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrde
 
 def barzilai_borwein_step(length: float, curvature: float, stretch: float, iteration: int) -> float:
     """The long step d'd / d'Ad in odd iterations, the short one d'Ad / |Ad|^2 in even ones; 1 if neither is one."""
-    if not curvature > 1e-14 * length:
+    if not curvature > STEERING.flat * length:
         return 1.0
     return float(length / curvature if iteration % 2 else curvature / stretch)

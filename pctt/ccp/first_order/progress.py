@@ -13,8 +13,18 @@ from pctt.ccp.result import Limits, Result, Status
 from pctt.options import AT_LEAST_ONE, option
 
 GiveUp = Callable[[int, float], str]  # from iterations and natural residual: why not to go on, or ""
-PATIENCE = 5000  # iterations that may go by without a new best natural residual, by one per cent
-PATIENCE_WITH_LAW = 1500  # the same for Coulomb's law, which has a ladder of methods
+
+
+@dataclass(frozen=True)
+class Steering:
+    """When a method has stalled."""
+
+    patience: int = 5000  #: without progress [iterations]: these methods have plateaus of thousands
+    patience_with_law: int = 1500  #: the same for Coulomb's law, where another method takes over [iterations]
+    progress: float = 0.99  #: a natural residual below this part of the best one is progress; rounding alone is not
+
+
+STEERING = Steering()
 
 
 @dataclass(frozen=True)
@@ -37,7 +47,7 @@ class Progress:
         self.history: list[float] = []
         self.status, self.reason = Status.STALLED, ""
         self._best = np.inf
-        self._patience = PATIENCE_WITH_LAW if problem.opening else PATIENCE
+        self._patience = STEERING.patience_with_law if problem.opening else STEERING.patience
         self._next_look = 0
         self._gain = (np.inf, 0)  # natural residual and iteration of the last progress
 
@@ -79,7 +89,7 @@ class Progress:
             return Status.BREAKDOWN, f"not a number after {self.iterations} iterations"
         if self.iterations >= self.limits.max_it:
             return Status.ITERATION_LIMIT, f"{self.iterations} iterations"
-        if residual < 0.99 * self._gain[0]:
+        if residual < STEERING.progress * self._gain[0]:
             self._gain = (residual, self.iterations)
         if self.iterations - self._gain[1] >= self._patience:
             return Status.STALLED, f"no progress in the last {self._patience} of {self.iterations} iterations"

@@ -6,12 +6,14 @@ Martinez, Raydan, "Nonmonotone spectral projected gradient methods on convex set
 
 The preconditioner is the diagonal of N (``scaled.py``), taken so that the projection stays exact in its
 metric. Steps are accepted by the nonmonotone test of Grippo, Lampariello and Lucidi: sufficient descent below the
-largest of the last MEMORY objectives; along a segment the objective is a known parabola, so that a
+largest of the last `Steering.memory` objectives; along a segment the objective is a known parabola, so that a
 shortened step costs no product. The fallback is that the best point seen is returned (``progress.py``), which
 a nonmonotone method needs.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,9 +24,17 @@ from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 
-MEMORY = 10
-SUFFICIENT = 1e-4  # part of the descent that the slope promises
-SHORTEN = (0.1, 0.9)  # a refused step is shortened by a factor between these
+
+@dataclass(frozen=True)
+class Steering:
+    """Numbers that steer the method; the values of Birgin, Martinez and Raydan."""
+
+    memory: int = 10  #: objectives below whose largest the next one must be
+    sufficient: float = 1e-4  #: part of the descent promised by the slope that a step must bring
+    shorten: tuple[float, float] = (0.1, 0.9)  #: a refused step is shortened by a factor between these
+
+
+STEERING = Steering()
 
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder) -> Result:
@@ -42,7 +52,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrde
         slope, length, curvature, stretch = scaled.dots((y, d), (d, d), (d, Ad), (Ad, Ad))
         slope = min(slope, -length / step)  # so it is for a projection; y'd drowns in rounding near the solution
         fraction, change = _line_search(slope, curvature, rises.max())
-        rises = np.append(rises - change, 0.0)[-MEMORY:]
+        rises = np.append(rises - change, 0.0)[-STEERING.memory :]
         if fraction != 1.0:
             d *= fraction
             Ad *= fraction
@@ -57,7 +67,8 @@ def _line_search(slope: float, curvature: float, rise: float) -> tuple[float, fl
 
     ``rise``: how far above the present objective the next one may be."""
     fraction, change = 1.0, slope + 0.5 * curvature
-    while change > rise + SUFFICIENT * fraction * slope and slope < 0:
-        fraction *= min(max(-slope / (curvature * fraction), SHORTEN[0]), SHORTEN[1])
+    least, most = STEERING.shorten
+    while change > rise + STEERING.sufficient * fraction * slope and slope < 0:
+        fraction *= min(max(-slope / (curvature * fraction), least), most)
         change = fraction * slope + 0.5 * fraction**2 * curvature
     return fraction, change

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -10,27 +12,46 @@ from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
 from pctt.ccp.newton.protocols import NewtonForm
 
 RUNGS = {"pbjacobi": {"pc_type": "pbjacobi"}, "cholesky": {"pc_type": "cholesky"}}
-CAP = {"pbjacobi": "1500", "cholesky": "60"}
 UNSYMMETRIC = {  # systems of Coulomb's law
     "pbjacobi": {"ksp_type": "bcgs"},
     "cholesky": {"ksp_type": "gmres", "ksp_gmres_restart": "100", "pc_type": "lu"},
 }
 
-SOLVES = 1.8  # iterations of predictor and correctors / those of the predictor
-OLD_FACTOR = 60.0  # iterations to expect with the factor of an earlier matrix
+
+@dataclass(frozen=True)
+class Steering:
+    """Numbers that steer the choice. Costs are in iterations with block Jacobi, measured at 5, 4,900 and 35,900 bodies
+    (docs/ccp.md); those with a factor are for 5,000 bodies and one rank."""
+
+    jacobi: float = 5.0  #: set-up of block Jacobi [its iterations]
+    factor: float = 550.0  #: a Cholesky factor [the same],
+    factor_growth: float = 0.4  #: which grows with this power of the number of bodies
+    apply: float = 25.0  #: an iteration with a factor [the same],
+    apply_growth: float = 0.3  #: which grows with this power
+    solves: float = 1.8  #: iterations of predictor and correctors over those of the predictor
+    hardness: float = 20.0  #: expected with block Jacobi in a problem's first systems, which are easy [iterations]
+    easiest: float = 10.0  #: expected at least, so that one easy system does not set the growth [iterations]
+    growth: float = 2.0  #: greatest expected growth of iterations from one system to the next
+    old_factor: float = 60.0  #: expected with the factor of the last matrix [iterations],
+    ageing: float = 1.5  #: and by how much more with each further matrix
+    jacobi_max_it: int = 1500  #: limit of block Jacobi
+    factor_max_it: int = 60  #: limit of a factor: beyond, a new one takes less time
+
+
+STEERING = Steering()
 
 
 def cost(rung: str, iterations: float, bodies: int, ranks: int) -> float:
-    """Of the systems with one matrix, the predictor's taking so many iterations, in iterations with block Jacobi,
-    measured at 5, 4,900 and 35,900 bodies (docs/ccp.md). On more ranks products take less time, factors hardly do."""
-    setup = {"pbjacobi": 5.0, "cholesky": 550.0 * (bodies / 5000.0) ** 0.4 * ranks}
-    return setup[rung] + solves_cost(rung, iterations, bodies, ranks)
+    """Cost of all systems with one matrix, if the predictor's takes so many iterations. On more ranks products take
+    less time, but factors hardly do."""
+    factor = STEERING.factor * (bodies / 5000.0) ** STEERING.factor_growth * ranks
+    return {"pbjacobi": STEERING.jacobi, "cholesky": factor}[rung] + solves_cost(rung, iterations, bodies, ranks)
 
 
 def solves_cost(rung: str, iterations: float, bodies: int, ranks: int) -> float:
     """The same when the preconditioner is there already."""
-    iteration = {"pbjacobi": 1.0, "cholesky": 25.0 * (bodies / 5000.0) ** 0.3 * ranks}
-    return SOLVES * iteration[rung] * max(1.0, iterations)
+    apply = STEERING.apply * (bodies / 5000.0) ** STEERING.apply_growth * ranks
+    return STEERING.solves * {"pbjacobi": 1.0, "cholesky": apply}[rung] * max(1.0, iterations)
 
 
 class BodyLadder(KrylovFamily):
@@ -45,9 +66,9 @@ class BodyLadder(KrylovFamily):
 
     def __init__(self, comm: MPI.Comm):
         super().__init__(comm)
-        self._hardness = 20.0  # expected iterations with block Jacobi
-        self._growth = 1.0
-        self._lagged: float | None = None  # expected iterations with the factor that is there
+        self._hardness = self._growth = 0.0
+        self._lagged: float | None = None
+        self._forget()
         self._approximation: PETSc.Mat | None = None
         self.iterations = self.fallbacks = 0
         self.used: dict[str, int] = {}
@@ -95,10 +116,10 @@ class BodyLadder(KrylovFamily):
 
     def _learn(self, rung: str, iterations: int) -> None:
         if rung == "cholesky":
-            self._lagged = 1.5 * iterations if self._keep else OLD_FACTOR
+            self._lagged = STEERING.ageing * iterations if self._keep else STEERING.old_factor
             return
-        hardness = max(10.0, float(iterations))
-        self._growth = min(max(hardness / self._hardness, 1.0), 2.0)
+        hardness = max(STEERING.easiest, float(iterations))
+        self._growth = min(max(hardness / self._hardness, 1.0), STEERING.growth)
         self._hardness = hardness
 
     @property
@@ -111,13 +132,18 @@ class BodyLadder(KrylovFamily):
 
     def begin(self) -> None:
         self.iterations = self.fallbacks = 0
-        self._hardness, self._growth, self._lagged = 20.0, 1.0, None  # a problem's first systems are easy ones
+        self._forget()
+
+    def _forget(self) -> None:
+        self._hardness, self._growth = STEERING.hardness, 1.0  # expected iterations with block Jacobi
+        self._lagged = None  # expected iterations with the factor that is there
 
     def _solver(self, rung: str) -> Krylov:
         unsymmetric = not self.system.symmetric
         name = rung + "_any" * unsymmetric
         if name not in self._krylov:
-            defaults = {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "ksp_max_it": CAP[rung], **RUNGS[rung]}
+            defaults = {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", **RUNGS[rung]}
+            defaults["ksp_max_it"] = str(STEERING.factor_max_it if rung == "cholesky" else STEERING.jacobi_max_it)
             defaults |= UNSYMMETRIC[rung] if unsymmetric else {}
             if rung == "cholesky" and self.comm.size == 1 and PETSc.Sys.hasExternalPackage("suitesparse"):
                 # 1.3 times faster than MUMPS, its solves twice

@@ -10,6 +10,8 @@ which gives the same iterates for a semidefinite matrix. PETSc's TAOGPCG is for 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pctt.ccp.cone import Array
@@ -19,9 +21,17 @@ from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 
-PROJECTIONS = 10  # most gradient projections in a row
-KRYLOV = 10  # most MINRES iterations in a row,
-REDUCTION = 0.3  # and the reduction of the residual in the face at which it ends
+
+@dataclass(frozen=True)
+class Steering:
+    """When the method changes between projections and MINRES."""
+
+    projections: int = 10  #: most gradient projections in a row
+    krylov: int = 10  #: most MINRES iterations in a row,
+    reduction: float = 0.3  #: and the reduction of the residual in the face at which they end
+
+
+STEERING = Steering()
 
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder) -> Result:
@@ -33,7 +43,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrde
     y = scaled.gradient(x)
     face = Face(x, scaled.mu)
     while progress.goes_on(x, y):
-        for _ in range(PROJECTIONS):
+        for _ in range(STEERING.projections):
             before = face
             x, y, products = projection.step(x, y)
             progress.iterations += products
@@ -55,7 +65,7 @@ def _minres(problem: ScaledProblem, face: Face, r: Array, progress: Progress) ->
     progress.iterations += 1
     p, Ap = r, Ar
     rAr, first = problem.dots((r, Ar), (r, r))
-    for _ in range(KRYLOV):
+    for _ in range(STEERING.krylov):
         squared = problem.dots((Ap, Ap))[0]
         if not (rAr > 0 and squared > 0):
             break
@@ -66,7 +76,7 @@ def _minres(problem: ScaledProblem, face: Face, r: Array, progress: Progress) ->
         progress.iterations += 1
         before = rAr
         rAr, now = problem.dots((r, Ar), (r, r))
-        if now <= REDUCTION**2 * first or progress.iterations >= progress.limits.max_it:
+        if now <= STEERING.reduction**2 * first or progress.iterations >= progress.limits.max_it:
             break
         p = r + rAr / before * p
         Ap = Ar + rAr / before * Ap

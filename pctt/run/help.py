@@ -1,0 +1,46 @@
+"""What ``python -m pctt.run -help`` prints: the options of the registry, by topic."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from pctt import ccp
+from pctt.options import OptionError, describe
+from pctt.pc import PRECONDITIONERS
+from pctt.run.options import option_groups
+from pctt.run.settings import DEMO, find_scene
+
+NEWTON_HELP = """\
+  The KSP without prefix, e.g. -ksp_type bcgs -ksp_rtol 1e-3 -ksp_max_it 1000 -ksp_pc_side right -pc_type pbjacobi
+  (the defaults; rtol is 10 ccp_tol where that is smaller), -ksp_monitor, -ksp_view, -log_view. A compared
+  preconditioner NAME has the prefix -compare_NAME_, e.g. -compare_ilu_pc_factor_levels 1. On several ranks ilu and
+  icc work within each rank."""
+TOPICS = {"run": "the run itself", "scene": "the scene of -scene", "ccp": "cone problems and their solvers",
+          "pc": "preconditioners of this package", "ksp": "Newton systems"}  # fmt: skip
+
+
+def help_text(database: Mapping[str, str], topic: str = "") -> str:
+    """Options with default, unit and meaning, of one of TOPICS or of all; OptionError for another topic."""
+    if topic and topic not in TOPICS:
+        raise OptionError(f"-help {topic}: there is no such topic; allowed are {', '.join(TOPICS)}, or none for all")
+    lines = ["Options of pctt.run (names <default unit>: meaning); without any, it runs the demo:"]
+    lines += ["  " + " ".join(f"-{name} {value}" for name, value in DEMO.items())]
+    lines += ["Of one topic: " + ", ".join(f"-help {name} ({text})" for name, text in TOPICS.items()), ""]
+    for part, title, text in _help_sections(database):
+        if topic in ("", part):
+            lines += [title, text, ""]
+    return "\n".join(lines[:-1] if not topic else lines[4:-1])
+
+
+def _help_sections(database: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
+    """Topic, title and text of each section of the help."""
+    scene = database.get("scene", "mixer")
+    parts = ["run", "scene", "ccp", "ccp", *("ccp" for _ in ccp.SOLVERS)]
+    titles = ["Run", f"Scene {scene}", "Cone problem", "Coulomb's law by cone problems, with -ccp_coulomb"]
+    titles += [f"-ccp_type {name}: {solver.help}" for name, solver in ccp.SOLVERS.items()]
+    for part, title, (group, prefix) in zip(parts, titles, option_groups(find_scene(scene))):
+        yield part, title, "\n".join(map(str, describe(group, prefix)))
+    for pc in PRECONDITIONERS:
+        title = f"-pc_type python -pc_python_type pctt.pc.{pc.__name__}"
+        yield "pc", title, "\n".join(map(str, describe(pc.options_class, pc.options_prefix)))
+    yield "ksp", "Newton systems", NEWTON_HELP
