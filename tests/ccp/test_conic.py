@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from problems import SELF, Graph, Known, from_graph, from_matrix, heap, known_optimum, matrix
 
-from pctt import ccp
+from pctt import ccp, memory
 from pctt.blocks import BlockRows
 from pctt.ccp import ConeProblem, Limits, newton_for
 from pctt.ccp.interior import conic
@@ -101,6 +102,22 @@ def test_its_systems_climb_from_block_jacobi_to_factors():
         ksp = newton.linear._solver(rung).ksp
         assert (ksp.getType(), ksp.pc.getType()) == ("cg", rung)
     newton.destroy()
+
+
+def test_without_memory_for_factors_block_jacobi_goes_on_alone(monkeypatch):
+    G, r, mu = packing(8)
+    monkeypatch.setattr(memory, "available", lambda comm: 1e6)
+    newton = newton_for(SELF, "conic")
+    assert ccp.solve(ConeProblem(SELF, r, mu, G=G), None, "conic", Limits(1e-6), newton=newton).converged
+    assert list(newton.linear.used) == ["pbjacobi"]
+    newton.destroy()
+
+
+def test_the_share_of_the_memory_is_a_part_of_what_the_machine_has():
+    share = memory.available(SELF)
+    assert share > 0
+    if share < np.inf:  # Linux
+        assert share <= os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def test_all_forms_give_the_same_velocities_with_and_without_compliance():

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt import memory
 from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
 from pctt.ccp.newton.protocols import NewtonForm
@@ -34,8 +35,12 @@ class Steering:
     growth: float = 2.0  #: greatest expected growth of iterations from one system to the next
     old_factor: float = 60.0  #: expected with the factor of the last matrix [iterations],
     ageing: float = 1.5  #: and by how much more with each further matrix
-    jacobi_max_it: int = 1500  #: limit of block Jacobi
+    jacobi_max_it: int = 1500  #: limit of block Jacobi,
+    alone_max_it: int = 20_000  #: and where there is no room for factors
     factor_max_it: int = 60  #: limit of a factor: beyond, a new one takes less time
+    #: memory of a factor of 35,900 bodies [bytes], a fifth more than measured; it grows as nested dissection in space
+    factor_bytes: float = 2.2e9
+    spare: float = 0.9  #: part of the available memory that a factor may take
 
 
 STEERING = Steering()
@@ -54,12 +59,19 @@ def solves_cost(rung: str, iterations: float, bodies: int, ranks: int) -> float:
     return STEERING.solves * {"pbjacobi": 1.0, "cholesky": apply}[rung] * max(1.0, iterations)
 
 
+def fits(bodies: int, comm: MPI.Comm) -> bool:
+    """Whether the memory has room for a factor; collective."""
+    needed = STEERING.factor_bytes * (bodies / 35900.0) ** (4.0 / 3.0) / comm.size
+    return needed < STEERING.spare * memory.available(comm)
+
+
 class BodyLadder(KrylovFamily):
     """Conjugate gradients on the body system, preconditioned by what is expected to cost least: block Jacobi while it
     takes few iterations, then Cholesky factors of its stiff part; a factor of an earlier matrix is kept as long as
     iterating with it costs less than a new one. (Incomplete factors never pay: an iteration costs six times as much.)
+    Where the memory has no room for factors, block Jacobi goes on alone.
 
-    The choice rests on iteration counts and fixed costs, so that a repeated run repeats it.
+    The choice rests on iteration counts, fixed costs and that room, so that a repeated run repeats it.
     """
 
     takes_any = True
@@ -68,6 +80,7 @@ class BodyLadder(KrylovFamily):
         super().__init__(comm)
         self._hardness = self._growth = 0.0
         self._lagged: float | None = None
+        self._asked, self._room = 0, True  # bodies for which room was asked for, and whether there was
         self._forget()
         self._approximation: PETSc.Mat | None = None
         self.iterations = self.fallbacks = 0
@@ -77,9 +90,11 @@ class BodyLadder(KrylovFamily):
         assert isinstance(system, BodyForm)
         self.system = system
         bodies, ranks = system.matrix.getSize()[0] // 6, self.comm.size
+        if bodies > self._asked:  # while no factor of this size is there, which would count as taken
+            self._asked, self._room = bodies, fits(bodies, self.comm)
         expected = self._hardness * self._growth
         costs = {"pbjacobi": cost("pbjacobi", expected, bodies, ranks), "cholesky": cost("cholesky", 1, bodies, ranks)}
-        rung, keep = min(costs, key=lambda name: costs[name]), False
+        rung, keep = min(costs, key=lambda name: costs[name]) if self._room else "pbjacobi", False
         if self._lagged is not None and solves_cost("cholesky", self._lagged, bodies, ranks) < min(costs.values()):
             rung, keep = "cholesky", True
         self._rung, self._keep = self.comm.bcast((rung, keep))  # costs may differ in a last bit between processors
@@ -91,7 +106,7 @@ class BodyLadder(KrylovFamily):
             done = self._try(self._rung, b, x, rtol)
             if done.converged:
                 return True
-            if self._rung == "cholesky" and not self._keep:
+            if not self._room or (self._rung == "cholesky" and not self._keep):
                 self.fallbacks += 1
                 return False
             self._rung, self._keep, self._fresh = "cholesky", False, True
@@ -140,10 +155,11 @@ class BodyLadder(KrylovFamily):
 
     def _solver(self, rung: str) -> Krylov:
         unsymmetric = not self.system.symmetric
-        name = rung + "_any" * unsymmetric
+        name = rung + "_any" * unsymmetric + "_alone" * (not self._room)
         if name not in self._krylov:
             defaults = {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", **RUNGS[rung]}
-            defaults["ksp_max_it"] = str(STEERING.factor_max_it if rung == "cholesky" else STEERING.jacobi_max_it)
+            jacobi_max_it = STEERING.jacobi_max_it if self._room else STEERING.alone_max_it
+            defaults["ksp_max_it"] = str(STEERING.factor_max_it if rung == "cholesky" else jacobi_max_it)
             defaults |= UNSYMMETRIC[rung] if unsymmetric else {}
             if rung == "cholesky" and self.comm.size == 1 and PETSc.Sys.hasExternalPackage("suitesparse"):
                 # 1.3 times faster than MUMPS, its solves twice
