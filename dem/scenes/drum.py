@@ -53,10 +53,6 @@ class Drum(SmallSpheres):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n < 3:
-            raise ValueError(f"n must be at least 3, got {self.n}")
-        if self.sides < 12:
-            raise ValueError(f"sides must be at least 12, got {self.sides}")
         for name in ("length", "fill", "radius", "density", "froude", "gravity"):
             checks.positive(name, getattr(self, name))
         for name in ("friction", "wall_friction", "end_friction", "spread"):

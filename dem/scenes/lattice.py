@@ -15,7 +15,15 @@ class SmallSpheres(Experiment):
     """Lengths of scenes whose container is round, with a radius of n sphere diameters."""
 
     n: int
+    sides: int  #: of the container
     radius: float  #: of the greatest spheres [m]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.n < 3:
+            raise ValueError(f"n must be at least 3, got {self.n}")
+        if self.sides < 12:
+            raise ValueError(f"sides must be at least 12, got {self.sides}")
 
     @property
     def delta(self) -> float:

@@ -55,10 +55,6 @@ class Silo(SmallSpheres):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n < 3:
-            raise ValueError(f"n must be at least 3, got {self.n}")
-        if self.sides < 12:
-            raise ValueError(f"sides must be at least 12, got {self.sides}")
         for name in ("filling", "outlet", "drop", "radius", "density", "gravity"):
             checks.positive(name, getattr(self, name))
         checks.not_negative("friction", self.friction)

@@ -1,7 +1,7 @@
-"""Ctrl-C and its like: a run ends after the step under way, with its checkpoint written, all ranks together.
+"""Ctrl-C and other signals that end a run: all ranks finish the present step, write the checkpoint and end together.
 
-A signal comes to each rank at another moment, or to one rank only. So it is noted, and after every step the ranks tell
-each other. The same signal once more ends the rank at once.
+A signal reaches the ranks at different moments, or one rank only. So each rank notes it, and after every step the ranks
+tell each other. The same signal once more ends the rank at once.
 """
 
 from __future__ import annotations

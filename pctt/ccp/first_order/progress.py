@@ -1,4 +1,4 @@
-"""When a first-order method looks at its accuracy, why it stops, and what it hands back."""
+"""The looks of a first-order method at its accuracy, its reasons to stop, and its result."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class FirstOrder:
 class Progress:
     """Counts the iterations of a method (products with N) and keeps its best point.
 
-    The objective of these methods need not fall in every step, and the natural residual falls in none of them
-    steadily: what is handed back is the best point that was looked at.
+    The objective of these methods need not fall in every step, and the natural residual falls steadily in none of them.
+    So the result is the best of all points that were looked at.
     """
 
     def __init__(self, problem: ScaledProblem, limits: Limits, options: FirstOrder, give_up: GiveUp | None = None):

@@ -1,4 +1,4 @@
-"""The body system's own ladder: what solves its systems for the least expected cost."""
+"""The ladder of the body system: it solves each system in the way with the least expected cost."""
 
 from __future__ import annotations
 
@@ -55,9 +55,10 @@ def solves_cost(rung: str, iterations: float, bodies: int, ranks: int) -> float:
 
 
 class BodyLadder(KrylovFamily):
-    """Conjugate gradients on the body system, preconditioned by what is expected to cost least: block Jacobi while it
-    takes few iterations, then Cholesky factors of its stiff part; a factor of an earlier matrix is kept as long as
-    iterating with it costs less than a new one. (Incomplete factors never pay: an iteration costs six times as much.)
+    """Conjugate gradients on the body system, with the preconditioner of the least expected cost: block Jacobi while it
+    takes few iterations, then Cholesky factors of the stiff part. A factor of an earlier matrix is kept as long as
+    iterating with it costs less than a new factor. (Incomplete factors never pay: an iteration costs six times as
+    much.)
 
     The choice rests on iteration counts and fixed costs, so that a repeated run repeats it.
     """
