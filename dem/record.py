@@ -1,4 +1,4 @@
-"""What a time step shows: forces on the large bodies, energies and their balance, statistics of the contacts.
+"""Records of a time step: forces on the large bodies, energies and their balance, statistics of the contacts.
 
 All functions are collective, and their results are the same on all ranks and, to rounding, for any number of ranks.
 """
@@ -120,7 +120,8 @@ def energy_balance(step: Step) -> dict[str, float]:
 
 
 def contact_statistics(step: Step) -> dict[str, float]:
-    """Numbers of contacts, and what they are like; overlaps are those at the start of the step.
+    """Statistics of the contacts: how many there are, how many bear forces and slide. Overlaps are those at the start
+    of the step.
 
     The coordination number is the mean number of active contacts per grain.
     """

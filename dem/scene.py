@@ -1,4 +1,4 @@
-"""Description of a scene: what there is at time zero.
+"""Description of a scene: its bodies, materials and gravity at time zero.
 
 A scene is the same on every rank and knows nothing of ranks; `dem.start.new_world` distributes it.
 

@@ -1,4 +1,4 @@
-"""Where worlds come from: a scene at time zero, or the state of an earlier run; each rank gets its grains."""
+"""Worlds from a scene at time zero, or from the state of an earlier run; each rank gets its grains."""
 
 from __future__ import annotations
 

@@ -30,8 +30,8 @@ class Drum(SmallSpheres):
 
     The drum is a mesh of flat sides with a horizontal axis, along y; its ends are discs, without friction unless
     `end_friction` says otherwise, so that a short drum stands for a piece of a long one. The angle of the bed is that
-    of its centre of mass about the axis, which is the slope of a plane surface. The torque of the bed's weight is that
-    of the drum.
+    of its centre of mass about the axis; for a plane surface it is the slope. The torque on the drum balances the
+    torque of the bed's weight.
     """
 
     n: int = option(8, "", "size: radius of the drum in diameters of a sphere")

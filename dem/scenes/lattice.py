@@ -1,4 +1,5 @@
-"""What the scenes share: the perturbed cubic lattice on which spheres start, and the lengths of the small ones."""
+"""Parts that the scenes share: the perturbed cubic lattice on which spheres start, and the lengths in scenes of small
+spheres."""
 
 from __future__ import annotations
 
