@@ -232,7 +232,7 @@ def dump_folder(run: Run) -> Path:
     """The folder above all that ``-dump_problem`` writes; raises OptionError for options that do not fit."""
     place = run.dump_problem
     if dump_steps(run) and not place:
-        raise OptionError(f"-dump_steps {run.dump_steps}: -dump_problem FOLDER has to say where to")
+        raise OptionError(f"-dump_steps {run.dump_steps}: it needs -dump_problem FOLDER, which says where to write")
     if place and run.problem:
         raise OptionError(f"-dump_problem {place}: -problem {run.problem} makes no steps; allowed is one of the two")
     if "{" in place:

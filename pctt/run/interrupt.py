@@ -28,7 +28,7 @@ def heed(comm: MPI.Comm) -> None:
     def note(number: int, frame: FrameType | None) -> None:
         signal.signal(number, signal.SIG_DFL)
         if comm.rank == 0 and not _noted:
-            sys.stderr.write("\npctt.run: will end after this step; once more, and it ends at once\n")
+            sys.stderr.write("\npctt.run: the run will end after this step; the same signal again ends it at once\n")
             sys.stderr.flush()
         _noted.append(number)
 

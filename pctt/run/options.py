@@ -134,7 +134,7 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb:
         (
             run.settle,
             lambda name: (name in own or name.startswith(("ccp_", *OF_SOLVERS))) and name not in OF_SETTLING,
-            "-settle makes its state with APGD and takes no notice of it; allowed is one of the two",
+            "-settle makes its state with APGD, where this option has no effect; allowed is one of the two",
         ),
         (not run.problem, lambda name: name == "problem_guess", "allowed with -problem only"),
         (

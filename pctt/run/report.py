@@ -27,10 +27,10 @@ def law(coulomb: bool) -> str:
 
 
 def loose_line(tol: float) -> str:
-    """What a first-order method does at a tolerance above the default."""
+    """A warning for a first-order method at a tolerance above the default."""
     return (
-        f"WARNING: -ccp_tol {tol:g}: first-order methods leave overlaps of millimetres above 1e-4, which are pushed "
-        "apart: a packing may not come to rest"
+        f"WARNING: -ccp_tol {tol:g}: above 1e-4 first-order methods leave overlaps of millimetres; as these are pushed "
+        "apart, a packing may not come to rest"
     )
 
 

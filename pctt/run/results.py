@@ -99,7 +99,7 @@ class Results:
         with written(frames / f"{world.step:06d}.h5", self.comm) as file:
             file.attributes("/", {"step": world.step, "time": world.time})
             file.attributes("record", row)
-            _write_bodies(file, world)
+            _write_by_id(file, world, ("position", "quaternion", "velocity"))
             near = contacts.near.bodies
             file.rows("contact/key", contacts.key)
             file.rows("contact/body", np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1))
@@ -194,10 +194,6 @@ class Results:
 
 def _step_of(line: str) -> int:
     return int(json.loads(line)["step"])
-
-
-def _write_bodies(file: RowWriter, world: World) -> None:
-    _write_by_id(file, world, ("position", "quaternion", "velocity"))
 
 
 def _write_constants(file: RowWriter, world: World) -> None:

@@ -100,7 +100,7 @@ class BodyLadder(KrylovFamily):
     def _try(self, rung: str, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
         krylov = self._solver(rung)
         if self._fresh and not self._keep:
-            self._approximation = self._approximate(rung)
+            self._approximation = self.system.matrix if rung == "pbjacobi" else self.system.stiff_part()
         P = self._approximation
         done = krylov.solve(self.system.matrix, b, x, rtol, P, keep=self._keep)
         self._fresh = False
@@ -110,10 +110,6 @@ class BodyLadder(KrylovFamily):
             self._worst = done.iterations
             self._learn(rung, done.iterations)
         return done
-
-    def _approximate(self, rung: str) -> PETSc.Mat:
-        """The matrix that a rung's preconditioner is made from."""
-        return self.system.matrix if rung == "pbjacobi" else self.system.stiff_part()
 
     def _learn(self, rung: str, iterations: int) -> None:
         if rung == "cholesky":
