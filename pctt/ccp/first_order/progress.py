@@ -52,7 +52,7 @@ class Progress:
         self._gain = (np.inf, 0)  # natural residual and iteration of the last progress
 
     def goes_on(self, x: Array, gradient: Array | None = None) -> bool:
-        """Whether to iterate further from x; looks at the natural residual where that is due.
+        """Whether to iterate further from x. Every ``check`` iterations this computes the natural residual.
 
         ``gradient`` is A x + b if the method has it."""
         if self.iterations < min(self._next_look, self.limits.max_it):

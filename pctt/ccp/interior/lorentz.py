@@ -23,7 +23,7 @@ ROUND = 1e-14  # tangential part of a unit scaling point below which it has no d
 
 
 def determinant(x: Array) -> Array:
-    """x_0^2 - |x_1:|^2 (nc,) of points inside, kept positive where rounding would not.
+    """x_0^2 - |x_1:|^2 (nc,) of points inside, kept positive in spite of rounding.
 
     Near the boundary rounding is at most 1.5 eps x_0^2: the first difference is exact, and neither the product nor the
     square is larger than x_0^2 / 2."""
