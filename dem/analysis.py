@@ -10,10 +10,10 @@ from dem.arrays import Bools, Floats
 
 
 def low_pass(time: Floats, values: Floats, cutoff: float) -> Floats:
-    """Values (n,) at equally spaced times (n,) [s] without what is faster than `cutoff` [Hz].
+    """Values (n,) at equally spaced times (n,) [s], without their parts of higher frequency than `cutoff` [Hz].
 
-    Butterworth filter of second order, forwards and backwards, so that nothing is shifted in time. As they are if
-    there are fewer than three or if they do not resolve the cutoff.
+    Butterworth filter of second order, forwards and backwards, so that nothing is shifted in time. The values come back
+    unchanged if there are fewer than three, or if they do not resolve the cutoff.
     """
     if len(values) < 3:
         return values.copy()
@@ -43,7 +43,7 @@ def steady_part(time: Floats, start: float, period: float) -> Bools:
 
 
 def swing(values: Floats, filtered_values: Floats) -> float:
-    """Standard deviation of what the filter takes away from a series (n,), relative to the mean of the series."""
+    """Standard deviation of the part of a series (n,) that the filter removes, relative to the mean of the series."""
     return float(np.std(values - filtered_values) / np.mean(values))
 
 

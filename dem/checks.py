@@ -1,4 +1,4 @@
-"""Checks of what a user passes; each raises ValueError with the name of the quantity."""
+"""Checks of a user's arguments; each raises ValueError with the name of the quantity."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Loops over contacts, pairs and bodies, compiled by numba at their first call.
 
-Each does what the numpy code beside its caller does, in one pass over memory. Import it by `dem.loops.loops`.
-Arrays are C-contiguous, of float64 and int64.
+Each gives the same as the numpy code beside its caller, in one pass over memory. Import it by `dem.loops.loops`. Arrays
+are C-contiguous, of float64 and int64.
 """
 
 from __future__ import annotations

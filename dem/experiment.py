@@ -1,4 +1,4 @@
-"""What a scene is to the program: options, recommended numerics, bodies to build, quantities to record::
+"""The interface between a scene and the program: options, recommended numerics, bodies, quantities to record::
 
     @dataclass(frozen=True)
     class Drop(Experiment):
@@ -65,7 +65,8 @@ class Experiment:
     digest: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
-        """ValueError, which starts with the name of the option, for numbers that are none; extend it to check more."""
+        """ValueError for numbers that are not finite. The message starts with the name of the option. Extend this to
+        check more."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, float):
@@ -78,12 +79,12 @@ class Experiment:
     def record(self, step: Step) -> Mapping[str, float]:
         """Quantities of the scene's own to record after every step, by name with the unit in brackets: "depth [m]".
 
-        Called on all ranks, and must return the same on all: what `Step` offers is of that kind.
+        It is called on all ranks, and must return the same on all. All results of `Step` are the same on all ranks.
         """
         return {}
 
     def analyse(self, records: Mapping[str, Floats]) -> Mapping[str, float | Floats]:
-        """What the records (by name, one entry per step) show at the end of a run.
+        """Results of a run, from its records (by name, one entry per step).
 
         Numbers are printed and go to summary.json; arrays, with an entry per record, become columns of analysis.csv.
         """

@@ -1,4 +1,4 @@
-"""Memory of the last impulses of contacts, wherever their bodies have gone since.
+"""Memory of the last impulses of contacts, also if their bodies have changed their rank since.
 
 The memory is a directory distributed by a hash of the contact key: it does not depend on which rank owns a
 contact, so that neither migration of bodies nor a restart on another number of ranks matters.
@@ -23,7 +23,8 @@ def in_the_world(impulse: Floats, frame: Floats) -> Floats:
 
 
 def in_frames(stored: Floats, frame: Floats) -> Floats:
-    """Impulses (nc, 3) in frames (nc, 3, 3) of what `in_the_world` returns (nc, 4), without what is normal to these."""
+    """Impulses (nc, 3) in frames (nc, 3, 3), from rows (nc, 4) as `in_the_world` returns them; of the tangential
+    vectors only the part that is tangential in these frames."""
     if compiled := loops():
         return compiled.in_frames(stored, np.ascontiguousarray(frame))
     return np.hstack([stored[:, :1], np.einsum("cij,cj->ci", frame[:, 1:], stored[:, 1:])])

@@ -1,4 +1,4 @@
-"""Where the compiled loops of the package are asked for: at their first use, as the import of numba takes long."""
+"""The compiled loops of the package, imported at their first use, as the import of numba takes long."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from types import ModuleType
 
 @cache
 def loops() -> ModuleType | None:
-    """The module `dem.compiled`, or None without numba, or where numba can keep nothing: then the numpy code beside
-    each caller does the same, to rounding."""
+    """The module `dem.compiled`. None if numba is not there, or cannot keep its machine code on the disk; then the
+    numpy code beside each caller gives the same, to rounding."""
     try:
         from dem import compiled
     except (ImportError, RuntimeError):

@@ -1,7 +1,7 @@
 """Surfaces made of triangles: tools such as buckets, wheels, hoppers and drums, drawn elsewhere or turned on a lathe.
 
-A surface has no thickness and two sides: what touches it stays on the side where it is. A closed surface whose normals
-point outwards bounds a solid, which has volume, centre and inertia.
+A surface has no thickness and two sides; a body that touches it stays on its side. A closed surface whose normals point
+outwards bounds a solid, which has volume, centre and inertia.
 """
 
 from __future__ import annotations

@@ -34,11 +34,11 @@ class Dynamic:
 class Guided(Dynamic):
     """Moved by forces along one direction of the world only, without turning: a piston, a press.
 
-    The guide takes all other forces and all torques: the inverse mass of the other five degrees of freedom is zero.
-    A drive may push along it with a constant force, beside gravity, from one time to another: at rest the contacts
-    then bear that force, and the weight as far as it is along the guide. With a `speed` the drive is a servo: it
-    pushes, either way, with what would bring the body to that speed at the end of the step if nothing touched it, and
-    with `force` at most. A load L makes it slower than that by dt L / mass.
+    The guide takes all other forces and all torques: the inverse mass of the other five degrees of freedom is zero. A
+    drive may push along it with a constant force, beside gravity, from one time to another: at rest the contacts then
+    bear that force, and the weight as far as it is along the guide. With a `speed` the drive is a servo: it pushes,
+    either way, with the force that would bring the body to that speed at the end of the step if nothing touched it, but
+    with `force` at most. A load L makes the body slower by dt L / mass.
     """
 
     direction: Sequence[float]  #: (3,), normalised
@@ -58,8 +58,8 @@ class Guided(Dynamic):
         return np.outer(self.direction, self.direction)
 
     def force_at(self, time: float, lack: float = 0.0) -> Floats:
-        """Force of the drive (3,) over a step that begins at `time` [s]. `lack` [N] is what would take the body from
-        its speed at the end of the step without the drive to the speed of the servo."""
+        """Force of the drive (3,) over a step that begins at `time` [s]. `lack` [N] is the force that takes the body to
+        the speed of the servo at the end of the step."""
         force = self.force if self.speed is None else min(max(lack, -self.force), self.force)
         return force * (self.start <= time < self.end) * np.array(self.direction)
 
@@ -128,8 +128,8 @@ class Rotation:
 
 @dataclass(frozen=True)
 class Oscillation:
-    """Sinusoidal translation: displacement amplitude * (sin(2 pi t / period + phase) - sin(phase)), where t is the
-    time since `start`; at rest before, and from `end` on where it is then."""
+    """Sinusoidal translation: displacement amplitude * (sin(2 pi t / period + phase) - sin(phase)), where t is the time
+    since `start`. The body rests before `start`, and after `end` in its last place."""
 
     direction: Sequence[float]  #: (3,), normalised
     amplitude: float  #: [m]
@@ -190,7 +190,7 @@ class Path:
     @classmethod
     def read(cls, file: str | FilePath) -> Path:
         """From a text file with time [s] and x, y, z [m] in each line, between them commas or blanks; # begins a
-        remark. ValueError, which names file and line, for what is no such line."""
+        remark. ValueError, with file and line, for any other line."""
         rows: list[tuple[float, ...]] = []
         for number, line in enumerate(FilePath(file).read_text().splitlines(), 1):
             words = line.partition("#")[0].replace(",", " ").split()

@@ -40,7 +40,8 @@ def without_ghosts(world: World, margin: Floats) -> Neighbourhood:
 
 
 def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
-    """All bodies whose margin may meet that of a local grain; `margin` (grains,) [m] of the local ones; collective.
+    """All bodies whose margin may meet the margin of a local grain; `margin` (grains,) [m] of the local grains;
+    collective.
 
     FloatingPointError, on all ranks, if a position or margin is not finite.
     """

@@ -1,4 +1,4 @@
-"""What a time step shows: forces on the large bodies, energies and their balance, statistics of the contacts.
+"""Records of a time step: forces on the large bodies, energies and their balance, statistics of the contacts.
 
 All functions are collective, and their results are the same on all ranks and, to rounding, for any number of ranks.
 """
@@ -26,8 +26,8 @@ SLIDING = 0.99
 
 
 def row(step: Step, scene: Experiment) -> dict[str, float]:
-    """All quantities of a step by name, with units in brackets; SceneError if those of the scene's own fail or are
-    bad."""
+    """All quantities of a step by name, with units in brackets. SceneError if the scene's `record` fails or returns
+    something else than numbers by name."""
     out = {"step": step.world.step, "time [s]": step.world.time}
     out |= energy_balance(step) | contact_statistics(step)
     if scene.domain is not None:
@@ -72,7 +72,8 @@ def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
 
 
 def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:
-    """Kinetic and potential energy [J] of the bodies of a table that forces can move, the latter zero at the origin."""
+    """Kinetic and potential energy [J] of the bodies of a table that forces can move; the potential energy is zero at
+    the origin."""
     dynamic = bodies.is_dynamic(table)
     table = table if dynamic.all() else table.take(dynamic)
     spin = quaternion.rotate(quaternion.conjugate(table.quaternion), table.velocity[:, 3:])
@@ -87,10 +88,10 @@ def energy_balance(step: Step) -> dict[str, float]:
 
         change of kinetic + potential = work of motions - friction loss - impact loss + time stepping
 
-    With g the impulses and w the mean of the velocities before and after (of prescribed motions: that of the step),
-    the impulses do the work g' D' w: its tangential part is the friction loss, and its normal part is lost in impacts
-    or, where it is gained, spent on pushing overlaps apart. What prescribed bodies do to the others is the work of
-    motions. The rest is the error of the semi-implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
+    With g the impulses and w the mean of the velocities before and after (of prescribed motions: that of the step), the
+    impulses do the work g' D' w. Its tangential part is the friction loss. Its normal part is lost in impacts, or
+    pushes overlaps apart where it is a gain. The work of motions is that of prescribed bodies on the others. The rest
+    is the error of the semi-implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
     """
     world, near, comm = step.world, step.contacts.near, step.world.comm
     before = near.bodies.take(slice(0, near.grains)), near.bodies.take(slice(near.grains + near.ghosts, None))
@@ -120,7 +121,8 @@ def energy_balance(step: Step) -> dict[str, float]:
 
 
 def contact_statistics(step: Step) -> dict[str, float]:
-    """Numbers of contacts, and what they are like; overlaps are those at the start of the step.
+    """Statistics of the contacts: how many there are, how many bear forces and slide. Overlaps are those at the start
+    of the step.
 
     The coordination number is the mean number of active contacts per grain.
     """

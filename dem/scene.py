@@ -1,4 +1,4 @@
-"""Description of a scene: what there is at time zero.
+"""Description of a scene: its bodies, materials and gravity at time zero.
 
 A scene is the same on every rank and knows nothing of ranks; `dem.start.new_world` distributes it.
 
@@ -143,11 +143,11 @@ class Scene:
     ) -> None:
         """Add a large body made of `shapes`, which are placed in its body frame.
 
-        The pose and the velocities are those of time zero. A dynamic body needs either `density` [kg/m^3],
-        and its frame is then moved to the centre of mass and the principal axes, or `mass` [kg] with the
-        principal moments `inertia` (3,) [kg m^2] of a frame that is there already; a guided one needs no moments. The
-        frame of a hinged one is turned until its z axis is that of the hinge, and its centre of mass must be on it.
-        Two large bodies touch if at least one of them is dynamic.
+        The pose and the velocities are those of time zero. A dynamic body needs either its `density` [kg/m^3], or its
+        `mass` [kg] and principal moments `inertia` (3,) [kg m^2]. With a density, its frame is moved to the centre of
+        mass and the principal axes; with a mass, the frame must be there already. A guided body needs no moments. The
+        frame of a hinged body is turned until its z axis is that of the hinge, and its centre of mass must be on that
+        axis. Two large bodies touch if at least one of them is dynamic.
         """
         if not name or name in (body.name for body in self.large_bodies):
             raise ValueError(f"large bodies need distinct names, got {name!r}")
@@ -205,8 +205,8 @@ class Scene:
         return table
 
     def grains(self) -> Bodies:
-        """All grains, in the order of their ids. ValueError if there is none, or if there are boxes or meshes beside a
-        mesh that they cannot touch."""
+        """All grains, in the order of their ids. ValueError if there is none, or if a mesh might meet boxes or other
+        meshes, which it cannot touch."""
         if sum(len(part) for part in self._grains) == 0:
             raise ValueError("empty scene: there is no grain")
         _refuse_beside_meshes(self.large_bodies, any((part.shape == BOX).any() for part in self._grains))

@@ -76,7 +76,7 @@ Shape = Union[Plane, Box, Sphere, Capsule, Mesh]
 
 
 def described(shape: Shape) -> dict[str, Any]:
-    """The kind of a shape and what it was made of, by name."""
+    """The kind of a shape and its parameters by name."""
     if isinstance(shape, Mesh):
         names = ("vertices", "triangles", "center", "quaternion")
         return {"kind": "Mesh", **{name: np.asarray(getattr(shape, name)).tolist() for name in names}}

@@ -1,4 +1,4 @@
-"""Where worlds come from: a scene at time zero, or the state of an earlier run; each rank gets its grains."""
+"""Worlds from a scene at time zero, or from the state of an earlier run; each rank gets its grains."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def restored_world(
 ) -> World:
     """The world whose `World.state` was taken, for the same scene; collective.
 
-    `local`: the rows `restart_rows` of every local array. On the number of ranks of the state, the
-    restored world is the same to the last bit; on another number, the grains are distributed anew.
-    ValueError if the scene has other bodies than the state.
+    `local`: the rows `restart_rows` of every local array. If the number of ranks is that of the state, the restored
+    world is the same to the last bit; otherwise the grains are distributed anew. ValueError if the scene has other
+    bodies than the state.
     """
     world = _world(scene, comm, Bodies(**{name: np.array(column) for name, column in local.items()}))
     count = len(scene.grains())

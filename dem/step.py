@@ -1,4 +1,4 @@
-"""A step that was made, and what can be asked of it: the argument of a scene's `record`."""
+"""A step that was made, with its forces, places and sums: the argument of a scene's `record`."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class Step:
         return self.world.large.velocity[self.world.large_row(name)].copy()
 
     def total(self, values: ArrayLike) -> float:
-        """The sum over all grains, of values (grains,) of those in `world.grains`; collective, which the `record` of a
-        scene must therefore call on all ranks."""
+        """The sum of values (grains,) over all grains; each rank passes those of its `world.grains`. Collective: the
+        `record` of a scene must call it on all ranks."""
         meet(self.world.comm, "Step.total")
         return float(self.world.comm.allreduce(float(np.sum(values))))
 

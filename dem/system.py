@@ -60,7 +60,7 @@ class ContactSystem:
         b (nc, 3): (max(gap / dt, -recovery_speed), 0, 0) [m/s]
         r (nc, 3): b + D' v_free [m/s]
         free_velocity (owned, 6): velocities without contacts
-        local_contacts, owned_bodies, total_bodies (int): sizes
+        owned_bodies, total_bodies (int): number of bodies whose rows this rank owns, and of all
     """
 
     def __init__(self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf) -> None:
@@ -72,7 +72,6 @@ class ContactSystem:
         self.dt = dt
         self.key, self.mu, self.point = contacts.key, contacts.friction, contacts.point
         self.frame = contact_frames(contacts.normal)
-        self.local_contacts = len(contacts)
         self.owned_bodies, self.total_bodies = world.owned, world.body_count
         self._comm, self._slabs = world.comm, world.slabs
         self._near, self._body = near, contacts.body

@@ -1,9 +1,9 @@
 """Calls of the code of a scene, which end alike on all ranks.
 
-What a user has written runs on every rank and may raise on some of them only; the others would then wait for those in
-the next collective call for ever. So all ranks meet after each such call, and tell each other what went wrong.
-Collective functions that the code of a scene may itself call (`dem.record.Step.total`) begin with a meeting as well:
-ranks of which one is there, and another has failed or come to its end, learn of it.
+The user's code runs on every rank, and may raise on some of them only. In the next collective call the other ranks
+would wait for these for ever. So all ranks meet after each such call and exchange their errors. Collective functions
+that the code of a scene may call itself (`dem.step.Step.total`) begin with a meeting too. So a rank in such a function
+learns that another one has failed or has left the code.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ def together(
 ) -> Result:
     """What `call` returns on this rank; collective.
 
-    If it raised on any rank, all raise: SceneError, which says `what` was called, or an exception of the types `own`.
+    If it raised on any rank, all ranks raise: a SceneError that names `what` was called, or an exception of the types
+    `own`.
     """
     failure = None
     try:
@@ -45,7 +46,7 @@ def together(
 
 
 def meet(comm: MPI.Comm, where: str, failure: tuple[type[Exception], str] | None = None) -> None:
-    """Have all ranks meet at a place in the code of a scene; raises if one has failed, or has come elsewhere."""
+    """Wait for all ranks at a place in the code of a scene. Raises if one has failed or is at another place."""
     places, failures = zip(*comm.allgather((where, failure)))
     failed = [rank for rank in range(comm.size) if failures[rank]]
     if failed:

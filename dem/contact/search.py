@@ -28,8 +28,9 @@ WIDEST = 2.0
 
 @dataclass(frozen=True)
 class Contacts:
-    """The contacts of this rank: first those that need no other rank, as it owns both bodies or their motion is
-    prescribed, then the others; each part ordered by the row of the body that owns the contact and then by key."""
+    """The contacts of this rank. First come those that need no other rank, because it owns both bodies or their motion
+    is prescribed, then the others. Each part is ordered by the row of the body that owns the contact, and then by
+    key."""
 
     key: Ints  #: (nc,) the same for the same two shapes and feature at all times and on any number of ranks
     a: Ints  #: (nc,) row of the first body in `near.bodies`, the one of lower id
@@ -53,12 +54,12 @@ class Contacts:
 def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | float = 0.0) -> Contacts:
     """All contacts that this rank owns of the pairs whose margins meet; collective.
 
-    The margin of a body is delta/2 [m], or the way that it goes in dt [s] without contact forces if that is longer: a
-    gap of at most `delta` is a contact, and so is a longer one that may close within the step, also as one of the two
-    is stopped by a third. A grain in the margin of a large body has that of the large body there if it is wider, as
-    the large body may strike it and send it on. `margin` (grains,) [m]: no margin of a local grain is to be less.
-    A contact belongs to the rank that owns the body of lower global index. The numbers of contacts that the grains own
-    are left in `world.grains.weight`.
+    The margin of a body is delta/2 [m], or the way that it goes in dt [s] without contact forces if that is longer. So
+    a gap of at most `delta` is a contact, and so is a wider one that may close within the step, also when a third body
+    stops one of the two. A large body may strike a grain in its margin and send it on; so such a grain gets the margin
+    of the large body, if that is wider. `margin` (grains,) [m] are the least margins of the local grains. A contact
+    belongs to the rank that owns the body of lower global index. The numbers of contacts that the grains own are left
+    in `world.grains.weight`.
     """
     not_negative("contact distance delta", delta)
     shapes, total = [body.shapes for body in world.large_bodies], int(world.slabs[-1])
@@ -123,7 +124,7 @@ def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: floa
     """The contacts of wider margins, if with these velocities (owned, 6) grains go further in dt [s] than their margins
     in the search for `contacts`; None if that brings no new ones: then no two grains meet unseen; collective.
 
-    A search for the contacts that are found may be followed by another: margins only grow.
+    The search may be repeated for the contacts that it finds: margins only grow.
     """
     seen = contacts.near.margin[: contacts.near.grains]
     ways = _way(world.grains, velocity[: len(seen)], dt)
@@ -135,8 +136,8 @@ def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: floa
 
 
 def _way(grains: Bodies, velocity: Floats, dt: float) -> Floats:
-    """How far (n,) a point of each grain goes in dt [s], about and at most WIDEST radii [m]; of spheres their centre,
-    as turning brings their surface nowhere. NaN where the velocity is not finite."""
+    """About how far (n,) a point of each grain goes in dt [s], at most WIDEST radii [m]. For spheres it is the centre's
+    way, as turning does not move their surface. NaN where the velocity is not finite."""
     radius = bodies.bounding_radius(grains)
     turn = np.where(grains.shape == SPHERE, 0.0, radius) * length(velocity[:, 3:])
     way = np.minimum(dt * (length(velocity[:, :3]) + turn), WIDEST * radius)
@@ -251,10 +252,10 @@ def _part_margin(shift: Floats, pivot: Floats, center: Floats, radius: Floats, d
 
 
 def _gives_way(world: World, near: Neighbourhood, a: Ints, b: Ints, touch: Touch) -> np.ndarray:
-    """Which contacts (nc,) of bodies in the rows a, b (nc,) a force can open: not those of a guided body with what
-    holds it across its guide, nor of a hinged one with what does not turn it.
+    """Which contacts (nc,) of bodies in the rows a, b (nc,) a force can open. It cannot open those whose normal is
+    across the guide of a guided body, nor those that do not turn a hinged one, if the other body is held too.
 
-    Their normal impulse would change no velocity, and any friction with it.
+    Their normal impulse changes no velocity, and would allow any friction.
     """
     first = near.grains + near.ghosts
     gives = np.ones(len(a), dtype=bool)

@@ -30,8 +30,8 @@ class Drum(SmallSpheres):
 
     The drum is a mesh of flat sides with a horizontal axis, along y; its ends are discs, without friction unless
     `end_friction` says otherwise, so that a short drum stands for a piece of a long one. The angle of the bed is that
-    of its centre of mass about the axis, which is the slope of a plane surface. The torque of the bed's weight is that
-    of the drum.
+    of its centre of mass about the axis; for a plane surface it is the slope. The torque on the drum balances the
+    torque of the bed's weight.
     """
 
     n: int = option(8, "", "size: radius of the drum in diameters of a sphere")
@@ -53,10 +53,6 @@ class Drum(SmallSpheres):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n < 3:
-            raise ValueError(f"n must be at least 3, got {self.n}")
-        if self.sides < 12:
-            raise ValueError(f"sides must be at least 12, got {self.sides}")
         for name in ("length", "fill", "radius", "density", "froude", "gravity"):
             checks.positive(name, getattr(self, name))
         for name in ("friction", "wall_friction", "end_friction", "spread"):

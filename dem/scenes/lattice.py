@@ -1,4 +1,5 @@
-"""What the scenes share: the perturbed cubic lattice on which spheres start, and the lengths of the small ones."""
+"""Parts that the scenes share: the perturbed cubic lattice on which spheres start, and the lengths in scenes of small
+spheres."""
 
 from __future__ import annotations
 
@@ -15,7 +16,15 @@ class SmallSpheres(Experiment):
     """Lengths of scenes whose container is round, with a radius of n sphere diameters."""
 
     n: int
+    sides: int  #: of the container
     radius: float  #: of the greatest spheres [m]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.n < 3:
+            raise ValueError(f"n must be at least 3, got {self.n}")
+        if self.sides < 12:
+            raise ValueError(f"sides must be at least 12, got {self.sides}")
 
     @property
     def delta(self) -> float:

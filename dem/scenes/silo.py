@@ -33,9 +33,9 @@ class Silo(SmallSpheres):
     """Spheres settle in a cylinder with a cone below, whose outlet is shut; then the gate is drawn aside, and they flow
     out onto a floor.
 
-    Cylinder and cone are one mesh, of flat sides. With `half_angle` 90 the bottom is flat. What is recorded is the mass
-    below the outlet, of which the flow is the slope while a tenth to a half of the mass runs out. Beside it stands the
-    flow by Beverloo's law, for the bulk density of a packing fraction of 0.58.
+    Cylinder and cone are one mesh, of flat sides. With `half_angle` 90 the bottom is flat. The mass below the outlet is
+    recorded. Its slope, while a tenth to a half of the mass runs out, is the flow. The flow by Beverloo's law stands
+    beside it, for the bulk density of a packing fraction of 0.58.
     """
 
     n: int = option(6, "", "size: radius of the cylinder in diameters of a sphere")
@@ -55,10 +55,6 @@ class Silo(SmallSpheres):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n < 3:
-            raise ValueError(f"n must be at least 3, got {self.n}")
-        if self.sides < 12:
-            raise ValueError(f"sides must be at least 12, got {self.sides}")
         for name in ("filling", "outlet", "drop", "radius", "density", "gravity"):
             checks.positive(name, getattr(self, name))
         checks.not_negative("friction", self.friction)

@@ -1,7 +1,7 @@
-"""Grains of rice, which are capsules, flow out of a hopper::
+"""Spheres of two sizes flow out of a hopper with a conical outlet::
 
-    python -m pctt.run -scene docs/examples/hopper.py -ccp_type apgd -steps 360 -output_every 4 -output hopper
-    python -m pctt.render hopper -color speed -elevation 12 -size 640x480
+    python -m pctt.run -scene docs/examples/hopper.py -ccp_type apgd -steps 240 -output_every 4 -output hopper
+    python -m pctt.render hopper -color size -elevation 12 -size 640x480
 """
 
 from __future__ import annotations
@@ -21,30 +21,28 @@ from dem.shapes import Plane
 
 @dataclass(frozen=True)
 class Hopper(Experiment):
-    """Capsules settle in a cylinder with a conical outlet; then the gate slides away."""
+    """Spheres settle in a cylinder with a cone below; then the gate slides away."""
 
-    layers: int = option(10, "", "layers of grains")
-    outlet: float = option(0.024, "m", "diameter of the outlet")
+    layers: int = option(12, "", "layers of spheres")
+    outlet: float = option(0.03, "m", "diameter of the outlet")
     angle: float = option(35.0, "degrees", "of the cone, from the vertical")
     friction: float = option(0.4, "", "friction coefficient of all contacts")
-    settling_time: float = option(0.3, "s", "when the gate opens")
-    dt = 0.0025
-    delta = 0.0005
-    radius, half_length, wide = 0.0025, 0.0025, 0.04  # m; of the core of a grain, and the radius of the cylinder
+    settling_time: float = option(0.35, "s", "when the gate opens")
+    dt = 0.004
+    delta = 0.0006
+    radii, wide = (0.0025, 0.0035), 0.04  # m; of the spheres, and of the cylinder
 
     def build(self) -> Scene:
         """The scene, with the large bodies "hopper", "gate" and "floor"; the outlet is at z = 0."""
         scene = Scene(self.friction)
-        hole = self.outlet / 2
-        cone, pitch = (self.wide - hole) / tan(radians(self.angle)), 2.2 * (self.radius + self.half_length)
-        across = np.arange(-8, 9) * pitch
+        hole, pitch = self.outlet / 2, 2.2 * self.radii[1]
+        cone = (self.wide - hole) / tan(radians(self.angle))
+        across = np.arange(-6, 7) * pitch
         up = cone + (np.arange(self.layers) + 0.6) * pitch
         places = perturbed(across, across, up, 0.0003, 1)
-        room = 0.98 * self.wide - self.radius - self.half_length
-        places = places[np.hypot(places[:, 0], places[:, 1]) < room]
-        turns = np.random.default_rng(1).standard_normal((len(places), 4))  # every direction is equally likely
-        turns /= np.linalg.norm(turns, axis=1, keepdims=True)
-        scene.add_capsules(places, self.radius, self.half_length, 1400.0, quaternions=turns)
+        places = places[np.hypot(places[:, 0], places[:, 1]) < 0.98 * self.wide - self.radii[1]]
+        radius = np.random.default_rng(1).choice(self.radii, len(places))
+        scene.add_spheres(places, radius, 2500.0)
         profile = [(hole, 0), (self.wide, cone), (self.wide, up[-1] + pitch)]
         scene.add_body("hopper", [Mesh.revolved(profile, 32)])
         away = Glide((20 * hole, 0, 0), self.settling_time, self.settling_time + 0.1)
@@ -58,10 +56,10 @@ class Hopper(Experiment):
         return {"discharged [kg]": step.total(grains.mass[grains.position[:, 2] < 0])}
 
     def analyse(self, records):
-        """The mean flow, and that over the area of the outlet."""
+        """The mean flow from the opening of the gate on, and that over the area of the outlet."""
         time, out = records["time [s]"], records["discharged [kg]"]
-        open_ = time > self.settling_time + 0.1
-        if np.count_nonzero(open_) < 3:
+        flows = (time > self.settling_time + 0.1) & (out < 0.9 * out[-1])
+        if np.count_nonzero(flows) < 3:
             return {}
-        flow = float(np.polyfit(time[open_], out[open_], 1)[0])
+        flow = float(np.polyfit(time[flows], out[flows], 1)[0])
         return {"flow [kg/s]": flow, "flux [kg/(m^2 s)]": flow / (pi / 4 * self.outlet**2)}

@@ -62,13 +62,14 @@ def solve(
 ) -> Result:
     """Solve a cone problem by a method of SOLVERS; with ``coulomb`` find impulses of Coulomb's law.
 
-    Coulomb's law has a ladder: the method's own way if it has one (`Solver.has_law`); where that does not converge, or
-    there is none, one cone problem after another (`pctt.ccp.coulomb`); where that does not either, the best of both
-    and of the relaxation, by the Coulomb residual, not converged. ``law`` of the result says which it was.
+    For Coulomb's law there is a ladder of three rungs. The first is the method's own way, if it has one
+    (`Solver.has_law`). If that does not converge, the second is a sequence of cone problems (`pctt.ccp.coulomb`). If
+    that does not converge either, the result is the best of both and of the relaxation, by the Coulomb residual, and
+    counts as not converged. ``law`` of the result names the rung.
 
-    ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an
-    instance of the method's options class; ``newton``, for methods that solve Newton systems, keeps what serves one
-    problem after another. A problem without a solution has the status UNBOUNDED.
+    ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
+    the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
+    from one problem to the next. A problem without a solution has the status UNBOUNDED.
     """
     solver = SOLVERS[type]
     limits = limits or Limits()

@@ -1,8 +1,7 @@
-"""How good a solution is: figures that every method is judged by, computed by code that no solver shares.
+"""The accuracy of a solution: figures that judge every method, computed by code of their own, which no solver uses.
 
-The projection below goes through the angle in the (normal, tangential) half plane, and y = N g is formed from
-the momentum that g gives the bodies where the problem has them, so that a mistake in a solver's own
-arithmetic shows.
+The projection below goes through the angle in the (normal, tangential) half plane, and y = N g is formed from the
+momentum of the bodies if the problem has bodies. So a mistake in a solver's own arithmetic shows.
 """
 
 from __future__ import annotations

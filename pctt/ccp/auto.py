@@ -1,17 +1,18 @@
-"""APGD as long as it is expected to be done before the conic interior point method would be, then that.
+"""APGD, as long as it is expected to finish before the conic interior point method would; then that method.
 
 Costs are in iterations of APGD: the conic method's by a table (`conic_cost`), APGD's own by extrapolation.
 
 1. Begin with APGD. From a tenth of the conic method's cost on, fit its natural residual of the iterations k/4 to k by
    log rho = a - b sqrt(k), which lies between the power law of its beginning and the geometric decay of its end.
    Where the line meets the tolerance is the number of iterations that it will need (`forecast`).
-2. Where the rest of these is more than what the conic method would cost from here, go over to it. It begins at APGD's
-   point, which saves it about what APGD has cost until then (up to 0.3 of its own cost): trying APGD is almost free.
-3. Where it stalls, go back to APGD, from the better of the two points, to the end.
+2. If the remaining iterations cost more than the conic method would from here, change to it. It begins at APGD's point,
+   which saves about as much as APGD has cost so far (up to 0.3 of its own cost): trying APGD is almost free.
+3. If it stalls, go back to APGD, from the better of the two points, to the end.
 
-From the second cone problem on a `Memory` joins in: how many iterations APGD needed, or was expected to, and what the
-conic method really cost, by the clock. Without it (``-ccp_auto_remember false``) the rules only count, so that a
-repeated run repeats its choices. docs/measurements.md has what these rules cost beside the better of the two methods.
+From the second cone problem on, a `Memory` helps. It holds the iterations that APGD needed, or was expected to need,
+and the measured cost of the conic method. Without it (``-ccp_auto_remember false``) the rules count iterations only, so
+that a repeated run repeats its choices. docs/measurements.md compares the cost of these rules with that of the better
+of the two methods.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class Needed(NamedTuple):
 
 @dataclass
 class Memory:
-    """What the cone problems so far have shown, by decade of their tolerance; lives as long as a `Newton`.
+    """Observations on the cone problems so far, by decade of their tolerance. It lives as long as a `Newton`.
 
     needed : by APGD for the last problem
     factor : what the conic method cost / what `conic_cost` says
@@ -129,7 +130,8 @@ class Watch:
         self._course: list[tuple[int, float]] = []
 
     def __call__(self, iterations: int, residual: float) -> str:
-        """Why APGD is to be given up, or "". The first rank decides: logarithms may differ in a last bit elsewhere."""
+        """The reason to give APGD up, or "". The first rank decides for all: on other ranks logarithms may differ in
+        the last bit."""
         words, self.needed = self._comm.bcast((self._look(iterations, residual), self.needed))
         return words
 
@@ -151,8 +153,8 @@ class Watch:
 
 
 def forecast(k: Array, rho: Array, tol: float) -> float:
-    """Iterations at which natural residuals rho, looked at after k iterations, will have come down to tol; inf where
-    they do not fall."""
+    """The number of iterations at which the natural residual will reach tol, from its values rho after k iterations;
+    inf if it does not fall."""
     recent = k >= 0.25 * k[-1]
     x, y = np.sqrt(k[recent]), np.log(np.minimum.accumulate(rho)[recent])
     x_mean, y_mean = x.mean(), y.mean()
@@ -163,10 +165,11 @@ def forecast(k: Array, rho: Array, tol: float) -> float:
 
 
 def expected(forecast: float, last: Needed | None, iterations: int, cost: float) -> float:
-    """Iterations that APGD is expected to need after so many, from its forecast and from what the last problem needed.
+    """The iterations that APGD is expected to need in all, from its present forecast and from the last problem.
 
-    What was counted is believed: steps differ little, and courses from a warm start have plateaus. Where the last was
-    a forecast too, the geometric mean of both; and the forecast alone once APGD has made more than that."""
+    A counted number is believed: steps differ little, and residuals from a warm start have plateaus. If the number of
+    the last problem is a forecast too, the geometric mean of both is taken. Once APGD has made more iterations than the
+    last problem's number, the forecast alone counts."""
     forecast = min(forecast, iterations + STEERING.far * cost)
     if last is None or iterations >= last.iterations:
         return forecast
@@ -176,8 +179,9 @@ def expected(forecast: float, last: Needed | None, iterations: int, cost: float)
 
 
 def conic_cost(contacts: int, softness: float, tol: float) -> float:
-    """What the conic method costs from a cold start, in iterations of APGD: as the cube root of the number of contacts,
-    measured on settled mixers of 18,525 and 144,658 (docs/measurements.md). Small problems have fixed costs."""
+    """The cost of the conic method from a cold start, in iterations of APGD. It grows as the cube root of the number of
+    contacts, measured on settled mixers of 18,525 and 144,658 (docs/measurements.md). Small problems have fixed
+    costs."""
     accuracy, rigid, soft = [-8, -7, -6, -4, -2], [195, 160, 130, 82, 25], [165, 140, 118, 66, 22]
     per_root = np.interp(np.log10(tol), accuracy, soft if softness >= 1e-6 else rigid)
     return float(per_root * np.cbrt(max(contacts, 400)))

@@ -1,7 +1,7 @@
 """The friction cone |(g_1, g_2)| <= mu g_n and the arithmetic that the solvers need on it.
 
-Impulses are arrays (nc, 3), one row per contact in the order (normal, tangent 1, tangent 2); ``mu`` is (nc,). What is
-``compiled`` is in ``cone_loops`` too.
+Impulses are arrays (nc, 3), one row per contact in the order (normal, tangent 1, tangent 2); ``mu`` is (nc,). Functions
+marked ``compiled`` have a twin in ``cone_loops``.
 """
 
 from __future__ import annotations

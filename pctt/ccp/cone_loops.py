@@ -1,7 +1,7 @@
 """The functions of ``cone`` as loops over the contacts.
 
-Arrays of rows are taken flat: so the compiler sees the distance from one contact to the next, and works on several at
-once. Comparisons are written such that a number that is none stays none.
+Arrays of rows are taken flat: so the compiler knows the distance from one contact to the next, and works on several at
+once. Comparisons are written so that a NaN stays a NaN.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to
 
 @loop
 def _nearest(n, t_1, t_2, mu):
-    """The nearest point of a cone, by selections rather than branches, which no processor could foresee."""
+    """The nearest point of a cone, by selections: a processor could not predict branches."""
     length = np.sqrt(t_1 * t_1 + t_2 * t_2)
     height = (mu * length + n) * (1.0 / (1.0 + mu * mu))
     height = n if height < n else height

@@ -1,8 +1,8 @@
-"""Coulomb's law, by a fixed-point iteration around the convex cone problem; and the ladder of which that is a rung.
+"""Coulomb's law by a fixed-point iteration around the convex cone problem, and the ladder that this is a rung of.
 
-The cone problem is a relaxation: a contact that slides with speed |y_t| gets the normal velocity mu |y_t|, it opens by
-dt mu |y_t| in a step. Coulomb's law has complementarity of g_n and y_n themselves, which the De Saxce velocity
-y + (mu |y_t|, 0, 0) states as a cone problem again, no longer convex. For a given opening s,
+The cone problem is a relaxation: a contact that slides with speed |y_t| gets the normal velocity mu |y_t|, and opens by
+dt mu |y_t| in a step. In Coulomb's law g_n and y_n themselves are complementary. With the De Saxce velocity y + (mu
+|y_t|, 0, 0) this is a cone problem again, but no convex one. For a given opening s,
 
     min 1/2 g'Ng + (r + s n)'g over the friction cones,    y = N g + r,
 
@@ -67,7 +67,8 @@ def ladder(
 ) -> Result:
     """Impulses of Coulomb's law by the first rung that converges, or the best of all; see `pctt.ccp.solve`.
 
-    ``once(problem, guess, tol, law)`` solves a cone problem, or with ``law`` Coulomb's, which ``has_law`` says it can.
+    ``once(problem, guess, tol, law)`` solves a cone problem, or with ``law`` finds impulses of Coulomb's law, if
+    ``has_law``.
     """
     tol, tried = options.tol or tol, []
     if has_law or problem.size == 0:
@@ -100,7 +101,7 @@ def solve(
     """Impulses that obey Coulomb's law; ``convex(problem, guess, tol)`` solves a cone problem.
 
     The result's residual and history are those of Coulomb's law, one value per cone problem; its iterations are those
-    of all cone problems. ``problem.r`` is another one while this works.
+    of all cone problems. ``problem.r`` is changed during the iteration and restored.
     """
     # a lone contact that slides answers an opening s by -gain s: the step leads to its fixed point at once
     N = problem.diagonal_blocks
@@ -156,8 +157,8 @@ def solve(
 class Anderson:
     """Anderson's acceleration of s = F(s), for distributed arrays (nc,); Walker and Ni (2011).
 
-    The residuals f = F(s) - s of the last ``memory`` points are taken for linear; ``relaxation`` (nc,) is the step
-    along what they leave.
+    The residual f = F(s) - s is taken as linear over the last ``memory`` points. ``relaxation`` (nc,) is the length of
+    the step along the remaining residual.
     """
 
     def __init__(self, problem: ConeProblem, relaxation: Array, memory: int):

@@ -16,7 +16,7 @@ def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None, oper
     """The cone problem of a file, its contacts in equal parts over the ranks; collective. ``compliance`` takes the
     place of the file's.
 
-    Raises FileFormatError on every rank where the file cannot be read in the format that it seems to have.
+    Raises FileFormatError on every rank if the file cannot be read in the format of its first bytes.
     """
     format = comm.bcast(_format(path) if comm.rank == 0 else None)
     return FORMATS[format].load(path, comm, compliance, operator)

@@ -39,7 +39,7 @@ def gather_matrix(A: PETSc.Mat) -> sp.csr_matrix:
 def write_whole(path: str | Path, comm: MPI.Comm, write: Callable[[Path], None]) -> None:
     """Rank 0 lets ``write`` make a file under a temporary name and gives it its own when complete; collective.
 
-    Raises OSError on all ranks if that fails; what stood under ``path`` is then untouched.
+    Raises OSError on all ranks if that fails; an earlier file under ``path`` then stays as it is.
     """
     failure = None
     if comm.rank == 0:

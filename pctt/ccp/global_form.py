@@ -1,4 +1,5 @@
-"""Global problems, M v = H r + f, u = H'v + w, without their velocities v: what files of other programs hold."""
+"""Elimination of the velocities v from global problems, M v = H r + f, u = H'v + w, the form in files of other
+programs."""
 
 from __future__ import annotations
 

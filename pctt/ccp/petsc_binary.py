@@ -107,6 +107,6 @@ def _vector(viewer: PETSc.Viewer) -> Array:
 
 
 def _reason(error: PETSc.Error) -> str:
-    """The last line of an error, which says what is wrong; those above it are functions and lines of PETSc."""
+    """The last line of an error, which states the reason; the lines above it are functions and lines of PETSc."""
     last = str(error).splitlines()[-1]
     return last.partition("] ")[2] or last

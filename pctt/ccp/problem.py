@@ -94,8 +94,8 @@ class ConeProblem:
         return y
 
     def momentum(self, g: Array) -> Array:
-        """G' g (6m,): what impulses g (nc, 3) change in the mass-scaled velocities of this rank's bodies. Of a
-        problem that is given by N, which knows no bodies, g itself."""
+        """G' g (6m,): the change of the mass-scaled velocities of this rank's bodies by impulses g (nc, 3). A problem
+        given by N has no bodies: g itself."""
         return g.ravel().copy() if self.contact_map is None else self.contact_map.momenta(g).ravel()
 
     def velocity_of(self, momentum: Array) -> Array:
@@ -112,7 +112,7 @@ class ConeProblem:
     def natural_residual(self, g: Array, y: Array) -> float:
         """||g - P(g - y / mean diag N)|| / ||g||, velocities y = N g + r: the stop test of every solver.
 
-        inf where that is no number: for g = 0 that does not solve the problem, and where g or y is nan or inf."""
+        inf if that is undefined: for g = 0, unless it solves the problem, and if g or y has a nan or inf."""
         squares = projected_move_squares(g, y, 1.0 / self.mean_diagonal, self.mu)
         distance, norm = np.sqrt(self.sum(np.array(squares)))
         if distance == 0:

@@ -1,4 +1,5 @@
-"""The solvers of the cone problem: what ``-ccp_type``, the table of the documentation and the tests are made from."""
+"""The solvers of the cone problem. ``-ccp_type``, the table in the documentation and the tests are made from this
+list."""
 
 from __future__ import annotations
 
@@ -26,8 +27,8 @@ class Solver:
     Newton systems.
 
     ``needs`` is PRODUCT, MATRIX, NEWTON or EITHER; ``iterations`` the default limit (``-ccp_max_it``). A method that
-    ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself, at tolerances from
-    ``law_tol`` on for about what the relaxation costs.
+    ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself. At tolerances of ``law_tol``
+    and above that costs about as much as the relaxation.
     """
 
     name: str

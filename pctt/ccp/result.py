@@ -1,4 +1,4 @@
-"""What a solver of the cone problem hands back, and the options that all of them share."""
+"""The result of a solver of the cone problem, and the options that all solvers share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pctt.ccp.cone import Array
 from pctt.options import POSITIVE, option
 
 RELAXATION, COULOMB, FIXED_POINT = "relaxation", "Coulomb", "Coulomb by cone problems"
-LAWS = (RELAXATION, COULOMB, FIXED_POINT)
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Result:
     history : natural residual per iteration
     cone_problems : how many were solved for it: more than one for Coulomb's law
     solver : name of the method that found it, where that was chosen; "" otherwise
-    law : of LAWS, what the impulses obey and the residuals are those of
+    law : RELAXATION, COULOMB or FIXED_POINT: the law of the impulses and of the residuals
 
     With FIXED_POINT ``history`` has one residual per cone problem.
     """

@@ -237,7 +237,7 @@ def _sparse(words: _Words, name: str, shape: tuple[int, int]) -> _Entries:
     found = re.search(kinds[origin], head)
     if found is None:
         form = "'triplet: ROWS-by-COLUMNS, ..." if origin == 1 else "'ROWS-by-COLUMNS, ..."
-        raise words.wrong(begin, f"what CSparse prints of {name} is missing: {form} nnz: ENTRIES'")
+        raise words.wrong(begin, f"the head that CSparse prints of {name} is missing: {form} nnz: ENTRIES'")
     words.taken = ends[0] + 1
     rows, columns, entries = (int(number) for number in found.groups())
     if origin == 1:

@@ -70,8 +70,8 @@ class Whole:
 
 @dataclass(frozen=True)
 class Stored:
-    """A problem from a file, and with it the impulses (nc, 3) of this rank's contacts that the file has; ``note`` says
-    what the reader had to make of the data."""
+    """A problem from a file, with the impulses (nc, 3) in the file for this rank's contacts. ``note`` says what the
+    reader had to change."""
 
     problem: ConeProblem
     form: str
@@ -93,8 +93,8 @@ def symmetric_blocks(W: sp.spmatrix) -> tuple[sp.bsr_matrix, str]:
 
 
 def mirrored(A: sp.spmatrix) -> sp.csr_matrix | None:
-    """A square matrix of one triangle with the triangle's mirror; None for one with entries on both sides of its
-    diagonal, or on none. Half the sum of a triangle and its mirror would be another matrix."""
+    """A square matrix that is stored as one triangle, with the mirror of that triangle. None if there are entries on
+    both sides of the diagonal, or on neither. Half the sum of a triangle and its mirror would be another matrix."""
     above, below = sp.triu(A, 1), sp.tril(A, -1)
     if (above.count_nonzero() == 0) == (below.count_nonzero() == 0):
         return None
@@ -104,7 +104,7 @@ def mirrored(A: sp.spmatrix) -> sp.csr_matrix | None:
 def sparse_matrix(problem: ConeProblem) -> PETSc.Mat:
     """A new Mat, all of N without compliance, for the formats that hold a sparse N and nothing beside it.
 
-    Raises ValueError, on all ranks alike, where a body has so many contacts that it would fill N.
+    Raises ValueError on all ranks if a body has so many contacts that it would fill N.
     """
     if problem.low_rank is not None:
         raise ValueError(
@@ -126,7 +126,8 @@ def spread(
 
     ``compliance`` takes the place of the file's; ``operator`` is that of `ConeProblem`.
 
-    Raises FileFormatError on every rank where ``read`` raises one, or what h5py, numpy and scipy raise for bad data.
+    Raises FileFormatError on every rank if ``read`` raises one, or any error that h5py, numpy and scipy raise for bad
+    data.
     """
     parts: list[_Part] | None = None
     error = None

@@ -1,7 +1,7 @@
 """Cone problems without a solution: impulses that grow without limit while the objective falls.
 
-They come from bodies that are pushed into each other and cannot get out of it: a grain squeezed by closing walls, or a
-wedge that friction holds between them. The natural residual does not show it, it falls like 1 / ||g||.
+They come from bodies that are pushed into each other and cannot escape: a grain squeezed by closing walls, or a wedge
+held by friction between them. The natural residual does not show it: it falls like 1 / ||g||.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ ROUNDING = 1e-15  # of d'Nd, in units of mean diag N
 
 
 def why_unbounded(problem: ConeProblem, g: Array) -> str:
-    """In words, that the direction d = g / ||g|| of impulses g (nc, 3) in the cones shows the problem to be unbounded;
-    "" if it does not. One product with N.
+    """The reason, in words, if the direction d = g / ||g|| of impulses g (nc, 3) in the cones shows that the problem is
+    unbounded; else "". One product with N.
 
-    A solution has velocities y = G v + r in the dual cones, so that d.y >= 0 and ||v|| >= -r.d / ||G'd||. The
-    right-hand side is infinite for an unbounded problem, where impulses grow along a d with G'd = 0 and r.d < 0; the
-    answer is yes where it is more than AMPLIFICATION times ||r|| / sqrt(mean diag N), the size that the data suggest,
-    where a contact counts in ||r|| by its share in d. Self-stress, G'd = 0 with r.d >= 0, is no sign of it, however
-    large; and nothing is unbounded with compliance, which d'Nd has.
+    A solution has velocities y = G v + r in the dual cones, so that d.y >= 0 and ||v|| >= -r.d / ||G'd||. In an
+    unbounded problem impulses grow along a d with G'd = 0 and r.d < 0, and this bound is infinite. The problem counts
+    as unbounded if the bound is more than AMPLIFICATION times ||r|| / sqrt(mean diag N), the size that the data
+    suggest; a contact counts in ||r|| by its share in d. Self-stress, G'd = 0 with r.d >= 0, does not count, however
+    large. With compliance no problem is unbounded, as d'Nd includes it.
     """
     r = problem.r.copy()
     r[problem.mu == 0, 1:] = 0.0  # sliding that no impulse answers

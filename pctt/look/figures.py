@@ -30,7 +30,7 @@ STYLE = {
 # names of the figures of what records.csv holds, by the unit in the heads of its columns
 UNITS = {
     "": "statistics", "N": "forces", "N m": "torques", "J": "energies", "m": "lengths", "m/s": "velocities",
-    "Pa": "stresses",
+    "Pa": "stresses", "kg": "masses", "degrees": "angles",
 }
 # columns of the energy balance, see dem.record.energy_balance
 BALANCE = ("kinetic_energy", "potential_energy", "work_of_motions", "friction_loss", "impact_loss", "time_stepping")

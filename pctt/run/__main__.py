@@ -75,8 +75,8 @@ STATUS: dict[type[Exception], int] = {OptionError: 2, FileError: 2, SceneError: 
 
 
 def run() -> int:
-    """Exit status: 0; 1 if a scene fails; 2 for a bad option or file; 130, as shells have it for Ctrl-C, if a signal
-    has ended the run. What went wrong is told once. Other errors abort all ranks."""
+    """Exit status: 0; 1 if a scene fails; 2 for a bad option or file; 130, the status of Ctrl-C in shells, if a signal
+    has ended the run. One message says what went wrong. Other errors abort all ranks."""
     comm = MPI.COMM_WORLD
     heed(comm)
     try:

@@ -37,7 +37,7 @@ def scene_record(name: str, scene: Any) -> str:
 
 
 def origin(name: str, scene: Experiment, dt: float) -> dict[str, Any]:
-    """What a run must have in common with the one that it goes on from, as attributes of a checkpoint.
+    """The properties that a run must share with the run whose checkpoint it continues, as attributes of a checkpoint.
 
     ``scene`` is `scene_record`, ``dt`` the time step [s], ``scene_file`` the digest of the user's scene file or "".
     """
@@ -66,7 +66,7 @@ def surfaces(large_bodies: Iterable[LargeBody]) -> dict[str, list[float]]:
 
 
 def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMemory) -> None:
-    """Write a checkpoint with its `origin`; collective. The previous one under this name stays until this one is
+    """Write a checkpoint with its `origin`; collective. An earlier file of this name stays until the new one is
     complete."""
     local, replicated = world.state()
     key, impulse = memory.state()
@@ -89,9 +89,9 @@ def load(
 ) -> tuple[World, ImpulseMemory]:
     """The world and the impulses of a checkpoint of the scene; collective.
 
-    On the number of ranks that wrote it the world is the same to the last bit. Raises FileError if it is no
-    checkpoint, OptionError if it is of another `origin` or a large body has other triangles; with ``changed_file`` the
-    scene file and the triangles may be others.
+    If the number of ranks is that of the writing run, the world is the same to the last bit. Raises FileError if the
+    file is no checkpoint, and OptionError if it has another `origin` or a large body has another surface; with
+    ``changed_file`` the scene file and the surfaces may differ.
     """
     with readable(path, comm) as file:
         if file.attrs.get("format") != FORMAT:
@@ -125,7 +125,8 @@ def load(
 
 
 def _refuse_other_origin(path: Path, old: dict[str, Any], new: dict[str, Any], changed_file: bool) -> None:
-    """OptionError for the first thing in which two origins differ; checkpoints of earlier versions lack some."""
+    """OptionError for the first property in which two origins differ. Checkpoints of earlier versions lack some
+    properties."""
     old_scene, new_scene = json.loads(old["scene"]), json.loads(new["scene"])
     was, now = (f"-scene {scene['scene']}" for scene in (old_scene, new_scene))
     if was != now:
@@ -160,7 +161,8 @@ def _refuse_other_surfaces(path: Path, old: dict[str, list[float]], new: dict[st
 
 
 def settled_path(record: str, settings: dict[str, Any]) -> Path:
-    """Where the settled state of a scene is kept: a file named by scene and digest of what shaped it."""
+    """The file of a scene's settled state. Its name has the scene and a digest of all options that influence the
+    state."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pctt"
     scene = json.loads(record)
     digest = hashlib.sha256((record + json.dumps(settings, sort_keys=True)).encode()).hexdigest()[:12]

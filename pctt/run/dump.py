@@ -1,4 +1,5 @@
-"""Cone problems of steps written to files: those that ``-dump_problem`` asks for, and hard ones by themselves.
+"""Cone problems of steps, written to files: those of ``-dump_problem``, and, without being asked, those that the solver
+failed on.
 
 FCLIB files hold the global problem, M v = H r + f, u = H'v + w, because it says more than W does and takes
 less room (W of a packing has four times the nonzeros of H), and W follows from it. Bodies of prescribed
@@ -6,7 +7,7 @@ motion have no rows: their velocity is part of w. With v_free the velocities wit
 
     f = M v_free,    H = D,    w = r - H' v_free    (gap/dt, and what the prescribed bodies move).
 
-A guided body has only the part of D along its guide, and nothing turns it: the moments that M has for it are any.
+A guided body has only the part of D along its guide. Nothing turns it, so its moments in M are arbitrary.
 """
 
 from __future__ import annotations
@@ -52,10 +53,10 @@ class Dump:
     def step(
         self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result, asked: ccp.Result
     ) -> dict[str, Any]:
-        """Write the problem of the step being made, before the bodies move, if it is to be; collective.
+        """Write the problem of the present step, before the bodies move, if the options say so; collective.
 
-        ``asked`` is what the asked-for solver made of it, ``result`` what the step goes on with. Returns what
-        the step's figures say of it; FileError if a file cannot be written.
+        ``asked`` is the result of the solver that the user chose, ``result`` the one that the step uses. Returns the
+        entries for the step's figures. FileError if a file cannot be written.
         """
         comm, number = self._world.comm, self._world.step + 1
         wanted = self.run.dump_problem and (not self._steps or number in self._steps)
@@ -178,7 +179,7 @@ def _block_diagonal(blocks: Array, comm: MPI.Comm) -> PETSc.Mat:
 
 
 def _map(system: ContactSystem, world: World, dynamic: np.ndarray) -> PETSc.Mat:
-    """D of the dynamic bodies alone, of those that are guided as far as they can move, (6 n x 3 nc); collective."""
+    """D (6 n x 3 nc) of the dynamic bodies alone; guided bodies have only the part along their guides. Collective."""
     body, blocks = system.blocks()
     grains = world.slabs[-1]
     large = body >= grains
@@ -231,7 +232,7 @@ def dump_folder(run: Run) -> Path:
     """The folder above all that ``-dump_problem`` writes; raises OptionError for options that do not fit."""
     place = run.dump_problem
     if dump_steps(run) and not place:
-        raise OptionError(f"-dump_steps {run.dump_steps}: -dump_problem FOLDER has to say where to")
+        raise OptionError(f"-dump_steps {run.dump_steps}: it needs -dump_problem FOLDER, which says where to write")
     if place and run.problem:
         raise OptionError(f"-dump_problem {place}: -problem {run.problem} makes no steps; allowed is one of the two")
     if "{" in place:

@@ -31,8 +31,8 @@ def refuse_serial(comm: MPI.Comm) -> None:
 
 
 class RowWriter:
-    """What a file is to hold: datasets, of which ``rows`` are concatenated over the ranks and ``whole`` are the same on
-    each, and attributes. Arrays must not change until the file is written."""
+    """The contents of a file: datasets and attributes. Datasets of ``rows`` are concatenated over the ranks, those of
+    ``whole`` are the same on each. Arrays must not change until the file is written."""
 
     def __init__(self) -> None:
         self._rows: dict[str, np.ndarray] = {}
@@ -84,8 +84,8 @@ class RowWriter:
 def written(path: Path, comm: MPI.Comm) -> Iterator[RowWriter]:
     """A file for all ranks, written under a temporary name when the block ends; collective.
 
-    Raises FileError on all ranks if it cannot be written; what stood under ``path`` is then untouched. Where one of
-    several ranks fails in the middle all are ended, after a word of that rank.
+    Raises FileError on all ranks if the file cannot be written; an earlier file under ``path`` then stays as it is. If
+    one of several ranks fails while all are writing, it prints a message and ends them all.
     """
     contents = RowWriter()
     yield contents

@@ -1,7 +1,7 @@
-"""Ctrl-C and its like: a run ends after the step under way, with its checkpoint written, all ranks together.
+"""Ctrl-C and other signals that end a run: all ranks finish the present step, write the checkpoint and end together.
 
-A signal comes to each rank at another moment, or to one rank only. So it is noted, and after every step the ranks tell
-each other. The same signal once more ends the rank at once.
+A signal reaches the ranks at different moments, or one rank only. So each rank notes it, and after every step the ranks
+tell each other. The same signal once more ends the rank at once.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def heed(comm: MPI.Comm) -> None:
     def note(number: int, frame: FrameType | None) -> None:
         signal.signal(number, signal.SIG_DFL)
         if comm.rank == 0 and not _noted:
-            sys.stderr.write("\npctt.run: will end after this step; once more, and it ends at once\n")
+            sys.stderr.write("\npctt.run: the run will end after this step; the same signal again ends it at once\n")
             sys.stderr.flush()
         _noted.append(number)
 

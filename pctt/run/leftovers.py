@@ -1,4 +1,4 @@
-"""What a user has typed and the run would take no notice of: stray words, and options that PETSc does not ask for."""
+"""Words of the command line that would have no effect: stray words, and options that nothing reads."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _used = getattr(ctypes.CDLL(PETSc.__file__), "PetscOptionsUsed", None)
 
 
 def refuse_stray(words: Sequence[str]) -> None:
-    """OptionError for a word of the command line that is no option nor the value of the one before it."""
+    """OptionError for a word of the command line that is neither an option nor the value of an option."""
     before = ""
     for word in words:
         is_option = re.match(r"--?[a-zA-Z]", word) is not None
@@ -68,6 +68,6 @@ def remark() -> str:
 
 
 def keep_from_petsc(names: Iterable[str]) -> None:
-    """Have PETSc, which in some versions warns of options that nobody asked for, say nothing of these at its end."""
+    """Keep PETSc from warnings about these options. Some versions warn at the end of options that nothing has read."""
     for name in names:
         PETSc.Options().hasName(name)

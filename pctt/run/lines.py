@@ -12,10 +12,10 @@ from pctt.run.place import Place
 
 
 class StepLines:
-    """A file in the place of a run that grows by a line per step; one rank.
+    """A file of a run that grows by a line per step; one rank.
 
-    Of the lines that are there those up to the step ``last`` stay. The first line that is added is written together
-    with them, at one stroke; every other one is a single write, whatever the length of the file.
+    Earlier lines stay up to the step ``last``. The first new line replaces the file at one stroke, with the lines that
+    stay; every other new line is a single write, whatever the length of the file.
     """
 
     def __init__(self, place: Place, name: str, step_of: Callable[[str], int], last: int):
@@ -27,12 +27,14 @@ class StepLines:
         return self._place.now / self._name
 
     def __iter__(self) -> Iterator[str]:
-        """The lines that are there, but for those that the first new one replaces. ValueError for one without step."""
+        """The present lines, without those that the first new line will remove. ValueError for a line without a
+        step."""
         lines = disk.lines(self.path)
         return lines if self._begun else (line for line in lines if self._step_of(line) <= self._last)
 
     def add(self, line: str) -> None:
-        """FileError if it cannot be written; the lines before are then as they were. The first makes the folder."""
+        """Add a line; the first one makes the folder. FileError if it cannot be written; the earlier lines then stay as
+        they are."""
         if self._begun:
             with told(self.path):
                 disk.append(self.path, line)

@@ -88,8 +88,8 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
 
 
 def _read_scene(scene_class: type[Experiment], database: Mapping[str, str]) -> tuple[Experiment, Any, Any]:
-    """The scene with the options of the database, its time step and its contact distance; OptionError for an option
-    that it refuses."""
+    """The scene with the options of the database, its time step and its contact distance. OptionError if the scene
+    refuses an option."""
     try:
         scene = read(scene_class, database, "scene_")
     except OptionError:
@@ -111,7 +111,7 @@ def option_groups(scene: type[Experiment]) -> list[tuple[type, str]]:
 
 
 def _obeys_coulomb(run: Run, limits: ccp.Limits) -> bool:
-    """Whether Coulomb's law is to hold; a file of ``-problem`` is solved as the cone problem that it is."""
+    """Whether the steps obey Coulomb's law. A file of ``-problem`` is solved as a plain cone problem by default."""
     if run.ccp_coulomb is not None:
         return run.ccp_coulomb
     return not run.problem and limits.tol >= ccp.SOLVERS[run.ccp_type].law_tol
@@ -134,7 +134,7 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb:
         (
             run.settle,
             lambda name: (name in own or name.startswith(("ccp_", *OF_SOLVERS))) and name not in OF_SETTLING,
-            "-settle makes its state with APGD and takes no notice of it; allowed is one of the two",
+            "-settle makes its state with APGD, where this option has no effect; allowed is one of the two",
         ),
         (not run.problem, lambda name: name == "problem_guess", "allowed with -problem only"),
         (
@@ -174,8 +174,8 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb:
 
 
 def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) -> None:
-    """OptionError for options of the KSP that PETSc refuses or does not know; it would do so at the first Newton
-    system, or never."""
+    """OptionError for options of the KSP that PETSc refuses or does not know. PETSc itself would complain only at the
+    first Newton system, or never."""
     given = {name: value for name, value in database.items() if name.startswith(("ksp_", "pc_"))}
     known = PETSc.Options().getAll()
     absent = {name: value for name, value in given.items() if name not in known}
@@ -218,7 +218,7 @@ def _refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
 
 
 def _refuse_occupied(run: Run, comm: MPI.Comm) -> None:
-    """OptionError if the output folder holds a run that this one neither goes on with nor may replace."""
+    """OptionError if the output folder holds a run, unless this run continues it or has ``-overwrite``."""
     folder = Path(run.output)
     there: list[str] = []
     if comm.rank == 0 and not run.overwrite and not (is_checkpoint_of(folder, run.restart) and not run.problem):

@@ -26,10 +26,10 @@ def is_checkpoint_of(folder: Path, restart: str) -> bool:
 
 
 class Place:
-    """Where a run writes: ``now``. That is its ``folder``, unless another run is there, which stays untouched until
-    ``take``: up to then it is a hidden folder in it.
+    """The place where a run writes, ``now``. It is the run's ``folder``, unless that holds another run. Then it is a
+    hidden folder in it until ``take`` replaces the other run, which stays untouched up to then.
 
-    A run that ``goes_on`` from the folder's own checkpoint adds to what is there.
+    A run that ``goes_on`` from the folder's own checkpoint adds to the files of the earlier one.
     """
 
     def __init__(self, folder: Path, comm: MPI.Comm, restart: str = ""):

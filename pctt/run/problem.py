@@ -103,7 +103,8 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
 
 
 def _load(path: str, comm: MPI.Comm, compliance: float | None, operator: str) -> Stored:
-    """The problem in a file, with another compliance if one is given; FileError on all ranks if it is none."""
+    """The problem in a file, with another compliance if one is given. FileError on all ranks if the file holds no
+    problem."""
     try:
         return files.load(path, comm, compliance, operator)
     except FileFormatError as error:
@@ -111,8 +112,8 @@ def _load(path: str, comm: MPI.Comm, compliance: float | None, operator: str) ->
 
 
 def _distance(problem: ccp.ConeProblem, impulse: Array, reference: Array) -> dict[str, Any]:
-    """How far W r + q, which is unique at the optimum, is from that of the file's own impulses, and how good
-    those are."""
+    """The distance of W r + q from the same vector for the impulses in the file, and how accurate those impulses are.
+    At the optimum W r + q is unique, r is not."""
     distance = problem.norm(problem.product(impulse - reference))
     accuracy = ccp.measure(problem, reference)
     return {

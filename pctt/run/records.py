@@ -1,4 +1,5 @@
-"""The records of a run: records.csv with a row per step, and analysis.csv with what the scene makes of them."""
+"""The records of a run: records.csv with a row per step, and analysis.csv with the series that the scene derives from
+them."""
 
 from __future__ import annotations
 
@@ -39,8 +40,8 @@ class Records:
         return None
 
     def add(self, row: Mapping[str, float]) -> None:
-        """Append the row of a step, the same on all ranks; collective. FileError if its names are not those of the
-        rows before."""
+        """Append the row of a step, the same on all ranks; collective. FileError if its names differ from those of
+        earlier rows."""
         header = ",".join(row)
         if self._header not in (None, header):
             path = self._place.folder / "records.csv"

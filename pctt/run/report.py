@@ -27,10 +27,10 @@ def law(coulomb: bool) -> str:
 
 
 def loose_line(tol: float) -> str:
-    """What a first-order method does at a tolerance above the default."""
+    """A warning for a first-order method at a tolerance above the default."""
     return (
-        f"WARNING: -ccp_tol {tol:g}: first-order methods leave overlaps of millimetres above 1e-4, which are pushed "
-        "apart: a packing may not come to rest"
+        f"WARNING: -ccp_tol {tol:g}: above 1e-4 first-order methods leave overlaps of millimetres; as these are pushed "
+        "apart, a packing may not come to rest"
     )
 
 
@@ -89,9 +89,9 @@ def accuracy_lines(line: Mapping[str, Any], history: Sequence[float]) -> str:
 
 
 class Progress:
-    """Prints what a run says, down to a level; on a terminal also a line of what is being done at the moment.
+    """Prints the messages of a run up to a level, and on a terminal a line about its present work.
 
-    Levels: 0 what a run starts from and ends with, 1 a line per step, 2 the accuracy of each step.
+    Levels: 0 the start and the end of a run, 1 a line per step, 2 the accuracy of each step.
     """
 
     def __init__(self, active: bool, level: int = 1):
@@ -154,8 +154,8 @@ def remaining(spent: float, done: int, steps: int) -> str:
 
 
 def _terminal() -> bool:
-    """Whether a person watches. Under mpiexec standard output looks like a terminal even where it goes to a file:
-    then that of mpiexec itself, our parent, decides (where it cannot be seen, nobody watches)."""
+    """Whether a person watches. Under mpiexec standard output looks like a terminal even if it goes to a file. Then the
+    output of mpiexec, our parent process, decides; if we cannot look at it, nobody watches."""
     if not any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK")):
         return sys.stdout.isatty()
     try:
@@ -204,7 +204,8 @@ def phase_table(steps: Sequence[Mapping[str, Any]]) -> str:
 
 
 def law_line(steps: Sequence[Mapping[str, Any]], tol: float) -> str:
-    """Which law the steps obey and how well, with a warning where the relaxation is far from Coulomb's."""
+    """A line about the law that the steps obey, and its residual, with a warning if the relaxation is far from
+    Coulomb's law."""
     laws = Counter(line["law"] for line in steps)
     counted = ", ".join(f"{name} in {count} steps" for name, count in laws.most_common())
     worst = max(line["coulomb_residual"] for line in steps)

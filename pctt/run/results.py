@@ -9,8 +9,8 @@
     summary.json     figures of the whole run, and of the compared preconditioners
     hard/            cone problems that the asked-for solver did not solve
 
-What a step writes does not grow with the steps before it. Tables get a line with one write; every other file is
-written under a temporary name and renamed. So a run that is killed leaves whole files.
+The data written per step do not grow with the number of steps. Tables get a line with one write; every other file is
+written under a temporary name and renamed. So a killed run leaves whole files.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ LINKS = (
 
 
 class Results:
-    """Writes what a run leaves in its place.
+    """Writes the files of a run.
 
-    A run that goes on from the folder's own checkpoint adds to what the earlier one left, any other replaces it: but
-    nothing of the earlier run goes before the first new step ``stands``.
+    A run that continues from the folder's own checkpoint adds to the files of the earlier run; any other run replaces
+    them. Either removes nothing before its first step ``stands``.
     """
 
     def __init__(self, place: Place, comm: MPI.Comm, record: str, world: World):
@@ -99,7 +99,7 @@ class Results:
         with written(frames / f"{world.step:06d}.h5", self.comm) as file:
             file.attributes("/", {"step": world.step, "time": world.time})
             file.attributes("record", row)
-            _write_bodies(file, world)
+            _write_by_id(file, world, ("position", "quaternion", "velocity"))
             near = contacts.near.bodies
             file.rows("contact/key", contacts.key)
             file.rows("contact/body", np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1))
@@ -143,11 +143,12 @@ class Results:
         self.write_summary(world, compare)
 
     def steps(self) -> Iterator[dict[str, Any]]:
-        """The figures of the steps, also of those that an earlier run left for this one to go on from; on rank 0."""
+        """The figures of all steps, also of the earlier run that this one continues; on rank 0."""
         return map(figures_json.loads, self._steps)
 
     def stands(self, world: World, line: dict[str, Any]) -> None:
-        """The step with these figures is written: after the first one, what it replaces may go; collective."""
+        """Say that the step with these figures is written. After the first one, the files that it replaces are removed;
+        collective."""
         if self._stands:
             return
         self.place.take()
@@ -157,8 +158,8 @@ class Results:
         self._stands = True
 
     def _remove_later(self, world: World, hard: str) -> None:
-        """Remove what an earlier run left of steps that this one makes again, but for what the first has written,
-        such as the file ``hard``."""
+        """Remove the files of an earlier run's later steps, but not those of this run's first step, such as the file
+        ``hard``."""
         folder, kept = self.place.folder, self._kept_steps
         (folder / "analysis.csv").unlink(missing_ok=True)
         steps = self._frames()
@@ -195,13 +196,9 @@ def _step_of(line: str) -> int:
     return int(json.loads(line)["step"])
 
 
-def _write_bodies(file: RowWriter, world: World) -> None:
-    _write_by_id(file, world, ("position", "quaternion", "velocity"))
-
-
 def _write_constants(file: RowWriter, world: World) -> None:
-    """What no step changes: columns of the table of bodies, the names of the materials, and the shapes of the large
-    bodies as JSON."""
+    """Write the data that are the same in all steps: columns of the table of bodies, the names of the materials, and
+    the shapes of the large bodies as JSON."""
     _write_by_id(file, world, ("shape", "size", "mass", "material"))
     large = [
         {"name": body.name, "shapes": [described(shape) for shape in body.shapes]}

@@ -1,4 +1,4 @@
-"""What a run is told: the options of ``python -m pctt.run`` as data; `pctt.run.options` reads and checks them."""
+"""The options of ``python -m pctt.run`` as data; `pctt.run.options` reads and checks them."""
 
 from __future__ import annotations
 
@@ -107,8 +107,8 @@ class Run:
 class Options:
     """Everything that a run needs to know, with the scene's own values filled in.
 
-    ``scene`` is an instance of a class of ``dem.scenes.SCENES`` or of the user's; ``solver`` of the options class
-    of ``ccp_type``; ``coulomb`` is there where Coulomb's law is to hold.
+    ``scene`` is an instance of a class of ``dem.scenes.SCENES`` or of the user's class, ``solver`` one of the options
+    class of ``ccp_type``. ``coulomb`` is None if the steps obey the relaxation.
     """
 
     run: Run

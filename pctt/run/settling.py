@@ -24,9 +24,10 @@ from pctt.run.stepper import Stepper
 
 
 def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, anew: bool = False) -> Path:
-    """The cached settled state of the scene, made if it is not there (or ``anew``): the scene's settling time
-    with APGD, its last tenth with the contacts and ten times the accuracy, so that no overlap is left that
-    a first accurate step would have to push apart. What an interrupted or killed settling has left is gone on from."""
+    """The cached settled state of the scene; it is made if it is missing, or with ``anew``. Settling takes the scene's
+    settling time with APGD. The last tenth has the contact distance of the scene and ten times the accuracy: otherwise
+    overlaps remain, and the first accurate step of a run would push them apart. An interrupted or killed settling is
+    continued."""
     if not options.scene.settling_time:
         raise OptionError(f"-scene {options.run.scene}: has no settling_time and so no settled state")
     made_with = checkpoint.origin(scene_name(options.run.scene), options.scene, options.dt)

@@ -74,7 +74,8 @@ class Output:
         self.results = Results(place, world.comm, self._made_with["scene"], world)
 
     def step(self, stepper: Stepper, line: dict[str, Any], last: bool) -> None:
-        """Records, state, figures and checkpoint after a step, the ``last`` one of the run or not; collective."""
+        """Write records, state, figures and checkpoint after a step; ``last`` says whether it is the last one of the
+        run. Collective."""
         run, world, results = self._options.run, self._world, self.results
         with log.phase("output"):
             row = stepper.records()
@@ -138,8 +139,8 @@ def _analyse(scene: Experiment, results: Results, comm: MPI.Comm) -> dict[str, f
 
 
 def _count_output(line: dict[str, Any]) -> None:
-    """Add the seconds of output since the last count to the figures of a step: those of its checkpoint count in the
-    next step, as the figures are written before."""
+    """Add the seconds of output since the last count to the figures of a step. A step's checkpoint is written after its
+    figures, so its seconds count in the next step."""
     phases = line["phases"]
     phases |= log.take_seconds(("output",))
     line["seconds"] = sum(phases.values())

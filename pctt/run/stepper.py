@@ -46,7 +46,7 @@ class Solved(NamedTuple):
 class Stepper:
     """One time step after another of a world; keeps the last step's contacts and impulses for output.
 
-    Owns what it is given as ``newton`` and the PETSc objects of the step under way, which `destroy` frees.
+    Owns its ``newton`` and the PETSc objects of the present step; `destroy` frees them.
     """
 
     contacts: Any
@@ -159,8 +159,8 @@ class Stepper:
         return self._problem, guess
 
     def _overrun(self, problem: ccp.ConeProblem, impulse: np.ndarray) -> tuple[Contacts, ImpulseMemory] | None:
-        """The contacts with those that nobody foresaw, as impulses of the step sent a grain further than its margin,
-        and the impulses so far; None if it runs into nothing there."""
+        """The contacts together with those that the search did not foresee, because an impulse of this step sends a
+        grain further than its margin, and the impulses so far. None if no such grain meets anything."""
         world, options = self.world, self.options
         with log.phase("search"):
             velocity = self.system.velocity(impulse)
@@ -180,7 +180,7 @@ class Stepper:
         return wider, memory
 
     def records(self) -> dict[str, float]:
-        """What the last step shows, by name; collective. SceneError if the scene's own records are at fault."""
+        """The records of the last step by name; collective. SceneError if the scene's own `record` fails."""
         step = Step(self.world, self.contacts, self.system, self.impulse)
         return recording.row(step, self.options.scene)
 

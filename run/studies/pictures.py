@@ -13,7 +13,6 @@ import argparse
 import ast
 import os
 import shlex
-import shutil
 import subprocess
 import tempfile
 from pathlib import Path
@@ -23,13 +22,13 @@ EXAMPLES = ROOT / "docs" / "examples"
 
 # steps from the settled state to the picture, and options of pctt.render
 PICTURES = {
-    "mixer": (1, ("-color", "force", "-range", "0", "20000", "-cut", "-size", "960x720")),
+    "mixer": (1, ("-color", "force", "-range", "0", "5000", "-cut", "-size", "960x720")),
     "blade": (10, ("-color", "speed", "-size", "800x560")),
     "shear": (10, ("-color", "speed", "-size", "800x560")),
 }
 # the step that is drawn of an example with a film
 STEPS = {"drum": 240, "hopper": 120, "incline": 60, "blade": 160, "bucket": 260}
-COLOURS = 128  # of an example's picture, which makes it small
+COLOURS = 256  # of a picture, which makes it a third as large
 
 
 def draw(scene: str, n: int, target: Path) -> None:
@@ -41,8 +40,7 @@ def draw(scene: str, n: int, target: Path) -> None:
         python("-m", "pctt.run", *run, "-output_every", 10**7, "-output", folder)
         python("-m", "pctt.render", folder, *look)
         (picture,) = Path(folder, "pictures").glob("*.png")
-        shutil.copyfile(picture, target)
-    print(target, flush=True)
+        keep(picture, target)
 
 
 def commands(example: Path) -> list[list[str]]:
@@ -62,11 +60,16 @@ def draw_example(name: str) -> None:
         picture = Path(folder, f"{name}.png")
         if name in STEPS:
             picture = Path(folder, name, "pictures", f"{STEPS[name]:06d}.png")
-        from PIL import Image
+        keep(picture, EXAMPLES / f"{name}.png")
 
-        with Image.open(picture) as image:
-            image.convert("RGB").quantize(COLOURS).save(EXAMPLES / f"{name}.png", optimize=True)
-    print(EXAMPLES / f"{name}.png", flush=True)
+
+def keep(picture: Path, target: Path) -> None:
+    """Put a small copy of a picture into its place."""
+    from PIL import Image
+
+    with Image.open(picture) as image:
+        image.convert("RGB").quantize(COLOURS).save(target, optimize=True)
+    print(target, flush=True)
 
 
 def python(*words: object, folder: str | Path = ROOT) -> None:

@@ -200,7 +200,7 @@ BROKEN = {
     "a block outside": (word(TEXT["blocks"], 24, "4"), r"do not fit together"),
     "indices of another length": (word(TEXT["blocks"], 16, "6"), r"indices of lengths 6 and"),
     "an unknown kind": (word(TEXT["triplets"], 5, "3"), r"line 6: kind 3 of W or M; allowed are 1 \(triplets\) and 2"),
-    "columns called triplets": (word(TEXT["columns"], 5, "1"), r"line 7: what CSparse prints of W or M is missing"),
+    "columns called triplets": (word(TEXT["columns"], 5, "1"), r"line 7: the head that CSparse prints of W"),
     "a triplet outside": (word(TEXT["triplets"], -19, "12"), r"entries outside its rows and columns"),
     "letters for a row": (word(TEXT["triplets"], -20, "x"), r"'x' in the places of W or M"),
     "more columns": (TEXT["columns"].replace("12-by-12", "12-by-11"), r"columns in W or M|has the size|words of W"),

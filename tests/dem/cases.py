@@ -125,16 +125,16 @@ def contacts_by_key(contacts: Contacts, comm: MPI.Comm) -> dict[str, np.ndarray]
 def dense_map(system: ContactSystem) -> Floats:
     """D' (3 nc, 6 bodies) of the local contacts."""
     body, blocks = system.blocks()
-    dense = np.zeros((system.local_contacts, 3, system.total_bodies, 6))
+    dense = np.zeros((len(system.key), 3, system.total_bodies, 6))
     for c, both in enumerate(body):
         dense[c][:, both] = blocks[c].transpose(1, 0, 2)
-    return dense.reshape(3 * system.local_contacts, 6 * system.total_bodies)
+    return dense.reshape(3 * len(system.key), 6 * system.total_bodies)
 
 
 def dense_scaled_map(system: ContactSystem, comm: MPI.Comm) -> Floats:
     """G = D' M^-1/2 (3 nc, 6 bodies) of the local contacts, from the blocks that solvers make of it; collective."""
     G = CompactRows(*system.contact_map, columns=system.owned_bodies).block_rows(comm)
-    dense = np.zeros((system.local_contacts, 3, system.total_bodies, 6))
-    contact = np.repeat(np.arange(system.local_contacts), np.diff(G.indptr))
+    dense = np.zeros((len(system.key), 3, system.total_bodies, 6))
+    contact = np.repeat(np.arange(len(system.key)), np.diff(G.indptr))
     dense[contact, :, G.indices] = G.blocks
-    return dense.reshape(3 * system.local_contacts, 6 * system.total_bodies)
+    return dense.reshape(3 * len(system.key), 6 * system.total_bodies)

@@ -34,15 +34,15 @@ def from_compact(system, comm):
     rows = system.contact_map
     roots = [root_matrix(row) for part in comm.allgather(rows.root) for row in part]
     assert len(roots) == system.total_bodies
-    blocks = np.zeros((system.local_contacts, 3, system.total_bodies, 6))
-    for c in range(system.local_contacts):
+    blocks = np.zeros((len(system.key), 3, system.total_bodies, 6))
+    for c in range(len(system.key)):
         frame = rows.frame[c].reshape(3, 3)
         for side, sign in ((0, -1.0), (1, 1.0)):
             body, arm = rows.body[c, side], rows.arm[c, 3 * side : 3 * side + 3]
             if body >= 0:
                 moment = frame @ -cross_matrix(arm)  # of w: F (w x r)
                 blocks[c, :, body] += sign * np.hstack([frame, moment]) @ roots[body]
-    return blocks.reshape(3 * system.local_contacts, -1)
+    return blocks.reshape(3 * len(system.key), -1)
 
 
 def mixed(comm):
@@ -85,7 +85,7 @@ def test_compact_rows_are_g(case):
     world = make(comm)
     system = ContactSystem(world, find_contacts(world, 0.03), 0.01)
     rows = system.contact_map
-    assert comm.allreduce(system.local_contacts) > 40
+    assert comm.allreduce(len(system.key)) > 40
     assert rows.root.shape == (world.owned, width)
     for array, shape, kind in zip(rows, [(9,), (6,), (2,), (width,)], "ffif"):
         assert array.shape[1:] == shape

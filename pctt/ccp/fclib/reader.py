@@ -18,9 +18,9 @@ from pctt.ccp.stored import FileFormatError, Stored, Whole, spread, symmetric_bl
 def read(path: str | Path, comm: MPI.Comm) -> ConeProblem:
     """The cone problem of an FCLIB file, its contacts in equal parts over the ranks.
 
-    A local problem is given by N = W. A global one is given by the map G = H' L^-T of the bodies, with
-    M = L L', where M has 6 x 6 blocks on its diagonal and nothing else, and otherwise by N = H' M^-1 H.
-    Raises FileFormatError on every rank where the file cannot be read as one.
+    A local problem is given by N = W. A global one is given by the map G = H' L^-T of the bodies, with M = L L', where
+    M has 6 x 6 blocks on its diagonal and nothing else, and otherwise by N = H' M^-1 H. Raises FileFormatError on every
+    rank if the file is none.
     """
     return load(path, comm).problem
 

@@ -1,8 +1,8 @@
 """Cone problems written as FCLIB files.
 
-All is gathered on rank 0, which writes the file: FCLIB's own reader is serial, so a problem has to fit one
-node anyway. Matrices are written as triplets, rows in ``i`` and columns in ``p``: of the three formats it is
-the one that every known reader takes, Siconos for one refuses global problems in CSR.
+All is gathered on rank 0, which writes the file: FCLIB's own reader is serial, so a problem has to fit one node anyway.
+Matrices are written as triplets, rows in ``i`` and columns in ``p``. Of the three formats this is the one that every
+known reader takes; Siconos, for example, refuses global problems in CSR.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 """Accelerated projected gradient descent (APGD) with restart.
 
-Mazhar, Heyn, Negrut, Tasora, "Using Nesterov's method to accelerate multibody dynamics with friction and
-contact", ACM Trans. Graph. 34 (2015); restart by the gradient test of O'Donoghue and Candes (2015). N is
-applied once per iteration: the gradient at the extrapolated point follows from those at the last two
-iterates, and for a quadratic objective the line search is a Rayleigh quotient. The extrapolated point is formed where
-it is used, twice: reading the last two iterates costs less than writing and reading it.
+Mazhar, Heyn, Negrut, Tasora, "Using Nesterov's method to accelerate multibody dynamics with friction and contact", ACM
+Trans. Graph. 34 (2015); restart by the gradient test of O'Donoghue and Candes (2015). N is applied once per iteration:
+the gradient at the extrapolated point follows from those at the last two iterates, and for a quadratic objective the
+line search is a Rayleigh quotient. The extrapolated point is computed twice, where it is used: reading the last two
+iterates takes less time than storing and reading the point.
 
-For Coulomb's law the gradient gets the opening mu |y_t| that it asks for itself, in every iteration, and momentum a
-bound (`Momentum`): the projected step then has Coulomb's law as its fixed point, and one run finds it.
+For Coulomb's law the opening mu |y_t| of the present gradient is added to it in every iteration, and momentum gets a
+bound (`Momentum`). Then Coulomb's law is the fixed point of the projected step, and one run finds it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from pctt.ccp.result import Limits, Result
 
 @dataclass(frozen=True)
 class Steering:
-    """How the estimate L of the curvature, whose inverse is the length of a step, follows what steps show of it."""
+    """How the estimate L of the curvature follows the curvature along the steps; its inverse is the length of a
+    step."""
 
     margin: float = 1.1  #: L of a repeated step, over the curvature found: the next step need not be repeated too
     decay: float = 0.95  #: factor on L after each step, so that steps grow again where the curvature allows it

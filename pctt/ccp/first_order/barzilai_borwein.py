@@ -1,10 +1,10 @@
 """Projected Barzilai-Borwein method with adaptive nonmonotone line search.
 
-Dai and Fletcher, "Projected Barzilai-Borwein methods for large-scale box-constrained quadratic programming",
-Numer. Math. 100 (2005); on cones because the method asks for nothing but the projection. Steps alternate
-between the two Barzilai-Borwein lengths. A step is shortened, to the exact minimiser on its segment, only
-where the objective would rise above a reference value: the worst of the values since the best one, taken
-over when `Steering.memory` steps have brought no new best. One product with N per iteration.
+Dai and Fletcher, "Projected Barzilai-Borwein methods for large-scale box-constrained quadratic programming", Numer.
+Math. 100 (2005); here on cones, as the method needs nothing but the projection. Steps alternate between the two
+Barzilai-Borwein lengths. A step is shortened, to the exact minimiser on its segment, only where the objective would
+rise above a reference value: the worst of the values since the best one, taken over when `Steering.memory` steps have
+brought no new best. One product with N per iteration.
 """
 
 from __future__ import annotations

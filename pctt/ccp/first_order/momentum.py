@@ -26,12 +26,12 @@ STEERING = Steering()
 class Momentum:
     """beta, the momentum of the next step.
 
-    For a convex problem it may come as near to 1 as it likes. The projected step of Coulomb's law is no gradient step:
-    the opening mu |y_t| follows the sliding, which no function of the impulses has as its derivative. So it is,
-    linearised, an unsymmetric map with complex eigenvalues a + ib; momentum makes growing oscillations of those with
-    1 - beta < |b| / sqrt(a), and without a bound the method ends in a cycle at a residual of some 1e-4. How large b is
-    depends on friction and on what slides. The bound is found on the way: more damping where a window of iterations
-    has brought little, less where it has brought much."""
+    For a convex problem it may come arbitrarily near to 1. The projected step of Coulomb's law is no gradient step: the
+    opening mu |y_t| is not the derivative of any function of the impulses. Linearised, the step is an unsymmetric map
+    with complex eigenvalues a + ib. If 1 - beta < |b| / sqrt(a), momentum turns them into growing oscillations, and
+    without a bound the method ends in a cycle at a residual of about 1e-4. The size of b depends on friction and on the
+    sliding contacts. So the bound is found on the way: more damping if a window of iterations has brought little, less
+    if it has brought much."""
 
     def __init__(self, bounded: bool):
         self.bounded, self.damping = bounded, STEERING.damping if bounded else 0.0

@@ -1,4 +1,4 @@
-"""When a first-order method looks at its accuracy, why it stops, and what it hands back."""
+"""The looks of a first-order method at its accuracy, its reasons to stop, and its result."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class FirstOrder:
 class Progress:
     """Counts the iterations of a method (products with N) and keeps its best point.
 
-    The objective of these methods need not fall in every step, and the natural residual falls in none of them
-    steadily: what is handed back is the best point that was looked at.
+    The objective of these methods need not fall in every step, and the natural residual falls steadily in none of them.
+    So the result is the best of all points that were looked at.
     """
 
     def __init__(self, problem: ScaledProblem, limits: Limits, options: FirstOrder, give_up: GiveUp | None = None):
@@ -52,7 +52,7 @@ class Progress:
         self._gain = (np.inf, 0)  # natural residual and iteration of the last progress
 
     def goes_on(self, x: Array, gradient: Array | None = None) -> bool:
-        """Whether to iterate further from x; looks at the natural residual where that is due.
+        """Whether to iterate further from x. Every ``check`` iterations this computes the natural residual.
 
         ``gradient`` is A x + b if the method has it."""
         if self.iterations < min(self._next_look, self.limits.max_it):

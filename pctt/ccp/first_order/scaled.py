@@ -20,8 +20,8 @@ class ScaledProblem:
     of its mean tangential entry of diag N: the cones stay friction cones, of friction mu s_t / s_n. This is
     diagonal preconditioning by a metric in which the projection is still exact.
 
-    With ``coulomb`` it is Coulomb's law, in the same variables: x is a solution where the projected step from x along
-    the gradient *with its opening* (mu |y_t|, 0, 0) leads back to x, and that is what the natural residual measures.
+    With ``coulomb`` it is Coulomb's law, in the same variables: x is a solution if the projected step from x along the
+    gradient *with its opening* (mu |y_t|, 0, 0) leads back to x. The natural residual measures how far it leads away.
     """
 
     def __init__(self, problem: ConeProblem, coulomb: bool = False):

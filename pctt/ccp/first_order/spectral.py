@@ -4,11 +4,11 @@ Heyn, Anitescu, Tasora, Negrut, "Using Krylov subspace and spectral methods for 
 problems in many-body contact dynamics simulation", Int. J. Numer. Meth. Engng 95 (2013), after Birgin,
 Martinez, Raydan, "Nonmonotone spectral projected gradient methods on convex sets", SIAM J. Optim. 10 (2000).
 
-The preconditioner is the diagonal of N (``scaled.py``), taken so that the projection stays exact in its
-metric. Steps are accepted by the nonmonotone test of Grippo, Lampariello and Lucidi: sufficient descent below the
-largest of the last `Steering.memory` objectives; along a segment the objective is a known parabola, so that a
-shortened step costs no product. The fallback is that the best point seen is returned (``progress.py``), which
-a nonmonotone method needs.
+The preconditioner is the diagonal of N (``scaled.py``), taken so that the projection stays exact in its metric. Steps
+are accepted by the nonmonotone test of Grippo, Lampariello and Lucidi: sufficient descent below the largest of the last
+`Steering.memory` objectives; along a segment the objective is a known parabola, so that a shortened step costs no
+product. The fallback is that the result is the best point seen (``progress.py``), as the last point of a nonmonotone
+method may be worse.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ bounded.
 
 A contact without friction has no interior; its constraint is -g_n <= 0, its tangential impulses stay zero.
 
-What is ``compiled`` is in ``barrier_loops`` too: the form that is the default.
+Functions marked ``compiled`` have a twin in ``barrier_loops``, for the default form.
 """
 
 from __future__ import annotations

@@ -5,15 +5,15 @@ the central path s o z = t e of
 
     v = G' g,    y = G v + C g + r,    s and z in the cones, s'z = 0,
 
-with the mass-scaled momenta v as unknowns of their own: what an inexact linear solve leaves (``-ccp_newton body``)
-spoils v = G' g alone, which the next step mends. With W the scaling of the pair (s, z), a step solves
+with the mass-scaled momenta v as unknowns of their own: the residual of an inexact linear solve (``-ccp_newton body``)
+spoils v = G' g alone, and the next step mends that. With W the scaling of the pair (s, z), a step solves
 
     dz = G dv + C dg + r_z,    dv = G' dg - r_v,    W^-1 ds + W dz = w - W z.
 
-Late in an iteration W^2 is large along an impulse that slides, and W^2 z, which is s, drowns in rounding when it is
-multiplied out: what each contact would do without the others, ds = W w - s, is formed from s instead.
+Late in an iteration W^2 is large along an impulse that slides, and the product W^2 z, which equals s, drowns in
+rounding. So the change of each contact without the others, ds = W w - s, is formed from s instead.
 
-For Coulomb's law z is that of the De Saxce velocity, (y_n / mu + |y_t|, y_t); `slip` has what that adds.
+For Coulomb's law z belongs to the De Saxce velocity, (y_n / mu + |y_t|, y_t); `slip` has the additional terms.
 
 Source: Nesterov and Todd (1997), Mehrotra (1992); Acary, Armand, Nguyen and Shpakovych, "Second-order cone
 programming for frictional contact mechanics using interior point algorithm", Optim. Methods Softw. (2023), for their
@@ -157,7 +157,7 @@ class Cones:
 
 
 class Course:
-    """What is known of the iterations so far, and when they end.
+    """The course of the iterations so far, and the test that ends them.
 
     history : natural residual of every iterate
     waited : iterations without progress

@@ -1,4 +1,4 @@
-"""The guess that an interior point method starts from: the last step's impulses, where they are of the right size."""
+"""The guess that an interior point method starts from: the last step's impulses, if their size is right."""
 
 from __future__ import annotations
 

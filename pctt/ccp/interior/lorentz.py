@@ -4,7 +4,7 @@ The product x o y = (x'y, x_0 y_1: + y_0 x_1:) has the unit e = (1, 0, 0); x has
 Nesterov-Todd scaling of a pair (s, z) inside the cones is the symmetric W with W z = W^-1 s, of which W^2 and W^-2
 have the eigenvectors (1, u), (1, -u) and (0, u'), u the direction of the scaling point.
 
-What is ``compiled`` is in ``lorentz_loops`` too.
+Functions marked ``compiled`` have a twin in ``lorentz_loops``.
 
 Source: Nesterov and Todd (1997); Andersen, Roos and Terlaky (2003); Domahidi, Chu and Boyd (2013).
 """
@@ -23,7 +23,7 @@ ROUND = 1e-14  # tangential part of a unit scaling point below which it has no d
 
 
 def determinant(x: Array) -> Array:
-    """x_0^2 - |x_1:|^2 (nc,) of points inside, kept positive where rounding would not.
+    """x_0^2 - |x_1:|^2 (nc,) of points inside, kept positive in spite of rounding.
 
     Near the boundary rounding is at most 1.5 eps x_0^2: the first difference is exact, and neither the product nor the
     square is larger than x_0^2 / 2."""

@@ -116,8 +116,8 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
 
 
 class Linearised(NamedTuple):
-    """What the directions of a Newton step share: impulses and multipliers, velocities, the constraints with their
-    first and second derivatives, and the complementarity 1/t that is aimed at."""
+    """The data that all directions of a Newton step share: impulses and multipliers, velocities, the constraints with
+    their first and second derivatives, and the target 1/t of the complementarity."""
 
     g: Array
     lam: Array
@@ -131,19 +131,19 @@ class Linearised(NamedTuple):
 def _accuracy(problem: ConeProblem, at: Linearised, residual: float) -> float:
     """How accurately to solve a Newton system (momenta, sqrt J).
 
-    What a solve leaves are velocities. They must not be more than a part of those that the natural residual stands for:
-    complementarity would fall without them, and near the boundary no step makes up for that."""
+    The residual of a solve is a velocity. It must be only a part of the velocities that the natural residual stands
+    for: otherwise complementarity would fall without them, and near the boundary no step makes up for that."""
     shown = residual * problem.norm(at.g) * problem.mean_diagonal
     left = min(STEERING.rtol * problem.norm(_right_side(at)), STEERING.forcing * shown)
     return left / float(np.sqrt(problem.mean_diagonal))
 
 
 def _next_damping(damping: float, step: float, residual: float) -> float:
-    """Of the proximal term, as a part of the natural residual, after a step of length ``step``.
+    """The factor of the proximal term after a step of length ``step``, as a part of the natural residual.
 
-    Forces that hold each other move no body, so nothing but the barrier answers for them: directions along them are
-    long, leave the cones at once, and cut the rest of the step short. The proximal term makes those short; of
-    velocities it leaves rho dg, less than what the natural residual shows."""
+    Forces that hold each other move no body, and only the barrier bounds them: directions along them are long, leave
+    the cones at once, and cut the rest of the step short. The proximal term shortens them. It leaves a velocity of rho
+    dg, which is less than the natural residual shows."""
     if residual > STEERING.late:
         return 0.0
     if step < STEERING.cut:
@@ -192,9 +192,9 @@ def _direction(
 
 
 def _bend(at: Linearised, dg: Array, dlam: Array, reach: float) -> tuple[Array, Array]:
-    """What the linearised conditions miss, ``reach`` along a direction and divided by that: the terms of second order
-    of sum lambda_i grad f_i (without third derivatives) and of lambda_i f_i. A contact that slides has to turn its
-    impulse along the cone, and straight steps leave it soon."""
+    """The terms that the linearised conditions lack at ``reach`` along a direction, divided by ``reach``: those of
+    second order of sum lambda_i grad f_i (without third derivatives) and of lambda_i f_i. A contact that slides has to
+    turn its impulse along the cone, and straight steps leave it soon."""
     turned = times(at.hessian, dg)
     missed = dlam * dot(at.df, dg) + 0.5 * at.lam * dot(dg, turned)
     return reach * dlam[:, None] * turned, reach * missed

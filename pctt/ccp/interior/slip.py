@@ -1,4 +1,4 @@
-"""What Coulomb's law adds to an iteration of `conic`: the derivative of the opening.
+"""The additional terms of Coulomb's law in an iteration of `conic`: the derivative of the opening.
 
 The velocity of a contact has the opening mu |y_t| added to its normal part. Newton's method takes its derivative along:
 with u = y_t / |y_t|,

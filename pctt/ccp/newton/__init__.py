@@ -1,4 +1,4 @@
-"""Newton systems of the interior point methods, in one of three forms, and what solves them.
+"""Newton systems of the interior point methods, in one of three forms, and their solvers.
 
 An interior point step has barrier blocks B (nc, 3, 3), one per contact, and asks for impulses dg and mass-scaled
 momenta dv with
@@ -75,8 +75,9 @@ class Newton:
         self._structure = structure
 
     def sharpen(self) -> bool:
-        """Go on with this problem in the form that rounding hurts least, `kkt`; False if that is so already, or too
-        large. Body systems of rigid contacts lose a natural residual of 1e-8: (B + C)^-1 grows like its inverse."""
+        """Continue this problem in the form that rounding hurts least, `kkt`. False if it has that form already, or is
+        too large for it. Body systems of rigid contacts lose a natural residual of 1e-8: (B + C)^-1 grows like its
+        inverse."""
         if self._present == "kkt" or self.problem.size > SHARP_LIMIT or self.problem.low_rank is not None:
             return False
         self._take("kkt")
@@ -120,7 +121,7 @@ class Newton:
 
     @property
     def pc_report(self) -> list[str]:
-        """What the preconditioner tells of itself and its fallbacks so far, if it is one of the project's."""
+        """Lines about the preconditioner and its fallbacks so far, if it is one of this package."""
         return [line for linear in self._linear.values() for line in linear.report()]
 
     @property
@@ -129,8 +130,8 @@ class Newton:
         return self._present == "body" and self.linear.takes_any
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
-        """New barrier blocks B (nc, 3, 3); ``inverse`` is (B + C)^-1 where the caller knows it better. Blocks that are
-        not ``symmetric`` are for systems that take any (`takes_any`)."""
+        """Set the barrier blocks B (nc, 3, 3). A caller that has (B + C)^-1 more accurately than by inversion passes it
+        as ``inverse``. Only systems with `takes_any` accept blocks that are not ``symmetric``."""
         with phase("CCPUpdate"):
             assert self.system is not None
             self.system.update(barrier, inverse, symmetric)
@@ -144,9 +145,9 @@ class Newton:
         start: Array | None = None,
         uncoupled: Array | None = None,
     ) -> tuple[Array, Array]:
-        """dg (nc, 3) and the system's solution x, to a residual of ``tol`` (sqrt J: of momenta; of velocities times
-        the root of the mean diagonal of N). ``start`` is an earlier x to begin from; ``uncoupled`` is (B + C)^-1 q,
-        what each contact would do without the others, where the caller knows it better."""
+        """dg (nc, 3) and the system's solution x, to a residual of ``tol`` (sqrt J: of momenta; of velocities times the
+        root of the mean diagonal of N). ``start`` is an earlier x to begin from. ``uncoupled`` is (B + C)^-1 q, the
+        change of each contact without the others, for callers that have it more accurately than by a product."""
         with phase("CCPKrylov"):
             assert self.system is not None
             b = self.system.right_hand_side(q, r_v, uncoupled)

@@ -2,8 +2,8 @@
 
     K dv = G' (B + C)^-1 q - r_v,    dg = (B + C)^-1 (q - G dv).
 
-What an inexact solve leaves in K stays in the momenta: it is not multiplied by anything. K is smaller than the contact
-system and far better conditioned once contacts open or slide.
+The residual of an inexact solve of K stays in the momenta: nothing multiplies it. K is smaller than the contact system
+and far better conditioned once contacts open or slide.
 
 For Coulomb's law (B + C)^-1 is not symmetric, and K is not either.
 """
@@ -40,8 +40,8 @@ class BodyForm:
         self._placed = False
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
-        """K for the barrier blocks B, or for ``inverse`` = (B + C)^-1 where the caller has it more accurately;
-        ``symmetric`` says whether that is."""
+        """Make K for the barrier blocks B, or from ``inverse`` = (B + C)^-1 if the caller has it more accurately.
+        ``symmetric`` says whether the blocks are."""
         if inverse is None:
             whole = barrier + self.problem.compliance_blocks
             floor = 1e-14 * np.trace(whole, axis1=1, axis2=2)  # a block that rounding has made singular

@@ -1,4 +1,4 @@
-"""The body system's own ladder: what solves its systems for the least expected cost."""
+"""The ladder of the body system: it solves each system in the way with the least expected cost."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ def fits(bodies: int, comm: MPI.Comm) -> bool:
 
 
 class BodyLadder(KrylovFamily):
-    """Conjugate gradients on the body system, preconditioned by what is expected to cost least: block Jacobi while it
-    takes few iterations, then Cholesky factors of its stiff part; a factor of an earlier matrix is kept as long as
-    iterating with it costs less than a new one. (Incomplete factors never pay: an iteration costs six times as much.)
-    Where the memory has no room for factors, block Jacobi goes on alone.
+    """Conjugate gradients on the body system, with the preconditioner of the least expected cost: block Jacobi while it
+    takes few iterations, then Cholesky factors of the stiff part. A factor of an earlier matrix is kept as long as
+    iterating with it costs less than a new factor. (Incomplete factors never pay: an iteration costs six times as
+    much.) Where the memory has no room for factors, block Jacobi goes on alone.
 
     The choice rests on iteration counts, fixed costs and that room, so that a repeated run repeats it.
     """
@@ -114,7 +114,7 @@ class BodyLadder(KrylovFamily):
     def _try(self, rung: str, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
         krylov = self._solver(rung)
         if self._fresh and not self._keep:
-            self._approximation = self._approximate(rung)
+            self._approximation = self.system.matrix if rung == "pbjacobi" else self.system.stiff_part()
         P = self._approximation
         done = krylov.solve(self.system.matrix, b, x, rtol, P, keep=self._keep)
         self._fresh = False
@@ -124,10 +124,6 @@ class BodyLadder(KrylovFamily):
             self._worst = done.iterations
             self._learn(rung, done.iterations)
         return done
-
-    def _approximate(self, rung: str) -> PETSc.Mat:
-        """The matrix that a rung's preconditioner is made from."""
-        return self.system.matrix if rung == "pbjacobi" else self.system.stiff_part()
 
     def _learn(self, rung: str, iterations: int) -> None:
         if rung == "cholesky":

@@ -103,7 +103,8 @@ class Comparison(KrylovFamily):
     def run(self, A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: Source = None) -> Solve:
         """All preconditioners on one system; x is of the first that converged, else of the best.
 
-        What the others take counts as the phase `compare`, not as `solve`: a run that compares nothing is spared it.
+        The seconds of the others count in the phase `compare`, not in `solve`: a run without comparison does not spend
+        them.
         """
         chosen: Solve | None = None
         kept = None

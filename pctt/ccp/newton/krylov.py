@@ -35,7 +35,7 @@ _NOT_SUPPORTED = 56  # PETSC_ERR_SUP: this method has no code for block formats
 @dataclass(frozen=True)
 class Solve:
     """One linear solve: ``true_residual`` is ||b - S x|| / ||b||, computed afterwards (1 after a breakdown), ``asked``
-    what it was to be."""
+    the tolerance."""
 
     converged: bool
     reason: str
@@ -101,7 +101,7 @@ class Krylov:
         P: Source = None,
         keep: bool = False,
     ) -> Solve:
-        """x = A^-1 b from zero. A set-up or solve that breaks down, on whichever rank, is reported, never raised.
+        """x = A^-1 b from zero. If a set-up or a solve breaks down on any rank, the result says so; nothing is raised.
 
         P : the Mat from which the preconditioner is made, or a function that makes it where A is one and the
             preconditioner reads entries; none: A
@@ -188,7 +188,7 @@ class Krylov:
         return context.report() if isinstance(context, PythonPC) else []
 
     def forget(self) -> None:
-        """The next matrix has another structure; a python preconditioner keeps what may serve that one too."""
+        """Prepare for a matrix of another structure. A python preconditioner keeps the data that may serve it too."""
         self.ksp.reset()
         self._version = None
         if self._formed is not None:
@@ -245,10 +245,10 @@ def _now(comm: MPI.Comm) -> float:
 
 
 def on_all_ranks(comm: MPI.Comm, work: Callable[[], None]) -> int:
-    """Do some work on all ranks: 0, or, alike on all of them, PETSc's error code where it failed on one or more.
+    """Do some work on all ranks. Returns 0, or on all ranks PETSc's error code if the work failed on one or more.
 
-    A rank that has failed alone cannot call back the others from a collective call of PETSc: where they do not come
-    within WAIT_FOR_OTHERS, it ends the run, with a word."""
+    A rank that fails alone cannot call the others back from a collective call of PETSc. If they do not arrive within
+    WAIT_FOR_OTHERS, it prints a message and ends the run."""
     code = np.zeros(1, int)
     words = ""
     try:

@@ -1,4 +1,4 @@
-"""What `Newton` asks of a form of its systems, and of what solves them."""
+"""The interfaces that `Newton` expects of a form of its systems and of their solvers."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class NewtonForm(Protocol):
         """Take another problem with the same contacts between the same bodies."""
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
-        """The matrix for the barrier blocks B (nc, 3, 3); ``inverse`` is (B + C)^-1 where the caller has it more
-        accurately, ``symmetric`` says whether that is."""
+        """Make the matrix for the barrier blocks B (nc, 3, 3), or from ``inverse`` = (B + C)^-1 if the caller has it
+        more accurately. ``symmetric`` says whether the blocks are."""
 
     def entries(self) -> PETSc.Mat:
         """The matrix, or its sparse part, as one that preconditioners can read; collective."""
 
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
-        """Of the unknowns; ``uncoupled`` is (B + C)^-1 q where the caller knows it better."""
+        """The right-hand side for the unknowns. ``uncoupled`` is (B + C)^-1 q, if the caller has it more accurately."""
 
     def impulses(self, x: Array, q: Array, uncoupled: Array | None = None) -> Array:
         """dg (nc, 3) of a solution."""
@@ -44,7 +44,8 @@ class NewtonForm(Protocol):
         """dv of a solution."""
 
     def tolerance(self, tol: float) -> float:
-        """The norm of this system's residual that leaves velocities as wrong as momenta (sqrt J) by ``tol``."""
+        """The norm of this system's residual at which the velocities are as wrong as by momenta of norm ``tol`` (sqrt
+        J)."""
 
     def destroy(self) -> None: ...
 
@@ -76,7 +77,7 @@ class LinearSolver(Protocol):
         """x = A^-1 b to a relative residual of rtol; whether that was reached."""
 
     def report(self) -> list[str]:
-        """What the preconditioner tells of itself, if it is one of the project's."""
+        """Lines about the preconditioner, if it is one of this package."""
 
     def forget(self) -> None:
         """The next matrix has another structure."""

@@ -20,7 +20,7 @@ LADDER = {
 
 
 class UsersSolver(KrylovFamily):
-    """The `LinearSolver` that is the KSP without prefix, as the options have it; what it does not solve goes down the
+    """A `LinearSolver` by the KSP without prefix, with the user's options. Systems that it does not solve go down the
     ladder.
 
     Attributes

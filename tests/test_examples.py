@@ -1,0 +1,150 @@
+"""Every file of docs/examples, run at a small size, and the page that shows them."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dem.experiment import from_file
+from dem.impulses import ImpulseMemory
+from dem.scene import Scene
+from dem.start import new_world
+from pctt.run.options import read_options
+from pctt.run.stepper import Stepper
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "docs" / "examples"
+PAGE = (ROOT / "docs" / "examples.md").read_text()
+STUDIES = str(ROOT / "run" / "studies")
+PICTURE_BYTES = 150_000
+
+
+@pytest.fixture(autouse=True)
+def imports(monkeypatch):
+    """The examples import each other, as files of one folder do."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    monkeypatch.syspath_prepend(STUDIES)
+
+
+def run(name: str, steps: int, **options: str) -> tuple[object, dict[str, np.ndarray]]:
+    """The scene of an example and the records of its first steps."""
+    words = {"scene": str(EXAMPLES / f"{name}.py"), "ccp_type": "apgd", **options}
+    given = read_options(words, MPI.COMM_SELF)
+    stepper = Stepper(given, new_world(given.scene.build(), MPI.COMM_SELF), ImpulseMemory(MPI.COMM_SELF))
+    rows = []
+    for _ in range(steps):
+        stepper.step()
+        rows.append(stepper.records())
+    return given.scene, {column: np.array([row[column] for row in rows]) for column in rows[0]}
+
+
+def test_the_page_shows_every_example_and_its_picture():
+    import pictures
+
+    listed = {path.stem for path in EXAMPLES.glob("*.py")} - {"problems", "comparison"}
+    assert set(re.findall(r"\]\(examples/(\w+)\.py\)", PAGE)) == listed
+    assert sorted(re.findall(r"\]\(examples/(\w+)\.png\)", PAGE)) == pictures.pictured()
+    for name in pictures.pictured():
+        assert (EXAMPLES / f"{name}.png").stat().st_size < PICTURE_BYTES
+
+
+def test_the_commands_in_the_heads_name_the_files_and_known_options():
+    import pictures
+
+    for name in pictures.STEPS:
+        *_, simulate, draw = pictures.commands(EXAMPLES / f"{name}.py")
+        words = dict(zip(simulate[2:], simulate[3:]))
+        assert simulate[:2] == ["-m", "pctt.run"]
+        assert words["-scene"] == f"docs/examples/{name}.py"
+        assert words["-output"] == name
+        assert draw[:3] == ["-m", "pctt.render", name]
+        assert pictures.STEPS[name] <= int(words["-steps"])
+        assert pictures.STEPS[name] % int(words["-output_every"]) == 0
+
+
+def test_a_sliding_box_and_a_rolling_sphere_have_the_textbooks_accelerations():
+    scene, records = run("incline", 10, ccp_tol="1e-8", ccp_coulomb="true")
+    found = scene.analyse(records)
+    assert found["sphere_acceleration [m/s^2]"] == pytest.approx(5 / 7 * 9.81 * np.sin(np.radians(25)), rel=1e-7)
+    assert abs(found["box_error [m/s^2]"]) < 1e-6
+    assert abs(found["sphere_error [m/s^2]"]) < 1e-6
+
+
+def test_a_slope_on_which_the_box_would_stick_is_refused():
+    with pytest.raises(ValueError, match=r"angle 10: its tangent must be between"):
+        from_file(EXAMPLES / "incline.py")(angle=10.0)
+
+
+def test_the_halves_of_the_drum_begin_apart():
+    _, records = run("drum", 3, scene_radius="0.03", scene_length="0.02", scene_settling_time="0")
+    assert 0.5 < records["separation"][-1] < 1.5
+    assert records["force_side_z [N]"].min() <= 0
+
+
+def test_the_hopper_keeps_its_grains_until_the_gate_opens():
+    scene, records = run("hopper", 40, scene_layers="2", scene_settling_time="0.08", scene_outlet="0.04")
+    out = records["discharged [kg]"]
+    assert (out[:18] == 0).all()
+    assert out[-1] > 0
+    assert (np.diff(out) >= 0).all()
+    assert set(scene.analyse(records)) <= {"flow [kg/s]", "flux [kg/(m^2 s)]"}
+
+
+def test_the_plough_feels_the_bed():
+    scene, records = run("blade", 20, scene_settling_time="0", scene_speed="1.0")
+    assert records["draft [N]"].max() > 0
+    assert scene.analyse(records)["mean_draft [N]"] > 0
+
+
+def test_the_bucket_is_a_scene_with_a_tool_from_a_file(tmp_path, monkeypatch):
+    pytest.importorskip("trimesh", reason="trimesh is not installed (extra `meshes`)")
+    monkeypatch.setattr(sys, "argv", ["bucket.py", str(tmp_path / "bucket.stl")])
+    exec(compile((EXAMPLES / "bucket.py").read_text(), "bucket.py", "exec"), {"__name__": "__main__"})
+    scene = from_file(EXAMPLES / "bucket.py")(file=str(tmp_path / "bucket.stl")).build()
+    assert isinstance(scene, Scene)
+    assert [body.name for body in scene.large_bodies] == ["tray", "bucket"]
+    _, records = run("bucket", 2, scene_file=str(tmp_path / "bucket.stl"))
+    assert records["lifted [kg]"].tolist() == [0.0, 0.0]
+
+
+def test_poisson(tmp_path, capsys):
+    iterations = importlib.import_module("poisson").main(16)
+    assert iterations["tensor train, rank 24"] < iterations["none"]
+    # the series for the middle of the square is 0.0737; the grid has no point there
+    assert "greatest u 0.07" in capsys.readouterr().out
+
+
+def test_elasticity_agrees_with_beam_theory(capsys):
+    importlib.import_module("elasticity").main(4)
+    said = re.findall(r"deflection of the end ([\d.]+)", capsys.readouterr().out)
+    assert len(set(said)) == 1  # all preconditioners lead to the same
+    assert float(said[0]) == pytest.approx(349.44, rel=0.1)
+
+
+def test_an_integral_equation():
+    iterations, residual = importlib.import_module("integral_equation").main(32)
+    assert iterations <= 10
+    assert residual < 1e-8
+
+
+@pytest.mark.parametrize("name", ["poisson", "elasticity", "integral_equation"])
+def test_pictures_of_solutions(name, tmp_path, monkeypatch):
+    matplotlib = pytest.importorskip("matplotlib", reason="matplotlib is not installed (extra `figures`)")
+    matplotlib.use("agg")
+    importlib.import_module(name).main(8, str(tmp_path / "picture.png"))
+    assert (tmp_path / "picture.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("name", ["fredholm", "gaussian_process", "lippmann_schwinger"])
+def test_comparisons_on_small_grids(name, capsys):
+    importlib.import_module("comparison").compare(getattr(importlib.import_module("problems"), name)(8), eps=1e-6)
+    said = capsys.readouterr().out
+    assert "CG + train, FFT products" in said
+    assert "dense Cholesky" in said
+    assert "compare(" in (EXAMPLES / f"{name}.py").read_text()
