@@ -8,12 +8,13 @@ from petsc4py import PETSc
 
 from pctt.mat.tensor_train import CompressedEntries, compressed
 from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
-from pctt.pc.positivity import finds_negative, has_inertia_of
+from pctt.pc.positivity import CERTAIN, finds_negative, has_inertia_of
 from pctt.pc.train_options import Account, Options
 from pctt.tt.lowest import lowest
 from pctt.tt.train import identity
 
 SINGLE = 1e-5  # eps from which products of the inverse are made in single precision
+WORTH = 0.25  # of eps: the least that is asked for to have a certificate
 TIGHTER, TRIES = 0.05, 4  # eps is lowered where the train of the matrix or of its inverse is not positive
 
 
@@ -61,6 +62,9 @@ class EntriesTrain:
         T = self.compressed.train
         if lowest(identity(T.rows) + T) <= 0:
             return None
+        certain = CERTAIN / T.norm()
+        if WORTH * eps <= certain:  # with a little more accuracy, no trial has to say that the inverse is positive
+            eps = min(eps, certain)
         rng = np.random.default_rng(self.options.seed)
         return approximate_inverse(self.compressed.found, rank, eps, True, None, rng)
 
