@@ -16,18 +16,19 @@ NOTHING = 1e-24  # part of a square that is rounding
 
 
 def has_inertia_of(residual: float) -> bool:
-    """Whether ||I - S X||_F = `residual` < 1 for symmetric S and X, with room for an estimate: then X has as many negative
-    eigenvalues as S. (On the way from S^-1 to X, S^-1 - t (S^-1 - X) = S^-1 (I - t (I - S X)) is never singular.)"""
+    """Whether ||I - S X||_F = `residual` < 1 for symmetric S and X, with room for an estimate: then X has as many
+    negative eigenvalues as S. (On the way from S^-1 to X, S^-1 - t (S^-1 - X) = S^-1 (I - t (I - S X)) is never
+    singular.)"""
     return residual < CERTAIN
 
 
 def finds_negative(X: Product, A: Product, size: int, comm: MPI.Comm, steps: int = STEPS) -> bool:
     """Whether a few steps of Lanczos' method find a direction y with y'X y <= 0.
 
-    The method is that for X A, self-adjoint in the inner product of A whatever the signs of X: the Ritz values, of which
-    one is negative if and only if a pivot of their tridiagonal matrix is, are those of X on the images A v. Where X is
-    near A^-1, all eigenvalues but the wrong ones are near one, so that these are found at once. A that is not positive
-    itself counts as found; collective.
+    The method is that for X A, self-adjoint in the inner product of A whatever the signs of X. A pivot of its
+    tridiagonal matrix is negative if and only if a Ritz value is, and then y = A v has y'X y < 0 for the Ritz vector v.
+    Where X is near A^-1, all eigenvalues but the wrong ones are near one, so that these are found at once. A that is not
+    positive itself counts as found; collective.
 
     X, A : symmetric; this rank's part of a product from its part (`size`,) of a vector
     """

@@ -8,7 +8,7 @@ stays in the cache, each as a batch of small matrix products
 
 in which nothing is transposed. Two work arrays are reused. A core of mode m between ranks r and r' costs 2 n r m r'
 operations, nearly all of them in large matrix products. Where ranks bulge between two cores, one core for both modes
-costs less: cores are merged so that the sum is least (`cheapest_groups`). In single precision it takes half the seconds.
+costs less: cores are merged so that the sum is least (`cheapest_groups`). Single precision takes half the seconds.
 
 On several ranks each owns a range of rows and computes only these: its share of the boxes i_1, wholly local.
 It needs all of x, because every box of a train couples with every other; n numbers gathered once are the
@@ -136,7 +136,7 @@ def cheapest_groups(modes: Sequence[int], ranks: Sequence[int]) -> list[int]:
     d = len(modes)
     best: list[tuple[float, list[int]]] = [(0.0, [])] * (d + 1)  # of the cores from k on
     for k in range(d - 1, -1, -1):
-        stops = range(k + 1, k + 1 + leading(modes[k:], MOST))
+        stops = list(range(k + 1, k + 1 + leading(modes[k:], MOST)))
         if k == 0:
             stops = [stop for stop in stops if prod(modes[:stop]) >= FIRST] or stops[-1:]
         best[k] = min(

@@ -62,8 +62,8 @@ def test_near_inverses_have_the_inertia_of_the_matrix():
 
 @pytest.mark.parametrize("max_rank", [6, 10, 20])
 def test_no_train_of_a_poisson_matrix_breaks_the_solve(max_rank):
-    """Inverses of rank 20 of this matrix that were not positive passed as such, by the arithmetic of some processors and
-    by the seeds 1 and 2 of others."""
+    """Inverses of rank 20 of this matrix that were not positive passed as such, by the arithmetic of some processors,
+    and by the seeds 1 and 2 of others."""
     for seed in range(3):
         ksp = solver(poisson(64), rank="fixed", max_rank=max_rank, seed=seed)
         ksp.setUp()
