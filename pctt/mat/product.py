@@ -17,7 +17,7 @@ LONG = 1_000_000  # rows from which a vector that is gathered on each of several
 class TrainProduct:
     """y = T x for the rows of this rank, from those of x.
 
-    train : matrix train of the modes of `digits`
+    train : matrix train of the modes of `digits`; where it is of single precision, products are, to about 1e-6
     counts : rows of each rank
     order : row at each point of the grid, or None
 
@@ -51,14 +51,17 @@ class TrainProduct:
         self.product = np.empty(digits.size)
         self.apply = Apply(train, digits.size, bounds)
 
-    def set_train(self, train: Train) -> None:
-        self.apply.set_train(train)
-
     def __call__(self, x: Array) -> Array:
         """Valid until the next call."""
         if self.comm.size > 1:
             self.comm.Allgatherv(np.ascontiguousarray(x), [self.whole, self.counts])
             x = self.whole
+        if self.apply.dtype == float:
+            return self._times(x)
+        largest = float(np.abs(x).max(initial=0.0)) or 1.0  # single precision ends at 1e38
+        return np.multiply(largest, self._times(x / largest), dtype=float)
+
+    def _times(self, x: Array) -> Array:
         if self.same:
             self.apply.x[:] = x
             return self.apply.product()

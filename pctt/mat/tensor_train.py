@@ -21,6 +21,7 @@ from pctt.tt.entries import EntryMatrix
 from pctt.tt.train import Array, Train
 
 MAX_RANK = 200
+ROUNDING = 0.1  # of a symmetric part, over eps
 
 
 class CompressedEntries:
@@ -45,6 +46,9 @@ class CompressedEntries:
         known = start.found if start is not None and start.digits.modes == self.digits.modes else None
         self.found: Cross = compress_cross(matrix, max_rank, eps, known, rng=np.random.default_rng(seed))
         self.symmetric = is_symmetric(self.entries, self.digits.rows)
+        if self.symmetric:
+            train = comm.bcast(self.train.symmetric_part(ROUNDING * eps))
+            self.found = replace(self.found, train=train)
 
     def rounded(self, eps: float, max_rank: int) -> CompressedEntries:
         """The same of lower rank and accuracy, without looking at an entry."""

@@ -12,7 +12,6 @@ import numpy as np
 from pctt.tt.als import Compression
 from pctt.tt.cross import Cross
 from pctt.tt.inverse import invert, invert_near_identity
-from pctt.tt.lowest import lowest
 from pctt.tt.train import Train
 
 
@@ -23,6 +22,7 @@ class ApproximateInverse:
     residual : of the inverse of the train of the matrix, see `pctt.tt.Inverse`
     of : the compression that was inverted
     cap : of the ranks
+    repaired : equations on the way that showed a matrix that is not positive
     """
 
     train: Train
@@ -30,6 +30,7 @@ class ApproximateInverse:
     of: Compression | Cross
     cap: int
     identity: bool = False
+    repaired: int = 0
 
 
 def approximate_inverse(
@@ -39,11 +40,11 @@ def approximate_inverse(
     near_identity: bool,
     start: Train | None = None,
     rng: np.random.Generator | None = None,
-) -> tuple[ApproximateInverse, bool]:
-    """X or I + Z, from a start if there is one, and whether no direction was found in which it is negative."""
+) -> ApproximateInverse:
+    """X or I + Z, from a start if there is one; symmetric, but it need not be positive."""
     if not near_identity:
         found = invert(of.train, cap, start, eps=eps, rng=rng)
-        return ApproximateInverse(found.train, found.residual, of, cap), lowest(found.train) > 0
+        return ApproximateInverse(found.train, found.residual, of, cap, False, found.repaired)
     found = invert_near_identity(of.train, cap, start, eps=eps, rng=rng)
     assert found.correction is not None
-    return ApproximateInverse(found.correction, found.residual, of, cap, identity=True), lowest(found.train) > 0
+    return ApproximateInverse(found.correction, found.residual, of, cap, True, found.repaired)

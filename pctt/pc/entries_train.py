@@ -6,13 +6,15 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.mat.product import TrainProduct
 from pctt.mat.tensor_train import CompressedEntries, compressed
 from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
+from pctt.pc.positivity import CERTAIN, finds_negative, has_inertia_of
 from pctt.pc.train_options import Account, Options
 from pctt.tt.lowest import lowest
 from pctt.tt.train import identity
 
+SINGLE = 1e-5  # eps from which products of the inverse are made in single precision
+WORTH = 0.25  # of eps: the least that is asked for to have a certificate
 TIGHTER, TRIES = 0.05, 4  # eps is lowered where the train of the matrix or of its inverse is not positive
 
 
@@ -40,10 +42,9 @@ class EntriesTrain:
             self.account.reused += warm
             with PETSc.Log.Event("TTInvert"):
                 # every rank inverts the same train; a last bit of difference must not part their ways
-                self.inverse, positive = self.comm.bcast(self._invert(rank, eps))
-            if positive:
-                self._product = self._prepare()
-                return True
+                self.inverse = self.comm.bcast(self._invert(rank, eps))
+                if self.inverse is not None and self._is_positive(self.inverse):
+                    return True
             if self.inverse is not None and self.inverse.residual > eps:
                 break  # the rank does not reach this accuracy, let alone a higher one
         return self._refuse(f"the inverse of rank {rank} is not positive")
@@ -55,18 +56,28 @@ class EntriesTrain:
         name = f"-{self.prefix}pc_tt_order"
         return CompressedEntries(P, eps, rank, self.options.order, name, start, self.options.seed)
 
-    def _invert(self, rank: int, eps: float) -> tuple[ApproximateInverse | None, bool]:
+    def _invert(self, rank: int, eps: float) -> ApproximateInverse | None:
+        """None where the train of the matrix is found not to be positive."""
         assert self.compressed is not None
         T = self.compressed.train
         if lowest(identity(T.rows) + T) <= 0:
-            return None, False
+            return None
+        certain = CERTAIN / T.norm()
+        if WORTH * eps <= certain:  # with a little more accuracy, no trial has to say that the inverse is positive
+            eps = min(eps, certain)
         rng = np.random.default_rng(self.options.seed)
         return approximate_inverse(self.compressed.found, rank, eps, True, None, rng)
 
-    def _prepare(self) -> TrainProduct:
+    def _is_positive(self, inverse: ApproximateInverse) -> bool:
+        """Use I + Z, and whether it is positive: as its matrix is, if near enough to the inverse, or on trial."""
         assert self.compressed is not None
-        assert self.inverse is not None
-        return self.compressed.product(self.inverse.train)
+        Z, T = inverse.train, self.compressed.train
+        self._product = self.compressed.product(Z.astype(np.float32) if self.options.eps >= SINGLE else Z)
+        if inverse.repaired == 0 and self.comm.bcast(has_inertia_of(inverse.residual * T.norm())):
+            return True
+        product = self.compressed.product(T)
+        count = int(self.compressed.counts[self.comm.rank])
+        return not finds_negative(lambda x: x + self._product(x), lambda x: x + product(x), count, self.comm)
 
     def _refuse(self, why: str) -> bool:
         self.account.fallbacks.append(why)

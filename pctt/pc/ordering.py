@@ -7,8 +7,8 @@ from petsc4py import PETSc
 
 from pctt.mat.order import grid_of
 from pctt.morton import morton_codes
-from pctt.tt.apply import group_modes
 from pctt.tt.grid import GridDigits
+from pctt.tt.quantise import group_modes
 
 ENDS = 16  # slots in the first and last mode of a grid, at most
 

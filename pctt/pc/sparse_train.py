@@ -13,6 +13,7 @@ from petsc4py import PETSc
 
 from pctt.options import OptionError
 from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
+from pctt.pc.positivity import finds_negative
 from pctt.pc.refresh_schedule import RefreshSchedule
 from pctt.pc.slots import Slots, capacity
 from pctt.pc.slotted import SlottedMatrix
@@ -99,14 +100,13 @@ class SparseTrain:
             self.compression = self._compress(rank, warm)
         with PETSc.Log.Event("TTInvert"):
             # every rank inverts the same train; a last bit of difference must not part their ways
-            new, positive = self.comm.bcast(self._invert(rank, warm))
+            new = self.comm.bcast(self._invert(rank, warm))
+            self._use(new)
+            positive = self._is_positive(P)
         self.account.reused += warm
         if kept is None:
-            if not positive:
-                return self._refuse(f"the inverse of rank {rank} is not positive")
             self._schedule = RefreshSchedule()
-            self._use(new)
-            return True
+            return positive or self._refuse(f"the inverse of rank {rank} is not positive")
         left = []
         for inverse in (kept, new):
             self._use(inverse)
@@ -119,6 +119,22 @@ class SparseTrain:
     def _use(self, inverse: ApproximateInverse) -> None:
         self.inverse = inverse
         self._prepare_apply(inverse.train)
+
+    def _is_positive(self, P: PETSc.Mat) -> bool:
+        """Whether the train in use is, as far as a trial with the symmetric part of P finds."""
+        x, y = P.createVecs()
+
+        def times(v: np.ndarray) -> np.ndarray:
+            x.array_w[:] = v
+            P.mult(x, y)
+            product = y.array_r.copy()
+            P.multTranspose(x, y)
+            return 0.5 * (product + y.array_r)
+
+        found = finds_negative(self.times, times, x.getLocalSize(), self.comm)
+        x.destroy()
+        y.destroy()
+        return not found
 
     def _left(self, P: PETSc.Mat) -> float:
         """||w - S X w|| / ||w|| of a random vector w, S the scaled matrix."""
@@ -163,8 +179,7 @@ class SparseTrain:
         train = self.compression.train if warm and self.compression is not None else None
         return compress(self.hierarchy, rank, options.eps, train, rng=rng)
 
-    def _invert(self, rank: int, warm: bool) -> tuple[ApproximateInverse, bool]:
-        """The inverse and whether no direction was found in which it is negative."""
+    def _invert(self, rank: int, warm: bool) -> ApproximateInverse:
         assert self.compression is not None
         options, rng = self.options, np.random.default_rng(self.options.seed)
         start = self.inverse.train if warm and self.inverse is not None else None

@@ -26,7 +26,7 @@ from pctt.tt.train import Array, Train, low_rank, matrix_train, zeros
 
 SAMPLES = 1024  # stored entries, and as many others, on which a train is validated
 EXTRA = 32  # of the stored entries where the train is worst: what enriches the next sweep, at most
-TIGHTER = 0.5  # what the accuracy of the single cores is multiplied by where a sweep has missed eps
+TIGHTER = 0.1  # what the accuracy of the single cores is multiplied by where a sweep has missed eps
 WORTH = 0.9  # a sweep that leaves more than this of the error was idle
 
 

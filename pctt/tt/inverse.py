@@ -31,7 +31,8 @@ IDLE = 0.8  # a sweep that leaves more than this of the residual is the last, or
 ENOUGH = 0.5  # part of eps at which the residual, estimated on the way, is worth measuring
 DROP = 0.1  # of that residual: what a core may leave out of the inverse
 NOISE = 1e-7  # part of the residual that is taken for rounding
-ROUNDINGS = 8  # trials of a rounding that the residual allows, each three times as exact as the last
+COARSEST, FINER, STEPS = 4.0, 0.84, 32  # tolerances of a rounding, over eps: the first, its fall in a step, the most
+LEAP = 8  # steps that are left out at first
 SKETCH = 64  # rank of the random train with which a residual of high rank is estimated
 HIGH = 300  # product of ranks of S and X from which that is done
 
@@ -252,15 +253,29 @@ def _solve(
 
 
 def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Train, float]:
-    """X of the least ranks that a few trials find to leave the residual below eps, and the residual."""
-    for tries in range(ROUNDINGS):
-        smaller = X.round(eps / 3**tries)
-        if smaller.ranks == X.ranks:
-            break
-        found = residual(S, smaller, B)
-        if found <= eps:
-            return smaller, found
-    return X, left
+    """X of the least ranks that a few trials find to leave the residual below eps, and the residual: tolerances of the
+    rounding fall in leaps until one is fine enough, then the steps of the last leap are bisected."""
+
+    def trial(step: int) -> tuple[Train, float]:
+        smaller = X.round(COARSEST * FINER**step * eps)
+        return smaller, residual(S, smaller, B)
+
+    step = 0
+    best = trial(step)
+    while best[1] > eps:
+        step += LEAP
+        if step > STEPS:
+            return X, left
+        best = trial(step)
+    good, bad = step, step - LEAP
+    while step and good - bad > 1:
+        middle = (good + bad) // 2
+        found = trial(middle)
+        if found[1] <= eps:
+            best, good = found, middle
+        else:
+            bad = middle
+    return best
 
 
 def _transpose(x: Array, left: Array, right: Array) -> Array:

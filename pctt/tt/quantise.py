@@ -75,6 +75,31 @@ def linear(multi: Array, modes: Sequence[int]) -> Array:
     return np.ravel_multi_index(tuple(multi), tuple(modes))
 
 
+def group_modes(modes: Sequence[int], ends: int = 64, middle: int = 4) -> list[int]:
+    """How many neighbouring modes to merge: up to `ends` at both ends, up to `middle` between.
+
+    >>> group_modes([2] * 16)
+    [6, 2, 2, 6]
+    """
+    modes = list(modes)
+    head = leading(modes, ends)
+    tail = leading(modes[:head - 1 if head else None:-1], ends) if head < len(modes) else 0
+    groups, k = [head], head
+    while k < len(modes) - tail:
+        groups.append(leading(modes[k : len(modes) - tail], middle))
+        k += groups[-1]
+    return groups + ([tail] if tail else [])
+
+
+def leading(modes: Sequence[int], limit: int) -> int:
+    """How many of the leading modes have a product of at most `limit`; at least one."""
+    count, size = 1, modes[0]
+    while count < len(modes) and size * modes[count] <= limit:
+        size *= modes[count]
+        count += 1
+    return count
+
+
 def merge(train: Train, groups: Sequence[int]) -> Train:
     """The same train with neighbouring modes merged: groups[k] cores become core k.
 

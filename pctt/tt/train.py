@@ -206,6 +206,10 @@ class Train:
         """Transpose of a matrix."""
         return Train([core.transpose(0, 2, 1, 3) for core in self._matrix().cores])
 
+    def symmetric_part(self, eps: float) -> Train:
+        """(T + T') / 2 of a square matrix, rounded to eps: no further from a symmetric matrix than T."""
+        return (0.5 * (self + self.T)).round(eps)
+
     def astype(self, dtype: DTypeLike) -> Train:
         return Train([core.astype(dtype) for core in self.cores])
 

@@ -253,10 +253,10 @@ def test_all_ranks_have_the_inverse_of_one_also_where_they_round_otherwise(monke
     invert = sparse_train.approximate_inverse
 
     def rounded(*arguments):
-        found, positive = invert(*arguments)
+        found = invert(*arguments)
         for core in found.train.cores:
             core *= 1 + 1e-7 * comm.rank
-        return found, positive
+        return found
 
     monkeypatch.setattr(sparse_train, "approximate_inverse", rounded)
     ksp = solver(poisson(16), rank="fixed", max_rank=6)
