@@ -20,9 +20,9 @@ def arguments() -> argparse.Namespace:
         "figures of a run: its steps, the columns of records.csv, the compared preconditioners, and, for one recorded"
         " step, the sparsity of the Newton matrix and the graphs of bodies and contacts",
     )
-    line.add_argument("-step", type=int, help="recorded step of sparsity and graphs; none: the last with contacts")
+    line.add_argument("-step", type=int, help="recorded step of sparsity and graphs; without: the last with contacts")
     line.add_argument("-format", choices=FORMATS, default="png", help="kind of file")
-    line.add_argument("-output", metavar="DIR", help="where to write; none: figures/ in the folder")
+    line.add_argument("-output", metavar="DIR", help="folder to write to; without: figures/ in the output folder")
     return line.parse_args()
 
 

@@ -27,19 +27,19 @@ COLOURS: dict[str, tuple[str, str, tuple[float, float]]] = {
 def arguments() -> argparse.Namespace:
     line = parser("render", (__doc__ or "").partition(": ")[2])
     add_steps(line)
-    line.add_argument("-color", choices=COLOURS, default="speed", help="what the colour of a grain tells")
+    line.add_argument("-color", choices=COLOURS, default="speed", help="the quantity that colours the grains")
     line.add_argument(
-        "-range", type=float, nargs=2, metavar=("LOW", "HIGH"), help="ends of the colour bar; none: from the data"
+        "-range", type=float, nargs=2, metavar=("LOW", "HIGH"), help="ends of the colour bar; without: from the data"
     )
-    line.add_argument("-azimuth", type=float, default=-60.0, help="camera about the vertical, from x [degrees]")
+    line.add_argument("-azimuth", type=float, default=-60.0, help="camera around the vertical, from x [degrees]")
     line.add_argument("-elevation", type=float, default=25.0, help="camera above the horizon, below 90 [degrees]")
-    line.add_argument("-zoom", type=positive(float), default=1.0, help="1: the whole scene")
-    line.add_argument("-size", type=_size, default="1280x960", metavar="WxH", help="of a picture [pixels]")
-    line.add_argument("-opacity", type=float, default=1.0, help="of paddles, blades and other large bodies, 0 to 1")
+    line.add_argument("-zoom", type=positive(float), default=1.0, help="1 shows the whole scene")
+    line.add_argument("-size", type=_size, default="1280x960", metavar="WxH", help="size of a picture [pixels]")
+    line.add_argument("-opacity", type=float, default=1.0, help="opacity of large bodies such as blades, 0 to 1")
     line.add_argument("-cut", action="store_true", help="leave out the grains in the half nearer to the camera")
     line.add_argument("-film", choices=FILMS, default="mp4", help="film of the pictures, if there are several")
     line.add_argument("-fps", type=positive(float), default=20.0, help="pictures of the film per second")
-    line.add_argument("-output", metavar="DIR", help="where to write; none: pictures/ in the folder")
+    line.add_argument("-output", metavar="DIR", help="folder to write to; without: pictures/ in the output folder")
     given = line.parse_args()
     if not -90 < given.elevation < 90:
         line.error(f"argument -elevation: {given.elevation:g}: allowed is a number between -90 and 90")

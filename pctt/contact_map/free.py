@@ -135,7 +135,7 @@ class FreeMap:
         PETSc.Log.logFlops(self._flops["through"])
 
     def _enter(self, scale: Array | None, v: Array) -> None:
-        """Store R v (v if there is no R) for the own bodies, and begin to send it to the ranks that have them as ghosts.
+        """Store R v, or v if there is no R, for the own bodies, and begin to send it to the ranks with ghosts of them.
 
         The caller must call `end_update` later.
         """

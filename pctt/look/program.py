@@ -14,7 +14,7 @@ from pctt import disk
 from pctt.look.folder import FolderError
 
 LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")
-EXTRA = "the libraries that draw are the extra `pictures`: pip install -e '.[pictures]' in the project's folder"
+EXTRA = "the extra `pictures` has the libraries that draw: pip install -e '.[pictures]' in the project's folder"
 
 
 def parser(program: str, text: str) -> argparse.ArgumentParser:
