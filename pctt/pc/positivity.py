@@ -27,8 +27,8 @@ def finds_negative(X: Product, A: Product, size: int, comm: MPI.Comm, steps: int
 
     The method is that for X A, self-adjoint in the inner product of A whatever the signs of X. A pivot of its
     tridiagonal matrix is negative if and only if a Ritz value is, and then y = A v has y'X y < 0 for the Ritz vector v.
-    Where X is near A^-1, all eigenvalues but the wrong ones are near one, so that these are found at once. A that is not
-    positive itself counts as found; collective.
+    Where X is near A^-1, all eigenvalues but the wrong ones are near one, so that these are found at once. A that is
+    not positive itself counts as found; collective.
 
     X, A : symmetric; this rank's part of a product from its part (`size`,) of a vector
     """
