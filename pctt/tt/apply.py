@@ -130,8 +130,8 @@ def cheapest_groups(modes: Sequence[int], ranks: Sequence[int]) -> list[int]:
 
     >>> cheapest_groups([2] * 12, [1, 4, 8, 8, 8, 4, 4, 4, 8, 8, 8, 4, 1])
     [6, 6]
-    >>> cheapest_groups([2] * 12, [1, 4, 16, 32, 32, 32, 32, 32, 32, 32, 16, 4, 1])
-    [5, 2, 2, 3]
+    >>> cheapest_groups([2] * 18, [1, 4, *[16] * 15, 4, 1])
+    [6, 2, 2, 2, 6]
     """
     d = len(modes)
     best: list[tuple[float, list[int]]] = [(0.0, [])] * (d + 1)  # of the cores from k on

@@ -204,6 +204,30 @@ def test_an_indefinite_matrix_is_not_given_to_cg():
     np.testing.assert_allclose(y.array, 1 / np.diag(dense()))
 
 
+@pytest.mark.parallel(1, 2)
+def test_the_inverse_multiplies_numbers_of_any_size():
+    """Its products are in single precision, which ends at 1e38."""
+    mat = shell(grid=GRID)
+    ksp, _ = solve(mat)
+    assert ksp.pc.getPythonContext().made._product.apply.dtype == np.float32
+    x, y = mat.createVecs()
+    first, last = x.getOwnershipRange()
+    v = np.random.default_rng(0).standard_normal(108)
+    expected = np.linalg.solve(dense(), v)[first:last]
+    for size in (1.0, 1e-60, 1e60):
+        x.array[:] = size * v[first:last]
+        ksp.pc.apply(x, y)
+        np.testing.assert_allclose(y.array / size, expected, atol=0.05)
+    x.set(0.0)
+    ksp.pc.apply(x, y)
+    assert not y.array.any()
+
+
+def test_trains_of_symmetric_matrices_are_symmetric():
+    train = from_entries(kernel, GRID, 1e-3).getPythonContext().compressed.train
+    assert (train - train.T).norm() < 1e-12 * train.norm()
+
+
 def test_new_values_make_a_new_train():
     scale = 1.0
     mat = shell(lambda i, j: scale * kernel(i, j), grid=GRID)
