@@ -33,7 +33,7 @@ FORMATS = ("vtp", "vtkhdf")
 def arguments() -> argparse.Namespace:
     line = parser("export", "the recorded steps of a run as time series for ParaView (.pvd of .vtp files)")
     add_steps(line)
-    line.add_argument("-format", choices=FORMATS, default="vtp", help="a .vtp file per step, or one .vtkhdf of all steps")
+    line.add_argument("-format", choices=FORMATS, default="vtp", help="a .vtp file per step, or one .vtkhdf for all")
     target = line.add_mutually_exclusive_group()
     target.add_argument("-output", metavar="DIR", help="folder to write to; without: paraview/ in the output folder")
     target.add_argument("-single", metavar="FILE.h5", help="write one HDF5 file like state.h5 instead, with all data")
