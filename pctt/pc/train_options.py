@@ -1,4 +1,4 @@
-"""Options and account of ``pctt.pc.TensorTrain``."""
+"""Options of ``pctt.pc.TensorTrain``, and the account of what it did."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Optional
 
 from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, option
 
-SPARSE_RANK, ENTRIES_RANK = 10, 100  # the cap where none is given
+SPARSE_RANK, ENTRIES_RANK = 10, 100  # default caps
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options ``-pc_tt_*``, behind the prefix of the PC."""
+    """Options ``-pc_tt_*``, after the prefix of the PC."""
 
     eps: float = option(
         1e-2, "relative Frobenius error at which a compression ends, and residual at which an inverse does",
@@ -58,7 +58,7 @@ class Options:
 
 @dataclass
 class Account:
-    """What the preconditioner did so far, for ``-ksp_view`` and the run's summary."""
+    """What the preconditioner has done so far, for ``-ksp_view`` and the summary of the run."""
 
     setups: int = 0
     reused: int = 0
