@@ -47,7 +47,7 @@ def run(name: str, steps: int, **options: str) -> tuple[object, dict[str, np.nda
 def test_the_page_shows_every_example_and_its_picture():
     import pictures
 
-    listed = {path.stem for path in EXAMPLES.glob("*.py")} - {"problems", "comparison"}
+    listed = {path.stem for path in EXAMPLES.glob("*.py")} - {"integral_problems", "comparison"}
     assert set(re.findall(r"\]\(examples/(\w+)\.py\)", PAGE)) == listed
     assert sorted(re.findall(r"\]\(examples/(\w+)\.png\)", PAGE)) == pictures.pictured()
     for name in pictures.pictured():
@@ -143,7 +143,8 @@ def test_pictures_of_solutions(name, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["fredholm", "gaussian_process", "lippmann_schwinger"])
 def test_comparisons_on_small_grids(name, capsys):
-    importlib.import_module("comparison").compare(getattr(importlib.import_module("problems"), name)(8), eps=1e-6)
+    problem = getattr(importlib.import_module("integral_problems"), name)
+    importlib.import_module("comparison").compare(problem(8), eps=1e-6)
     said = capsys.readouterr().out
     assert "CG + train, FFT products" in said
     assert "dense Cholesky" in said

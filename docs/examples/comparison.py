@@ -14,8 +14,8 @@ import petsc4py
 from scipy import linalg
 
 petsc4py.init(sys.argv)
+from integral_problems import Problem
 from petsc4py import PETSc
-from problems import Problem
 
 from pctt.mat import from_entries
 

@@ -2,7 +2,7 @@
 win: .venv/bin/python docs/examples/gaussian_process.py"""
 
 from comparison import compare
-from problems import gaussian_process
+from integral_problems import gaussian_process
 
 if __name__ == "__main__":
     for width in (0.01, 0.02, 0.1):

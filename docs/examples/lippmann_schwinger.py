@@ -2,7 +2,7 @@
 .venv/bin/python docs/examples/lippmann_schwinger.py"""
 
 from comparison import compare
-from problems import lippmann_schwinger
+from integral_problems import lippmann_schwinger
 
 if __name__ == "__main__":
     compare(lippmann_schwinger(64), eps=1e-5)

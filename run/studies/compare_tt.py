@@ -22,7 +22,7 @@ import torchtt
 from pctt import tt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
-from problems import fredholm, potential
+from integral_problems import fredholm, potential
 
 torch.set_num_threads(1)
 

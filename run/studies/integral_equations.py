@@ -16,7 +16,7 @@ from measure import figure, record, say_machine
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
 from comparison import cg, cholesky, operator, seconds
-from problems import Problem, fredholm, potential
+from integral_problems import Problem, fredholm, potential
 
 from pctt import tt
 

@@ -251,7 +251,7 @@ def test_the_example_of_the_documentation_runs():
 
 def test_the_examples_multiply_with_their_entries():
     """Products by FFT are those of the entries, and a train solves each with few iterations."""
-    path = Path(__file__).resolve().parents[2] / "docs" / "examples" / "problems.py"
+    path = Path(__file__).resolve().parents[2] / "docs" / "examples" / "integral_problems.py"
     spec = importlib.util.spec_from_file_location("examples_problems", path)
     assert spec is not None
     assert spec.loader is not None
