@@ -40,14 +40,15 @@ class Options:
     """Options ``-pc_body_*``, after the prefix of the PC. The inner KSP has the additional prefix ``body_``."""
 
     rtol: float = option(
-        0.0, "residual of S to which K is solved, relative; 0: half the tolerance of the KSP", check=NOT_NEGATIVE
+        0.0, "relative residual of S at which the solve with K stops; 0: half the tolerance of the KSP",
+        check=NOT_NEGATIVE,
     )
     shift: float = option(
-        0.03, "part by which the diagonal blocks are enlarged in the matrix that is factorised", check=NOT_NEGATIVE
+        0.03, "the diagonal blocks of the factorised matrix are enlarged by this part", check=NOT_NEGATIVE
     )
     least: float = option(
         0.1,
-        "blocks of K with no entry above this part of the mass are left out of the matrix that is factorised",
+        "the factorised matrix lacks the blocks of K that have no entry above this part of the mass",
         check=NOT_NEGATIVE,
     )
 

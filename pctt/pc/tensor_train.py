@@ -25,7 +25,7 @@ from pctt.pc.second_solve import solve_again
 from pctt.pc.sparse_train import SparseTrain
 from pctt.pc.train_options import ENTRIES_RANK, SPARSE_RANK, Account, Options
 
-NOT_SYMMETRIC = "the matrix is not symmetric, and a train for its inverse may not be of use"
+NOT_SYMMETRIC = "the matrix is not symmetric, so a train for its inverse may be useless"
 LOWER = 3  # if the cap fails or does not pay, the policy tries the cap divided by this
 POOR = 0.5  # an inverse with a larger residual causes a warning
 
