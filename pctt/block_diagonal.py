@@ -38,8 +38,10 @@ def block_diagonal(P: PETSc.Mat, blocks: np.ndarray | None = None) -> PETSc.Mat:
 
 
 def without_memory(P: PETSc.Mat, kind: str) -> PETSc.Mat | None:
-    """A new Mat to make a preconditioner of this type from, instead of P, for which PETSc may remember old diagonal
-    blocks. None if P itself can be used. The caller destroys the Mat."""
+    """A new Mat for a preconditioner of this type, because PETSc may remember old diagonal blocks of P.
+
+    None if the preconditioner can use P itself. The caller destroys the Mat.
+    """
     if kind == "pbjacobi":
         return block_diagonal(P)
     return _copy(P) if kind == "sor" and P.getType() == "seqbaij" else None

@@ -107,7 +107,7 @@ def cylinder() -> vtkPolyData:
 def finite(folder: Folder, frame: Frame, row: int, box: np.ndarray | None = None) -> vtkPolyData:
     """The surface of the large body `row` without its planes.
 
-    With a box (2, 3), it also lacks the walls beside the box, and the surface of a `shell` is empty.
+    With a box (2, 3), the surface also lacks the walls beside the box. For a `shell` it is empty then.
     """
     place, turn = _pose(folder, frame, row)
     parts: list[vtkPolyData] = []

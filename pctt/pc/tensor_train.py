@@ -107,7 +107,7 @@ class TensorTrain(PythonPC):
             PETSc.Sys.Print(f"  {self.name}: {self._line()}", comm=P.comm)
 
     def _judge_entries(self, made: EntriesTrain) -> None:
-        """Say what a user should know of a matrix whose train was not chosen by measured gain."""
+        """Warn about a bad or missing train of a matrix, if measured gains have not chosen the train."""
         if made.compressed is not None and self.symmetric != made.compressed.symmetric:
             self._say_symmetry(made.compressed.symmetric)
         word = ""
