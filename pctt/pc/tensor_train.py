@@ -107,7 +107,7 @@ class TensorTrain(PythonPC):
             PETSc.Sys.Print(f"  {self.name}: {self._line()}", comm=P.comm)
 
     def _judge_entries(self, made: EntriesTrain) -> None:
-        """Warn about a bad or missing train of a matrix, if measured gains have not chosen the train."""
+        """Warn if the train of a matrix given by its entries is bad or missing, or if the matrix is not symmetric."""
         if made.compressed is not None and self.symmetric != made.compressed.symmetric:
             self._say_symmetry(made.compressed.symmetric)
         word = ""
