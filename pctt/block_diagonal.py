@@ -1,8 +1,8 @@
-"""The diagonal blocks of a Mat, as they are now.
+"""The present diagonal blocks of a Mat.
 
-Newer releases of PETSc (seen in 3.22 and 3.25, not in 3.18) keep the inverses of the first diagonal blocks of a BAIJ
-matrix, 3.25 of an AIJ matrix too, whatever values it gets later: ``MatInvertBlockDiagonal``, ``-pc_type pbjacobi`` and
-SOR on BAIJ work with the first ones for ever. A Mat that is made anew has no such memory.
+PETSc inverts the diagonal blocks of a BAIJ matrix once and keeps these inverses even if the matrix gets other values
+(seen in 3.22 and 3.25, not in 3.18; in 3.25 also for AIJ). So ``MatInvertBlockDiagonal``, ``-pc_type pbjacobi`` and SOR
+on BAIJ always use the first inverses. A new Mat has no such memory.
 """
 
 from __future__ import annotations
@@ -12,20 +12,23 @@ from petsc4py import PETSc
 
 from pctt.blocks import block_csr_matrix
 
-#: Types of preconditioners that ask a Mat for the inverses of its diagonal blocks.
+#: Types of preconditioners that use the inverses of the diagonal blocks of a Mat.
 BY_DIAGONAL_BLOCKS = frozenset({"pbjacobi", "sor"})
 
 
 def set_diagonal_blocks(P: PETSc.Mat, blocks: np.ndarray) -> None:
-    """Say what the diagonal blocks (n, bs, bs) of this rank's block rows are, which saves a copy of P; to be said
-    again whenever P changes."""
+    """Attach the diagonal blocks (n, bs, bs) of this rank's block rows to P, which saves a copy of P.
+
+    Call this again whenever P changes.
+    """
     P.setAttr("diagonal_blocks", blocks)
 
 
 def block_diagonal(P: PETSc.Mat, blocks: np.ndarray | None = None) -> PETSc.Mat:
-    """A new Mat with the diagonal blocks of P, which is all that ``pbjacobi`` asks of it; the caller destroys it.
+    """A new Mat with the diagonal blocks of P; ``pbjacobi`` needs nothing else. The caller destroys the Mat.
 
-    Where they are not given, and P does not say what they are, a copy of P."""
+    If neither the argument ``blocks`` nor an attribute of P gives the blocks, the new Mat is a copy of P.
+    """
     blocks = P.getAttr("diagonal_blocks") if blocks is None else blocks
     if blocks is None:
         return P.duplicate(copy=True)
@@ -35,15 +38,17 @@ def block_diagonal(P: PETSc.Mat, blocks: np.ndarray | None = None) -> PETSc.Mat:
 
 
 def without_memory(P: PETSc.Mat, kind: str) -> PETSc.Mat | None:
-    """A new Mat from which a preconditioner of this type is to be made in place of P, as PETSc may remember diagonal
-    blocks of P that are no longer true; None where P itself will do. The caller destroys it."""
+    """A new Mat for a preconditioner of this type, because PETSc may remember old diagonal blocks of P.
+
+    None if the preconditioner can use P itself. The caller destroys the Mat.
+    """
     if kind == "pbjacobi":
         return block_diagonal(P)
     return _copy(P) if kind == "sor" and P.getType() == "seqbaij" else None
 
 
 def _copy(P: PETSc.Mat) -> PETSc.Mat:
-    """Of a sequential BAIJ matrix; ``MatDuplicate`` makes one that has no SOR."""
+    """A copy of a sequential BAIJ matrix; SOR does not work with the copy that ``MatDuplicate`` makes."""
     copy = PETSc.Mat().create(P.comm)
     copy.setSizes(P.getSizes())
     copy.setBlockSize(P.getBlockSize())
@@ -56,7 +61,7 @@ def _copy(P: PETSc.Mat) -> PETSc.Mat:
 def inverse_diagonal_blocks(P: PETSc.Mat) -> np.ndarray:
     """Inverses (n, bs, bs) of the diagonal blocks of this rank's block rows.
 
-    Raises numpy.linalg.LinAlgError, on the ranks concerned, where one is singular.
+    Raises numpy.linalg.LinAlgError on the ranks that have a singular block.
     """
     blocks = P.getAttr("diagonal_blocks")
     if blocks is not None:

@@ -1,4 +1,4 @@
-"""Distributed matrices of small dense blocks: their local rows as arrays, and PETSc Mats made of them."""
+"""Distributed matrices of small dense blocks: the local rows as arrays, and PETSc Mats made from them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from petsc4py import PETSc
 
 @dataclass(frozen=True)
 class BlockRows:
-    """Local block rows of G in block CSR: one row of 3 x 6 blocks per contact, one block column per body.
+    """Local block rows of G in block CSR format: one row of 3 x 6 blocks per contact, one block column per body.
 
     Attributes
     ----------
-    indptr : (nc + 1,) start of each contact's blocks
+    indptr : (nc + 1,) index of the first block of each contact, and the number of blocks
     indices : (nnz,) global block columns (bodies)
     blocks : (nnz, 3, 6)
     columns : number of block columns that this rank owns
@@ -34,11 +34,11 @@ class BlockRows:
         return len(self.indptr) - 1
 
 
-HUB = 500  # contacts of a body above which its columns of G are kept apart
+HUB = 500  # a body with more contacts is a hub: its columns of G are stored separately
 
 
 def without_hubs(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, np.ndarray]:
-    """G without the columns of bodies with more than HUB contacts, and these bodies (global block columns)."""
+    """G without the columns of the bodies that have more than HUB contacts, and these bodies (global block columns)."""
     bodies, count = np.unique(G.indices, return_counts=True)
     columns = comm.allreduce(G.columns)
     # a body with more than HUB contacts has more than HUB / ranks on some rank
@@ -54,7 +54,7 @@ def without_hubs(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, np.ndarray]:
 
 
 def dense_columns(comm: MPI.Comm, G: BlockRows, bodies: np.ndarray) -> PETSc.Mat | None:
-    """The columns of some bodies (global block columns) of G as a dense Mat (3Nc x 6 per body); None without bodies."""
+    """The columns of G for ``bodies`` (global block columns) as a dense Mat (3Nc x 6 per body); None without bodies."""
     if len(bodies) == 0:
         return None
     columns = np.zeros((G.rows, 3, len(bodies), 6))
@@ -68,7 +68,7 @@ def dense_columns(comm: MPI.Comm, G: BlockRows, bodies: np.ndarray) -> PETSc.Mat
 
 
 def diagonal_blocks(G: BlockRows) -> NDArray[np.float64]:
-    """Diagonal 3 x 3 blocks of G G' (nc, 3, 3)."""
+    """The diagonal blocks of G G' (nc, 3, 3)."""
     products = G.blocks @ G.blocks.transpose(0, 2, 1)
     shape = (G.rows, len(products))
     add = sp.csr_matrix((np.ones(len(products)), np.arange(len(products)), G.indptr), shape=shape)
@@ -76,19 +76,19 @@ def diagonal_blocks(G: BlockRows) -> NDArray[np.float64]:
 
 
 def block_matrix(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
-    """G as a Mat (3Nc x 6M) of block size 3."""
+    """G as a Mat (3Nc x 6M) with block size 3."""
     indices = (2 * G.indices[:, None] + [0, 1]).ravel()
     blocks = G.blocks.reshape(-1, 3, 2, 3).transpose(0, 2, 1, 3)
     return block_csr_matrix(comm, 3 * G.rows, 6 * G.columns, 2 * G.indptr, indices, blocks)
 
 
 def square_block_matrix(comm: MPI.Comm, rows: sp.bsr_matrix) -> PETSc.Mat:
-    """A square Mat from this rank's block rows (b nc x b Nc), of their block size b."""
+    """A square Mat from this rank's block rows (b nc x b Nc); b is the block size of the rows and of the Mat."""
     size = rows.blocksize[0]
     shape = (rows.shape[0] // size, rows.shape[1] // size)
-    columns = rows.indices.copy()  # sorted in place
+    columns = rows.indices.copy()  # the sort below changes them in place
     order = sp.csr_matrix((np.arange(len(columns)), columns, rows.indptr), shape=shape)
-    order.sort_indices()  # PETSc wants sorted columns; sorting positions is much faster than sorting blocks
+    order.sort_indices()  # PETSc needs sorted columns; sorting positions is much faster than sorting blocks
     count = rows.shape[0]
     return block_csr_matrix(comm, count, count, rows.indptr, order.indices, rows.data[order.data])
 
@@ -96,8 +96,10 @@ def square_block_matrix(comm: MPI.Comm, rows: sp.bsr_matrix) -> PETSc.Mat:
 def block_csr_matrix(
     comm: MPI.Comm, rows: int, columns: int, indptr: np.ndarray, indices: np.ndarray, blocks: NDArray[np.float64]
 ) -> PETSc.Mat:
-    """A BAIJ Mat from local block CSR arrays, ``blocks`` (nb, b, b); ``rows`` and ``columns`` are local scalar
-    sizes."""
+    """A BAIJ Mat from local block CSR arrays with ``blocks`` (nb, b, b).
+
+    ``rows`` and ``columns`` are the local sizes in scalar rows and columns.
+    """
     csr = (indptr.astype(PETSc.IntType), indices.astype(PETSc.IntType), np.ascontiguousarray(blocks).ravel())
     size = ((rows, PETSc.DETERMINE), (columns, PETSc.DETERMINE))
     mat = PETSc.Mat().create(comm)

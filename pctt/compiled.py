@@ -1,8 +1,8 @@
-"""Loops that numba compiles, where it is installed: one pass over the memory for what numpy does in many.
+"""Loops that numba compiles, if it is installed. A loop passes once over the memory, numpy passes many times.
 
-A function on arrays is then written twice. With numpy it is ``compiled`` and runs everywhere. The loop of the same name
-is in the module beside it (``cone_loops`` for ``cone``), which the first call imports (numba takes its time).
-tests/ccp/test_loops.py compares both.
+A function on arrays is written twice. The numpy version has the decorator `compiled` and runs everywhere. The loop has
+the same name and is in the module beside it (``cone_loops`` for ``cone``). The first call imports this module, because
+the import of numba takes time. tests/ccp/test_loops.py compares both versions.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 @cache
 def available() -> bool:
-    """Whether numba is here and works with this numpy; ``NUMBA_DISABLE_JIT=1`` says no."""
+    """Whether numba is installed, works with this numpy, and is not switched off by ``NUMBA_DISABLE_JIT=1``."""
     try:
         import numba
     except ImportError:
@@ -28,8 +28,10 @@ def available() -> bool:
 
 
 def compiled(function: Function) -> Function:
-    """Have the loop run in place of ``function``, where numba is available and all arrays are of float64, contiguous
-    and writable: then one machine code per loop serves. All arguments are arrays or numbers, given in order."""
+    """Run the loop instead of ``function`` if numba is available and all arrays are contiguous, writable float64.
+
+    With this condition each loop is compiled once. All arguments are arrays or numbers, and have no keywords.
+    """
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
@@ -52,19 +54,19 @@ def loop_of(function: Callable[..., Any]) -> Callable[..., Any]:
 def loop(function: Function) -> Function:
     """Compile at the first call and keep the machine code on disk.
 
-    Products and sums may be fused, and a division by zero gives inf or nan as in numpy. What is kept is made anew when
-    the file of ``function`` changes, that file alone: so a loop calls none of another file."""
+    Products and sums may be fused, and a division by zero gives inf or nan as in numpy. numba compiles again only when
+    the file of ``function`` itself changes. So a loop must not call a loop of another file."""
     import numba
 
     options: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}
     try:
         return numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # there is no folder to keep it in
+    except RuntimeError:  # no folder to keep the machine code in
         return numba.njit(**options)(function)
 
 
 def tell_first_compilation(say: Callable[[str], None]) -> None:
-    """Have ``say`` told, once, when numba compiles a loop of this program rather than reading what it kept."""
+    """Call ``say``, once, when numba compiles a loop of this program because it has no machine code for it on disk."""
     if not available():
         return
     from numba.core import event

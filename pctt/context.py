@@ -1,8 +1,10 @@
-"""Python that PETSc calls: what the contexts of the project's PCs and Mats of type python share.
+"""The base class of contexts: the Python objects that PETSc calls for the project's PCs and Mats of type python.
 
-petsc4py leaves three things to them: a context that is alive when Python ends is called after that end (a crash), an
-error that a context raises may lose its words on the way out, and the last collection of garbage waits for ever where
-one rank has no object of PETSc left and another has.
+The class solves three problems of petsc4py:
+
+- If a context is alive when Python ends, PETSc calls it after that end, and the program crashes.
+- An error that a context raises may lose its message on its way through PETSc.
+- If one rank has no PETSc object left at the end and another rank has one, the last garbage collection waits for ever.
 """
 
 from __future__ import annotations
@@ -18,14 +20,15 @@ from petsc4py import PETSc
 
 from pctt.petsc import remember
 
-#: What PETSc calls by name.
+#: The methods that PETSc calls by name.
 CALLED = ("setFromOptions", "setUp", "apply", "applyTranspose", "mult", "multTranspose", "getDiagonal", "view")
 
 
 class Context:
-    """Base class; what a subclass raises in a method of `CALLED` is remembered for `pctt.petsc.own_errors`."""
+    """Base class. If a subclass raises an error in a method of `CALLED`, the error is remembered for
+    `pctt.petsc.own_errors`."""
 
-    without: str  # the type of PC or Mat that goes on where the context leaves
+    without: str  # the type that the PC or Mat gets when the context leaves it
 
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
@@ -34,20 +37,20 @@ class Context:
                 setattr(cls, name, _remembering(cls.__dict__[name]))
 
     def create(self, owner: PETSc.Object) -> None:
-        """PETSc's call where the context comes to its PC or Mat."""
-        owner.decRef()  # a reference that does not keep the owner alive; `destroy` gives it back
+        """PETSc calls this when its PC or Mat gets the context."""
+        owner.decRef()  # our reference must not keep the owner alive; `destroy` gives it back
         self._owner: PETSc.Object | None = owner
         _living.add(self)
         _keep_communicator(owner)
 
     def destroy(self, owner: PETSc.Object) -> None:
-        """PETSc's call at the end of the PC or Mat."""
+        """PETSc calls this at the end of the PC or Mat."""
         if self._owner is not None:
             self._owner.incRef()
             self._owner = None
 
     def leave(self) -> None:
-        """Have the owner go on without this context."""
+        """Give the owner a type that does not need this context."""
         if self._owner is not None:
             self._owner.setType(self.without)
 
@@ -59,7 +62,7 @@ def _remembering(method: Callable[..., Any]) -> Callable[..., Any]:
             return method(*arguments)
         except BaseException as error:
             remember(error)
-            gc.collect()  # not on the error's way through PETSc, where a dead context cannot be destroyed
+            gc.collect()  # now, because PETSc cannot destroy a dead context while the error passes through it
             raise
 
     return called
@@ -70,16 +73,21 @@ _kept: list[PETSc.Vec] = []
 
 
 def _keep_communicator(owner: PETSc.Object) -> None:
-    """Have PETSc's own copy of the world's communicator stay: at Python's end PETSc would make a new one, with all
-    ranks, on those where it has gone with the last object."""
+    """Keep PETSc's own copy of the world communicator until Python ends.
+
+    PETSc frees the copy with the last object on a rank. At the end it would make a new copy on such ranks, and this
+    needs all ranks.
+    """
     if not _kept and owner.comm.size == PETSc.COMM_WORLD.size:
-        _kept.append(PETSc.Vec().create(comm=owner.comm))  # never set up: no memory, no message
+        _kept.append(PETSc.Vec().create(comm=owner.comm))  # not set up, so it needs no memory and sends no message
 
 
 @atexit.register
 def _leave_all() -> None:
-    """Take the contexts out of owners that are still there, say in the traceback of an error, and let PETSc destroy
-    what petsc4py has let go of."""
+    """Remove the contexts from owners that still exist, for example in the traceback of an error.
+
+    Then PETSc destroys the objects that petsc4py has released.
+    """
     for living in list(_living):
         living.leave()
     gc.collect()

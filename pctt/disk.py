@@ -1,4 +1,4 @@
-"""Files that are whole at any moment, also for a reader, after SIGKILL and on a full disk."""
+"""Files that are whole at any moment: for a reader, after SIGKILL and on a full disk."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import h5py
 
-#: What HDF5 takes beside the numbers, for the file and for each data set or attribute [bytes]; it used a quarter of it.
+#: Bytes for HDF5 beside the numbers: per file, and per data set or attribute. HDF5 was seen to use a quarter of them.
 PER_FILE, PER_ITEM = 16384, 2048
 
 
@@ -21,9 +21,9 @@ def temporary_name(path: Path) -> Path:
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A temporary name for a file that takes the place of ``path`` when the block ends, once it is on the disk.
+    """A temporary name for a file. When the block ends, the file is flushed to the disk and replaces ``path``.
 
-    If the block raises, or the disk, what stood under ``path`` is untouched and no temporary file stays.
+    If the block or the disk raises an error, the old file stays as it was, and the temporary file is removed.
     """
     temporary = temporary_name(path)
     try:
@@ -36,7 +36,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 def append(path: Path, line: str) -> None:
-    """Add a line to a text file. Of a line for which the disk has no room nothing stays, and OSError is raised."""
+    """Add a line to a text file. If the disk has no room, OSError is raised and no part of the line stays."""
     with open(path, "ab", buffering=0) as file:
         length, rest = file.seek(0, os.SEEK_END), f"{line}\n".encode()
         try:
@@ -49,8 +49,10 @@ def append(path: Path, line: str) -> None:
 
 
 def lines(path: Path) -> Iterator[str]:
-    """The whole lines of a text file to which lines are appended; none if there is no such file. A last one without
-    its end is still being written, or was when the machine stopped."""
+    """The whole lines of a text file to which `append` writes; none if the file does not exist.
+
+    A last line without its end is left out: a program is writing it, or was writing it when the machine stopped.
+    """
     if path.exists():
         with open(path) as file:
             for line in file:
@@ -59,16 +61,15 @@ def lines(path: Path) -> Iterator[str]:
 
 
 def make_hdf5(path: Path, numbers: int, items: int) -> None:
-    """Make an HDF5 file without contents, on a disk with room for so many bytes of numbers in so many data sets and
-    attributes, which stays taken until the file, opened with "r+", is closed.
+    """Make an empty HDF5 file and reserve room on the disk for ``numbers`` bytes in ``items`` data sets and attributes.
 
-    Raises OSError where there is no such room, also because of a quota or a limit of the process. HDF5 itself does not
-    come back from a full disk when it closes a file: with 1.10 several ranks wait for each other for ever, and one rank
-    crashes at its end.
+    The room stays reserved until the file, opened with "r+", is closed. Raises OSError if there is not enough room,
+    also because of a quota or a limit of the process. This is done first because HDF5 does not recover if the disk is
+    full when it closes a file: with 1.10 several ranks wait for each other for ever, and one rank crashes at its end.
     """
     size = numbers + PER_FILE + items * PER_ITEM
     _take_room(path, size)  # before HDF5 writes its first bytes
-    h5py.File(path, "w").close()  # which gives the room back
+    h5py.File(path, "w").close()  # this gives the room back
     _take_room(path, size)
 
 
@@ -79,7 +80,7 @@ def _take_room(path: Path, size: int) -> None:
         try:
             os.posix_fallocate(file.fileno(), 0, size)
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # the file system does not know
+            if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # the file system cannot reserve
                 raise
 
 

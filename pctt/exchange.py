@@ -1,4 +1,4 @@
-"""Rows of arrays that change ranks."""
+"""Sending rows of arrays to other ranks."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from mpi4py import MPI
 
 
 def offsets(comm: MPI.Comm, count: int) -> np.ndarray:
-    """First global index of each rank's part, and the total (size + 1,)."""
+    """The first global index of each rank's part, then the total number (size + 1,)."""
     return np.concatenate([[0], np.cumsum(comm.allgather(count))])
 
 
 def send_rows(
     comm: MPI.Comm, arrays: list[np.ndarray], rank: np.ndarray
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Send row i of each array to ``rank[i]``; the rows received and the ranks that they came from."""
+    """Send row i of each array to ``rank[i]``. Returns the received rows and the ranks that sent them."""
     order = np.argsort(rank, kind="stable")
     send = np.bincount(rank, minlength=comm.size).astype(np.int64)
     receive = np.empty_like(send)

@@ -1,11 +1,12 @@
 """``python -m pctt.export DIR``: the recorded steps of a run as time series for ParaView, or as one HDF5 file.
 
-Written are DIR/paraview/bodies.pvd, contacts.pvd and large.pvd, each a list of one .vtp file per step. Any number
-of ranks share the steps. These formats are read by every ParaView and VTK of the last fifteen years. With
-``-format vtkhdf`` the first rank writes bodies.vtkhdf, contacts.vtkhdf and large.vtkhdf instead, all steps in each,
-for ParaView 5.12 or newer.
+The program writes DIR/paraview/bodies.pvd, contacts.pvd and large.pvd. Each is a list of .vtp files, one per step. Any
+number of ranks share the steps. Every ParaView and VTK of the last fifteen years reads these formats. With
+``-format vtkhdf`` the first rank writes bodies.vtkhdf, contacts.vtkhdf and large.vtkhdf instead, for ParaView 5.12 or
+newer. Each of these files has all steps.
 
-With ``-single FILE.h5`` that file is written instead, by the first rank: what state.h5 links to, in the same groups.
+With ``-single FILE.h5`` the first rank writes one HDF5 file instead. It has the data that state.h5 links to, in the
+same groups.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ FORMATS = ("vtp", "vtkhdf")
 def arguments() -> argparse.Namespace:
     line = parser("export", "the recorded steps of a run as time series for ParaView (.pvd of .vtp files)")
     add_steps(line)
-    line.add_argument("-format", choices=FORMATS, default="vtp", help="a .vtp file per step, or one .vtkhdf of all")
+    line.add_argument("-format", choices=FORMATS, default="vtp", help="a .vtp file per step, or one .vtkhdf for all")
     target = line.add_mutually_exclusive_group()
-    target.add_argument("-output", metavar="DIR", help="where to write; none: paraview/ in the folder")
-    target.add_argument("-single", metavar="FILE.h5", help="write one HDF5 file like state.h5 instead, with all in it")
+    target.add_argument("-output", metavar="DIR", help="folder to write to; without: paraview/ in the output folder")
+    target.add_argument("-single", metavar="FILE.h5", help="write one HDF5 file like state.h5 instead, with all data")
     return line.parse_args()
 
 
@@ -53,9 +54,9 @@ def main(comm: MPI.Comm) -> None:
 
     from vtkmodules.vtkCommonCore import vtkLogger
 
-    from pctt.look import surfaces  # needs vtk, which asking for help does not
+    from pctt.look import surfaces  # imported here, because it needs vtk and -help does not
 
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # what fails is told by write_vtp
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # write_vtp reports errors
     box = surfaces.bounds(folder, [folder.frame(step) for step in {steps[0], steps[-1]}])
     if given.format == "vtkhdf":
         if comm.rank == 0:
@@ -73,18 +74,18 @@ def main(comm: MPI.Comm) -> None:
         for name in SERIES:
             write_pvd(target / f"{name}.pvd", {f"{name}_{step:06d}.vtp": together[step] for step in steps})
         print(f"{len(steps)} steps: {target}/" + ", ".join(f"{name}.pvd" for name in SERIES))
-    comm.Barrier()  # all files are there when any rank goes on
+    comm.Barrier()  # all files exist when any rank returns
 
 
 def series(name: str, folder: Folder, frame: Frame, box: np.ndarray) -> Any:
-    """One step of one of SERIES as vtkPolyData."""
+    """One step of the series ``name``, one of SERIES, as vtkPolyData."""
     if name == "large":
         return large(folder, frame, box)
     return bodies(folder, frame) if name == "bodies" else contacts(folder, frame)
 
 
 def write_vtkhdf(target: Path, folder: Folder, steps: list[int], box: np.ndarray) -> None:
-    """Write the series, a file each; FolderError if one cannot be written."""
+    """Write one file per series; FolderError if a file cannot be written."""
     from pctt.look import vtkhdf
 
     times = [folder.frame(step).time for step in steps]
@@ -96,8 +97,10 @@ def write_vtkhdf(target: Path, folder: Folder, steps: list[int], box: np.ndarray
 
 
 def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
-    """Write one HDF5 file with all that state.h5 links to of these steps; FolderError if a file cannot be read or
-    written."""
+    """Write one HDF5 file with the data of these steps to which state.h5 links.
+
+    FolderError if a file cannot be read or written.
+    """
     groups = {"bodies": folder.bodies_path, **{f"steps/{step:06d}": folder.frame_path(step) for step in steps}}
     with whole(path) as temporary:
         make_hdf5(temporary, sum(source.stat().st_size for source in groups.values()), items=0)
@@ -111,7 +114,7 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
 
 @contextmanager
 def _part(path: Path) -> Iterator[h5py.File]:
-    """A file of a run, open to be copied; FolderError if it cannot be."""
+    """A file of a run, open for copying; FolderError if it cannot be copied."""
     try:
         with h5py.File(path, "r") as file:
             yield file
@@ -120,8 +123,11 @@ def _part(path: Path) -> Iterator[h5py.File]:
 
 
 def bodies(folder: Folder, frame: Frame) -> Any:
-    """The grains as points, with what a glyph needs: a unit sphere or box scaled by the vector `extent` and turned by
-    `quaternion` is the grain; `radius` is that of the sphere about it."""
+    """The grains as points, with the data for glyphs.
+
+    Scale a unit sphere or box by the vector `extent` and turn it by `quaternion`: the result is the grain. `radius` is
+    the radius of the sphere that encloses the grain.
+    """
     from pctt.look import surfaces
 
     grains = slice(folder.grains)
@@ -144,8 +150,8 @@ def bodies(folder: Folder, frame: Frame) -> Any:
 
 
 def contacts(folder: Folder, frame: Frame) -> Any:
-    """The contacts as force chains: lines between the centres of the two bodies, to the contact point where a body is
-    a large one, whose centre says nothing."""
+    """The contacts as force chains: a line joins the centres of the two bodies. A large body has no useful centre, so
+    the line ends at the contact point instead."""
     from pctt.look import surfaces
 
     contact = frame.contacts
@@ -168,7 +174,7 @@ def contacts(folder: Folder, frame: Frame) -> Any:
 
 
 def large(folder: Folder, frame: Frame, box: np.ndarray) -> Any:
-    """The surfaces of the large bodies, with the number of the body, its planes cut to the box (2, 3) of the scene."""
+    """The surfaces of the large bodies, with the id of the body. Planes are cut to the box (2, 3) of the scene."""
     from pctt.look import surfaces
 
     parts = []
@@ -203,7 +209,7 @@ def write_vtp(path: Path, data: Any, time: float) -> None:
 
 
 def write_pvd(path: Path, files: dict[str, float]) -> None:
-    """Write a collection of files by their times [s]."""
+    """Write a list of files with their times [s]."""
     lines = [f'    <DataSet timestep="{time!r}" file="{name}"/>' for name, time in files.items()]
     head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n  <Collection>'
     with whole(path) as temporary:
@@ -211,7 +217,7 @@ def write_pvd(path: Path, files: dict[str, float]) -> None:
 
 
 def program() -> int:
-    """The command pctt-export: its exit status."""
+    """Run the command pctt-export and return its exit status."""
     return run(main, "export")
 
 

@@ -1,4 +1,4 @@
-"""Figures as JSON, which has no word for infinity and for what is no number: there it gets null."""
+"""Figures as JSON. JSON has no infinity and no NaN, so they are written as null."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 
 
 def dumps(figures: Any, indent: int | None = None) -> str:
-    """The text of figures by name, and of what they hold."""
+    """The JSON text of figures: numbers, and dicts and lists of them."""
     return json.dumps(_finite(figures), indent=indent)
 
 
 def loads(line: str) -> dict[str, Any]:
-    """The figures of a text; those that were no numbers are infinite. ValueError if it is no JSON."""
+    """The figures of a JSON text by name; null becomes infinity. ValueError if the text is not JSON."""
     return {name: math.inf if value is None else value for name, value in json.loads(line).items()}
 
 

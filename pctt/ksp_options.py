@@ -1,4 +1,4 @@
-"""Options of a KSP that the project makes: its defaults stand in PETSc's database only while PETSc reads it."""
+"""Options of a KSP that the project makes. Its defaults are in PETSc's database only while PETSc reads them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from petsc4py import PETSc
 
 @contextmanager
 def entered(options: Mapping[str, str | None]) -> Iterator[None]:
-    """Have these options in the database within the block; afterwards it is the user's again."""
+    """Put these options into the database within the block; afterwards it has the user's options again."""
     database = PETSc.Options()
     users = {name: value for name, value in database.getAll().items() if name in options}
     for name, value in options.items():
@@ -21,14 +21,17 @@ def entered(options: Mapping[str, str | None]) -> Iterator[None]:
         for name in options:
             if name in users:
                 database[name] = users[name]
-                database.hasName(name)  # it has been used: PETSc is not to report it as left over
+                database.hasName(name)  # marks it as used, so that PETSc does not report it as left over
             else:
                 database.delValue(name)
 
 
 def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> dict[str, str | None]:
-    """What is to be entered for a KSP of this prefix: defaults where the user has said nothing, and block Jacobi in
-    place of ILU and ICC on several ranks, as PETSc has these for one rank only."""
+    """The options to enter for a KSP with this prefix.
+
+    They are the defaults of options that the user has not given. On several ranks block Jacobi replaces ILU and ICC,
+    which PETSc has for one rank only; they become the solvers of its blocks.
+    """
     given = PETSc.Options().getAll()
     options: dict[str, str | None] = {
         prefix + name: value for name, value in defaults.items() if prefix + name not in given
@@ -40,12 +43,13 @@ def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> dict[str, 
         for name, value in everything.items():
             if name.startswith(prefix + "pc_factor_"):
                 options[f"{prefix}sub_{name[len(prefix):]}"] = value
-                PETSc.Options().hasName(name)  # PETSc is not to report it as left over
+                PETSc.Options().hasName(name)  # marks it as used, so that PETSc does not report it as left over
     return options
 
 
 def prefer_mumps(pc: PETSc.PC, kind: str) -> None:
-    """Let a factorisation be MUMPS's where PETSc has it: its own keeps to natural orders and one rank."""
+    """Use MUMPS for a factorisation if PETSc has it. PETSc's own factorisations have natural orders and one rank
+    only."""
     if kind in ("cholesky", "lu") and PETSc.Sys.hasExternalPackage("mumps"):
         pc.setType(kind)
         pc.setFactorSolverType("mumps")

@@ -1,4 +1,4 @@
-"""Phases of a run as PETSc log events, which ``-log_view`` shows, and their seconds for our own reports."""
+"""Phases of a run. They are PETSc log events, which ``-log_view`` shows; their seconds are kept for our own reports."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _watchers: list[Callable[[str], None]] = []
 
 
 def watch(callback: Callable[[str], None]) -> None:
-    """Have ``callback(name)`` called at the start of every phase on this rank."""
+    """Call ``callback(name)`` at the start of every phase on this rank."""
     _watchers.append(callback)
 
 
 @contextmanager
 def phase(name: str) -> Iterator[None]:
-    """Log a phase under the event ``name`` and add its wall seconds on this rank to ``name``'s account."""
+    """Log a phase as the event ``name``, and add its wall seconds on this rank to the account of ``name``."""
     for tell in _watchers:
         tell(name)
     start = time.perf_counter()
@@ -38,5 +38,5 @@ def move_seconds(seconds: float, source: str, target: str) -> None:
 
 
 def take_seconds(names: Iterable[str]) -> dict[str, float]:
-    """Seconds on the accounts of the phases since they were last taken."""
+    """The seconds on the accounts of the phases; the accounts are empty afterwards."""
     return {name: _seconds.pop(name, 0.0) for name in names}

@@ -1,4 +1,4 @@
-"""How much memory a rank may still take."""
+"""The memory that a rank can still take."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ KIB = 1024.0
 
 
 def available(comm: MPI.Comm) -> float:
-    """Bytes that each rank may still take if all take as much: what its node has available, shared by the ranks there,
-    the least of all ranks; inf where the system does not say. Collective."""
+    """The bytes that each rank can still take if all ranks take the same amount. Collective.
+
+    It is the available memory of a node divided by its number of ranks, the smallest value of all nodes; inf if the
+    system does not tell.
+    """
     node = comm.Split_type(MPI.COMM_TYPE_SHARED)
     share = _of_node() / node.size
     node.Free()
@@ -19,7 +22,7 @@ def available(comm: MPI.Comm) -> float:
 
 
 def _of_node() -> float:
-    """What Linux could hand out without swapping [bytes], within the limit of the control group of this process."""
+    """The memory that Linux can give without swapping, within the limit of this process's control group [bytes]."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
@@ -29,7 +32,7 @@ def _of_node() -> float:
 
 
 def _of_group() -> list[float]:
-    """What a container may still take [bytes], in a list; none where it has no limit."""
+    """A list with the memory that a container can still take [bytes]; empty if the container has no limit."""
     group = Path("/sys/fs/cgroup")
     try:
         limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))

@@ -1,4 +1,4 @@
-"""Places on a Morton curve: neighbours in space are neighbours in number."""
+"""Numbers of points along a Morton curve: points that are near in space have near numbers."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_BITS = 21  # per axis: three of them fill a signed 64 bit integer
+_BITS = 21  # per axis: three axes fill a signed 64-bit integer
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A cube that points are placed in before they are numbered."""
+    """The cube whose grid gives the numbers of points."""
 
     low: np.ndarray
     extent: float
@@ -27,7 +27,9 @@ class Frame:
 
 
 def morton_codes(points: np.ndarray, frame: Frame | None = None) -> np.ndarray:
-    """Interleaved bits of the coordinates (n, up to 3) on a grid over a cube, by default their bounding cube (n,).
+    """Morton codes (n,) of points (n, up to 3): the interleaved bits of their coordinates on a grid over a cube.
+
+    By default it is the bounding cube of the points.
 
     >>> morton_codes(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])).argsort()
     array([0, 1, 2, 3])

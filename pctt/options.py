@@ -1,7 +1,7 @@
-"""Options of the project: dataclass fields that are read from the PETSc options database.
+"""Options of the project: fields of dataclasses, with values from the PETSc options database.
 
-A group of options is a frozen dataclass whose fields carry ``metadata`` with ``help`` and, where they apply,
-``unit``, ``choices`` and ``check``. The field ``name`` of a group with prefix ``scene_`` is ``-scene_name``.
+A group of options is a frozen dataclass. The ``metadata`` of each field has ``help`` and, if needed, ``unit``,
+``choices`` and ``check``. The field ``name`` of a group with the prefix ``scene_`` is the option ``-scene_name``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Group = TypeVar("Group")
 
 
 class OptionError(ValueError):
-    """A bad option: the message names the option, the value and what is allowed."""
+    """A bad option. The message names the option, its value and the allowed values."""
 
 
 def option(
@@ -28,7 +28,7 @@ def option(
     choices: Iterable[str] | None = None,
     check: tuple[str, Callable[[Any], bool]] | None = None,
 ) -> Any:
-    """A dataclass field that is an option; ``check`` is (what is allowed, test of a value)."""
+    """A dataclass field that is an option. ``check`` is a pair: the allowed values in words, and a test of a value."""
     metadata = {"help": help, "unit": unit, "choices": tuple(choices) if choices else None, "check": check}
     return dataclasses.field(default=default, metadata=metadata)
 
@@ -73,7 +73,7 @@ def describe(group: type, prefix: str = "") -> list[Description]:
 
 
 def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "") -> Group:
-    """A group with the values that the database gives; raises OptionError for a bad one.
+    """A group with the values in the database; raises OptionError for a bad value.
 
     ``database`` maps names without the dash to strings, as ``PETSc.Options().getAll()`` does.
     """
@@ -87,7 +87,7 @@ def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "
 
 
 def _value(name: str, text: str | None, kind: Any, metadata: Mapping[str, Any]) -> Any:
-    text = text or ""  # the database has None where an option is given without a value
+    text = text or ""  # the database has None for an option without a value
     choices, check = metadata.get("choices"), metadata.get("check")
     inner = [k for k in typing.get_args(kind) if k is not type(None)]  # the X of Optional[X]
     kind = inner[0] if inner else kind
@@ -116,12 +116,12 @@ def _truth(text: str) -> bool:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """The end of a message: which of the known names may have been meant."""
+    """The end of a message: the known name that the user may have meant."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
     return f"; did you mean {close[0]}?" if close else ""
 
 
-# first words of the names that PETSc, its solvers and its own command line take
+# first words of the names of options of PETSc, of its solvers and of its command line
 _PETSC = (
     "ksp_", "pc_", "mat_", "vec_", "sub_", "mg_", "fieldsplit_", "prefix_", "log_", "options_", "info",
     "malloc", "memory_", "viewer_", "citations", "help", "version", "on_error", "error_output_", "debug",
@@ -134,9 +134,9 @@ _PETSC = (
 
 
 def refuse_unknown(names: Iterable[str], known: Iterable[str], prefixes: Iterable[str] = ()) -> None:
-    """Raise OptionError for a name that neither the project nor PETSc knows, with the nearest of ours.
+    """Raise OptionError for a name that neither the project nor PETSc knows; the message has the nearest of our names.
 
-    ``prefixes`` are first words beside PETSc's own that are let through.
+    Names that begin with PETSc's first words, or with one of ``prefixes``, pass.
     """
     known = set(known)
     through = (*_PETSC, *prefixes)
@@ -146,7 +146,7 @@ def refuse_unknown(names: Iterable[str], known: Iterable[str], prefixes: Iterabl
 
 
 def no_such_option(name: str, known: Iterable[str]) -> OptionError:
-    """The error for a name that is not known, with the nearest that is."""
+    """The error for an unknown name; its message has the nearest known name."""
     close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.5)
     hint = f"did you mean -{close[0]}?" if close else "-help lists the options"
     return OptionError(f"-{name}: no such option; {hint}")

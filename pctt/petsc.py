@@ -1,4 +1,4 @@
-"""What differs between builds and releases of PETSc: scalars, and how errors come back."""
+"""Differences between builds and releases of PETSc: the scalars, and the way in which errors return to Python."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 
 def require_real_double(scalar: type = PETSc.ScalarType) -> None:
-    """ImportError, in words, for a build of PETSc with other scalars."""
+    """Raise ImportError with a clear message if this build of PETSc has other scalars."""
     if np.dtype(scalar) != np.float64:
         version = ".".join(map(str, PETSc.Sys.getVersion()))
         raise ImportError(
@@ -20,14 +20,16 @@ def require_real_double(scalar: type = PETSc.ScalarType) -> None:
         )
 
 
-_raised: list[BaseException] | None = None  # by contexts, since the innermost `own_errors` began
+_raised: list[BaseException] | None = None  # errors that contexts raised since the innermost `own_errors` began
 
 
 @contextmanager
 def own_errors() -> Iterator[None]:
-    """Have what our Python raises when PETSc calls it come out as it was raised. petsc4py does so up to 3.18; newer
-    releases make it the cause of an error of PETSc, or forget it, or crash, where the collector meets a dead python PC
-    on the way: it rests."""
+    """Within the block, an error that our Python raises while PETSc calls it comes out as it was raised.
+
+    petsc4py does this up to 3.18. Newer releases make our error the cause of a PETSc error, or lose it. They also crash
+    if the garbage collector meets a dead python PC before the error is out. So the collector is off in the block.
+    """
     global _raised
     before, _raised = _raised, []
     collects = gc.isenabled()
@@ -44,13 +46,13 @@ def own_errors() -> Iterator[None]:
 
 
 def remember(error: BaseException) -> None:
-    """Keep an error until the `own_errors` around it ends."""
+    """Keep an error until the surrounding `own_errors` ends."""
     if _raised is not None:
         _raised.append(error)
 
 
 def origin(error: BaseException) -> BaseException:
-    """What first went wrong: the Python error behind one of PETSc, if there is one."""
+    """The first error of a chain: the Python error that caused a PETSc error, or ``error`` itself."""
     while isinstance(error, PETSc.Error) and error.__cause__ is not None:
         error = error.__cause__
     return error

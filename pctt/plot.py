@@ -17,12 +17,12 @@ FORMATS = ("png", "pdf", "svg")
 def arguments() -> argparse.Namespace:
     line = parser(
         "plot",
-        "figures of a run: its steps, what records.csv holds, the compared preconditioners, and of one recorded step"
-        " the sparsity of the Newton matrix and the graphs of bodies and contacts",
+        "figures of a run: its steps, the columns of records.csv, the compared preconditioners, and, for one recorded"
+        " step, the sparsity of the Newton matrix and the graphs of bodies and contacts",
     )
-    line.add_argument("-step", type=int, help="recorded step of sparsity and graphs; none: the last with contacts")
+    line.add_argument("-step", type=int, help="recorded step of sparsity and graphs; without: the last with contacts")
     line.add_argument("-format", choices=FORMATS, default="png", help="kind of file")
-    line.add_argument("-output", metavar="DIR", help="where to write; none: figures/ in the folder")
+    line.add_argument("-output", metavar="DIR", help="folder to write to; without: figures/ in the output folder")
     return line.parse_args()
 
 
@@ -64,7 +64,7 @@ def main(comm: MPI.Comm) -> None:
 
 
 def _frame(folder: Folder, step: int | None):
-    """The frame of a step, or the last that has contacts; None if there is none."""
+    """The frame of ``step`` if it has contacts, by default the last frame with contacts; None without such a frame."""
     if not folder.steps:
         return None
     folder.require_frames()
@@ -76,7 +76,7 @@ def _frame(folder: Folder, step: int | None):
 
 
 def program() -> int:
-    """The command pctt-plot: its exit status."""
+    """Run the command pctt-plot and return its exit status."""
     return run(main, "plot")
 
 

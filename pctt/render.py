@@ -14,7 +14,7 @@ from pctt.look.program import add_steps, chosen, made_folder, parser, positive, 
 
 SAMPLE = 12  # frames that decide the camera and the range of the colours
 FILMS = ("mp4", "gif", "none")
-# title of the bar; colour map and the part of it that is used
+# title of the colour bar, colour map, part of the map that is used
 COLOURS: dict[str, tuple[str, str, tuple[float, float]]] = {
     "speed": ("speed\n[m/s]", "viridis", (0.12, 1.0)),
     "force": ("contact\nforce [N]", "YlOrRd", (0.0, 0.95)),
@@ -27,19 +27,19 @@ COLOURS: dict[str, tuple[str, str, tuple[float, float]]] = {
 def arguments() -> argparse.Namespace:
     line = parser("render", (__doc__ or "").partition(": ")[2])
     add_steps(line)
-    line.add_argument("-color", choices=COLOURS, default="speed", help="what the colour of a grain tells")
+    line.add_argument("-color", choices=COLOURS, default="speed", help="the quantity that colours the grains")
     line.add_argument(
-        "-range", type=float, nargs=2, metavar=("LOW", "HIGH"), help="ends of the colour bar; none: from the data"
+        "-range", type=float, nargs=2, metavar=("LOW", "HIGH"), help="ends of the colour bar; without: from the data"
     )
-    line.add_argument("-azimuth", type=float, default=-60.0, help="camera about the vertical, from x [degrees]")
+    line.add_argument("-azimuth", type=float, default=-60.0, help="camera around the vertical, from x [degrees]")
     line.add_argument("-elevation", type=float, default=25.0, help="camera above the horizon, below 90 [degrees]")
-    line.add_argument("-zoom", type=positive(float), default=1.0, help="1: the whole scene")
-    line.add_argument("-size", type=_size, default="1280x960", metavar="WxH", help="of a picture [pixels]")
-    line.add_argument("-opacity", type=float, default=1.0, help="of paddles, blades and other large bodies, 0 to 1")
+    line.add_argument("-zoom", type=positive(float), default=1.0, help="1 shows the whole scene")
+    line.add_argument("-size", type=_size, default="1280x960", metavar="WxH", help="size of a picture [pixels]")
+    line.add_argument("-opacity", type=float, default=1.0, help="opacity of large bodies such as blades, 0 to 1")
     line.add_argument("-cut", action="store_true", help="leave out the grains in the half nearer to the camera")
     line.add_argument("-film", choices=FILMS, default="mp4", help="film of the pictures, if there are several")
     line.add_argument("-fps", type=positive(float), default=20.0, help="pictures of the film per second")
-    line.add_argument("-output", metavar="DIR", help="where to write; none: pictures/ in the folder")
+    line.add_argument("-output", metavar="DIR", help="folder to write to; without: pictures/ in the output folder")
     given = line.parse_args()
     if not -90 < given.elevation < 90:
         line.error(f"argument -elevation: {given.elevation:g}: allowed is a number between -90 and 90")
@@ -69,7 +69,7 @@ def main(comm: MPI.Comm) -> None:
     steps = chosen(folder.steps, given)
     target = made_folder(Path(given.output) if given.output else folder.path / "pictures")
 
-    from pctt.look import stage  # it needs vtk, which asking for help does not
+    from pctt.look import stage  # imported here, because it needs vtk and -help does not
 
     sample = [folder.frame(steps[k]) for k in np.unique(np.linspace(0, len(steps) - 1, SAMPLE).astype(int))]
     title, name, ends = COLOURS[given.color]
@@ -92,7 +92,7 @@ def main(comm: MPI.Comm) -> None:
 
 
 def _value(colour: str, folder: Folder, frame: Frame) -> np.ndarray:
-    """What colours the grains (grains,)."""
+    """The values (grains,) that give the colours of the grains."""
     from pctt.look import surfaces
 
     values = {
@@ -106,14 +106,17 @@ def _value(colour: str, folder: Folder, frame: Frame) -> np.ndarray:
 
 
 def _materials(folder: Folder) -> np.ndarray:
-    """The numbers of the materials of the grains, rising."""
+    """The numbers of the materials of the grains, in rising order."""
     return np.unique(folder.material[: folder.grains])
 
 
 def _range(colour: str, values: list[np.ndarray]) -> tuple[float, float]:
-    """The ends of the colours: for numbers all of them, for materials an equal part each, for sizes the least and the
-    greatest. Speeds and forces begin at 0 and end where one grain in a hundred is beyond: a few fast ones do not leave
-    the others in one colour."""
+    """The lowest and the highest value of the colours.
+
+    Ids use the range of all ids, materials get equal parts of the range, and sizes use the smallest and the largest
+    size. Speeds and forces begin at 0 and end at a round number that at most one grain in a hundred exceeds. So a few
+    fast grains do not leave the others in one colour.
+    """
     together = np.concatenate(values)
     if colour == "material":
         return -0.5, together.max(initial=0.0) + 0.5
@@ -124,7 +127,7 @@ def _range(colour: str, values: list[np.ndarray]) -> tuple[float, float]:
         return (low, high) if low < 0.999 * high else (0.0, high or 1.0)
     high = float(np.quantile(together, 0.99)) or 1.0
     step = 10 ** np.floor(np.log10(high))
-    return 0.0, step * min(k for k in (1, 2, 4, 6, 8, 10) if k * step >= high)  # four equal parts are short numbers
+    return 0.0, step * min(k for k in (1, 2, 4, 6, 8, 10) if k * step >= high)  # a quarter has few digits
 
 
 def write_png(path: Path, picture: np.ndarray) -> None:
@@ -136,7 +139,7 @@ def write_png(path: Path, picture: np.ndarray) -> None:
 
 
 def write_mp4(path: Path, pictures: list[Path], fps: float) -> None:
-    """Write a film in H.264, which browsers and slides play."""
+    """Write a film in H.264. Browsers and presentation programs play it."""
     import imageio_ffmpeg
     from PIL import Image
 
@@ -153,7 +156,7 @@ def write_mp4(path: Path, pictures: list[Path], fps: float) -> None:
 
 
 def write_gif(path: Path, pictures: list[Path], fps: float) -> None:
-    """Write a film that repeats, in the colours of its first picture."""
+    """Write a film that repeats; its palette is that of the first picture."""
     from PIL import Image
 
     images = [Image.open(picture).convert("RGB") for picture in pictures]
@@ -164,7 +167,7 @@ def write_gif(path: Path, pictures: list[Path], fps: float) -> None:
 
 
 def program() -> int:
-    """The command pctt-render: its exit status."""
+    """Run the command pctt-render and return its exit status."""
     return run(main, "render")
 
 

@@ -1,4 +1,4 @@
-"""Symmetric matrices that are a function: PETSc Mats of type python."""
+"""Symmetric matrices given by a function: PETSc Mats of type python."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ Array = NDArray[np.float64]
 
 
 def symmetric_shell(comm: MPI.Comm, rows: int, block: int, product: Callable[[Array, Array], None]) -> PETSc.Mat:
-    """A Mat of ``rows`` local rows in blocks, whose ``product(x, out)`` is a collective function of local flat arrays.
+    """A Mat with ``rows`` local rows in blocks of size ``block``. Its product is ``product(x, out)``.
 
-    Its diagonal is that of the attribute ``diagonal_blocks`` (`pctt.pc.block_diagonal.set_diagonal_blocks`)."""
+    This function is collective and gets local flat arrays. The diagonal of the Mat is that of the attribute
+    ``diagonal_blocks`` (`pctt.block_diagonal.set_diagonal_blocks`).
+    """
     mat = PETSc.Mat().createPython(((rows, PETSc.DETERMINE), (rows, PETSc.DETERMINE)), Shell(product), comm=comm)
     mat.setBlockSize(block)
     mat.setUp()
@@ -24,7 +26,7 @@ def symmetric_shell(comm: MPI.Comm, rows: int, block: int, product: Callable[[Ar
 
 
 class Shell:
-    """What PETSc calls for a matrix of `symmetric_shell`."""
+    """The methods that PETSc calls for a matrix of `symmetric_shell`."""
 
     def __init__(self, product: Callable[[Array, Array], None]):
         self.product = product

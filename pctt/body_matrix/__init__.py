@@ -1,4 +1,5 @@
-"""The Newton matrix in the bodies' velocities, as products (`operator`), as entries, and what of it is factorised."""
+"""The Newton matrix in the velocities of the bodies: its products (`operator`), its entries (`entries`), and the part
+that is factorised (`stiff_part`)."""
 
 from pctt.body_matrix.entries import BodyMatrix
 from pctt.body_matrix.operator import BodyOperator

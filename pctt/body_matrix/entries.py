@@ -1,8 +1,8 @@
-"""The Newton matrix in the bodies' velocities, K = I + G' B^-1 G, a 6 x 6 block per body and per pair in contact.
+"""The Newton matrix in the velocities of the bodies, K = I + G' B^-1 G: a 6 x 6 block per body and per pair in contact.
 
-G is the mass-scaled contact map (3Nc x 6M) in block rows (``pctt.blocks.BlockRows``), B block diagonal with a 3 x 3
-block per contact. Each rank multiplies its own contacts' rows; blocks of bodies that other ranks own go to these, by
-a pattern found once, and are added in an order that does not change.
+G is the mass-scaled contact map (3Nc x 6M) in block rows (``pctt.blocks.BlockRows``). B is block diagonal with a 3 x 3
+block per contact. Each rank multiplies the rows of its own contacts. It sends the blocks of bodies that other ranks own
+to these ranks, by a pattern that is computed once. The blocks are always added in the same order.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ ADD = PETSc.InsertMode.ADD_VALUES
 
 
 class BodyMatrix:
-    """K as a Mat of block size 6 (``mat``), and its ``stiff_part``, which is what factorisations are made of."""
+    """K as a Mat of block size 6 (``mat``), and its ``stiff_part``, which factorisations use."""
 
     def __init__(self, comm: PETSc.Comm, G: BlockRows, compiled: bool | None = None):
-        """``compiled``: whether its values are made by compiled loops; None: where numba is installed."""
+        """``compiled`` says whether compiled loops compute the values; with None they do if numba is installed."""
         self.comm = comm.tompi4py() if isinstance(comm, PETSc.Comm) else comm
         product = CompiledProduct if (is_free("auto") if compiled is None else compiled) else SparseProduct
-        # in 64 bits: pairs of bodies get a number each
+        # 64 bits, because each pair of bodies gets a number
         self.bodies, column = np.unique(np.asarray(G.indices, np.int64), return_inverse=True)
         self._product = product(G, column.ravel(), len(self.bodies))
         self.load(G)
@@ -39,7 +39,7 @@ class BodyMatrix:
         self._product.load(G)
 
     def _index(self, G: BlockRows) -> None:
-        """Who owns the blocks that this rank's contacts contribute to, and how those of a body's row are added up."""
+        """Find the owners of the blocks to which this rank's contacts contribute, and the pattern of the own rows."""
         starts = offsets(self.comm, G.columns)
         first, own = int(starts[self.comm.rank]), G.columns
         row, column = self.bodies[self._product.row], self.bodies[self._product.column]
@@ -61,10 +61,10 @@ class BodyMatrix:
         self.mat.setType(PETSc.Mat.Type.BAIJ)
         self.mat.setPreallocationCSR((self._indptr, self._indices))
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        self._stiff: dict[tuple[bool, bool], StiffPart] = {}  # in scalar format or not, symmetric or not
+        self._stiff: dict[tuple[bool, bool], StiffPart] = {}  # keys: in scalar format or not, symmetric or not
 
     def update(self, inverse: np.ndarray) -> None:
-        """K for the blocks B^-1 (nc, 3, 3)."""
+        """Compute K for the blocks B^-1 (nc, 3, 3)."""
         blocks = self._product.blocks(inverse)
         self._values = np.zeros((len(self._indices), 6, 6))
         self._values[self._own_places] = blocks[~self._away] if self._away.any() else blocks
@@ -78,15 +78,18 @@ class BodyMatrix:
     def stiff_part(
         self, least: float, shift: float = 0.0, scalar: bool = False, symmetric: bool = True
     ) -> PETSc.Mat:
-        """K without the blocks between bodies whose entries are all below ``least`` (of the mass), its diagonal blocks
-        multiplied by 1 + shift; one Mat in block format and one in scalar format are kept and renewed."""
+        """K without the blocks between two bodies whose entries are all below ``least`` (in units of the mass).
+
+        Diagonal blocks are multiplied by 1 + shift. The Mat is kept and gets new values at the next call; there is one
+        for each combination of ``scalar`` and ``symmetric``.
+        """
         form = (scalar, symmetric)
         if form not in self._stiff:
             self._stiff[form] = StiffPart(self.mat, self._indptr, self._indices, self._diagonal_places, *form)
         return self._stiff[form].update(self._values, least, shift)
 
     def places(self, points: np.ndarray) -> np.ndarray:
-        """Places of this rank's bodies (n, 3): the means of their contact points (nc, 3); collective."""
+        """Places (n, 3) of this rank's bodies: the means of their contact points. ``points`` (nc, 3); collective."""
         sums = self.mat.createVecRight()
         counts = sums.duplicate()
         if len(points):
@@ -103,11 +106,12 @@ class BodyMatrix:
         return places
 
     def set_rigid_modes(self, points: np.ndarray) -> None:
-        """Give ``mat`` the six rigid motions as near null space; points (nc, 3) of contact; collective.
+        """Give ``mat`` the six rigid motions as near null space; ``points`` (nc, 3) are the contact points; collective.
 
-        A motion u(p) = t + w x p moves the contact point p of a body by F u in the contact frame F. Its mass-scaled
-        velocity z is the least squares solution of (block of G) z = F u over the contacts of the body, so that masses,
-        inertias and places need not be known. F are the first three columns of the block, with rows made unit vectors.
+        A motion u(p) = t + w x p moves the contact point p of a body by F u in the contact frame F. The mass-scaled
+        velocity z of the body is the least squares solution of (block of G) z = F u over its contacts. So masses,
+        inertias and places of the bodies are not needed. F is given by the first three columns of the block, with its
+        rows scaled to unit vectors.
         """
         blocks, body = self.G.blocks, np.asarray(self.G.indices, np.int64)
         contact = np.repeat(np.arange(len(points)), np.diff(self.G.indptr))
@@ -140,17 +144,17 @@ class BodyMatrix:
 
 
 class CompiledProduct:
-    """The blocks of G' B^-1 G of a rank's contacts, between the bodies that they touch, by a loop over the contacts.
+    """The blocks of G' B^-1 G for the contacts of a rank, computed by a loop over the contacts.
 
     Attributes
     ----------
-    row, column : (n,) bodies of each block, in the order of `blocks`
+    row, column : (n,) the two bodies of each block, in the order of `blocks`
     """
 
     def __init__(self, G: BlockRows, body: np.ndarray, bodies: int):
-        """``body``: the columns of G among ``bodies``."""
+        """``body`` has the columns of G, numbered from 0 to ``bodies - 1``."""
         start, count = np.asarray(G.indptr[:-1]), np.diff(G.indptr)
-        of_row = np.repeat(count, count)  # blocks beside each block
+        of_row = np.repeat(count, count)  # for each block the number of blocks in its row
         first = np.repeat(np.arange(len(body)), of_row)
         second = np.arange(len(first)) - np.repeat(np.cumsum(of_row) - of_row, of_row) + np.repeat(start, count**2)
         names, place = np.unique(body[first] * max(bodies, 1) + body[second], return_inverse=True)
@@ -164,7 +168,7 @@ class CompiledProduct:
 
     def blocks(self, inverse: np.ndarray) -> np.ndarray:
         """(n, 6, 6) for the blocks B^-1 (nc, 3, 3)."""
-        from pctt.contact_map.block_loops import add_all_blocks  # compiled, takes half a second to come
+        from pctt.contact_map.block_loops import add_all_blocks  # its import takes half a second
 
         out = np.zeros((len(self.row), 6, 6))
         add_all_blocks(self._blocks, self._start, self._place, np.ascontiguousarray(inverse), out)
@@ -172,7 +176,7 @@ class CompiledProduct:
 
 
 class SparseProduct:
-    """The same by scipy."""
+    """The same blocks, computed by scipy."""
 
     def __init__(self, G: BlockRows, body: np.ndarray, bodies: int):
         self._body, self._bodies = body, bodies
@@ -199,7 +203,7 @@ class SparseProduct:
 
 
 def _put(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, blocks: np.ndarray) -> None:
-    """All block rows of this rank."""
+    """Set all block rows of this rank."""
     if len(indices):
         mat.setValuesBlockedCSR(indptr, indices, blocks.ravel())
     mat.assemble()

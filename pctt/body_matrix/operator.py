@@ -1,5 +1,7 @@
-"""The Newton operator in the bodies' velocities, K = I + G' H G: a function where products are compiled loops, and its
-matrix for preconditioners that read entries."""
+"""The Newton operator in the velocities of the bodies, K = I + G' H G.
+
+With compiled loops it is a function. Preconditioners that need entries get its matrix.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +23,11 @@ Array = NDArray[np.float64]
 
 
 class BodyOperator:
-    """K of one contact map after another of the same structure.
+    """K for a sequence of contact maps with the same structure.
 
     Attributes
     ----------
-    mat : K as a Mat of block size 6, a shell where the map is free of matrices
+    mat : K as a Mat of block size 6; a shell if the map is free of matrices
     """
 
     def __init__(self, contact_map: ContactMap):
@@ -38,7 +40,7 @@ class BodyOperator:
 
     @property
     def whole(self) -> BodyMatrix:
-        """The matrix of K, its values perhaps not yet made; collective at its first use."""
+        """The matrix of K, perhaps without its present values; collective at its first use."""
         if self._matrix is None:
             G = self.contact_map.block_rows
             self._matrix = BodyMatrix(self.contact_map.comm, G, compiled=self.contact_map.free)
@@ -51,7 +53,7 @@ class BodyOperator:
         self._loaded = False
 
     def update(self, inverse: Array, symmetric: bool = True) -> None:
-        """K for blocks H (nc, 3, 3), which may be unsymmetric."""
+        """Take the blocks H (nc, 3, 3) of K, which may be unsymmetric."""
         self._inverse, self._made = inverse, False
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         if not self.contact_map.free:

@@ -1,5 +1,8 @@
-"""The part of a body matrix that is worth factorising: late in an interior point iteration a third of the contacts have
-opened, and a factor of the rest costs half, incomplete ones too, and serves as well."""
+"""The part of a body matrix that is worth factorising.
+
+Late in an interior point iteration a third of the contacts have opened. A factor of the rest costs half and is as good
+a preconditioner. This holds for incomplete factors too.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +11,21 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-EXCESS = 1.15  # blocks of a kept pattern / those that are wanted
+EXCESS = 1.15  # largest ratio of the blocks in a kept pattern to the wanted blocks
 
 
 class StiffPart:
-    """A Mat with some of the blocks of a block matrix: its diagonal blocks, and those with an entry of at least
-    ``least``. Its pattern is kept, and with it a factor's symbolic part, while it holds all such blocks and few others.
+    """A Mat with some of the blocks of a block matrix: the diagonal blocks, and the blocks with an entry of at least
+    ``least``.
+
+    The pattern is kept while it has all these blocks and few others. Then the symbolic part of a factor can be kept
+    too.
 
     whole : the block matrix
-    indptr, indices : this rank's block rows of it
-    diagonal : which blocks are diagonal ones
-    scalar : make an AIJ Mat, for what has no code for blocks, else BAIJ
-    symmetric : whether the blocks are those of a symmetric matrix
+    indptr, indices : block CSR pattern of this rank's block rows
+    diagonal : indices of the diagonal blocks
+    scalar : make an AIJ Mat, for solvers that have no code for blocks; otherwise a BAIJ Mat
+    symmetric : whether the matrix is symmetric
     """
 
     def __init__(
@@ -38,7 +44,10 @@ class StiffPart:
         self.mat: PETSc.Mat | None = None
 
     def update(self, values: np.ndarray, least: float, shift: float = 0.0) -> PETSc.Mat:
-        """The Mat for the blocks ``values`` (n, size, size) of the whole, diagonal ones multiplied by 1 + shift."""
+        """The Mat for the blocks ``values`` (n, size, size) of the whole matrix.
+
+        Diagonal blocks are multiplied by 1 + shift.
+        """
         wanted = np.abs(values).max(axis=(1, 2), initial=0.0) >= least
         wanted[self._diagonal] = True
         if self.mat is None or not self._holds(wanted):
@@ -55,7 +64,7 @@ class StiffPart:
         return self.mat
 
     def _holds(self, wanted: np.ndarray) -> bool:
-        """Whether the kept pattern has these blocks on all ranks and hardly more."""
+        """Whether the kept pattern has these blocks on all ranks, and few others."""
         counts = [int((wanted & ~self._kept).sum()), int(wanted.sum()), int(self._kept.sum())]
         missing, needed, kept = self.comm.allreduce(np.array(counts))
         return bool(missing == 0 and kept <= EXCESS * needed)

@@ -1,7 +1,7 @@
-"""The contact map G = D' M^-1/2, between the velocities of bodies and those of contacts, and products with it.
+"""The contact map G = D' M^-1/2, from the velocities of bodies to the velocities of contacts, and products with it.
 
-Two storages: frames and arms (`CompactRows`), or 3 x 6 blocks (`BlockRows`). Two ways to multiply (``-ccp_operator``):
-`FreeMap` by compiled loops over the contacts, `AssembledMap` by a matrix of PETSc.
+There are two storage formats: frames and arms (`CompactRows`), and 3 x 6 blocks (`BlockRows`). There are two ways to
+multiply (``-ccp_operator``): `FreeMap` uses compiled loops over the contacts, `AssembledMap` uses a PETSc matrix.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ OPERATORS = ("auto", "free", "assembled")
 
 
 def is_free(operator: str) -> bool:
-    """Whether products are made by compiled loops.
+    """Whether compiled loops compute the products.
 
-    ValueError where the operator is not of OPERATORS, or asks for compiled loops and numba is missing."""
+    ValueError if the operator is not in OPERATORS, or if it needs compiled loops and numba is missing.
+    """
     if operator not in OPERATORS:
         raise ValueError(f"-ccp_operator {operator}: allowed are {', '.join(OPERATORS)}")
     if operator == "assembled":
@@ -39,9 +40,9 @@ def is_free(operator: str) -> bool:
 
 
 def contact_map(comm: MPI.Comm, rows: BlockRows | CompactRows, operator: str = "auto") -> ContactMap:
-    """The map of these rows; ``operator`` is of OPERATORS; collective."""
+    """The map with these rows; ``operator`` is one of OPERATORS. Collective."""
     if is_free(operator):
-        from pctt.contact_map.free import FreeMap  # its compiled loops take half a second to come
+        from pctt.contact_map.free import FreeMap  # the import of its compiled loops takes half a second
 
         return FreeMap(comm, rows)
     return AssembledMap(comm, rows)

@@ -1,4 +1,4 @@
-"""Products with the contact map as a block matrix of PETSc, for where numba is missing, or to compare."""
+"""Products with the contact map as a PETSc block matrix. They are used if numba is missing, and for comparison."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 class AssembledMap:
-    """The contact map G of all ranks; the members of `FreeMap` that do without compiled loops. Products are
+    """The contact map G of all ranks. It has the members of `FreeMap` that need no compiled loops. Products are
     collective."""
 
     free = False
@@ -50,7 +50,7 @@ class AssembledMap:
         return diagonal_blocks(self.block_rows)
 
     def scaled(self, size: Array) -> ScaledRows:
-        """The map with its rows multiplied by ``size`` (nc, 3); it ends with this one."""
+        """The map with its rows multiplied by ``size`` (nc, 3); it is valid until this map is destroyed."""
         return ScaledRows(self, size)
 
     @cached_property

@@ -1,5 +1,7 @@
-"""Compiled loops over contacts that are rows of 3 x 6 blocks (`BlockRows`): the functions of `compact_loops`, for
-mass-scaled velocities. Row c has the blocks ``start[c]`` to ``start[c + 1]``, in the columns ``body`` (nb,).
+"""Compiled loops over contacts that are stored as rows of 3 x 6 blocks (`BlockRows`).
+
+The functions are those of `compact_loops`, for mass-scaled velocities. Row c has the blocks ``start[c]`` to
+``start[c + 1] - 1``; their columns are in ``body`` (nb,).
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ def velocity_at(c, blocks, start, body, w):
 
 @loop
 def push(c, blocks, start, body, g0, g1, g2, m):
-    """Add the momenta G'g of an impulse at the contact c."""
+    """Add the momenta G' g of an impulse g at the contact c to m."""
     for k in range(start[c], start[c + 1]):
         i = body[k]
         for n in range(6):
@@ -41,7 +43,7 @@ def add_velocities(blocks, start, body, w, y):
 
 @loop
 def add_momenta(blocks, start, body, g, m):
-    """m += G' g, of impulses g (nc, 3)."""
+    """m += G' g for impulses g (nc, 3)."""
     for c in range(len(start) - 1):
         push(c, blocks, start, body, g[c, 0], g[c, 1], g[c, 2], m)
 
@@ -59,7 +61,7 @@ def add_through(blocks, start, body, weight, w, m):
 
 @loop
 def add_any_through(blocks, start, body, weight, w, m):
-    """m += G' H G w; ``weight`` (nc, 9) is H, not symmetric."""
+    """m += G' H G w; ``weight`` (nc, 9) is H, which need not be symmetric."""
     for c in range(len(start) - 1):
         y0, y1, y2 = velocity_at(c, blocks, start, body, w)
         f0 = weight[c, 0] * y0 + weight[c, 1] * y1 + weight[c, 2] * y2
@@ -70,7 +72,7 @@ def add_any_through(blocks, start, body, weight, w, m):
 
 @loop
 def any_weights(blocks, start, body, H, weight):
-    """What `add_any_through` wants to know of H (nc, 3, 3)."""
+    """The ``weight`` (nc, 9) of `add_any_through` for H (nc, 3, 3)."""
     for c in range(len(H)):
         for i in range(3):
             for j in range(3):
@@ -103,7 +105,7 @@ def pack(H, weight):
 
 @loop
 def weights(blocks, start, body, H, weight):
-    """What `add_through` wants to know of H: its upper triangle."""
+    """The ``weight`` (nc, 6) of `add_through` for H (nc, 3, 3): the upper triangle."""
     pack(H, weight)
 
 
@@ -124,9 +126,10 @@ def add_body_blocks(blocks, start, body, weight, out):
 
 @loop
 def add_all_blocks(blocks, start, place, H, out):
-    """out += the blocks G_p' H G_q of every contact and any two of its bodies p, q, at ``place`` in out (n, 6, 6).
+    """Add the block G_p' H G_q of every contact and every pair p, q of its bodies to ``out`` (n, 6, 6); H (nc, 3, 3).
 
-    A contact's places follow one another, p before q; H (nc, 3, 3)."""
+    ``place`` has the index in ``out`` for each of these blocks, contact by contact; q varies fastest.
+    """
     at = 0
     for c in range(len(start) - 1):
         for p in range(start[c], start[c + 1]):
@@ -144,7 +147,7 @@ def add_all_blocks(blocks, start, place, H, out):
 
 @loop
 def local_product(weight, g, y):
-    """y = H g (nc, 3), H the symmetric blocks of ``weight`` (nc, 6)."""
+    """y = H g (nc, 3); ``weight`` (nc, 6) has the upper triangles of the symmetric blocks H."""
     for c in range(len(weight)):
         g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
         y[c, 0] = weight[c, 0] * g0 + weight[c, 1] * g1 + weight[c, 2] * g2

@@ -1,8 +1,8 @@
-"""Compiled loops over contacts that are frames and arms (`CompactRows`); importing this takes half a second.
+"""Compiled loops over contacts that are stored as frames and arms (`CompactRows`). The import takes half a second.
 
-``body`` (nc, 2) are local numbers; w and m are (bodies, 6), physical velocities and momenta. The loops add to their
-last argument. (They go over all contacts that they are given: between two bounds, or with signed numbers of
-bodies, every index might be one from the end, and the test for that costs a third of a product.)
+``body`` (nc, 2) has local numbers of bodies. w and m (bodies, 6) are physical velocities and momenta. The loops add to
+their last argument. They run over all contacts of their arrays, not between two given bounds, and the numbers of
+bodies are unsigned. Otherwise every index could be negative, and the test for this costs a third of a product.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pctt.compiled import loop
 
 @loop
 def velocity_at(c, arm, body, w):
-    """Of the second body at the contact point c as seen from the first."""
+    """The velocity of the second body at the contact point c, relative to the first body."""
     a, b = body[c, 0], body[c, 1]
     r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
     u0 = w[b, 0] - w[a, 0] + w[b, 4] * s2 - w[b, 5] * s1 - (w[a, 4] * r2 - w[a, 5] * r1)
@@ -25,7 +25,7 @@ def velocity_at(c, arm, body, w):
 
 @loop
 def push(c, arm, body, f0, f1, f2, m):
-    """Add an impulse at the contact point c to the second body's momenta, and take it from the first's."""
+    """Add an impulse at the contact point c to the second body's momenta, and subtract it from the first body's."""
     a, b = body[c, 0], body[c, 1]
     r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
     m[a, 0] -= f0
@@ -54,7 +54,7 @@ def add_velocities(frame, arm, body, w, y):
 
 @loop
 def add_momenta(frame, arm, body, g, m):
-    """m += D g, of impulses g (nc, 3)."""
+    """m += D g for impulses g (nc, 3)."""
     for c in range(len(body)):
         g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
         f0 = frame[c, 0] * g0 + frame[c, 3] * g1 + frame[c, 6] * g2
@@ -65,7 +65,7 @@ def add_momenta(frame, arm, body, g, m):
 
 @loop
 def add_through(frame, arm, body, weight, w, m):
-    """m += D H D' w; ``weight`` (nc, 6) is F'HF, of `weights`: the frame itself is not needed."""
+    """m += D H D' w; ``weight`` (nc, 6) is F'HF from `weights`, so the loop does not need the frame itself."""
     for c in range(len(body)):
         u0, u1, u2 = velocity_at(c, arm, body, w)
         f0 = weight[c, 0] * u0 + weight[c, 1] * u1 + weight[c, 2] * u2
@@ -76,7 +76,7 @@ def add_through(frame, arm, body, weight, w, m):
 
 @loop
 def add_any_through(frame, arm, body, weight, w, m):
-    """m += D H D' w for any H; ``weight`` (nc, 9) is F'HF, of `any_weights`."""
+    """m += D H D' w for any H; ``weight`` (nc, 9) is F'HF from `any_weights`."""
     for c in range(len(body)):
         u0, u1, u2 = velocity_at(c, arm, body, w)
         f0 = weight[c, 0] * u0 + weight[c, 1] * u1 + weight[c, 2] * u2
@@ -87,7 +87,7 @@ def add_any_through(frame, arm, body, weight, w, m):
 
 @loop
 def any_weights(frame, arm, body, H, weight):
-    """weight (nc, 9) = F'HF of blocks H (nc, 3, 3) that need not be symmetric."""
+    """weight (nc, 9) = F'HF for blocks H (nc, 3, 3) that need not be symmetric."""
     for c in range(len(frame)):
         for j in range(3):
             f0, f1, f2 = frame[c, j], frame[c, 3 + j], frame[c, 6 + j]
@@ -101,7 +101,7 @@ def any_weights(frame, arm, body, H, weight):
 @loop
 def add_any_body_blocks(frame, arm, body, weight, blocks):
     """blocks (bodies, 6, 6) += the diagonal blocks of D H D', for the ``weight`` of `any_weights`."""
-    J = np.zeros((3, 6))  # velocity of the point by those of the body
+    J = np.zeros((3, 6))  # from the velocities of the body to the velocity of the contact point
     J[0, 0] = J[1, 1] = J[2, 2] = 1.0
     for c in range(len(frame)):
         for side in range(2):
@@ -120,7 +120,7 @@ def add_any_body_blocks(frame, arm, body, weight, blocks):
 
 @loop
 def weights(frame, arm, body, H, weight):
-    """weight (nc, 6) = F'HF, the upper triangle, of symmetric blocks H (nc, 3, 3)."""
+    """weight (nc, 6) = upper triangle of F'HF for symmetric blocks H (nc, 3, 3)."""
     for c in range(len(frame)):
         for i in range(3):
             h0 = H[c, 0, 0] * frame[c, i] + H[c, 0, 1] * frame[c, 3 + i] + H[c, 0, 2] * frame[c, 6 + i]
@@ -168,7 +168,8 @@ def add_body_blocks(frame, arm, body, weight, blocks):
 
 @loop
 def contact_blocks(frame, arm, body, mass, out):
-    """out (nc, 3, 3): the diagonal blocks of D' M^-1 D; ``mass`` (bodies, 12) is M^-1, as `CompactRows.root`."""
+    """out (nc, 3, 3) = diagonal blocks of D' M^-1 D; ``mass`` (bodies, 12) is M^-1 in the format of
+    `CompactRows.root`."""
     J = np.empty((3, 6))
     for c in range(len(frame)):
         for i in range(3):
@@ -194,7 +195,8 @@ def contact_blocks(frame, arm, body, mass, out):
 
 @loop
 def scale(root, v, out):
-    """out = R v, R block diagonal in the form of `CompactRows.root`; v and out (bodies, 6), out may have more rows."""
+    """out = R v for v and out (bodies, 6); out may have more rows. R is block diagonal in the format of
+    `CompactRows.root`."""
     if root.shape[1] == 6:
         for i in range(len(root)):
             for k in range(6):

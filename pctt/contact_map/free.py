@@ -1,7 +1,7 @@
-"""Products with the contact map without a matrix, by compiled loops over the contacts.
+"""Products with the contact map by compiled loops over the contacts, without a matrix.
 
-A product moves 136 bytes per contact (frame, arms, bodies) where PETSc's block formats move 300 to 800. Bodies that
-other ranks own are ghosts: while their values travel, the contacts that do not touch them are worked on.
+A product moves 136 bytes per contact (frame, arms, bodies); PETSc's block formats move 300 to 800. Bodies that other
+ranks own are ghosts. While their values travel, the loops work on the contacts that do not touch ghosts.
 """
 
 from __future__ import annotations
@@ -25,13 +25,15 @@ Array = NDArray[np.float64]
 
 
 class FreeMap:
-    """The contact map G of all ranks. Impulses and velocities of contacts are (nc, 3), mass-scaled velocities of bodies
-    (columns, 6); flat arrays will do too. All products are collective.
+    """The contact map G of all ranks.
+
+    Impulses and velocities of contacts are arrays (nc, 3), mass-scaled velocities of bodies are arrays (columns, 6).
+    Flat arrays are allowed too. All products are collective.
 
     given : the rows, `CompactRows` or `BlockRows`
     """
 
-    free = True  # of matrices
+    free = True  # it needs no matrix
 
     def __init__(self, comm: MPI.Comm, given: BlockRows | CompactRows, ghosts: Ghosts | None = None):
         self.comm, self.given = comm, given
@@ -41,7 +43,7 @@ class FreeMap:
         else:
             self._take_blocks(given, ghosts)
         self._w, self._m = np.zeros((2, self._ghosts.nobody + 1, 6))
-        # contacts that wait for no other rank, in two halves, and the others
+        # two halves of the contacts that wait for no other rank, then the other contacts
         ends = [0, self._first_away // 2, self._first_away, self.rows]
         self._half, self._rest, self._away = (Contacts.of(self, *pair) for pair in zip(ends, ends[1:]))
 
@@ -68,7 +70,7 @@ class FreeMap:
         self._flops = {"single": 36 * len(given.blocks), "through": 72 * len(given.blocks) + 15 * self.rows}
 
     def _cut(self, first: int, last: int) -> Any:
-        """The arrays of the contacts from ``first`` to ``last``."""
+        """The arrays of the contacts ``first`` to ``last - 1``."""
         if self._loops is compact_loops:
             return tuple(array[first:last] for array in self._arrays)
         blocks, start, body = self._arrays
@@ -101,7 +103,7 @@ class FreeMap:
         PETSc.Log.logFlops(2 * self._flops["single"])
 
     def pack(self, H: Array) -> Array:
-        """Symmetric blocks H (nc, 3, 3) for `local_product`."""
+        """Symmetric blocks H (nc, 3, 3) in the format (nc, 6) of `local_product`."""
         weight = np.empty((self.rows, 6))
         block_loops.pack(_floats(H), weight)
         return weight
@@ -112,14 +114,14 @@ class FreeMap:
         PETSc.Log.logFlops(15 * self.rows)
 
     def weights(self, H: Array, symmetric: bool = True) -> Array:
-        """What `through` wants to know of blocks H (nc, 3, 3): (nc, 6), or (nc, 9) of those that are not symmetric."""
+        """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""
         weight = np.empty((self.rows, 6 if symmetric else 9))
         loop = self._loops.weights if symmetric else self._loops.any_weights
         loop(*self._arrays, _floats(H), weight)
         return weight
 
     def through(self, weight: Array, v: Array, out: Array) -> None:
-        """out = v + G' H G v (columns, 6), C-contiguous."""
+        """out = v + G' H G v (columns, 6); out is C-contiguous."""
         v = v.reshape(-1, 6)
         self._m[:] = 0.0
         self._enter(self._root, v)
@@ -133,7 +135,10 @@ class FreeMap:
         PETSc.Log.logFlops(self._flops["through"])
 
     def _enter(self, scale: Array | None, v: Array) -> None:
-        """Put R v, or v, of the own bodies in place, and send it to where they are ghosts; `end_update` is to come."""
+        """Store R v, or v if there is no R, for the own bodies, and begin to send it to the ranks with ghosts of them.
+
+        The caller must call `end_update` later.
+        """
         if scale is None:
             self._w[: self.columns] = v[: self.columns]
         else:
@@ -147,7 +152,7 @@ class FreeMap:
         self._away.add_velocities(self._w, y)
 
     def _collect(self, g: Array) -> None:
-        """The momenta that impulses give the bodies, without their masses."""
+        """Collect the momenta that the impulses give to the bodies, not yet scaled by masses."""
         g = _floats(g)
         self._m[:] = 0.0
         self._away.add_momenta(g, self._m)
@@ -157,7 +162,7 @@ class FreeMap:
         self._ghosts.end_add(self._m)
 
     def _left(self, scale: Array | None) -> Array:
-        """What is left of the momenta: R m of the own bodies."""
+        """The scaled momenta of the own bodies: R m, or m if there is no R."""
         if scale is None:
             return self._m[: self.columns].copy()
         out = np.empty((self.columns, 6))
@@ -196,7 +201,7 @@ class FreeMap:
         return own
 
     def scaled(self, size: Array) -> FreeMap:
-        """The map with its rows multiplied by ``size`` (nc, 3); it ends with this one."""
+        """The map with its rows multiplied by ``size`` (nc, 3); it is valid until this map is destroyed."""
         if isinstance(self.given, CompactRows):
             frame = (self.given.frame.reshape(-1, 3, 3) * size[:, :, None]).reshape(-1, 9)
             return FreeMap(self.comm, dataclasses.replace(self.given, frame=frame), self._ghosts)
@@ -215,7 +220,7 @@ class FreeMap:
 
 @dataclasses.dataclass(frozen=True)
 class Contacts:
-    """Some contacts of a map, one after the other: the loops over them."""
+    """A range of contacts of a map, and the loops over it."""
 
     loops: ModuleType
     here: slice
@@ -239,7 +244,7 @@ class Contacts:
             loop(*self.arrays, weight[self.here], w, m)
 
 
-_FULL = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # of (xx, xy, xz, yy, yz, zz), the nine of a matrix
+_FULL = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # indices in (xx, xy, xz, yy, yz, zz) of the nine entries of a matrix
 
 
 def _floats(array: Array) -> Array:
@@ -247,7 +252,7 @@ def _floats(array: Array) -> Array:
 
 
 def _first(mask: np.ndarray) -> int:
-    """Where the first True is, or the length."""
+    """The index of the first True, or the length."""
     return int(np.argmax(mask)) if mask.any() else len(mask)
 
 
@@ -261,7 +266,7 @@ def _wide(root: Array) -> Array:
 
 
 def _square(root: Array) -> Array:
-    """R^2, in the form of R."""
+    """R^2, in the format of R."""
     if root.shape[1] == 6:
         return root * root
     full = root.reshape(-1, 6)[:, _FULL].reshape(-1, 3, 3)

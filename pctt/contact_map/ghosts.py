@@ -1,4 +1,4 @@
-"""The bodies that a rank's contacts touch: its own, and ghosts, copies of bodies that other ranks own."""
+"""The bodies that the contacts of a rank touch: its own bodies, and ghosts, copies of bodies that other ranks own."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pctt.exchange import offsets
 
 
 class Ghosts:
-    """Local numbers of bodies: own ones, then ghosts, then one number for all that is nobody's.
+    """Local numbers of bodies: first the own bodies, then the ghosts, then one number, `nobody`, for no body.
 
-    Values of bodies are arrays (nobody + 1, k): those of `nobody` are zero, or rubbish that nobody reads.
+    Values of bodies are arrays (nobody + 1, k). The last row, for `nobody`, is zero, or has values that nothing reads.
 
     Attributes
     ----------
@@ -22,7 +22,7 @@ class Ghosts:
     """
 
     def __init__(self, comm: MPI.Comm, own: int, body: np.ndarray):
-        """``body``: global indices, of any shape, -1 for none; collective."""
+        """``own`` is the number of own bodies. ``body`` has global indices in any shape, -1 for no body. Collective."""
         starts = offsets(comm, own)
         first, last = starts[comm.rank], starts[comm.rank + 1]
         here = (body >= first) & (body < last)
@@ -42,7 +42,7 @@ class Ghosts:
             self._sf.setUp()
 
     def update(self, values: np.ndarray) -> None:
-        """Give ghosts the values that their owners have."""
+        """Copy the values of the owners to the ghosts."""
         self.begin_update(values)
         self.end_update(values)
 
@@ -55,7 +55,10 @@ class Ghosts:
             self._sf.bcastEnd(*self._ends(values), MPI.REPLACE)
 
     def begin_add(self, values: np.ndarray) -> None:
-        """Add the values of ghosts to those of their owners, which may go on changing their own until `end_add`."""
+        """Begin to add the values of the ghosts to those of the owners.
+
+        Owners may still change their own values until `end_add`.
+        """
         if self._sf is not None:
             unit, own, ghosts = self._ends(values)
             self._arriving = np.zeros_like(own)

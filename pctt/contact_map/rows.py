@@ -1,4 +1,4 @@
-"""The rows of the contact map G = D' M^-1/2 that a rank has, in the storage in which they are given."""
+"""The local rows of the contact map G = D' M^-1/2, in one of two storage formats."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CompactRows:
-    """Contacts of rigid bodies: 15 numbers where two 3 x 6 blocks have 36.
+    """Contacts of rigid bodies: 15 numbers per contact, while two 3 x 6 blocks have 36 numbers.
 
-    The velocity of body b seen from body a in the frame F of a contact is F (v_b + w_b x r_b - v_a - w_a x r_a).
+    In the frame F of a contact, body b has the velocity F (v_b + w_b x r_b - v_a - w_a x r_a) relative to body a.
 
     Attributes
     ----------
     frame : (nc, 9) rows normal, tangent 1, tangent 2 of F
     arm : (nc, 6) r_a and r_b, from the centres of the bodies to the contact point (m)
     body : (nc, 2) global indices of a and b; -1 for a body that no impulse moves
-    root : (columns, 6) the diagonals of M^-1/2 of the bodies that this rank owns, or (columns, 12) its two symmetric
-        blocks, of translation and rotation, as (xx, xy, xz, yy, yz, zz) each; the same width on all ranks
+    root : M^-1/2 of the bodies that this rank owns: (columns, 6) with its diagonals, or (columns, 12) with its two
+        symmetric blocks, for translation and rotation, as (xx, xy, xz, yy, yz, zz) each; the same width on all ranks
     columns : number of bodies that this rank owns
 
-    A contact of which both bodies are owned here does not wait for other ranks if it comes before the first one that
-    has to.
+    Put the contacts between two own bodies first: a product does not wait for other ranks until it reaches the first
+    contact with a body of another rank.
     """
 
     frame: Array
@@ -44,7 +44,7 @@ class CompactRows:
         return len(self.frame)
 
     def block_rows(self, comm: MPI.Comm) -> BlockRows:
-        """The same as 3 x 6 blocks; collective."""
+        """These rows as 3 x 6 blocks; collective."""
         ghosts = Ghosts(comm, self.columns, self.body)
         root = np.zeros((ghosts.nobody + 1, self.root.shape[1]))
         root[: self.columns] = self.root

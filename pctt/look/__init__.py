@@ -1,4 +1,4 @@
-"""What a person looks at, made from the output folder of a run: reading it, surfaces, figures, command lines.
+"""Figures, pictures and files for ParaView from the output folder of a run.
 
 The programs are ``python -m pctt.plot``, ``pctt.render`` and ``pctt.export``.
 """

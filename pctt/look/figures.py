@@ -1,4 +1,4 @@
-"""Figures of a run, by matplotlib: each function makes one."""
+"""Figures of a run, made with matplotlib. Each public function makes one figure or one kind of figures."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ STYLE = {
     "savefig.dpi": 150,
 }
 
-# names of the figures of what records.csv holds, by the unit in the heads of its columns
+# names of the figures for the columns of records.csv, by the unit in the heads of the columns
 UNITS = {
     "": "statistics", "N": "forces", "N m": "torques", "J": "energies", "m": "lengths", "m/s": "velocities",
     "Pa": "stresses", "kg": "masses", "degrees": "angles",
 }
-# columns of the energy balance, see dem.record.energy_balance
+# columns of the energy balance (dem.record.energy_balance)
 BALANCE = ("kinetic_energy", "potential_energy", "work_of_motions", "friction_loss", "impact_loss", "time_stepping")
-NEIGHBOURS = 12  # of a grain, in an example
+NEIGHBOURS = 12  # number of neighbours of the middle grain in an `example`
 ALIKE = 5  # curves share axes if their greatest values differ by less than this factor
 
 
 def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
-    """Contacts, iterations, residual, peak memory and seconds of each step; ``lines``: those of steps.jsonl."""
+    """Contacts, iterations, residual, peak memory and seconds of each step; ``lines`` are those of steps.jsonl."""
     time = np.array([line["time"] for line in lines])
     figure = Figure(figsize=(12.5, 6.4))
     panels = figure.subplot_mosaic([["contacts", "its", "seconds"], ["residual", "memory", "seconds"]])
@@ -80,7 +80,7 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
         residual.plot(time, asked, color="black", linewidth=0.8, linestyle="--", label="tolerance")
     if residual.get_legend_handles_labels()[0]:
         residual.legend(fontsize="small")
-    if positive.any():  # a decade at least, or the labels of the axis say little
+    if positive.any():  # the axis has at least a decade, because it would have too few labels otherwise
         middle = np.sqrt(values[positive].min() * values[positive].max())
         low, high = residual.get_ylim()
         residual.set_ylim(min(low, 0.3 * middle), max(high, 3 * middle))
@@ -109,9 +109,12 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def curves(records: Mapping[str, np.ndarray], analysis: Mapping[str, np.ndarray]) -> dict[str, Figure]:
-    """What an experiment measures against how far its tool has gone: for a column ``TOOL_position [m]`` the columns of
-    forces, for ``..._displacement [m]`` those of stresses and the volume strain; raw, and filtered where the analysis
-    has it. The columns are those of records.csv and analysis.csv; no figure without them."""
+    """The measured quantities of an experiment against the way of its tool, a figure per tool.
+
+    For a column ``TOOL_position [m]`` the figure shows the columns of forces. For ``..._displacement [m]`` it shows the
+    columns of stresses and the volume strain. It shows the raw values of records.csv, and the filtered values if
+    analysis.csv has them. There is no figure without such columns.
+    """
     made = {}
     for way in [head for head in records if re.search(r"_(position|displacement) \[m\]$", head)]:
         unit = "N" if "position" in way else "Pa"
@@ -129,7 +132,7 @@ def curves(records: Mapping[str, np.ndarray], analysis: Mapping[str, np.ndarray]
             if filtered is not None:
                 axes.plot(records[way], filtered, color=f"C{k}", linewidth=1.6, label=f"{name}, filtered")
         low, high = np.nanpercentile([records[head] for head in heads], [0.5, 99.5])
-        axes.set_ylim(low - 0.08 * (high - low), high + 0.08 * (high - low) or 1.0)  # few peaks would flatten the rest
+        axes.set_ylim(low - 0.08 * (high - low), high + 0.08 * (high - low) or 1.0)  # peaks would flatten the rest
         axes.set_ylabel(f"{UNITS[unit]} [{unit}]")
         axes.legend(fontsize="small")
         for panel in below:
@@ -141,8 +144,11 @@ def curves(records: Mapping[str, np.ndarray], analysis: Mapping[str, np.ndarray]
 
 
 def records(columns: Mapping[str, np.ndarray]) -> dict[str, Figure]:
-    """What records.csv holds over time: the energy balance, and a figure for each other unit in the heads
-    ``name [unit]`` of its columns. Vectors have axes of their own, and so has what is much larger or smaller."""
+    """The columns of records.csv over time: a figure for the energy balance, and a figure for each other unit in the
+    heads ``name [unit]`` of the columns.
+
+    Vectors have axes of their own. Columns whose values differ much in size do not share axes.
+    """
     balance = [f"{name} [J]" for name in BALANCE]
     figures = {}
     if set(balance) <= set(columns):
@@ -179,8 +185,11 @@ def records(columns: Mapping[str, np.ndarray]) -> dict[str, Figure]:
 
 
 def _panels(columns: Mapping[str, np.ndarray], heads: Sequence[str]) -> dict[str, list[str]]:
-    """The columns that share axes, by what they have in common: components x, y, z by the name of the vector, single
-    ones by their own, and others of like size by a name that is empty but for blanks."""
+    """The columns that share axes, by the name of these axes.
+
+    The components x, y, z of a vector share axes, and the name is that of the vector. Other columns of similar size
+    share axes, and the name has only blanks. For a column alone it is the name of the column.
+    """
     panels: dict[str, list[str]] = {}
     sizes: list[tuple[float, list[str]]] = []
     for head in heads:
@@ -211,11 +220,12 @@ def _with_unit(axes: Axes, name: str, unit: str) -> None:
 
 
 def energy(columns: Mapping[str, np.ndarray]) -> Figure:
-    """Energies, and the work and the losses up to the time; below, on a scale of its own, the drift of the balance,
+    """Energies, and the sums of the work and of the losses, over time. The lower axes show the drift: the change of
 
-        kinetic + potential + losses - work - what it was before the first step,
+        kinetic + potential + losses - work
 
-    which is the error of the time stepping. Potential energy counts from the first record."""
+    since the beginning of the first step. The drift is the error of the time stepping. Potential energy counts from the
+    first record."""
     time = columns["time [s]"]
     kinetic, potential, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
     curves = {
@@ -240,7 +250,8 @@ def energy(columns: Mapping[str, np.ndarray]) -> Figure:
 
 
 def compare(summary: Mapping[str, Mapping[str, float]]) -> Figure:
-    """The compared preconditioners, the losers too: Krylov iterations, and seconds for all systems of the run."""
+    """All compared preconditioners, also those that failed: Krylov iterations, and seconds for all systems of the
+    run."""
     names = list(summary)
     rows = np.arange(len(names))
     keys = next(iter(summary.values()))
@@ -274,10 +285,11 @@ def compare(summary: Mapping[str, Mapping[str, float]]) -> Figure:
 
 
 def sparsity(folder: Folder, frame: Frame) -> Figure:
-    """The pattern of the Newton system of a small example (the contacts of `example`), and that of the Schur
-    complement S = N + B of the whole frame, in its order. Two contacts are coupled if they share a body that can move.
+    """Two patterns: the Newton matrix for the contacts of `example`, and the Schur complement S = N + B for all
+    contacts in the order of the frame. Two contacts are coupled if they share a body that can move.
 
-    Newton system: the 3 Nc impulses and the Nc multipliers; N + lambda hess f, grad f, its transpose, diag f.
+    The unknowns of the Newton system are the 3 Nc impulses and the Nc multipliers. Its blocks are N + lambda hess f,
+    grad f, the transpose of grad f, and diag f.
     """
     figure = Figure(figsize=(9, 4.9))
     left, right = figure.subplots(1, 2)
@@ -297,8 +309,10 @@ def sparsity(folder: Folder, frame: Frame) -> Figure:
 
 
 def graphs(folder: Folder, frame: Frame) -> Figure:
-    """A small example as in Figure 4 of the paper: bodies, the graph of the bodies, the graph of the contacts; seen
-    along the direction in which it is thinnest."""
+    """The contacts of `example` as in Figure 4 of the paper: bodies, graph of the bodies, graph of the contacts.
+
+    The cluster is seen along the direction in which it is thinnest.
+    """
     few = example(folder, frame)
     pair, point = frame.contacts.body[few], frame.contacts.point[few]
     grains = np.unique(pair[pair < folder.grains])
@@ -307,7 +321,7 @@ def graphs(folder: Folder, frame: Frame) -> Figure:
     spot, centers = (point - middle) @ axes3.T, (frame.position - middle) @ axes3.T
     radius = np.linalg.norm(folder.size, axis=1)
     beyond = 1.15 * (np.linalg.norm(centers[grains], axis=1) + 0.5 * radius[grains]).max()
-    for body in np.unique(pair[pair >= folder.grains]):  # a large body stands outside of the grains
+    for body in np.unique(pair[pair >= folder.grains]):  # draw a large body outside of the grains
         way = spot[(pair == body).any(axis=1)].mean(axis=0)
         length = np.linalg.norm(way)
         centers[body] = beyond * (way / length if length > 1e-9 * beyond else np.array([0.0, -1.0]))
@@ -323,7 +337,7 @@ def graphs(folder: Folder, frame: Frame) -> Figure:
     bodies.plot(*centers[grains].T, "o", color="C3", label="centres")
     bodies.plot(*spot.T, "s", color="white", markeredgecolor="black", label="contacts")
     figure.legend(*bodies.get_legend_handles_labels(), loc="lower left", ncols=2)
-    # room for the legend, and for the titles, which axes of equal scales let stand out
+    # room for the legend and for the titles; axes with equal scales let the titles stand out
     figure.get_layout_engine().set(rect=(0, 0.08, 1, 0.9))
 
     for a, b in pair:
@@ -352,8 +366,12 @@ def graphs(folder: Folder, frame: Frame) -> Figure:
 
 
 def example(folder: Folder, frame: Frame) -> np.ndarray:
-    """Rows of the contacts of a small cluster: a grain that touches a large body if any does, the one with most
-    contacts, its NEIGHBOURS nearest neighbours, and what these touch of each other and of the large bodies."""
+    """Indices of the contacts of a small cluster.
+
+    The middle of the cluster is the grain with the most contacts among those that touch a large body, or among all
+    grains if none touches one. The cluster has this grain, its NEIGHBOURS nearest neighbours and the large bodies. The
+    contacts are those between these bodies.
+    """
     pair = frame.contacts.body
     degree = np.bincount(pair.ravel(), minlength=len(frame.position))[: folder.grains]
     at_large = np.unique(pair[(pair >= folder.grains).any(axis=1)].min(axis=1, initial=folder.grains))
@@ -369,7 +387,7 @@ def example(folder: Folder, frame: Frame) -> np.ndarray:
 
 
 def _coupling(folder: Folder, frame: Frame) -> sp.csr_matrix:
-    """Pattern (nc, nc) of the blocks of N: contacts that share a body of finite mass, and the diagonal."""
+    """Pattern (nc, nc) of the blocks of N: pairs of contacts that share a body of finite mass, and the diagonal."""
     pair = frame.contacts.body
     row, body = np.repeat(np.arange(len(pair)), 2), pair.ravel()
     moves = np.isfinite(folder.mass[body])
@@ -382,7 +400,7 @@ def _coupling(folder: Folder, frame: Frame) -> sp.csr_matrix:
 def _spy(axes: Axes, pattern: Any) -> None:
     entries = sp.coo_matrix(pattern)
     n = entries.shape[0]
-    if n <= 300:  # to the dot; markers of so large entries would leave gaps
+    if n <= 300:  # an image, because markers of this size would leave gaps
         filled = np.ma.masked_equal(entries.toarray() != 0, False)
         axes.imshow(filled, cmap=ListedColormap(["C0"]), interpolation="nearest")
     else:

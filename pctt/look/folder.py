@@ -1,4 +1,4 @@
-"""The output folder of a run, read back."""
+"""Reading the output folder of a run."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ from pctt import disk, figures_json
 
 
 class FolderError(RuntimeError):
-    """A folder that lacks what is to be shown; the message names the folder and what to do."""
+    """The folder lacks data that a program needs; the message names the folder and says what to do."""
 
 
 @dataclass(frozen=True)
 class Contacts:
-    """The contacts of a step, of bodies a and b, and the impulses that acted in it."""
+    """The contacts of a step between bodies a and b, and the impulses that acted in the step."""
 
     body: np.ndarray  #: (nc, 2) ids of a and b
     point: np.ndarray  #: (nc, 3) [m]
-    frame: np.ndarray  #: (nc, 3, 3) rows normal (from a to b), t1, t2
+    frame: np.ndarray  #: (nc, 3, 3) with rows normal (from a to b), t1, t2
     gap: np.ndarray  #: (nc,) [m]
-    impulse: np.ndarray  #: (nc, 3) on b, in the frame [N s]
-    dt: float  #: the step in which the impulses acted [s]
+    impulse: np.ndarray  #: (nc, 3) on b, in the contact frame [N s]
+    dt: float  #: length of the step in which the impulses acted [s]
 
     @property
     def force(self) -> np.ndarray:
-        """(nc, 3) mean forces on b in the step, in the world frame [N]."""
+        """Mean forces (nc, 3) on b in the step, in the world frame [N]."""
         return np.einsum("ci,cij->cj", self.impulse, self.frame) / self.dt
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A recorded step. Rows are bodies by id, the grains first, then the large bodies."""
+    """A recorded step. The rows of the arrays are the bodies in the order of their ids: first the grains, then the
+    large bodies."""
 
     step: int
     time: float  #: [s]
@@ -48,20 +49,21 @@ class Frame:
 
     @property
     def speed(self) -> np.ndarray:
-        """(n,) of the centres [m/s]."""
+        """Speeds (n,) of the centres [m/s]."""
         return np.linalg.norm(self.velocity[:, :3], axis=1)
 
     def load(self) -> np.ndarray:
-        """(n,) sum of the magnitudes of the contact forces on each body [N]."""
+        """Sums (n,) of the magnitudes of the contact forces on each body [N]."""
         size = np.linalg.norm(self.contacts.force, axis=1)
         return np.bincount(self.contacts.body.ravel(), np.repeat(size, 2), minlength=len(self.position))
 
 
 class Folder:
-    """The output folder of ``python -m pctt.run``. Raises FolderError if it is none.
+    """The output folder of ``python -m pctt.run``. Raises FolderError if the folder is not one.
 
-    Attributes: ``path``; ``summary`` (dict) is summary.json; ``steps`` (list) are the recorded steps, by which
-    ``frame`` reads them. They are taken from frames/ itself: of a run that goes on state.h5 may lack the last.
+    Attributes: ``path``; ``summary`` (dict) has the contents of summary.json; ``steps`` (list) has the numbers of the
+    recorded steps, for `frame`. The numbers come from the files in frames/, because state.h5 may lack the last steps
+    while the run continues.
     """
 
     def __init__(self, path: str | Path):
@@ -77,7 +79,7 @@ class Folder:
         self.steps = sorted(int(path.stem) for path in self._frames.glob("*.h5") if path.stem.isdigit())
 
     def require_frames(self) -> None:
-        """FolderError unless there are recorded steps, with the shapes of the bodies."""
+        """Read the shapes of the bodies; FolderError if these, or recorded steps, are missing."""
         if not self.steps:
             raise FolderError(f"{self.path}: no recorded steps; run with -output_every 1 or more")
         try:
@@ -86,7 +88,7 @@ class Folder:
                 self.size: np.ndarray = file["size"][()]
                 self.mass: np.ndarray = file["mass"][()]
                 self.material: np.ndarray = file["material"][()]
-                #: names of the materials by their numbers; folders of earlier versions have none
+                #: names of the materials by their numbers; folders of earlier versions have no names
                 names = file["materials"][()] if "materials" in file else np.arange(self.material.max() + 1).astype("S")
                 self.materials: list[str] = [name.decode() for name in names]
                 #: name and shapes of each large body, the rows after the grains
@@ -110,7 +112,7 @@ class Folder:
 
     @property
     def bodies_path(self) -> Path:
-        """The file of what no step changes."""
+        """The file with the data that no step changes."""
         return self._frames / "bodies.h5"
 
     def frame_path(self, step: int) -> Path:
@@ -118,8 +120,10 @@ class Folder:
         return self._frames / f"{step:06d}.h5"
 
     def lines(self) -> list[dict[str, Any]]:
-        """The figures of each step, in their order, from steps.jsonl; none if there is no such file. Those that were
-        no numbers are infinite."""
+        """The figures of each step, in the order of the steps, from steps.jsonl; an empty list if the file is missing.
+
+        Values that JSON has no number for (infinity and NaN) are infinite.
+        """
         path = self.path / "steps.jsonl"
         try:
             return [figures_json.loads(line) for line in disk.lines(path)]
@@ -127,11 +131,11 @@ class Folder:
             raise FolderError(f"{path}: no list of steps ({error})") from None
 
     def records(self) -> dict[str, np.ndarray]:
-        """Columns of records.csv by their heads, such as ``force_blade_x [N]``; none if there is no such file."""
+        """Columns of records.csv by their heads, such as ``force_blade_x [N]``; empty if the file is missing."""
         return self._table("records.csv")
 
     def analysis(self) -> dict[str, np.ndarray]:
-        """Columns of analysis.csv, as of `records`; none where the rows are not those of records.csv."""
+        """Columns of analysis.csv by their heads; empty if its rows do not match those of records.csv."""
         found, records = self._table("analysis.csv"), self.records()
         same = found and records and np.array_equal(found["time [s]"], records["time [s]"])
         return found if same else {}

@@ -1,4 +1,4 @@
-"""What the programs that show a folder have in common: their command lines, their errors, their ranks."""
+"""Common parts of the programs that show the output folder of a run: command lines, errors, ranks."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from pctt import disk
 from pctt.look.folder import FolderError
 
 LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")
-EXTRA = "the libraries that draw are the extra `pictures`: pip install -e '.[pictures]' in the project's folder"
+EXTRA = "the extra `pictures` has the libraries that draw: pip install -e '.[pictures]' in the project's folder"
 
 
 def parser(program: str, text: str) -> argparse.ArgumentParser:
-    """A command line whose first word is the folder."""
+    """The parser of a command line whose first word is the folder."""
     line = argparse.ArgumentParser(
         f"python -m pctt.{program}",
         description=text,
@@ -32,7 +32,7 @@ def parser(program: str, text: str) -> argparse.ArgumentParser:
 
 
 def add_steps(line: argparse.ArgumentParser) -> None:
-    """Options that choose among the recorded steps."""
+    """Add the options that choose some of the recorded steps."""
     line.add_argument("-first", type=int, default=0, metavar="STEP", help="first step")
     line.add_argument("-last", type=int, default=sys.maxsize, metavar="STEP", help="last step")
     line.add_argument("-every", type=positive(int), default=1, metavar="K", help="only every k-th recorded step")
@@ -48,7 +48,7 @@ def chosen(steps: list[int], arguments: argparse.Namespace) -> list[int]:
 
 
 def positive(kind: Callable[[str], float]) -> Callable[[str], float]:
-    """Type of an option that must be above zero."""
+    """The argparse type of an option whose value must be positive."""
 
     def read(text: str) -> float:
         value = kind(text)
@@ -61,12 +61,15 @@ def positive(kind: Callable[[str], float]) -> Callable[[str], float]:
 
 
 def run(main: Callable[[MPI.Comm], None], program: str) -> int:
-    """Exit status of ``main(comm)``: 0, or 2 for a folder that cannot be shown, told once."""
+    """Run ``main(comm)`` and return the exit status: 0, or 2 after an error that the user can repair.
+
+    Such errors are a folder that cannot be shown and a missing library. The message is printed once.
+    """
     comm = MPI.COMM_WORLD
     try:
         main(comm)
     except FolderError as error:
-        if comm.size > 1:  # perhaps on this rank alone
+        if comm.size > 1:  # the error may be on this rank only
             print(f"pctt.{program}: {error}", file=sys.stderr, flush=True)
             comm.Abort(2)
         print(f"pctt.{program}: {error}", file=sys.stderr)
@@ -81,7 +84,7 @@ def run(main: Callable[[MPI.Comm], None], program: str) -> int:
 
 
 def made_folder(path: Path) -> Path:
-    """The folder, made if it is not there; FolderError if it cannot be."""
+    """Make the folder if it does not exist, and return it; FolderError if this is not possible."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -91,7 +94,10 @@ def made_folder(path: Path) -> Path:
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A temporary name for a file that gets its own when the block ends; FolderError if it cannot be written."""
+    """A temporary name for a file, which is renamed to ``path`` when the block ends.
+
+    FolderError if the file cannot be written.
+    """
     try:
         with disk.whole(path) as temporary:
             yield temporary

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
-import vtkmodules.vtkRenderingFreeType  # noqa: F401 - text
-import vtkmodules.vtkRenderingUI  # noqa: F401 - windows on a display
+import vtkmodules.vtkRenderingFreeType  # noqa: F401 - VTK needs it to draw text
+import vtkmodules.vtkRenderingUI  # noqa: F401 - VTK needs it for windows on a display
 from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkLogger, vtkLookupTable, vtkVersion
 from vtkmodules.vtkCommonDataModel import vtkPolyData
@@ -38,39 +38,38 @@ WALL = (0.88, 0.89, 0.91)
 EDGE = (0.50, 0.52, 0.55)
 TOOL = (0.58, 0.63, 0.70)
 SHELL = (0.72, 0.75, 0.80)
-STAGE = 0.86  # part of the width that the scene has; the rest is the colour bar's
+STAGE = 0.86  # part of the width for the scene; the rest is for the colour bar
 
 
 @dataclass(frozen=True)
 class View:
-    """How a scene is looked at."""
+    """How a scene is shown."""
 
     azimuth: float  #: of the camera about the vertical, from the x axis [degrees]
     elevation: float  #: of the camera above the horizon [degrees]
-    zoom: float  #: 1: all of the scene fits in
+    zoom: float  #: with 1 the whole scene fits into the picture
     width: int  #: [pixels]
-    height: int
-    opacity: float  #: of large bodies, but for their planes
+    height: int  #: [pixels]
+    opacity: float  #: of large bodies without their planes
     cut: bool  #: leave out the grains in the half that is nearer to the camera
 
 
 @dataclass(frozen=True)
 class Paint:
-    """What the colours of the grains mean."""
+    """The meaning of the colours of the grains."""
 
     title: str
     low: float
     high: float
     map: str  #: name of a colour map of matplotlib
     ends: tuple[float, float] = (0.0, 1.0)  #: the part of the map that is used
-    names: Sequence[str] = ()  #: of the values 0, 1, ...: if there are any, a legend takes the place of the bar
+    names: Sequence[str] = ()  #: of the values 0, 1, ...; with names, a legend takes the place of the bar
 
 
 class Stage:
-    """Draws frames of one folder, all seen in the same way, from where all of the ``frames`` given at first fits in.
+    """Draws frames of one folder, all with the same camera. The ``frames`` given at first fit into the picture.
 
-    Of planes, and of drums and other shells, only the side of the grains is drawn, so that walls between them and the
-    camera hide nothing.
+    Planes, drums and other shells are drawn on the side of the grains only, so no wall hides the grains.
     """
 
     def __init__(self, folder: Folder, frames: Sequence[Frame], view: View, paint: Paint):
@@ -85,7 +84,7 @@ class Stage:
         self._renderer.SetUseDepthPeeling(view.opacity < 1)
         vtkLightKit().AddLightsToRenderer(self._renderer)
         colours = _lookup_table(paint)
-        self._spheres = vtkOpenGLSphereMapper()  # drawn pixel by pixel: round at any size, thousands cost little
+        self._spheres = vtkOpenGLSphereMapper()  # round at any size, and thousands cost little
         self._spheres.SetScaleArray("radius")
         self._boxes, self._cylinders = _glyphs(surfaces.cube()), _glyphs(surfaces.cylinder())
         for mapper in (self._spheres, self._boxes, self._cylinders):
@@ -95,7 +94,7 @@ class Stage:
         faces.BackfaceCullingOn()
         self._shells.GetProperty().BackfaceCullingOn()
         self._shells.GetProperty().SetAmbient(0.3)
-        self._walls.GetMapper().SetRelativeCoincidentTopologyPolygonOffsetParameters(4, 8)  # behind their edges
+        self._walls.GetMapper().SetRelativeCoincidentTopologyPolygonOffsetParameters(4, 8)  # walls behind their edges
         faces.SetAmbient(0.75)
         faces.SetDiffuse(0.25)
         edges.LightingOff()
@@ -112,7 +111,7 @@ class Stage:
         self._window.AddRenderer(margin)
 
     def draw(self, frame: Frame, value: np.ndarray) -> np.ndarray:
-        """The picture (height, width, 3) of a frame, its grains coloured by value (grains,)."""
+        """The picture (height, width, 3) of a frame; ``value`` (grains,) gives the colours of the grains."""
         folder = self.folder
         place, turn = (a[: folder.grains] for a in (frame.position, frame.quaternion))
         shape, extent = folder.shape[: folder.grains], surfaces.extent(folder)
@@ -164,7 +163,7 @@ class Stage:
         return actor
 
     def _aim(self, points: np.ndarray) -> None:
-        """Put the camera as near as all points (n, 3) allow."""
+        """Put the camera as near as possible, so that it still sees all points (n, 3)."""
         camera = self._renderer.GetActiveCamera()
         center = self.box.mean(axis=0)
         corners = points - center
@@ -195,12 +194,12 @@ class Stage:
 
 
 def _window(view: View) -> vtkRenderWindow:
-    """A window that nobody sees; FolderError where VTK would end the process for want of a driver."""
+    """A window without a display; FolderError if VTK would end the process because it lacks a driver."""
     version = vtkVersion.GetVTKVersion()
     if not os.environ.get("DISPLAY"):
         if tuple(map(int, version.split(".")[:2])) < (9, 4):
             raise FolderError(f"vtk {version} cannot draw without a display: pip install 'vtk>=9.4', or set DISPLAY")
-        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # it warns that it tries X first, then EGL
+        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # VTK warns that it tries X first, then EGL
     window = vtkRenderWindow()
     if window.GetClassName() == "vtkOSOpenGLRenderWindow" and not find_library("OSMesa"):
         raise FolderError(
@@ -224,13 +223,13 @@ def _glyphs(source: vtkPolyData) -> vtkGlyph3DMapper:
 
 
 def _show(mapper: vtkMapper, points: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
-    data = surfaces.polydata(points.astype(np.float32), "verts")  # the mapper of spheres takes no other
+    data = surfaces.polydata(points.astype(np.float32), "verts")  # the mapper of spheres needs float32
     surfaces.add_arrays(data.GetPointData(), columns)
     mapper.SetInputDataObject(data)
 
 
 def _towards_camera(view: View, level: bool = False) -> np.ndarray:
-    """Unit vector to the camera, or what is level of it."""
+    """Unit vector to the camera; if ``level``, its horizontal direction."""
     azimuth, elevation = np.radians([view.azimuth, 0.0 if level else view.elevation])
     flat = np.cos(elevation)
     return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
@@ -262,7 +261,7 @@ def _colour_bar(colours: vtkLookupTable, title: str, view: View) -> vtkScalarBar
 
 
 def _legend(colours: vtkLookupTable, paint: Paint, view: View) -> list[vtkTextActor]:
-    """The title and below it each name on its colour, all in letters so small that the longest name has room."""
+    """The title, and below it each name on its colour. The letters are so small that the longest name has room."""
     size = min(view.height / 36, 1.6 * (1 - STAGE) * view.width / max(map(len, paint.names)))
     lines = []
     for row, text in enumerate([paint.title, *paint.names]):

@@ -1,4 +1,4 @@
-"""Bodies as surfaces of VTK: grains and large bodies, planes cut to the size of the scene."""
+"""Surfaces of grains and large bodies for VTK; planes are cut to the size of the scene."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from dem.mesh import Surface
 from pctt.look.folder import Folder, FolderError, Frame
 
 MARGIN = 0.06  # how far walls go beyond the grains, in diagonals of the scene
-HOLLOW = 0.3  # of the way from the middle of a shell to its bounds, which is empty
+HOLLOW = 0.3  # a hollow body is empty up to this part of the way from its middle to its bounds
 
 
 def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
-    """Lowest and highest corner (2, 3) of the scene in these frames [m]: of the grains, and of the large bodies among
-    or around them that are no walls."""
+    """Lowest and highest corner (2, 3) of the scene in these frames [m]. The scene has the grains and the large bodies
+    among or around them, without walls."""
     radius = enclosing_radius(folder)[:, None]
     places = [frame.position[: folder.grains] for frame in frames]
     low = np.min([(place - radius).min(axis=0) for place in places], axis=0)
@@ -44,7 +44,7 @@ def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
 
 
 def enclosing_radius(folder: Folder) -> np.ndarray:
-    """Radii (grains,) of the spheres about the grains [m]."""
+    """Radii (grains,) of the spheres that enclose the grains [m]."""
     return 0.5 * np.where(
         folder.shape[: folder.grains] == BOX,
         np.linalg.norm(extent(folder), axis=1),
@@ -64,7 +64,10 @@ def extent(folder: Folder) -> np.ndarray:
 
 
 def polydata(points: np.ndarray, cells: str = "", ends: np.ndarray | None = None) -> vtkPolyData:
-    """Points (n, 3), and all of them in turn as `verts`, `lines` or `polys`; a cell ends before each of `ends`."""
+    """Data with points (n, 3), and with cells `verts`, `lines` or `polys` that take the points in their order.
+
+    A cell ends before each of the indices `ends`; by default every point is a cell.
+    """
     data = vtkPolyData()
     place = vtkPoints()
     place.SetData(numpy_to_vtk(np.ascontiguousarray(points).reshape(-1, 3), deep=True))
@@ -102,8 +105,10 @@ def cylinder() -> vtkPolyData:
 
 
 def finite(folder: Folder, frame: Frame, row: int, box: np.ndarray | None = None) -> vtkPolyData:
-    """The surface of the large body `row`, but for its planes; with a box (2, 3), also but for its walls about it, and
-    nothing of a body that is a `shell`."""
+    """The surface of the large body `row` without its planes.
+
+    With a box (2, 3), the surface also lacks the walls beside the box. For a `shell` it is empty then.
+    """
     place, turn = _pose(folder, frame, row)
     parts: list[vtkPolyData] = []
     shapes = folder.large[row]["shapes"]
@@ -112,7 +117,7 @@ def finite(folder: Folder, frame: Frame, row: int, box: np.ndarray | None = None
     for shape in shapes:
         if shape["kind"] != "Plane":
             part = _placed(_surface(shape), shape, place, turn)
-            # a single shape is a tool, such as a blade, and drawn whole
+            # a body of a single shape is a tool, such as a blade; it is drawn completely
             if box is None or len(shapes) == 1 or shape["kind"] != "Box" or not _is_wall(part, box):
                 parts.append(part)
     return joined(parts)
@@ -128,7 +133,10 @@ def _is_wall(solid: vtkPolyData, box: np.ndarray) -> bool:
 
 
 def shell(folder: Folder, frame: Frame, row: int) -> vtkPolyData:
-    """The triangles of the large body `row` if it is a shell, such as a drum or a silo, as seen from inside."""
+    """The triangles of the large body `row`, as seen from inside, if it is a shell, such as a drum or a silo.
+
+    Otherwise the surface is empty.
+    """
     if not is_shell(folder, row):
         return vtkPolyData()
     triangles = _solid(folder, frame, row)
@@ -136,7 +144,7 @@ def shell(folder: Folder, frame: Frame, row: int) -> vtkPolyData:
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     away = np.einsum("mi,mi->m", normal, triangles.mean(axis=1) - middle) > 0.0
     if any(shape["kind"] == "Box" for shape in folder.large[row]["shapes"]):
-        triangles = triangles[~away]  # of thick walls only the inside
+        triangles = triangles[~away]  # only the inner sides of thick walls
     else:
         triangles[away] = triangles[away, ::-1]
     return polydata(triangles.reshape(-1, 3), "polys", 3 * np.arange(1, len(triangles) + 1))
@@ -144,8 +152,11 @@ def shell(folder: Folder, frame: Frame, row: int) -> vtkPolyData:
 
 @lru_cache(maxsize=256)
 def is_shell(folder: Folder, row: int) -> bool:
-    """Whether the large body `row` is hollow, made of meshes or of boxes that stand obliquely to each other, and has
-    half of the grains inside at the first or at the last recorded step."""
+    """Whether the large body `row` is a hollow body around the grains.
+
+    It consists of meshes, or of boxes that stand obliquely to each other. At the first or at the last recorded step
+    half of the grains are inside.
+    """
     solid = [shape for shape in folder.large[row]["shapes"] if shape["kind"] != "Plane"]
     meshes = any(shape["kind"] == "Mesh" for shape in solid)
     if not solid or {shape["kind"] for shape in solid} - {"Box", "Mesh"} or not (meshes or len(solid) > 2):
@@ -164,7 +175,7 @@ def is_shell(folder: Folder, row: int) -> bool:
 
 
 def _is_hollow(triangles: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool:
-    """Whether there is nothing of the triangles (m, 3, 3) about the middle of their bounds."""
+    """Whether the triangles (m, 3, 3) leave the space around the middle of their bounds empty."""
     corners = (triangles.reshape(-1, 3) - 0.5 * (low + high)) / (0.5 * (high - low))
     surface = Surface(corners, np.arange(len(corners)).reshape(-1, 3))
     middle = np.broadcast_to(-surface.middle, (len(triangles), 3))
@@ -172,7 +183,7 @@ def _is_hollow(triangles: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool
 
 
 def _solid(folder: Folder, frame: Frame, row: int) -> np.ndarray:
-    """The corners (m, 3, 3) of the triangles of the large body `row` but for its planes."""
+    """The corners (m, 3, 3) of the triangles of the large body `row` without its planes."""
     place, turn = _pose(folder, frame, row)
     shapes = [shape for shape in folder.large[row]["shapes"] if shape["kind"] != "Plane"]
     return _triangles(joined([_placed(_surface(shape), shape, place, turn) for shape in shapes]))
@@ -199,34 +210,39 @@ def joined(parts: Sequence[vtkPolyData]) -> vtkPolyData:
 
 @dataclass(frozen=True)
 class Wall:
-    """A rectangle that bounds the grains; of a plane, one that is larger than the scene."""
+    """A rectangle that bounds the grains; for a plane, it is larger than the scene."""
 
     center: np.ndarray  #: (3,) [m]
-    normal: np.ndarray  #: (3,) unit vector to the side of the grains
+    normal: np.ndarray  #: (3,) unit vector towards the grains
     first: np.ndarray  #: (3,) half of one edge [m]; normal, first and second are right-handed
-    second: np.ndarray  #: (3,) half of the other
+    second: np.ndarray  #: (3,) half of the other edge [m]
 
     def corners(self) -> np.ndarray:
-        """(4, 3), counterclockwise as seen from the side of the grains."""
+        """The corners (4, 3), counterclockwise as seen from the grains [m]."""
         first, second = self.first, self.second
         return self.center + np.array([first + second, second - first, -first - second, first - second])
 
     def covers(self, points: np.ndarray) -> bool:
-        """Whether points (k, 3) all lie in the prism that stands on the rectangle."""
+        """Whether all points (k, 3) lie in the prism over the rectangle."""
         away = points - self.center
         return all((np.abs(away @ half) <= (1 + 1e-9) * (half @ half)).all() for half in (self.first, self.second))
 
 
 def planes(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.ndarray]:
-    """The planes of the large body `row` as polygons (k, 3) seen from their open side, cut where another plane of the
-    body is before them and at `room` of the box (2, 3)."""
+    """The planes of the large body `row` as polygons (k, 3), as seen from their open side.
+
+    A plane is cut at the `room` of the box (2, 3), and where another plane of the body stands in front of it.
+    """
     return _cut(_planes(folder, frame, row, box), box)
 
 
 def walls(folder: Folder, frame: Frame, box: np.ndarray) -> list[np.ndarray]:
-    """What bounds the grains, as polygons (k, 3) seen from inside: the planes of all large bodies; and of their boxes
-    that stand beside the scene, `box` (2, 3), the faces towards its middle. They are cut as `planes` are, also where
-    those of other bodies are before them."""
+    """The walls around the grains as polygons (k, 3), as seen from inside.
+
+    Walls are the planes of all large bodies. If a large body has boxes that stand beside the scene, `box` (2, 3), the
+    faces of these boxes towards the middle of the scene are walls too. The polygons are cut like those of `planes`, and
+    also where a wall of another body stands in front of them.
+    """
     rows = range(len(folder.large))
     return _cut([wall for kind in (_planes, _box_walls) for row in rows for wall in kind(folder, frame, row, box)], box)
 
@@ -271,7 +287,7 @@ def _box_walls(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[
 
 
 def _cut(found: Sequence[Wall], box: np.ndarray) -> list[np.ndarray]:
-    """The polygons (k, 3) that are left of walls within the `room` of a box (2, 3) where no other wall hides them."""
+    """The parts of walls, as polygons (k, 3), that lie in the `room` of a box (2, 3) and behind no other wall."""
     low, high = room(box)
     sides = [(axis, low) for axis in np.eye(3)] + [(-axis, high) for axis in np.eye(3)]
     polygons = []
@@ -288,7 +304,10 @@ def _cut(found: Sequence[Wall], box: np.ndarray) -> list[np.ndarray]:
 
 
 def _before(polygon: np.ndarray, normal: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """The part of a convex polygon (k, 3) before a plane; all of one that rounding alone puts behind it."""
+    """The part of a convex polygon (k, 3) in front of a plane.
+
+    A polygon that lies in the plane up to rounding is kept whole.
+    """
     height = (polygon - point) @ normal
     if len(polygon) and np.ptp(height) < 1e-9 * np.ptp(polygon):
         return polygon if height[0] >= -1e-9 * np.ptp(polygon) else polygon[:0]
@@ -328,7 +347,7 @@ def _pose(folder: Folder, frame: Frame, row: int) -> tuple[np.ndarray, np.ndarra
 
 
 def _surface(shape: Mapping[str, Any]) -> vtkPolyData:
-    """A shape of a large body in its own frame."""
+    """The surface of a shape of a large body, in the frame of the shape."""
     if shape["kind"] == "Sphere":
         ball = vtkSphereSource()
         ball.SetRadius(shape["radius"])
@@ -358,7 +377,7 @@ def _surface(shape: Mapping[str, Any]) -> vtkPolyData:
 
 
 def _along_z(source: vtkCylinderSource) -> vtkPolyData:
-    """The surface of a source along y, turned to z."""
+    """The surface of a source whose axis is y, turned so that its axis is z."""
     turn = vtkTransform()
     turn.RotateX(90)
     return _moved(source, turn)
@@ -374,7 +393,7 @@ def _moved(source: Any, transform: vtkTransform) -> vtkPolyData:
 
 
 def _placed(surface: vtkPolyData, shape: Mapping[str, Any], place: np.ndarray, turn: np.ndarray) -> vtkPolyData:
-    """The surface of a shape moved into the body frame and with it into the world."""
+    """The surface of a shape, moved into the frame of the body and then into the world frame."""
     inner = np.array(shape.get("quaternion", (1.0, 0.0, 0.0, 0.0)))
     matrix = np.eye(4)
     matrix[:3, :3] = quaternion.matrix(quaternion.multiply(turn, inner))

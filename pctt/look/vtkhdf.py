@@ -30,7 +30,7 @@ def write(path: Path, times: Sequence[float], data: Iterable[Any]) -> None:
 
 
 def _append_step(root: h5py.Group, steps: h5py.Group, data: Any) -> None:
-    """The data behind those of the steps before, and in ``steps`` where they begin."""
+    """Append the data of a step to those of the earlier steps, and the offsets where they begin to ``steps``."""
     points = data.GetPoints()
     places = vtk_to_numpy(points.GetData()) if points else np.zeros((0, 3))
     _append(steps, "PointOffsets", [_append(root, "Points", places)])
@@ -42,7 +42,7 @@ def _append_step(root: h5py.Group, steps: h5py.Group, data: Any) -> None:
         ends = vtk_to_numpy(array.GetOffsetsArray()) if count else np.zeros(1)
         joined = vtk_to_numpy(array.GetConnectivityArray()) if count else np.zeros(0)
         before = _append(group, "NumberOfCells", [count])
-        cells.append(_append(group, "Offsets", ends.astype(np.int64)) - before)  # each part has one more than cells
+        cells.append(_append(group, "Offsets", ends.astype(np.int64)) - before)  # a part has one offset more than cells
         connectivity.append(_append(group, "Connectivity", joined.astype(np.int64)))
         _append(group, "NumberOfConnectivityIds", [len(joined)])
     _append(steps, "CellOffsets", [cells])
@@ -55,7 +55,7 @@ def _append_step(root: h5py.Group, steps: h5py.Group, data: Any) -> None:
 
 
 def _append(group: h5py.Group, name: str, rows: Any) -> int:
-    """Add rows to a dataset, made if it is not there; the number of rows before."""
+    """Append rows to a dataset and return the number of rows before; make the dataset if it does not exist."""
     rows = np.asarray(rows)
     if name not in group:
         group.create_dataset(name, (0, *rows.shape[1:]), rows.dtype, maxshape=(None, *rows.shape[1:]), chunks=True)

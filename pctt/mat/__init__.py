@@ -1,4 +1,4 @@
-"""Mats that are functions: `-mat_type python -mat_python_type pctt.mat.TensorTrain`."""
+"""Mats that are given by functions: `-mat_type python -mat_python_type pctt.mat.TensorTrain`."""
 
 from pctt.petsc import require_real_double
 

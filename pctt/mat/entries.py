@@ -1,4 +1,4 @@
-"""The entries of a Mat on several ranks: those of a function that the user gives, or of a dense Mat."""
+"""The entries of a Mat on several ranks: from a function of the user, or from a dense Mat."""
 
 from __future__ import annotations
 
@@ -12,27 +12,28 @@ from petsc4py import PETSc
 from pctt.tt.train import Array
 
 DENSE = ("dense", "seqdense", "mpidense")
-CHECKS = 256  # pairs of entries that are compared with those across the diagonal
-ASYMMETRY = 1e-8  # of these that is put down to rounding
+CHECKS = 256  # number of entries that are compared with those across the diagonal
+ASYMMETRY = 1e-8  # a smaller relative difference of these counts as rounding
 
 
 class EntriesError(ValueError):
-    """Entries that are no numbers, or a function for them that fails; raised on all ranks alike."""
+    """Entries are not numbers, or the function for them fails; raised on all ranks."""
 
 
 def has_entries(P: PETSc.Mat) -> bool:
-    """Whether P's entries are looked up one by one: P has the attribute ``entries``, or is dense and on a grid or
-    without blocks."""
+    """Whether P gives its entries one by one: P has the attribute ``entries``, or it is dense and has a grid or no
+    blocks."""
     dense = P.getType() in DENSE and (P.getBlockSize() == 1 or P.getAttr("grid") is not None)
     return dense or P.getAttr("entries") is not None
 
 
 class Entries:
-    """Values at rows i and columns j, the same (p,) integers on all ranks: each evaluates its share; collective.
+    """Calling it gives the values (p,) at rows i and columns j; collective.
 
-    function : takes i and j (p,) and gives (p,) numbers
+    i and j are the same integers (p,) on all ranks, and each rank evaluates its share. If one rank has an error, all
+    ranks raise it.
 
-    The error of one rank is raised on all.
+    function : takes i and j (p,) and returns numbers (p,)
     """
 
     def __init__(self, comm: MPI.Comm, function: Callable[[Array, Array], Array]) -> None:
@@ -40,7 +41,7 @@ class Entries:
 
     @classmethod
     def of(cls, P: PETSc.Mat) -> Entries:
-        """Those of a Mat for which `has_entries`."""
+        """The entries of a Mat for which `has_entries` is true."""
         comm, function = P.comm.tompi4py(), P.getAttr("entries")
         given = comm.allgather(None if function is None else callable(function))
         if len(set(given)) > 1 or given[0] is False:
@@ -62,10 +63,10 @@ class Entries:
         return out
 
     def own(self, i: Array, j: Array) -> Array:
-        """Values at a rank's own rows and columns, of which other ranks know nothing; collective."""
+        """Values at rows and columns that only this rank knows; collective."""
         try:
             values, wrong = self._evaluate(i, j), ""
-        except Exception as error:  # of any kind: it is the user's code
+        except Exception as error:  # any kind, because it is the user's code
             values, wrong = np.zeros(len(i)), _words(error)
         if self.comm.size > 1 and not self.comm.allreduce(bool(wrong), op=MPI.LOR):
             return values
@@ -101,7 +102,7 @@ def _words(error: Exception) -> str:
 
 
 class DenseEntries(Entries):
-    """Those of a dense Mat, of which each rank has its rows."""
+    """The entries of a dense Mat; each rank has its rows."""
 
     def __init__(self, P: PETSc.Mat) -> None:
         self.comm = P.comm.tompi4py()
@@ -121,14 +122,14 @@ class DenseEntries(Entries):
 
 
 def is_symmetric(entries: Entries, rows: int) -> bool:
-    """Whether entries are those across the diagonal, at some random places; collective."""
+    """Whether entries at some random places equal those across the diagonal; collective."""
     i, j = np.random.default_rng(0).integers(0, rows, (2, CHECKS))
     here, there = entries(i, j), entries(j, i)
     return entries.comm.bcast(bool(np.linalg.norm(here - there) <= ASYMMETRY * np.linalg.norm(here)))
 
 
 def diagonal_blocks(P: PETSc.Mat) -> Array:
-    """The diagonal blocks (n, bs, bs) of this rank's block rows of a Mat for which `has_entries`; collective."""
+    """The diagonal blocks (n, bs, bs) of this rank's block rows, for a Mat with `has_entries`; collective."""
     bs = P.getBlockSize()
     rows = np.arange(*P.getOwnershipRange()).reshape(-1, bs, 1)
     i, j = np.broadcast_arrays(rows, rows.transpose(0, 2, 1))

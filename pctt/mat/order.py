@@ -1,9 +1,9 @@
-"""The grid that the rows of a Mat belong to, and the order in which a train sees them.
+"""The grid to which the rows of a Mat belong, and the order of the rows in a train.
 
     grid      the attribute ``grid`` = (n_1, n_2, ...), the shape of a vector as an array (row i at
               numpy.unravel_index(i, grid)), or the DMDA of the Mat: one axis after the other
     morton    along a space-filling curve through the points of the attribute ``coordinates``
-    natural   as the rows are numbered
+    natural   the given order of the rows
 """
 
 from __future__ import annotations
@@ -20,8 +20,11 @@ from pctt.tt.train import Array
 
 
 def grid_of(P: PETSc.Mat) -> tuple[tuple[int, ...], Array | None] | None:
-    """Shape of the grid of P's block rows and the block row at each of its points (None: its number), or None where
-    there is no grid; ValueError, on all ranks alike, for one that does not fit; collective."""
+    """The shape of the grid of P's block rows, and the block row at each point of the grid; collective.
+
+    The second is None if the block rows are in the order of the points. The result is None if there is no grid.
+    ValueError on all ranks if the grid does not fit.
+    """
     count = P.getSize()[0] // P.getBlockSize()
     comm = P.comm.tompi4py()
     given = P.getAttr("grid")
@@ -62,10 +65,10 @@ def _natural_order(dm: PETSc.DM, block: int) -> Array:
 
 
 def digits_of(P: PETSc.Mat, order: str, name: str) -> tuple[GridDigits, Array | None, str]:
-    """Digits of P's rows, the row at each of the points (None: its number), and the order that was taken.
+    """The digits of P's rows, the row at each point (None if rows are in the order of points), and the chosen order.
 
-    order : auto, grid, morton or natural; auto takes the first of these for which P has what it needs
-    name : of the option, for the ValueError where P lacks that
+    order : auto, grid, morton or natural; auto takes the first of the others for which P has the data
+    name : name of the option, for the ValueError if P lacks the data
     """
     block = P.getBlockSize()
     grid = grid_of(P) if order in ("auto", "grid") else None
@@ -73,7 +76,7 @@ def digits_of(P: PETSc.Mat, order: str, name: str) -> tuple[GridDigits, Array | 
         shape, rows = grid
         return GridDigits(shape, block=block), _scalar(rows, block), "grid"
     count = P.getSize()[0] // block
-    points = P.getAttr("coordinates")  # checked: on all ranks or on none
+    points = P.getAttr("coordinates")  # it was checked: all ranks have it or none
     if points is not None and order in ("auto", "morton"):
         parts = P.comm.tompi4py().allgather(np.asarray(points, dtype=float).reshape(-1, np.shape(points)[-1]))
         codes = morton_codes(np.concatenate(parts))

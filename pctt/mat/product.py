@@ -1,4 +1,4 @@
-"""Product of a train, whose cores all ranks have, with a vector that is spread over them."""
+"""The product of a train with a distributed vector. All ranks have the cores of the train."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from pctt.tt.apply import Apply
 from pctt.tt.grid import GridDigits
 from pctt.tt.train import Array, Train
 
-LONG = 1_000_000  # rows from which a vector that is gathered on each of several ranks is worth a warning
+LONG = 1_000_000  # several ranks that gather longer vectors cause a warning
 
 
 class TrainProduct:
-    """y = T x for the rows of this rank, from those of x.
+    """This rank's rows of y = T x, from its rows of x.
 
-    train : matrix train of the modes of `digits`; where it is of single precision, products are, to about 1e-6
-    counts : rows of each rank
+    train : matrix train with the modes of `digits`; in single precision, products have errors of about 1e-6
+    counts : number of rows of each rank
     order : row at each point of the grid, or None
 
-    Every rank gathers x, multiplies with its part of the train's rows, and the parts are gathered where the ranks' rows
-    are not the train's.
+    Every rank gathers x and multiplies with its part of the rows of the train. If the order of the rows in the train
+    differs from the order in the Mat, the ranks also gather the product.
     """
 
     def __init__(
@@ -52,13 +52,13 @@ class TrainProduct:
         self.apply = Apply(train, digits.size, bounds)
 
     def __call__(self, x: Array) -> Array:
-        """Valid until the next call."""
+        """The product; the array is valid until the next call."""
         if self.comm.size > 1:
             self.comm.Allgatherv(np.ascontiguousarray(x), [self.whole, self.counts])
             x = self.whole
         if self.apply.dtype == float:
             return self._times(x)
-        largest = float(np.abs(x).max(initial=0.0)) or 1.0  # single precision ends at 1e38
+        largest = float(np.abs(x).max(initial=0.0)) or 1.0  # single precision overflows at 1e38
         return np.multiply(largest, self._times(x / largest), dtype=float)
 
     def _times(self, x: Array) -> Array:

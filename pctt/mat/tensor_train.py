@@ -1,4 +1,4 @@
-"""A matrix given by its entries on a grid as a tensor train, in PETSc a Mat of type python."""
+"""A matrix that is given by its entries on a grid, as a tensor train; for PETSc it is a Mat of type python."""
 
 from __future__ import annotations
 
@@ -21,21 +21,23 @@ from pctt.tt.entries import EntryMatrix
 from pctt.tt.train import Array, Train
 
 MAX_RANK = 200
-ROUNDING = 0.1  # of a symmetric part, over eps
+ROUNDING = 0.1  # tolerance for rounding a symmetric part, divided by eps
 
 
 class CompressedEntries:
-    """The train T of a matrix A = c (I + T) by its entries, c the mean of the diagonal: what Mat and PC share.
+    """The train T of a matrix A = c (I + T) that is given by its entries; c is the mean of the diagonal.
 
-    shift, scale : A = shift I + scale T; both are c, or 0 and 1 where the mean is not positive
-    error : ||A - c (I + T)||_F / ||A - c I||_F, estimated from entries that the compression has not seen
+    Both the Mat and the PC use it.
+
+    shift, scale : A = shift I + scale T; both are c, or 0 and 1 if the mean is not positive
+    error : ||A - c (I + T)||_F / ||A - c I||_F, estimated from entries that the compression has not used
     """
 
     def __init__(
         self, P: PETSc.Mat, eps: float, max_rank: int, order: str = "auto", name: str = "order",
         start: CompressedEntries | None = None, seed: int = 0,
     ) -> None:  # fmt: skip
-        """EntriesError or ValueError, on all ranks alike, for bad entries or a bad grid; collective."""
+        """Collective; EntriesError or ValueError on all ranks for bad entries or a bad grid."""
         comm = P.comm.tompi4py()
         self.entries = Entries.of(P)
         self.digits, self.rows, self.order = digits_of(P, order, name)
@@ -51,7 +53,7 @@ class CompressedEntries:
             self.found = replace(self.found, train=train)
 
     def rounded(self, eps: float, max_rank: int) -> CompressedEntries:
-        """The same of lower rank and accuracy, without looking at an entry."""
+        """The same matrix with lower rank and accuracy, without evaluating entries."""
         coarse = copy(self)
         train = self.train.round(eps, max_rank)
         left = float((train - self.train).norm() / (self.train.norm() or 1.0))
@@ -67,7 +69,7 @@ class CompressedEntries:
         return self.found.error
 
     def product(self, train: Train) -> TrainProduct:
-        """With the rows in the order of the Mat's."""
+        """The product with a train, with rows in the order of the Mat."""
         return TrainProduct(self.comm, self.counts, self.digits, self.rows, train)
 
     def words(self) -> str:
@@ -81,10 +83,10 @@ class CompressedEntries:
 
 
 class TensorTrain(Context):
-    """Context of a Mat whose products are those of a train; see `from_entries`.
+    """The context of a Mat that multiplies with a train; see `from_entries`.
 
-    A Mat that is made by hand, of type python and ``pctt.mat.TensorTrain``, needs the attribute ``entries``, and
-    ``grid`` or ``coordinates``, before ``setUp``.
+    You can also make such a Mat yourself, of type python and ``pctt.mat.TensorTrain``. Then give it the attributes
+    ``entries`` and ``grid`` or ``coordinates`` before ``setUp``.
     """
 
     without = PETSc.Mat.Type.AIJ
@@ -132,7 +134,7 @@ class TensorTrain(Context):
 
 
 def compressed(P: PETSc.Mat) -> CompressedEntries | None:
-    """What P multiplies with, if it is a Mat of this module."""
+    """The compressed entries of P, if P is a Mat of this module; otherwise None."""
     context = P.getPythonContext() if P.getType() == PETSc.Mat.Type.PYTHON else None
     return context.compressed if isinstance(context, TensorTrain) else None
 
@@ -144,15 +146,15 @@ def from_entries(
     max_rank: int = MAX_RANK,
     comm: MPI.Comm | PETSc.Comm | None = None,
 ) -> PETSc.Mat:
-    """The matrix A(i, j) = entries(i, j) of the points of a grid as a Mat that multiplies as a tensor train.
+    """The matrix A(i, j) = entries(i, j) for the points of a grid, as a Mat that multiplies with a tensor train.
 
-    entries : takes rows and columns, integer arrays (p,), and gives (p,) numbers; called on all ranks alike
+    entries : takes rows and columns, integer arrays (p,), and returns numbers (p,); all ranks call it
     grid : (n_1, n_2, ...), the shape of a vector as an array: row i is at numpy.unravel_index(i, grid)
-    eps : error relative to ||A - c I||_F, c the mean of the diagonal, at which the compression ends
-    max_rank : cap of the ranks
+    eps : the compression ends at this error relative to ||A - c I||_F, where c is the mean of the diagonal
+    max_rank : largest allowed rank
 
-    The Mat keeps the function as its attribute ``entries``: preconditioners of `pctt.pc` and errors come from it.
-    EntriesError (a ValueError), on all ranks alike, for entries that are no finite numbers; ValueError for a bad grid.
+    The Mat keeps the function as its attribute ``entries``, and the preconditioners of `pctt.pc` use it. Raises
+    EntriesError (a ValueError) on all ranks if entries are not finite numbers, and ValueError for a bad grid.
 
     >>> A = from_entries(lambda i, j: (i == j) + 0.1 / (1.0 + abs(i - j)), (64,))
     >>> A.getPythonContext().compressed.error < 1e-8

@@ -1,6 +1,7 @@
 """The inverse of a compressed matrix as a train.
 
-The matrix is I + T where it was scaled to a diagonal of identities, T its compressed off-diagonal part; else T.
+If the matrix was scaled, its diagonal blocks are identities; then it is I + T, where the train T is the compressed
+off-diagonal part. Otherwise it is T.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from pctt.tt.train import Train
 
 @dataclass(frozen=True)
 class ApproximateInverse:
-    """The train of an inverse: X, or Z with X = I + Z where ``identity``.
+    """The train of an inverse: X, or Z with X = I + Z if ``identity``.
 
-    residual : of the inverse of the train of the matrix, see `pctt.tt.Inverse`
+    residual : residual of the inverse for the train of the matrix, see `pctt.tt.Inverse`
     of : the compression that was inverted
-    cap : of the ranks
-    repaired : equations on the way that showed a matrix that is not positive
+    cap : largest allowed rank
+    repaired : number of local systems that were found not to be positive
     """
 
     train: Train
@@ -41,7 +42,7 @@ def approximate_inverse(
     start: Train | None = None,
     rng: np.random.Generator | None = None,
 ) -> ApproximateInverse:
-    """X or I + Z, from a start if there is one; symmetric, but it need not be positive."""
+    """X or I + Z, from a start if there is one. It is symmetric, but it may be indefinite."""
     if not near_identity:
         found = invert(of.train, cap, start, eps=eps, rng=rng)
         return ApproximateInverse(found.train, found.residual, of, cap, False, found.repaired)

@@ -1,9 +1,10 @@
-"""What the python-type preconditioners of the project share.
+"""The base class of the project's preconditioners of type python.
 
     -pc_type python -pc_python_type pctt.pc.TensorTrain -pc_tt_max_rank 10
 
-A class names its group of options (a dataclass, see ``pctt.options``) and their prefix; PETSc's own calls are turned
-into ``build`` (a matrix of a new structure), ``update`` (new values in the same structure) and ``apply``.
+A subclass names its group of options (a dataclass, see ``pctt.options``) and their prefix. The base class turns the
+calls of PETSc into ``build`` (a matrix with a new structure), ``update`` (new values in the same structure) and
+``apply``.
 """
 
 from __future__ import annotations
@@ -18,26 +19,26 @@ from pctt.shell import is_shell
 
 
 class PythonPC(Context):
-    """Base class; subclasses set ``options_class`` and ``options_prefix`` and define build, update, apply.
+    """Base class. Subclasses set ``options_class`` and ``options_prefix``, and define build, update and apply.
 
-    The preconditioner is taken to be symmetric. Matrices of other types than AIJ and BAIJ are converted.
+    The class assumes that the preconditioner is symmetric. Matrices of other types than AIJ and BAIJ are converted.
     """
 
     options_class: type
     options_prefix: str
     without = PETSc.PC.Type.NONE
-    needs_entries = True  # of the matrix; without, one that is a function will do
+    needs_entries = True  # if False, a matrix given by a function is enough
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
         self.options: Any = self.options_class()
         self.prefix = ""
         self._structure: tuple | None = None
-        self.P: PETSc.Mat | None = None  # what it is made from, in AIJ or BAIJ
+        self.P: PETSc.Mat | None = None  # the matrix, in AIJ or BAIJ
         self._converted: PETSc.Mat | None = None
 
     def setFromOptions(self, pc: PETSc.PC) -> None:
-        """Read the options behind the PC's prefix; OptionError for a bad one, or a misspelt one."""
+        """Read the options with the prefix of the PC; OptionError for a bad value or a misspelt name."""
         self.prefix = pc.getOptionsPrefix() or ""
         prefix = self.prefix + self.options_prefix
         database = PETSc.Options().getAll()
@@ -46,13 +47,13 @@ class PythonPC(Context):
             if name.startswith(prefix) and name not in known:
                 raise no_such_option(name, known)
         for name in known:
-            PETSc.Options().hasName(name)  # or PETSc reports it as unused
+            PETSc.Options().hasName(name)  # otherwise PETSc reports it as unused
         self.options = read(self.options_class, database, prefix)
         if "help" in database:
             PETSc.Sys.Print("\n".join(map(str, describe(self.options_class, prefix))), comm=pc.comm)
 
     def setUp(self, pc: PETSc.PC) -> None:
-        """ValueError, on all ranks alike, for a matrix that is not square or cannot be converted."""
+        """ValueError on all ranks if the matrix is not square or cannot be converted."""
         _, P = pc.getOperators()
         rows, columns = P.getSize()
         if rows != columns:
@@ -68,16 +69,16 @@ class PythonPC(Context):
         self.update(pc, P)
 
     def takes(self, P: PETSc.Mat) -> bool:
-        """Whether P is taken as it is, of whatever type."""
+        """Whether P is used as it is, whatever its type."""
         return False
 
     @property
     def name(self) -> str:
-        """As in ``-pc_python_type``."""
+        """The name for ``-pc_python_type``."""
         return f"pctt.pc.{type(self).__name__}"
 
     def _as_sparse(self, P: PETSc.Mat) -> PETSc.Mat:
-        """P, or a copy of it in AIJ where it is of another type."""
+        """P, or a copy of P in AIJ if P has another type."""
         if P.getType().startswith(("seqaij", "mpiaij", "seqbaij", "mpibaij")):
             return P
         if not P.getType().startswith(("seqsbaij", "mpisbaij", "seqdense", "mpidense")):
@@ -96,10 +97,10 @@ class PythonPC(Context):
         return sparse
 
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        """What depends on the structure of P alone."""
+        """Set up everything that depends only on the structure of P."""
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        """What depends on the values of P."""
+        """Set up everything that depends on the values of P."""
         raise NotImplementedError
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
@@ -109,14 +110,14 @@ class PythonPC(Context):
         self.apply(pc, x, y)
 
     def reset(self, pc: PETSc.PC) -> None:
-        """Forget the matrix; what may serve the next one stays."""
+        """Forget the matrix; keep everything that the next matrix can use."""
         self._structure = self.P = None
 
     def release(self) -> None:
-        """Destroy the PETSc objects that it owns."""
+        """Destroy the PETSc objects of this preconditioner."""
 
     def destroy(self, pc: PETSc.PC) -> None:
-        """PETSc's call at the end of the PC."""
+        """PETSc calls this at the end of the PC."""
         self.release()
         self.P = None
         if self._converted is not None:
@@ -134,5 +135,5 @@ class PythonPC(Context):
         return []
 
 
-#: What a user's Mat may bring, see docs/preconditioners.md.
+#: The attributes that a user's Mat may have, see docs/preconditioners.md.
 ATTRIBUTES = ("coordinates", "grid", "key", "contact_map", "barrier")

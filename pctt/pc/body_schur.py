@@ -1,17 +1,17 @@
-"""``-pc_type python -pc_python_type pctt.pc.BodySchur``: contact systems solved through the bodies.
+"""``-pc_type python -pc_python_type pctt.pc.BodySchur``: it solves contact systems through the bodies.
 
-With S = G G' + B, B block diagonal (3 x 3) and positive definite, S z = r is
+Let S = G G' + B, where B is block diagonal (3 x 3) and positive definite. Then S z = r is equivalent to
 
     K y = G' B^-1 r,   z = B^-1 (r - G y),    K = I + G' B^-1 G   (6 x 6 blocks per body),
 
-and the residual of S is exactly G times the residual of K: r - S z = G (K y - G' B^-1 r). An inner Krylov method on K,
-stopped by what that leaves in S, is therefore safe, where a merely approximate inverse of K is not: its error comes
-back multiplied by B^-1. So does rounding, where B is tiny: ``richardson`` refines what one solve leaves. K is smaller
-than S, and far better conditioned where contacts slide or open.
+and the residual of S is exactly G times the residual of K: r - S z = G (K y - G' B^-1 r). So it is safe to solve with K
+by an inner Krylov method that stops when the residual of S is small enough. An approximate inverse of K is not safe,
+because B^-1 multiplies its error. If B is tiny, B^-1 also multiplies rounding errors; ``richardson`` then refines the
+solution of one solve. K is smaller than S, and it is far better conditioned if contacts slide or open.
 
-The Mat S brings what it is made of as attributes: ``contact_map``, G as ``pctt.blocks.BlockRows``, as
-``pctt.contact_map.CompactRows`` or with its products, and ``barrier``, the blocks of B (nc, 3, 3). S itself may be a
-function.
+The Mat S has its parts as attributes. ``contact_map`` is G, as ``pctt.blocks.BlockRows``, as
+``pctt.contact_map.CompactRows``, or as a map with products. ``barrier`` has the blocks of B (nc, 3, 3). S itself may be
+a function.
 """
 
 from __future__ import annotations
@@ -37,23 +37,24 @@ _FACTORS = {"ilu", "icc", "bjacobi", "cholesky", "lu"}
 
 @dataclass(frozen=True)
 class Options:
-    """Options ``-pc_body_*``, behind the prefix of the PC. The inner KSP has the further prefix ``body_``."""
+    """Options ``-pc_body_*``, after the prefix of the PC. The inner KSP has the additional prefix ``body_``."""
 
     rtol: float = option(
-        0.0, "residual of S to which K is solved, relative; 0: half the tolerance of the KSP", check=NOT_NEGATIVE
+        0.0, "relative residual of S at which the solve with K stops; 0: half the tolerance of the KSP",
+        check=NOT_NEGATIVE,
     )
     shift: float = option(
-        0.03, "part by which the diagonal blocks are enlarged in the matrix that is factorised", check=NOT_NEGATIVE
+        0.03, "the diagonal blocks of the factorised matrix are enlarged by this part", check=NOT_NEGATIVE
     )
     least: float = option(
         0.1,
-        "blocks of K with no entry above this part of the mass are left out of the matrix that is factorised",
+        "the factorised matrix lacks the blocks of K that have no entry above this part of the mass",
         check=NOT_NEGATIVE,
     )
 
 
 class BodySchur(PythonPC):
-    """The python PC; used with ``-ksp_type preonly``, ``richardson`` (iterative refinement) or ``fgmres``."""
+    """The python PC. Use it with ``-ksp_type preonly``, ``richardson`` (iterative refinement) or ``fgmres``."""
 
     options_class = Options
     options_prefix = "pc_body_"
@@ -65,7 +66,7 @@ class BodySchur(PythonPC):
         self.ksp: PETSc.KSP | None = None
         self.solves = self.its = 0
         self._rtol, self._atol = 1e-3, 0.0
-        self._formed: PETSc.Mat | None = None  # what the inner preconditioner is made from, if not the stiff part
+        self._formed: PETSc.Mat | None = None  # the matrix of the inner preconditioner, if it is not the stiff part
 
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         G = P.getAttr("contact_map")
@@ -90,18 +91,18 @@ class BodySchur(PythonPC):
             self.K.whole.mat.setAttr("coordinates", self.K.whole.places(points))
             if self.ksp.pc.getType() in _COARSE_SPACE:
                 self.K.whole.set_rigid_modes(points)
-        # an inner residual enters that of S through G; twice, as the power method stays below
+        # the residual of S is G times the inner one; the factor 2 because the power method gives a lower bound
         self._gain = 2 * float(np.sqrt(_largest_eigenvalue(self._G)))
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        """K for the present barrier blocks."""
+        """Compute K for the present barrier blocks."""
         given = P.getAttr("contact_map")
         if given is not self._given:  # of the same structure
             self._release_map()
             self._given, self._G = given, _as_map(P, given)
             self.K.load(self._G)
         barrier = P.getAttr("barrier")
-        floor = 1e-14 * np.trace(barrier, axis1=1, axis2=2)  # a block that rounding has made singular
+        floor = 1e-14 * np.trace(barrier, axis1=1, axis2=2)  # rounding may have made a block singular
         self.inverse_barrier = np.linalg.inv(barrier + floor[:, None, None] * np.eye(3))
         self.K.update(self.inverse_barrier)
         assert self.ksp is not None
@@ -113,7 +114,7 @@ class BodySchur(PythonPC):
             old.destroy()
 
     def _stiff_part(self) -> PETSc.Mat:
-        """What the inner preconditioner is made from."""
+        """The matrix of the inner preconditioner."""
         assert self.ksp is not None
         kind = self.ksp.pc.getType()
         least = self.options.least if kind in _FACTORS else 0.0
@@ -128,11 +129,11 @@ class BodySchur(PythonPC):
 
     def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         self._rtol = self.options.rtol or 0.5 * ksp.getTolerances()[0]
-        # of what is left when the first solve has been refined, no more is asked than that the whole comes out right
+        # refining solves need not reduce their own right side by rtol, only the residual of the whole
         self._atol = self._rtol * b.norm() if ksp.getType() in ("preonly", "richardson") else 0.0
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """z = B^-1 (r - G K^-1 G' B^-1 r), K by the inner KSP."""
+        """z = B^-1 (r - G K^-1 G' B^-1 r); the inner KSP solves with K."""
         assert self.ksp is not None
         r = x.array_r.reshape(-1, 3)
         self._rhs.array_w[:] = self._G.momenta(times(self.inverse_barrier, r)).ravel()
@@ -165,12 +166,12 @@ def times(blocks: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _as_map(P: PETSc.Mat, given: ContactMap | BlockRows | CompactRows) -> ContactMap:
-    """The contact map that a Mat brings, or one of the rows that it brings."""
+    """The contact map that the Mat has as attribute, or a map made from the rows that it has."""
     return contact_map(P.comm.tompi4py(), given) if isinstance(given, (BlockRows, CompactRows)) else given
 
 
 def _largest_eigenvalue(G: ContactMap, iterations: int = 15) -> float:
-    """Of G G', from below, by the power method."""
+    """A lower bound of the largest eigenvalue of G G', by the power method."""
     g = np.random.default_rng(G.comm.rank).standard_normal((G.rows, 3))
     value = 1.0
     for _ in range(iterations):

@@ -1,4 +1,5 @@
-"""The train of the inverse of a matrix that is given by its entries: compressed by cross alone, nothing is scaled."""
+"""The train of the inverse of a matrix that is given by its entries. Cross approximation compresses the matrix; it is
+not scaled."""
 
 from __future__ import annotations
 
@@ -13,15 +14,15 @@ from pctt.pc.train_options import Account, Options
 from pctt.tt.lowest import lowest
 from pctt.tt.train import identity
 
-SINGLE = 1e-5  # eps from which products of the inverse are made in single precision
-WORTH = 0.25  # of eps: the least that is asked for to have a certificate
-TIGHTER, TRIES = 0.05, 4  # eps is lowered where the train of the matrix or of its inverse is not positive
+SINGLE = 1e-5  # with this eps or a larger one, products of the inverse use single precision
+WORTH = 0.25  # smallest part of eps that is asked for to get a certificate
+TIGHTER, TRIES = 0.05, 4  # eps is lowered if the train of the matrix or of its inverse is not positive
 
 
 class EntriesTrain:
-    """`make` a train for a matrix, multiply with it by `times`.
+    """`make` makes a train for a matrix, `times` multiplies with it.
 
-    compressed, inverse : of the present matrix; None before, and after a failure
+    compressed, inverse : trains of the present matrix and of its inverse; None before `make`, and after a failure
     """
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
@@ -30,9 +31,10 @@ class EntriesTrain:
         self.inverse: ApproximateInverse | None = None
 
     def make(self, P: PETSc.Mat, rank: int) -> bool:
-        """Make a train; False, with the reason on the account, if there is no positive inverse.
+        """Make a train. If there is no positive inverse, return False and write the reason to the account.
 
-        EntriesError, ValueError, on all ranks alike, for entries or a grid that are not as they should be."""
+        EntriesError or ValueError on all ranks for bad entries or a bad grid.
+        """
         for eps in self.options.eps * TIGHTER ** np.arange(TRIES):
             warm = self.compressed is not None and self.options.reuse != "none"
             with PETSc.Log.Event("TTCompress"):
@@ -41,12 +43,12 @@ class EntriesTrain:
                 return self._refuse("the mean of the diagonal is not positive")
             self.account.reused += warm
             with PETSc.Log.Event("TTInvert"):
-                # every rank inverts the same train; a last bit of difference must not part their ways
+                # every rank inverts the same train, but results may differ in the last bit: all take the first rank's
                 self.inverse = self.comm.bcast(self._invert(rank, eps))
                 if self.inverse is not None and self._is_positive(self.inverse):
                     return True
             if self.inverse is not None and self.inverse.residual > eps:
-                break  # the rank does not reach this accuracy, let alone a higher one
+                break  # the rank cannot reach this accuracy, and even less a higher one
         return self._refuse(f"the inverse of rank {rank} is not positive")
 
     def _compress(self, P: PETSc.Mat, rank: int, eps: float, start: CompressedEntries | None) -> CompressedEntries:
@@ -57,19 +59,22 @@ class EntriesTrain:
         return CompressedEntries(P, eps, rank, self.options.order, name, start, self.options.seed)
 
     def _invert(self, rank: int, eps: float) -> ApproximateInverse | None:
-        """None where the train of the matrix is found not to be positive."""
+        """The inverse; None if the train of the matrix turns out not to be positive."""
         assert self.compressed is not None
         T = self.compressed.train
         if lowest(identity(T.rows) + T) <= 0:
             return None
         certain = CERTAIN / T.norm()
-        if WORTH * eps <= certain:  # with a little more accuracy, no trial has to say that the inverse is positive
+        if WORTH * eps <= certain:  # a little more accuracy is cheaper than a test whether the inverse is positive
             eps = min(eps, certain)
         rng = np.random.default_rng(self.options.seed)
         return approximate_inverse(self.compressed.found, rank, eps, True, None, rng)
 
     def _is_positive(self, inverse: ApproximateInverse) -> bool:
-        """Use I + Z, and whether it is positive: as its matrix is, if near enough to the inverse, or on trial."""
+        """Take I + Z into use, and tell whether it is positive.
+
+        It is positive, like its matrix, if it is near enough to the inverse. Otherwise a test decides.
+        """
         assert self.compressed is not None
         Z, T = inverse.train, self.compressed.train
         self._product = self.compressed.product(Z.astype(np.float32) if self.options.eps >= SINGLE else Z)
@@ -85,11 +90,11 @@ class EntriesTrain:
         return False
 
     def distrust(self) -> bool:
-        """Every matrix has a train of its own."""
+        """False, because every matrix has a train of its own."""
         return False
 
     def times(self, x: np.ndarray) -> np.ndarray:
-        """(x + Z x) / c, this rank's part from its part."""
+        """This rank's part of (x + Z x) / c, from its part of x."""
         assert self.compressed is not None
         return (x + self._product(x)) / self.compressed.shift
 

@@ -1,16 +1,18 @@
-"""What a preconditioner asks of the Mat that a user brings."""
+"""Checks of the Mat that a user gives to a preconditioner."""
 
 from __future__ import annotations
 
 import numpy as np
 from petsc4py import PETSc
 
-ASYMMETRY = 1e-8  # ||A - A'|| / ||A|| that is put down to rounding
+ASYMMETRY = 1e-8  # a smaller ||A - A'|| / ||A|| counts as rounding
 
 
 def check_coordinates(P: PETSc.Mat) -> None:
-    """ValueError, on all ranks alike, unless the Mat's attribute ``coordinates`` holds finite numbers, a row per local
-    block row, or is missing on all ranks; collective."""
+    """ValueError on all ranks if the attribute ``coordinates`` of the Mat is wrong; collective.
+
+    Allowed are finite numbers, a row per local block row. The attribute may also be missing on all ranks.
+    """
     points = P.getAttr("coordinates")
     count = P.getLocalSize()[0] // P.getBlockSize()
     wrong = ""
@@ -35,7 +37,7 @@ def check_coordinates(P: PETSc.Mat) -> None:
 
 
 def is_symmetric(P: PETSc.Mat) -> bool:
-    """Whether u'(P v) is v'(P u) but for rounding, for two random vectors; at once, where the Mat knows."""
+    """Whether P is symmetric. If the Mat does not know it, compare u'(P v) with v'(P u) for two random vectors."""
     known, symmetric = P.isSymmetricKnown()
     if known:
         return symmetric

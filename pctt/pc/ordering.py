@@ -1,4 +1,4 @@
-"""An order of a matrix's block rows in which neighbours in space are neighbours in number."""
+"""Orders of the block rows of a matrix in which points that are near in space have near numbers."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from pctt.morton import morton_codes
 from pctt.tt.grid import GridDigits
 from pctt.tt.quantise import group_modes
 
-ENDS = 16  # slots in the first and last mode of a grid, at most
+ENDS = 16  # largest number of slots in the first and in the last mode of a grid
 
 
 def block_order(P: PETSc.Mat, order: str = "auto") -> np.ndarray:
-    """Place of each local block row of P among this rank's (n,), a permutation of 0 ... n-1.
+    """Places (n,) of the local block rows of P among those of this rank, a permutation of 0 ... n-1.
 
-    morton : along a Morton curve through the points that the Mat's attribute ``coordinates`` holds, an array (n, 3),
-        (n, 2) or (n, 1) with a row per local block row (``P.setAttr("coordinates", points)``)
-    rcm : by reverse Cuthill-McKee of this rank's part
-    natural : as they are
-    auto : morton where there are points, else rcm
+    morton : along a Morton curve through the points in the Mat's attribute ``coordinates``, an array (n, 3), (n, 2) or
+        (n, 1) with a row per local block row (``P.setAttr("coordinates", points)``)
+    rcm : reverse Cuthill-McKee order of this rank's part
+    natural : the given order
+    auto : morton if there are points, else rcm
 
-    ValueError where there are no points for morton.
+    ValueError if morton is asked for and there are no points.
     """
     bs = P.getBlockSize()
     count = P.getLocalSize()[0] // bs
@@ -37,7 +37,7 @@ def block_order(P: PETSc.Mat, order: str = "auto") -> np.ndarray:
     else:
         given, _ = P.getDiagonalBlock().getOrdering(PETSc.Mat.OrderingType.RCM)
         rows = given.getIndices().astype(np.int64)
-        if len(rows) != count:  # scalar rows: a block goes where its first row goes
+        if len(rows) != count:  # the order is of scalar rows; a block takes the place of its first row
             rows = rows[rows % bs == 0] // bs
     place = np.empty(count, np.int64)
     place[rows] = np.arange(count)
@@ -45,11 +45,11 @@ def block_order(P: PETSc.Mat, order: str = "auto") -> np.ndarray:
 
 
 def grid_slots(P: PETSc.Mat, order: str) -> tuple[np.ndarray, int, tuple[int, ...]] | None:
-    """Slot of each local block row among this rank's, their number, and the slot modes, in the order of a grid; None
-    where P has no grid, or none is asked for; collective.
+    """The slot of each local block row among those of this rank, the number of slots, and the slot modes, in the order
+    of a grid. None if P has no grid, or if ``order`` does not ask for it. Collective.
 
-    ValueError, on all ranks alike, for a grid that does not fit, and where one is asked for that is not there or whose
-    points are spread over the ranks in another order.
+    ValueError on all ranks if the grid does not fit. The same if ``order`` asks for a grid and P has none, or if the
+    points of the grid are distributed over the ranks in another order.
     """
     if order not in ("auto", "grid") or (order == "auto" and P.getAttr("key") is not None):
         return None

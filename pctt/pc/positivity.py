@@ -1,4 +1,4 @@
-"""Whether a symmetric approximate inverse is positive definite, before conjugate gradients are given it."""
+"""Tests whether a symmetric approximate inverse is positive definite, before conjugate gradients use it."""
 
 from __future__ import annotations
 
@@ -10,27 +10,30 @@ from mpi4py import MPI
 from pctt.tt.train import Array
 
 Product = Callable[[Array], Array]
-STEPS = 12  # on trains that a search with trains of rank 8 took for positive, 1 to 9 were enough
-CERTAIN = 0.7  # bound of ||I - S X||_F, an estimate that is off by a third at times
-NOTHING = 1e-24  # part of a square that is rounding
+STEPS = 12  # 1 to 9 were enough for indefinite trains that a search with trains of rank 8 took for positive
+CERTAIN = 0.7  # bound of ||I - S X||_F; below 1, because the estimate is sometimes wrong by a third
+NOTHING = 1e-24  # a smaller part of a square counts as rounding
 
 
 def has_inertia_of(residual: float) -> bool:
-    """Whether ||I - S X||_F = `residual` < 1 for symmetric S and X, with room for an estimate: then X has as many
-    negative eigenvalues as S. (On the way from S^-1 to X, S^-1 - t (S^-1 - X) = S^-1 (I - t (I - S X)) is never
-    singular.)"""
+    """Whether ||I - S X||_F = `residual` is safely below 1 for symmetric S and X. There is a margin, because the
+    residual may be an estimate.
+
+    Then X has as many negative eigenvalues as S: on the line from S^-1 to X the matrix
+    S^-1 - t (S^-1 - X) = S^-1 (I - t (I - S X)) is never singular.
+    """
     return residual < CERTAIN
 
 
 def finds_negative(X: Product, A: Product, size: int, comm: MPI.Comm, steps: int = STEPS) -> bool:
-    """Whether a few steps of Lanczos' method find a direction y with y'X y <= 0.
+    """Whether a few steps of Lanczos' method find a direction y with y'X y <= 0. Collective.
 
-    The method is that for X A, self-adjoint in the inner product of A whatever the signs of X. A pivot of its
-    tridiagonal matrix is negative if and only if a Ritz value is, and then y = A v has y'X y < 0 for the Ritz vector v.
-    Where X is near A^-1, all eigenvalues but the wrong ones are near one, so that these are found at once. If A itself
-    is not positive, that counts as found; collective.
+    The method works on X A, which is self-adjoint in the inner product of A for any signs of X. Its tridiagonal matrix
+    has a negative pivot if and only if it has a negative Ritz value. Then y = A v has y'X y < 0 for the Ritz vector v.
+    If X is near A^-1, all eigenvalues except the wrong ones are near one, so the method finds the wrong ones quickly.
+    If A itself is not positive, the result is True too.
 
-    X, A : symmetric; this rank's part of a product from its part (`size`,) of a vector
+    X, A : symmetric products; each gives this rank's part of the product from its part (`size`,) of a vector
     """
 
     def dot(u: Array, v: Array) -> float:

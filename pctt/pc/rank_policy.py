@@ -1,21 +1,21 @@
-"""Which rank the next preconditioner gets: what has paid in measured seconds per digit of residual.
+"""The choice of the rank of the next preconditioner: the rank with the fewest measured seconds per digit of residual.
 
-Rank 1 is block Jacobi, which costs nothing to set up. A higher rank must earn its compression, its inversion and its
-dearer application by fewer iterations; on random packings it seldom does, and then trying it must not cost either: all
-trials together may take a small part of the time of the solves.
+Rank 1 is block Jacobi, which costs nothing to set up. A higher rank needs compression and inversion, and its
+application is more expensive. It must save enough iterations to pay for this. On random packings it seldom does, and
+then trials must be cheap too: all trials together may take a small part of the time of the solves.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-BUDGET = 0.03  # of the seconds of all solves, for trials
-MEMORY = 0.5  # weight of the newest figure in a rank's average
+BUDGET = 0.03  # part of the seconds of all solves that trials may take
+MEMORY = 0.5  # weight of the newest figure in the average of a rank
 
 
 @dataclass
 class Figures:
-    """A rank's running figures: ``cost`` seconds per digit, ``seconds`` of one use, set-up included."""
+    """Running averages of a rank: ``cost`` is seconds per digit, ``seconds`` is the time of one use with set-up."""
 
     cost: float = float("inf")
     seconds: float = 0.0
@@ -31,9 +31,10 @@ class Figures:
 
 @dataclass
 class RankPolicy:
-    """Ranks 1 and those of ``ladder``; ``automatic`` False always takes the last of the ladder that is not banned.
+    """The policy for rank 1 and the ranks of ``ladder``. If ``automatic`` is False, it always takes the last rank of
+    the ladder that is not banned.
 
-    A rank whose preconditioner was not positive, or with which the Krylov method stalled, is banned until ``forgive``.
+    A rank is banned until ``forgive`` if its preconditioner was not positive or the Krylov method stalled with it.
     """
 
     ladder: tuple[int, ...]
@@ -56,14 +57,17 @@ class RankPolicy:
         if not untried or self.figures[best].uses == 0:
             return best
         candidate = min(untried, key=lambda rank: (self.figures[rank].uses, rank))
-        # what is known of it, or a guess: a first trial builds the tables of the structure too
+        # the known seconds, or a guess; the first trial also builds the tables of the structure
         price = self.figures[candidate].seconds or 10 * self.figures[best].seconds
         if self.on_trials + price <= BUDGET * self.spent:
             return candidate
         return best
 
     def report(self, rank: int, seconds: float, digits: float, sound: bool = True) -> None:
-        """Tell what a use of a rank took (set-up and solve) and reached; ``sound`` False bans the rank."""
+        """Report a use of a rank: its seconds (set-up and solve) and the digits that it gained.
+
+        ``sound`` is False for a failure, which bans the rank.
+        """
         best = min(self.figures.values(), key=lambda f: f.cost)
         self.figures[rank].add(seconds, digits)
         self.spent += seconds
@@ -74,6 +78,6 @@ class RankPolicy:
             self.figures[rank].banned = True
 
     def forgive(self) -> None:
-        """Allow all ranks again: a new problem."""
+        """Allow all ranks again, for a new problem."""
         for figures in self.figures.values():
             figures.banned = False

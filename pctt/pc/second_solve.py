@@ -1,4 +1,4 @@
-"""A solve that an indefinite preconditioner has spoilt, made again with block Jacobi."""
+"""A second solve with block Jacobi, after an indefinite preconditioner has spoilt the first."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from petsc4py import PETSc
 
 _Reason = PETSc.KSP.ConvergedReason
-#: Ends of a Krylov method that a preconditioner which is not positive definite brings about.
+#: Reasons for the end of a Krylov method whose preconditioner is not positive definite.
 SPOILT = frozenset(
     {
         _Reason.DIVERGED_BREAKDOWN,
@@ -23,8 +23,11 @@ SPOILT = frozenset(
 def solve_again(
     ksp: PETSc.KSP, block_diagonal: Callable[[PETSc.Mat], PETSc.Mat], P: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec
 ) -> bool:
-    """Within ``postSolve`` of a preconditioner: where its KSP has broken down, solve by the same method with block
-    Jacobi of P from zero, and give the KSP the outcome. Whether that was done."""
+    """Solve again if the KSP has broken down; returns whether this was done. Call it in ``postSolve`` of the
+    preconditioner.
+
+    The second solve uses the same method with block Jacobi of P and starts from zero. The KSP gets its outcome.
+    """
     if ksp.getConvergedReason() not in SPOILT:
         return False
     again = PETSc.KSP().create(ksp.comm)

@@ -1,9 +1,9 @@
-"""Slots of the block rows of one matrix after another: the tree of the paper's evolving hierarchies.
+"""Slots for the block rows of a sequence of matrices: the tree of the paper's evolving hierarchies.
 
-A slot is a place in the order along which a train is quantised; each rank has a contiguous range of them, in boxes of
-equal size along a Morton curve. Where the block rows have names (the Mat's attribute ``key``), a few slots stay
-empty, so that the rows of the next matrix can take and leave places: a row that stays near its box keeps its slot, a
-new one gets the nearest empty slot. Cores of a train for the last matrix are then a start for the next.
+A slot is a place in the order along which a train is quantised. Each rank has a contiguous range of slots, in boxes of
+equal size along a Morton curve. If the block rows have names (the Mat's attribute ``key``), a few slots stay empty. So
+the rows of the next matrix can take and leave places: a row that stays near its box keeps its slot, and a new row gets
+the nearest empty slot. Then the cores of the last train are a start for the next train.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from pctt.morton import Frame, morton_codes
 from pctt.pc.ordering import block_order, grid_slots
 
 SPARE = 0.06  # part of the slots that is empty at first
-NEAR = 1  # boxes by which a row may be off without being moved
-REACH = 12  # boxes within which an empty slot is looked for
-FAR = 0.02  # part of the rows that may be put further away
+NEAR = 1  # a row moves only if it is more than this number of boxes from its box
+REACH = 12  # the search for an empty slot goes this number of boxes far
+FAR = 0.02  # part of the rows that may go further away
 
 
 def capacity(P: PETSc.Mat, box: int, order: str = "auto") -> int:
-    """Slots that this rank's block rows get; collective, ValueError as of `grid_slots`."""
+    """The number of slots for the block rows of this rank. Collective; ValueError as in `grid_slots`."""
     grid = grid_slots(P, order)
     if grid is not None:
         return grid[1]
@@ -34,18 +34,18 @@ def capacity(P: PETSc.Mat, box: int, order: str = "auto") -> int:
 
 
 class Slots:
-    """Slots of this rank's block rows.
+    """The slots of this rank's block rows.
 
     Attributes
     ----------
     place : (n,) slot of each block row of the present matrix
-    capacity : slots of this rank
-    modes : slot modes of a grid, else none
-    moved, entered, left : rows that got another slot, a first one, or were gone at the last `follow`
+    capacity : number of slots of this rank
+    modes : slot modes of a grid; empty without a grid
+    moved, entered, left : numbers of rows that got another slot, were new, or were gone at the last `follow`
     """
 
     def __init__(self, P: PETSc.Mat, box: int, order: str = "auto"):
-        """Rows in the order of a grid, or evenly spread along the curve, where ``box`` slots make a box."""
+        """Put the rows in the order of a grid, or evenly along the curve. ``box`` slots make a box."""
         count = P.getLocalSize()[0] // P.getBlockSize()
         keys, points = P.getAttr("key"), P.getAttr("coordinates")
         self.box = box
@@ -65,7 +65,7 @@ class Slots:
             self._frame = Frame.of(points)
             codes = morton_codes(points, self._frame)[rows]
             boxes = np.arange(self.capacity // box) * box
-            first = np.searchsorted(self.place[rows], boxes)  # the first row at or after each box's start
+            first = np.searchsorted(self.place[rows], boxes)  # the first row at or after the start of each box
             self._starts = np.append(codes, np.iinfo(np.int64).max)[first]
             self._remember(keys)
 
@@ -74,9 +74,10 @@ class Slots:
         self._keys, self._key_places = np.asarray(keys)[by_key], self.place[by_key]
 
     def follow(self, P: PETSc.Mat, agree: Callable[[bool], bool]) -> bool:
-        """Take the rows of another matrix; False, and nothing changes, if they do not fit or little would be kept.
+        """Take the rows of another matrix.
 
-        ``agree`` tells whether all ranks say yes.
+        If they do not fit or few rows would keep their slots, return False and change nothing. ``agree`` tells whether
+        all ranks say yes.
         """
         keys, points = P.getAttr("key"), P.getAttr("coordinates")
         place = None
@@ -106,7 +107,7 @@ class Slots:
             return None
         free = np.ones(self.capacity, bool)
         free[place[stays]] = False
-        if free.sum() != self.capacity - stays.sum():  # two rows of the same name
+        if free.sum() != self.capacity - stays.sum():  # two rows have the same name
             return None
         for distance in range(REACH + 1):
             for side in (1, -1) if distance else (1,):
@@ -120,21 +121,20 @@ class Slots:
 
 
 def _nearest_in_order(wanted: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """A slot of its own for each of ``wanted`` (n,) among the ``empty`` ones, at or after it where that goes; both
-    ascending."""
+    """A different slot of ``empty`` for each slot of ``wanted`` (n,), at or after it if possible; both ascend."""
     turn = np.arange(len(wanted))
     at = np.maximum.accumulate(np.searchsorted(empty, wanted) - turn) + turn
     return empty[np.minimum(at, len(empty) - len(wanted) + turn)]
 
 
 def _settle(place: np.ndarray, target: np.ndarray, free: np.ndarray, box: int) -> None:
-    """Give rows without a place (-1) the empty slots of their target boxes, as far as these go."""
+    """Give rows without a place (-1) empty slots of their target boxes, until these are full."""
     waiting = np.flatnonzero((place < 0) & (target >= 0) & (target < len(free) // box))
     if len(waiting) == 0:
         return
     waiting = waiting[np.argsort(target[waiting], kind="stable")]
     wanted = target[waiting]
-    turn = np.arange(len(wanted)) - np.searchsorted(wanted, wanted)  # how many wait for the same box before
+    turn = np.arange(len(wanted)) - np.searchsorted(wanted, wanted)  # how many rows before wait for the same box
     empty = np.flatnonzero(free)
     start = np.searchsorted(empty, wanted * box)
     room = np.searchsorted(empty, (wanted + 1) * box) - start

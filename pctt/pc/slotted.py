@@ -1,8 +1,8 @@
-"""A Mat's blocks by slots: what a train compresses.
+"""The blocks of a Mat by slots, for the compression into a train.
 
-Slots are those of ``slots.py``; an empty one stands for a row of the identity. With block scaling L_i L_i' = P_ii
-(L_i^-T is the Cholesky factor of P_ii^-1) the matrix becomes I + T with T_ij = L_i^-1 P_ij L_j^-T, and T, without its
-diagonal, is what is compressed: the identity stays exact, and a train of rank zero is block Jacobi.
+Slots are those of ``slots.py``. An empty slot stands for a row of the identity. Block scaling uses L_i L_i' = P_ii,
+where L_i^-T is the Cholesky factor of P_ii^-1. The matrix becomes I + T with T_ij = L_i^-1 P_ij L_j^-T. Only T, which
+has no diagonal, is compressed. So the identity stays exact, and a train of rank zero is block Jacobi.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from pctt.pc.slots import Slots
 class SlottedMatrix:
     """Local block rows of a Mat P, their slots, and their scaling.
 
-    ``scale`` follows the diagonal blocks of P; ``list_blocks``, once per structure, and ``load`` all of them.
+    ``scale`` reads the diagonal blocks of P. ``list_blocks``, called once per structure, and ``load`` read all blocks.
 
     Attributes
     ----------
     place : (n,) slot of each local block row, counted from ``first``
-    first, capacity, size : first slot of this rank, slots of this rank, slots of all ranks
-    rows, columns : (nb,) global slots of the local blocks off the diagonal
-    root : (capacity, bs, bs) R_i = L_i^-1 of each local slot (scaled), in slot order
+    first, capacity, size : first slot of this rank, number of its slots, number of slots of all ranks
+    rows, columns : (nb,) global slots of the local off-diagonal blocks
+    root : (capacity, bs, bs) R_i = L_i^-1 of each local slot, in slot order; identities without scaling
     """
 
     def __init__(self, P: PETSc.Mat, slots: Slots, comm: MPI.Comm, scaled: bool):
@@ -42,9 +42,9 @@ class SlottedMatrix:
     def list_blocks(self, P: PETSc.Mat) -> None:
         """Find the blocks of P: ``rows`` and ``columns``."""
         own = int(self._counts[: self.comm.rank].sum())  # the first block row of this rank
-        slot = self._gathered(self.first + self.place)  # of every global block row
+        slot = self._gathered(self.first + self.place)  # slot of every global block row
         pattern = self._pattern(P)
-        self._order = pattern.data - 1  # of the entries of the blocks among P's values, -1 where there is none
+        self._order = pattern.data - 1  # index of each entry of the blocks in P's values, -1 if P does not store it
         row = np.repeat(np.arange(len(self.place)), np.diff(pattern.indptr))
         self._pointers, self._column = pattern.indptr, pattern.indices
         self._kept = pattern.indices != own + row if self.scaled else np.ones(len(row), bool)
@@ -56,17 +56,17 @@ class SlottedMatrix:
             self.rows, self.columns = np.append(self.rows, empty), np.append(self.columns, empty)
 
     def scale(self, P: PETSc.Mat) -> None:
-        """Roots of the diagonal blocks of P's present values.
+        """Compute the roots of the present diagonal blocks of P.
 
-        Raises numpy.linalg.LinAlgError, on the ranks concerned, where a block is not positive definite.
+        Raises numpy.linalg.LinAlgError on the ranks that have a block that is not positive definite.
         """
         if not self.scaled:
             return
         self.root[self.place] = np.linalg.cholesky(inverse_diagonal_blocks(P)).transpose(0, 2, 1)
 
     def load(self, P: PETSc.Mat) -> np.ndarray:
-        """The blocks (nb, bs, bs) at ``rows`` and ``columns`` for P's present values, scaled, if asked for, by the
-        roots of ``scale``."""
+        """The present blocks (nb, bs, bs) of P at ``rows`` and ``columns``, with scaling multiplied by the roots of
+        ``scale``."""
         blocks = np.append(P.getValuesCSR()[2], 0.0)[self._order]
         if not self.scaled:
             typical = P.getDiagonal().sum() / P.getSize()[0]
@@ -74,14 +74,14 @@ class SlottedMatrix:
         roots = self.root[self.place]
         everywhere = self._gathered(roots)
         scaled = _diagonal(roots) @ self._bsr(blocks) @ _diagonal(everywhere.transpose(0, 2, 1))
-        return scaled.data[self._kept]  # scipy keeps the order of the blocks: one factor per block
+        return scaled.data[self._kept]  # scipy keeps the order of the blocks, because each has one factor
 
     def _bsr(self, blocks: np.ndarray) -> sp.bsr_matrix:
         shape = (self.block * len(self.place), self.block * self._total)
         return sp.bsr_matrix((blocks, self._column, self._pointers), shape=shape)
 
     def _pattern(self, P: PETSc.Mat) -> sp.bsr_matrix:
-        """The blocks of this rank's rows, with the numbers of P's values, from 1, for values."""
+        """The pattern of the blocks of this rank's rows. Its values are the numbers of P's values, from 1."""
         indptr, indices, values = P.getValuesCSR()
         shape = (len(indptr) - 1, self.block * self._total)
         numbers = np.arange(1, len(values) + 1, dtype=np.int32)
@@ -98,7 +98,7 @@ class SlottedMatrix:
         return out
 
     def gather_slots(self, local: np.ndarray, out: np.ndarray) -> None:
-        """Vectors in slot order, this rank's part (n bs,), to all of it (size bs,) on every rank."""
+        """Gather a vector in slot order: ``local`` (n bs,) is this rank's part, ``out`` (size bs,) the whole vector."""
         if self.comm.size == 1:
             out[:] = local
         else:

@@ -1,8 +1,8 @@
-"""The train of a sparse matrix's inverse, from one matrix to the next.
+"""The train of the inverse of a sparse matrix, for a sequence of matrices.
 
-The block rows are put into slots, scaled by the Cholesky factors of the diagonal blocks, the off-diagonal part is
-compressed into a train T (paper, section 3), and I + T is inverted as a train. Slots, cores and whole trains of one
-matrix serve the next.
+The block rows get slots and are scaled by the Cholesky factors of the diagonal blocks. The off-diagonal part is
+compressed into a train T (paper, section 3), and I + T is inverted as a train. The next matrix can use the slots, the
+cores and whole trains again.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from pctt.tt.train import Train
 
 
 class SparseTrain:
-    """`make` a train for a matrix, multiply with it by `times`.
+    """`make` makes a train for a matrix, `times` multiplies with it.
 
-    inverse, compression : what is in use, and the newest train of a matrix; None before, and after a failure
-    slots, hierarchy : of the present structure
-    tree : slots that live from structure to structure
+    inverse, compression : the inverse in use, and the newest train of a matrix; None before `make`, and after a failure
+    slots, hierarchy : slots and block pairs of the present structure
+    tree : slots that are kept from structure to structure
     """
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
@@ -52,7 +52,7 @@ class SparseTrain:
         self._apply: Apply | None = None
 
     def begin(self, P: PETSc.Mat) -> None:
-        """A new structure; ValueError, on all ranks alike, for modes or a grid that do not fit it."""
+        """Begin a new structure; ValueError on all ranks if the modes or the grid do not fit it."""
         slots = self.comm.allreduce(capacity(P, self.options.leaf, self.options.order))
         self._check_modes(slots)
         self._forget_structure()
@@ -60,7 +60,10 @@ class SparseTrain:
             self._forget_trains()
 
     def make(self, P: PETSc.Mat, rank: int) -> bool:
-        """Keep the train or make one; False, with the reason on the account, if there is no positive inverse."""
+        """Keep the train or make a new one.
+
+        If there is no positive inverse, return False and write the reason to the account.
+        """
         if self.options.reuse == "none":
             self._forget_structure()
             self._forget_trains()
@@ -88,7 +91,7 @@ class SparseTrain:
         return True
 
     def _try_new(self, P: PETSc.Mat, rank: int, kept: ApproximateInverse | None) -> bool:
-        """Make a train for P and use it, or the kept one where that is as good; False without a positive one."""
+        """Make a train for P and use it, or use the kept train if it is as good; False if no train is positive."""
         assert self.slots is not None
         if self.hierarchy is None:
             with PETSc.Log.Event("TTBuild"):
@@ -99,7 +102,7 @@ class SparseTrain:
         with PETSc.Log.Event("TTCompress"):
             self.compression = self._compress(rank, warm)
         with PETSc.Log.Event("TTInvert"):
-            # every rank inverts the same train; a last bit of difference must not part their ways
+            # every rank inverts the same train, but results may differ in the last bit: all take the first rank's
             new = self.comm.bcast(self._invert(rank, warm))
             self._use(new)
             positive = self._is_positive(P)
@@ -121,7 +124,7 @@ class SparseTrain:
         self._prepare_apply(inverse.train)
 
     def _is_positive(self, P: PETSc.Mat) -> bool:
-        """Whether the train in use is, as far as a trial with the symmetric part of P finds."""
+        """Whether the train in use is positive, as far as a test with the symmetric part of P shows."""
         x, y = P.createVecs()
 
         def times(v: np.ndarray) -> np.ndarray:
@@ -137,7 +140,7 @@ class SparseTrain:
         return not found
 
     def _left(self, P: PETSc.Mat) -> float:
-        """||w - S X w|| / ||w|| of a random vector w, S the scaled matrix."""
+        """||w - S X w|| / ||w|| for a random vector w, where S is the scaled matrix."""
         assert self.slots is not None
         slots = self.slots
         w = np.zeros((slots.capacity, slots.block))
@@ -152,7 +155,7 @@ class SparseTrain:
         return float(np.sqrt(squares[0] / squares[1]))
 
     def _take_slots(self, P: PETSc.Mat) -> None:
-        """The slots of P's block rows, those of the last structure where they fit."""
+        """Give slots to P's block rows; use those of the last structure if they fit."""
         if self.tree is not None and not self.tree.follow(P, self._agree):
             self.account.resets += 1
             self._forget_trains()
@@ -190,7 +193,7 @@ class SparseTrain:
         return self._check_modes(slots) or self.tree.modes or choose_modes(slots, self.options.leaf)
 
     def _check_modes(self, slots: int) -> tuple[int, ...]:
-        """The modes that the user gave, none if none; OptionError if they are no numbers or too few."""
+        """The modes that the user gave, or (). OptionError if they are not numbers or hold too few slots."""
         text = self.options.modes
         if not text:
             return ()
@@ -223,18 +226,18 @@ class SparseTrain:
             self._apply.set_train(train)
 
     def distrust(self) -> bool:
-        """Whether a train of an earlier matrix is in use: the next set-up then tries another."""
+        """Whether a train of an earlier matrix is in use. If so, the next set-up tries another train."""
         if self._schedule.served:
             self._schedule.lose()
             return True
         return False
 
     def times(self, x: np.ndarray) -> np.ndarray:
-        """L^-T X L^-1 x, this rank's part from its part."""
+        """This rank's part of L^-T X L^-1 x, from its part of x."""
         return self._from_slots(self._inverse_times(self._to_slots(x)))
 
     def _to_slots(self, x: np.ndarray) -> np.ndarray:
-        """L^-1 x in slot order, (capacity bs,), in a buffer that the next call reuses."""
+        """L^-1 x in slot order (capacity bs,), in a buffer that the next call overwrites."""
         assert self.slots is not None
         slots = self.slots
         if slots.capacity > len(slots.place):

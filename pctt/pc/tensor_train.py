@@ -1,9 +1,9 @@
 """``-pc_type python -pc_python_type pctt.pc.TensorTrain``: a tensor train as approximate inverse.
 
-Of a sparse matrix: its blocks are ordered, scaled, compressed and inverted as in ``sparse_train.py``; at rank 1 there
-is no train but the scaled diagonal alone, which is block Jacobi, and by default the rank is the one that has paid in
-measured seconds per digit (``rank_policy.py``). Of a matrix that is given by its entries (the attribute ``entries``, or
-a dense Mat): compressed by cross and inverted, ``entries_train.py``.
+The blocks of a sparse matrix are ordered, scaled, compressed and inverted as in ``sparse_train.py``. At rank 1 there is
+no train, only the scaled diagonal, which is block Jacobi. By default the rank is the one with the fewest measured
+seconds per digit (``rank_policy.py``). A matrix that is given by its entries (the attribute ``entries``, or a dense
+Mat) is compressed by cross approximation and inverted (``entries_train.py``).
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from pctt.pc.second_solve import solve_again
 from pctt.pc.sparse_train import SparseTrain
 from pctt.pc.train_options import ENTRIES_RANK, SPARSE_RANK, Account, Options
 
-NOT_SYMMETRIC = "the matrix is not symmetric, and a train for its inverse may not be of use"
-LOWER = 3  # the cap divided by this is the rank that is tried where the cap fails or does not pay
-POOR = 0.5  # residual of an inverse of which a word is said
+NOT_SYMMETRIC = "the matrix is not symmetric, so a train for its inverse may be useless"
+LOWER = 3  # if the cap fails or does not pay, the policy tries the cap divided by this
+POOR = 0.5  # an inverse with a larger residual causes a warning
 
 
 class TensorTrain(PythonPC):
-    """The python PC; see the module and ``Options``. Works on symmetric positive definite Mats of any block size.
+    """The python PC; see the module and ``Options``. It works on symmetric positive definite Mats of any block size.
 
-    made : what makes trains of sparse matrices, or of those that are given by their entries
+    made : the maker of trains, for sparse matrices or for matrices given by their entries
     """
 
     options_class = Options
@@ -49,7 +49,7 @@ class TensorTrain(PythonPC):
         self.symmetric = True
         self.made: SparseTrain | EntriesTrain | None = None
         self._jacobi: PETSc.PC | None = None
-        self._diagonal: PETSc.Mat | None = None  # what block Jacobi is made from
+        self._diagonal: PETSc.Mat | None = None  # the matrix of block Jacobi
 
     # -- set-up ---------------------------------------------------------------------------------------------
 
@@ -57,7 +57,7 @@ class TensorTrain(PythonPC):
         return has_entries(P)
 
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        """ValueError, on all ranks alike, for coordinates, a grid or modes that do not fit the matrix."""
+        """ValueError on all ranks if coordinates, grid or modes do not fit the matrix."""
         self.comm = P.comm.tompi4py()
         check_coordinates(P)
         if has_entries(P):
@@ -79,7 +79,7 @@ class TensorTrain(PythonPC):
             cap = self.options.cap(SPARSE_RANK)
             self.policy = RankPolicy((max(1, cap // LOWER), cap), self.options.rank == "auto")
         else:
-            self.policy.forgive()  # what failed on another matrix may do here
+            self.policy.forgive()  # a rank that failed on another matrix may work here
 
     def _say_symmetry(self, symmetric: bool) -> None:
         self.symmetric = symmetric
@@ -87,11 +87,11 @@ class TensorTrain(PythonPC):
             warnings.warn(f"{self.name}: {NOT_SYMMETRIC}", stacklevel=2)
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        """A preconditioner of the rank that the policy chooses; one that fails is replaced by block Jacobi."""
+        """Make a preconditioner of the rank that the policy chooses; if this fails, use block Jacobi."""
         assert self.policy is not None
         assert self.made is not None
         start = time.perf_counter()
-        # the rank of all: figures that differ in a last bit must not part the ways of the processes
+        # all take the first process's choice, because figures may differ in the last bit
         self.rank = self.comm.bcast(self.policy.choose())
         if self.rank > 1 and not self.made.make(P, self.rank):
             self.policy.report(self.rank, self._slowest(time.perf_counter() - start), 0.0, sound=False)
@@ -107,7 +107,7 @@ class TensorTrain(PythonPC):
             PETSc.Sys.Print(f"  {self.name}: {self._line()}", comm=P.comm)
 
     def _judge_entries(self, made: EntriesTrain) -> None:
-        """Say what a user should know of a matrix whose train was not chosen by measured gain."""
+        """Warn if the train of a matrix given by its entries is bad or missing, or if the matrix is not symmetric."""
         if made.compressed is not None and self.symmetric != made.compressed.symmetric:
             self._say_symmetry(made.compressed.symmetric)
         word = ""
@@ -132,7 +132,7 @@ class TensorTrain(PythonPC):
     # -- application ----------------------------------------------------------------------------------------
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = M x with M block Jacobi or the train."""
+        """y = M x, where M is block Jacobi or the train."""
         if self.rank == 1:
             assert self._jacobi is not None
             self._jacobi.apply(x, y)
@@ -147,12 +147,12 @@ class TensorTrain(PythonPC):
         self._solve_start = time.perf_counter()
 
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Tell the policy what the solve took and reached; ban a rank with which the method stalled."""
+        """Report the seconds and the accuracy of the solve to the policy; ban a rank with which the method stalled."""
         assert self.policy is not None
         reason, rank = ksp.getConvergedReason(), self.rank
         assert self.made is not None
         spoilt = rank > 1 and solve_again(ksp, self._block_diagonal, self.P, b, x)
-        if spoilt:  # nor is another solve with this matrix to meet it
+        if spoilt:  # other solves with this matrix must not use the train either
             self.rank = 1
             self._make_block_jacobi(self.P)
             what = f"{ksp.getType()} broke down ({reason}) at rank {rank}"
@@ -171,7 +171,7 @@ class TensorTrain(PythonPC):
         if stalled and rank > 1 and not spoilt:
             self.account.fallbacks.append(f"{ksp.getType()} stalled at rank {rank}")
         sound = not (spoilt or stalled)
-        if not sound and self.made.distrust():  # a train of an earlier matrix: one made for the next may do
+        if not sound and self.made.distrust():  # it was a train of an earlier matrix; a new train may work
             sound = True
         self.policy.report(rank, self._setup_seconds + seconds, max(digits, 0.0), sound)
         self._setup_seconds = 0.0  # a second solve with the same matrix has no set-up

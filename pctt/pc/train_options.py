@@ -1,4 +1,4 @@
-"""Options and account of ``pctt.pc.TensorTrain``."""
+"""Options of ``pctt.pc.TensorTrain``, and the account of what it did."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from typing import Optional
 
 from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, option
 
-SPARSE_RANK, ENTRIES_RANK = 10, 100  # the cap where none is given
+SPARSE_RANK, ENTRIES_RANK = 10, 100  # default caps
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options ``-pc_tt_*``, behind the prefix of the PC."""
+    """Options ``-pc_tt_*``, after the prefix of the PC."""
 
     eps: float = option(
-        1e-2, "relative Frobenius error at which a compression ends, and residual at which an inverse does",
+        1e-2, "a compression ends at this relative Frobenius error, an inverse at this residual",
         check=FRACTION,
     )
     max_rank: Optional[int] = option(
-        None, f"cap of the ranks of matrix and inverse; none: {SPARSE_RANK}, {ENTRIES_RANK} for a matrix given by its "
-        "entries", check=AT_LEAST_ONE,
+        None, f"cap of the ranks of matrix and inverse; none: {SPARSE_RANK}, or {ENTRIES_RANK} for a matrix given by "
+        "its entries", check=AT_LEAST_ONE,
     )
     rank: str = option("auto", "auto: the rank that pays, 1 included; fixed: max_rank", choices=("auto", "fixed"))
     compress: str = option(
-        "als", "of a sparse matrix; als: alternating least squares over the nonzeros; cross: AMEn cross (the paper)",
+        "als", "for sparse matrices; als: alternating least squares over the nonzeros; cross: AMEn cross (the paper)",
         choices=("als", "cross"),
     )
     scaling: str = option(
@@ -33,17 +33,17 @@ class Options:
     )
     order: str = option(
         "auto",
-        "of the rows; grid: of the attribute grid or the DMDA, one axis after the other; morton: along a curve through "
-        "the attribute coordinates; rcm: reverse Cuthill-McKee; natural: as numbered; auto: the first that the matrix "
-        "has what it needs for (with names of rows morton)",
+        "order of the rows; grid: the attribute grid or the DMDA, one axis after the other; morton: along a curve "
+        "through the attribute coordinates; rcm: reverse Cuthill-McKee; natural: as numbered; auto: the first for "
+        "which the matrix has the data (with names of rows: morton)",
         choices=("auto", "grid", "morton", "rcm", "natural"),
     )
     leaf: int = option(16, "least number of blocks in the first and last mode", check=AT_LEAST_ONE)
-    modes: str = option("", "modes of the blocks with commas between; none: chosen for little padding")
+    modes: str = option("", "modes of the blocks, separated by commas; none: modes with little padding")
     reuse: str = option(
         "steps",
-        "newton: cores, index sets and block pairs of the last matrix of the same structure; steps: also its slots and "
-        "cores for the next structure; none: everything anew",
+        "newton: use cores, index sets and block pairs of the last matrix with the same structure; steps: use its "
+        "slots and cores for the next structure too; none: compute everything anew",
         choices=("none", "newton", "steps"),
     )
     keep: bool = option(
@@ -58,7 +58,7 @@ class Options:
 
 @dataclass
 class Account:
-    """What the preconditioner did so far, for ``-ksp_view`` and the run's summary."""
+    """What the preconditioner has done so far, for ``-ksp_view`` and the summary of the run."""
 
     setups: int = 0
     reused: int = 0

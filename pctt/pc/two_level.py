@@ -1,12 +1,13 @@
 """``-pc_type python -pc_python_type pctt.pc.TwoLevel``: block Jacobi and a coarse space on boxes of block rows.
 
-The block rows (bodies) are divided into boxes by recursive bisection of their places. On each box the coarse space has
-the restriction of the Mat's near null space (``MatSetNearNullSpace``: for the body system the rigid motions, which
-`BodyMatrix` provides), or the constants where it has none. With Z their orthonormal columns and D the block diagonal,
+Recursive bisection of their places divides the block rows (bodies) into boxes. On each box the coarse space has the
+restriction of the Mat's near null space (``MatSetNearNullSpace``). For the body system these are the rigid motions,
+which `BodyMatrix` provides. A Mat without near null space gets the constants. With the orthonormal columns Z of the
+coarse space and the block diagonal D of A,
 
     M = D^-1 + Z (Z' A Z)^-1 Z'.
 
-PETSc's multigrid of two levels does the rest, and has its options, with the further prefix ``two_``: say
+PETSc's multigrid with two levels applies M. It has its usual options with the additional prefix ``two_``, for example
 ``-two_pc_mg_type multiplicative -two_mg_levels_ksp_type chebyshev``, or another ``-two_mg_coarse_pc_type``.
 """
 
@@ -25,9 +26,9 @@ from pctt.pc.base import PythonPC
 from pctt.pc.mat import check_coordinates
 from pctt.pc.ordering import block_order
 
-DEPENDENT = 1e-8  # part of the largest: modes of a box with smaller Gram eigenvalues depend on the others
+DEPENDENT = 1e-8  # modes of a box whose Gram eigenvalues are below this part of the largest depend on the others
 
-#: Of the multigrid: one application of block Jacobi, and factors of the coarse matrix, all of which the first rank has.
+#: Options of the multigrid: one application of block Jacobi, and factors of the coarse matrix, all on the first rank.
 DEFAULTS = {
     "pc_mg_type": "additive",
     "mg_levels_ksp_type": "preonly",
@@ -40,7 +41,7 @@ DEFAULTS = {
 
 @dataclass(frozen=True)
 class Options:
-    """Options ``-pc_two_*``, behind the prefix of the PC."""
+    """Options ``-pc_two_*``, after the prefix of the PC."""
 
     boxes: int = option(256, "number of boxes, rounded down to a power of two", check=AT_LEAST_ONE)
 
@@ -54,11 +55,11 @@ class TwoLevel(PythonPC):
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
-        self._own: list = []  # PETSc objects of the structure
-        self._values: list = []  # and of the values
+        self._own: list = []  # PETSc objects that depend on the structure only
+        self._values: list = []  # PETSc objects that depend on the values
 
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        """Boxes, coarse space and multigrid."""
+        """Make the boxes, the coarse space and the multigrid."""
         self.release()
         check_coordinates(P)
         comm = P.comm.tompi4py()
@@ -75,9 +76,9 @@ class TwoLevel(PythonPC):
         self._own = [self._Z, self.multigrid]
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        """Block diagonal and coarse matrix."""
+        """Compute the block diagonal and the coarse matrix."""
         old = self._values
-        # PETSc has no such product of block formats, and its conversion counts as a change of P
+        # a copy, because PETSc has no such product for block formats, and its conversion counts as a change of P
         rows = PETSc.Mat().createAIJ(P.getSizes(), csr=P.getValuesCSR(), comm=P.comm)
         coarse = rows.ptap(self._Z)
         rows.destroy()
@@ -111,8 +112,11 @@ class TwoLevel(PythonPC):
 
 
 def coarse_space(comm: MPI.Comm, modes: np.ndarray, box: np.ndarray, boxes: int) -> tuple[PETSc.Mat, np.ndarray]:
-    """Z from the modes (n, bs, k) and the boxes (n,) of this rank's block rows: orthonormal on each box, zero where
-    dependent; and 1 for these of this rank's columns, 0 for others. The first rank has all columns."""
+    """Z from the modes (n, bs, k) and the boxes (n,) of this rank's block rows, and a mask of its columns.
+
+    The columns of Z are orthonormal on each box. Columns of dependent modes are zero, and the mask is 1 for them and 0
+    for others. The first rank has all columns.
+    """
     count, bs, k = modes.shape
     gram = np.zeros((boxes, k, k))
     np.add.at(gram, box, modes.transpose(0, 2, 1) @ modes)
@@ -132,7 +136,8 @@ def coarse_space(comm: MPI.Comm, modes: np.ndarray, box: np.ndarray, boxes: int)
 
 
 def bisect(points: np.ndarray, boxes: int) -> np.ndarray:
-    """Box of each point (n,): halves of equal number along the longest side, until there are at most ``boxes``.
+    """Box of each point (n,). Each box is halved along its longest side into equal numbers of points, until another
+    step would give more than ``boxes`` boxes.
 
     >>> bisect(np.array([[0.0], [3.0], [1.0], [2.0]]), 2)
     array([0, 1, 0, 1])
@@ -153,7 +158,7 @@ def bisect(points: np.ndarray, boxes: int) -> np.ndarray:
 
 
 def _places(P: PETSc.Mat) -> np.ndarray:
-    """A place (n, d) of each of this rank's block rows; without coordinates, their number in an order of the matrix."""
+    """Places (n, d) of this rank's block rows; without coordinates, their numbers in an order of the matrix."""
     points = P.getAttr("coordinates")
     if points is None:
         return (P.getOwnershipRange()[0] // P.getBlockSize() + block_order(P)).astype(float)[:, None]

@@ -7,8 +7,8 @@
     X = invert(identity(T.rows) + T, max_rank=10).train
     y = Apply(X, n)(x)
 
-Nothing here knows of PETSc or MPI: where the rows are distributed, a function that adds an array over the
-ranks is passed in.
+This package does not use PETSc or MPI. If the rows are distributed, the caller passes a function that adds an array
+over the ranks.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Compression of a sparse matrix into a train by alternating least squares (ALS).
 
-With orthonormal left and right interfaces the best core between them is the matrix contracted with both. A
-pass over the cores, forward or backward, computes a new orthonormal interface per bond from the core that is
-best there. The right interfaces of the start are random, or those of a train (that of a similar matrix, say
-of the last Newton step). All contractions are those of `SparseHierarchy`: one product with all nonzeros per
-pass and one for the start, the rest is small.
+With orthonormal left and right interfaces, the best core between them is the matrix contracted with both. A pass over
+the cores, forward or backward, computes the best core at each bond and from it a new orthonormal interface. At the
+start the right interfaces are random, or those of another train, for example the train of the last Newton step. All
+contractions are methods of `SparseHierarchy`. Each pass needs one product with all nonzeros, and the start needs one;
+the rest is small.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pctt.tt.quantise import slots_of
 from pctt.tt.sparse import SparseHierarchy, on_one_rank
 from pctt.tt.train import Array, Train, full_ranks, matrix_train, zeros
 
-FIRST_RANK = 16  # a larger cap is approached by doubling
-LARGE, PART = 1 << 15, 8  # slots from which one node of the last bond in PART is enough for a start
-LEAF_CHUNK = 1 << 21  # entries of leaves that are compared at a time
+FIRST_RANK = 16  # ranks begin here and are doubled up to a larger cap
+LARGE, PART = 1 << 15, 8  # with more slots than LARGE, the start uses one in PART nodes of the last bond
+LEAF_CHUNK = 1 << 21  # number of entries of leaves that are compared at a time
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Compression:
     """A train of a sparse matrix A.
 
     error : ||A - T||_F / ||A||_F, measured
-    passes : forward passes over all nonzeros
+    passes : number of forward passes over all nonzeros
     """
 
     train: Train
@@ -43,13 +43,13 @@ def compress(
     sweeps: int | None = None,
     rng: np.random.Generator | None = None,
 ) -> Compression:
-    """Train of ranks at most `max_rank`, within eps where the rank allows.
+    """A train with ranks at most `max_rank`, with an error below eps if the rank allows it.
 
     Parameters
     ----------
-    start : warm start; its ranks are filled up with random directions
-    sweeps : there and back after the first pass, per rank that is tried; by default 0 from a start, 1 from
-        scratch. From scratch the start for a matrix of more than LARGE slots comes from a part of it.
+    start : a train for a warm start; random directions fill up its ranks
+    sweeps : number of sweeps, backward and forward, after the first pass, for each rank that is tried. The default is
+        0 with a start and 1 without. Without a start, a matrix with more than LARGE slots gets one from a part of it.
 
     >>> i = np.arange(63)
     >>> A = SparseHierarchy(np.r_[i, i + 1], np.r_[i + 1, i], [4, 4, 4])
@@ -86,7 +86,7 @@ def compress(
 def _passes(
     matrix: SparseHierarchy, cores: list[Array], rank: int, sweeps: int, rng: np.random.Generator
 ) -> list[Array]:
-    """Cores of the given rank after a forward pass and so many sweeps, from old cores, if any."""
+    """Cores of the given rank after a forward pass and ``sweeps`` sweeps; they begin with the old cores, if any."""
     cores, x = forward(matrix, _spreads(matrix, _right_orthonormal(_widen(matrix, cores, rank, rng))))
     for _ in range(sweeps):
         cores, x = forward(matrix, backward(matrix, x, cores[-1]))
@@ -94,9 +94,9 @@ def _passes(
 
 
 def forward(matrix: SparseHierarchy, spreads: list[Array]) -> tuple[list[Array], list[Array]]:
-    """From the first core to the last, given the matrix contracted with the right interfaces.
+    """A pass from the first core to the last; ``spreads`` is the matrix contracted with the right interfaces.
 
-    Returns the new flat cores, left-orthogonal but for the last, and their left interfaces.
+    Returns the new flat cores and their left interfaces. All cores except the last are left-orthogonal.
     """
     x, cores = [matrix.root()], []
     for k, spread in enumerate(spreads):
@@ -108,7 +108,7 @@ def forward(matrix: SparseHierarchy, spreads: list[Array]) -> tuple[list[Array],
 
 
 def backward(matrix: SparseHierarchy, x: list[Array], last: Array) -> list[Array]:
-    """From the last core to the first, given left interfaces and the best last core for them.
+    """A pass from the last core to the first, from left interfaces and the best last core for them.
 
     Returns the matrix contracted with the new right interfaces.
     """
@@ -123,7 +123,7 @@ def backward(matrix: SparseHierarchy, x: list[Array], last: Array) -> list[Array
 
 
 def _spreads(matrix: SparseHierarchy, cores: list[Array]) -> list[Array]:
-    """The matrix contracted with the right interfaces of all but the first core."""
+    """The matrix contracted with the right interfaces of all cores except the first."""
     V = matrix.leaf_up(cores[-1])
     spreads = [matrix.spread(len(cores) - 2, V)]
     for k in range(len(cores) - 2, 0, -1):
@@ -133,11 +133,11 @@ def _spreads(matrix: SparseHierarchy, cores: list[Array]) -> list[Array]:
 
 
 def relative_error(matrix: SparseHierarchy, train: Train) -> float:
-    """||A - T||_F / ||A||_F over all entries, zeros included.
+    """||A - T||_F / ||A||_F over all entries, including zeros.
 
-    From ||A||^2 - 2 <A, T> + ||T||^2, which rounding makes worthless below the root of the machine precision:
-    there it is summed entry by entry over the hierarchy on a single rank; on several ranks the
-    value is raised to what rounding leaves certain.
+    It is computed from ||A||^2 - 2 <A, T> + ||T||^2. Below the root of the machine precision rounding makes this
+    worthless. Then a single rank sums the errors entry by entry over the hierarchy; with several ranks the result is
+    the smallest value that is certain in spite of rounding.
     """
     norm = matrix.norm()
     if norm == 0:
@@ -150,13 +150,16 @@ def relative_error(matrix: SparseHierarchy, train: Train) -> float:
 
 
 def _certain(train: Train) -> float:
-    """The least square of a relative error that a difference of squares gives with two or three digits."""
+    """The smallest square of a relative error for which a difference of squares has two or three correct digits."""
     return 1e3 * float(np.finfo(train.dtype).eps)
 
 
 def _sum_of_errors(matrix: SparseHierarchy, train: Train) -> float:
-    """Sum of (A - T)^2 over all entries, without cancellation: those below listed pairs one by one, the rest, where
-    A is zero, as squares of the train's left interface (the right one is orthonormal)."""
+    """Sum of (A - T)^2 over all entries, without cancellation.
+
+    Entries below listed pairs are summed one by one. At the other entries A is zero, and their sum is the squared norm
+    of the train's left interface, because the right interface is orthonormal.
+    """
     cores = train.right_orthogonal().flat()
     x, total = matrix.root(), 0.0
     for k, core in enumerate(cores[:-1]):
@@ -174,14 +177,14 @@ def _sum_of_errors(matrix: SparseHierarchy, train: Train) -> float:
 
 
 def _exact(matrix: SparseHierarchy) -> Compression:
-    """Of a matrix that is zero or has a single mode."""
+    """The exact train of a matrix that is zero or has a single mode."""
     if len(matrix.modes) > 1:
         return Compression(zeros(matrix.modes, matrix.modes, matrix.dtype), 0.0, 0)
     return Compression(matrix_train([matrix.leaf_core(matrix.root())], matrix.modes), 0.0, 0)
 
 
 def _widen(matrix: SparseHierarchy, cores: list[Array], rank: int, rng: np.random.Generator) -> list[Array]:
-    """Random cores of the given rank where the modes allow it, with old cores, if any, in their first rows."""
+    """Random cores with the given rank, as far as the modes allow it; their first rows have the old cores, if any."""
     squares = [m * m for m in matrix.modes]
     ranks = [1, *np.minimum(rank, full_ranks(squares)), 1]
     wide = []
@@ -196,7 +199,7 @@ def _widen(matrix: SparseHierarchy, cores: list[Array], rank: int, rng: np.rando
 
 
 def _right_orthonormal(cores: list[Array]) -> list[Array]:
-    """Cores whose right interfaces are orthonormal and span those of the given ones; the first is left out."""
+    """Cores whose right interfaces are orthonormal and span those of the given cores, except for the first core."""
     cores = list(cores)
     for k in range(len(cores) - 1, 0, -1):
         Q, R = np.linalg.qr(cores[k].reshape(len(cores[k]), -1).T)
@@ -206,6 +209,6 @@ def _right_orthonormal(cores: list[Array]) -> list[Array]:
 
 
 def _orthonormal_rows(core: Array) -> Array:
-    """A core (r, n, r') with orthonormal rows, seen as (r, n r'), that span those of the given one."""
+    """A core (r, n, r') whose rows, as a matrix (r, n r'), are orthonormal and span those of the given core."""
     Q = np.linalg.qr(core.reshape(len(core), -1).T)[0]
     return np.ascontiguousarray(Q.T).reshape(-1, *core.shape[1:])

@@ -1,19 +1,20 @@
 """Fast product of a matrix train with full vectors.
 
-The vector is contracted with one core after the other, the first mode first. Seen as x (m_1, n / m_1), the
-first core turns it into z (i_1, b, rest); for every i_1 the remaining cores act on a block (b, rest) that
-stays in the cache, each as a batch of small matrix products
+The vector is contracted with one core after the other, beginning with the first mode. The first core turns the vector,
+as a matrix x (m_1, n / m_1), into z (i_1, b, rest). For every i_1 the other cores act on a block (b, rest) that stays
+in the cache. Each does this as a batch of small matrix products
 
     z (i_1 ... i_{k-1}; b_{k-1} j_k; rest)  ->  (i_1 ... i_{k-1} i_k; b_k; rest),
 
-in which nothing is transposed. Two work arrays are reused. A core of mode m between ranks r and r' costs 2 n r m r'
-operations, nearly all of them in large matrix products. Where ranks bulge between two cores, one core for both modes
-costs less: cores are merged so that the sum is least (`cheapest_groups`). Single precision takes half the seconds.
+without a transposition. Two work arrays are reused. A core of mode m between the ranks r and r' costs 2 n r m r'
+operations, and nearly all of them are in large matrix products. If the rank between two cores is large, one core for
+both modes costs less. So cores are merged such that the sum of the costs is least (`cheapest_groups`). Single precision
+takes half the seconds.
 
-On several ranks each owns a range of rows and computes only these: its share of the boxes i_1, wholly local.
-It needs all of x, because every box of a train couples with every other; n numbers gathered once are the
-least that any exchange costs (reducing the z of each rank's own columns would send r n). Who calls `product` has
-gathered it.
+With several processes each owns a range of rows and computes only these: its share of the boxes i_1, without
+communication. It needs all of x, because every box of a train couples with every other box. No exchange costs less than
+gathering n numbers once (a sum of the z of each process's own columns would send r n). The caller of `product` gathers
+x.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ import numpy as np
 from pctt.tt.quantise import leading, merge, slots_of
 from pctt.tt.train import Array, Train
 
-WORK = 1 << 22  # bytes of the first intermediate that are made at a time
-FIRST, MOST = 32, 256  # rows of the first core, at least, and of any that is merged, at most
-WORD = 64  # multiplications in the seconds that a number takes to be written and read again
+WORK = 1 << 22  # bytes of the first intermediate result that are computed at a time
+FIRST, MOST = 32, 256  # least number of rows of the first core, and largest number of rows of a merged core
+WORD = 64  # writing and reading a number takes as long as this number of multiplications
 
 
 class Apply:
-    """Product y = T x, or the rows `start` to `stop` of it, for vectors of n <= size entries (padded with zeros).
+    """The product y = T x, or its rows `start` to `stop - 1`, for vectors of n <= size entries (padded with zeros).
 
-    train : square matrix train; `set_train` takes another one of the same modes
+    train : square matrix train; `set_train` takes another train with the same modes
     n : length of the vectors
-    rows : the rows (start, stop) that this rank owns, by default all
+    rows : the range (start, stop) of rows that this rank owns, by default all rows
 
     >>> from pctt.tt.train import random
     >>> T = random([3, 2, 4], 5, [3, 2, 4])
@@ -59,7 +60,7 @@ class Apply:
         self.set_train(train)
 
     def set_train(self, train: Train) -> None:
-        """Another train of the same modes."""
+        """Take another train with the same modes."""
         train = merge(train, cheapest_groups(train.rows, train.ranks))
         first, *middle, last = [core.astype(self.dtype) for core in train.cores] + [
             np.ones((1, 1, 1, 1), self.dtype) for _ in range(2 - len(train))
@@ -73,7 +74,7 @@ class Apply:
         self._allocate(train.rows[1:] or (1,))
 
     def _allocate(self, modes: Sequence[int]) -> None:
-        """Work arrays, and views of them in the shapes of every step, for boxes of the given modes."""
+        """Allocate work arrays for boxes of the given modes, and views of them in the shapes of every step."""
         boxes, rank, _ = self._first.shape
         box = slots_of(modes)
         start, stop = self.rows
@@ -88,9 +89,9 @@ class Apply:
         self._z = z.reshape(chunk * rank, box)
         shapes = [
             (slots_of(modes[:k]), r * m, slots_of(modes[k + 1 :])) for k, (r, m) in enumerate(zip(ranks, modes))
-        ]  # what a core is applied to
+        ]  # shapes of the inputs of the cores
         self._inputs = [part.reshape(shapes[0] if self._middle else shapes[0][:2]) for part in z]
-        self._steps: list[tuple[Array, Array, Array]] = []  # (matrix, its product, the same seen by the next)
+        self._steps: list[tuple[Array, Array, Array]] = []  # (matrix, its product, the product as input of the next)
         for k, W in enumerate(self._middle):
             count, _, rest = shapes[k]
             flat = work[k % 2][: count * len(W) * rest]
@@ -99,7 +100,7 @@ class Apply:
         self._outputs = list(self._y.reshape(len(self._boxes), box // modes[-1], modes[-1]))
 
     def __call__(self, x: Array, out: Array | None = None) -> Array:
-        """My rows of T x, for the whole x."""
+        """This rank's rows of T x, from the whole x."""
         self.x[: self.n] = x
         y = self.product()
         if out is None:
@@ -108,7 +109,7 @@ class Apply:
         return out
 
     def product(self) -> Array:
-        """My rows of T x for the whole x that the caller has put into `self.x[:n]`; valid until the next call."""
+        """This rank's rows of T x; the caller has put the whole x into `self.x[:n]`. Valid until the next call."""
         chunk = len(self._inputs)
         for first in range(0, len(self._boxes), chunk):
             count = min(chunk, len(self._boxes) - first)
@@ -124,9 +125,11 @@ class Apply:
 
 
 def cheapest_groups(modes: Sequence[int], ranks: Sequence[int]) -> list[int]:
-    """How many neighbouring cores of a train of these modes and ranks (r_0, ..., r_d) to merge into one, for the least
-    work per number of a vector: a core of mode m takes r m r' multiplications, and WORD for each of the r' numbers that
-    it hands on. The first core has at least FIRST rows where the modes allow it: boxes, which ranks share.
+    """The numbers of neighbouring cores to merge into one for the least work per number of a vector.
+
+    The train has these modes and ranks (r_0, ..., r_d). A core of mode m takes r m r' multiplications, and WORD for
+    each of the r' numbers that it hands to the next core. The first core has at least FIRST rows if the modes allow it.
+    Its rows are the boxes that the processes share.
 
     >>> cheapest_groups([2] * 12, [1, 4, 8, 8, 8, 4, 4, 4, 8, 8, 8, 4, 1])
     [6, 6]
@@ -134,7 +137,7 @@ def cheapest_groups(modes: Sequence[int], ranks: Sequence[int]) -> list[int]:
     [6, 2, 2, 2, 6]
     """
     d = len(modes)
-    best: list[tuple[float, list[int]]] = [(0.0, [])] * (d + 1)  # of the cores from k on
+    best: list[tuple[float, list[int]]] = [(0.0, [])] * (d + 1)  # work and groups of the cores from k on
     for k in range(d - 1, -1, -1):
         stops = list(range(k + 1, k + 1 + leading(modes[k:], MOST)))
         if k == 0:

@@ -1,15 +1,14 @@
-"""Cross approximation of a sparse matrix: a train from some of its entries, looked up one by one.
+"""Cross approximation of a matrix: a train from some of its entries.
 
-A train of rank r is determined by the entries on crosses: for every bond a few *prefixes* (i_1 j_1, ..., i_k
-j_k) and *suffixes* (i_{k+1} j_{k+1}, ..., i_d j_d). A sweep evaluates, core after core, the matrix at prefix
-x digit x suffix, finds its dominant column space, and keeps as the next prefixes the rows on which that space
-is best conditioned (maximal volume); the sweep back does the same with suffixes. The cost of a sweep is of
-the order d r^2 m^2 entries, independent of the number of nonzeros (Oseledets & Tyrtyshnikov, Linear Algebra
-Appl. 432, 2010; Savostyanov & Oseledets, 2011).
+The entries on crosses determine a train of rank r. Every bond has a few *prefixes* (i_1 j_1, ..., i_k j_k) and
+*suffixes* (i_{k+1} j_{k+1}, ..., i_d j_d), which give the crosses. A sweep goes from core to core. It evaluates the
+matrix at prefix x digit x suffix and finds its dominant column space. The rows on which this space is best conditioned
+(maximal volume) become the next prefixes. The sweep back does the same with suffixes. A sweep needs of the order of
+d r^2 m^2 entries, independent of the number of nonzeros (Oseledets & Tyrtyshnikov, Linear Algebra Appl. 432, 2010;
+Savostyanov & Oseledets, 2011).
 
-Random crosses of a sparse matrix are zero nearly everywhere, so the first pivots are stored nonzeros, and the
-enrichment of every sweep (the role of the residual in AMEn) are those among a sample of stored nonzeros where
-the train is worst.
+Random crosses of a sparse matrix are zero nearly everywhere. So the first pivots are stored nonzeros. Every sweep adds
+those nonzeros of a sample where the train is worst; they have the role of the residual in AMEn.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ from pctt.tt.entries import EntryMatrix
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Array, Train, low_rank, matrix_train, zeros
 
-SAMPLES = 1024  # stored entries, and as many others, on which a train is validated
-EXTRA = 32  # of the stored entries where the train is worst: what enriches the next sweep, at most
-TIGHTER = 0.1  # what the accuracy of the single cores is multiplied by where a sweep has missed eps
-WORTH = 0.9  # a sweep that leaves more than this of the error was idle
+SAMPLES = 1024  # a train is validated on this number of stored entries and on as many others
+EXTRA = 32  # largest number of stored entries, those where the train is worst, that enrich the next sweep
+TIGHTER = 0.1  # if a sweep misses eps, the tolerance of the single cores is multiplied by this
+WORTH = 0.9  # a sweep that leaves more than this part of the error was idle
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,8 @@ class Cross:
     """A train from crosses.
 
     error : ||A - T||_F / ||A||_F, measured, or estimated from validation entries
-    sweeps, evaluations : there and back over the cores; entries of the matrix that were looked up
-    prefixes, suffixes : index sets of bonds 0, ..., d, the start for a similar matrix
+    sweeps, evaluations : numbers of sweeps there and back over the cores, and of evaluated entries of the matrix
+    prefixes, suffixes : index sets of bonds 0, ..., d, a start for a similar matrix
     """
 
     train: Train
@@ -56,15 +55,15 @@ def compress_cross(
     measure: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Cross:
-    """Train of ranks at most `max_rank` from entries of the matrix, within about eps if the rank allows.
+    """A train with ranks at most `max_rank` from entries of the matrix. Its error is about eps if the rank allows it.
 
     Parameters
     ----------
-    start : the result for a similar matrix, whose index sets are the first ones
-    sweeps : the most; the estimated error ends them when it is below eps or falls by less than a tenth
-        in two sweeps running
-    measure : measure the error of a sparse matrix at last, at a cost linear in the nonzeros; without, and of a matrix
-        that is a function, it is estimated from fresh samples, and all is sublinear
+    start : the result for a similar matrix; its index sets are the first ones
+    sweeps : largest number of sweeps. They end earlier if the estimated error is below eps, or if it falls by less than
+        a tenth in two consecutive sweeps.
+    measure : measure the final error of a sparse matrix, at a cost linear in the nonzeros. Otherwise, and for a matrix
+        given by a function, it is estimated from fresh samples, and all costs are sublinear.
     rng : must give the same numbers on all ranks
 
     >>> i = np.arange(63)
@@ -103,9 +102,9 @@ def compress_cross(
 
 
 class _Entries:
-    """Entries of the matrix by one key: the digits i_k m_k + j_k of base m_k^2, the first mode most significant.
+    """Entries of the matrix by one key. Its digits are i_k m_k + j_k of base m_k^2, the first mode most significant.
 
-    A prefix of length k and a suffix are the keys of their own digits: key = prefix * width[k] + suffix.
+    A prefix of length k and a suffix are keys of their own digits: key = prefix * width[k] + suffix.
     """
 
     def __init__(self, matrix: SparseHierarchy | EntryMatrix, rng: np.random.Generator) -> None:
@@ -138,7 +137,7 @@ class _Entries:
         return self.matrix.sample(count, self.rng)
 
     def validation(self) -> tuple[Array, Array]:
-        """Fresh keys, and weights with which a sum of squares over them estimates that over all entries."""
+        """Fresh keys, and weights: the weighted sum of squares over them estimates the sum over all entries."""
         return self.matrix.validation(SAMPLES, self.rng)
 
     def of_train(self, train: Train, keys: Array) -> Array:
@@ -146,13 +145,13 @@ class _Entries:
         return train.at(digits)
 
     def error(self, train: Train, keys: Array, weights: Array) -> float:
-        """Estimate of the relative error."""
+        """The estimated relative error."""
         square = (self.at(keys) - self.of_train(train, keys)) ** 2
         return float(weights @ square) ** 0.5 / self.norm
 
     def worst(self, train: Train, count: int) -> Array:
-        """Keys of the stored entries, out of a sample, where the train is worst."""
-        keys = self.rng.permutation(np.unique(self.stored(SAMPLES)))  # equal errors are spread over the matrix
+        """Keys of those stored entries in a sample where the train is worst."""
+        keys = self.rng.permutation(np.unique(self.stored(SAMPLES)))  # spreads equal errors over the matrix
         error = np.abs(self.at(keys) - self.of_train(train, keys))
         return keys[np.argsort(-error, kind="stable")[:count]]
 
@@ -160,7 +159,7 @@ class _Entries:
 def _forward(
     entries: _Entries, suffixes: list[Array], extra: Array, max_rank: int, eps: float
 ) -> tuple[list[Array], list[Array]]:
-    """From the first core to the last: interpolating cores and new prefixes."""
+    """The sweep from the first core to the last: it returns interpolating cores and new prefixes."""
     d = len(entries.squares)
     prefixes = [np.zeros(1, np.int64)]
     cores = []
@@ -177,7 +176,7 @@ def _forward(
 def _backward(
     entries: _Entries, prefixes: list[Array], extra: Array, max_rank: int, eps: float
 ) -> list[Array]:
-    """From the last core to the first: new suffixes."""
+    """The sweep from the last core to the first: it returns new suffixes."""
     d = len(entries.squares)
     suffixes = [np.zeros(1, np.int64)]
     for k in range(d - 1, 0, -1):
@@ -190,7 +189,7 @@ def _backward(
 
 
 def _dominant(C: Array, max_rank: int, eps: float) -> tuple[Array, Array]:
-    """U (n, r) and rows with U[rows] = I that interpolate the dominant columns of C (n, m) well; r >= 1."""
+    """U (n, r) and rows with U[rows] = I, which interpolate the dominant columns of C (n, m) well; r >= 1."""
     Q = low_rank(C, eps * float(np.linalg.norm(C)), max_rank)[0]
     rows = linalg.qr(Q.T, mode="r", pivoting=True, check_finite=False)[1][: Q.shape[1]].astype(np.int64)
     for _ in range(100):  # towards maximal volume, one exchange of rows at a time

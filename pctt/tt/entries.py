@@ -1,8 +1,8 @@
-"""A matrix that is a function of its indices, as `compress_cross` sees it: nothing here is linear in its size.
+"""A matrix given by a function of its indices, for `compress_cross`. No cost here is linear in the size of the matrix.
 
-Norms and errors are sums over random pairs of points, the column near the row on all scales: a coordinate is off by up
-to 2^s - 1, s random. The chance of a pair is known, so that the weighted sum has the right expectation, and the
-diagonal and the steep part of a singular kernel are met as often as the rest.
+Norms and errors are sums over random pairs of points. The column is near the row on all scales: their coordinates
+differ by up to 2^s - 1 with a random s. The probability of a pair is known, so the weighted sum has the right
+expectation. The samples meet the diagonal and the steep part of a singular kernel as often as the rest.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ NORM_SAMPLES = 4096
 
 
 class EntryMatrix:
-    """T = (A - c I) / c of the matrix A(i, j) = entries(i, j) of the points of a grid, c the mean of A's diagonal
-    (T = A where that is not positive); padding stands for rows of c I.
+    """T = (A - c I) / c for the matrix A(i, j) = entries(i, j) of the points of a grid; c is the mean of A's diagonal.
 
-    Errors are relative to T: the identity, whose norm grows with the number of points, does not hide them.
+    If the mean is not positive, T = A. Padded rows are rows of c I. Errors are relative to T, because the norm of the
+    identity grows with the number of points and would hide them.
 
-    entries : takes rows and columns (p,), integers, and gives (p,) numbers
-    digits : of the grid
-    order : (rows,) the row at each point of the grid, where that is not its number
+    entries : takes rows and columns, integers (p,), and returns numbers (p,)
+    digits : the digits of the grid
+    order : (rows,) the row at each point of the grid, if rows are not in the order of the points
     agree : as in `SparseHierarchy`
 
     shift, scale : c and 1 / c
@@ -50,15 +50,15 @@ class EntryMatrix:
         self._norm = self.agree(float(weights @ self.lookup(keys) ** 2) ** 0.5)
 
     def norm(self) -> float:
-        """Frobenius norm, estimated."""
+        """The estimated Frobenius norm."""
         return self._norm
 
     def lookup(self, keys: Array) -> Array:
-        """Entries by keys of any shape."""
+        """Entries at keys of any shape."""
         return self._at(self.digits.pair(keys))
 
     def crosses(self, prefixes: Array, digits: Array, suffixes: Array) -> Array:
-        """Entries (p, m, s) by the sums of keys that share no digit."""
+        """Entries (p, m, s) at the sums of keys that share no digit."""
         pair = self.digits.pair
         return self._at(pair(prefixes)[:, None, None] + pair(digits)[:, None] + pair(suffixes))
 
@@ -79,7 +79,7 @@ class EntryMatrix:
         return self._pairs(count, rng)[0]
 
     def validation(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Keys of 2 count pairs and weights with which a sum of squares over them estimates that over all pairs."""
+        """Keys of 2 count pairs, and weights: the weighted sum of squares over them estimates that over all pairs."""
         return self._pairs(2 * count, rng)
 
     def _pairs(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -87,10 +87,10 @@ class EntryMatrix:
         rows, columns = [], []
         weight = np.full(count, float(self.digits.rows) / count)
         inside = np.ones(count, bool)
-        joint = rng.random(count) < 0.5  # one scale for all axes, else one for each
+        joint = rng.random(count) < 0.5  # one scale for all axes, otherwise one for each axis
         common = rng.random(count)
         for n in sizes:
-            scales = int(np.ceil(np.log2(n))) + 1  # 2^s - 1 >= n - 1 at the last
+            scales = int(np.ceil(np.log2(n))) + 1  # for the last scale 2^s - 1 >= n - 1
             own = rng.random(count)
             reach = (1 << (np.where(joint, common, own) * scales).astype(np.int64)) - 1
             row = rng.integers(0, n, count)
@@ -103,8 +103,10 @@ class EntryMatrix:
         return self.digits.key(np.array(rows)[:, inside], np.array(columns)[:, inside]), weight[inside]
 
     def _chance(self, offset: Array, sizes: list[int]) -> Array:
-        """Chance of offsets (D + 1, p), given the row: one half of a product over the axes, one half of an average over
-        a common scale."""
+        """The probability of offsets (D + 1, p), given the row.
+
+        It is half of a product over the axes, plus half of an average over a common scale.
+        """
         apart = np.ones(offset.shape[1])
         edges = {0.0, 1.0}
         for n, off in zip(sizes, offset):

@@ -1,9 +1,8 @@
-"""Digits of the points of a grid, the order in which a train sees them.
+"""Digits of the points of a grid: the order of the points in a train.
 
-A coordinate 0 <= c_a < n_a is written in digits whose bases, all small primes, have a product p_a >= n_a with little
-padding. The modes of a train are the digits of one axis after the other, or those of all axes level by level
-(interleaved, as along a Morton curve). Row numbers, places in the train and keys of pairs of points are all sums of one
-number per axis, which small tables hold.
+A coordinate 0 <= c_a < n_a is written in digits. Their bases are small primes with a product p_a >= n_a, so there is
+little padding. The modes of a train are the digits of one axis after the other. Row numbers, places in the train and
+keys of pairs of points are all sums of one number per axis, and small tables have these numbers.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ PRIMES = (2, 3, 5, 7)  # bases of digits
 
 
 class GridDigits:
-    """The digits of a grid of shape (n_1, ..., n_D), its points numbered as numpy numbers an array of this shape.
+    """The digits of a grid of shape (n_1, ..., n_D). Its points are numbered like the entries of a numpy array.
 
     block : unknowns per point, the fastest digit of a row
 
-    modes : of the train, row and column alike
-    places : (n_1 ... n_D block,) place of each row among those of the train (`slots_of(modes)` of them)
+    modes : modes of the train, the same for rows and columns
+    places : (n_1 ... n_D block,) place of each row among the `slots_of(modes)` rows of the train
 
     >>> GridDigits((8, 6)).modes
     (2, 2, 2, 3, 2)
@@ -39,14 +38,15 @@ class GridDigits:
         self._tables(axes)
 
     def _tables(self, axes: list[list[int]]) -> None:
-        """Per axis what its coordinate adds to a place in the train and to the two halves of a key; per mode what a
-        pair of digits adds to the pair of padded rows."""
+        """Make the tables. For each axis they have the contribution of its coordinate to a place in the train and to
+        the two halves of a key. For each mode they have the contribution of a pair of digits to the pair of padded
+        rows."""
         self.padded = tuple(prod(digits) for digits in axes)
         self.size = slots_of(self.modes)
         if self.size >= 2**31:
             raise ValueError(f"too many points for a train: a grid of shape {self.shape}")
-        width = [int(w) for w in np.cumprod([1, *self.modes[::-1]])[-2::-1]]  # of a digit in a place
-        square = [w * w for w in width]  # and of a pair of digits in a key
+        width = [int(w) for w in np.cumprod([1, *self.modes[::-1]])[-2::-1]]  # weight of a digit in a place
+        square = [w * w for w in width]  # weight of a pair of digits in a key
         stride = np.cumprod([1, *self.padded[::-1]])[-2::-1] * self.block
         self.place, self.row_key, self.column_key = ([np.zeros(p, np.int64) for p in self.padded] for _ in range(3))
         row_of = [np.zeros(m, np.int64) for m in self.modes]
@@ -54,7 +54,7 @@ class GridDigits:
         for a, bases_of_axis in enumerate(axes):
             for level, base in enumerate(bases_of_axis):
                 weight = prod(bases_of_axis[level + 1 :])
-                below = self.modes[k] // base  # the block, in the last mode
+                below = self.modes[k] // base  # in the last mode the block, otherwise 1
                 digit = np.arange(self.padded[a]) // weight % base * below
                 self.place[a] += digit * width[k]
                 self.row_key[a] += digit * self.modes[k] * square[k]
@@ -64,11 +64,11 @@ class GridDigits:
         row_of[-1] += np.arange(self.modes[-1]) % self.block
         self._pairs = [(row[:, None] * self.size + row).ravel() for row in row_of]
         self._square = square
-        self._inner = self.modes[-1], 1  # what an unknown of a block adds to the halves of a key
+        self._inner = self.modes[-1], 1  # contribution of an unknown of a block to the halves of a key
 
     @property
     def rows(self) -> int:
-        """Rows of the matrix: those of points in the grid."""
+        """Number of rows of the matrix, without padded rows."""
         return prod(self.shape) * self.block
 
     @property
@@ -79,15 +79,17 @@ class GridDigits:
         return np.add.outer(out, np.arange(self.block)).ravel()
 
     def key(self, row: Array, column: Array) -> Array:
-        """Keys of pairs of points given by coordinates (D + 1, ...), the last the unknown of the block."""
+        """Keys of pairs of points with coordinates (D + 1, ...); the last coordinate is the unknown in the block."""
         out = row[-1] * self._inner[0] + column[-1] * self._inner[1]
         for a in range(len(self.shape)):
             out = out + self.row_key[a][row[a]] + self.column_key[a][column[a]]
         return out
 
     def pair(self, keys: Array) -> Array:
-        """Pairs row * size + column (padded) of keys, digits i_k m_k + j_k of base m_k^2: the pair of a sum of keys
-        that share no digit is the sum of their pairs."""
+        """Pairs row * size + column, of padded rows and columns, for keys with the digits i_k m_k + j_k of base m_k^2.
+
+        If keys share no digit, the pair of their sum is the sum of their pairs.
+        """
         pair = np.zeros(keys.shape, np.int64)
         for table, square in zip(self._pairs, self._square):
             digit, keys = np.divmod(keys, square)
@@ -95,7 +97,7 @@ class GridDigits:
         return pair
 
     def within(self, padded: Array) -> tuple[Array, Array]:
-        """Rows of the matrix of padded rows, and which of them there are; the others' numbers mean nothing."""
+        """The rows of the matrix for padded rows, and a mask of those that exist; the other numbers mean nothing."""
         if self.padded == self.shape:
             return padded, np.ones(padded.shape, bool)
         *coordinates, inner = np.unravel_index(padded, (*self.padded, self.block))
@@ -108,7 +110,7 @@ class GridDigits:
 
 
 def bases(n: int) -> list[int]:
-    """Bases of the digits of 0, ..., n - 1: primes up to 7 with the least product that is at least n, largest first.
+    """Bases of the digits of 0, ..., n - 1: primes up to 7, largest first, with the least product that is at least n.
 
     >>> bases(64), bases(100), bases(97), bases(1)
     ([2, 2, 2, 2, 2, 2], [5, 5, 2, 2], [7, 7, 2], [])

@@ -1,18 +1,18 @@
 """Approximate inverse of a symmetric positive definite matrix, as a train.
 
-The solution X of S X = B minimises tr(X' S X) / 2 - tr(X' B), whose gradient is S X - B. Alternating over the
-cores of X, the column index of the core at hand is a spectator: with orthonormal interfaces P of the other
-cores the best core solves
+The solution X of S X = B minimises tr(X' S X) / 2 - tr(X' B), whose gradient is S X - B. The method alternates over the
+cores of X. S does not act on the column index of the present core. So with orthonormal interfaces P of the other cores
+the best core solves
 
-    M y_j = f_j  for every column j of its mode,    M = P' S P  of order r m r',
+    M y_j = f_j  for every column j of its mode,    M = P' S P  of order r m r'.
 
-with the same symmetric positive definite M for all columns: one Cholesky factorisation, or, where that costs
-more, conjugate gradients that never form M. The condition of S is not squared, as it is where ||S X - B|| is
-minimised. (Alternating energy minimisation: Oseledets & Dolgov, SIAM J. Sci. Comput. 34, 2012.)
+All columns have the same symmetric positive definite M. Conjugate gradients solve these systems and never form M. The
+condition of S is not squared; minimising ||S X - B|| would square it. (Alternating energy minimisation: Oseledets &
+Dolgov, SIAM J. Sci. Comput. 34, 2012.)
 
-The ranks grow on the way: every core gets, beside its own columns, those of the residual B - S X, seen through the
-interfaces of a train Z near it that is renewed with every core (AMEn: Dolgov & Savostyanov, ibid. 36, 2014). Each pass
-over the cores doubles the ranks, until the residual is small enough or the cap is reached.
+The ranks grow on the way. Every core gets, beside its own columns, columns of the residual B - S X, as seen through the
+interfaces of a train Z near the residual. Z is renewed with every core (AMEn: Dolgov & Savostyanov, ibid. 36, 2014).
+Each pass over the cores doubles the ranks until the residual is small enough or the cap is reached.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ import numpy as np
 from pctt.tt.projection import Projection, columns, rows
 from pctt.tt.train import Array, Train, full_ranks, identity, random
 
-LOCAL_GAIN, LOCAL_ITS = 0.1, 20  # what conjugate gradients leave of the residual of a local system, and their most
-LOCAL_EPS = 0.1  # of the residual that is asked for: all that a local system needs
-LEAST_GROWTH, MOST_GROWTH = 4, 16  # of a rank in a pass
-IDLE = 0.8  # a sweep that leaves more than this of the residual is the last, or, if ranks can grow, drops too much
-ENOUGH = 0.5  # part of eps at which the residual, estimated on the way, is worth measuring
-DROP = 0.1  # of that residual: what a core may leave out of the inverse
-NOISE = 1e-7  # part of the residual that is taken for rounding
-COARSEST, FINER, STEPS = 4.0, 0.84, 32  # tolerances of a rounding, over eps: the first, its fall in a step, the most
-LEAP = 8  # steps that are left out at first
-SKETCH = 64  # rank of the random train with which a residual of high rank is estimated
-HIGH = 300  # product of ranks of S and X from which that is done
+LOCAL_GAIN, LOCAL_ITS = 0.1, 20  # conjugate gradients: factor by which they reduce a local residual, most iterations
+LOCAL_EPS = 0.1  # a local system needs no smaller residual than this part of the tolerance
+LEAST_GROWTH, MOST_GROWTH = 4, 16  # limits of the growth of a rank in a pass
+IDLE = 0.8  # a sweep that leaves more than this part of the residual is the last, or, if ranks can grow, drops too much
+ENOUGH = 0.5  # the residual is measured when its estimate is below this part of eps
+DROP = 0.1  # a core may leave out this part of the tolerance
+NOISE = 1e-7  # a smaller part of the residual counts as rounding
+COARSEST, FINER, STEPS = 4.0, 0.84, 32  # tolerances for rounding / eps: the first, its factor per step, number of steps
+LEAP = 8  # the first trials go this number of steps at a time
+SKETCH = 64  # rank of the random train for the estimate of a residual of high rank
+HIGH = 300  # with a larger product of the ranks of S and X, the residual is estimated
 
 
 @dataclass(frozen=True)
 class Inverse:
     """A train X of the inverse of S, symmetric up to rounding.
 
-    correction : Z = X - I where that is what was computed (`invert_near_identity`)
-    residual : ||I - S X||_F / ||I||_F, with a correction ||I - S X||_F / ||S - I||_F; NaN where it was not asked for
-    sweeps : there and back over the cores
-    repaired : local systems that were not positive definite (S was not, or nearly) and had modes left out
+    correction : Z = X - I, if the method computed Z (`invert_near_identity`)
+    residual : ||I - S X||_F / ||I||_F, with a correction ||I - S X||_F / ||S - I||_F; NaN if it was not measured
+    sweeps : number of sweeps there and back over the cores
+    repaired : number of local systems that were not positive definite, because S was not, or nearly not
     """
 
     train: Train
@@ -63,14 +63,14 @@ def invert(
     measure: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Inverse:
-    """Inverse of a symmetric positive definite S with ranks at most `max_rank`.
+    """The inverse of a symmetric positive definite S with ranks at most `max_rank`.
 
     Parameters
     ----------
-    start : a train near the inverse, by default a multiple of the identity
-    sweeps : there and back over the cores, at most; by default 1 from a start, else as many as the ranks need to reach
-        the cap, and two more
-    eps : the residual at which the ranks need not grow
+    start : a train near the inverse, by default the identity
+    sweeps : largest number of sweeps there and back over the cores. The default is 1 with a start; otherwise it is the
+        number that the ranks need to reach the cap, and two more.
+    eps : with a residual below this the ranks need not grow
     measure : compute the residual
 
     >>> from pctt.tt.train import decompose_matrix
@@ -93,10 +93,11 @@ def invert_near_identity(
     measure: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Inverse:
-    """Inverse of S = I + T as X = I + Z: the identity is exact, the ranks of X are at most `max_rank`, those of Z one
-    less. With rank 1, Z = 0. The start is an earlier Z (`correction`); the rest is as in `invert`.
+    """The inverse of S = I + T as X = I + Z, with an exact identity.
 
-    Z is cheaper to apply than X: `Apply(Z)` and one addition.
+    The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z
+    (`correction`). All other arguments are those of `invert`. Z is cheaper to apply than X: it takes `Apply(Z)` and one
+    addition.
     """
     unit = identity(T.rows, T.dtype)
     if max_rank <= 1 or T.norm() == 0:
@@ -106,8 +107,11 @@ def invert_near_identity(
 
 
 def residual(S: Train, X: Train, B: Train | None = None) -> float:
-    """||B - S X||_F / ||B||_F, B the identity by default, in train arithmetic: of the cost of a product of both ranks.
-    Where that is high, an estimate from products with random trains, off by a third or so."""
+    """||B - S X||_F / ||B||_F in train arithmetic; by default B is the identity.
+
+    The cost grows with the product of the ranks of S and X. If this product is high, the result is an estimate from
+    products with random trains, with an error of about a third.
+    """
     B = identity(S.rows, S.dtype) if B is None else B
     if max(S.ranks) * max(X.ranks) > HIGH:
         return _sketched(S, X, B) / B.norm()
@@ -116,12 +120,12 @@ def residual(S: Train, X: Train, B: Train | None = None) -> float:
     square = 1 - 2 * SX.inner(B) / scale + SX.inner(SX) / scale
     if square > 1e4 * float(np.finfo(SX.dtype).eps):
         return float(square**0.5)
-    return float((B - SX).norm() / scale**0.5)  # what rounding left of the difference of squares
+    return float((B - SX).norm() / scale**0.5)  # rounding spoils the difference of squares
 
 
 def _sketched(S: Train, X: Train, B: Train) -> float:
-    """Estimate of ||B - S X||_F: the root mean square of inner products with random trains that share all cores but
-    the last (Feldman et al., "Tensor train sketching", have the variance)."""
+    """An estimate of ||B - S X||_F: the root mean square of inner products with random trains. These share all cores
+    except the last (Feldman et al., "Tensor train sketching", give the variance)."""
     rng = np.random.default_rng(0)
     sketch = Projection(S, B, len(X))
     sketch.left[0] = np.ones((1, 1, 1))
@@ -135,12 +139,13 @@ def _sketched(S: Train, X: Train, B: Train) -> float:
 
 
 class Growing:
-    """The symmetric train x of the inverse while its cores are solved for one by one, and a train z near its residual.
+    """The symmetric train x of the inverse, whose cores are computed one by one, and a train z near its residual.
 
-    Both are symmetric by structure: a basis vector of a bond is a matrix that is its own transpose, or minus that, by
-    the bond's signs; a core (a, i, j, b) then is its transpose in i and j times the signs of a and b.
+    x is symmetric by structure. A basis vector of a bond is a matrix that equals its own transpose or minus its
+    transpose; the signs of the bond tell which. So a core (a, i, j, b) equals its transpose in i and j times the signs
+    of a and b.
 
-    estimate : of ||B - S x||, what z has seen of it in the last pass
+    estimate : the part of ||B - S x|| that z has seen in the last pass
     """
 
     def __init__(self, S: Train, B: Train, x: Train, most: list[int], eps: float, rng: np.random.Generator) -> None:
@@ -180,8 +185,11 @@ class Growing:
         self.estimate = float(np.linalg.norm(z[0]))
 
     def _solve(self, k: int) -> None:
-        """The symmetric core of least energy, nearly, by conjugate gradients from the one that is there, scaled by the
-        diagonal, until LOCAL_GAIN of the first residual or `goal` times the right side is left."""
+        """Compute nearly the symmetric core of least energy by conjugate gradients, from the present core.
+
+        They are scaled by the diagonal. They stop at LOCAL_GAIN times the first residual or `goal` times the right
+        side.
+        """
         signs = self.signs[k : k + 2]
 
         def symmetric(y: Array) -> Array:
@@ -223,7 +231,7 @@ def _solve(
     measure: bool,
     rng: np.random.Generator | None,
 ) -> tuple[Train, float, int, int]:
-    """The symmetric solution of S X = B, its relative residual, the sweeps made, the local systems repaired."""
+    """The symmetric solution of S X = B, its relative residual, and the numbers of sweeps and of repaired systems."""
     if S.rows != S.columns:
         raise ValueError("only a square matrix has an inverse")
     rng = np.random.default_rng(0) if rng is None else rng
@@ -242,7 +250,7 @@ def _solve(
             left = residual(S, X, B) if measure else eps
             if left <= eps:
                 return *(_rounded(S, B, X, left, eps) if measure else (X, np.nan)), count, growing.repaired
-            enough *= 0.5 * eps / left  # it sees a part of the residual
+            enough *= 0.5 * eps / left  # the estimate sees only a part of the residual
         if growing.estimate > IDLE * before:
             if all(x.shape[3] >= r for x, r in zip(growing.x, most)):
                 break
@@ -253,8 +261,11 @@ def _solve(
 
 
 def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Train, float]:
-    """X of the least ranks that a few trials find to leave the residual below eps, and the residual: tolerances of the
-    rounding fall in leaps until one is fine enough, then the steps of the last leap are bisected."""
+    """X rounded so that its residual stays below eps, and this residual.
+
+    A few trials search for the coarsest tolerance. The tolerances fall in leaps until one is fine enough. Then the
+    search bisects the steps of the last leap.
+    """
 
     def trial(step: int) -> tuple[Train, float]:
         smaller = X.round(COARSEST * FINER**step * eps)
@@ -279,16 +290,16 @@ def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Tra
 
 
 def _transpose(x: Array, left: Array, right: Array) -> Array:
-    """The core of the transposed train, for interfaces of these signs."""
+    """The core of the transposed train, for interfaces with these signs."""
     return x.transpose(0, 2, 1, 3) * np.multiply.outer(left, right)[:, None, None, :]
 
 
 def _with_signs(X: Train, most: list[int]) -> tuple[list[Array], list[Array]]:
-    """(X + X') / 2 with orthonormal right interfaces, of ranks at most `most`, and the signs of all bonds."""
+    """(X + X') / 2 with orthonormal right interfaces and ranks at most `most`, and the signs of all bonds."""
     x = list(X.left_orthogonal().cores)
     signs = [np.ones(1, X.dtype)] * (len(x) + 1)
     for k in range(len(x) - 1, 0, -1):
-        signs[k] = np.zeros(len(x[k]), X.dtype)  # neither
+        signs[k] = np.zeros(len(x[k]), X.dtype)  # no symmetry yet
         _push_left(x, signs, k, most[k - 1], 0.0)
     x[0] = 0.5 * (x[0] + _transpose(x[0], signs[0], signs[1]))
     return x, signs
@@ -297,8 +308,10 @@ def _with_signs(X: Train, most: list[int]) -> tuple[list[Array], list[Array]]:
 def _push_right(
     x: list[Array], signs: list[Array], k: int, most: int, drop: float, more: Array | None = None
 ) -> None:
-    """Core k with at most so many orthonormal columns, seen as (a m n, b), and room for more; the rest goes to the
-    next core."""
+    """Give core k, as a matrix (a m n, b), at most ``most`` orthonormal columns, some of them from ``more``.
+
+    The next core takes the other factor.
+    """
     a, m, n, b = x[k].shape
     Q, R, new = _basis(x[k], signs[k], signs[k + 1], most, drop, more)
     x[k] = Q.reshape(a, m, n, -1)
@@ -309,8 +322,10 @@ def _push_right(
 def _push_left(
     x: list[Array], signs: list[Array], k: int, most: int, drop: float, more: Array | None = None
 ) -> None:
-    """Core k with at most so many orthonormal rows, seen as (a, m n b), and room for more; the rest goes to the core
-    before."""
+    """Give core k, as a matrix (a, m n b), at most ``most`` orthonormal rows, some of them from ``more``.
+
+    The core before takes the other factor.
+    """
     a, m, n, b = x[k].shape
     turned = None if more is None else more.transpose(3, 1, 2, 0)
     Q, R, new = _basis(x[k].transpose(3, 1, 2, 0), signs[k + 1], signs[k], most, drop, turned)
@@ -322,8 +337,11 @@ def _push_left(
 def _basis(
     x: Array, left: Array, right: Array, most: int, drop: float, more: Array | None
 ) -> tuple[Array, Array, Array]:
-    """Orthonormal columns Q for a core x (a, m, n, b) = Q R with bonds of these signs, at most `most`, up to `room` for
-    the residual `more` (a, m, n, c) beside them; and the signs of the columns."""
+    """Q and R of a core x (a, m, n, b) = Q R, and the signs of the columns of Q.
+
+    ``left`` and ``right`` are the signs of the bonds of x. Q has at most `most` orthonormal columns; some of them are
+    for the residual `more` (a, m, n, c).
+    """
     size = len(x) * x.shape[1] * x.shape[2]
     parts = []
     for sign in (1.0, -1.0):
@@ -343,7 +361,7 @@ def _basis(
             half = 0.5 * (more + sign * _transpose(more, left, np.ones(more.shape[3], x.dtype))).reshape(size, -1)
             half = half - known @ (known.T @ half)
             extra.append(np.linalg.svd(half, full_matrices=False)[:2])
-        floor = NOISE * float(np.linalg.norm(more))  # what is left of directions that are known has no sign
+        floor = NOISE * float(np.linalg.norm(more))  # smaller remains of known directions have no sign
         new = _largest([s for _, s in extra], room, 0.1)
         new = [min(n, int(np.count_nonzero(s > floor))) for n, (_, s) in zip(new, extra)]
         for part, (U, _) in enumerate(extra):
@@ -355,8 +373,10 @@ def _basis(
 
 
 def _own_transposes(U: Array, sign: float, left: Array, shape: tuple[int, ...]) -> Array:
-    """Orthonormal columns U that are their own transposes times a sign, those too that singular values near zero have
-    left to rounding."""
+    """Orthonormal columns U, corrected so that each equals its transpose times ``sign``.
+
+    With singular values near zero, rounding spoils this property.
+    """
     core = U.reshape(*shape[:3], -1)
     half = 0.5 * (core + sign * _transpose(core, left, np.ones(U.shape[1], U.dtype))).reshape(U.shape)
     if np.linalg.norm(half - U) <= NOISE * U.shape[1] ** 0.5:
@@ -366,8 +386,10 @@ def _own_transposes(U: Array, sign: float, left: Array, shape: tuple[int, ...]) 
 
 
 def _largest(values: list[Array], most: int, drop: float) -> list[int]:
-    """How many of each of two descending lists are kept: at most so many, at least one, and of these as few as leave
-    out no more than `drop` times the norm of all."""
+    """The numbers of values to keep from each of two descending lists: together at least one and at most `most`.
+
+    They are as small as possible if the norm of the other values must not exceed `drop` times the norm of all values.
+    """
     both = np.sort(np.concatenate(values))[::-1]
     tail = np.sqrt(np.cumsum(both[::-1].astype(float) ** 2))[::-1]
     floor = max(drop, float(np.finfo(both.dtype).eps)) * tail[0]

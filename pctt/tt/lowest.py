@@ -1,4 +1,4 @@
-"""Whether a symmetric train is positive: a search for its least eigenvalue."""
+"""A search for the least eigenvalue of a symmetric train, to test whether the train is positive."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from pctt.tt.train import Array, Train, random
 
 
 def lowest(X: Train, rank: int | None = None, sweeps: int = 4, rng: np.random.Generator | None = None) -> float:
-    """An upper bound of the least eigenvalue of a symmetric X: the least v'Xv / v'v that an alternating search over
-    trains v of the given rank finds, by default 8, or 4 with modes above 8, which cost more. A negative value proves
-    that X is not positive definite.
+    """An upper bound of the least eigenvalue of a symmetric X.
+
+    It is the least v'Xv / v'v that an alternating search over trains v of the given rank finds. The default rank is 8,
+    or 4 with modes above 8, which cost more. A negative value proves that X is not positive definite.
 
     >>> from pctt.tt.train import identity
     >>> round(lowest(identity([4, 4, 4])), 12)

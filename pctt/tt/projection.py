@@ -1,4 +1,4 @@
-"""Equations S x = B between the interfaces of trains: what alternating methods solve core after core."""
+"""Equations S x = B between the interfaces of trains; alternating methods solve them core after core."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from pctt.tt.train import Array, Train
 
 
 class Projection:
-    """y' S x and y' B contracted over the cores before and after the one at hand, for trains y and x of matrices whose
-    columns are spectators.
+    """y' S x and y' B, contracted over the cores before and after the present core k.
+
+    y and x are trains of matrices; S does not act on their columns.
 
     left[k], right[k] : y' S x over the cores before and after k, (c, R, a) and (c', R', a')
-    left_B[k], right_B[k] : the same of y' B, (c, R) and (c', R')
+    left_B[k], right_B[k] : y' B over the same cores, (c, R) and (c', R')
     """
 
     def __init__(self, S: Train, B: Train | None, length: int) -> None:
@@ -24,7 +25,7 @@ class Projection:
 
     @classmethod
     def around(cls, S: Train, B: Train | None, y: list[Array], x: list[Array]) -> Projection:
-        """With all that is right of the first core."""
+        """A projection for the first core: everything right of it is contracted."""
         new = cls(S, B, len(x))
         for k in range(len(x) - 1, 0, -1):
             new.step_left(k, y[k], x[k])
@@ -46,7 +47,7 @@ class Projection:
             self.right_B[k - 1] = np.tensordot(y, T, ((1, 2, 3), (1, 2, 3)))
 
     def matrix(self, k: int) -> Array:
-        """M = P' S P (a m b, a m b), symmetric, for y = x, P the interfaces around core k."""
+        """M = P' S P (a m b, a m b), symmetric, for y = x; P are the interfaces around core k."""
         S, left, right = self.S[k], self.left[k], self.right[k]
         T = np.tensordot(np.tensordot(left, S, (1, 0)), right, (4, 1))  # (a, a', i, i', b, b')
         n = left.shape[0] * S.shape[1] * right.shape[0]
@@ -54,7 +55,7 @@ class Projection:
         return 0.5 * (M + M.T)
 
     def times(self, k: int, x: Array) -> Array:
-        """M x for x (a, m, n, b), without M."""
+        """M x for x (a, m, n, b), without forming M."""
         return local_product(self.left[k], self.S[k], self.right[k], x)
 
     def diagonal(self, k: int) -> Array:
@@ -70,11 +71,11 @@ class Projection:
         return self._of_B(k, self.left_B[k], self.right_B[k])
 
     def rest(self, k: int, x: Array) -> Array:
-        """P' (B - S x) between my interfaces, for the core x."""
+        """P' (B - S x) between the interfaces of this projection, for the core x."""
         return self.right_side(k) - self.times(k, x)
 
     def rest_left(self, other: Projection, k: int, x: Array) -> Array:
-        """The same with my interfaces on the left, those of another test train on the right."""
+        """The same with the interfaces of this projection on the left and those of another one on the right."""
         return self._of_B(k, self.left_B[k], other.right_B[k]) - local_product(
             self.left[k], self.S[k], other.right[k], x
         )
@@ -88,17 +89,17 @@ class Projection:
 
 
 def local_product(left: Array, S: Array, right: Array, x: Array) -> Array:
-    """left (a, R, a'), S (R, i, j, R'), right (b, R', b') on x (a', j, n, b')."""
+    """The product of left (a, R, a'), S (R, i, j, R') and right (b, R', b') with x (a', j, n, b')."""
     T = np.tensordot(left, x, 1)  # (a, R, j, n, b')
     T = np.tensordot(T, S, ((1, 2), (0, 2)))  # (a, n, b', i, R')
     return np.tensordot(T, right, ((2, 4), (2, 1))).transpose(0, 2, 1, 3)  # (a, i, n, b)
 
 
 def columns(x: Array) -> Array:
-    """A core (a, m, n, b) with orthonormal columns that span those of the given one."""
+    """A core (a, m, n, b) with orthonormal columns that span those of the given core."""
     return np.linalg.qr(x.reshape(-1, x.shape[3]))[0].reshape(*x.shape[:3], -1)
 
 
 def rows(x: Array) -> Array:
-    """A core (a, m, n, b) with orthonormal rows that span those of the given one."""
+    """A core (a, m, n, b) with orthonormal rows that span those of the given core."""
     return np.ascontiguousarray(columns(x.transpose(3, 1, 2, 0)).transpose(3, 1, 2, 0))

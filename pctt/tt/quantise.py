@@ -1,8 +1,8 @@
-"""Modes of a long vector: how its index is cut into digits, how it is padded, how neighbouring modes are merged.
+"""Modes of a long vector: the division of its index into digits, the padding, and the merging of neighbouring modes.
 
-A vector of n *slots* (blocks of `block` unknowns each: a contact, a node, a body) gets modes m_1, ..., m_d
-with m_1 m_2 ... m_d >= n. The last mode is the leaf: a run of neighbouring slots that no rank separates. The
-scalar modes of a train are the slot modes with the leaf times the block size; slots keep their order.
+A vector has n *slots*, blocks of `block` unknowns each (a contact, a node, a body). Its modes m_1, ..., m_d satisfy
+m_1 m_2 ... m_d >= n. The last mode is the leaf, a run of neighbouring slots that no bond separates. The scalar modes of
+a train are the slot modes, with the leaf multiplied by the block size. Slots keep their order.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ FIRST = 64  # the largest first mode
 def choose_modes(n: int, leaf: int = 16, middle: int = 4) -> tuple[int, ...]:
     """Slot modes [first, middle, ..., middle, last] for n slots.
 
-    The first mode is at most FIRST, the last between `leaf` and 5/4 `leaf`, whichever
-    pads least; few slots get one or two modes. A train of rank r with these modes costs about 2 n r (first +
-    r sum(middle) + last) operations to apply, which is why the ends are not larger.
+    The first mode is at most FIRST. The last is the number between `leaf` and 5/4 `leaf` with the least padding. A
+    small number of slots gets one or two modes. The application of a train of rank r with these modes costs about
+    2 n r (first + r sum(middle) + last) operations; for this reason the ends are not larger.
 
     >>> choose_modes(134_547)
     (31, 4, 4, 4, 4, 17)
@@ -45,7 +45,7 @@ def choose_modes(n: int, leaf: int = 16, middle: int = 4) -> tuple[int, ...]:
 
 
 def check_modes(modes: Sequence[int], n: int) -> tuple[int, ...]:
-    """Modes that a user gave, as a tuple; raises ValueError if they do not hold n slots."""
+    """The modes that a user gave, as a tuple; raises ValueError if they do not hold n slots."""
     if not modes or min(modes) < 1 or slots_of(modes) < n:
         raise ValueError(f"modes {list(modes)} hold {slots_of(modes)} slots, but {n} are needed")
     return tuple(int(m) for m in modes)
@@ -57,7 +57,7 @@ def slots_of(modes: Sequence[int]) -> int:
 
 
 def scalar_modes(modes: Sequence[int], block: int) -> tuple[int, ...]:
-    """Modes of the unknowns: the leaf holds `block` of them per slot.
+    """Modes of the unknowns; the leaf has `block` unknowns per slot.
 
     >>> scalar_modes([2, 4, 16], 3)
     (2, 4, 48)
@@ -76,7 +76,7 @@ def linear(multi: Array, modes: Sequence[int]) -> Array:
 
 
 def group_modes(modes: Sequence[int], ends: int = 64, middle: int = 4) -> list[int]:
-    """How many neighbouring modes to merge: up to `ends` at both ends, up to `middle` between.
+    """Numbers of neighbouring modes to merge, so that products are at most `ends` at both ends and `middle` between.
 
     >>> group_modes([2] * 16)
     [6, 2, 2, 6]
@@ -92,7 +92,7 @@ def group_modes(modes: Sequence[int], ends: int = 64, middle: int = 4) -> list[i
 
 
 def leading(modes: Sequence[int], limit: int) -> int:
-    """How many of the leading modes have a product of at most `limit`; at least one."""
+    """The number of leading modes whose product is at most `limit`; at least one."""
     count, size = 1, modes[0]
     while count < len(modes) and size * modes[count] <= limit:
         size *= modes[count]
@@ -101,7 +101,7 @@ def leading(modes: Sequence[int], limit: int) -> int:
 
 
 def merge(train: Train, groups: Sequence[int]) -> Train:
-    """The same train with neighbouring modes merged: groups[k] cores become core k.
+    """The same train with merged neighbouring modes: groups[k] cores become core k.
 
     >>> from pctt.tt.train import identity
     >>> merge(identity([2, 3, 4, 5]), [2, 1, 1]).rows
@@ -120,7 +120,7 @@ def merge(train: Train, groups: Sequence[int]) -> Train:
 
 
 def _join(a: Array, b: Array) -> Array:
-    """Core of two merged modes."""
+    """The core of two merged modes."""
     core = np.tensordot(a, b, 1)
     if a.ndim == 3:
         return core.reshape(a.shape[0], -1, b.shape[-1])

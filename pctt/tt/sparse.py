@@ -1,17 +1,16 @@
 """A sparse matrix as a hierarchy of block pairs, and its contractions with the cores of a train.
 
-The pair (i, j) of a nonzero block has digits (i_1, j_1), ..., (i_d, j_d) in the modes of the train. The
-distinct prefixes of length k are the *nodes of bond k*: the pairs of coarse boxes between which the matrix
-has an entry (the nonempty nodes of the product tree of the paper, section 3.2). Everything that a compression
-needs is a product over these lists:
+The pair (i, j) of a nonzero block has digits (i_1, j_1), ..., (i_d, j_d) in the modes of the train. The distinct
+prefixes of length k are the *nodes of bond k*: the pairs of coarse boxes between which the matrix has an entry (the
+nonempty nodes of the product tree of the paper, section 3.2). A compression needs only products over these lists:
 
     down     x_{k+1}(node) = x_k(parent) G(digit)           rows of the left interface, level by level
     up       V_k(node) = sum over children  V_{k+1} G(digit)'  the matrix contracted with the right interface
     middle   sum over nodes  x_k(node)' V_{k+1}(child)         the matrix contracted with both: a new core
 
-Their cost is linear in the number of nodes, and that of the leaf in the number of nonzeros. Each is a sum
-over nonzeros: where several ranks hold the entries of their own rows, an injected reduction adds the small
-results of `middle` and `leaf_core`, nothing else is exchanged, and all ranks hold the same cores.
+Their cost is linear in the number of nodes; for the leaf it is linear in the number of nonzeros. Each is a sum over
+nonzeros. If several processes have the entries of their own rows, the function `reduce` adds the small results of
+`middle` and `leaf_core` over the processes. Nothing else is exchanged, and all processes have the same cores.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ Agreement = Callable[[Any], Any]
 
 
 def on_one_rank(x: Any) -> Any:
-    """The reduction, and the agreement, of a single rank."""
+    """The reduction and the agreement for a single rank."""
     return x
 
 
@@ -40,16 +39,15 @@ class SparseHierarchy:
 
     Parameters
     ----------
-    rows, columns : (nb,) slots of the blocks; the same slot pair may come several times (its blocks are
-        added)
-    modes : slot modes m_1, ..., m_d of rows and columns alike
+    rows, columns : (nb,) slots of the blocks; a pair of slots may occur several times, its blocks are added
+    modes : slot modes m_1, ..., m_d, the same for rows and columns
     block : size of a block
     reduce : adds an array over the ranks (see the module)
-    agree : gives all ranks what the first one has: decisions and sizes that rest on rounding, which may differ
-        between processors
+    agree : gives all ranks the first rank's value; it is used for decisions and sizes that depend on rounding, which
+        may differ between processors
 
-    The list is built once per pattern; `set_values` takes new blocks (nb, block, block) in the order of
-    `rows` and `columns`.
+    The lists are built once per pattern. `set_values` takes new blocks (nb, block, block) in the order of `rows` and
+    `columns`.
 
     >>> i = np.arange(7)
     >>> A = SparseHierarchy(i, i + 1, [2, 4])
@@ -75,7 +73,7 @@ class SparseHierarchy:
         self._order = np.argsort(keys, kind="stable")
         keys = keys[self._order]
         new = _starts(keys)
-        self._starts = None if len(new) == len(keys) else new  # of runs of blocks that are added
+        self._starts = None if len(new) == len(keys) else new  # where runs of blocks that are added start
         self.keys = keys[new]
         self._rows = np.asarray(rows)[self._order[new]]
         self._by_row: tuple[Array, Array, Array] | None = None
@@ -84,9 +82,10 @@ class SparseHierarchy:
         self._set_leaf(np.zeros(len(self._leaf_columns)))
 
     def _index_leaf(self) -> None:
-        """Row pointers and columns of the leaf matrix: a row per node of the last bond, its leaf's entries in it.
+        """Make the row pointers and columns of the leaf matrix. It has a row per node of the last bond, with the
+        entries of the leaf of this node.
 
-        Its columns are ordered (i, j, s, t), slots before places in the block, so that blocks are contiguous.
+        Its columns have the order (i, j, s, t), slots before places in the block, so blocks are contiguous.
         """
         square, bb = self.slot_modes[-1] ** 2, self.block**2
         starts = _starts(self.keys // square)
@@ -97,7 +96,7 @@ class SparseHierarchy:
         self._leaf_keys = self.keys[starts] // square
 
     def _index_bonds(self) -> None:
-        """For each bond the places parent * m^2 + digit of its nodes among all children of its parents."""
+        """Make, for each bond, the places parent * m^2 + digit of its nodes among all children of their parents."""
         keys = self._leaf_keys
         self.nodes = [len(keys)]
         self.places: list[Array] = []
@@ -108,10 +107,10 @@ class SparseHierarchy:
             self.places.insert(0, parent * (m * m) + keys % (m * m))
             keys = parents[starts]
             self.nodes.insert(0, len(keys))
-        self.nodes[0] = 1  # the root stays where there is no entry
+        self.nodes[0] = 1  # the root exists even without entries
 
     def set_values(self, values: Array) -> None:
-        """New blocks (nb, block, block), in the order in which their slots were given."""
+        """Take new blocks (nb, block, block), in the order in which their slots were given."""
         values = np.asarray(values).reshape(len(self._order), self.block**2)[self._order]
         if self._starts is not None:
             values = np.add.reduceat(values, self._starts, axis=0)
@@ -124,7 +123,8 @@ class SparseHierarchy:
         self._leaf_transposed = self._leaf.T
 
     def thinned(self, part: int) -> SparseHierarchy:
-        """One in `part` of the nodes of the last bond, with all that they hold, chosen by their keys alone."""
+        """A hierarchy with one in `part` of the nodes of the last bond and all their entries. The choice depends on the
+        keys alone."""
         hashed = self._leaf_keys.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(32)
         kept = np.flatnonzero(hashed % np.uint64(part) == 0)
         thin = copy(self)
@@ -145,13 +145,13 @@ class SparseHierarchy:
 
     @property
     def size(self) -> int:
-        """Scalar rows, padding included."""
+        """Number of scalar rows, with padding."""
         return slots_of(self.modes)
 
     def lookup(self, keys: Array) -> Array:
-        """Entries by scalar keys: digits i_k m_k + j_k of base m_k^2 in the scalar modes, the first most significant.
+        """Entries at scalar keys. The digits of these are i_k m_k + j_k of base m_k^2, the first most significant.
 
-        Zero where nothing is stored; summed over the ranks.
+        An entry that is not stored is zero. The result is summed over the ranks.
         """
         m, q, b = self.modes[-1], self.slot_modes[-1], self.block
         node, leaf = np.divmod(keys, m * m)
@@ -165,15 +165,15 @@ class SparseHierarchy:
         return self.reduce(out)
 
     def crosses(self, prefixes: Array, digits: Array, suffixes: Array) -> Array:
-        """Entries (p, m, s) by the sums of keys."""
+        """Entries (p, m, s) at the sums of keys."""
         return self.lookup(prefixes[:, None, None] + digits[:, None] + suffixes)
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Scalar keys of `count` stored entries (none where there are none), the same on all ranks if `rng` is.
+        """Scalar keys of `count` stored entries, the same on all ranks if `rng` is; empty without stored entries.
 
-        Half of them in random rows, half near the first or last row of a random box of a random bond; of the
-        row a random entry, the leftmost or the rightmost: entries that join coarse boxes may be few, but they
-        matter. A row belongs to one rank; it contributes the key, the others nothing.
+        Half of them are in random rows, half near the first or last row of a random box of a random bond. In a row the
+        method takes a random entry, the leftmost or the rightmost, because the entries that join coarse boxes may be
+        few but are important. A row belongs to one rank, and only this rank contributes the key.
         """
         by_row, sorted_rows, rows_of_all = self._rows_sorted()
         if len(rows_of_all) == 0:
@@ -193,8 +193,8 @@ class SparseHierarchy:
         return self.reduce(found)
 
     def validation(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Keys of `count` stored entries and as many others, and weights with which a sum of squares over them
-        estimates that over all entries."""
+        """Keys of `count` stored entries and of as many others, and weights: the weighted sum of squares over them
+        estimates the sum over all entries."""
         stored = self.sample(count, rng)
         size = float(self.size) ** 2
         others = rng.integers(0, slots_of(self.modes) ** 2, count)
@@ -204,14 +204,14 @@ class SparseHierarchy:
         return np.concatenate((stored, others)), weights
 
     def _scalar_key(self, key: Array, s: Array, t: Array) -> Array:
-        """Scalar keys of the entries (s, t) of blocks given by their keys."""
+        """Scalar keys of the entries (s, t) of the blocks with these keys."""
         q, b, m = self.slot_modes[-1], self.block, self.modes[-1]
         node, leaf = np.divmod(key, q * q)
         i, j = np.divmod(leaf, q)
         return node * (m * m) + (i * b + s) * m + j * b + t
 
     def _rows_sorted(self) -> tuple[Array, Array, Array]:
-        """Places of my blocks in the order of their row slots, these, and the row slots that hold blocks anywhere."""
+        """Places of this rank's blocks sorted by row slot, these row slots, and the row slots of all ranks' blocks."""
         if self._by_row is None:
             order = np.argsort(self._rows, kind="stable")
             holds = np.zeros(slots_of(self.slot_modes), np.int64)
@@ -231,19 +231,19 @@ class SparseHierarchy:
         return np.ones((1, 1), self.dtype)
 
     def down(self, k: int, x: Array, core: Array) -> Array:
-        """Left interface (nodes[k+1], r') of bond k+1 from that of bond k, x (nodes[k], r), and core k."""
+        """The left interface (nodes[k+1], r') of bond k+1, from that of bond k, x (nodes[k], r), and core k."""
         r, m2, r_ = core.shape
         return (x @ core.reshape(r, m2 * r_)).reshape(-1, r_).take(self.places[k], axis=0)
 
     def spread(self, k: int, V: Array) -> Array:
-        """V (nodes[k+1], r) with a place for every child of a node of bond k: (nodes[k], m^2 r)."""
+        """V (nodes[k+1], r) as an array (nodes[k], m^2 r), which has a place for every child of a node of bond k."""
         r = V.shape[1]
         out = np.zeros((self.nodes[k] * self.slot_modes[k] ** 2, r), V.dtype)
         out[self.places[k]] = V
         return out.reshape(self.nodes[k], self.slot_modes[k] ** 2 * r)
 
     def up(self, spread: Array, core: Array) -> Array:
-        """The matrix contracted with the right interface, one core further: (nodes[k], r) from `spread`."""
+        """The matrix contracted with the right interface and one more core: (nodes[k], r) from `spread`."""
         return spread @ core.reshape(len(core), -1).T
 
     def middle(self, x: Array, spread: Array, rank: int) -> Array:
@@ -260,11 +260,11 @@ class SparseHierarchy:
         return self._leaf @ np.ascontiguousarray(self.leaf_row(core).T)
 
     def leaf_row(self, core: Array) -> Array:
-        """The last core (r, m^2, 1) as rows (r, m^2) in the column order of the leaf matrix."""
+        """The last core (r, m^2, 1) as a matrix (r, m^2), in the column order of the leaf matrix."""
         return self._leaf_order(core, to_train=False)
 
     def leaf_rows(self, part: slice) -> Array:
-        """Dense leaves of some nodes of the last bond, in the column order of the leaf matrix."""
+        """The dense leaves of some nodes of the last bond, in the column order of the leaf matrix."""
         return self._leaf[part].toarray()
 
     def inner(self, cores: Sequence[Array]) -> float:
@@ -275,7 +275,7 @@ class SparseHierarchy:
         return float(np.vdot(self.leaf_core(x), cores[-1]))
 
     def _leaf_order(self, core: Array, to_train: bool) -> Array:
-        """Between the column orders (i, j, s, t) of the leaf matrix and (i, s, j, t) of a core."""
+        """Convert between the column order (i, j, s, t) of the leaf matrix and the order (i, s, j, t) of a core."""
         q, b = self.slot_modes[-1], self.block
         shape = (-1, q, q, b, b) if to_train else (-1, q, b, q, b)
         rank = len(core)
@@ -284,7 +284,7 @@ class SparseHierarchy:
 
 
 def _hierarchical_keys(rows: Array, columns: Array, modes: Sequence[int]) -> Array:
-    """Keys of slot pairs that sort them by (i_1, j_1), then (i_2, j_2), ...: digits of base m_1^2, m_2^2, ..."""
+    """Keys that sort pairs of slots by (i_1, j_1), then (i_2, j_2), ...: digits of base m_1^2, m_2^2, ..."""
     if float(slots_of(modes)) ** 2 >= 2.0**63:
         raise ValueError(f"too many slots for one key of 64 bits: modes {list(modes)}")
     row_key = np.zeros(1, np.int64)
@@ -296,7 +296,7 @@ def _hierarchical_keys(rows: Array, columns: Array, modes: Sequence[int]) -> Arr
 
 
 def _starts(keys: Array) -> Array:
-    """Where runs of equal sorted keys start."""
+    """The indices where runs of equal sorted keys start."""
     if len(keys) == 0:
         return np.zeros(0, np.int64)
     return np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))

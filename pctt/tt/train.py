@@ -1,12 +1,12 @@
 """Tensor trains of vectors (tensors) and matrices.
 
-A train writes the entries of a tensor with modes n_1, ..., n_d as products of small matrices,
+A train represents the entries of a tensor with modes n_1, ..., n_d as products of small matrices,
 
     T(i_1, ..., i_d) = G_1(i_1) G_2(i_2) ... G_d(i_d),      G_k(i_k) of shape (r_{k-1}, r_k),  r_0 = r_d = 1
 
-(Oseledets, "Tensor-train decomposition", SIAM J. Sci. Comput. 33, 2011). A matrix is the train of its entries
-A(i, j) with i = (i_1, ..., i_d) and j = (j_1, ..., j_d), whose k-th core carries the pair (i_k, j_k). Linear
-and multi-indices are related lexicographically, the first mode slowest, as numpy's C order does.
+(Oseledets, "Tensor-train decomposition", SIAM J. Sci. Comput. 33, 2011). The train of a matrix has the entries A(i, j)
+with i = (i_1, ..., i_d) and j = (j_1, ..., j_d). Its k-th core has the pair (i_k, j_k). Linear indices and
+multi-indices are related as in numpy's C order: the first mode is slowest.
 
 >>> x, y, z = np.ogrid[0:1:4j, 0:1:5j, 0:1:6j]
 >>> train = decompose(np.sin(x + y + z), eps=1e-12)
@@ -26,14 +26,14 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 Array = NDArray[Any]
 
-CHUNK = 1 << 15  # multi-indices that are looked up at a time: their rows of cores stay in the cache
+CHUNK = 1 << 15  # number of multi-indices evaluated at a time, so that their rows of cores stay in the cache
 
 
 class Train:
-    """A tensor train: its cores, and the arithmetic on them.
+    """A tensor train: its cores, and arithmetic with trains.
 
-    cores : (r_{k-1}, n_k, r_k) each for a tensor, (r_{k-1}, m_k, n_k, r_k) each for a matrix with row modes
-        m_k and column modes n_k. They are not copied; nothing here writes to them.
+    cores : each is (r_{k-1}, n_k, r_k) for a tensor, and (r_{k-1}, m_k, n_k, r_k) for a matrix with row modes m_k and
+        column modes n_k. They are not copied, and no method writes to them.
 
     >>> T = identity([2, 3, 4])
     >>> T
@@ -44,7 +44,7 @@ class Train:
     True
     """
 
-    __array_priority__ = 100  # numpy scalars leave `scalar * train` to the train
+    __array_priority__ = 100  # so that numpy scalars leave `scalar * train` to the train
 
     def __init__(self, cores: Iterable[Array]) -> None:
         self.cores = tuple(cores)
@@ -66,7 +66,7 @@ class Train:
 
     @property
     def modes(self) -> tuple[tuple[int, ...], ...]:
-        """(n_k,) of every core of a tensor, (m_k, n_k) of a matrix."""
+        """(n_k,) for every core of a tensor, (m_k, n_k) for a matrix."""
         return tuple(core.shape[1:-1] for core in self.cores)
 
     @property
@@ -90,12 +90,12 @@ class Train:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of `full()`: (n_1, ..., n_d) of a tensor, (prod m_k, prod n_k) of a matrix."""
+        """The shape of `full()`: (n_1, ..., n_d) for a tensor, (prod m_k, prod n_k) for a matrix."""
         return (_product(self.rows), _product(self.columns)) if self.is_matrix else self.rows
 
     @property
     def storage(self) -> int:
-        """Numbers in the cores."""
+        """How many numbers the cores have."""
         return sum(core.size for core in self.cores)
 
     def __repr__(self) -> str:
@@ -122,7 +122,7 @@ class Train:
         return pairs.transpose(*range(0, 2 * d, 2), *range(1, 2 * d, 2)).reshape(self.shape)
 
     def entries(self, i: ArrayLike, j: ArrayLike | None = None) -> Array:
-        """Entries at linear indices i, of a matrix at rows i and columns j (integer arrays of one shape).
+        """Entries at linear indices i; for a matrix at rows i and columns j (integer arrays of one shape).
 
         >>> identity([2, 3]).entries([0, 1, 5], [0, 2, 5])
         array([1., 0., 1.])
@@ -137,7 +137,7 @@ class Train:
         return self.at(digits).reshape(i.shape)
 
     def at(self, digits: Array) -> Array:
-        """Entries at multi-indices (d, p) of the flat cores: i_k of a tensor, i_k n_k + j_k of a matrix."""
+        """Entries at multi-indices (d, p) of the flat cores: i_k for a tensor, i_k n_k + j_k for a matrix."""
         tables = [np.ascontiguousarray(core.transpose(1, 0, 2)) for core in self.flat()]
         out = np.empty(digits.shape[1], self.dtype)
         for start in range(0, len(out), CHUNK):
@@ -149,7 +149,7 @@ class Train:
         return out
 
     def diagonal_blocks(self) -> Array:
-        """Blocks (P, m_d, n_d) on the diagonal of the matrix at the last level, P = m_1 ... m_{d-1}."""
+        """The diagonal blocks (P, m_d, n_d) of the matrix at the last level, P = m_1 ... m_{d-1}."""
         out = np.ones((1, 1), self.dtype)
         for core in self._matrix().cores[:-1]:
             out = np.tensordot(out, core.diagonal(axis1=1, axis2=2), (1, 0)).transpose(0, 2, 1)
@@ -207,21 +207,21 @@ class Train:
         return Train([core.transpose(0, 2, 1, 3) for core in self._matrix().cores])
 
     def symmetric_part(self, eps: float) -> Train:
-        """(T + T') / 2 of a square matrix, rounded to eps: no further from a symmetric matrix than T."""
+        """(T + T') / 2 of a square matrix, rounded to eps. It approximates a symmetric matrix at least as well as T."""
         return (0.5 * (self + self.T)).round(eps)
 
     def astype(self, dtype: DTypeLike) -> Train:
         return Train([core.astype(dtype) for core in self.cores])
 
     def inner(self, other: Train) -> float:
-        """Sum of products of the entries, trace(A' B) for matrices."""
+        """Sum of the products of the entries; trace(A' B) for matrices."""
         gram = np.ones((1, 1), np.result_type(self.dtype, other.dtype))
         for a, b in zip(self.flat(), other.flat()):
             gram = np.tensordot(a, np.tensordot(gram, b, 1), ((0, 1), (0, 1)))
         return float(gram[0, 0])
 
     def norm(self) -> float:
-        """Frobenius norm, through orthogonal cores: that of a difference keeps the accuracy of its terms."""
+        """Frobenius norm, from orthogonal cores, so that the norm of a difference is as accurate as its terms."""
         return float(np.linalg.norm(self.left_orthogonal().cores[-1]))
 
     def trace(self) -> float:
@@ -234,7 +234,7 @@ class Train:
     # Orthogonal cores and rounding
 
     def left_orthogonal(self) -> Train:
-        """The same train with orthonormal columns in all but the last core, seen as (r n, r')."""
+        """The same train; all cores except the last, as matrices (r n, r'), have orthonormal columns."""
         cores = self.flat()
         for k in range(len(cores) - 1):
             a, n, b = cores[k].shape
@@ -244,7 +244,7 @@ class Train:
         return self._like(cores)
 
     def right_orthogonal(self) -> Train:
-        """The same train with orthonormal rows in all but the first core, seen as (r, n r')."""
+        """The same train; all cores except the first, as matrices (r, n r'), have orthonormal rows."""
         cores = self.flat()
         for k in range(len(cores) - 1, 0, -1):
             a, n, b = cores[k].shape
@@ -254,9 +254,9 @@ class Train:
         return self._like(cores)
 
     def round(self, eps: float = 1e-14, max_rank: int | None = None) -> Train:
-        """The train of least ranks within eps times the norm (quasi-optimal), ranks at most `max_rank`.
+        """A train with the least ranks, at most `max_rank`, within eps times the norm (quasi-optimal).
 
-        The cores come out left-orthogonal.
+        The cores of the result are left-orthogonal.
         """
         cores = self.right_orthogonal().flat()
         delta = eps * float(np.linalg.norm(cores[0])) / max(1, len(cores) - 1) ** 0.5
@@ -270,11 +270,11 @@ class Train:
     # Helpers
 
     def flat(self) -> list[Array]:
-        """Cores with one mode each, (r, n, r'): those of a matrix with (m_k, n_k) as one."""
+        """Cores (r, n, r') with one mode each; a matrix has (m_k, n_k) as one mode."""
         return [core.reshape(core.shape[0], -1, core.shape[-1]) for core in self.cores]
 
     def _like(self, cores: Iterable[Array]) -> Train:
-        """A train with my modes and these cores (r, n, r')."""
+        """A train with the modes of this one and with these cores (r, n, r')."""
         return Train(core.reshape(core.shape[0], *mode, core.shape[-1]) for core, mode in zip(cores, self.modes))
 
     def _matrix(self) -> Train:
@@ -286,9 +286,9 @@ class Train:
 def decompose(
     tensor: ArrayLike, eps: float = 1e-12, max_rank: int | None = None, modes: Sequence[int] | None = None
 ) -> Train:
-    """Train of a dense tensor within eps times its norm: Algorithm 1 of the paper (TT-SVD).
+    """A train of a dense tensor with an error of at most eps times its norm: Algorithm 1 of the paper (TT-SVD).
 
-    modes : reshapes the tensor first (quantises a vector).
+    modes : the tensor is reshaped to these modes first (this quantises a vector).
 
     >>> decompose(np.arange(64.0), modes=[4, 4, 4]).ranks
     (1, 2, 2, 1)
@@ -312,7 +312,7 @@ def decompose_matrix(
     eps: float = 1e-12,
     max_rank: int | None = None,
 ) -> Train:
-    """Train of a dense matrix (prod rows, prod columns) within eps times its norm.
+    """A train of a dense matrix (prod rows, prod columns) with an error of at most eps times its norm.
 
     >>> decompose_matrix(np.diag(np.ones(15), 1), [2, 2, 4]).ranks
     (1, 2, 2, 1)
@@ -327,7 +327,7 @@ def decompose_matrix(
 
 
 def matrix_train(cores: Iterable[Array], rows: Sequence[int], columns: Sequence[int] | None = None) -> Train:
-    """A matrix of cores (r, m n, r') that carry pairs of indices as one."""
+    """A matrix from cores (r, m n, r') that have pairs of indices as one mode."""
     columns = rows if columns is None else columns
     return Train(core.reshape(core.shape[0], m, n, core.shape[-1]) for core, m, n in zip(cores, rows, columns))
 
@@ -338,7 +338,7 @@ def identity(modes: Sequence[int], dtype: DTypeLike = float) -> Train:
 
 
 def zeros(rows: Sequence[int], columns: Sequence[int] | None = None, dtype: DTypeLike = float) -> Train:
-    """The zero vector, or the zero matrix where there are columns; of rank 1."""
+    """The zero vector, or with ``columns`` the zero matrix, of rank 1."""
     return Train([np.zeros((1, *mode, 1), dtype) for mode in _mode_shapes(rows, columns)])
 
 
@@ -349,9 +349,9 @@ def random(
     rng: np.random.Generator | None = None,
     dtype: DTypeLike = float,
 ) -> Train:
-    """A train of normally distributed cores, with entries of variance 1; no rank exceeds what the modes allow.
+    """A train with normally distributed cores, whose entries have the variance 1. No rank exceeds what the modes allow.
 
-    rank : of all bonds, or r_1, ..., r_{d-1}.
+    rank : the rank of all bonds, or the ranks r_1, ..., r_{d-1}.
 
     >>> random([2, 4, 4, 2], 5).ranks
     (1, 2, 5, 2, 1)
@@ -367,7 +367,7 @@ def random(
 
 
 def full_ranks(modes: Sequence[int]) -> list[int]:
-    """The greatest ranks r_1, ..., r_{d-1} that a tensor of these modes can have.
+    """The greatest ranks r_1, ..., r_{d-1} that a tensor with these modes can have.
 
     >>> full_ranks([2, 4, 4, 2])
     [2, 8, 2]
@@ -378,7 +378,7 @@ def full_ranks(modes: Sequence[int]) -> list[int]:
 
 
 def low_rank(matrix: Array, delta: float, max_rank: int | None = None) -> tuple[Array, Array]:
-    """U, V with ||matrix - U V|| <= delta unless `max_rank` forbids it; U has orthonormal columns (at least one)."""
+    """U and V with ||matrix - U V|| <= delta, if `max_rank` allows it. U has orthonormal columns (at least one)."""
     U, s, V = np.linalg.svd(matrix, full_matrices=False)
     tail = np.sqrt(np.cumsum(s[::-1].astype(float) ** 2))[::-1]  # tail[r] = ||s[r:]||
     floor = np.finfo(matrix.dtype).eps * (tail[0] if len(tail) else 0.0)
