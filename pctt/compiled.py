@@ -28,22 +28,24 @@ def available() -> bool:
 
 
 def compiled(function: Function) -> Function:
-    """Run the loop instead of ``function`` if numba is available and all arrays are contiguous, writable float64.
+    """Run the loop instead of ``function`` if numba is available and all arrays are contiguous and writable, and all of
+    double or all of single precision.
 
-    With this condition each loop is compiled once. All arguments are arrays or numbers, and have no keywords.
+    With this condition each loop is compiled at most twice. All arguments are arrays or numbers, and have no keywords.
     """
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
-        if available() and all(map(_fits, arguments)):
+        if available() and _fit(arguments):
             return loop_of(function)(*(a if isinstance(a, np.ndarray) else float(a) for a in arguments))
         return function(*arguments)
 
     return call  # type: ignore[return-value]
 
 
-def _fits(argument: Any) -> bool:
-    return not isinstance(argument, np.ndarray) or (argument.dtype == np.float64 and argument.flags.carray)
+def _fit(arguments: tuple[Any, ...]) -> bool:
+    arrays = [argument for argument in arguments if isinstance(argument, np.ndarray)]
+    return {a.dtype.char for a in arrays} in ({"d"}, {"f"}) and all(a.flags.carray for a in arrays)
 
 
 @cache

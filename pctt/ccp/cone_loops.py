@@ -1,16 +1,17 @@
 """The functions of ``cone`` as loops over the contacts.
 
 Arrays of rows are taken flat: so the compiler knows the distance from one contact to the next, and works on several at
-once. Comparisons are written so that a NaN stays a NaN.
+once. Comparisons are written so that a NaN stays a NaN. Constants have single precision, so that loops on arrays of single
+precision stay in it. They are exact in double precision too.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from pctt.ccp.cone import TINY
 from pctt.compiled import loop
 
+ZERO, ONE, TINY = np.float32(0.0), np.float32(1.0), np.finfo(np.float32).tiny
 STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to the next
 
 
@@ -18,9 +19,9 @@ STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to
 def _nearest(n, t_1, t_2, mu):
     """The nearest point of a cone, by selections: a processor could not predict branches."""
     length = np.sqrt(t_1 * t_1 + t_2 * t_2)
-    height = (mu * length + n) * (1.0 / (1.0 + mu * mu))
+    height = (mu * length + n) * (ONE / (ONE + mu * mu))
     height = n if height < n else height
-    height = 0.0 if height < 0.0 else height
+    height = ZERO if height < ZERO else height
     radius = mu * height
     reach = radius if length < radius else length
     shrink = radius / (TINY if reach < TINY else reach)
@@ -39,6 +40,7 @@ def project_to(x, mu, out):
 @loop
 def projected_move(x, y, step, mu):
     out = np.empty_like(x)
+    step = x.dtype.type(step)
     x, y, to = x.ravel(), y.ravel(), out.ravel()
     for c in range(len(mu)):
         i = 3 * c
@@ -49,9 +51,11 @@ def projected_move(x, y, step, mu):
 
 @loop
 def accelerated_step(x, last_x, y, last_y, beta, step, mu, opening, out):
+    number = x.dtype.type
+    beta, step = number(beta), number(step)
     x, last_x, y, last_y, to = x.ravel(), last_x.ravel(), y.ravel(), last_y.ravel(), out.ravel()
-    z, y_z = np.empty(3 * STRIP), np.empty(3 * STRIP)
-    squares, products = np.zeros(3 * STRIP), np.zeros(3 * STRIP)
+    z, y_z = np.empty(3 * STRIP, x.dtype), np.empty(3 * STRIP, x.dtype)
+    squares, products = np.zeros(3 * STRIP, x.dtype), np.zeros(3 * STRIP, x.dtype)
     for first in range(0, len(mu), STRIP):
         friction = mu[first : first + STRIP]
         a, b = 3 * first, 3 * (first + len(friction))
@@ -100,15 +104,28 @@ def _add_products(x, y, z, sums):
 
 @loop
 def accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta):
-    sum_0 = sum_1 = sum_2 = 0.0
-    for c in range(len(x)):
-        d_0 = new_x[c, 0] - (x[c, 0] + beta * (x[c, 0] - last_x[c, 0]))
-        d_1 = new_x[c, 1] - (x[c, 1] + beta * (x[c, 1] - last_x[c, 1]))
-        d_2 = new_x[c, 2] - (x[c, 2] + beta * (x[c, 2] - last_x[c, 2]))
-        sum_0 += d_0 * (new_y[c, 0] - (y[c, 0] + beta * (y[c, 0] - last_y[c, 0])))
-        sum_1 += d_1 * (new_y[c, 1] - (y[c, 1] + beta * (y[c, 1] - last_y[c, 1])))
-        sum_2 += d_2 * (new_y[c, 2] - (y[c, 2] + beta * (y[c, 2] - last_y[c, 2])))
-    return sum_0 + sum_1 + sum_2
+    beta = x.dtype.type(beta)
+    new_x, x, last_x, new_y, y, last_y = (
+        new_x.ravel(), x.ravel(), last_x.ravel(), new_y.ravel(), y.ravel(), last_y.ravel(),
+    )  # fmt: skip
+    d, products = np.empty(3 * STRIP, x.dtype), np.zeros(3 * STRIP, x.dtype)
+    for i in range(0, len(x), 3 * STRIP):
+        j = min(i + 3 * STRIP, len(x))
+        _extrapolated_move(new_x[i:j], x[i:j], last_x[i:j], beta, d)
+        _add_extrapolated_work(new_y[i:j], y[i:j], last_y[i:j], beta, d, products)
+    return products.sum()
+
+
+@loop
+def _extrapolated_move(new, x, last_x, beta, out):
+    for k in range(len(x)):
+        out[k] = new[k] - (x[k] + beta * (x[k] - last_x[k]))
+
+
+@loop
+def _add_extrapolated_work(new, x, last_x, beta, d, sums):
+    for k in range(len(x)):
+        sums[k] += d[k] * (new[k] - (x[k] + beta * (x[k] - last_x[k])))
 
 
 @loop

@@ -31,18 +31,25 @@ class FreeMap:
     Flat arrays are allowed too. All products are collective.
 
     given : the rows, `CompactRows` or `BlockRows`
+    precision : of the arrays that products take and return; single precision moves half of the bytes
     """
 
     free = True  # it needs no matrix
 
-    def __init__(self, comm: MPI.Comm, given: BlockRows | CompactRows, ghosts: Ghosts | None = None):
-        self.comm, self.given = comm, given
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        given: BlockRows | CompactRows,
+        ghosts: Ghosts | None = None,
+        precision: type[np.floating] = np.float64,
+    ):
+        self.comm, self.given, self.precision = comm, given, precision
         self.rows, self.columns = given.rows, given.columns
         if isinstance(given, CompactRows):
             self._take_compact(given, ghosts)
         else:
             self._take_blocks(given, ghosts)
-        self._w, self._m = np.zeros((2, self._ghosts.nobody + 1, 6))
+        self._w, self._m = np.zeros((2, self._ghosts.nobody + 1, 6), precision)
         # two halves of the contacts that wait for no other rank, then the other contacts
         ends = [0, self._first_away // 2, self._first_away, self.rows]
         self._half, self._rest, self._away = (Contacts.of(self, *pair) for pair in zip(ends, ends[1:]))
@@ -50,10 +57,10 @@ class FreeMap:
     def _take_compact(self, given: CompactRows, ghosts: Ghosts | None) -> None:
         self._ghosts = ghosts or Ghosts(self.comm, given.columns, given.body)
         self._loops: ModuleType = compact_loops
-        self._arrays: Any = (_floats(given.frame), _floats(given.arm), self._ghosts.body)
+        self._arrays: Any = (self._floats(given.frame), self._floats(given.arm), self._ghosts.body)
         self._root: Array | None
         self._mass: Array | None
-        self._root, self._mass = _floats(given.root), _square(given.root)
+        self._root, self._mass = self._floats(given.root), self._floats(_square(given.root))
         self._first_away = _first(self._is_ghost(self._ghosts.body).any(axis=1))
         self._flops = {"single": 45 * self.rows + 6 * self.columns, "through": 72 * self.rows + 18 * self.columns}
 
@@ -61,7 +68,7 @@ class FreeMap:
         self._ghosts = ghosts or Ghosts(self.comm, given.columns, given.indices)
         self._loops = block_loops
         start = np.ascontiguousarray(given.indptr, dtype=np.int64)
-        self._arrays = (_floats(given.blocks), start, self._ghosts.body)
+        self._arrays = (self._floats(given.blocks), start, self._ghosts.body)
         self._root = self._mass = None
         contact = np.repeat(np.arange(self.rows), np.diff(start))
         away = np.zeros(self.rows, bool)
@@ -83,7 +90,7 @@ class FreeMap:
 
     def velocities(self, v: Array) -> Array:
         """G v (nc, 3)."""
-        y = np.zeros((self.rows, 3))
+        y = np.zeros((self.rows, 3), self.precision)
         self._enter(self._root, v.reshape(-1, 6))
         self._add_velocities(y)
         PETSc.Log.logFlops(self._flops["single"])
@@ -104,8 +111,8 @@ class FreeMap:
 
     def pack(self, H: Array) -> Array:
         """Symmetric blocks H (nc, 3, 3) in the format (nc, 6) of `local_product`."""
-        weight = np.empty((self.rows, 6))
-        block_loops.pack(_floats(H), weight)
+        weight = np.empty((self.rows, 6), self.precision)
+        block_loops.pack(self._floats(H), weight)
         return weight
 
     def local_product(self, weight: Array, g: Array, y: Array) -> None:
@@ -115,9 +122,9 @@ class FreeMap:
 
     def weights(self, H: Array, symmetric: bool = True) -> Array:
         """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""
-        weight = np.empty((self.rows, 6 if symmetric else 9))
+        weight = np.empty((self.rows, 6 if symmetric else 9), self.precision)
         loop = self._loops.weights if symmetric else self._loops.any_weights
-        loop(*self._arrays, _floats(H), weight)
+        loop(*self._arrays, self._floats(H), weight)
         return weight
 
     def through(self, weight: Array, v: Array, out: Array) -> None:
@@ -153,7 +160,7 @@ class FreeMap:
 
     def _collect(self, g: Array) -> None:
         """Collect the momenta that the impulses give to the bodies, not yet scaled by masses."""
-        g = _floats(g)
+        g = self._floats(g)
         self._m[:] = 0.0
         self._away.add_momenta(g, self._m)
         self._ghosts.begin_add(self._m)
@@ -165,7 +172,7 @@ class FreeMap:
         """The scaled momenta of the own bodies: R m, or m if there is no R."""
         if scale is None:
             return self._m[: self.columns].copy()
-        out = np.empty((self.columns, 6))
+        out = np.empty((self.columns, 6), self.precision)
         compact_loops.scale(scale, self._m, out)
         return out
 
@@ -176,8 +183,8 @@ class FreeMap:
         if isinstance(self.given, BlockRows):
             return diagonal_blocks(self.given)
         assert self._mass is not None
-        out = np.empty((self.rows, 3, 3))
-        mass = np.zeros((self._ghosts.nobody + 1, 12))
+        out = np.empty((self.rows, 3, 3), self.precision)
+        mass = np.zeros((self._ghosts.nobody + 1, 12), self.precision)
         mass[: self.columns] = _wide(self._mass)
         self._ghosts.update(mass)
         self._loops.contact_blocks(*self._arrays, mass, out)
@@ -185,7 +192,7 @@ class FreeMap:
 
     def body_blocks(self, weight: Array) -> Array:
         """The diagonal blocks of I + G' H G (columns, 6, 6)."""
-        blocks = np.zeros((self._ghosts.nobody + 1, 6, 6))
+        blocks = np.zeros((self._ghosts.nobody + 1, 6, 6), self.precision)
         loop = self._loops.add_body_blocks if weight.shape[1] == 6 else self._loops.add_any_body_blocks
         loop(*self._arrays, weight, blocks)
         self._ghosts.begin_add(blocks)
@@ -200,19 +207,22 @@ class FreeMap:
         own[:, range(6), range(6)] += 1.0
         return own
 
-    def scaled(self, size: Array) -> FreeMap:
+    def scaled(self, size: Array, precision: type[np.floating] = np.float64) -> FreeMap:
         """The map with its rows multiplied by ``size`` (nc, 3); it is valid until this map is destroyed."""
         if isinstance(self.given, CompactRows):
             frame = (self.given.frame.reshape(-1, 3, 3) * size[:, :, None]).reshape(-1, 9)
-            return FreeMap(self.comm, dataclasses.replace(self.given, frame=frame), self._ghosts)
+            return FreeMap(self.comm, dataclasses.replace(self.given, frame=frame), self._ghosts, precision)
         each = np.repeat(size, np.diff(self.given.indptr), axis=0)
         given = dataclasses.replace(self.given, blocks=self.given.blocks * each[:, :, None])
-        return FreeMap(self.comm, given, self._ghosts)
+        return FreeMap(self.comm, given, self._ghosts, precision)
 
     @cached_property
     def block_rows(self) -> BlockRows:
         """The rows as 3 x 6 blocks; collective at its first use."""
         return block_rows(self.comm, self.given)
+
+    def _floats(self, array: Array) -> Array:
+        return np.ascontiguousarray(array, dtype=self.precision)
 
     def destroy(self) -> None:
         self._ghosts.destroy()
@@ -247,10 +257,6 @@ class Contacts:
 _FULL = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # indices in (xx, xy, xz, yy, yz, zz) of the nine entries of a matrix
 
 
-def _floats(array: Array) -> Array:
-    return np.ascontiguousarray(array, dtype=float)
-
-
 def _first(mask: np.ndarray) -> int:
     """The index of the first True, or the length."""
     return int(np.argmax(mask)) if mask.any() else len(mask)
@@ -270,4 +276,4 @@ def _square(root: Array) -> Array:
     if root.shape[1] == 6:
         return root * root
     full = root.reshape(-1, 6)[:, _FULL].reshape(-1, 3, 3)
-    return _floats((full @ full).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]].reshape(-1, 12))
+    return (full @ full).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]].reshape(-1, 12)

@@ -12,7 +12,8 @@ from pctt.exchange import offsets
 class Ghosts:
     """Local numbers of bodies: first the own bodies, then the ghosts, then one number, `nobody`, for no body.
 
-    Values of bodies are arrays (nobody + 1, k). The last row, for `nobody`, is zero, or has values that nothing reads.
+    Values of bodies are arrays (nobody + 1, k), of single or double precision. They travel in double precision, as PETSc
+    adds up no other. The last row, for `nobody`, is zero, or has values that nothing reads.
 
     Attributes
     ----------
@@ -48,11 +49,14 @@ class Ghosts:
 
     def begin_update(self, values: np.ndarray) -> None:
         if self._sf is not None:
-            self._sf.bcastBegin(*self._ends(values), MPI.REPLACE)
+            self._travelling = values.astype(float, copy=False)
+            self._sf.bcastBegin(*self._ends(self._travelling), MPI.REPLACE)
 
     def end_update(self, values: np.ndarray) -> None:
         if self._sf is not None:
-            self._sf.bcastEnd(*self._ends(values), MPI.REPLACE)
+            unit, own, ghosts = self._ends(self._travelling)
+            self._sf.bcastEnd(unit, own, ghosts, MPI.REPLACE)
+            values[self.own : self.nobody] = ghosts
 
     def begin_add(self, values: np.ndarray) -> None:
         """Begin to add the values of the ghosts to those of the owners.
@@ -61,13 +65,13 @@ class Ghosts:
         """
         if self._sf is not None:
             unit, own, ghosts = self._ends(values)
-            self._arriving = np.zeros_like(own)
-            self._sf.reduceBegin(unit, ghosts, self._arriving, MPI.SUM)
+            self._arriving, self._leaving = np.zeros(own.shape), ghosts.astype(float, copy=False)
+            self._sf.reduceBegin(unit, self._leaving, self._arriving, MPI.SUM)
 
     def end_add(self, values: np.ndarray) -> None:
         if self._sf is not None:
-            unit, own, ghosts = self._ends(values)
-            self._sf.reduceEnd(unit, ghosts, self._arriving, MPI.SUM)
+            unit, own, _ = self._ends(values)
+            self._sf.reduceEnd(unit, self._leaving, self._arriving, MPI.SUM)
             own += self._arriving
 
     def _ends(self, values: np.ndarray) -> tuple[MPI.Datatype, np.ndarray, np.ndarray]:

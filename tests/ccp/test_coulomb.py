@@ -81,7 +81,7 @@ def test_contacts_obey_coulombs_law(solver):
 def test_all_solvers_find_the_same():
     problem = sliding_heap(0.3, seed=2)
     found = [solve(problem, name, 1e-7).impulse for name in ("apgd", "conic")]
-    assert problem.product(found[0]) == pytest.approx(problem.product(found[1]), abs=1e-5)
+    assert problem.product(found[0]) == pytest.approx(problem.product(found[1]), abs=1e-4)
 
 
 @pytest.mark.parametrize("mu", [0.8, 1.5])

@@ -69,6 +69,11 @@ def check(comm: MPI.Comm, rows: CompactRows | BlockRows, G: np.ndarray, here: sl
     product.scaled(size[here]).add_delassus(g[here], y)
     expected = size.ravel() * (G @ G.T @ (size * g).ravel())
     np.testing.assert_allclose(y, expected.reshape(-1, 3)[here], rtol=1e-12, atol=1e-12)
+    if product.free:
+        y = np.zeros_like(y, dtype=np.float32)
+        product.scaled(size[here], np.float32).add_delassus(g[here].astype(np.float32), y)
+        close = {"rtol": 1e-4, "atol": 1e-5 * np.abs(expected).max(initial=0.0)}
+        np.testing.assert_allclose(y, expected.reshape(-1, 3)[here], **close)
 
     operator = BodyOperator(product)
     x, out = operator.mat.createVecs()

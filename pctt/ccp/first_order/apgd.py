@@ -12,6 +12,7 @@ bound (`Momentum`). Then Coulomb's law is the fixed point of the projected step,
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,10 +30,13 @@ class Steering:
     """How the estimate L of the curvature follows the curvature along the steps; its inverse is the length of a
     step."""
 
-    margin: float = 1.1  #: L of a repeated step, over the curvature found: the next step need not be repeated too
-    decay: float = 0.95  #: factor on L after each step, so that steps grow again where the curvature allows it
+    margin: float = 1.3  #: L of a repeated step, over the curvature found: the next step need not be repeated too
+    decay: float = 0.99  #: factor on L after each step, so that steps grow again where the curvature allows it
     rounding: float = 1e-12  #: part of L by which the curvature may exceed it
     least: float = 1e-3  #: the first L at least; A has a diagonal of about one
+    #: natural residual above which single precision is enough, times the root of the number of contacts: rounding hides
+    #: the curvature along a step, but the errors of many contacts cancel
+    single: float = 3e-4
 
 
 STEERING = Steering()
@@ -51,10 +55,27 @@ def solve(
     give_up: GiveUp | None = None,
     coulomb: bool = False,
 ) -> Result:
-    """Impulses from a first guess (nc, 3): of the cone problem, or of Coulomb's law."""
-    scaled = ScaledProblem(problem, coulomb)
-    progress = Progress(scaled, limits, options, give_up)
+    """Impulses from a first guess (nc, 3): of the cone problem, or of Coulomb's law.
+
+    With compiled products the first iterations have single precision. The last ones, and the residual of the result,
+    always have double precision.
+    """
     momentum = Momentum(bounded=coulomb)
+    progress = None
+    if problem.free_map is not None:
+        enough = STEERING.single / np.sqrt(max(problem.size, 1))
+        rough = dataclasses.replace(limits, tol=max(limits.tol, enough))
+        progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, options, give_up)
+        guess = _descend(progress, momentum, guess)
+    progress = Progress(ScaledProblem(problem, coulomb), limits, options, give_up, progress)
+    _descend(progress, momentum, guess)
+    return progress.result()
+
+
+def _descend(progress: Progress, momentum: Momentum, guess: Array) -> Array:
+    """The best impulses that accelerated projected steps find from a first guess."""
+    scaled = progress.problem
+    momentum.restart()
     x = scaled.start(guess)
     y = scaled.gradient(x)
     last_x, last_y, new_x, new_y = x.copy(), y.copy(), np.empty_like(x), np.empty_like(y)
@@ -68,14 +89,15 @@ def solve(
             progress.iterations += 1
             curvature = accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta)
             curvature, length, uphill = scaled.sums(curvature, length, uphill)
-            if not curvature > lipschitz * length * (1 + STEERING.rounding):  # also ends on a number that is none
+            longer = lipschitz * length * (1 + STEERING.rounding)
+            if not (length > 0 and curvature > longer):  # also ends on a number that is none
                 break
             lipschitz = STEERING.margin * curvature / length
         momentum.advance(uphill > 0)
         last_x, x, new_x = x, new_x, last_x
         last_y, y, new_y = y, new_y, last_y
         lipschitz *= STEERING.decay
-    return progress.result()
+    return progress.impulse
 
 
 def _first_lipschitz(problem: ScaledProblem) -> float:

@@ -21,6 +21,7 @@ class Steering:
 
     patience: int = 5000  #: without progress [iterations]: these methods have plateaus of thousands
     patience_with_law: int = 1500  #: the same for Coulomb's law, where another method takes over [iterations]
+    patience_in_single: int = 300  #: the same in single precision, where double precision takes over [iterations]
     progress: float = 0.99  #: a natural residual below this part of the best one is progress; rounding alone is not
 
 
@@ -41,15 +42,25 @@ class Progress:
     So the result is the best of all points that were looked at.
     """
 
-    def __init__(self, problem: ScaledProblem, limits: Limits, options: FirstOrder, give_up: GiveUp | None = None):
+    def __init__(
+        self,
+        problem: ScaledProblem,
+        limits: Limits,
+        options: FirstOrder,
+        give_up: GiveUp | None = None,
+        before: Progress | None = None,
+    ):
+        """``before`` is the progress in lower precision, whose iterations and history go on."""
         self.problem, self.limits, self.check, self.give_up = problem, limits, options.check, give_up
-        self.iterations = 0
-        self.history: list[float] = []
+        self.iterations = before.iterations if before else 0
+        self.history: list[float] = before.history if before else []
         self.status, self.reason = Status.STALLED, ""
         self._best = np.inf
         self._patience = STEERING.patience_with_law if problem.opening else STEERING.patience
+        if problem.precision == np.float32:
+            self._patience = STEERING.patience_in_single
         self._next_look = 0
-        self._gain = (np.inf, 0)  # natural residual and iteration of the last progress
+        self._gain = (np.inf, self.iterations)  # natural residual and iteration of the last progress
 
     def goes_on(self, x: Array, gradient: Array | None = None) -> bool:
         """Whether to iterate further from x. Every ``check`` iterations this computes the natural residual.
@@ -60,15 +71,19 @@ class Progress:
         self._next_look = self.iterations + self.check
         residual = self._residual(x, gradient)
         self.history.append(residual)
-        if residual < self._best or len(self.history) == 1:
+        if residual < self._best or not hasattr(self, "_point"):
             self._best, self._point = residual, x.copy()
         self.status, self.reason = self._why_stop(residual)
         return not self.reason
 
+    @property
+    def impulse(self) -> Array:
+        """Of the best point (nc, 3)."""
+        return self.problem.impulse(self._point)
+
     def result(self) -> Result:
         status = Status.CONVERGED if self._best <= self.limits.tol else self.status
-        impulse = self.problem.impulse(self._point)
-        return Result(impulse, status, self.reason, self._best, self.iterations, history=self.history)
+        return Result(self.impulse, status, self.reason, self._best, self.iterations, history=self.history)
 
     def _residual(self, x: Array, gradient: Array | None) -> float:
         """The natural residual; nan where x or its gradient is no number."""
