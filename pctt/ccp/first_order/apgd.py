@@ -89,8 +89,8 @@ def _descend(progress: Progress, momentum: Momentum, guess: Array) -> Array:
             progress.iterations += 1
             curvature = accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta)
             curvature, length, uphill = scaled.sums(curvature, length, uphill)
-            longer = lipschitz * length * (1 + STEERING.rounding)
-            if not (length > 0 and curvature > longer):  # also ends on a number that is none
+            allowed = lipschitz * length * (1 + STEERING.rounding)
+            if not (length > 0 and curvature > allowed):  # also ends on a number that is none
                 break
             lipschitz = STEERING.margin * curvature / length
         momentum.advance(uphill > 0)

@@ -12,8 +12,8 @@ class Steering:
     """How the bound of momentum is found; without unit but where one is given. docs/notebook_ccp.md has what was
     measured."""
 
-    damping: float = 0.07  #: 1 - the greatest momentum, at first
-    window: int = 50  #: after which it is looked at [iterations]
+    damping: float = 0.05  #: 1 - the greatest momentum, at first
+    window: int = 100  #: after which it is looked at [iterations]
     little: float = 0.8  #: what is left of the residual after a window with too much momentum,
     much: float = 0.6  #: or with room for more
     heavier: float = 2.0  #: factors on the damping then
