@@ -31,11 +31,15 @@ class Momentum:
     with complex eigenvalues a + ib. If 1 - beta < |b| / sqrt(a), momentum turns them into growing oscillations, and
     without a bound the method ends in a cycle at a residual of about 1e-4. The size of b depends on friction and on the
     sliding contacts. So the bound is found on the way: more damping if a window of iterations has brought little, less
-    if it has brought much."""
+    if it has brought much.
+
+    On large problems a window brings little whatever the damping is. So if more damping has made it worse, the next
+    change is less damping, and the other way round. If the residual has grown, more damping is always right."""
 
     def __init__(self, bounded: bool):
         self.bounded, self.damping = bounded, STEERING.damping if bounded else 0.0
         self._end, self._looks, self._last = STEERING.window, 0, np.inf
+        self._left, self._change = np.inf, STEERING.heavier  # of the last window with little progress; factor after it
         self.restart()
 
     def restart(self) -> None:
@@ -57,7 +61,12 @@ class Momentum:
         self._end, self._looks = iterations + STEERING.window, len(residuals)
         left = least / self._last
         if left > STEERING.little:
-            self.damping = min(STEERING.heavier * self.damping, 1.0)
+            if left >= 1:
+                self._change = STEERING.heavier
+            elif left > self._left:
+                self._change = 1 / self._change
+            self.damping = min(self._change * self.damping, 1.0)
         elif left < STEERING.much:
             self.damping *= STEERING.lighter
-        self._last = least
+            self._change = STEERING.heavier
+        self._last, self._left = least, left
