@@ -39,7 +39,7 @@ class Momentum:
     def __init__(self, bounded: bool):
         self.bounded, self.damping = bounded, STEERING.damping if bounded else 0.0
         self._end, self._looks, self._last = STEERING.window, 0, np.inf
-        self._left, self._change = np.inf, STEERING.heavier  # of the last window with little progress; factor after it
+        self._left, self._change = np.inf, STEERING.heavier  # by the last window; factor of the last change
         self.restart()
 
     def restart(self) -> None:
