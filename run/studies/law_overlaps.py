@@ -60,8 +60,8 @@ def main(scene: str, n: str, steps: int, every: int) -> None:
         same = [row for row in rows if (row["law"], row["tol"]) == (law, tol)]
         made, net = ([row[name] for row in same] for name in ("overlap [mm]", "less opening [mm]"))
         shown = f"{max(net):20.4f} {statistics.median(net):7.4f}" if law == "relaxation" else f"{'':28}"
-        solved = sum(row["converged"] for row in same)
-        print(f"{law:10} {tol:7.0e} {max(made):18.4f} {statistics.median(made):7.4f} {shown} {solved:6d} of {len(same)}")
+        solved = f"{sum(row['converged'] for row in same):6d} of {len(same)}"
+        print(f"{law:10} {tol:7.0e} {max(made):18.4f} {statistics.median(made):7.4f} {shown} {solved}")
     record("law_overlaps", {**about, "words": words}, rows)
 
 
