@@ -190,8 +190,10 @@ class Stepper:
         with log.phase("search"):
             velocity, depth = self.system.velocity(impulse), TURNED * options.delta
             found = find_turned(self.world, self.contacts, velocity, options.dt, depth, options.run.recovery_speed)
+        if found is None:
+            return None
         self._corrections += 1
-        return None if found is None else (found, self._remembered(impulse))
+        return found, self._remembered(impulse)
 
     def _remembered(self, impulse: np.ndarray) -> ImpulseMemory:
         """A memory of these impulses of the present contacts."""

@@ -89,7 +89,7 @@ def test_bodies_that_keep_apart_are_left_alone():
 
 
 def test_the_gap_at_the_start_leads_to_that_of_the_end():
-    """With velocities that send grains into each other: gap + dt times the normal velocity is the overlap of the end."""
+    """With velocities that send grains into each other: gap + dt times normal velocity is the gap of the end."""
     world, contacts, velocity, found = found_of(MPI.COMM_SELF)
     end = find_contacts(advanced(world, velocity, DT), 0.0)
     new = found.take(np.isin(found.key, end.key) & ~np.isin(found.key, contacts.key))
