@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
+
 import numpy as np
 
 from dem import quaternion
@@ -26,6 +29,14 @@ def advance(world: World, velocity: Floats, dt: float) -> None:
     world.time += dt
     world.step += 1
     together(world.comm, "motion of a large body", lambda: _follow_motions(world))
+
+
+def advanced(world: World, velocity: Floats, dt: float) -> World:
+    """The world that `advance` leads to; this one stays as it is. Collective."""
+    after = copy(world)
+    after.grains, after.large = replace(world.grains), replace(world.large)
+    advance(after, velocity, dt)
+    return after
 
 
 def _follow_motions(world: World) -> None:

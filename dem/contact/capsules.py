@@ -1,6 +1,11 @@
-"""Narrow phase of capsules: one or two points, or more where two of them cross at a small angle.
+"""Narrow phase of capsules: points at the ends of what lies side by side, and the closest point between them.
 
 A capsule is all that lies within its radius of a core segment: centre (m, 3), unit axis (m, 3), half length (m,).
+
+Every point within reach is a contact, not only the closest: capsules that turn may touch in another point at the end
+of the step. Ends alone do not hold apart capsules that cross between them, as their normals lean to the side: an end
+that moves sideways gets away from the other core while the crossing comes closer. The closest point alone does not
+hold back an end that turns towards the other.
 """
 
 from __future__ import annotations
@@ -9,7 +14,6 @@ import numpy as np
 
 from dem.arrays import Floats, Ints
 from dem.contact.narrow import (
-    FLUSH,
     Manifold,
     Touch,
     across,
@@ -24,6 +28,9 @@ from dem.quaternion import cross
 
 #: Ends of core segments that face each other within this share of the length are one contact.
 SNAP = 1e-6
+#: The closest point is a contact of its own if it is closer than the ends by this share of the lesser radius (of the
+#: least half extent). Bodies at rest side by side, which rock by less, keep the contacts of their ends alone.
+DISTINCT = 1e-4
 
 
 def capsule_plane(
@@ -64,9 +71,9 @@ def capsule_capsule(
     crossing = _crossing(first, second)
     closest = _least([*ends, crossing])
     lowest = np.min([np.where(mask, end.gap, np.inf) for end, mask in zip(ends, beside)], axis=0)
-    flush = lowest <= closest.gap + _tolerance(delta, radius, other_radius)
-    shown = [flush & mask & (end.gap <= delta) for end, mask in zip(ends, beside)]
-    return _manifold([*ends, closest], [*shown, ~flush & (closest.gap <= delta)])
+    distinct = lowest > closest.gap + DISTINCT * np.minimum(radius, other_radius)
+    shown = [mask & (end.gap <= delta) for end, mask in zip(ends, beside)]
+    return _manifold([*ends, closest], [*shown, distinct & (closest.gap <= delta)])
 
 
 def capsule_box(
@@ -82,8 +89,8 @@ def capsule_box(
     """Capsules and boxes: centres, frames (m, 3, 3), half extents (m, 3).
 
     A capsule that lies over a face touches it at both ends of the stretch that is over the face, features 0 and 1.
-    Otherwise, feature 2 is the point where it is closest to the box. A core that meets the box is pushed out through
-    the face for which that is the shortest way.
+    Where neither is as close as the capsule is, feature 2 is the point where it is closest to the box. A core that
+    meets the box is pushed out through the face for which that is the shortest way.
     """
     rows = np.arange(len(center))
     middle = ((center - box_center)[:, None, :] @ turn)[:, 0]
@@ -94,14 +101,11 @@ def capsule_box(
     apart = np.concatenate([low - half, -(low + np.abs(way)) - half], axis=1)  # of the six faces
     slack = SNAP * (half_length + half.min(axis=1))
     face = (apart >= apart.max(axis=1, keepdims=True) - SNAP * slack[:, None]).argmax(axis=1)
-    separation = apart[rows, face]
     k, sign = face % 3, np.where(face < 3, 1.0, -1.0)
 
     at = _closest_to_box(start, way, half)
     closest = sphere_box(center + ((2.0 * at - 1.0) * half_length)[:, None] * axis, radius, box_center, turn, half)
-    distance = closest.gap + radius
-    meets = distance <= 0.0
-    distance = np.where(meets, separation, distance)
+    meets = closest.gap <= -radius
 
     # The stretch of the core over the face: clipped with the slabs of the two other axes.
     begin, end = np.zeros(len(center)), np.ones(len(center))
@@ -116,17 +120,11 @@ def capsule_box(
         gap = sign * (start[rows, k] + place * way[rows, k]) - half[rows, k] - radius
         ball = center + ((2.0 * place - 1.0) * half_length)[:, None] * axis
         stretch.append(Touch(ball + (radius + 0.5 * gap)[:, None] * normal, normal, gap))
-    tolerance = _tolerance(delta, radius, half.min(axis=1))
-    lowest = np.minimum(stretch[0].gap, stretch[1].gap) + radius
-    flush = (separation >= distance - tolerance) & (lowest <= distance + tolerance)
-    flush = over & (flush | meets)
+    lowest = np.where(over, np.minimum(stretch[0].gap, stretch[1].gap), np.inf)
+    distinct = (lowest > closest.gap + DISTINCT * np.minimum(radius, half.min(axis=1))) & ~(over & meets)
     long = (end - begin) * half_length > slack
     near = [touch.gap <= delta for touch in (*stretch, closest)]
-    return _manifold([*stretch, closest], [flush & near[0], flush & near[1] & long, ~flush & near[2]])
-
-
-def _tolerance(delta: Floats, size: Floats, other_size: Floats) -> Floats:
-    return FLUSH * delta + SNAP * np.minimum(size, other_size)
+    return _manifold([*stretch, closest], [over & near[0], over & near[1] & long, distinct & near[2]])
 
 
 def _manifold(touches: list[Touch], shown: list[np.ndarray]) -> Manifold:

@@ -86,7 +86,7 @@ def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | 
     i, j = i[pair], j[pair]
     key = table.keys(i, j, feature)
     a, b = table.row[i], table.row[j]
-    order = _order(world, near, a, b, key)
+    order = contact_order(world, near, a, b, key)
     order = order[_gives_way(world, near, a, b, touch)[order]]
     a, b = a[order], b[order]
     owner = np.minimum(a, b)
@@ -105,7 +105,7 @@ def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | 
     )
 
 
-def _order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints) -> Ints:
+def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints) -> Ints:
     """The order of contacts of bodies in the rows a, b (nc,): first those whose solution needs no other rank, of bodies
     that this rank owns or whose motion is prescribed; each part by the row of the owner and by key."""
     rows = len(near.bodies)

@@ -18,6 +18,7 @@ from dem.step import Step
 from dem.stepper import advance
 from dem.system import ContactSystem
 from dem.together import SceneError
+from dem.turning import find_turned
 from dem.world import World
 from pctt import ccp, log
 from pctt.run.dump import Dump
@@ -25,6 +26,9 @@ from pctt.run.settings import Options
 
 #: An overlap by a contact that the search did not foresee is solved for if it would be deeper than this part of delta.
 OVERRUN = 0.01
+
+#: An overlap that bodies make as they turn is corrected if it is deeper than this part of delta, so many times a step.
+TURNED, CORRECTIONS = 0.1, 3
 
 
 class Solved(NamedTuple):
@@ -64,6 +68,7 @@ class Stepper:
     ):
         self.options, self.world, self.memory, self.newton, self.dump = options, world, memory, newton, dump
         self._problem: ccp.ConeProblem | None = None
+        self._corrections = 0  # of the present step
 
     def __enter__(self) -> Stepper:
         return self
@@ -88,7 +93,8 @@ class Stepper:
         problem, guess = self._assemble(self._search(), self.memory)
         with log.phase("solve"):
             solved = self.solve(problem, guess)
-        while again := self._overrun(problem, solved.result.impulse):
+        self._corrections = 0
+        while again := self._overrun(problem, solved.result.impulse) or self._turned(solved.result.impulse):
             problem, guess = self._assemble(*again)
             with log.phase("solve"):
                 solved = self.solve(problem, guess).after(solved)
@@ -173,11 +179,27 @@ class Stepper:
             with cone_problem(system, world.comm) as beyond:
                 opening = (beyond.velocity_of(problem.momentum(impulse)) + beyond.r)[:, 0]
                 closes = options.dt * beyond.min(opening.min(initial=0.0)) < -OVERRUN * options.delta
-        if not closes:
+        return (wider, self._remembered(impulse)) if closes else None
+
+    def _turned(self, impulse: np.ndarray) -> tuple[Contacts, ImpulseMemory] | None:
+        """The contacts, with those that overlap at the end of the step because bodies turn, and the impulses so far.
+        None if there are none, or after so many corrections."""
+        if self._corrections == CORRECTIONS:
             return None
-        memory = ImpulseMemory(world.comm)
+        options = self.options
+        with log.phase("search"):
+            velocity, depth = self.system.velocity(impulse), TURNED * options.delta
+            found = find_turned(self.world, self.contacts, velocity, options.dt, depth, options.run.recovery_speed)
+        if found is None:
+            return None
+        self._corrections += 1
+        return found, self._remembered(impulse)
+
+    def _remembered(self, impulse: np.ndarray) -> ImpulseMemory:
+        """A memory of these impulses of the present contacts."""
+        memory = ImpulseMemory(self.world.comm)
         memory.remember(self.system.key, impulse, self.system.frame)
-        return wider, memory
+        return memory
 
     def records(self) -> dict[str, float]:
         """The records of the last step by name; collective. SceneError if the scene's own `record` fails."""

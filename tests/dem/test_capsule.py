@@ -9,8 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from dem import quaternion
-from dem.contact.capsules import capsule_box, capsule_capsule, capsule_plane
-from dem.contact.narrow import FLUSH
+from dem.contact.capsules import DISTINCT, capsule_box, capsule_capsule, capsule_plane
 from dem.shapes import Capsule, Sphere, capsule_mass, mass_properties, moved
 
 DELTA = 0.1
@@ -95,6 +94,32 @@ def test_capsules_with_cores_that_meet_are_pushed_apart_across_both():
     np.testing.assert_allclose(gaps, -0.5)
 
 
+def test_capsules_that_cross_at_a_small_angle_touch_at_the_crossing_and_at_all_ends():
+    one, other = capsule((0, 0, 0), (1, 0, 0), 1, 0.3), capsule((0, 0, 0.65), (np.cos(0.2), np.sin(0.2), 0), 1, 0.3)
+    feature, point, normal, gaps = touch(one, other)
+    assert sorted(feature) == [0, 1, 2, 3, 4]
+    side = np.sin(0.2)  # how far an end is beside the other core
+    np.testing.assert_allclose(gaps[feature == 4], 0.05)
+    np.testing.assert_allclose(gaps[feature < 4], np.hypot(0.65, side) - 0.6)
+    np.testing.assert_allclose(normal[feature == 4], [[0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(normal[feature < 4, 2]), 0.65 / np.hypot(0.65, side))
+
+
+def test_a_capsule_that_leans_on_the_edge_of_a_box_also_touches_over_the_face():
+    """Its core passes the edge x = 1, z = 0.2 at the distance r + gap, and leans by 0.05 to the face."""
+    slab, radius, gap = body((0, 0, 0), np.eye(3), (1, 1, 0.2)), 0.3, 0.02
+    lean = np.array([np.cos(0.05), 0, -np.sin(0.05)])
+    center = np.array([1, 0, 0.2]) + (radius + gap) * np.array([np.sin(0.05), 0, np.cos(0.05)])
+    feature, point, normal, gaps = touch(capsule(center, lean, 0.5, radius), slab)
+    np.testing.assert_array_equal(np.sort(feature), [0, 1, 2])
+    np.testing.assert_allclose(gaps[feature == 2], gap)
+    height = (radius + gap) / np.cos(0.05) - radius  # over the edge
+    np.testing.assert_allclose(gaps[feature == 1], height, atol=1e-6)
+    np.testing.assert_allclose(normal[feature < 2], [[0, 0, -1]] * 2, atol=1e-15)
+    at_end = center[2] + 0.5 * np.sin(0.05) - 0.2 - radius
+    np.testing.assert_allclose(gaps[feature == 0], at_end, atol=1e-12)
+
+
 @pytest.mark.parametrize("gap", [0.05, 0.0, -0.05])
 @pytest.mark.parametrize(("x", "stretch"), [(0.0, (-0.5, 0.5)), (0.9, (0.4, 1.0)), (-1.3, (-1.0, -0.8))])
 def test_a_capsule_on_a_face_touches_at_the_ends_of_the_stretch_over_it(gap, x, stretch):
@@ -168,9 +193,9 @@ def test_the_least_gap_is_the_distance_and_points_lie_between_the_surfaces(pair)
     if gap > DELTA + 1e-7:
         assert len(gaps) == 0
     elif len(gaps) == 0:
-        assert gap > (1 - FLUSH) * DELTA - 1e-5
+        assert gap > DELTA - DISTINCT - 1e-5
     else:
-        assert -1e-6 <= gaps.min() - gap <= FLUSH * DELTA + 1e-5
+        assert -1e-6 <= gaps.min() - gap <= DISTINCT + 1e-5
         assert gaps.max() <= DELTA
         assert len(set(feature)) == len(feature)
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, rtol=1e-12)

@@ -7,10 +7,12 @@ import pytest
 from drive import HALF, RADIUS, sphere, steps
 from mpi4py import MPI
 
+from dem import quaternion
 from dem.motion import Glide, Rotation
+from dem.record import energy
 from dem.scene import Scene
 from dem.scenes.mixer import Mixer
-from dem.shapes import Box, Plane
+from dem.shapes import Box, Capsule, Plane
 from dem.start import new_world
 
 DT, DELTA = 0.025, 0.01  #: at 4 m/s a body moves ten times the contact distance in a step
@@ -83,3 +85,50 @@ def test_spheres_that_fall_together_do_not_run_into_the_one_that_is_stopped():
 def test_spheres_poured_onto_a_turning_paddle_do_not_overlap():
     world = new_world(Mixer(n=1).build(), MPI.COMM_SELF)
     assert worst_overlap(world, 20, tol=1e-4) < 0.01 * RADIUS
+
+
+def capsules_in_a_box(half_length, tip, seed=0, radius=RADIUS, dt=0.01):
+    """Capsules that fly to the middle and spin; their tips move by `tip` radii in a step."""
+    rng, far = np.random.default_rng(seed), 2.06 * (radius + half_length)
+    scene = Scene(0.3, gravity=(0, 0, 0))
+    sides = np.concatenate([np.eye(3), -np.eye(3)])
+    scene.add_body("box", [Plane(tuple(-side), tuple(1.6 * far * side)) for side in sides])
+    place = far * (np.indices((3, 3, 3)).reshape(3, -1).T - 1.0)
+    turns, spin = rng.normal(size=(27, 4)), rng.normal(size=(27, 3))
+    spin *= tip * radius / (radius + half_length) / dt / np.linalg.norm(spin, axis=1, keepdims=True)
+    scene.add_capsules(
+        place, radius, half_length, 1000.0, quaternions=turns, velocity=-2.0 * place, angular_velocity=spin
+    )
+    return new_world(scene, MPI.COMM_SELF)
+
+
+@pytest.mark.parametrize("half_length", [0.6, 1.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_spinning_capsules_do_not_run_into_each_other(half_length, seed):
+    """The tips move by a third of a radius in a step. With the ends alone as contacts it is half a radius."""
+    world = capsules_in_a_box(half_length, 1 / 3, seed)
+    kinetic, _ = energy(world.grains, world.gravity)
+    for step in steps(world, 40, 0.01, tol=1e-6, delta=DELTA):
+        assert step.contacts.gap.min(initial=0.0) > -0.15 * RADIUS
+        now, _ = energy(world.grains, world.gravity)
+        assert now < 1.001 * kinetic  # the gyroscopic torque is explicit
+        kinetic = now
+
+
+@pytest.mark.parametrize("angle", [0.02, 0.05, 0.1])
+def test_a_capsule_that_spins_over_another_stops_on_it(angle):
+    """Capsules that cross in the middle, at a small angle. The upper one spins about the line between the centres and
+    sinks until it touches the lower one: the spin takes the ends aside, and the distance of the cores is the height."""
+    half_length, gap, dt = 3 * RADIUS, 0.05 * RADIUS, 0.01
+    speed, spin = 0.2 * RADIUS / dt, RADIUS / 3 / half_length / dt
+    scene = Scene(0.0, gravity=(0, 0, 0))
+    lying = quaternion.exponential(np.array([0.0, np.pi / 2, 0.0]))
+    scene.add_body("below", [Capsule(RADIUS, half_length, quaternion=tuple(lying))])
+    turn = quaternion.multiply(quaternion.exponential(np.array([0.0, 0.0, angle])), lying)
+    motion = {"velocity": (0, 0, -speed), "angular_velocity": (0, 0, spin)}
+    scene.add_capsules([0, 0, 2 * RADIUS + gap], RADIUS, half_length, 1000.0, quaternions=turn, **motion)
+    world = new_world(scene, MPI.COMM_SELF)
+    for _ in steps(world, 1, dt, delta=0.1 * RADIUS):
+        pass
+    assert world.grains.position[0, 2] == pytest.approx(2 * RADIUS, abs=1e-6)
+    np.testing.assert_allclose(world.grains.velocity[0], [0, 0, -gap / dt, 0, 0, spin], atol=1e-4)

@@ -1,0 +1,128 @@
+"""Capsules and boxes whose tips move by a part of their radius in a step do not run into each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drive import RADIUS
+from mpi4py import MPI
+from several_ranks import alone
+
+from dem.contact import find_contacts
+from dem.impulses import ImpulseMemory
+from dem.record import energy
+from dem.scene import Scene
+from dem.shapes import Plane
+from dem.start import new_world
+from dem.stepper import advanced
+from dem.turning import find_turned
+from pctt.run.options import read_options
+from pctt.run.stepper import Stepper
+
+DT, DELTA = 0.01, 0.1 * RADIUS
+
+
+def spinning(shape, tip, seed=0, half_length=3 * RADIUS, pitch=2.06):
+    """Grains in a box without gravity that fly to the middle and spin; their tips move by `tip` radii in a step."""
+    rng, far = np.random.default_rng(seed), pitch * (RADIUS + half_length)
+    scene = Scene(0.3, gravity=(0, 0, 0))
+    sides = np.concatenate([np.eye(3), -np.eye(3)])
+    scene.add_body("box", [Plane(tuple(-side), tuple(1.6 * far * side)) for side in sides])
+    place = far * (np.indices((3, 3, 3)).reshape(3, -1).T - 1.0)
+    turns, spin = rng.normal(size=(27, 4)), rng.normal(size=(27, 3))
+    spin *= tip * RADIUS / (RADIUS + half_length) / DT / np.linalg.norm(spin, axis=1, keepdims=True)
+    motion = {"quaternions": turns, "velocity": -2.0 * place, "angular_velocity": spin}
+    if shape == "capsules":
+        scene.add_capsules(place, RADIUS, half_length, 1000.0, **motion)
+    else:
+        scene.add_boxes(place, (RADIUS, RADIUS, half_length), 1000.0, **motion)
+    return scene
+
+
+def stepper_of(scene):
+    words = {"scene_n": "1", "dt": str(DT), "delta": str(DELTA), "ccp_type": "apgd", "ccp_tol": "1e-6"}
+    world = new_world(scene, MPI.COMM_SELF)
+    return Stepper(read_options(words, MPI.COMM_SELF), world, ImpulseMemory(MPI.COMM_SELF))
+
+
+@pytest.mark.parametrize("shape", ["capsules", "boxes"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_spinning_grains_do_not_run_into_each_other(shape, seed):
+    """Without a correction capsules overlap by up to .05 of the radius, boxes by .15 of the least half extent."""
+    stepper = stepper_of(spinning(shape, 1 / 3, seed))
+    kinetic, _ = energy(stepper.world.grains, stepper.world.gravity)
+    for _ in range(40):
+        assert stepper.step()["converged"]
+        assert stepper.contacts.gap.min(initial=0.0) > -0.03 * RADIUS
+        now, _ = energy(stepper.world.grains, stepper.world.gravity)
+        assert now < 1.001 * kinetic  # the gyroscopic torque is explicit
+        kinetic = now
+
+
+@pytest.mark.parametrize("angle", [0.2, 0.4])
+def test_a_lever_stops_with_its_tip_on_the_floor(angle):
+    """A box tips about an edge that rests on the floor, and would turn in the step by `angle`, half of it beneath the
+    floor. Its corners go along circles: with the gaps of the start alone they end beneath the floor at 0.4."""
+    length, lean, thick = 10 * RADIUS, 0.5 * angle, 0.1 * RADIUS
+    axis, up = np.array([np.cos(lean), 0, np.sin(lean)]), np.array([-np.sin(lean), 0, np.cos(lean)])
+    middle = 0.5 * length * axis + thick * up + [0, 0, 1e-9]
+    spin = np.array([0.0, angle / DT, 0.0])
+    scene = Scene(0.0, gravity=(0, 0, 0))
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    turn = (np.cos(lean / 2), 0, -np.sin(lean / 2), 0)
+    motion = {"quaternions": turn, "velocity": np.cross(spin, middle), "angular_velocity": spin}
+    scene.add_boxes(middle, (0.5 * length, RADIUS, thick), 1000.0, **motion)
+    stepper = stepper_of(scene)
+    stepper.step()
+    stepper.step()  # whose contacts are those of the end of the first
+    assert stepper.contacts.gap.min() > -0.1 * DELTA - 1e-6
+
+
+def test_bodies_that_keep_apart_are_left_alone():
+    """Far from each other, or turning less than the overlap that is allowed, or spheres."""
+    world = new_world(spinning("boxes", 1 / 3), MPI.COMM_SELF)
+    contacts, velocity = find_contacts(world, DELTA, DT), np.concatenate([world.grains.velocity, np.zeros((1, 6))])
+    assert find_turned(world, contacts, velocity, DT, 0.01 * RADIUS, np.inf) is None
+    assert find_turned(world, contacts, 100 * velocity, DT, 100 * RADIUS, np.inf) is None
+    assert world.step == 0
+    assert find_turned(world, contacts, np.nan * velocity, DT, 0.01 * RADIUS, np.inf) is None
+
+
+def test_the_gap_at_the_start_leads_to_that_of_the_end():
+    """With velocities that send grains into each other: gap + dt times normal velocity is the gap of the end."""
+    world, contacts, velocity, found = found_of(MPI.COMM_SELF)
+    end = find_contacts(advanced(world, velocity, DT), 0.0)
+    new = found.take(np.isin(found.key, end.key) & ~np.isin(found.key, contacts.key))
+    assert len(new) > 0
+    assert set(contacts.key) <= set(found.key)
+    moves = np.concatenate([velocity[:27], np.zeros((1, 6))])
+    place = found.near.bodies.position
+    at_point = [moves[row, :3] + np.cross(moves[row, 3:], new.point - place[row]) for row in (new.a, new.b)]
+    change = DT * np.einsum("ci,ci->c", new.normal, at_point[1] - at_point[0])
+    gap = dict(zip(end.key, end.gap))
+    np.testing.assert_allclose(new.gap + change, [gap[key] for key in new.key], atol=1e-12)
+
+
+def found_of(comm):
+    """A world, its contacts, velocities (owned, 6) with which its capsules turn and fly into each other, and what is
+    found then."""
+    world = new_world(spinning("capsules", 2.0, pitch=2.02), comm)
+    world.grains.velocity *= [12, 12, 12, 1, 1, 1]
+    velocity = np.concatenate([world.grains.velocity, np.zeros((world.owned - len(world.grains), 6))])
+    contacts = find_contacts(world, DELTA, DT)
+    found = find_turned(world, contacts, velocity, DT, 0.01 * RADIUS, np.inf)
+    return world, contacts, velocity, found
+
+
+def table_of(comm):
+    """Keys, gaps and points of what is found, of all ranks, by key."""
+    _, _, _, found = found_of(comm)
+    key, gap, point = (np.concatenate(comm.allgather(values)) for values in (found.key, found.gap, found.point))
+    order = np.argsort(key)
+    return key[order], gap[order], point[order]
+
+
+@pytest.mark.parallel(2, 3)
+def test_what_is_found_does_not_depend_on_the_number_of_ranks(ranks):
+    for here, there in zip(table_of(MPI.COMM_WORLD), alone(table_of)):
+        np.testing.assert_allclose(here, there, atol=1e-12, err_msg=f"{ranks} ranks")
