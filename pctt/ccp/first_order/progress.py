@@ -20,7 +20,7 @@ class Steering:
     """When a method has stalled."""
 
     patience: int = 5000  #: without progress [iterations]: these methods have plateaus of thousands
-    patience_with_law: int = 1500  #: the same for Coulomb's law, where another method takes over [iterations]
+    patience_with_law: int = 3000  #: the same for Coulomb's law, where another method takes over [iterations]
     patience_in_single: int = 300  #: the same in single precision, where double precision takes over [iterations]
     progress: float = 0.99  #: a natural residual below this part of the best one is progress; rounding alone is not
 
