@@ -67,7 +67,7 @@ class Dump:
             self._write_fclib(path, system, problem, guess, result, asked)
 
         if problem.size and wanted:
-            path = problem_path(self.run.dump_problem, number, problem.size)
+            path = Path(self.run.dump_problem) / f"step{number:06d}_{problem.size}contacts.h5"
             binary = path.with_suffix(".petsc")
             _write(path, comm, as_fclib)
             files["dumped"] = [str(path)]
@@ -207,16 +207,6 @@ def _map(system: ContactSystem, world: World, dynamic: np.ndarray) -> PETSc.Mat:
     return H
 
 
-# -- options -------------------------------------------------------------------------------------------------
-
-
-def problem_path(place: str, step: int, contacts: int) -> Path:
-    """The FCLIB file of a step: in the folder ``place``, or ``place`` itself where that has {step} in it."""
-    if "{" not in place:
-        return Path(place) / f"step{step:06d}_{contacts}contacts.h5"
-    return Path(place.format(step=step, contacts=contacts))
-
-
 def dump_steps(run: Run) -> list[int]:
     """The steps of ``-dump_steps``; OptionError if they are not whole numbers."""
     try:
@@ -226,23 +216,3 @@ def dump_steps(run: Run) -> list[int]:
     if min(steps, default=1) < 1:
         raise OptionError(f"-dump_steps {run.dump_steps}: allowed are whole numbers >= 1 with commas between")
     return steps
-
-
-def dump_folder(run: Run) -> Path:
-    """The folder above all that ``-dump_problem`` writes; raises OptionError for options that do not fit."""
-    place = run.dump_problem
-    if dump_steps(run) and not place:
-        raise OptionError(f"-dump_steps {run.dump_steps}: it needs -dump_problem FOLDER, which says where to write")
-    if place and run.problem:
-        raise OptionError(f"-dump_problem {place}: -problem {run.problem} makes no steps; allowed is one of the two")
-    if "{" in place:
-        try:
-            two = {problem_path(place, step, 1) for step in (1, 2)}
-        except (LookupError, ValueError, AttributeError):
-            two = set()
-        if len(two) < 2 or two.pop().suffix not in (".h5", ".hdf5"):
-            raise OptionError(
-                f"-dump_problem {place}: allowed is a folder, or a file name that ends in .h5 or .hdf5 with {{step}} "
-                "in it, and {contacts} if wanted, such as problems/{step:06d}_{contacts}.h5"
-            )
-    return Path(place.partition("{")[0] + "x").parent if "{" in place else Path(place)
