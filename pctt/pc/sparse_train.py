@@ -34,13 +34,15 @@ class SparseTrain:
     tree : slots that are kept from structure to structure
     """
 
+    slots: SlottedMatrix
+
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
         self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
         self._forget_structure()
         self._forget_trains()
 
     def _forget_structure(self) -> None:
-        self.slots: SlottedMatrix | None = None
+        self._begun = False  # whether there are slots for the present structure
         self.hierarchy: SparseHierarchy | None = None
 
     def _forget_trains(self) -> None:
@@ -67,10 +69,9 @@ class SparseTrain:
         if self.options.reuse == "none":
             self._forget_structure()
             self._forget_trains()
-        first = self.slots is None
+        first = not self._begun
         if first:
             self._take_slots(P)
-        assert self.slots is not None
         try:
             self.slots.scale(P)
             singular = False
@@ -93,11 +94,9 @@ class SparseTrain:
 
     def _try_new(self, P: PETSc.Mat, rank: int, kept: Inverse | None) -> bool:
         """Make a train for P and use it, or use the kept train if it is as good; False if no train is positive."""
-        assert self.slots is not None
         if self.hierarchy is None:
             with PETSc.Log.Event("TTBuild"):
-                self._list_block_pairs(P)
-        assert self.hierarchy is not None
+                self.hierarchy = self._block_pairs(P)
         self.hierarchy.set_values(self.slots.load(P))
         warm = self.compression is not None
         with PETSc.Log.Event("TTCompress"):
@@ -142,7 +141,6 @@ class SparseTrain:
 
     def _left(self, P: PETSc.Mat) -> float:
         """||w - S X w|| / ||w|| for a random vector w, where S is the scaled matrix."""
-        assert self.slots is not None
         slots = self.slots
         w = np.zeros((slots.capacity, slots.block))
         w[slots.place] = np.random.default_rng(self.options.seed).standard_normal((len(slots.place), slots.block))
@@ -157,23 +155,20 @@ class SparseTrain:
 
     def _take_slots(self, P: PETSc.Mat) -> None:
         """Give slots to P's block rows; use those of the last structure if they fit."""
-        if self.tree is not None and not self.tree.follow(P, self._agree):
+        if self.tree is not None and not self.tree.follow(P, lambda fits: self.comm.allreduce(fits, op=MPI.LAND)):
             self.account.resets += 1
             self._forget_trains()
         if self.tree is None:
             self.tree = Slots(P, self.options.leaf, self.options.order)
         self.slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaling == "block")
+        self._begun = True
 
-    def _list_block_pairs(self, P: PETSc.Mat) -> None:
-        assert self.slots is not None
+    def _block_pairs(self, P: PETSc.Mat) -> SparseHierarchy:
         assert self.tree is not None
-        self.slots.list_blocks(P)
         slots = self.slots
+        slots.list_blocks(P)
         modes = self.tree.modes or choose_modes(slots.size, self.options.leaf)
-        self.hierarchy = SparseHierarchy(slots.rows, slots.columns, modes, slots.block, self._add, self.comm.bcast)
-
-    def _agree(self, here: bool) -> bool:
-        return bool(self.comm.allreduce(here, op=MPI.LAND))
+        return SparseHierarchy(slots.rows, slots.columns, modes, slots.block, self._add, self.comm.bcast)
 
     def _compress(self, rank: int, warm: bool) -> Compression | Cross:
         assert self.hierarchy is not None
@@ -199,7 +194,6 @@ class SparseTrain:
     # -- application ----------------------------------------------------------------------------------------
 
     def _prepare_apply(self, train: Train) -> None:
-        assert self.slots is not None
         slots = self.slots
         if self._apply is None:
             bs = slots.block
@@ -224,7 +218,6 @@ class SparseTrain:
 
     def _to_slots(self, x: np.ndarray) -> np.ndarray:
         """L^-1 x in slot order (capacity bs,), in a buffer that the next call overwrites."""
-        assert self.slots is not None
         slots = self.slots
         if slots.capacity > len(slots.place):
             self._local[:] = 0.0
@@ -234,7 +227,6 @@ class SparseTrain:
 
     def _from_slots(self, z: np.ndarray) -> np.ndarray:
         """L^-T z in the order of the block rows."""
-        assert self.slots is not None
         slots = self.slots
         np.matmul(slots.root.transpose(0, 2, 1), z.reshape(self._scaled.shape), out=self._scaled)
         return self._scaled[slots.place].ravel()
@@ -242,7 +234,6 @@ class SparseTrain:
     def _inverse_times(self, x: np.ndarray) -> np.ndarray:
         """This rank's part of X x in slot order, from its part of x."""
         assert self.inverse is not None
-        assert self.slots is not None
         assert self._apply is not None
         self.slots.gather_slots(x, self._whole)
         self._apply.x[: self._apply.n] = self._whole
