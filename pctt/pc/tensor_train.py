@@ -31,25 +31,21 @@ POOR = 0.5  # an inverse with a larger residual causes a warning
 
 
 class TensorTrain(PythonPC):
-    """The python PC; see the module and ``Options``. It works on symmetric positive definite Mats of any block size.
-
-    made : the maker of trains, for sparse matrices or for matrices given by their entries
-    """
+    """The python PC; see the module and ``Options``. It works on symmetric positive definite Mats of any block size."""
 
     options_class = Options
     options_prefix = "pc_tt_"
     options: Options
+    policy: RankPolicy
+    made: SparseTrain | EntriesTrain  #: the maker of trains
     sparse_train: type[SparseTrain] = SparseTrain
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
         self.account = Account()
-        self.policy: RankPolicy | None = None
         self.rank = 1
         self.symmetric = True
-        self.made: SparseTrain | EntriesTrain | None = None
-        self._jacobi: PETSc.PC | None = None
-        self._diagonal: PETSc.Mat | None = None  # the matrix of block Jacobi
+        self._own: list[PETSc.Object] = []  # block Jacobi and its matrix
 
     # -- set-up ---------------------------------------------------------------------------------------------
 
@@ -68,18 +64,18 @@ class TensorTrain(PythonPC):
         self.release()
         self._jacobi = PETSc.PC().create(P.comm)
         self._jacobi.setType(PETSc.PC.Type.PBJACOBI)
+        self._own = [self._jacobi]
 
     def _begin_sparse(self, P: PETSc.Mat) -> None:
-        if not isinstance(self.made, SparseTrain):
+        if isinstance(getattr(self, "made", None), SparseTrain):
+            self.policy.forgive()  # a rank that failed on another matrix may work here
+        else:
+            cap = self.options.cap(SPARSE_RANK)
             self.made = self.sparse_train(self.comm, self.options, self.account, self.prefix)
-            self.policy = None
+            self.policy = RankPolicy((max(1, cap // LOWER), cap), self.options.rank == "auto")
+        assert isinstance(self.made, SparseTrain)
         self.made.begin(P)
         self._say_symmetry(is_symmetric(P))
-        if self.policy is None:
-            cap = self.options.cap(SPARSE_RANK)
-            self.policy = RankPolicy((max(1, cap // LOWER), cap), self.options.rank == "auto")
-        else:
-            self.policy.forgive()  # a rank that failed on another matrix may work here
 
     def _say_symmetry(self, symmetric: bool) -> None:
         self.symmetric = symmetric
@@ -88,8 +84,6 @@ class TensorTrain(PythonPC):
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Make a preconditioner of the rank that the policy chooses; if this fails, use block Jacobi."""
-        assert self.policy is not None
-        assert self.made is not None
         start = time.perf_counter()
         # all take the first process's choice, because figures may differ in the last bit
         self.rank = self.comm.bcast(self.policy.choose())
@@ -119,12 +113,12 @@ class TensorTrain(PythonPC):
             warnings.warn(f"{self.name}: {word}", stacklevel=2)
 
     def _make_block_jacobi(self, P: PETSc.Mat) -> None:
-        assert self._jacobi is not None
-        old, self._diagonal = self._diagonal, self._block_diagonal(P)
-        self._jacobi.setOperators(self._diagonal)
+        old, diagonal = self._own[1:], self._block_diagonal(P)
+        self._jacobi.setOperators(diagonal)
         self._jacobi.setUp()
-        if old is not None:
-            old.destroy()
+        self._own = [self._jacobi, diagonal]
+        for mat in old:
+            mat.destroy()
 
     def _block_diagonal(self, P: PETSc.Mat) -> PETSc.Mat:
         return block_diagonal(P, diagonal_blocks(P) if has_entries(P) else None)
@@ -134,10 +128,8 @@ class TensorTrain(PythonPC):
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x, where M is block Jacobi or the train."""
         if self.rank == 1:
-            assert self._jacobi is not None
             self._jacobi.apply(x, y)
             return
-        assert self.made is not None
         with PETSc.Log.Event("TTApply"):
             y.array_w[:] = self.made.times(x.array_r)
 
@@ -148,9 +140,7 @@ class TensorTrain(PythonPC):
 
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Report the seconds and the accuracy of the solve to the policy; ban a rank with which the method stalled."""
-        assert self.policy is not None
         reason, rank = ksp.getConvergedReason(), self.rank
-        assert self.made is not None
         spoilt = rank > 1 and solve_again(ksp, self._block_diagonal, self.P, b, x)
         if spoilt:  # other solves with this matrix must not use the train either
             self.rank = 1
@@ -191,19 +181,16 @@ class TensorTrain(PythonPC):
         ]
         lines += [] if self.symmetric else [NOT_SYMMETRIC]
         lines += [f"fell back: {why} ({a.fallbacks.count(why)} times)" for why in dict.fromkeys(a.fallbacks)]
-        if self.policy is not None:
-            figures = self.policy.figures.items()
-            costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
-            lines.append(f"seconds per digit: {costs or 'none measured yet'}")
-        return lines
+        figures = self.policy.figures.items()
+        costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
+        return [*lines, f"seconds per digit: {costs or 'none measured yet'}"]
 
     def _line(self) -> str:
-        if self.rank == 1 or self.made is None:
+        if self.rank == 1:
             return f"rank 1 (block Jacobi), set up in {self._setup_seconds:.2e} s"
         return f"{self.made.words()}, {self._setup_seconds:.2e} s"
 
     def release(self) -> None:
-        for thing in (self._jacobi, self._diagonal):
-            if thing is not None:
-                thing.destroy()
-        self._jacobi = self._diagonal = None
+        for thing in self._own:
+            thing.destroy()
+        self._own = []

@@ -58,7 +58,7 @@ class Dump:
         ``asked`` is the result of the solver that the user chose, ``result`` the one that the step uses. Returns the
         entries for the step's figures. FileError if a file cannot be written.
         """
-        comm, number = self._world.comm, self._world.step + 1
+        number = self._world.step + 1
         wanted = self.run.dump_problem and (not self._steps or number in self._steps)
         hard = not asked.converged and self._hard_left > 0
         files: dict[str, Any] = {"dumped": [], "hard_problem": ""}
@@ -69,15 +69,16 @@ class Dump:
         if problem.size and wanted:
             path = Path(self.run.dump_problem) / f"step{number:06d}_{problem.size}contacts.h5"
             binary = path.with_suffix(".petsc")
-            _write(path, comm, as_fclib)
+            _write(path, as_fclib)
             files["dumped"] = [str(path)]
             if problem.low_rank is None:  # else N is no sparse matrix
-                _write(binary, comm, lambda path: petsc_binary.write(path, problem))
+                _write(binary, lambda path: petsc_binary.write(path, problem))
                 files["dumped"].append(str(binary))
         if problem.size and hard:
             self._hard_left -= 1
             name = f"step{number:06d}_{problem.size}contacts_{asked.iterations}its.h5"
-            _write(self._place.now / HARD / name, comm, as_fclib)
+            self._place.make(HARD)
+            _write(self._place.now / HARD / name, as_fclib)
             files["hard_problem"] = str(self._place.folder / HARD / name)
         return files
 
@@ -136,18 +137,9 @@ class Dump:
         )
 
 
-def _write(path: Path, comm: MPI.Comm, write: Callable[[Path], None]) -> None:
-    """Let ``write`` make a file, and its folder before; collective. FileError if that fails."""
-    failure = None
-    if comm.rank == 0:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            failure = f"{path}: cannot write ({error.strerror})"
-    failure = comm.bcast(failure)
+def _write(path: Path, write: Callable[[Path], None]) -> None:
+    """Let ``write`` make a file; collective. FileError if that fails."""
     try:
-        if failure:
-            raise OSError(failure)
         write(path)
     except OSError as error:  # raised on all ranks alike
         raise FileError(str(error)) from None
