@@ -21,13 +21,17 @@ from pctt.pc.base import PythonPC
 from pctt.pc.entries_train import EntriesTrain
 from pctt.pc.mat import check_coordinates, is_symmetric
 from pctt.pc.rank_policy import RankPolicy
-from pctt.pc.second_solve import solve_again
 from pctt.pc.sparse_train import SparseTrain
 from pctt.pc.train_options import ENTRIES_RANK, SPARSE_RANK, Account, Options
 
 NOT_SYMMETRIC = "the matrix is not symmetric, so a train for its inverse may be useless"
 LOWER = 3  # if the cap fails or does not pay, the policy tries the cap divided by this
 POOR = 0.5  # an inverse with a larger residual causes a warning
+#: Reasons for the end of a Krylov method whose preconditioner is not positive definite.
+SPOILT = {
+    getattr(PETSc.KSP.ConvergedReason, f"DIVERGED_{name}")
+    for name in ("BREAKDOWN", "BREAKDOWN_BICG", "INDEFINITE_MAT", "INDEFINITE_PC", "NANORINF", "DTOL")
+}
 
 
 class TensorTrain(PythonPC):
@@ -141,10 +145,9 @@ class TensorTrain(PythonPC):
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Report the seconds and the accuracy of the solve to the policy; ban a rank with which the method stalled."""
         reason, rank = ksp.getConvergedReason(), self.rank
-        spoilt = rank > 1 and solve_again(ksp, self._block_diagonal, self.P, b, x)
-        if spoilt:  # other solves with this matrix must not use the train either
-            self.rank = 1
-            self._make_block_jacobi(self.P)
+        spoilt = rank > 1 and reason in SPOILT
+        if spoilt:
+            self._solve_again(ksp, b, x)
             what = f"{ksp.getType()} broke down ({reason}) at rank {rank}"
             self.account.fallbacks.append(f"{what}, solved again with block Jacobi")
         seconds = self._slowest(time.perf_counter() - self._solve_start)
@@ -165,6 +168,24 @@ class TensorTrain(PythonPC):
             sound = True
         self.policy.report(rank, self._setup_seconds + seconds, max(digits, 0.0), sound)
         self._setup_seconds = 0.0  # a second solve with the same matrix has no set-up
+
+    def _solve_again(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Solve from zero by the same method with block Jacobi, which other solves with this matrix then use too. The KSP
+        gets the outcome."""
+        self.rank = 1
+        self._make_block_jacobi(self.P)
+        again = PETSc.KSP().create(ksp.comm)
+        again.setType(ksp.getType())
+        again.setPCSide(ksp.getPCSide())
+        again.setNormType(ksp.getNormType())
+        rtol, atol, divtol, max_it = ksp.getTolerances()
+        again.setTolerances(rtol, atol, divtol, max_it)
+        again.pc.setType(PETSc.PC.Type.PBJACOBI)
+        again.setOperators(ksp.getOperators()[0], self._own[1])
+        again.solve(b, x)
+        ksp.setIterationNumber(ksp.getIterationNumber() + again.getIterationNumber())
+        ksp.setConvergedReason(again.getConvergedReason())
+        again.destroy()
 
     def _slowest(self, seconds: float) -> float:
         return self.comm.allreduce(seconds, op=MPI.MAX)
