@@ -170,8 +170,10 @@ class TensorTrain(PythonPC):
         self._setup_seconds = 0.0  # a second solve with the same matrix has no set-up
 
     def _solve_again(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Solve from zero by the same method with block Jacobi, which other solves with this matrix then use too. The KSP
-        gets the outcome."""
+        """Solve from zero by the same method with block Jacobi, which other solves with this matrix then use too.
+
+        The KSP gets the outcome.
+        """
         self.rank = 1
         self._make_block_jacobi(self.P)
         again = PETSc.KSP().create(ksp.comm)

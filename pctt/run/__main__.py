@@ -45,7 +45,7 @@ def main(comm: MPI.Comm) -> None:
         return
     refuse_stray(sys.argv[1:])
     options = read_options(database, comm)
-    if options.problem is not None:
+    if options.run.problem:
         solve_file(options, comm)
     else:
         simulate(options, comm)

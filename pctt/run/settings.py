@@ -116,10 +116,6 @@ class Options:
     coulomb: ccp.Coulomb | None
     demo: bool
 
-    @property
-    def problem(self) -> str | None:
-        return self.run.problem or None
-
     def compare_names(self) -> list[str]:
         return [name for name in self.run.compare.split(",") if name]
 

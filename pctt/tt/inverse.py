@@ -177,7 +177,7 @@ class Growing:
         x, z = self.x, self.z
         for k in range(len(x) - 1, 0, -1):
             self._solve(k)
-            new = self.galerkin.rest_right(self.residual, k, x[k])  # (z, m, n, b)
+            new = self.residual.rest_left(self.galerkin, k, x[k])  # (z, m, n, b)
             z[k] = self.residual.rest(k, x[k])
             _push_left(x, self.signs, k, self.most[k - 1], self.drop, new)
             z[k] = rows(z[k])

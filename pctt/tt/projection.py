@@ -80,9 +80,6 @@ class Projection:
             self.left[k], self.S[k], other.right[k], x
         )
 
-    def rest_right(self, other: Projection, k: int, x: Array) -> Array:
-        return other.rest_left(self, k, x)
-
     def _of_B(self, k: int, left: Array, right: Array) -> Array:
         assert self.B is not None
         return np.tensordot(np.tensordot(left, self.B[k], 1), right, (3, 1))
