@@ -50,22 +50,6 @@ def concatenate(parts: Sequence[Bodies]) -> Bodies:
     return Bodies(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
-def empty() -> Bodies:
-    """A table without rows."""
-    return Bodies(
-        id=np.zeros(0, np.int64),
-        position=np.zeros((0, 3)),
-        quaternion=np.zeros((0, 4)),
-        velocity=np.zeros((0, 6)),
-        mass=np.zeros(0),
-        inertia=np.zeros((0, 3)),
-        material=np.zeros(0, np.int64),
-        shape=np.zeros(0, np.int64),
-        size=np.zeros((0, 3)),
-        weight=np.zeros(0),
-    )
-
-
 def is_dynamic(bodies: Bodies) -> Bools:
     """Mask (n,) of the bodies that forces can move."""
     return np.isfinite(bodies.mass)

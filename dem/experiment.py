@@ -25,7 +25,7 @@ import importlib.util
 import sys
 import traceback
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -39,9 +39,12 @@ from dem.together import told
 KINDS = (int, float, bool, str)
 
 
-def option(default: Any, unit: str, text: str) -> Any:
-    """A field of an experiment: its default, unit ("" if it has none) and meaning, which `-help` shows."""
-    return dataclasses.field(default=default, metadata={"unit": unit, "help": text})
+def option(default: Any, unit: str, text: str, test: Callable[[str, Any], Any] | None = None) -> Any:
+    """A field of an experiment: its default, unit ("" if it has none) and meaning, which `-help` shows.
+
+    `test` is a function of `dem.checks`, such as `positive`: it raises ValueError for a name and a bad value.
+    """
+    return dataclasses.field(default=default, metadata={"unit": unit, "help": text, "test": test})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,12 +68,14 @@ class Experiment:
     digest: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
-        """ValueError for numbers that are not finite. The message starts with the name of the option. Extend this to
-        check more."""
+        """ValueError for numbers that are not finite or fail the test of their option. The message starts with the name
+        of the option. Extend this to check more."""
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
+            value, test = getattr(self, field.name), field.metadata.get("test")
             if isinstance(value, float):
                 checks.finite(field.name, value)
+            if test is not None:
+                test(field.name, value)
 
     def build(self) -> Scene:
         """The bodies, materials and motions at time zero."""

@@ -49,9 +49,7 @@ class Guided(Dynamic):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "direction", unit_vector("direction of a guide", self.direction))
-        finite("force of a guide", self.force)
-        _ordered("force of a guide", self.start, self.end)
-        _servo("guide", "force", self.force, self.speed)
+        _check_drive("guide", "force", self.force, self.start, self.end, self.speed)
 
     def free_directions(self) -> Floats:
         """Projector (3, 3) on the direction of the guide."""
@@ -80,9 +78,7 @@ class Hinged(Dynamic):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "axis", unit_vector("axis of a hinge", self.axis))
-        finite("torque of a hinge", self.torque)
-        _ordered("torque of a hinge", self.start, self.end)
-        _servo("hinge", "torque", self.torque, self.speed)
+        _check_drive("hinge", "torque", self.torque, self.start, self.end, self.speed)
 
     def free_directions(self) -> Floats:
         """Projector (3, 3) on nothing: the axis stays where it is."""
@@ -119,7 +115,7 @@ class Rotation:
         object.__setattr__(self, "center", finite_vector("centre of rotation", self.center))
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
-        """Position (3,) and quaternion (4,) at `time` [s] of a body with the given ones at time zero."""
+        """As of `Fixed`."""
         turn = quaternion.exponential(_gone(time, self.start, self.end) * np.array(self.velocity))
         center = np.array(self.center)
         turned = quaternion.normalized(quaternion.multiply(turn, orientation))
@@ -145,7 +141,7 @@ class Oscillation:
         positive("period of oscillation", self.period)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
-        """Position (3,) and quaternion (4,) at `time` [s] of a body with the given ones at time zero."""
+        """As of `Fixed`."""
         angle = 2.0 * np.pi * _gone(time, self.start, self.end) / self.period
         swing = np.sin(angle + self.phase) - np.sin(self.phase)
         return position + self.amplitude * swing * np.array(self.direction), orientation
@@ -164,7 +160,7 @@ class Glide:
         _ordered("glide", self.start, self.end)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
-        """Position (3,) and quaternion (4,) at `time` [s] of a body with the given ones at time zero."""
+        """As of `Fixed`."""
         return position + _gone(time, self.start, self.end) * np.array(self.velocity), orientation
 
 
@@ -208,7 +204,7 @@ class Path:
         return cls([row[0] for row in rows], [row[1:] for row in rows])
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
-        """Position (3,) and quaternion (4,) at `time` [s] of a body with the given ones at time zero."""
+        """As of `Fixed`."""
         places = np.array(self.positions)
         place = np.array([np.interp(time, self.times, axis) for axis in places.T])
         return position + place - places[0], orientation
@@ -240,9 +236,9 @@ def _ordered(what: str, start: float, end: float) -> None:
         raise ValueError(f"the {what} cannot begin at {start:g} s and end at {end:g} s")
 
 
-def _servo(what: str, strength: str, most: float, speed: float | None) -> None:
-    if speed is None:
-        return
-    finite(f"speed of a {what}", speed)
-    if most <= 0.0:
+def _check_drive(what: str, strength: str, most: float, start: float, end: float, speed: float | None) -> None:
+    finite(f"{strength} of a {what}", most)
+    _ordered(f"{strength} of a {what}", start, end)
+    finite(f"speed of a {what}", speed or 0.0)
+    if speed is not None and most <= 0.0:
         raise ValueError(f"a {what} with a speed needs the greatest {strength} of its servo, above zero, got {most:g}")

@@ -66,14 +66,10 @@ class Scene:
         positions (n, 3) [m]; radius [m] and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3).
         """
         centers = _points("positions of spheres", positions)
-        count = len(centers)
-        radii = checks.positive_column("radius", radius, count)
-        mass, inertia = shapes.sphere_mass(radii, checks.positive_column("density", density, count))
-        size = np.zeros((count, 3))
-        size[:, 0] = radii
-        upright = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
-        speeds = _velocities(velocity, angular_velocity, count)
-        return self._add_grains(SPHERE, centers, upright, speeds, mass, inertia, material, size)
+        radii = checks.positive_column("radius", radius, len(centers))
+        mass, inertia = shapes.sphere_mass(radii, checks.positive_column("density", density, len(centers)))
+        size, speeds = radii[:, None] * [1.0, 0.0, 0.0], _velocities(velocity, angular_velocity, len(centers))
+        return self._add_grains(SPHERE, centers, (1.0, 0.0, 0.0, 0.0), speeds, mass, inertia, material, size)
 
     def add_boxes(
         self,
@@ -92,12 +88,10 @@ class Scene:
         quaternions (4,) or (n, 4); velocities (3,) or (n, 3).
         """
         centers = _points("positions of boxes", positions)
-        count = len(centers)
-        size = checks.rows("half extents", checks.positive("half extents", half_extents), count, 3)
-        mass, inertia = shapes.box_mass(size, checks.positive_column("density", density, count))
-        turns = checks.unit_quaternions("quaternions of boxes", quaternions, count)
-        speeds = _velocities(velocity, angular_velocity, count)
-        return self._add_grains(BOX, centers, turns, speeds, mass, inertia, material, size)
+        size = checks.rows("half extents", checks.positive("half extents", half_extents), len(centers), 3)
+        mass, inertia = shapes.box_mass(size, checks.positive_column("density", density, len(centers)))
+        speeds = _velocities(velocity, angular_velocity, len(centers))
+        return self._add_grains(BOX, centers, quaternions, speeds, mass, inertia, material, size)
 
     def add_capsules(
         self,
@@ -121,10 +115,8 @@ class Scene:
         radii = checks.positive_column("radius", radius, count)
         halves = checks.positive_column("half length", half_length, count)
         mass, inertia = shapes.capsule_mass(radii, halves, checks.positive_column("density", density, count))
-        size = np.stack([radii, halves, np.zeros(count)], axis=1)
-        turns = checks.unit_quaternions("quaternions of capsules", quaternions, count)
-        speeds = _velocities(velocity, angular_velocity, count)
-        return self._add_grains(CAPSULE, centers, turns, speeds, mass, inertia, material, size)
+        size, speeds = np.stack([radii, halves, 0 * radii], axis=1), _velocities(velocity, angular_velocity, count)
+        return self._add_grains(CAPSULE, centers, quaternions, speeds, mass, inertia, material, size)
 
     def add_body(
         self,
@@ -236,7 +228,7 @@ class Scene:
         self,
         kind: int,
         position: Floats,
-        turn: Floats,
+        quaternions: ArrayLike,
         velocity: Floats,
         mass: Floats,
         inertia: Floats,
@@ -251,7 +243,7 @@ class Scene:
             Bodies(
                 id=ids,
                 position=position,
-                quaternion=turn,
+                quaternion=checks.unit_quaternions("quaternions", quaternions, len(ids)),
                 velocity=velocity,
                 mass=mass,
                 inertia=inertia,

@@ -107,16 +107,28 @@ def capsule_mass(radius: Floats, half_length: Floats, density: Floats) -> tuple[
     return cylinder + ball, np.stack([lateral, lateral, axial], axis=1)
 
 
-def mesh_mass(shape: Mesh, density: float) -> tuple[float, Floats, Floats]:
-    """Mass, centre of mass (3,) and inertia tensor (3, 3) about it of a solid mesh, in the body frame. ValueError
-    unless it is closed and its normals point outwards."""
-    shape.surface.refuse_unless_solid()
-    volume, first, second = shape.surface.integrals()
-    center = first / volume
-    spread = second - volume * np.outer(center, center)
-    turn = quaternion.matrix(np.array(shape.quaternion))
-    tensor = density * turn @ (np.trace(spread) * np.eye(3) - spread) @ turn.T
-    return density * volume, np.array(shape.center) + turn @ (shape.surface.middle + center), tensor
+def solid_properties(shape: Shape, density: float) -> tuple[float, Floats, Floats]:
+    """Mass, centre of mass (3,) and inertia tensor (3, 3) about it of one shape, in the body frame; ValueError as of
+    `mass_properties`."""
+    if isinstance(shape, Plane):
+        raise ValueError("a half space has no finite mass: give mass and inertia, or a prescribed motion")
+    place = np.array(shape.center)
+    turn = np.eye(3) if isinstance(shape, Sphere) else quaternion.matrix(np.array(shape.quaternion))
+    if isinstance(shape, Mesh):
+        shape.surface.refuse_unless_solid()
+        volume, first, second = shape.surface.integrals()
+        center = first / volume
+        spread = second - volume * np.outer(center, center)
+        tensor = density * turn @ (np.trace(spread) * np.eye(3) - spread) @ turn.T
+        return density * volume, place + turn @ (shape.surface.middle + center), tensor
+    solid = np.array([density])
+    if isinstance(shape, Sphere):
+        mass, moments = sphere_mass(np.array([shape.radius]), solid)
+    elif isinstance(shape, Box):
+        mass, moments = box_mass(np.array([shape.half_extents]), solid)
+    else:
+        mass, moments = capsule_mass(np.array([shape.radius]), np.array([shape.half_length]), solid)
+    return float(mass[0]), place, (turn * moments[0]) @ turn.T
 
 
 def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Floats, Floats]:
@@ -125,37 +137,13 @@ def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Flo
     Volumes that shapes share count once for each of them. ValueError for half spaces and for meshes that are open or
     have their normals inwards: they have no mass.
     """
-    masses: list[float] = []
-    centers: list[Sequence[float] | Floats] = []
-    tensors: list[Floats] = []
-    for shape in shapes:
-        if isinstance(shape, Plane):
-            raise ValueError("a half space has no finite mass: give mass and inertia, or a prescribed motion")
-        if isinstance(shape, Mesh):
-            weight, middle, tensor = mesh_mass(shape, density)
-            masses.append(weight)
-            centers.append(middle)
-            tensors.append(tensor)
-            continue
-        turn, solid = np.eye(3), np.array([density])
-        if isinstance(shape, Sphere):
-            mass, moments = sphere_mass(np.array([shape.radius]), solid)
-        else:
-            turn = quaternion.matrix(np.array(shape.quaternion))
-            if isinstance(shape, Box):
-                mass, moments = box_mass(np.array([shape.half_extents]), solid)
-            else:
-                mass, moments = capsule_mass(np.array([shape.radius]), np.array([shape.half_length]), solid)
-        masses.append(mass[0])
-        centers.append(shape.center)
-        tensors.append((turn * moments[0]) @ turn.T)
-    weights, points = np.array(masses), np.array(centers)
-    total = weights.sum()
-    center = weights @ points / total
-    arms = points - center
+    masses, centers, tensors = (np.array(column) for column in zip(*(solid_properties(s, density) for s in shapes)))
+    total = masses.sum()
+    center = masses @ centers / total
+    arms = centers - center
     # Parallel axes: m (|r|^2 E - r r') for every part.
-    steiner = np.sum(weights * (arms**2).sum(axis=1)) * np.eye(3) - (arms.T * weights) @ arms
-    return float(total), center, np.sum(tensors, axis=0) + steiner
+    steiner = np.sum(masses * (arms**2).sum(axis=1)) * np.eye(3) - (arms.T * masses) @ arms
+    return float(total), center, tensors.sum(axis=0) + steiner
 
 
 def moved(shape: Shape, center: Floats, turn: Floats) -> Shape:

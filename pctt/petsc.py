@@ -20,6 +20,8 @@ def require_real_double(scalar: type = PETSc.ScalarType) -> None:
         )
 
 
+require_real_double()  # here, as every package that uses PETSc imports this module
+
 _raised: list[BaseException] | None = None  # errors that contexts raised since the innermost `own_errors` began
 
 

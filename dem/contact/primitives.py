@@ -175,28 +175,14 @@ def _box_plane(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     return Manifold(pair[manifold.pair], corner[manifold.pair], manifold.touch)
 
 
-def _spheres_mesh(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
-    def touch(rows: Ints, mesh: int) -> Manifold:
-        center, radius = table.sphere(i[rows])
-        return sphere_mesh(center, radius, *table.mesh(mesh), delta[rows])
-
-    return _by_mesh(j, touch)
-
-
-def _capsules_mesh(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
-    def touch(rows: Ints, mesh: int) -> Manifold:
-        center, axis, half_length, radius = table.capsule(i[rows])
-        return capsule_mesh(center, axis, half_length, radius, *table.mesh(mesh), delta[rows])
-
-    return _by_mesh(j, touch)
-
-
-def _by_mesh(j: Ints, touch: Callable[[Ints, int], Manifold]) -> Manifold:
-    """The manifolds of pairs whose second shapes are the meshes of rows j (m,), mesh by mesh."""
+def _on_meshes(
+    contacts: Callable[..., Manifold], shapes: tuple[Floats, ...], table: Primitives, j: Ints, delta: Floats
+) -> Manifold:
+    """The manifolds of shapes, given by their arrays (m, ...), with the meshes of rows j (m,), mesh by mesh."""
     found = []
     for mesh in np.unique(j):
         rows = np.flatnonzero(j == mesh)
-        manifold = touch(rows, int(mesh))
+        manifold = contacts(*(values[rows] for values in shapes), *table.mesh(int(mesh)), delta[rows])
         found.append(manifold._replace(pair=rows[manifold.pair]))
     return _joined(found)
 
@@ -228,7 +214,7 @@ _TOUCH: dict[tuple[int, int], Callable[[Primitives, Ints, Ints, Floats], Manifol
     (CAPSULE, PLANE): lambda t, i, j, delta: capsule_plane(*t.capsule(i), *t.plane(j), delta),
     (BOX, BOX): lambda t, i, j, delta: box_box(*t.box(i), *t.box(j), delta),
     (BOX, PLANE): _box_plane,
-    (SPHERE, MESH): _spheres_mesh,
-    (CAPSULE, MESH): _capsules_mesh,
+    (SPHERE, MESH): lambda t, i, j, delta: _on_meshes(sphere_mesh, t.sphere(i), t, j, delta),
+    (CAPSULE, MESH): lambda t, i, j, delta: _on_meshes(capsule_mesh, t.capsule(i), t, j, delta),
     (MESH, PLANE): _meshes_plane,
 }

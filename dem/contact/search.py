@@ -16,7 +16,6 @@ from dem.contact.broad import close_pairs
 from dem.contact.narrow import Touch
 from dem.contact.primitives import MESH, PLANE, Primitives, primitives, touches
 from dem.free_motion import free_velocity, large_free_velocity
-from dem.loops import loops
 from dem.motion import Dynamic, Hinged
 from dem.neighbourhood import Neighbourhood, neighbourhood, without_ghosts
 from dem.quaternion import cross, length
@@ -114,10 +113,7 @@ def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints
     if world.comm.rank < world.comm.size - 1:
         foreign[near.grains + near.ghosts :] = bodies.is_dynamic(world.large)
     owner = np.minimum(a, b)  # the local grains are the first rows, and ghosts come from higher ranks only
-    major = owner + rows * (foreign[a] | foreign[b])
-    if compiled := loops():
-        return compiled.lexsort(key, major, 2 * rows)
-    return np.lexsort((key, major))
+    return np.lexsort((key, owner + rows * (foreign[a] | foreign[b])))
 
 
 def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Contacts | None:

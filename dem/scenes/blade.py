@@ -9,18 +9,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from dem import analysis, checks
+from dem import analysis
 from dem.arrays import Floats
-from dem.experiment import Experiment, option
+from dem.checks import not_negative, positive
+from dem.experiment import option
 from dem.motion import Oscillation
 from dem.scene import Scene
-from dem.scenes.lattice import check_room, perturbed, rest_after_fall
+from dem.scenes.lattice import LargeSpheres, perturbed, rest_after_fall
 from dem.shapes import Box, Plane
 from dem.step import Step
 
 
 @dataclass(frozen=True)
-class Blade(Experiment):
+class Blade(LargeSpheres):
     """(2n+1)^3 spheres settle in a closed box, then a blade goes from one end to the other and back.
 
     The blade spans the width of the box, as in the bin of Melanz et al. (2017), and stands upright, its lower edge at
@@ -32,33 +33,18 @@ class Blade(Experiment):
     experiment similar for all n.
     """
 
-    n: int = option(4, "", "size: there are (2n+1)^3 spheres")
-    radius: float = option(0.1, "m", "radius of the spheres")
-    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
-    friction: float = option(0.25, "", "friction coefficient of all contacts")
-    pitch: float = option(0.25, "m", "spacing of the lattice on which the spheres start")
-    perturbation: float = option(0.02, "m", "greatest displacement of a sphere from its lattice point, per axis")
-    seed: int = option(1, "", "seed of the perturbation")
-    margin: float = option(0.0, "m", "width of the box beyond (2n+1) pitch")
-    thickness: float = option(0.1, "m", "thickness of the blade")
-    blade_height: float = option(0.3, "box widths", "height of the blade")
+    margin: float = option(0.0, "m", "width of the box beyond (2n+1) pitch", not_negative)
+    thickness: float = option(0.1, "m", "thickness of the blade", positive)
+    blade_height: float = option(0.3, "box widths", "height of the blade", positive)
     clearance: float = option(0.3, "box widths", "gap between the floor and the blade")
     end_gap: float = option(0.3, "box widths", "gap between the blade and the end walls where it turns")
-    period: float = option(4.0, "s", "period of the velocity of the blade: it crosses the box in half of it")
-    gravity: float = option(9.81, "m/s^2", "gravity, downwards")
-    cutoff: float = option(2.0, "Hz", "cutoff frequency of the low-pass filter of the forces")
+    period: float = option(4.0, "s", "period of the velocity of the blade: it crosses the box in half of it", positive)
+    cutoff: float = option(2.0, "Hz", "cutoff frequency of the low-pass filter of the forces", positive)
 
     dt: ClassVar[float] = 0.01
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n < 1:
-            raise ValueError(f"n must be at least 1, got {self.n}")
-        for name in ("radius", "density", "pitch", "thickness", "blade_height", "period", "gravity", "cutoff"):
-            checks.positive(name, getattr(self, name))
-        for name in ("friction", "margin"):
-            checks.not_negative(name, getattr(self, name))
-        check_room(self.radius, self.pitch, self.perturbation)
         for name in ("clearance", "end_gap"):
             gap = getattr(self, name) * self.width
             if gap < 2 * self.radius:

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from dem import checks
 from dem.arrays import Floats
+from dem.checks import not_negative, positive
 from dem.experiment import option
 from dem.mesh import Mesh
 from dem.motion import Rotation
 from dem.scene import Scene
-from dem.scenes.lattice import SmallSpheres, check_room, perturbed, rest_after_fall
+from dem.scenes.lattice import SmallSpheres, perturbed, rest_after_fall
 
 if TYPE_CHECKING:
     from dem.record import Step
@@ -35,33 +35,24 @@ class Drum(SmallSpheres):
     """
 
     n: int = option(8, "", "size: radius of the drum in diameters of a sphere")
-    length: float = option(6.0, "sphere diameters", "length of the drum")
-    fill: float = option(0.3, "", "part of the drum that the settled bed fills, at most about a third")
-    radius: float = option(0.005, "m", "radius of the greatest spheres")
+    length: float = option(6.0, "sphere diameters", "length of the drum", positive)
+    fill: float = option(0.3, "", "part of the drum that the settled bed fills, at most about a third", positive)
     spread: float = option(0.2, "", "part by which the smallest spheres are smaller; equal ones order themselves")
-    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
-    friction: float = option(0.5, "", "friction coefficient between spheres")
-    wall_friction: float = option(0.9, "", "friction coefficient on the side of the drum")
-    end_friction: float = option(0.0, "", "friction coefficient on the ends of the drum")
-    froude: float = option(0.01, "", "speed: Froude number omega^2 R / g")
+    friction: float = option(0.5, "", "friction coefficient between spheres", not_negative)
+    wall_friction: float = option(0.9, "", "friction coefficient on the side of the drum", not_negative)
+    end_friction: float = option(0.0, "", "friction coefficient on the ends of the drum", not_negative)
+    froude: float = option(0.01, "", "speed: Froude number omega^2 R / g", positive)
     sides: int = option(48, "", "flat sides of the drum")
     perturbation: float = option(0.0004, "m", "greatest displacement of a sphere from its lattice point, per axis")
-    seed: int = option(1, "", "seed of the perturbation")
-    gravity: float = option(9.81, "m/s^2", "gravity, downwards")
 
     dt: ClassVar[float] = 0.005
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("length", "fill", "radius", "density", "froude", "gravity"):
-            checks.positive(name, getattr(self, name))
-        for name in ("friction", "wall_friction", "end_friction", "spread"):
-            checks.not_negative(name, getattr(self, name))
-        if self.spread >= 1.0:
-            raise ValueError(f"spread must be below 1, got {self.spread:g}")
+        if not 0.0 <= self.spread < 1.0:
+            raise ValueError(f"spread must be below 1 and not negative, got {self.spread:g}")
         if self.length < 2.0:
             raise ValueError(f"length must be at least 2 sphere diameters, got {self.length:g}")
-        check_room(self.radius, self.pitch, self.perturbation)
         if self.spheres > len(self._lattice()):
             raise ValueError(
                 f"fill {self.fill:g}: {self.spheres} spheres, but only {len(self._lattice())} have room at the start"

@@ -1,28 +1,67 @@
-"""Parts that the scenes share: the perturbed cubic lattice on which spheres start, and the lengths in scenes of small
+"""What the scenes share: options, the perturbed cubic lattice on which spheres start, lengths in scenes of small
 spheres."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import ceil, sqrt
+from typing import Any, ClassVar
 
 import numpy as np
 
-from dem import checks
 from dem.arrays import Floats
-from dem.experiment import Experiment
+from dem.checks import not_negative, positive
+from dem.experiment import Experiment, option
 
 
-class SmallSpheres(Experiment):
+@dataclass(frozen=True)
+class Spheres(Experiment):
+    """Options of all scenes: spheres that start on a perturbed lattice."""
+
+    n: int = option(4, "", "size: there are (2n+1)^3 spheres")
+    radius: float = option(0.1, "m", "radius of the spheres", positive)
+    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)", positive)
+    friction: float = option(0.25, "", "friction coefficient of all contacts", not_negative)
+    perturbation: float = option(0.02, "m", "greatest displacement of a sphere from its lattice point, per axis")
+    seed: int = option(1, "", "seed of the perturbation")
+    gravity: float = option(9.81, "m/s^2", "gravity, downwards", positive)
+
+    least_n: ClassVar[int] = 1
+    pitch: ClassVar[Any]  #: spacing of the lattice [m]
+
+    def __post_init__(self) -> None:
+        """ValueError unless the spheres cannot touch at the start, however they are moved."""
+        super().__post_init__()
+        if self.n < self.least_n:
+            raise ValueError(f"n must be at least {self.least_n}, got {self.n}")
+        not_negative("perturbation", self.perturbation)
+        free = self.pitch / 2 - self.radius
+        if self.perturbation >= free:
+            raise ValueError(
+                f"perturbation {self.perturbation:g} m must be less than pitch / 2 - radius = {free:g} m, "
+                "half the free space between spheres of the lattice"
+            )
+
+
+@dataclass(frozen=True)
+class LargeSpheres(Spheres):
+    """A scene whose lattice has a spacing of its own."""
+
+    pitch: float = option(0.25, "m", "spacing of the lattice on which the spheres start", positive)  # type: ignore[misc]
+
+
+@dataclass(frozen=True)
+class SmallSpheres(Spheres):
     """Lengths of scenes whose container is round, with a radius of n sphere diameters."""
 
-    n: int
-    sides: int  #: of the container
-    radius: float  #: of the greatest spheres [m]
+    friction: float = option(0.5, "", "friction coefficient of all contacts", not_negative)
+    radius: float = option(0.005, "m", "radius of the greatest spheres", positive)
+    sides: int = option(32, "", "flat sides of the container")
+
+    least_n: ClassVar[int] = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n < 3:
-            raise ValueError(f"n must be at least 3, got {self.n}")
         if self.sides < 12:
             raise ValueError(f"sides must be at least 12, got {self.sides}")
 
@@ -47,17 +86,6 @@ def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -
     axis."""
     lattice = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     return lattice + perturbation * np.random.default_rng(seed).uniform(-1.0, 1.0, lattice.shape)
-
-
-def check_room(radius: float, pitch: float, perturbation: float) -> None:
-    """ValueError unless spheres of a lattice of this pitch cannot touch, however they are moved [m]."""
-    checks.not_negative("perturbation", perturbation)
-    free = pitch / 2 - radius
-    if perturbation >= free:
-        raise ValueError(
-            f"perturbation {perturbation:g} m must be less than pitch / 2 - radius = {free:g} m, "
-            "half the free space between spheres of the lattice"
-        )
 
 
 def rest_after_fall(height: float, gravity: float) -> float:

@@ -9,17 +9,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from dem import checks
 from dem.arrays import Floats
-from dem.experiment import Experiment, option
+from dem.checks import not_negative, positive
+from dem.experiment import option
 from dem.motion import Rotation
 from dem.scene import Scene
-from dem.scenes.lattice import check_room, perturbed
+from dem.scenes.lattice import LargeSpheres, perturbed
 from dem.shapes import Box, Plane
 
 
 @dataclass(frozen=True)
-class Mixer(Experiment):
+class Mixer(LargeSpheres):
     """(2n+1)^3 spheres on a randomly perturbed cubic lattice fall into a fixed box onto a turning paddle.
 
     The box is open at the top, and its width grows as 2n+1, so that the number of spheres per floor area and
@@ -28,35 +28,17 @@ class Mixer(Experiment):
     benchmark of Chrono.
     """
 
-    n: int = option(4, "", "size: there are (2n+1)^3 spheres")
-    radius: float = option(0.1, "m", "radius of the spheres")
-    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
-    friction: float = option(0.25, "", "friction coefficient of all contacts")
-    pitch: float = option(0.25, "m", "spacing of the lattice on which the spheres start")
-    perturbation: float = option(0.02, "m", "greatest displacement of a sphere from its lattice point, per axis")
-    seed: int = option(1, "", "seed of the perturbation")
-    margin: float = option(0.0, "m", "width of the box beyond (2n+1) pitch")
-    paddle_length: float = option(1 / 2, "box widths", "length of the paddle")
-    paddle_height: float = option(1 / 4, "box widths", "height of the paddle")
-    paddle_thickness: float = option(1 / 20, "box widths", "thickness of the paddle")
-    clearance: float = option(0.05, "m", "gap between the floor and the paddle")
+    margin: float = option(0.0, "m", "width of the box beyond (2n+1) pitch", not_negative)
+    paddle_length: float = option(1 / 2, "box widths", "length of the paddle", positive)
+    paddle_height: float = option(1 / 4, "box widths", "height of the paddle", positive)
+    paddle_thickness: float = option(1 / 20, "box widths", "thickness of the paddle", positive)
+    clearance: float = option(0.05, "m", "gap between the floor and the paddle", not_negative)
     angular_velocity: float = option(pi / 3, "rad/s", "angular velocity of the paddle about the vertical")
-    gravity: float = option(9.81, "m/s^2", "gravity, downwards")
 
-    #: Recommended time step [s] and contact distance [m].
     dt: ClassVar[float] = 0.025
-    delta: ClassVar[float] = 0.02
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n < 1:
-            raise ValueError(f"n must be at least 1, got {self.n}")
-        sizes = ("radius", "pitch", "paddle_length", "paddle_height", "paddle_thickness")
-        for name in (*sizes, "density", "gravity"):
-            checks.positive(name, getattr(self, name))
-        for name in ("friction", "margin", "clearance"):
-            checks.not_negative(name, getattr(self, name))
-        check_room(self.radius, self.pitch, self.perturbation)
         if self.radius <= self.clearance <= 2 * self.radius:
             raise ValueError(
                 f"clearance {self.clearance:g} m between one and two radii ({self.radius:g} m): "

@@ -9,12 +9,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from dem import analysis, checks
+from dem import analysis
 from dem.arrays import Floats
-from dem.experiment import Experiment, option
+from dem.checks import not_negative, positive
+from dem.experiment import option
 from dem.motion import Guided, Oscillation
 from dem.scene import Scene
-from dem.scenes.lattice import check_room, perturbed, rest_after_fall
+from dem.scenes.lattice import LargeSpheres, perturbed, rest_after_fall
 from dem.shapes import Box, Plane, Shape
 from dem.step import Step
 
@@ -23,7 +24,7 @@ PACKING = 0.6
 
 
 @dataclass(frozen=True)
-class Shear(Experiment):
+class Shear(LargeSpheres):
     """(3n+1)(2n+1)^2 spheres settle in a box under a press; then the lower half of the box moves along x and back.
 
     The box is 3n+1 lattice cells long, along x, and 2n+1 wide. Its halves have thick walls, so that no gap opens where
@@ -35,33 +36,19 @@ class Shear(Experiment):
     """
 
     n: int = option(4, "", "size: there are (3n+1)(2n+1)^2 spheres")
-    radius: float = option(0.1, "m", "radius of the spheres")
-    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
-    friction: float = option(0.25, "", "friction coefficient between spheres")
-    wall_friction: float = option(0.25, "", "friction coefficient between spheres and walls, floor, press")
-    pitch: float = option(0.25, "m", "spacing of the lattice on which the spheres start")
-    perturbation: float = option(0.02, "m", "greatest displacement of a sphere from its lattice point, per axis")
-    seed: int = option(1, "", "seed of the perturbation")
-    press_density: float = option(10.0, "densities of the spheres", "density of the press")
-    press_thickness: float = option(0.05, "box widths", "thickness of the press")
-    split: float = option(0.5, "bed depths", "height of the plane between the halves, for a packing fraction of 0.6")
-    stroke: float = option(0.1, "box lengths", "greatest displacement of the lower half")
-    period: float = option(4.0, "s", "period of the velocity of the lower half")
-    gravity: float = option(9.81, "m/s^2", "gravity, downwards")
-    cutoff: float = option(2.0, "Hz", "cutoff frequency of the low-pass filter of the stresses")
+    friction: float = option(0.25, "", "friction coefficient between spheres", not_negative)
+    wall_friction: float = option(0.25, "", "friction coefficient of spheres on walls, floor and press", not_negative)
+    press_density: float = option(10.0, "densities of the spheres", "density of the press", positive)
+    press_thickness: float = option(0.05, "box widths", "thickness of the press", positive)
+    split: float = option(0.5, "bed depths", "height of the plane between the halves; packing fraction 0.6", positive)
+    stroke: float = option(0.1, "box lengths", "greatest displacement of the lower half", positive)
+    period: float = option(4.0, "s", "period of the velocity of the lower half", positive)
+    cutoff: float = option(2.0, "Hz", "cutoff frequency of the low-pass filter of the stresses", positive)
 
     dt: ClassVar[float] = 0.01
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n < 1:
-            raise ValueError(f"n must be at least 1, got {self.n}")
-        sizes = ("radius", "density", "pitch", "press_density", "press_thickness", "split", "stroke", "period")
-        for name in (*sizes, "gravity", "cutoff"):
-            checks.positive(name, getattr(self, name))
-        for name in ("friction", "wall_friction"):
-            checks.not_negative(name, getattr(self, name))
-        check_room(self.radius, self.pitch, self.perturbation)
         if self.split >= 1.0:
             raise ValueError(f"split {self.split:g} bed depths puts all spheres into the lower half, must be below 1")
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from dem import checks
 from dem.arrays import Floats
+from dem.checks import positive
 from dem.experiment import option
 from dem.mesh import Mesh
 from dem.motion import Glide
 from dem.scene import Scene
-from dem.scenes.lattice import SmallSpheres, check_room, perturbed, rest_after_fall
+from dem.scenes.lattice import SmallSpheres, perturbed, rest_after_fall
 from dem.shapes import Plane
 
 if TYPE_CHECKING:
@@ -39,26 +39,16 @@ class Silo(SmallSpheres):
     """
 
     n: int = option(6, "", "size: radius of the cylinder in diameters of a sphere")
-    filling: float = option(1.5, "silo diameters", "height of the settled bed if it were all in the cylinder")
-    outlet: float = option(5.0, "sphere diameters", "diameter of the outlet")
+    filling: float = option(1.5, "silo diameters", "height of the settled bed if it were all in the cylinder", positive)
+    outlet: float = option(5.0, "sphere diameters", "diameter of the outlet", positive)
     half_angle: float = option(30.0, "degrees", "of the cone, from the vertical; 90: flat bottom")
-    drop: float = option(1.0, "silo diameters", "height of the outlet above the floor")
-    radius: float = option(0.005, "m", "radius of the spheres")
-    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)")
-    friction: float = option(0.5, "", "friction coefficient of all contacts")
-    sides: int = option(32, "", "flat sides of the silo")
+    drop: float = option(1.0, "silo diameters", "height of the outlet above the floor", positive)
     perturbation: float = option(0.0005, "m", "greatest displacement of a sphere from its lattice point, per axis")
-    seed: int = option(1, "", "seed of the perturbation")
-    gravity: float = option(9.81, "m/s^2", "gravity, downwards")
 
     dt: ClassVar[float] = 0.005
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("filling", "outlet", "drop", "radius", "density", "gravity"):
-            checks.positive(name, getattr(self, name))
-        checks.not_negative("friction", self.friction)
-        check_room(self.radius, self.pitch, self.perturbation)
         if not 1.0 < self.outlet < 2 * self.n:
             raise ValueError(
                 f"outlet {self.outlet:g} must be between 1 sphere diameter and the {2 * self.n} of the silo"

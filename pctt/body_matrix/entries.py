@@ -14,7 +14,6 @@ from petsc4py import PETSc
 from pctt.block_diagonal import set_diagonal_blocks
 from pctt.blocks import BlockRows
 from pctt.body_matrix.stiff_part import StiffPart
-from pctt.contact_map import is_free
 from pctt.exchange import offsets, send_rows
 
 ADD = PETSc.InsertMode.ADD_VALUES
@@ -23,26 +22,36 @@ ADD = PETSc.InsertMode.ADD_VALUES
 class BodyMatrix:
     """K as a Mat of block size 6 (``mat``), and its ``stiff_part``, which factorisations use."""
 
-    def __init__(self, comm: PETSc.Comm, G: BlockRows, compiled: bool | None = None):
-        """``compiled`` says whether compiled loops compute the values; with None they do if numba is installed."""
+    def __init__(self, comm: PETSc.Comm, G: BlockRows):
         self.comm = comm.tompi4py() if isinstance(comm, PETSc.Comm) else comm
-        product = CompiledProduct if (is_free("auto") if compiled is None else compiled) else SparseProduct
         # 64 bits, because each pair of bodies gets a number
         self.bodies, column = np.unique(np.asarray(G.indices, np.int64), return_inverse=True)
-        self._product = product(G, column.ravel(), len(self.bodies))
+        self._column = column.ravel()
         self.load(G)
         self._index(G)
 
     def load(self, G: BlockRows) -> None:
         """Take a G of the same structure."""
         self.G = G
-        self._product.load(G)
+        shape = (3 * G.rows, 6 * len(self.bodies))
+        self._rows = sp.bsr_matrix((G.blocks, self._column, G.indptr), shape=shape) if len(G.blocks) else None
+        self._columns = None if self._rows is None else self._rows.T.tobsr()
+
+    def _product(self, inverse: np.ndarray) -> sp.bsr_matrix:
+        """G' B^-1 G of the contacts and bodies of this rank, for the blocks B^-1 (nc, 3, 3)."""
+        if self._columns is None:
+            return sp.bsr_matrix((0, 0), blocksize=(6, 6))
+        count = len(inverse)
+        weight = sp.bsr_matrix((inverse, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
+        return self._columns @ (weight @ self._rows)
 
     def _index(self, G: BlockRows) -> None:
         """Find the owners of the blocks to which this rank's contacts contribute, and the pattern of the own rows."""
         starts = offsets(self.comm, G.columns)
         first, own = int(starts[self.comm.rank]), G.columns
-        row, column = self.bodies[self._product.row], self.bodies[self._product.column]
+        local = self._product(np.tile(np.eye(3), (G.rows, 1, 1)))
+        row = np.repeat(self.bodies, np.diff(local.indptr))
+        column = self.bodies[local.indices]
         self._owner = np.searchsorted(starts, row, side="right") - 1
         self._away = self._owner != self.comm.rank
         home = ~self._away
@@ -65,7 +74,7 @@ class BodyMatrix:
 
     def update(self, inverse: np.ndarray) -> None:
         """Compute K for the blocks B^-1 (nc, 3, 3)."""
-        blocks = self._product.blocks(inverse)
+        blocks = self._product(inverse).data.reshape(-1, 6, 6)
         self._values = np.zeros((len(self._indices), 6, 6))
         self._values[self._own_places] = blocks[~self._away] if self._away.any() else blocks
         if self.comm.size > 1:
@@ -141,65 +150,6 @@ class BodyMatrix:
         self.mat.destroy()
         for part in self._stiff.values():
             part.destroy()
-
-
-class CompiledProduct:
-    """The blocks of G' B^-1 G for the contacts of a rank, computed by a loop over the contacts.
-
-    Attributes
-    ----------
-    row, column : (n,) the two bodies of each block, in the order of `blocks`
-    """
-
-    def __init__(self, G: BlockRows, body: np.ndarray, bodies: int):
-        """``body`` has the columns of G, numbered from 0 to ``bodies - 1``."""
-        start, count = np.asarray(G.indptr[:-1]), np.diff(G.indptr)
-        of_row = np.repeat(count, count)  # for each block the number of blocks in its row
-        first = np.repeat(np.arange(len(body)), of_row)
-        second = np.arange(len(first)) - np.repeat(np.cumsum(of_row) - of_row, of_row) + np.repeat(start, count**2)
-        names, place = np.unique(body[first] * max(bodies, 1) + body[second], return_inverse=True)
-        self.row, self.column = np.divmod(names, max(bodies, 1))
-        self._place = place.ravel()
-
-    def load(self, G: BlockRows) -> None:
-        """Take a G of the same structure."""
-        self._start = np.ascontiguousarray(G.indptr, dtype=np.int64)
-        self._blocks = np.ascontiguousarray(G.blocks, dtype=float)
-
-    def blocks(self, inverse: np.ndarray) -> np.ndarray:
-        """(n, 6, 6) for the blocks B^-1 (nc, 3, 3)."""
-        from pctt.contact_map.block_loops import add_all_blocks  # its import takes half a second
-
-        out = np.zeros((len(self.row), 6, 6))
-        add_all_blocks(self._blocks, self._start, self._place, np.ascontiguousarray(inverse), out)
-        return out
-
-
-class SparseProduct:
-    """The same blocks, computed by scipy."""
-
-    def __init__(self, G: BlockRows, body: np.ndarray, bodies: int):
-        self._body, self._bodies = body, bodies
-        self.load(G)
-        local = self._product(np.tile(np.eye(3), (G.rows, 1, 1)))
-        self.row, self.column = np.repeat(np.arange(len(local.indptr) - 1), np.diff(local.indptr)), local.indices
-
-    def load(self, G: BlockRows) -> None:
-        """Take a G of the same structure."""
-        shape = (3 * G.rows, 6 * self._bodies)
-        self._rows = sp.bsr_matrix((G.blocks, self._body, G.indptr), shape=shape) if len(G.blocks) else None
-        self._columns = None if self._rows is None else self._rows.T.tobsr()
-
-    def blocks(self, inverse: np.ndarray) -> np.ndarray:
-        """(n, 6, 6) for the blocks B^-1 (nc, 3, 3)."""
-        return self._product(inverse).data.reshape(-1, 6, 6)
-
-    def _product(self, inverse: np.ndarray) -> sp.bsr_matrix:
-        if self._columns is None:
-            return sp.bsr_matrix((0, 0), blocksize=(6, 6))
-        count = len(inverse)
-        weight = sp.bsr_matrix((inverse, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
-        return self._columns @ (weight @ self._rows)
 
 
 def _put(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, blocks: np.ndarray) -> None:

@@ -42,8 +42,7 @@ class BodyOperator:
     def whole(self) -> BodyMatrix:
         """The matrix of K, perhaps without its present values; collective at its first use."""
         if self._matrix is None:
-            G = self.contact_map.block_rows
-            self._matrix = BodyMatrix(self.contact_map.comm, G, compiled=self.contact_map.free)
+            self._matrix = BodyMatrix(self.contact_map.comm, self.contact_map.block_rows)
             self._loaded, self._made = True, False
         return self._matrix
 

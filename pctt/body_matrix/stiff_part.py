@@ -41,7 +41,7 @@ class StiffPart:
         self._indptr, self._indices, self._diagonal = indptr, indices, diagonal
         self._size, self._sizes, self._scalar = whole.getBlockSize(), whole.getSizes(), scalar
         self._symmetric = symmetric
-        self.mat: PETSc.Mat | None = None
+        self.mat: PETSc.Mat = None  # before the first `update`
 
     def update(self, values: np.ndarray, least: float, shift: float = 0.0) -> PETSc.Mat:
         """The Mat for the blocks ``values`` (n, size, size) of the whole matrix.
@@ -52,7 +52,6 @@ class StiffPart:
         wanted[self._diagonal] = True
         if self.mat is None or not self._holds(wanted):
             self._take_pattern(wanted)
-        assert self.mat is not None
         blocks = values[self._kept]
         blocks[self._kept_diagonal] *= 1.0 + shift
         if self._scalar:

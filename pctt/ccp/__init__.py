@@ -13,10 +13,6 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from pctt.petsc import require_real_double
-
-require_real_double()
-
 from pctt.blocks import BlockRows
 from pctt.ccp import coulomb as coulombs_law
 from pctt.ccp.accuracy import Accuracy, measure

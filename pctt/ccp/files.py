@@ -16,12 +16,8 @@ def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None, oper
     """The cone problem of a file, its contacts in equal parts over the ranks; collective. ``compliance`` takes the
     place of the file's.
 
-    Raises FileFormatError on every rank if the file cannot be read in the format of its first bytes.
+    Raises FileFormatError on every rank if the file cannot be read in the format of its first bytes: FCLIB if these are
+    of no other.
     """
-    format = comm.bcast(_format(path) if comm.rank == 0 else None)
-    return FORMATS[format].load(path, comm, compliance, operator)
-
-
-def _format(path: str | Path) -> str:
-    """The format that a file begins as, FCLIB where it is none of the others."""
-    return next((name for name, module in FORMATS.items() if name != "FCLIB" and module.is_one(path)), "FCLIB")
+    begins = [name for name, module in FORMATS.items() if comm.rank == 0 and name != "FCLIB" and module.is_one(path)]
+    return FORMATS[comm.bcast([*begins, "FCLIB"][0])].load(path, comm, compliance, operator)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -24,7 +25,7 @@ class FileFormatError(ValueError):
 
 @dataclass(frozen=True)
 class Whole:
-    """All of a file, for nc contacts; checked when made.
+    """All of a file, for nc contacts; `spread` gives each rank the rows of its own contacts.
 
     Attributes
     ----------
@@ -49,7 +50,8 @@ class Whole:
     compliance: float = 0.0
     note: str = ""
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """FileFormatError unless all sizes fit together and all numbers are finite."""
         count = len(self.mu)
         if self.matrix.shape[0] != 3 * count or len(self.r) != 3 * count:
             raise FileFormatError(
@@ -129,63 +131,38 @@ def spread(
     Raises FileFormatError on every rank if ``read`` raises one, or any error that h5py, numpy and scipy raise for bad
     data.
     """
-    parts: list[_Part] | None = None
+    parts: list[tuple[Whole, int]] = []
     error = None
     if comm.rank == 0:
         try:
             whole = read()
+            whole.check()
             parts = [_part(whole, rank, comm.size) for rank in range(comm.size)]
         except (OSError, LookupError, ValueError, TypeError, RuntimeError) as reason:
             error = f"{path}: no {format} problem: {reason}"
     error = comm.bcast(error)
     if error:
         raise FileFormatError(error)
-    return comm.scatter(parts or []).stored(comm, compliance, operator)
+    part, columns = comm.scatter(parts)
+    rows, G, N = part.matrix, None, None
+    if rows.blocksize == (3, 6):
+        G = BlockRows(rows.indptr, rows.indices, rows.data, columns)
+    else:
+        N = square_block_matrix(comm, rows)
+    e = part.compliance if compliance is None else compliance
+    problem = ConeProblem(comm, part.r, part.mu, G=G, N=N, point=part.point, compliance=e, operator=operator)
+    return Stored(problem, part.form, part.title, part.solution, part.guess, part.note)
 
 
-@dataclass(frozen=True)
-class _Part:
-    """What one rank gets: a file's words, the vectors of the rank's contacts, and their rows of the matrix."""
-
-    form: str
-    title: str
-    mu: Array  # (nc,)
-    triples: dict[str, Array | None]  # r, solution, guess, point, (nc, 3)
-    rows: tuple[np.ndarray, np.ndarray, Array]  # indptr, indices, blocks
-    columns: int  # block columns that the rank owns
-    contacts: int  # on all ranks
-    compliance: float
-    note: str
-
-    def stored(self, comm: MPI.Comm, compliance: float | None, operator: str) -> Stored:
-        """The problem of all parts; collective."""
-        indptr, indices, blocks = self.rows
-        G = N = None
-        if blocks.shape[1:] == (3, 6):
-            G = BlockRows(indptr, indices, blocks, self.columns)
-        else:
-            shape = (3 * len(self.mu), 3 * self.contacts)
-            N = square_block_matrix(comm, sp.bsr_matrix((blocks, indices, indptr), shape=shape))
-        r, solution, guess, point = (self.triples[name] for name in ("r", "solution", "guess", "point"))
-        assert r is not None
-        e = self.compliance if compliance is None else compliance
-        problem = ConeProblem(comm, r, self.mu, G=G, N=N, point=point, compliance=e, operator=operator)
-        return Stored(problem, self.form, self.title, solution, guess, self.note)
-
-
-def _part(whole: Whole, rank: int, ranks: int) -> _Part:
-    A, contacts, bodies = whole.matrix, len(whole.mu), whole.matrix.shape[1] // whole.matrix.blocksize[1]
+def _part(whole: Whole, rank: int, ranks: int) -> tuple[Whole, int]:
+    """What one rank gets: the rows of its contacts, and how many of the block columns (bodies) it owns."""
+    A, contacts, columns = whole.matrix, len(whole.mu), whole.matrix.shape[1] // whole.matrix.blocksize[1]
     mine = slice(contacts * rank // ranks, contacts * (rank + 1) // ranks)
     near = slice(A.indptr[mine.start], A.indptr[mine.stop])
+    pointers = A.indptr[mine.start : mine.stop + 1] - near.start
+    shape = (3 * (mine.stop - mine.start), A.shape[1])
+    rows = sp.bsr_matrix((A.data[near], A.indices[near], pointers), shape=shape)
     vectors = {name: getattr(whole, name) for name in ("r", "solution", "guess", "point")}
-    return _Part(
-        whole.form,
-        whole.title,
-        whole.mu[mine],
-        {name: None if x is None else np.reshape(x, (-1, 3))[mine] for name, x in vectors.items()},
-        (A.indptr[mine.start : mine.stop + 1] - near.start, A.indices[near], A.data[near]),
-        bodies * (rank + 1) // ranks - bodies * rank // ranks,
-        contacts,
-        whole.compliance,
-        whole.note,
-    )
+    parts: dict[str, Any] = {name: None if x is None else np.reshape(x, (-1, 3))[mine] for name, x in vectors.items()}
+    own = columns * (rank + 1) // ranks - columns * rank // ranks
+    return replace(whole, matrix=rows, mu=whole.mu[mine], **parts), own

@@ -91,9 +91,7 @@ def add_arrays(attributes: Any, arrays: Mapping[str, np.ndarray]) -> None:
 
 def cube() -> vtkPolyData:
     """The surface of a box of widths 1."""
-    source = vtkCubeSource()
-    source.Update()
-    return source.GetOutput()
+    return _surface({"kind": "Box", "half_extents": (0.5, 0.5, 0.5)})
 
 
 def cylinder() -> vtkPolyData:

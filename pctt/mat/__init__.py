@@ -1,9 +1,5 @@
 """Mats that are given by functions: `-mat_type python -mat_python_type pctt.mat.TensorTrain`."""
 
-from pctt.petsc import require_real_double
-
-require_real_double()
-
 from pctt.mat.tensor_train import TensorTrain, from_entries
 
 __all__ = ["TensorTrain", "from_entries"]

@@ -90,10 +90,10 @@ class TensorTrain(Context):
     """
 
     without = PETSc.Mat.Type.AIJ
+    compressed: CompressedEntries  #: after ``setUp``
 
     def __init__(self, eps: float = 1e-8, max_rank: int = MAX_RANK) -> None:
         self.eps, self.max_rank = eps, max_rank
-        self.compressed: CompressedEntries | None = None
 
     def setUp(self, mat: PETSc.Mat) -> None:
         self.compressed = CompressedEntries(mat, self.eps, self.max_rank)
@@ -111,32 +111,29 @@ class TensorTrain(Context):
         self._times(self._product, x, y)
 
     def multTranspose(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        assert self.compressed is not None
         if self._transposed is None:
             symmetric = self.compressed.symmetric
             self._transposed = self._product if symmetric else self.compressed.product(self.compressed.train.T)
         self._times(self._transposed, x, y)
 
     def _times(self, product: TrainProduct, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        assert self.compressed is not None
         with PETSc.Log.Event("TTMult"):
             local = x.array_r
             y.array_w[:] = self.compressed.shift * local + self.compressed.scale * product(local)
 
     def getDiagonal(self, mat: PETSc.Mat, diagonal: PETSc.Vec) -> None:
-        assert self.compressed is not None
         here = np.arange(*mat.getOwnershipRange())
         diagonal.array_w[:] = self.compressed.entries.own(here, here)
 
     def view(self, mat: PETSc.Mat, viewer: PETSc.Viewer | None = None) -> None:
-        if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII and self.compressed is not None:
+        if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII and hasattr(self, "compressed"):
             viewer.printfASCII(f"  tensor train: {self.compressed.words()}\n")
 
 
 def compressed(P: PETSc.Mat) -> CompressedEntries | None:
     """The compressed entries of P, if P is a Mat of this module; otherwise None."""
     context = P.getPythonContext() if P.getType() == PETSc.Mat.Type.PYTHON else None
-    return context.compressed if isinstance(context, TensorTrain) else None
+    return getattr(context, "compressed", None) if isinstance(context, TensorTrain) else None
 
 
 def from_entries(

@@ -1,9 +1,5 @@
 """Preconditioners for ``-pc_type python -pc_python_type pctt.pc.NAME``."""
 
-from pctt.petsc import require_real_double
-
-require_real_double()
-
 from pctt.pc.body_schur import BodySchur
 from pctt.pc.tensor_train import TensorTrain
 from pctt.pc.two_level import TwoLevel

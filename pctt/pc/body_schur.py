@@ -63,7 +63,7 @@ class BodySchur(PythonPC):
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
-        self.ksp: PETSc.KSP | None = None
+        self.ksp: PETSc.KSP = None  # before `build`
         self.solves = self.its = 0
         self._rtol, self._atol = 1e-3, 0.0
         self._formed: PETSc.Mat | None = None  # the matrix of the inner preconditioner, if it is not the stiff part
@@ -105,7 +105,6 @@ class BodySchur(PythonPC):
         floor = 1e-14 * np.trace(barrier, axis1=1, axis2=2)  # rounding may have made a block singular
         self.inverse_barrier = np.linalg.inv(barrier + floor[:, None, None] * np.eye(3))
         self.K.update(self.inverse_barrier)
-        assert self.ksp is not None
         old, self._formed = self._formed, without_memory(self.K.mat, self.ksp.pc.getType())
         self.ksp.setOperators(self.K.mat, self._stiff_part() if self._formed is None else self._formed)
         with entered(self._options):
@@ -115,7 +114,6 @@ class BodySchur(PythonPC):
 
     def _stiff_part(self) -> PETSc.Mat:
         """The matrix of the inner preconditioner."""
-        assert self.ksp is not None
         kind = self.ksp.pc.getType()
         least = self.options.least if kind in _FACTORS else 0.0
         entries = self.K.entries()
@@ -134,7 +132,6 @@ class BodySchur(PythonPC):
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """z = B^-1 (r - G K^-1 G' B^-1 r); the inner KSP solves with K."""
-        assert self.ksp is not None
         r = x.array_r.reshape(-1, 3)
         self._rhs.array_w[:] = self._G.momenta(times(self.inverse_barrier, r)).ravel()
         self.ksp.setTolerances(rtol=1e-14, atol=(self._atol or self._rtol * x.norm()) / self._gain)

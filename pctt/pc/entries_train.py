@@ -8,9 +8,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.mat.tensor_train import CompressedEntries, compressed
-from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
 from pctt.pc.positivity import CERTAIN, finds_negative, has_inertia_of
 from pctt.pc.train_options import Account, Options
+from pctt.tt.inverse import Inverse, invert_near_identity
 from pctt.tt.lowest import lowest
 from pctt.tt.train import identity
 
@@ -28,7 +28,7 @@ class EntriesTrain:
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
         self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
         self.compressed: CompressedEntries | None = None
-        self.inverse: ApproximateInverse | None = None
+        self.inverse: Inverse | None = None
 
     def make(self, P: PETSc.Mat, rank: int) -> bool:
         """Make a train. If there is no positive inverse, return False and write the reason to the account.
@@ -58,7 +58,7 @@ class EntriesTrain:
         name = f"-{self.prefix}pc_tt_order"
         return CompressedEntries(P, eps, rank, self.options.order, name, start, self.options.seed)
 
-    def _invert(self, rank: int, eps: float) -> ApproximateInverse | None:
+    def _invert(self, rank: int, eps: float) -> Inverse | None:
         """The inverse; None if the train of the matrix turns out not to be positive."""
         assert self.compressed is not None
         T = self.compressed.train
@@ -68,15 +68,15 @@ class EntriesTrain:
         if WORTH * eps <= certain:  # a little more accuracy is cheaper than a test whether the inverse is positive
             eps = min(eps, certain)
         rng = np.random.default_rng(self.options.seed)
-        return approximate_inverse(self.compressed.found, rank, eps, True, None, rng)
+        return invert_near_identity(T, rank, eps=eps, rng=rng)
 
-    def _is_positive(self, inverse: ApproximateInverse) -> bool:
+    def _is_positive(self, inverse: Inverse) -> bool:
         """Take I + Z into use, and tell whether it is positive.
 
         It is positive, like its matrix, if it is near enough to the inverse. Otherwise a test decides.
         """
         assert self.compressed is not None
-        Z, T = inverse.train, self.compressed.train
+        Z, T = inverse.applied, self.compressed.train
         self._product = self.compressed.product(Z.astype(np.float32) if self.options.eps >= SINGLE else Z)
         if inverse.repaired == 0 and self.comm.bcast(has_inertia_of(inverse.residual * T.norm())):
             return True
@@ -102,5 +102,5 @@ class EntriesTrain:
         """Ranks, errors and sizes."""
         if self.inverse is None or self.compressed is None:
             return ""
-        X = self.inverse.train
+        X = self.inverse.applied
         return f"{self.compressed.words()}; inverse I + Z ranks {X.ranks} residual {self.inverse.residual:.2g}"

@@ -22,17 +22,6 @@ REACH = 12  # the search for an empty slot goes this number of boxes far
 FAR = 0.02  # part of the rows that may go further away
 
 
-def capacity(P: PETSc.Mat, box: int, order: str = "auto") -> int:
-    """The number of slots for the block rows of this rank. Collective; ValueError as in `grid_slots`."""
-    grid = grid_slots(P, order)
-    if grid is not None:
-        return grid[1]
-    count = P.getLocalSize()[0] // P.getBlockSize()
-    if P.getAttr("key") is None or P.getAttr("coordinates") is None:
-        return count
-    return -(-int(np.ceil(count * (1 + SPARE))) // box) * box
-
-
 class Slots:
     """The slots of this rank's block rows.
 
@@ -58,7 +47,8 @@ class Slots:
             return
         self.evolving = keys is not None and points is not None and order in ("auto", "morton")
         rows = np.argsort(block_order(P, order), kind="stable")
-        self.capacity = capacity(P, box, order)
+        spare = -(-int(np.ceil(count * (1 + SPARE))) // box) * box
+        self.capacity = spare if self.evolving else count
         self.place = np.empty(count, np.int64)
         self.place[rows] = np.arange(count) * self.capacity // max(count, 1)
         if self.evolving:

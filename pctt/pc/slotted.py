@@ -73,12 +73,10 @@ class SlottedMatrix:
             return np.concatenate([blocks, np.tile(typical * np.eye(self.block), (self._empty, 1, 1))])
         roots = self.root[self.place]
         everywhere = self._gathered(roots)
-        scaled = _diagonal(roots) @ self._bsr(blocks) @ _diagonal(everywhere.transpose(0, 2, 1))
-        return scaled.data[self._kept]  # scipy keeps the order of the blocks, because each has one factor
-
-    def _bsr(self, blocks: np.ndarray) -> sp.bsr_matrix:
         shape = (self.block * len(self.place), self.block * self._total)
-        return sp.bsr_matrix((blocks, self._column, self._pointers), shape=shape)
+        rows = sp.bsr_matrix((blocks, self._column, self._pointers), shape=shape)
+        scaled = _diagonal(roots) @ rows @ _diagonal(everywhere.transpose(0, 2, 1))
+        return scaled.data[self._kept]  # scipy keeps the order of the blocks, because each has one factor
 
     def _pattern(self, P: PETSc.Mat) -> sp.bsr_matrix:
         """The pattern of the blocks of this rank's rows. Its values are the numbers of P's values, from 1."""

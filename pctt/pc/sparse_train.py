@@ -11,17 +11,17 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.options import OptionError
-from pctt.pc.approximate_inverse import ApproximateInverse, approximate_inverse
+from pctt.pc.ordering import grid_slots
 from pctt.pc.positivity import finds_negative
 from pctt.pc.refresh_schedule import RefreshSchedule
-from pctt.pc.slots import Slots, capacity
+from pctt.pc.slots import Slots
 from pctt.pc.slotted import SlottedMatrix
 from pctt.pc.train_options import Account, Options
 from pctt.tt.als import Compression, compress
 from pctt.tt.apply import Apply
 from pctt.tt.cross import Cross, compress_cross
-from pctt.tt.quantise import check_modes, choose_modes
+from pctt.tt.inverse import Inverse, invert, invert_near_identity
+from pctt.tt.quantise import choose_modes
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Train
 
@@ -34,27 +34,29 @@ class SparseTrain:
     tree : slots that are kept from structure to structure
     """
 
+    slots: SlottedMatrix
+
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
         self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
         self._forget_structure()
         self._forget_trains()
 
     def _forget_structure(self) -> None:
-        self.slots: SlottedMatrix | None = None
+        self._begun = False  # whether there are slots for the present structure
         self.hierarchy: SparseHierarchy | None = None
 
     def _forget_trains(self) -> None:
         self.tree: Slots | None = None
         self.compression: Compression | Cross | None = None
-        self.inverse: ApproximateInverse | None = None
-        self._opening: ApproximateInverse | None = None  # the inverse for the first matrix of a structure
+        self.inverse: Inverse | None = None
+        self._opening: Inverse | None = None  # the inverse for the first matrix of a structure
+        self._cap = 0  # of the ranks of these
         self._schedule = RefreshSchedule()
         self._apply: Apply | None = None
 
     def begin(self, P: PETSc.Mat) -> None:
-        """Begin a new structure; ValueError on all ranks if the modes or the grid do not fit it."""
-        slots = self.comm.allreduce(capacity(P, self.options.leaf, self.options.order))
-        self._check_modes(slots)
+        """Begin a new structure; ValueError on all ranks if the grid does not fit it."""
+        grid_slots(P, self.options.order)
         self._forget_structure()
         if self.options.reuse != "steps":
             self._forget_trains()
@@ -67,10 +69,9 @@ class SparseTrain:
         if self.options.reuse == "none":
             self._forget_structure()
             self._forget_trains()
-        first = self.slots is None
+        first = not self._begun
         if first:
             self._take_slots(P)
-        assert self.slots is not None
         try:
             self.slots.scale(P)
             singular = False
@@ -78,8 +79,9 @@ class SparseTrain:
             singular = True
         if self.comm.allreduce(singular, op=MPI.LOR):
             return self._refuse("a diagonal block is not positive definite")
-        if self.inverse is not None and self.inverse.cap != rank:
+        if self._cap != rank:
             self.compression = self.inverse = self._opening = None
+            self._cap = rank
         kept = (self._opening if first else self.inverse) if self.options.keep else None
         if kept is not None and not self._schedule.over():
             self._use(kept)
@@ -90,13 +92,11 @@ class SparseTrain:
             self._opening = self.inverse
         return True
 
-    def _try_new(self, P: PETSc.Mat, rank: int, kept: ApproximateInverse | None) -> bool:
+    def _try_new(self, P: PETSc.Mat, rank: int, kept: Inverse | None) -> bool:
         """Make a train for P and use it, or use the kept train if it is as good; False if no train is positive."""
-        assert self.slots is not None
         if self.hierarchy is None:
             with PETSc.Log.Event("TTBuild"):
-                self._list_block_pairs(P)
-        assert self.hierarchy is not None
+                self.hierarchy = self._block_pairs(P)
         self.hierarchy.set_values(self.slots.load(P))
         warm = self.compression is not None
         with PETSc.Log.Event("TTCompress"):
@@ -119,9 +119,9 @@ class SparseTrain:
             self.account.kept += 1
         return True
 
-    def _use(self, inverse: ApproximateInverse) -> None:
+    def _use(self, inverse: Inverse) -> None:
         self.inverse = inverse
-        self._prepare_apply(inverse.train)
+        self._prepare_apply(inverse.applied)
 
     def _is_positive(self, P: PETSc.Mat) -> bool:
         """Whether the train in use is positive, as far as a test with the symmetric part of P shows."""
@@ -141,7 +141,6 @@ class SparseTrain:
 
     def _left(self, P: PETSc.Mat) -> float:
         """||w - S X w|| / ||w|| for a random vector w, where S is the scaled matrix."""
-        assert self.slots is not None
         slots = self.slots
         w = np.zeros((slots.capacity, slots.block))
         w[slots.place] = np.random.default_rng(self.options.seed).standard_normal((len(slots.place), slots.block))
@@ -156,22 +155,20 @@ class SparseTrain:
 
     def _take_slots(self, P: PETSc.Mat) -> None:
         """Give slots to P's block rows; use those of the last structure if they fit."""
-        if self.tree is not None and not self.tree.follow(P, self._agree):
+        if self.tree is not None and not self.tree.follow(P, lambda fits: self.comm.allreduce(fits, op=MPI.LAND)):
             self.account.resets += 1
             self._forget_trains()
         if self.tree is None:
             self.tree = Slots(P, self.options.leaf, self.options.order)
         self.slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaling == "block")
+        self._begun = True
 
-    def _list_block_pairs(self, P: PETSc.Mat) -> None:
-        assert self.slots is not None
-        self.slots.list_blocks(P)
+    def _block_pairs(self, P: PETSc.Mat) -> SparseHierarchy:
+        assert self.tree is not None
         slots = self.slots
-        modes = self._modes(slots.size)
-        self.hierarchy = SparseHierarchy(slots.rows, slots.columns, modes, slots.block, self._add, self.comm.bcast)
-
-    def _agree(self, here: bool) -> bool:
-        return bool(self.comm.allreduce(here, op=MPI.LAND))
+        slots.list_blocks(P)
+        modes = self.tree.modes or choose_modes(slots.size, self.options.leaf)
+        return SparseHierarchy(slots.rows, slots.columns, modes, slots.block, self._add, self.comm.bcast)
 
     def _compress(self, rank: int, warm: bool) -> Compression | Cross:
         assert self.hierarchy is not None
@@ -182,28 +179,12 @@ class SparseTrain:
         train = self.compression.train if warm and self.compression is not None else None
         return compress(self.hierarchy, rank, options.eps, train, rng=rng)
 
-    def _invert(self, rank: int, warm: bool) -> ApproximateInverse:
+    def _invert(self, rank: int, warm: bool) -> Inverse:
         assert self.compression is not None
         options, rng = self.options, np.random.default_rng(self.options.seed)
-        start = self.inverse.train if warm and self.inverse is not None else None
-        return approximate_inverse(self.compression, rank, options.eps, options.scaling == "block", start, rng)
-
-    def _modes(self, slots: int) -> tuple[int, ...]:
-        assert self.tree is not None
-        return self._check_modes(slots) or self.tree.modes or choose_modes(slots, self.options.leaf)
-
-    def _check_modes(self, slots: int) -> tuple[int, ...]:
-        """The modes that the user gave, or (). OptionError if they are not numbers or hold too few slots."""
-        text = self.options.modes
-        if not text:
-            return ()
-        try:
-            return check_modes([int(word) for word in text.split(",")], slots)
-        except ValueError:
-            raise OptionError(
-                f"-{self.prefix}pc_tt_modes {text}: allowed are whole numbers >= 1 with commas between, whose product "
-                f"is at least {slots}"
-            ) from None
+        start = self.inverse.applied if warm and self.inverse is not None else None
+        method = invert_near_identity if options.scaling == "block" else invert  # block scaling has unit blocks
+        return method(self.compression.train, rank, start, eps=options.eps, rng=rng)
 
     def _refuse(self, why: str) -> bool:
         self.account.fallbacks.append(why)
@@ -213,7 +194,6 @@ class SparseTrain:
     # -- application ----------------------------------------------------------------------------------------
 
     def _prepare_apply(self, train: Train) -> None:
-        assert self.slots is not None
         slots = self.slots
         if self._apply is None:
             bs = slots.block
@@ -238,7 +218,6 @@ class SparseTrain:
 
     def _to_slots(self, x: np.ndarray) -> np.ndarray:
         """L^-1 x in slot order (capacity bs,), in a buffer that the next call overwrites."""
-        assert self.slots is not None
         slots = self.slots
         if slots.capacity > len(slots.place):
             self._local[:] = 0.0
@@ -248,7 +227,6 @@ class SparseTrain:
 
     def _from_slots(self, z: np.ndarray) -> np.ndarray:
         """L^-T z in the order of the block rows."""
-        assert self.slots is not None
         slots = self.slots
         np.matmul(slots.root.transpose(0, 2, 1), z.reshape(self._scaled.shape), out=self._scaled)
         return self._scaled[slots.place].ravel()
@@ -256,7 +234,6 @@ class SparseTrain:
     def _inverse_times(self, x: np.ndarray) -> np.ndarray:
         """This rank's part of X x in slot order, from its part of x."""
         assert self.inverse is not None
-        assert self.slots is not None
         assert self._apply is not None
         self.slots.gather_slots(x, self._whole)
         self._apply.x[: self._apply.n] = self._whole
@@ -272,12 +249,11 @@ class SparseTrain:
 
     def words(self) -> str:
         """Ranks, errors and sizes."""
-        if self.inverse is None:
+        if self.inverse is None or self.compression is None:
             return ""
-        compression, X = self.inverse.of, self.inverse.train
-        T = compression.train
+        T, X = self.compression.train, self.inverse.applied
         form = "I + Z" if self.inverse.identity else "X"
         return (
-            f"modes {'x'.join(map(str, T.rows))}, matrix ranks {T.ranks} error {compression.error:.2g}, inverse "
+            f"modes {'x'.join(map(str, T.rows))}, matrix ranks {T.ranks} error {self.compression.error:.2g}, inverse "
             f"{form} ranks {X.ranks} residual {self.inverse.residual:.2g}, {X.storage} numbers"
         )

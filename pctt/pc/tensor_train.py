@@ -21,35 +21,35 @@ from pctt.pc.base import PythonPC
 from pctt.pc.entries_train import EntriesTrain
 from pctt.pc.mat import check_coordinates, is_symmetric
 from pctt.pc.rank_policy import RankPolicy
-from pctt.pc.second_solve import solve_again
 from pctt.pc.sparse_train import SparseTrain
 from pctt.pc.train_options import ENTRIES_RANK, SPARSE_RANK, Account, Options
 
 NOT_SYMMETRIC = "the matrix is not symmetric, so a train for its inverse may be useless"
 LOWER = 3  # if the cap fails or does not pay, the policy tries the cap divided by this
 POOR = 0.5  # an inverse with a larger residual causes a warning
+#: Reasons for the end of a Krylov method whose preconditioner is not positive definite.
+SPOILT = {
+    getattr(PETSc.KSP.ConvergedReason, f"DIVERGED_{name}")
+    for name in ("BREAKDOWN", "BREAKDOWN_BICG", "INDEFINITE_MAT", "INDEFINITE_PC", "NANORINF", "DTOL")
+}
 
 
 class TensorTrain(PythonPC):
-    """The python PC; see the module and ``Options``. It works on symmetric positive definite Mats of any block size.
-
-    made : the maker of trains, for sparse matrices or for matrices given by their entries
-    """
+    """The python PC; see the module and ``Options``. It works on symmetric positive definite Mats of any block size."""
 
     options_class = Options
     options_prefix = "pc_tt_"
     options: Options
+    policy: RankPolicy
+    made: SparseTrain | EntriesTrain  #: the maker of trains
     sparse_train: type[SparseTrain] = SparseTrain
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
         self.account = Account()
-        self.policy: RankPolicy | None = None
         self.rank = 1
         self.symmetric = True
-        self.made: SparseTrain | EntriesTrain | None = None
-        self._jacobi: PETSc.PC | None = None
-        self._diagonal: PETSc.Mat | None = None  # the matrix of block Jacobi
+        self._own: list[PETSc.Object] = []  # block Jacobi and its matrix
 
     # -- set-up ---------------------------------------------------------------------------------------------
 
@@ -68,18 +68,18 @@ class TensorTrain(PythonPC):
         self.release()
         self._jacobi = PETSc.PC().create(P.comm)
         self._jacobi.setType(PETSc.PC.Type.PBJACOBI)
+        self._own = [self._jacobi]
 
     def _begin_sparse(self, P: PETSc.Mat) -> None:
-        if not isinstance(self.made, SparseTrain):
+        if isinstance(getattr(self, "made", None), SparseTrain):
+            self.policy.forgive()  # a rank that failed on another matrix may work here
+        else:
+            cap = self.options.cap(SPARSE_RANK)
             self.made = self.sparse_train(self.comm, self.options, self.account, self.prefix)
-            self.policy = None
+            self.policy = RankPolicy((max(1, cap // LOWER), cap), self.options.rank == "auto")
+        assert isinstance(self.made, SparseTrain)
         self.made.begin(P)
         self._say_symmetry(is_symmetric(P))
-        if self.policy is None:
-            cap = self.options.cap(SPARSE_RANK)
-            self.policy = RankPolicy((max(1, cap // LOWER), cap), self.options.rank == "auto")
-        else:
-            self.policy.forgive()  # a rank that failed on another matrix may work here
 
     def _say_symmetry(self, symmetric: bool) -> None:
         self.symmetric = symmetric
@@ -88,8 +88,6 @@ class TensorTrain(PythonPC):
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Make a preconditioner of the rank that the policy chooses; if this fails, use block Jacobi."""
-        assert self.policy is not None
-        assert self.made is not None
         start = time.perf_counter()
         # all take the first process's choice, because figures may differ in the last bit
         self.rank = self.comm.bcast(self.policy.choose())
@@ -119,12 +117,12 @@ class TensorTrain(PythonPC):
             warnings.warn(f"{self.name}: {word}", stacklevel=2)
 
     def _make_block_jacobi(self, P: PETSc.Mat) -> None:
-        assert self._jacobi is not None
-        old, self._diagonal = self._diagonal, self._block_diagonal(P)
-        self._jacobi.setOperators(self._diagonal)
+        old, diagonal = self._own[1:], self._block_diagonal(P)
+        self._jacobi.setOperators(diagonal)
         self._jacobi.setUp()
-        if old is not None:
-            old.destroy()
+        self._own = [self._jacobi, diagonal]
+        for mat in old:
+            mat.destroy()
 
     def _block_diagonal(self, P: PETSc.Mat) -> PETSc.Mat:
         return block_diagonal(P, diagonal_blocks(P) if has_entries(P) else None)
@@ -134,10 +132,8 @@ class TensorTrain(PythonPC):
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x, where M is block Jacobi or the train."""
         if self.rank == 1:
-            assert self._jacobi is not None
             self._jacobi.apply(x, y)
             return
-        assert self.made is not None
         with PETSc.Log.Event("TTApply"):
             y.array_w[:] = self.made.times(x.array_r)
 
@@ -148,13 +144,10 @@ class TensorTrain(PythonPC):
 
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Report the seconds and the accuracy of the solve to the policy; ban a rank with which the method stalled."""
-        assert self.policy is not None
         reason, rank = ksp.getConvergedReason(), self.rank
-        assert self.made is not None
-        spoilt = rank > 1 and solve_again(ksp, self._block_diagonal, self.P, b, x)
-        if spoilt:  # other solves with this matrix must not use the train either
-            self.rank = 1
-            self._make_block_jacobi(self.P)
+        spoilt = rank > 1 and reason in SPOILT
+        if spoilt:
+            self._solve_again(ksp, b, x)
             what = f"{ksp.getType()} broke down ({reason}) at rank {rank}"
             self.account.fallbacks.append(f"{what}, solved again with block Jacobi")
         seconds = self._slowest(time.perf_counter() - self._solve_start)
@@ -176,6 +169,26 @@ class TensorTrain(PythonPC):
         self.policy.report(rank, self._setup_seconds + seconds, max(digits, 0.0), sound)
         self._setup_seconds = 0.0  # a second solve with the same matrix has no set-up
 
+    def _solve_again(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Solve from zero by the same method with block Jacobi, which other solves with this matrix then use too.
+
+        The KSP gets the outcome.
+        """
+        self.rank = 1
+        self._make_block_jacobi(self.P)
+        again = PETSc.KSP().create(ksp.comm)
+        again.setType(ksp.getType())
+        again.setPCSide(ksp.getPCSide())
+        again.setNormType(ksp.getNormType())
+        rtol, atol, divtol, max_it = ksp.getTolerances()
+        again.setTolerances(rtol, atol, divtol, max_it)
+        again.pc.setType(PETSc.PC.Type.PBJACOBI)
+        again.setOperators(ksp.getOperators()[0], self._own[1])
+        again.solve(b, x)
+        ksp.setIterationNumber(ksp.getIterationNumber() + again.getIterationNumber())
+        ksp.setConvergedReason(again.getConvergedReason())
+        again.destroy()
+
     def _slowest(self, seconds: float) -> float:
         return self.comm.allreduce(seconds, op=MPI.MAX)
 
@@ -191,19 +204,16 @@ class TensorTrain(PythonPC):
         ]
         lines += [] if self.symmetric else [NOT_SYMMETRIC]
         lines += [f"fell back: {why} ({a.fallbacks.count(why)} times)" for why in dict.fromkeys(a.fallbacks)]
-        if self.policy is not None:
-            figures = self.policy.figures.items()
-            costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
-            lines.append(f"seconds per digit: {costs or 'none measured yet'}")
-        return lines
+        figures = self.policy.figures.items()
+        costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
+        return [*lines, f"seconds per digit: {costs or 'none measured yet'}"]
 
     def _line(self) -> str:
-        if self.rank == 1 or self.made is None:
+        if self.rank == 1:
             return f"rank 1 (block Jacobi), set up in {self._setup_seconds:.2e} s"
         return f"{self.made.words()}, {self._setup_seconds:.2e} s"
 
     def release(self) -> None:
-        for thing in (self._jacobi, self._diagonal):
-            if thing is not None:
-                thing.destroy()
-        self._jacobi = self._diagonal = None
+        for thing in self._own:
+            thing.destroy()
+        self._own = []

@@ -39,7 +39,6 @@ class Options:
         choices=("auto", "grid", "morton", "rcm", "natural"),
     )
     leaf: int = option(16, "least number of blocks in the first and last mode", check=AT_LEAST_ONE)
-    modes: str = option("", "modes of the blocks, separated by commas; none: modes with little padding")
     reuse: str = option(
         "steps",
         "newton: use cores, index sets and block pairs of the last matrix with the same structure; steps: use its "

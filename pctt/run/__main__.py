@@ -16,14 +16,11 @@ petsc4py.init([word for word in sys.argv if word not in HELP | VERSION])
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.petsc import require_real_double
-
 try:
-    require_real_double()
+    import pctt.petsc
 except ImportError as error:
     sys.exit(str(error))
 
-import pctt
 from dem.together import SceneError
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError
@@ -48,7 +45,7 @@ def main(comm: MPI.Comm) -> None:
         return
     refuse_stray(sys.argv[1:])
     options = read_options(database, comm)
-    if options.problem is not None:
+    if options.run.problem:
         solve_file(options, comm)
     else:
         simulate(options, comm)

@@ -58,7 +58,7 @@ class Dump:
         ``asked`` is the result of the solver that the user chose, ``result`` the one that the step uses. Returns the
         entries for the step's figures. FileError if a file cannot be written.
         """
-        comm, number = self._world.comm, self._world.step + 1
+        number = self._world.step + 1
         wanted = self.run.dump_problem and (not self._steps or number in self._steps)
         hard = not asked.converged and self._hard_left > 0
         files: dict[str, Any] = {"dumped": [], "hard_problem": ""}
@@ -67,17 +67,18 @@ class Dump:
             self._write_fclib(path, system, problem, guess, result, asked)
 
         if problem.size and wanted:
-            path = problem_path(self.run.dump_problem, number, problem.size)
+            path = Path(self.run.dump_problem) / f"step{number:06d}_{problem.size}contacts.h5"
             binary = path.with_suffix(".petsc")
-            _write(path, comm, as_fclib)
+            _write(path, as_fclib)
             files["dumped"] = [str(path)]
             if problem.low_rank is None:  # else N is no sparse matrix
-                _write(binary, comm, lambda path: petsc_binary.write(path, problem))
+                _write(binary, lambda path: petsc_binary.write(path, problem))
                 files["dumped"].append(str(binary))
         if problem.size and hard:
             self._hard_left -= 1
             name = f"step{number:06d}_{problem.size}contacts_{asked.iterations}its.h5"
-            _write(self._place.now / HARD / name, comm, as_fclib)
+            self._place.make(HARD)
+            _write(self._place.now / HARD / name, as_fclib)
             files["hard_problem"] = str(self._place.folder / HARD / name)
         return files
 
@@ -136,18 +137,9 @@ class Dump:
         )
 
 
-def _write(path: Path, comm: MPI.Comm, write: Callable[[Path], None]) -> None:
-    """Let ``write`` make a file, and its folder before; collective. FileError if that fails."""
-    failure = None
-    if comm.rank == 0:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            failure = f"{path}: cannot write ({error.strerror})"
-    failure = comm.bcast(failure)
+def _write(path: Path, write: Callable[[Path], None]) -> None:
+    """Let ``write`` make a file; collective. FileError if that fails."""
     try:
-        if failure:
-            raise OSError(failure)
         write(path)
     except OSError as error:  # raised on all ranks alike
         raise FileError(str(error)) from None
@@ -207,16 +199,6 @@ def _map(system: ContactSystem, world: World, dynamic: np.ndarray) -> PETSc.Mat:
     return H
 
 
-# -- options -------------------------------------------------------------------------------------------------
-
-
-def problem_path(place: str, step: int, contacts: int) -> Path:
-    """The FCLIB file of a step: in the folder ``place``, or ``place`` itself where that has {step} in it."""
-    if "{" not in place:
-        return Path(place) / f"step{step:06d}_{contacts}contacts.h5"
-    return Path(place.format(step=step, contacts=contacts))
-
-
 def dump_steps(run: Run) -> list[int]:
     """The steps of ``-dump_steps``; OptionError if they are not whole numbers."""
     try:
@@ -226,23 +208,3 @@ def dump_steps(run: Run) -> list[int]:
     if min(steps, default=1) < 1:
         raise OptionError(f"-dump_steps {run.dump_steps}: allowed are whole numbers >= 1 with commas between")
     return steps
-
-
-def dump_folder(run: Run) -> Path:
-    """The folder above all that ``-dump_problem`` writes; raises OptionError for options that do not fit."""
-    place = run.dump_problem
-    if dump_steps(run) and not place:
-        raise OptionError(f"-dump_steps {run.dump_steps}: it needs -dump_problem FOLDER, which says where to write")
-    if place and run.problem:
-        raise OptionError(f"-dump_problem {place}: -problem {run.problem} makes no steps; allowed is one of the two")
-    if "{" in place:
-        try:
-            two = {problem_path(place, step, 1) for step in (1, 2)}
-        except (LookupError, ValueError, AttributeError):
-            two = set()
-        if len(two) < 2 or two.pop().suffix not in (".h5", ".hdf5"):
-            raise OptionError(
-                f"-dump_problem {place}: allowed is a folder, or a file name that ends in .h5 or .hdf5 with {{step}} "
-                "in it, and {contacts} if wanted, such as problems/{step:06d}_{contacts}.h5"
-            )
-    return Path(place.partition("{")[0] + "x").parent if "{" in place else Path(place)

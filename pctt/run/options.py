@@ -21,7 +21,7 @@ from pctt.contact_map import is_free
 from pctt.ksp_options import entered, to_enter
 from pctt.options import OptionError, describe, read, refuse_unknown
 from pctt.petsc import own_errors
-from pctt.run.dump import dump_folder
+from pctt.run.dump import dump_steps
 from pctt.run.hdf5 import refuse_serial
 from pctt.run.leftovers import OF_SOLVERS, refuse_misspelt
 from pctt.run.place import held, is_checkpoint_of
@@ -78,11 +78,11 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     refuse_serial(comm)
     _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
     _refuse_missing("-problem", run.problem, comm)
-    problems = dump_folder(run)
+    dump_steps(run)  # refuses what is no list of steps
     if not run.settle:
         _refuse_unwritable("-output", Path(run.output), comm)
         if run.dump_problem:
-            _refuse_unwritable("-dump_problem", problems, comm)
+            _refuse_unwritable("-dump_problem", Path(run.dump_problem), comm)
         _refuse_occupied(run, comm)
     return options
 
@@ -136,6 +136,7 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb:
             lambda name: (name in own or name.startswith(("ccp_", *OF_SOLVERS))) and name not in OF_SETTLING,
             "-settle makes its state with APGD, where this option has no effect; allowed is one of the two",
         ),
+        (not run.dump_problem, lambda name: name == "dump_steps", "it needs -dump_problem FOLDER"),
         (not run.problem, lambda name: name == "problem_guess", "allowed with -problem only"),
         (
             not run.settle and run.restart != "settled",

@@ -20,8 +20,7 @@ from pctt.run.settings import Options
 
 def solve_file(options: Options, comm: MPI.Comm) -> None:
     """Solve, print the figures, and write them to summary.json in the output folder."""
-    assert options.problem is not None
-    stored = _load(options.problem, comm, options.run.ccp_compliance, options.run.ccp_operator)
+    stored = _load(options.run.problem, comm, options.run.ccp_compliance, options.run.ccp_operator)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     with stored.problem:
         summary = _solve(stored, options, compare)
@@ -64,7 +63,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
     solves = compare.take_solves()
     by_newton = ccp.SOLVERS[used].newton
     return {
-        "problem": str(options.problem),
+        "problem": options.run.problem,
         "format": stored.form,
         "title": stored.title,
         "note": stored.note,

@@ -64,11 +64,7 @@ class Run:
     checkpoint_every: int = option(1, "steps between two checkpoints", check=AT_LEAST_ONE)
     problem: str = option("", "FCLIB, PETSc binary or Siconos file with a cone problem to solve instead of a scene")
     problem_guess: bool = option(True, "start -problem from the guess in the file, if there is one")
-    dump_problem: str = option(
-        "",
-        "folder for the steps' cone problems as FCLIB and PETSc binary files; or names of the FCLIB files, with {step} "
-        "and perhaps {contacts} in them",
-    )
+    dump_problem: str = option("", "folder for the steps' cone problems as FCLIB and PETSc binary files")
     dump_steps: str = option("", "steps that -dump_problem writes, with commas between; none: every step")
     dump_hard: int = option(
         5, "how many cone problems that -ccp_type does not solve are written to the folder hard of -output", check=COUNT
@@ -119,10 +115,6 @@ class Options:
     solver: Any
     coulomb: ccp.Coulomb | None
     demo: bool
-
-    @property
-    def problem(self) -> str | None:
-        return self.run.problem or None
 
     def compare_names(self) -> list[str]:
         return [name for name in self.run.compare.split(",") if name]

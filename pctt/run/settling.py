@@ -23,11 +23,13 @@ from pctt.run.settings import Options, scene_name
 from pctt.run.stepper import Stepper
 
 
-def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, anew: bool = False) -> Path:
-    """The cached settled state of the scene; it is made if it is missing, or with ``anew``. Settling takes the scene's
-    settling time with APGD. The last tenth has the contact distance of the scene and ten times the accuracy: otherwise
-    overlaps remain, and the first accurate step of a run would push them apart. An interrupted or killed settling is
-    continued."""
+def settled_state(
+    options: Options, scene: Scene, comm: MPI.Comm, progress: report.Progress, anew: bool = False
+) -> Path:
+    """The cached settled state of ``scene``, which the experiment of the options has `built`. It is made if it is
+    missing, or with ``anew``. Settling takes the settling time with APGD. The last tenth has the contact distance of
+    the scene and ten times the accuracy: otherwise overlaps remain, and the first accurate step of a run would push
+    them apart. An interrupted or killed settling is continued."""
     if not options.scene.settling_time:
         raise OptionError(f"-scene {options.run.scene}: has no settling_time and so no settled state")
     made_with = checkpoint.origin(scene_name(options.run.scene), options.scene, options.dt)
@@ -39,7 +41,7 @@ def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, a
     }
     if options.scene.digest:
         settings["file"] = options.scene.digest  # a file that was changed may build another scene
-    if triangles := checkpoint.surfaces(built(options.scene, comm).large_bodies):
+    if triangles := checkpoint.surfaces(scene.large_bodies):
         settings["surfaces"] = {name: [f"{value:.5g}" for value in figures] for name, figures in triangles.items()}
     path = checkpoint.settled_path(made_with["scene"], settings)
     if not anew and comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
@@ -50,10 +52,10 @@ def settled_state(options: Options, comm: MPI.Comm, progress: report.Progress, a
     if comm.rank == 0:
         path.parent.mkdir(parents=True, exist_ok=True)
     if comm.bcast(unfinished.exists()):
-        world, memory = checkpoint.load(unfinished, built(options.scene, comm), made_with, comm)
+        world, memory = checkpoint.load(unfinished, scene, made_with, comm)
         progress.say(f"  goes on after step {world.step}, from {unfinished}")
     else:
-        world, memory = world_at_start(options.scene, comm), ImpulseMemory(comm)
+        world, memory = world_at_start(options.scene, scene, comm), ImpulseMemory(comm)
     _settle(options, world, memory, steps, unfinished, made_with, progress)
     checkpoint.save(path, made_with, world, memory)
     if comm.rank == 0:
@@ -104,12 +106,12 @@ def _settle(
                 raise interrupt.InterruptError(words)
 
 
-def world_at_start(scene: Experiment, comm: MPI.Comm) -> World:
-    """The scene at time zero; OptionError if it cannot start so."""
+def world_at_start(experiment: Experiment, scene: Scene, comm: MPI.Comm) -> World:
+    """What the experiment built, at time zero; OptionError if it cannot start so."""
     try:
-        return new_world(built(scene, comm), comm)
+        return new_world(scene, comm)
     except ValueError as error:
-        raise OptionError(f"scene {type(scene).__name__}: {error}") from None
+        raise OptionError(f"scene {type(experiment).__name__}: {error}") from None
 
 
 def built(scene: Experiment, comm: MPI.Comm) -> Scene:

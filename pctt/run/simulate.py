@@ -28,7 +28,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     progress = report.Progress(comm.rank == 0 and not options.run.quiet, options.run.monitor)
     tell_first_compilation(progress.say)
     if options.run.settle:
-        path = settled_state(options, comm, progress, anew=True)
+        path = settled_state(options, built(options.scene, comm), comm, progress, anew=True)
         progress.say(f"settled state: {path}")
         return
     if options.demo:
@@ -148,11 +148,11 @@ def _count_output(line: dict[str, Any]) -> None:
 
 def first_state(options: Options, comm: MPI.Comm, progress: report.Progress) -> tuple[World, ImpulseMemory]:
     """The world and the impulses that a run begins with: the scene's own, or those of ``-restart``."""
-    run, scene = options.run, options.scene
+    run, scene = options.run, built(options.scene, comm)
     if not run.restart:
-        return world_at_start(scene, comm), ImpulseMemory(comm)
-    path = settled_state(options, comm, progress) if run.restart == "settled" else Path(run.restart)
-    made_with = checkpoint.origin(scene_name(run.scene), scene, options.dt)
-    world, memory = checkpoint.load(path, built(scene, comm), made_with, comm, run.restart_changed_file)
+        return world_at_start(options.scene, scene, comm), ImpulseMemory(comm)
+    path = settled_state(options, scene, comm, progress) if run.restart == "settled" else Path(run.restart)
+    made_with = checkpoint.origin(scene_name(run.scene), options.scene, options.dt)
+    world, memory = checkpoint.load(path, scene, made_with, comm, run.restart_changed_file)
     progress.say(f"from {path}: step {world.step}, time {world.time:g} s")
     return world, memory

@@ -20,7 +20,7 @@ from pctt.tt.entries import EntryMatrix
 from pctt.tt.grid import GridDigits
 from pctt.tt.inverse import Inverse, invert, invert_near_identity, residual
 from pctt.tt.lowest import lowest
-from pctt.tt.quantise import check_modes, choose_modes, merge, scalar_modes, slots_of
+from pctt.tt.quantise import choose_modes, merge, scalar_modes, slots_of
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Train, decompose, decompose_matrix, identity, matrix_train, random, zeros
 
@@ -33,7 +33,6 @@ __all__ = [
     "Inverse",
     "SparseHierarchy",
     "Train",
-    "check_modes",
     "choose_modes",
     "compress",
     "compress_cross",

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pctt.tt.projection import columns, rows
 from pctt.tt.quantise import slots_of
 from pctt.tt.sparse import SparseHierarchy, on_one_rank
 from pctt.tt.train import Array, Train, full_ranks, matrix_train, zeros
@@ -87,7 +88,7 @@ def _passes(
     matrix: SparseHierarchy, cores: list[Array], rank: int, sweeps: int, rng: np.random.Generator
 ) -> list[Array]:
     """Cores of the given rank after a forward pass and ``sweeps`` sweeps; they begin with the old cores, if any."""
-    cores, x = forward(matrix, _spreads(matrix, _right_orthonormal(_widen(matrix, cores, rank, rng))))
+    cores, x = forward(matrix, _spreads(matrix, Train(_widen(matrix, cores, rank, rng)).right_orthogonal().flat()))
     for _ in range(sweeps):
         cores, x = forward(matrix, backward(matrix, x, cores[-1]))
     return cores
@@ -102,7 +103,7 @@ def forward(matrix: SparseHierarchy, spreads: list[Array]) -> tuple[list[Array],
     for k, spread in enumerate(spreads):
         rank = spread.shape[1] // matrix.slot_modes[k] ** 2
         core = matrix.middle(x[k], spread, rank)
-        cores.append(np.linalg.qr(core.reshape(-1, rank))[0].reshape(*core.shape[:2], -1))
+        cores.append(columns(core))
         x.append(matrix.down(k, x[k], cores[k]))
     return [*cores, matrix.leaf_core(x[-1])], x
 
@@ -112,11 +113,11 @@ def backward(matrix: SparseHierarchy, x: list[Array], last: Array) -> list[Array
 
     Returns the matrix contracted with the new right interfaces.
     """
-    right = _orthonormal_rows(last)
+    right = rows(last)
     V = matrix.leaf_up(right)
     spreads = [matrix.spread(len(x) - 2, V)]
     for k in range(len(x) - 2, 0, -1):
-        right = _orthonormal_rows(matrix.middle(x[k], spreads[0], V.shape[1]))
+        right = rows(matrix.middle(x[k], spreads[0], V.shape[1]))
         V = matrix.up(spreads[0], right)
         spreads.insert(0, matrix.spread(k - 1, V))
     return spreads
@@ -196,19 +197,3 @@ def _widen(matrix: SparseHierarchy, cores: list[Array], rank: int, rng: np.rando
             core[:a, :, :b] = cores[k][:a, :, :b]
         wide.append(core)
     return wide
-
-
-def _right_orthonormal(cores: list[Array]) -> list[Array]:
-    """Cores whose right interfaces are orthonormal and span those of the given cores, except for the first core."""
-    cores = list(cores)
-    for k in range(len(cores) - 1, 0, -1):
-        Q, R = np.linalg.qr(cores[k].reshape(len(cores[k]), -1).T)
-        cores[k] = np.ascontiguousarray(Q.T).reshape(-1, *cores[k].shape[1:])
-        cores[k - 1] = cores[k - 1] @ R.T
-    return cores
-
-
-def _orthonormal_rows(core: Array) -> Array:
-    """A core (r, n, r') whose rows, as a matrix (r, n r'), are orthonormal and span those of the given core."""
-    Q = np.linalg.qr(core.reshape(len(core), -1).T)[0]
-    return np.ascontiguousarray(Q.T).reshape(-1, *core.shape[1:])

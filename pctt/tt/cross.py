@@ -77,9 +77,9 @@ def compress_cross(
     if entries.norm == 0:
         nothing = [np.zeros(1, np.int64)] * len(entries.width)
         return Cross(zeros(matrix.modes, matrix.modes, matrix.dtype), 0.0, 0, 0, nothing, nothing)
-    validation = entries.validation()
+    validation = matrix.validation(SAMPLES, rng)
     most = min(max_rank, EXTRA)
-    extra = entries.stored(most)
+    extra = matrix.sample(most, rng)
     prefixes, suffixes = (start.prefixes, start.suffixes) if start else entries.split(extra)
     best: Cross | None = None
     idle, inner = 0, eps
@@ -98,7 +98,7 @@ def compress_cross(
     assert best is not None, "there is at least one sweep"
     if isinstance(matrix, SparseHierarchy) and measure:
         return replace(best, error=relative_error(matrix, best.train))
-    return replace(best, error=matrix.agree(entries.error(best.train, *entries.validation())))
+    return replace(best, error=matrix.agree(entries.error(best.train, *matrix.validation(SAMPLES, rng))))
 
 
 class _Entries:
@@ -132,14 +132,6 @@ class _Entries:
         """The distinct prefixes and suffixes of keys for every bond."""
         return [np.unique(keys // w) for w in self.width], [np.unique(keys % w) for w in self.width]
 
-    def stored(self, count: int) -> Array:
-        """Keys of up to `count` stored entries, in random rows."""
-        return self.matrix.sample(count, self.rng)
-
-    def validation(self) -> tuple[Array, Array]:
-        """Fresh keys, and weights: the weighted sum of squares over them estimates the sum over all entries."""
-        return self.matrix.validation(SAMPLES, self.rng)
-
     def of_train(self, train: Train, keys: Array) -> Array:
         digits = np.stack([keys // w % square for w, square in zip(self.width[1:], self.squares)])
         return train.at(digits)
@@ -151,7 +143,8 @@ class _Entries:
 
     def worst(self, train: Train, count: int) -> Array:
         """Keys of those stored entries in a sample where the train is worst."""
-        keys = self.rng.permutation(np.unique(self.stored(SAMPLES)))  # spreads equal errors over the matrix
+        keys = np.unique(self.matrix.sample(SAMPLES, self.rng))
+        keys = self.rng.permutation(keys)  # spreads equal errors over the matrix
         error = np.abs(self.at(keys) - self.of_train(train, keys))
         return keys[np.argsort(-error, kind="stable")[:count]]
 

@@ -39,19 +39,27 @@ HIGH = 300  # with a larger product of the ranks of S and X, the residual is est
 
 @dataclass(frozen=True)
 class Inverse:
-    """A train X of the inverse of S, symmetric up to rounding.
+    """A train of the inverse of S, symmetric up to rounding.
 
-    correction : Z = X - I, if the method computed Z (`invert_near_identity`)
-    residual : ||I - S X||_F / ||I||_F, with a correction ||I - S X||_F / ||S - I||_F; NaN if it was not measured
+    applied : X, or Z with X = I + Z if ``identity``
+    residual : ||I - S X||_F / ||I||_F, with ``identity`` ||I - S X||_F / ||S - I||_F
     sweeps : number of sweeps there and back over the cores
     repaired : number of local systems that were not positive definite, because S was not, or nearly not
     """
 
-    train: Train
-    correction: Train | None
+    applied: Train
+    identity: bool
     residual: float
     sweeps: int
     repaired: int
+
+    @property
+    def train(self) -> Train:
+        """X."""
+        if not self.identity:
+            return self.applied
+        unit = identity(self.applied.rows, self.applied.dtype)
+        return unit + self.applied if self.applied.norm() > 0 else unit
 
 
 def invert(
@@ -60,7 +68,6 @@ def invert(
     start: Train | None = None,
     sweeps: int | None = None,
     eps: float = 0.0,
-    measure: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Inverse:
     """The inverse of a symmetric positive definite S with ranks at most `max_rank`.
@@ -71,7 +78,6 @@ def invert(
     sweeps : largest number of sweeps there and back over the cores. The default is 1 with a start; otherwise it is the
         number that the ranks need to reach the cap, and two more.
     eps : with a residual below this the ranks need not grow
-    measure : compute the residual
 
     >>> from pctt.tt.train import decompose_matrix
     >>> A = 3 * np.eye(64) - np.diag(np.ones(63), 1) - np.diag(np.ones(63), -1)
@@ -79,9 +85,8 @@ def invert(
     >>> X.train.ranks, X.residual < 1e-6
     ((1, 5, 5, 1), True)
     """
-    unit = identity(S.rows, S.dtype)
-    X, left, count, repaired = _solve(S, unit, start, max_rank, sweeps, eps, measure, rng)
-    return Inverse(X, None, left, count, repaired)
+    X, left, count, repaired = _solve(S, identity(S.rows, S.dtype), start, max_rank, sweeps, eps, rng)
+    return Inverse(X, False, left, count, repaired)
 
 
 def invert_near_identity(
@@ -90,20 +95,18 @@ def invert_near_identity(
     start: Train | None = None,
     sweeps: int | None = None,
     eps: float = 0.0,
-    measure: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Inverse:
     """The inverse of S = I + T as X = I + Z, with an exact identity.
 
-    The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z
-    (`correction`). All other arguments are those of `invert`. Z is cheaper to apply than X: it takes `Apply(Z)` and one
-    addition.
+    The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z. All other
+    arguments are those of `invert`. Z is cheaper to apply than X: it takes `Apply(Z)` and one addition.
     """
     unit = identity(T.rows, T.dtype)
     if max_rank <= 1 or T.norm() == 0:
-        return Inverse(unit, 0 * unit, float(max_rank <= 1) if T.norm() else 0.0, 0, 0)
-    Z, left, count, repaired = _solve(unit + T, -T, start, max_rank - 1, sweeps, eps, measure, rng)
-    return Inverse(unit + Z, Z, left, count, repaired)
+        return Inverse(0 * unit, True, float(max_rank <= 1) if T.norm() else 0.0, 0, 0)
+    Z, left, count, repaired = _solve(unit + T, -T, start, max_rank - 1, sweeps, eps, rng)
+    return Inverse(Z, True, left, count, repaired)
 
 
 def residual(S: Train, X: Train, B: Train | None = None) -> float:
@@ -174,7 +177,7 @@ class Growing:
         x, z = self.x, self.z
         for k in range(len(x) - 1, 0, -1):
             self._solve(k)
-            new = self.galerkin.rest_right(self.residual, k, x[k])  # (z, m, n, b)
+            new = self.residual.rest_left(self.galerkin, k, x[k])  # (z, m, n, b)
             z[k] = self.residual.rest(k, x[k])
             _push_left(x, self.signs, k, self.most[k - 1], self.drop, new)
             z[k] = rows(z[k])
@@ -228,7 +231,6 @@ def _solve(
     max_rank: int,
     sweeps: int | None,
     eps: float,
-    measure: bool,
     rng: np.random.Generator | None,
 ) -> tuple[Train, float, int, int]:
     """The symmetric solution of S X = B, its relative residual, and the numbers of sweeps and of repaired systems."""
@@ -247,9 +249,9 @@ def _solve(
         count += 1
         if growing.estimate <= enough * norm:
             X = Train(growing.x)
-            left = residual(S, X, B) if measure else eps
+            left = residual(S, X, B)
             if left <= eps:
-                return *(_rounded(S, B, X, left, eps) if measure else (X, np.nan)), count, growing.repaired
+                return *_rounded(S, B, X, left, eps), count, growing.repaired
             enough *= 0.5 * eps / left  # the estimate sees only a part of the residual
         if growing.estimate > IDLE * before:
             if all(x.shape[3] >= r for x, r in zip(growing.x, most)):
@@ -257,7 +259,7 @@ def _solve(
             growing.drop *= 0.3
         before = growing.estimate
     X = Train(growing.x)
-    return X, residual(S, X, B) if measure else np.nan, count, growing.repaired
+    return X, residual(S, X, B), count, growing.repaired
 
 
 def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Train, float]:

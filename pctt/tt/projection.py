@@ -80,9 +80,6 @@ class Projection:
             self.left[k], self.S[k], other.right[k], x
         )
 
-    def rest_right(self, other: Projection, k: int, x: Array) -> Array:
-        return other.rest_left(self, k, x)
-
     def _of_B(self, k: int, left: Array, right: Array) -> Array:
         assert self.B is not None
         return np.tensordot(np.tensordot(left, self.B[k], 1), right, (3, 1))
@@ -96,10 +93,11 @@ def local_product(left: Array, S: Array, right: Array, x: Array) -> Array:
 
 
 def columns(x: Array) -> Array:
-    """A core (a, m, n, b) with orthonormal columns that span those of the given core."""
-    return np.linalg.qr(x.reshape(-1, x.shape[3]))[0].reshape(*x.shape[:3], -1)
+    """A core (a, ..., b) with orthonormal columns that span those of the given core."""
+    return np.linalg.qr(x.reshape(-1, x.shape[-1]))[0].reshape(*x.shape[:-1], -1)
 
 
 def rows(x: Array) -> Array:
-    """A core (a, m, n, b) with orthonormal rows that span those of the given core."""
-    return np.ascontiguousarray(columns(x.transpose(3, 1, 2, 0)).transpose(3, 1, 2, 0))
+    """A core (a, ..., b) with orthonormal rows that span those of the given core."""
+    Q = np.linalg.qr(x.reshape(len(x), -1).T)[0]
+    return np.ascontiguousarray(Q.T).reshape(-1, *x.shape[1:])

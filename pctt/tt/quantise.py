@@ -44,13 +44,6 @@ def choose_modes(n: int, leaf: int = 16, middle: int = 4) -> tuple[int, ...]:
     return best
 
 
-def check_modes(modes: Sequence[int], n: int) -> tuple[int, ...]:
-    """The modes that a user gave, as a tuple; raises ValueError if they do not hold n slots."""
-    if not modes or min(modes) < 1 or slots_of(modes) < n:
-        raise ValueError(f"modes {list(modes)} hold {slots_of(modes)} slots, but {n} are needed")
-    return tuple(int(m) for m in modes)
-
-
 def slots_of(modes: Sequence[int]) -> int:
     """The number of slots (or scalars) that modes hold: their product."""
     return int(np.prod([int(m) for m in modes], dtype=np.int64))

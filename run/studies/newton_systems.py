@@ -141,12 +141,15 @@ class WatchedSparseTrain(SparseTrain):
 
     def _invert(self, rank: int, warm: bool):
         start = time.perf_counter()
-        inverse, positive = super()._invert(rank, warm)
+        inverse = super()._invert(rank, warm)
         self.rows[-1] |= {"invert_s": time.perf_counter() - start, "residual": inverse.residual}
         # what is stored of I + Z is Z, of one rank less
-        rank = mean_rank(inverse.train.ranks) + inverse.identity
-        self.rows[-1] |= {"inverse_rank": rank, "positive": positive}
-        return inverse, positive
+        self.rows[-1] |= {"inverse_rank": mean_rank(inverse.applied.ranks) + inverse.identity}
+        return inverse
+
+    def _is_positive(self, P: PETSc.Mat) -> bool:
+        self.rows[-1] |= {"positive": super()._is_positive(P)}
+        return self.rows[-1]["positive"]
 
 
 class WatchedTrain(TensorTrain):

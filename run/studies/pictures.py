@@ -1,10 +1,10 @@
 """Draws the pictures of README and docs anew; needs no display, but the extra `pictures`.
 
-    run/study pictures [mixer blade shear] [-n N] [-output DIR]    # from their settled states: DIR/NAME.png
-    run/study pictures examples                                    # docs/examples/*.png, by the commands in the files
+    run/study pictures [mixer blade shear drum silo] [-n N] [-output DIR]    # from their settled states: DIR/NAME.png
+    run/study pictures examples                            # docs/examples/*.png, by the commands in the files
 
-Default are the three scenes, 8 and docs. A settled state that is not in ~/.cache/pctt is made first, which takes
-minutes. $RANKS (2) is the number of ranks.
+Default are the five scenes, 8 (silo: 4) and docs. A settled state that is not in ~/.cache/pctt is made first, which
+takes minutes. $RANKS (2) is the number of ranks.
 """
 
 from __future__ import annotations
@@ -20,22 +20,24 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "docs" / "examples"
 
-# steps from the settled state to the picture, and options of pctt.render
+# size, steps from the settled state to the picture, and options of pctt.render
 PICTURES = {
-    "mixer": (1, ("-color", "force", "-range", "0", "5000", "-cut", "-size", "960x720")),
-    "blade": (10, ("-color", "speed", "-size", "800x560")),
-    "shear": (10, ("-color", "speed", "-size", "800x560")),
+    "mixer": (8, 1, ("-color", "force", "-range", "0", "5000", "-cut", "-size", "960x720")),
+    "blade": (8, 10, ("-color", "speed", "-size", "800x560")),
+    "shear": (8, 10, ("-color", "speed", "-size", "800x560")),
+    "drum": (8, 440, ("-color", "speed", "-size", "800x640")),
+    "silo": (4, 60, ("-color", "speed", "-size", "560x720")),
 }
 # the step that is drawn of an example with a film
 STEPS = {"drum": 240, "hopper": 120, "incline": 60, "blade": 160, "bucket": 260}
 COLOURS = 256  # of a picture, which makes it a third as large
 
 
-def draw(scene: str, n: int, target: Path) -> None:
+def draw(scene: str, n: int | None, target: Path) -> None:
     """Simulate the steps of a scene and draw the last."""
-    steps, look = PICTURES[scene]
+    own, steps, look = PICTURES[scene]
     with tempfile.TemporaryDirectory() as folder:
-        run = ["-scene", scene, "-scene_n", n, "-restart", "settled", "-ccp_type", "apgd", "-steps", steps]
+        run = ["-scene", scene, "-scene_n", n or own, "-restart", "settled", "-ccp_type", "apgd", "-steps", steps]
         # the last step is recorded always, and no other is a multiple of so many
         python("-m", "pctt.run", *run, "-output_every", 10**7, "-output", folder)
         python("-m", "pctt.render", folder, *look)
@@ -91,7 +93,7 @@ if __name__ == "__main__":
     )
     known = [*PICTURES, "examples"]
     words.add_argument("scenes", nargs="*", metavar="WHAT", help=f"of {', '.join(known)}; none: all scenes")
-    words.add_argument("-n", type=int, default=8, help="size of the scenes (8)")
+    words.add_argument("-n", type=int, help="size of the scenes; without: that of the pictures in docs")
     words.add_argument("-output", type=Path, default=ROOT / "docs", metavar="DIR", help="where to write scenes (docs)")
     given = words.parse_args()
     unknown = set(given.scenes) - set(known)

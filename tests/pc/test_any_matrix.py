@@ -14,7 +14,6 @@ from petsc4py import PETSc
 from systems import contact_matrix, contacts, poisson
 from test_tensor_train import context, solve, solver
 
-from pctt.options import OptionError
 from pctt.pc.mat import is_symmetric
 from pctt.petsc import own_errors
 
@@ -89,13 +88,6 @@ def test_bad_coordinates_are_refused_at_set_up(name, points, words):
     ksp.pc.setPythonType(f"pctt.pc.{name}")
     with refused(f"{words}.*allowed are finite numbers of shape"):
         ksp.setUp()
-
-
-@pytest.mark.parametrize("modes", ["4,x", "2,2", "0,64", ","])
-@pytest.mark.parametrize("rank", ["auto", "fixed"])
-def test_bad_modes_are_refused_at_set_up(modes, rank):
-    with refused(f"-pc_tt_modes {modes}: allowed are whole numbers.*at least 64", OptionError):
-        solver(poisson(8), modes=modes, rank=rank).setUp()
 
 
 def test_a_matrix_that_is_not_symmetric_is_said_to_be_so():

@@ -100,21 +100,21 @@ assert len(chosen) > 1, chosen
 
 # processors that round differently: ranks of trains, pivots of crosses, numbers of inverses
 mat.shift(4.0)
-round_here, dominant, invert = Train.round, cross._dominant, module.approximate_inverse
+round_here, dominant, invert = Train.round, cross._dominant, module.invert_near_identity
 
 
-def invert_here(*arguments):
-    inverse = invert(*arguments)
-    return dataclasses.replace(inverse, train=(1 + 1e-12 * comm.rank) * inverse.train)
+def invert_here(*arguments, **named):
+    inverse = invert(*arguments, **named)
+    return dataclasses.replace(inverse, applied=(1 + 1e-12 * comm.rank) * inverse.applied)
 
 
 Train.round = lambda self, eps=1e-14, max_rank=None: round_here(self, max(eps, 0.3 * comm.rank), max_rank)
 cross._dominant = lambda C, most, eps: dominant(C, most if comm.rank == 0 else max(1, most - 1), eps)
-module.approximate_inverse = invert_here
+module.invert_near_identity = invert_here
 for way in ("als", "cross"):
     ksp = solver(mat, max_rank=6, rank="fixed", compress=way)
     assert solve(ksp)[1] < 1e-6
-    trains = comm.allgather([core.tobytes() for core in context(ksp).made.inverse.train.cores])
+    trains = comm.allgather([core.tobytes() for core in context(ksp).made.inverse.applied.cores])
     assert trains == [trains[0]] * comm.size, way
     ksp.destroy()
 print("done", flush=True)

@@ -277,7 +277,7 @@ def test_rows_that_change_ranks(ranks):
         assert pc.rank == 6, pc.account.fallbacks
         assert its < 70
         assert residual < 1e-6
-        trains = comm.allgather([core.sum() for core in pc.made.inverse.train.cores])
+        trains = comm.allgather([core.sum() for core in pc.made.inverse.applied.cores])
         assert all(np.array_equal(train, trains[0]) for train in trains)
     # for the last matrix the first rank of several has no room for all
     assert (pc.account.resets, pc.account.reused) == ((0, 3) if ranks == 1 else (1, 2))

@@ -64,10 +64,6 @@ BAD_OPTIONS = {
     "-dump_steps 3,x -dump_problem d": ["3,x", "whole numbers >= 1"],
     "-dump_steps 0 -dump_problem d": ["0", "whole numbers >= 1"],
     "-dump_steps 3": ["3", "-dump_problem"],
-    "-dump_problem d{contacts}.h5": ["d{contacts}.h5", "{step} in it"],
-    "-dump_problem d{stop}.h5": ["d{stop}.h5", "{step} in it"],
-    "-dump_problem d{step:x.h5": ["d{step:x.h5", "{step} in it"],
-    "-dump_problem d{step}": ["d{step}", ".h5 or .hdf5"],
     "-dump_problem results/notes.txt": ["results/notes.txt", "folder that can be written"],
     # options that mean nothing beside others
     "-scene blade -problem p.h5": ["blade", "-problem p.h5 makes no steps"],

@@ -113,11 +113,11 @@ def test_a_guided_body_moves_along_its_guide_alone(program, tmp_path):
     assert summary(tmp_path / "again")["objective"] == pytest.approx(line["objective"], rel=1e-6)
 
 
-def test_names_by_a_pattern_a_start_without_guess_and_a_broken_file(program, settled, tmp_path):
-    program(*SETTLED, "-steps", 2, "-dump_problem", "all/{contacts}/{step:03d}.hdf5")
+def test_names_a_start_without_guess_and_a_broken_file(program, settled, tmp_path):
+    program(*SETTLED, "-steps", 2, "-dump_problem", "all")
     steps = steps_of(tmp_path / "results")
     for line in steps:
-        path = tmp_path / "all" / str(line["contacts"]) / f"{line['step']:03d}.hdf5"
+        path = tmp_path / "all" / f"step{line['step']:06d}_{line['contacts']}contacts.h5"
         assert line["dumped"] == [str(p.relative_to(tmp_path)) for p in (path, path.with_suffix(".petsc"))]
         assert path.exists()
     cold = ("-problem_guess", "false", "-ccp_type", "apgd", "-ccp_tol", 1e-10, "-output", "cold")

@@ -99,8 +99,7 @@ def test_rank_one_near_identity_is_the_identity() -> None:
     T = tt.random([3, 4], 2, [3, 4])
     found = tt.invert_near_identity(T, 1)
     np.testing.assert_array_equal(found.train.full(), np.eye(12))
-    assert found.correction is not None
-    assert found.correction.norm() == 0
+    assert found.applied.norm() == 0
 
 
 def test_inverse_of_single_precision() -> None:

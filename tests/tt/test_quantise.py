@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -36,10 +35,3 @@ def test_merged_modes_leave_the_matrix_alone(data: st.DataObject, modes: list[in
     merged = tt.merge(train, groups)
     assert len(merged) == len(groups)
     np.testing.assert_allclose(merged.full().ravel(), train.full().ravel(), atol=1e-12)
-
-
-def test_user_modes() -> None:
-    assert tt.check_modes([4, 4], 15) == (4, 4)
-    assert tt.scalar_modes((4, 5), 3) == (4, 15)
-    with pytest.raises(ValueError, match="hold 16 slots, but 17"):
-        tt.check_modes([4, 4], 17)

@@ -6,8 +6,6 @@ a function that is convex and of degree one, whose gradient stays away from zero
 bounded.
 
 A contact without friction has no interior; its constraint is -g_n <= 0, its tangential impulses stay zero.
-
-Functions marked ``compiled`` have a twin in ``barrier_loops``, for the default form.
 """
 
 from __future__ import annotations
@@ -17,42 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from pctt.ccp.cone import Array
-from pctt.compiled import compiled
-
-
-@compiled
-def perspective_value(g: Array, mu: Array) -> Array:
-    f = 0.5 * ((g[:, 1] ** 2 + g[:, 2] ** 2) / g[:, 0] - mu**2 * g[:, 0])
-    return np.where(mu > 0, f, -g[:, 0])
-
-
-@compiled
-def perspective_gradient(g: Array, mu: Array) -> Array:
-    df = np.empty_like(g)
-    df[:, 1:] = g[:, 1:] / g[:, :1]
-    df[:, 0] = -0.5 * (df[:, 1] ** 2 + df[:, 2] ** 2 + mu**2)
-    df[mu == 0] = [-1.0, 0.0, 0.0]
-    return df
-
-
-@compiled
-def perspective_hessian(g: Array, mu: Array) -> Array:
-    slope = g[:, 1:] / g[:, :1]
-    H = np.zeros((len(g), 3, 3))
-    H[:, 0, 0] = (slope**2).sum(1)
-    H[:, 0, 1:] = H[:, 1:, 0] = -slope
-    H[:, 1, 1] = H[:, 2, 2] = 1.0
-    H /= g[:, 0][:, None, None]
-    H[mu == 0] = 0.0
-    return H
-
-
-@compiled
-def blocks(lam: Array, f: Array, df: Array, hessian: Array) -> Array:
-    """lambda hess f + lambda/(-f) grad f grad f' (nc, 3, 3)."""
-    out = lam[:, None, None] * hessian
-    out += (lam / -f)[:, None, None] * df[:, :, None] * df[:, None, :]
-    return out
 
 
 @dataclass(frozen=True)
@@ -62,13 +24,25 @@ class Perspective:
     mu: Array
 
     def value(self, g: Array) -> Array:
-        return perspective_value(g, self.mu)
+        f = 0.5 * ((g[:, 1] ** 2 + g[:, 2] ** 2) / g[:, 0] - self.mu**2 * g[:, 0])
+        return np.where(self.mu > 0, f, -g[:, 0])
 
     def gradient(self, g: Array) -> Array:
-        return perspective_gradient(g, self.mu)
+        df = np.empty_like(g)
+        df[:, 1:] = g[:, 1:] / g[:, :1]
+        df[:, 0] = -0.5 * (df[:, 1] ** 2 + df[:, 2] ** 2 + self.mu**2)
+        df[self.mu == 0] = [-1.0, 0.0, 0.0]
+        return df
 
     def hessian(self, g: Array) -> Array:
-        return perspective_hessian(g, self.mu)
+        slope = g[:, 1:] / g[:, :1]
+        H = np.zeros((len(g), 3, 3))
+        H[:, 0, 0] = (slope**2).sum(1)
+        H[:, 0, 1:] = H[:, 1:, 0] = -slope
+        H[:, 1, 1] = H[:, 2, 2] = 1.0
+        H /= g[:, 0][:, None, None]
+        H[self.mu == 0] = 0.0
+        return H
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,6 @@ def determinant(x: Array) -> Array:
     return np.maximum(found, np.maximum(LEAST * x[:, 0] ** 2, TINY))
 
 
-@compiled
 def product(x: Array, y: Array) -> Array:
     """x o y."""
     out = np.empty_like(x)
@@ -43,7 +42,6 @@ def product(x: Array, y: Array) -> Array:
     return out
 
 
-@compiled
 def divide(x: Array, y: Array) -> Array:
     """The w with x o w = y; x inside the cones."""
     out = np.empty_like(y)
@@ -91,26 +89,6 @@ def central_pair(x: Array, tau: Array, complementarity: Array | float) -> tuple[
     s = assembled(positive_part(high), positive_part(low))
     z = assembled(positive_part(-high), positive_part(-low)) / tau[:, None]
     return s, z
-
-
-@compiled
-def scaling(s: Array, z: Array) -> tuple[Array, Array, Array, Array]:
-    """The root, eta, spread and direction of ``NesterovTodd``."""
-    size_s, size_z = (np.sqrt(determinant(x)) for x in (s, z))
-    angle = np.sqrt(np.maximum(0.5 * (1.0 + dot(s, z) / (size_s * size_z)), 0.5))
-    of_s, of_z = 0.5 / (angle * size_s), 0.5 / (angle * size_z)
-    point = np.empty_like(s)
-    point[:, 0] = of_s * s[:, 0] + of_z * z[:, 0]
-    for k in (1, 2):
-        point[:, k] = of_s * s[:, k] - of_z * z[:, k]
-    t = tangential(point)
-    direction = np.empty_like(point[:, 1:])
-    for k in (0, 1):
-        direction[:, k] = np.divide(point[:, 1 + k], t, out=np.full_like(t, 1.0 - k), where=t > ROUND)
-    spread = point[:, 0] + t
-    point[:, 0] += 1.0
-    root = point / np.sqrt(2.0 * point[:, :1])
-    return root, np.sqrt(size_s / size_z), spread, direction
 
 
 @compiled
@@ -164,7 +142,6 @@ def _blocks(direction: Array, along: Array, against: Array, across: Array) -> Ar
     return out
 
 
-@compiled
 def towards_interval(x: Array, low: float, high: float) -> Array:
     """What moves the spectral values of x into [low, high], but none by more than ``high`` downwards."""
     size = tangential(x)
@@ -193,7 +170,21 @@ class NesterovTodd:
 
     @classmethod
     def of(cls, s: Array, z: Array) -> NesterovTodd:
-        return cls(*scaling(s, z))
+        size_s, size_z = (np.sqrt(determinant(x)) for x in (s, z))
+        angle = np.sqrt(np.maximum(0.5 * (1.0 + dot(s, z) / (size_s * size_z)), 0.5))
+        of_s, of_z = 0.5 / (angle * size_s), 0.5 / (angle * size_z)
+        point = np.empty_like(s)
+        point[:, 0] = of_s * s[:, 0] + of_z * z[:, 0]
+        for k in (1, 2):
+            point[:, k] = of_s * s[:, k] - of_z * z[:, k]
+        t = tangential(point)
+        direction = np.empty_like(point[:, 1:])
+        for k in (0, 1):
+            direction[:, k] = np.divide(point[:, 1 + k], t, out=np.full_like(t, 1.0 - k), where=t > ROUND)
+        spread = point[:, 0] + t
+        point[:, 0] += 1.0
+        root = point / np.sqrt(2.0 * point[:, :1])
+        return cls(root, np.sqrt(size_s / size_z), spread, direction)
 
     def times(self, x: Array) -> Array:
         """W x."""

@@ -1,11 +1,11 @@
-"""The functions of ``lorentz`` as loops over the contacts."""
+"""Functions of ``lorentz`` as loops over the contacts."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from pctt.ccp.cone import TINY
-from pctt.ccp.interior.lorentz import LEAST, ROUND
+from pctt.ccp.interior.lorentz import LEAST
 from pctt.compiled import loop
 
 
@@ -17,29 +17,6 @@ def _determinant(x_0, x_1, x_2):
     found = (x_0 - large) * (x_0 + large) - small * small
     least = max(LEAST * x_0 * x_0, TINY)
     return least if found < least else found
-
-
-@loop
-def product(x, y):
-    out = np.empty_like(x)
-    for c in range(len(x)):
-        x_0, y_0 = x[c, 0], y[c, 0]
-        out[c, 0] = x_0 * y_0 + x[c, 1] * y[c, 1] + x[c, 2] * y[c, 2]
-        out[c, 1] = x_0 * y[c, 1] + y_0 * x[c, 1]
-        out[c, 2] = x_0 * y[c, 2] + y_0 * x[c, 2]
-    return out
-
-
-@loop
-def divide(x, y):
-    out = np.empty_like(y)
-    for c in range(len(x)):
-        x_0, x_1, x_2 = x[c, 0], x[c, 1], x[c, 2]
-        w = (x_0 * y[c, 0] - x_1 * y[c, 1] - x_2 * y[c, 2]) / _determinant(x_0, x_1, x_2)
-        out[c, 0] = w
-        out[c, 1] = (y[c, 1] - w * x_1) / x_0
-        out[c, 2] = (y[c, 2] - w * x_2) / x_0
-    return out
 
 
 @loop
@@ -58,30 +35,6 @@ def step_to_boundary(x, dx):
             if speed != speed:  # no other is larger
                 break
     return 1.0 / fastest if fastest > 0 else np.inf
-
-
-@loop
-def scaling(s, z):
-    count = len(s)
-    root, eta, spread, direction = np.empty_like(s), np.empty(count), np.empty(count), np.empty((count, 2))
-    for c in range(count):
-        size_s = np.sqrt(_determinant(s[c, 0], s[c, 1], s[c, 2]))
-        size_z = np.sqrt(_determinant(z[c, 0], z[c, 1], z[c, 2]))
-        cosine = (s[c, 0] * z[c, 0] + s[c, 1] * z[c, 1] + s[c, 2] * z[c, 2]) / (size_s * size_z)
-        squared = 0.5 * (1.0 + cosine)
-        angle = np.sqrt(0.5 if squared < 0.5 else squared)
-        of_s, of_z = 0.5 / (angle * size_s), 0.5 / (angle * size_z)
-        point_0 = of_s * s[c, 0] + of_z * z[c, 0]
-        point_1 = of_s * s[c, 1] - of_z * z[c, 1]
-        point_2 = of_s * s[c, 2] - of_z * z[c, 2]
-        t = np.sqrt(point_1 * point_1 + point_2 * point_2)
-        direction[c, 0], direction[c, 1] = (point_1 / t, point_2 / t) if t > ROUND else (1.0, 0.0)
-        spread[c] = point_0 + t
-        point_0 += 1.0
-        length = np.sqrt(2.0 * point_0)
-        root[c, 0], root[c, 1], root[c, 2] = point_0 / length, point_1 / length, point_2 / length
-        eta[c] = np.sqrt(size_s / size_z)
-    return root, eta, spread, direction
 
 
 @loop
@@ -136,22 +89,3 @@ def _block(u, v, along, against, across, out):
     out[1, 1] = mean * u * u + across * v * v
     out[2, 2] = mean * v * v + across * u * u
     out[1, 2] = out[2, 1] = (mean - across) * u * v
-
-
-@loop
-def towards_interval(x, low, high):
-    out = np.empty_like(x)
-    for c in range(len(x)):
-        size = np.sqrt(x[c, 1] * x[c, 1] + x[c, 2] * x[c, 2])
-        larger = _shift(x[c, 0] + size, low, high)
-        smaller = _shift(x[c, 0] - size, low, high)
-        turn = 0.5 * (larger - smaller) / (1e-300 if size < 1e-300 else size)
-        out[c, 0], out[c, 1], out[c, 2] = 0.5 * (larger + smaller), turn * x[c, 1], turn * x[c, 2]
-    return out
-
-
-@loop
-def _shift(value, low, high):
-    aim = low if value < low else high if value > high else value
-    shift = aim - value
-    return -high if shift < -high else shift

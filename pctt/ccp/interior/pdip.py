@@ -24,7 +24,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pctt.ccp.cone import Array, dot, step_to_boundary, step_to_zero, times
-from pctt.ccp.interior import barrier
 from pctt.ccp.interior.barrier import CONSTRAINTS, Perspective, Quadratic
 from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.newton import Newton
@@ -225,7 +224,8 @@ def _start(
 def _barrier_blocks(cone: Perspective | Quadratic, at: Linearised, proximal: float) -> Array:
     """lambda hess f + lambda/(-f) grad f grad f' + rho I (nc, 3, 3), positive definite inside the cone."""
     with phase("CCPBarrier"):
-        blocks = barrier.blocks(at.lam, at.f, at.df, at.hessian)
+        blocks = at.lam[:, None, None] * at.hessian
+        blocks += (at.lam / -at.f)[:, None, None] * at.df[:, :, None] * at.df[:, None, :]
         blocks[:, [0, 1, 2], [0, 1, 2]] += proximal
         frictionless = cone.mu == 0
         if frictionless.any():  # hold the tangential impulses at zero

@@ -66,7 +66,8 @@ class Newton:
         for linear in self._linear.values():
             linear.begin()
         structure = problem.structure()
-        same = self.system is not None and present == self._present and _equal(structure, self._structure)
+        same = self.system is not None and present == self._present and self._structure is not None
+        same = same and all(map(np.array_equal, structure, self._structure or ()))
         if problem.comm.allreduce(same, op=MPI.LAND):
             assert self.system is not None
             self.system.load(problem)
@@ -192,7 +193,3 @@ class Newton:
         self._linear.clear()
         if self.compare is not None:
             self.compare.destroy()
-
-
-def _equal(one: tuple, other: tuple | None) -> bool:
-    return other is not None and all(np.array_equal(a, b) for a, b in zip(one, other))

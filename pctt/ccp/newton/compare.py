@@ -107,13 +107,13 @@ class Comparison(KrylovFamily):
         them.
         """
         chosen: Solve | None = None
-        kept = None
         with log.phase("CCPCompare"):
             self._make_entries(A, P)
             for name in self.names:
                 done = self._solver(name).solve(A, b, x, rtol, P)
                 self.records[name].add(done)
-                if chosen is None or (not chosen.converged and _is_better(done, chosen)):
+                better = chosen is None or done.converged or done.true_residual < chosen.true_residual
+                if chosen is None or (better and not chosen.converged):
                     chosen, kept = done, x.array.copy()
         assert chosen is not None
         spent = log.take_seconds(("CCPCompare",))["CCPCompare"]
@@ -154,10 +154,6 @@ class Comparison(KrylovFamily):
             defaults = NAMED.get(name, {"pc_type": name})
             self._krylov[name] = Krylov(self.comm, f"compare_{name}_", defaults)
         return self._krylov[name]
-
-
-def _is_better(one: Solve, other: Solve) -> bool:
-    return (one.converged, -one.true_residual) > (other.converged, -other.true_residual)
 
 
 def _check_name(name: str, comm: MPI.Comm) -> None:

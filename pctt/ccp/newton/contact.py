@@ -28,17 +28,13 @@ class ContactForm:
         self._low_rank: PETSc.Mat | None = None
         if problem.free_map is not None:
             self.matrix = symmetric_shell(problem.comm, problem.r.size, 3, self._product)
-        else:
-            self._take_entries()
-
-    def _take_entries(self) -> None:
-        """Have all of S as matrices."""
-        self._entries = Entries(self.problem)
+            return
+        self._entries = Entries(problem)
         self.matrix = self._entries.mat
-        if self.problem.low_rank is not None:
-            self._low_rank = self.problem.N.duplicate(copy=True)
+        if problem.low_rank is not None:
+            self._low_rank = problem.N.duplicate(copy=True)
             self._low_rank.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            self.matrix = _with_low_rank(self._low_rank, self.problem.low_rank)
+            self.matrix = _with_low_rank(self._low_rank, problem.low_rank)
 
     def load(self, problem: ConeProblem) -> None:
         """Take another problem with the same contacts between the same bodies."""
