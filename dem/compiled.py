@@ -17,6 +17,32 @@ compiled = njit(cache=True, fastmath={"contract"})
 
 
 @compiled
+def contact_frames(normal):
+    """`dem.system.contact_frames`."""
+    frame = np.empty((len(normal), 3, 3))
+    for c in range(len(normal)):
+        x, y, z = normal[c, 0], normal[c, 1], normal[c, 2]
+        sign = np.copysign(1.0, z)
+        p = -1.0 / (sign + z)
+        q = x * y * p
+        frame[c, 0, 0], frame[c, 0, 1], frame[c, 0, 2] = x, y, z
+        frame[c, 1, 0], frame[c, 1, 1], frame[c, 1, 2] = 1.0 + sign * x * x * p, sign * q, -sign * x
+        frame[c, 2, 0], frame[c, 2, 1], frame[c, 2, 2] = q, sign + y * y * p, -y
+    return frame
+
+
+@compiled
+def contact_arms(point, position, row):
+    """`dem.system.contact_arms`."""
+    arm = np.empty((len(point), 6))
+    for c in range(len(point)):
+        a, b = row[c, 0], row[c, 1]
+        for k in range(3):
+            arm[c, k], arm[c, 3 + k] = point[c, k] - position[a, k], point[c, k] - position[b, k]
+    return arm
+
+
+@compiled
 def relative_velocity(frame, arm, row, velocity):
     """`dem.system.relative_velocity`."""
     out = np.empty((len(frame), 3))
@@ -52,6 +78,28 @@ def sum_of_impulses(frame, arm, row, impulse, count):
         b[3] += r[4] * z - r[5] * y
         b[4] += r[5] * x - r[3] * z
         b[5] += r[3] * y - r[4] * x
+    return out
+
+
+@compiled
+def in_the_world(impulse, frame):
+    """`dem.impulses.in_the_world`."""
+    out = np.empty((len(frame), 4))
+    for c in range(len(frame)):
+        out[c, 0] = impulse[c, 0]
+        for k in range(3):
+            out[c, 1 + k] = impulse[c, 1] * frame[c, 1, k] + impulse[c, 2] * frame[c, 2, k]
+    return out
+
+
+@compiled
+def in_frames(stored, frame):
+    """`dem.impulses.in_frames`."""
+    out = np.empty((len(frame), 3))
+    for c in range(len(frame)):
+        out[c, 0] = stored[c, 0]
+        for i in range(1, 3):
+            out[c, i] = stored[c, 1] * frame[c, i, 0] + stored[c, 2] * frame[c, i, 1] + stored[c, 3] * frame[c, i, 2]
     return out
 
 
@@ -156,3 +204,57 @@ def sphere_sphere(center, size, i, j, delta):
             point[found, 0], point[found, 1], point[found, 2] = p[0] + middle * x, p[1] + middle * y, p[2] + middle * z
             found += 1
     return pair[:found], point[:found], normal[:found], gap[:found]
+
+
+@compiled
+def lexsort(key, major, count):
+    """`numpy.lexsort((key, major))` of distinct keys (n,), with `major` (n,) in 0 ... count - 1."""
+    start = np.zeros(count + 1, np.int64)
+    for k in range(len(major)):
+        start[major[k] + 1] += 1
+    for k in range(count):
+        start[k + 1] += start[k]
+    order, free = np.empty(len(major), np.int64), start[:-1].copy()
+    for k in range(len(major)):
+        order[free[major[k]]] = k
+        free[major[k]] += 1
+    for m in range(count):
+        _shell_sort(order[start[m] : start[m + 1]], key)
+    return order
+
+
+@compiled
+def _shell_sort(rows, key):
+    """Sort a few rows by their keys, in place."""
+    gap = 1
+    while 3 * gap < len(rows):
+        gap = 3 * gap + 1
+    while gap > 0:
+        for k in range(gap, len(rows)):
+            row, place = rows[k], k
+            while place >= gap and key[rows[place - gap]] > key[row]:
+                rows[place] = rows[place - gap]
+                place -= gap
+            rows[place] = row
+        gap //= 3
+
+
+# -- the motion --------------------------------------------------------------------------------------------------
+
+
+@compiled
+def integrate(quaternion, angular_velocity, dt):
+    """`dem.quaternion.integrate` of rows."""
+    out = np.empty((len(quaternion), 4))
+    for n in range(len(quaternion)):
+        x, y, z = dt * angular_velocity[n, 0], dt * angular_velocity[n, 1], dt * angular_velocity[n, 2]
+        angle = np.sqrt(x * x + y * y + z * z)
+        w = np.cos(0.5 * angle)
+        share = np.sin(0.5 * angle) / angle if angle > 0.0 else 0.5
+        x, y, z = share * x, share * y, share * z
+        a, b, c, d = quaternion[n, 0], quaternion[n, 1], quaternion[n, 2], quaternion[n, 3]
+        e, f = w * a - x * b - y * c - z * d, w * b + a * x + y * d - z * c
+        g, h = w * c + a * y + z * b - x * d, w * d + a * z + x * c - y * b
+        size = 1.0 / np.sqrt(e * e + f * f + g * g + h * h)
+        out[n, 0], out[n, 1], out[n, 2], out[n, 3] = size * e, size * f, size * g, size * h
+    return out

@@ -11,6 +11,23 @@ from mpi4py import MPI
 
 from dem.arrays import Bools, Floats, Ints
 from dem.exchange import exchange
+from dem.loops import loops
+
+
+def in_the_world(impulse: Floats, frame: Floats) -> Floats:
+    """Normal impulses and tangential vectors in the world (nc, 4), of impulses (nc, 3) in frames (nc, 3, 3)."""
+    if compiled := loops():
+        return compiled.in_the_world(np.ascontiguousarray(impulse, dtype=np.float64), np.ascontiguousarray(frame))
+    tangential = impulse[:, 1:2] * frame[:, 1] + impulse[:, 2:] * frame[:, 2]
+    return np.hstack([impulse[:, :1], tangential])
+
+
+def in_frames(stored: Floats, frame: Floats) -> Floats:
+    """Impulses (nc, 3) in frames (nc, 3, 3), from rows (nc, 4) as `in_the_world` returns them; of the tangential
+    vectors only the part that is tangential in these frames."""
+    if compiled := loops():
+        return compiled.in_frames(stored, np.ascontiguousarray(frame))
+    return np.hstack([stored[:, :1], np.einsum("cij,cj->ci", frame[:, 1:], stored[:, 1:])])
 
 
 class ImpulseMemory:
@@ -28,8 +45,7 @@ class ImpulseMemory:
     def remember(self, key: Ints, impulse: Floats, frame: Floats) -> None:
         """Replace the memory by impulses (nc, 3) of contacts with keys (nc,) and frames (nc, 3, 3);
         collective."""
-        tangential = impulse[:, 1:2] * frame[:, 1] + impulse[:, 2:] * frame[:, 2]
-        self.restore(key, np.hstack([impulse[:, :1], tangential]))
+        self.restore(key, in_the_world(impulse, frame))
 
     def recall(self, key: Ints, frame: Floats) -> tuple[Floats, Bools]:
         """Impulses (nc, 3) in the given frames (nc, 3, 3), zero where unknown, and the mask (nc,) of those
@@ -46,7 +62,7 @@ class ImpulseMemory:
         answer = exchange(self._comm, answer, asked["rank"][known])
         stored, found = np.zeros((count, 4)), np.zeros(count, dtype=bool)
         stored[answer["row"]], found[answer["row"]] = answer["impulse"], True
-        return np.hstack([stored[:, :1], np.einsum("cij,cj->ci", frame[:, 1:], stored[:, 1:])]), found
+        return in_frames(stored, frame), found
 
     def state(self) -> tuple[Ints, Floats]:
         """Keys (n,) and impulses (n, 4) (normal, tangential vector) that this rank stores, for `restore`."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from dem.arrays import Floats
+from dem.loops import loops
 
 
 def cross(a: Floats, b: Floats) -> Floats:
@@ -104,4 +105,6 @@ def integrate(q: Floats, angular_velocity: Floats, dt: float) -> Floats:
 
     q <- exp(dt w) q, renormalised so that the rounding of many steps does not add up.
     """
+    if (compiled := loops()) and q.ndim == 2:
+        return compiled.integrate(np.ascontiguousarray(q), np.ascontiguousarray(angular_velocity), float(dt))
     return normalized(multiply(exponential(dt * angular_velocity), q))

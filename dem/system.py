@@ -76,7 +76,7 @@ class ContactSystem:
         self._comm, self._slabs = world.comm, world.slabs
         self._near, self._body = near, contacts.body
         self._row = np.stack([contacts.a, contacts.b], axis=1)
-        self._arm = (self.point[:, None] - near.bodies.position[self._row]).reshape(-1, 6)
+        self._arm = contact_arms(self.point, near.bodies.position, self._row)
 
         self._owned = np.arange(world.owned)
         self._owned[near.grains :] += near.ghosts
@@ -144,6 +144,8 @@ def contact_frames(normal: Floats) -> Floats:
     Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
     but where the sign of its z component changes.
     """
+    if compiled := loops():
+        return compiled.contact_frames(np.ascontiguousarray(normal))
     x, y, z = normal.T
     sign = np.copysign(1.0, z)
     p = -1.0 / (sign + z)
@@ -153,6 +155,14 @@ def contact_frames(normal: Floats) -> Floats:
     frame[:, 1, 0], frame[:, 1, 1], frame[:, 1, 2] = 1.0 + sign * x * x * p, sign * q, -sign * x
     frame[:, 2, 0], frame[:, 2, 1], frame[:, 2, 2] = q, sign + y * y * p, -y
     return frame
+
+
+def contact_arms(point: Floats, position: Floats, row: Ints) -> Floats:
+    """Vectors (nc, 6) from the centres of the two bodies of each contact to its point (nc, 3); `row` (nc, 2) are the
+    bodies' rows in a table of positions (rows, 3)."""
+    if compiled := loops():
+        return compiled.contact_arms(point, position, row)
+    return (point[:, None] - position[row]).reshape(-1, 6)
 
 
 def relative_velocity(frame: Floats, arm: Floats, row: Ints, velocity: Floats) -> Floats:

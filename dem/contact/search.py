@@ -16,6 +16,7 @@ from dem.contact.broad import close_pairs
 from dem.contact.narrow import Touch
 from dem.contact.primitives import MESH, PLANE, Primitives, primitives, touches
 from dem.free_motion import free_velocity, large_free_velocity
+from dem.loops import loops
 from dem.motion import Dynamic, Hinged
 from dem.neighbourhood import Neighbourhood, neighbourhood, without_ghosts
 from dem.quaternion import cross, length
@@ -113,7 +114,10 @@ def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints
     if world.comm.rank < world.comm.size - 1:
         foreign[near.grains + near.ghosts :] = bodies.is_dynamic(world.large)
     owner = np.minimum(a, b)  # the local grains are the first rows, and ghosts come from higher ranks only
-    return np.lexsort((key, owner + rows * (foreign[a] | foreign[b])))
+    major = owner + rows * (foreign[a] | foreign[b])
+    if compiled := loops():
+        return compiled.lexsort(key, major, 2 * rows)
+    return np.lexsort((key, major))
 
 
 def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Contacts | None:

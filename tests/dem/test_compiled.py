@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cases import contacts_by_key, crude_impulse, heap, step
+from cases import contacts_by_key, crude_impulse, heap, random_quaternions, step
 from mpi4py import MPI
 
+from dem import impulses, quaternion
 from dem import system as contact_system
-from dem.contact import broad, find_contacts, primitives
+from dem.contact import broad, find_contacts, primitives, search
 from dem.loops import loops
 from dem.scene import Scene
 from dem.start import new_world
@@ -25,7 +26,7 @@ def without_loops(monkeypatch):
 
     def call(work, *arguments):
         with monkeypatch.context() as patch:
-            for module in (broad, contact_system, primitives):
+            for module in (broad, contact_system, impulses, primitives, quaternion, search):
                 patch.setattr(module, "loops", lambda: None)
             return work(*arguments)
 
@@ -54,6 +55,13 @@ def test_pairs_of_spheres_that_touch_to_rounding_and_of_concentric_ones():
     grid = np.stack(np.meshgrid(*[0.2 * np.arange(6)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     assert len(broad.close_pairs(grid, np.full(len(grid), 0.1), 0.0)) == 3 * 5 * 36
     assert len(broad.close_pairs(np.zeros((5, 3)), np.ones(5), 0.0)) == 10
+
+
+def test_order():
+    rng = np.random.default_rng(1)
+    for count, groups in ((0, 1), (1, 1), (500, 1), (500, 7), (500, 1000)):
+        key, major = rng.permutation(10**6)[:count], rng.integers(0, groups, count)
+        np.testing.assert_array_equal(loops().lexsort(key, major, groups), np.lexsort((key, major)))
 
 
 def run(capsules):
@@ -91,16 +99,38 @@ def test_contacts_of_equal_bodies_agree_to_rounding(without_loops):
 def test_no_contacts(without_loops):
     """Every function of no contacts, with and without numba: shapes and types."""
     none, rows = np.zeros((0, 3)), np.zeros((0, 2), np.int64)
-    frame, arm = np.zeros((0, 3, 3)), np.zeros((0, 6))
+    frame, arm, position = np.zeros((0, 3, 3)), np.zeros((0, 6)), np.zeros((4, 3))
     calls = {
+        (0, 3, 3): (contact_system.contact_frames, none),
+        (0, 6): (contact_system.contact_arms, none, position, rows),
         (0, 3): (contact_system.relative_velocity, frame, arm, rows, np.zeros((4, 6))),
         (4, 6): (contact_system.sum_of_impulses, frame, arm, rows, none, 4),
+        (0, 4): (impulses.in_the_world, none, frame),
     }
     for shape, (work, *arguments) in calls.items():
         for result in (work(*arguments), without_loops(work, *arguments)):
             assert result.shape == shape
             assert result.dtype == np.float64
             assert not result.any()
+
+
+def test_impulses_in_the_world_and_back(without_loops):
+    rng = np.random.default_rng(4)
+    normal, impulse = rng.normal(size=(50, 3)), rng.normal(size=(50, 3))
+    frame = contact_system.contact_frames(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    stored = impulses.in_the_world(impulse, frame)
+    np.testing.assert_allclose(stored, without_loops(impulses.in_the_world, impulse, frame), atol=1e-15)
+    np.testing.assert_allclose(impulses.in_frames(stored, frame), impulse, atol=1e-14)
+    np.testing.assert_allclose(without_loops(impulses.in_frames, stored, frame), impulse, atol=1e-14)
+
+
+def test_orientations(without_loops):
+    rng = np.random.default_rng(6)
+    turn, spin = random_quaternions(rng, 30), 20.0 * rng.normal(size=(30, 3))
+    spin[:3] = 0.0
+    spin[3:6] *= 1e-12
+    plain = without_loops(quaternion.integrate, turn, spin, 0.02)
+    np.testing.assert_allclose(quaternion.integrate(turn, spin, 0.02), plain, atol=1e-15)
 
 
 def _call(work, *arguments):
