@@ -125,27 +125,6 @@ def add_body_blocks(blocks, start, body, weight, out):
 
 
 @loop
-def add_all_blocks(blocks, start, place, H, out):
-    """Add the block G_p' H G_q of every contact and every pair p, q of its bodies to ``out`` (n, 6, 6); H (nc, 3, 3).
-
-    ``place`` has the index in ``out`` for each of these blocks, contact by contact; q varies fastest.
-    """
-    at = 0
-    for c in range(len(start) - 1):
-        for p in range(start[c], start[c + 1]):
-            for q in range(start[c], start[c + 1]):
-                to = place[at]
-                at += 1
-                for n in range(6):
-                    b0, b1, b2 = blocks[q, 0, n], blocks[q, 1, n], blocks[q, 2, n]
-                    h0 = H[c, 0, 0] * b0 + H[c, 0, 1] * b1 + H[c, 0, 2] * b2
-                    h1 = H[c, 1, 0] * b0 + H[c, 1, 1] * b1 + H[c, 1, 2] * b2
-                    h2 = H[c, 2, 0] * b0 + H[c, 2, 1] * b1 + H[c, 2, 2] * b2
-                    for m in range(6):
-                        out[to, m, n] += blocks[p, 0, m] * h0 + blocks[p, 1, m] * h1 + blocks[p, 2, m] * h2
-
-
-@loop
 def local_product(weight, g, y):
     """y = H g (nc, 3); ``weight`` (nc, 6) has the upper triangles of the symmetric blocks H."""
     for c in range(len(weight)):

@@ -52,7 +52,7 @@ class Progress:
     ):
         """``before`` is the progress in lower precision, whose iterations and history go on."""
         self.problem, self.limits, self.check, self.give_up = problem, limits, options.check, give_up
-        self.iterations = before.iterations if before else 0
+        self.iterations: int = before.iterations if before else 0
         self.history: list[float] = before.history if before else []
         self.status, self.reason = Status.STALLED, ""
         self._best = np.inf

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -11,6 +12,10 @@ from petsc4py import PETSc
 from pctt.ccp import cone
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
+
+if TYPE_CHECKING:
+    from pctt.contact_map.assembled import ScaledRows
+    from pctt.contact_map.free import FreeMap
 
 
 class ScaledProblem:
@@ -37,7 +42,7 @@ class ScaledProblem:
         self.mu = self._rounded(problem.mu * self._scale[:, 1] / self._scale[:, 0])
         self.b = self._rounded(problem.r * self._shrink)
         self._compliance = self._rounded(problem.compliance * self._shrink**2)
-        self._map = None
+        self._map: FreeMap | ScaledRows | None = None
         if problem.free_map is not None:
             self._map = problem.free_map.scaled(self._shrink, precision)
         elif problem.contact_map is not None:
