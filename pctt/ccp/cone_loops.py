@@ -1,8 +1,8 @@
 """The functions of ``cone`` as loops over the contacts.
 
 Arrays of rows are taken flat: so the compiler knows the distance from one contact to the next, and works on several at
-once. Comparisons are written so that a NaN stays a NaN. Constants have single precision, so that loops on arrays of single
-precision stay in it. They are exact in double precision too.
+once. Comparisons are written so that a NaN stays a NaN. Constants have single precision, so that loops on arrays of
+single precision stay in it. They are exact in double precision too.
 """
 
 from __future__ import annotations

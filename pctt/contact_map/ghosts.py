@@ -12,8 +12,8 @@ from pctt.exchange import offsets
 class Ghosts:
     """Local numbers of bodies: first the own bodies, then the ghosts, then one number, `nobody`, for no body.
 
-    Values of bodies are arrays (nobody + 1, k), of single or double precision. They travel in double precision, as PETSc
-    adds up no other. The last row, for `nobody`, is zero, or has values that nothing reads.
+    Values of bodies are arrays (nobody + 1, k), of single or double precision. They travel in double precision, as
+    PETSc adds up no other. The last row, for `nobody`, is zero, or has values that nothing reads.
 
     Attributes
     ----------
