@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+import numpy as np
 import pytest
 
 pytest_plugins = ["several_ranks"]
@@ -14,3 +15,11 @@ MOST_WORKERS = 8  # files go to workers whole, and there is no more work than th
 def pytest_xdist_auto_num_workers() -> int:
     """`-n auto` of pytest-xdist: a worker for each core that this process may use."""
     return min(len(os.sched_getaffinity(0)), MOST_WORKERS)
+
+
+@pytest.fixture
+def double(monkeypatch):
+    """APGD in double precision from the first iteration: rounding alone is left between two ways to compute it."""
+    from pctt.ccp.first_order import apgd  # not before tests begin: it starts PETSc
+
+    monkeypatch.setattr(apgd, "STEERING", apgd.Steering(single=np.inf))

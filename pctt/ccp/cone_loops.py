@@ -11,7 +11,7 @@ import numpy as np
 
 from pctt.compiled import loop
 
-ZERO, ONE, TINY = np.float32(0.0), np.float32(1.0), np.finfo(np.float32).tiny
+ZERO, ONE = np.float32(0.0), np.float32(1.0)
 STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to the next
 
 
@@ -24,7 +24,7 @@ def _nearest(n, t_1, t_2, mu):
     height = ZERO if height < ZERO else height
     radius = mu * height
     reach = radius if length < radius else length
-    shrink = radius / (TINY if reach < TINY else reach)
+    shrink = radius / (ONE if reach == ZERO else reach)
     return height, t_1 * shrink, t_2 * shrink
 
 

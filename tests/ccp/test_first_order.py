@@ -267,12 +267,6 @@ def test_a_good_start_saves_iterations(method):
     assert warm.iterations < cold.iterations
 
 
-@pytest.fixture
-def double(monkeypatch):
-    """APGD in double precision from the first iteration."""
-    monkeypatch.setattr(apgd, "STEERING", apgd.Steering(single=np.inf))
-
-
 def test_a_solution_given_by_n_and_by_g_is_the_same(double):
     known, graph = heap(7)
     for method in METHODS:

@@ -317,7 +317,7 @@ def test_pdip_takes_the_users_krylov_method(database):
 
 
 def test_options_of_a_solver_are_used():
-    """Careful centring takes more Newton steps, looking seldom more iterations than needed."""
+    """Careful centring takes more Newton steps, looking seldom more iterations than needed, in each precision."""
     known, graph = heap()
     problem = from_graph(known, graph)
     slow = ccp.solve(problem, limits=Limits(1e-6), options=ccp.SOLVERS["pdip"].options(centering=0.8))
@@ -325,7 +325,7 @@ def test_options_of_a_solver_are_used():
     every = ccp.solve(problem, type="apgd", limits=Limits(1e-6), options=apgd.APGD(check=1))
     seldom = ccp.solve(problem, type="apgd", limits=Limits(1e-6), options=apgd.APGD(check=500))
     assert every.converged
-    assert every.iterations <= seldom.iterations <= 510 + every.iterations
+    assert every.iterations <= seldom.iterations <= 1010 + every.iterations
     assert len(seldom.history) < len(every.history)
 
 

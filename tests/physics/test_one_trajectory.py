@@ -47,7 +47,7 @@ def two_steps(comm: MPI.Comm, state: dict[str, np.ndarray], **settings) -> dict[
 @pytest.mark.parametrize(
     "cases", [("given iterations", "pdip"), pytest.param(("apgd",), marks=pytest.mark.slow)], ids=" and ".join
 )
-def test_the_trajectory_does_not_depend_on_the_number_of_ranks(cases, ranks):
+def test_the_trajectory_does_not_depend_on_the_number_of_ranks(cases, ranks, double):
     state = alone(lambda comm: fallen())
     for case in cases:
         settings, limits = CASES[case]

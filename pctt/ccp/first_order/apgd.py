@@ -66,7 +66,9 @@ def solve(
         enough = STEERING.single / np.sqrt(max(problem.size, 1))
         rough = dataclasses.replace(limits, tol=max(limits.tol, enough))
         progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, options, give_up)
-        guess = _descend(progress, momentum, guess)
+        rough_impulse = _descend(progress, momentum, guess)
+        if progress.iterations:  # else rounding would spoil a guess that is good already
+            guess = rough_impulse
     progress = Progress(ScaledProblem(problem, coulomb), limits, options, give_up, progress)
     _descend(progress, momentum, guess)
     return progress.result()
