@@ -49,7 +49,7 @@ def test_steps_can_be_made_again_into_another_folder(program, settled, tmp_path)
 
 
 @pytest.mark.parallel(3)
-def test_on_another_number_of_ranks_the_way_is_the_same_but_for_rounding(settled, tmp_path, monkeypatch):
+def test_on_another_number_of_ranks_the_way_is_the_same_but_for_rounding(settled, tmp_path, monkeypatch, double):
     """Twenty iterations a step, solved or not: only the order of sums depends on the ranks."""
     monkeypatch.chdir(tmp_path)
     comm = MPI.COMM_WORLD
