@@ -182,7 +182,7 @@ def conic_cost(contacts: int, softness: float, tol: float) -> float:
     """The cost of the conic method from a cold start, in iterations of APGD. It grows as the cube root of the number of
     contacts, measured on settled mixers of 18,525 and 144,658 (docs/measurements.md). Small problems have fixed
     costs."""
-    accuracy, rigid, soft = [-8, -7, -6, -4, -2], [195, 160, 130, 82, 25], [165, 140, 118, 66, 22]
+    accuracy, rigid, soft = [-8, -7, -6, -4, -2], [195, 175, 150, 90, 28], [165, 150, 130, 75, 25]
     per_root = np.interp(np.log10(tol), accuracy, soft if softness >= 1e-6 else rigid)
     return float(per_root * np.cbrt(max(contacts, 400)))
 
