@@ -55,11 +55,11 @@ class Progress:
         self.iterations: int = before.iterations if before else 0
         self.history: list[float] = before.history if before else []
         self.status, self.reason = Status.STALLED, ""
-        self._best = np.inf
+        self._best, self._point = np.inf, np.zeros((0, 3))
         self._patience = STEERING.patience_with_law if problem.opening else STEERING.patience
         if problem.precision == np.float32:
             self._patience = STEERING.patience_in_single
-        self._next_look = 0
+        self._looks = self._next_look = 0
         self._gain = (np.inf, self.iterations)  # natural residual and iteration of the last progress
 
     def goes_on(self, x: Array, gradient: Array | None = None) -> bool:
@@ -71,8 +71,9 @@ class Progress:
         self._next_look = self.iterations + self.check
         residual = self._residual(x, gradient)
         self.history.append(residual)
-        if residual < self._best or not hasattr(self, "_point"):
+        if residual < self._best or self._looks == 0:
             self._best, self._point = residual, x.copy()
+        self._looks += 1
         self.status, self.reason = self._why_stop(residual)
         return not self.reason
 
