@@ -13,7 +13,9 @@ spoils v = G' g alone, and the next step mends that. With W the scaling of the p
 Late in an iteration W^2 is large along an impulse that slides, and the product W^2 z, which equals s, drowns in
 rounding. So the change of each contact without the others, ds = W w - s, is formed from s instead.
 
-For Coulomb's law z belongs to the De Saxce velocity, (y_n / mu + |y_t|, y_t); `slip` has the additional terms.
+For Coulomb's law z belongs to the De Saxce velocity, (y_n / mu + |y_t|, y_t); `slip` has the additional terms. A step is
+straight in y, so that z takes the opening as it is, and not by its derivative. The problem is not convex: where the
+path leads nowhere, others that begin nearer to the best point so far are tried.
 
 Source: Nesterov and Todd (1997), Mehrotra (1992); Acary, Armand, Nguyen and Shpakovych, "Second-order cone
 programming for frictional contact mechanics using interior point algorithm", Optim. Methods Softw. (2023), for their
@@ -26,11 +28,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cone import Array, add_opening, times
+from pctt.ccp.cone import Array, add_opening, step_to_zero, times
 from pctt.ccp.interior import lorentz
 from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.interior.lorentz import NesterovTodd
-from pctt.ccp.interior.slip import Slip, sliding_directions
+from pctt.ccp.interior.slip import Slip, closed, opened, sliding_directions
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
@@ -68,7 +70,11 @@ class Steering:
     #: impulses off where next to nothing bounds them
     late: float = 1e-2
     patience: int = 3  #: iterations without progress before the Newton systems are sharpened;
-    patience_with_law: int = 8  #: for Coulomb's law, before the method gives up
+    patience_with_law: int = 8  #: for Coulomb's law, before the path is given up
+    #: starts of the paths from the best point that are tried then, in the unit of ``-ccp_conic_start``
+    again: tuple[float, ...] = (0.3, 0.03)
+    #: for Coulomb's law, part of the way to the boundary at most: next to it a contact has no room to turn
+    boundary_with_law: float = 0.9
 
 
 STEERING = Steering()
@@ -78,14 +84,23 @@ def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Conic, newton: Newton, coulomb: bool = False
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step. Default
-    iteration limit 60."""
+    iteration limit 60, for Coulomb's law 120."""
     newton.begin(problem)
     if coulomb and not newton.takes_any:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
     cones = Cones.of(problem, coulomb)
-    at = _start(cones, guess, options)
-    course = Course(cones, limits.tol, limits.max_it if limits.max_it >= 0 else 60)
+    course = Course(cones, limits.tol, limits.max_it if limits.max_it >= 0 else 120 if coulomb else 60)
+    _follow_path(cones, _start(cones, guess, options.start), newton, options, course)
+    for start in STEERING.again if coulomb else ():
+        if course.stalled:
+            course.begins_again()
+            _follow_path(cones, _start(cones, course.best, start), newton, options, course)
+    return course.result(newton)
+
+
+def _follow_path(cones: Cones, at: Point, newton: Newton, options: Conic, course: Course) -> None:
+    """Follow the central path from a point to the solution, or as far as it leads."""
     while not course.ends(at, newton):
         scaled = Scaled.of(cones, at, newton, options, course)
         with phase("ConicPredictor"):
@@ -94,8 +109,7 @@ def solve(
         with phase("ConicCorrector"):
             direction, step = _corrected(scaled, predictor, target, course)
         if step > 0:
-            at = at.moved(direction, step)
-    return course.result(newton)
+            at = cones.moved(at, direction, step)
 
 
 class Point(NamedTuple):
@@ -105,15 +119,14 @@ class Point(NamedTuple):
     z: Array
     v: Array
 
-    def moved(self, d: Direction, step: float) -> Point:
-        return Point(self.s + step * d.ds, self.z + step * d.dz, self.v + step * d.dv)
-
 
 class Direction(NamedTuple):
-    """A change of a `Point`, and the Newton system's solution ``x`` that it was made from."""
+    """A change of a `Point`, and the Newton system's solution ``x`` that it was made from. ``dy`` is dz without the
+    change of the opening."""
 
     ds: Array
     dz: Array
+    dy: Array
     dv: Array
     x: Array
 
@@ -145,29 +158,47 @@ class Cones:
         y[self.frictionless, 1:] = 0.0
         return add_opening(y, self.problem.mu) if self.coulomb else y
 
-    def residuals(self, at: Point) -> tuple[Array, Array, Array]:
-        """r_v = v - G' g, r_z = y / scale - z with y from v, and the directions (nc, 3) in which contacts slide."""
+    def residuals(self, at: Point) -> tuple[Array, Array]:
+        """r_v = v - G' g, and r_y = y / scale - z with y from v and z without its opening."""
         problem, g = self.problem, at.s / self.scale
         y = problem.velocity_of(at.v) + problem.compliance * g + problem.r
         y[self.frictionless, 1:] = 0.0
-        u = sliding_directions(y, at.z[:, 0])
+        z = closed(at.z) if self.coulomb else at.z
+        return at.v - problem.momentum(g), y / self.scale - z
+
+    def moved(self, at: Point, d: Direction, step: float) -> Point:
+        """The point after a step; for Coulomb's law with the openings of its velocities."""
+        z = opened(closed(at.z) + step * d.dy) if self.coulomb else at.z + step * d.dz
+        return Point(at.s + step * d.ds, z, at.v + step * d.dv)
+
+    def reach(self, at: Point, d: Direction) -> float:
+        """The longest step that keeps both in the cones of this rank."""
         if self.coulomb:
-            add_opening(y, problem.mu)
-        return at.v - problem.momentum(g), y / self.scale - at.z, u
+            of_z = step_to_zero(closed(at.z)[:, 0], np.ascontiguousarray(d.dy[:, 0]))
+        else:
+            of_z = lorentz.step_to_boundary(at.z, d.dz)
+        return min(lorentz.step_to_boundary(at.s, d.ds), of_z)
 
 
 class Course:
     """The course of the iterations so far, and the test that ends them.
 
     history : natural residual of every iterate
+    best : impulses of the least residual
     waited : iterations without progress
+    stalled : whether patience with the present path is at its end
     """
 
     def __init__(self, cones: Cones, tol: float, max_it: int):
         self._cones, self._tol, self._max_it = cones, tol, max_it
         self._patience = STEERING.patience_with_law if cones.coulomb else STEERING.patience
         self.history: list[float] = []
-        self.waited, self._last_gap = 0, np.inf
+        self.best = np.zeros_like(cones.scale)
+        self.begins_again()
+
+    def begins_again(self) -> None:
+        """Another path begins."""
+        self._least, self._last_gap, self.waited, self.stalled = np.inf, np.inf, 0, False
 
     @property
     def residual(self) -> float:
@@ -178,18 +209,17 @@ class Course:
         problem, g = self._cones.problem, at.s / self._cones.scale
         gap = problem.dot(at.s, at.z)
         residual = problem.natural_residual(g, self._cones.velocity(g))
-        if not self.history or residual <= min(self.history):
-            self._best = g
-        progress = residual <= 0.9 * min(self.history, default=np.inf) or gap <= 0.5 * self._last_gap
-        self.waited, self._last_gap = (0 if progress else self.waited + 1), gap
+        if residual <= min(self.history, default=np.inf):
+            self.best = g
+        progress = residual <= 0.9 * self._least or gap <= 0.5 * self._last_gap
+        self.waited, self._last_gap, self._least = (0 if progress else self.waited + 1), gap, min(self._least, residual)
         self.history.append(residual)
         if residual <= self._tol or len(self.history) > self._max_it or why_unbounded(problem, g):
             return True
         if self.waited > self._patience:
-            if self._cones.coulomb or not newton.sharpen():
-                return True
+            self.stalled = self._cones.coulomb or not newton.sharpen()
             self.waited = 0
-        return False
+        return self.stalled
 
     def result(self, newton: Newton) -> Result:
         """The best iterate, and why it was the last."""
@@ -200,14 +230,14 @@ class Course:
         elif iterations == self._max_it:
             status, words = Status.ITERATION_LIMIT, f"{self._max_it} iterations"
         least = min(self.history)
-        return Result(self._best, status, words, least, iterations, newton.ksp_its, newton.fallbacks, self.history)
+        return Result(self.best, status, words, least, iterations, newton.ksp_its, newton.fallbacks, self.history)
 
 
 @dataclass(frozen=True)
 class Scaled:
     """An iteration's linear equations, which all its directions share.
 
-    at, r_v, r_z : the iterate and its residuals
+    at, r_v, r_y, r_z : the iterate and its residuals; r_z is r_y with the change of the opening
     W : scaling of the pair
     inverse, barrier_share : (nc, 3, 3) (B + C)^-1 and, in the scaled variables, (B + C)^-1 B
     slip : what Coulomb's law adds
@@ -219,6 +249,7 @@ class Scaled:
     newton: Newton
     at: Point
     r_v: Array
+    r_y: Array
     r_z: Array
     W: NesterovTodd
     inverse: Array
@@ -231,19 +262,22 @@ class Scaled:
     def of(cls, cones: Cones, at: Point, newton: Newton, options: Conic, course: Course) -> Scaled:
         """Scaling and residuals of an iterate; the Newton systems get its matrix."""
         problem = cones.problem
-        r_v, r_z, u = cones.residuals(at)
+        r_v, r_y = cones.residuals(at)
+        r_z = r_y
         W = NesterovTodd.of(at.s, at.z)
         B, inverse, barrier_share = _barrier_blocks(cones, W)
         slip = None
         if cones.coulomb:
             compliance = problem.compliance[:, 1:2] + STEERING.proximal * problem.mean_diagonal
-            slip = Slip.of(inverse, u, cones.scale, compliance)
+            slip = Slip.of(inverse, sliding_directions(at.z), cones.scale, compliance)
+            r_z = slip.opened(r_y)
         newton.update(B, inverse if slip is None else inverse + slip.blocks, symmetric=slip is None)
         # a residual of v = G' g makes y wrong by G times that
         tol = options.forcing * course.residual * problem.norm(at.s / cones.scale) * np.sqrt(problem.mean_diagonal)
         tol *= 1.0 if newton.primary == "momenta" else STEERING.closer
         tol *= STEERING.sharper if cones.coulomb else 1.0
-        return cls(cones, newton, at, r_v, r_z, W, inverse, barrier_share, slip, tol, options.boundary)
+        boundary = min(options.boundary, STEERING.boundary_with_law) if cones.coulomb else options.boundary
+        return cls(cones, newton, at, r_v, r_y, r_z, W, inverse, barrier_share, slip, tol, boundary)
 
     def direction(self, w: Array, start: Array | None = None) -> Direction:
         """The direction of the right-hand side w; ``start``: an earlier solution of the Newton system."""
@@ -257,21 +291,17 @@ class Scaled:
         dg, x = newton.solve((c - self.r_z) * scale, self.tol, self.r_v, start, uncoupled)
         dv = newton.momentum(x, dg, self.r_v)
         ds = dg * scale
-        if newton.primary == "momenta":  # r_z vanishes, r_v takes the error of the linear solve
-            dz = (problem.velocity_of(dv) + problem.compliance * dg) / scale
-            if self.slip is not None:
-                self.slip.open(dz)
-            dz += self.r_z
-        else:  # r_v vanishes, r_z takes it
-            dz = c - self.W.divide(self.W.divide(ds))
-        dz[self.cones.frictionless, 1:] = ds[self.cones.frictionless, 1:] = 0.0
-        return Direction(ds, dz, dv, x)
+        if newton.primary == "momenta":  # r_y vanishes, r_v takes the error of the linear solve
+            dy = (problem.velocity_of(dv) + problem.compliance * dg) / scale + self.r_y
+        else:  # r_v vanishes, r_y takes it
+            dy = c - self.W.divide(self.W.divide(ds))
+        dy[self.cones.frictionless, 1:] = ds[self.cones.frictionless, 1:] = 0.0
+        return Direction(ds, dy if self.slip is None else self.slip.opened(dy), dy, dv, x)
 
     def reach(self, d: Direction) -> float:
         """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""
         problem = self.cones.problem
-        here = min(lorentz.step_to_boundary(self.at.s, d.ds), lorentz.step_to_boundary(self.at.z, d.dz))
-        longest = problem.min(here)
+        longest = problem.min(self.cones.reach(self.at, d))
         return longest if np.isfinite(problem.sum(float(d.ds.sum() + d.dz.sum()))) else 0.0
 
     def step(self, d: Direction) -> float:
@@ -328,8 +358,9 @@ def _corrected(scaled: Scaled, predictor: Direction, target: float, course: Cour
     return direction, step
 
 
-def _start(cones: Cones, guess: Array, options: Conic) -> Point:
-    """A pair on the central path near the guess: s - tau z = s_0 - tau z_0."""
+def _start(cones: Cones, guess: Array, start: float) -> Point:
+    """A pair on the central path near the guess: s - tau z = s_0 - tau z_0. ``start`` is its complementarity in the
+    unit of ``-ccp_conic_start``."""
     problem, scale = cones.problem, cones.scale
     guess = no_larger_than_useful(problem, guess)
     s, z = guess * scale, cones.velocity(guess) / scale
@@ -337,7 +368,7 @@ def _start(cones: Cones, guess: Array, options: Conic) -> Point:
     diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2
     tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
     closing = problem.dot(problem.r, problem.r) / problem.size
-    amount = options.start * closing / problem.mean_diagonal
+    amount = start * closing / problem.mean_diagonal
     s, z = lorentz.central_pair(s - tau[:, None] * z, tau, amount)
     return Point(s, z, problem.momentum(s / scale))
 

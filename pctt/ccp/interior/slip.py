@@ -16,12 +16,26 @@ from typing import NamedTuple
 import numpy as np
 
 from pctt.ccp.cone import TINY, Array, dot, tangential, times
+from pctt.ccp.interior.lorentz import determinant
 
 
-def sliding_directions(y: Array, z_n: Array) -> Array:
-    """The directions (nc, 3) in which contacts with velocities y (nc, 3) slide; shorter than 1 where z_n, the scaled
-    normal velocity (nc,) of the iterate, is more than |y_t|: a contact sticks, and y_t may turn."""
-    u = y / np.maximum(np.maximum(tangential(y), z_n), TINY)[:, None]
+def opened(y: Array) -> Array:
+    """(y_n + |y_t|, y_t) of scaled velocities y (nc, 3): inside the cones if y_n > 0."""
+    z = y.copy()
+    z[:, 0] += tangential(y)
+    return z
+
+
+def closed(z: Array) -> Array:
+    """The y (nc, 3) of which z is `opened`."""
+    y = z.copy()
+    y[:, 0] = determinant(z) / (z[:, 0] + tangential(z))
+    return y
+
+
+def sliding_directions(z: Array) -> Array:
+    """The directions (nc, 3) in which contacts with scaled velocities z slide; zero without sliding."""
+    u = z / np.maximum(tangential(z), TINY)[:, None]
     u[:, 0] = 0.0
     return u
 
@@ -50,6 +64,8 @@ class Slip(NamedTuple):
         """Y c becomes X c, in place."""
         uncoupled -= self.p * (self.less * dot(self.u, uncoupled)[:, None])
 
-    def open(self, dz: Array) -> None:
-        """G dv + C dg becomes T times that, in place."""
-        dz[:, 0] += dot(self.u, dz)
+    def opened(self, dy: Array) -> Array:
+        """T dy (nc, 3)."""
+        dz = dy.copy()
+        dz[:, 0] += dot(self.u, dy)
+        return dz
