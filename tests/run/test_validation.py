@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -65,6 +66,27 @@ def test_angles_of_a_heap_are_means_with_an_error(laws, monkeypatch):
     assert (second["found"], second["agrees"]) == (pytest.approx(1.0), False)
     assert shown["scatter"] == pytest.approx(0.5**0.5)
     assert shown["height"].shape == (3, 2, 11)
+
+
+def test_a_wedge_has_its_angle(laws, monkeypatch):
+    """Small spheres that fill the space below a slope of 25 degrees; a tenth of them still moves; others fell."""
+    rng = np.random.default_rng(1)
+    x, z = rng.uniform(0.0, 0.13, 40000), rng.uniform(0.0, 0.08, 40000)
+    below = z < 0.01 + x * np.tan(np.radians(25.0))
+    place = np.stack([-x[below], 0.0 * x[below], z[below]], axis=1)
+    fallen = np.array([[0.1, 0.0, -0.1], [-0.1, 0.0, -0.1]])
+    count = len(place) + len(fallen)
+    speed = np.where(np.arange(count) % 10 == 0, 0.1, 0.0)
+    frame = SimpleNamespace(position=np.concatenate([place, fallen]), speed=speed)
+    run = SimpleNamespace(
+        grains=count, steps=[5], mass=np.ones(count), require_frames=lambda: None, frame=lambda step: frame
+    )
+    monkeypatch.setattr(laws, "Folder", lambda path: run)
+    found = laws.profile(Path())
+    assert found.angle == pytest.approx(25.0, abs=0.5)
+    assert found.x == pytest.approx(0.015 + 0.01 * np.arange(11))
+    assert found.height == pytest.approx(0.01 + found.x * np.tan(np.radians(25.0)), rel=0.1)
+    assert found.moving == pytest.approx(0.1, abs=0.001)
 
 
 def test_the_table_gives_errors_of_means(laws):

@@ -59,8 +59,8 @@ def heap(folders: Mapping[float, Sequence[Path]]) -> tuple[list[Row], dict]:
     angles = np.array([[bed.angle for bed in several] for several in beds])
     angle, scatter = angles.mean(axis=1), float(np.sqrt(angles.var(axis=1, ddof=1).mean()))
     error = scatter / np.sqrt(angles.shape[1])
-    moving = max(bed.moving for several in beds for bed in several)
-    found = [row("heap", "share of a heap's spheres that still move, worst bed", 0.0, moving, REST, "", 0.05)]
+    moving = float(np.mean([bed.moving for several in beds for bed in several]))
+    found = [row("heap", "share of a heap's spheres that still move, mean of all beds", 0.0, moving, REST, "", 0.05)]
     for mu, degrees in zip(frictions, angle):
         what = f"angle of repose at friction {mu:g}, spheres without rolling resistance"
         high = 20.9 if mu < 0.3 else 32.8
@@ -89,19 +89,18 @@ class Profile(NamedTuple):
 
 
 def profile(folder: Path) -> Profile:
-    """The last frame; the bins at the lip and at the wall do not count."""
+    """The last frame. The surface is at twice the mean height of the mass in a bin: this scatters less than the highest
+    of a few spheres. The line weighs the bins by their mass; those at the lip and at the wall do not count."""
     run = Folder(folder)
     run.require_frames()
     frame = run.frame(run.steps[-1])
     place = frame.position[: run.grains]
-    top = place[:, 2] + run.size[: run.grains, 0]
     heap = (place[:, 0] < 0.0) & (place[:, 2] > 0.0)
-    place, top = place[heap], top[heap]
+    place, mass = place[heap], run.mass[: run.grains][heap]
     column = (-place[:, 0] / DIAMETER).astype(int)
-    columns = np.arange(1, column.max())
-    height = np.array([top[column == k].max(initial=0.0) for k in columns])
-    x = (columns + 0.5) * DIAMETER
-    slope = np.polyfit(x, height, 1)[0]
+    held, moment = (np.bincount(column, weights)[1:-1] for weights in (mass, mass * place[:, 2]))
+    x, height = (np.arange(len(held)) + 1.5) * DIAMETER, 2.0 * moment / held
+    slope = np.polyfit(x, height, 1, w=np.sqrt(held))[0]
     moving = float((frame.speed[: run.grains][heap] > 0.01).mean())
     return Profile(x, height, float(np.degrees(np.arctan(slope))), moving)
 
