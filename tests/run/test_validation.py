@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ def laws(monkeypatch):
     from validation import laws, rows
 
     yield laws
-    for name in [name for name in sys.modules if name.startswith("validation")]:
+    for name in [name for name in sys.modules if name.startswith(("validation", "validate", "measure"))]:
         del sys.modules[name]
     assert rows
 
@@ -51,12 +52,70 @@ def test_a_band_tells_how_far_off_a_figure_is(laws):
     assert row("sliding", "lift", 0.0, 1e-9, "", "m", 1e-6)["agrees"] is True
 
 
-def test_the_page_has_all_that_it_shows(laws):
-    text = (RUN / "validation" / "page.md").read_text()
-    filled = text.format(
-        minutes=9.0, cores=2, cpu="a processor", table="", outlets="4.5", rubs=0.24, unsolved=1, steps=9
+def test_angles_of_a_heap_are_means_with_an_error(laws, monkeypatch):
+    """Two beds a degree apart: a scatter of sqrt(1/2), an error of the mean of 1/2, of a difference of sqrt(1/2)."""
+    angles = {"a": 14.0, "b": 15.0, "c": 24.0, "d": 25.0, "e": 25.0, "f": 26.0}
+    line = np.arange(11.0)
+    monkeypatch.setattr(laws, "profile", lambda name: laws.Profile(line, line, angles[name], 0.01))
+    found, shown = laws.heap({0.1: "ab", 0.3: "cd", 0.6: "ef"})
+    rest, *repose, first, second = found
+    assert rest["agrees"]
+    assert [row["found"] for row in repose] == pytest.approx([14.5, 24.5, 25.5])
+    assert [row["error"] for row in repose] == pytest.approx([0.5] * 3)
+    assert (first["found"], first["error"], first["agrees"]) == pytest.approx((10.0, 0.5**0.5, True))
+    assert (second["found"], second["agrees"]) == (pytest.approx(1.0), False)
+    assert shown["scatter"] == pytest.approx(0.5**0.5)
+    assert shown["height"].shape == (3, 2, 11)
+
+
+def test_a_wedge_has_its_angle(laws, monkeypatch):
+    """Small spheres that fill the space below a slope of 25 degrees; a tenth of them still moves; others fell."""
+    rng = np.random.default_rng(1)
+    x, z = rng.uniform(0.0, 0.13, 40000), rng.uniform(0.0, 0.08, 40000)
+    below = z < 0.01 + x * np.tan(np.radians(25.0))
+    place = np.stack([-x[below], 0.0 * x[below], z[below]], axis=1)
+    fallen = np.array([[0.1, 0.0, -0.1], [-0.1, 0.0, -0.1]])
+    count = len(place) + len(fallen)
+    speed = np.where(np.arange(count) % 10 == 0, 0.1, 0.0)
+    frame = SimpleNamespace(position=np.concatenate([place, fallen]), speed=speed)
+    run = SimpleNamespace(
+        grains=count, steps=[5], mass=np.ones(count), require_frames=lambda: None, frame=lambda step: frame
     )
+    monkeypatch.setattr(laws, "Folder", lambda path: run)
+    found = laws.profile(Path())
+    assert found.angle == pytest.approx(25.0, abs=0.5)
+    assert found.x == pytest.approx(0.015 + 0.01 * np.arange(11))
+    assert found.height == pytest.approx(0.01 + found.x * np.tan(np.radians(25.0)), rel=0.1)
+    assert found.moving == pytest.approx(0.1, abs=0.001)
+
+
+def test_the_table_gives_errors_of_means(laws):
+    from validate import table
+    from validation.rows import above, band
+
+    rows = [
+        above("heap", "growth", 0.0, 3.0, 1.0, "", "degrees"),
+        above("heap", "growth", 0.0, 1.0, 1.0, "", "degrees"),
+        band("heap", "angle", 20.0, 30.0, 25.0, "", "degrees", 0.5),
+        band("silo", "k", 1.0, 2.0, 3.0, "", ""),
+    ]
+    assert table(rows).splitlines()[2:] == [
+        "| heap | growth | above 0 degrees | 3 +- 1 degrees | +3 errors |  |",
+        "| heap | growth | above 0 degrees | 1 +- 1 degrees | **+1 errors** |  |",
+        "| heap | angle | [20, 30] degrees | 25 +- 0.5 degrees | inside |  |",
+        "| silo | k | [1, 2] | 3 | **+50 %** |  |",
+    ]
+
+
+def test_the_page_has_all_that_it_shows(laws):
+    from validate import solved
+
+    text = (RUN / "validation" / "page.md").read_text("utf-8")
+    figures = {"minutes": 9.0, "cores": 2, "cpu": "a processor", "table": "", "outlets": "4.5", "rubs": 0.24}
+    filled = text.format(**figures, solved=solved(0, 9), beds=4, scatter=1.5)
     assert "about 9 minutes on 2 cores with nothing else to do (a processor)" in filled
+    assert "All 9 steps were solved to the tolerance." in filled
+    assert solved(1, 9).startswith("1 of the 9 steps did not reach the tolerance; the [notebook](")
 
 
 @pytest.mark.parametrize("name", ["heap", "column"])
@@ -65,3 +124,11 @@ def test_the_scenes_build(name):
     built = scene.build()
     assert 500 < len(built.grains()) < 1100
     assert len(built.large_bodies) >= 2
+
+
+def test_the_seed_makes_another_bed():
+    heap = from_file(RUN / "validation" / "heap.py")
+    one, same, other = (heap(seed=seed).build().grains() for seed in (1, 1, 2))
+    assert np.array_equal(one.position, same.position)
+    assert (one.position != other.position).all()
+    assert (one.mass != other.mass).all()

@@ -24,6 +24,7 @@ class Heap(Experiment):
     columns: int = option(11, "", "spheres of the lattice along the shelf")
     rows: int = option(4, "", "across")
     layers: int = option(22, "", "above each other")
+    seed: int = option(1, "", "seed of the places and of the radii")
     gate_speed: float = option(0.1, "m/s", "of the gate, upwards")
     dt = 0.005
     delta = 0.001
@@ -41,8 +42,8 @@ class Heap(Experiment):
         x = -(np.arange(self.columns) + 0.6) * self.pitch
         y = (np.arange(self.rows) - (self.rows - 1) / 2) * self.pitch
         z = 1.5 * RADIUS + (np.arange(self.layers) + 0.6) * self.pitch
-        places = perturbed(x, y, z, 0.1 * RADIUS, 1)
-        radii = RADIUS * np.random.default_rng(2).uniform(SMALLEST, 1.0, len(places))
+        places = perturbed(x, y, z, 0.1 * RADIUS, self.seed)
+        radii = RADIUS * np.random.default_rng(self.seed).uniform(SMALLEST, 1.0, len(places))
         scene.add_spheres(places, radii, 2500.0, material="spheres")
         length, half, tall = (self.columns + 0.2) * self.pitch, (self.rows + 0.1) * self.pitch / 2, 0.3
         sides = [Plane((0, -side, 0), (0, side * half, 0)) for side in (-1, 1)]

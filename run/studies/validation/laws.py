@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from validation.rows import Row, band, row
+from validation.rows import Row, above, band, row
 
 from pctt.look.folder import Folder
 
@@ -16,6 +17,7 @@ BEVERLOO = "Beverloo, Leniger, van de Velde 1961; Mankoc et al. 2007 (arXiv:0707
 JOP = "Jop, Forterre, Pouliquen 2006: glass beads, mu(I) from tan 20.9 to tan 32.8 degrees"
 ZHOU = "Zhou, Xu, Yu, Zulli 2001: the angle grows with the friction"
 ROUX = "Peyneau, Roux 2008: 5.76 degrees without friction; Jop et al. 2006: 20.9 to 32.8 for glass beads"
+REST = "a heap is at rest"
 JANSSEN = "Janssen 1895 (Sperl 2006)"
 RANKINE = "Rankine's active state of 20.9 degrees, and equal stresses"
 
@@ -47,33 +49,60 @@ def silo(folders: Mapping[float, Path]) -> tuple[list[Row], dict]:
     return found, {"outlet": outlet, "flow": flow, "slope": slope, "level": level}
 
 
-def heap(folders: Mapping[float, Path]) -> tuple[list[Row], dict]:
-    """Slope of what rests, against friction."""
-    friction, shapes = np.array(list(folders)), [profile(folder) for folder in folders.values()]
-    angle = np.array([slope for _, _, slope in shapes])
-    rising = float((np.diff(angle) > 0.0).mean())
-    found = [row("heap", "share of the steps of friction in which the angle grows", 1.0, rising, ZHOU, "", 0.0)]
-    for mu, degrees in zip(friction, angle):
+def heap(folders: Mapping[float, Sequence[Path]]) -> tuple[list[Row], dict]:
+    """Slopes of what rests, against friction; means of as many beds for each.
+
+    Beds of one friction differ by chance, and no more or less for another friction: all of them tell how much.
+    """
+    frictions = list(folders)
+    beds = [[profile(folder) for folder in several] for several in folders.values()]
+    angles = np.array([[bed.angle for bed in several] for several in beds])
+    angle, scatter = angles.mean(axis=1), float(np.sqrt(angles.var(axis=1, ddof=1).mean()))
+    error = scatter / np.sqrt(angles.shape[1])
+    moving = float(np.mean([bed.moving for several in beds for bed in several]))
+    found = [row("heap", "share of a heap's spheres that still move, mean of all beds", 0.0, moving, REST, "", 0.05)]
+    for mu, degrees in zip(frictions, angle):
         what = f"angle of repose at friction {mu:g}, spheres without rolling resistance"
-        found.append(band("heap", what, 5.76, 20.9 if mu < 0.3 else 32.8, float(degrees), ROUX, "degrees"))
-    return found, {"friction": friction, "angle": angle, "profiles": [(x, z) for x, z, _ in shapes]}
+        high = 20.9 if mu < 0.3 else 32.8
+        found.append(band("heap", what, 5.76, high, float(degrees), ROUX, "degrees", error))
+    for mu, more, growth in zip(frictions, frictions[1:], np.diff(angle)):
+        what = f"growth of this angle from friction {mu:g} to {more:g}"
+        found.append(above("heap", what, 0.0, float(growth), np.sqrt(2.0) * error, ZHOU, "degrees"))
+    height = np.array([[bed.height for bed in several] for several in beds])
+    return found, {
+        "friction": frictions,
+        "angle": angle,
+        "error": error,
+        "scatter": scatter,
+        "x": beds[0][0].x,
+        "height": height,
+    }
 
 
-def profile(folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
-    """Height of the surface over the distance from the edge, in bins a diameter wide [m], and the angle of the line
-    through them [degrees]; the bins at the lip and at the wall do not count."""
+class Profile(NamedTuple):
+    """The surface of a heap at the end of a run."""
+
+    x: np.ndarray  #: distance from the edge of the middles of bins a diameter wide [m]
+    height: np.ndarray  #: of the surface in the bins [m]
+    angle: float  #: of the line through them [degrees]
+    moving: float  #: share of the heap's spheres that are faster than 10 mm/s
+
+
+def profile(folder: Path) -> Profile:
+    """The last frame. The surface is at twice the mean height of the mass in a bin: this scatters less than the highest
+    of a few spheres. The line weighs the bins by their mass; those at the lip and at the wall do not count."""
     run = Folder(folder)
     run.require_frames()
-    place = run.frame(run.steps[-1]).position[: run.grains]
-    top = place[:, 2] + run.size[: run.grains, 0]
-    rests = (place[:, 0] < 0.0) & (place[:, 2] > 0.0)
-    place, top = place[rests], top[rests]
+    frame = run.frame(run.steps[-1])
+    place = frame.position[: run.grains]
+    heap = (place[:, 0] < 0.0) & (place[:, 2] > 0.0)
+    place, mass = place[heap], run.mass[: run.grains][heap]
     column = (-place[:, 0] / DIAMETER).astype(int)
-    columns = np.arange(1, column.max())
-    height = np.array([top[column == k].max(initial=0.0) for k in columns])
-    x = (columns + 0.5) * DIAMETER
-    slope = np.polyfit(x, height, 1)[0]
-    return x, height, float(np.degrees(np.arctan(slope)))
+    held, moment = (np.bincount(column, weights)[1:-1] for weights in (mass, mass * place[:, 2]))
+    x, height = (np.arange(len(held)) + 1.5) * DIAMETER, 2.0 * moment / held
+    slope = np.polyfit(x, height, 1, w=np.sqrt(held))[0]
+    moving = float((frame.speed[: run.grains][heap] > 0.01).mean())
+    return Profile(x, height, float(np.degrees(np.arctan(slope))), moving)
 
 
 def drum(folder: Path) -> tuple[list[Row], dict]:

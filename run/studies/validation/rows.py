@@ -22,16 +22,36 @@ def row(check: str, quantity: str, reference: float, found: float, source: str, 
     }
 
 
-def band(check: str, quantity: str, low: float, high: float, found: float, source: str, unit: str) -> Row:
-    """What is to lie in a published band; the deviation is that from its nearer end, relative, zero inside."""
+def band(
+    check: str, quantity: str, low: float, high: float, found: float, source: str, unit: str, error: float | None = None
+) -> Row:
+    """What is to lie in a published band, with its standard error if it is a mean; the deviation is that from the
+    nearer end of the band, relative, zero inside."""
     nearer = min(max(found, low), high)
     return {
         "check": check,
         "quantity": quantity,
         "reference": [low, high],
         "found": found,
+        "error": error,
         "unit": unit,
         "deviation": found / nearer - 1.0,
         "agrees": bool(low <= found <= high),
+        "source": source,
+    }
+
+
+def above(check: str, quantity: str, low: float, found: float, error: float, source: str, unit: str) -> Row:
+    """What is to lie above `low` by more than twice its standard error; the deviation is in standard errors."""
+    deviation = (found - low) / error
+    return {
+        "check": check,
+        "quantity": quantity,
+        "reference": [low, None],
+        "found": found,
+        "error": error,
+        "unit": unit,
+        "deviation": deviation,
+        "agrees": bool(deviation > 2.0),
         "source": source,
     }
