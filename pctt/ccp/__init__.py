@@ -8,6 +8,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -58,10 +60,10 @@ def solve(
 ) -> Result:
     """Solve a cone problem by a method of SOLVERS; with ``coulomb`` find impulses of Coulomb's law.
 
-    For Coulomb's law there is a ladder of three rungs. The first is the method's own way, if it has one
-    (`Solver.has_law`). If that does not converge, the second is a sequence of cone problems (`pctt.ccp.coulomb`). If
-    that does not converge either, the result is the best of both and of the relaxation, by the Coulomb residual, and
-    counts as not converged. ``law`` of the result names the rung.
+    For Coulomb's law there is a ladder. The first rung is the method's own way, if it has one (`Solver.has_law`); where
+    an interior point method stalls, APGD goes on from its point. If that does not converge, the second rung is a
+    sequence of cone problems (`pctt.ccp.coulomb`). If that does not converge either, the result is the best of all and
+    of the relaxation, by the Coulomb residual, and counts as not converged. ``law`` of the result names the rung.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
     the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
@@ -81,7 +83,10 @@ def solve(
     try:
         if coulomb is None:
             return once(problem, guess, limits.tol)
-        return coulombs_law.ladder(problem, guess, limits.tol, coulomb, once, solver.has_law)
+        ways: list[Callable[..., Result]] = [partial(once, law=True)] if solver.has_law or problem.size == 0 else []
+        if solver.has_law and solver.needs == NEWTON:
+            ways = 2 * [*ways, _finish_by_apgd]
+        return coulombs_law.ladder(problem, guess, limits.tol, coulomb, once, ways)
     finally:
         if own is not None:
             own.destroy()
@@ -103,6 +108,14 @@ def _once(
         if unbounded:
             result.status, result.reason = Status.UNBOUNDED, unbounded
         return result
+
+
+def _finish_by_apgd(problem: ConeProblem, guess: Array, tol: float) -> Result:
+    """Coulomb's law from a point near it."""
+    method = SOLVERS["apgd"]
+    result = _once(problem, guess, method, Limits(tol, method.iterations), method.options(), None, law=True)
+    result.solver = method.name
+    return result
 
 
 def newton_for(comm: MPI.Comm, type: str, form: str = "auto", compare: Comparison | None = None) -> Newton:

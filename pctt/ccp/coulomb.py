@@ -12,7 +12,7 @@ Malick, "A formulation of the linear discrete Coulomb friction problem via conve
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,33 +62,43 @@ def ladder(
     guess: Array,
     tol: float,
     options: Coulomb,
-    once: Callable[..., Result],
-    has_law: bool,
+    convex: Callable[[ConeProblem, Array, float], Result],
+    ways: Sequence[Callable[[ConeProblem, Array, float], Result]],
 ) -> Result:
     """Impulses of Coulomb's law by the first rung that converges, or the best of all; see `pctt.ccp.solve`.
 
-    ``once(problem, guess, tol, law)`` solves a cone problem, or with ``law`` finds impulses of Coulomb's law, if
-    ``has_law``.
+    ``convex(problem, guess, tol)`` solves a cone problem; each of ``ways``, called alike, looks for Coulomb's law by
+    itself, from the point of the one before; one that gives up has none.
     """
-    tol, tried = options.tol or tol, []
-    if has_law or problem.size == 0:
-        own = once(problem, guess, tol, law=True)
-        own.law = COULOMB
-        if own.final:
-            return own
-        tried.append(own)
-    start = tried[0].impulse if tried else guess
-    tried.append(solve(problem, start, tol, options, once))
-    if not tried[-1].final:
-        plain = once(problem, guess, tol)
-        y = problem.product(plain.impulse) + problem.r
-        plain.natural_residual, plain.status = residual(problem, plain.impulse, y), Status.STALLED
-        plain.reason = f"relaxation, as Coulomb's law was not met: {tried[-1].reason}"
-        tried.append(plain)
-    best = tried[-1] if tried[-1].final else min(tried, key=lambda result: result.natural_residual)
+    tol = options.tol or tol
+    tried: list[Result] = []
+    for way in ways:
+        tried.append(way(problem, tried[-1].impulse if tried else guess, tol))
+        tried[-1].law = COULOMB
+        if tried[-1].final:
+            return _last_of(tried)
+        if tried[-1].status is Status.GIVEN_UP:
+            break
+    tried.append(solve(problem, _best_of(tried).impulse if tried else guess, tol, options, convex))
+    if tried[-1].final:
+        return _last_of(tried)
+    plain = convex(problem, guess, tol)
+    y = problem.product(plain.impulse) + problem.r
+    plain.natural_residual, plain.status = residual(problem, plain.impulse, y), Status.STALLED
+    plain.reason = f"relaxation, as Coulomb's law was not met: {tried[-1].reason}"
+    tried.append(plain)
+    return _last_of(sorted(tried, key=lambda result: -result.natural_residual))
+
+
+def _best_of(tried: list[Result]) -> Result:
+    return min(tried, key=lambda result: result.natural_residual)
+
+
+def _last_of(tried: list[Result]) -> Result:
+    """The last result, with what all have cost."""
     for count in ("iterations", "ksp_its", "fallbacks"):
-        setattr(best, count, sum(getattr(result, count) for result in tried))
-    return best
+        setattr(tried[-1], count, sum(getattr(result, count) for result in tried))
+    return tried[-1]
 
 
 def solve(

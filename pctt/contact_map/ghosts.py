@@ -6,14 +6,15 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.exchange import offsets
+from pctt.exchange import offsets, send_rows
 
 
 class Ghosts:
     """Local numbers of bodies: first the own bodies, then the ghosts, then one number, `nobody`, for no body.
 
     Values of bodies are arrays (nobody + 1, k), of single or double precision. They travel in double precision, as
-    PETSc adds up no other. The last row, for `nobody`, is zero, or has values that nothing reads.
+    PETSc adds up no other; only those of bodies that are ghosts elsewhere are touched. The last row, for `nobody`, is
+    zero, or has values that nothing reads.
 
     Attributes
     ----------
@@ -36,11 +37,19 @@ class Ghosts:
         self._sf: PETSc.SF | None = None
         self._units: dict[int, MPI.Datatype] = {}
         if comm.size > 1:
-            owner = np.searchsorted(starts, names, side="right") - 1
-            remote = np.stack([owner, names - starts[owner]], axis=1)
-            self._sf = PETSc.SF().create(comm)
-            self._sf.setGraph(own, np.arange(len(names), dtype=PETSc.IntType), remote.astype(PETSc.IntType).ravel())
-            self._sf.setUp()
+            self._sf = self._star_forest(starts, names)
+
+    def _star_forest(self, starts: np.ndarray, names: np.ndarray) -> PETSc.SF:
+        """From the own bodies that are ghosts elsewhere (`_shared`, in this order) to the ghosts on other ranks."""
+        owner = np.searchsorted(starts, names, side="right") - 1
+        asked, by = send_rows(self.comm, [names - starts[owner]], owner)
+        self._shared = np.unique(asked[0])
+        (place,), _ = send_rows(self.comm, [np.searchsorted(self._shared, asked[0])], by)  # in the order of the ghosts
+        remote = np.stack([owner, place], axis=1).astype(PETSc.IntType)
+        sf = PETSc.SF().create(self.comm)
+        sf.setGraph(len(self._shared), np.arange(len(names), dtype=PETSc.IntType), remote.ravel())
+        sf.setUp()
+        return sf
 
     def update(self, values: np.ndarray) -> None:
         """Copy the values of the owners to the ghosts."""
@@ -49,14 +58,14 @@ class Ghosts:
 
     def begin_update(self, values: np.ndarray) -> None:
         if self._sf is not None:
-            self._travelling = values.astype(float, copy=False)
-            self._sf.bcastBegin(*self._ends(self._travelling), MPI.REPLACE)
+            self._leaving = values[self._shared].astype(float, copy=False)
+            self._arriving = np.empty((self.nobody - self.own, *values.shape[1:]))
+            self._sf.bcastBegin(self._unit(values), self._leaving, self._arriving, MPI.REPLACE)
 
     def end_update(self, values: np.ndarray) -> None:
         if self._sf is not None:
-            unit, own, ghosts = self._ends(self._travelling)
-            self._sf.bcastEnd(unit, own, ghosts, MPI.REPLACE)
-            values[self.own : self.nobody] = ghosts
+            self._sf.bcastEnd(self._unit(values), self._leaving, self._arriving, MPI.REPLACE)
+            values[self.own : self.nobody] = self._arriving
 
     def begin_add(self, values: np.ndarray) -> None:
         """Begin to add the values of the ghosts to those of the owners.
@@ -64,21 +73,21 @@ class Ghosts:
         Owners may still change their own values until `end_add`.
         """
         if self._sf is not None:
-            unit, own, ghosts = self._ends(values)
-            self._arriving, self._leaving = np.zeros(own.shape), ghosts.astype(float, copy=False)
-            self._sf.reduceBegin(unit, self._leaving, self._arriving, MPI.SUM)
+            self._leaving = values[self.own : self.nobody].astype(float)
+            self._arriving = np.zeros((len(self._shared), *values.shape[1:]))
+            self._sf.reduceBegin(self._unit(values), self._leaving, self._arriving, MPI.SUM)
 
     def end_add(self, values: np.ndarray) -> None:
         if self._sf is not None:
-            unit, own, _ = self._ends(values)
-            self._sf.reduceEnd(unit, self._leaving, self._arriving, MPI.SUM)
-            own += self._arriving
+            self._sf.reduceEnd(self._unit(values), self._leaving, self._arriving, MPI.SUM)
+            values[self._shared] += self._arriving
 
-    def _ends(self, values: np.ndarray) -> tuple[MPI.Datatype, np.ndarray, np.ndarray]:
+    def _unit(self, values: np.ndarray) -> MPI.Datatype:
+        """A row of values, for MPI."""
         width = values[0].size
         if width not in self._units:
             self._units[width] = MPI.DOUBLE.Create_contiguous(width).Commit()
-        return self._units[width], values[: self.own], values[self.own : self.nobody]
+        return self._units[width]
 
     def destroy(self) -> None:
         if self._sf is not None:

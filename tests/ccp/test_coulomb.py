@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from several_ranks import alone
 
 from pctt import ccp
 from pctt.ccp import Coulomb, Limits, Status, coulomb, fclib
+from pctt.ccp.interior import conic, lorentz, slip
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "fclib"
 SOLVERS = pytest.mark.parametrize("solver", ["apgd", "conic", "pdip", "auto"])
@@ -107,22 +109,55 @@ def test_the_last_rung_is_the_relaxation(monkeypatch):
     """Where nothing finds Coulomb's law the best is handed back, and named."""
     problem = sliding_heap(0.3)
 
-    def failing(law):
-        def once(problem, guess, tol, law=False):
-            g = np.full_like(guess, 1e-3) if law else ccp.solve(problem, guess, "apgd", Limits(tol)).impulse
-            return ccp.Result(g, Status.STALLED if law else Status.CONVERGED, "as it happens", 1.0, 7)
+    def convex(problem, guess, tol):
+        impulse = ccp.solve(problem, guess, "apgd", Limits(tol)).impulse
+        return ccp.Result(impulse, Status.CONVERGED, "as it happens", 1.0, 7)
 
-        return once
+    def failing(problem, guess, tol):
+        return ccp.Result(np.full_like(guess, 1e-3), Status.STALLED, "as it happens", 1.0, 7)
 
     not_met = Status.STALLED, "not met", 0.9, 5
     monkeypatch.setattr(coulomb, "solve", lambda problem, guess, *rest: ccp.Result(guess, *not_met))
     guess = np.zeros_like(problem.r)
-    result = coulomb.ladder(problem, guess, 1e-8, Coulomb(), failing(True), has_law=True)
+    result = coulomb.ladder(problem, guess, 1e-8, Coulomb(), convex, [failing])
     assert not result.converged
     assert result.law == "relaxation"
     assert result.reason.startswith("relaxation, as Coulomb's law was not met")
     assert result.iterations == 7 + 5 + 7
     assert result.natural_residual == pytest.approx(ccp.measure(problem, result.impulse).coulomb_residual, rel=1e-6)
+
+
+def test_each_way_begins_where_the_one_before_has_ended():
+    problem = sliding_heap(0.3)
+    starts = []
+
+    def way(problem, guess, tol):
+        starts.append(guess[0, 0])
+        status = Status.CONVERGED if len(starts) == 3 else Status.STALLED
+        return ccp.Result(guess + 1.0, status, "as it happens", 1e-3, 7)
+
+    result = coulomb.ladder(problem, np.zeros_like(problem.r), 1e-8, Coulomb(), way, 4 * [way])
+    assert starts == [0.0, 1.0, 2.0]
+    assert (result.converged, result.law, result.iterations) == (True, "Coulomb", 21)
+
+
+def test_where_conic_stalls_apgd_goes_on_from_its_point(monkeypatch):
+    """And `conic` begins near the point at which that has ended."""
+    problem = sliding_heap(0.3)
+    monkeypatch.setattr(conic, "STEERING", dataclasses.replace(conic.STEERING, patience_with_law=-1))
+    result = ccp.solve(problem, None, "conic", Limits(1e-6), coulomb=Coulomb())
+    assert (result.converged, result.law, result.solver) == (True, "Coulomb", "apgd")
+    assert ccp.measure(problem, result.impulse).coulomb_residual < 1e-5
+
+
+def test_the_opening_is_exact():
+    """Velocities (y_n, y_t), y_n > 0, and points inside the cone are one to one, up to its boundary."""
+    y = np.random.default_rng(1).normal(size=(50, 3))
+    y[:, 0] = 10.0 ** np.linspace(-12, 1, 50)
+    z = slip.opened(y)
+    assert (lorentz.determinant(z) > 0).all()
+    np.testing.assert_allclose(z[:, 0] - y[:, 0], np.hypot(y[:, 1], y[:, 2]), rtol=1e-12)
+    np.testing.assert_allclose(slip.closed(z), y, rtol=1e-9, atol=1e-15)
 
 
 def test_a_problem_without_solution_stays_one(monkeypatch):
@@ -131,10 +166,10 @@ def test_a_problem_without_solution_stays_one(monkeypatch):
     none = ccp.Result(np.ones_like(problem.r), Status.UNBOUNDED, "no solution", 0.9, 5)
     monkeypatch.setattr(coulomb, "solve", lambda *arguments: none)
 
-    def once(problem, guess, tol, law=False):
+    def stalling(problem, guess, tol):
         return ccp.Result(guess, Status.STALLED, "as it happens", 1e-3, 7)
 
-    result = coulomb.ladder(problem, np.zeros_like(problem.r), 1e-8, Coulomb(), once, has_law=True)
+    result = coulomb.ladder(problem, np.zeros_like(problem.r), 1e-8, Coulomb(), stalling, [stalling])
     assert (result.status, result.reason, result.iterations) == (Status.UNBOUNDED, "no solution", 12)
 
 

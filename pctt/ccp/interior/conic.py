@@ -14,8 +14,7 @@ Late in an iteration W^2 is large along an impulse that slides, and the product 
 rounding. So the change of each contact without the others, ds = W w - s, is formed from s instead.
 
 For Coulomb's law z belongs to the De Saxce velocity, (y_n / mu + |y_t|, y_t); `slip` has the additional terms. A step is
-straight in y, so that z takes the opening as it is, and not by its derivative. The problem is not convex: where the
-path leads nowhere, others that begin nearer to the best point so far are tried.
+straight in y, so that z takes the opening as it is, and not by its derivative.
 
 Source: Nesterov and Todd (1997), Mehrotra (1992); Acary, Armand, Nguyen and Shpakovych, "Second-order cone
 programming for frictional contact mechanics using interior point algorithm", Optim. Methods Softw. (2023), for their
@@ -70,11 +69,10 @@ class Steering:
     #: impulses off where next to nothing bounds them
     late: float = 1e-2
     patience: int = 3  #: iterations without progress before the Newton systems are sharpened;
-    patience_with_law: int = 8  #: for Coulomb's law, before the path is given up
-    #: starts of the paths from the best point that are tried then, in the unit of ``-ccp_conic_start``
-    again: tuple[float, ...] = (0.3, 0.03)
+    patience_with_law: int = 8  #: for Coulomb's law, before the method gives up
     #: for Coulomb's law, part of the way to the boundary at most: next to it a contact has no room to turn
     boundary_with_law: float = 0.9
+    near_start: float = 3e4  #: for Coulomb's law, ``-ccp_conic_start`` at most, by the guess's residual
 
 
 STEERING = Steering()
@@ -84,23 +82,17 @@ def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Conic, newton: Newton, coulomb: bool = False
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step. Default
-    iteration limit 60, for Coulomb's law 120."""
+    iteration limit 60."""
     newton.begin(problem)
     if coulomb and not newton.takes_any:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
     cones = Cones.of(problem, coulomb)
-    course = Course(cones, limits.tol, limits.max_it if limits.max_it >= 0 else 120 if coulomb else 60)
-    _follow_path(cones, _start(cones, guess, options.start), newton, options, course)
-    for start in STEERING.again if coulomb else ():
-        if course.stalled:
-            course.begins_again()
-            _follow_path(cones, _start(cones, course.best, start), newton, options, course)
-    return course.result(newton)
-
-
-def _follow_path(cones: Cones, at: Point, newton: Newton, options: Conic, course: Course) -> None:
-    """Follow the central path from a point to the solution, or as far as it leads."""
+    start = options.start
+    if coulomb:  # from a point near the law, the end of another path
+        start = min(start, STEERING.near_start * problem.natural_residual(guess, cones.velocity(guess)))
+    at = _start(cones, guess, start)
+    course = Course(cones, limits.tol, limits.max_it if limits.max_it >= 0 else 60)
     while not course.ends(at, newton):
         scaled = Scaled.of(cones, at, newton, options, course)
         with phase("ConicPredictor"):
@@ -110,6 +102,7 @@ def _follow_path(cones: Cones, at: Point, newton: Newton, options: Conic, course
             direction, step = _corrected(scaled, predictor, target, course)
         if step > 0:
             at = cones.moved(at, direction, step)
+    return course.result(newton)
 
 
 class Point(NamedTuple):
@@ -184,21 +177,14 @@ class Course:
     """The course of the iterations so far, and the test that ends them.
 
     history : natural residual of every iterate
-    best : impulses of the least residual
     waited : iterations without progress
-    stalled : whether patience with the present path is at its end
     """
 
     def __init__(self, cones: Cones, tol: float, max_it: int):
         self._cones, self._tol, self._max_it = cones, tol, max_it
         self._patience = STEERING.patience_with_law if cones.coulomb else STEERING.patience
         self.history: list[float] = []
-        self.best = np.zeros_like(cones.scale)
-        self.begins_again()
-
-    def begins_again(self) -> None:
-        """Another path begins."""
-        self._least, self._last_gap, self.waited, self.stalled = np.inf, np.inf, 0, False
+        self.waited, self._last_gap = 0, np.inf
 
     @property
     def residual(self) -> float:
@@ -209,17 +195,18 @@ class Course:
         problem, g = self._cones.problem, at.s / self._cones.scale
         gap = problem.dot(at.s, at.z)
         residual = problem.natural_residual(g, self._cones.velocity(g))
-        if residual <= min(self.history, default=np.inf):
-            self.best = g
-        progress = residual <= 0.9 * self._least or gap <= 0.5 * self._last_gap
-        self.waited, self._last_gap, self._least = (0 if progress else self.waited + 1), gap, min(self._least, residual)
+        if not self.history or residual <= min(self.history):
+            self._best = g
+        progress = residual <= 0.9 * min(self.history, default=np.inf) or gap <= 0.5 * self._last_gap
+        self.waited, self._last_gap = (0 if progress else self.waited + 1), gap
         self.history.append(residual)
         if residual <= self._tol or len(self.history) > self._max_it or why_unbounded(problem, g):
             return True
         if self.waited > self._patience:
-            self.stalled = self._cones.coulomb or not newton.sharpen()
+            if self._cones.coulomb or not newton.sharpen():
+                return True
             self.waited = 0
-        return self.stalled
+        return False
 
     def result(self, newton: Newton) -> Result:
         """The best iterate, and why it was the last."""
@@ -230,7 +217,7 @@ class Course:
         elif iterations == self._max_it:
             status, words = Status.ITERATION_LIMIT, f"{self._max_it} iterations"
         least = min(self.history)
-        return Result(self.best, status, words, least, iterations, newton.ksp_its, newton.fallbacks, self.history)
+        return Result(self._best, status, words, least, iterations, newton.ksp_its, newton.fallbacks, self.history)
 
 
 @dataclass(frozen=True)
@@ -359,8 +346,7 @@ def _corrected(scaled: Scaled, predictor: Direction, target: float, course: Cour
 
 
 def _start(cones: Cones, guess: Array, start: float) -> Point:
-    """A pair on the central path near the guess: s - tau z = s_0 - tau z_0. ``start`` is its complementarity in the
-    unit of ``-ccp_conic_start``."""
+    """A pair on the central path near the guess: s - tau z = s_0 - tau z_0; ``start`` as ``-ccp_conic_start``."""
     problem, scale = cones.problem, cones.scale
     guess = no_larger_than_useful(problem, guess)
     s, z = guess * scale, cones.velocity(guess) / scale
