@@ -13,8 +13,8 @@ spoils v = G' g alone, and the next step mends that. With W the scaling of the p
 Late in an iteration W^2 is large along an impulse that slides, and the product W^2 z, which equals s, drowns in
 rounding. So the change of each contact without the others, ds = W w - s, is formed from s instead.
 
-For Coulomb's law z belongs to the De Saxce velocity, (y_n / mu + |y_t|, y_t); `slip` has the additional terms. A step is
-straight in y, so that z takes the opening as it is, and not by its derivative.
+For Coulomb's law z belongs to the De Saxce velocity, (y_n / mu + |y_t|, y_t); `slip` has the additional terms. A step
+is straight in y, so that z takes the opening as it is, and not by its derivative.
 
 Source: Nesterov and Todd (1997), Mehrotra (1992); Acary, Armand, Nguyen and Shpakovych, "Second-order cone
 programming for frictional contact mechanics using interior point algorithm", Optim. Methods Softw. (2023), for their
@@ -56,7 +56,7 @@ class Steering:
     proximal: float = 1e-9  #: compliance within a step [mean diag N]: it bounds (B + C)^-1; the answer does not have it
     #: part of the forcing where impulses are the unknowns: what a solve leaves moves velocities, compared with zero
     closer: float = 0.01
-    sharper: float = 0.01  #: part of the forcing for Coulomb's law, whose systems are not symmetric
+    sharper: float = 0.1  #: part of the forcing for Coulomb's law
     centering: float = 0.02  #: part of the complementarity to aim at, per deviation from the central path
     least: float = 0.01  #: part of the complementarity to aim at in any case
     near: tuple[float, float] = (0.1, 10.0)  #: what counts as near the central path [complementarity aimed at]
