@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -60,10 +59,11 @@ def solve(
 ) -> Result:
     """Solve a cone problem by a method of SOLVERS; with ``coulomb`` find impulses of Coulomb's law.
 
-    For Coulomb's law there is a ladder. The first rung is the method's own way, if it has one (`Solver.has_law`); where
-    an interior point method stalls, APGD goes on from its point. If that does not converge, the second rung is a
-    sequence of cone problems (`pctt.ccp.coulomb`). If that does not converge either, the result is the best of all and
-    of the relaxation, by the Coulomb residual, and counts as not converged. ``law`` of the result names the rung.
+    For Coulomb's law there is a ladder. The first rung is the method's own way, if it has one (`Solver.has_law`). Where
+    `conic` or `auto` stall, `apgd` goes on from there, and where that stalls, `conic` and `apgd` once more. If none of
+    them converges, the second rung is a sequence of cone problems (`pctt.ccp.coulomb`). If that does not converge
+    either, the result is the best of all and of the relaxation, by the Coulomb residual, and counts as not converged.
+    ``law`` of the result names the rung.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
     the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
@@ -76,17 +76,23 @@ def solve(
     guess = np.zeros_like(problem.r) if guess is None else guess
     own = newton_for(problem.comm, type) if solver.newton and newton is None else None
 
-    def once(problem: ConeProblem, guess: Array, tol: float, law: bool = False) -> Result:
-        to = dataclasses.replace(limits, tol=tol)
-        return _once(problem, guess, solver, to, options or solver.options(), newton or own, law)
+    def by(method: Solver, problem: ConeProblem, guess: Array, tol: float, law: bool = False) -> Result:
+        if method is solver:
+            to = dataclasses.replace(limits, tol=tol)
+            return _once(problem, guess, method, to, options or method.options(), newton or own, law)
+        to = Limits(tol, method.iterations)
+        result = _once(problem, guess, method, to, method.options(), newton or own, law)
+        result.solver = result.solver or method.name
+        return result
 
     try:
         if coulomb is None:
-            return once(problem, guess, limits.tol)
-        ways: list[Callable[..., Result]] = [partial(once, law=True)] if solver.has_law or problem.size == 0 else []
-        if solver.has_law and solver.needs == NEWTON:
-            ways = 2 * [*ways, _finish_by_apgd]
-        return coulombs_law.ladder(problem, guess, limits.tol, coulomb, once, ways)
+            return by(solver, problem, guess, limits.tol)
+        methods = [solver] if solver.has_law or problem.size == 0 else []
+        if solver.has_law and solver.newton:
+            methods += [SOLVERS[name] for name in ("apgd", "conic", "apgd")]
+        ways = [partial(by, method, law=True) for method in methods]
+        return coulombs_law.ladder(problem, guess, limits.tol, coulomb, partial(by, solver), ways)
     finally:
         if own is not None:
             own.destroy()
@@ -108,14 +114,6 @@ def _once(
         if unbounded:
             result.status, result.reason = Status.UNBOUNDED, unbounded
         return result
-
-
-def _finish_by_apgd(problem: ConeProblem, guess: Array, tol: float) -> Result:
-    """Coulomb's law from a point near it."""
-    method = SOLVERS["apgd"]
-    result = _once(problem, guess, method, Limits(tol, method.iterations), method.options(), None, law=True)
-    result.solver = method.name
-    return result
 
 
 def newton_for(comm: MPI.Comm, type: str, form: str = "auto", compare: Comparison | None = None) -> Newton:

@@ -166,10 +166,7 @@ class Cones:
 
     def reach(self, at: Point, d: Direction) -> float:
         """The longest step that keeps both in the cones of this rank."""
-        if self.coulomb:
-            of_z = step_to_zero(closed(at.z)[:, 0], d.dy[:, 0])
-        else:
-            of_z = lorentz.step_to_boundary(at.z, d.dz)
+        of_z = step_to_zero(closed(at.z)[:, 0], d.dy[:, 0]) if self.coulomb else lorentz.step_to_boundary(at.z, d.dz)
         return min(lorentz.step_to_boundary(at.s, d.ds), of_z)
 
 
