@@ -22,7 +22,12 @@ def interrupted(options, ranks, tmp_path, cache, ready, number, twice=False):
     """Start a run, wait until `ready`, and send the signal: to the program, or to the mpiexec of run/setup, or where
     there is another, to the last rank. Its exit status, and what it said to the standard error."""
     with subprocess.Popen(
-        command(*options, ranks=ranks), cwd=tmp_path, env=environment(cache), stderr=subprocess.PIPE, text=True
+        command(*options, ranks=ranks),
+        cwd=tmp_path,
+        env=environment(cache),
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=_listen_to_ctrl_c,
     ) as run:
         end = time.monotonic() + 120
         while not ready():
@@ -37,6 +42,11 @@ def interrupted(options, ranks, tmp_path, cache, ready, number, twice=False):
             os.kill(target, number)
         _, said = run.communicate(timeout=120)
     return run.returncode, said
+
+
+def _listen_to_ctrl_c():
+    """A shell has what it starts in the background ignore the signal, and mpiexec inherits this."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @pytest.mark.parametrize("ranks", RANKS)
