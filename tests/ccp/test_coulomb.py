@@ -150,6 +150,19 @@ def test_where_conic_stalls_apgd_goes_on_from_its_point(monkeypatch):
     assert ccp.measure(problem, result.impulse).coulomb_residual < 1e-5
 
 
+def test_conic_begins_near_a_good_guess(monkeypatch):
+    """And inside the cones also where the guess is exact."""
+    problem = sliding_heap(0.3)
+    guess = solve(problem, "apgd", tol=1e-11).impulse
+    cold = solve(problem, "conic", tol=1e-6).iterations
+    assert solve(problem, "conic", tol=1e-6, guess=guess).iterations < cold
+    monkeypatch.setattr(problem, "natural_residual", lambda g, y: 0.0 if g is guess else original(g, y))
+    original = type(problem).natural_residual.__get__(problem)
+    result = solve(problem, "conic", tol=1e-6, guess=guess)
+    assert result.converged, result.reason
+    assert result.iterations < cold
+
+
 def test_the_opening_is_exact():
     """Velocities (y_n, y_t), y_n > 0, and points inside the cone are one to one, up to its boundary."""
     y = np.random.default_rng(1).normal(size=(50, 3))

@@ -72,7 +72,7 @@ class Steering:
     patience_with_law: int = 8  #: for Coulomb's law, before the method gives up
     #: for Coulomb's law, part of the way to the boundary at most: next to it a contact has no room to turn
     boundary_with_law: float = 0.9
-    near_start: float = 3e4  #: for Coulomb's law, ``-ccp_conic_start`` at most, by the guess's residual
+    near_start: float = 3e4  #: for Coulomb's law, ``-ccp_conic_start`` at most, per residual of the guess or tolerance
 
 
 STEERING = Steering()
@@ -90,7 +90,8 @@ def solve(
     cones = Cones.of(problem, coulomb)
     start = options.start
     if coulomb:  # from a point near the law, the end of another path
-        start = min(start, STEERING.near_start * problem.natural_residual(guess, cones.velocity(guess)))
+        off = max(problem.natural_residual(guess, cones.velocity(guess)), limits.tol)
+        start = min(start, STEERING.near_start * off)
     at = _start(cones, guess, start)
     course = Course(cones, limits.tol, limits.max_it if limits.max_it >= 0 else 60)
     while not course.ends(at, newton):
@@ -254,7 +255,7 @@ class Scaled:
         if cones.coulomb:
             compliance = problem.compliance[:, 1:2] + STEERING.proximal * problem.mean_diagonal
             slip = Slip.of(inverse, sliding_directions(at.z), cones.scale, compliance)
-            r_z = slip.opened(r_y)
+            r_z = slip.change(r_y)
         newton.update(B, inverse if slip is None else inverse + slip.blocks, symmetric=slip is None)
         # a residual of v = G' g makes y wrong by G times that
         tol = options.forcing * course.residual * problem.norm(at.s / cones.scale) * np.sqrt(problem.mean_diagonal)
@@ -280,7 +281,7 @@ class Scaled:
         else:  # r_v vanishes, r_y takes it
             dy = c - self.W.divide(self.W.divide(ds))
         dy[self.cones.frictionless, 1:] = ds[self.cones.frictionless, 1:] = 0.0
-        return Direction(ds, dy if self.slip is None else self.slip.opened(dy), dy, dv, x)
+        return Direction(ds, dy if self.slip is None else self.slip.change(dy), dy, dv, x)
 
     def reach(self, d: Direction) -> float:
         """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""

@@ -64,8 +64,8 @@ class Slip(NamedTuple):
         """Y c becomes X c, in place."""
         uncoupled -= self.p * (self.less * dot(self.u, uncoupled)[:, None])
 
-    def opened(self, dy: Array) -> Array:
-        """T dy (nc, 3)."""
+    def change(self, dy: Array) -> Array:
+        """T dy (nc, 3), the change of z to first order."""
         dz = dy.copy()
         dz[:, 0] += dot(self.u, dy)
         return dz

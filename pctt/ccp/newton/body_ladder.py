@@ -157,9 +157,9 @@ class BodyLadder(KrylovFamily):
             jacobi_max_it = STEERING.jacobi_max_it if self._room else STEERING.alone_max_it
             defaults["ksp_max_it"] = str(STEERING.factor_max_it if rung == "cholesky" else jacobi_max_it)
             defaults |= UNSYMMETRIC[rung] if unsymmetric else {}
-            alone = self.comm.size == 1 and PETSc.Sys.hasExternalPackage("suitesparse")
-            if rung == "cholesky" and alone and not unsymmetric:
-                # 1.3 times faster than MUMPS, its solves twice; UMFPACK, for the others, takes twice as long as MUMPS
+            cholmod = self.comm.size == 1 and PETSc.Sys.hasExternalPackage("suitesparse")
+            if rung == "cholesky" and cholmod and not unsymmetric:
+                # 1.3 times faster than MUMPS, its solves twice; for unsymmetric matrices UMFPACK takes twice as long
                 defaults["pc_factor_mat_solver_type"] = "cholmod"
             self._krylov[name] = Krylov(self.comm, f"body_{name}_", defaults)
         return self._krylov[name]
