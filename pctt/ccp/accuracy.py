@@ -1,7 +1,7 @@
 """The accuracy of a solution: figures that judge every method, computed by code of their own, which no solver uses.
 
-The projection below goes through the angle in the (normal, tangential) half plane, and y = N g is formed from the
-momentum of the bodies if the problem has bodies. So a mistake in a solver's own arithmetic shows.
+The projection below is numpy's, and not the solvers' loop, and y = N g is formed from the momentum of the bodies if
+the problem has bodies. So a mistake in a solver's own arithmetic shows.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import Array, dot
 from pctt.ccp.problem import ConeProblem
 
 
@@ -49,14 +49,15 @@ def measure(problem: ConeProblem, g: Array) -> Accuracy:
     sliding = np.hypot(y[:, 1], y[:, 2])
     with_opening = y.copy()
     with_opening[:, 0] += problem.mu * sliding
+    natural = _residual(problem, g, y)
     return Accuracy(
-        natural_residual=_residual(problem, g, y),
-        rigid_residual=_residual(problem, g, y - problem.compliance * g),
+        natural_residual=natural,
+        rigid_residual=_residual(problem, g, y - problem.compliance * g) if problem.softness else natural,
         coulomb_residual=_residual(problem, g, with_opening),
         objective=problem.dot(g, 0.5 * (y + problem.r)),
         cone_violation=max(0.0, problem.max((tangential - problem.mu * g[:, 0]).max(initial=0.0))),
         dual_violation=max(0.0, problem.max((problem.mu * sliding - y[:, 0]).max(initial=0.0))),
-        complementarity=problem.max(np.abs((g * y).sum(1)).max(initial=0.0)),
+        complementarity=problem.max(np.abs(dot(g, y)).max(initial=0.0)),
         impulse_norm=norm,
         velocity_norm=problem.norm(y),
     )
@@ -69,14 +70,12 @@ def _residual(problem: ConeProblem, g: Array, y: Array) -> float:
 
 
 def _nearest_in_cone(x: Array, mu: Array) -> Array:
-    """Projection on the cone of half angle atan(mu): turn a point to the cone's surface and shorten it."""
-    radius = np.sqrt((x * x).sum(1))
-    angle = np.arctan2(np.hypot(x[:, 1], x[:, 2]), x[:, 0])  # from the axis, 0 to pi
-    half = np.arctan(mu)
-    excess = np.maximum(angle - half, 0.0)
-    # exactly zero in the polar cone, where the cosine of a rounded pi / 2 is not
-    length = np.where(excess < np.pi / 2, radius * np.cos(excess), 0.0)
-    turned = np.minimum(angle, half)
-    azimuth = np.arctan2(x[:, 2], x[:, 1])
-    flat = length * np.sin(turned)
-    return np.stack([length * np.cos(turned), flat * np.cos(azimuth), flat * np.sin(azimuth)], axis=1)
+    """Projection on the cone of slope mu, in the half plane of axis and point: the nearest point of the surface's ray,
+    unless the point is inside."""
+    tangential = np.hypot(x[:, 1], x[:, 2])
+    ray_n, ray_t = 1 / np.hypot(1, mu), mu / np.hypot(1, mu)
+    along = np.maximum(ray_n * x[:, 0] + ray_t * tangential, 0.0)
+    inside = (x[:, 0] >= 0) & (tangential <= mu * x[:, 0])
+    turn = np.divide(ray_t * along, tangential, out=np.zeros_like(along), where=tangential > 0)
+    nearest = np.stack([ray_n * along, turn * x[:, 1], turn * x[:, 2]], axis=1)
+    return np.where(inside[:, None], x, nearest)

@@ -152,7 +152,7 @@ class ConeProblem:
     @cached_property
     def diagonal_blocks(self) -> Array:
         """The 3 x 3 diagonal blocks of N (nc, 3, 3), the low-rank term and the compliance included."""
-        return self._rigid_blocks + self.compliance_blocks
+        return self._rigid_blocks + self.compliance_blocks if self.softness else self._rigid_blocks
 
     @cached_property
     def sparse_diagonal_blocks(self) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import Array, dot
 from pctt.ccp.problem import ConeProblem
 
 AMPLIFICATION = 1e3  # change of velocity per speed of the contacts that no step is believed to need
@@ -28,8 +28,7 @@ def why_unbounded(problem: ConeProblem, g: Array) -> str:
     """
     r = problem.r.copy()
     r[problem.mu == 0, 1:] = 0.0  # sliding that no impulse answers
-    sizes = np.linalg.norm(g, axis=1)
-    speeds = (r * r).sum(1)
+    sizes, speeds = np.sqrt(dot(g, g)), dot(r, r)
     weight = np.maximum(sizes / max(problem.max(sizes.max(initial=0.0)), 1e-300), ELSEWHERE**2)
     parts = (np.vdot(r, g), weight @ speeds, np.vdot(problem.product(g), g), sizes @ sizes)
     along, closing, bent, length = problem.sum(np.array(parts))

@@ -33,10 +33,10 @@ class ScaledProblem:
 
     def __init__(self, problem: ConeProblem, coulomb: bool = False, precision: type[np.floating] = np.float64):
         self.problem, self.opening, self.precision = problem, float(coulomb), precision
-        diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2)
+        blocks = problem.diagonal_blocks
         size = np.empty_like(problem.r)
-        size[:, 0] = diagonal[:, 0]
-        size[:, 1:] = diagonal[:, 1:].mean(axis=1, keepdims=True)
+        size[:, 0] = blocks[:, 0, 0]
+        size[:, 1] = size[:, 2] = 0.5 * (blocks[:, 1, 1] + blocks[:, 2, 2])
         self._scale = np.sqrt(np.where(size > 0, size, problem.mean_diagonal))
         self._shrink = 1.0 / self._scale
         self.mu = self._rounded(problem.mu * self._scale[:, 1] / self._scale[:, 0])
