@@ -15,7 +15,9 @@ from dem.shapes import Box, Plane
 from dem.start import new_world
 from dem.together import SceneError
 from pctt import ccp
+from pctt.options import OptionError
 from pctt.run.options import read_options
+from pctt.run.settling import world_at_start
 from pctt.run.stepper import Stepper
 
 
@@ -122,3 +124,25 @@ def test_a_body_that_is_lost_ends_the_run():
     stepper.world.set_grains(Bodies(**columns))
     with pytest.raises(SceneError, match="step 1"):
         stepper.step()
+
+
+def test_a_body_that_is_lost_within_a_step_ends_the_run_too(monkeypatch):
+    """The search at the end of a step, which turns bodies, may be the first to see it."""
+    scene = Scene(0.3)
+    scene.add_spheres([0, 0, 0], 0.1, 1000.0)
+    stepper = stepper_of(scene)
+
+    def lost(*arguments):
+        raise FloatingPointError("no finite position")
+
+    monkeypatch.setattr("pctt.run.stepper.find_turned", lost)
+    with pytest.raises(SceneError, match="step 1: no finite position"):
+        stepper.step()
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_a_start_at_a_speed_whose_square_overflows_is_refused():
+    scene = Scene(0.3)
+    scene.add_spheres([0, 0, 0], 0.1, 1000.0, velocity=(1e200, 0, 0))
+    with pytest.raises(OptionError, match="no finite position or velocity at step 0"):
+        world_at_start(Mixer(n=1), scene, MPI.COMM_SELF)
