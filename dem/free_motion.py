@@ -15,7 +15,6 @@ from dem.quaternion import cross
 from dem.scene import LargeBody
 from dem.world import World
 
-
 #: Newton steps for the spin of a body, and the relative error of its angular momentum at which they have converged.
 NEWTON_STEPS, CONVERGED = 4, 1e-6
 
@@ -47,9 +46,9 @@ def free_spin(spin: Floats, moments: Floats, dt: float) -> Floats:
     A step turns a body by exp(dt w). In the middle of it the body has the angular momentum exp(dt/2 w) I w in the frame
     of its start, and in the middle of the last step it had exp(-dt/2 w_old) I w_old. Newton's method makes the two
     equal. So the angular momentum is kept (to rounding below half a radian a step), and the energy to O(dt^2): with
-    an explicit torque it would grow without bound. This is the implicit midpoint rule on the rotations (Simo and Wong, International
-    Journal for Numerical Methods in Engineering 31, 1991). A body that turns by much more than a radian in a step, for
-    which Newton's method does not converge, keeps its spin: no such step resolves its motion.
+    an explicit torque it would grow without bound. Compare Simo and Wong, International Journal for Numerical Methods
+    in Engineering 31, 1991. A body that turns by much more than a radian in a step, for which Newton's method does not
+    converge, keeps its spin: no such step resolves its motion.
     """
     half = 0.5 * dt
     moments = moments / moments.max(axis=1, keepdims=True)  # nothing but their ratios counts

@@ -90,8 +90,8 @@ def energy_balance(step: Step) -> dict[str, float]:
 
     With g the impulses and w the mean of the velocities before and after (of prescribed motions: that of the step), the
     impulses do the work g' D' w. Its tangential part is the friction loss. Its normal part is lost in impacts, or
-    pushes overlaps apart where it is a gain. The work of motions is that of prescribed bodies on the others, and that of
-    the drives of guided and hinged bodies. The rest is the error of the semi-implicit step, of the order of dt:
+    pushes overlaps apart where it is a gain. The work of motions is that of prescribed bodies on the others, and that
+    of the drives of guided and hinged bodies. The rest is the error of the semi-implicit step, of the order of dt:
     -dt/2 m g (v_new - v_old) per body.
     """
     world, near, comm = step.world, step.contacts.near, step.world.comm
