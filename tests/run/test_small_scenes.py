@@ -70,7 +70,7 @@ def test_what_a_struck_grain_strikes_is_seen(solver):
 
 @pytest.mark.parametrize("motion", [Dynamic(), Guided((0, 0, 1))], ids=["free", "guided"])
 def test_what_a_struck_plate_strikes_is_seen(motion):
-    """A light plate between two spheres: the upper one would send it 8 cm in the first step, the lower one is 6 cm off."""
+    """A light plate between two spheres: the upper one would send it 8 cm in a step, the lower one is 6 cm off."""
     scene = Scene(0.0, gravity=(0, 0, 0))
     scene.add_body("plate", [Box((0.3, 0.3, 0.01))], motion, density=10.0)
     scene.add_spheres([[0, 0, 0.13], [0, 0, -0.17]], 0.1, 5000.0, velocity=[[0, 0, -10.0], [0, 0, 0]])
