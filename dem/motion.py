@@ -55,11 +55,12 @@ class Guided(Dynamic):
         """Projector (3, 3) on the direction of the guide."""
         return np.outer(self.direction, self.direction)
 
-    def force_at(self, time: float, lack: float = 0.0) -> Floats:
-        """Force of the drive (3,) over a step that begins at `time` [s]. `lack` [N] is the force that takes the body to
+    def mean_force(self, time: float, dt: float, lack: float = 0.0) -> Floats:
+        """Mean force of the drive (3,) from `time` to `time + dt` [s]. `lack` [N] is the force that takes the body to
         the speed of the servo at the end of the step."""
-        force = self.force if self.speed is None else min(max(lack, -self.force), self.force)
-        return force * (self.start <= time < self.end) * np.array(self.direction)
+        most = self.force * _share(time, dt, self.start, self.end)
+        force = most if self.speed is None else min(max(lack, -most), most)
+        return force * np.array(self.direction)
 
 
 @dataclass(frozen=True)
@@ -84,10 +85,11 @@ class Hinged(Dynamic):
         """Projector (3, 3) on nothing: the axis stays where it is."""
         return np.zeros((3, 3))
 
-    def torque_at(self, time: float, lack: float = 0.0) -> Floats:
-        """Torque of the drive (3,) over a step that begins at `time` [s]; `lack` [N m] as of `Guided.force_at`."""
-        torque = self.torque if self.speed is None else min(max(lack, -self.torque), self.torque)
-        return torque * (self.start <= time < self.end) * np.array(self.axis)
+    def mean_torque(self, time: float, dt: float, lack: float = 0.0) -> Floats:
+        """Mean torque of the drive (3,) from `time` to `time + dt` [s]; `lack` [N m] as of `Guided.mean_force`."""
+        most = self.torque * _share(time, dt, self.start, self.end)
+        torque = most if self.speed is None else min(max(lack, -most), most)
+        return torque * np.array(self.axis)
 
 
 @dataclass(frozen=True)
@@ -229,6 +231,11 @@ def mean_velocity(
 def _gone(time: float, start: float, end: float) -> float:
     """How much of the time between start and end has gone by [s]."""
     return max(min(time, end) - start, 0.0)
+
+
+def _share(time: float, dt: float, start: float, end: float) -> float:
+    """The part of a step from `time` to `time + dt` [s] that is between start and end."""
+    return (_gone(time + dt, start, end) - _gone(time, start, end)) / dt
 
 
 def _ordered(what: str, start: float, end: float) -> None:

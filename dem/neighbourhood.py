@@ -51,7 +51,8 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
     comm.Allgather(_chunk_boxes(grains.position, radius), boxes)
     if np.isnan(boxes).any():
         raise FloatingPointError(
-            f"a grain has no finite position or velocity at step {world.step} (time {world.time:g} s)"
+            f"a grain has no finite position or velocity at step {world.step} (time {world.time:g} s), or its square "
+            "overflows"
         )
     first = world.slabs[comm.rank]
     columns = dict(grains.columns(), margin=margin, index=np.arange(first, first + len(grains)))

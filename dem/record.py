@@ -90,8 +90,9 @@ def energy_balance(step: Step) -> dict[str, float]:
 
     With g the impulses and w the mean of the velocities before and after (of prescribed motions: that of the step), the
     impulses do the work g' D' w. Its tangential part is the friction loss. Its normal part is lost in impacts, or
-    pushes overlaps apart where it is a gain. The work of motions is that of prescribed bodies on the others. The rest
-    is the error of the semi-implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
+    pushes overlaps apart where it is a gain. The work of motions is that of prescribed bodies on the others, and that
+    of the drives of guided and hinged bodies. The rest is the error of the semi-implicit step, of the order of dt:
+    -dt/2 m g (v_new - v_old) per body.
     """
     world, near, comm = step.world, step.contacts.near, step.world.comm
     before = near.bodies.take(slice(0, near.grains)), near.bodies.take(slice(near.grains + near.ghosts, None))
@@ -108,15 +109,16 @@ def energy_balance(step: Step) -> dict[str, float]:
     now = sums(*(energy(table, world.gravity) for table in after))
     normal, tangential = ((sums(*map(np.vdot, load, mean))) for load in step.generalised_impulses)
     received = np.vdot((step.generalised_impulses[0][1] + step.generalised_impulses[1][1])[~moves], mean[1][~moves])
+    work = np.vdot(step.system.drive_impulse, mean[1]) - received
     whole = comm.allreduce(np.array([*was, *now, normal, tangential]))
     change = whole[2] + whole[3] - whole[0] - whole[1]
     return {
         "kinetic_energy [J]": whole[2],
         "potential_energy [J]": whole[3],
-        "work_of_motions [J]": -received,
+        "work_of_motions [J]": work,
         "friction_loss [J]": -whole[5],
         "impact_loss [J]": -whole[4],
-        "time_stepping [J]": change + received - whole[4] - whole[5],
+        "time_stepping [J]": change - work - whole[4] - whole[5],
     }
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import replace
 
-import numpy as np
-
 from dem import quaternion
 from dem.arrays import Floats
 from dem.bodies import Bodies
@@ -20,11 +18,8 @@ def advance(world: World, velocity: Floats, dt: float) -> None:
 
     x <- x + dt v, q <- exp(dt w) q. Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
     """
-    count = len(world.grains)
-    _move(world.grains, velocity[:count], dt)
-    large_velocity = np.zeros_like(world.large.velocity)
-    large_velocity[: len(velocity) - count] = velocity[count:]  # all of them on the last rank, none elsewhere
-    world.comm.Bcast(large_velocity, root=world.comm.size - 1)
+    large_velocity = world.large_velocity(velocity)
+    _move(world.grains, velocity[: len(world.grains)], dt)
     _move(world.large, large_velocity, dt)
     world.time += dt
     world.step += 1

@@ -26,7 +26,7 @@ from dem.arrays import Floats, Ints
 from dem.checks import positive
 from dem.contact import Contacts
 from dem.exchange import exchange
-from dem.free_motion import free_directions, free_velocities
+from dem.free_motion import drive_impulses, free_directions, free_velocities
 from dem.loops import loops
 from dem.quaternion import cross
 from dem.world import World
@@ -60,6 +60,7 @@ class ContactSystem:
         b (nc, 3): (max(gap / dt, -recovery_speed), 0, 0) [m/s]
         r (nc, 3): b + D' v_free [m/s]
         free_velocity (owned, 6): velocities without contacts
+        drive_impulse (large, 6): impulses and angular impulses of the drives of large bodies, the same on all ranks
         owned_bodies, total_bodies (int): number of bodies whose rows this rank owns, and of all
     """
 
@@ -84,6 +85,7 @@ class ContactSystem:
         self._diagonal = world.only_spheres and not bodies.is_dynamic(world.large).any()
         free = free_velocities(world, near, dt)
         self.free_velocity = free.take(self._owned, axis=0)
+        self.drive_impulse = drive_impulses(world, dt)
         self.b = np.zeros((len(contacts), 3))
         self.b[:, 0] = np.maximum(contacts.gap / dt, -recovery_speed)
         self.r = self.b + relative_velocity(self.frame, self._arm, self._row, free)

@@ -74,6 +74,15 @@ class World:
             raise KeyError(f"no large body {name!r}; there are: {', '.join(names) or 'none'}")
         return names.index(name)
 
+    def large_velocity(self, velocity: Floats) -> Floats:
+        """Those (large, 6) of the large bodies, on all ranks, of the velocities (owned, 6) of the bodies whose rows
+        each rank owns; collective."""
+        large = np.zeros_like(self.large.velocity)
+        count = len(self.grains)
+        large[: len(velocity) - count] = velocity[count:]  # all of them on the last rank, none elsewhere
+        self.comm.Bcast(large, root=self.comm.size - 1)
+        return large
+
     def prescribed_velocity(self, dt: float) -> Floats:
         """Velocities (large bodies, 6) over the next step of `dt` [s]; dynamic bodies keep theirs; collective.
         SceneError if a motion fails."""

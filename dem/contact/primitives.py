@@ -108,6 +108,17 @@ def primitives(near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int
     )
 
 
+def extents(shapes: list[tuple[Shape, ...]]) -> Floats:
+    """Distances (large,) of the furthest points of large bodies from their reference points [m]; half spaces, which
+    have none, count with a metre."""
+
+    def extent(shape: Shape) -> float:
+        kind, center, _, size = _placed(shape)
+        return float(np.linalg.norm(center) + enclosing_radius(np.array([kind]), size[None])[0])
+
+    return np.array([max(extent(shape) for shape in parts) for parts in shapes])
+
+
 def _numbers_of(shape: Shape) -> int:
     """How many numbers a part takes, that its features may be distinct."""
     return 1 + (PARTS * shape.surface.features - 1) // FEATURES if isinstance(shape, Mesh) else 1

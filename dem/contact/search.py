@@ -14,7 +14,7 @@ from dem.bodies import BOX, SPHERE, Bodies
 from dem.checks import not_negative
 from dem.contact.broad import close_pairs
 from dem.contact.narrow import Touch
-from dem.contact.primitives import MESH, PLANE, Primitives, primitives, touches
+from dem.contact.primitives import MESH, PLANE, Primitives, extents, primitives, touches
 from dem.free_motion import free_velocity, large_free_velocity
 from dem.loops import loops
 from dem.motion import Dynamic, Hinged
@@ -41,6 +41,7 @@ class Contacts:
     gap: Floats  #: (nc,) signed distance, negative if the bodies overlap [m]
     friction: Floats  #: (nc,) coefficient
     near: Neighbourhood  #: the bodies of the rows `a` and `b`
+    shifts: Floats  #: (k, large, 6) the ways and turns of the large bodies that the search reckoned with [m, rad]
 
     def __len__(self) -> int:
         return len(self.key)
@@ -51,25 +52,29 @@ class Contacts:
         return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
 
-def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | float = 0.0) -> Contacts:
+def find_contacts(
+    world: World, delta: float, dt: float = 0.0, margin: Floats | float = 0.0, shifts: Floats | None = None
+) -> Contacts:
     """All contacts that this rank owns of the pairs whose margins meet; collective.
 
     The margin of a body is delta/2 [m], or the way that it goes in dt [s] without contact forces if that is longer. So
     a gap of at most `delta` is a contact, and so is a wider one that may close within the step, also when a third body
     stops one of the two. A large body may strike a grain in its margin and send it on; so such a grain gets the margin
-    of the large body, if that is wider. `margin` (grains,) [m] are the least margins of the local grains. A contact
-    belongs to the rank that owns the body of lower global index. The numbers of contacts that the grains own are left
-    in `world.grains.weight`.
+    of the large body, if that is wider. `margin` (grains,) [m] are the least margins of the local grains, `shifts` (k,
+    large, 6) [m, rad] further ways and turns of the large bodies that their margins are to cover. A contact belongs to
+    the rank that owns the body of lower global index. The numbers of contacts that the grains own are left in
+    `world.grains.weight`.
     """
     not_negative("contact distance delta", delta)
     shapes, total = [body.shapes for body in world.large_bodies], int(world.slabs[-1])
-    shift = dt * large_free_velocity(world, dt) if dt else np.zeros_like(world.large.velocity)
+    if shifts is None:
+        shifts = (dt * large_free_velocity(world, dt) if dt else np.zeros_like(world.large.velocity))[None]
     way = _way(world.grains, free_velocity(world.grains, world.gravity, dt), dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
     alone = without_ghosts(world, margin)
     table = primitives(alone, shapes, total)
     widest = np.maximum(margin, WIDEST * table.radius[: len(margin)])
-    beside = _grains_beside_parts(alone, table, delta, shift, widest)
+    beside = _grains_beside_parts(alone, table, delta, shifts, widest)
     if dt:
         margin = _margins_of_struck(table, margin, beside, widest)
     near = neighbourhood(world, margin)
@@ -77,7 +82,7 @@ def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | 
         table = primitives(near, shapes, total)
     found = [_grain_pairs(near, table), _grains_on_parts(near, beside)]
     if world.comm.rank == world.comm.size - 1:
-        found.append(_large_pairs(world, near, table, delta, shift))
+        found.append(_large_pairs(world, near, table, delta, shifts))
     pairs, reach = (np.concatenate(columns) for columns in zip(*found))
     swap = table.number[pairs[:, 0]] > table.number[pairs[:, 1]]
     i, j = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
@@ -102,6 +107,7 @@ def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | 
         gap=touch.gap[order],
         friction=world.friction[material[a], material[b]],
         near=near,
+        shifts=shifts,
     )
 
 
@@ -121,18 +127,33 @@ def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints
 
 
 def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Contacts | None:
-    """The contacts of wider margins, if with these velocities (owned, 6) grains go further in dt [s] than their margins
-    in the search for `contacts`; None if that brings no new ones: then no two grains meet unseen; collective.
+    """The contacts of wider margins, if with these velocities (owned, 6) bodies go further in dt [s] than their margins
+    in the search for `contacts`; None if that brings no new ones: then no grain meets anything unseen; collective.
 
     The search may be repeated for the contacts that it finds: margins only grow.
     """
     seen = contacts.near.margin[: contacts.near.grains]
     ways = _way(world.grains, velocity[: len(seen)], dt)
-    if not world.comm.allreduce(bool((ways > seen).any()), MPI.LOR):
+    shift = dt * world.large_velocity(velocity)
+    beyond = _go_beyond(world, shift, contacts.shifts, delta)
+    if not (world.comm.allreduce(bool((ways > seen).any()), MPI.LOR) or beyond):
         return None
-    wider = find_contacts(world, delta, dt, np.maximum(seen, ways))
+    shifts = np.concatenate([contacts.shifts, shift[None]]) if beyond else contacts.shifts
+    wider = find_contacts(world, delta, dt, np.maximum(seen, ways), shifts)
     new = len(wider) > len(contacts) or not np.isin(wider.key, contacts.key, assume_unique=True).all()
     return wider if world.comm.allreduce(new, MPI.LOR) else None
+
+
+def _go_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
+    """Whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as in one
+    of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
+    free = bodies.is_dynamic(world.large)
+    size = extents([body.shapes for body in world.large_bodies])[free]
+
+    def way(shift: Floats) -> Floats:
+        return length(shift[..., free, :3]) + size * length(shift[..., free, 3:])
+
+    return bool(((way(shift) > delta / 2) & (way(shift - seen) > 0.01 * delta).all(axis=0)).any())
 
 
 def _way(grains: Bodies, velocity: Floats, dt: float) -> Floats:
@@ -190,15 +211,15 @@ def _grains_on_parts(near: Neighbourhood, beside: _Beside) -> tuple[Ints, Floats
 
 
 def _grains_beside_parts(
-    alone: Neighbourhood, table: Primitives, delta: float, shift: Floats, widest: Floats
+    alone: Neighbourhood, table: Primitives, delta: float, shifts: Floats, widest: Floats
 ) -> _Beside:
-    """The parts of large bodies, which move and turn by `shift` (large bodies, 6), whose margins the local grains might
-    meet with margins of at most `widest` (grains,)."""
+    """The parts of large bodies, which move and turn by `shifts` (k, large bodies, 6), whose margins the local grains
+    might meet with margins of at most `widest` (grains,)."""
     count = alone.grains
     center, radius = table.center[:count], table.radius[:count]
     found = [_Beside(*(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0)))]
     for body in np.unique(table.row[count:]):
-        margin = _part_margin(shift[[body - count]], alone.bodies.position[[body]], center, radius, delta)
+        margin = _part_margin(shifts[:, [body - count]], alone.bodies.position[[body]], center, radius, delta)
         beyond = margin + (1.0 + 1e-9) * radius  # where the rounding matters, the narrow phase is to decide
         margin = np.broadcast_to(margin, count)
         for part in count + np.flatnonzero(table.row[count:] == body):
@@ -221,7 +242,7 @@ def _distance_at_least(table: Primitives, part: int, points: Floats) -> Floats:
 
 
 def _large_pairs(
-    world: World, near: Neighbourhood, table: Primitives, delta: float, shift: Floats
+    world: World, near: Neighbourhood, table: Primitives, delta: float, shifts: Floats
 ) -> tuple[Ints, Floats]:
     """The same for the parts of any two large bodies of which one at least is free to move."""
     first = near.grains + near.ghosts
@@ -234,21 +255,21 @@ def _large_pairs(
     i, j = np.where(table.kind[i] == PLANE, j, i), np.where(table.kind[i] == PLANE, i, j)
     at = table.center[i], table.radius[i]
     rows = [table.row[part] for part in (i, j)]
-    margins = [_part_margin(shift[row - first], near.bodies.position[row], *at, delta) for row in rows]
+    margins = [_part_margin(shifts[:, row - first], near.bodies.position[row], *at, delta) for row in rows]
     return np.stack([i, j], axis=1), margins[0] + margins[1]
 
 
-def _part_margin(shift: Floats, pivot: Floats, center: Floats, radius: Floats, delta: float) -> Floats:
+def _part_margin(shifts: Floats, pivot: Floats, center: Floats, radius: Floats, delta: float) -> Floats:
     """Margins (m,) of the parts of large bodies at the surfaces of primitives of centres (m, 3) and radii (m,) [m]. The
-    bodies move and turn, about the pivots (m, 3), by `shift` (m, 6).
+    bodies move and turn, about the pivots (m, 3), by any of the `shifts` (k, m, 6).
 
-    Of one body, with (1, 6) and (1, 3), a single margin (1,) if that is the same everywhere.
+    Of one body, with (k, 1, 6) and (1, 3), a single margin (1,) if that is the same everywhere.
     """
-    move, turn = shift[:, :3], shift[:, 3:]
-    if not turn.any():
-        return np.maximum(delta / 2, length(move))
-    way = length(move + cross(turn, center - pivot)) + radius * length(turn)
-    return np.maximum(delta / 2, way)
+    move, turn = shifts[..., :3], shifts[..., 3:]
+    way = length(move)
+    if turn.any():
+        way = length(move + cross(turn, center - pivot)) + radius * length(turn)
+    return np.maximum(delta / 2, way.max(axis=0))
 
 
 def _gives_way(world: World, near: Neighbourhood, a: Ints, b: Ints, touch: Touch) -> np.ndarray:

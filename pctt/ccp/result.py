@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from pctt.ccp.cone import Array
-from pctt.options import POSITIVE, option
+from pctt.options import FRACTION, option
 
 RELAXATION, COULOMB, FIXED_POINT = "relaxation", "Coulomb", "Coulomb by cone problems"
 
@@ -15,7 +15,7 @@ RELAXATION, COULOMB, FIXED_POINT = "relaxation", "Coulomb", "Coulomb by cone pro
 class Limits:
     """Options of every solver: ``-ccp_tol``, ``-ccp_max_it``."""
 
-    tol: float = option(1e-4, "natural residual at which a cone problem counts as solved", check=POSITIVE)
+    tol: float = option(1e-4, "natural residual at which a cone problem counts as solved", check=FRACTION)
     max_it: int = option(
         -1,
         "iterations before a solver gives up; -1: the solver's own default",

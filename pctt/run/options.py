@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -19,7 +20,7 @@ from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.users_solver import LADDER
 from pctt.contact_map import is_free
 from pctt.ksp_options import entered, to_enter
-from pctt.options import OptionError, describe, read, refuse_unknown
+from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read, refuse_unknown
 from pctt.petsc import own_errors
 from pctt.run.dump import dump_steps
 from pctt.run.hdf5 import refuse_serial
@@ -32,6 +33,9 @@ OF_STEPS = {
     "scene", "steps", "dt", "delta", "recovery_speed", "restart", "restart_changed_file", "settle", "settle_delta",
     "settle_tol", "output_every", "checkpoint_every", "dump_problem", "dump_steps", "dump_hard", "monitor",
 }  # fmt: skip
+
+#: What the numerical parameters of a scene may be.
+NUMERICS = {"dt": POSITIVE, "delta": NOT_NEGATIVE, "settle_delta": NOT_NEGATIVE, "settling_time": NOT_NEGATIVE}
 
 #: Options that settled states depend on, and -quiet.
 OF_SETTLING = {"settle", "scene", "dt", "delta", "recovery_speed", "settle_delta", "settle_tol", "quiet"}
@@ -53,7 +57,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     obeys_coulomb = _obeys_coulomb(run, limits)
     _refuse_without_effect(database, run, obeys_coulomb)
     what = f"options of the scene {scene_class.__name__}"
-    scene, dt, delta = together(comm, what, lambda: _read_scene(scene_class, database), own=(OptionError,))
+    scene, dt, delta = together(comm, what, lambda: _read_scene(run.scene, scene_class, database), own=(OptionError,))
     if "settle_delta" not in database:
         run = dataclasses.replace(run, settle_delta=scene.settle_delta)
     options = Options(
@@ -87,9 +91,11 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     return options
 
 
-def _read_scene(scene_class: type[Experiment], database: Mapping[str, str]) -> tuple[Experiment, Any, Any]:
+def _read_scene(
+    name: str, scene_class: type[Experiment], database: Mapping[str, str]
+) -> tuple[Experiment, float, float]:
     """The scene with the options of the database, its time step and its contact distance. OptionError if the scene
-    refuses an option."""
+    refuses an option, or has bad ones of its own."""
     try:
         scene = read(scene_class, database, "scene_")
     except OptionError:
@@ -98,9 +104,26 @@ def _read_scene(scene_class: type[Experiment], database: Mapping[str, str]) -> t
         if not str(error).startswith(tuple(field.name for field in dataclasses.fields(scene_class))):
             raise
         raise OptionError(f"-scene_{error}") from None
-    # They may be properties too: what fails is to fail before any work.
-    _ = scene.settling_time, scene.settle_delta, scene.domain
+    _refuse_bad_numerics(name, scene)
     return scene, scene.dt, scene.delta
+
+
+def _refuse_bad_numerics(name: str, scene: Experiment) -> None:
+    """OptionError for an attribute of the scene that is no number, or a bad one, before any work. They may be
+    properties and options too."""
+    for attribute, (allowed, test) in NUMERICS.items():
+        value = getattr(scene, attribute)
+        if not (isinstance(value, (int, float, np.number)) and test(value)):
+            raise OptionError(f"-scene {name}: its {attribute} is {value!r}; allowed is {allowed}")
+    if scene.domain is not None:
+        try:
+            low, high = (np.broadcast_to(np.asarray(corner, dtype=float), 3) for corner in scene.domain)
+            empty = not (low <= high).all()
+        except (TypeError, ValueError):
+            empty = True
+        if empty:
+            allowed = "a lower and an upper corner, each of three numbers, or None"
+            raise OptionError(f"-scene {name}: its domain is {scene.domain!r}; allowed is {allowed}")
 
 
 def option_groups(scene: type[Experiment]) -> list[tuple[type, str]]:

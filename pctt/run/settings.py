@@ -10,7 +10,7 @@ from dem.experiment import Experiment, SceneFileError, from_file
 from dem.scenes import SCENES
 from pctt import ccp
 from pctt.contact_map import OPERATORS
-from pctt.options import AT_LEAST_ONE, COUNT, NOT_NEGATIVE, POSITIVE, OptionError, nearest, option
+from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, NOT_NEGATIVE, POSITIVE, OptionError, nearest, option
 
 # what runs when no option is given
 DEMO = {
@@ -55,7 +55,7 @@ class Run:
         unit="m",
         check=NOT_NEGATIVE,
     )
-    settle_tol: float = option(1e-3, "natural residual of the steps of -settle", check=POSITIVE)
+    settle_tol: float = option(1e-3, "natural residual of the steps of -settle", check=FRACTION)
     output: str = option("results", "folder for state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
     overwrite: bool = option(
         False, "let the run replace another one in the folder of -output, once its first step is written"

@@ -110,7 +110,7 @@ def world_at_start(experiment: Experiment, scene: Scene, comm: MPI.Comm) -> Worl
     """What the experiment built, at time zero; OptionError if it cannot start so."""
     try:
         return new_world(scene, comm)
-    except ValueError as error:
+    except (ValueError, FloatingPointError) as error:  # the latter of velocities whose squares overflow
         raise OptionError(f"scene {type(experiment).__name__}: {error}") from None
 
 

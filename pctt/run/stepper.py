@@ -90,6 +90,12 @@ class Stepper:
     def step(self) -> dict[str, Any]:
         """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no
         number)."""
+        try:
+            return self._step()
+        except FloatingPointError as error:  # raised on all ranks alike
+            raise SceneError(f"step {self.world.step + 1}: {error}") from None
+
+    def _step(self) -> dict[str, Any]:
         problem, guess = self._assemble(self._search(), self.memory)
         with log.phase("solve"):
             solved = self.solve(problem, guess)
@@ -114,10 +120,7 @@ class Stepper:
         """The contacts of the step."""
         with log.phase("search"):
             rebalance(self.world)
-            try:
-                return find_contacts(self.world, self.options.delta, self.options.dt)
-            except FloatingPointError as error:  # raised on all ranks alike
-                raise SceneError(f"step {self.world.step + 1}: {error}") from None
+            return find_contacts(self.world, self.options.delta, self.options.dt)
 
     def _figures(
         self, contacts: int, solved: Solved, accuracy: ccp.Accuracy, files: dict[str, Any]

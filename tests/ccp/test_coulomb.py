@@ -173,6 +173,12 @@ def test_the_opening_is_exact():
     np.testing.assert_allclose(slip.closed(z), y, rtol=1e-9, atol=1e-15)
 
 
+def test_contacts_that_do_not_slide_have_no_direction():
+    z = np.array([[1e3, 0.0, 0.0], [1.0, 3.0, -4.0]])
+    with np.errstate(all="raise"):
+        np.testing.assert_allclose(slip.sliding_directions(z), [[0, 0, 0], [0, 0.6, -0.8]])
+
+
 def test_a_problem_without_solution_stays_one(monkeypatch):
     """However small a residual an earlier rung has left."""
     problem = sliding_heap(0.3)

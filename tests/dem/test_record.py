@@ -14,10 +14,10 @@ from dem import record
 from dem.bodies import COMPOUND
 from dem.contact import find_contacts
 from dem.experiment import Experiment
-from dem.motion import Glide
+from dem.motion import Glide, Guided, Hinged
 from dem.partition import rebalance
 from dem.scene import Scene
-from dem.shapes import Plane
+from dem.shapes import Plane, Sphere
 from dem.start import new_world
 from dem.stepper import advance
 from dem.system import ContactSystem
@@ -93,6 +93,26 @@ def test_a_moving_floor_does_work_through_friction():
     np.testing.assert_allclose(step.force_on("floor")[:3], [-pull / DT, 0, 0], atol=1e-9)
     np.testing.assert_allclose(step.velocity("floor"), [2.0, 0, 0, 0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(step.position("floor"), [2.0 * DT, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("motion", "work"),
+    [
+        (Guided((1, 0, 0), force=100.0, start=0.033, end=0.1), 0.5 * (100.0 * 0.067) ** 2 / 50.0),
+        (Hinged((0, 0, 1), torque=3.0, speed=0.5), 0.5 * 2.0 * 0.5**2),
+    ],
+    ids=["guided", "hinged"],
+)
+def test_drives_do_the_work_that_the_bodies_have_afterwards(motion, work):
+    """Nothing else acts; also a drive that begins within a step gives its whole impulse."""
+    scene = Scene(0.3, gravity=(0, 0, 0))
+    scene.add_spheres([0, 0, 9.0], 0.1, 1000.0)
+    scene.add_body("tool", [Sphere(0.1)], motion, mass=50.0, inertia=(2.0, 2.0, 2.0))
+    world = new_world(scene, SELF)
+    rows = [record.energy_balance(made(world)) for _ in range(50)]
+    assert rows[-1]["kinetic_energy [J]"] == pytest.approx(work, rel=1e-12)
+    assert sum(row["work_of_motions [J]"] for row in rows) == pytest.approx(work, rel=1e-12)
+    np.testing.assert_allclose([row["time_stepping [J]"] for row in rows], 0.0, atol=1e-12)
 
 
 def test_the_balance_of_a_heap_closes_whatever_the_impulses():

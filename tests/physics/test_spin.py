@@ -1,12 +1,14 @@
-"""A box that tumbles freely through ten thousand steps."""
+"""Bodies that tumble freely through many steps."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from drive import G
 from mpi4py import MPI
 
-from dem.free_motion import free_velocity
+from dem import quaternion
+from dem.free_motion import free_spin, free_velocity
 from dem.scene import Scene
 from dem.start import new_world
 from dem.stepper import advance
@@ -29,3 +31,30 @@ def test_quaternions_stay_unit_quaternions_over_ten_thousand_steps():
     k = world.step
     np.testing.assert_allclose(world.grains.position[:, 2], -G * dt**2 * k * (k + 1) / 2, rtol=1e-10)
     assert np.isfinite(world.grains.velocity).all()
+
+
+@pytest.mark.parametrize("turn", [0.02, 0.2, 0.8])
+def test_a_free_body_keeps_its_angular_momentum_and_its_energy(turn):
+    """It turns by `turn` radians in a step, for 3,000 steps, also about the axis of the middle moment."""
+    dt, rng = 0.01, np.random.default_rng(4)
+    moments = np.array([[1.0, 3.6, 4.3], [1.0, 1.0, 0.02], [0.5, 0.5, 1.0], [1.0, 0.9, 0.15]]).repeat(5, axis=0)
+    q = quaternion.normalized(rng.normal(size=(20, 4)))
+    spin = rng.normal(size=(20, 3))
+    spin[0] = [0.001, 1.0, 0.001]
+    spin *= turn / dt / quaternion.length(spin)[:, None]
+    energies, momenta = [], []
+    for _ in range(3000):
+        spin = free_spin(spin, moments, dt)
+        w = quaternion.rotate(q, spin)
+        momenta.append(quaternion.rotate(quaternion.integrate(q, w, dt / 2), moments * spin))
+        q = quaternion.integrate(q, w, dt)
+        energies.append((moments * spin**2).sum(axis=1))
+    change = np.linalg.norm(np.array(momenta) - momenta[0], axis=2) / np.linalg.norm(momenta[0], axis=1)
+    assert change.max() < (1e-9 if turn < 0.5 else 1e-5)
+    assert np.abs(np.array(energies) / energies[0] - 1.0).max() < 0.1 * turn**2
+
+
+def test_a_spin_about_a_principal_axis_stays_and_so_does_one_that_no_step_resolves():
+    moments = np.array([1.0, 2.0, 2.5])
+    for spin in (*np.eye(3), 500.0 * np.array([1.0, 2.0, 3.0]), np.array([1e200, 0.0, 1.0])):
+        np.testing.assert_allclose(free_spin(spin[None], moments[None], 0.01)[0], spin, rtol=1e-14)

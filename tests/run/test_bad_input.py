@@ -45,8 +45,9 @@ BAD_OPTIONS = {
     "-scene_paddle_length 1.5": ["1.5", "does not fit", "below 1"],
     "-ccp_type nosuch": ["nosuch", "pdip", "apgd"],
     "-ccp_type pdpi": ["pdpi", "did you mean pdip?"],
-    "-ccp_tol 0": ["0", "positive"],
-    "-ccp_tol 1e-4x": ["1e-4x", "positive"],
+    "-ccp_tol 0": ["0", "between 0 and 1"],
+    "-ccp_tol 1e4": ["1e4", "between 0 and 1"],  # a typing error for 1e-4: any impulses would be a solution
+    "-ccp_tol 1e-4x": ["1e-4x", "between 0 and 1"],
     "-ccp_max_it -2": ["-2", ">= -1"],
     "-ccp_pdip_centering 2": ["2", "between 0 and 1"],
     "-compare nosuch": ["nosuch", "ilu", "pbjacobi"],
@@ -171,6 +172,31 @@ def test_a_bad_option_is_refused_before_any_work(options, results, monkeypatch):
         read_options(database, MPI.COMM_SELF)
     check_words(str(refusal.value), options)
     assert contents(results) == before
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("dt = -0.01", ["its dt is -0.01", "positive"]),
+        ("dt = float('nan')", ["its dt is nan", "positive"]),
+        ("dt = '0.01'", ["its dt is '0.01'", "positive"]),
+        ("dt: float = 0.0", ["its dt is 0.0", "positive"]),
+        ("delta = None", ["its delta is None", ">= 0"]),
+        ("settle_delta = -1", ["its settle_delta is -1", ">= 0"]),
+        ("settling_time = -1.0", ["its settling_time is -1.0", ">= 0"]),
+        ("domain = (0, 1, 2)", ["its domain is (0, 1, 2)", "upper corner"]),
+        ("domain = ((0, 0, 2), (1, 1, 1))", ["its domain is", "upper corner"]),
+    ],
+)
+def test_a_bad_numerical_parameter_of_a_scene_file_is_refused_before_any_work(line, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    head = "from dataclasses import dataclass\nfrom dem.experiment import Experiment\n@dataclass(frozen=True)\n"
+    body = f"class Own(Experiment):\n    {line}\n    def build(self):\n        return 1\n"
+    (tmp_path / "own.py").write_text(head + body)
+    with pytest.raises(OptionError) as refusal:
+        read_options({"scene": "own.py"}, MPI.COMM_SELF)
+    for word in ["-scene own.py", *words]:
+        assert word in str(refusal.value)
 
 
 @pytest.mark.parametrize("options", FROM_OUTSIDE)

@@ -8,14 +8,16 @@ from mpi4py import MPI
 
 from dem.bodies import Bodies
 from dem.impulses import ImpulseMemory
-from dem.motion import Glide
+from dem.motion import Dynamic, Glide, Guided
 from dem.scene import Scene
 from dem.scenes import Mixer
 from dem.shapes import Box, Plane
 from dem.start import new_world
 from dem.together import SceneError
 from pctt import ccp
+from pctt.options import OptionError
 from pctt.run.options import read_options
+from pctt.run.settling import world_at_start
 from pctt.run.stepper import Stepper
 
 
@@ -64,6 +66,23 @@ def test_what_a_struck_grain_strikes_is_seen(solver):
     assert stepper.records()["worst_overlap [m]"] < 1e-9
     stepper.step()
     assert stepper.records()["worst_overlap [m]"] < 1e-6
+
+
+@pytest.mark.parametrize("motion", [Dynamic(), Guided((0, 0, 1))], ids=["free", "guided"])
+def test_what_a_struck_plate_strikes_is_seen(motion):
+    """A light plate between two spheres: the upper one would send it 8 cm in a step, the lower one is 6 cm off."""
+    scene = Scene(0.0, gravity=(0, 0, 0))
+    scene.add_body("plate", [Box((0.3, 0.3, 0.01))], motion, density=10.0)
+    scene.add_spheres([[0, 0, 0.13], [0, 0, -0.17]], 0.1, 5000.0, velocity=[[0, 0, -10.0], [0, 0, 0]])
+    stepper = stepper_of(scene, ccp_type="apgd", ccp_tol=1e-8, delta=0.01, dt=0.01)
+    for _ in range(2):
+        stepper.step()
+        places = stepper.world.grains.position[np.argsort(stepper.world.grains.id), 2]
+        gaps = np.abs(places - stepper.world.large.position[0, 2]) - 0.11
+        assert gaps.min() > -1e-6
+    mass = 5000.0 * 4e-3 / 3 * np.pi
+    speed = 10.0 * mass / (2 * mass + 10.0 * 0.6 * 0.6 * 0.02)
+    np.testing.assert_allclose(stepper.world.grains.velocity[:, 2], -speed, rtol=1e-6)
 
 
 def test_one_body_alone_has_no_contacts():
@@ -122,3 +141,25 @@ def test_a_body_that_is_lost_ends_the_run():
     stepper.world.set_grains(Bodies(**columns))
     with pytest.raises(SceneError, match="step 1"):
         stepper.step()
+
+
+def test_a_body_that_is_lost_within_a_step_ends_the_run_too(monkeypatch):
+    """The search at the end of a step, which turns bodies, may be the first to see it."""
+    scene = Scene(0.3)
+    scene.add_spheres([0, 0, 0], 0.1, 1000.0)
+    stepper = stepper_of(scene)
+
+    def lost(*arguments):
+        raise FloatingPointError("no finite position")
+
+    monkeypatch.setattr("pctt.run.stepper.find_turned", lost)
+    with pytest.raises(SceneError, match="step 1: no finite position"):
+        stepper.step()
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_a_start_at_a_speed_whose_square_overflows_is_refused():
+    scene = Scene(0.3)
+    scene.add_spheres([0, 0, 0], 0.1, 1000.0, velocity=(1e200, 0, 0))
+    with pytest.raises(OptionError, match="no finite position or velocity at step 0"):
+        world_at_start(Mixer(n=1), scene, MPI.COMM_SELF)

@@ -35,9 +35,9 @@ def closed(z: Array) -> Array:
 
 def sliding_directions(z: Array) -> Array:
     """The directions (nc, 3) in which contacts with scaled velocities z slide; zero without sliding."""
-    u = z / np.maximum(tangential(z), TINY)[:, None]
+    u = z.copy()
     u[:, 0] = 0.0
-    return u
+    return u / np.maximum(tangential(z), TINY)[:, None]
 
 
 class Slip(NamedTuple):
