@@ -130,7 +130,7 @@ class BodySchur(PythonPC):
         # refining solves need not reduce their own right side by rtol, only the residual of the whole
         self._atol = self._rtol * b.norm() if ksp.getType() in ("preonly", "richardson") else 0.0
 
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """z = B^-1 (r - G K^-1 G' B^-1 r); the inner KSP solves with K."""
         r = x.array_r.reshape(-1, 3)
         self._rhs.array_w[:] = self._G.momenta(times(self.inverse_barrier, r)).ravel()
