@@ -29,7 +29,7 @@ def stored(A: np.ndarray, kind: str = "aij", block: int = 1, pattern: np.ndarray
     return mat if kind == "aij" else mat.convert(kind, PETSc.Mat())
 
 
-def solver(mat: PETSc.Mat, name: str = "TensorTrain", method: str = "cg", prefix: str = "", **options: str) -> PETSc.KSP:
+def solver(mat: PETSc.Mat, name="TensorTrain", method="cg", prefix="", **options: str) -> PETSc.KSP:
     for option, value in options.items():
         PETSc.Options()[prefix + option] = value
     ksp = PETSc.KSP().create(mat.comm)
@@ -95,7 +95,8 @@ def test_a_view_before_the_set_up(name, capfd):
 
 def test_options_for_all_levels_are_those_of_each():
     database = PETSc.Options()
-    database.insertString("-mg_levels_pc_tt_max_rank 7 -fieldsplit_two_mg_levels_pc_type jacobi -fieldsplit_pc_two_boxes 4")
+    database.insertString("-mg_levels_pc_tt_max_rank 7 -fieldsplit_pc_two_boxes 4")
+    database.insertString("-fieldsplit_two_mg_levels_pc_type jacobi")
     ksp = solver(poisson(8), prefix="mg_levels_1_")
     assert ksp.pc.getPythonContext().options.max_rank == 7
     ksp = solver(poisson(8), "TwoLevel", prefix="fieldsplit_0_")
