@@ -11,6 +11,13 @@ def offsets(comm: MPI.Comm, count: int) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(comm.allgather(count))])
 
 
+def refuse(comm: MPI.Comm, wrong: str) -> None:
+    """ValueError on all ranks if any rank has words for what is wrong with the user's data. Collective."""
+    for rank, words in enumerate(comm.allgather(wrong)):
+        if words:
+            raise ValueError(words + (f" (on rank {rank})" if comm.size > 1 else ""))
+
+
 def send_rows(
     comm: MPI.Comm, arrays: list[np.ndarray], rank: np.ndarray
 ) -> tuple[list[np.ndarray], np.ndarray]:

@@ -32,12 +32,13 @@ def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> dict[str, 
     They are the defaults of options that the user has not given. On several ranks block Jacobi replaces ILU and ICC,
     which PETSc has for one rank only; they become the solvers of its blocks.
     """
-    given = PETSc.Options().getAll()
-    options: dict[str, str | None] = {
-        prefix + name: value for name, value in defaults.items() if prefix + name not in given
+    database = PETSc.Options()
+    given = database.getAll()
+    options: dict[str, str | None] = {  # PETSc looks them up: options of mg_levels_ are also those of mg_levels_1_
+        prefix + name: value for name, value in defaults.items() if not database.hasName(prefix + name)
     }
     everything = {**given, **options}
-    kind = everything.get(prefix + "pc_type")
+    kind = options.get(prefix + "pc_type") or database.getString(prefix + "pc_type", "")
     if ranks > 1 and kind in ("ilu", "icc"):
         options |= {prefix + "pc_type": "bjacobi", prefix + "sub_pc_type": kind}
         for name, value in everything.items():

@@ -26,6 +26,7 @@ from pctt.ccp.registry import NEWTON, SOLVERS, Solver
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.contact_map import CompactRows
+from pctt.exchange import refuse
 from pctt.log import phase
 
 __all__ = [
@@ -73,7 +74,7 @@ def solve(
     limits = limits or Limits()
     if limits.max_it < 0:
         limits = dataclasses.replace(limits, max_it=solver.iterations)
-    guess = np.zeros_like(problem.r) if guess is None else guess
+    guess = _start(problem, guess)
     own = newton_for(problem.comm, type) if solver.newton and newton is None else None
 
     def by(method: Solver, problem: ConeProblem, guess: Array, tol: float, law: bool = False) -> Result:
@@ -96,6 +97,14 @@ def solve(
     finally:
         if own is not None:
             own.destroy()
+
+
+def _start(problem: ConeProblem, guess: Array | None) -> Array:
+    """The guess as an array (nc, 3) of float64, zero without one; ValueError on all ranks for another shape."""
+    start = np.zeros_like(problem.r) if guess is None else np.ascontiguousarray(guess, dtype=float)
+    fits = start.shape == problem.r.shape
+    refuse(problem.comm, "" if fits else f"a guess of shape {start.shape}; allowed is {problem.r.shape}")
+    return start
 
 
 def _once(

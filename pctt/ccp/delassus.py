@@ -32,6 +32,19 @@ def local_blocks(N: PETSc.Mat) -> Array:
     return out
 
 
+def in_blocks(N: PETSc.Mat) -> PETSc.Mat:
+    """A new Mat in BAIJ of block size 3 with the entries of N, a Mat of type AIJ, BAIJ, SBAIJ or dense."""
+    kind = N.getType()
+    if kind.endswith("baij") and not kind.endswith("sbaij") and N.getBlockSize() == 3:
+        return N.duplicate(copy=True)
+    rows = N if kind.endswith(("seqaij", "mpiaij")) else N.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
+    indptr, indices, values = rows.getValuesCSR()
+    local = sp.csr_matrix((values, indices, indptr), shape=(N.getLocalSize()[0], N.getSize()[1]))
+    if rows is not N:
+        rows.destroy()
+    return square_block_matrix(N.comm.tompi4py(), local.tobsr((3, 3)))
+
+
 def delassus(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
     """N = G G' as a Mat (3Nc x 3Nc) of block size 3, rows distributed as those of G."""
     first = offsets(comm, G.rows)[comm.rank]

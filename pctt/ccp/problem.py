@@ -11,8 +11,9 @@ from petsc4py import PETSc
 
 from pctt.blocks import BlockRows, dense_columns, diagonal_blocks, without_hubs
 from pctt.ccp.cone import Array, projected_move_squares
-from pctt.ccp.delassus import delassus, local_blocks
+from pctt.ccp.delassus import delassus, in_blocks, local_blocks
 from pctt.contact_map import CompactRows, ContactMap, contact_map
+from pctt.exchange import refuse
 
 if TYPE_CHECKING:
     from pctt.contact_map.free import FreeMap
@@ -55,10 +56,9 @@ class ConeProblem:
         if (G is None) == (N is None):
             raise ValueError("a cone problem is given by either the map G or the matrix N")
         self.comm, self.point, self.key = comm, point, key
+        refuse(comm, _wrong(r, mu, G, N, point, key))
         self.r = np.ascontiguousarray(r, dtype=float).reshape(-1, 3)
         self.mu = np.ascontiguousarray(mu, dtype=float)
-        if len(self.r) != len(self.mu):
-            raise ValueError(f"{len(self.r)} contacts in r but {len(self.mu)} friction coefficients")
         bad = ~np.isfinite(self.r).all(1) | ~(np.isfinite(self.mu) & (self.mu >= 0))
         if self.sum(bad.sum()):
             raise ValueError(f"{self.sum(bad.sum())} contacts with a NaN, infinite or negative coefficient")
@@ -133,8 +133,7 @@ class ConeProblem:
 
     def rigid_matrix(self) -> PETSc.Mat:
         """A new Mat like ``N`` without the compliance; the low-rank term is not in it."""
-        given = self.contact_map is None
-        return self._given.duplicate(copy=True) if given else delassus(self.comm, self._split[0])
+        return in_blocks(self._given) if self.contact_map is None else delassus(self.comm, self._split[0])
 
     @cached_property
     def low_rank(self) -> PETSc.Mat | None:
@@ -229,3 +228,28 @@ class ConeProblem:
         for name in ("N", "low_rank"):
             if self.__dict__.get(name) is not None:
                 self.__dict__.pop(name).destroy()
+
+
+def _wrong(
+    r: Array, mu: Array, G: BlockRows | CompactRows | None, N: PETSc.Mat | None, point: Array | None,
+    key: np.ndarray | None,
+) -> str:  # fmt: skip
+    """What is wrong with the shapes of a problem's data on this rank; empty if nothing is."""
+    try:
+        shape, friction = np.asarray(r, dtype=float).shape, np.asarray(mu, dtype=float).shape
+    except (TypeError, ValueError) as error:
+        return f"r or mu are no numbers: {error}"
+    nc = int(np.prod(shape)) // 3
+    if shape not in ((nc, 3), (3 * nc,)):
+        return f"r has the shape {shape}; allowed is (nc, 3)"
+    if friction != (nc,):
+        return f"{nc} contacts in r but {friction[0] if len(friction) == 1 else friction} friction coefficients"
+    if G is not None and (not isinstance(G, (BlockRows, CompactRows)) or G.rows != nc):
+        rows = f"{G.rows} contacts" if isinstance(G, (BlockRows, CompactRows)) else f"the type {type(G).__name__}"
+        return f"{nc} contacts in r, but G has {rows}; allowed are BlockRows or CompactRows of as many"
+    if N is not None and N.getLocalSize() != (3 * nc, 3 * nc):
+        return f"{nc} contacts in r, but N has {N.getLocalSize()} local rows and columns"
+    for name, given, width in (("point", point, (3,)), ("key", key, ())):
+        if given is not None and np.shape(given) != (nc, *width):
+            return f"{name} has the shape {np.shape(given)}; allowed is {(nc, *width)}"
+    return ""

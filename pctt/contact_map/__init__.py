@@ -14,7 +14,7 @@ from pctt.blocks import BlockRows
 from pctt.compiled import available
 from pctt.contact_map.assembled import AssembledMap
 from pctt.contact_map.ghosts import Ghosts
-from pctt.contact_map.rows import CompactRows, block_rows
+from pctt.contact_map.rows import CompactRows, block_rows, checked
 
 if TYPE_CHECKING:
     from pctt.contact_map.free import FreeMap
@@ -40,7 +40,8 @@ def is_free(operator: str) -> bool:
 
 
 def contact_map(comm: MPI.Comm, rows: BlockRows | CompactRows, operator: str = "auto") -> ContactMap:
-    """The map with these rows; ``operator`` is one of OPERATORS. Collective."""
+    """The map with these rows; ``operator`` is one of OPERATORS. Collective; ValueError on all ranks for wrong rows."""
+    rows = checked(comm, rows)
     if is_free(operator):
         from pctt.contact_map.free import FreeMap  # the import of its compiled loops takes half a second
 

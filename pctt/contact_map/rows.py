@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import operator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from pctt.blocks import BlockRows
 from pctt.contact_map.ghosts import Ghosts
+from pctt.exchange import refuse
 
 Array = NDArray[np.float64]
 
@@ -71,6 +73,60 @@ class CompactRows:
             blocks[:, :, columns] = blocks[:, :, columns] @ symmetric[part][local]
         indptr = np.concatenate([[0], np.cumsum(moves.sum(axis=1))])
         return BlockRows(indptr, body[moves], blocks, self.columns)
+
+
+def checked(comm: MPI.Comm, rows: BlockRows | CompactRows) -> BlockRows | CompactRows:
+    """The same rows with C-contiguous arrays of float64 and int64, as the compiled loops trust. Collective.
+
+    ValueError on all ranks if shapes do not fit or bodies do not exist.
+    """
+    wrong, width, last = "", -1, -1
+    try:
+        rows = _compact(rows) if isinstance(rows, CompactRows) else _blocks(rows)
+    except (TypeError, ValueError) as error:
+        wrong = str(error)
+    else:
+        body = rows.body if isinstance(rows, CompactRows) else rows.indices
+        last = int(body.max(initial=-1))
+        width = rows.root.shape[1] if isinstance(rows, CompactRows) else -1
+    refuse(comm, wrong)
+    figures = comm.allgather((rows.columns, last, width))
+    bodies = sum(columns for columns, _, _ in figures)
+    if max(last for _, last, _ in figures) >= bodies:
+        raise ValueError(f"a contact has the body {max(last for _, last, _ in figures)}, but there are {bodies} bodies")
+    if len({width for _, _, width in figures}) > 1:
+        raise ValueError("the rows have another format, or a root of another width, on some ranks")
+    return rows
+
+
+def _compact(rows: CompactRows) -> CompactRows:
+    nc, columns = len(rows.frame), operator.index(rows.columns)
+    root = _array("root", rows.root, float, (columns, 6), (columns, 12))
+    body = _array("body", rows.body, np.int64, (nc, 2))
+    if body.min(initial=0) < -1:
+        raise ValueError(f"body of the rows has {body.min()}; allowed are indices of bodies, and -1 for no body")
+    frame, arm = _array("frame", rows.frame, float, (nc, 9)), _array("arm", rows.arm, float, (nc, 6))
+    return replace(rows, frame=frame, arm=arm, body=body, root=root, columns=columns)
+
+
+def _blocks(rows: BlockRows) -> BlockRows:
+    count, columns = len(rows.indices), operator.index(rows.columns)
+    indptr = _array("indptr", rows.indptr, np.int64, (max(len(rows.indptr), 1),))
+    if indptr[0] != 0 or indptr[-1] != count or (np.diff(indptr) < 0).any():
+        raise ValueError(f"indptr of the rows does not ascend from 0 to the number of blocks, {count}")
+    indices = _array("indices", rows.indices, np.int64, (count,))
+    if indices.min(initial=0) < 0:
+        raise ValueError(f"indices of the rows have {indices.min()}; allowed are indices of bodies")
+    return BlockRows(indptr, indices, _array("blocks", rows.blocks, float, (count, 3, 6)), columns)
+
+
+def _array(name: str, given: np.ndarray, kind: type, *shapes: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(given)
+    if array.shape not in shapes:
+        raise ValueError(f"{name} of the rows has the shape {array.shape}; allowed is {' or '.join(map(str, shapes))}")
+    if array.dtype.kind not in ("iu" if kind is np.int64 else "fiu") and array.size:
+        raise ValueError(f"{name} of the rows has the type {array.dtype}; allowed is {np.dtype(kind).name}")
+    return np.ascontiguousarray(array, dtype=kind)
 
 
 def block_rows(comm: MPI.Comm, rows: BlockRows | CompactRows) -> BlockRows:

@@ -107,7 +107,7 @@ class DenseEntries(Entries):
     def __init__(self, P: PETSc.Mat) -> None:
         self.comm = P.comm.tompi4py()
         self.first, self.last = P.getOwnershipRange()
-        self.local = P.getDenseArray()
+        self.local = P.getDenseArray(readonly=True)  # otherwise it counts as a change of P
 
     def __call__(self, i: Array, j: Array) -> Array:
         mine = np.flatnonzero((i >= self.first) & (i < self.last))

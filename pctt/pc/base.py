@@ -4,7 +4,7 @@
 
 A subclass names its group of options (a dataclass, see ``pctt.options``) and their prefix. The base class turns the
 calls of PETSc into ``build`` (a matrix with a new structure), ``update`` (new values in the same structure) and
-``apply``.
+``multiply``.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from pctt.shell import is_shell
 
 
 class PythonPC(Context):
-    """Base class. Subclasses set ``options_class`` and ``options_prefix``, and define build, update and apply.
+    """Base class. Subclasses set ``options_class`` and ``options_prefix``, and define build, update and multiply.
 
-    The class assumes that the preconditioner is symmetric. Matrices of other types than AIJ and BAIJ are converted.
+    Matrices of other types than AIJ and BAIJ are converted. For a matrix without rows no method of a subclass is
+    called.
     """
 
     options_class: type
@@ -34,22 +35,27 @@ class PythonPC(Context):
         self.options: Any = self.options_class()
         self.prefix = ""
         self._structure: tuple | None = None
-        self.P: PETSc.Mat | None = None  # the matrix, in AIJ or BAIJ
+        self.P: PETSc.Mat | None = None  # the matrix, in AIJ or BAIJ; None if it has no rows
         self._converted: PETSc.Mat | None = None
 
     def setFromOptions(self, pc: PETSc.PC) -> None:
-        """Read the options with the prefix of the PC; OptionError for a bad value or a misspelt name."""
+        """Read the options with the prefix of the PC; OptionError for a bad value or a misspelt name.
+
+        The next set-up uses them.
+        """
         self.prefix = pc.getOptionsPrefix() or ""
         prefix = self.prefix + self.options_prefix
-        database = PETSc.Options().getAll()
+        database = PETSc.Options()
         known = [line.name for line in describe(self.options_class, prefix)]
-        for name in database:
+        for name in database.getAll():
             if name.startswith(prefix) and name not in known:
                 raise no_such_option(name, known)
-        for name in known:
-            PETSc.Options().hasName(name)  # otherwise PETSc reports it as unused
-        self.options = read(self.options_class, database, prefix)
-        if "help" in database:
+        # PETSc looks them up, because the options of mg_levels_ are also those of mg_levels_1_
+        given = {name: database.getString(name) for name in known if database.hasName(name)}
+        before, self.options = self.options, read(self.options_class, given, prefix)
+        if self.options != before:
+            self._structure = None
+        if database.hasName("help"):
             PETSc.Sys.Print("\n".join(map(str, describe(self.options_class, prefix))), comm=pc.comm)
 
     def setUp(self, pc: PETSc.PC) -> None:
@@ -59,6 +65,9 @@ class PythonPC(Context):
         if rows != columns:
             raise ValueError(f"{self.name}: the matrix has {rows} rows and {columns} columns; allowed is a square one")
         handle = P.handle
+        if rows == 0:
+            self.P, self._structure = None, (handle, 0)
+            return
         if not self.takes(P) and (self.needs_entries or not is_shell(P)):
             P = self._as_sparse(P)
         self.P = P
@@ -103,11 +112,28 @@ class PythonPC(Context):
         """Set up everything that depends on the values of P."""
         raise NotImplementedError
 
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = M x."""
         raise NotImplementedError
 
+    def multiply_transpose(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = M' x; unless a subclass says something else, M is symmetric."""
+        self.multiply(x, y)
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        if self._ready(pc):
+            self.multiply(x, y)
+
     def applyTranspose(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.apply(pc, x, y)
+        if self._ready(pc):
+            self.multiply_transpose(x, y)
+
+    def _ready(self, pc: PETSc.PC) -> bool:
+        """Whether there are rows. PETSc does not set up a PC again that gets a new context, as in
+        ``PCSetFromOptions`` with ``-pc_python_type``; so this does it."""
+        if self._structure is None:
+            self.setUp(pc)
+        return self.P is not None
 
     def reset(self, pc: PETSc.PC) -> None:
         """Forget the matrix; keep everything that the next matrix can use."""
@@ -127,7 +153,8 @@ class PythonPC(Context):
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer | None = None) -> None:
         if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII:
-            for line in pc.comm.tompi4py().bcast(self.report()):
+            lines = ["no matrix with rows"] if self.P is None else self.report()
+            for line in pc.comm.tompi4py().bcast(lines):
                 viewer.printfASCII(f"  {line}\n")
 
     def report(self) -> list[str]:

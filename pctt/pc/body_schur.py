@@ -19,12 +19,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.block_diagonal import without_memory
 from pctt.blocks import BlockRows
 from pctt.body_matrix import BodyOperator
 from pctt.contact_map import CompactRows, ContactMap, contact_map
+from pctt.exchange import refuse
 from pctt.ksp_options import entered, prefer_mumps, to_enter
 from pctt.options import NOT_NEGATIVE, option
 from pctt.pc.base import PythonPC
@@ -64,7 +66,7 @@ class BodySchur(PythonPC):
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
         self.ksp: PETSc.KSP = None  # before `build`
-        self.solves = self.its = 0
+        self.solves = self.its = self._failure = 0
         self._rtol, self._atol = 1e-3, 0.0
         self._formed: PETSc.Mat | None = None  # the matrix of the inner preconditioner, if it is not the stiff part
 
@@ -73,7 +75,7 @@ class BodySchur(PythonPC):
         if G is None:
             raise ValueError("pctt.pc.BodySchur: the Mat has no attribute contact_map; see docs/preconditioners.md")
         self.release()
-        self._given, self._G = G, _as_map(P, G)
+        self._take_map(P, G)
         self.K = BodyOperator(self._G)
         points = P.getAttr("coordinates")
         self._y, self._rhs = self.K.mat.createVecs()
@@ -99,11 +101,9 @@ class BodySchur(PythonPC):
         given = P.getAttr("contact_map")
         if given is not self._given:  # of the same structure
             self._release_map()
-            self._given, self._G = given, _as_map(P, given)
+            self._take_map(P, given)
             self.K.load(self._G)
-        barrier = P.getAttr("barrier")
-        floor = 1e-14 * np.trace(barrier, axis1=1, axis2=2)  # rounding may have made a block singular
-        self.inverse_barrier = np.linalg.inv(barrier + floor[:, None, None] * np.eye(3))
+        self.inverse_barrier = _inverse(P.comm.tompi4py(), P.getAttr("barrier"), self._G.rows)
         self.K.update(self.inverse_barrier)
         old, self._formed = self._formed, without_memory(self.K.mat, self.ksp.pc.getType())
         self.ksp.setOperators(self.K.mat, self._stiff_part() if self._formed is None else self._formed)
@@ -128,9 +128,10 @@ class BodySchur(PythonPC):
     def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         self._rtol = self.options.rtol or 0.5 * ksp.getTolerances()[0]
         # refining solves need not reduce their own right side by rtol, only the residual of the whole
+        self._failure = 0
         self._atol = self._rtol * b.norm() if ksp.getType() in ("preonly", "richardson") else 0.0
 
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """z = B^-1 (r - G K^-1 G' B^-1 r); the inner KSP solves with K."""
         r = x.array_r.reshape(-1, 3)
         self._rhs.array_w[:] = self._G.momenta(times(self.inverse_barrier, r)).ravel()
@@ -138,7 +139,20 @@ class BodySchur(PythonPC):
         self.ksp.solve(self._rhs, self._y)
         self.solves += 1
         self.its += self.ksp.getIterationNumber()
+        if self.ksp.getConvergedReason() < 0:
+            self._failure = self.ksp.getConvergedReason()
         y.array_w[:] = times(self.inverse_barrier, r - self._G.velocities(self._y.array_r)).ravel()
+
+    def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """``preonly`` has no test of its own, so a failure of the inner method that spoils x is that of the solve."""
+        if self.P is None or not self._failure or ksp.getType() != PETSc.KSP.Type.PREONLY:
+            return
+        residual = b.duplicate()
+        pc.getOperators()[0].mult(x, residual)
+        residual.aypx(-1.0, b)
+        if not residual.norm() <= ksp.getTolerances()[0] * b.norm():  # also true for nan
+            ksp.setConvergedReason(self._failure)
+        residual.destroy()
 
     def report(self) -> list[str]:
         inner = self.its / max(self.solves, 1)
@@ -152,6 +166,14 @@ class BodySchur(PythonPC):
             self._release_map()
             self.ksp = self._formed = None
 
+    def _take_map(self, P: PETSc.Mat, given: ContactMap | BlockRows | CompactRows) -> None:
+        """ValueError on all ranks if the map does not fit P."""
+        comm, rows = P.comm.tompi4py(), P.getLocalSize()[0]
+        count = getattr(given, "rows", None)
+        words = "" if count is not None and 3 * count == rows else f"the map of contacts has {count} rows, S has {rows}"
+        refuse(comm, words and f"{self.name}: {words}; allowed are three rows of S for each contact of the map")
+        self._given, self._G = given, _as_map(P, given)
+
     def _release_map(self) -> None:
         if self._G is not self._given:
             self._G.destroy()
@@ -160,6 +182,24 @@ class BodySchur(PythonPC):
 def times(blocks: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Products of blocks (nc, 3, 3) with rows (nc, 3)."""
     return np.einsum("nij,nj->ni", blocks, x)
+
+
+def _inverse(comm: MPI.Comm, barrier: np.ndarray | None, count: int) -> np.ndarray:
+    """The inverses (count, 3, 3) of the blocks of B; ValueError on all ranks if a block is singular or missing."""
+    wrong, inverse = "", np.zeros((0, 3, 3))
+    if barrier is None:
+        wrong = "is missing"
+    elif np.shape(barrier) != (count, 3, 3):
+        wrong = f"has the shape {np.shape(barrier)}"
+    else:
+        blocks = np.asarray(barrier, dtype=float)
+        floor = 1e-14 * np.trace(blocks, axis1=1, axis2=2)  # rounding may have made a block singular
+        try:
+            inverse = np.linalg.inv(blocks + floor[:, None, None] * np.eye(3))
+        except np.linalg.LinAlgError:
+            wrong = "has a singular block"
+    refuse(comm, wrong and f"pctt.pc.BodySchur: barrier of the Mat {wrong}; allowed are {(count, 3, 3)} regular blocks")
+    return inverse
 
 
 def _as_map(P: PETSc.Mat, given: ContactMap | BlockRows | CompactRows) -> ContactMap:

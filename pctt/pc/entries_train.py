@@ -64,7 +64,7 @@ class EntriesTrain:
         T = self.compressed.train
         if lowest(identity(T.rows) + T) <= 0:
             return None
-        certain = CERTAIN / T.norm()
+        certain = CERTAIN / (T.norm() or 1.0)  # zero for a multiple of the identity
         if WORTH * eps <= certain:  # a little more accuracy is cheaper than a test whether the inverse is positive
             eps = min(eps, certain)
         rng = np.random.default_rng(self.options.seed)

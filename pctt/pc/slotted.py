@@ -15,11 +15,14 @@ from petsc4py import PETSc
 from pctt.block_diagonal import inverse_diagonal_blocks
 from pctt.pc.slots import Slots
 
+CSR = tuple[np.ndarray, np.ndarray, np.ndarray]  # row pointers, columns, values of this rank's rows
+
 
 class SlottedMatrix:
     """Local block rows of a Mat P, their slots, and their scaling.
 
-    ``scale`` reads the diagonal blocks of P. ``list_blocks``, called once per structure, and ``load`` read all blocks.
+    ``scale`` reads the diagonal blocks of P. ``list_blocks``, called once per pattern, and ``load`` read all blocks.
+    Both take the rows of P in CSR format (``P.getValuesCSR()``).
 
     Attributes
     ----------
@@ -38,12 +41,19 @@ class SlottedMatrix:
         self.first, self.size = int(self._capacities[: comm.rank].sum()), int(self._capacities.sum())
         self.place, self.capacity = slots.place, slots.capacity
         self.root = np.tile(np.eye(self.block), (self.capacity, 1, 1))
+        self._csr: tuple[np.ndarray, ...] | None = None  # the pattern that is listed
 
-    def list_blocks(self, P: PETSc.Mat) -> None:
+    def lists(self, csr: CSR) -> bool:
+        """Whether `list_blocks` has seen this pattern; collective. A Mat may get another one with as many nonzeros."""
+        same = self._csr is not None and all(map(np.array_equal, self._csr, csr[:2]))
+        return self.comm.allreduce(same, op=MPI.LAND)
+
+    def list_blocks(self, csr: CSR) -> None:
         """Find the blocks of P: ``rows`` and ``columns``."""
+        self._csr = csr[:2]
         own = int(self._counts[: self.comm.rank].sum())  # the first block row of this rank
         slot = self._gathered(self.first + self.place)  # slot of every global block row
-        pattern = self._pattern(P)
+        pattern = self._pattern(csr)
         self._order = pattern.data - 1  # index of each entry of the blocks in P's values, -1 if P does not store it
         row = np.repeat(np.arange(len(self.place)), np.diff(pattern.indptr))
         self._pointers, self._column = pattern.indptr, pattern.indices
@@ -64,23 +74,26 @@ class SlottedMatrix:
             return
         self.root[self.place] = np.linalg.cholesky(inverse_diagonal_blocks(P)).transpose(0, 2, 1)
 
-    def load(self, P: PETSc.Mat) -> np.ndarray:
+    def load(self, P: PETSc.Mat, csr: CSR) -> np.ndarray:
         """The present blocks (nb, bs, bs) of P at ``rows`` and ``columns``, with scaling multiplied by the roots of
         ``scale``."""
-        blocks = np.append(P.getValuesCSR()[2], 0.0)[self._order]
+        blocks = np.append(csr[2], 0.0)[self._order]
         if not self.scaled:
             typical = P.getDiagonal().sum() / P.getSize()[0]
             return np.concatenate([blocks, np.tile(typical * np.eye(self.block), (self._empty, 1, 1))])
         roots = self.root[self.place]
         everywhere = self._gathered(roots)
+        if self.block == 1:  # scipy drops stored zeros from products of matrices of single numbers
+            scaled = np.repeat(roots, np.diff(self._pointers), axis=0) * blocks * everywhere[self._column]
+            return scaled[self._kept]
         shape = (self.block * len(self.place), self.block * self._total)
         rows = sp.bsr_matrix((blocks, self._column, self._pointers), shape=shape)
         scaled = _diagonal(roots) @ rows @ _diagonal(everywhere.transpose(0, 2, 1))
         return scaled.data[self._kept]  # scipy keeps the order of the blocks, because each has one factor
 
-    def _pattern(self, P: PETSc.Mat) -> sp.bsr_matrix:
+    def _pattern(self, csr: CSR) -> sp.bsr_matrix:
         """The pattern of the blocks of this rank's rows. Its values are the numbers of P's values, from 1."""
-        indptr, indices, values = P.getValuesCSR()
+        indptr, indices, values = csr
         shape = (len(indptr) - 1, self.block * self._total)
         numbers = np.arange(1, len(values) + 1, dtype=np.int32)
         rows = sp.csr_matrix((numbers, indices, indptr), shape=shape)

@@ -15,7 +15,7 @@ from pctt.pc.ordering import grid_slots
 from pctt.pc.positivity import finds_negative
 from pctt.pc.refresh_schedule import RefreshSchedule
 from pctt.pc.slots import Slots
-from pctt.pc.slotted import SlottedMatrix
+from pctt.pc.slotted import CSR, SlottedMatrix
 from pctt.pc.train_options import Account, Options
 from pctt.tt.als import Compression, compress
 from pctt.tt.apply import Apply
@@ -38,6 +38,7 @@ class SparseTrain:
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
         self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
+        self._block = 0  # block size of the last structure
         self._forget_structure()
         self._forget_trains()
 
@@ -58,8 +59,9 @@ class SparseTrain:
         """Begin a new structure; ValueError on all ranks if the grid does not fit it."""
         grid_slots(P, self.options.order)
         self._forget_structure()
-        if self.options.reuse != "steps":
+        if self.options.reuse != "steps" or P.getBlockSize() != self._block:
             self._forget_trains()
+        self._block = P.getBlockSize()
 
     def make(self, P: PETSc.Mat, rank: int) -> bool:
         """Keep the train or make a new one.
@@ -94,10 +96,11 @@ class SparseTrain:
 
     def _try_new(self, P: PETSc.Mat, rank: int, kept: Inverse | None) -> bool:
         """Make a train for P and use it, or use the kept train if it is as good; False if no train is positive."""
-        if self.hierarchy is None:
+        csr = P.getValuesCSR()
+        if self.hierarchy is None or not self.slots.lists(csr):
             with PETSc.Log.Event("TTBuild"):
-                self.hierarchy = self._block_pairs(P)
-        self.hierarchy.set_values(self.slots.load(P))
+                self.hierarchy = self._block_pairs(csr)
+        self.hierarchy.set_values(self.slots.load(P, csr))
         warm = self.compression is not None
         with PETSc.Log.Event("TTCompress"):
             self.compression = self._compress(rank, warm)
@@ -163,10 +166,10 @@ class SparseTrain:
         self.slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaling == "block")
         self._begun = True
 
-    def _block_pairs(self, P: PETSc.Mat) -> SparseHierarchy:
+    def _block_pairs(self, csr: CSR) -> SparseHierarchy:
         assert self.tree is not None
         slots = self.slots
-        slots.list_blocks(P)
+        slots.list_blocks(csr)
         modes = self.tree.modes or choose_modes(slots.size, self.options.leaf)
         return SparseHierarchy(slots.rows, slots.columns, modes, slots.block, self._add, self.comm.bcast)
 

@@ -71,7 +71,8 @@ class TensorTrain(PythonPC):
         self._own = [self._jacobi]
 
     def _begin_sparse(self, P: PETSc.Mat) -> None:
-        if isinstance(getattr(self, "made", None), SparseTrain):
+        made = getattr(self, "made", None)
+        if isinstance(made, SparseTrain) and made.options == self.options:
             self.policy.forgive()  # a rank that failed on another matrix may work here
         else:
             cap = self.options.cap(SPARSE_RANK)
@@ -129,13 +130,20 @@ class TensorTrain(PythonPC):
 
     # -- application ----------------------------------------------------------------------------------------
 
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x, where M is block Jacobi or the train."""
         if self.rank == 1:
             self._jacobi.apply(x, y)
             return
         with PETSc.Log.Event("TTApply"):
             y.array_w[:] = self.made.times(x.array_r)
+
+    def multiply_transpose(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = M' x; trains are symmetric, blocks of a matrix may be not."""
+        if self.rank == 1:
+            self._jacobi.applyTranspose(x, y)
+        else:
+            self.multiply(x, y)
 
     # -- watching the solves --------------------------------------------------------------------------------
 
@@ -144,8 +152,10 @@ class TensorTrain(PythonPC):
 
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Report the seconds and the accuracy of the solve to the policy; ban a rank with which the method stalled."""
+        if self.P is None:
+            return
         reason, rank = ksp.getConvergedReason(), self.rank
-        spoilt = rank > 1 and reason in SPOILT
+        spoilt = rank > 1 and reason in SPOILT and self.symmetric  # otherwise it may have been a transpose solve
         if spoilt:
             self._solve_again(ksp, b, x)
             what = f"{ksp.getType()} broke down ({reason}) at rank {rank}"

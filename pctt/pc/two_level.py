@@ -73,7 +73,10 @@ class TwoLevel(PythonPC):
         self.multigrid.setType(PETSc.PC.Type.MG)
         self.multigrid.setMGLevels(2)
         self.multigrid.setMGInterpolation(1, self._Z)
-        self._own = [self._Z, self.multigrid]
+        # PETSc takes the transpose of Z only if Z has fewer columns than rows
+        restriction = self._Z.transpose(PETSc.Mat())
+        self.multigrid.setMGRestriction(1, restriction)
+        self._own = [self._Z, restriction, self.multigrid]
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Compute the block diagonal and the coarse matrix."""
@@ -98,7 +101,7 @@ class TwoLevel(PythonPC):
         for thing in old:
             thing.destroy()
 
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x."""
         self.multigrid.apply(x, y)
 
@@ -162,7 +165,7 @@ def _places(P: PETSc.Mat) -> np.ndarray:
     points = P.getAttr("coordinates")
     if points is None:
         return (P.getOwnershipRange()[0] // P.getBlockSize() + block_order(P)).astype(float)[:, None]
-    return np.asarray(points, dtype=float).reshape(P.getLocalSize()[0] // P.getBlockSize(), -1)
+    return np.asarray(points, dtype=float)  # (n, d), as `check_coordinates` has seen
 
 
 def _modes(P: PETSc.Mat) -> np.ndarray:

@@ -32,6 +32,8 @@ class GridDigits:
 
     def __init__(self, shape: Sequence[int], block: int = 1) -> None:
         self.shape, self.block = tuple(int(n) for n in shape), int(block)
+        if min((*self.shape, self.block)) < 1:
+            raise ValueError(f"a grid of shape {self.shape} with blocks of {self.block}; allowed are numbers >= 1")
         axes = [bases(n) for n in self.shape]
         modes = [base for digits in axes for base in digits] or [1]
         self.modes = scalar_modes(modes, self.block)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from mpi4py import MPI
+from petsc4py import PETSc
 from problems import SELF, Graph, from_graph, heap, matrix, part, random_graph
 
 from pctt.blocks import block_matrix, diagonal_blocks, square_block_matrix
-from pctt.ccp import ConeProblem
+from pctt.ccp import ConeProblem, Limits, solve
 from pctt.ccp.delassus import delassus, local_blocks
 
 GRAPHS = {
@@ -131,6 +132,48 @@ def test_a_problem_needs_one_operator_and_matching_finite_data():
         data[name][3] = value
         with pytest.raises(ValueError, match="1 contacts with a NaN, infinite or negative coefficient"):
             ConeProblem(SELF, data["r"], data["mu"], G=G)
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    known, graph = heap()
+    G = graph.part(SELF)
+    given = {"r": known.r, "mu": known.mu, "G": G}
+    for changes, words in (
+        ({"mu": known.mu[:, None]}, r"40 contacts in r but \(40, 1\) friction coefficients"),
+        ({"r": known.r[:, :2]}, r"r has the shape \(40, 2\)"),
+        ({"r": known.r.T}, r"r has the shape \(3, 40\)"),
+        ({"r": known.r[1:], "mu": known.mu[1:]}, "39 contacts in r, but G has 40 contacts"),
+        ({"G": 3}, "but G has the type int"),
+        ({"G": None, "N": matrix(SELF, np.eye(9))}, r"but N has \(9, 9\) local rows"),
+        ({"point": np.zeros((39, 3))}, r"point has the shape \(39, 3\)"),
+        ({"key": np.zeros((40, 1))}, r"key has the shape \(40, 1\)"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            ConeProblem(SELF, **{**given, **changes})
+    with pytest.raises(ValueError, match=r"a guess of shape \(120,\); allowed is \(40, 3\)"):
+        solve(ConeProblem(SELF, known.r, known.mu, G=G), np.zeros(120))
+
+
+@pytest.mark.parallel(2)
+def test_a_shape_that_does_not_fit_on_one_rank_is_refused_on_all():
+    known, graph = heap()
+    problem = from_graph(known, graph, MPI.COMM_WORLD)
+    mu = problem.mu[1:] if MPI.COMM_WORLD.rank else problem.mu
+    with pytest.raises(ValueError, match="20 contacts in r but 19 .*on rank 1"):
+        ConeProblem(MPI.COMM_WORLD, problem.r, mu, G=problem.contact_map.given)
+
+
+@pytest.mark.parametrize("block", [1, 3])
+@pytest.mark.parametrize("kind", ["aij", "baij", "sbaij", "dense"])
+@pytest.mark.parametrize("method", ["pdip", "conic", "gauss_seidel"])
+def test_N_in_any_format(kind, block, method):
+    known, _ = heap()
+    N = PETSc.Mat().createDense(known.N.shape, array=known.N + np.eye(len(known.N)), comm=SELF).convert("aij")
+    N.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    N = N if kind == "aij" else N.convert(kind, PETSc.Mat())
+    N.setBlockSize(block) if kind in ("aij", "dense") else None
+    with ConeProblem(SELF, known.r, known.mu, N=N) as problem:
+        assert solve(problem, type=method, limits=Limits(1e-6)).converged
 
 
 def test_known_problems_are_what_they_say():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -165,3 +167,65 @@ def test_flops_are_logged():
     before = PETSc.Log.getFlops()
     product.velocities(np.zeros((5, 6)))
     assert PETSc.Log.getFlops() - before == 45 * 20 + 6 * 5
+
+
+OTHER_FORMS = {
+    "Fortran": np.asfortranarray,
+    "single precision": lambda a: a.astype(np.float32 if a.dtype.kind == "f" else np.int32),
+    "lists": np.ndarray.tolist,
+    "big-endian": lambda a: a.astype(a.dtype.newbyteorder(">")),
+    "every other row": lambda a: np.repeat(a, 2, axis=0)[::2],
+}
+
+
+@pytest.mark.parametrize("form", OTHER_FORMS)
+@pytest.mark.parametrize("way", WAYS)
+def test_arrays_of_other_forms(way, form):
+    whole, G = random_contacts(0, 12, 7, wide=False)
+    other = OTHER_FORMS[form]
+    g = np.random.default_rng(0).standard_normal((12, 3))
+    rows = CompactRows(other(whole.frame), other(whole.arm), other(whole.body), other(whole.root), 7)
+    blocks = whole.block_rows(MPI.COMM_SELF)
+    for given in (rows, BlockRows(other(blocks.indptr), other(blocks.indices), other(blocks.blocks), 7)):
+        product = contact_map(MPI.COMM_SELF, given, way)
+        close = {"atol": 1e-4} if form == "single precision" else CLOSE
+        np.testing.assert_allclose(product.momenta(np.asfortranarray(g)).ravel(), G.T @ g.ravel(), **close)
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize(
+    ("name", "wrong", "words"),
+    [
+        ("frame", lambda a: a[:-1], "body of the rows has the shape"),
+        ("arm", lambda a: a[:, :3], "arm of the rows has the shape"),
+        ("body", lambda a: a + 7, "but there are 7 bodies"),
+        ("body", lambda a: a - 2, "allowed are indices of bodies"),
+        ("body", lambda a: a + 0.5, "type float64; allowed is int64"),
+        ("root", lambda a: a[1:], "root of the rows has the shape"),
+        ("columns", lambda a: a + 1, "root of the rows has the shape"),
+    ],
+)
+def test_rows_that_do_not_fit_are_refused_on_all_ranks(name, wrong, words):
+    """The compiled loops would write outside of their arrays; the mistake is on the last rank."""
+    comm = MPI.COMM_WORLD
+    rows = own_part(random_contacts(0, 12, 7, wide=False)[0], comm)
+    if comm.rank == comm.size - 1:
+        rows = dataclasses.replace(rows, **{name: wrong(getattr(rows, name))})
+    with pytest.raises(ValueError, match=words):
+        contact_map(comm, rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("indptr", np.array([0, 2, 1, 2]), "does not ascend"),
+        ("indptr", np.array([0, 1, 2, 9]), "does not ascend"),
+        ("indices", np.array([0, 5]), "the body 5, but there are 2 bodies"),
+        ("indices", np.array([0, -1]), "allowed are indices"),
+        ("blocks", np.ones((2, 6, 3)), r"blocks of the rows has the shape \(2, 6, 3\)"),
+    ],
+)
+def test_blocks_that_do_not_fit_are_refused(name, value, words):
+    rows = BlockRows(np.array([0, 1, 1, 2]), np.array([0, 1]), np.ones((2, 3, 6)), 2)
+    with pytest.raises(ValueError, match=words):
+        contact_map(MPI.COMM_SELF, dataclasses.replace(rows, **{name: value}))

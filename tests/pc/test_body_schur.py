@@ -9,6 +9,7 @@ from systems import contact_matrix, contacts, dense, poisson
 
 from pctt.blocks import BlockRows
 from pctt.body_matrix import BodyMatrix
+from pctt.petsc import own_errors
 
 
 def solve(mat: PETSc.Mat, ksp_type: str, rtol: float, **options: object) -> tuple[float, np.ndarray, np.ndarray]:
@@ -61,6 +62,39 @@ def test_refinement_mends_what_rounding_spoils_where_barriers_are_tiny():
     refined, _, _ = solve(mat, "richardson", 1e-10, **options)
     assert spoilt > 1e-9
     assert refined <= 1e-10
+
+
+def test_a_breakdown_of_the_inner_method_is_that_of_the_solve():
+    """``preonly`` itself would call the solve converged."""
+    for size in (-1.0, np.nan):
+        mat = contact_matrix(*contacts(30, 20))
+        mat.setAttr("barrier", np.tile(size * np.eye(3), (30, 1, 1)))
+        ksp = PETSc.KSP().create(mat.comm)
+        ksp.setOperators(mat)
+        ksp.setType("preonly")
+        ksp.pc.setType("python")
+        ksp.pc.setPythonType("pctt.pc.BodySchur")
+        x, b = mat.createVecs()
+        b.set(1.0)
+        ksp.solve(b, x)
+        assert ksp.getConvergedReason() < 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("barrier", None, "barrier of the Mat is missing"),
+        ("barrier", np.zeros((30, 3, 3)), "has a singular block"),
+        ("barrier", np.ones((29, 3, 3)), r"has the shape \(29, 3, 3\); allowed are \(30, 3, 3\)"),
+        ("contact_map", contacts(29, 20)[0], "has 29 rows, S has 90"),
+        ("contact_map", 3, "has None rows"),
+    ],
+)
+def test_parts_that_do_not_fit_the_matrix_are_refused(name, value, words):
+    mat = contact_matrix(*contacts(30, 20))
+    mat.setAttr(name, value)
+    with pytest.raises(ValueError, match=words), own_errors():
+        solve(mat, "fgmres", 1e-3)
 
 
 def test_follows_new_barriers():

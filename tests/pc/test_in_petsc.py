@@ -1,0 +1,206 @@
+"""The preconditioners as parts of PETSc programs: matrices that are unusual, and calls in an unusual order."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from mpi4py import MPI
+from petsc4py import PETSc
+from systems import dense, poisson, spd
+
+NAMES = ("TensorTrain", "TwoLevel", "BodySchur")
+SMALL = {"pc_tt_rank": "fixed", "pc_tt_max_rank": "20"}
+
+
+def stored(A: np.ndarray, kind: str = "aij", block: int = 1, pattern: np.ndarray | None = None) -> PETSc.Mat:
+    """A sequential Mat of this type; ``pattern`` has nonzeros also at zeros that are stored."""
+    where = sp.csr_matrix(A if pattern is None else pattern)
+    row = np.repeat(np.arange(len(A)), np.diff(where.indptr))
+    mat = PETSc.Mat().create(PETSc.COMM_SELF)
+    mat.setSizes(A.shape)
+    mat.setBlockSize(block)
+    mat.setType("aij")
+    mat.setPreallocationCSR((where.indptr, where.indices, A[row, where.indices]))
+    if kind == "sbaij":
+        mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    return mat if kind == "aij" else mat.convert(kind, PETSc.Mat())
+
+
+def solver(mat: PETSc.Mat, name="TensorTrain", method="cg", prefix="", **options: str) -> PETSc.KSP:
+    for option, value in options.items():
+        PETSc.Options()[prefix + option] = value
+    ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOptionsPrefix(prefix)
+    ksp.setOperators(mat)
+    ksp.setType(method)
+    ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+    ksp.setTolerances(rtol=1e-9, max_it=500)
+    ksp.pc.setType("python")
+    ksp.pc.setPythonType(f"pctt.pc.{name}")
+    ksp.setFromOptions()
+    return ksp
+
+
+def left(ksp: PETSc.KSP, transposed: bool = False) -> float:
+    """The relative true residual of a solve, computed by numpy."""
+    mat = ksp.getOperators()[0]
+    x, b = mat.createVecs()
+    b.array[:] = np.random.default_rng(0).standard_normal(b.getLocalSize())
+    (ksp.solveTranspose if transposed else ksp.solve)(b, x)
+    A = dense(mat).T if transposed else dense(mat)
+    return float(np.linalg.norm(A @ x.array - b.array) / b.norm())
+
+
+def ring(n: int, distance: int) -> np.ndarray:
+    """Each row has its neighbours ``distance`` before and after."""
+    off = np.roll(np.eye(n), distance, axis=1)
+    return 3 * np.eye(n) - off - off.T
+
+
+def test_a_dense_matrix_is_set_up_once():
+    """Not for every product, as it would be if reading the matrix counted as a change of it."""
+    mat = stored(spd(30, 0), "dense")
+    ksp = solver(mat)
+    for _ in range(2):
+        assert left(ksp) < 1e-8
+    assert ksp.pc.getPythonContext().account.setups == 1
+
+
+@pytest.mark.parametrize("kind", ["aij", "baij", "sbaij", "dense"])
+@pytest.mark.parametrize("name", NAMES[:2])
+def test_a_matrix_without_rows(kind, name):
+    """Block Jacobi has such blocks on ranks without rows."""
+    mat = PETSc.Mat().create(PETSc.COMM_SELF)
+    mat.setSizes((0, 0))
+    mat.setType(kind)
+    mat.setUp()
+    mat.assemble()
+    ksp = solver(mat, name)
+    x, b = mat.createVecs()
+    ksp.solve(b, x)
+    assert ksp.getConvergedReason() > 0
+    ksp.reset()
+    ksp.setOperators(stored(ring(20, 1)))
+    assert left(ksp) < 1e-8
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_view_before_the_set_up(name, capfd):
+    solver(stored(ring(20, 1)), name).view()
+    assert f"pctt.pc.{name}" in capfd.readouterr().out
+
+
+def test_options_for_all_levels_are_those_of_each():
+    database = PETSc.Options()
+    database.insertString("-mg_levels_pc_tt_max_rank 7 -fieldsplit_pc_two_boxes 4")
+    database.insertString("-fieldsplit_two_mg_levels_pc_type jacobi")
+    ksp = solver(poisson(8), prefix="mg_levels_1_")
+    assert ksp.pc.getPythonContext().options.max_rank == 7
+    ksp = solver(poisson(8), "TwoLevel", prefix="fieldsplit_0_")
+    ksp.setUp()
+    assert ksp.pc.getPythonContext().boxes == 4
+    assert ksp.pc.getPythonContext().multigrid.getMGSmoother(1).pc.getType() == "jacobi"
+
+
+def test_new_options_are_those_of_the_next_set_up():
+    ksp = solver(poisson(8), pc_tt_rank="fixed", pc_tt_max_rank="2")
+    assert left(ksp) < 1e-8
+    PETSc.Options()["pc_tt_max_rank"] = "12"
+    ksp.setFromOptions()
+    ksp.setOperators(poisson(8))
+    assert left(ksp) < 1e-8
+    assert ksp.pc.getPythonContext().rank == 12
+
+
+def test_a_new_context_of_a_solver_in_use():
+    """PETSc makes one whenever the type is in the database, and does not set it up."""
+    ksp = solver(poisson(8), pc_type="python", pc_python_type="pctt.pc.TensorTrain", **SMALL)
+    assert left(ksp) < 1e-8
+    ksp.setFromOptions()
+    assert left(ksp) < 1e-8
+    ksp.pc.setPythonType("pctt.pc.TwoLevel")
+    assert left(ksp) < 1e-8
+
+
+@pytest.mark.parametrize("block", [1, 3])
+def test_zeros_that_are_stored(block):
+    """MatZeroRowsColumns leaves such zeros."""
+    A = ring(36, block)
+    ksp = solver(stored(A, block=block, pattern=A + ring(36, 2 * block)), **SMALL)
+    assert left(ksp) < 1e-8
+    assert ksp.pc.getPythonContext().rank == 20
+    assert ksp.getIterationNumber() < 9
+
+
+def test_another_pattern_with_as_many_nonzeros():
+    mat = stored(ring(40, 1))
+    ksp = solver(mat, pc_tt_keep="false", **SMALL)
+    left(ksp)
+    other = sp.csr_matrix(ring(40, 7))
+    mat.setPreallocationCSR((other.indptr, other.indices, other.data))
+    ksp.setOperators(mat)
+    assert left(ksp) < 1e-8
+    train = ksp.pc.getPythonContext().made.hierarchy
+    np.testing.assert_allclose(train.norm(), np.linalg.norm(ring(40, 7) / 3 - np.eye(40)))
+
+
+def test_rows_with_names_in_blocks_of_another_size():
+    ksp = None
+    for block, count in ((3, 20), (1, 20), (2, 19)):
+        mat = stored(spd(block * count, 0), block=block)
+        mat.setAttr("coordinates", np.linspace(0, 1, count)[:, None])
+        mat.setAttr("key", np.arange(count))
+        if ksp is None:
+            ksp = solver(mat, **SMALL)
+        ksp.reset()
+        ksp.setOperators(mat)
+        assert left(ksp) < 1e-8
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 24])
+def test_a_dense_multiple_of_the_identity(size):
+    assert left(solver(stored(4.0 * np.eye(size), "dense"))) < 1e-12
+
+
+@pytest.mark.parametrize("transposed", [False, True])
+def test_methods_that_need_the_transpose(transposed):
+    """BiCG diverges if block Jacobi and its transpose are the same for blocks that are not symmetric."""
+    A = spd(24, 0) + np.triu(np.random.default_rng(1).standard_normal((24, 24)), 1) * 6
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ksp = solver(stored(A, block=3), method="bicg")
+        assert left(ksp, transposed) < 1e-7
+
+
+@pytest.mark.parametrize(("count", "block"), [(8, 1), (16, 3), (4, 2), (1, 1)])
+def test_a_coarse_space_of_all_vectors(count, block):
+    """There Z is square, and PETSc does not know a restriction from an interpolation by its shape."""
+    A = spd(count * block, 0)
+    mat = stored(A, block=block)
+    mat.setAttr("coordinates", np.random.default_rng(0).random((count, 2)))
+    ksp = solver(mat, "TwoLevel")
+    assert left(ksp) < 1e-8
+    x, y = mat.createVecs()
+    blocks = np.kron(np.eye(count), np.ones((block, block))) * A
+    x.array[:] = np.arange(len(A))
+    ksp.pc.apply(x, y)
+    np.testing.assert_allclose(y.array, np.linalg.solve(blocks, x.array) + np.linalg.solve(A, x.array), rtol=1e-9)
+
+
+@pytest.mark.parallel(2, 3)
+@pytest.mark.parametrize("name", NAMES[:2])
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_ranks_without_rows(name, size):
+    comm = MPI.COMM_WORLD
+    own = size if comm.rank == comm.size - 1 else 0
+    csr = sp.csr_matrix(ring(size, 1)[:own] if size > 2 else 2.0 * np.eye(size)[:own])
+    mat = PETSc.Mat().createAIJ(((own, size), (own, size)), csr=(csr.indptr, csr.indices, csr.data), comm=comm)
+    mat.setAttr("coordinates", np.arange(3.0 * own).reshape(own, 3))
+    ksp = solver(mat, name)
+    x, b = mat.createVecs()
+    b.set(1.0)
+    ksp.solve(b, x)
+    np.testing.assert_allclose(x.array, 1.0 if size > 2 else 0.5)
