@@ -45,10 +45,13 @@ class Contacts:
     def __len__(self) -> int:
         return len(self.key)
 
+    def columns(self) -> dict[str, np.ndarray]:
+        """The arrays by name, without copies."""
+        return {name: value for name, value in vars(self).items() if name != "near"}
+
     def take(self, rows: np.ndarray) -> Contacts:
         """Those of these rows, or where a mask (nc,) is true."""
-        columns = ("key", "a", "b", "body", "point", "normal", "gap", "friction")
-        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+        return replace(self, **{name: column[rows] for name, column in self.columns().items()})
 
 
 def find_contacts(world: World, delta: float, dt: float = 0.0, margin: Floats | float = 0.0) -> Contacts:
