@@ -24,6 +24,16 @@ def set_diagonal_blocks(P: PETSc.Mat, blocks: np.ndarray) -> None:
     P.setAttr("diagonal_blocks", blocks)
 
 
+def put_diagonal_blocks(mat: PETSc.Mat, blocks: np.ndarray) -> None:
+    """Write the diagonal blocks (n, bs, bs) of this rank's block rows into a Mat; collective."""
+    size = mat.getBlockSize()
+    first, last = mat.getOwnershipRange()
+    rows = np.arange(first // size, last // size, dtype=PETSc.IntType)[:, None]
+    if len(blocks):  # petsc4py divides by their number
+        mat.setValuesBlockedRCV(rows, rows, blocks.reshape(-1, size**2))
+    mat.assemble()
+
+
 def block_diagonal(P: PETSc.Mat, blocks: np.ndarray | None = None) -> PETSc.Mat:
     """A new Mat with the diagonal blocks of P; ``pbjacobi`` needs nothing else. The caller destroys the Mat.
 

@@ -81,8 +81,7 @@ STEERING = Steering()
 def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Conic, newton: Newton, coulomb: bool = False
 ) -> Result:
-    """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step. Default
-    iteration limit 60."""
+    """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step."""
     newton.begin(problem)
     if coulomb and not newton.takes_any:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
@@ -93,7 +92,7 @@ def solve(
         off = max(problem.natural_residual(guess, cones.velocity(guess)), limits.tol)
         start = min(start, STEERING.near_start * off)
     at = _start(cones, guess, start)
-    course = Course(cones, limits.tol, limits.max_it if limits.max_it >= 0 else 60)
+    course = Course(cones, limits.tol, limits.max_it)
     while not course.ends(at, newton):
         scaled = Scaled.of(cones, at, newton, options, course)
         with phase("ConicPredictor"):

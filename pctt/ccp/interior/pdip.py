@@ -78,24 +78,20 @@ STEERING = Steering()
 
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, newton: Newton) -> Result:
-    """Impulses; ``guess`` (nc, 3) gives the normal impulses of persistent contacts, 0 elsewhere.
-
-    Default iteration limit 100 Newton steps.
-    """
-    max_it = limits.max_it if limits.max_it >= 0 else 100
+    """Impulses; ``guess`` (nc, 3) gives the normal impulses of persistent contacts, 0 elsewhere."""
     cone = CONSTRAINTS[options.constraint](problem.mu)
     newton.begin(problem)
     g, lam = _start(problem, guess, cone, options)
     history: list[float] = []
     step, damping = 1.0, 0.0
-    for iteration in range(max_it + 1):
+    for iteration in range(limits.max_it + 1):
         y = _velocity(problem, g)
         history.append(problem.natural_residual(g, y))
         if history[-1] <= limits.tol:
             status, reason = Status.CONVERGED, "natural residual below the tolerance"
             break
-        if iteration == max_it:
-            status, reason = Status.ITERATION_LIMIT, f"{max_it} Newton steps"
+        if iteration == limits.max_it:
+            status, reason = Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
             break
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
         centering = options.centering if step > STEERING.stuck else 1.0
