@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.blocks import block_csr_matrix
+from pctt.blocks import block_csr_matrix, new_matrix
 
 #: Types of preconditioners that use the inverses of the diagonal blocks of a Mat.
 BY_DIAGONAL_BLOCKS = frozenset({"pbjacobi", "sor"})
@@ -59,11 +59,7 @@ def without_memory(P: PETSc.Mat, kind: str) -> PETSc.Mat | None:
 
 def _copy(P: PETSc.Mat) -> PETSc.Mat:
     """A copy of a sequential BAIJ matrix; SOR does not work with the copy that ``MatDuplicate`` makes."""
-    copy = PETSc.Mat().create(P.comm)
-    copy.setSizes(P.getSizes())
-    copy.setBlockSize(P.getBlockSize())
-    copy.setType(P.getType())
-    copy.setPreallocationCSR(P.getRowIJ(compressed=True))
+    copy = new_matrix(P.comm, P.getSizes(), P.getBlockSize(), P.getRowIJ(compressed=True), P.getType())
     P.copy(copy, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
     return copy
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -101,10 +102,16 @@ def block_csr_matrix(
     ``rows`` and ``columns`` are the local sizes in scalar rows and columns.
     """
     csr = (indptr.astype(PETSc.IntType), indices.astype(PETSc.IntType), np.ascontiguousarray(blocks).ravel())
-    size = ((rows, PETSc.DETERMINE), (columns, PETSc.DETERMINE))
+    return new_matrix(comm, ((rows, PETSc.DETERMINE), (columns, PETSc.DETERMINE)), blocks.shape[-1], csr)
+
+
+def new_matrix(
+    comm: MPI.Comm, sizes: Any, block: int, csr: tuple[np.ndarray, ...], kind: str = PETSc.Mat.Type.BAIJ
+) -> PETSc.Mat:
+    """A Mat of this type with the pattern ``csr`` of the local rows, and its values if they are the third array."""
     mat = PETSc.Mat().create(comm)
-    mat.setSizes(size)
-    mat.setBlockSize(blocks.shape[-1])
-    mat.setType(PETSc.Mat.Type.BAIJ)
+    mat.setSizes(sizes)
+    mat.setBlockSize(block)
+    mat.setType(kind)
     mat.setPreallocationCSR(csr)
     return mat

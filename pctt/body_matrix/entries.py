@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 
 from pctt.block_diagonal import set_diagonal_blocks
-from pctt.blocks import BlockRows
+from pctt.blocks import BlockRows, new_matrix
 from pctt.body_matrix.stiff_part import StiffPart
 from pctt.exchange import offsets, send_rows
 
@@ -64,11 +64,8 @@ class BodyMatrix:
         row, column = np.divmod(every, total)
         indptr = np.searchsorted(row, np.arange(first, first + own + 1))
         self._indptr, self._indices = indptr.astype(PETSc.IntType), column.astype(PETSc.IntType)
-        self.mat = PETSc.Mat().create(self.comm)
-        self.mat.setSizes(((6 * own, PETSc.DETERMINE), (6 * own, PETSc.DETERMINE)))
-        self.mat.setBlockSize(6)
-        self.mat.setType(PETSc.Mat.Type.BAIJ)
-        self.mat.setPreallocationCSR((self._indptr, self._indices))
+        sizes = ((6 * own, PETSc.DETERMINE), (6 * own, PETSc.DETERMINE))
+        self.mat = new_matrix(self.comm, sizes, 6, (self._indptr, self._indices))
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self._stiff: dict[tuple[bool, bool], StiffPart] = {}  # keys: in scalar format or not, symmetric or not
 

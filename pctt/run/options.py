@@ -43,7 +43,6 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     database = DEMO if demo else database
     run = read(Run, database)
     solver = ccp.SOLVERS[run.ccp_type]
-    prefix = f"ccp_{run.ccp_type}_"
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in option_groups(scene_class) for d in describe(group, start)]
     refuse_unknown(database, known, prefixes=OF_SOLVERS)
@@ -62,7 +61,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         run.dt if run.dt is not None else dt,
         run.delta if run.delta is not None else delta,
         limits,
-        read(solver.options, database, prefix),
+        read(solver.options, database, solver.prefix),
         read(ccp.Coulomb, database, "ccp_coulomb_") if obeys_coulomb else None,
         demo,
     )
@@ -105,7 +104,7 @@ def _read_scene(scene_class: type[Experiment], database: Mapping[str, str]) -> t
 
 def option_groups(scene: type[Experiment]) -> list[tuple[type, str]]:
     """The classes whose fields are options, with their prefixes."""
-    solvers = [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
+    solvers = [(solver.options, solver.prefix) for solver in ccp.SOLVERS.values()]
     laws: list[tuple[type, str]] = [(ccp.Limits, "ccp_"), (ccp.Coulomb, "ccp_coulomb_")]
     return [(Run, ""), (scene, "scene_"), *laws, *solvers]
 
