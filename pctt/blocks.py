@@ -12,6 +12,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class BlockRows:
@@ -27,7 +29,7 @@ class BlockRows:
 
     indptr: np.ndarray
     indices: np.ndarray
-    blocks: NDArray[np.float64]
+    blocks: Array
     columns: int
 
     @property
@@ -68,7 +70,7 @@ def dense_columns(comm: MPI.Comm, G: BlockRows, bodies: np.ndarray) -> PETSc.Mat
     return mat
 
 
-def diagonal_blocks(G: BlockRows) -> NDArray[np.float64]:
+def diagonal_blocks(G: BlockRows) -> Array:
     """The diagonal blocks of G G' (nc, 3, 3)."""
     products = G.blocks @ G.blocks.transpose(0, 2, 1)
     shape = (G.rows, len(products))
@@ -95,7 +97,7 @@ def square_block_matrix(comm: MPI.Comm, rows: sp.bsr_matrix) -> PETSc.Mat:
 
 
 def block_csr_matrix(
-    comm: MPI.Comm, rows: int, columns: int, indptr: np.ndarray, indices: np.ndarray, blocks: NDArray[np.float64]
+    comm: MPI.Comm, rows: int, columns: int, indptr: np.ndarray, indices: np.ndarray, blocks: Array
 ) -> PETSc.Mat:
     """A BAIJ Mat from local block CSR arrays with ``blocks`` (nb, b, b).
 

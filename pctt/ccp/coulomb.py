@@ -149,19 +149,9 @@ def solve(
         words = f"Coulomb's law not met: residual {min(history):.1e} at best in {len(history)} cone problems"
         if not inner.converged:
             words = inner.reason if inner.status is Status.UNBOUNDED else f"{words}, the last: {inner.reason}"
-    return Result(
-        best.impulse,
-        status,
-        words,
-        min(history),
-        iterations,
-        ksp_its,
-        fallbacks,
-        history,
-        len(history),
-        best.solver,
-        FIXED_POINT,
-    )
+    found = Result(best.impulse, status, words, min(history), iterations, ksp_its, fallbacks, history)
+    found.cone_problems, found.solver, found.law = len(history), best.solver, FIXED_POINT
+    return found
 
 
 class Anderson:

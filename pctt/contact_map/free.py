@@ -13,15 +13,12 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, diagonal_blocks
+from pctt.blocks import Array, BlockRows, diagonal_blocks
 from pctt.contact_map import block_loops, compact_loops
 from pctt.contact_map.ghosts import Ghosts
 from pctt.contact_map.rows import CompactRows, block_rows, packed, symmetric_blocks
-
-Array = NDArray[np.float64]
 
 
 class FreeMap:

@@ -6,12 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
-from pctt.blocks import BlockRows
+from pctt.blocks import Array, BlockRows
 from pctt.contact_map.ghosts import Ghosts
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,6 @@ class ContactForm:
             self.matrix = _with_low_rank(self._low_rank, problem.low_rank)
 
     def load(self, problem: ConeProblem) -> None:
-        """Take another problem with the same contacts between the same bodies."""
         self.problem = problem
         if self._entries is not None:
             self._entries.load(problem)

@@ -48,7 +48,6 @@ class KKTForm:
         return sp.bsr_matrix((wide, self._indices, self._indptr), shape=shape)
 
     def load(self, problem: ConeProblem) -> None:
-        """Take another problem with the same contacts between the same bodies."""
         other = KKTForm(problem)
         other.matrix.copy(self.matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         other.destroy()
