@@ -43,8 +43,8 @@ def find_turned(
 
 
 def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
-    """Whether points of grains that are no spheres move by more than `depth` as these turn, on any rank; not if a
-    velocity is no number."""
+    """Whether points of grains that are no spheres move by more than `depth` as these turn, on any rank. False if a
+    velocity is not finite."""
     if world.only_spheres:
         return False
     grains = world.grains

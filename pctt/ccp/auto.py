@@ -49,8 +49,8 @@ class Steering:
     """Numbers that steer the choice; costs are in iterations of APGD (docs/ccp.md has what was measured)."""
 
     conic_it: int = 60  #: limit of the conic method's iterations
-    earliest: float = 0.1  #: the first forecast comes after this part of the conic method's cost, and
-    looks: int = 8  #: so many looks at the natural residual
+    earliest: float = 0.1  #: part of the conic method's cost before which there is no forecast
+    looks: int = 8  #: looks at the natural residual before which there is no forecast
     saved: float = 0.3  #: part of the conic method's cost, at most, by beginning at APGD's point
     far: float = 4.0  #: times that cost: more iterations of APGD than this need not be told apart
     #: complementarity of the conic method's start, by APGD's natural residual; its own default at most

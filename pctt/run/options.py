@@ -74,15 +74,8 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
             is_free(run.ccp_operator)
         except ValueError as error:
             raise OptionError(str(error)) from None
-    refuse_serial(comm)
-    _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
-    _refuse_missing("-problem", run.problem, comm)
     dump_steps(run)  # refuses what is no list of steps
-    if not run.settle:
-        _refuse_unwritable("-output", Path(run.output), comm)
-        if run.dump_problem:
-            _refuse_unwritable("-dump_problem", Path(run.dump_problem), comm)
-        _refuse_occupied(run, comm)
+    _refuse_places(run, comm)
     return options
 
 
@@ -193,6 +186,18 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) ->
         raise OptionError(f"{listed}: PETSc refuses: {reason}") from None
     finally:
         ksp.destroy()
+
+
+def _refuse_places(run: Run, comm: MPI.Comm) -> None:
+    """OptionError for files that are not there, and for folders in which the run cannot write or must not."""
+    refuse_serial(comm)
+    _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
+    _refuse_missing("-problem", run.problem, comm)
+    if not run.settle:
+        _refuse_unwritable("-output", Path(run.output), comm)
+        if run.dump_problem:
+            _refuse_unwritable("-dump_problem", Path(run.dump_problem), comm)
+        _refuse_occupied(run, comm)
 
 
 def _refuse_missing(name: str, path: str, comm: MPI.Comm) -> None:

@@ -58,20 +58,19 @@ class PDIP:
 class Steering:
     """Numbers that steer the method, without unit; docs/notebook_ccp.md has what was measured."""
 
-    rtol: float = 1e-3  #: of the linear solves, where ``-ksp_rtol`` does not say otherwise,
-    forcing: float = 0.03  #: and what they may leave of velocities, as a part of what the natural residual shows
-    stuck: float = 0.1  #: a step after which the next only centres
-    #: natural residual below which S has a proximal term: before, impulses may have to grow by orders
+    rtol: float = 1e-3  #: relative residual of the linear solves, if ``-ksp_rtol`` gives no other
+    forcing: float = 0.03  #: residual of a linear solve at most, as a part of what the natural residual shows
+    stuck: float = 0.1  #: after a shorter step the next one only centres
+    #: natural residual below which S has a proximal term; before, impulses may have to grow by orders of magnitude
     late: float = 1e-3
-    cut: float = 0.3  #: a step after which it grows,
-    whole: float = 0.7  #: and one after which it falls,
-    factor: float = 4.0  #: by this factor,
-    damping: tuple[float, float] = (1.0, 4.0)  #: from and to this part of the natural residual, times mean diag N
-    short: float = 0.5  #: a step whose direction is corrected,
-    further: float = 0.3  #: for one that goes so much further
-    #: unless the terms of second order enlarge the right-hand side so much: no correction then helps
-    bent: float = 100.0
-    longer: float = 1.2  #: a corrected step that is worth taking, as a part of the other
+    cut: float = 0.3  #: after a shorter step the proximal term grows
+    whole: float = 0.7  #: after a longer step it falls
+    factor: float = 4.0  #: by which it grows or falls
+    damping: tuple[float, float] = (1.0, 4.0)  #: its bounds where it grows [natural residual times mean diag N]
+    short: float = 0.5  #: the direction of a shorter step is corrected
+    further: float = 0.3  #: the correction aims at a step that is longer by this
+    bent: float = 100.0  #: no correction helps if terms of second order enlarge the right-hand side by this factor
+    longer: float = 1.2  #: a corrected step is taken if it is so many times as long
 
 
 STEERING = Steering()
