@@ -78,7 +78,9 @@ class BodyMatrix:
             (received,), _ = send_rows(self.comm, [blocks[self._away]], self._owner[self._away])
             np.add.at(self._values, self._received_places, received)
         self._values[self._diagonal_places] += np.eye(6)
-        _put(self.mat, self._indptr, self._indices, self._values)
+        if len(self._indices):
+            self.mat.setValuesBlockedCSR(self._indptr, self._indices, self._values.ravel())
+        self.mat.assemble()
         set_diagonal_blocks(self.mat, self._values[self._diagonal_places])
 
     def stiff_part(
@@ -147,10 +149,3 @@ class BodyMatrix:
         self.mat.destroy()
         for part in self._stiff.values():
             part.destroy()
-
-
-def _put(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, blocks: np.ndarray) -> None:
-    """Set all block rows of this rank."""
-    if len(indices):
-        mat.setValuesBlockedCSR(indptr, indices, blocks.ravel())
-    mat.assemble()

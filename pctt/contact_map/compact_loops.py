@@ -104,7 +104,7 @@ def weights(frame, arm, body, H, weight):
 
 @loop
 def add_body_blocks(frame, arm, body, weight, blocks):
-    """blocks (bodies, 6, 6) += the diagonal blocks of D H D', for the ``weight`` of `any_weights`."""
+    """blocks (bodies, 6, 6) += the diagonal blocks of D H D', for the ``weight`` of `weights`."""
     J = np.zeros((3, 6))  # from the velocities of the body to the velocity of the contact point
     J[0, 0] = J[1, 1] = J[2, 2] = 1.0
     for c in range(len(frame)):

@@ -18,7 +18,7 @@ from petsc4py import PETSc
 from pctt.blocks import Array, BlockRows, diagonal_blocks
 from pctt.contact_map import block_loops, compact_loops
 from pctt.contact_map.ghosts import Ghosts
-from pctt.contact_map.rows import CompactRows, block_rows, packed, symmetric_blocks
+from pctt.contact_map.rows import CompactRows, block_rows, packed, root_blocks
 
 
 class FreeMap:
@@ -181,7 +181,7 @@ class FreeMap:
         assert self._mass is not None
         out = np.empty((self.rows, 3, 3), self.precision)
         mass = np.zeros((self._ghosts.nobody + 1, 12), self.precision)
-        mass[: self.columns] = packed(symmetric_blocks(self._mass))
+        mass[: self.columns] = packed(root_blocks(self._mass))
         self._ghosts.update(mass)
         self._loops.contact_blocks(*self._arrays, mass, out)
         return out
@@ -197,7 +197,7 @@ class FreeMap:
             own *= self._root[:, :, None] * self._root[:, None, :]
         elif self._root is not None:
             roots = np.zeros((self.columns, 6, 6))
-            roots[:, :3, :3], roots[:, 3:, 3:] = symmetric_blocks(self._root).transpose(1, 0, 2, 3)
+            roots[:, :3, :3], roots[:, 3:, 3:] = root_blocks(self._root).transpose(1, 0, 2, 3)
             own = roots @ own @ roots
         own[:, range(6), range(6)] += 1.0
         return own
@@ -257,5 +257,5 @@ def _square(root: Array) -> Array:
     """R^2, in the format of R."""
     if root.shape[1] == 6:
         return root * root
-    blocks = symmetric_blocks(root)
+    blocks = root_blocks(root)
     return packed(blocks @ blocks)

@@ -55,13 +55,13 @@ class CompactRows:
         body = np.take_along_axis(self.body, order, axis=1)
         moves = body >= 0
         local = np.take_along_axis(ghosts.body, order, axis=1)[moves]
-        blocks, both = blocks[moves], symmetric_blocks(root)[local]
+        blocks, both = blocks[moves], root_blocks(root)[local]
         blocks = np.concatenate([blocks[:, :, :3] @ both[:, 0], blocks[:, :, 3:] @ both[:, 1]], axis=2)
         indptr = np.concatenate([[0], np.cumsum(moves.sum(axis=1))])
         return BlockRows(indptr, body[moves], blocks, self.columns)
 
 
-def symmetric_blocks(root: Array) -> Array:
+def root_blocks(root: Array) -> Array:
     """Matrices in the format of `CompactRows.root` as blocks (n, 2, 3, 3)."""
     if root.shape[1] == 6:
         return root.reshape(-1, 2, 3, 1) * np.eye(3)
@@ -69,7 +69,7 @@ def symmetric_blocks(root: Array) -> Array:
 
 
 def packed(blocks: Array) -> Array:
-    """Symmetric blocks (n, 2, 3, 3) as (n, 12), the inverse of `symmetric_blocks`."""
+    """Symmetric blocks (n, 2, 3, 3) as (n, 12), the inverse of `root_blocks`."""
     return blocks.reshape(-1, 2, 9)[:, :, [0, 1, 2, 4, 5, 8]].reshape(-1, 12)
 
 

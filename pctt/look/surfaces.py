@@ -183,8 +183,13 @@ def _is_hollow(triangles: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool
 
 def _solid(folder: Folder, frame: Frame, row: int) -> np.ndarray:
     """The corners (m, 3, 3) of the triangles of the large body `row` without its planes."""
+    return _triangles(joined([part for _, part in _parts(folder, frame, row)]))
+
+
+def _triangles(surface: vtkPolyData) -> np.ndarray:
+    """The corners (m, 3, 3) of the triangles of a surface."""
     source = vtkTriangleFilter()
-    source.SetInputData(joined([part for _, part in _parts(folder, frame, row)]))
+    source.SetInputData(surface)
     source.Update()
     data = source.GetOutput()
     cells = vtk_to_numpy(data.GetPolys().GetConnectivityArray()).reshape(-1, 3)
