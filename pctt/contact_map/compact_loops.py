@@ -97,9 +97,12 @@ def weights(frame, arm, body, H, weight):
             h0 = H[c, 0, 0] * frame[c, i] + H[c, 0, 1] * frame[c, 3 + i] + H[c, 0, 2] * frame[c, 6 + i]
             h1 = H[c, 1, 0] * frame[c, i] + H[c, 1, 1] * frame[c, 3 + i] + H[c, 1, 2] * frame[c, 6 + i]
             h2 = H[c, 2, 0] * frame[c, i] + H[c, 2, 1] * frame[c, 3 + i] + H[c, 2, 2] * frame[c, 6 + i]
-            for j in range(0 if whole else i, 3):
-                place = i + 3 * j if whole else j if i == 0 else i + j + 1
-                weight[c, place] = h0 * frame[c, j] + h1 * frame[c, 3 + j] + h2 * frame[c, 6 + j]
+            for j in range(3):  # all of them: a compiler unrolls loops of known lengths
+                entry = h0 * frame[c, j] + h1 * frame[c, 3 + j] + h2 * frame[c, 6 + j]
+                if whole:
+                    weight[c, i + 3 * j] = entry
+                elif i <= j:
+                    weight[c, j if i == 0 else i + j + 1] = entry
 
 
 @loop
