@@ -16,7 +16,7 @@ import numpy as np
 from dem.arrays import Bools, Floats, Ints
 from dem.contact.capsules import end_ball
 from dem.contact.narrow import Capsules, Manifold, Planes, Spheres, Touch, closest_on_lines, dot, sphere_plane
-from dem.mesh import Surface, spread
+from dem.mesh import Closest, Surface, spread
 from dem.quaternion import length
 
 #: Sine of the angle by which a direction may leave those in which an edge or a vertex is closest, for rounding.
@@ -84,17 +84,17 @@ def _feet(center: Floats, radius: Floats, reach: Floats, surface: Surface) -> tu
     """The places of the surface at distances from centres (m, 3) that are least around them and within reach (m,): rows
     of the centres, features, points, unit vectors from there to the centre, distances."""
     row, triangle = surface.near(center, reach)
-    point, feature, distance = surface.closest(center[row], triangle)
-    close = np.flatnonzero(distance <= reach[row])
-    row, triangle, feature = row[close], triangle[close], feature[close]
-    point, distance = point[close], distance[close]
+    found = surface.closest(center[row], triangle)
+    close = np.flatnonzero(found.distance <= reach[row])
+    row, triangle = row[close], triangle[close]
+    point, feature, distance = found.point[close], found.feature[close], found.distance[close]
     _, first = np.unique(row * surface.features + feature, return_index=True)  # triangles share edges and vertices
     away = center[row[first]] - point[first]
     size = distance[first, None]
     away = np.where(size > 0.0, away / np.where(size > 0.0, size, 1.0), surface.normal[triangle[first]])
     least = first[_within_cone(surface, feature[first], point[first], np.where(size > 0.0, away, 0.0), ROUNDING)]
     away = away[np.isin(first, least)]
-    chosen = _one_for_each(row, triangle, point, feature, distance, least, radius, surface)
+    chosen = _one_for_each(row, triangle, Closest(point, feature, distance), least, radius, surface)
     return row[least][chosen], feature[least][chosen], point[least][chosen], away[chosen], distance[least][chosen]
 
 
@@ -110,18 +110,10 @@ def _within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, s
     return inside
 
 
-def _one_for_each(
-    row: Ints,
-    triangle: Ints,
-    point: Floats,
-    feature: Ints,
-    distance: Floats,
-    least: Ints,
-    radius: Floats,
-    surface: Surface,
-) -> Ints:
+def _one_for_each(row: Ints, triangle: Ints, found: Closest, least: Ints, radius: Floats, surface: Surface) -> Ints:
     """Which of the entries `least` are contacts of their own: not those that rounding made twice, nor places of edges
     that lie in another triangle, as where the corners of one meet the side of another."""
+    point, feature, distance = found
     count = np.bincount(row[least], minlength=len(radius))
     several = np.flatnonzero(count[row[least]] > 1)
     if not len(several):

@@ -104,20 +104,14 @@ class Dump:
         def state(g: Array) -> fclib.Solution:
             return fclib.Solution(g, problem.product(g) + problem.r, system.velocity(g)[dynamic].ravel())
 
-        guess_known = problem.norm(guess) > 0
         fclib.write_global(
-            path,
-            M,
-            H,
-            f.array,
-            w,
-            problem.mu,
-            self._info(problem, result, asked),
-            state(result.impulse) if result.converged else None,
-            state(guess) if guess_known else None,
-            system.point,
-            problem.softness,
-        )
+            path, M, H, f.array, w, problem.mu,
+            info=self._info(problem, result, asked),
+            solution=state(result.impulse) if result.converged else None,
+            guess=state(guess) if problem.norm(guess) > 0 else None,
+            point=system.point,
+            compliance=problem.softness,
+        )  # fmt: skip
         for petsc_object in (M, H, v_free, f, moved):
             petsc_object.destroy()
 
