@@ -107,9 +107,9 @@ def in_frames(stored, frame):
 
 
 @compiled
-def pairs_in_cells(center, radius, first, second, alike, reach):
-    """Pairs (m, 2), the lower row first, of a sphere of the rows `first` and one of the rows `second` that come within
-    `reach`, or within rounding of it.
+def pairs_in_cells(center, radius, first, second, alike):
+    """Pairs (m, 2), the lower row first, of a sphere of the rows `first` and one of the rows `second` that touch, to
+    rounding.
 
     first, second: the same rows if `alike`, else without common ones. Those of `second` are sorted into cubic cells, so
     wide that a pair is at most one cell apart. Cells share a cube of buckets, so that a sphere far away costs nothing;
@@ -118,9 +118,9 @@ def pairs_in_cells(center, radius, first, second, alike, reach):
     largest = 0.0
     for row in second:
         largest = max(largest, radius[row])
-    width = largest + reach
+    width = largest
     for row in first:
-        width = max(width, (radius[row] + largest + reach) * (1.0 + 1e-6))
+        width = max(width, (radius[row] + largest) * (1.0 + 1e-6))
     per = 1.0 / width
     side = 4
     while side * side * side < len(second):
@@ -145,7 +145,7 @@ def pairs_in_cells(center, radius, first, second, alike, reach):
     pairs, found, done = np.empty((8 * len(first) + 8, 2), np.int64), 0, 0
     while True:
         done, found = _pairs_of_rows(
-            center, radius, rows, done, alike, largest, reach, per, side, start, place, member, pairs, found
+            center, radius, rows, done, alike, largest, per, side, start, place, member, pairs, found
         )
         if done == len(rows):
             return pairs[:found].copy()
@@ -153,13 +153,13 @@ def pairs_in_cells(center, radius, first, second, alike, reach):
 
 
 @compiled
-def _pairs_of_rows(center, radius, rows, done, alike, largest, reach, per, side, start, place, member, pairs, found):
+def _pairs_of_rows(center, radius, rows, done, alike, largest, per, side, start, place, member, pairs, found):
     """Add to the first pairs those of the rows that are not done, as long as there is room; new numbers of rows done
     and pairs found. A loop that makes the room itself takes twice the time."""
     last = side - 1
     for n in range(done, len(rows)):
         i, behind, before = rows[n], n + 1 if alike else 0, found
-        a, b, c, r = center[i, 0], center[i, 1], center[i, 2], radius[i] + reach
+        a, b, c, r = center[i, 0], center[i, 1], center[i, 2], radius[i]
         out = (r + largest) * (1.0 + 1e-9)
         bottom, top = int(np.floor((c - out) * per)), int(np.floor((c + out) * per))
         for x in range(int(np.floor((a - out) * per)), int(np.floor((a + out) * per)) + 1):

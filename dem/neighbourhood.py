@@ -32,11 +32,9 @@ class Neighbourhood:
 
 def without_ghosts(world: World, margin: Floats) -> Neighbourhood:
     """The local grains, of which `margin` (grains,) [m] is, and the large bodies."""
-    index = np.arange(world.slabs[world.comm.rank], world.slabs[world.comm.rank + 1])
-    large = world.slabs[-1] + np.arange(len(world.large))
-    return Neighbourhood(
-        bodies.concatenate([world.grains, world.large]), margin, np.concatenate([index, large]), len(index), 0
-    )
+    count, large = len(world.grains), world.slabs[-1] + np.arange(len(world.large))
+    index = np.concatenate([world.slabs[world.comm.rank] + np.arange(count), large])
+    return Neighbourhood(bodies.concatenate([world.grains, world.large]), margin, index, count, 0)
 
 
 def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
@@ -54,18 +52,17 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
             f"a grain has no finite position or velocity at step {world.step} (time {world.time:g} s), or its square "
             "overflows"
         )
-    first = world.slabs[comm.rank]
-    columns = dict(grains.columns(), margin=margin, index=np.arange(first, first + len(grains)))
+    alone, count = without_ghosts(world, margin), len(grains)
+    columns = dict(grains.columns(), margin=margin, index=alone.index[:count])
     row, rank = _touched(grains.position, radius, boxes[: comm.rank])
     ghosts = exchange(comm, {name: column[row] for name, column in columns.items()}, rank)
-    ghost_index, ghost_margin = ghosts.pop("index"), ghosts.pop("margin")
-    large_index = world.slabs[-1] + np.arange(len(world.large))
+    index, ghost_margin = ghosts.pop("index"), ghosts.pop("margin")
     return Neighbourhood(
         bodies=bodies.concatenate([grains, Bodies(**ghosts), world.large]),
         margin=np.concatenate([margin, ghost_margin]),
-        index=np.concatenate([columns["index"], ghost_index, large_index]),
-        grains=len(grains),
-        ghosts=len(ghost_index),
+        index=np.concatenate([alone.index[:count], index, alone.index[count:]]),
+        grains=count,
+        ghosts=len(index),
     )
 
 

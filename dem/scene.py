@@ -148,31 +148,23 @@ class Scene:
         place = np.array(checks.finite_vector(f"position of {name!r}", position))
         turn = checks.unit_quaternions(f"quaternion of {name!r}", quaternion, 1)[0]
         speed = _velocities(velocity, angular_velocity, 1)[0]
-        parts = tuple(shapes)
+        _refuse_speed(name, motion, speed)
+        parts, weight, moments = tuple(shapes), np.inf, np.full(3, np.inf)
         if not isinstance(motion, Dynamic):
-            if speed.any():
-                raise ValueError(f"the motion of {name!r} is prescribed: it takes no initial velocity")
-            weight, moments = np.inf, np.full(3, np.inf)
+            pass
         elif density is not None and mass is None and inertia is None:
             solid = float(checks.positive(f"density of {name!r}", density))
             parts, place, turn, weight, moments = _centered(parts, place, turn, solid)
-        elif density is None and mass is not None and inertia is not None:
+        elif density is None and mass is not None and (inertia is not None or isinstance(motion, Guided)):
             weight = float(checks.positive(f"mass of {name!r}", mass))
-            moments = checks.rows("inertia", checks.positive(f"inertia of {name!r}", inertia), 1, 3)[0]
-        elif density is None and mass is not None and isinstance(motion, Guided):
-            weight = float(checks.positive(f"mass of {name!r}", mass))
+            if inertia is not None:
+                moments = checks.rows("inertia", checks.positive(f"inertia of {name!r}", inertia), 1, 3)[0]
         else:
             raise ValueError(f"dynamic body {name!r} needs either its density or both mass and inertia")
         if isinstance(motion, Guided):
-            across = speed[:3] - motion.free_directions() @ speed[:3]
-            if speed[3:].any() or np.linalg.norm(across) > 1e-12 * np.linalg.norm(speed):
-                raise ValueError(f"{name!r} is guided: its initial velocity must be along the guide")
             moments = np.full(3, np.inf)
         if isinstance(motion, Hinged):
-            along = np.array(motion.axis)
-            if speed[:3].any() or length(np.cross(along, speed[3:])) > 1e-12 * length(speed[3:]):
-                raise ValueError(f"{name!r} is hinged: its initial velocity must be an angular one about the hinge")
-            arm = place - np.array(checks.finite_vector(f"position of {name!r}", position))
+            along, arm = np.array(motion.axis), place - np.array(position)
             if length(np.cross(along, arm)) > 1e-6 * max(length(arm), np.sqrt(moments.max() / weight)):
                 raise ValueError(f"{name!r} is hinged: its centre of mass must be on the axis through its position")
             parts, turn, moments = _on_hinge(parts, turn, moments, along)
@@ -254,6 +246,20 @@ class Scene:
             )
         )
         return ids
+
+
+def _refuse_speed(name: str, motion: Motion, speed: Floats) -> None:
+    """ValueError for an initial velocity (6,) that the motion does not allow."""
+    if not isinstance(motion, Dynamic) and speed.any():
+        raise ValueError(f"the motion of {name!r} is prescribed: it takes no initial velocity")
+    if isinstance(motion, Guided):
+        across = speed[:3] - motion.free_directions() @ speed[:3]
+        if speed[3:].any() or length(across) > 1e-12 * length(speed):
+            raise ValueError(f"{name!r} is guided: its initial velocity must be along the guide")
+    if isinstance(motion, Hinged):
+        across = np.cross(motion.axis, speed[3:])
+        if speed[:3].any() or length(across) > 1e-12 * length(speed[3:]):
+            raise ValueError(f"{name!r} is hinged: its initial velocity must be an angular one about the hinge")
 
 
 def _on_hinge(

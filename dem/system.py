@@ -92,7 +92,7 @@ class ContactSystem:
 
     @cached_property
     def contact_map(self) -> ScaledMap:
-        """The mass-scaled map G = D' M^-1/2 as frames, arms and bodies; of every solver that needs no blocks."""
+        """The mass-scaled map G = D' M^-1/2 as frames, arms and bodies, for solvers that need no blocks."""
         body = np.where(bodies.is_dynamic(self._near.bodies)[self._row], self._body, -1)
         return ScaledMap(self.frame.reshape(-1, 9), self._arm, body, self._root)
 

@@ -16,8 +16,6 @@ from dem.stepper import advanced
 from dem.system import contact_arms, contact_frames, relative_velocity
 from dem.world import World
 
-COLUMNS = ("key", "a", "b", "body", "point", "normal", "gap", "friction")
-
 
 def find_turned(
     world: World, contacts: Contacts, velocity: Floats, dt: float, depth: float, recovery_speed: float
@@ -45,8 +43,8 @@ def find_turned(
 
 
 def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
-    """Whether points of grains that are no spheres move by more than `depth` as these turn, on any rank; not if a
-    velocity is no number."""
+    """Whether points of grains that are no spheres move by more than `depth` as these turn, on any rank. False if a
+    velocity is not finite."""
     if world.only_spheres:
         return False
     grains = world.grains
@@ -76,6 +74,7 @@ def _rows_in(contacts: Contacts, end: Contacts) -> tuple[Ints, Ints, Bools]:
 
 def _joined(world: World, one: Contacts, other: Contacts) -> Contacts:
     """Both, in the order of contacts."""
-    both = {name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in COLUMNS}
+    more = other.columns()
+    both = {name: np.concatenate([column, more[name]]) for name, column in one.columns().items()}
     order = contact_order(world, one.near, both["a"], both["b"], both["key"])
     return replace(one, **{name: column.take(order, axis=0) for name, column in both.items()})

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.blocks import block_csr_matrix
+from pctt.blocks import block_csr_matrix, new_matrix
 
 #: Types of preconditioners that use the inverses of the diagonal blocks of a Mat.
 BY_DIAGONAL_BLOCKS = frozenset({"pbjacobi", "sor"})
@@ -22,6 +22,16 @@ def set_diagonal_blocks(P: PETSc.Mat, blocks: np.ndarray) -> None:
     Call this again whenever P changes.
     """
     P.setAttr("diagonal_blocks", blocks)
+
+
+def put_diagonal_blocks(mat: PETSc.Mat, blocks: np.ndarray) -> None:
+    """Write the diagonal blocks (n, bs, bs) of this rank's block rows into a Mat; collective."""
+    size = mat.getBlockSize()
+    first, last = mat.getOwnershipRange()
+    rows = np.arange(first // size, last // size, dtype=PETSc.IntType)[:, None]
+    if len(blocks):  # petsc4py divides by their number
+        mat.setValuesBlockedRCV(rows, rows, blocks.reshape(-1, size**2))
+    mat.assemble()
 
 
 def block_diagonal(P: PETSc.Mat, blocks: np.ndarray | None = None) -> PETSc.Mat:
@@ -49,11 +59,7 @@ def without_memory(P: PETSc.Mat, kind: str) -> PETSc.Mat | None:
 
 def _copy(P: PETSc.Mat) -> PETSc.Mat:
     """A copy of a sequential BAIJ matrix; SOR does not work with the copy that ``MatDuplicate`` makes."""
-    copy = PETSc.Mat().create(P.comm)
-    copy.setSizes(P.getSizes())
-    copy.setBlockSize(P.getBlockSize())
-    copy.setType(P.getType())
-    copy.setPreallocationCSR(P.getRowIJ(compressed=True))
+    copy = new_matrix(P.comm, P.getSizes(), P.getBlockSize(), P.getRowIJ(compressed=True), P.getType())
     P.copy(copy, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
     return copy
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import operator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class BlockRows:
 
     indptr: np.ndarray
     indices: np.ndarray
-    blocks: NDArray[np.float64]
+    blocks: Array
     columns: int
 
     @property
@@ -67,7 +70,7 @@ def dense_columns(comm: MPI.Comm, G: BlockRows, bodies: np.ndarray) -> PETSc.Mat
     return mat
 
 
-def diagonal_blocks(G: BlockRows) -> NDArray[np.float64]:
+def diagonal_blocks(G: BlockRows) -> Array:
     """The diagonal blocks of G G' (nc, 3, 3)."""
     products = G.blocks @ G.blocks.transpose(0, 2, 1)
     shape = (G.rows, len(products))
@@ -94,17 +97,23 @@ def square_block_matrix(comm: MPI.Comm, rows: sp.bsr_matrix) -> PETSc.Mat:
 
 
 def block_csr_matrix(
-    comm: MPI.Comm, rows: int, columns: int, indptr: np.ndarray, indices: np.ndarray, blocks: NDArray[np.float64]
+    comm: MPI.Comm, rows: int, columns: int, indptr: np.ndarray, indices: np.ndarray, blocks: Array
 ) -> PETSc.Mat:
     """A BAIJ Mat from local block CSR arrays with ``blocks`` (nb, b, b).
 
     ``rows`` and ``columns`` are the local sizes in scalar rows and columns.
     """
     csr = (indptr.astype(PETSc.IntType), indices.astype(PETSc.IntType), np.ascontiguousarray(blocks).ravel())
-    size = ((rows, PETSc.DETERMINE), (columns, PETSc.DETERMINE))
+    return new_matrix(comm, ((rows, PETSc.DETERMINE), (columns, PETSc.DETERMINE)), blocks.shape[-1], csr)
+
+
+def new_matrix(
+    comm: MPI.Comm, sizes: Any, block: int, csr: tuple[np.ndarray, ...], kind: str = PETSc.Mat.Type.BAIJ
+) -> PETSc.Mat:
+    """A Mat of this type with the pattern ``csr`` of the local rows, and its values if they are the third array."""
     mat = PETSc.Mat().create(comm)
-    mat.setSizes(size)
-    mat.setBlockSize(blocks.shape[-1])
-    mat.setType(PETSc.Mat.Type.BAIJ)
+    mat.setSizes(sizes)
+    mat.setBlockSize(block)
+    mat.setType(kind)
     mat.setPreallocationCSR(csr)
     return mat

@@ -15,6 +15,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -216,9 +217,8 @@ def write_pvd(path: Path, files: dict[str, float]) -> None:
         temporary.write_text("\n".join([head, *lines, "  </Collection>", "</VTKFile>", ""]))
 
 
-def program() -> int:
-    """Run the command pctt-export and return its exit status."""
-    return run(main, "export")
+#: The command pctt-export; its exit status.
+program = partial(run, main, "export")
 
 
 if __name__ == "__main__":

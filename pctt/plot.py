@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 
 from mpi4py import MPI
@@ -75,9 +76,8 @@ def _frame(folder: Folder, step: int | None):
     return None
 
 
-def program() -> int:
-    """Run the command pctt-plot and return its exit status."""
-    return run(main, "plot")
+#: The command pctt-plot; its exit status.
+program = partial(run, main, "plot")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -166,9 +167,8 @@ def write_gif(path: Path, pictures: list[Path], fps: float) -> None:
         first.save(temporary, format="gif", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
 
 
-def program() -> int:
-    """Run the command pctt-render and return its exit status."""
-    return run(main, "render")
+#: The command pctt-render; its exit status.
+program = partial(run, main, "render")
 
 
 if __name__ == "__main__":

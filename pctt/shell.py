@@ -34,8 +34,7 @@ class Shell:
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         self.product(x.array_r, y.array_w)
 
-    def multTranspose(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.product(x.array_r, y.array_w)
+    multTranspose = mult  # noqa: N815 - as PETSc names it
 
     def getDiagonal(self, mat: PETSc.Mat, diagonal: PETSc.Vec) -> None:
         blocks = mat.getAttr("diagonal_blocks")

@@ -13,7 +13,19 @@ from typing import NamedTuple
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
-from dem.contact.narrow import CORNERS, FLUSH, Manifold, Touch, closest_on_lines, dot, reversed_touch, sphere_box
+from dem.contact.narrow import (
+    CORNERS,
+    FLUSH,
+    Boxes,
+    Manifold,
+    Spheres,
+    Touch,
+    closest_on_lines,
+    dot,
+    joined,
+    reversed_touch,
+    sphere_box,
+)
 from dem.quaternion import cross
 
 #: Corners and edges that are closer to each other across the normal than this share of the least half extent of
@@ -58,38 +70,29 @@ _FACE_SIGNS, _FACE_CORNERS, _FACE_EDGES = _faces()
 class _Pairs(NamedTuple):
     """Pairs of boxes with their separations along the 15 axes, negative where they overlap."""
 
-    center: Floats  # (m, 3)
-    turn: Floats  # (m, 3, 3)
-    half: Floats  # (m, 3)
-    offset: Floats  # (m, 3) from the first centre to the second
-    other_turn: Floats
-    other_half: Floats
+    first: Boxes
+    second: Boxes
     faces: Floats  # (m, 6) along the axes of the first and of the second box
     edges: Floats  # (m, 9) along the cross products, -inf for parallel edges
 
     def take(self, rows: Ints | Bools) -> _Pairs:
-        return _Pairs(*(column[rows] for column in self))
+        return _Pairs(self.first.take(rows), self.second.take(rows), self.faces[rows], self.edges[rows])
+
+    def offset(self) -> Floats:
+        """From the first centres to the second (m, 3)."""
+        return self.second.center - self.first.center
 
     def size(self) -> Floats:
         """Least half extents (m,)."""
-        return np.minimum(self.half.min(axis=1), self.other_half.min(axis=1))
+        return np.minimum(self.first.half.min(axis=1), self.second.half.min(axis=1))
 
 
-def box_box(
-    center: Floats,
-    turn: Floats,
-    half: Floats,
-    other_center: Floats,
-    other_turn: Floats,
-    other_half: Floats,
-    delta: Floats,
-) -> Manifold:
-    """Boxes on boxes: centres (m, 3), frames (m, 3, 3), half extents (m, 3); contacts of gap at most `delta` (m,) [m].
+def box_box(first: Boxes, second: Boxes, delta: Floats) -> Manifold:
+    """Contacts of gap at most `delta` (m,) [m]: up to eight points per pair, on faces all with the same normal.
 
-    Up to eight points per pair, on faces all with the same normal. The features are independent of which of the two
-    faces gives the normal.
+    The features are independent of which of the two faces gives the normal.
     """
-    rows, pairs = _separated_within(center, turn, half, other_center, other_turn, other_half, delta)
+    rows, pairs = _separated_within(first, second, delta)
     delta = delta[rows]
     face, edge = pairs.faces.max(axis=1), pairs.edges.max(axis=1)
     least = np.maximum(face, edge)  # not more than the distance, and the very distance of overlapping boxes
@@ -108,35 +111,23 @@ def box_box(
     pointed = np.setdiff1d(np.arange(len(rows)), flat[flush])
     pair, feature, touch = _closest_points(pairs.take(pointed), tolerance[pointed])
     near = np.flatnonzero(touch.gap <= delta[pointed[pair]])
-    return Manifold(
-        np.concatenate([on_faces.pair, rows[pointed[pair[near]]]]),
-        np.concatenate([on_faces.feature, feature[near]]),
-        Touch(*(np.concatenate([one, two[near]]) for one, two in zip(on_faces.touch, touch))),
-    )
+    return joined([on_faces, Manifold(rows[pointed[pair[near]]], feature[near], touch.take(near))])
 
 
-def _separated_within(
-    center: Floats,
-    turn: Floats,
-    half: Floats,
-    other_center: Floats,
-    other_turn: Floats,
-    other_half: Floats,
-    reach: Floats,
-) -> tuple[Ints, _Pairs]:
+def _separated_within(first: Boxes, second: Boxes, reach: Floats) -> tuple[Ints, _Pairs]:
     """The pairs that none of the 15 axes parts by more than `reach`, and their numbers."""
-    offset = other_center - center
-    cosines = turn.transpose(0, 2, 1) @ other_turn
+    offset = second.center - first.center
+    cosines = first.turn.transpose(0, 2, 1) @ second.turn
     absolute = np.abs(cosines)
-    place = (offset[:, None, :] @ turn)[:, 0]
-    other_place = (offset[:, None, :] @ other_turn)[:, 0]
-    extent = half + (absolute @ other_half[:, :, None])[:, :, 0]
-    other_extent = other_half + (half[:, None, :] @ absolute)[:, 0]
+    place = (offset[:, None, :] @ first.turn)[:, 0]
+    other_place = (offset[:, None, :] @ second.turn)[:, 0]
+    extent = first.half + (absolute @ second.half[:, :, None])[:, :, 0]
+    other_extent = second.half + (first.half[:, None, :] @ absolute)[:, 0]
     faces = np.concatenate([np.abs(place) - extent, np.abs(other_place) - other_extent], axis=1)
 
     rows = np.flatnonzero(faces.max(axis=1) <= reach)
     place, cosines, absolute = place[rows], cosines[rows], absolute[rows]
-    h, g = half[rows], other_half[rows]
+    h, g = first.half[rows], second.half[rows]
     edges = np.empty((len(rows), 9))
     for i in range(3):
         i1, i2 = (i + 1) % 3, (i + 2) % 3
@@ -150,16 +141,7 @@ def _separated_within(
             edges[:, 3 * i + j] = np.where(length > PARALLEL, apart / np.maximum(length, PARALLEL), -np.inf)
     kept = np.flatnonzero(edges.max(axis=1) <= reach[rows])
     rows = rows[kept]
-    return rows, _Pairs(
-        center=center[rows],
-        turn=turn[rows],
-        half=half[rows],
-        offset=offset[rows],
-        other_turn=other_turn[rows],
-        other_half=other_half[rows],
-        faces=faces[rows],
-        edges=edges[kept],
-    )
+    return rows, _Pairs(first.take(rows), second.take(rows), faces[rows], edges[kept])
 
 
 class _Laid(NamedTuple):
@@ -173,20 +155,18 @@ class _Laid(NamedTuple):
 
 def _faces_laid_over(pairs: _Pairs) -> _Laid:
     """The corners of the polygon that is common to two faces, seen along the normal of one of them."""
-    rows, snap = np.arange(len(pairs.center)), SNAP * pairs.size()
-    # Among axes of equal separation the first, whatever rounding says.
-    largest = pairs.faces.max(axis=1)
-    best = (pairs.faces >= (largest - TIE * pairs.size())[:, None]).argmax(axis=1)
-    axes = np.concatenate([pairs.turn.transpose(0, 2, 1), pairs.other_turn.transpose(0, 2, 1)], axis=1)
+    rows, offset, snap = np.arange(len(pairs.faces)), pairs.offset(), SNAP * pairs.size()
+    best = _first_largest(pairs.faces, TIE * pairs.size())
+    axes = np.concatenate([pairs.first.turn.transpose(0, 2, 1), pairs.second.turn.transpose(0, 2, 1)], axis=1)
     box, k = 3 * (best // 3), best % 3
     normal = axes[rows, best]
-    normal = normal * np.copysign(1.0, dot(normal, pairs.offset))[:, None]
+    normal = normal * np.copysign(1.0, dot(normal, offset))[:, None]
     frame = np.stack([axes[rows, box + (k + 1) % 3], axes[rows, box + (k + 2) % 3], normal], axis=1)
 
     # Corners p and q of the two faces in this frame, about the first centre: two coordinates and a height.
-    first, p, p_slope = _face_towards(frame @ pairs.turn, pairs.half, 1.0)
-    second, q, q_slope = _face_towards(frame @ pairs.other_turn, pairs.other_half, -1.0)
-    q += (frame @ pairs.offset[:, :, None])[:, None, :, 0]
+    first, p, p_slope = _face_towards(frame @ pairs.first.turn, pairs.first.half, 1.0)
+    second, q, q_slope = _face_towards(frame @ pairs.second.turn, pairs.second.half, -1.0)
+    q += (frame @ offset[:, :, None])[:, None, :, 0]
     p_out, q_out = _outside(p, q), _outside(q, p)  # (m, corner, edge of the other face)
     thick = snap[:, None, None]
     p_in, q_in = (p_out <= thick).all(axis=2), (q_out <= thick).all(axis=2)
@@ -224,7 +204,13 @@ def _faces_laid_over(pairs: _Pairs) -> _Laid:
     )
     middle = np.concatenate([found[..., :2], found[..., 2:].mean(axis=2, keepdims=True)], axis=2)
     gap = np.where(valid, found[..., 3] - found[..., 2], np.inf)
-    return _Laid(pairs.center[:, None] + middle @ frame, normal, gap, feature)
+    return _Laid(pairs.first.center[:, None] + middle @ frame, normal, gap, feature)
+
+
+def _first_largest(values: Floats, tie: Floats) -> Ints:
+    """Of each row (m, n) the number of the first entry that equals the largest within `tie` (m,): the choice does not
+    depend on rounding."""
+    return (values >= values.max(axis=1, keepdims=True) - tie[:, None]).argmax(axis=1)
 
 
 def _face_towards(turn: Floats, half: Floats, side: float) -> tuple[Ints, Floats, Floats]:
@@ -232,7 +218,7 @@ def _face_towards(turn: Floats, half: Floats, side: float) -> tuple[Ints, Floats
     (side -1): its number (m,), its corners (m, 4, 3), and the gradient (m, 2) of its height."""
     rows = np.arange(len(turn))
     tilt = np.abs(turn[:, 2])
-    k = (tilt >= tilt.max(axis=1, keepdims=True) - TIE).argmax(axis=1)
+    k = _first_largest(tilt, np.full(len(tilt), TIE))
     outward = turn[rows, :, k]
     face = 2 * k + (side * outward[:, 2] > 0.0)
     corners = (_FACE_SIGNS[face] * half[:, None]) @ turn.transpose(0, 2, 1)
@@ -267,27 +253,25 @@ def _closest_points(pairs: _Pairs, tolerance: Floats) -> Manifold:
     shown[:, 8:] &= ~same.any(axis=1)
     pair, corner = np.nonzero(shown)
     edges = np.flatnonzero(on_edges)
-    return Manifold(
-        np.concatenate([edges, tip[pair]]),
-        np.concatenate([edge[edges], corner]),
-        Touch(*(np.concatenate([one[edges], two[pair, corner]]) for one, two in zip(touch, corners))),
-    )
+    at_corners = Manifold(tip[pair], corner, corners.take((pair, corner)))
+    return joined([Manifold(edges, edge[edges], touch.take(edges)), at_corners])
 
 
 def _corners(pairs: _Pairs) -> Touch:
     """Contacts (m, 16, ...) of the corners of the first box with the second, and of those of the second with the
     first."""
-    here, there = np.repeat(np.zeros_like(pairs.offset), 8, axis=0), np.repeat(pairs.offset, 8, axis=0)
-    first = (here, np.repeat(pairs.turn, 8, axis=0), np.repeat(pairs.half, 8, axis=0))
-    second = (there, np.repeat(pairs.other_turn, 8, axis=0), np.repeat(pairs.other_half, 8, axis=0))
-    none, sign = np.zeros(len(here)), np.tile(CORNERS, (len(pairs.offset), 1))
+    count, offset = len(pairs.faces), pairs.offset()  # places about the first centre
+    rows = np.repeat(np.arange(count), 8)
+    first = pairs.first._replace(center=np.zeros_like(offset)).take(rows)
+    second = pairs.second._replace(center=offset).take(rows)
+    none, sign = np.zeros(8 * count), np.tile(CORNERS, (count, 1))
     sides = []
     for one, two in ((first, second), (second, first)):
-        tips = one[0] + (one[1] @ (one[2] * sign)[:, :, None])[:, :, 0]
-        sides.append(sphere_box(tips, none, *two))
+        tips = one.center + (one.turn @ (one.half * sign)[:, :, None])[:, :, 0]
+        sides.append(sphere_box(Spheres(tips, none), two))
     sides[1] = reversed_touch(sides[1])
     touch = Touch(*(np.concatenate([v.reshape(-1, 8, *v.shape[1:]) for v in both], axis=1) for both in zip(*sides)))
-    return touch._replace(point=pairs.center[:, None] + touch.point)
+    return touch._replace(point=pairs.first.center[:, None] + touch.point)
 
 
 def _edge_edge(pairs: _Pairs) -> tuple[Ints, Touch]:
@@ -296,24 +280,23 @@ def _edge_edge(pairs: _Pairs) -> tuple[Ints, Touch]:
     The gap is that along the normal where the boxes overlap, else the distance of the two points. Infinite if all
     edges are parallel.
     """
-    rows = np.arange(len(pairs.center))
-    separation = pairs.edges.max(axis=1)
-    best = (pairs.edges >= (separation - TIE * pairs.size())[:, None]).argmax(axis=1)
-    i, j = np.divmod(best, 3)
-    axis, other_axis = pairs.turn[rows, :, i], pairs.other_turn[rows, :, j]
+    rows, (center, turn, half), (_, other_turn, other_half) = np.arange(len(pairs.faces)), pairs.first, pairs.second
+    offset, separation = pairs.offset(), pairs.edges.max(axis=1)
+    i, j = np.divmod(_first_largest(pairs.edges, TIE * pairs.size()), 3)
+    axis, other_axis = turn[rows, :, i], other_turn[rows, :, j]
     normal = cross(axis, other_axis)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), PARALLEL)
-    normal *= np.copysign(1.0, dot(normal, pairs.offset))[:, None]
+    normal *= np.copysign(1.0, dot(normal, offset))[:, None]
 
-    sign = np.copysign(1.0, (normal[:, None, :] @ pairs.turn)[:, 0])
-    other_sign = -np.copysign(1.0, (normal[:, None, :] @ pairs.other_turn)[:, 0])
+    sign = np.copysign(1.0, (normal[:, None, :] @ turn)[:, 0])
+    other_sign = -np.copysign(1.0, (normal[:, None, :] @ other_turn)[:, 0])
     feature = EDGES + 12 * _edge_number(i, sign) + _edge_number(j, other_sign)
-    arm, other_arm = sign * pairs.half, other_sign * pairs.other_half
+    arm, other_arm = sign * half, other_sign * other_half
     arm[rows, i], other_arm[rows, j] = 0.0, 0.0
-    middle = (pairs.turn @ arm[:, :, None])[:, :, 0]
-    other_middle = pairs.offset + (pairs.other_turn @ other_arm[:, :, None])[:, :, 0]
+    middle = (turn @ arm[:, :, None])[:, :, 0]
+    other_middle = offset + (other_turn @ other_arm[:, :, None])[:, :, 0]
     s, t = closest_on_lines(middle, axis, other_middle, other_axis)
-    limit, other_limit = pairs.half[rows, i], pairs.other_half[rows, j]
+    limit, other_limit = half[rows, i], other_half[rows, j]
     one = middle + np.clip(s, -limit, limit)[:, None] * axis
     two = other_middle + np.clip(t, -other_limit, other_limit)[:, None] * other_axis
 
@@ -322,4 +305,4 @@ def _edge_edge(pairs: _Pairs) -> tuple[Ints, Touch]:
     apart = separation > TIE * pairs.size()  # in contact, the two points are too close to give a direction
     normal = np.where(apart[:, None], between / np.where(apart, distance, 1.0)[:, None], normal)
     gap = np.where(apart, distance, np.where(np.isfinite(separation), separation, np.inf))
-    return feature, Touch(pairs.center + 0.5 * (one + two), normal, gap)
+    return feature, Touch(center + 0.5 * (one + two), normal, gap)

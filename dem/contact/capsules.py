@@ -1,7 +1,5 @@
 """Narrow phase of capsules: points at the ends of what lies side by side, and the closest point between them.
 
-A capsule is all that lies within its radius of a core segment: centre (m, 3), unit axis (m, 3), half length (m,).
-
 Every point within reach is a contact, not only the closest: capsules that turn may touch in another point at the end
 of the step. Ends alone do not hold apart capsules that cross between them, as their normals lean to the side: an end
 that moves sideways gets away from the other core while the crossing comes closer. The closest point alone does not
@@ -14,11 +12,16 @@ import numpy as np
 
 from dem.arrays import Floats, Ints
 from dem.contact.narrow import (
+    Boxes,
+    Capsules,
     Manifold,
+    Planes,
+    Spheres,
     Touch,
     across,
     closest_on_lines,
     dot,
+    joined,
     reversed_touch,
     sphere_box,
     sphere_capsule,
@@ -33,67 +36,47 @@ SNAP = 1e-6
 DISTINCT = 1e-4
 
 
-def capsule_plane(
-    center: Floats, axis: Floats, half_length: Floats, radius: Floats, outward: Floats, origin: Floats, delta: Floats
-) -> Manifold:
-    """Capsules and half spaces as in `sphere_plane`: the two end balls, features 0 and 1."""
-    ends = [sphere_plane(center + (side * half_length)[:, None] * axis, radius, outward, origin) for side in (-1, 1)]
+def end_ball(capsule: Capsules, side: float) -> Spheres:
+    """The balls at the end (side 1) or the start (side -1) of the cores."""
+    return Spheres(capsule.center + (side * capsule.half_length)[:, None] * capsule.axis, capsule.radius)
+
+
+def capsule_plane(capsule: Capsules, plane: Planes, delta: Floats) -> Manifold:
+    """The two end balls, features 0 and 1."""
+    ends = [sphere_plane(end_ball(capsule, side), plane) for side in (-1.0, 1.0)]
     return _manifold(ends, [end.gap <= delta for end in ends])
 
 
-def capsule_capsule(
-    center: Floats,
-    axis: Floats,
-    half_length: Floats,
-    radius: Floats,
-    other: Floats,
-    other_axis: Floats,
-    other_half: Floats,
-    other_radius: Floats,
-    delta: Floats,
-) -> Manifold:
-    """Capsules on capsules.
-
-    Features 0 and 1 are the end balls of the first capsule that lie beside the core of the second, 2 and 3 those of
+def capsule_capsule(first: Capsules, second: Capsules, delta: Floats) -> Manifold:
+    """Features 0 and 1 are the end balls of the first capsule that lie beside the core of the second, 2 and 3 those of
     the second beside the core of the first. Where none of them is as close as the capsules are, feature 4 is the
     closest point, at the crossing of the cores or between two ends.
     """
-    first = (center, axis, half_length, radius)
-    second = (other, other_axis, other_half, other_radius)
     ends, beside = [], []
     for one, two, margin in ((first, second, SNAP), (second, first, -SNAP)):
         for side in (-1.0, 1.0):
-            end = one[0] + (side * one[2])[:, None] * one[1]
-            touch = sphere_capsule(end, one[3], *two)
+            ball = end_ball(one, side)
+            touch = sphere_capsule(ball, two)
             ends.append(touch if one is first else reversed_touch(touch))
-            beside.append(np.abs(dot(end - two[0], two[1])) <= two[2] + margin * (half_length + other_half))
+            slack = margin * (first.half_length + second.half_length)
+            beside.append(np.abs(dot(ball.center - two.center, two.axis)) <= two.half_length + slack)
 
     crossing = _crossing(first, second)
     closest = _least([*ends, crossing])
     lowest = np.min([np.where(mask, end.gap, np.inf) for end, mask in zip(ends, beside)], axis=0)
-    distinct = lowest > closest.gap + DISTINCT * np.minimum(radius, other_radius)
+    distinct = lowest > closest.gap + DISTINCT * np.minimum(first.radius, second.radius)
     shown = [mask & (end.gap <= delta) for end, mask in zip(ends, beside)]
     return _manifold([*ends, closest], [*shown, distinct & (closest.gap <= delta)])
 
 
-def capsule_box(
-    center: Floats,
-    axis: Floats,
-    half_length: Floats,
-    radius: Floats,
-    box_center: Floats,
-    turn: Floats,
-    half: Floats,
-    delta: Floats,
-) -> Manifold:
-    """Capsules and boxes: centres, frames (m, 3, 3), half extents (m, 3).
-
-    A capsule that lies over a face touches it at both ends of the stretch that is over the face, features 0 and 1.
+def capsule_box(capsule: Capsules, box: Boxes, delta: Floats) -> Manifold:
+    """A capsule that lies over a face touches it at both ends of the stretch that is over the face, features 0 and 1.
     Where neither is as close as the capsule is, feature 2 is the point where it is closest to the box. A core that
     meets the box is pushed out through the face for which that is the shortest way.
     """
+    (center, axis, half_length, radius), turn, half = capsule, box.turn, box.half
     rows = np.arange(len(center))
-    middle = ((center - box_center)[:, None, :] @ turn)[:, 0]
+    middle = ((center - box.center)[:, None, :] @ turn)[:, 0]
     reach = half_length[:, None] * (axis[:, None, :] @ turn)[:, 0]
     start, way = middle - reach, 2.0 * reach  # of the core, in the frame of the box
 
@@ -104,7 +87,7 @@ def capsule_box(
     k, sign = face % 3, np.where(face < 3, 1.0, -1.0)
 
     at = _closest_to_box(start, way, half)
-    closest = sphere_box(center + ((2.0 * at - 1.0) * half_length)[:, None] * axis, radius, box_center, turn, half)
+    closest = sphere_box(Spheres(center + ((2.0 * at - 1.0) * half_length)[:, None] * axis, radius), box)
     meets = closest.gap <= -radius
 
     # The stretch of the core over the face: clipped with the slabs of the two other axes.
@@ -130,9 +113,8 @@ def capsule_box(
 def _manifold(touches: list[Touch], shown: list[np.ndarray]) -> Manifold:
     """Feature f of the pairs in the mask shown[f] has the geometry touches[f]."""
     pair = [np.flatnonzero(mask) for mask in shown]
-    parts = [Touch(*(values[rows] for values in touch)) for touch, rows in zip(touches, pair)]
-    feature = np.repeat(np.arange(len(pair)), [len(rows) for rows in pair])
-    return Manifold(np.concatenate(pair), feature, Touch(*(np.concatenate(values) for values in zip(*parts))))
+    parts = zip(pair, touches)
+    return joined([Manifold(rows, np.full(len(rows), f), touch.take(rows)) for f, (rows, touch) in enumerate(parts)])
 
 
 def _least(touches: list[Touch]) -> Touch:
@@ -142,7 +124,7 @@ def _least(touches: list[Touch]) -> Touch:
     return Touch(*(np.stack(values)[best, rows] for values in zip(*touches)))
 
 
-def _crossing(first: tuple[Floats, ...], second: tuple[Floats, ...]) -> Touch:
+def _crossing(first: Capsules, second: Capsules) -> Touch:
     """Where both core segments have the closest point of their lines inside; the gap is infinite elsewhere."""
     center, axis, half_length, radius = first
     other, other_axis, other_half, other_radius = second

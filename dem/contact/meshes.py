@@ -9,11 +9,14 @@ of its faces.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
-from dem.contact.narrow import Manifold, Touch, closest_on_lines, dot
-from dem.mesh import Surface, spread
+from dem.contact.capsules import end_ball
+from dem.contact.narrow import Capsules, Manifold, Planes, Spheres, Touch, closest_on_lines, dot, sphere_plane
+from dem.mesh import Closest, Surface, spread
 from dem.quaternion import length
 
 #: Sine of the angle by which a direction may leave those in which an edge or a vertex is closest, for rounding.
@@ -29,40 +32,36 @@ SAME = 1e-4
 PARTS = 3
 
 
-def sphere_mesh(
-    center: Floats, radius: Floats, surface: Surface, place: Floats, turn: Floats, delta: Floats
-) -> Manifold:
-    """Spheres of centres (m, 3) and radii (m,), and one surface: its middle (3,) and frame (3, 3)."""
-    local = (center - place) @ turn
-    row, feature, point, away, distance = _feet(local, radius, radius + delta, surface)
-    return _placed(row, feature, point, away, distance - radius[row], place, turn)
+class PlacedMesh(NamedTuple):
+    """One surface in the world."""
+
+    surface: Surface
+    middle: Floats  #: (3,) where its middle is [m]
+    turn: Floats  #: (3, 3) its frame
 
 
-def capsule_mesh(
-    center: Floats,
-    axis: Floats,
-    half_length: Floats,
-    radius: Floats,
-    surface: Surface,
-    place: Floats,
-    turn: Floats,
-    delta: Floats,
-) -> Manifold:
-    """Capsules and one surface as in `sphere_mesh`: the end balls, and the core between them on edges and vertices.
+def sphere_mesh(ball: Spheres, mesh: PlacedMesh, delta: Floats) -> Manifold:
+    """Spheres and one surface."""
+    local = (ball.center - mesh.middle) @ mesh.turn
+    row, feature, point, away, distance = _feet(local, ball.radius, ball.radius + delta, mesh.surface)
+    return _placed(row, feature, point, away, distance - ball.radius[row], mesh)
+
+
+def capsule_mesh(capsule: Capsules, mesh: PlacedMesh, delta: Floats) -> Manifold:
+    """Capsules and one surface: the end balls, and the core between them on edges and vertices.
 
     A core that goes through a face is pushed back across it the shorter way.
     """
-    local, axis, reach = (center - place) @ turn, axis @ turn, radius + delta
+    surface, radius, reach = mesh.surface, capsule.radius, capsule.radius + delta
+    core = capsule._replace(center=(capsule.center - mesh.middle) @ mesh.turn, axis=capsule.axis @ mesh.turn)
     found = []
     for end, side in enumerate((-1.0, 1.0)):
-        ball = local + (side * half_length)[:, None] * axis
-        row, feature, point, away, distance = _feet(ball, radius, reach, surface)
+        row, feature, point, away, distance = _feet(end_ball(core, side).center, radius, reach, surface)
         # Where the side of the capsule is clearly closer to an edge than its end is, the end is no contact.
-        beyond = side * dot(away, axis[row]) <= ROCKING
+        beyond = side * dot(away, core.axis[row]) <= ROCKING
         kept = (feature < len(surface.triangle)) | beyond
         found.append((row, feature + end * surface.features, point, away, distance - radius[row], kept))
-    row, triangle = surface.near(local, half_length + reach)
-    core = local, axis, half_length, radius
+    row, triangle = surface.near(core.center, core.half_length + reach)
     found += [_across_edges(row, triangle, core, reach, surface), _over_vertices(row, triangle, core, reach, surface)]
     through = _through_faces(row, triangle, core, surface)
     found.append(through)
@@ -70,35 +69,32 @@ def capsule_mesh(
     # The end on the wrong side of a face that the core goes through would be held there.
     stuck = np.isin(row * PARTS * surface.features + feature, _short_ends(through, core, surface))
     kept &= ~stuck
-    return _placed(row[kept], feature[kept], point[kept], away[kept], gap[kept], place, turn)
+    return _placed(row[kept], feature[kept], point[kept], away[kept], gap[kept], mesh)
 
 
-def mesh_plane(
-    surface: Surface, place: Floats, turn: Floats, outward: Floats, origin: Floats, delta: float
-) -> tuple[Ints, Touch]:
-    """One surface as in `sphere_mesh` and a half space, normal (3,) and point (3,): features and contacts."""
-    tip = place + surface.vertex[surface.hull] @ turn.T
-    gap = (tip - origin) @ outward
-    near = np.flatnonzero(gap <= delta)
-    point = tip[near] - 0.5 * gap[near, None] * outward
-    return surface.hull[near], Touch(point, np.broadcast_to(-outward, point.shape), gap[near])
+def mesh_plane(mesh: PlacedMesh, plane: Planes, delta: float) -> Manifold:
+    """One surface and one half space, whose arrays are (3,)."""
+    tip = mesh.middle + mesh.surface.vertex[mesh.surface.hull] @ mesh.turn.T
+    touch = sphere_plane(Spheres(tip, np.zeros(len(tip))), plane)
+    near = np.flatnonzero(touch.gap <= delta)
+    return Manifold(np.zeros_like(near), mesh.surface.hull[near], touch.take(near))
 
 
 def _feet(center: Floats, radius: Floats, reach: Floats, surface: Surface) -> tuple[Ints, Ints, Floats, Floats, Floats]:
     """The places of the surface at distances from centres (m, 3) that are least around them and within reach (m,): rows
     of the centres, features, points, unit vectors from there to the centre, distances."""
     row, triangle = surface.near(center, reach)
-    point, feature, distance = surface.closest(center[row], triangle)
-    close = np.flatnonzero(distance <= reach[row])
-    row, triangle, feature = row[close], triangle[close], feature[close]
-    point, distance = point[close], distance[close]
+    found = surface.closest(center[row], triangle)
+    close = np.flatnonzero(found.distance <= reach[row])
+    row, triangle = row[close], triangle[close]
+    point, feature, distance = found.point[close], found.feature[close], found.distance[close]
     _, first = np.unique(row * surface.features + feature, return_index=True)  # triangles share edges and vertices
     away = center[row[first]] - point[first]
     size = distance[first, None]
     away = np.where(size > 0.0, away / np.where(size > 0.0, size, 1.0), surface.normal[triangle[first]])
     least = first[_within_cone(surface, feature[first], point[first], np.where(size > 0.0, away, 0.0), ROUNDING)]
     away = away[np.isin(first, least)]
-    chosen = _one_for_each(row, triangle, point, feature, distance, least, radius, surface)
+    chosen = _one_for_each(row, triangle, Closest(point, feature, distance), least, radius, surface)
     return row[least][chosen], feature[least][chosen], point[least][chosen], away[chosen], distance[least][chosen]
 
 
@@ -114,18 +110,10 @@ def _within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, s
     return inside
 
 
-def _one_for_each(
-    row: Ints,
-    triangle: Ints,
-    point: Floats,
-    feature: Ints,
-    distance: Floats,
-    least: Ints,
-    radius: Floats,
-    surface: Surface,
-) -> Ints:
+def _one_for_each(row: Ints, triangle: Ints, found: Closest, least: Ints, radius: Floats, surface: Surface) -> Ints:
     """Which of the entries `least` are contacts of their own: not those that rounding made twice, nor places of edges
     that lie in another triangle, as where the corners of one meet the side of another."""
+    point, feature, distance = found
     count = np.bincount(row[least], minlength=len(radius))
     several = np.flatnonzero(count[row[least]] > 1)
     if not len(several):
@@ -154,11 +142,10 @@ def _one_for_each(
     return np.flatnonzero(~dropped)
 
 
-_Core = tuple[Floats, Floats, Floats, Floats]  # centres, axes, half lengths and radii in the frame of the surface
 _Found = tuple[Ints, Ints, Floats, Floats, Floats, Bools]  # rows, features, points, directions, gaps, which are kept
 
 
-def _across_edges(row: Ints, triangle: Ints, core: _Core, reach: Floats, surface: Surface) -> _Found:
+def _across_edges(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> _Found:
     """Where cores pass over edges, each between its ends."""
     center, axis, half_length, radius = core
     side = surface.side[triangle]
@@ -172,7 +159,7 @@ def _across_edges(row: Ints, triangle: Ints, core: _Core, reach: Floats, surface
     return _from_core(row[over], feature, point, s[over], ROCKING, core, reach, surface)
 
 
-def _over_vertices(row: Ints, triangle: Ints, core: _Core, reach: Floats, surface: Surface) -> _Found:
+def _over_vertices(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> _Found:
     """Vertices that are beside cores, between their ends."""
     center, axis, half_length, radius = core
     sharp = np.zeros(len(surface.vertex), dtype=bool)
@@ -187,7 +174,7 @@ def _over_vertices(row: Ints, triangle: Ints, core: _Core, reach: Floats, surfac
 
 
 def _from_core(
-    row: Ints, feature: Ints, point: Floats, s: Floats, slack: float, core: _Core, reach: Floats, surface: Surface
+    row: Ints, feature: Ints, point: Floats, s: Floats, slack: float, core: Capsules, reach: Floats, surface: Surface
 ) -> _Found:
     """The contacts of points of edges and vertices with the places `s` [m] of the cores, where these are closest."""
     center, axis, _, radius = core
@@ -199,7 +186,7 @@ def _from_core(
     return row, feature + 2 * surface.features, point, away, distance - radius[row], kept
 
 
-def _through_faces(row: Ints, triangle: Ints, core: _Core, surface: Surface) -> _Found:
+def _through_faces(row: Ints, triangle: Ints, core: Capsules, surface: Surface) -> _Found:
     """Where cores go through faces."""
     center, axis, half_length, radius = core
     normal, corner = surface.normal[triangle], surface.corner[triangle]
@@ -213,17 +200,15 @@ def _through_faces(row: Ints, triangle: Ints, core: _Core, surface: Surface) -> 
     return row, triangle + 2 * surface.features, point, away, -depth - radius[row], in_face
 
 
-def _short_ends(through: _Found, core: _Core, surface: Surface) -> Ints:
+def _short_ends(through: _Found, core: Capsules, surface: Surface) -> Ints:
     """Numbers, of the row and the feature, of the contacts of ends beyond faces that their cores go through."""
     row, feature, _, away, _, kept = through
     row, triangle, away = row[kept], feature[kept] - 2 * surface.features, away[kept]
-    end = (dot(away, core[1][row]) < 0.0).astype(np.int64)  # the first end is at the start of the axis
+    end = (dot(away, core.axis[row]) < 0.0).astype(np.int64)  # the first end is at the start of the axis
     return row * PARTS * surface.features + end * surface.features + triangle
 
 
-def _placed(
-    row: Ints, feature: Ints, point: Floats, away: Floats, gap: Floats, place: Floats, turn: Floats
-) -> Manifold:
+def _placed(row: Ints, feature: Ints, point: Floats, away: Floats, gap: Floats, mesh: PlacedMesh) -> Manifold:
     """The manifold of contacts in the frame of the surface: its points, and unit vectors from there."""
-    middle = point + 0.5 * gap[:, None] * away
-    return Manifold(row, feature, Touch(place + middle @ turn.T, -away @ turn.T, gap))
+    between = point + 0.5 * gap[:, None] * away
+    return Manifold(row, feature, Touch(mesh.middle + between @ mesh.turn.T, -away @ mesh.turn.T, gap))

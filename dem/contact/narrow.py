@@ -1,28 +1,63 @@
 """Narrow phase: where two shapes touch in one point.
 
-Each function takes m pairs of a first and a second shape and returns for each
-    point (m, 3)   middle between the two surfaces [m],
-    normal (m, 3)  unit vector from the first shape to the second,
-    gap (m,)       signed distance of the surfaces, negative if they overlap [m].
-Pairs that touch in several points are in `capsules` and `box_box`; they return a `Manifold`.
+Each function takes m pairs of a first and a second shape. Pairs that touch in several points are in `capsules`,
+`box_box` and `meshes`; they return a `Manifold`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from dem.arrays import Floats, Ints
-from dem.quaternion import cross
+from dem.arrays import Bools, Floats, Ints
+from dem.quaternion import cross, length
+
+
+class Spheres(NamedTuple):
+    """Spheres in the world frame."""
+
+    center: Floats  #: (m, 3) [m]
+    radius: Floats  #: (m,) [m]
+
+
+class Boxes(NamedTuple):
+    """Oriented boxes."""
+
+    center: Floats  #: (m, 3) [m]
+    turn: Floats  #: (m, 3, 3) from the frame of the box to the world
+    half: Floats  #: (m, 3) half extents [m]
+
+    def take(self, rows: Ints | Bools) -> Boxes:
+        return Boxes(*(column[rows] for column in self))
+
+
+class Capsules(NamedTuple):
+    """All that lies within the radius of a core segment."""
+
+    center: Floats  #: (m, 3) [m]
+    axis: Floats  #: (m, 3) unit vector
+    half_length: Floats  #: (m,) of the core segment [m]
+    radius: Floats  #: (m,) [m]
+
+
+class Planes(NamedTuple):
+    """Half spaces."""
+
+    outward: Floats  #: (m, 3) unit normal
+    origin: Floats  #: (m, 3) a point of the surface [m]
 
 
 class Touch(NamedTuple):
     """Contact geometry of m pairs."""
 
-    point: Floats
-    normal: Floats
-    gap: Floats
+    point: Floats  #: (m, 3) middle between the two surfaces [m]
+    normal: Floats  #: (m, 3) unit vector from the first shape to the second
+    gap: Floats  #: (m,) signed distance of the surfaces, negative if they overlap [m]
+
+    def take(self, rows: Any) -> Touch:
+        """The contacts of the given rows: an index array, a mask, or a pair of index arrays."""
+        return Touch(*(column[rows] for column in self))
 
 
 class Manifold(NamedTuple):
@@ -31,6 +66,13 @@ class Manifold(NamedTuple):
     pair: Ints  #: (k,) number of the pair
     feature: Ints  #: (k,) what touches in this point; distinct within a pair, the same while it goes on touching
     touch: Touch  #: (k, ...)
+
+
+def joined(parts: list[Manifold]) -> Manifold:
+    """All contacts of several manifolds of the same pairs."""
+    pair, feature, touch = zip(*parts)
+    columns = (np.concatenate(column) for column in zip(*touch))
+    return Manifold(np.concatenate(pair), np.concatenate(feature), Touch(*columns))
 
 
 #: Shapes touch in several points if the smallest gap among these is within this share of the contact distance
@@ -48,24 +90,23 @@ def reversed_touch(touch: Touch) -> Touch:
     return touch._replace(normal=-touch.normal)
 
 
-def sphere_sphere(center: Floats, radius: Floats, other_center: Floats, other_radius: Floats) -> Touch:
-    """Spheres of centres (m, 3) and radii (m,). Concentric ones are parted along z."""
-    offset = other_center - center
-    distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+def sphere_sphere(first: Spheres, second: Spheres) -> Touch:
+    """Concentric spheres are parted along z."""
+    offset = second.center - first.center
+    distance = length(offset)
     normal = offset / np.where(distance > 0.0, distance, 1.0)[:, None]
     normal[distance == 0.0] = (0.0, 0.0, 1.0)
-    gap = distance - radius - other_radius
-    return Touch(center + (radius + 0.5 * gap)[:, None] * normal, normal, gap)
+    gap = distance - first.radius - second.radius
+    return Touch(first.center + (first.radius + 0.5 * gap)[:, None] * normal, normal, gap)
 
 
-def sphere_capsule(
-    center: Floats, radius: Floats, other: Floats, axis: Floats, half_length: Floats, other_radius: Floats
-) -> Touch:
-    """Spheres of centres (m, 3) and radii (m,), and capsules: centres and unit axes (m, 3), half lengths of the
-    core segments and radii (m,). A centre on the core is pushed out across it."""
+def sphere_capsule(ball: Spheres, capsule: Capsules) -> Touch:
+    """A centre on the core is pushed out across it."""
+    center, radius = ball
+    other, axis, half_length, other_radius = capsule
     along = np.clip(dot(center - other, axis), -half_length, half_length)
     foot = other + along[:, None] * axis
-    touch = sphere_sphere(center, radius, foot, other_radius)
+    touch = sphere_sphere(ball, Spheres(foot, other_radius))
     on_core = np.flatnonzero((center == foot).all(axis=1))
     touch.normal[on_core] = across(axis[on_core])
     touch.point[on_core] = center[on_core] + (radius + 0.5 * touch.gap)[on_core, None] * touch.normal[on_core]
@@ -91,25 +132,19 @@ def closest_on_lines(point: Floats, axis: Floats, other: Floats, other_axis: Flo
     return (b - a * c) / square, (a * b - c) / square
 
 
-def sphere_plane(center: Floats, radius: Floats, outward: Floats, origin: Floats) -> Touch:
-    """Spheres of centres (m, 3) and radii (m,), and half spaces: normals and points of the surfaces, (m, 3) or
-    (3,) for all."""
-    gap = dot(center - origin, outward) - radius
-    point = center - (radius + 0.5 * gap)[:, None] * outward
-    return Touch(point, np.broadcast_to(-outward, center.shape), gap)
+def sphere_plane(ball: Spheres, plane: Planes) -> Touch:
+    gap = dot(ball.center - plane.origin, plane.outward) - ball.radius
+    point = ball.center - (ball.radius + 0.5 * gap)[:, None] * plane.outward
+    return Touch(point, np.broadcast_to(-plane.outward, point.shape), gap)
 
 
-def sphere_box(center: Floats, radius: Floats, box_center: Floats, turn: Floats, half: Floats) -> Touch:
-    """Spheres of centres (m, 3) and radii (m,), and boxes: centres, frames (m, 3, 3), half extents (m, 3).
-
-    Either side may be a single shape, with arguments (3,) and (3, 3). The nearest point of the box lies on a
-    face, an edge or a corner. A centre inside the box is pushed out through the nearest face.
-    """
-    offset = center - box_center
-    local = (offset[:, None, :] @ turn)[:, 0]
-    half = np.broadcast_to(half, local.shape)
+def sphere_box(ball: Spheres, box: Boxes) -> Touch:
+    """The nearest point of the box lies on a face, an edge or a corner. A centre inside the box is pushed out through
+    the nearest face."""
+    (center, radius), turn, half = ball, box.turn, box.half
+    local = ((center - box.center)[:, None, :] @ turn)[:, 0]
     beyond = local - np.clip(local, -half, half)
-    distance = np.sqrt(np.einsum("ij,ij->i", beyond, beyond))
+    distance = length(beyond)
     outward = beyond / np.where(distance > 0.0, distance, 1.0)[:, None]
     # At the surface `beyond` is zero or rounding noise: the direction of the nearest face is right there too.
     inside = np.flatnonzero(distance <= 1e-12 * half.max(axis=1))
@@ -127,10 +162,7 @@ def sphere_box(center: Floats, radius: Floats, box_center: Floats, turn: Floats,
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def corner_plane(
-    center: Floats, turn: Floats, half: Floats, corner: Ints, outward: Floats, origin: Floats
-) -> Touch:
-    """One corner (m,) each of boxes, as in `sphere_box`, and a half space, as in `sphere_plane`."""
-    tip = center + (turn @ (half * CORNERS[corner])[:, :, None])[:, :, 0]
-    gap = dot(tip - origin, outward)
-    return Touch(tip - 0.5 * gap[:, None] * outward, np.broadcast_to(-outward, tip.shape), gap)
+def corner_plane(box: Boxes, corner: Ints, plane: Planes) -> Touch:
+    """One corner (m,) of each box, and a half space."""
+    tip = box.center + (box.turn @ (box.half * CORNERS[corner])[:, :, None])[:, :, 0]
+    return sphere_plane(Spheres(tip, np.zeros(len(tip))), plane)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,12 +12,17 @@ from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, SPHERE, enclosing_radius
 from dem.contact.box_box import BOX_FEATURES, box_box
 from dem.contact.capsules import capsule_box, capsule_capsule, capsule_plane
-from dem.contact.meshes import PARTS, capsule_mesh, mesh_plane, sphere_mesh
+from dem.contact.meshes import PARTS, PlacedMesh, capsule_mesh, mesh_plane, sphere_mesh
 from dem.contact.narrow import (
     CORNERS,
+    Boxes,
+    Capsules,
     Manifold,
+    Planes,
+    Spheres,
     Touch,
     corner_plane,
+    joined,
     reversed_touch,
     sphere_box,
     sphere_capsule,
@@ -51,26 +56,21 @@ class Primitives(NamedTuple):
     surfaces: dict[int, Surface]  #: of the meshes, by row
     numbers: int  #: more than any of `number`, and those that meshes take after theirs
 
-    def sphere(self, rows: Ints) -> tuple[Floats, Floats]:
-        """Centres and radii."""
-        return self.center[rows], self.size[rows, 0]
+    def sphere(self, rows: Ints) -> Spheres:
+        return Spheres(self.center[rows], self.size[rows, 0])
 
-    def box(self, rows: Ints) -> tuple[Floats, Floats, Floats]:
-        """Centres, frames (m, 3, 3) and half extents."""
-        return self.center[rows], quaternion.matrix(self.quaternion[rows]), self.size[rows]
+    def box(self, rows: Ints) -> Boxes:
+        return Boxes(self.center[rows], quaternion.matrix(self.quaternion[rows]), self.size[rows])
 
-    def capsule(self, rows: Ints) -> tuple[Floats, Floats, Floats, Floats]:
-        """Centres, axes, half lengths and radii."""
+    def capsule(self, rows: Ints) -> Capsules:
         axis = quaternion.rotate(self.quaternion[rows], np.array([0.0, 0.0, 1.0]))
-        return self.center[rows], axis, self.size[rows, 1], self.size[rows, 0]
+        return Capsules(self.center[rows], axis, self.size[rows, 1], self.size[rows, 0])
 
-    def plane(self, rows: Ints) -> tuple[Floats, Floats]:
-        """Outward normals and points of the surfaces."""
-        return self.size[rows], self.center[rows]
+    def plane(self, rows: Ints | int) -> Planes:
+        return Planes(self.size[rows], self.center[rows])
 
-    def mesh(self, row: int) -> tuple[Surface, Floats, Floats]:
-        """Surface, its middle and frame (3, 3), of one mesh."""
-        return self.surfaces[row], self.center[row], quaternion.matrix(self.quaternion[row])
+    def mesh(self, row: int) -> PlacedMesh:
+        return PlacedMesh(self.surfaces[row], self.center[row], quaternion.matrix(self.quaternion[row]))
 
     def keys(self, i: Ints, j: Ints, feature: Ints) -> Ints:
         """Numbers (m,) of the features of pairs of rows i, j (m,), distinct and the same at all times."""
@@ -148,7 +148,7 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
 
     Two half spaces have none, nor have meshes with boxes or meshes: `dem.scene` refuses those.
     """
-    found = [Manifold(*_no_rows, Touch(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))]
+    found = [_NO_CONTACT]
     code = 8 * table.kind[i] + table.kind[j]
     for one, two in (divmod(int(kinds), 8) for kinds in np.flatnonzero(np.bincount(code))):
         rows = np.flatnonzero(code == 8 * one + two)
@@ -160,72 +160,65 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
         else:
             continue
         found.append(Manifold(rows[pair], feature, touch))
-    return _joined(found)
+    return joined(found)
 
 
-_no_rows = np.zeros(0, np.int64), np.zeros(0, np.int64)
+_NO_CONTACT = Manifold(
+    np.zeros(0, np.int64), np.zeros(0, np.int64), Touch(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+)
 
 
 def _single(touch: Touch, delta: Floats) -> Manifold:
     """The manifold of pairs that touch in one point."""
     pair = np.flatnonzero(touch.gap <= delta)
-    return Manifold(pair, np.zeros_like(pair), Touch(*(values[pair] for values in touch)))
+    return Manifold(pair, np.zeros_like(pair), touch.take(pair))
 
 
 def _spheres(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     if compiled := loops():
         pair, *touch = compiled.sphere_sphere(table.center, table.size, i, j, delta)
         return Manifold(pair, np.zeros_like(pair), Touch(*touch))
-    return _single(sphere_sphere(*table.sphere(i), *table.sphere(j)), delta)
+    return _single(sphere_sphere(table.sphere(i), table.sphere(j)), delta)
 
 
 def _box_plane(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     corner = np.tile(np.arange(len(CORNERS)), len(i))
     pair = np.repeat(np.arange(len(i)), len(CORNERS))
-    manifold = _single(corner_plane(*table.box(i[pair]), corner, *table.plane(j[pair])), delta[pair])
+    manifold = _single(corner_plane(table.box(i[pair]), corner, table.plane(j[pair])), delta[pair])
     return Manifold(pair[manifold.pair], corner[manifold.pair], manifold.touch)
 
 
 def _on_meshes(
-    contacts: Callable[..., Manifold], shapes: tuple[Floats, ...], table: Primitives, j: Ints, delta: Floats
+    contacts: Callable[..., Manifold], shapes: Callable[[Ints], Any], table: Primitives, i: Ints, j: Ints, delta: Floats
 ) -> Manifold:
-    """The manifolds of shapes, given by their arrays (m, ...), with the meshes of rows j (m,), mesh by mesh."""
+    """The manifolds of ``shapes(rows)``, of the rows i (m,), with the meshes of rows j (m,), mesh by mesh."""
     found = []
     for mesh in np.unique(j):
         rows = np.flatnonzero(j == mesh)
-        manifold = contacts(*(values[rows] for values in shapes), *table.mesh(int(mesh)), delta[rows])
+        manifold = contacts(shapes(i[rows]), table.mesh(int(mesh)), delta[rows])
         found.append(manifold._replace(pair=rows[manifold.pair]))
-    return _joined(found)
+    return joined(found)
 
 
 def _meshes_plane(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     found = []
     for pair, (mesh, plane) in enumerate(zip(i.tolist(), j.tolist())):
-        feature, touch = mesh_plane(*table.mesh(mesh), *table.plane(plane), delta[pair])
-        found.append(Manifold(np.full(len(feature), pair), feature, touch))
-    return _joined(found)
-
-
-def _joined(found: list[Manifold]) -> Manifold:
-    pairs, features, geometry = zip(*found)
-    return Manifold(
-        np.concatenate(pairs),
-        np.concatenate(features),
-        Touch(*(np.concatenate(values) for values in zip(*geometry))),
-    )
+        manifold = mesh_plane(table.mesh(mesh), table.plane(plane), delta[pair])
+        found.append(manifold._replace(pair=manifold.pair + pair))
+    return joined(found)
 
 
 _TOUCH: dict[tuple[int, int], Callable[[Primitives, Ints, Ints, Floats], Manifold]] = {
     (SPHERE, SPHERE): _spheres,
-    (SPHERE, BOX): lambda t, i, j, delta: _single(sphere_box(*t.sphere(i), *t.box(j)), delta),
-    (SPHERE, CAPSULE): lambda t, i, j, delta: _single(sphere_capsule(*t.sphere(i), *t.capsule(j)), delta),
-    (SPHERE, PLANE): lambda t, i, j, delta: _single(sphere_plane(*t.sphere(i), *t.plane(j)), delta),
-    (CAPSULE, CAPSULE): lambda t, i, j, delta: capsule_capsule(*t.capsule(i), *t.capsule(j), delta),
-    (CAPSULE, BOX): lambda t, i, j, delta: capsule_box(*t.capsule(i), *t.box(j), delta),
-    (CAPSULE, PLANE): lambda t, i, j, delta: capsule_plane(*t.capsule(i), *t.plane(j), delta),
-    (BOX, BOX): lambda t, i, j, delta: box_box(*t.box(i), *t.box(j), delta),
+    (SPHERE, BOX): lambda t, i, j, delta: _single(sphere_box(t.sphere(i), t.box(j)), delta),
+    (SPHERE, CAPSULE): lambda t, i, j, delta: _single(sphere_capsule(t.sphere(i), t.capsule(j)), delta),
+    (SPHERE, PLANE): lambda t, i, j, delta: _single(sphere_plane(t.sphere(i), t.plane(j)), delta),
+    (CAPSULE, CAPSULE): lambda t, i, j, delta: capsule_capsule(t.capsule(i), t.capsule(j), delta),
+    (CAPSULE, BOX): lambda t, i, j, delta: capsule_box(t.capsule(i), t.box(j), delta),
+    (CAPSULE, PLANE): lambda t, i, j, delta: capsule_plane(t.capsule(i), t.plane(j), delta),
+    (BOX, BOX): lambda t, i, j, delta: box_box(t.box(i), t.box(j), delta),
     (BOX, PLANE): _box_plane,
-    (SPHERE, MESH): lambda t, i, j, delta: _on_meshes(sphere_mesh, t.sphere(i), t, j, delta),
-    (CAPSULE, MESH): lambda t, i, j, delta: _on_meshes(capsule_mesh, t.capsule(i), t, j, delta),
+    (SPHERE, MESH): lambda t, i, j, delta: _on_meshes(sphere_mesh, t.sphere, t, i, j, delta),
+    (CAPSULE, MESH): lambda t, i, j, delta: _on_meshes(capsule_mesh, t.capsule, t, i, j, delta),
     (MESH, PLANE): _meshes_plane,
 }

@@ -46,10 +46,13 @@ class Contacts:
     def __len__(self) -> int:
         return len(self.key)
 
+    def columns(self) -> dict[str, np.ndarray]:
+        """The arrays by name, without copies."""
+        return {name: value for name, value in vars(self).items() if name != "near"}
+
     def take(self, rows: np.ndarray) -> Contacts:
-        """Those of these rows, or where a mask (nc,) is true."""
-        columns = ("key", "a", "b", "body", "point", "normal", "gap", "friction")
-        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+        """The contacts of the given rows (index array or mask)."""
+        return replace(self, **{name: column[rows] for name, column in self.columns().items()})
 
 
 def find_contacts(
@@ -197,14 +200,15 @@ def _grain_pairs(near: Neighbourhood, table: Primitives) -> tuple[Ints, Floats]:
     """Rows (m, 2) of local grains, and of a local grain and a ghost, whose margins may meet, and the gaps (m,) within
     which they do."""
     count = near.grains + near.ghosts
-    pairs = close_pairs(table.center[:count], table.radius[:count] + near.margin, 0.0)
+    pairs = close_pairs(table.center[:count], table.radius[:count] + near.margin)
     if near.ghosts:
         pairs = pairs[pairs[:, 0] < near.grains]
     return pairs, near.margin[pairs[:, 0]] + near.margin[pairs[:, 1]]
 
 
 def _grains_on_parts(near: Neighbourhood, beside: _Beside) -> tuple[Ints, Floats]:
-    """The same for local grains and parts of large bodies."""
+    """Rows (m, 2) of a local grain and a part of a large body whose margins may meet, and the gaps (m,) within which
+    they do."""
     close = beside.within(near.margin)
     pairs = np.stack([close.grain, near.grains + near.ghosts + close.part], axis=1)
     return pairs, near.margin[close.grain] + close.margin
@@ -244,7 +248,8 @@ def _distance_at_least(table: Primitives, part: int, points: Floats) -> Floats:
 def _large_pairs(
     world: World, near: Neighbourhood, table: Primitives, delta: float, shifts: Floats
 ) -> tuple[Ints, Floats]:
-    """The same for the parts of any two large bodies of which one at least is free to move."""
+    """Rows (m, 2) of the parts of two large bodies, of which one at least is free to move, and the gaps (m,) within
+    which their margins meet."""
     first = near.grains + near.ghosts
     free = np.array([isinstance(body.motion, Dynamic) for body in world.large_bodies], dtype=bool)
     body = table.row[first:] - first

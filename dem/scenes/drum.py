@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import atan2, ceil, degrees, pi, sin, sqrt
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -16,9 +16,7 @@ from dem.mesh import Mesh
 from dem.motion import Rotation
 from dem.scene import Scene
 from dem.scenes.lattice import SmallSpheres, perturbed, rest_after_fall
-
-if TYPE_CHECKING:
-    from dem.record import Step
+from dem.step import Step
 
 #: The z axis turned to the y axis.
 ALONG_Y = (sqrt(0.5), -sqrt(0.5), 0.0, 0.0)

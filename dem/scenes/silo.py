@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import ceil, pi, radians, sqrt, tan
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,9 +17,7 @@ from dem.motion import Glide
 from dem.scene import Scene
 from dem.scenes.lattice import SmallSpheres, perturbed, rest_after_fall
 from dem.shapes import Plane
-
-if TYPE_CHECKING:
-    from dem.record import Step
+from dem.step import Step
 
 #: Constants of Beverloo, Leniger and van de Velde (1961): of the flow, and diameters of a grain that the outlet lacks.
 BEVERLOO_C, BEVERLOO_K = 0.58, 1.5
@@ -124,7 +122,7 @@ class Silo(SmallSpheres):
         # Out of the way within a twentieth of a second, and no further.
         away = Glide((40 * hole, 0.0, 0.0), self.settling_time, self.settling_time + 0.05)
         disc = Mesh.revolved([(0.0, 0.0), (hole, 0.0)], self.sides)
-        scene.add_body("gate", [disc], away, position=(0.0, 0.0, 0.0))
+        scene.add_body("gate", [disc], away)
         scene.add_body("floor", [Plane((0, 0, 1))], position=(0.0, 0.0, self.floor))
         return scene
 

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 
 from pctt.block_diagonal import set_diagonal_blocks
-from pctt.blocks import BlockRows
+from pctt.blocks import BlockRows, new_matrix
 from pctt.body_matrix.stiff_part import StiffPart
 from pctt.exchange import offsets, send_rows
 
@@ -64,11 +64,8 @@ class BodyMatrix:
         row, column = np.divmod(every, total)
         indptr = np.searchsorted(row, np.arange(first, first + own + 1))
         self._indptr, self._indices = indptr.astype(PETSc.IntType), column.astype(PETSc.IntType)
-        self.mat = PETSc.Mat().create(self.comm)
-        self.mat.setSizes(((6 * own, PETSc.DETERMINE), (6 * own, PETSc.DETERMINE)))
-        self.mat.setBlockSize(6)
-        self.mat.setType(PETSc.Mat.Type.BAIJ)
-        self.mat.setPreallocationCSR((self._indptr, self._indices))
+        sizes = ((6 * own, PETSc.DETERMINE), (6 * own, PETSc.DETERMINE))
+        self.mat = new_matrix(self.comm, sizes, 6, (self._indptr, self._indices))
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self._stiff: dict[tuple[bool, bool], StiffPart] = {}  # keys: in scalar format or not, symmetric or not
 
@@ -81,7 +78,9 @@ class BodyMatrix:
             (received,), _ = send_rows(self.comm, [blocks[self._away]], self._owner[self._away])
             np.add.at(self._values, self._received_places, received)
         self._values[self._diagonal_places] += np.eye(6)
-        _put(self.mat, self._indptr, self._indices, self._values)
+        if len(self._indices):
+            self.mat.setValuesBlockedCSR(self._indptr, self._indices, self._values.ravel())
+        self.mat.assemble()
         set_diagonal_blocks(self.mat, self._values[self._diagonal_places])
 
     def stiff_part(
@@ -150,10 +149,3 @@ class BodyMatrix:
         self.mat.destroy()
         for part in self._stiff.values():
             part.destroy()
-
-
-def _put(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, blocks: np.ndarray) -> None:
-    """Set all block rows of this rank."""
-    if len(indices):
-        mat.setValuesBlockedCSR(indptr, indices, blocks.ravel())
-    mat.assemble()

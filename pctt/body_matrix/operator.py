@@ -7,19 +7,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, cast
 
-import numpy as np
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from pctt.block_diagonal import set_diagonal_blocks
+from pctt.blocks import Array
 from pctt.body_matrix.entries import BodyMatrix
 from pctt.contact_map import ContactMap
 from pctt.shell import symmetric_shell
 
 if TYPE_CHECKING:
     from pctt.contact_map.free import FreeMap
-
-Array = NDArray[np.float64]
 
 
 class BodyOperator:

@@ -11,6 +11,8 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.blocks import new_matrix
+
 EXCESS = 1.15  # largest ratio of the blocks in a kept pattern to the wanted blocks
 
 
@@ -74,15 +76,11 @@ class StiffPart:
         self._kept_diagonal = before[self._diagonal]
         self._kept_indptr = before[self._indptr].astype(PETSc.IntType)
         self._kept_indices = self._indices[kept].astype(PETSc.IntType)
-        self.mat = PETSc.Mat().create(self.comm)
-        self.mat.setSizes(self._sizes)
-        self.mat.setBlockSize(self._size)
-        self.mat.setType(PETSc.Mat.Type.AIJ if self._scalar else PETSc.Mat.Type.BAIJ)
+        pattern, kind = (self._kept_indptr, self._kept_indices), PETSc.Mat.Type.BAIJ
         if self._scalar:
             rows = self._scalar_rows(np.ones((int(kept.sum()), self._size, self._size)))
-            self.mat.setPreallocationCSR((rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType)))
-        else:
-            self.mat.setPreallocationCSR((self._kept_indptr, self._kept_indices))
+            pattern, kind = (rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType)), PETSc.Mat.Type.AIJ
+        self.mat = new_matrix(self.comm, self._sizes, self._size, pattern, kind)
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
 
     def _scalar_rows(self, blocks: np.ndarray) -> sp.csr_matrix:

@@ -49,8 +49,8 @@ class Steering:
     """Numbers that steer the choice; costs are in iterations of APGD (docs/ccp.md has what was measured)."""
 
     conic_it: int = 60  #: limit of the conic method's iterations
-    earliest: float = 0.1  #: the first forecast comes after this part of the conic method's cost, and
-    looks: int = 8  #: so many looks at the natural residual
+    earliest: float = 0.1  #: part of the conic method's cost before which there is no forecast
+    looks: int = 8  #: looks at the natural residual before which there is no forecast
     saved: float = 0.3  #: part of the conic method's cost, at most, by beginning at APGD's point
     far: float = 4.0  #: times that cost: more iterations of APGD than this need not be told apart
     #: complementarity of the conic method's start, by APGD's natural residual; its own default at most
@@ -89,27 +89,26 @@ def solve(
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law, by the method that is expected to be faster; ``solver`` of the
     result names it, ``reason`` says why."""
-    most = limits.max_it if limits.max_it >= 0 else 20_000
     memory = _memory(newton) if options.remember else Memory()
     model = conic_cost(problem.size, problem.softness, limits.tol)
     cost = options.bias * memory.factor.get(decade(limits.tol), 1.0) * model
     watch = Watch(limits.tol, cost, memory.needed.get(decade(limits.tol)), problem.comm)
 
     start = perf_counter()
-    limited = dataclasses.replace(limits, max_it=most)
-    first = apgd.solve(problem, guess, limited, apgd.APGD(), watch, coulomb)
+    first = apgd.solve(problem, guess, limits, apgd.APGD(), watch, coulomb)
     switched = perf_counter()
-    if first.converged or first.iterations >= most:
+    if first.converged or first.iterations >= limits.max_it:
         memory.needed[decade(limits.tol)] = Needed(first.iterations, True)
-        return _named(first, "apgd", f"{first.reason}; conic would have cost about {cost:.0f} iterations")
-    inner = dataclasses.replace(limits, max_it=min(STEERING.conic_it, most))
+        words = f"{first.reason}; conic would have cost about {cost:.0f} iterations"
+        return dataclasses.replace(first, solver="apgd", reason=words)
+    inner = dataclasses.replace(limits, max_it=min(STEERING.conic_it, limits.max_it))
     begin = conic.Conic(start=min(conic.Conic().start, STEERING.start * first.natural_residual))
     result = second = conic.solve(problem, first.impulse, inner, begin, newton, coulomb)
     words = f"{first.reason}; conic: {second.reason}"
     solver = "conic"
-    if not (second.final or most <= STEERING.conic_it):
+    if not (second.final or limits.max_it <= STEERING.conic_it):
         best = min(first, second, key=lambda result: result.natural_residual)
-        result = apgd.solve(problem, best.impulse, limited, apgd.APGD(), None, coulomb)
+        result = apgd.solve(problem, best.impulse, limits, apgd.APGD(), None, coulomb)
         result.ksp_its, result.fallbacks = second.ksp_its, second.fallbacks
         result.history = second.history + result.history
         words, solver = f"{words}; apgd: {result.reason}", "apgd"
@@ -118,7 +117,7 @@ def solve(
     done = first.iterations
     memory.needed[decade(limits.tol)] = Needed(watch.needed, False)
     memory.keep_cost(limits.tol, (after * max(done, 1) / before + min(done, STEERING.saved * model)) / model)
-    return _named(result, solver, words)
+    return dataclasses.replace(result, solver=solver, reason=words)
 
 
 class Watch:
@@ -196,8 +195,3 @@ def _memory(newton: Newton) -> Memory:
     if not isinstance(newton.memory, Memory):
         newton.memory = Memory()
     return newton.memory
-
-
-def _named(result: Result, solver: str, reason: str) -> Result:
-    result.solver, result.reason = solver, reason
-    return result

@@ -120,7 +120,7 @@ def solve(
     s = opening(problem, problem.product(guess) + problem.r) if problem.norm(guess) > 0 else np.zeros_like(problem.mu)
     best: Result | None = None
     history: list[float] = []
-    iterations = ksp_its = fallbacks = failed = 0
+    failed, spent = 0, np.zeros(3, int)  # iterations, Krylov iterations, fallbacks
     accuracy, g, r = max(STEERING.first, STEERING.inner * tol), guess, problem.r
     anderson = Anderson(problem, relaxation, options.memory)
     while len(history) < options.max_it:
@@ -130,8 +130,8 @@ def solve(
         finally:
             problem.r = r
         g = inner.impulse
-        iterations, ksp_its = iterations + inner.iterations, ksp_its + inner.ksp_its
-        fallbacks, failed = fallbacks + inner.fallbacks, 0 if inner.converged else failed + 1
+        spent += (inner.iterations, inner.ksp_its, inner.fallbacks)
+        failed = 0 if inner.converged else failed + 1
         y = problem.product(g) + r
         history.append(residual(problem, g, y))
         if best is None or history[-1] <= min(history):
@@ -149,19 +149,10 @@ def solve(
         words = f"Coulomb's law not met: residual {min(history):.1e} at best in {len(history)} cone problems"
         if not inner.converged:
             words = inner.reason if inner.status is Status.UNBOUNDED else f"{words}, the last: {inner.reason}"
-    return Result(
-        best.impulse,
-        status,
-        words,
-        min(history),
-        iterations,
-        ksp_its,
-        fallbacks,
-        history,
-        len(history),
-        best.solver,
-        FIXED_POINT,
-    )
+    iterations, ksp_its, fallbacks = spent.tolist()
+    found = Result(best.impulse, status, words, min(history), iterations, ksp_its, fallbacks, history)
+    found.cone_problems, found.solver, found.law = len(history), best.solver, FIXED_POINT
+    return found
 
 
 class Anderson:

@@ -1,5 +1,5 @@
-"""The solvers of the cone problem. ``-ccp_type``, the table in the documentation and the tests are made from this
-list."""
+"""The solvers of the cone problem. ``-ccp_type`` and the tests are made from this list, and the table of docs/ccp.md is
+compared with it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from pctt.ccp.first_order.compared import gauss_seidel, gpminres, jacobi, kucera
 from pctt.ccp.first_order.progress import FirstOrder
 from pctt.ccp.interior import conic, pdip
 from pctt.ccp.result import Result
-from pctt.options import describe
 
 PRODUCT, MATRIX, NEWTON = "products with N", "rows of N", "Newton systems"
 EITHER = "products with N, or Newton systems"
@@ -82,16 +81,3 @@ SOLVERS = {
                "projected block Jacobi, relaxed by an exact line search", "Tasora, Anitescu 2011"),
     )
 }  # fmt: skip
-
-
-def table() -> str:
-    """The solvers as a Markdown table."""
-    lines = ["| `-ccp_type` | method | needs | iterations | options and defaults | source |", "|" + "---|" * 6]
-    for solver in SOLVERS.values():
-        options = ", ".join(
-            f"`-{d.name} {str(d.default).lower() if isinstance(d.default, bool) else d.default}`"
-            for d in describe(solver.options, solver.prefix)
-        )
-        cells = [f"`{solver.name}`", solver.help, solver.needs, f"{solver.iterations:,}", options, solver.source]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from functools import cached_property
 
-import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
-from pctt.blocks import BlockRows, block_matrix, diagonal_blocks
+from pctt.blocks import Array, BlockRows, block_matrix, diagonal_blocks
 from pctt.contact_map.rows import CompactRows, block_rows
-
-Array = NDArray[np.float64]
 
 
 class AssembledMap:

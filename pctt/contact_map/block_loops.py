@@ -49,63 +49,43 @@ def add_momenta(blocks, start, body, g, m):
 
 
 @loop
+def weighted(weight, c, y0, y1, y2):
+    """H y at the contact c. ``weight`` has the upper triangles of symmetric blocks H, (nc, 6), or all of H, (nc, 9)."""
+    if weight.shape[1] == 6:
+        return (
+            weight[c, 0] * y0 + weight[c, 1] * y1 + weight[c, 2] * y2,
+            weight[c, 1] * y0 + weight[c, 3] * y1 + weight[c, 4] * y2,
+            weight[c, 2] * y0 + weight[c, 4] * y1 + weight[c, 5] * y2,
+        )
+    return (
+        weight[c, 0] * y0 + weight[c, 1] * y1 + weight[c, 2] * y2,
+        weight[c, 3] * y0 + weight[c, 4] * y1 + weight[c, 5] * y2,
+        weight[c, 6] * y0 + weight[c, 7] * y1 + weight[c, 8] * y2,
+    )
+
+
+@loop
 def add_through(blocks, start, body, weight, w, m):
-    """m += G' H G w; ``weight`` (nc, 6) is the upper triangle of H."""
+    """m += G' H G w for the ``weight`` of `weighted`."""
     for c in range(len(start) - 1):
         y0, y1, y2 = velocity_at(c, blocks, start, body, w)
-        f0 = weight[c, 0] * y0 + weight[c, 1] * y1 + weight[c, 2] * y2
-        f1 = weight[c, 1] * y0 + weight[c, 3] * y1 + weight[c, 4] * y2
-        f2 = weight[c, 2] * y0 + weight[c, 4] * y1 + weight[c, 5] * y2
+        f0, f1, f2 = weighted(weight, c, y0, y1, y2)
         push(c, blocks, start, body, f0, f1, f2, m)
-
-
-@loop
-def add_any_through(blocks, start, body, weight, w, m):
-    """m += G' H G w; ``weight`` (nc, 9) is H, which need not be symmetric."""
-    for c in range(len(start) - 1):
-        y0, y1, y2 = velocity_at(c, blocks, start, body, w)
-        f0 = weight[c, 0] * y0 + weight[c, 1] * y1 + weight[c, 2] * y2
-        f1 = weight[c, 3] * y0 + weight[c, 4] * y1 + weight[c, 5] * y2
-        f2 = weight[c, 6] * y0 + weight[c, 7] * y1 + weight[c, 8] * y2
-        push(c, blocks, start, body, f0, f1, f2, m)
-
-
-@loop
-def any_weights(blocks, start, body, H, weight):
-    """The ``weight`` (nc, 9) of `add_any_through` for H (nc, 3, 3)."""
-    for c in range(len(H)):
-        for i in range(3):
-            for j in range(3):
-                weight[c, 3 * i + j] = H[c, i, j]
-
-
-@loop
-def add_any_body_blocks(blocks, start, body, weight, out):
-    """out (bodies, 6, 6) += the diagonal blocks of G' H G."""
-    for c in range(len(start) - 1):
-        for k in range(start[c], start[c + 1]):
-            i = body[k]
-            for n in range(6):
-                b0, b1, b2 = blocks[k, 0, n], blocks[k, 1, n], blocks[k, 2, n]
-                h0 = weight[c, 0] * b0 + weight[c, 1] * b1 + weight[c, 2] * b2
-                h1 = weight[c, 3] * b0 + weight[c, 4] * b1 + weight[c, 5] * b2
-                h2 = weight[c, 6] * b0 + weight[c, 7] * b1 + weight[c, 8] * b2
-                for p in range(6):
-                    out[i, p, n] += blocks[k, 0, p] * h0 + blocks[k, 1, p] * h1 + blocks[k, 2, p] * h2
 
 
 @loop
 def pack(H, weight):
-    """weight (nc, 6): the upper triangle of symmetric blocks H (nc, 3, 3)."""
+    """Blocks H (nc, 3, 3) as the ``weight`` of `weighted`."""
+    whole = weight.shape[1] == 9
     for c in range(len(H)):
         for i in range(3):
-            for j in range(i, 3):
-                weight[c, j if i == 0 else i + j + 1] = H[c, i, j]
+            for j in range(0 if whole else i, 3):
+                weight[c, 3 * i + j if whole else j if i == 0 else i + j + 1] = H[c, i, j]
 
 
 @loop
 def weights(blocks, start, body, H, weight):
-    """The ``weight`` (nc, 6) of `add_through` for H (nc, 3, 3): the upper triangle."""
+    """The ``weight`` of `add_through` for H (nc, 3, 3)."""
     pack(H, weight)
 
 
@@ -117,18 +97,13 @@ def add_body_blocks(blocks, start, body, weight, out):
             i = body[k]
             for n in range(6):
                 b0, b1, b2 = blocks[k, 0, n], blocks[k, 1, n], blocks[k, 2, n]
-                h0 = weight[c, 0] * b0 + weight[c, 1] * b1 + weight[c, 2] * b2
-                h1 = weight[c, 1] * b0 + weight[c, 3] * b1 + weight[c, 4] * b2
-                h2 = weight[c, 2] * b0 + weight[c, 4] * b1 + weight[c, 5] * b2
+                h0, h1, h2 = weighted(weight, c, b0, b1, b2)
                 for p in range(6):
                     out[i, p, n] += blocks[k, 0, p] * h0 + blocks[k, 1, p] * h1 + blocks[k, 2, p] * h2
 
 
 @loop
 def local_product(weight, g, y):
-    """y = H g (nc, 3); ``weight`` (nc, 6) has the upper triangles of the symmetric blocks H."""
+    """y = H g (nc, 3) for the ``weight`` of `weighted`."""
     for c in range(len(weight)):
-        g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
-        y[c, 0] = weight[c, 0] * g0 + weight[c, 1] * g1 + weight[c, 2] * g2
-        y[c, 1] = weight[c, 1] * g0 + weight[c, 3] * g1 + weight[c, 4] * g2
-        y[c, 2] = weight[c, 2] * g0 + weight[c, 4] * g1 + weight[c, 5] * g2
+        y[c, 0], y[c, 1], y[c, 2] = weighted(weight, c, g[c, 0], g[c, 1], g[c, 2])

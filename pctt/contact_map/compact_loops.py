@@ -64,43 +64,50 @@ def add_momenta(frame, arm, body, g, m):
 
 
 @loop
+def weighted(weight, c, u0, u1, u2):
+    """W u at the contact c. ``weight`` has the upper triangles of symmetric blocks W, (nc, 6), or all of W, (nc, 9)."""
+    if weight.shape[1] == 6:
+        return (
+            weight[c, 0] * u0 + weight[c, 1] * u1 + weight[c, 2] * u2,
+            weight[c, 1] * u0 + weight[c, 3] * u1 + weight[c, 4] * u2,
+            weight[c, 2] * u0 + weight[c, 4] * u1 + weight[c, 5] * u2,
+        )
+    return (
+        weight[c, 0] * u0 + weight[c, 1] * u1 + weight[c, 2] * u2,
+        weight[c, 3] * u0 + weight[c, 4] * u1 + weight[c, 5] * u2,
+        weight[c, 6] * u0 + weight[c, 7] * u1 + weight[c, 8] * u2,
+    )
+
+
+@loop
 def add_through(frame, arm, body, weight, w, m):
-    """m += D H D' w; ``weight`` (nc, 6) is F'HF from `weights`, so the loop does not need the frame itself."""
+    """m += D H D' w; the ``weight`` of `weights` is F'HF, so the loop does not need the frame itself."""
     for c in range(len(body)):
         u0, u1, u2 = velocity_at(c, arm, body, w)
-        f0 = weight[c, 0] * u0 + weight[c, 1] * u1 + weight[c, 2] * u2
-        f1 = weight[c, 1] * u0 + weight[c, 3] * u1 + weight[c, 4] * u2
-        f2 = weight[c, 2] * u0 + weight[c, 4] * u1 + weight[c, 5] * u2
+        f0, f1, f2 = weighted(weight, c, u0, u1, u2)
         push(c, arm, body, f0, f1, f2, m)
 
 
 @loop
-def add_any_through(frame, arm, body, weight, w, m):
-    """m += D H D' w for any H; ``weight`` (nc, 9) is F'HF from `any_weights`."""
-    for c in range(len(body)):
-        u0, u1, u2 = velocity_at(c, arm, body, w)
-        f0 = weight[c, 0] * u0 + weight[c, 1] * u1 + weight[c, 2] * u2
-        f1 = weight[c, 3] * u0 + weight[c, 4] * u1 + weight[c, 5] * u2
-        f2 = weight[c, 6] * u0 + weight[c, 7] * u1 + weight[c, 8] * u2
-        push(c, arm, body, f0, f1, f2, m)
-
-
-@loop
-def any_weights(frame, arm, body, H, weight):
-    """weight (nc, 9) = F'HF for blocks H (nc, 3, 3) that need not be symmetric."""
+def weights(frame, arm, body, H, weight):
+    """F'HF of blocks H (nc, 3, 3) as the ``weight`` of `weighted`."""
+    whole = weight.shape[1] == 9
     for c in range(len(frame)):
-        for j in range(3):
-            f0, f1, f2 = frame[c, j], frame[c, 3 + j], frame[c, 6 + j]
-            h0 = H[c, 0, 0] * f0 + H[c, 0, 1] * f1 + H[c, 0, 2] * f2
-            h1 = H[c, 1, 0] * f0 + H[c, 1, 1] * f1 + H[c, 1, 2] * f2
-            h2 = H[c, 2, 0] * f0 + H[c, 2, 1] * f1 + H[c, 2, 2] * f2
-            for i in range(3):
-                weight[c, 3 * i + j] = frame[c, i] * h0 + frame[c, 3 + i] * h1 + frame[c, 6 + i] * h2
+        for i in range(3):
+            h0 = H[c, 0, 0] * frame[c, i] + H[c, 0, 1] * frame[c, 3 + i] + H[c, 0, 2] * frame[c, 6 + i]
+            h1 = H[c, 1, 0] * frame[c, i] + H[c, 1, 1] * frame[c, 3 + i] + H[c, 1, 2] * frame[c, 6 + i]
+            h2 = H[c, 2, 0] * frame[c, i] + H[c, 2, 1] * frame[c, 3 + i] + H[c, 2, 2] * frame[c, 6 + i]
+            for j in range(3):  # all of them: a compiler unrolls loops of known lengths
+                entry = h0 * frame[c, j] + h1 * frame[c, 3 + j] + h2 * frame[c, 6 + j]
+                if whole:
+                    weight[c, i + 3 * j] = entry
+                elif i <= j:
+                    weight[c, j if i == 0 else i + j + 1] = entry
 
 
 @loop
-def add_any_body_blocks(frame, arm, body, weight, blocks):
-    """blocks (bodies, 6, 6) += the diagonal blocks of D H D', for the ``weight`` of `any_weights`."""
+def add_body_blocks(frame, arm, body, weight, blocks):
+    """blocks (bodies, 6, 6) += the diagonal blocks of D H D', for the ``weight`` of `weights`."""
     J = np.zeros((3, 6))  # from the velocities of the body to the velocity of the contact point
     J[0, 0] = J[1, 1] = J[2, 2] = 1.0
     for c in range(len(frame)):
@@ -111,59 +118,9 @@ def add_any_body_blocks(frame, arm, body, weight, blocks):
             J[1, 3], J[1, 5] = -r2, r0
             J[2, 3], J[2, 4] = r1, -r0
             for n in range(6):
-                h0 = weight[c, 0] * J[0, n] + weight[c, 1] * J[1, n] + weight[c, 2] * J[2, n]
-                h1 = weight[c, 3] * J[0, n] + weight[c, 4] * J[1, n] + weight[c, 5] * J[2, n]
-                h2 = weight[c, 6] * J[0, n] + weight[c, 7] * J[1, n] + weight[c, 8] * J[2, n]
+                h0, h1, h2 = weighted(weight, c, J[0, n], J[1, n], J[2, n])
                 for k in range(6):
                     blocks[at, k, n] += J[0, k] * h0 + J[1, k] * h1 + J[2, k] * h2
-
-
-@loop
-def weights(frame, arm, body, H, weight):
-    """weight (nc, 6) = upper triangle of F'HF for symmetric blocks H (nc, 3, 3)."""
-    for c in range(len(frame)):
-        for i in range(3):
-            h0 = H[c, 0, 0] * frame[c, i] + H[c, 0, 1] * frame[c, 3 + i] + H[c, 0, 2] * frame[c, 6 + i]
-            h1 = H[c, 1, 0] * frame[c, i] + H[c, 1, 1] * frame[c, 3 + i] + H[c, 1, 2] * frame[c, 6 + i]
-            h2 = H[c, 2, 0] * frame[c, i] + H[c, 2, 1] * frame[c, 3 + i] + H[c, 2, 2] * frame[c, 6 + i]
-            for j in range(i, 3):
-                place = j if i == 0 else i + j + 1
-                weight[c, place] = h0 * frame[c, j] + h1 * frame[c, 3 + j] + h2 * frame[c, 6 + j]
-
-
-@loop
-def add_body_blocks(frame, arm, body, weight, blocks):
-    """blocks (bodies, 6, 6) += the diagonal blocks of D H D', for the ``weight`` of `weights`."""
-    turned = np.empty((3, 3))  # weight times (r x)'
-    for c in range(len(frame)):
-        for side in range(2):
-            i = body[c, side]
-            r0, r1, r2 = arm[c, 3 * side], arm[c, 3 * side + 1], arm[c, 3 * side + 2]
-            h00, h01, h02, h11, h12, h22 = (
-                weight[c, 0], weight[c, 1], weight[c, 2], weight[c, 3], weight[c, 4], weight[c, 5],
-            )  # fmt: skip
-            blocks[i, 0, 0] += h00
-            blocks[i, 0, 1] += h01
-            blocks[i, 0, 2] += h02
-            blocks[i, 1, 0] += h01
-            blocks[i, 1, 1] += h11
-            blocks[i, 1, 2] += h12
-            blocks[i, 2, 0] += h02
-            blocks[i, 2, 1] += h12
-            blocks[i, 2, 2] += h22
-            # row k of `turned` is r x (row k of the weight)
-            turned[0, 0], turned[0, 1], turned[0, 2] = r1 * h02 - r2 * h01, r2 * h00 - r0 * h02, r0 * h01 - r1 * h00
-            turned[1, 0], turned[1, 1], turned[1, 2] = r1 * h12 - r2 * h11, r2 * h01 - r0 * h12, r0 * h11 - r1 * h01
-            turned[2, 0], turned[2, 1], turned[2, 2] = r1 * h22 - r2 * h12, r2 * h02 - r0 * h22, r0 * h12 - r1 * h02
-            for k in range(3):
-                for n in range(3):
-                    blocks[i, k, 3 + n] += turned[k, n]
-                    blocks[i, 3 + n, k] += turned[k, n]
-            for n in range(3):
-                t0, t1, t2 = turned[0, n], turned[1, n], turned[2, n]
-                blocks[i, 3, 3 + n] += r1 * t2 - r2 * t1
-                blocks[i, 4, 3 + n] += r2 * t0 - r0 * t2
-                blocks[i, 5, 3 + n] += r0 * t1 - r1 * t0
 
 
 @loop

@@ -13,15 +13,12 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, diagonal_blocks
+from pctt.blocks import Array, BlockRows, diagonal_blocks
 from pctt.contact_map import block_loops, compact_loops
 from pctt.contact_map.ghosts import Ghosts
-from pctt.contact_map.rows import CompactRows, block_rows
-
-Array = NDArray[np.float64]
+from pctt.contact_map.rows import CompactRows, block_rows, packed, root_blocks
 
 
 class FreeMap:
@@ -123,8 +120,7 @@ class FreeMap:
     def weights(self, H: Array, symmetric: bool = True) -> Array:
         """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""
         weight = np.empty((self.rows, 6 if symmetric else 9), self.precision)
-        loop = self._loops.weights if symmetric else self._loops.any_weights
-        loop(*self._arrays, self._floats(H), weight)
+        self._loops.weights(*self._arrays, self._floats(H), weight)
         return weight
 
     def through(self, weight: Array, v: Array, out: Array) -> None:
@@ -185,7 +181,7 @@ class FreeMap:
         assert self._mass is not None
         out = np.empty((self.rows, 3, 3), self.precision)
         mass = np.zeros((self._ghosts.nobody + 1, 12), self.precision)
-        mass[: self.columns] = _wide(self._mass)
+        mass[: self.columns] = packed(root_blocks(self._mass))
         self._ghosts.update(mass)
         self._loops.contact_blocks(*self._arrays, mass, out)
         return out
@@ -193,16 +189,15 @@ class FreeMap:
     def body_blocks(self, weight: Array) -> Array:
         """The diagonal blocks of I + G' H G (columns, 6, 6)."""
         blocks = np.zeros((self._ghosts.nobody + 1, 6, 6), self.precision)
-        loop = self._loops.add_body_blocks if weight.shape[1] == 6 else self._loops.add_any_body_blocks
-        loop(*self._arrays, weight, blocks)
+        self._loops.add_body_blocks(*self._arrays, weight, blocks)
         self._ghosts.begin_add(blocks)
         self._ghosts.end_add(blocks)
         own = blocks[: self.columns]
-        if self._root is not None:
+        if self._root is not None and self._root.shape[1] == 6:
+            own *= self._root[:, :, None] * self._root[:, None, :]
+        elif self._root is not None:
             roots = np.zeros((self.columns, 6, 6))
-            for part in (0, 1):
-                rows = slice(3 * part, 3 * part + 3)
-                roots[:, rows, rows] = _wide(self._root).reshape(-1, 2, 6)[:, part, _FULL].reshape(-1, 3, 3)
+            roots[:, :3, :3], roots[:, 3:, 3:] = root_blocks(self._root).transpose(1, 0, 2, 3)
             own = roots @ own @ roots
         own[:, range(6), range(6)] += 1.0
         return own
@@ -250,11 +245,7 @@ class Contacts:
 
     def add_through(self, weight: Array, w: Array, m: Array) -> None:
         if self.here.stop > self.here.start:
-            loop = self.loops.add_through if weight.shape[1] == 6 else self.loops.add_any_through
-            loop(*self.arrays, weight[self.here], w, m)
-
-
-_FULL = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # indices in (xx, xy, xz, yy, yz, zz) of the nine entries of a matrix
+            self.loops.add_through(*self.arrays, weight[self.here], w, m)
 
 
 def _first(mask: np.ndarray) -> int:
@@ -262,18 +253,9 @@ def _first(mask: np.ndarray) -> int:
     return int(np.argmax(mask)) if mask.any() else len(mask)
 
 
-def _wide(root: Array) -> Array:
-    """Diagonals (n, 6) as symmetric blocks (n, 12)."""
-    if root.shape[1] == 12:
-        return root
-    out = np.zeros((len(root), 12))
-    out[:, [0, 3, 5, 6, 9, 11]] = root
-    return out
-
-
 def _square(root: Array) -> Array:
     """R^2, in the format of R."""
     if root.shape[1] == 6:
         return root * root
-    full = root.reshape(-1, 6)[:, _FULL].reshape(-1, 3, 3)
-    return (full @ full).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]].reshape(-1, 12)
+    blocks = root_blocks(root)
+    return packed(blocks @ blocks)

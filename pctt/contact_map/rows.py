@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
-from pctt.blocks import BlockRows
+from pctt.blocks import Array, BlockRows
 from pctt.contact_map.ghosts import Ghosts
 from pctt.exchange import refuse
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -52,13 +49,6 @@ class CompactRows:
         root[: self.columns] = self.root
         ghosts.update(root)
         ghosts.destroy()
-        symmetric = np.zeros((2, len(root), 3, 3))
-        if self.root.shape[1] == 6:
-            for part in (0, 1):
-                symmetric[part][:, range(3), range(3)] = root[:, 3 * part : 3 * part + 3]
-        else:
-            places = [0, 1, 2, 1, 3, 4, 2, 4, 5]
-            symmetric[:] = root.reshape(-1, 2, 6).transpose(1, 0, 2)[:, :, places].reshape(2, -1, 3, 3)
         order = np.argsort(self.body, axis=1)
         frame, arms = self.frame.reshape(-1, 1, 3, 3), self.arm.reshape(-1, 2, 1, 3)
         blocks = np.concatenate(np.broadcast_arrays(frame, np.cross(arms, frame)), axis=3)
@@ -67,10 +57,8 @@ class CompactRows:
         body = np.take_along_axis(self.body, order, axis=1)
         moves = body >= 0
         local = np.take_along_axis(ghosts.body, order, axis=1)[moves]
-        blocks = blocks[moves]
-        for part in (0, 1):
-            columns = slice(3 * part, 3 * part + 3)
-            blocks[:, :, columns] = blocks[:, :, columns] @ symmetric[part][local]
+        blocks, both = blocks[moves], root_blocks(root)[local]
+        blocks = np.concatenate([blocks[:, :, :3] @ both[:, 0], blocks[:, :, 3:] @ both[:, 1]], axis=2)
         indptr = np.concatenate([[0], np.cumsum(moves.sum(axis=1))])
         return BlockRows(indptr, body[moves], blocks, self.columns)
 
@@ -127,6 +115,18 @@ def _array(name: str, given: np.ndarray, kind: type, *shapes: tuple[int, ...]) -
     if array.dtype.kind not in ("iu" if kind is np.int64 else "fiu") and array.size:
         raise ValueError(f"{name} of the rows has the type {array.dtype}; allowed is {np.dtype(kind).name}")
     return np.ascontiguousarray(array, dtype=kind)
+
+
+def root_blocks(root: Array) -> Array:
+    """Matrices in the format of `CompactRows.root` as blocks (n, 2, 3, 3)."""
+    if root.shape[1] == 6:
+        return root.reshape(-1, 2, 3, 1) * np.eye(3)
+    return root.reshape(-1, 2, 6)[:, :, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+
+
+def packed(blocks: Array) -> Array:
+    """Symmetric blocks (n, 2, 3, 3) as (n, 12), the inverse of `root_blocks`."""
+    return blocks.reshape(-1, 2, 9)[:, :, [0, 1, 2, 4, 5, 8]].reshape(-1, 12)
 
 
 def block_rows(comm: MPI.Comm, rows: BlockRows | CompactRows) -> BlockRows:

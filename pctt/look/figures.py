@@ -43,54 +43,58 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
     time = np.array([line["time"] for line in lines])
     figure = Figure(figsize=(12.5, 6.4))
     panels = figure.subplot_mosaic([["contacts", "its", "seconds"], ["residual", "memory", "seconds"]])
-    contacts, its, residual, memory, seconds = (
-        panels[name] for name in ("contacts", "its", "residual", "memory", "seconds")
-    )
-    marker = "o" if len(lines) < 60 else None
-    look = {"marker": marker, "markersize": 3, "linewidth": 1.2}
+    look = {"marker": "o" if len(lines) < 60 else None, "markersize": 3, "linewidth": 1.2}
+    panels["contacts"].plot(time, [line["contacts"] for line in lines], color="C0", **look)
+    panels["contacts"].set_ylabel("contacts")
+    panels["contacts"].yaxis.set_major_locator(MaxNLocator(integer=True))
+    _iterations(panels["its"], time, lines, look)
+    _residuals(panels["residual"], time, lines, look)
+    used = np.array([line.get("peak_memory", np.nan) / 2**20 for line in lines])
+    panels["memory"].plot(time, used, color="C0", **look)
+    panels["memory"].set_ylabel("peak memory of all ranks [MiB]")
+    panels["memory"].set_ylim(0, 1.15 * max(np.nanmax(used, initial=0), 1))
+    _seconds(panels["seconds"], time, lines)
+    for name in ("residual", "memory", "seconds") if len(time) > 1 else ("residual", "memory"):
+        panels[name].set_xlabel("time [s]")
+    return figure
 
-    contacts.plot(time, [line["contacts"] for line in lines], color="C0", **look)
-    contacts.set_ylabel("contacts")
-    contacts.yaxis.set_major_locator(MaxNLocator(integer=True))
 
-    first_order = np.array([line["iterations"] if line["solver"] == "apgd" else 0 for line in lines])
+def _iterations(axes: Axes, time: np.ndarray, lines: Sequence[Mapping[str, Any]], look: Mapping[str, Any]) -> None:
     for label, counts in {
-        "Newton steps": np.array([line["newton_its"] for line in lines]),
-        "Krylov iterations": np.array([line["ksp_its"] for line in lines]),
-        "APGD iterations": first_order,
+        "Newton steps": [line["newton_its"] for line in lines],
+        "Krylov iterations": [line["ksp_its"] for line in lines],
+        "APGD iterations": [line["iterations"] if line["solver"] == "apgd" else 0 for line in lines],
     }.items():
-        if counts.any():
-            its.plot(time, counts, label=label, **look)
-    its.set_yscale("symlog", linthresh=1)
-    its.set_ylabel("iterations per step")
-    its.set_ylim(0, 2 * its.get_ylim()[1])
-    if its.lines:
-        its.legend()
+        if any(counts):
+            axes.plot(time, counts, label=label, **look)
+    axes.set_yscale("symlog", linthresh=1)
+    axes.set_ylabel("iterations per step")
+    axes.set_ylim(0, 2 * axes.get_ylim()[1])
+    if axes.lines:
+        axes.legend()
 
+
+def _residuals(axes: Axes, time: np.ndarray, lines: Sequence[Mapping[str, Any]], look: Mapping[str, Any]) -> None:
     relaxed = [line.get("law", "relaxation") == "relaxation" for line in lines]
     values = np.array([line["natural_residual" if r else "coulomb_residual"] for line, r in zip(lines, relaxed)])
-    good = np.array([line["converged"] for line in lines])
     positive = (values > 0) & np.isfinite(values)
-    residual.semilogy(time[positive], values[positive], color="C0", **look)
-    if not good.all():
-        bad = positive & ~good
-        residual.semilogy(time[bad], values[bad], "x", color="C3", label="not converged")
+    axes.semilogy(time[positive], values[positive], color="C0", **look)
+    bad = np.array([not line["converged"] for line in lines])
+    if bad.any():
+        axes.semilogy(time[positive & bad], values[positive & bad], "x", color="C3", label="not converged")
     asked = np.array([line.get("tolerance", np.nan) for line in lines])
     if np.isfinite(asked).any():
-        residual.plot(time, asked, color="black", linewidth=0.8, linestyle="--", label="tolerance")
-    if residual.get_legend_handles_labels()[0]:
-        residual.legend(fontsize="small")
+        axes.plot(time, asked, color="black", linewidth=0.8, linestyle="--", label="tolerance")
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize="small")
     if positive.any():  # the axis has at least a decade, because it would have too few labels otherwise
         middle = np.sqrt(values[positive].min() * values[positive].max())
-        low, high = residual.get_ylim()
-        residual.set_ylim(min(low, 0.3 * middle), max(high, 3 * middle))
-    residual.set_ylabel("natural residual" if all(relaxed) else "residual")
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, 0.3 * middle), max(high, 3 * middle))
+    axes.set_ylabel("natural residual" if all(relaxed) else "residual")
 
-    used = np.array([line.get("peak_memory", np.nan) / 2**20 for line in lines])
-    memory.plot(time, used, color="C0", **look)
-    memory.set_ylabel("peak memory of all ranks [MiB]")
-    memory.set_ylim(0, 1.15 * max(np.nanmax(used, initial=0), 1))
 
+def _seconds(axes: Axes, time: np.ndarray, lines: Sequence[Mapping[str, Any]]) -> None:
     names = list(dict.fromkeys(name for line in lines for name in line["phases"]))
     table = np.array([[line["phases"].get(name, 0.0) for line in lines] for name in names])
     order = np.argsort(-table.sum(axis=1))
@@ -98,14 +102,11 @@ def steps(lines: Sequence[Mapping[str, Any]]) -> Figure:
     if len(time) > 1:
         between = (time[1:] + time[:-1]) / 2
         edges = np.concatenate([[2 * time[0] - between[0]], between, [2 * time[-1] - between[-1]]])
-        seconds.stackplot(edges, np.hstack([shown, shown[:, -1:]]), labels=labels, step="post", alpha=0.85)
-        seconds.legend(ncols=3, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0))
+        axes.stackplot(edges, np.hstack([shown, shown[:, -1:]]), labels=labels, step="post", alpha=0.85)
+        axes.legend(ncols=3, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0))
     else:
-        seconds.bar(labels, shown[:, 0])
-    seconds.set_ylabel("seconds per step")
-    for axes in (residual, memory, seconds) if len(time) > 1 else (residual, memory):
-        axes.set_xlabel("time [s]")
-    return figure
+        axes.bar(labels, shown[:, 0])
+    axes.set_ylabel("seconds per step")
 
 
 def curves(records: Mapping[str, np.ndarray], analysis: Mapping[str, np.ndarray]) -> dict[str, Figure]:

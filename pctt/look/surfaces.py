@@ -107,18 +107,19 @@ def finite(folder: Folder, frame: Frame, row: int, box: np.ndarray | None = None
 
     With a box (2, 3), the surface also lacks the walls beside the box. For a `shell` it is empty then.
     """
-    place, turn = _pose(folder, frame, row)
-    parts: list[vtkPolyData] = []
-    shapes = folder.large[row]["shapes"]
+    parts = _parts(folder, frame, row)
     if box is not None and is_shell(folder, row):
-        return joined(parts)
-    for shape in shapes:
-        if shape["kind"] != "Plane":
-            part = _placed(_surface(shape), shape, place, turn)
-            # a body of a single shape is a tool, such as a blade; it is drawn completely
-            if box is None or len(shapes) == 1 or shape["kind"] != "Box" or not _is_wall(part, box):
-                parts.append(part)
-    return joined(parts)
+        parts = []
+    elif box is not None and len(folder.large[row]["shapes"]) > 1:  # a single shape is a tool, such as a blade
+        parts = [(shape, part) for shape, part in parts if shape["kind"] != "Box" or not _is_wall(part, box)]
+    return joined([part for _, part in parts])
+
+
+def _parts(folder: Folder, frame: Frame, row: int) -> list[tuple[Mapping[str, Any], vtkPolyData]]:
+    """The shapes of the large body `row` without its planes, and their surfaces in the world."""
+    place, turn = _pose(folder, frame, row)
+    solid = [shape for shape in folder.large[row]["shapes"] if shape["kind"] != "Plane"]
+    return [(shape, _placed(_surface(shape), shape, place, turn)) for shape in solid]
 
 
 def _is_wall(solid: vtkPolyData, box: np.ndarray) -> bool:
@@ -182,9 +183,7 @@ def _is_hollow(triangles: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool
 
 def _solid(folder: Folder, frame: Frame, row: int) -> np.ndarray:
     """The corners (m, 3, 3) of the triangles of the large body `row` without its planes."""
-    place, turn = _pose(folder, frame, row)
-    shapes = [shape for shape in folder.large[row]["shapes"] if shape["kind"] != "Plane"]
-    return _triangles(joined([_placed(_surface(shape), shape, place, turn) for shape in shapes]))
+    return _triangles(joined([part for _, part in _parts(folder, frame, row)]))
 
 
 def _triangles(surface: vtkPolyData) -> np.ndarray:
@@ -268,11 +267,11 @@ def _planes(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[Wal
 
 def _box_walls(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[Wall]:
     place, turn = _pose(folder, frame, row)
-    shapes = folder.large[row]["shapes"]
-    boxes = [shape for shape in shapes if shape["kind"] == "Box" and len(shapes) > 1]
-    found = []
-    for shape in [] if boxes and is_shell(folder, row) else boxes:
-        if _is_wall(_placed(_surface(shape), shape, place, turn), box):
+    found: list[Wall] = []
+    if len(folder.large[row]["shapes"]) == 1 or is_shell(folder, row):
+        return found
+    for shape, part in _parts(folder, frame, row):
+        if shape["kind"] == "Box" and _is_wall(part, box):
             center = place + quaternion.rotate(turn, np.array(shape["center"]))
             axes = quaternion.matrix(quaternion.multiply(turn, np.array(shape["quaternion"]))).T
             half = np.array(shape["half_extents"])

@@ -207,11 +207,11 @@ def _as_map(P: PETSc.Mat, given: ContactMap | BlockRows | CompactRows) -> Contac
     return contact_map(P.comm.tompi4py(), given) if isinstance(given, (BlockRows, CompactRows)) else given
 
 
-def _largest_eigenvalue(G: ContactMap, iterations: int = 15) -> float:
-    """A lower bound of the largest eigenvalue of G G', by the power method."""
+def _largest_eigenvalue(G: ContactMap) -> float:
+    """A lower bound of the largest eigenvalue of G G', by 15 steps of the power method."""
     g = np.random.default_rng(G.comm.rank).standard_normal((G.rows, 3))
     value = 1.0
-    for _ in range(iterations):
+    for _ in range(15):
         g /= max(np.sqrt(G.comm.allreduce(np.vdot(g, g))), TINY)
         momenta = G.momenta(g)
         value = G.comm.allreduce(np.vdot(momenta, momenta))

@@ -39,7 +39,7 @@ class RankPolicy:
 
     ladder: tuple[int, ...]
     automatic: bool = True
-    figures: dict[int, Figures] = field(default_factory=dict)
+    figures: dict[int, Figures] = field(init=False)
     spent: float = 0.0
     on_trials: float = 0.0
 

@@ -36,8 +36,8 @@ class SparseTrain:
 
     slots: SlottedMatrix
 
-    def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
-        self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
+    def __init__(self, comm: MPI.Comm, options: Options, account: Account) -> None:
+        self.comm, self.options, self.account = comm, options, account
         self._block = 0  # block size of the last structure
         self._forget_structure()
         self._forget_trains()

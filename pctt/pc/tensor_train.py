@@ -76,7 +76,7 @@ class TensorTrain(PythonPC):
             self.policy.forgive()  # a rank that failed on another matrix may work here
         else:
             cap = self.options.cap(SPARSE_RANK)
-            self.made = self.sparse_train(self.comm, self.options, self.account, self.prefix)
+            self.made = self.sparse_train(self.comm, self.options, self.account)
             self.policy = RankPolicy((max(1, cap // LOWER), cap), self.options.rank == "auto")
         assert isinstance(self.made, SparseTrain)
         self.made.begin(P)
@@ -118,15 +118,13 @@ class TensorTrain(PythonPC):
             warnings.warn(f"{self.name}: {word}", stacklevel=2)
 
     def _make_block_jacobi(self, P: PETSc.Mat) -> None:
-        old, diagonal = self._own[1:], self._block_diagonal(P)
+        old = self._own[1:]
+        diagonal = block_diagonal(P, diagonal_blocks(P) if has_entries(P) else None)
         self._jacobi.setOperators(diagonal)
         self._jacobi.setUp()
         self._own = [self._jacobi, diagonal]
         for mat in old:
             mat.destroy()
-
-    def _block_diagonal(self, P: PETSc.Mat) -> PETSc.Mat:
-        return block_diagonal(P, diagonal_blocks(P) if has_entries(P) else None)
 
     # -- application ----------------------------------------------------------------------------------------
 

@@ -18,8 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem import bodies, quaternion
@@ -27,8 +25,10 @@ from dem.free_motion import free_directions
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
+from pctt.blocks import BlockRows, block_csr_matrix, block_matrix
 from pctt.ccp import fclib, petsc_binary
 from pctt.ccp.cone import Array
+from pctt.exchange import offsets
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError
 from pctt.run.place import HARD, Place
@@ -104,20 +104,14 @@ class Dump:
         def state(g: Array) -> fclib.Solution:
             return fclib.Solution(g, problem.product(g) + problem.r, system.velocity(g)[dynamic].ravel())
 
-        guess_known = problem.norm(guess) > 0
         fclib.write_global(
-            path,
-            M,
-            H,
-            f.array,
-            w,
-            problem.mu,
-            self._info(problem, result, asked),
-            state(result.impulse) if result.converged else None,
-            state(guess) if guess_known else None,
-            system.point,
-            problem.softness,
-        )
+            path, M, H, f.array, w, problem.mu,
+            info=self._info(problem, result, asked),
+            solution=state(result.impulse) if result.converged else None,
+            guess=state(guess) if problem.norm(guess) > 0 else None,
+            point=system.point,
+            compliance=problem.softness,
+        )  # fmt: skip
         for petsc_object in (M, H, v_free, f, moved):
             petsc_object.destroy()
 
@@ -158,16 +152,9 @@ def _mass(world: World) -> tuple[np.ndarray, PETSc.Mat]:
     blocks[:, 3:, 3:] = np.linalg.inv(bodies.inverse_inertia(owned))
     alike = np.ptp(owned.inertia, axis=1) == 0  # exactly diagonal, as for spheres
     blocks[alike, 3:, 3:] = owned.inertia[alike, :, None] * np.eye(3)
-    return dynamic, _block_diagonal(blocks, world.comm)
-
-
-def _block_diagonal(blocks: Array, comm: MPI.Comm) -> PETSc.Mat:
-    """Matrix of the diagonal blocks (n, 6, 6) of this rank's bodies, scalar by scalar."""
-    count = len(blocks)
-    first = sum(comm.allgather(count)[: comm.rank])
-    rows = sp.bsr_matrix((blocks, np.arange(count), np.arange(count + 1)), shape=(6 * count, 6 * count)).tocsr()
-    csr = (rows.indptr.astype(PETSc.IntType), (rows.indices + 6 * first).astype(PETSc.IntType), rows.data)
-    return PETSc.Mat().createAIJ(((6 * count, None), (6 * count, None)), csr=csr, comm=comm)
+    count, first = len(owned), offsets(world.comm, len(owned))[world.comm.rank]
+    bodies_here = first + np.arange(count)
+    return dynamic, block_csr_matrix(world.comm, 6 * count, 6 * count, np.arange(count + 1), bodies_here, blocks)
 
 
 def _map(system: ContactSystem, world: World, dynamic: np.ndarray) -> PETSc.Mat:
@@ -181,19 +168,10 @@ def _map(system: ContactSystem, world: World, dynamic: np.ndarray) -> PETSc.Mat:
     turns = np.isfinite(world.large.inertia)  # about which of its axes a body does
     blocks[large, :, 3:] = blocks[large, :, 3:] @ ((axes * turns[:, None, :]) @ axes.transpose(0, 2, 1))[row]
     moves = np.concatenate([np.ones(grains, dtype=bool), bodies.is_dynamic(world.large)])
-    count = np.repeat(6 * moves[body].sum(axis=1), 3)
-    kept = np.broadcast_to(moves[body][:, None, :, None], (len(body), 3, 2, 6))
-    columns = 6 * (np.cumsum(moves) - 1)[body][:, None, :, None] + np.arange(6)
-    entries = blocks.transpose(0, 2, 1, 3)
-    transposed = PETSc.Mat().createAIJ(  # a row of D' has all its entries here
-        ((3 * len(body), None), (6 * int(dynamic.sum()), None)),
-        csr=(
-            np.concatenate([[0], np.cumsum(count)]).astype(PETSc.IntType),
-            np.broadcast_to(columns, kept.shape)[kept].astype(PETSc.IntType),
-            entries[kept],
-        ),
-        comm=world.comm,
-    )
+    kept = moves[body]
+    indptr = np.concatenate([[0], np.cumsum(kept.sum(axis=1))])
+    rows = BlockRows(indptr, (np.cumsum(moves) - 1)[body][kept], blocks[kept], int(dynamic.sum()))
+    transposed = block_matrix(world.comm, rows)  # a row of D' has all its entries here
     H = transposed.transpose(PETSc.Mat())
     transposed.destroy()
     return H

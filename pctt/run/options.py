@@ -47,7 +47,6 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     database = DEMO if demo else database
     run = read(Run, database)
     solver = ccp.SOLVERS[run.ccp_type]
-    prefix = f"ccp_{run.ccp_type}_"
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in option_groups(scene_class) for d in describe(group, start)]
     refuse_unknown(database, known, prefixes=OF_SOLVERS)
@@ -66,7 +65,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         run.dt if run.dt is not None else dt,
         run.delta if run.delta is not None else delta,
         limits,
-        read(solver.options, database, prefix),
+        read(solver.options, database, solver.prefix),
         read(ccp.Coulomb, database, "ccp_coulomb_") if obeys_coulomb else None,
         demo,
     )
@@ -79,15 +78,8 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
             is_free(run.ccp_operator)
         except ValueError as error:
             raise OptionError(str(error)) from None
-    refuse_serial(comm)
-    _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
-    _refuse_missing("-problem", run.problem, comm)
     dump_steps(run)  # refuses what is no list of steps
-    if not run.settle:
-        _refuse_unwritable("-output", Path(run.output), comm)
-        if run.dump_problem:
-            _refuse_unwritable("-dump_problem", Path(run.dump_problem), comm)
-        _refuse_occupied(run, comm)
+    _refuse_places(run, comm)
     return options
 
 
@@ -128,7 +120,7 @@ def _refuse_bad_numerics(name: str, scene: Experiment) -> None:
 
 def option_groups(scene: type[Experiment]) -> list[tuple[type, str]]:
     """The classes whose fields are options, with their prefixes."""
-    solvers = [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
+    solvers = [(solver.options, solver.prefix) for solver in ccp.SOLVERS.values()]
     laws: list[tuple[type, str]] = [(ccp.Limits, "ccp_"), (ccp.Coulomb, "ccp_coulomb_")]
     return [(Run, ""), (scene, "scene_"), *laws, *solvers]
 
@@ -217,6 +209,18 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) ->
         raise OptionError(f"{listed}: PETSc refuses: {reason}") from None
     finally:
         ksp.destroy()
+
+
+def _refuse_places(run: Run, comm: MPI.Comm) -> None:
+    """OptionError for files that are not there, and for folders in which the run cannot write or must not."""
+    refuse_serial(comm)
+    _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
+    _refuse_missing("-problem", run.problem, comm)
+    if not run.settle:
+        _refuse_unwritable("-output", Path(run.output), comm)
+        if run.dump_problem:
+            _refuse_unwritable("-dump_problem", Path(run.dump_problem), comm)
+        _refuse_occupied(run, comm)
 
 
 def _refuse_missing(name: str, path: str, comm: MPI.Comm) -> None:

@@ -232,14 +232,7 @@ def cone_problem(
     """The cone problem of a step's contacts."""
     G = ccp.CompactRows(*system.contact_map, columns=system.owned_bodies)
     return ccp.ConeProblem(
-        comm,
-        system.r,
-        system.mu,
-        G=G,
-        point=system.point,
-        key=system.key,
-        compliance=compliance,
-        operator=operator,
+        comm, system.r, system.mu, G=G, point=system.point, key=system.key, compliance=compliance, operator=operator
     )
 
 

@@ -99,14 +99,10 @@ class Apply:
             self._steps.append((W, flat.reshape(count, len(W), rest), flat.reshape(following)))
         self._outputs = list(self._y.reshape(len(self._boxes), box // modes[-1], modes[-1]))
 
-    def __call__(self, x: Array, out: Array | None = None) -> Array:
+    def __call__(self, x: Array) -> Array:
         """This rank's rows of T x, from the whole x."""
         self.x[: self.n] = x
-        y = self.product()
-        if out is None:
-            return y.astype(np.result_type(x), copy=True)
-        out[:] = y
-        return out
+        return self.product().astype(np.result_type(x), copy=True)
 
     def product(self) -> Array:
         """This rank's rows of T x; the caller has put the whole x into `self.x[:n]`. Valid until the next call."""

@@ -52,18 +52,18 @@ def compress_cross(
     eps: float = 1e-2,
     start: Cross | None = None,
     sweeps: int = 10,
-    measure: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Cross:
     """A train with ranks at most `max_rank` from entries of the matrix. Its error is about eps if the rank allows it.
+
+    The final error of a sparse matrix is measured, at a cost linear in the nonzeros; that of a matrix given by a
+    function is estimated from fresh samples. All other costs are sublinear.
 
     Parameters
     ----------
     start : the result for a similar matrix; its index sets are the first ones
     sweeps : largest number of sweeps. They end earlier if the estimated error is below eps, or if it falls by less than
         a tenth in two consecutive sweeps.
-    measure : measure the final error of a sparse matrix, at a cost linear in the nonzeros. Otherwise, and for a matrix
-        given by a function, it is estimated from fresh samples, and all costs are sublinear.
     rng : must give the same numbers on all ranks
 
     >>> i = np.arange(63)
@@ -96,7 +96,7 @@ def compress_cross(
         inner *= TIGHTER
         extra = matrix.agree(entries.worst(train, most))
     assert best is not None, "there is at least one sweep"
-    if isinstance(matrix, SparseHierarchy) and measure:
+    if isinstance(matrix, SparseHierarchy):
         return replace(best, error=relative_error(matrix, best.train))
     return replace(best, error=matrix.agree(entries.error(best.train, *matrix.validation(SAMPLES, rng))))
 

@@ -9,7 +9,7 @@ from pctt.tt.projection import Projection, columns, rows
 from pctt.tt.train import Array, Train, random
 
 
-def lowest(X: Train, rank: int | None = None, sweeps: int = 4, rng: np.random.Generator | None = None) -> float:
+def lowest(X: Train, rank: int | None = None, sweeps: int = 4) -> float:
     """An upper bound of the least eigenvalue of a symmetric X.
 
     It is the least v'Xv / v'v that an alternating search over trains v of the given rank finds. The default rank is 8,
@@ -19,9 +19,8 @@ def lowest(X: Train, rank: int | None = None, sweeps: int = 4, rng: np.random.Ge
     >>> round(lowest(identity([4, 4, 4])), 12)
     1.0
     """
-    rng = np.random.default_rng(0) if rng is None else rng
     rank = (8 if max(X.rows) <= 8 else 4) if rank is None else rank
-    v = list(random(X.rows, rank, [1] * len(X), rng, X.dtype).right_orthogonal().cores)
+    v = list(random(X.rows, rank, [1] * len(X), dtype=X.dtype).right_orthogonal().cores)
     galerkin = Projection.around(X, None, v, v)
     value = np.inf
 

@@ -13,15 +13,15 @@ import numpy as np
 
 from pctt.tt.train import Array, Train
 
-FIRST = 64  # the largest first mode
+FIRST, MIDDLE = 64, 4  # the largest first mode, and the modes between the first and the last
 
 
-def choose_modes(n: int, leaf: int = 16, middle: int = 4) -> tuple[int, ...]:
-    """Slot modes [first, middle, ..., middle, last] for n slots.
+def choose_modes(n: int, leaf: int = 16) -> tuple[int, ...]:
+    """Slot modes [first, MIDDLE, ..., MIDDLE, last] for n slots.
 
     The first mode is at most FIRST. The last is the number between `leaf` and 5/4 `leaf` with the least padding. A
     small number of slots gets one or two modes. The application of a train of rank r with these modes costs about
-    2 n r (first + r sum(middle) + last) operations; for this reason the ends are not larger.
+    2 n r (first + r MIDDLE levels + last) operations; for this reason the ends are not larger.
 
     >>> choose_modes(134_547)
     (31, 4, 4, 4, 4, 17)
@@ -33,12 +33,12 @@ def choose_modes(n: int, leaf: int = 16, middle: int = 4) -> tuple[int, ...]:
     if n <= 2 * leaf:
         return (n,)
     levels = 0
-    while n > FIRST * middle**levels * leaf:
+    while n > FIRST * MIDDLE**levels * leaf:
         levels += 1
     best: tuple[int, ...] = ()
     for last in range(leaf, leaf + leaf // 4 + 1):
-        below = last * middle**levels
-        candidate = (-(-n // below), *[middle] * levels, last)
+        below = last * MIDDLE**levels
+        candidate = (-(-n // below), *[MIDDLE] * levels, last)
         if not best or slots_of(candidate) < slots_of(best):
             best = candidate
     return best
@@ -58,20 +58,10 @@ def scalar_modes(modes: Sequence[int], block: int) -> tuple[int, ...]:
     return (*modes[:-1], modes[-1] * block)
 
 
-def digits(index: Array, modes: Sequence[int]) -> Array:
-    """Multi-indices (d, ...) of linear indices (...), the first mode slowest."""
-    return np.stack(np.unravel_index(index, tuple(modes)))
+def group_modes(modes: Sequence[int], ends: int) -> list[int]:
+    """Numbers of neighbouring modes to merge, so that products are at most `ends` at both ends and MIDDLE between.
 
-
-def linear(multi: Array, modes: Sequence[int]) -> Array:
-    """Linear indices (...) of multi-indices (d, ...): the inverse of `digits`."""
-    return np.ravel_multi_index(tuple(multi), tuple(modes))
-
-
-def group_modes(modes: Sequence[int], ends: int = 64, middle: int = 4) -> list[int]:
-    """Numbers of neighbouring modes to merge, so that products are at most `ends` at both ends and `middle` between.
-
-    >>> group_modes([2] * 16)
+    >>> group_modes([2] * 16, 64)
     [6, 2, 2, 6]
     """
     modes = list(modes)
@@ -79,7 +69,7 @@ def group_modes(modes: Sequence[int], ends: int = 64, middle: int = 4) -> list[i
     tail = leading(modes[:head - 1 if head else None:-1], ends) if head < len(modes) else 0
     groups, k = [head], head
     while k < len(modes) - tail:
-        groups.append(leading(modes[k : len(modes) - tail], middle))
+        groups.append(leading(modes[k : len(modes) - tail], MIDDLE))
         k += groups[-1]
     return groups + ([tail] if tail else [])
 

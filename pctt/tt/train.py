@@ -148,14 +148,6 @@ class Train:
             out[part] = x[:, 0, 0]
         return out
 
-    def diagonal_blocks(self) -> Array:
-        """The diagonal blocks (P, m_d, n_d) of the matrix at the last level, P = m_1 ... m_{d-1}."""
-        out = np.ones((1, 1), self.dtype)
-        for core in self._matrix().cores[:-1]:
-            out = np.tensordot(out, core.diagonal(axis1=1, axis2=2), (1, 0)).transpose(0, 2, 1)
-            out = out.reshape(-1, core.shape[-1])
-        return np.tensordot(out, self.cores[-1][..., 0], 1)
-
     # Arithmetic
 
     def __add__(self, other: Train) -> Train:
@@ -223,13 +215,6 @@ class Train:
     def norm(self) -> float:
         """Frobenius norm, from orthogonal cores, so that the norm of a difference is as accurate as its terms."""
         return float(np.linalg.norm(self.left_orthogonal().cores[-1]))
-
-    def trace(self) -> float:
-        """Sum of the diagonal entries of a matrix."""
-        out = np.ones(1, self.dtype)
-        for core in self._matrix().cores:
-            out = out @ core.trace(axis1=1, axis2=2)
-        return float(out[0])
 
     # Orthogonal cores and rounding
 

@@ -148,16 +148,6 @@ def test_neighbours_have_different_colours(hub):
         assert (coupled[later][:, colour == k]).any(axis=1).all()
 
 
-def test_colours_are_kept_while_the_graph_stays(monkeypatch):
-    known, _ = heap(5)
-    first = colouring.colours(neighbourhood(known))
-    monkeypatch.setattr(colouring, "_jones_plassmann", lambda graph: pytest.fail("made anew"))
-    assert np.array_equal(colouring.colours(neighbourhood(known)), first)
-    monkeypatch.undo()
-    other, _ = heap(6)
-    assert not np.array_equal(colouring.colours(neighbourhood(other)), first)
-
-
 def test_a_sweep_is_gauss_seidel_contact_by_contact():
     known, graph = heap(2, mu=np.arange(40) % 4 * 0.3)
     scaled = ScaledProblem(from_graph(known, graph))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dem import quaternion
 from dem.contact.box_box import CORNER_OF_SECOND, EDGES, SNAP, box_box
-from dem.contact.narrow import FLUSH
+from dem.contact.narrow import FLUSH, Boxes
 
 DELTA = 0.1
 
@@ -29,7 +29,7 @@ def box(half, center=(0.0, 0.0, 0.0), frame=None):
 
 def touch(one, other, delta=DELTA):
     """The contacts of two boxes: features, points, normals, gaps, ordered by gap and place."""
-    found = box_box(*(column[None] for column in (*one[:3], *other[:3])), np.array([delta]))
+    found = box_box(*(Boxes(*(column[None] for column in side[:3])) for side in (one, other)), np.array([delta]))
     order = np.lexsort((*np.round(found.touch.point, 9).T, np.round(found.touch.gap, 9)))
     return (found.feature[order], *(values[order] for values in found.touch))
 
@@ -138,7 +138,7 @@ def test_boxes_out_of_reach_and_no_boxes():
     assert len(touch(box((1, 1, 1)), box((1, 1, 1), (0, 0, 2.11)))[3]) == 0
     assert len(touch(box((1, 1, 1)), box((1, 1, 1), (0, 0, 2.1 - 1e-12)))[3]) == 4
     none = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
-    found = box_box(*none, *none, np.zeros(0))
+    found = box_box(Boxes(*none), Boxes(*none), np.zeros(0))
     assert len(found.pair) == len(found.touch.gap) == 0
 
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from dem import quaternion
 from dem.contact.capsules import DISTINCT, capsule_box, capsule_capsule, capsule_plane
+from dem.contact.narrow import Boxes, Capsules, Planes
 from dem.shapes import Capsule, Sphere, capsule_mass, mass_properties, moved
 
 DELTA = 0.1
@@ -34,26 +35,26 @@ def capsule(center, axis, half_length, radius):
 def arguments(one):
     center, frame, half, radius = one
     if radius == 0.0:
-        return center[None], frame[None], half[None]
-    return center[None], frame[None, :, 2], half[None, 2], np.array([radius])
+        return Boxes(center[None], frame[None], half[None])
+    return Capsules(center[None], frame[None, :, 2], half[None, 2], np.array([radius]))
 
 
 def touch(one, other, delta=DELTA):
     """The contacts of a capsule and a capsule or box: features, points, normals, gaps, ordered by place."""
     function = capsule_box if other[3] == 0.0 else capsule_capsule
-    found = function(*arguments(one), *arguments(other), np.array([delta]))
+    found = function(arguments(one), arguments(other), np.array([delta]))
     order = np.lexsort(np.round(found.touch.point, 9).T)
     return (found.feature[order], *(values[order] for values in found.touch))
 
 
 def test_a_capsule_on_a_plane_touches_with_both_ends_or_one():
-    up, origin = np.array([[0.0, 0, 1]]), np.zeros((1, 3))
-    lying = capsule_plane(*arguments(capsule((1, 2, 0.28), (1, 0, 0), 0.5, 0.25)), up, origin, np.array([DELTA]))
+    ground = Planes(np.array([[0.0, 0, 1]]), np.zeros((1, 3)))
+    lying = capsule_plane(arguments(capsule((1, 2, 0.28), (1, 0, 0), 0.5, 0.25)), ground, np.array([DELTA]))
     np.testing.assert_array_equal(lying.feature, [0, 1])
     np.testing.assert_allclose(lying.touch.gap, 0.03)
     np.testing.assert_allclose(lying.touch.point, [[0.5, 2, 0.015], [1.5, 2, 0.015]])
     np.testing.assert_array_equal(lying.touch.normal, [[0, 0, -1]] * 2)
-    leaning = capsule_plane(*arguments(capsule((0, 0, 0.55), (0.6, 0, 0.8), 0.5, 0.25)), up, origin, np.array([DELTA]))
+    leaning = capsule_plane(arguments(capsule((0, 0, 0.55), (0.6, 0, 0.8), 0.5, 0.25)), ground, np.array([DELTA]))
     np.testing.assert_allclose(leaning.touch.gap, [-0.1])
 
 

@@ -13,8 +13,8 @@ from mpi4py import MPI
 from dem import quaternion
 from dem.contact import find_contacts
 from dem.contact.capsules import capsule_plane
-from dem.contact.meshes import capsule_mesh, sphere_mesh
-from dem.contact.narrow import sphere_box
+from dem.contact.meshes import PlacedMesh, capsule_mesh, sphere_mesh
+from dem.contact.narrow import Boxes, Capsules, Planes, Spheres, sphere_box
 from dem.mesh import Mesh, merged
 from dem.motion import Dynamic, Rotation
 from dem.scene import Scene
@@ -52,14 +52,15 @@ def on(mesh, center, radius, delta=0.1):
     """Contacts of balls with a mesh at the origin."""
     center = np.atleast_2d(np.asarray(center, float))
     size = np.full(len(center), float(radius))
-    return sphere_mesh(center, size, mesh.surface, mesh.surface.middle, np.eye(3), np.full(len(center), delta))
+    placed = PlacedMesh(mesh.surface, mesh.surface.middle, np.eye(3))
+    return sphere_mesh(Spheres(center, size), placed, np.full(len(center), delta))
 
 
 def lying(mesh, center, axis, half_length, radius, delta=0.1):
     """Contacts of a capsule with a mesh at the origin, in the order of their points."""
     axis = np.array([axis], float) / np.linalg.norm(axis)
-    core = np.array([center], float), axis, np.array([half_length]), np.array([radius])
-    found = capsule_mesh(*core, mesh.surface, mesh.surface.middle, np.eye(3), np.array([delta]))
+    core = Capsules(np.array([center], float), axis, np.array([half_length]), np.array([radius]))
+    found = capsule_mesh(core, PlacedMesh(mesh.surface, mesh.surface.middle, np.eye(3)), np.array([delta]))
     order = np.lexsort(np.round(found.touch.point, 9).T)
     return found.feature[order], *(values[order] for values in found.touch)
 
@@ -140,8 +141,10 @@ def test_balls_on_a_block_of_triangles_as_on_a_box():
     size = np.full(len(center), 0.2)
     place, turn = np.array([1.0, 2, 3]), quaternion.matrix(random_quaternions(rng, 1)[0])
     center = place + center @ turn.T
-    box = sphere_box(center, size, place, turn, half)
-    found = sphere_mesh(center, size, mesh.surface, place, turn, np.full(len(center), 0.05))
+    balls = Spheres(center, size)
+    boxes = Boxes(*(np.repeat(array[None], len(center), 0) for array in (place, turn, half)))
+    box = sphere_box(balls, boxes)
+    found = sphere_mesh(balls, PlacedMesh(mesh.surface, place, turn), np.full(len(center), 0.05))
     touching = np.flatnonzero(box.gap <= 0.05)
     # A thin part of the block may be within reach behind its near face; the closest contact is that of the box.
     order = np.lexsort((found.touch.gap, found.pair))
@@ -163,8 +166,9 @@ def test_a_capsule_on_a_flat_mesh_as_on_a_plane(gap):
         center = np.append(rng.uniform(-0.4, 0.4, 2), 0.2 + gap)
         axis /= np.linalg.norm(axis)
         plane = capsule_plane(
-            *(center[None], axis[None], np.array([0.3]), np.array([0.2])),
-            *(np.array([[0.0, 0, 1]]), np.zeros((1, 3)), np.array([0.1])),
+            Capsules(center[None], axis[None], np.array([0.3]), np.array([0.2])),
+            Planes(np.array([[0.0, 0, 1]]), np.zeros((1, 3))),
+            np.array([0.1]),
         )
         _, point, normal, gaps = lying(mesh, center, axis, 0.3, 0.2)
         order = np.lexsort(np.round(plane.touch.point, 9).T)

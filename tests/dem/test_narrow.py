@@ -9,6 +9,10 @@ from cases import random_quaternions
 from dem import quaternion
 from dem.contact.narrow import (
     CORNERS,
+    Boxes,
+    Capsules,
+    Planes,
+    Spheres,
     closest_on_lines,
     corner_plane,
     sphere_box,
@@ -30,14 +34,14 @@ def check_consistency(touch, center, radius):
 
 def test_spheres():
     x, y = np.array([[0.0, 0, 0], [0, 0, 0]]), np.array([[3.0, 4, 0], [0, 0, 1]])
-    touch = sphere_sphere(x, np.array([2.0, 1.0]), y, np.array([2.0, 0.5]))
+    touch = sphere_sphere(Spheres(x, np.array([2.0, 1.0])), Spheres(y, np.array([2.0, 0.5])))
     np.testing.assert_allclose(touch.gap, [1.0, -0.5])
     np.testing.assert_allclose(touch.normal, [[0.6, 0.8, 0], [0, 0, 1]])
     np.testing.assert_allclose(touch.point, [[1.5, 2.0, 0], [0, 0, 0.75]])
 
 
 def test_concentric_spheres_are_parted_along_z():
-    touch = sphere_sphere(np.zeros((1, 3)), np.ones(1), np.zeros((1, 3)), np.ones(1))
+    touch = sphere_sphere(*[Spheres(np.zeros((1, 3)), np.ones(1))] * 2)
     np.testing.assert_array_equal(touch.normal, [[0, 0, 1]])
     assert touch.gap[0] == -2.0
 
@@ -45,7 +49,7 @@ def test_concentric_spheres_are_parted_along_z():
 def test_sphere_above_and_below_a_tilted_plane():
     outward, origin = np.array([0.6, 0.0, 0.8]), np.array([1.0, 2.0, 3.0])
     center = origin + np.outer([1.5, -4.0], outward) + np.array([0.8, 5.0, -0.6])
-    touch = sphere_plane(center, np.array([1.0, 1.0]), outward, origin)
+    touch = sphere_plane(Spheres(center, np.array([1.0, 1.0])), Planes(outward, origin))
     np.testing.assert_allclose(touch.gap, [0.5, -5.0])
     np.testing.assert_allclose(touch.normal, -np.tile(outward, (2, 1)))
     check_consistency(touch, center, np.ones(2))
@@ -66,7 +70,7 @@ def test_sphere_above_and_below_a_tilted_plane():
 )
 def test_sphere_on_faces_edges_corners_and_inside_a_box(center, outward, distance):
     center, radius = np.array([center], dtype=float), np.array([0.25])
-    touch = sphere_box(center, radius, np.zeros((1, 3)), UNIT, np.array([[1.0, 2.0, 3.0]]))
+    touch = sphere_box(Spheres(center, radius), Boxes(np.zeros((1, 3)), UNIT, np.array([[1.0, 2.0, 3.0]])))
     np.testing.assert_allclose(touch.gap, distance - 0.25, atol=1e-14)
     np.testing.assert_allclose(touch.normal, -np.array([outward]), atol=1e-14)
     check_consistency(touch, center, radius)
@@ -87,7 +91,7 @@ def test_sphere_and_rotated_boxes_against_sampling():
     local = RNG.uniform(-1.6, 1.6, (count, 3)) * half
     center = box_center + np.einsum("mij,mj->mi", turn, local)
     radius = RNG.uniform(0.1, 0.3, count)
-    touch = sphere_box(center, radius, box_center, turn, half)
+    touch = sphere_box(Spheres(center, radius), Boxes(box_center, turn, half))
     inside = (np.abs(local) < half).all(axis=1)
     assert 5 < inside.sum() < count - 5
     for k in range(count):
@@ -104,21 +108,11 @@ def test_sphere_and_rotated_boxes_against_sampling():
     check_consistency(touch, center, radius)
 
 
-def test_one_box_serves_many_spheres():
-    q = random_quaternions(RNG, 1)
-    turn, half, place = quaternion.matrix(q), np.array([0.5, 0.2, 0.4]), np.array([1.0, 2.0, 3.0])
-    center, radius = place + RNG.normal(size=(30, 3)), np.full(30, 0.1)
-    shared = sphere_box(center, radius, place, turn[0], half)
-    each = sphere_box(center, radius, np.tile(place, (30, 1)), np.repeat(turn, 30, 0), np.tile(half, (30, 1)))
-    for one, other in zip(shared, each):
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-14)
-
-
 def test_corners_of_a_box_on_a_plane():
     q = quaternion.exponential(np.array([[0.0, np.pi / 4, 0.0]]))
     turn = np.repeat(quaternion.matrix(q), 8, axis=0)
     center, half = np.tile([0.0, 0, 1.5], (8, 1)), np.tile([1.0, 2.0, 1.0], (8, 1))
-    touch = corner_plane(center, turn, half, np.arange(8), np.array([0.0, 0, 1]), np.zeros(3))
+    touch = corner_plane(Boxes(center, turn, half), np.arange(8), Planes(np.array([0.0, 0, 1]), np.zeros(3)))
     tip = center + (half * CORNERS) @ turn[0].T
     np.testing.assert_allclose(touch.gap, tip[:, 2], atol=1e-14)
     np.testing.assert_allclose(np.sort(touch.gap)[:2], 1.5 - np.sqrt(2.0))
@@ -129,7 +123,9 @@ def test_corners_of_a_box_on_a_plane():
 def test_sphere_beside_beyond_and_on_the_core_of_a_capsule():
     center = np.array([[0.0, 0.5, 0.3], [0, 0.6, -1.8], [0, 0, 0.4], [0.0, 0.0, 1.0]])
     up, none = np.tile([0.0, 0.0, 1.0], (4, 1)), np.zeros((4, 3))
-    touch = sphere_capsule(center, np.full(4, 0.1), none, up, np.full(4, 1.0), np.full(4, 0.25))
+    touch = sphere_capsule(
+        Spheres(center, np.full(4, 0.1)), Capsules(none, up, np.full(4, 1.0), np.full(4, 0.25))
+    )
     np.testing.assert_allclose(touch.gap, [0.15, 0.65, -0.35, -0.35])
     np.testing.assert_allclose(touch.normal[:2], [[0, -1, 0], [0, -0.6, 0.8]], atol=1e-15)
     np.testing.assert_allclose(touch.normal[2:, 2], 0.0)

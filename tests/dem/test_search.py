@@ -121,7 +121,7 @@ def test_broad_phase_with_radii_over_three_decades():
     position, radius = rng.uniform(size=(300, 3)), 10.0 ** rng.uniform(-3, -0.5, 300)
     distance = np.linalg.norm(position[:, None] - position, axis=2)
     i, j = np.nonzero(np.triu(distance <= radius[:, None] + radius + 0.01, 1))
-    pairs = close_pairs(position, radius, 0.01)
+    pairs = close_pairs(position, radius + 0.005)
     assert (pairs[:, 0] < pairs[:, 1]).all()
     found = set(map(tuple, pairs))
     assert len(found) == len(pairs)

@@ -109,7 +109,7 @@ def test_warm_start_is_no_worse() -> None:
 def test_cross_is_sublinear_and_survives_nearly_empty_matrices() -> None:
     looked = []
     for n in (2**12, 2**18):
-        found = tt.compress_cross(of_sparse(laplacian(n)).hierarchy(tt.choose_modes(n)), 8, 1e-10, measure=False)
+        found = tt.compress_cross(of_sparse(laplacian(n)).hierarchy(tt.choose_modes(n)), 8, 1e-10)
         assert found.error < 1e-8
         looked.append(found.evaluations)
     assert looked[1] < 4 * looked[0]

@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pctt import tt
-from pctt.tt.quantise import digits, linear
 
 
 @given(st.integers(1, 10**7))
@@ -17,13 +16,6 @@ def test_chosen_modes_pad_little(n: int) -> None:
     assert slots >= n
     assert slots <= 1.07 * n + (20 if n < 1000 else 0)
     assert all(m <= 64 for m in modes)
-
-
-@given(st.lists(st.integers(1, 6), min_size=1, max_size=5))
-def test_digits_and_indices(modes: list[int]) -> None:
-    index = np.arange(tt.slots_of(modes))
-    np.testing.assert_array_equal(linear(digits(index, modes), modes), index)
-    np.testing.assert_array_equal(digits(index, modes)[0], index // tt.slots_of(modes[1:] or [1]))
 
 
 @given(st.data(), st.lists(st.integers(1, 4), min_size=1, max_size=5), st.booleans())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -75,13 +73,6 @@ def test_arithmetic_of_matrices(pair: tuple[Train, Train], seed: int) -> None:
     )
     i, j = np.indices(A.shape)
     np.testing.assert_allclose(a.entries(i, j), A, rtol=0, atol=tolerance(a) * abs(A).max())
-    square = a.T @ a
-    assert square.trace() == pytest.approx(np.linalg.norm(A) ** 2, rel=tolerance(a))
-    n, count = a.columns[-1], square.shape[0] // a.columns[-1]
-    blocks = square.full().reshape(count, n, count, n)[np.arange(count), :, np.arange(count)]
-    np.testing.assert_allclose(
-        square.diagonal_blocks(), blocks, rtol=0, atol=tolerance(a) * np.linalg.norm(A) ** 2
-    )
 
 
 @given(pairs_of_trains(matrix=True), st.sampled_from([0.5, 0.1, 1e-2, 1e-4]), st.one_of(st.none(), st.integers(1, 4)))
@@ -154,7 +145,6 @@ def test_words() -> None:
         "matrix train 6 x 20: modes 2x4 3x5, ranks 1-2-1, 46 numbers for 120 entries (ratio 2.61)"
     )
     assert repr(tt.zeros([4, 4])).startswith("vector train 16: modes 4 4, ranks 1-1-1")
-    assert math.isclose(tt.identity([3, 4]).trace(), 12)
 
 
 @pytest.mark.parametrize(

@@ -101,52 +101,40 @@ def _write(
     compliance: float,
 ) -> None:
     """Gather, then write ``/fclib_local`` or ``/fclib_global``."""
-    whole_matrices = {name: gather_matrix(A) for name, A in matrices.items()}
-    whole_vectors = {name: gather_rows(comm, x).ravel() for name, x in vectors.items()}
-    states = {"solution": solution, "guesses/1": guess}
-    whole_states = {name: _gather_state(comm, state) for name, state in states.items() if state is not None}
-    points = None if point is None else gather_rows(comm, point)
+    top = f"fclib_{form}"
+    whole = {name: gather_matrix(A) for name, A in matrices.items()}
+    data = {f"{top}/spacedim": _integers([3])}
+    data |= {f"{top}/vectors/{name}": gather_rows(comm, x).ravel() for name, x in vectors.items()}
+    data |= {f"{top}/info/{name}": _string(text) for name, text in vars(info or Info()).items()}
+    for name, state in {"solution": solution, "guesses/1": guess}.items():
+        parts = {} if state is None else vars(state)
+        data |= {f"{name}/{letter}": gather_rows(comm, x).ravel() for letter, x in parts.items() if x is not None}
+    if guess is not None:
+        data["guesses/number_of_guesses"] = _integers([1])
+    if point is not None:
+        data["pctt/point"] = gather_rows(comm, point)
+    if compliance:
+        data["pctt/compliance"] = np.array(compliance)
 
     def write(temporary: Path) -> None:
-        arrays = [part for A in whole_matrices.values() for part in (A.data, A.indices, A.indices)]
-        arrays += [*whole_vectors.values(), *(x for state in whole_states.values() for x in state.values())]
-        arrays += [] if points is None else [points]
-        texts = sum(len(text.encode()) for text in vars(info or Info()).values())
-        make_hdf5(temporary, sum(array.nbytes for array in arrays) + texts, len(arrays) + 30)
+        for name, A in whole.items():
+            data.update({f"{top}/{name}/{part}": values for part, values in _triplets(A).items()})
+        make_hdf5(temporary, sum(values.nbytes for values in data.values()), len(data) + 10)  # and the groups
         with h5py.File(temporary, "r+") as file:
-            group = file.create_group(f"fclib_{form}")
-            group["spacedim"] = _integers([3])
-            for name, matrix in whole_matrices.items():
-                _write_matrix(group.create_group(name), matrix)
-            for name, vector in whole_vectors.items():
-                group[f"vectors/{name}"] = vector
-            for name, text in vars(info or Info()).items():
-                group[f"info/{name}"] = _string(text)
-            for name, state in whole_states.items():
-                for letter, vector in state.items():
-                    file[f"{name}/{letter}"] = vector
-            if guess is not None:
-                file["guesses/number_of_guesses"] = _integers([1])
-            if points is not None:
-                file["pctt/point"] = points
-            if compliance:
-                file["pctt/compliance"] = compliance
+            for name, values in data.items():
+                file[name] = values
 
     write_whole(path, comm, write)
 
 
-def _gather_state(comm: MPI.Comm, state: Solution) -> dict[str, Array]:
-    return {name: gather_rows(comm, x).ravel() for name, x in vars(state).items() if x is not None}
-
-
-def _write_matrix(group: h5py.Group, A: sp.csr_matrix) -> None:
-    """A in triplets without duplicates."""
+def _triplets(A: sp.csr_matrix) -> dict[str, np.ndarray]:
+    """A without duplicates, as FCLIB's datasets by name."""
     entries = A.tocoo()
     if entries.nnz > np.iinfo(np.int32).max:
         raise ValueError(f"{entries.nnz} nonzeros, more than FCLIB's 32-bit integers count")
-    for name, value in {"m": A.shape[0], "n": A.shape[1], "nz": entries.nnz, "nzmax": entries.nnz}.items():
-        group[name] = _integers([value])
-    group["i"], group["p"], group["x"] = _integers(entries.row), _integers(entries.col), entries.data
+    sizes = {"m": A.shape[0], "n": A.shape[1], "nz": entries.nnz, "nzmax": entries.nnz}
+    places = {"i": _integers(entries.row), "p": _integers(entries.col), "x": entries.data}
+    return {name: _integers([size]) for name, size in sizes.items()} | places
 
 
 def _integers(values: np.ndarray | list[int]) -> np.ndarray:

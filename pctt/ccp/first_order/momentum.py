@@ -13,11 +13,11 @@ class Steering:
     measured."""
 
     damping: float = 0.05  #: 1 - the greatest momentum, at first
-    window: int = 100  #: after which it is looked at [iterations]
-    little: float = 0.8  #: what is left of the residual after a window with too much momentum,
-    much: float = 0.6  #: or with room for more
-    heavier: float = 2.0  #: factors on the damping then
-    lighter: float = 0.9
+    window: int = 100  #: between two changes of the damping [iterations]
+    little: float = 0.8  #: there is too much momentum if a window leaves more than this part of the residual
+    much: float = 0.6  #: there is room for more if it leaves less than this part
+    heavier: float = 2.0  #: factor on the damping if there is too much momentum
+    lighter: float = 0.9  #: factor on the damping if there is room for more
 
 
 STEERING = Steering()

@@ -53,23 +53,24 @@ class Conic:
 class Steering:
     """Numbers that steer the method, without unit but where one is given; docs/notebook_ccp.md has the measurements."""
 
-    proximal: float = 1e-9  #: compliance within a step [mean diag N]: it bounds (B + C)^-1; the answer does not have it
-    #: part of the forcing where impulses are the unknowns: what a solve leaves moves velocities, compared with zero
+    #: compliance within a step [mean diag N]; it bounds (B + C)^-1, and the answer does not have it
+    proximal: float = 1e-9
+    #: factor on the forcing where impulses are the unknowns: there a residual changes velocities that should be zero
     closer: float = 0.01
-    sharper: float = 0.1  #: part of the forcing for Coulomb's law
+    sharper: float = 0.1  #: factor on the forcing for Coulomb's law
     centering: float = 0.02  #: part of the complementarity to aim at, per deviation from the central path
     least: float = 0.01  #: part of the complementarity to aim at in any case
     near: tuple[float, float] = (0.1, 10.0)  #: what counts as near the central path [complementarity aimed at]
-    short: float = 0.8  #: length of a step whose direction is corrected,
-    corrections: int = 3  #: at most so many times,
-    further: float = 0.3  #: for a step that goes so much further
-    longer: float = 1.02  #: a corrected short step is kept if it is so many times as long,
-    less: float = 0.7  #: a corrected long one if it leaves this part of the complementarity
-    #: natural residual below which long steps are corrected too, after a step with progress: before, that may send
-    #: impulses off where next to nothing bounds them
+    short: float = 0.8  #: the direction of a shorter step is corrected
+    corrections: int = 3  #: of a direction at most
+    further: float = 0.3  #: a correction of a short step aims at a step that is longer by this
+    longer: float = 1.02  #: a corrected short step is kept if it is so many times as long
+    less: float = 0.7  #: a corrected long step is kept if it leaves this part of the complementarity
+    #: natural residual below which long steps are corrected too, after a step with progress; before, a correction may
+    #: enlarge impulses that next to nothing bounds
     late: float = 1e-2
-    patience: int = 3  #: iterations without progress before the Newton systems are sharpened;
-    patience_with_law: int = 8  #: for Coulomb's law, before the method gives up
+    patience: int = 3  #: iterations without progress before the Newton systems are sharpened
+    patience_with_law: int = 8  #: the same for Coulomb's law, before the method gives up
     #: for Coulomb's law, part of the way to the boundary at most: next to it a contact has no room to turn
     boundary_with_law: float = 0.9
     near_start: float = 3e4  #: for Coulomb's law, ``-ccp_conic_start`` at most, per residual of the guess or tolerance
@@ -81,8 +82,7 @@ STEERING = Steering()
 def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Conic, newton: Newton, coulomb: bool = False
 ) -> Result:
-    """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step. Default
-    iteration limit 60."""
+    """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step."""
     newton.begin(problem)
     if coulomb and not newton.takes_any:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
@@ -93,7 +93,7 @@ def solve(
         off = max(problem.natural_residual(guess, cones.velocity(guess)), limits.tol)
         start = min(start, STEERING.near_start * off)
     at = _start(cones, guess, start)
-    course = Course(cones, limits.tol, limits.max_it if limits.max_it >= 0 else 60)
+    course = Course(cones, limits.tol, limits.max_it)
     while not course.ends(at, newton):
         scaled = Scaled.of(cones, at, newton, options, course)
         with phase("ConicPredictor"):

@@ -58,52 +58,47 @@ class PDIP:
 class Steering:
     """Numbers that steer the method, without unit; docs/notebook_ccp.md has what was measured."""
 
-    rtol: float = 1e-3  #: of the linear solves, where ``-ksp_rtol`` does not say otherwise,
-    forcing: float = 0.03  #: and what they may leave of velocities, as a part of what the natural residual shows
-    stuck: float = 0.1  #: a step after which the next only centres
-    #: natural residual below which S has a proximal term: before, impulses may have to grow by orders
+    rtol: float = 1e-3  #: relative residual of the linear solves, if ``-ksp_rtol`` gives no other
+    forcing: float = 0.03  #: residual of a linear solve at most, as a part of what the natural residual shows
+    stuck: float = 0.1  #: after a shorter step the next one only centres
+    #: natural residual below which S has a proximal term; before, impulses may have to grow by orders of magnitude
     late: float = 1e-3
-    cut: float = 0.3  #: a step after which it grows,
-    whole: float = 0.7  #: and one after which it falls,
-    factor: float = 4.0  #: by this factor,
-    damping: tuple[float, float] = (1.0, 4.0)  #: from and to this part of the natural residual, times mean diag N
-    short: float = 0.5  #: a step whose direction is corrected,
-    further: float = 0.3  #: for one that goes so much further
-    #: unless the terms of second order enlarge the right-hand side so much: no correction then helps
-    bent: float = 100.0
-    longer: float = 1.2  #: a corrected step that is worth taking, as a part of the other
+    cut: float = 0.3  #: after a shorter step the proximal term grows
+    whole: float = 0.7  #: after a longer step it falls
+    factor: float = 4.0  #: by which it grows or falls
+    damping: tuple[float, float] = (1.0, 4.0)  #: its bounds where it grows [natural residual times mean diag N]
+    short: float = 0.5  #: the direction of a shorter step is corrected
+    further: float = 0.3  #: the correction aims at a step that is longer by this
+    bent: float = 100.0  #: no correction helps if terms of second order enlarge the right-hand side by this factor
+    longer: float = 1.2  #: a corrected step is taken if it is so many times as long
 
 
 STEERING = Steering()
 
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, newton: Newton) -> Result:
-    """Impulses; ``guess`` (nc, 3) gives the normal impulses of persistent contacts, 0 elsewhere.
-
-    Default iteration limit 100 Newton steps.
-    """
-    max_it = limits.max_it if limits.max_it >= 0 else 100
+    """Impulses; ``guess`` (nc, 3) gives the normal impulses of persistent contacts, 0 elsewhere."""
     cone = CONSTRAINTS[options.constraint](problem.mu)
     newton.begin(problem)
     g, lam = _start(problem, guess, cone, options)
     history: list[float] = []
     step, damping = 1.0, 0.0
-    for iteration in range(max_it + 1):
+    for iteration in range(limits.max_it + 1):
         y = _velocity(problem, g)
         history.append(problem.natural_residual(g, y))
         if history[-1] <= limits.tol:
             status, reason = Status.CONVERGED, "natural residual below the tolerance"
             break
-        if iteration == max_it:
-            status, reason = Status.ITERATION_LIMIT, f"{max_it} Newton steps"
+        if iteration == limits.max_it:
+            status, reason = Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
             break
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
         centering = options.centering if step > STEERING.stuck else 1.0
         aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
-        at = Linearised(g, lam, y, f, df, hessian, aim)
+        at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, aim)
         damping = _next_damping(damping, step, history[-1])
-        newton.update(_barrier_blocks(cone, at, damping * min(history[-1], STEERING.late) * problem.mean_diagonal))
-        step, dg, dlam = _corrected(problem, newton, cone, at, _accuracy(problem, at, history[-1]), options)
+        newton.update(_barrier_blocks(at, damping * min(history[-1], STEERING.late) * problem.mean_diagonal))
+        step, dg, dlam = _corrected(at, _accuracy(at, history[-1]), options)
         if not step > 1e-10:
             status, reason = Status.STALLED, "steps became too short"
             if step != step:
@@ -115,9 +110,12 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
 
 
 class Linearised(NamedTuple):
-    """The data that all directions of a Newton step share: impulses and multipliers, velocities, the constraints with
-    their first and second derivatives, and the target 1/t of the complementarity."""
+    """The data that all directions of a Newton step share: the problem, impulses and multipliers, velocities, the
+    constraints with their first and second derivatives, and the target 1/t of the complementarity."""
 
+    problem: ConeProblem
+    newton: Newton
+    cone: Perspective | Quadratic
     g: Array
     lam: Array
     y: Array
@@ -127,11 +125,12 @@ class Linearised(NamedTuple):
     barrier: float
 
 
-def _accuracy(problem: ConeProblem, at: Linearised, residual: float) -> float:
+def _accuracy(at: Linearised, residual: float) -> float:
     """How accurately to solve a Newton system (momenta, sqrt J).
 
     The residual of a solve is a velocity. It must be only a part of the velocities that the natural residual stands
     for: otherwise complementarity would fall without them, and near the boundary no step makes up for that."""
+    problem = at.problem
     shown = residual * problem.norm(at.g) * problem.mean_diagonal
     left = min(STEERING.rtol * problem.norm(_right_side(at)), STEERING.forcing * shown)
     return left / float(np.sqrt(problem.mean_diagonal))
@@ -156,36 +155,29 @@ def _right_side(at: Linearised, bend: tuple[Array, Array] | None = None) -> Arra
     return ((at.barrier + missed) / at.f)[:, None] * at.df - at.y - curved
 
 
-def _corrected(
-    problem: ConeProblem, newton: Newton, cone: Perspective | Quadratic, at: Linearised, tol: float, options: PDIP
-) -> tuple[float, Array, Array]:
+def _corrected(at: Linearised, tol: float, options: PDIP) -> tuple[float, Array, Array]:
     """The step to take, and the direction dg, dlam: Newton's, corrected once where the cones' curvature cuts it short
     and that pays."""
-    dg, dlam, x = _direction(problem, newton, at, tol)
-    step = _step_length(problem, cone, at, dg, dlam, options)
+    dg, dlam, x = _direction(at, tol)
+    step = _step_length(at, dg, dlam, options)
     if not step < STEERING.short:
         return step, dg, dlam
     bend = _bend(at, dg, dlam, min(1.0, step + STEERING.further))
-    if problem.norm(_right_side(at, bend)) < STEERING.bent * problem.norm(_right_side(at)):
-        other_dg, other_dlam, _ = _direction(problem, newton, at, tol, bend, x)
-        other = _step_length(problem, cone, at, other_dg, other_dlam, options)
+    if at.problem.norm(_right_side(at, bend)) < STEERING.bent * at.problem.norm(_right_side(at)):
+        other_dg, other_dlam, _ = _direction(at, tol, bend, x)
+        other = _step_length(at, other_dg, other_dlam, options)
         if other > STEERING.longer * step:
             return other, other_dg, other_dlam
     return step, dg, dlam
 
 
 def _direction(
-    problem: ConeProblem,
-    newton: Newton,
-    at: Linearised,
-    tol: float,
-    bend: tuple[Array, Array] | None = None,
-    start: Array | None = None,
+    at: Linearised, tol: float, bend: tuple[Array, Array] | None = None, start: Array | None = None
 ) -> tuple[Array, Array, Array]:
     """dg, dlam and the Newton system's solution, with the terms of second order ``bend``; ``start``: an earlier
     solution."""
-    dg, x = newton.solve(_right_side(at, bend), tol, start=start)
-    dg[problem.mu == 0, 1:] = 0.0
+    dg, x = at.newton.solve(_right_side(at, bend), tol, start=start)
+    dg[at.problem.mu == 0, 1:] = 0.0
     aim = (at.barrier + (bend[1] if bend else 0.0)) / at.f
     return dg, -(at.lam + aim + at.lam / at.f * dot(at.df, dg)), x
 
@@ -221,31 +213,24 @@ def _start(
     return g, 3 * speed * mean_normal * (mean_mu or 1.0) / -cone.value(g)
 
 
-def _barrier_blocks(cone: Perspective | Quadratic, at: Linearised, proximal: float) -> Array:
+def _barrier_blocks(at: Linearised, proximal: float) -> Array:
     """lambda hess f + lambda/(-f) grad f grad f' + rho I (nc, 3, 3), positive definite inside the cone."""
     with phase("CCPBarrier"):
         blocks = at.lam[:, None, None] * at.hessian
         blocks += (at.lam / -at.f)[:, None, None] * at.df[:, :, None] * at.df[:, None, :]
         blocks[:, [0, 1, 2], [0, 1, 2]] += proximal
-        frictionless = cone.mu == 0
+        frictionless = at.problem.mu == 0
         if frictionless.any():  # hold the tangential impulses at zero
             stiff = 1e12 * np.maximum(blocks[frictionless, 0, 0], 1)
             blocks[frictionless, 1, 1] = blocks[frictionless, 2, 2] = stiff
         return blocks
 
 
-def _step_length(
-    problem: ConeProblem,
-    cone: Perspective | Quadratic,
-    at: Linearised,
-    dg: Array,
-    dlam: Array,
-    options: PDIP,
-) -> float:
+def _step_length(at: Linearised, dg: Array, dlam: Array, options: PDIP) -> float:
     """Longest step, at most 1, inside the cones, near the central path; nan if the direction is no number."""
+    problem, cone, g, lam = at.problem, at.cone, at.g, at.lam
     if not np.isfinite(problem.sum(dg.sum() + dlam.sum())):
         return np.nan
-    g, lam = at.g, at.lam
     step = min(1.0, options.boundary * problem.min(min(step_to_boundary(g, dg, cone.mu), step_to_zero(lam, dlam))))
     while step > 1e-10:
         gap = -(lam + step * dlam) * cone.value(g + step * dg)

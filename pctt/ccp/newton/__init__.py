@@ -157,18 +157,12 @@ class Newton:
                 self._x.array[:] = x = start.copy()
                 self.system.matrix.mult(self._x, self._b)
                 b = b - self._b.array
-            wanted = self.system.tolerance(tol)
-            x += self._solve(b, wanted)
+            self._b.array[:] = b
+            norm, wanted = self._b.norm(), self.system.tolerance(tol)
+            if wanted < norm < np.inf:  # the caller finds no step in a direction that is no number
+                self.linear.solve(self._b, self._x, max(wanted / norm, 1e-14))
+                x += self._x.array
             return self.system.impulses(x, q, uncoupled), x
-
-    def _solve(self, b: Array, wanted: float) -> Array:
-        """x with a residual of norm ``wanted``."""
-        self._b.array[:] = b
-        norm = self._b.norm()
-        if norm <= wanted or not np.isfinite(norm):  # the caller finds no step in a direction that is no number
-            return np.zeros_like(b)
-        self.linear.solve(self._b, self._x, max(wanted / norm, 1e-14))
-        return self._x.array.copy()
 
     def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
         """dv of a solution x."""

@@ -33,15 +33,12 @@ class BodyForm:
         self.symmetric = True
 
     def load(self, problem: ConeProblem) -> None:
-        """Take another problem with the same contacts between the same bodies."""
         assert problem.contact_map is not None
         self.problem = problem
         self.operator.load(problem.contact_map)
         self._placed = False
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
-        """Make K for the barrier blocks B, or from ``inverse`` = (B + C)^-1 if the caller has it more accurately.
-        ``symmetric`` says whether the blocks are."""
         if inverse is None:
             whole = barrier + self.problem.compliance_blocks
             floor = 1e-14 * np.trace(whole, axis1=1, axis2=2)  # a block that rounding has made singular

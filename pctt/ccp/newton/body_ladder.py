@@ -24,19 +24,19 @@ class Steering:
     """Numbers that steer the choice. Costs are in iterations with block Jacobi, measured at 5, 4,900 and 35,900 bodies
     (docs/ccp.md); those with a factor are for 5,000 bodies and one rank."""
 
-    jacobi: float = 5.0  #: set-up of block Jacobi [its iterations]
-    factor: float = 550.0  #: a Cholesky factor [the same],
-    factor_growth: float = 0.4  #: which grows with this power of the number of bodies
-    apply: float = 25.0  #: an iteration with a factor [the same],
-    apply_growth: float = 0.3  #: which grows with this power
+    jacobi: float = 5.0  #: set-up of block Jacobi
+    factor: float = 550.0  #: a Cholesky factor
+    factor_growth: float = 0.4  #: power of the number of bodies with which that cost grows
+    apply: float = 25.0  #: an iteration with a factor
+    apply_growth: float = 0.3  #: power of the number of bodies with which that cost grows
     solves: float = 1.8  #: iterations of predictor and correctors over those of the predictor
     hardness: float = 20.0  #: expected with block Jacobi in a problem's first systems, which are easy [iterations]
     easiest: float = 10.0  #: expected at least, so that one easy system does not set the growth [iterations]
     growth: float = 2.0  #: greatest expected growth of iterations from one system to the next
-    old_factor: float = 60.0  #: expected with the factor of the last matrix [iterations],
-    ageing: float = 1.5  #: and by how much more with each further matrix
-    jacobi_max_it: int = 1500  #: limit of block Jacobi,
-    alone_max_it: int = 20_000  #: and where there is no room for factors
+    old_factor: float = 60.0  #: expected with the factor of the last matrix [iterations]
+    ageing: float = 1.5  #: factor on that with each further matrix
+    jacobi_max_it: int = 1500  #: limit of block Jacobi
+    alone_max_it: int = 20_000  #: the same where there is no room for factors
     factor_max_it: int = 60  #: limit of a factor: beyond, a new one takes less time
     #: memory of a factor of 35,900 bodies [bytes], a fifth more than measured; it grows as nested dissection in space
     factor_bytes: float = 2.2e9

@@ -113,7 +113,7 @@ class Comparison(KrylovFamily):
                 done = self._solver(name).solve(A, b, x, rtol, P)
                 self.records[name].add(done)
                 better = chosen is None or done.converged or done.true_residual < chosen.true_residual
-                if chosen is None or (better and not chosen.converged):
+                if better and not (chosen and chosen.converged):
                     chosen, kept = done, x.array.copy()
         assert chosen is not None
         spent = log.take_seconds(("CCPCompare",))["CCPCompare"]

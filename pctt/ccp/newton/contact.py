@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.block_diagonal import set_diagonal_blocks
+from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.shell import symmetric_shell
@@ -37,7 +37,6 @@ class ContactForm:
             self.matrix = _with_low_rank(self._low_rank, problem.low_rank)
 
     def load(self, problem: ConeProblem) -> None:
-        """Take another problem with the same contacts between the same bodies."""
         self.problem = problem
         if self._entries is not None:
             self._entries.load(problem)
@@ -61,7 +60,7 @@ class ContactForm:
             return
         self.entries()
         if self._low_rank is not None:
-            _put(self._low_rank, self.problem.sparse_diagonal_blocks + barrier)
+            put_diagonal_blocks(self._low_rank, self.problem.sparse_diagonal_blocks + barrier)
             self.matrix.assemble()
 
     def _product(self, g: Array, out: Array) -> None:
@@ -118,17 +117,8 @@ class Entries:
         describe(self.mat, self.problem)
         self.mat.setAttr("barrier", barrier + self.problem.compliance_blocks)
         blocks = self.problem.diagonal_blocks + barrier
-        _put(self.mat, blocks)
+        put_diagonal_blocks(self.mat, blocks)
         set_diagonal_blocks(self.mat, blocks)
-
-
-def _put(mat: PETSc.Mat, blocks: Array) -> None:
-    """Write diagonal blocks (nc, 3, 3)."""
-    first, last = mat.getOwnershipRange()
-    rows = np.arange(first // 3, last // 3, dtype=PETSc.IntType)[:, None]
-    if len(blocks):  # petsc4py divides by their number
-        mat.setValuesBlockedRCV(rows, rows, blocks.reshape(-1, 9))
-    mat.assemble()
 
 
 def _with_low_rank(A: PETSc.Mat, U: PETSc.Mat) -> PETSc.Mat:

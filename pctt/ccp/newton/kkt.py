@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from petsc4py import PETSc
 
-from pctt.block_diagonal import set_diagonal_blocks
+from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks
 from pctt.blocks import square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
@@ -40,8 +40,6 @@ class KKTForm:
         self.matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         if problem.point is not None:
             self.matrix.setAttr("coordinates", problem.point)
-        first, last = self.matrix.getOwnershipRange()
-        self._block_rows = np.arange(first // 5, last // 5, dtype=PETSc.IntType)[:, None]
 
     def _padded(self, blocks: Array) -> sp.bsr_matrix:
         wide = np.zeros((len(blocks), 5, 5))
@@ -50,7 +48,6 @@ class KKTForm:
         return sp.bsr_matrix((wide, self._indices, self._indptr), shape=shape)
 
     def load(self, problem: ConeProblem) -> None:
-        """Take another problem with the same contacts between the same bodies."""
         other = KKTForm(problem)
         other.matrix.copy(self.matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         other.destroy()
@@ -68,9 +65,7 @@ class KKTForm:
         blocks[:, 3:, :3] = scale * V[:, :, 1:].transpose(0, 2, 1)
         tiny = np.finfo(float).tiny
         blocks[:, [3, 4], [3, 4]] = -(scale**2) / np.maximum(k[:, 1:], tiny**0.5)
-        if len(blocks):
-            self.matrix.setValuesBlockedRCV(self._block_rows, self._block_rows, blocks.reshape(-1, 25))
-        self.matrix.assemble()
+        put_diagonal_blocks(self.matrix, blocks)
         set_diagonal_blocks(self.matrix, blocks)
 
     def entries(self) -> PETSc.Mat:

@@ -86,12 +86,6 @@ class Krylov:
         self.rtol = options.getReal("ksp_rtol", rtol)
         self.ksp.setTolerances(rtol=self.rtol)
 
-    def set_rtol(self, rtol: float) -> None:
-        """Another relative tolerance, unless ``-ksp_rtol`` has fixed it."""
-        if not self._rtol_is_given:
-            self.rtol = rtol
-            self.ksp.setTolerances(rtol=rtol)
-
     def solve(
         self,
         A: PETSc.Mat,
@@ -103,12 +97,14 @@ class Krylov:
     ) -> Solve:
         """x = A^-1 b from zero. If a set-up or a solve breaks down on any rank, the result says so; nothing is raised.
 
+        rtol : another relative tolerance, unless ``-ksp_rtol`` has fixed it
         P : the Mat from which the preconditioner is made, or a function that makes it where A is one and the
             preconditioner reads entries; none: A
         keep : use the preconditioner of the last solve, whatever the matrix is now
         """
-        if rtol is not None:
-            self.set_rtol(float(rtol))
+        if rtol is not None and not self._rtol_is_given:
+            self.rtol = float(rtol)
+            self.ksp.setTolerances(rtol=self.rtol)
         start = _now(self.comm)
         with entered(self._options):
             error = on_all_ranks(self.comm, lambda: self._set_up(A, P, keep))

@@ -20,14 +20,8 @@ LADDER = {
 
 
 class UsersSolver(KrylovFamily):
-    """A `LinearSolver` by the KSP without prefix, with the user's options. Systems that it does not solve go down the
-    ladder.
-
-    Attributes
-    ----------
-    iterations : Krylov iterations so far
-    fallbacks : systems that the user's KSP did not solve to twice the tolerance
-    """
+    """A `LinearSolver` by the KSP without prefix, with the user's options. Systems that it does not solve to twice the
+    tolerance go down the ladder."""
 
     takes_any = False
 

@@ -12,43 +12,39 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.ccp.delassus import offsets
+from pctt.contact_map import Ghosts
+from pctt.exchange import offsets
 
 
 class Adjacency:
     """This rank's contacts and the contacts of other ranks (ghosts) that share a body with them.
 
-    ``indptr``, ``columns``: block rows of N, columns local: below ``own`` this rank's contacts, then the ghosts;
-    ``names`` their global indices; ``remote`` (ghosts, 2) owner and index there.
+    ``indptr``, ``columns``: block rows of N, columns local: below ``own`` this rank's contacts, then the ghosts.
     """
 
     def __init__(self, comm: MPI.Comm, indptr: np.ndarray, columns: np.ndarray):
-        starts = offsets(comm, len(indptr) - 1)
-        first, last = starts[comm.rank], starts[comm.rank + 1]
-        away = (columns < first) | (columns >= last)
-        ghosts, position = np.unique(columns[away], return_inverse=True)
-        self.comm, self.indptr, self.own = comm, indptr, int(last - first)
-        self.columns = columns - first
-        self.columns[away] = self.own + position
-        self.names = np.concatenate([np.arange(first, last), ghosts])
-        owner = np.searchsorted(starts, ghosts, side="right") - 1
-        self.remote = np.stack([owner, ghosts - starts[owner]], axis=1)
+        self.comm, self.indptr, self.own = comm, indptr, len(indptr) - 1
+        self._ghosts = Ghosts(comm, self.own, columns)
+        self.columns = self._ghosts.body
 
     def fetch(self, own: np.ndarray) -> np.ndarray:
-        """Values of own contacts and ghosts, from those of own contacts."""
-        out = np.concatenate([own, np.empty(len(self.remote), own.dtype)])
-        send = Halo(self.comm, self.own, np.arange(len(self.remote)), self.remote)
-        send(own, out[self.own :], MPI._typedict[own.dtype.char])
-        send.destroy()
-        return out
+        """Whole numbers (n,) or (n, k) of own contacts and ghosts, from those of own contacts; collective."""
+        values = np.zeros((self._ghosts.nobody + 1, *own.shape[1:]))
+        values[: self.own] = own
+        self._ghosts.update(values)
+        return values[:-1].astype(np.int64)
+
+    def destroy(self) -> None:
+        self._ghosts.destroy()
 
 
 class Halo:
-    """Copies values of owners to the ghosts ``leaves``, whose owners and positions there are ``remote``."""
+    """Copies values of owners to ghosts, of which ``remote`` (ghosts, 2) has the owners and their positions there."""
 
-    def __init__(self, comm: MPI.Comm, roots: int, leaves: np.ndarray, remote: np.ndarray):
+    def __init__(self, comm: MPI.Comm, roots: int, remote: np.ndarray):
         self._sf = PETSc.SF().create(comm)
-        self._sf.setGraph(roots, leaves.astype(PETSc.IntType), remote.astype(PETSc.IntType).ravel())
+        leaves = np.arange(len(remote), dtype=PETSc.IntType)
+        self._sf.setGraph(roots, leaves, remote.astype(PETSc.IntType).ravel())
         self._sf.setUp()
 
     def __call__(self, own: np.ndarray, ghosts: np.ndarray, unit: MPI.Datatype) -> None:
@@ -59,27 +55,14 @@ class Halo:
         self._sf.destroy()
 
 
-_last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # indptr, columns, colours
-
-
 def colours(graph: Adjacency) -> np.ndarray:
-    """Colour of each own contact and ghost; that of the last call while the graph is the same on all ranks."""
-    global _last
-    same = _last is not None and np.array_equal(_last[0], graph.indptr) and np.array_equal(_last[1], graph.columns)
-    if graph.comm.allreduce(bool(same), op=MPI.LAND):
-        assert _last is not None
-        return _last[2]
-    found = _jones_plassmann(graph)
-    _last = (graph.indptr, graph.columns, found)
-    return found
-
-
-def _jones_plassmann(graph: Adjacency) -> np.ndarray:
-    priority = _hash(graph.names)
+    """Colour of each own contact and ghost; collective."""
+    first = offsets(graph.comm, graph.own)[graph.comm.rank]
+    priority = _hash(graph.fetch(first + np.arange(graph.own)))
     row = np.repeat(np.arange(graph.own), np.diff(graph.indptr))
     waits = priority[graph.columns] > priority[row]  # edges to neighbours that choose before
     row, before = row[waits], graph.columns[waits]
-    colour = np.full(len(graph.names), -1)
+    colour = np.full(len(priority), -1)
     while graph.comm.allreduce(int((colour[: graph.own] < 0).sum())):
         undone = colour[before] < 0
         ready = colour[: graph.own] < 0
@@ -90,7 +73,7 @@ def _jones_plassmann(graph: Adjacency) -> np.ndarray:
         taken[place[row[edge]], colour[before[edge]]] = True
         own = colour[: graph.own].copy()
         own[ready] = np.argmin(taken, axis=1)
-        colour = graph.fetch(own) if graph.comm.size > 1 else own
+        colour = graph.fetch(own)
         open_ = ~edge & (colour[row] < 0)
         row, before = row[open_], before[open_]
     return colour

@@ -88,8 +88,9 @@ class Sweep:
         ghost_order = np.argsort(ghost, kind="stable")
         place = np.empty(len(colour), int)
         place[np.concatenate([self._order, graph.own + ghost_order])] = np.arange(len(colour))
-        there = graph.fetch(place[: graph.own])[graph.own :]  # where the ghosts' owners keep them
-        remote = np.stack([graph.remote[:, 0], there], axis=1)[ghost_order]
+        kept = np.stack([np.full(graph.own, comm.rank), place[: graph.own]], axis=1)
+        remote = graph.fetch(kept)[graph.own :][ghost_order]  # where the ghosts' owners keep them
+        graph.destroy()
         A = sp.bsr_matrix((rows.data, place[graph.columns], rows.indptr), shape=(rows.shape[0], 3 * len(colour)))
         self._x = np.zeros((len(colour), 3))
         self._colours = []
@@ -100,7 +101,7 @@ class Sweep:
         for k in range(count):
             part = slice(ends[k], ends[k + 1])
             away = slice(ghost_ends[k], ghost_ends[k + 1])
-            halo = Halo(comm, graph.own, np.arange(away.stop - away.start), remote[away]) if comm.size > 1 else None
+            halo = Halo(comm, graph.own, remote[away]) if comm.size > 1 else None
             ghosts = slice(graph.own + away.start, graph.own + away.stop)
             picked = _picked(A, self._order[part])
             self._colours.append(Colour(part, picked, steps[part], b[part], mu[part], halo, ghosts))
