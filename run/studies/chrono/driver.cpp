@@ -1,7 +1,7 @@
 // One time step of Chrono from a state in a file, from zero impulses: driver SCENE SOLVER ITERATIONS REPEATS IMPULSES
 //
-// SOLVER is "multicore apgd", "multicore bb", "core psor", "core bb" or "core apgd" as one argument. It runs all of
-// ITERATIONS: no tolerance ends it. The step is made REPEATS times, each in a system of its own. Standard output gets
+// SOLVER is "multicore apgd", "multicore bb", "core psor" or "core bb" as one argument. It runs all of ITERATIONS: no
+// tolerance ends it. The step is made REPEATS times, each in a system of its own. Standard output gets
 // a JSON object with the seconds of each, IMPULSES the contacts of the last: for each 14 doubles, numbers of its two
 // bodies (spheres first, then boxes), impulse on the second body [N s] (3), normal from first to second (3), the
 // points on the two surfaces [m] (3 + 3).
@@ -95,7 +95,9 @@ Scene read_scene(const std::string& path) {
     return scene;
 }
 
-void add_bodies(ChSystem& system, const Scene& scene) {
+const double immovable = 1e12;  // kg and kg m^2: Chrono's core takes no velocities of fixed bodies
+
+void add_bodies(ChSystem& system, const Scene& scene, bool fixed_bodies_move) {
     auto material = chrono_types::make_shared<ChContactMaterialNSC>();
     material->SetFriction(static_cast<float>(scene.friction));
     material->SetRestitution(0);
@@ -116,10 +118,14 @@ void add_bodies(ChSystem& system, const Scene& scene) {
     }
     for (const auto& b : scene.boxes) {
         auto body = chrono_types::make_shared<ChBody>();
-        body->SetFixed(true);
+        bool fixed = fixed_bodies_move || (b.velocity.Length() == 0 && b.spin.Length() == 0);
+        body->SetFixed(fixed);
+        body->SetMass(immovable);
+        body->SetInertiaXX(ChVector3d(immovable));
         body->SetPos(b.position);
         body->SetRot(b.turn);
-        add(body, chrono_types::make_shared<ChCollisionShapeBox>(material, b.half * 2), b.velocity, b.spin);
+        auto shape = chrono_types::make_shared<ChCollisionShapeBox>(material, b.half * 2);
+        add(body, shape, fixed ? b.velocity : b.velocity - scene.gravity * scene.dt, b.spin);
     }
     system.SetGravitationalAcceleration(scene.gravity);
 }
@@ -155,7 +161,7 @@ Seconds multicore_step(const Scene& scene, SolverType solver, int iterations, Co
     int bins = bins_per_axis(scene);
     settings.collision.bins_per_axis = vec3(bins, bins, bins);
     system.ChangeSolverType(solver);
-    add_bodies(system, scene);
+    add_bodies(system, scene, true);
 
     system.DoStepDynamics(scene.dt);
 
@@ -216,7 +222,7 @@ Seconds core_step(const Scene& scene, ChSolver::Type solver, int iterations, Con
     iterative->SetMaxIterations(iterations);
     iterative->SetTolerance(0);
     iterative->EnableWarmStart(false);
-    add_bodies(system, scene);
+    add_bodies(system, scene, false);
     system.DoStepDynamics(scene.dt);
     found.clear();
     system.GetContactContainer()->ReportAllContacts(chrono_types::make_shared<Report>(scene.dt, found));
@@ -233,8 +239,6 @@ Seconds step(const Scene& scene, const std::string& solver, int iterations, Cont
         return core_step(scene, ChSolver::Type::PSOR, iterations, found);
     if (solver == "core bb")
         return core_step(scene, ChSolver::Type::BARZILAIBORWEIN, iterations, found);
-    if (solver == "core apgd")
-        return core_step(scene, ChSolver::Type::APGD, iterations, found);
     throw std::runtime_error("there is no solver " + solver);
 }
 
