@@ -1,10 +1,10 @@
 // One time step of Chrono from a state in a file, from zero impulses: driver SCENE SOLVER ITERATIONS REPEATS IMPULSES
 //
 // SOLVER is "multicore apgd", "multicore bb", "core psor" or "core bb" as one argument. It runs all of ITERATIONS: no
-// tolerance ends it. The step is made REPEATS times, each in a system of its own. Standard output gets
-// a JSON object with the seconds of each, IMPULSES the contacts of the last: for each 14 doubles, numbers of its two
-// bodies (spheres first, then boxes), impulse on the second body [N s] (3), normal from first to second (3), the
-// points on the two surfaces [m] (3 + 3).
+// tolerance ends it. The step is made REPEATS times, each in a system of its own. Standard output gets a JSON object
+// with the seconds of each, IMPULSES the contacts of the last: for each 14 doubles, numbers of its two bodies (spheres
+// first, then boxes), impulse on the second body [N s] (3), normal from first to second (3), the points on the two
+// surfaces [m] (3 + 3).
 //
 // SCENE is text, numbers between white space: gravity (3), dt, greatest gap of a contact, friction coefficient, number
 // of spheres and of boxes; for each sphere position (3), velocity (6), radius, mass, moment of inertia; for each box
