@@ -47,8 +47,8 @@ class Contacts:
         return len(self.key)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The arrays by name, without copies."""
-        return {name: value for name, value in vars(self).items() if name != "near"}
+        """The arrays with a row per contact by name, without copies."""
+        return {name: value for name, value in vars(self).items() if name not in ("near", "shifts")}
 
     def take(self, rows: np.ndarray) -> Contacts:
         """The contacts of the given rows (index array or mask)."""
