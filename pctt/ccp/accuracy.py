@@ -27,6 +27,9 @@ class Accuracy:
     cone_violation : largest distance |g_t| - mu g_n outside the friction cone (N s)
     dual_violation : largest distance mu |y_t| - y_n outside the dual cone (m/s)
     complementarity : largest |g.y| of a contact (J)
+    closing_work : work of the normal impulses at contacts that still close, sum of g_n max(-y_n, 0), as a part of
+        1/2 g'Ng; 0 without impulses. About as large as the relative error of the objective, or larger: as that is
+        convex, f(g) - min f <= g'y + the work of optimal impulses on the velocities that y lacks to the dual cone
     impulse_norm, velocity_norm : ||g||, ||y||
     """
 
@@ -37,6 +40,7 @@ class Accuracy:
     cone_violation: float
     dual_violation: float
     complementarity: float
+    closing_work: float
     impulse_norm: float
     velocity_norm: float
 
@@ -50,6 +54,8 @@ def measure(problem: ConeProblem, g: Array) -> Accuracy:
     with_opening = y.copy()
     with_opening[:, 0] += problem.mu * sliding
     natural = _residual(problem, g, y)
+    closing = problem.dot(g[:, 0], np.maximum(-y[:, 0], 0.0))
+    energy = problem.dot(g, 0.5 * (y - problem.r))
     return Accuracy(
         natural_residual=natural,
         rigid_residual=_residual(problem, g, y - problem.compliance * g) if problem.softness else natural,
@@ -58,6 +64,7 @@ def measure(problem: ConeProblem, g: Array) -> Accuracy:
         cone_violation=max(0.0, problem.max((tangential - problem.mu * g[:, 0]).max(initial=0.0))),
         dual_violation=max(0.0, problem.max((problem.mu * sliding - y[:, 0]).max(initial=0.0))),
         complementarity=problem.max(np.abs(dot(g, y)).max(initial=0.0)),
+        closing_work=closing / energy if energy > 0 else 0.0,
         impulse_norm=norm,
         velocity_norm=problem.norm(y),
     )

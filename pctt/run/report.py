@@ -17,6 +17,8 @@ from pctt.ccp.result import FIXED_POINT, RELAXATION
 
 #: Coulomb residuals of the relaxation above this are worth a warning.
 LARGE_OPENING = 1e-3
+#: Work of closing contacts above this part of the impulses' energy is worth a warning.
+LARGE_CLOSING_WORK = 0.05
 #: Overlaps above this part of the radius of the smallest grain are worth a warning.
 LARGE_OVERLAP = 0.05
 
@@ -76,7 +78,7 @@ def accuracy_lines(line: Mapping[str, Any], history: Sequence[float]) -> str:
         f"       objective {line['objective']:.6g} J, outside the cone {line['cone_violation']:.1e} N s, outside the"
         f" dual cone {line['dual_violation']:.1e} m/s, complementarity {line['complementarity']:.1e} J"
     )
-    figures += f"\n       residual of Coulomb's law {line['coulomb_residual']:.1e}"
+    figures += f"\n       closing work {line['closing_work']:.1e}, residual of Coulomb's law {line['coulomb_residual']:.1e}"
     if line["rigid_residual"] != line["natural_residual"]:
         figures += f", of rigid contacts {line['rigid_residual']:.1e}"
     if line["solver"] != line["asked_solver"]:
@@ -213,6 +215,16 @@ def law_line(steps: Sequence[Mapping[str, Any]], tol: float) -> str:
     if RELAXATION not in laws or worst <= max(LARGE_OPENING, 10 * tol):
         return said
     return f"WARNING: {said}: sliding contacts open by dt mu |v_t|; -ccp_coulomb keeps them closed (docs/ccp.md)"
+
+
+def forces_line(steps: Sequence[Mapping[str, Any]]) -> str:
+    """A line about the accuracy of the forces on bodies, with a warning where they may be far off."""
+    worst = max(steps, key=lambda line: line["closing_work"])
+    middle = median(line["closing_work"] for line in steps)
+    said = f"closing work {middle:.1e} (median), {worst['closing_work']:.1e} at most, in step {worst['step']}"
+    if worst["closing_work"] <= LARGE_CLOSING_WORK:
+        return said
+    return f"WARNING: {said}: forces on bodies may be far off; try a smaller -ccp_tol or -ccp_type conic (docs/ccp.md)"
 
 
 def overlap_line(worst: Mapping[str, float]) -> str:
