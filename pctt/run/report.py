@@ -78,7 +78,8 @@ def accuracy_lines(line: Mapping[str, Any], history: Sequence[float]) -> str:
         f"       objective {line['objective']:.6g} J, outside the cone {line['cone_violation']:.1e} N s, outside the"
         f" dual cone {line['dual_violation']:.1e} m/s, complementarity {line['complementarity']:.1e} J"
     )
-    figures += f"\n       closing work {line['closing_work']:.1e}, residual of Coulomb's law {line['coulomb_residual']:.1e}"
+    figures += f"\n       closing work {line['closing_work']:.1e}"
+    figures += f", residual of Coulomb's law {line['coulomb_residual']:.1e}"
     if line["rigid_residual"] != line["natural_residual"]:
         figures += f", of rigid contacts {line['rigid_residual']:.1e}"
     if line["solver"] != line["asked_solver"]:
