@@ -15,8 +15,9 @@ from dem.quaternion import cross
 from dem.scene import LargeBody
 from dem.world import World
 
-#: Newton steps for the spin of a body, and the relative error of its angular momentum at which they have converged.
-NEWTON_STEPS, CONVERGED = 4, 1e-6
+#: Newton steps for the spin of a body at most, the relative change of the spin after which the next one would change
+#: nothing, and the relative error of the angular momentum at which they have converged.
+NEWTON_STEPS, LAST_CHANGE, CONVERGED = 4, 1e-8, 1e-6
 
 
 def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
@@ -58,6 +59,8 @@ def free_spin(spin: Floats, moments: Floats, dt: float) -> Floats:
             middle = _turned(half * new, moments * new)
             change = np.linalg.solve(_slope(new, moments, middle, half), (momentum - middle)[:, :, None])
             new = new + change[:, :, 0]
+            if (quaternion.length(change[:, :, 0]) <= LAST_CHANGE * quaternion.length(spin)).all():
+                break
         solved = _turned(-half * new, momentum) / moments
         error = quaternion.length(moments * (solved - new))
         return np.where((error <= CONVERGED * quaternion.length(momentum))[:, None], solved, spin)

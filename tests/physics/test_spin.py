@@ -14,7 +14,7 @@ from dem.start import new_world
 from dem.stepper import advance
 
 
-def test_quaternions_stay_unit_quaternions_over_ten_thousand_steps():
+def test_quaternions_stay_unit_quaternions_over_two_thousand_steps():
     rng = np.random.default_rng(2)
     scene = Scene(0.3)
     place = np.stack([np.arange(4.0), np.zeros(4), np.zeros(4)], axis=1)
@@ -23,11 +23,11 @@ def test_quaternions_stay_unit_quaternions_over_ten_thousand_steps():
     scene.add_boxes(place, (0.2, 0.1, 0.05), 1000.0, quaternions=turns, angular_velocity=spin)
     world = new_world(scene, MPI.COMM_SELF)
     dt, worst = 1e-3, 0.0
-    for _ in range(10_000):
+    for _ in range(2_000):
         advance(world, free_velocity(world.grains, world.gravity, dt), dt)
         worst = max(worst, np.abs(np.linalg.norm(world.grains.quaternion, axis=1) - 1.0).max())
     assert worst < 4 * np.finfo(float).eps
-    assert world.step == 10_000
+    assert world.step == 2_000
     k = world.step
     np.testing.assert_allclose(world.grains.position[:, 2], -G * dt**2 * k * (k + 1) / 2, rtol=1e-10)
     assert np.isfinite(world.grains.velocity).all()
@@ -35,7 +35,7 @@ def test_quaternions_stay_unit_quaternions_over_ten_thousand_steps():
 
 @pytest.mark.parametrize("turn", [0.02, 0.2, 0.8])
 def test_a_free_body_keeps_its_angular_momentum_and_its_energy(turn):
-    """It turns by `turn` radians in a step, for 3,000 steps, also about the axis of the middle moment."""
+    """It turns by `turn` radians in a step, for 1,000 steps, also about the axis of the middle moment."""
     dt, rng = 0.01, np.random.default_rng(4)
     moments = np.array([[1.0, 3.6, 4.3], [1.0, 1.0, 0.02], [0.5, 0.5, 1.0], [1.0, 0.9, 0.15]]).repeat(5, axis=0)
     q = quaternion.normalized(rng.normal(size=(20, 4)))
@@ -43,7 +43,7 @@ def test_a_free_body_keeps_its_angular_momentum_and_its_energy(turn):
     spin[0] = [0.001, 1.0, 0.001]
     spin *= turn / dt / quaternion.length(spin)[:, None]
     energies, momenta = [], []
-    for _ in range(3000):
+    for _ in range(1000):
         spin = free_spin(spin, moments, dt)
         w = quaternion.rotate(q, spin)
         momenta.append(quaternion.rotate(quaternion.integrate(q, w, dt / 2), moments * spin))
