@@ -64,23 +64,39 @@ class TwoLevel(PythonPC):
         check_coordinates(P)
         comm = P.comm.tompi4py()
         points = _places(P)
-        box = bisect(np.concatenate(comm.allgather(points)), self.options.boxes)
-        first = P.getOwnershipRange()[0] // P.getBlockSize()
-        self.boxes = int(box.max()) + 1
-        self._Z, self._dependent = coarse_space(comm, _modes(P), box[first : first + len(points)], self.boxes)
+        modes = _modes(P)
+        self.modes = modes.shape[2]
+        # fewer columns than rows: by the shape of Z PETSc tells interpolation from restriction
+        most = min(self.options.boxes, (P.getSize()[0] - 1) // self.modes)
         self.multigrid = PETSc.PC().create(P.comm)
         self.multigrid.setOptionsPrefix((pc.getOptionsPrefix() or "") + "two_")
+        self._own = [self.multigrid]
+        if most < 1:  # a matrix of a few rows
+            self.boxes = 0
+            self.multigrid.setType(PETSc.PC.Type.PBJACOBI)
+            return
+        box = bisect(np.concatenate(comm.allgather(points)), most)
+        first = P.getOwnershipRange()[0] // P.getBlockSize()
+        self.boxes = int(box.max()) + 1
+        self._Z, self._dependent = coarse_space(comm, modes, box[first : first + len(points)], self.boxes)
         self.multigrid.setType(PETSc.PC.Type.MG)
         self.multigrid.setMGLevels(2)
         self.multigrid.setMGInterpolation(1, self._Z)
-        # PETSc takes the transpose of Z only if Z has fewer columns than rows
-        restriction = self._Z.transpose(PETSc.Mat())
-        self.multigrid.setMGRestriction(1, restriction)
-        self._own = [self._Z, restriction, self.multigrid]
+        self._own.append(self._Z)
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Compute the block diagonal and the coarse matrix."""
         old = self._values
+        jacobi = block_diagonal(P)
+        self._values = [jacobi]
+        self.multigrid.setOperators(P, jacobi)
+        if self.boxes:
+            self._values.append(self._set_levels(P, jacobi))
+        for thing in old:
+            thing.destroy()
+
+    def _set_levels(self, P: PETSc.Mat, jacobi: PETSc.Mat) -> PETSc.Mat:
+        """Give the levels their matrices; the coarse one is returned."""
         # a copy, because PETSc has no such product for block formats, and its conversion counts as a change of P
         rows = PETSc.Mat().createAIJ(P.getSizes(), csr=P.getValuesCSR(), comm=P.comm)
         coarse = rows.ptap(self._Z)
@@ -89,24 +105,20 @@ class TwoLevel(PythonPC):
         diagonal.array[:] += self._dependent
         coarse.setDiagonal(diagonal)
         diagonal.destroy()
-        jacobi = block_diagonal(P)
-        self.multigrid.setOperators(P, jacobi)
         self.multigrid.getMGSmoother(1).setOperators(P, jacobi)
         self.multigrid.getMGCoarseSolve().setOperators(coarse)
         prefix = self.multigrid.getOptionsPrefix()
         with entered(to_enter(prefix, DEFAULTS, P.comm.size)):
             self.multigrid.setFromOptions()
             self.multigrid.setUp()
-        self._values = [coarse, jacobi]
-        for thing in old:
-            thing.destroy()
+        return coarse
 
     def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x."""
         self.multigrid.apply(x, y)
 
     def report(self) -> list[str]:
-        return [f"two levels: {self.boxes} boxes, {self._Z.getSize()[1] // self.boxes} modes each"]
+        return [f"two levels: {self.boxes} boxes, {self.modes} modes each"]
 
     def release(self) -> None:
         for thing in (*self._own, *self._values):
