@@ -105,7 +105,7 @@ def test_its_systems_climb_from_block_jacobi_to_factors():
 
 
 def test_without_memory_for_factors_block_jacobi_goes_on_alone(monkeypatch):
-    G, r, mu = packing(8)
+    G, r, mu = packing(5)
     monkeypatch.setattr(memory, "available", lambda comm: 1e6)
     newton = newton_for(SELF, "conic")
     assert ccp.solve(ConeProblem(SELF, r, mu, G=G), None, "conic", Limits(1e-6), newton=newton).converged
