@@ -138,7 +138,8 @@ def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: floa
     seen = contacts.near.margin[: contacts.near.grains]
     ways = _way(world.grains, velocity[: len(seen)], dt)
     shift = dt * world.large_velocity(velocity)
-    beyond = _go_beyond(world, shift, contacts.shifts, delta)
+    # reduced, though all ranks have the same data: processors of other kinds may round otherwise
+    beyond = world.comm.allreduce(_go_beyond(world, shift, contacts.shifts, delta), MPI.LOR)
     if not (world.comm.allreduce(bool((ways > seen).any()), MPI.LOR) or beyond):
         return None
     shifts = np.concatenate([contacts.shifts, shift[None]]) if beyond else contacts.shifts
