@@ -12,6 +12,10 @@ from numba import njit
 #: Fused multiply-adds are allowed; what else numba calls fast assumes that there are no NaNs.
 compiled = njit(cache=True, fastmath={"contract"})
 
+#: For a loop that another one calls: fused differently in the first process, it would have other bits there
+#: (`pctt.compiled.unfused`).
+unfused = njit(cache=True)
+
 
 # -- the contact map ---------------------------------------------------------------------------------------------
 
@@ -106,7 +110,7 @@ def in_frames(stored, frame):
 # -- the search --------------------------------------------------------------------------------------------------
 
 
-@compiled
+@unfused
 def pairs_in_cells(center, radius, first, second, alike):
     """Pairs (m, 2), the lower row first, of a sphere of the rows `first` and one of the rows `second` that touch, to
     rounding.
@@ -152,7 +156,7 @@ def pairs_in_cells(center, radius, first, second, alike):
         pairs = np.concatenate((pairs, np.empty((max(len(pairs), len(second)), 2), np.int64)))
 
 
-@compiled
+@unfused
 def _pairs_of_rows(center, radius, rows, done, alike, largest, per, side, start, place, member, pairs, found):
     """Add to the first pairs those of the rows that are not done, as long as there is room; new numbers of rows done
     and pairs found. A loop that makes the room itself takes twice the time."""

@@ -57,10 +57,29 @@ def loop(function: Function) -> Function:
     """Compile at the first call and keep the machine code on disk.
 
     Products and sums may be fused, and a division by zero gives inf or nan as in numpy. numba compiles again only when
-    the file of ``function`` itself changes. So a loop must not call a loop of another file."""
+    the file of ``function`` itself changes. So a loop must not call a loop of another file. In its own file it calls
+    functions that are `inlined`, or both are `unfused`."""
+    return _compile(function, fastmath={"contract"})
+
+
+def inlined(function: Function) -> Function:
+    """Compile as a part of each loop that calls it."""
+    return _compile(function, fastmath={"contract"}, inline="always")
+
+
+def unfused(function: Function) -> Function:
+    """A `loop` in which products and sums are not fused.
+
+    If a loop calls another, the machine code on disk differs from that of the process that compiled both: there the
+    compiler has seen the called loop once more. Fused differently, the first run on a machine would not have the bits
+    of the later ones."""
+    return _compile(function)
+
+
+def _compile(function: Function, **options: Any) -> Function:
     import numba
 
-    options: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}
+    options["error_model"] = "numpy"
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder to keep the machine code in

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from pctt.compiled import loop
+from pctt.compiled import inlined, loop, unfused
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to the next
 
 
-@loop
+@inlined
 def _nearest(n, t_1, t_2, mu):
     """The nearest point of a cone, by selections: a processor could not predict branches."""
     length = np.sqrt(t_1 * t_1 + t_2 * t_2)
@@ -49,7 +49,7 @@ def projected_move(x, y, step, mu):
     return out
 
 
-@loop
+@unfused
 def accelerated_step(x, last_x, y, last_y, beta, step, mu, opening, out):
     number = x.dtype.type
     beta, step = number(beta), number(step)
@@ -69,20 +69,20 @@ def accelerated_step(x, last_x, y, last_y, beta, step, mu, opening, out):
     return squares.sum(), products.sum()
 
 
-@loop
+@unfused
 def _extrapolate(x, last_x, beta, out):
     for k in range(len(x)):
         out[k] = x[k] + beta * (x[k] - last_x[k])
 
 
-@loop
+@unfused
 def _add_opening(y, mu):
     for c in range(len(mu)):
         i = 3 * c
         y[i] += mu[c] * np.sqrt(y[i + 1] * y[i + 1] + y[i + 2] * y[i + 2])
 
 
-@loop
+@unfused
 def _step(x, y, step, mu, out):
     for c in range(len(mu)):
         i = 3 * c
@@ -90,19 +90,19 @@ def _step(x, y, step, mu, out):
         out[i], out[i + 1], out[i + 2] = _nearest(n, t_1, t_2, mu[c])
 
 
-@loop
+@unfused
 def _add_squares(x, y, sums):
     for k in range(len(x)):
         sums[k] += (x[k] - y[k]) ** 2
 
 
-@loop
+@unfused
 def _add_products(x, y, z, sums):
     for k in range(len(x)):
         sums[k] += (x[k] - y[k]) * z[k]
 
 
-@loop
+@unfused
 def accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta):
     beta = x.dtype.type(beta)
     new_x, x, last_x, new_y, y, last_y = (
@@ -116,13 +116,13 @@ def accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta):
     return products.sum()
 
 
-@loop
+@unfused
 def _extrapolated_move(new, x, last_x, beta, out):
     for k in range(len(x)):
         out[k] = new[k] - (x[k] + beta * (x[k] - last_x[k]))
 
 
-@loop
+@unfused
 def _add_extrapolated_work(new, x, last_x, beta, d, sums):
     for k in range(len(x)):
         sums[k] += d[k] * (new[k] - (x[k] + beta * (x[k] - last_x[k])))

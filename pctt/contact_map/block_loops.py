@@ -6,10 +6,10 @@ The functions are those of `compact_loops`, for mass-scaled velocities. Row c ha
 
 from __future__ import annotations
 
-from pctt.compiled import loop
+from pctt.compiled import inlined, loop
 
 
-@loop
+@inlined
 def velocity_at(c, blocks, start, body, w):
     """G w at the contact c."""
     y0 = y1 = y2 = 0.0
@@ -22,7 +22,7 @@ def velocity_at(c, blocks, start, body, w):
     return y0, y1, y2
 
 
-@loop
+@inlined
 def push(c, blocks, start, body, g0, g1, g2, m):
     """Add the momenta G' g of an impulse g at the contact c to m."""
     for k in range(start[c], start[c + 1]):
@@ -48,7 +48,7 @@ def add_momenta(blocks, start, body, g, m):
         push(c, blocks, start, body, g[c, 0], g[c, 1], g[c, 2], m)
 
 
-@loop
+@inlined
 def weighted(weight, c, y0, y1, y2):
     """H y at the contact c. ``weight`` has the upper triangles of symmetric blocks H, (nc, 6), or all of H, (nc, 9)."""
     if weight.shape[1] == 6:
@@ -73,7 +73,7 @@ def add_through(blocks, start, body, weight, w, m):
         push(c, blocks, start, body, f0, f1, f2, m)
 
 
-@loop
+@inlined
 def pack(H, weight):
     """Blocks H (nc, 3, 3) as the ``weight`` of `weighted`."""
     whole = weight.shape[1] == 9

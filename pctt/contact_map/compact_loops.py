@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pctt.compiled import loop
+from pctt.compiled import inlined, loop
 
 
-@loop
+@inlined
 def velocity_at(c, arm, body, w):
     """The velocity of the second body at the contact point c, relative to the first body."""
     a, b = body[c, 0], body[c, 1]
@@ -23,7 +23,7 @@ def velocity_at(c, arm, body, w):
     return u0, u1, u2
 
 
-@loop
+@inlined
 def push(c, arm, body, f0, f1, f2, m):
     """Add an impulse at the contact point c to the second body's momenta, and subtract it from the first body's."""
     a, b = body[c, 0], body[c, 1]
@@ -63,7 +63,7 @@ def add_momenta(frame, arm, body, g, m):
         push(c, arm, body, f0, f1, f2, m)
 
 
-@loop
+@inlined
 def weighted(weight, c, u0, u1, u2):
     """W u at the contact c. ``weight`` has the upper triangles of symmetric blocks W, (nc, 6), or all of W, (nc, 9)."""
     if weight.shape[1] == 6:

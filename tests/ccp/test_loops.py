@@ -42,9 +42,9 @@ class Sample:
         """By module and function."""
         a = self.positive
         return {
-            "cone.project_to": (self.x, self.mu, np.empty_like(self.x)),
+            "cone.project_to": (self.x, self.mu, np.zeros_like(self.x)),
             "cone.projected_move": (self.x, self.y, 0.3, self.mu),
-            "cone.accelerated_step": (self.x, self.dx, self.y, self.dy, 0.7, 0.3, self.mu, 1.0, np.empty_like(self.x)),
+            "cone.accelerated_step": (self.x, self.dx, self.y, self.dy, 0.7, 0.3, self.mu, 1.0, np.zeros_like(self.x)),
             "cone.accelerated_curvature": (self.x, self.dx, self.z, self.y, self.dy, self.dz, 0.7),
             "cone.times": (self.blocks, self.x),
             "cone.step_to_boundary": (self.inside, self.dx, self.mu),

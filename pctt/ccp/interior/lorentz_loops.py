@@ -6,10 +6,10 @@ import numpy as np
 
 from pctt.ccp.cone import TINY
 from pctt.ccp.interior.lorentz import LEAST
-from pctt.compiled import loop
+from pctt.compiled import inlined, loop
 
 
-@loop
+@inlined
 def _determinant(x_0, x_1, x_2):
     small, large = abs(x_1), abs(x_2)
     if small > large:
@@ -80,7 +80,7 @@ def barrier_blocks(direction, eta, spread, scale, compliance, proximal):
     return B, inverse, share
 
 
-@loop
+@inlined
 def _block(u, v, along, against, across, out):
     mean, half = 0.5 * (along + against), 0.5 * (along - against)
     out[0, 0] = mean
