@@ -65,7 +65,7 @@ def test_the_cone_problem_of_its_page_is_solved(in_folder, capsys):
     names: dict[str, Any] = {}
     exec(blocks("docs/ccp.md")[0], names)
     assert names["result"].converged
-    assert "natural residual below the tolerance" in capsys.readouterr().out
+    assert "natural residual and closing work below the tolerance" in capsys.readouterr().out
 
 
 def test_poisson_with_a_train(in_folder, capfd):

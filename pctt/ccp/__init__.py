@@ -79,9 +79,8 @@ def solve(
 
     def by(method: Solver, problem: ConeProblem, guess: Array, tol: float, law: bool = False) -> Result:
         if method is solver:
-            to = dataclasses.replace(limits, tol=tol)
-            return _once(problem, guess, method, to, options or method.options(), newton or own, law)
-        to = Limits(tol, method.iterations)
+            return _once(problem, guess, method, limits.to(tol), options or method.options(), newton or own, law)
+        to = dataclasses.replace(limits.to(tol), max_it=method.iterations)
         result = _once(problem, guess, method, to, method.options(), newton or own, law)
         result.solver = result.solver or method.name
         return result
@@ -93,7 +92,7 @@ def solve(
         if solver.has_law and solver.newton:
             methods += [SOLVERS[name] for name in ("apgd", "conic", "apgd")]
         ways = [partial(by, method, law=True) for method in methods]
-        return coulombs_law.ladder(problem, guess, limits.tol, coulomb, partial(by, solver), ways)
+        return coulombs_law.ladder(problem, guess, limits, coulomb, partial(by, solver), ways)
     finally:
         if own is not None:
             own.destroy()

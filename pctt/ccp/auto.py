@@ -102,12 +102,12 @@ def solve(
         words = f"{first.reason}; conic would have cost about {cost:.0f} iterations"
         return dataclasses.replace(first, solver="apgd", reason=words)
     inner = dataclasses.replace(limits, max_it=min(STEERING.conic_it, limits.max_it))
-    begin = conic.Conic(start=min(conic.Conic().start, STEERING.start * first.natural_residual))
+    begin = conic.Conic(start=min(conic.Conic().start, STEERING.start * first.residual))
     result = second = conic.solve(problem, first.impulse, inner, begin, newton, coulomb)
     words = f"{first.reason}; conic: {second.reason}"
     solver = "conic"
     if not (second.final or limits.max_it <= STEERING.conic_it):
-        best = min(first, second, key=lambda result: result.natural_residual)
+        best = min(first, second, key=lambda result: result.residual)
         result = apgd.solve(problem, best.impulse, limits, apgd.APGD(), None, coulomb)
         result.ksp_its, result.fallbacks = second.ksp_its, second.fallbacks
         result.history = second.history + result.history

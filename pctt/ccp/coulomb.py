@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pctt.ccp.cone import Array, add_opening, tangential
+from pctt.ccp.cone import Array, tangential
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.result import COULOMB, FIXED_POINT, Result, Status
+from pctt.ccp.result import COULOMB, FIXED_POINT, Limits, Result, Status
 from pctt.options import AT_LEAST_ONE, COUNT, NOT_NEGATIVE, option
 
 
@@ -47,11 +47,6 @@ class Coulomb:
     memory: int = option(5, "earlier openings from which Anderson's acceleration takes the next", check=COUNT)
 
 
-def residual(problem: ConeProblem, g: Array, y: Array) -> float:
-    """The natural residual of g (nc, 3) with the De Saxce velocity of y = N g + r."""
-    return problem.natural_residual(g, add_opening(y.copy(), problem.mu))
-
-
 def opening(problem: ConeProblem, y: Array) -> Array:
     """mu |y_t| (nc,) of velocities y (nc, 3)."""
     return problem.mu * tangential(y)
@@ -60,7 +55,7 @@ def opening(problem: ConeProblem, y: Array) -> Array:
 def ladder(
     problem: ConeProblem,
     guess: Array,
-    tol: float,
+    limits: Limits,
     options: Coulomb,
     convex: Callable[[ConeProblem, Array, float], Result],
     ways: Sequence[Callable[[ConeProblem, Array, float], Result]],
@@ -70,28 +65,33 @@ def ladder(
     ``convex(problem, guess, tol)`` solves a cone problem; each of ``ways``, called alike, looks for Coulomb's law by
     itself, from the point of the one before; one that gives up has none.
     """
-    tol = options.tol or tol
+    limits = limits.to(options.tol or limits.tol)
     tried: list[Result] = []
     for way in ways:
-        tried.append(way(problem, tried[-1].impulse if tried else guess, tol))
+        tried.append(way(problem, tried[-1].impulse if tried else guess, limits.tol))
         tried[-1].law = COULOMB
         if tried[-1].final:
             return _last_of(tried)
         if tried[-1].status is Status.GIVEN_UP:
             break
-    tried.append(solve(problem, _best_of(tried).impulse if tried else guess, tol, options, convex))
+    tried.append(solve(problem, _best_of(tried).impulse if tried else guess, limits, options, convex))
     if tried[-1].final:
         return _last_of(tried)
-    plain = convex(problem, guess, tol)
+    plain = convex(problem, guess, limits.tol)
     y = problem.product(plain.impulse) + problem.r
-    plain.natural_residual, plain.status = residual(problem, plain.impulse, y), Status.STALLED
+    plain.residual, plain.status = _residual(problem, limits, plain.impulse, y), Status.STALLED
     plain.reason = f"relaxation, as Coulomb's law was not met: {tried[-1].reason}"
     tried.append(plain)
-    return _last_of(sorted(tried, key=lambda result: -result.natural_residual))
+    return _last_of(sorted(tried, key=lambda result: -result.residual))
+
+
+def _residual(problem: ConeProblem, limits: Limits, g: Array, y: Array) -> float:
+    """That of Coulomb's law for impulses g (nc, 3) with y = N g + r."""
+    return limits.residual(problem.natural_residual(g, y, coulomb=True), problem, g, y)
 
 
 def _best_of(tried: list[Result]) -> Result:
-    return min(tried, key=lambda result: result.natural_residual)
+    return min(tried, key=lambda result: result.residual)
 
 
 def _last_of(tried: list[Result]) -> Result:
@@ -104,7 +104,7 @@ def _last_of(tried: list[Result]) -> Result:
 def solve(
     problem: ConeProblem,
     guess: Array,
-    tol: float,
+    limits: Limits,
     options: Coulomb,
     convex: Callable[[ConeProblem, Array, float], Result],
 ) -> Result:
@@ -120,7 +120,7 @@ def solve(
     s = opening(problem, problem.product(guess) + problem.r) if problem.norm(guess) > 0 else np.zeros_like(problem.mu)
     best: Result | None = None
     history: list[float] = []
-    failed, spent = 0, np.zeros(3, int)  # iterations, Krylov iterations, fallbacks
+    failed, spent, tol = 0, np.zeros(3, int), limits.tol  # iterations, Krylov iterations, fallbacks
     accuracy, g, r = max(STEERING.first, STEERING.inner * tol), guess, problem.r
     anderson = Anderson(problem, relaxation, options.memory)
     while len(history) < options.max_it:
@@ -133,7 +133,7 @@ def solve(
         spent += (inner.iterations, inner.ksp_its, inner.fallbacks)
         failed = 0 if inner.converged else failed + 1
         y = problem.product(g) + r
-        history.append(residual(problem, g, y))
+        history.append(_residual(problem, limits, g, y))
         if best is None or history[-1] <= min(history):
             best = inner
         if history[-1] <= tol or failed > 1 or inner.status is Status.UNBOUNDED:

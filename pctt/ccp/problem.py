@@ -10,7 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.blocks import BlockRows, dense_columns, diagonal_blocks, without_hubs
-from pctt.ccp.cone import Array, projected_move_squares
+from pctt.ccp.cone import Array, add_opening, projected_move_squares
 from pctt.ccp.delassus import delassus, in_blocks, local_blocks
 from pctt.contact_map import CompactRows, ContactMap, contact_map
 from pctt.exchange import refuse
@@ -109,16 +109,27 @@ class ConeProblem:
         self._given.mult(self._in, self._out)
         return self._out.array.reshape(-1, 3).copy()
 
-    def natural_residual(self, g: Array, y: Array) -> float:
-        """||g - P(g - y / mean diag N)|| / ||g||, velocities y = N g + r: the stop test of every solver.
+    def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
+        """||g - P(g - y / mean diag N)|| / ||g||, velocities y = N g + r: the stop test of every solver. For Coulomb's
+        law y gets its opening.
 
         inf if that is undefined: for g = 0, unless it solves the problem, and if g or y has a nan or inf."""
+        if coulomb:
+            y = add_opening(y.copy(), self.mu)
         squares = projected_move_squares(g, y, 1.0 / self.mean_diagonal, self.mu)
         distance, norm = np.sqrt(self.sum(np.array(squares)))
         if distance == 0:
             return 0.0
         residual = float(distance / norm) if norm > 0 else np.inf
         return residual if residual == residual else np.inf
+
+    def closing_work(self, g: Array, y: Array) -> float:
+        """Work of the normal impulses at contacts that still close, sum of g_n max(-y_n, 0), over 1/2 g'Ng; velocities
+        y = N g + r. 0 without impulses, inf if it is no number."""
+        closing = float(g[:, 0] @ np.maximum(-y[:, 0], 0.0))
+        closing, energy = self.sum(np.array([closing, 0.5 * np.vdot(g, y - self.r)]))
+        work = float(closing / energy) if energy > 0 else 0.0
+        return work if work == work else np.inf
 
     @cached_property
     def N(self) -> PETSc.Mat:

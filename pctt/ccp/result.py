@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import TYPE_CHECKING
 
 from pctt.ccp.cone import Array
 from pctt.options import FRACTION, option
 
+if TYPE_CHECKING:
+    from pctt.ccp.problem import ConeProblem
+
 RELAXATION, COULOMB, FIXED_POINT = "relaxation", "Coulomb", "Coulomb by cone problems"
+
+ENOUGH = 100.0  #: a natural residual of the tolerance over this counts as solved, whatever the closing work is
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Options of every solver: ``-ccp_tol``, ``-ccp_max_it``."""
+    """When a solver stops; options of every solver: ``-ccp_tol``, ``-ccp_max_it``, ``-ccp_closing_work``."""
 
     tol: float = option(1e-4, "natural residual at which a cone problem counts as solved", check=FRACTION)
     max_it: int = option(
@@ -21,6 +29,29 @@ class Limits:
         "iterations before a solver gives up; -1: the solver's own default",
         check=("a whole number >= -1", lambda x: x >= -1),
     )
+    closing_work: float = option(
+        0.05,
+        "closing work at which a cone problem counts as solved; inf: any",
+        check=("a positive number, or inf", lambda x: x > 0),
+    )
+
+    def residual(self, natural: float, problem: ConeProblem, g: Array, y: Array) -> float:
+        """What ``tol`` is for: the natural residual of impulses g (nc, 3) with y = N g + r, or their closing work in
+        units in which its limit is ``tol``, whichever is larger. It is at most ENOUGH times the natural residual: where
+        bodies are squeezed no accuracy may bring the closing work below its limit."""
+        if math.isinf(self.closing_work):
+            return natural
+        closing = self.tol / self.closing_work * problem.closing_work(g, y)
+        return min(max(natural, closing), ENOUGH * natural)
+
+    @property
+    def met(self) -> str:
+        """The reason of a result that meets them."""
+        return f"natural residual{'' if math.isinf(self.closing_work) else ' and closing work'} below the tolerance"
+
+    def to(self, tol: float) -> Limits:
+        """The same for another tolerance of the same residual."""
+        return dataclasses.replace(self, tol=tol, closing_work=self.closing_work / self.tol * tol)
 
 
 class Status(Enum):
@@ -41,13 +72,13 @@ class Result:
     Attributes
     ----------
     impulse : (nc, 3) impulses of this rank's contacts (N s)
-    status : CONVERGED where the natural residual fell below the tolerance, else why not
+    status : CONVERGED where the residual of `Limits` fell below the tolerance, else why not
     reason : why the iteration ended, in words
-    natural_residual : the solver's own last value
+    residual : the solver's own last value: the natural residual if the closing work has no limit
     iterations : Newton steps, or steps of a first-order method
     ksp_its : Krylov iterations in all Newton steps
     fallbacks : Newton systems that the user's KSP did not solve
-    history : natural residual per iteration
+    history : residual per iteration
     cone_problems : how many were solved for it: more than one for Coulomb's law
     solver : name of the method that found it, where that was chosen; "" otherwise
     law : RELAXATION, COULOMB or FIXED_POINT: the law of the impulses and of the residuals
@@ -58,7 +89,7 @@ class Result:
     impulse: Array
     status: Status
     reason: str
-    natural_residual: float
+    residual: float
     iterations: int
     ksp_its: int = 0
     fallbacks: int = 0

@@ -118,12 +118,12 @@ class Dump:
     def _info(self, problem: ccp.ConeProblem, result: ccp.Result, asked: ccp.Result) -> fclib.Info:
         options, world = self._options, self._world
         scene, solver = options.run.scene, options.run.ccp_type
-        stored = f"The solution has natural residual {result.natural_residual:.3g}." if result.converged else ""
+        stored = f"The solution has natural residual {result.residual:.3g}." if result.converged else ""
         return fclib.Info(
             f"{scene}, step {world.step + 1}",
             f"{problem.size} contacts of {options.scene!r}, from time {world.time:g} s over {options.dt:g} s. "
             f"{solver} with -ccp_tol {options.limits.tol:g}: {asked.reason}, {asked.iterations} iterations, "
-            f"natural residual {asked.natural_residual:.3g}. {stored}",
+            f"natural residual {asked.residual:.3g}. {stored}",
             "Solution and guess are those of Coulomb's law (mu |u_t| is added to the normal velocity)."
             if options.coulomb
             else "Solution and guess are those of the convex cone problem, min 1/2 r'Wr + q'r over the friction cones "

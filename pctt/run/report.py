@@ -225,7 +225,7 @@ def forces_line(steps: Sequence[Mapping[str, Any]]) -> str:
     said = f"closing work {middle:.1e} (median), {worst['closing_work']:.1e} at most, in step {worst['step']}"
     if worst["closing_work"] <= LARGE_CLOSING_WORK:
         return said
-    return f"WARNING: {said}: forces on bodies may be far off; try a smaller -ccp_tol or -ccp_type conic (docs/ccp.md)"
+    return f"WARNING: {said}: forces on bodies may be far off; try -ccp_closing_work {LARGE_CLOSING_WORK} (docs/ccp.md)"
 
 
 def overlap_line(worst: Mapping[str, float]) -> str:

@@ -220,7 +220,7 @@ class Stepper:
             return Solved(asked, asked, used, newton_its)
         limits = dataclasses.replace(options.limits, max_it=-1)
         second = ccp.solve(problem, asked.impulse, "apgd", limits, coulomb=options.coulomb)
-        if second.natural_residual < asked.natural_residual:
+        if second.residual < asked.residual:
             second.ksp_its, second.fallbacks = asked.ksp_its, asked.fallbacks
             return Solved(second, asked, "apgd", newton_its)
         return Solved(asked, asked, used, newton_its)

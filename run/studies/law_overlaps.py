@@ -31,7 +31,7 @@ class Compared(Stepper):
             for law, (coulomb, tolerances) in LAWS.items():
                 start = guess
                 for tol in tolerances:
-                    result = ccp.solve(problem, start, "apgd", ccp.Limits(tol), coulomb=coulomb)
+                    result = ccp.solve(problem, start, "apgd", ccp.Limits(tol, closing_work=np.inf), coulomb=coulomb)
                     start = result.impulse
                     rows.append({"law": law, "tol": tol, **self.overlaps(problem, result)})
         return super().solve(problem, guess)

@@ -5,6 +5,7 @@ NAME` for one of them within -ccp_coulomb, or of peers.PEERS."""
 from __future__ import annotations
 
 import json
+import math
 import resource
 import sys
 import time
@@ -39,8 +40,8 @@ class Watch:
             self._of.add_delassus = self._counted()  # type: ignore[method-assign]
         self.start = time.perf_counter()
 
-    def look(self, g: np.ndarray, y: np.ndarray) -> float:
-        residual = self._look(g, y)
+    def look(self, g: np.ndarray, y: np.ndarray, coulomb: bool = False) -> float:
+        residual = self._look(g, y, coulomb)
         spent = time.perf_counter() - self.start
         self.course.append((spent, residual, self.products, self.newton.ksp_its if self.newton else 0))
         if spent > self.seconds:
@@ -64,7 +65,7 @@ def own(problem: ccp.ConeProblem, name: str, tol: float, seconds: float, coulomb
     """A solver of the registry from a cold start."""
     newton = ccp.newton_for(problem.comm, name) if ccp.SOLVERS[name].newton else None
     watch = Watch(problem, newton, seconds)
-    limits = ccp.Limits(tol, 10_000_000 if not newton else -1)
+    limits = ccp.Limits(tol, 10_000_000 if not newton else -1, math.inf)
     law = ccp.Coulomb() if coulomb else None
     impulse = None
     try:

@@ -29,7 +29,7 @@ def test_conic_where_apgd_is_expected_to_take_longer():
     assert (result.converged, result.solver) == (True, "conic")
     assert result.reason.startswith("apgd at ")
     assert 70 <= int(result.reason.split(" after ")[1].split()[0]) <= 120  # eight looks, ten iterations each
-    assert result.reason.endswith("conic: natural residual below the tolerance")
+    assert result.reason.endswith("conic: natural residual and closing work below the tolerance")
 
 
 def test_back_to_apgd_where_conic_stalls(monkeypatch):
@@ -41,7 +41,7 @@ def test_back_to_apgd_where_conic_stalls(monkeypatch):
     monkeypatch.setattr(auto.conic, "solve", stalls)
     result = solve(tol=1e-10, bias=1e-6)
     assert (result.converged, result.solver) == (True, "apgd")
-    assert "conic: 3 iterations; apgd: natural residual below" in result.reason
+    assert "conic: 3 iterations; apgd: natural residual and closing work below" in result.reason
     assert result.ksp_its > 0
 
 

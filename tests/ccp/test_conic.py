@@ -57,7 +57,7 @@ def solve(problem: ConeProblem, tol: float, form: str = "auto") -> ccp.Result:
 
 
 def check(problem: ConeProblem, result: ccp.Result, tol: float) -> None:
-    assert result.converged, f"{result.reason}: {result.natural_residual:.1e}"
+    assert result.converged, f"{result.reason}: {result.residual:.1e}"
     figures = ccp.measure(problem, result.impulse)
     assert figures.natural_residual <= 1.01 * tol
     assert figures.cone_violation <= 1e-12 * figures.impulse_norm

@@ -69,7 +69,7 @@ def steps(
         problem = cone_problem(system, world.comm)
         result = ccp.solve(problem, None, solver, limits, coulomb=coulomb)
         problem.destroy()
-        reached = f"{result.reason}, residual {result.natural_residual:.1e}"
+        reached = f"{result.reason}, residual {result.residual:.1e}"
         assert result.converged or iterations, f"step {world.step + 1}: {reached}"
         advance(world, system.velocity(result.impulse), dt)
         yield Step(world, contacts, system, result.impulse)

@@ -12,7 +12,6 @@ bound (`Momentum`). Then Coulomb's law is the fixed point of the projected step,
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,7 +63,7 @@ def solve(
     progress = None
     if problem.free_map is not None:
         enough = STEERING.single / np.sqrt(max(problem.size, 1))
-        rough = dataclasses.replace(limits, tol=max(limits.tol, enough))
+        rough = limits.to(max(limits.tol, enough))
         progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, options, give_up)
         rough_impulse = _descend(progress, momentum, guess)
         if progress.iterations:  # else rounding would spoil a guess that is good already

@@ -10,9 +10,10 @@ import numpy as np
 from pctt.ccp.cone import Array
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.result import Limits, Result, Status
+from pctt.ccp.unbounded import why_unbounded
 from pctt.options import AT_LEAST_ONE, option
 
-GiveUp = Callable[[int, float], str]  # from iterations and natural residual: why not to go on, or ""
+GiveUp = Callable[[int, float], str]  # from iterations and residual: why not to go on, or ""
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,11 @@ class Progress:
         if problem.precision == np.float32:
             self._patience = STEERING.patience_in_single
         self._looks = self._next_look = 0
-        self._gain = (np.inf, self.iterations)  # natural residual and iteration of the last progress
+        self._suspicious, self._unbounded = limits.tol, ""
+        self._gain = (np.inf, self.iterations)  # residual and iteration of the last progress
 
     def goes_on(self, x: Array, gradient: Array | None = None) -> bool:
-        """Whether to iterate further from x. Every ``check`` iterations this computes the natural residual.
+        """Whether to iterate further from x. Every ``check`` iterations this computes the residual.
 
         ``gradient`` is A x + b if the method has it."""
         if self.iterations < min(self._next_look, self.limits.max_it):
@@ -87,20 +89,31 @@ class Progress:
         return Result(self.impulse, status, self.reason, self._best, self.iterations, history=self.history)
 
     def _residual(self, x: Array, gradient: Array | None) -> float:
-        """The natural residual; nan where x or its gradient is no number."""
+        """The residual that the tolerance is for; nan where x or its gradient is no number."""
         if gradient is not None:
-            residual = self.problem.natural_residual(x, gradient)
+            residual = self._judge(x, gradient)
             # inf where x = 0, or x is no number; methods that update the gradient collect rounding: look twice
             if self.limits.tol < residual < np.inf:
                 return residual
         gradient = self.problem.gradient(x)
         finite = np.isfinite(self.problem.dots((x, gradient))[0])
-        return self.problem.natural_residual(x, gradient) if finite else np.nan
+        return self._judge(x, gradient) if finite else np.nan
+
+    def _judge(self, x: Array, gradient: Array) -> float:
+        """The residual that the tolerance is for. Where only the closing work is too large, the problem may have no
+        solution: this is found out whenever the natural residual has fallen to a tenth."""
+        natural, residual = self.problem.residuals(self.limits, x, gradient)
+        if natural <= self._suspicious and residual > self.limits.tol:
+            self._suspicious = 0.1 * natural
+            self._unbounded = why_unbounded(self.problem.problem, self.problem.impulse(x))
+        return residual
 
     def _why_stop(self, residual: float) -> tuple[Status, str]:
         """The reason is empty as long as there is none."""
         if residual <= self.limits.tol:
-            return Status.CONVERGED, "natural residual below the tolerance"
+            return Status.CONVERGED, self.limits.met
+        if self._unbounded:
+            return Status.UNBOUNDED, self._unbounded
         if np.isnan(residual):
             return Status.BREAKDOWN, f"not a number after {self.iterations} iterations"
         if self.iterations >= self.limits.max_it:

@@ -12,6 +12,7 @@ from petsc4py import PETSc
 from pctt.ccp import cone
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
+from pctt.ccp.result import Limits
 
 if TYPE_CHECKING:
     from pctt.contact_map.assembled import ScaledRows
@@ -114,12 +115,11 @@ class ScaledProblem:
         largest = np.linalg.eigvalsh(self.blocks)[:, -1]
         return np.repeat(1.0 / np.where(largest > 0, largest, 1.0), 3).reshape(-1, 3)
 
-    def natural_residual(self, x: Array, gradient: Array) -> float:
-        """That of the impulse of x, in its own units."""
-        y = gradient * self._scale
-        if self.opening:
-            cone.add_opening(y, self.problem.mu)
-        return self.problem.natural_residual(self.impulse(x), y)
+    def residuals(self, limits: Limits, x: Array, gradient: Array) -> tuple[float, float]:
+        """The natural residual of the impulse of x, in its own units, and the residual that the tolerance is for."""
+        g, y = self.impulse(x), gradient * self._scale
+        natural = self.problem.natural_residual(g, y, bool(self.opening))
+        return natural, limits.residual(natural, self.problem, g, y)
 
     def largest_curvature(self, steps: int = 10) -> float:
         """Estimate from below of the largest eigenvalue of A: ``steps`` power iterations from b."""

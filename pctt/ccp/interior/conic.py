@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cone import Array, add_opening, step_to_zero, times
+from pctt.ccp.cone import Array, step_to_zero, times
 from pctt.ccp.interior import lorentz
 from pctt.ccp.interior.guess import no_larger_than_useful
 from pctt.ccp.interior.lorentz import NesterovTodd
@@ -90,10 +90,10 @@ def solve(
     cones = Cones.of(problem, coulomb)
     start = options.start
     if coulomb:  # from a point near the law, the end of another path
-        off = max(problem.natural_residual(guess, cones.velocity(guess)), limits.tol)
+        off = max(problem.natural_residual(guess, cones.velocity(guess), coulomb), limits.tol)
         start = min(start, STEERING.near_start * off)
     at = _start(cones, guess, start)
-    course = Course(cones, limits.tol, limits.max_it)
+    course = Course(cones, limits)
     while not course.ends(at, newton):
         scaled = Scaled.of(cones, at, newton, options, course)
         with phase("ConicPredictor"):
@@ -146,11 +146,10 @@ class Cones:
         return cls(problem, scale, frictionless, coulomb)
 
     def velocity(self, g: Array) -> Array:
-        """y = N g + r but for the sliding of contacts without friction, which no impulse answers; for Coulomb's law
-        with its opening."""
+        """y = N g + r but for the sliding of contacts without friction, which no impulse answers."""
         y = self.problem.product(g) + self.problem.r
         y[self.frictionless, 1:] = 0.0
-        return add_opening(y, self.problem.mu) if self.coulomb else y
+        return y
 
     def residuals(self, at: Point) -> tuple[Array, Array]:
         """r_v = v - G' g, and r_y = y / scale - z with y from v and z without its opening."""
@@ -174,15 +173,16 @@ class Cones:
 class Course:
     """The course of the iterations so far, and the test that ends them.
 
-    history : natural residual of every iterate
+    history : residual of every iterate
+    natural : natural residual of the last one
     waited : iterations without progress
     """
 
-    def __init__(self, cones: Cones, tol: float, max_it: int):
-        self._cones, self._tol, self._max_it = cones, tol, max_it
+    def __init__(self, cones: Cones, limits: Limits):
+        self._cones, self._limits = cones, limits
         self._patience = STEERING.patience_with_law if cones.coulomb else STEERING.patience
         self.history: list[float] = []
-        self.waited, self._last_gap = 0, np.inf
+        self.natural, self.waited, self._least, self._last_gap = np.inf, 0, np.inf, np.inf
 
     @property
     def residual(self) -> float:
@@ -192,13 +192,17 @@ class Course:
         """Note an iterate; whether it is the last. Without progress the Newton systems are sharpened, once."""
         problem, g = self._cones.problem, at.s / self._cones.scale
         gap = problem.dot(at.s, at.z)
-        residual = problem.natural_residual(g, self._cones.velocity(g))
-        if not self.history or residual <= min(self.history):
+        y = self._cones.velocity(g)
+        natural = problem.natural_residual(g, y, self._cones.coulomb)
+        residual = self._limits.residual(natural, problem, g, y)
+        unbounded = bool(why_unbounded(problem, g))
+        if unbounded or residual <= min(self.history, default=residual):
             self._best = g
-        progress = residual <= 0.9 * min(self.history, default=np.inf) or gap <= 0.5 * self._last_gap
+        progress = natural <= 0.9 * self._least or gap <= 0.5 * self._last_gap
         self.waited, self._last_gap = (0 if progress else self.waited + 1), gap
+        self.natural, self._least = natural, min(natural, self._least)
         self.history.append(residual)
-        if residual <= self._tol or len(self.history) > self._max_it or why_unbounded(problem, g):
+        if residual <= self._limits.tol or len(self.history) > self._limits.max_it or unbounded:
             return True
         if self.waited > self._patience:
             if self._cones.coulomb or not newton.sharpen():
@@ -210,10 +214,10 @@ class Course:
         """The best iterate, and why it was the last."""
         iterations = len(self.history) - 1
         status, words = Status.STALLED, f"stalled after {iterations} iterations"
-        if self.residual <= self._tol:
-            status, words = Status.CONVERGED, "natural residual below the tolerance"
-        elif iterations == self._max_it:
-            status, words = Status.ITERATION_LIMIT, f"{self._max_it} iterations"
+        if self.residual <= self._limits.tol:
+            status, words = Status.CONVERGED, self._limits.met
+        elif iterations == self._limits.max_it:
+            status, words = Status.ITERATION_LIMIT, f"{iterations} iterations"
         least = min(self.history)
         return Result(self._best, status, words, least, iterations, newton.ksp_its, newton.fallbacks, self.history)
 
@@ -258,7 +262,7 @@ class Scaled:
             r_z = slip.change(r_y)
         newton.update(B, inverse if slip is None else inverse + slip.blocks, symmetric=slip is None)
         # a residual of v = G' g makes y wrong by G times that
-        tol = options.forcing * course.residual * problem.norm(at.s / cones.scale) * np.sqrt(problem.mean_diagonal)
+        tol = options.forcing * course.natural * problem.norm(at.s / cones.scale) * np.sqrt(problem.mean_diagonal)
         tol *= 1.0 if newton.primary == "momenta" else STEERING.closer
         tol *= STEERING.sharper if cones.coulomb else 1.0
         boundary = min(options.boundary, STEERING.boundary_with_law) if cones.coulomb else options.boundary

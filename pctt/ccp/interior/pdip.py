@@ -85,9 +85,10 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     step, damping = 1.0, 0.0
     for iteration in range(limits.max_it + 1):
         y = _velocity(problem, g)
-        history.append(problem.natural_residual(g, y))
+        natural = problem.natural_residual(g, y)
+        history.append(limits.residual(natural, problem, g, y))
         if history[-1] <= limits.tol:
-            status, reason = Status.CONVERGED, "natural residual below the tolerance"
+            status, reason = Status.CONVERGED, limits.met
             break
         if iteration == limits.max_it:
             status, reason = Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
@@ -96,9 +97,9 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         centering = options.centering if step > STEERING.stuck else 1.0
         aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, aim)
-        damping = _next_damping(damping, step, history[-1])
-        newton.update(_barrier_blocks(at, damping * min(history[-1], STEERING.late) * problem.mean_diagonal))
-        step, dg, dlam = _corrected(at, _accuracy(at, history[-1]), options)
+        damping = _next_damping(damping, step, natural)
+        newton.update(_barrier_blocks(at, damping * min(natural, STEERING.late) * problem.mean_diagonal))
+        step, dg, dlam = _corrected(at, _accuracy(at, natural), options)
         if not step > 1e-10:
             status, reason = Status.STALLED, "steps became too short"
             if step != step:
