@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 RELAXATION, COULOMB, FIXED_POINT = "relaxation", "Coulomb", "Coulomb by cone problems"
 
-ENOUGH = 100.0  #: a natural residual of the tolerance over this counts as solved, whatever the closing work is
+ENOUGH = 1000.0  #: a natural residual of the tolerance over this counts as solved, whatever the closing work is
 
 
 @dataclass(frozen=True)

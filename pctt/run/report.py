@@ -218,14 +218,16 @@ def law_line(steps: Sequence[Mapping[str, Any]], tol: float) -> str:
     return f"WARNING: {said}: sliding contacts open by dt mu |v_t|; -ccp_coulomb keeps them closed (docs/ccp.md)"
 
 
-def forces_line(steps: Sequence[Mapping[str, Any]]) -> str:
-    """A line about the accuracy of the forces on bodies, with a warning where they may be far off."""
+def forces_line(steps: Sequence[Mapping[str, Any]], limit: float) -> str:
+    """A line about the accuracy of the forces on bodies, with a warning where they may be far off; ``limit`` is
+    ``-ccp_closing_work``."""
     worst = max(steps, key=lambda line: line["closing_work"])
     middle = median(line["closing_work"] for line in steps)
     said = f"closing work {middle:.1e} (median), {worst['closing_work']:.1e} at most, in step {worst['step']}"
     if worst["closing_work"] <= LARGE_CLOSING_WORK:
         return said
-    return f"WARNING: {said}: forces on bodies may be far off; try -ccp_closing_work {LARGE_CLOSING_WORK} (docs/ccp.md)"
+    hint = f"-ccp_closing_work {LARGE_CLOSING_WORK}" if limit > LARGE_CLOSING_WORK else "a smaller -ccp_tol"
+    return f"WARNING: {said}: forces on bodies may be far off; try {hint} (docs/ccp.md)"
 
 
 def overlap_line(worst: Mapping[str, float]) -> str:

@@ -102,7 +102,7 @@ class Output:
             lines = [line for line in results.steps() if line["step"] > self._start]
             progress.say("\n" + report.phase_table(lines))
             progress.say(report.law_line(lines, self._options.limits.tol))
-            progress.say(report.forces_line(lines))
+            progress.say(report.forces_line(lines, self._options.limits.closing_work))
         if figures:
             progress.say(report.figure_table(figures))
         if comm.rank == 0:

@@ -68,5 +68,8 @@ def test_accuracy_shows_the_course_of_the_residual():
 
 def test_forces_that_may_be_far_off_are_a_warning():
     steps = [{"step": 3 + k, "closing_work": work} for k, work in enumerate((1e-3, 2e-2, 4e-3))]
-    assert report.forces_line(steps) == "closing work 4.0e-03 (median), 2.0e-02 at most, in step 4"
-    assert report.forces_line([*steps, {"step": 9, "closing_work": 0.2}]).startswith("WARNING: closing work")
+    assert report.forces_line(steps, 0.05) == "closing work 4.0e-03 (median), 2.0e-02 at most, in step 4"
+    far_off = [*steps, {"step": 9, "closing_work": 0.2}]
+    assert report.forces_line(far_off, float("inf")).startswith("WARNING: closing work")
+    assert "try -ccp_closing_work 0.05" in report.forces_line(far_off, float("inf"))
+    assert "try a smaller -ccp_tol" in report.forces_line(far_off, 0.05)
