@@ -262,3 +262,82 @@ def integrate(quaternion, angular_velocity, dt):
         size = 1.0 / np.sqrt(e * e + f * f + g * g + h * h)
         out[n, 0], out[n, 1], out[n, 2], out[n, 3] = size * e, size * f, size * g, size * h
     return out
+
+
+@unfused
+def free_spin(spin, moments, dt, newton_steps, last_change, converged):
+    """`dem.free_motion.free_spin`, body by body: each ends Newton's method by itself."""
+    out = spin.copy()
+    half = 0.5 * dt
+    for n in range(len(spin)):
+        w, largest = (spin[n, 0], spin[n, 1], spin[n, 2]), max(moments[n, 0], moments[n, 1], moments[n, 2])
+        inertia = (moments[n, 0] / largest, moments[n, 1] / largest, moments[n, 2] / largest)
+        momentum, new = _turned(_times(-half, w), _each(inertia, w)), w
+        for _ in range(newton_steps):
+            turn = _times(half, new)
+            middle = _turned(turn, _each(inertia, new))
+            change = _solve(
+                _slope((inertia[0], 0.0, 0.0), (1.0, 0.0, 0.0), turn, middle, half),
+                _slope((0.0, inertia[1], 0.0), (0.0, 1.0, 0.0), turn, middle, half),
+                _slope((0.0, 0.0, inertia[2]), (0.0, 0.0, 1.0), turn, middle, half),
+                _plus(momentum, _times(-1.0, middle)),
+            )
+            new = _plus(new, change)
+            if _dot(change, change) <= last_change**2 * _dot(w, w):
+                break
+        back = _turned(_times(-half, new), momentum)
+        error = _plus(back, _times(-1.0, _each(inertia, new)))
+        if _dot(error, error) <= converged**2 * _dot(momentum, momentum):
+            out[n, 0], out[n, 1], out[n, 2] = back[0] / inertia[0], back[1] / inertia[1], back[2] / inertia[2]
+    return out
+
+
+@unfused
+def _slope(along, axis, turn, middle, half):
+    """How the angular momentum in the middle of the step changes with the spin about an axis."""
+    once = _cross(turn, axis)
+    turned = _plus(axis, _plus(_times(0.5, once), _times(1.0 / 6.0, _cross(turn, once))))
+    return _plus(_turned(turn, along), _times(-half, _cross(middle, turned)))
+
+
+@unfused
+def _turned(rotation, v):
+    """The vector v, turned by a rotation vector."""
+    square = _dot(rotation, rotation)
+    angle = np.sqrt(square)
+    once = _cross(rotation, v)
+    sine, versed = (np.sin(angle) / angle, (1.0 - np.cos(angle)) / square) if angle > 1e-8 else (1.0, 0.5)
+    return _plus(v, _plus(_times(sine, once), _times(versed, _cross(rotation, once))))
+
+
+@unfused
+def _solve(a, b, c, right):
+    """The solution of a matrix with columns a, b, c, by Cramer's rule."""
+    across = _cross(b, c)
+    scale = 1.0 / _dot(a, across)
+    return _times(scale, (_dot(right, across), _dot(a, _cross(right, c)), _dot(a, _cross(b, right))))
+
+
+@unfused
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@unfused
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@unfused
+def _plus(a, b):
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@unfused
+def _each(a, b):
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
+
+
+@unfused
+def _times(a, b):
+    return a * b[0], a * b[1], a * b[2]

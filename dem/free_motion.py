@@ -9,6 +9,7 @@ import numpy as np
 from dem import bodies, quaternion
 from dem.arrays import Floats
 from dem.bodies import SPHERE, Bodies
+from dem.loops import loops
 from dem.motion import Dynamic, Guided, Hinged
 from dem.neighbourhood import Neighbourhood
 from dem.quaternion import cross
@@ -51,6 +52,9 @@ def free_spin(spin: Floats, moments: Floats, dt: float) -> Floats:
     in Engineering 31, 1991. A body that turns by much more than a radian in a step, for which Newton's method does not
     converge, keeps its spin: no such step resolves its motion.
     """
+    if compiled := loops():
+        arrays = np.ascontiguousarray(spin), np.ascontiguousarray(moments)
+        return compiled.free_spin(*arrays, dt, NEWTON_STEPS, LAST_CHANGE, CONVERGED)
     half = 0.5 * dt
     moments = moments / moments.max(axis=1, keepdims=True)  # nothing but their ratios counts
     with np.errstate(over="ignore", invalid="ignore"):  # the search finds lost bodies

@@ -7,9 +7,10 @@ import pytest
 from cases import contacts_by_key, crude_impulse, heap, random_quaternions, step
 from mpi4py import MPI
 
-from dem import impulses, quaternion
+from dem import free_motion, impulses, quaternion
 from dem import system as contact_system
 from dem.contact import broad, find_contacts, primitives, search
+from dem.free_motion import free_spin
 from dem.loops import loops
 from dem.scene import Scene
 from dem.start import new_world
@@ -26,7 +27,7 @@ def without_loops(monkeypatch):
 
     def call(work, *arguments):
         with monkeypatch.context() as patch:
-            for module in (broad, contact_system, impulses, primitives, quaternion, search):
+            for module in (broad, contact_system, free_motion, impulses, primitives, quaternion, search):
                 patch.setattr(module, "loops", lambda: None)
             return work(*arguments)
 
@@ -135,3 +136,15 @@ def test_orientations(without_loops):
 
 def _call(work, *arguments):
     return work(*arguments)
+
+
+@pytest.mark.parametrize("turn", [1e-9, 0.01, 0.3, 1.0, 30.0])
+def test_free_spins_agree(turn, without_loops):
+    """Also of rods and plates, of bodies at rest, of a step that turns too far, and of a body that is lost. The loop ends
+    Newton's method for each body, numpy for all."""
+    rng = np.random.default_rng(0)
+    moments = np.concatenate([rng.uniform(0.5, 1.0, (40, 3)), [[1.0, 1.0, 1e-3], [0.5, 0.5, 1.0], [1.0, 1.0, 1.0]]])
+    spin = rng.normal(size=(43, 3)) * turn / 0.01
+    spin[:3] = 0.0, np.nan, np.inf
+    compiled, plain = (call(free_spin, spin, moments, 0.01) for call in (_call, without_loops))
+    np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-10 * turn / 0.01)
