@@ -140,8 +140,8 @@ def _call(work, *arguments):
 
 @pytest.mark.parametrize("turn", [1e-9, 0.01, 0.3, 1.0, 30.0])
 def test_free_spins_agree(turn, without_loops):
-    """Also of rods and plates, of bodies at rest, of a step that turns too far, and of a body that is lost. The loop ends
-    Newton's method for each body, numpy for all."""
+    """Also of rods and plates, of bodies at rest, of a step that turns too far, and of a body that is lost. The loop
+    ends Newton's method for each body, numpy for all."""
     rng = np.random.default_rng(0)
     moments = np.concatenate([rng.uniform(0.5, 1.0, (40, 3)), [[1.0, 1.0, 1e-3], [0.5, 0.5, 1.0], [1.0, 1.0, 1.0]]])
     spin = rng.normal(size=(43, 3)) * turn / 0.01
