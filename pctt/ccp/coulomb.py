@@ -74,6 +74,9 @@ def ladder(
             return _last_of(tried)
         if tried[-1].status is Status.GIVEN_UP:
             break
+        y = problem.product(tried[-1].impulse) + problem.r
+        if problem.natural_residual(tried[-1].impulse, y, coulomb=True) <= limits.tol:
+            return _last_of(tried)  # the closing work alone is too large: no other way would do better
     tried.append(solve(problem, _best_of(tried).impulse if tried else guess, limits, options, convex))
     if tried[-1].final:
         return _last_of(tried)

@@ -94,7 +94,7 @@ def run(path: Path, method: str, tol: float, seconds: float) -> dict[str, Any]:
     words = [str(path), name, str(tol), str(seconds), "auto" if name == method else "assembled"]
     command = [sys.executable, str(Path(__file__).with_name("solve_one.py")), *words]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=seconds + 15, check=True)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=2 * seconds + 15, check=True)
         return json.loads(done.stdout.splitlines()[-1])
     except subprocess.TimeoutExpired:
         return {"reason": f"{seconds:g} s"}

@@ -19,16 +19,18 @@ from validation.rows import Row
 RUNS, PAGE, PICTURE = Path("results/validation"), Path("docs/validation.md"), Path("docs/validation.png")
 TEXT = Path("run/studies/validation/page.md")  # of the page, with the places of the figures
 OUTLETS = (4.5, 5.5, 6.5)
-FRICTIONS, SEEDS = (0.1, 0.3, 0.6), (1, 2, 3, 4)  # a bed of the heap for each pair
+FRICTIONS = (0.1, 0.3, 0.6)
+SEEDS = (1, 2, 3, 4)  # a bed of the silo for each outlet and each of them, and of the heap for each friction
 
 #: The runs of each check: names and options of ``python -m pctt.run``.
 JOBS: dict[str, dict[str, Sequence[object]]] = {
     "silo": {
-        f"silo_{outlet:g}": (
+        f"silo_{outlet:g}_{seed}": (
             *("silo", "-scene_n", 6, "-scene_filling", 0.7, "-scene_half_angle", 90, "-scene_outlet", outlet),
-            *("-steps", steps),
+            *("-scene_seed", seed, "-steps", steps),
         )
         for outlet, steps in zip(OUTLETS, (520, 350, 280))
+        for seed in SEEDS
     },
     "heap": {
         f"heap_{friction:g}_{seed}": (
@@ -44,7 +46,7 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
 
 #: What reads the runs of each check: rows of the table, and what the figure shows.
 CHECKS: dict[str, Callable[[], tuple[list[Row], dict[str, Any]]]] = {
-    "silo": lambda: laws.silo({outlet: RUNS / f"silo_{outlet:g}" for outlet in OUTLETS}),
+    "silo": lambda: laws.silo({D: [RUNS / f"silo_{D:g}_{seed}" for seed in SEEDS] for D in OUTLETS}),
     "drum": lambda: laws.drum(RUNS / "drum"),
     "heap": lambda: laws.heap({mu: [RUNS / f"heap_{mu:g}_{seed}" for seed in SEEDS] for mu in FRICTIONS}),
     "column": lambda: laws.column(RUNS / "column"),
@@ -116,7 +118,7 @@ def draw(shown: dict[str, dict[str, Any]]) -> None:
     (one, two), (three, four) = axes
     wide = np.linspace(-silo["level"] / silo["slope"], 7.0)
     one.plot(wide, silo["slope"] * wide + silo["level"], color="C7", label="Beverloo's law, fitted")
-    one.plot(silo["outlet"], silo["flow"] ** 0.4, "o", label="silo")
+    one.plot(silo["outlet"], silo["flow"] ** 0.4, "o", color="C0", label=["silo"] + [None] * (len(SEEDS) - 1))
     one.set_xlabel("outlet [sphere diameters]")
     one.set_ylabel("flow$^{2/5}$ [(kg/s)$^{2/5}$]")
     for mu, angle, z in zip(heap["friction"], heap["angle"], heap["height"]):

@@ -10,6 +10,7 @@ import pytest
 from mpi4py import MPI
 from problems import SELF, from_graph, heap, matrix
 from several_ranks import alone
+from test_accuracy import column
 
 from pctt import ccp
 from pctt.ccp import Coulomb, Limits, Status, coulomb, fclib
@@ -282,3 +283,12 @@ def test_the_answer_does_not_depend_on_the_ranks():
     expected = alone(lambda comm: figures_of(comm, "apgd"))
     for solver in ("apgd", "conic"):
         np.testing.assert_allclose(figures_of(MPI.COMM_WORLD, solver), expected, rtol=1e-5)
+
+
+def test_where_the_closing_work_alone_is_too_large_no_cone_problems_follow():
+    """After 60 iterations the natural residual of a column that comes to rest is small enough."""
+    limits = Limits(1e-2, 60)
+    result = ccp.solve(column(30, stopped=0)[0], type="apgd", limits=limits, coulomb=Coulomb())
+    assert not result.converged
+    assert result.residual > limits.tol
+    assert (result.law, result.cone_problems) == ("Coulomb", 1)

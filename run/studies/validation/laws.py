@@ -31,22 +31,27 @@ def records(folder: Path) -> dict[str, np.ndarray]:
     return dict(zip(lines[0], np.array(lines[1:], dtype=float).T))
 
 
-def silo(folders: Mapping[float, Path]) -> tuple[list[Row], dict]:
-    """Flow against the diameter of the outlet [sphere diameters]."""
+def silo(folders: Mapping[float, Sequence[Path]]) -> tuple[list[Row], dict]:
+    """Flow against the diameter of the outlet [sphere diameters]; a fit for each bed, and means of the fits."""
     outlet = np.array(list(folders))
-    read = [json.loads((folder / "summary.json").read_text())["analysis"] for folder in folders.values()]
-    flow = np.array([figures["mass_flow [kg/s]"] for figures in read])
+    flow = np.array([[_flow(folder) for folder in several] for several in folders.values()])
     slope, level = np.polyfit(outlet, flow**0.4, 1)
-    k, unit = -level / slope, PACKING * DENSITY * np.sqrt(GRAVITY) * DIAMETER**2.5
-    exponent = float(np.polyfit(np.log(outlet - 1.4), np.log(flow), 1)[0])
-    straight = float(np.abs((slope * outlet + level) ** 2.5 / flow - 1.0).max())
+    unit = PACKING * DENSITY * np.sqrt(GRAVITY) * DIAMETER**2.5
+    fits = np.array([np.polyfit(np.log(outlet - 1.4), np.log(flow), 1)[0], -level / slope, slope**2.5 / unit])
+    (exponent, k, C), errors = fits.mean(axis=1), fits.std(axis=1, ddof=1) / np.sqrt(flow.shape[1])
+    straight = float(np.abs((outlet * slope.mean() + level.mean()) ** 2.5 / flow.mean(axis=1) - 1.0).max())
     found = [
-        row("silo", "exponent of the flow in D - 1.4 d", 2.5, exponent, BEVERLOO, "", 0.1),
-        row("silo", "worst deviation of a flow from the fitted law (D - k d)^5/2", 0.0, straight, BEVERLOO, "", 0.1),
-        band("silo", "k of the fitted law", 1.0, 2.0, float(k), BEVERLOO, ""),
-        band("silo", "C of the fitted law", 0.55, 0.65, float(slope**2.5 / unit), BEVERLOO, ""),
+        row("silo", "exponent of the flow in D - 1.4 d", 2.5, float(exponent), BEVERLOO, "", 0.1, float(errors[0])),
+        row("silo", "worst deviation of a mean flow from the fitted law", 0.0, straight, BEVERLOO, "", 0.1),
+        band("silo", "k of the fitted law (D - k d)^5/2", 1.0, 2.0, float(k), BEVERLOO, "", float(errors[1])),
+        band("silo", "C of the fitted law", 0.55, 0.65, float(C), BEVERLOO, "", float(errors[2])),
     ]
-    return found, {"outlet": outlet, "flow": flow, "slope": slope, "level": level}
+    return found, {"outlet": outlet, "flow": flow, "slope": slope.mean(), "level": level.mean()}
+
+
+def _flow(folder: Path) -> float:
+    """The mass flow that the scene found [kg/s]."""
+    return float(json.loads((folder / "summary.json").read_text())["analysis"]["mass_flow [kg/s]"])
 
 
 def heap(folders: Mapping[float, Sequence[Path]]) -> tuple[list[Row], dict]:

@@ -7,14 +7,25 @@ from typing import Any
 Row = dict[str, Any]
 
 
-def row(check: str, quantity: str, reference: float, found: float, source: str, unit: str, allowed: float) -> Row:
-    """What is compared; `allowed` is the deviation that is fine, relative, or absolute where the reference is zero."""
+def row(
+    check: str,
+    quantity: str,
+    reference: float,
+    found: float,
+    source: str,
+    unit: str,
+    allowed: float,
+    error: float | None = None,
+) -> Row:
+    """What is compared, with its standard error if it is a mean; `allowed` is the deviation that is fine, relative, or
+    absolute where the reference is zero."""
     deviation = found - reference if reference == 0.0 else found / reference - 1.0
     return {
         "check": check,
         "quantity": quantity,
         "reference": reference,
         "found": found,
+        "error": error,
         "unit": unit,
         "deviation": deviation,
         "agrees": bool(abs(deviation) <= allowed),
