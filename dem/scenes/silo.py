@@ -28,8 +28,8 @@ PACKING = 0.58
 
 @dataclass(frozen=True)
 class Silo(SmallSpheres):
-    """Spheres settle in a cylinder with a cone below, whose outlet is shut; then the gate is drawn aside, and they flow
-    out onto a floor.
+    """Spheres settle in a cylinder with a cone below, whose outlet is shut; then the gate drops away, and they flow out
+    onto a floor.
 
     Cylinder and cone are one mesh, of flat sides. With `half_angle` 90 the bottom is flat. The mass below the outlet is
     recorded. Its slope, while a tenth to a half of the mass runs out, is the flow. The flow by Beverloo's law stands
@@ -119,8 +119,8 @@ class Silo(SmallSpheres):
         wide, hole = self.container_radius, self.outlet_radius
         profile = [(hole, 0.0), (wide, self.cone_height), (wide, self.top)]
         scene.add_body("silo", [Mesh.revolved(profile, self.sides)])
-        # Out of the way within a twentieth of a second, and no further.
-        away = Glide((40 * hole, 0.0, 0.0), self.settling_time, self.settling_time + 0.05)
+        # Down and through the floor, within a twentieth of a second. Drawn aside it would wedge spheres against the rim.
+        away = Glide((0.0, 0.0, 20 * (self.floor - hole)), self.settling_time, self.settling_time + 0.05)
         disc = Mesh.revolved([(0.0, 0.0), (hole, 0.0)], self.sides)
         scene.add_body("gate", [disc], away)
         scene.add_body("floor", [Plane((0, 0, 1))], position=(0.0, 0.0, self.floor))

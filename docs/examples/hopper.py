@@ -21,7 +21,7 @@ from dem.shapes import Plane
 
 @dataclass(frozen=True)
 class Hopper(Experiment):
-    """Spheres settle in a cylinder with a cone below; then the gate slides away."""
+    """Spheres settle in a cylinder with a cone below; then the gate drops away."""
 
     layers: int = option(12, "", "layers of spheres")
     outlet: float = option(0.03, "m", "diameter of the outlet")
@@ -45,7 +45,7 @@ class Hopper(Experiment):
         scene.add_spheres(places, radius, 2500.0)
         profile = [(hole, 0), (self.wide, cone), (self.wide, up[-1] + pitch)]
         scene.add_body("hopper", [Mesh.revolved(profile, 32)])
-        away = Glide((20 * hole, 0, 0), self.settling_time, self.settling_time + 0.1)
+        away = Glide((0, 0, -20 * (self.wide + hole)), self.settling_time, self.settling_time + 0.05)
         scene.add_body("gate", [Mesh.revolved([(0, 0), (hole, 0)], 32)], away)
         scene.add_body("floor", [Plane((0, 0, 1))], position=(0, 0, -self.wide))
         return scene

@@ -89,7 +89,7 @@ def table(rows: list[Row]) -> str:
             expected, off = f"above {reference[0]:g}{unit}", f"{row['deviation']:+.2g} errors"
         else:
             expected = f"[{reference[0]:g}, {reference[1]:g}]{unit}"
-            off = "inside" if row["agrees"] else f"{100 * row['deviation']:+.2g} %"
+            off = "inside" if row["deviation"] == 0.0 else f"{100 * row['deviation']:+.2g} %"
         words = [row["check"], row["quantity"], expected, f"{row['found']:.4g}{error}{unit}"]
         lines.append("| " + " | ".join([*words, off if row["agrees"] else f"**{off}**", row["source"]]) + " |")
     return "\n".join(lines)

@@ -36,9 +36,10 @@ def row(
 def band(
     check: str, quantity: str, low: float, high: float, found: float, source: str, unit: str, error: float | None = None
 ) -> Row:
-    """What is to lie in a published band, with its standard error if it is a mean; the deviation is that from the
-    nearer end of the band, relative, zero inside."""
+    """What is to lie in a published band, to two standard errors if it is a mean; the deviation is that from the nearer
+    end of the band, relative, zero inside."""
     nearer = min(max(found, low), high)
+    spare = 2.0 * (error or 0.0)
     return {
         "check": check,
         "quantity": quantity,
@@ -47,7 +48,7 @@ def band(
         "error": error,
         "unit": unit,
         "deviation": found / nearer - 1.0,
-        "agrees": bool(low <= found <= high),
+        "agrees": bool(low - spare <= found <= high + spare),
         "source": source,
     }
 
