@@ -119,7 +119,7 @@ class Silo(SmallSpheres):
         wide, hole = self.container_radius, self.outlet_radius
         profile = [(hole, 0.0), (wide, self.cone_height), (wide, self.top)]
         scene.add_body("silo", [Mesh.revolved(profile, self.sides)])
-        # Down and through the floor, within a twentieth of a second. Drawn aside it would wedge spheres against the rim.
+        # Down and through the floor, in a twentieth of a second. Drawn aside it would wedge spheres against the rim.
         away = Glide((0.0, 0.0, 20 * (self.floor - hole)), self.settling_time, self.settling_time + 0.05)
         disc = Mesh.revolved([(0.0, 0.0), (hole, 0.0)], self.sides)
         scene.add_body("gate", [disc], away)
