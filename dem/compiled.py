@@ -14,7 +14,7 @@ compiled = njit(cache=True, fastmath={"contract"})
 
 #: For a loop that another one calls: fused differently in the first process, it would have other bits there
 #: (`pctt.compiled.unfused`).
-unfused = njit(cache=True)
+unfused = njit(cache=True, error_model="numpy")
 
 
 # -- the contact map ---------------------------------------------------------------------------------------------

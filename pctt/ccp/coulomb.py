@@ -74,10 +74,10 @@ def ladder(
             return _last_of(tried)
         if tried[-1].status is Status.GIVEN_UP:
             break
-        y = problem.product(tried[-1].impulse) + problem.r
-        if problem.natural_residual(tried[-1].impulse, y, coulomb=True) <= limits.tol:
-            return _last_of(tried)  # the closing work alone is too large: no other way would do better
-    tried.append(solve(problem, _best_of(tried).impulse if tried else guess, limits, options, convex))
+    tried.sort(key=lambda result: -result.residual)
+    if tried and _only_closes(problem, limits, tried[-1]):
+        return _last_of(tried)
+    tried.append(solve(problem, tried[-1].impulse if tried else guess, limits, options, convex))
     if tried[-1].final:
         return _last_of(tried)
     plain = convex(problem, guess, limits.tol)
@@ -88,13 +88,17 @@ def ladder(
     return _last_of(sorted(tried, key=lambda result: -result.residual))
 
 
+def _only_closes(problem: ConeProblem, limits: Limits, found: Result) -> bool:
+    """Whether only the closing work of a result is too large. Then cone problems would not do better."""
+    if found.status is Status.GIVEN_UP:
+        return False
+    y = problem.product(found.impulse) + problem.r
+    return problem.natural_residual(found.impulse, y, coulomb=True) <= limits.tol
+
+
 def _residual(problem: ConeProblem, limits: Limits, g: Array, y: Array) -> float:
     """That of Coulomb's law for impulses g (nc, 3) with y = N g + r."""
     return limits.residual(problem.natural_residual(g, y, coulomb=True), problem, g, y)
-
-
-def _best_of(tried: list[Result]) -> Result:
-    return min(tried, key=lambda result: result.residual)
 
 
 def _last_of(tried: list[Result]) -> Result:

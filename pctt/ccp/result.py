@@ -6,13 +6,10 @@ import dataclasses
 import math
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING
 
 from pctt.ccp.cone import Array
+from pctt.ccp.problem import ConeProblem
 from pctt.options import FRACTION, option
-
-if TYPE_CHECKING:
-    from pctt.ccp.problem import ConeProblem
 
 RELAXATION, COULOMB, FIXED_POINT = "relaxation", "Coulomb", "Coulomb by cone problems"
 
