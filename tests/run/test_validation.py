@@ -27,17 +27,21 @@ def laws(monkeypatch):
 
 
 def test_flows_of_beverloo_give_his_constants(laws, tmp_path):
+    """Of three beds for each outlet, each with a tenth more flow than the one before."""
     folders = {}
     for outlet in (4.5, 5.5, 6.5):
-        flow = 0.58 * 0.58 * 2500 * np.sqrt(9.81) * (0.01 * (outlet - 1.4)) ** 2.5
-        folders[outlet] = tmp_path / str(outlet)
-        folders[outlet].mkdir()
-        (folders[outlet] / "summary.json").write_text(json.dumps({"analysis": {"mass_flow [kg/s]": flow}}))
+        folders[outlet] = [tmp_path / f"{outlet}_{more}" for more in (0.9, 1.0, 1.1)]
+        for folder, more in zip(folders[outlet], (0.9, 1.0, 1.1)):
+            flow = more * 0.58 * 0.58 * 2500 * np.sqrt(9.81) * (0.01 * (outlet - 1.4)) ** 2.5
+            folder.mkdir()
+            (folder / "summary.json").write_text(json.dumps({"analysis": {"mass_flow [kg/s]": flow}}))
     found, _ = laws.silo(folders)
     exponent, straight, k, c = (row["found"] for row in found)
     assert exponent == pytest.approx(2.5)
-    assert straight == pytest.approx(0.0, abs=1e-9)
+    assert straight == pytest.approx(0.0, abs=1e-2)
     assert (k, c) == pytest.approx((1.4, 0.58))
+    assert found[2]["error"] == pytest.approx(0.0, abs=1e-9)
+    assert found[3]["error"] == pytest.approx(0.058 / np.sqrt(3))
     assert all(row["agrees"] for row in found)
 
 
@@ -48,6 +52,8 @@ def test_a_band_tells_how_far_off_a_figure_is(laws):
     assert (inside["agrees"], inside["deviation"]) == (True, 0.0)
     assert below["agrees"] is False
     assert below["deviation"] == pytest.approx(-0.1)
+    assert band("silo", "C", 0.55, 0.65, 0.66, "", "", error=0.01)["agrees"] is True  # within two of its errors
+    assert band("silo", "C", 0.55, 0.65, 0.68, "", "", error=0.01)["agrees"] is False
     assert row("sliding", "way", 2.0, 2.1, "", "m", 0.01)["agrees"] is False
     assert row("sliding", "lift", 0.0, 1e-9, "", "m", 1e-6)["agrees"] is True
 
