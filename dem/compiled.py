@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-#: Fused multiply-adds are allowed; what else numba calls fast assumes that there are no NaNs.
-compiled = njit(cache=True, fastmath={"contract"})
+#: Fused multiply-adds are allowed; what else numba calls fast assumes that there are no NaNs. A division by zero gives
+#: inf or nan, as in numpy.
+compiled = njit(cache=True, fastmath={"contract"}, error_model="numpy")
 
 #: For a loop that another one calls: fused differently in the first process, it would have other bits there
 #: (`pctt.compiled.unfused`).
@@ -265,49 +266,60 @@ def integrate(quaternion, angular_velocity, dt):
 
 
 @unfused
-def free_spin(spin, moments, dt, newton_steps, last_change, converged):
+def free_spin(turn, spin, moments, dt, newton_steps, last_change, converged):
     """`dem.free_motion.free_spin`, body by body: each ends Newton's method by itself."""
     out = spin.copy()
     half = 0.5 * dt
     for n in range(len(spin)):
-        w, largest = (spin[n, 0], spin[n, 1], spin[n, 2]), max(moments[n, 0], moments[n, 1], moments[n, 2])
+        frame, twice = (turn[n, 1], turn[n, 2], turn[n, 3]), 2.0 * turn[n, 0]
+        w = _turned((spin[n, 0], spin[n, 1], spin[n, 2]), frame, -twice, 2.0)
+        largest = max(moments[n, 0], moments[n, 1], moments[n, 2])
         inertia = (moments[n, 0] / largest, moments[n, 1] / largest, moments[n, 2] / largest)
-        momentum, new = _turned(_times(-half, w), _each(inertia, w)), w
+        rotation = _times(half, w)
+        sine, versed = _shares(rotation)
+        momentum, new = _turned(_each(inertia, w), rotation, -sine, versed), w
         for _ in range(newton_steps):
-            turn = _times(half, new)
-            middle = _turned(turn, _each(inertia, new))
+            middle = _turned(_each(inertia, new), rotation, sine, versed)
             change = _solve(
-                _slope((inertia[0], 0.0, 0.0), (1.0, 0.0, 0.0), turn, middle, half),
-                _slope((0.0, inertia[1], 0.0), (0.0, 1.0, 0.0), turn, middle, half),
-                _slope((0.0, 0.0, inertia[2]), (0.0, 0.0, 1.0), turn, middle, half),
+                _slope((inertia[0], 0.0, 0.0), (1.0, 0.0, 0.0), rotation, sine, versed, middle, half),
+                _slope((0.0, inertia[1], 0.0), (0.0, 1.0, 0.0), rotation, sine, versed, middle, half),
+                _slope((0.0, 0.0, inertia[2]), (0.0, 0.0, 1.0), rotation, sine, versed, middle, half),
                 _plus(momentum, _times(-1.0, middle)),
             )
             new = _plus(new, change)
+            rotation = _times(half, new)
+            sine, versed = _shares(rotation)
             if _dot(change, change) <= last_change**2 * _dot(w, w):
                 break
-        back = _turned(_times(-half, new), momentum)
+        back = _turned(momentum, rotation, -sine, versed)
         error = _plus(back, _times(-1.0, _each(inertia, new)))
         if _dot(error, error) <= converged**2 * _dot(momentum, momentum):
-            out[n, 0], out[n, 1], out[n, 2] = back[0] / inertia[0], back[1] / inertia[1], back[2] / inertia[2]
+            solved = back[0] / inertia[0], back[1] / inertia[1], back[2] / inertia[2]
+            out[n, 0], out[n, 1], out[n, 2] = _turned(solved, frame, twice, 2.0)
     return out
 
 
 @unfused
-def _slope(along, axis, turn, middle, half):
+def _slope(along, axis, rotation, sine, versed, middle, half):
     """How the angular momentum in the middle of the step changes with the spin about an axis."""
-    once = _cross(turn, axis)
-    turned = _plus(axis, _plus(_times(0.5, once), _times(1.0 / 6.0, _cross(turn, once))))
-    return _plus(_turned(turn, along), _times(-half, _cross(middle, turned)))
+    turned = _turned(axis, rotation, 0.5, 1.0 / 6.0)
+    return _plus(_turned(along, rotation, sine, versed), _times(-half, _cross(middle, turned)))
 
 
 @unfused
-def _turned(rotation, v):
-    """The vector v, turned by a rotation vector."""
+def _turned(v, r, sine, versed):
+    """v + sine r x v + versed r x (r x v): the vector v, turned by the rotation vector r with its `_shares`, or by the
+    quaternion (w, r) with 2 w and 2; with -sine the other way."""
+    once = _cross(r, v)
+    return _plus(v, _plus(_times(sine, once), _times(versed, _cross(r, once))))
+
+
+@unfused
+def _shares(rotation):
+    """sin(a) / a and (1 - cos(a)) / a^2 of the angle a of a rotation vector."""
     square = _dot(rotation, rotation)
     angle = np.sqrt(square)
-    once = _cross(rotation, v)
-    sine, versed = (np.sin(angle) / angle, (1.0 - np.cos(angle)) / square) if angle > 1e-8 else (1.0, 0.5)
-    return _plus(v, _plus(_times(sine, once), _times(versed, _cross(rotation, once))))
+    return (np.sin(angle) / angle, (1.0 - np.cos(angle)) / square) if angle > 1e-8 else (1.0, 0.5)
 
 
 @unfused

@@ -33,17 +33,15 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
     rows = np.flatnonzero(dynamic & (table.shape != SPHERE))
     if not len(rows):
         return velocity
-    rows = rows[np.isfinite(table.inertia[rows]).all(axis=1)]  # guided bodies do not turn
-    rows = rows[np.ptp(table.inertia[rows], axis=1) > 0.0]
-    turn, moments = table.quaternion[rows], table.inertia[rows]
-    spin = quaternion.rotate(quaternion.conjugate(turn), velocity[rows, 3:])
-    velocity[rows, 3:] = quaternion.rotate(turn, free_spin(spin, moments, dt))
+    a, b, c = table.inertia[rows].T
+    rows = rows[np.isfinite(a + b + c) & ((a != b) | (b != c))]  # guided bodies do not turn
+    velocity[rows, 3:] = free_spin(table.quaternion[rows], velocity[rows, 3:], table.inertia[rows], dt)
     return velocity
 
 
-def free_spin(spin: Floats, moments: Floats, dt: float) -> Floats:
-    """Angular velocities (n, 3) [rad/s] after dt [s] without torque, of bodies with principal moments (n, 3), from
-    `spin` (n, 3); both in the frames of the bodies at the start of the step.
+def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
+    """Angular velocities (n, 3) [rad/s] after dt [s] without torque, from `spin` (n, 3), of bodies with orientations
+    `turn` (n, 4) at the start of the step and principal moments (n, 3). All vectors are in the world frame.
 
     A step turns a body by exp(dt w). In the middle of it the body has the angular momentum exp(dt/2 w) I w in the frame
     of its start, and in the middle of the last step it had exp(-dt/2 w_old) I w_old. Newton's method makes the two
@@ -53,21 +51,24 @@ def free_spin(spin: Floats, moments: Floats, dt: float) -> Floats:
     converge, keeps its spin: no such step resolves its motion.
     """
     if compiled := loops():
-        arrays = np.ascontiguousarray(spin), np.ascontiguousarray(moments)
+        arrays = (np.ascontiguousarray(array) for array in (turn, spin, moments))
         return compiled.free_spin(*arrays, dt, NEWTON_STEPS, LAST_CHANGE, CONVERGED)
     half = 0.5 * dt
     moments = moments / moments.max(axis=1, keepdims=True)  # nothing but their ratios counts
-    with np.errstate(over="ignore", invalid="ignore"):  # the search finds lost bodies
-        momentum, new = _turned(-half * spin, moments * spin), spin
+    # The search finds lost bodies. A body that turns too far may have a singular slope: its spin is no number then.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        start = quaternion.rotate(quaternion.conjugate(turn), spin)
+        momentum, new = _turned(-half * start, moments * start), start
         for _ in range(NEWTON_STEPS):
             middle = _turned(half * new, moments * new)
-            change = np.linalg.solve(_slope(new, moments, middle, half), (momentum - middle)[:, :, None])
-            new = new + change[:, :, 0]
-            if (quaternion.length(change[:, :, 0]) <= LAST_CHANGE * quaternion.length(spin)).all():
+            change = _solve(_slope(new, moments, middle, half), momentum - middle)
+            new = new + change
+            if (quaternion.length(change) <= LAST_CHANGE * quaternion.length(start)).all():
                 break
         solved = _turned(-half * new, momentum) / moments
         error = quaternion.length(moments * (solved - new))
-        return np.where((error <= CONVERGED * quaternion.length(momentum))[:, None], solved, spin)
+        converged = (error <= CONVERGED * quaternion.length(momentum))[:, None]
+        return np.where(converged, quaternion.rotate(turn, solved), spin)
 
 
 def _slope(spin: Floats, moments: Floats, middle: Floats, half: float) -> Floats:
@@ -76,6 +77,14 @@ def _slope(spin: Floats, moments: Floats, middle: Floats, half: float) -> Floats
     turn = np.eye(3) + across / 2 + across @ across / 6  # a turn by v changes with v by 1 + [v]/2 + [v]^2/6 + ...
     matrix = quaternion.matrix(quaternion.exponential(half * spin))
     return matrix * moments[:, None, :] - half * _cross_matrix(middle) @ turn
+
+
+def _solve(matrices: Floats, right: Floats) -> Floats:
+    """Solutions (n, 3) for matrices (n, 3, 3), by Cramer's rule; no numbers where they are singular."""
+    a, b, c = np.moveaxis(matrices, 2, 0)
+    across = cross(b, c)
+    parts = [across, cross(c, a), cross(a, b)]
+    return np.einsum("knj,nj->nk", parts, right) / np.einsum("nj,nj->n", a, across)[:, None]
 
 
 def _turned(rotation: Floats, vectors: Floats) -> Floats:

@@ -72,7 +72,8 @@ def find_contacts(
     shapes, total = [body.shapes for body in world.large_bodies], int(world.slabs[-1])
     if shifts is None:
         shifts = (dt * large_free_velocity(world, dt) if dt else np.zeros_like(world.large.velocity))[None]
-    way = _way(world.grains, free_velocity(world.grains, world.gravity, dt), dt)
+    free = free_velocity(world.grains, world.gravity, dt) if dt else world.grains.velocity
+    way = _way(world.grains, free, dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
     alone = without_ghosts(world, margin)
     table = primitives(alone, shapes, total)
