@@ -300,6 +300,7 @@ def own(state: State, tol: float, repeats: int) -> dict[str, Any]:
 def warm(n: int, tol: float) -> dict[str, Any]:
     """Steps of a run of the mixer, each from the impulses of the last."""
     words = ["-scene", "mixer", "-scene_n", n, "-restart", "settled", "-steps", 6, "-output_every", 0]
+    words += ["-ccp_closing_work", "inf"]
     _, lines = results(1, *words, "-ccp_type", "apgd", "-ccp_tol", tol, "-ccp_coulomb", "false")
     lines = lines[1:]
     row = {"solver": "pctt apgd, warm", "iterations": statistics.median(line["iterations"] for line in lines)}

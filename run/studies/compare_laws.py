@@ -48,6 +48,7 @@ def _both_laws(scene: str, n: int, method: str, tol: str, count: int) -> list[di
     rows = []
     for law, flags in (("relaxation", ("false",)), ("Coulomb", ("true", "-ccp_coulomb_max_it", MOST))):
         options = ("-scene", scene, "-scene_n", n, "-restart", "settled", "-steps", count, "-output_every", 0)
+        options += ("-ccp_closing_work", "inf")
         _, steps = results(1, *options, "-ccp_type", method, "-ccp_tol", tol, "-ccp_coulomb", *flags)
         row = {
             "scene": scene,

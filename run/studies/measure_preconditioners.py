@@ -13,6 +13,7 @@ NAMES = "none,ilu,ilu-shifted,pbjacobi,sor,icc-shifted,gamg,hypre,cholesky,body-
 def main(n: int, every: int, names: str, options: list[str]) -> None:
     about = say_machine()
     run = ["-scene_n", n, "-restart", "settled", "-steps", 1, "-compare", names, "-compare_every", every]
+    run += ["-ccp_closing_work", "inf"]
     summary, (step,) = results(1, *run, *options)
     print(
         f"mixer n = {n}: {step['contacts']} contacts, {step['newton_its']} Newton steps to natural residual "

@@ -104,11 +104,12 @@ class ReplayingStepper(Stepper):
 def replay_steps(
     words: list[Any], steps: int, look: Callable[[Replay], None], newton_steps: int | None = None
 ) -> list[dict[str, Any]]:
-    """Make time steps with these options of pctt.run, ``["-scene_n", 4, ...]``; the figures of each step.
+    """Make time steps with these options of pctt.run, ``["-scene_n", 4, ...]``; the figures of each step. They end at
+    the natural residual alone, as the paper's.
 
     newton_steps : how many Newton systems of each are looked at; the steps are then made by APGD
     """
-    database = {str(name)[1:]: str(value) for name, value in zip(words[::2], words[1::2])}
+    database = {"ccp_closing_work": "inf"} | {str(name)[1:]: str(value) for name, value in zip(words[::2], words[1::2])}
     comm = MPI.COMM_WORLD
     try:
         options = read_options(database | {"output": "results", "overwrite": "true"}, comm)

@@ -19,6 +19,7 @@ def measure(scene: str, n: int) -> list[dict[str, Any]]:
     number."""
     every = EVERY.get(n, 1)
     words = ["-scene", scene, "-scene_n", n, "-restart", "settled", "-steps", 1, "-ccp_type", "pdip"]
+    words += ["-ccp_closing_work", "inf"]
     summary, (step,) = results(1, *words, "-compare", ",".join(METHODS), "-compare_every", every)
     rows = []
     for name, done in summary["compare"].items():
