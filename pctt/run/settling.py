@@ -30,6 +30,28 @@ def settled_state(
     missing, or with ``anew``. Settling takes the settling time with APGD. The last tenth has the contact distance of
     the scene and ten times the accuracy: otherwise overlaps remain, and the first accurate step of a run would push
     them apart. An interrupted or killed settling is continued."""
+    path, made_with = cache(options, scene)
+    if not anew and comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
+        return path
+    progress.say(f"settling {options.run.scene}, {steps(options)} steps with APGD to {options.run.settle_tol:g}:")
+    if comm.rank == 0:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    if comm.bcast(unfinished(path).exists()):
+        world, memory = checkpoint.load(unfinished(path), scene, made_with, comm)
+        progress.say(f"  goes on after step {world.step}, from {unfinished(path)}")
+    else:
+        world, memory = world_at_start(options.scene, scene, comm), ImpulseMemory(comm)
+    _settle(options, world, memory, unfinished(path), made_with, progress)
+    checkpoint.save(path, made_with, world, memory)
+    if comm.rank == 0:
+        checkpoint.write_checksum(path)
+        unfinished(path).unlink(missing_ok=True)
+    comm.Barrier()
+    return path
+
+
+def cache(options: Options, scene: Scene) -> tuple[Path, dict[str, str]]:
+    """The file of a scene's settled state, and what it is made with; OptionError if the scene never settles."""
     if not options.scene.settling_time:
         raise OptionError(f"-scene {options.run.scene}: has no settling_time and so no settled state")
     made_with = checkpoint.origin(scene_name(options.run.scene), options.scene, options.dt)
@@ -43,38 +65,28 @@ def settled_state(
         settings["file"] = options.scene.digest  # a file that was changed may build another scene
     if triangles := checkpoint.surfaces(scene.large_bodies):
         settings["surfaces"] = {name: [f"{value:.5g}" for value in figures] for name, figures in triangles.items()}
-    path = checkpoint.settled_path(made_with["scene"], settings)
-    if not anew and comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
-        return path
-    steps = math.ceil(options.scene.settling_time / options.dt * (1 - 1e-12))
-    progress.say(f"settling {options.run.scene}, {steps} steps with APGD to {options.run.settle_tol:g}:")
-    unfinished = path.with_suffix(".unfinished.h5")
-    if comm.rank == 0:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    if comm.bcast(unfinished.exists()):
-        world, memory = checkpoint.load(unfinished, scene, made_with, comm)
-        progress.say(f"  goes on after step {world.step}, from {unfinished}")
-    else:
-        world, memory = world_at_start(options.scene, scene, comm), ImpulseMemory(comm)
-    _settle(options, world, memory, steps, unfinished, made_with, progress)
-    checkpoint.save(path, made_with, world, memory)
-    if comm.rank == 0:
-        checkpoint.write_checksum(path)
-        unfinished.unlink(missing_ok=True)
-    comm.Barrier()
-    return path
+    return checkpoint.settled_path(made_with["scene"], settings), made_with
+
+
+def unfinished(path: Path) -> Path:
+    """The checkpoint that an interrupted settling leaves beside its settled state."""
+    return path.with_suffix(".unfinished.h5")
+
+
+def steps(options: Options) -> int:
+    """The steps of a settling from the start."""
+    return math.ceil(options.scene.settling_time / options.dt * (1 - 1e-12))
 
 
 def _settle(
     options: Options,
     world: World,
     memory: ImpulseMemory,
-    steps: int,
-    unfinished: Path,
+    path: Path,
     made_with: dict[str, str],
     progress: report.Progress,
 ) -> None:
-    """The steps of settling, with a checkpoint ``unfinished`` after every tenth of them."""
+    """The steps of settling, with a checkpoint ``path`` after every tenth of them."""
     settling = dataclasses.replace(
         options,
         run=dataclasses.replace(options.run, ccp_type="apgd", ccp_compliance=None),
@@ -83,26 +95,27 @@ def _settle(
         solver=ccp.SOLVERS["apgd"].options(),
         coulomb=None,
     )
-    tenth = max(1, steps // 10)
+    end = steps(options)
+    tenth = max(1, end // 10)
     start = time.perf_counter()
-    progress.start(steps - world.step)
+    progress.start(end - world.step)
     with Stepper(settling, world, memory) as stepper:
-        while world.step < steps:
+        while world.step < end:
             progress.doing(f"settling, time {world.time:.3f} s")
-            if world.step + 1 >= steps - steps // 10:
+            if world.step + 1 >= end - end // 10:
                 limits = ccp.Limits(tol=0.1 * options.run.settle_tol)
                 stepper.options = dataclasses.replace(settling, delta=options.delta, limits=limits)
             line = stepper.step()
             interrupted = interrupt.asked(world.comm)
-            if world.step % tenth == 0 or world.step == steps or interrupted:
-                checkpoint.save(unfinished, made_with, world, memory)
+            if world.step % tenth == 0 or world.step == end or interrupted:
+                checkpoint.save(path, made_with, world, memory)
                 spent = time.perf_counter() - start
                 progress.say(
                     f"  step {world.step:5d}  time {line['time']:6.2f} s  contacts {line['contacts']:8d}"
                     f"  residual {line['natural_residual']:.1e}  {spent:7.1f} s spent"
                 )
             if interrupted:
-                words = f"settling interrupted after step {world.step} of {steps}; the same command goes on there"
+                words = f"settling interrupted after step {world.step} of {end}; the same command goes on there"
                 raise interrupt.InterruptError(words)
 
 

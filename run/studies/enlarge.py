@@ -1,15 +1,15 @@
-"""A mixer of size 2N from copies of the settled one of size N, which falling would take hours: run/study enlarge N
-writes the checkpoint results/mixer_n(2N).h5. The copies leave holes where their paddles were, and there is air
-between the layers: go on with some fifty steps, e.g.
+"""A settled mixer of size 2N from copies of the settled one of size N, which falling would take hours:
 
-    .venv/bin/mpiexec -n 2 .venv/bin/python -m pctt.run -scene_n 32 -restart results/mixer_n32.h5 -steps 50
-        -ccp_type apgd -ccp_tol 1e-3 -output results/n32
+    run/study enlarge N
+    RANKS=1 run/settle mixer 2N
+
+The first command writes an unfinished settling in ~/.cache/pctt, and the second one goes on there. The copies leave
+holes where their paddles were, and there is air between the layers: `LANDING` of the scene's settling time is left.
 """
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -19,7 +19,11 @@ from dem.arrays import Floats
 from dem.impulses import ImpulseMemory
 from dem.scenes import Mixer
 from dem.start import new_world
-from pctt.run import checkpoint
+from pctt.run import checkpoint, settling
+from pctt.run.options import read_options
+from pctt.run.settings import Options
+
+LANDING = 1.75  # s: the layers land within .6 s, the bed comes to rest, the last tenth of the settling is accurate
 
 
 def copies(bed: Floats, radius: float, width: float) -> Floats:
@@ -48,28 +52,28 @@ def spread(places: Floats, spheres: int, scene: Mixer) -> Floats:
 
 
 def main(n: int) -> None:
-    small, large = Mixer(n=n), Mixer(n=2 * n)
-    settled = newest(n)
+    small = Mixer(n=n)
+    settled, _ = settling.cache(_options(n), small.build())
+    if not checkpoint.intact(settled):
+        raise FileNotFoundError(f"no settled mixer of size {n} in {settled.parent}: run/settle mixer {n} makes it")
     with h5py.File(settled) as file:
         bed = file["grains/position"][:]
+    options = _options(2 * n)
+    large, scene = options.scene, options.scene.build()
     places = copies(bed, small.radius, small.width)
     places = spread(places[fits(places, large)], (4 * n + 1) ** 3, large)
-    world = new_world(large.build(), MPI.COMM_SELF)
+    world = new_world(scene, MPI.COMM_SELF)
     world.grains.position[:] = places
-    path = Path("results") / f"mixer_n{2 * n}.h5"
-    path.parent.mkdir(exist_ok=True)
-    made_with = checkpoint.origin("mixer", large, large.dt)
-    checkpoint.save(path, made_with, world, ImpulseMemory(MPI.COMM_SELF))
-    print(f"{path}: {len(places)} spheres, of copies of {settled}")
+    world.step = settling.steps(options) - round(LANDING / options.dt)
+    world.time = world.step * options.dt
+    path, made_with = settling.cache(options, scene)
+    checkpoint.save(settling.unfinished(path), made_with, world, ImpulseMemory(MPI.COMM_SELF))
+    print(f"{settling.unfinished(path)}: {len(places)} spheres, of copies of {settled}")
 
 
-def newest(n: int) -> Path:
-    """The cached settled state of the mixer of size n; FileNotFoundError if there is none."""
-    cache = checkpoint.settled_path(checkpoint.scene_record("mixer", Mixer(n=n)), {}).parent
-    found = sorted(cache.glob(f"mixer_n{n}_*.h5"), key=lambda path: path.stat().st_mtime)
-    if not found:
-        raise FileNotFoundError(f"no settled mixer of size {n} in {cache}: run/settle mixer {n} makes it")
-    return found[-1]
+def _options(n: int) -> Options:
+    """The options of `run/settle mixer n`."""
+    return read_options({"scene": "mixer", "scene_n": str(n), "settle": "true"}, MPI.COMM_SELF)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from types import SimpleNamespace
 
 import numpy as np
@@ -94,7 +95,7 @@ def test_barrier_blocks_are_symmetric_and_positive_definite_inside(name, towards
     f, df = cone.value(g), cone.gradient(g)
     lam = np.random.default_rng(2).uniform(0.1, 2.0, len(mu))
     only_mu = SimpleNamespace(mu=mu)
-    at = Linearised(only_mu, None, cone, g, lam, np.zeros_like(g), f, df, cone.hessian(g), 1.0)
+    at = Linearised(only_mu, None, cone, g, lam, np.zeros_like(g), f, df, cone.hessian(g), 1.0, deque())
     blocks = _barrier_blocks(at, 0.0)
     assert np.allclose(blocks, blocks.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(blocks).min() > 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mpi4py import MPI
-from problems import SELF, from_graph, from_matrix, heap
+from problems import SELF, from_graph, from_matrix, heap, part
 
 from pctt import blocks, ccp
 from pctt.ccp.newton.body import BodyForm
@@ -135,3 +135,24 @@ def test_few_contacts_are_never_kept_apart():
     G, hubs = blocks.without_hubs(SELF, from_graph(*heap(3)).contact_map.given)
     assert len(hubs) == 0
     assert G.rows == 40
+
+
+@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parametrize("form", ["contact", "body"])
+def test_a_solve_begins_from_the_best_combination_of_earlier_solutions(form):
+    """Where the solution is a combination of them, nothing is left to solve."""
+    comm = MPI.COMM_WORLD
+    known, graph = heap(3)
+    here = part(comm, len(known.mu))
+    problem = ccp.ConeProblem(comm, known.r[here], known.mu[here], G=graph.part(comm))
+    newton = ccp.Newton(comm, form)
+    newton.begin(problem)
+    rng = np.random.default_rng(0)
+    root, q, other = rng.standard_normal((40, 3, 3)), rng.standard_normal((40, 3)), rng.standard_normal((40, 3))
+    newton.update((root @ root.transpose(0, 2, 1) + np.eye(3))[here])
+    (dg, x), (_, away) = newton.solve(q[here], 1e-10), newton.solve(other[here], 1e-10)
+    iterations = newton.ksp_its
+    again, _ = newton.solve(q[here], 1e-8, earlier=[2 * x + away, away - x, np.zeros_like(x), away])
+    assert newton.ksp_its == iterations
+    assert np.allclose(again, dg, rtol=0, atol=1e-7)
+    newton.destroy()

@@ -268,8 +268,8 @@ class Scaled:
         boundary = min(options.boundary, STEERING.boundary_with_law) if cones.coulomb else options.boundary
         return cls(cones, newton, at, r_v, r_y, r_z, W, inverse, barrier_share, slip, tol, boundary)
 
-    def direction(self, w: Array, start: Array | None = None) -> Direction:
-        """The direction of the right-hand side w; ``start``: an earlier solution of the Newton system."""
+    def direction(self, w: Array, *earlier: Array) -> Direction:
+        """The direction of the right-hand side w; ``earlier``: solutions of the Newton system to begin from."""
         problem, newton, scale = self.cones.problem, self.newton, self.cones.scale
         c = self.W.divide(w) - self.at.z
         uncoupled = times(self.barrier_share, self.W.times(w) - self.at.s)
@@ -277,7 +277,7 @@ class Scaled:
         uncoupled -= times(self.inverse, self.r_z * scale)
         if self.slip is not None:
             self.slip.reduce(uncoupled)
-        dg, x = newton.solve((c - self.r_z) * scale, self.tol, self.r_v, start, uncoupled)
+        dg, x = newton.solve((c - self.r_z) * scale, self.tol, self.r_v, earlier, uncoupled)
         dv = newton.momentum(x, dg, self.r_v)
         ds = dg * scale
         if newton.primary == "momenta":  # r_y vanishes, r_v takes the error of the linear solve

@@ -18,6 +18,7 @@ decides when to stop.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -58,7 +59,7 @@ class PDIP:
 class Steering:
     """Numbers that steer the method, without unit; docs/notebook_ccp.md has what was measured."""
 
-    rtol: float = 1e-3  #: relative residual of the linear solves, if ``-ksp_rtol`` gives no other
+    rtol: float = 3e-4  #: relative residual of the linear solves, if ``-ksp_rtol`` gives no other
     forcing: float = 0.03  #: residual of a linear solve at most, as a part of what the natural residual shows
     stuck: float = 0.1  #: after a shorter step the next one only centres
     #: natural residual below which S has a proximal term; before, impulses may have to grow by orders of magnitude
@@ -71,6 +72,7 @@ class Steering:
     further: float = 0.3  #: the correction aims at a step that is longer by this
     bent: float = 100.0  #: no correction helps if terms of second order enlarge the right-hand side by this factor
     longer: float = 1.2  #: a corrected step is taken if it is so many times as long
+    earlier: int = 3  #: a linear solve begins from the best combination of so many earlier solutions
 
 
 STEERING = Steering()
@@ -82,6 +84,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     newton.begin(problem)
     g, lam = _start(problem, guess, cone, options)
     history: list[float] = []
+    earlier: deque[Array] = deque(maxlen=STEERING.earlier)
     step, damping = 1.0, 0.0
     for iteration in range(limits.max_it + 1):
         y = _velocity(problem, g)
@@ -96,10 +99,10 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
         centering = options.centering if step > STEERING.stuck else 1.0
         aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
-        at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, aim)
+        at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, aim, earlier)
         damping = _next_damping(damping, step, natural)
         newton.update(_barrier_blocks(at, damping * min(natural, STEERING.late) * problem.mean_diagonal))
-        step, dg, dlam = _corrected(at, _accuracy(at, natural), options)
+        step, dg, dlam = _corrected(at, natural, options)
         if not step > 1e-10:
             status, reason = Status.STALLED, "steps became too short"
             if step != step:
@@ -112,7 +115,8 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
 
 class Linearised(NamedTuple):
     """The data that all directions of a Newton step share: the problem, impulses and multipliers, velocities, the
-    constraints with their first and second derivatives, and the target 1/t of the complementarity."""
+    constraints with their first and second derivatives, the target 1/t of the complementarity, and the last solutions
+    of Newton systems."""
 
     problem: ConeProblem
     newton: Newton
@@ -124,16 +128,17 @@ class Linearised(NamedTuple):
     df: Array
     hessian: Array
     barrier: float
+    earlier: deque[Array]
 
 
-def _accuracy(at: Linearised, residual: float) -> float:
-    """How accurately to solve a Newton system (momenta, sqrt J).
+def _accuracy(at: Linearised, q: Array, residual: float) -> float:
+    """How accurately to solve a Newton system with the right-hand side q (momenta, sqrt J).
 
     The residual of a solve is a velocity. It must be only a part of the velocities that the natural residual stands
     for: otherwise complementarity would fall without them, and near the boundary no step makes up for that."""
     problem = at.problem
     shown = residual * problem.norm(at.g) * problem.mean_diagonal
-    left = min(STEERING.rtol * problem.norm(_right_side(at)), STEERING.forcing * shown)
+    left = min(STEERING.rtol * problem.norm(q), STEERING.forcing * shown)
     return left / float(np.sqrt(problem.mean_diagonal))
 
 
@@ -150,37 +155,36 @@ def _next_damping(damping: float, step: float, residual: float) -> float:
     return damping / STEERING.factor if step > STEERING.whole else damping
 
 
-def _right_side(at: Linearised, bend: tuple[Array, Array] | None = None) -> Array:
-    """Of the Newton system, with the terms of second order ``bend``."""
-    curved, missed = bend or (0.0, 0.0)
-    return ((at.barrier + missed) / at.f)[:, None] * at.df - at.y - curved
-
-
-def _corrected(at: Linearised, tol: float, options: PDIP) -> tuple[float, Array, Array]:
+def _corrected(at: Linearised, residual: float, options: PDIP) -> tuple[float, Array, Array]:
     """The step to take, and the direction dg, dlam: Newton's, corrected once where the cones' curvature cuts it short
     and that pays."""
-    dg, dlam, x = _direction(at, tol)
+    q = _right_side(at, at.barrier)
+    tol = _accuracy(at, q, residual)
+    dg, dlam = _direction(at, q, at.barrier, tol)
     step = _step_length(at, dg, dlam, options)
     if not step < STEERING.short:
         return step, dg, dlam
-    bend = _bend(at, dg, dlam, min(1.0, step + STEERING.further))
-    if at.problem.norm(_right_side(at, bend)) < STEERING.bent * at.problem.norm(_right_side(at)):
-        other_dg, other_dlam, _ = _direction(at, tol, bend, x)
+    curved, missed = _bend(at, dg, dlam, min(1.0, step + STEERING.further))
+    bent = _right_side(at, at.barrier + missed) - curved
+    if at.problem.norm(bent) < STEERING.bent * at.problem.norm(q):
+        other_dg, other_dlam = _direction(at, bent, at.barrier + missed, tol)
         other = _step_length(at, other_dg, other_dlam, options)
         if other > STEERING.longer * step:
             return other, other_dg, other_dlam
     return step, dg, dlam
 
 
-def _direction(
-    at: Linearised, tol: float, bend: tuple[Array, Array] | None = None, start: Array | None = None
-) -> tuple[Array, Array, Array]:
-    """dg, dlam and the Newton system's solution, with the terms of second order ``bend``; ``start``: an earlier
-    solution."""
-    dg, x = at.newton.solve(_right_side(at, bend), tol, start=start)
+def _right_side(at: Linearised, aim: Array | float) -> Array:
+    """Of the Newton system, for the complementarity ``aim``, of all contacts or of each."""
+    return (aim / at.f)[:, None] * at.df - at.y
+
+
+def _direction(at: Linearised, q: Array, aim: Array | float, tol: float) -> tuple[Array, Array]:
+    """dg and dlam for the right-hand side q and the complementarity ``aim``."""
+    dg, x = at.newton.solve(q, tol, earlier=at.earlier)
+    at.earlier.append(x)
     dg[at.problem.mu == 0, 1:] = 0.0
-    aim = (at.barrier + (bend[1] if bend else 0.0)) / at.f
-    return dg, -(at.lam + aim + at.lam / at.f * dot(at.df, dg)), x
+    return dg, -(at.lam + aim / at.f + at.lam / at.f * dot(at.df, dg))
 
 
 def _bend(at: Linearised, dg: Array, dlam: Array, reach: float) -> tuple[Array, Array]:

@@ -12,13 +12,13 @@ preconditioners stay from one cone problem to the next, and matrices too where t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import TINY, Array
 from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.body_ladder import BodyLadder
 from pctt.ccp.newton.compare import Comparison
@@ -143,26 +143,51 @@ class Newton:
         q: Array,
         tol: float,
         r_v: Array | None = None,
-        start: Array | None = None,
+        earlier: Sequence[Array] = (),
         uncoupled: Array | None = None,
     ) -> tuple[Array, Array]:
         """dg (nc, 3) and the system's solution x, to a residual of ``tol`` (sqrt J: of momenta; of velocities times the
-        root of the mean diagonal of N). ``start`` is an earlier x to begin from. ``uncoupled`` is (B + C)^-1 q, the
-        change of each contact without the others, for callers that have it more accurately than by a product."""
+        root of the mean diagonal of N). ``earlier`` are earlier solutions x to begin from; a fixed ``-ksp_rtol`` refers
+        to the residual that they leave. ``uncoupled`` is (B + C)^-1 q, the change of each contact without the others,
+        for callers that have it more accurately than by a product."""
         with phase("CCPKrylov"):
             assert self.system is not None
             b = self.system.right_hand_side(q, r_v, uncoupled)
-            x = np.zeros_like(b)
-            if start is not None:
-                self._x.array[:] = x = start.copy()
-                self.system.matrix.mult(self._x, self._b)
-                b = b - self._b.array
-            self._b.array[:] = b
+            x, product = self._start(b, earlier)
+            self._b.array[:] = b - product
             norm, wanted = self._b.norm(), self.system.tolerance(tol)
             if wanted < norm < np.inf:  # the caller finds no step in a direction that is no number
                 self.linear.solve(self._b, self._x, max(wanted / norm, 1e-14))
                 x += self._x.array
             return self.system.impulses(x, q, uncoupled), x
+
+    def _start(self, b: Array, earlier: Sequence[Array]) -> tuple[Array, Array]:
+        """Where to begin from, and its product: the last of the earlier solutions, or zero. Of several, where A is
+        positive definite, the combination x with the least energy 1/2 x'Ax - b'x: in the norm of A no other one is
+        nearer to the solution."""
+        assert self.system is not None
+        several = len(earlier) > 1 and self.system.symmetric and self.system.definite
+        xs = np.array(earlier).reshape(len(earlier), len(b))
+        if not several:
+            xs = xs[-1:]
+        products = np.empty_like(xs)
+        for x, product in zip(xs, products):
+            self._x.array[:] = x
+            self.system.matrix.mult(self._x, self._b)
+            product[:] = self._b.array
+        share = self._least_energy(xs, products, b) if several else np.ones(len(xs))
+        return share @ xs, share @ products
+
+    def _least_energy(self, xs: Array, products: Array, b: Array) -> Array:
+        """The coefficients of the combination of vectors xs (k, rows) with the least energy; zeros if the energies are
+        no numbers."""
+        sums = self.problem.sum(np.column_stack([xs @ products.T, xs @ b]))
+        if not np.isfinite(sums).all():
+            return np.zeros(len(xs))
+        energies, works = sums[:, :-1], sums[:, -1]
+        size = np.sqrt(np.maximum(np.diagonal(energies), TINY))
+        # scaled, as solutions shrink from one Newton step to the next; of nearly parallel ones only the sum counts
+        return np.linalg.lstsq(energies / np.outer(size, size), works / size, rcond=1e-10)[0] / size
 
     def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
         """dv of a solution x."""

@@ -23,6 +23,8 @@ LEAST = 0.1  # of the mass: entries of a block between bodies that a factor is b
 class BodyForm:
     """The `NewtonForm` of the module."""
 
+    definite = True
+
     def __init__(self, problem: ConeProblem):
         if problem.contact_map is None:
             raise ValueError("-ccp_newton body: the problem is given by N alone; allowed are contact and kkt")

@@ -20,7 +20,7 @@ from pctt.shell import symmetric_shell
 class ContactForm:
     """The `NewtonForm` S dg = q + G r_v, dv = G' dg - r_v."""
 
-    symmetric = True
+    symmetric = definite = True
 
     def __init__(self, problem: ConeProblem):
         self.problem = problem

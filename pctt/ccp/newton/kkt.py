@@ -27,6 +27,7 @@ class KKTForm:
     """The `NewtonForm` of the module."""
 
     symmetric = True
+    definite = False
 
     def __init__(self, problem: ConeProblem):
         if problem.low_rank is not None:

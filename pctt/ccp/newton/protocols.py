@@ -18,11 +18,13 @@ class NewtonForm(Protocol):
     problem : the cone problem
     matrix : the system's matrix; it may be a function
     symmetric : whether the present matrix is
+    definite : whether it is positive definite where it is symmetric
     """
 
     problem: ConeProblem
     matrix: PETSc.Mat
     symmetric: bool
+    definite: bool
 
     def load(self, problem: ConeProblem) -> None:
         """Take another problem with the same contacts between the same bodies."""
