@@ -64,8 +64,7 @@ def main(n: int) -> None:
     places = spread(places[fits(places, large)], (4 * n + 1) ** 3, large)
     world = new_world(scene, MPI.COMM_SELF)
     world.grains.position[:] = places
-    world.step = settling.steps(options) - round(LANDING / options.dt)
-    world.time = world.step * options.dt
+    world.step = settling.steps(options) - round(LANDING / options.dt)  # at time zero the paddle is where `fits` has it
     path, made_with = settling.cache(options, scene)
     checkpoint.save(settling.unfinished(path), made_with, world, ImpulseMemory(MPI.COMM_SELF))
     print(f"{settling.unfinished(path)}: {len(places)} spheres, of copies of {settled}")

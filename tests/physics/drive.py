@@ -116,3 +116,20 @@ def by_id(world: World) -> dict[str, Floats]:
     table = {name: np.concatenate([part[name] for part in parts]) for name in names}
     order = np.argsort(table["id"])
     return {name: column[order] for name, column in table.items()}
+
+
+def spinning(shape, tip, seed=0, half_length=3 * RADIUS, pitch=2.06, dt=0.01):
+    """Grains in a box without gravity that fly to the middle and spin; their tips move by `tip` radii in a step."""
+    rng, far = np.random.default_rng(seed), pitch * (RADIUS + half_length)
+    scene = Scene(0.3, gravity=(0, 0, 0))
+    sides = np.concatenate([np.eye(3), -np.eye(3)])
+    scene.add_body("box", [Plane(tuple(-side), tuple(1.6 * far * side)) for side in sides])
+    place = far * (np.indices((3, 3, 3)).reshape(3, -1).T - 1.0)
+    turns, spin = rng.normal(size=(27, 4)), rng.normal(size=(27, 3))
+    spin *= tip * RADIUS / (RADIUS + half_length) / dt / np.linalg.norm(spin, axis=1, keepdims=True)
+    motion = {"quaternions": turns, "velocity": -2.0 * place, "angular_velocity": spin}
+    if shape == "capsules":
+        scene.add_capsules(place, RADIUS, half_length, 1000.0, **motion)
+    else:
+        scene.add_boxes(place, (RADIUS, RADIUS, half_length), 1000.0, **motion)
+    return scene
