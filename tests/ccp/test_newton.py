@@ -156,3 +156,21 @@ def test_a_solve_begins_from_the_best_combination_of_earlier_solutions(form):
     assert newton.ksp_its == iterations
     assert np.allclose(again, dg, rtol=0, atol=1e-7)
     newton.destroy()
+
+
+def test_a_tolerance_of_the_user_is_kept_where_earlier_solutions_leave_less_than_is_wanted(database):
+    """The barrier changes a little; then the earlier solution is good enough for the method, but not for the user."""
+    database["ksp_rtol"] = 1e-10
+    known, graph = heap(3)
+    problem = ccp.ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF))
+    newton = ccp.Newton(SELF, "contact")
+    newton.begin(problem)
+    root, q = np.random.default_rng(0).standard_normal((2, 40, 3, 3))
+    barrier = root @ root.transpose(0, 2, 1) + np.eye(3)
+    newton.update(barrier)
+    _, x = newton.solve(q[:, 0], 1.0)
+    newton.update(1.01 * barrier)
+    dg, _ = newton.solve(q[:, 0], 1e3, earlier=[x])
+    left = problem.product(dg) + (1.01 * barrier @ dg[:, :, None])[:, :, 0] - q[:, 0]
+    assert np.linalg.norm(left) < 1e-8 * np.linalg.norm(q[:, 0])
+    newton.destroy()

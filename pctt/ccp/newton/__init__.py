@@ -156,6 +156,8 @@ class Newton:
             x, product = self._start(b, earlier)
             self._b.array[:] = b - product
             norm, wanted = self._b.norm(), self.system.tolerance(tol)
+            if PETSc.Options().hasName("ksp_rtol"):  # the user's, which the linear solver takes whatever is wanted
+                wanted = min(wanted, 0.5 * norm)
             if wanted < norm < np.inf:  # the caller finds no step in a direction that is no number
                 self.linear.solve(self._b, self._x, max(wanted / norm, 1e-14))
                 x += self._x.array
