@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import re
 import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 STUDIES = ROOT / "run" / "studies"
@@ -32,3 +35,21 @@ def test_pages_name_studies_that_there_are():
             assert (STUDIES / f"{name}.py").is_file(), f"{page}: run/study {name}"
         for name in re.findall(r"\brun/([a-z_]+)", page.read_text()):
             assert (ROOT / "run" / name).exists() or (ROOT / "pctt" / "run" / name).exists(), f"{page}: run/{name}"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "table_ranks 1 -every 8 -uncapped",
+        "figure_reuse 1 -steps 2 -newton 3",
+        "study_ranks 1 -seconds 1",
+        pytest.param("law_overlaps blade 2 4 2", marks=pytest.mark.slow),
+        pytest.param("operators 1", marks=pytest.mark.slow),
+        pytest.param("figure_scaling 1 2 -contacts 1000", marks=pytest.mark.slow),
+    ],
+)
+def test_a_study_of_the_smallest_size_runs(words, tmp_path):
+    name, *rest = words.split()
+    done = subprocess.run([sys.executable, STUDIES / f"{name}.py", *rest], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert list((tmp_path / "results").glob(f"{name}*.json"))

@@ -272,7 +272,7 @@ class Chrono:
 
 def accuracy(step: Step, impulse: np.ndarray) -> dict[str, float]:
     found = ccp.measure(step.problem, impulse)
-    figures = {"residual": found.residual, "objective": found.objective}
+    figures = {"residual": found.natural_residual, "objective": found.objective}
     return figures | {"floor_force": step.floor_force(impulse)}
 
 

@@ -50,9 +50,9 @@ class Recorder(ccp.Newton):
         self._barrier = barrier.copy()
         super().update(barrier, inverse)
 
-    def solve(self, q, tol, r_v=None, start=None):
+    def solve(self, q: np.ndarray, tol: float, *more: Any, **named: Any) -> tuple[np.ndarray, np.ndarray]:
         self.systems.append(System(self._barrier, q.ravel().copy()))
-        return super().solve(q, tol, r_v, start)
+        return super().solve(q, tol, *more, **named)
 
 
 class Replay:

@@ -56,7 +56,7 @@ def uncapped(replay: Replay, scaling: str) -> list[dict[str, Any]]:
     assert hierarchy is not None
     size, block = slots.size, slots.block
     blocks = np.zeros((size, size, block, block))
-    blocks[slots.rows, slots.columns] = slots.load(matrix)
+    blocks[slots.rows, slots.columns] = slots.load(matrix, matrix.getValuesCSR())
     dense = blocks.transpose(0, 2, 1, 3).reshape(size * block, -1)
     dense += (scaling == "block") * np.eye(len(dense))  # the diagonal is not among the blocks
     pc.destroy()
