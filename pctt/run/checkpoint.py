@@ -176,12 +176,13 @@ def write_checksum(path: Path) -> None:
 
 
 def intact(path: Path) -> bool:
-    """Whether a settled state and its checksum are there and agree; FileError if they do not agree."""
+    """Whether a settled state and its checksum are there and agree; FileError if they do not agree; one rank."""
     checksum = Path(f"{path}.sha256")
     if not (path.exists() and checksum.exists()):
         return False
     if checksum.read_text().split()[0] != _digest(path):
-        raise FileError(f"{path}: does not agree with its checksum; delete it to have it made again")
+        remedy = "delete it to have it made again"
+        raise FileError(f"{path}: does not agree with its checksum; {remedy}", one_rank=True)
     return True
 
 
