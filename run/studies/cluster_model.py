@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from measure import record, say_machine
+from measure import median_seconds, record, say_machine
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -132,12 +132,8 @@ def _petsc_reductions() -> float:
 
 def seconds_of_product(problem: ccp.ConeProblem) -> float:
     """Of y += N g, median."""
-    g, y, spent = np.ones_like(problem.r), np.zeros_like(problem.r), []
-    for _ in range(50):
-        start = time.perf_counter()
-        problem.contact_map.add_delassus(g, y)
-        spent.append(time.perf_counter() - start)
-    return statistics.median(spent)
+    g, y = np.ones_like(problem.r), np.zeros_like(problem.r)
+    return median_seconds(lambda: problem.contact_map.add_delassus(g, y), 50)
 
 
 def ping_pong() -> tuple[float, float]:

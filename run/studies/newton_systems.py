@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -204,14 +203,3 @@ def set_up(pc: PETSc.PC, matrix: PETSc.Mat) -> dict[str, Any]:
     pc.setOperators(matrix)
     pc.setUp()
     return pc.getPythonContext().rows[-1]
-
-
-def median_seconds(do: Callable[[], object], repeat: int = 5) -> float:
-    """Median time of a few runs, after one that does not count."""
-    do()
-    seconds = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        do()
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds)
