@@ -21,12 +21,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib.util
 import sys
 import traceback
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any, ClassVar
 
 from dem import checks
@@ -109,10 +109,8 @@ def from_file(path: Path) -> type[Experiment]:
         reason = error.strerror if isinstance(error, OSError) else "no text"
         raise SceneFileError(f"cannot be read ({reason})") from None
     name = f"scene_file_{path.stem}"  # by which `together` knows the code of a scene
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    module = ModuleType(name)
+    module.__file__ = str(path.absolute())
     sys.modules[name] = module  # dataclasses and type hints look their module up
     try:
         exec(compile(text, str(path), "exec"), module.__dict__)
