@@ -53,6 +53,29 @@ def record(name: str, about: dict[str, object], rows: list[dict]) -> None:
     print(path)
 
 
+class Counter:
+    """Counts the calls of methods of a class while it is entered."""
+
+    def __init__(self, of: type, *names: str):
+        self.of, self.calls, self.originals = of, 0, {name: getattr(of, name) for name in names}
+
+    def __enter__(self) -> Counter:
+        for name, original in self.originals.items():
+            setattr(self.of, name, self._counted(original))
+        return self
+
+    def _counted(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def method(*arguments: Any) -> Any:
+            self.calls += 1
+            return original(*arguments)
+
+        return method
+
+    def __exit__(self, *exception: object) -> None:
+        for name, original in self.originals.items():
+            setattr(self.of, name, original)
+
+
 def exponent(x: Sequence[float], y: Sequence[float]) -> float:
     """Of y ~ x^p, by least squares of the logarithms; NaN for less than two points."""
     return float(np.polyfit(np.log(x), np.log(y), 1)[0]) if len(x) > 1 else np.nan
