@@ -29,7 +29,7 @@ HOLLOW = 0.3  # a hollow body is empty up to this part of the way from its middl
 def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
     """Lowest and highest corner (2, 3) of the scene in these frames [m]. The scene has the grains and the large bodies
     among or around them, without walls."""
-    radius = enclosing_radius(folder)[:, None]
+    radius = folder.radius[:, None]
     places = [frame.position[: folder.grains] for frame in frames]
     low = np.min([(place - radius).min(axis=0) for place in places], axis=0)
     high = np.max([(place + radius).max(axis=0) for place in places], axis=0)
@@ -41,15 +41,6 @@ def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
                 if solid.GetNumberOfPoints():
                     corners += list(np.reshape(solid.GetBounds(), (3, 2)).T)
     return np.array([np.min(corners, axis=0), np.max(corners, axis=0)])
-
-
-def enclosing_radius(folder: Folder) -> np.ndarray:
-    """Radii (grains,) of the spheres that enclose the grains [m]."""
-    return 0.5 * np.where(
-        folder.shape[: folder.grains] == BOX,
-        np.linalg.norm(extent(folder), axis=1),
-        extent(folder).max(axis=1),
-    )
 
 
 def extent(folder: Folder) -> np.ndarray:
