@@ -65,6 +65,13 @@ def own(problem: ccp.ConeProblem, name: str, tol: float, seconds: float, coulomb
     return {**found, "course": watch.course[1:], "impulse": impulse}
 
 
+def peer(problem: ccp.ConeProblem, name: str, tol: float, seconds: float) -> dict[str, Any]:
+    """A solver of another project."""
+    start = time.perf_counter()
+    impulse, reason = peers.PEERS[name].solve(problem, tol, seconds)
+    return {"seconds": time.perf_counter() - start, "reason": reason, "impulse": impulse}
+
+
 def write(path: Path, problem: ccp.ConeProblem) -> None:
     """A problem of frames and arms on one rank, for `read`."""
     G = vars(problem.contact_map.given)
@@ -100,9 +107,7 @@ def main(path: str, method: str, tol: float, seconds: float, operator: str = "au
     warm_up(method, operator)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     if method in peers.PEERS:
-        start = time.perf_counter()
-        impulse, reason = peers.PEERS[method].solve(problem, tol, seconds)
-        found: dict[str, Any] = {"seconds": time.perf_counter() - start, "reason": reason, "impulse": impulse}
+        found = peer(problem, method, tol, seconds)
     else:
         law, _, name = method.rpartition(" ")
         found = own(problem, name, tol, seconds, law == "coulomb")
