@@ -119,11 +119,8 @@ def from_file(path: Path) -> type[Experiment]:
         if isinstance(error, SyntaxError) and error.filename == str(path):
             raise SceneFileError(f"line {error.lineno}: {error.msg}") from None
         raise SceneFileError(f"line {own[-1] if own else '?'}: {told(error)}") from None
-    found = [
-        item
-        for item in vars(module).values()
-        if isinstance(item, type) and issubclass(item, Experiment) and item.__module__ == name
-    ]
+    classes = dict.fromkeys(item for item in vars(module).values() if isinstance(item, type))  # one may have two names
+    found = [item for item in classes if issubclass(item, Experiment) and item.__module__ == name]
     if len(found) != 1:
         what = ", ".join(item.__name__ for item in found) or "no class derived from dem.experiment.Experiment"
         raise SceneFileError(f"must define one scene, has {what}")
