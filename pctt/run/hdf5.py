@@ -122,7 +122,7 @@ def written(path: Path, comm: MPI.Comm) -> Iterator[RowWriter]:
 
 def raise_together(what: str, failure: str | None, comm: MPI.Comm) -> None:
     """FileError on all ranks if one has a failure: ``what`` it is, and the words of the first; collective."""
-    failures = [text for text in comm.allgather(failure) if text]
+    failures = [text for text in comm.allgather(failure) if text is not None]
     if failures:
         raise FileError(f"{what} ({failures[0]})")
 
