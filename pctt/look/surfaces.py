@@ -49,9 +49,8 @@ def extent(folder: Folder) -> np.ndarray:
     unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE}
     if unknown:
         raise FolderError(f"{folder.path}: no surface is known for grains of shape {unknown.pop()}")
-    round_ones = np.repeat(size[:, :1], 3, axis=1)
-    long_ones = round_ones + [0, 0, 1] * size[:, 1:2]
-    return 2 * np.where(shape == SPHERE, round_ones, np.where(shape == CAPSULE, long_ones, size))
+    round_ones = size[:, :1] + [0, 0, 1] * size[:, 1:2]  # a sphere is a capsule of length zero
+    return 2 * np.where(shape == BOX, size, round_ones)
 
 
 def polydata(points: np.ndarray, cells: str = "", ends: np.ndarray | None = None) -> vtkPolyData:
