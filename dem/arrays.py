@@ -14,3 +14,6 @@ Bools = NDArray[np.bool_]
 
 #: Anything that a user may pass where numbers are expected.
 ArrayLike = Union[float, Sequence[float], Sequence[Sequence[float]], Floats]
+
+#: The lower and the upper corner of a box [m].
+Corners = tuple[tuple[float, float, float], tuple[float, float, float]]

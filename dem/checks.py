@@ -49,20 +49,18 @@ def rows(name: str, values: ArrayLike, count: int, width: int) -> Floats:
     return np.broadcast_to(array, (count, width)).copy()
 
 
-def finite_vector(name: str, values: Sequence[float]) -> tuple[float, float, float]:
+def finite_vector(name: str, values: Sequence[float]) -> tuple[float, ...]:
     """Three finite numbers as a tuple."""
-    x, y, z = (float(value) for value in rows(name, values, 1, 3)[0])
-    return x, y, z
+    return tuple(rows(name, values, 1, 3)[0].tolist())
 
 
-def unit_vector(name: str, values: Sequence[float]) -> tuple[float, float, float]:
+def unit_vector(name: str, values: Sequence[float]) -> tuple[float, ...]:
     """Three finite numbers, not all zero, scaled to unit length."""
     vector = np.array(finite_vector(name, values))
-    length = float(np.linalg.norm(vector))
+    length = np.linalg.norm(vector)
     if length == 0.0:
         raise ValueError(f"{name} is the zero vector")
-    x, y, z = (float(value) for value in vector / length)
-    return x, y, z
+    return tuple((vector / length).tolist())
 
 
 def unit_quaternions(name: str, values: ArrayLike, count: int) -> Floats:
@@ -72,3 +70,8 @@ def unit_quaternions(name: str, values: ArrayLike, count: int) -> Floats:
     if (norm == 0.0).any():
         raise ValueError(f"{name}: zero quaternion")
     return array / norm
+
+
+def unit_quaternion(name: str, values: ArrayLike) -> tuple[float, ...]:
+    """One quaternion as a tuple of unit norm."""
+    return tuple(unit_quaternions(name, values, 1)[0].tolist())

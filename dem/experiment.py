@@ -21,12 +21,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib.util
 import sys
 import traceback
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any, ClassVar
 
 from dem import checks
@@ -109,10 +109,8 @@ def from_file(path: Path) -> type[Experiment]:
         reason = error.strerror if isinstance(error, OSError) else "no text"
         raise SceneFileError(f"cannot be read ({reason})") from None
     name = f"scene_file_{path.stem}"  # by which `together` knows the code of a scene
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    module = ModuleType(name)
+    module.__file__ = str(path.absolute())
     sys.modules[name] = module  # dataclasses and type hints look their module up
     try:
         exec(compile(text, str(path), "exec"), module.__dict__)
@@ -121,11 +119,8 @@ def from_file(path: Path) -> type[Experiment]:
         if isinstance(error, SyntaxError) and error.filename == str(path):
             raise SceneFileError(f"line {error.lineno}: {error.msg}") from None
         raise SceneFileError(f"line {own[-1] if own else '?'}: {told(error)}") from None
-    found = [
-        item
-        for item in vars(module).values()
-        if isinstance(item, type) and issubclass(item, Experiment) and item.__module__ == name
-    ]
+    classes = dict.fromkeys(item for item in vars(module).values() if isinstance(item, type))  # one may have two names
+    found = [item for item in classes if issubclass(item, Experiment) and item.__module__ == name]
     if len(found) != 1:
         what = ", ".join(item.__name__ for item in found) or "no class derived from dem.experiment.Experiment"
         raise SceneFileError(f"must define one scene, has {what}")

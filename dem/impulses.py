@@ -75,8 +75,7 @@ class ImpulseMemory:
         self._key, self._impulse = rows["key"][order], rows["impulse"].take(order, axis=0)
 
     def _home(self, key: Ints) -> Ints:
-        if self._comm.size == 1:
-            return np.zeros(len(key), np.int64)
+        """The ranks (n,) that store the keys."""
         # Fibonacci hashing: the low bits of keys are mostly zero and must not choose the rank.
         mixed = (key.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)
         return (mixed % np.uint64(self._comm.size)).astype(np.int64)

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from dem.arrays import ArrayLike, Floats, Ints
-from dem.checks import finite, finite_vector, positive, unit_quaternions
+from dem.checks import finite, finite_vector, positive, unit_quaternion
 from dem.quaternion import cross, length
 
 #: Vertices of a file that are closer than this share of the extent are one: numbers of STL files have seven digits.
@@ -262,8 +262,7 @@ class Mesh:
         object.__setattr__(self, "vertices", vertices[used])
         object.__setattr__(self, "triangles", rows.reshape(-1, 3))
         object.__setattr__(self, "center", finite_vector("centre of a mesh", self.center))
-        turn = unit_quaternions("quaternion of a mesh", self.quaternion, 1)[0]
-        object.__setattr__(self, "quaternion", tuple(turn.tolist()))
+        object.__setattr__(self, "quaternion", unit_quaternion("quaternion of a mesh", self.quaternion))
         object.__setattr__(self, "surface", Surface(vertices[used], rows.reshape(-1, 3)))
 
     @classmethod

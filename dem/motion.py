@@ -58,9 +58,7 @@ class Guided(Dynamic):
     def mean_force(self, time: float, dt: float, lack: float = 0.0) -> Floats:
         """Mean force of the drive (3,) from `time` to `time + dt` [s]. `lack` [N] is the force that takes the body to
         the speed of the servo at the end of the step."""
-        most = self.force * _share(time, dt, self.start, self.end)
-        force = most if self.speed is None else min(max(lack, -most), most)
-        return force * np.array(self.direction)
+        return _driven(self, self.force, time, dt, lack) * np.array(self.direction)
 
 
 @dataclass(frozen=True)
@@ -87,9 +85,7 @@ class Hinged(Dynamic):
 
     def mean_torque(self, time: float, dt: float, lack: float = 0.0) -> Floats:
         """Mean torque of the drive (3,) from `time` to `time + dt` [s]; `lack` [N m] as of `Guided.mean_force`."""
-        most = self.torque * _share(time, dt, self.start, self.end)
-        torque = most if self.speed is None else min(max(lack, -most), most)
-        return torque * np.array(self.axis)
+        return _driven(self, self.torque, time, dt, lack) * np.array(self.axis)
 
 
 @dataclass(frozen=True)
@@ -233,9 +229,11 @@ def _gone(time: float, start: float, end: float) -> float:
     return max(min(time, end) - start, 0.0)
 
 
-def _share(time: float, dt: float, start: float, end: float) -> float:
-    """The part of a step from `time` to `time + dt` [s] that is between start and end."""
-    return (_gone(time + dt, start, end) - _gone(time, start, end)) / dt
+def _driven(body: Guided | Hinged, strength: float, time: float, dt: float, lack: float) -> float:
+    """The mean force or torque of a drive of this strength from `time` to `time + dt` [s]; of a servo what lacks."""
+    share = (_gone(time + dt, body.start, body.end) - _gone(time, body.start, body.end)) / dt
+    most = strength * share
+    return most if body.speed is None else min(max(lack, -most), most)
 
 
 def _ordered(what: str, start: float, end: float) -> None:

@@ -146,7 +146,7 @@ class Scene:
         if not shapes:
             raise ValueError(f"large body {name!r} has no shape")
         place = np.array(checks.finite_vector(f"position of {name!r}", position))
-        turn = checks.unit_quaternions(f"quaternion of {name!r}", quaternion, 1)[0]
+        turn = np.array(checks.unit_quaternion(f"quaternion of {name!r}", quaternion))
         speed = _velocities(velocity, angular_velocity, 1)[0]
         _refuse_speed(name, motion, speed)
         parts, weight, moments = tuple(shapes), np.inf, np.full(3, np.inf)

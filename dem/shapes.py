@@ -10,7 +10,7 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
-from dem.checks import finite_vector, positive, unit_quaternions, unit_vector
+from dem.checks import finite_vector, positive, unit_quaternion, unit_vector
 from dem.mesh import Mesh
 
 
@@ -38,8 +38,7 @@ class Box:
         positive("half extents of a box", self.half_extents)
         object.__setattr__(self, "half_extents", finite_vector("half extents of a box", self.half_extents))
         object.__setattr__(self, "center", finite_vector("centre of a box", self.center))
-        turn = unit_quaternions("quaternion of a box", self.quaternion, 1)[0]
-        object.__setattr__(self, "quaternion", tuple(turn.tolist()))
+        object.__setattr__(self, "quaternion", unit_quaternion("quaternion of a box", self.quaternion))
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,7 @@ class Capsule:
         positive("radius of a capsule", self.radius)
         positive("half length of a capsule", self.half_length)
         object.__setattr__(self, "center", finite_vector("centre of a capsule", self.center))
-        turn = unit_quaternions("quaternion of a capsule", self.quaternion, 1)[0]
-        object.__setattr__(self, "quaternion", tuple(turn.tolist()))
+        object.__setattr__(self, "quaternion", unit_quaternion("quaternion of a capsule", self.quaternion))
 
 
 Shape = Union[Plane, Box, Sphere, Capsule, Mesh]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 
 import numpy as np
 from mpi4py import MPI
@@ -23,7 +24,7 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     radii.
     """
     grains = scene.grains()
-    world = _world(scene, comm, grains.take(_even_slice(len(grains), comm)))
+    world = _world(scene, comm, grains.take(even_slice(len(grains), comm)))
     redistribute(world)
     _refuse_overlap(world, overlap)
     return world
@@ -40,8 +41,7 @@ def restored_world(
     """
     world = _world(scene, comm, Bodies(**{name: np.array(column) for name, column in local.items()}))
     count = len(scene.grains())
-    prefix = "large_"
-    large = {name[len(prefix) :]: np.array(replicated[name]) for name in replicated if name.startswith(prefix)}
+    large = {field.name: np.array(replicated[f"large_{field.name}"]) for field in fields(Bodies)}
     if world.slabs[-1] != count or len(large["id"]) != len(world.large):
         raise ValueError(
             f"the state has {world.slabs[-1]} grains and {len(large['id'])} large bodies, "
@@ -58,10 +58,11 @@ def restart_rows(slabs: Ints, comm: MPI.Comm) -> slice:
     """Rows of a whole state's grain arrays that this rank hands to `restored_world`; slabs as in the state."""
     if len(slabs) == comm.size + 1:
         return slice(int(slabs[comm.rank]), int(slabs[comm.rank + 1]))
-    return _even_slice(int(slabs[-1]), comm)
+    return even_slice(int(slabs[-1]), comm)
 
 
-def _even_slice(count: int, comm: MPI.Comm) -> slice:
+def even_slice(count: int, comm: MPI.Comm) -> slice:
+    """This rank's part of so many rows, in the order of the ranks."""
     return slice(count * comm.rank // comm.size, count * (comm.rank + 1) // comm.size)
 
 

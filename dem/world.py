@@ -36,9 +36,8 @@ class World:
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
     only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
 
-    _followed: tuple[tuple[float, float], dict[int, Floats]] = field(
-        init=False, repr=False, default_factory=lambda: ((np.nan, np.nan), {})
-    )  #: time and dt [s] of the last question for the velocities of prescribed motions, and the answer
+    #: By time and dt [s] the mean velocities of prescribed motions, by row; of the last question alone.
+    _followed: dict[tuple[float, float], dict[int, Floats]] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.set_grains(self.grains)
@@ -86,10 +85,11 @@ class World:
     def prescribed_velocity(self, dt: float) -> Floats:
         """Velocities (large bodies, 6) over the next step of `dt` [s]; dynamic bodies keep theirs; collective.
         SceneError if a motion fails."""
-        if self._followed[0] != (self.time, dt):  # a step asks several times
-            self._followed = (self.time, dt), together(self.comm, "motion of a large body", lambda: self._follow(dt))
+        asked = (self.time, dt)
+        if asked not in self._followed:  # a step asks several times
+            self._followed = {asked: together(self.comm, "motion of a large body", lambda: self._follow(dt))}
         velocity = self.large.velocity.copy()
-        for row, mean in self._followed[1].items():
+        for row, mean in self._followed[asked].items():
             velocity[row] = mean
         return velocity
 

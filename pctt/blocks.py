@@ -47,8 +47,8 @@ def without_hubs(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, np.ndarray]:
     # a body with more than HUB contacts has more than HUB / ranks on some rank
     often = comm.allreduce(set(bodies[count > HUB / comm.size].tolist()), op=operator.or_)
     candidates = np.array(sorted(often), dtype=np.int64)
-    here = np.bincount(G.indices, minlength=columns)[candidates] if len(candidates) else np.zeros(0, np.int64)
-    hubs = candidates[comm.allreduce(here) > HUB] if len(candidates) else candidates
+    here = np.bincount(G.indices, minlength=columns)[candidates]
+    hubs = candidates[comm.allreduce(here) > HUB]
     if len(hubs) == 0:
         return G, hubs
     kept = ~np.isin(G.indices, hubs)

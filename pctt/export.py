@@ -135,7 +135,7 @@ def bodies(folder: Folder, frame: Frame) -> Any:
     data = surfaces.polydata(frame.position[grains], "verts")
     columns = {
         "id": np.arange(folder.grains),
-        "radius": surfaces.enclosing_radius(folder),
+        "radius": folder.radius,
         "extent": surfaces.extent(folder),
         "quaternion": frame.quaternion[grains],
         "velocity": frame.velocity[grains, :3],

@@ -33,18 +33,17 @@ def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> dict[str, 
     which PETSc has for one rank only; they become the solvers of its blocks.
     """
     database = PETSc.Options()
-    given = database.getAll()
     options: dict[str, str | None] = {  # PETSc looks them up: options of mg_levels_ are also those of mg_levels_1_
         prefix + name: value for name, value in defaults.items() if not database.hasName(prefix + name)
     }
-    everything = {**given, **options}
+    everything = {**database.getAll(), **options}
     kind = options.get(prefix + "pc_type") or database.getString(prefix + "pc_type", "")
     if ranks > 1 and kind in ("ilu", "icc"):
         options |= {prefix + "pc_type": "bjacobi", prefix + "sub_pc_type": kind}
         for name, value in everything.items():
             if name.startswith(prefix + "pc_factor_"):
                 options[f"{prefix}sub_{name[len(prefix):]}"] = value
-                PETSc.Options().hasName(name)  # marks it as used, so that PETSc does not report it as left over
+                database.hasName(name)  # marks it as used, so that PETSc does not report it as left over
     return options
 
 

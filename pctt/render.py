@@ -94,13 +94,11 @@ def main(comm: MPI.Comm) -> None:
 
 def _value(colour: str, folder: Folder, frame: Frame) -> np.ndarray:
     """The values (grains,) that give the colours of the grains."""
-    from pctt.look import surfaces
-
     values = {
         "speed": lambda: frame.speed,
         "force": frame.load,
         "id": lambda: np.arange(folder.grains),
-        "size": lambda: 2 * surfaces.enclosing_radius(folder),
+        "size": lambda: 2 * folder.radius,
         "material": lambda: np.searchsorted(_materials(folder), folder.material),
     }
     return values[colour]()[: folder.grains].astype(float)

@@ -15,9 +15,9 @@ from dem.checks import not_negative
 from dem.contact.broad import close_pairs
 from dem.contact.narrow import Touch
 from dem.contact.primitives import MESH, PLANE, Primitives, extents, primitives, touches
-from dem.free_motion import free_velocity, large_free_velocity
+from dem.free_motion import free_directions, free_velocity, large_free_velocity
 from dem.loops import loops
-from dem.motion import Dynamic, Hinged
+from dem.motion import Hinged
 from dem.neighbourhood import Neighbourhood, neighbourhood, without_ghosts
 from dem.quaternion import cross, length
 from dem.world import World
@@ -223,7 +223,7 @@ def _grains_beside_parts(
     might meet with margins of at most `widest` (grains,)."""
     count = alone.grains
     center, radius = table.center[:count], table.radius[:count]
-    found = [_Beside(*(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0)))]
+    found = [_Beside(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))]
     for body in np.unique(table.row[count:]):
         margin = _part_margin(shifts[:, [body - count]], alone.bodies.position[[body]], center, radius, delta)
         beyond = margin + (1.0 + 1e-9) * radius  # where the rounding matters, the narrow phase is to decide
@@ -253,7 +253,7 @@ def _large_pairs(
     """Rows (m, 2) of the parts of two large bodies, of which one at least is free to move, and the gaps (m,) within
     which their margins meet."""
     first = near.grains + near.ghosts
-    free = np.array([isinstance(body.motion, Dynamic) for body in world.large_bodies], dtype=bool)
+    free = bodies.is_dynamic(world.large)
     body = table.row[first:] - first
     i, j = np.triu_indices(len(body), 1)
     touch = (body[i] != body[j]) & (free[body[i]] | free[body[j]])
@@ -290,7 +290,7 @@ def _gives_way(world: World, near: Neighbourhood, a: Ints, b: Ints, touch: Touch
     rows = np.flatnonzero((a >= first) & (b >= first))
     if len(rows):
         motions = [body.motion for body in world.large_bodies]
-        free = np.array([m.free_directions() if isinstance(m, Dynamic) else np.zeros((3, 3)) for m in motions])
+        free = free_directions(world.large_bodies) * bodies.is_dynamic(world.large)[:, None, None]
         axis = np.array([m.axis if isinstance(m, Hinged) else np.zeros(3) for m in motions])
         normal, opens = touch.normal[rows], np.zeros(len(rows))
         for body in (a[rows], b[rows]):

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from dem import analysis
-from dem.arrays import Floats
+from dem.arrays import Corners, Floats
 from dem.checks import not_negative, positive
 from dem.experiment import option
 from dem.motion import Oscillation
@@ -95,7 +95,7 @@ class Blade(LargeSpheres):
         return rest_after_fall(self.height, self.gravity)
 
     @property
-    def domain(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    def domain(self) -> Corners:
         """The inside of the box [m]."""
         return (-self.length / 2, -self.width / 2, 0.0), (self.length / 2, self.width / 2, self.height)
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dem.arrays import Floats
+from dem.arrays import Corners, Floats
 from dem.checks import not_negative, positive
 from dem.experiment import option
 from dem.mesh import Mesh
@@ -85,7 +85,7 @@ class Drum(SmallSpheres):
         return rest_after_fall(2 * self.container_radius, self.gravity) - 1.5
 
     @property
-    def domain(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    def domain(self) -> Corners:
         """The box around the drum [m]."""
         high = (self.container_radius, self.width / 2, self.container_radius)
         return (-high[0], -high[1], -high[2]), high

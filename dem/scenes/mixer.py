@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dem.arrays import Floats
+from dem.arrays import Corners, Floats
 from dem.checks import not_negative, positive
 from dem.experiment import option
 from dem.motion import Rotation
@@ -57,7 +57,7 @@ class Mixer(LargeSpheres):
         return (2 * self.n + 1) * self.pitch + self.margin
 
     @property
-    def domain(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    def domain(self) -> Corners:
         """The inside of the box [m]."""
         wall = self.width / 2
         return (-wall, -wall, 0.0), (wall, wall, inf)

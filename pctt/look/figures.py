@@ -320,7 +320,7 @@ def graphs(folder: Folder, frame: Frame) -> Figure:
     middle = frame.position[grains].mean(axis=0)
     axes3 = np.linalg.svd(frame.position[grains] - middle, full_matrices=True)[2][:2]
     spot, centers = (point - middle) @ axes3.T, (frame.position - middle) @ axes3.T
-    radius = np.linalg.norm(folder.size, axis=1)
+    radius = folder.radius
     beyond = 1.15 * (np.linalg.norm(centers[grains], axis=1) + 0.5 * radius[grains]).max()
     for body in np.unique(pair[pair >= folder.grains]):  # draw a large body outside of the grains
         way = spot[(pair == body).any(axis=1)].mean(axis=0)

@@ -11,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from dem.bodies import enclosing_radius
 from pctt import disk, figures_json
 
 
@@ -96,6 +97,11 @@ class Folder:
         except (KeyError, OSError) as error:
             raise FolderError(f"{self.bodies_path}: lacks the shapes of the bodies; run again ({error})") from None
         self.grains = len(self.shape) - len(self.large)
+
+    @property
+    def radius(self) -> np.ndarray:
+        """Radii (grains,) of the spheres that enclose the grains [m]."""
+        return enclosing_radius(self.shape[: self.grains], self.size[: self.grains])
 
     def frame(self, step: int) -> Frame:
         """A recorded step; FolderError if its file is damaged."""

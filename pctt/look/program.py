@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -63,16 +64,16 @@ def positive(kind: Callable[[str], float]) -> Callable[[str], float]:
 def run(main: Callable[[MPI.Comm], None], program: str) -> int:
     """Run ``main(comm)`` and return the exit status: 0, or 2 after an error that the user can repair.
 
-    Such errors are a folder that cannot be shown and a missing library. The message is printed once.
+    Such errors are a folder that cannot be shown and a missing library. The message is printed once. Other errors abort
+    all ranks.
     """
     comm = MPI.COMM_WORLD
     try:
         main(comm)
     except FolderError as error:
+        print(f"pctt.{program}: {error}", file=sys.stderr, flush=True)
         if comm.size > 1:  # the error may be on this rank only
-            print(f"pctt.{program}: {error}", file=sys.stderr, flush=True)
             comm.Abort(2)
-        print(f"pctt.{program}: {error}", file=sys.stderr)
         return 2
     except ImportError as error:
         if (error.name or "").partition(".")[0] not in LIBRARIES:
@@ -80,6 +81,12 @@ def run(main: Callable[[MPI.Comm], None], program: str) -> int:
         if comm.rank == 0:
             print(f"pctt.{program}: {error}; {EXTRA}", file=sys.stderr)
         return 2
+    except Exception:
+        if comm.size == 1:
+            raise
+        traceback.print_exc()
+        sys.stderr.flush()
+        comm.Abort(1)  # the other ranks may wait for this one
     return 0
 
 

@@ -14,7 +14,7 @@ from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
 from vtkmodules.vtkCommonTransforms import vtkTransform
 from vtkmodules.vtkFiltersCore import vtkAppendPolyData, vtkTriangleFilter
-from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
+from vtkmodules.vtkFiltersGeneral import vtkTransformFilter
 from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSphereSource
 
 from dem import quaternion
@@ -29,7 +29,7 @@ HOLLOW = 0.3  # a hollow body is empty up to this part of the way from its middl
 def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
     """Lowest and highest corner (2, 3) of the scene in these frames [m]. The scene has the grains and the large bodies
     among or around them, without walls."""
-    radius = enclosing_radius(folder)[:, None]
+    radius = folder.radius[:, None]
     places = [frame.position[: folder.grains] for frame in frames]
     low = np.min([(place - radius).min(axis=0) for place in places], axis=0)
     high = np.max([(place + radius).max(axis=0) for place in places], axis=0)
@@ -43,24 +43,14 @@ def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
     return np.array([np.min(corners, axis=0), np.max(corners, axis=0)])
 
 
-def enclosing_radius(folder: Folder) -> np.ndarray:
-    """Radii (grains,) of the spheres that enclose the grains [m]."""
-    return 0.5 * np.where(
-        folder.shape[: folder.grains] == BOX,
-        np.linalg.norm(extent(folder), axis=1),
-        extent(folder).max(axis=1),
-    )
-
-
 def extent(folder: Folder) -> np.ndarray:
     """Widths (grains, 3) of the grains along their own axes [m]."""
     shape, size = folder.shape[: folder.grains, None], folder.size[: folder.grains]
     unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE}
     if unknown:
         raise FolderError(f"{folder.path}: no surface is known for grains of shape {unknown.pop()}")
-    round_ones = np.repeat(size[:, :1], 3, axis=1)
-    long_ones = round_ones + [0, 0, 1] * size[:, 1:2]
-    return 2 * np.where(shape == SPHERE, round_ones, np.where(shape == CAPSULE, long_ones, size))
+    round_ones = size[:, :1] + [0, 0, 1] * size[:, 1:2]  # a sphere is a capsule of length zero
+    return 2 * np.where(shape == BOX, size, round_ones)
 
 
 def polydata(points: np.ndarray, cells: str = "", ends: np.ndarray | None = None) -> vtkPolyData:
@@ -382,7 +372,7 @@ def _along_z(source: vtkCylinderSource) -> vtkPolyData:
 
 def _moved(source: Any, transform: vtkTransform) -> vtkPolyData:
     source.Update()
-    moved = vtkTransformPolyDataFilter()
+    moved = vtkTransformFilter()
     moved.SetInputConnection(source.GetOutputPort())
     moved.SetTransform(transform)
     moved.Update()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import platform
 import sys
 import traceback
-from contextlib import suppress
 
 import petsc4py
 
@@ -59,12 +58,14 @@ def _topic(words: list[str]) -> str:
 
 def versions() -> str:
     """This program and what it stands on."""
-    petsc = ".".join(map(str, PETSc.Sys.getVersion()))
-    with suppress(ImportError):
+    try:
         import numba
 
-        return f"pctt {pctt.__version__} (PETSc {petsc}, Python {platform.python_version()}, numba {numba.__version__})"
-    return f"pctt {pctt.__version__} (PETSc {petsc}, Python {platform.python_version()}, no numba)"
+        loops = f"numba {numba.__version__}"
+    except ImportError:
+        loops = "no numba"
+    petsc = ".".join(map(str, PETSc.Sys.getVersion()))
+    return f"pctt {pctt.__version__} (PETSc {petsc}, Python {platform.python_version()}, {loops})"
 
 
 #: Exit status by what ends a run; raised on all ranks alike, but for a FileError of `one_rank`.

@@ -20,10 +20,10 @@ from dem.impulses import ImpulseMemory
 from dem.mesh import Mesh
 from dem.quaternion import cross
 from dem.scene import LargeBody, Scene
-from dem.start import restart_rows, restored_world
+from dem.start import even_slice, restart_rows, restored_world
 from dem.world import World
 from pctt.options import OptionError
-from pctt.run.hdf5 import FileError, readable, write_text, written
+from pctt.run.hdf5 import FileError, raise_together, readable, write_text, written
 
 FORMAT = "pctt checkpoint 1"
 
@@ -37,10 +37,8 @@ def scene_record(name: str, scene: Any) -> str:
 
 
 def origin(name: str, scene: Experiment, dt: float) -> dict[str, Any]:
-    """The properties that a run must share with the run whose checkpoint it continues, as attributes of a checkpoint.
-
-    ``scene`` is `scene_record`, ``dt`` the time step [s], ``scene_file`` the digest of the user's scene file or "".
-    """
+    """What a run must share with the run whose checkpoint it continues, as attributes of a checkpoint: the
+    `scene_record`, the time step [s], and the digest of the user's scene file or ""."""
     return {"scene": scene_record(name, scene), "dt": dt, "scene_file": scene.digest}
 
 
@@ -104,14 +102,11 @@ def load(
             replicated = {n: file[f"world/{n}"][()] for n in (*_LARGE, "slabs", "time", "step")}
             rows = restart_rows(replicated["slabs"], comm)
             local = {n: file[f"grains/{n}"][rows] for n in _COLUMNS}
-            count = len(file["contacts/key"])
-            part = slice(count * comm.rank // comm.size, count * (comm.rank + 1) // comm.size)
+            part = even_slice(len(file["contacts/key"]), comm)
             key, impulse = file["contacts/key"][part], file["contacts/impulse"][part]
         except (KeyError, OSError, ValueError) as error:
             failure = str(error)
-        failures = [text for text in comm.allgather(failure) if text]
-        if failures:
-            raise FileError(f"{path}: incomplete checkpoint ({failures[0]})")
+        raise_together(f"{path}: incomplete checkpoint", failure, comm)
     _refuse_other_origin(path, stored, made_with, changed_file)
     if not changed_file:
         _refuse_other_surfaces(path, triangles, surfaces(scene.large_bodies))
@@ -176,12 +171,13 @@ def write_checksum(path: Path) -> None:
 
 
 def intact(path: Path) -> bool:
-    """Whether a settled state and its checksum are there and agree; FileError if they do not agree."""
+    """Whether a settled state and its checksum are there and agree; FileError if they do not agree; one rank."""
     checksum = Path(f"{path}.sha256")
     if not (path.exists() and checksum.exists()):
         return False
     if checksum.read_text().split()[0] != _digest(path):
-        raise FileError(f"{path}: does not agree with its checksum; delete it to have it made again")
+        remedy = "delete it to have it made again"
+        raise FileError(f"{path}: does not agree with its checksum; {remedy}", one_rank=True)
     return True
 
 

@@ -96,14 +96,14 @@ def written(path: Path, comm: MPI.Comm) -> Iterator[RowWriter]:
             try:
                 make_hdf5(temporary_name(path), numbers, items)
             except OSError as error:
-                failure = error.strerror
-        _raise_together(path, failure, comm)
+                failure = error.strerror or str(error)
+        raise_together(f"{path}: cannot write", failure, comm)
         parallel = {"driver": "mpio", "comm": comm} if comm.size > 1 else {}
         try:
             file = h5py.File(temporary_name(path), "r+", **parallel)
         except OSError as error:
             failure = str(error)
-        _raise_together(path, failure, comm)
+        raise_together(f"{path}: cannot write", failure, comm)
         assert file is not None
         try:
             contents.write(file, comm)
@@ -116,15 +116,15 @@ def written(path: Path, comm: MPI.Comm) -> Iterator[RowWriter]:
                 comm.Abort(2)
             with suppress(OSError, RuntimeError):
                 file.close()
-        _raise_together(path, failure, comm)
+        raise_together(f"{path}: cannot write", failure, comm)
     comm.Barrier()
 
 
-def _raise_together(path: Path, failure: str | None, comm: MPI.Comm) -> None:
-    """FileError on all ranks if one failed."""
-    failures = [text for text in comm.allgather(failure) if text]
+def raise_together(what: str, failure: str | None, comm: MPI.Comm) -> None:
+    """FileError on all ranks if one has a failure: ``what`` it is, and the words of the first; collective."""
+    failures = [text for text in comm.allgather(failure) if text is not None]
     if failures:
-        raise FileError(f"{path}: cannot write ({failures[0]})")
+        raise FileError(f"{what} ({failures[0]})")
 
 
 @contextmanager
@@ -157,10 +157,8 @@ def readable(path: Path, comm: MPI.Comm) -> Iterator[h5py.File]:
         file = h5py.File(path, "r")
     except OSError as error:
         failure = str(error)
-    failures = [text for text in comm.allgather(failure) if text]
     try:
-        if failures:
-            raise FileError(f"{path}: no readable HDF5 file ({failures[0]})")
+        raise_together(f"{path}: no readable HDF5 file", failure, comm)
         yield file
     finally:
         if file is not None:

@@ -35,11 +35,11 @@ def help_text(database: Mapping[str, str], topic: str = "") -> str:
 def _help_sections(database: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
     """Topic, title and text of each section of the help."""
     scene = database.get("scene", "mixer")
-    parts = ["run", "scene", "ccp", "ccp", *("ccp" for _ in ccp.SOLVERS)]
     titles = ["Run", f"Scene {scene}", "Cone problem", "Coulomb's law by cone problems, with -ccp_coulomb"]
     titles += [f"-ccp_type {name}: {solver.help}" for name, solver in ccp.SOLVERS.items()]
-    for part, title, (group, prefix) in zip(parts, titles, option_groups(find_scene(scene))):
-        yield part, title, "\n".join(map(str, describe(group, prefix)))
+    for title, (group, prefix) in zip(titles, option_groups(find_scene(scene))):
+        topic = prefix.partition("_")[0] or "run"  # the first word of the options
+        yield topic, title, "\n".join(map(str, describe(group, prefix)))
     for pc in PRECONDITIONERS:
         title = f"-pc_type python -pc_python_type pctt.pc.{pc.__name__}"
         yield "pc", title, "\n".join(map(str, describe(pc.options_class, pc.options_prefix)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -136,56 +136,36 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb:
     """OptionError for the first option that means nothing beside the others."""
     solver = ccp.SOLVERS[run.ccp_type]
     newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
-    others = tuple(other.prefix for other in ccp.SOLVERS.values() if other is not solver)
+    of_others = tuple(other.prefix for other in ccp.SOLVERS.values() if other is not solver)
     compared = tuple(f"compare_{name}_" for name in run.compare.split(",") if name)
     ladder = tuple(f"fallback_{name}_" for name in LADDER)
     own = {field.name for field in dataclasses.fields(Run)}
-    rules: list[tuple[Any, Callable[[str], bool], str]] = [  # if, which options, why not
-        (
-            run.problem,
-            lambda name: name in OF_STEPS or name.startswith("scene_"),
-            f"-problem {run.problem} makes no steps; allowed is one of the two",
-        ),
-        (
-            run.settle,
-            lambda name: (name in own or name.startswith(("ccp_", *OF_SOLVERS))) and name not in OF_SETTLING,
-            "-settle makes its state with APGD, where this option has no effect; allowed is one of the two",
-        ),
-        (not run.dump_problem, lambda name: name == "dump_steps", "it needs -dump_problem FOLDER"),
-        (not run.problem, lambda name: name == "problem_guess", "allowed with -problem only"),
-        (
-            not run.settle and run.restart != "settled",
-            lambda name: name in ("settle_delta", "settle_tol"),
-            "allowed with -settle or -restart settled only",
-        ),
-        (
-            run.restart in ("", "settled"),
-            lambda name: name == "restart_changed_file",
-            "allowed with -restart FILE only",
-        ),
-        (run.quiet, lambda name: name == "monitor", "-quiet prints nothing; allowed is one of the two"),
-        (
-            not solver.newton,
-            lambda name: name in ("compare", "ccp_newton") or name.startswith(OF_SOLVERS),
-            f"-ccp_type {run.ccp_type} solves no Newton systems; allowed is {newton}",
-        ),
-        (not run.compare, lambda name: name == "compare_every", "allowed with -compare only"),
-        (
-            True,
-            lambda name: name.startswith("compare_") and name != "compare_every" and not name.startswith(compared),
-            f"its preconditioner is not compared; -compare lists {run.compare or 'none'}",
-        ),
-        (
-            True,
-            lambda name: name.startswith("fallback_") and not name.startswith(ladder),
-            f"no such fallback; there are {', '.join(LADDER)}",
-        ),
-        (True, lambda name: name.startswith(others), f"belongs to another -ccp_type than {run.ccp_type}"),
-        (not obeys_coulomb, lambda name: name.startswith("ccp_coulomb_"), "allowed with -ccp_coulomb only"),
+
+    def strangers(start: str, known: tuple[str, ...]) -> set[str]:
+        return {name for name in database if name.startswith(start) and not name.startswith(known)}
+
+    settles = "-settle makes its state with APGD, where this option has no effect; allowed is one of the two"
+    no_newton = f"-ccp_type {run.ccp_type} solves no Newton systems; allowed is {newton}"
+    not_compared = f"its preconditioner is not compared; -compare lists {run.compare or 'none'}"
+    unsettled = not run.settle and run.restart != "settled"
+    rules: list[tuple[Any, set[str], tuple[str, ...], str]] = [  # if, which options by name or by beginning, why not
+        (run.problem, OF_STEPS, ("scene_",), f"-problem {run.problem} makes no steps; allowed is one of the two"),
+        (run.settle, own - OF_SETTLING, ("ccp_", *OF_SOLVERS), settles),
+        (not run.dump_problem, {"dump_steps"}, (), "it needs -dump_problem FOLDER"),
+        (not run.problem, {"problem_guess"}, (), "allowed with -problem only"),
+        (unsettled, {"settle_delta", "settle_tol"}, (), "allowed with -settle or -restart settled only"),
+        (run.restart in ("", "settled"), {"restart_changed_file"}, (), "allowed with -restart FILE only"),
+        (run.quiet, {"monitor"}, (), "-quiet prints nothing; allowed is one of the two"),
+        (not solver.newton, {"compare", "ccp_newton"}, OF_SOLVERS, no_newton),
+        (not run.compare, {"compare_every"}, (), "allowed with -compare only"),
+        (True, strangers("compare_", compared) - {"compare_every"}, (), not_compared),
+        (True, strangers("fallback_", ladder), (), f"no such fallback; there are {', '.join(LADDER)}"),
+        (True, set(), of_others, f"belongs to another -ccp_type than {run.ccp_type}"),
+        (not obeys_coulomb, set(), ("ccp_coulomb_",), "allowed with -ccp_coulomb only"),
     ]
-    for applies, concerned, reason in rules:
+    for applies, names, starts, reason in rules:
         for name, value in database.items():
-            if applies and concerned(name):
+            if applies and (name in names or name.startswith(starts)):
                 raise OptionError(f"{f'-{name} {value or str()}'.rstrip()}: {reason}")
 
 

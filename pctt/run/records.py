@@ -47,8 +47,7 @@ class Records:
             path = self._place.folder / "records.csv"
             raise FileError(f"{path}: has other columns than this run, choose another -output")
         if self._comm.rank == 0:
-            step, *rest = row.values()
-            line = ",".join([str(int(step)), *(repr(float(value)) for value in rest)])
+            line = _row(*row.values())
             self._lines.add(line if self._header else f"{header}\n{line}")
         self._header = header
 
@@ -80,6 +79,9 @@ def _table(columns: Mapping[str, Sequence[float] | np.ndarray]) -> str:
     lengths = {name: len(column) for name, column in columns.items()}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"the arrays of analyse need one entry per record, their lengths are {lengths}")
-    steps, *rest = columns.values()
-    rows = (f"{int(step)}," + ",".join(repr(float(value)) for value in row) for step, *row in zip(steps, *rest))
+    rows = (_row(*values) for values in zip(*columns.values()))
     return "\n".join([",".join(columns), *rows]) + "\n"
+
+
+def _row(step: float, *values: float) -> str:
+    return ",".join([str(int(step)), *(repr(float(value)) for value in values)])

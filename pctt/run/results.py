@@ -25,7 +25,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
-from dem.contact.search import Contacts
+from dem.contact import Contacts
 from dem.exchange import exchange
 from dem.shapes import described
 from dem.system import ContactSystem

@@ -19,6 +19,7 @@ from dem.world import World
 from pctt import ccp
 from pctt.options import OptionError
 from pctt.run import checkpoint, interrupt, report
+from pctt.run.hdf5 import told
 from pctt.run.settings import Options, scene_name
 from pctt.run.stepper import Stepper
 
@@ -35,7 +36,8 @@ def settled_state(
         return path
     progress.say(f"settling {options.run.scene}, {steps(options)} steps with APGD to {options.run.settle_tol:g}:")
     if comm.rank == 0:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        with told(path.parent):
+            path.parent.mkdir(parents=True, exist_ok=True)
     if comm.bcast(unfinished(path).exists()):
         world, memory = checkpoint.load(unfinished(path), scene, made_with, comm)
         progress.say(f"  goes on after step {world.step}, from {unfinished(path)}")

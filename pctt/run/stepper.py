@@ -53,7 +53,7 @@ class Stepper:
     Owns its ``newton`` and the PETSc objects of the present step; `destroy` frees them.
     """
 
-    contacts: Any
+    contacts: Contacts
     system: ContactSystem
     impulse: np.ndarray
     history: list[float]  #: natural residual by iteration

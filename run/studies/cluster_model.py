@@ -12,11 +12,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from measure import record, say_machine
+from measure import Counter, median_seconds, record, say_machine
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -39,29 +38,6 @@ SOLVED = 4  # ranks up to which the step is solved: more wait for each other on 
 SMALL, LARGE = 8, 2**20  # bytes of the messages that latency and bandwidth are measured with
 
 # -- on many ranks: counts ----------------------------------------------------------------------------------
-
-
-class Counter:
-    """Counts the calls of methods of a class while it is entered."""
-
-    def __init__(self, of: type, *names: str):
-        self.of, self.calls, self.originals = of, 0, {name: getattr(of, name) for name in names}
-
-    def __enter__(self) -> Counter:
-        for name, original in self.originals.items():
-            setattr(self.of, name, self._counted(original))
-        return self
-
-    def _counted(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        def method(*arguments: Any) -> Any:
-            self.calls += 1
-            return original(*arguments)
-
-        return method
-
-    def __exit__(self, *exception: object) -> None:
-        for name, original in self.originals.items():
-            setattr(self.of, name, original)
 
 
 def count(n: int) -> dict[str, Any]:
@@ -132,12 +108,8 @@ def _petsc_reductions() -> float:
 
 def seconds_of_product(problem: ccp.ConeProblem) -> float:
     """Of y += N g, median."""
-    g, y, spent = np.ones_like(problem.r), np.zeros_like(problem.r), []
-    for _ in range(50):
-        start = time.perf_counter()
-        problem.contact_map.add_delassus(g, y)
-        spent.append(time.perf_counter() - start)
-    return statistics.median(spent)
+    g, y = np.ones_like(problem.r), np.zeros_like(problem.r)
+    return median_seconds(lambda: problem.contact_map.add_delassus(g, y), 50)
 
 
 def ping_pong() -> tuple[float, float]:

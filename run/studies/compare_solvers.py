@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import solve_one
-from measure import record, say_machine
+from measure import figure, record, say_machine
 from mpi4py import MPI
 from peers import PEERS
 
@@ -158,23 +158,17 @@ def show(method: str, rows: list[dict[str, Any]]) -> None:
 
 
 def plot(name: str, title: str, table: dict[str, list[dict[str, Any]]]) -> None:
-    try:
-        from matplotlib import pyplot
-    except ImportError:
-        print("no plot: matplotlib is not installed")
-        return
-    figure, axes = pyplot.subplots(figsize=(7, 5), layout="constrained")
-    for method, rows in table.items():
-        course = np.array(rows[-1].get("course", []), dtype=float).reshape(-1, 2)
-        course = course[np.isfinite(course).all(axis=1)]
-        if len(course):
-            best = np.minimum.accumulate(course[:, 1])
-            axes.loglog(course[:, 0], best, label=method, ls="--" if method in PEERS else "-", lw=1.2)
-    axes.set(xlabel="seconds", ylabel="natural residual", title=title, ylim=(1e-9, 2))
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    figure.savefig(f"results/{name}.png", dpi=150)
-    pyplot.close(figure)
+    with figure(name, 1) as panels:
+        for axes in panels:
+            for method, rows in table.items():
+                course = np.array(rows[-1].get("course", []), dtype=float).reshape(-1, 2)
+                course = course[np.isfinite(course).all(axis=1)]
+                if len(course):
+                    best = np.minimum.accumulate(course[:, 1])
+                    axes.loglog(course[:, 0], best, label=method, ls="--" if method in PEERS else "-", lw=1.2)
+            axes.set(xlabel="seconds", ylabel="natural residual", title=title, ylim=(1e-9, 2))
+            axes.grid(alpha=0.3)
+            axes.legend(fontsize=8)
 
 
 def main() -> None:

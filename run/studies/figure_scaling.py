@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from measure import figure, record, say_machine
+from measure import exponent, figure, median_seconds, record, say_machine
 from mpi4py import MPI
-from newton_systems import Replay, median_seconds, replay_steps, set_up, settled, train_pc
+from newton_systems import Replay, replay_steps, set_up, settled, train_pc
 from petsc4py import PETSc
 
 from pctt.blocks import square_block_matrix
@@ -109,27 +109,27 @@ def main(given: argparse.Namespace) -> None:
 
     for n in given.n:
         replay_steps(settled(n, "-ccp_max_it", NEWTON), 1, look)
-    exponents = {phase: exponent(rows, phase) for phase in PHASES}
+    exponents = {phase: exponent(*against_contacts(rows, phase)) for phase in PHASES}
     cells = " ".join(f"{exponents[phase]:12.2f}" for phase in PHASES)
     print(f"{'seconds ~ Nc to the power':>20} {cells}")
     record("figure_scaling", about, [*rows, {"exponents": exponents}])
     draw(rows, exponents)
 
 
-def exponent(rows: list[dict[str, Any]], phase: str) -> float:
-    """Of seconds ~ Nc^p, by least squares of the logarithms."""
-    points = np.array([(row["contacts"], row[phase]) for row in rows if phase in row])
-    return float(np.polyfit(*np.log(points).T, 1)[0]) if len(points) > 1 else np.nan
+def against_contacts(rows: list[dict[str, Any]], phase: str) -> np.ndarray:
+    """Contacts and seconds (2, points) of a phase, by the number of contacts."""
+    points = sorted((row["contacts"], row[phase]) for row in rows if phase in row)
+    return np.array(points).reshape(-1, 2).T
 
 
 def draw(rows: list[dict[str, Any]], exponents: dict[str, float]) -> None:
     with figure("figure_scaling", 2) as axes:
         for ax, phases, title in zip(axes, (PHASES[:9], PHASES[9:]), ("set-up", "application")):
             for phase in phases:
-                points = np.array([(row["contacts"], row[phase]) for row in rows if phase in row])
                 style = "o--" if "warm" in phase else "o-"
-                if len(points):
-                    ax.plot(*points[points[:, 0].argsort()].T, style, label=f"{phase}: Nc^{exponents[phase]:.2f}")
+                points = against_contacts(rows, phase)
+                if points.size:
+                    ax.plot(*points, style, label=f"{phase}: Nc^{exponents[phase]:.2f}")
             ax.set(xscale="log", yscale="log", xlabel="contacts Nc", ylabel="seconds", title=title)
             ax.legend(fontsize="small")
 

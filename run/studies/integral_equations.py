@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import figure, record, say_machine
+from measure import exponent, figure, record, say_machine
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
 from comparison import cg, cholesky, operator, seconds
@@ -59,9 +59,9 @@ def inverse_of(train: tt.Train) -> tt.Inverse:
     return tt.invert_near_identity(train.symmetric_part(0.1 * EPS), 100, eps=EPS)
 
 
-def exponent(rows: list[dict[str, Any]], name: str) -> float:
-    """Of the growth of seconds with the unknowns, by least squares."""
-    return float(np.polyfit(*(np.log([row[key] for row in rows]) for key in ("unknowns", name)), 1)[0])
+def against_unknowns(rows: list[dict[str, Any]], part: str) -> tuple[list[float], list[float]]:
+    """Unknowns and seconds of a part."""
+    return [row["unknowns"] for row in rows], [row[f"{part}_s"] for row in rows]
 
 
 def beside_best(problem: Problem) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def main(given: argparse.Namespace) -> None:
             figures = f"cross {row['cross_s']:.3f} s, inverse {row['inverse_s']:.3f} s, ranks {row['ranks']}"
             print(f"{row['problem']}: {figures}", flush=True)
         rows += growth[name]
-        rows += [say(f"{name}: exponent of {part}", exponent(growth[name], f"{part}_s"), 0.2)
+        rows += [say(f"{name}: exponent of {part}", exponent(*against_unknowns(growth[name], part)), 0.2)
                  for part in ("cross", "inverse")]  # fmt: skip
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     last = growth["Fredholm"][-1]
@@ -129,8 +129,7 @@ def draw(growth: dict[str, list[dict[str, Any]]]) -> None:
         for axes in panels:
             for name, found in growth.items():
                 for part, line in (("cross", "-"), ("inverse", "--")):
-                    x, y = ([row[key] for row in found] for key in ("unknowns", f"{part}_s"))
-                    axes.loglog(x, y, line + "o", label=f"{name}, {part}")
+                    axes.loglog(*against_unknowns(found, part), line + "o", label=f"{name}, {part}")
             axes.set_xlabel("unknowns")
             axes.set_ylabel("CPU seconds")
             axes.legend()

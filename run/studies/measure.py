@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import os
 import platform
+import statistics
 import subprocess
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy
+import numpy as np
 import petsc4py
 import scipy
 
@@ -21,7 +23,7 @@ def machine() -> dict[str, object]:
     """What the figures were measured on."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "?")
-    versions = {"python": platform.python_version(), "numpy": numpy.__version__, "scipy": scipy.__version__}
+    versions = {"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__}
     threads = os.environ.get("OMP_NUM_THREADS", "1")
     petsc = petsc4py.__version__
     return {"cpu": cpu, "cores": os.cpu_count(), "OMP_NUM_THREADS": threads, "petsc4py": petsc, **versions}
@@ -49,6 +51,45 @@ def record(name: str, about: dict[str, object], rows: list[dict]) -> None:
     path = Path("results") / f"{name}.json"
     path.write_text(json.dumps({"machine": about, "rows": rows}, indent=1) + "\n")
     print(path)
+
+
+class Counter:
+    """Counts the calls of methods of a class while it is entered."""
+
+    def __init__(self, of: type, *names: str):
+        self.of, self.calls, self.originals = of, 0, {name: getattr(of, name) for name in names}
+
+    def __enter__(self) -> Counter:
+        for name, original in self.originals.items():
+            setattr(self.of, name, self._counted(original))
+        return self
+
+    def _counted(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def method(*arguments: Any) -> Any:
+            self.calls += 1
+            return original(*arguments)
+
+        return method
+
+    def __exit__(self, *exception: object) -> None:
+        for name, original in self.originals.items():
+            setattr(self.of, name, original)
+
+
+def exponent(x: Sequence[float], y: Sequence[float]) -> float:
+    """Of y ~ x^p, by least squares of the logarithms; NaN for less than two points."""
+    return float(np.polyfit(np.log(x), np.log(y), 1)[0]) if len(x) > 1 else np.nan
+
+
+def median_seconds(do: Callable[[], object], repeat: int = 5) -> float:
+    """Median time of a few runs, after one that does not count."""
+    do()
+    seconds = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        do()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds)
 
 
 @contextmanager

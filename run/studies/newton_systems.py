@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +20,7 @@ from dem.impulses import ImpulseMemory
 from dem.world import World
 from pctt import ccp
 from pctt.ccp.newton.contact import ContactForm
+from pctt.ksp_options import entered
 from pctt.options import OptionError
 from pctt.pc import TensorTrain
 from pctt.pc.sparse_train import SparseTrain
@@ -46,13 +46,13 @@ class Recorder(ccp.Newton):
         super().begin(problem)
         self.systems: list[System] = []
 
-    def update(self, barrier: np.ndarray, inverse: np.ndarray | None = None) -> None:
+    def update(self, barrier: np.ndarray, *more: Any, **named: Any) -> None:
         self._barrier = barrier.copy()
-        super().update(barrier, inverse)
+        super().update(barrier, *more, **named)
 
-    def solve(self, q: np.ndarray, tol: float, *more: Any, **named: Any) -> tuple[np.ndarray, np.ndarray]:
+    def solve(self, q: np.ndarray, *more: Any, **named: Any) -> tuple[np.ndarray, np.ndarray]:
         self.systems.append(System(self._barrier, q.ravel().copy()))
-        return super().solve(q, tol, *more, **named)
+        return super().solve(q, *more, **named)
 
 
 class Replay:
@@ -116,11 +116,8 @@ def replay_steps(
     except OptionError as error:
         sys.exit(str(error))
     world, memory = first_state(options, comm, Progress(False))
-    stepper = ReplayingStepper(options, world, memory, look, newton_steps)
-    lines = [stepper.step() for _ in range(steps)]
-    assert stepper.newton is not None
-    stepper.newton.destroy()
-    return lines
+    with ReplayingStepper(options, world, memory, look, newton_steps) as stepper:
+        return [stepper.step() for _ in range(steps)]
 
 
 def settled(n: int, *more: Any) -> list[Any]:
@@ -189,13 +186,8 @@ def train_pc(comm: MPI.Comm, **options: Any) -> tuple[PETSc.PC, WatchedTrain]:
     pc.setOptionsPrefix("watched_")
     pc.setType("python")
     pc.setPythonContext(context)
-    database = PETSc.Options()
-    entered = {f"watched_pc_tt_{name}": str(value) for name, value in {"rank": "fixed", **options}.items()}
-    for name, value in entered.items():
-        database[name] = value
-    pc.setFromOptions()
-    for name in entered:
-        database.delValue(name)
+    with entered({f"watched_pc_tt_{name}": str(value) for name, value in {"rank": "fixed", **options}.items()}):
+        pc.setFromOptions()
     return pc, context
 
 
@@ -204,14 +196,3 @@ def set_up(pc: PETSc.PC, matrix: PETSc.Mat) -> dict[str, Any]:
     pc.setOperators(matrix)
     pc.setUp()
     return pc.getPythonContext().rows[-1]
-
-
-def median_seconds(do: Callable[[], object], repeat: int = 5) -> float:
-    """Median time of a few runs, after one that does not count."""
-    do()
-    seconds = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        do()
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds)

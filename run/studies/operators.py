@@ -20,10 +20,11 @@ petsc4py.init([sys.argv[0]])
 
 import numpy as np
 from compare_solvers import COMM, step_problem
-from measure import record, say_machine
+from measure import median_seconds, record, say_machine
 from petsc4py import PETSc
 
 from pctt import ccp
+from pctt.block_diagonal import block_diagonal
 from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.contact import ContactForm
 
@@ -91,8 +92,6 @@ def iteration_of_cg(body: BodyForm, vectors: tuple[PETSc.Vec, PETSc.Vec]) -> Cal
     ksp.setType("cg")
     ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
     ksp.pc.setType("pbjacobi")
-    from pctt.block_diagonal import block_diagonal
-
     ksp.setOperators(body.matrix, block_diagonal(body.matrix))
     ksp.setTolerances(rtol=1e-300, atol=1e-300, max_it=50)
     b, x = vectors
@@ -102,13 +101,7 @@ def iteration_of_cg(body: BodyForm, vectors: tuple[PETSc.Vec, PETSc.Vec]) -> Cal
 def bandwidth() -> float:
     """GB/s of a = b + s c on arrays far larger than the caches."""
     b, c, a = np.random.default_rng(0).random((3, 20_000_000))
-    seconds = []
-    for _ in range(7):
-        start = time.perf_counter()
-        np.multiply(c, 3.0, out=a)
-        np.add(a, b, out=a)
-        seconds.append(time.perf_counter() - start)
-    return 5 * b.nbytes / statistics.median(seconds) / 1e9
+    return 5 * b.nbytes / median_seconds(lambda: np.add(np.multiply(c, 3.0, out=a), b, out=a), 7) / 1e9
 
 
 def apgd_iteration(problem: ccp.ConeProblem) -> float:

@@ -16,7 +16,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -80,15 +79,13 @@ def fastest(path: str, law: str, solver: str, tol: float, seconds: float) -> dic
 def once(path: str, law: str, solver: str, tol: float, seconds: float) -> dict[str, Any]:
     with solve_one.read(path, "auto") as problem:
         if solver in PEERS:
-            start = time.perf_counter()
-            impulse, reason = PEERS[solver].solve(problem, tol, seconds)
-            found: dict[str, Any] = {"seconds": time.perf_counter() - start, "reason": reason}
+            found = solve_one.peer(problem, solver, tol, seconds)
             if found["seconds"] > seconds:
                 found["reason"] = f"{seconds:g} s"
         else:
-            run = solve_one.own(problem, solver, tol, seconds, law == "coulomb")
-            impulse = run["impulse"]
-            found = {name: run[name] for name in ("seconds", "reason", "solver", "products", "ksp_its")}
+            found = solve_one.own(problem, solver, tol, seconds, law == "coulomb")
+            del found["course"]
+        impulse = found.pop("impulse")
         residual, objective = np.inf, None  # of a solve that is out of time the best that it looked at is not known
         if impulse is not None and np.isfinite(impulse).all():
             accuracy = ccp.measure(problem, impulse)

@@ -9,12 +9,12 @@ import math
 import resource
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import peers
+from measure import Counter
 from mpi4py import MPI
 
 from pctt import ccp
@@ -28,56 +28,48 @@ class OutOfTimeError(Exception):
 class Watch:
     """The course of a solver: what every look at the natural residual found, and what had been done until then."""
 
-    def __init__(self, problem: ccp.ConeProblem, newton: ccp.Newton | None, seconds: float):
-        self.newton, self.seconds = newton, seconds
+    def __init__(self, problem: ccp.ConeProblem, newton: ccp.Newton | None, products: Counter, seconds: float):
+        self.newton, self.products, self.seconds = newton, products, seconds
         self.course: list[tuple[float, float, int, int]] = []
-        self.products = 0
-        self._look, self._map = problem.natural_residual, problem.contact_map
+        self._look = problem.natural_residual
         problem.natural_residual = self.look  # type: ignore[method-assign]
-        self._of = type(self._map)
-        self._product = self._of.add_delassus if self._of is not type(None) else None
-        if self._product is not None:
-            self._of.add_delassus = self._counted()  # type: ignore[method-assign]
         self.start = time.perf_counter()
 
     def look(self, g: np.ndarray, y: np.ndarray, coulomb: bool = False) -> float:
         residual = self._look(g, y, coulomb)
         spent = time.perf_counter() - self.start
-        self.course.append((spent, residual, self.products, self.newton.ksp_its if self.newton else 0))
+        self.course.append((spent, residual, self.products.calls, self.newton.ksp_its if self.newton else 0))
         if spent > self.seconds:
             raise OutOfTimeError
         return residual
-
-    def _counted(self) -> Callable[..., None]:
-        def add_delassus(*arguments: Any) -> None:
-            self.products += 1
-            self._product(*arguments)
-
-        return add_delassus
-
-    def stop(self, problem: ccp.ConeProblem) -> None:
-        del problem.natural_residual
-        if self._product is not None:
-            self._of.add_delassus = self._product  # type: ignore[method-assign]
 
 
 def own(problem: ccp.ConeProblem, name: str, tol: float, seconds: float, coulomb: bool) -> dict[str, Any]:
     """A solver of the registry from a cold start."""
     newton = ccp.newton_for(problem.comm, name) if ccp.SOLVERS[name].newton else None
-    watch = Watch(problem, newton, seconds)
+    counted = [] if problem.contact_map is None else ["add_delassus"]
     limits = ccp.Limits(tol, 10_000_000 if not newton else -1, math.inf)
     law = ccp.Coulomb() if coulomb else None
     impulse = None
-    try:
-        result = ccp.solve(problem, None, name, limits, None, newton, law)
-        impulse, reason, solver = result.impulse, result.reason, result.solver or name
-    except OutOfTimeError:
-        reason, solver = f"{seconds:g} s", name
-    spent = time.perf_counter() - watch.start
-    watch.stop(problem)
+    with Counter(type(problem.contact_map), *counted) as products:
+        watch = Watch(problem, newton, products, seconds)
+        try:
+            result = ccp.solve(problem, None, name, limits, None, newton, law)
+            impulse, reason, solver = result.impulse, result.reason, result.solver or name
+        except OutOfTimeError:
+            reason, solver = f"{seconds:g} s", name
+        spent = time.perf_counter() - watch.start
+    del problem.natural_residual
     ksp_its = newton.ksp_its if newton else 0
-    found = {"seconds": spent, "reason": reason, "solver": solver, "products": watch.products, "ksp_its": ksp_its}
+    found = {"seconds": spent, "reason": reason, "solver": solver, "products": products.calls, "ksp_its": ksp_its}
     return {**found, "course": watch.course[1:], "impulse": impulse}
+
+
+def peer(problem: ccp.ConeProblem, name: str, tol: float, seconds: float) -> dict[str, Any]:
+    """A solver of another project."""
+    start = time.perf_counter()
+    impulse, reason = peers.PEERS[name].solve(problem, tol, seconds)
+    return {"seconds": time.perf_counter() - start, "reason": reason, "impulse": impulse}
 
 
 def write(path: Path, problem: ccp.ConeProblem) -> None:
@@ -115,9 +107,7 @@ def main(path: str, method: str, tol: float, seconds: float, operator: str = "au
     warm_up(method, operator)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     if method in peers.PEERS:
-        start = time.perf_counter()
-        impulse, reason = peers.PEERS[method].solve(problem, tol, seconds)
-        found: dict[str, Any] = {"seconds": time.perf_counter() - start, "reason": reason, "impulse": impulse}
+        found = peer(problem, method, tol, seconds)
     else:
         law, _, name = method.rpartition(" ")
         found = own(problem, name, tol, seconds, law == "coulomb")

@@ -4,7 +4,6 @@ checkpoint, and compares what it leaves with what a run in peace leaves, bit for
 
 from __future__ import annotations
 
-import json
 import math
 import random
 import subprocess
@@ -12,7 +11,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import h5py
 
@@ -39,7 +37,7 @@ def torture(place: Path, n: int, kills: int, steps: int) -> int:
         seconds.append(time.perf_counter() - begun)
     _, startup, whole = seconds
     checkpoint = killed / "checkpoint.h5"
-    first, end = span(peace)
+    first, end = span(Folder(peace))
     print(f"shear n = {n}: {steps} steps in {whole:.1f} s, of which {startup:.1f} s to start", flush=True)
     done, count, torn, whole_end = first - 1, 0, 0, False  # a run killed after its last step leaves no analysis
     while count < kills and done < end:
@@ -74,15 +72,9 @@ def start(scene: tuple[str, ...], state: str | Path, folder: Path, steps: int) -
     return subprocess.Popen([sys.executable, "-m", "pctt.run", *words], cwd=ROOT)
 
 
-def span(folder: Path) -> tuple[int, int]:
+def span(run: Folder) -> tuple[int, int]:
     """First and last step of a run."""
-    summary = json.loads((folder / "summary.json").read_text())
-    return summary["first_step"], summary["last_step"]
-
-
-def noted(folder: Path) -> list[dict[str, Any]]:
-    """The figures of the steps."""
-    return [json.loads(line) for line in lines(folder / "steps.jsonl")]
+    return run.summary["first_step"], run.summary["last_step"]
 
 
 def broken(folder: Path, first: int, done: int) -> str:
@@ -90,12 +82,11 @@ def broken(folder: Path, first: int, done: int) -> str:
     rows = [int(row.partition(",")[0]) for row in list(lines(folder / "records.csv"))[1:]]
     with h5py.File(folder / "state.h5", "r") as file:
         linked = [int(name) for name in file["steps"] if file["steps"][name]["position"].shape[1] == 3]
-    frames = Folder(folder).steps
+    run = Folder(folder)
+    frames, (begun, ended) = run.steps, span(run)
     if linked != frames[: len(linked)] or len(linked) < 0.99 * len(frames) - 1:
         return f"state.h5 leads to the steps {linked} of {frames}"
-    summary = json.loads((folder / "summary.json").read_text())
-    known = list(range(summary["first_step"], summary["last_step"] + 1))
-    figures = [line["step"] for line in noted(folder)]
+    figures, known = [line["step"] for line in run.lines()], list(range(begun, ended + 1))
     found = {"records.csv": rows, "frames": frames, "steps.jsonl": figures, "summary.json": known}
     for name, steps in found.items():
         if steps != list(range(first, first + len(steps))) or steps[-1] < done:
@@ -107,7 +98,7 @@ def differences(one: Path, two: Path) -> list[str]:
     """What the folders of two runs differ in, but for the seconds that they took."""
     found = [f"{name} differs" for name in ("records.csv", "analysis.csv") if text(one / name) != text(two / name)]
     found += [f"{name}: {item}" for name in ("state.h5", "checkpoint.h5") for item in unequal(one / name, two / name)]
-    steps = [noted(folder) for folder in (one, two)]
+    steps = [Folder(folder).lines() for folder in (one, two)]
     for field in ("step", "contacts", "iterations"):
         if [line[field] for line in steps[0]] != [line[field] for line in steps[1]]:
             found.append(f"steps.jsonl: {field}")

@@ -178,10 +178,11 @@ def main(names: Sequence[str]) -> None:
         files = [RUNS / name / "steps.jsonl" for jobs in JOBS.values() for name in jobs]
         lines = [json.loads(line) for file in files for line in file.read_text().splitlines()]
         missed = sum(not line["converged"] for line in lines)
-        about["minutes"] = seconds / 60 / min(2, os.cpu_count() or 1)
+        cores = min(2, os.cpu_count() or 1)
+        about["minutes"] = seconds / 60 / cores
         text = TEXT.read_text("utf-8").format(
             minutes=about["minutes"],
-            cores=min(2, os.cpu_count() or 1),
+            cores=cores,
             cpu=about["cpu"],
             table=table(rows),
             rubs=shown["column"]["rubs"],

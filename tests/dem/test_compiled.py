@@ -149,3 +149,8 @@ def test_free_spins_agree(turn, without_loops):
     frame = random_quaternions(rng, 43)
     compiled, plain = (call(free_spin, frame, spin, moments, 0.01) for call in (_call, without_loops))
     np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-10 * turn / 0.01)
+
+
+def test_there_are_no_loops_where_numba_is_switched_off(monkeypatch):
+    monkeypatch.setattr("numba.config.DISABLE_JIT", 1)
+    assert loops.__wrapped__() is None

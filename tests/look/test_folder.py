@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import resource
+import subprocess
+import sys
 
 import h5py
 import handmade
 import numpy as np
 import pytest
+from several_ranks import environment, mpiexec
 
 from dem.scenes import Mixer
 from pctt.look.folder import Folder, FolderError
@@ -181,6 +184,26 @@ runpy.run_module("pctt.{program}", run_name="__main__")
     assert line.startswith(f"pctt.{program}: No module named ")
     assert missing in line or program == "render"  # which may ask for matplotlib first
     assert "pip install -e '.[pictures]'" in line
+
+
+FAILS = """
+from pctt.look.program import run
+
+def main(comm):
+    if comm.rank == 1:
+        raise KeyError("lost")
+    comm.Barrier()
+
+run(main, "plot")
+"""
+
+
+@pytest.mark.mpi
+def test_an_error_of_one_rank_ends_all():
+    words = [*mpiexec(2), sys.executable, "-c", FAILS]
+    done = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode != 0
+    assert "KeyError: 'lost'" in done.stderr
 
 
 def test_records_are_columns_of_numbers(tmp_path):

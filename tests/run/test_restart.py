@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 
 import h5py
 import numpy as np
@@ -105,6 +106,23 @@ def test_the_settled_state_is_made_once_and_used_again(program, tmp_path):
     assert state.stat().st_mtime_ns == made
     assert_same_bits(tmp_path / "first" / "state.h5", tmp_path / "second" / "state.h5")
     assert not list(tmp_path.glob("first/*.tmp"))
+
+
+@pytest.mark.mpi
+def test_a_settled_state_that_is_damaged_ends_all_ranks(program, settled, tmp_path):
+    cache = tmp_path / "cache"
+    shutil.copytree(settled.parent, cache / "pctt")
+    with (cache / "pctt" / settled.name).open("ab") as file:
+        file.write(b"x")
+    done = program(*SETTLED, ranks=2, status=None, cache=cache)
+    assert done.returncode != 0
+    assert "does not agree with its checksum; delete it" in done.stderr
+
+
+def test_a_cache_that_cannot_be_made_is_named(program, tmp_path):
+    (tmp_path / "file").touch()
+    done = program(*SETTLED, status=2, cache=tmp_path / "file")
+    assert f"{tmp_path}/file/pctt: cannot write" in done.stderr
 
 
 def test_a_settled_state_is_known_by_its_scene_and_by_what_settled_it(tmp_path, monkeypatch):

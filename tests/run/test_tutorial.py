@@ -119,6 +119,12 @@ def test_a_bad_scene_file_is_refused_with_the_reason(text, tmp_path):
     assert str(error.value).startswith(f"-scene {path}: ")
 
 
+def test_a_scene_may_have_two_names(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(GOOD + "Other = One\n")
+    assert find_scene(str(path)).__name__ == "One"
+
+
 def test_a_scene_file_that_is_not_there_is_refused():
     with pytest.raises(OptionError, match="missing.py: cannot be read"):
         find_scene("missing.py")

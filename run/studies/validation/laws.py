@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -24,17 +22,10 @@ RANKINE = "Rankine's active state of 20.9 degrees, and equal stresses"
 DIAMETER, DENSITY, GRAVITY, PACKING, WALL_FRICTION = 0.01, 2500.0, 9.81, 0.58, 0.5
 
 
-def records(folder: Path) -> dict[str, np.ndarray]:
-    """Columns of records.csv."""
-    with (folder / "records.csv").open() as file:
-        lines = list(csv.reader(file))
-    return dict(zip(lines[0], np.array(lines[1:], dtype=float).T))
-
-
 def silo(folders: Mapping[float, Sequence[Path]]) -> tuple[list[Row], dict]:
     """Flow against the diameter of the outlet [sphere diameters]; a fit for each bed, and means of the fits."""
     outlet = np.array(list(folders))
-    flow = np.array([[_flow(folder) for folder in several] for several in folders.values()])
+    flow = np.array([[_analysis(folder)["mass_flow [kg/s]"] for folder in several] for several in folders.values()])
     slope, level = np.polyfit(outlet, flow**0.4, 1)
     unit = PACKING * DENSITY * np.sqrt(GRAVITY) * DIAMETER**2.5
     fits = np.array([np.polyfit(np.log(outlet - 1.4), np.log(flow), 1)[0], -level / slope, slope**2.5 / unit])
@@ -49,9 +40,9 @@ def silo(folders: Mapping[float, Sequence[Path]]) -> tuple[list[Row], dict]:
     return found, {"outlet": outlet, "flow": flow, "slope": slope.mean(), "level": level.mean()}
 
 
-def _flow(folder: Path) -> float:
-    """The mass flow that the scene found [kg/s]."""
-    return float(json.loads((folder / "summary.json").read_text())["analysis"]["mass_flow [kg/s]"])
+def _analysis(folder: Path) -> dict[str, float]:
+    """What the scene of a run found."""
+    return Folder(folder).summary["analysis"]
 
 
 def heap(folders: Mapping[float, Sequence[Path]]) -> tuple[list[Row], dict]:
@@ -112,9 +103,7 @@ def profile(folder: Path) -> Profile:
 
 def drum(folder: Path) -> tuple[list[Row], dict]:
     """Angle of the flowing bed."""
-    figures = json.loads((folder / "summary.json").read_text())["analysis"]
-    angle = figures["dynamic_angle [degrees]"]
-    columns = records(folder)
+    angle, columns = _analysis(folder)["dynamic_angle [degrees]"], Folder(folder).records()
     found = [band("drum", "dynamic angle at Froude number .01, friction .5", 20.9, 32.8, angle, JOP, "degrees")]
     return found, {"time": columns["time [s]"], "angle": columns["bed_angle [degrees]"], "mean": angle}
 
