@@ -30,6 +30,7 @@ from pctt.exchange import refuse
 from pctt.ksp_options import entered, prefer_mumps, to_enter
 from pctt.options import NOT_NEGATIVE, option
 from pctt.pc.base import PythonPC
+from pctt.pc.mat import residual_norm
 
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu"}  # these have no code for block formats
 _COARSE_SPACE = {"gamg", "python"}  # these use the rigid motions
@@ -147,12 +148,8 @@ class BodySchur(PythonPC):
         """``preonly`` has no test of its own, so a failure of the inner method that spoils x is that of the solve."""
         if self.P is None or not self._failure or ksp.getType() != PETSc.KSP.Type.PREONLY:
             return
-        residual = b.duplicate()
-        pc.getOperators()[0].mult(x, residual)
-        residual.aypx(-1.0, b)
-        if not residual.norm() <= ksp.getTolerances()[0] * b.norm():  # also true for nan
+        if not residual_norm(pc.getOperators()[0], b, x) <= ksp.getTolerances()[0] * b.norm():  # also true for nan
             ksp.setConvergedReason(self._failure)
-        residual.destroy()
 
     def report(self) -> list[str]:
         inner = self.its / max(self.solves, 1)

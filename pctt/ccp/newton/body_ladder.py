@@ -78,13 +78,14 @@ class BodyLadder(KrylovFamily):
 
     def __init__(self, comm: MPI.Comm):
         super().__init__(comm)
-        self._hardness = self._growth = 0.0
-        self._lagged: float | None = None
         self._asked, self._room = 0, True  # bodies for which room was asked for, and whether there was
-        self._forget()
         self._approximation: PETSc.Mat | None = None
-        self.iterations = self.fallbacks = 0
         self.used: dict[str, int] = {}
+
+    def begin(self) -> None:
+        super().begin()
+        self._hardness, self._growth = STEERING.hardness, 1.0  # expected iterations with block Jacobi
+        self._lagged: float | None = None  # expected iterations with the factor that is there
 
     def new_matrix(self, system: NewtonForm) -> None:
         assert isinstance(system, BodyForm)
@@ -140,14 +141,6 @@ class BodyLadder(KrylovFamily):
     def report(self) -> list[str]:
         """Nothing: its rungs are PETSc's own."""
         return []
-
-    def begin(self) -> None:
-        self.iterations = self.fallbacks = 0
-        self._forget()
-
-    def _forget(self) -> None:
-        self._hardness, self._growth = STEERING.hardness, 1.0  # expected iterations with block Jacobi
-        self._lagged = None  # expected iterations with the factor that is there
 
     def _solver(self, rung: str) -> Krylov:
         unsymmetric = not self.system.symmetric

@@ -16,6 +16,7 @@ from petsc4py import PETSc
 from pctt.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
 from pctt.ksp_options import entered, prefer_mumps, to_enter
 from pctt.pc.base import PythonPC
+from pctt.pc.mat import residual_norm
 from pctt.petsc import own_errors
 from pctt.shell import is_shell
 
@@ -192,18 +193,24 @@ class Krylov:
             self._formed = None
 
     def destroy(self) -> None:
+        self.forget()
         self.ksp.destroy()
-        if self._formed is not None:
-            self._formed.destroy()
-            self._formed = None
 
 
 class KrylovFamily:
-    """Krylov methods by name, each made when it is first needed."""
+    """Krylov methods by name, each made when it is first needed.
+
+    iterations, fallbacks : of the present problem, as of `LinearSolver`
+    """
 
     def __init__(self, comm: MPI.Comm):
         self.comm = comm
         self._krylov: dict[str, Krylov] = {}
+        self.begin()
+
+    def begin(self) -> None:
+        """Another problem."""
+        self.iterations = self.fallbacks = 0
 
     def forget(self) -> None:
         """The next matrix has another structure."""
@@ -223,11 +230,7 @@ _REASONS = {
 
 def _true_residual(S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:
     """||b - S x|| / ||b||; an x that is no number is replaced by zero, and leaves 1."""
-    residual = b.duplicate()
-    S.mult(x, residual)
-    residual.aypx(-1.0, b)
-    norm, reference = residual.norm(), b.norm()
-    residual.destroy()
+    norm, reference = residual_norm(S, b, x), b.norm()
     if not np.isfinite(norm):
         x.zeroEntries()
         return 1.0

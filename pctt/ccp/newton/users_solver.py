@@ -25,13 +25,9 @@ class UsersSolver(KrylovFamily):
 
     takes_any = False
 
-    def __init__(self, comm: MPI.Comm, defaults: dict[str, str], compare: Comparison | None = None, prefix: str = ""):
+    def __init__(self, comm: MPI.Comm, defaults: dict[str, str], compare: Comparison | None, prefix: str):
         super().__init__(comm)
         self.defaults, self.compare, self.prefix = defaults, compare, prefix
-        self.iterations = self.fallbacks = 0
-
-    def begin(self) -> None:
-        self.iterations = self.fallbacks = 0
 
     def new_matrix(self, system: NewtonForm) -> None:
         self.system = system
