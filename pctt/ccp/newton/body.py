@@ -60,20 +60,14 @@ class BodyForm:
         """What is worth factorising of K, in scalar rows."""
         return self.operator.entries().stiff_part(LEAST, scalar=True, symmetric=self.symmetric)
 
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         push = self.problem.momentum(times(self._inverse, q) if uncoupled is None else uncoupled)
         return push if r_v is None else push - r_v
 
-    def impulses(self, x: Array, q: Array, uncoupled: Array | None = None) -> Array:
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
         if uncoupled is None:
             return times(self._inverse, q - self.problem.velocity_of(x))
         return uncoupled - times(self._inverse, self.problem.velocity_of(x))
-
-    def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
-        return x
-
-    def tolerance(self, tol: float) -> float:
-        return tol
 
     def destroy(self) -> None:
         self.operator.destroy()

@@ -36,18 +36,11 @@ class NewtonForm(Protocol):
     def entries(self) -> PETSc.Mat:
         """The matrix, or its sparse part, as one that preconditioners can read; collective."""
 
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         """The right-hand side for the unknowns. ``uncoupled`` is (B + C)^-1 q, if the caller has it more accurately."""
 
-    def impulses(self, x: Array, q: Array, uncoupled: Array | None = None) -> Array:
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
         """dg (nc, 3) of a solution."""
-
-    def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
-        """dv of a solution."""
-
-    def tolerance(self, tol: float) -> float:
-        """The norm of this system's residual at which the velocities are as wrong as by momenta of norm ``tol`` (sqrt
-        J)."""
 
     def destroy(self) -> None: ...
 
