@@ -24,7 +24,7 @@ from petsc4py import PETSc
 
 from pctt.block_diagonal import without_memory
 from pctt.blocks import BlockRows
-from pctt.body_matrix import BodyOperator
+from pctt.body_matrix import BodyOperator, inverse_blocks
 from pctt.contact_map import CompactRows, ContactMap, contact_map
 from pctt.exchange import refuse
 from pctt.ksp_options import entered, prefer_mumps, to_enter
@@ -169,7 +169,8 @@ class BodySchur(PythonPC):
         count = getattr(given, "rows", None)
         words = "" if count is not None and 3 * count == rows else f"the map of contacts has {count} rows, S has {rows}"
         refuse(comm, words and f"{self.name}: {words}; allowed are three rows of S for each contact of the map")
-        self._given, self._G = given, _as_map(P, given)
+        self._given = given
+        self._G = contact_map(comm, given) if isinstance(given, (BlockRows, CompactRows)) else given
 
     def _release_map(self) -> None:
         if self._G is not self._given:
@@ -189,19 +190,12 @@ def _inverse(comm: MPI.Comm, barrier: np.ndarray | None, count: int) -> np.ndarr
     elif np.shape(barrier) != (count, 3, 3):
         wrong = f"has the shape {np.shape(barrier)}"
     else:
-        blocks = np.asarray(barrier, dtype=float)
-        floor = 1e-14 * np.trace(blocks, axis1=1, axis2=2)  # rounding may have made a block singular
         try:
-            inverse = np.linalg.inv(blocks + floor[:, None, None] * np.eye(3))
+            inverse = inverse_blocks(np.asarray(barrier, dtype=float))
         except np.linalg.LinAlgError:
             wrong = "has a singular block"
     refuse(comm, wrong and f"pctt.pc.BodySchur: barrier of the Mat {wrong}; allowed are {(count, 3, 3)} regular blocks")
     return inverse
-
-
-def _as_map(P: PETSc.Mat, given: ContactMap | BlockRows | CompactRows) -> ContactMap:
-    """The contact map that the Mat has as attribute, or a map made from the rows that it has."""
-    return contact_map(P.comm.tompi4py(), given) if isinstance(given, (BlockRows, CompactRows)) else given
 
 
 def _largest_eigenvalue(G: ContactMap) -> float:
