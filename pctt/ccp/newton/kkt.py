@@ -18,7 +18,7 @@ from petsc4py import PETSc
 
 from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks
 from pctt.blocks import square_block_matrix
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import TINY, Array
 from pctt.ccp.delassus import rows_in_blocks
 from pctt.ccp.problem import ConeProblem
 from pctt.options import OptionError
@@ -63,8 +63,7 @@ class KKTForm:
         blocks[:, :3, :3] += np.maximum(k[:, 0], 0.0)[:, None, None] * weakest[:, :, None] * weakest[:, None, :]
         blocks[:, :3, 3:] = scale * V[:, :, 1:]
         blocks[:, 3:, :3] = scale * V[:, :, 1:].transpose(0, 2, 1)
-        tiny = np.finfo(float).tiny
-        blocks[:, [3, 4], [3, 4]] = -(scale**2) / np.maximum(k[:, 1:], tiny**0.5)
+        blocks[:, [3, 4], [3, 4]] = -(scale**2) / np.maximum(k[:, 1:], TINY**0.5)
         put_diagonal_blocks(self.matrix, blocks)
         set_diagonal_blocks(self.matrix, blocks)
 
