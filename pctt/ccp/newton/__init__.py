@@ -23,8 +23,9 @@ from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.body_ladder import BodyLadder
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.contact import ContactForm
+from pctt.ccp.newton.form import NewtonForm
 from pctt.ccp.newton.kkt import KKTForm
-from pctt.ccp.newton.protocols import LinearSolver, NewtonForm
+from pctt.ccp.newton.krylov import LinearSolver
 from pctt.ccp.newton.users_solver import UsersSolver
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase

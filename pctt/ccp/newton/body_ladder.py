@@ -9,8 +9,8 @@ from petsc4py import PETSc
 
 from pctt import memory
 from pctt.ccp.newton.body import BodyForm
-from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
-from pctt.ccp.newton.protocols import NewtonForm
+from pctt.ccp.newton.form import NewtonForm
+from pctt.ccp.newton.krylov import Krylov, LinearSolver, Solve
 
 RUNGS = {"pbjacobi": {"pc_type": "pbjacobi"}, "cholesky": {"pc_type": "cholesky"}}
 UNSYMMETRIC = {  # systems of Coulomb's law
@@ -65,7 +65,7 @@ def fits(bodies: int, comm: MPI.Comm) -> bool:
     return needed < STEERING.spare * memory.available(comm)
 
 
-class BodyLadder(KrylovFamily):
+class BodyLadder(LinearSolver):
     """Conjugate gradients on the body system, with the preconditioner of the least expected cost: block Jacobi while it
     takes few iterations, then Cholesky factors of the stiff part. A factor of an earlier matrix is kept as long as
     iterating with it costs less than a new factor. (Incomplete factors never pay: an iteration costs six times as
@@ -137,10 +137,6 @@ class BodyLadder(KrylovFamily):
     @property
     def factored(self) -> bool:
         return self._rung == "cholesky" and not self._keep
-
-    def report(self) -> list[str]:
-        """Nothing: its rungs are PETSc's own."""
-        return []
 
     def _solver(self, rung: str) -> Krylov:
         unsymmetric = not self.system.symmetric

@@ -14,6 +14,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
+from pctt.ccp.newton.form import NewtonForm
 from pctt.ksp_options import entered, prefer_mumps, to_enter
 from pctt.pc.base import PythonPC
 from pctt.pc.mat import residual_norm
@@ -198,19 +199,11 @@ class Krylov:
 
 
 class KrylovFamily:
-    """Krylov methods by name, each made when it is first needed.
-
-    iterations, fallbacks : of the present problem, as of `LinearSolver`
-    """
+    """Krylov methods by name, each made when it is first needed."""
 
     def __init__(self, comm: MPI.Comm):
         self.comm = comm
         self._krylov: dict[str, Krylov] = {}
-        self.begin()
-
-    def begin(self) -> None:
-        """Another problem."""
-        self.iterations = self.fallbacks = 0
 
     def forget(self) -> None:
         """The next matrix has another structure."""
@@ -221,6 +214,43 @@ class KrylovFamily:
         for krylov in self._krylov.values():
             krylov.destroy()
         self._krylov.clear()
+
+
+class LinearSolver(KrylovFamily):
+    """Solves the systems of a `NewtonForm`. Subclasses define new_matrix, solve and factored.
+
+    Attributes
+    ----------
+    iterations, fallbacks : of the present problem: Krylov iterations, systems not solved in the first way
+    takes_any : whether matrices need not be symmetric
+    """
+
+    takes_any = False
+
+    def __init__(self, comm: MPI.Comm):
+        super().__init__(comm)
+        self.begin()
+
+    def begin(self) -> None:
+        """Another problem."""
+        self.iterations = self.fallbacks = 0
+
+    def new_matrix(self, system: NewtonForm) -> None:
+        """The system has new values."""
+        raise NotImplementedError
+
+    def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
+        """x = A^-1 b to a relative residual of rtol; whether that was reached."""
+        raise NotImplementedError
+
+    @property
+    def factored(self) -> bool:
+        """Whether the present matrix has been factorised, and another solve costs little."""
+        raise NotImplementedError
+
+    def report(self) -> list[str]:
+        """Lines about the preconditioner, if it is one of this package."""
+        return []
 
 
 _REASONS = {

@@ -1,4 +1,4 @@
-"""The interfaces that `Newton` expects of a form of its systems and of their solvers."""
+"""The interface that `Newton` expects of a form of its systems."""
 
 from __future__ import annotations
 
@@ -41,40 +41,5 @@ class NewtonForm(Protocol):
 
     def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
         """dg (nc, 3) of a solution."""
-
-    def destroy(self) -> None: ...
-
-
-class LinearSolver(Protocol):
-    """Solves the systems of a form.
-
-    Attributes
-    ----------
-    iterations, fallbacks : of the present problem: Krylov iterations, systems not solved in the first way
-    takes_any : whether matrices need not be symmetric
-    """
-
-    iterations: int
-    fallbacks: int
-    takes_any: bool
-
-    @property
-    def factored(self) -> bool:
-        """Whether the present matrix has been factorised, and another solve costs little."""
-
-    def begin(self) -> None:
-        """Another problem."""
-
-    def new_matrix(self, system: NewtonForm) -> None:
-        """The system has new values."""
-
-    def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
-        """x = A^-1 b to a relative residual of rtol; whether that was reached."""
-
-    def report(self) -> list[str]:
-        """Lines about the preconditioner, if it is one of this package."""
-
-    def forget(self) -> None:
-        """The next matrix has another structure."""
 
     def destroy(self) -> None: ...
