@@ -2,6 +2,6 @@
 that is factorised (`stiff_part`)."""
 
 from pctt.body_matrix.entries import BodyMatrix
-from pctt.body_matrix.operator import BodyOperator
+from pctt.body_matrix.operator import BodyOperator, inverse_blocks
 
-__all__ = ["BodyMatrix", "BodyOperator"]
+__all__ = ["BodyMatrix", "BodyOperator", "inverse_blocks"]

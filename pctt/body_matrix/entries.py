@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.block_diagonal import set_diagonal_blocks
@@ -22,8 +23,8 @@ ADD = PETSc.InsertMode.ADD_VALUES
 class BodyMatrix:
     """K as a Mat of block size 6 (``mat``), and its ``stiff_part``, which factorisations use."""
 
-    def __init__(self, comm: PETSc.Comm, G: BlockRows):
-        self.comm = comm.tompi4py() if isinstance(comm, PETSc.Comm) else comm
+    def __init__(self, comm: MPI.Comm, G: BlockRows):
+        self.comm = comm
         # 64 bits, because each pair of bodies gets a number
         self.bodies, column = np.unique(np.asarray(G.indices, np.int64), return_inverse=True)
         self._column = column.ravel()

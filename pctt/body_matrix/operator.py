@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, cast
 
+import numpy as np
 from petsc4py import PETSc
 
 from pctt.block_diagonal import set_diagonal_blocks
@@ -17,6 +18,12 @@ from pctt.shell import symmetric_shell
 
 if TYPE_CHECKING:
     from pctt.contact_map.free import FreeMap
+
+
+def inverse_blocks(blocks: Array) -> Array:
+    """The inverses of positive definite blocks (nc, 3, 3), also of those that rounding has made singular."""
+    floor = 1e-14 * np.trace(blocks, axis1=1, axis2=2)
+    return np.linalg.inv(blocks + floor[:, None, None] * np.eye(3))
 
 
 class BodyOperator:

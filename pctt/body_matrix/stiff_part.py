@@ -37,7 +37,7 @@ class StiffPart:
         indices: np.ndarray,
         diagonal: np.ndarray,
         scalar: bool,
-        symmetric: bool = True,
+        symmetric: bool,
     ):
         self.comm: MPI.Comm = whole.comm.tompi4py()
         self._indptr, self._indices, self._diagonal = indptr, indices, diagonal
@@ -45,7 +45,7 @@ class StiffPart:
         self._symmetric = symmetric
         self.mat: PETSc.Mat = None  # before the first `update`
 
-    def update(self, values: np.ndarray, least: float, shift: float = 0.0) -> PETSc.Mat:
+    def update(self, values: np.ndarray, least: float, shift: float) -> PETSc.Mat:
         """The Mat for the blocks ``values`` (n, size, size) of the whole matrix.
 
         Diagonal blocks are multiplied by 1 + shift.

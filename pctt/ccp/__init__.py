@@ -126,6 +126,8 @@ def _once(
 
 def newton_for(comm: MPI.Comm, type: str, form: str = "auto", compare: Comparison | None = None) -> Newton:
     """The Newton systems that a method of SOLVERS works with; ``form`` is auto or of FORMS."""
+    if compare is not None and not compare.names:
+        compare = None
     if form == "auto":
-        form = "body" if type in ("conic", "auto") and not (compare and compare.names) else "contact"
-    return Newton(comm, form, compare if compare is not None and compare.names else None)
+        form = "body" if type in ("conic", "auto") and compare is None else "contact"
+    return Newton(comm, form, compare)

@@ -55,12 +55,6 @@ def projected_move(x: Array, y: Array, step: float, mu: Array) -> Array:
     return moved
 
 
-def projected_move_squares(x: Array, y: Array, step: float, mu: Array) -> tuple[float, float]:
-    """|P(x - step y) - x|^2 and |x|^2 on this rank."""
-    moved = projected_move(x, y, step, mu)
-    return float(np.vdot(moved, moved)), float(np.vdot(x, x))
-
-
 @compiled
 def accelerated_step(
     x: Array, last_x: Array, y: Array, last_y: Array, beta: float, step: float, mu: Array, opening: float, out: Array

@@ -38,11 +38,17 @@ def in_blocks(N: PETSc.Mat) -> PETSc.Mat:
     if kind.endswith("baij") and not kind.endswith("sbaij") and N.getBlockSize() == 3:
         return N.duplicate(copy=True)
     rows = N if kind.endswith(("seqaij", "mpiaij")) else N.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
-    indptr, indices, values = rows.getValuesCSR()
-    local = sp.csr_matrix((values, indices, indptr), shape=(N.getLocalSize()[0], N.getSize()[1]))
+    local = rows_in_blocks(rows)
     if rows is not N:
         rows.destroy()
-    return square_block_matrix(N.comm.tompi4py(), local.tobsr((3, 3)))
+    return square_block_matrix(N.comm.tompi4py(), local)
+
+
+def rows_in_blocks(N: PETSc.Mat) -> sp.bsr_matrix:
+    """This rank's rows of a Mat of type AIJ or BAIJ in 3 x 3 blocks, their columns global."""
+    indptr, indices, values = N.getValuesCSR()
+    shape = (N.getLocalSize()[0], N.getSize()[1])
+    return sp.csr_matrix((values, indices, indptr), shape=shape).tobsr((3, 3))
 
 
 def delassus(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:

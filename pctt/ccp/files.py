@@ -17,7 +17,14 @@ def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None, oper
     place of the file's.
 
     Raises FileFormatError on every rank if the file cannot be read in the format of its first bytes: FCLIB if these are
-    of no other.
+    of no other, or cannot be read.
     """
-    begins = [name for name, module in FORMATS.items() if comm.rank == 0 and name != "FCLIB" and module.is_one(path)]
-    return FORMATS[comm.bcast([*begins, "FCLIB"][0])].load(path, comm, compliance, operator)
+    name = comm.bcast(_format(path) if comm.rank == 0 else "")
+    return FORMATS[name].load(path, comm, compliance, operator)
+
+
+def _format(path: str | Path) -> str:
+    try:
+        return next((name for name in ("PETSc binary", "Siconos") if FORMATS[name].is_one(path)), "FCLIB")
+    except OSError:  # its reader tells all ranks why
+        return "FCLIB"

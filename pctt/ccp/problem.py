@@ -10,7 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.blocks import BlockRows, dense_columns, diagonal_blocks, without_hubs
-from pctt.ccp.cone import Array, add_opening, projected_move_squares
+from pctt.ccp.cone import Array, add_opening, projected_move
 from pctt.ccp.delassus import delassus, in_blocks, local_blocks
 from pctt.contact_map import CompactRows, ContactMap, contact_map
 from pctt.exchange import refuse
@@ -60,8 +60,8 @@ class ConeProblem:
         self.r = np.ascontiguousarray(r, dtype=float).reshape(-1, 3)
         self.mu = np.ascontiguousarray(mu, dtype=float)
         bad = ~np.isfinite(self.r).all(1) | ~(np.isfinite(self.mu) & (self.mu >= 0))
-        if self.sum(bad.sum()):
-            raise ValueError(f"{self.sum(bad.sum())} contacts with a NaN, infinite or negative coefficient")
+        if count := self.sum(bad.sum()):
+            raise ValueError(f"{count} contacts with a NaN, infinite or negative coefficient")
         self.size = self.sum(len(self.mu))
         self.contact_map: ContactMap | None = None if G is None else contact_map(comm, G, operator)
         self._given: PETSc.Mat = N  # where there is no G
@@ -116,8 +116,8 @@ class ConeProblem:
         inf if that is undefined: for g = 0, unless it solves the problem, and if g or y has a nan or inf."""
         if coulomb:
             y = add_opening(y.copy(), self.mu)
-        squares = projected_move_squares(g, y, 1.0 / self.mean_diagonal, self.mu)
-        distance, norm = np.sqrt(self.sum(np.array(squares)))
+        move = projected_move(g, y, 1.0 / self.mean_diagonal, self.mu)
+        distance, norm = np.sqrt(self.sum(np.array([np.vdot(move, move), np.vdot(g, g)])))
         if distance == 0:
             return 0.0
         residual = float(distance / norm) if norm > 0 else np.inf
@@ -231,14 +231,9 @@ class ConeProblem:
 
     def destroy(self) -> None:
         """Free the PETSc objects now, not when the garbage collector finds the cycle."""
-        if self.contact_map is not None:
-            self.contact_map.destroy()
-        for name in ("_in", "_out"):
-            if name in self.__dict__:
-                self.__dict__.pop(name).destroy()
-        for name in ("N", "low_rank"):
-            if self.__dict__.get(name) is not None:
-                self.__dict__.pop(name).destroy()
+        for thing in (self.contact_map, *(self.__dict__.pop(name, None) for name in ("_in", "_out", "N", "low_rank"))):
+            if thing is not None:
+                thing.destroy()
 
 
 def _wrong(

@@ -128,8 +128,7 @@ def spread(
 
     ``compliance`` takes the place of the file's; ``operator`` is that of `ConeProblem`.
 
-    Raises FileFormatError on every rank if ``read`` raises one, or any error that h5py, numpy and scipy raise for bad
-    data.
+    Raises FileFormatError on every rank if ``read`` raises any error: bad data surprise h5py, numpy and scipy.
     """
     parts: list[tuple[Whole, int]] = []
     error = None
@@ -138,7 +137,7 @@ def spread(
             whole = read()
             whole.check()
             parts = [_part(whole, rank, comm.size) for rank in range(comm.size)]
-        except (OSError, LookupError, ValueError, TypeError, RuntimeError) as reason:
+        except Exception as reason:  # of any kind: the other ranks wait for the parts
             error = f"{path}: no {format} problem: {reason}"
     error = comm.bcast(error)
     if error:

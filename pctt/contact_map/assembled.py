@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 
+import numpy as np
 from mpi4py import MPI
 
 from pctt.blocks import Array, BlockRows, block_matrix, diagonal_blocks
@@ -66,7 +67,7 @@ class ScaledRows:
         self.whole, self.size = whole, size
 
     def add_delassus(self, g: Array, y: Array) -> None:
-        out = y * 0.0
+        out = np.zeros_like(y)
         self.whole.add_delassus(g * self.size, out)
         out *= self.size
         y += out

@@ -37,19 +37,15 @@ class Ghosts:
         self._sf: PETSc.SF | None = None
         self._units: dict[int, MPI.Datatype] = {}
         if comm.size > 1:
-            self._sf = self._star_forest(starts, names)
+            self._sf = self._to_ghosts(starts, names)
 
-    def _star_forest(self, starts: np.ndarray, names: np.ndarray) -> PETSc.SF:
+    def _to_ghosts(self, starts: np.ndarray, names: np.ndarray) -> PETSc.SF:
         """From the own bodies that are ghosts elsewhere (`_shared`, in this order) to the ghosts on other ranks."""
         owner = np.searchsorted(starts, names, side="right") - 1
         asked, by = send_rows(self.comm, [names - starts[owner]], owner)
         self._shared = np.unique(asked[0])
         (place,), _ = send_rows(self.comm, [np.searchsorted(self._shared, asked[0])], by)  # in the order of the ghosts
-        remote = np.stack([owner, place], axis=1).astype(PETSc.IntType)
-        sf = PETSc.SF().create(self.comm)
-        sf.setGraph(len(self._shared), np.arange(len(names), dtype=PETSc.IntType), remote.ravel())
-        sf.setUp()
-        return sf
+        return star_forest(self.comm, len(self._shared), np.stack([owner, place], axis=1))
 
     def update(self, values: np.ndarray) -> None:
         """Copy the values of the owners to the ghosts."""
@@ -96,3 +92,11 @@ class Ghosts:
         for unit in self._units.values():
             unit.Free()
         self._units.clear()
+
+
+def star_forest(comm: MPI.Comm, roots: int, remote: np.ndarray) -> PETSc.SF:
+    """From this rank's roots to leaves; ``remote`` (leaves, 2) has the ranks of their roots and the places there."""
+    sf = PETSc.SF().create(comm)
+    sf.setGraph(roots, np.arange(len(remote), dtype=PETSc.IntType), remote.astype(PETSc.IntType).ravel())
+    sf.setUp()
+    return sf

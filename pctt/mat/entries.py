@@ -52,15 +52,18 @@ class Entries:
         return cls(comm, function) if given[0] else DenseEntries(P)
 
     def __call__(self, i: Array, j: Array) -> Array:
-        size, rank = self.comm.size, self.comm.rank
-        share = slice(len(i) * rank // size, len(i) * (rank + 1) // size)
+        share = self._share(i)
         values = self.own(i[share], j[share])
-        if size == 1:
+        if self.comm.size == 1:
             return values
         out = np.zeros(len(i))
         out[share] = values
         self.comm.Allreduce(MPI.IN_PLACE, out)
         return out
+
+    def _share(self, i: Array) -> slice | Array:
+        size, rank = self.comm.size, self.comm.rank
+        return slice(len(i) * rank // size, len(i) * (rank + 1) // size)
 
     def own(self, i: Array, j: Array) -> Array:
         """Values at rows and columns that only this rank knows; collective."""
@@ -109,13 +112,8 @@ class DenseEntries(Entries):
         self.first, self.last = P.getOwnershipRange()
         self.local = P.getDenseArray(readonly=True)  # otherwise it counts as a change of P
 
-    def __call__(self, i: Array, j: Array) -> Array:
-        mine = np.flatnonzero((i >= self.first) & (i < self.last))
-        out = np.zeros(len(i))
-        out[mine] = self.own(i[mine], j[mine])
-        if self.comm.size > 1:
-            self.comm.Allreduce(MPI.IN_PLACE, out)
-        return out
+    def _share(self, i: Array) -> slice | Array:
+        return np.flatnonzero((i >= self.first) & (i < self.last))
 
     def function(self, i: Array, j: Array) -> Array:
         return self.local[i - self.first, j]

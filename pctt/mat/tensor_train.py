@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
+from math import prod
 
 import numpy as np
 from mpi4py import MPI
@@ -160,7 +161,7 @@ def from_entries(
     shape = tuple(int(n) for n in grid)
     if not shape or min(shape) < 1:
         raise ValueError(f"a grid of shape {shape}; allowed are whole numbers >= 1")
-    rows = int(np.prod(shape, dtype=np.int64))
+    rows = prod(shape)
     mat = PETSc.Mat().create(comm=comm or PETSc.COMM_WORLD)
     mat.setSizes(((PETSc.DECIDE, rows), (PETSc.DECIDE, rows)))
     mat.setType(PETSc.Mat.Type.PYTHON)

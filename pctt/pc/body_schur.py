@@ -24,12 +24,13 @@ from petsc4py import PETSc
 
 from pctt.block_diagonal import without_memory
 from pctt.blocks import BlockRows
-from pctt.body_matrix import BodyOperator
+from pctt.body_matrix import BodyOperator, inverse_blocks
 from pctt.contact_map import CompactRows, ContactMap, contact_map
 from pctt.exchange import refuse
 from pctt.ksp_options import entered, prefer_mumps, to_enter
 from pctt.options import NOT_NEGATIVE, option
 from pctt.pc.base import PythonPC
+from pctt.pc.mat import residual_norm
 
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu"}  # these have no code for block formats
 _COARSE_SPACE = {"gamg", "python"}  # these use the rigid motions
@@ -147,12 +148,8 @@ class BodySchur(PythonPC):
         """``preonly`` has no test of its own, so a failure of the inner method that spoils x is that of the solve."""
         if self.P is None or not self._failure or ksp.getType() != PETSc.KSP.Type.PREONLY:
             return
-        residual = b.duplicate()
-        pc.getOperators()[0].mult(x, residual)
-        residual.aypx(-1.0, b)
-        if not residual.norm() <= ksp.getTolerances()[0] * b.norm():  # also true for nan
+        if not residual_norm(pc.getOperators()[0], b, x) <= ksp.getTolerances()[0] * b.norm():  # also true for nan
             ksp.setConvergedReason(self._failure)
-        residual.destroy()
 
     def report(self) -> list[str]:
         inner = self.its / max(self.solves, 1)
@@ -172,7 +169,8 @@ class BodySchur(PythonPC):
         count = getattr(given, "rows", None)
         words = "" if count is not None and 3 * count == rows else f"the map of contacts has {count} rows, S has {rows}"
         refuse(comm, words and f"{self.name}: {words}; allowed are three rows of S for each contact of the map")
-        self._given, self._G = given, _as_map(P, given)
+        self._given = given
+        self._G = contact_map(comm, given) if isinstance(given, (BlockRows, CompactRows)) else given
 
     def _release_map(self) -> None:
         if self._G is not self._given:
@@ -192,19 +190,12 @@ def _inverse(comm: MPI.Comm, barrier: np.ndarray | None, count: int) -> np.ndarr
     elif np.shape(barrier) != (count, 3, 3):
         wrong = f"has the shape {np.shape(barrier)}"
     else:
-        blocks = np.asarray(barrier, dtype=float)
-        floor = 1e-14 * np.trace(blocks, axis1=1, axis2=2)  # rounding may have made a block singular
         try:
-            inverse = np.linalg.inv(blocks + floor[:, None, None] * np.eye(3))
+            inverse = inverse_blocks(np.asarray(barrier, dtype=float))
         except np.linalg.LinAlgError:
             wrong = "has a singular block"
     refuse(comm, wrong and f"pctt.pc.BodySchur: barrier of the Mat {wrong}; allowed are {(count, 3, 3)} regular blocks")
     return inverse
-
-
-def _as_map(P: PETSc.Mat, given: ContactMap | BlockRows | CompactRows) -> ContactMap:
-    """The contact map that the Mat has as attribute, or a map made from the rows that it has."""
-    return contact_map(P.comm.tompi4py(), given) if isinstance(given, (BlockRows, CompactRows)) else given
 
 
 def _largest_eigenvalue(G: ContactMap) -> float:

@@ -1,4 +1,4 @@
-"""Checks of the Mat that a user gives to a preconditioner."""
+"""Checks of the Mat that a user gives to a preconditioner, and of its solutions."""
 
 from __future__ import annotations
 
@@ -53,3 +53,13 @@ def is_symmetric(P: PETSc.Mat) -> bool:
     for vec in (u, v, product):
         vec.destroy()
     return bool(P.comm.tompi4py().bcast(abs(values[0] - values[1]) <= ASYMMETRY * size or not np.isfinite(size)))
+
+
+def residual_norm(A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:
+    """||b - A x||; nan or inf if x is no number."""
+    residual = b.duplicate()
+    A.mult(x, residual)
+    residual.aypx(-1.0, b)
+    norm = residual.norm()
+    residual.destroy()
+    return norm

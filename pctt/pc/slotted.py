@@ -110,10 +110,7 @@ class SlottedMatrix:
 
     def gather_slots(self, local: np.ndarray, out: np.ndarray) -> None:
         """Gather a vector in slot order: ``local`` (n bs,) is this rank's part, ``out`` (size bs,) the whole vector."""
-        if self.comm.size == 1:
-            out[:] = local
-        else:
-            self.comm.Allgatherv(local, [out, self._capacities * self.block])
+        self.comm.Allgatherv(local, [out, self._capacities * self.block])
 
 
 def _diagonal(blocks: np.ndarray) -> sp.bsr_matrix:

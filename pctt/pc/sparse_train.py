@@ -23,7 +23,6 @@ from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.inverse import Inverse, invert, invert_near_identity
 from pctt.tt.quantise import choose_modes
 from pctt.tt.sparse import SparseHierarchy
-from pctt.tt.train import Train
 
 
 class SparseTrain:
@@ -122,10 +121,6 @@ class SparseTrain:
             self.account.kept += 1
         return True
 
-    def _use(self, inverse: Inverse) -> None:
-        self.inverse = inverse
-        self._prepare_apply(inverse.applied)
-
     def _is_positive(self, P: PETSc.Mat) -> bool:
         """Whether the train in use is positive, as far as a test with the symmetric part of P shows."""
         x, y = P.createVecs()
@@ -196,17 +191,17 @@ class SparseTrain:
 
     # -- application ----------------------------------------------------------------------------------------
 
-    def _prepare_apply(self, train: Train) -> None:
-        slots = self.slots
+    def _use(self, inverse: Inverse) -> None:
+        self.inverse, slots = inverse, self.slots
         if self._apply is None:
             bs = slots.block
             rows = (slots.first * bs, (slots.first + slots.capacity) * bs)
-            self._apply = Apply(train, slots.size * bs, rows)
+            self._apply = Apply(inverse.applied, slots.size * bs, rows)
             self._local = np.empty((slots.capacity, bs))
             self._scaled = np.empty((slots.capacity, bs, 1))
             self._whole = np.empty(slots.size * bs)
         else:
-            self._apply.set_train(train)
+            self._apply.set_train(inverse.applied)
 
     def distrust(self) -> bool:
         """Whether a train of an earlier matrix is in use. If so, the next set-up tries another train."""

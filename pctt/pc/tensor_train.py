@@ -19,7 +19,7 @@ from pctt.block_diagonal import block_diagonal
 from pctt.mat.entries import diagonal_blocks, has_entries
 from pctt.pc.base import PythonPC
 from pctt.pc.entries_train import EntriesTrain
-from pctt.pc.mat import check_coordinates, is_symmetric
+from pctt.pc.mat import check_coordinates, is_symmetric, residual_norm
 from pctt.pc.rank_policy import RankPolicy
 from pctt.pc.sparse_train import SparseTrain
 from pctt.pc.train_options import ENTRIES_RANK, SPARSE_RANK, Account, Options
@@ -162,11 +162,7 @@ class TensorTrain(PythonPC):
         reference = b.norm()
         if reference == 0 or ksp.getIterationNumber() == 0:
             return
-        residual = b.duplicate()
-        pc.getOperators()[0].mult(x, residual)
-        residual.aypx(-1.0, b)
-        true = self.comm.bcast(residual.norm() / reference)
-        residual.destroy()
+        true = self.comm.bcast(residual_norm(pc.getOperators()[0], b, x) / reference)
         stalled = ksp.getConvergedReason() < 0 and ksp.getType() not in ("preonly", "richardson")
         digits = -np.log10(max(true, 1e-16)) if np.isfinite(true) else 0.0
         if stalled and rank > 1 and not spoilt:

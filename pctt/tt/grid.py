@@ -66,7 +66,6 @@ class GridDigits:
         row_of[-1] += np.arange(self.modes[-1]) % self.block
         self._pairs = [(row[:, None] * self.size + row).ravel() for row in row_of]
         self._square = square
-        self._inner = self.modes[-1], 1  # contribution of an unknown of a block to the halves of a key
 
     @property
     def rows(self) -> int:
@@ -82,7 +81,7 @@ class GridDigits:
 
     def key(self, row: Array, column: Array) -> Array:
         """Keys of pairs of points with coordinates (D + 1, ...); the last coordinate is the unknown in the block."""
-        out = row[-1] * self._inner[0] + column[-1] * self._inner[1]
+        out = row[-1] * self.modes[-1] + column[-1]
         for a in range(len(self.shape)):
             out = out + self.row_key[a][row[a]] + self.column_key[a][column[a]]
         return out

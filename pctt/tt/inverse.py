@@ -17,7 +17,7 @@ Each pass over the cores doubles the ranks until the residual is small enough or
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -85,8 +85,7 @@ def invert(
     >>> X.train.ranks, X.residual < 1e-6
     ((1, 5, 5, 1), True)
     """
-    X, left, count, repaired = _solve(S, identity(S.rows, S.dtype), start, max_rank, sweeps, eps, rng)
-    return Inverse(X, False, left, count, repaired)
+    return _solve(S, identity(S.rows, S.dtype), start, max_rank, sweeps, eps, rng)
 
 
 def invert_near_identity(
@@ -105,8 +104,7 @@ def invert_near_identity(
     unit = identity(T.rows, T.dtype)
     if max_rank <= 1 or T.norm() == 0:
         return Inverse(0 * unit, True, float(max_rank <= 1) if T.norm() else 0.0, 0, 0)
-    Z, left, count, repaired = _solve(unit + T, -T, start, max_rank - 1, sweeps, eps, rng)
-    return Inverse(Z, True, left, count, repaired)
+    return replace(_solve(unit + T, -T, start, max_rank - 1, sweeps, eps, rng), identity=True)
 
 
 def residual(S: Train, X: Train, B: Train | None = None) -> float:
@@ -232,8 +230,8 @@ def _solve(
     sweeps: int | None,
     eps: float,
     rng: np.random.Generator | None,
-) -> tuple[Train, float, int, int]:
-    """The symmetric solution of S X = B, its relative residual, and the numbers of sweeps and of repaired systems."""
+) -> Inverse:
+    """The symmetric solution of S X = B with its relative residual."""
     if S.rows != S.columns:
         raise ValueError("only a square matrix has an inverse")
     rng = np.random.default_rng(0) if rng is None else rng
@@ -251,7 +249,8 @@ def _solve(
             X = Train(growing.x)
             left = residual(S, X, B)
             if left <= eps:
-                return *_rounded(S, B, X, left, eps), count, growing.repaired
+                X, left = _rounded(S, B, X, left, eps)
+                return Inverse(X, False, left, count, growing.repaired)
             enough *= 0.5 * eps / left  # the estimate sees only a part of the residual
         if growing.estimate > IDLE * before:
             if all(x.shape[3] >= r for x, r in zip(growing.x, most)):
@@ -259,7 +258,7 @@ def _solve(
             growing.drop *= 0.3
         before = growing.estimate
     X = Train(growing.x)
-    return X, residual(S, X, B), count, growing.repaired
+    return Inverse(X, False, residual(S, X, B), count, growing.repaired)
 
 
 def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Train, float]:

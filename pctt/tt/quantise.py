@@ -8,6 +8,7 @@ a train are the slot modes, with the leaf multiplied by the block size. Slots ke
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import prod
 
 import numpy as np
 
@@ -46,7 +47,7 @@ def choose_modes(n: int, leaf: int = 16) -> tuple[int, ...]:
 
 def slots_of(modes: Sequence[int]) -> int:
     """The number of slots (or scalars) that modes hold: their product."""
-    return int(np.prod([int(m) for m in modes], dtype=np.int64))
+    return prod(map(int, modes))
 
 
 def scalar_modes(modes: Sequence[int], block: int) -> tuple[int, ...]:

@@ -19,6 +19,7 @@ True
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -91,7 +92,7 @@ class Train:
     @property
     def shape(self) -> tuple[int, ...]:
         """The shape of `full()`: (n_1, ..., n_d) for a tensor, (prod m_k, prod n_k) for a matrix."""
-        return (_product(self.rows), _product(self.columns)) if self.is_matrix else self.rows
+        return (prod(self.rows), prod(self.columns)) if self.is_matrix else self.rows
 
     @property
     def storage(self) -> int:
@@ -100,9 +101,9 @@ class Train:
 
     def __repr__(self) -> str:
         kind = "matrix" if self.is_matrix else "vector"
-        shape = " x ".join(map(str, self.shape)) if self.is_matrix else str(_product(self.rows))
+        shape = " x ".join(map(str, self.shape)) if self.is_matrix else str(prod(self.rows))
         modes = " ".join("x".join(map(str, mode)) for mode in self.modes)
-        entries = _product(_product(mode) for mode in self.modes)
+        entries = prod(prod(mode) for mode in self.modes)
         return (
             f"{kind} train {shape}: modes {modes}, ranks {'-'.join(map(str, self.ranks))}, "
             f"{self.storage} numbers for {entries} entries (ratio {entries / self.storage:.3g})"
@@ -344,7 +345,7 @@ def random(
     rng = np.random.default_rng(0) if rng is None else rng
     shapes = _mode_shapes(rows, columns)
     asked = [rank] * (len(shapes) - 1) if isinstance(rank, int) else list(rank)
-    ranks = [1, *np.minimum(asked, full_ranks([_product(shape) for shape in shapes])), 1]
+    ranks = [1, *np.minimum(asked, full_ranks([prod(shape) for shape in shapes])), 1]
     return Train(
         (rng.standard_normal((ranks[k], *shape, ranks[k + 1])) / ranks[k] ** 0.5).astype(dtype)
         for k, shape in enumerate(shapes)
@@ -379,10 +380,3 @@ def _mode_shapes(rows: Sequence[int], columns: Sequence[int] | None) -> list[tup
 def _floating(x: ArrayLike) -> Array:
     x = np.asarray(x)
     return x if x.dtype in (np.float32, np.float64) else x.astype(float)
-
-
-def _product(numbers: Iterable[int]) -> int:
-    out = 1
-    for n in numbers:
-        out *= int(n)
-    return out

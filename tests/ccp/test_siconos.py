@@ -227,6 +227,13 @@ def test_a_broken_file_is_refused_on_all_ranks(tmp_path, monkeypatch):
         files.load(written(Path("bad.dat"), BROKEN["cut"][0], comm), comm)
 
 
+@pytest.mark.parallel(2)
+def test_a_path_without_a_file_is_refused_on_all_ranks(tmp_path):
+    for path in (tmp_path / "nothing.dat", tmp_path):
+        with pytest.raises(FileFormatError, match="no FCLIB problem"):
+            files.load(path, MPI.COMM_WORLD)
+
+
 @pytest.mark.parametrize("storage", STORAGES)
 def test_a_file_cut_anywhere_or_with_another_word_anywhere_ends_in_one_error_or_is_read(tmp_path, storage):
     rng = np.random.default_rng(5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from petsc4py import PETSc
 from systems import contact_matrix, contacts, dense, poisson
 
@@ -119,7 +120,7 @@ def test_bodies_are_numbered_in_64_bits():
     bodies = 70_000
     last = np.array([0, bodies - 1, bodies - 2, bodies - 1], np.int32)
     G = BlockRows(np.array([0, 2, 4], np.int32), last, np.ones((4, 3, 6)), bodies)
-    K = BodyMatrix(PETSc.COMM_SELF, G)
+    K = BodyMatrix(MPI.COMM_SELF, G)
     K.update(np.tile(np.eye(3), (2, 1, 1)))
     first, final = (np.arange(6 * body, 6 * body + 6, dtype=PETSc.IntType) for body in (0, bodies - 1))
     for rows, columns in ((first, final), (final, first)):

@@ -38,6 +38,12 @@ def test_entries_have_their_places(shape: tuple[int, ...], block: int, permuted:
     assert not T.any()  # padding stands for rows of the identity
 
 
+def test_a_grid_of_too_many_points_is_refused() -> None:
+    for shape in ((2**16, 2**15), (2**32, 2**32)):  # the second product is zero in 64 bits
+        with pytest.raises(ValueError, match="too many points"):
+            tt.GridDigits(shape)
+
+
 def gauss(n: int, dimensions: int, width: float = 0.1):
     """I + 100 h^d exp(-r^2 / 2 w^2) on a grid of the unit cube."""
 

@@ -9,6 +9,7 @@ brought no new best. One product with N per iteration.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,9 @@ from pctt.ccp.first_order.progress import FirstOrder, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
+
+# from slope and curvature, of the change slope t + curvature t^2 / 2 of the objective: the part t of the step to take
+LineSearch = Callable[[float, float], float]
 
 
 @dataclass(frozen=True)
@@ -33,40 +37,52 @@ STEERING = Steering()
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder) -> Result:
     """Impulses from a first guess (nc, 3)."""
+    return descend(problem, guess, limits, options, adaptive_search())
+
+
+def descend(
+    problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder, line_search: LineSearch
+) -> Result:
+    """Impulses by projected steps of these lengths with any line search."""
     scaled = ScaledProblem(problem)
     progress = Progress(scaled, limits, options)
     x = scaled.start(guess)
     y = scaled.gradient(x)
     step = 1.0  # A has a diagonal of about one
-    reference, best, worst, since = np.inf, 0.0, 0.0, 0  # objectives, less that of x
     while progress.goes_on(x, y):
         d = scaled.projected_move(x, y, step)
         Ad = scaled.product(d)
         progress.iterations += 1
         slope, length, curvature, stretch = scaled.dots((y, d), (d, d), (d, Ad), (Ad, Ad))
         slope = min(slope, -length / step)  # so it is for a projection; y'd drowns in rounding near the solution
-        fraction = 1.0
-        if curvature > 0 and slope + 0.5 * curvature > reference:
-            fraction = min(1.0, -slope / curvature)
-        change = fraction * slope + 0.5 * fraction**2 * curvature
-        reference, best, worst = reference - change, best - change, worst - change
-        if fraction != 1.0:
-            d *= fraction
-            Ad *= fraction
+        part = line_search(slope, curvature)
+        if part != 1.0:
+            d *= part
+            Ad *= part
         x = np.add(x, d, out=d)
         y += Ad
+        step = 1.0
+        if curvature > STEERING.flat * length:
+            step = float(length / curvature if progress.iterations % 2 else curvature / stretch)
+    return progress.result()
+
+
+def adaptive_search() -> LineSearch:
+    reference, best, worst, since = np.inf, 0.0, 0.0, 0  # objectives, less that of the present point
+
+    def search(slope: float, curvature: float) -> float:
+        nonlocal reference, best, worst, since
+        part = 1.0
+        if curvature > 0 and slope + 0.5 * curvature > reference:
+            part = min(1.0, -slope / curvature)
+        change = part * slope + 0.5 * part**2 * curvature
+        reference, best, worst = reference - change, best - change, worst - change
         if best > 0:
             best, worst, since = 0.0, 0.0, 0
         else:
             worst, since = max(worst, 0.0), since + 1
             if since == STEERING.memory:
                 reference, worst, since = worst, 0.0, 0
-        step = barzilai_borwein_step(length, curvature, stretch, progress.iterations)
-    return progress.result()
+        return part
 
-
-def barzilai_borwein_step(length: float, curvature: float, stretch: float, iteration: int) -> float:
-    """The long step d'd / d'Ad in odd iterations, the short one d'Ad / |Ad|^2 in even ones; 1 if neither is one."""
-    if not curvature > STEERING.flat * length:
-        return 1.0
-    return float(length / curvature if iteration % 2 else curvature / stretch)
+    return search

@@ -23,8 +23,9 @@ from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.body_ladder import BodyLadder
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.contact import ContactForm
+from pctt.ccp.newton.form import NewtonForm
 from pctt.ccp.newton.kkt import KKTForm
-from pctt.ccp.newton.protocols import LinearSolver, NewtonForm
+from pctt.ccp.newton.krylov import LinearSolver
 from pctt.ccp.newton.users_solver import UsersSolver
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase
@@ -155,7 +156,8 @@ class Newton:
             b = self.system.right_hand_side(q, r_v, uncoupled)
             x, product = self._start(b, earlier)
             self._b.array[:] = b - product
-            norm, wanted = self._b.norm(), self.system.tolerance(tol)
+            norm = self._b.norm()
+            wanted = tol if self.primary == "momenta" else tol * float(np.sqrt(self.problem.mean_diagonal))
             if PETSc.Options().hasName("ksp_rtol"):  # the user's, which the linear solver takes whatever is wanted
                 wanted = min(wanted, 0.5 * norm)
             if wanted < norm < np.inf:  # the caller finds no step in a direction that is no number
@@ -193,8 +195,7 @@ class Newton:
 
     def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
         """dv of a solution x."""
-        assert self.system is not None
-        return self.system.momentum(x, dg, r_v)
+        return x if self.primary == "momenta" else self.problem.momentum(dg) - r_v
 
     def forget(self) -> None:
         """Drop what belongs to the last problem's structure."""

@@ -10,10 +10,9 @@ For Coulomb's law (B + C)^-1 is not symmetric, and K is not either.
 
 from __future__ import annotations
 
-import numpy as np
 from petsc4py import PETSc
 
-from pctt.body_matrix import BodyOperator
+from pctt.body_matrix import BodyOperator, inverse_blocks
 from pctt.ccp.cone import Array, times
 from pctt.ccp.problem import ConeProblem
 
@@ -26,8 +25,7 @@ class BodyForm:
     definite = True
 
     def __init__(self, problem: ConeProblem):
-        if problem.contact_map is None:
-            raise ValueError("-ccp_newton body: the problem is given by N alone; allowed are contact and kkt")
+        assert problem.contact_map is not None
         self.problem = problem
         self.operator = BodyOperator(problem.contact_map)
         self.matrix = self.operator.mat
@@ -42,9 +40,7 @@ class BodyForm:
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
         if inverse is None:
-            whole = barrier + self.problem.compliance_blocks
-            floor = 1e-14 * np.trace(whole, axis1=1, axis2=2)  # a block that rounding has made singular
-            inverse = np.linalg.inv(whole + floor[:, None, None] * np.eye(3))
+            inverse = inverse_blocks(barrier + self.problem.compliance_blocks)
         self._inverse, self.symmetric = inverse, symmetric
         self.operator.update(inverse, symmetric)
 
@@ -60,20 +56,14 @@ class BodyForm:
         """What is worth factorising of K, in scalar rows."""
         return self.operator.entries().stiff_part(LEAST, scalar=True, symmetric=self.symmetric)
 
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         push = self.problem.momentum(times(self._inverse, q) if uncoupled is None else uncoupled)
         return push if r_v is None else push - r_v
 
-    def impulses(self, x: Array, q: Array, uncoupled: Array | None = None) -> Array:
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
         if uncoupled is None:
             return times(self._inverse, q - self.problem.velocity_of(x))
         return uncoupled - times(self._inverse, self.problem.velocity_of(x))
-
-    def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
-        return x
-
-    def tolerance(self, tol: float) -> float:
-        return tol
 
     def destroy(self) -> None:
         self.operator.destroy()

@@ -9,8 +9,8 @@ from petsc4py import PETSc
 
 from pctt import memory
 from pctt.ccp.newton.body import BodyForm
-from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
-from pctt.ccp.newton.protocols import NewtonForm
+from pctt.ccp.newton.form import NewtonForm
+from pctt.ccp.newton.krylov import Krylov, LinearSolver, Solve
 
 RUNGS = {"pbjacobi": {"pc_type": "pbjacobi"}, "cholesky": {"pc_type": "cholesky"}}
 UNSYMMETRIC = {  # systems of Coulomb's law
@@ -65,7 +65,7 @@ def fits(bodies: int, comm: MPI.Comm) -> bool:
     return needed < STEERING.spare * memory.available(comm)
 
 
-class BodyLadder(KrylovFamily):
+class BodyLadder(LinearSolver):
     """Conjugate gradients on the body system, with the preconditioner of the least expected cost: block Jacobi while it
     takes few iterations, then Cholesky factors of the stiff part. A factor of an earlier matrix is kept as long as
     iterating with it costs less than a new factor. (Incomplete factors never pay: an iteration costs six times as
@@ -78,13 +78,14 @@ class BodyLadder(KrylovFamily):
 
     def __init__(self, comm: MPI.Comm):
         super().__init__(comm)
-        self._hardness = self._growth = 0.0
-        self._lagged: float | None = None
         self._asked, self._room = 0, True  # bodies for which room was asked for, and whether there was
-        self._forget()
         self._approximation: PETSc.Mat | None = None
-        self.iterations = self.fallbacks = 0
         self.used: dict[str, int] = {}
+
+    def begin(self) -> None:
+        super().begin()
+        self._hardness, self._growth = STEERING.hardness, 1.0  # expected iterations with block Jacobi
+        self._lagged: float | None = None  # expected iterations with the factor that is there
 
     def new_matrix(self, system: NewtonForm) -> None:
         assert isinstance(system, BodyForm)
@@ -136,18 +137,6 @@ class BodyLadder(KrylovFamily):
     @property
     def factored(self) -> bool:
         return self._rung == "cholesky" and not self._keep
-
-    def report(self) -> list[str]:
-        """Nothing: its rungs are PETSc's own."""
-        return []
-
-    def begin(self) -> None:
-        self.iterations = self.fallbacks = 0
-        self._forget()
-
-    def _forget(self) -> None:
-        self._hardness, self._growth = STEERING.hardness, 1.0  # expected iterations with block Jacobi
-        self._lagged = None  # expected iterations with the factor that is there
 
     def _solver(self, rung: str) -> Krylov:
         unsymmetric = not self.system.symmetric

@@ -8,7 +8,6 @@ alone. Bodies with very many contacts (a press, a drum) would fill N: they enter
 
 from __future__ import annotations
 
-import numpy as np
 from petsc4py import PETSc
 
 from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks
@@ -79,17 +78,11 @@ class ContactForm:
             self._made = True
         return self._entries.mat
 
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
 
-    def impulses(self, x: Array, q: Array, uncoupled: Array | None = None) -> Array:
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
         return x.reshape(-1, 3).copy()
-
-    def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
-        return self.problem.momentum(dg) - r_v
-
-    def tolerance(self, tol: float) -> float:
-        return tol * float(np.sqrt(self.problem.mean_diagonal))
 
     def destroy(self) -> None:
         self.matrix.destroy()

@@ -18,7 +18,8 @@ from petsc4py import PETSc
 
 from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks
 from pctt.blocks import square_block_matrix
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import TINY, Array
+from pctt.ccp.delassus import rows_in_blocks
 from pctt.ccp.problem import ConeProblem
 from pctt.options import OptionError
 
@@ -33,9 +34,7 @@ class KKTForm:
         if problem.low_rank is not None:
             raise OptionError("-ccp_newton kkt: a body has too many contacts; allowed are contact and body")
         self.problem = problem
-        indptr, indices, values = problem.N.getValuesCSR()
-        shape = (len(indptr) - 1, 3 * problem.size)
-        small = sp.csr_matrix((values, indices, indptr), shape=shape).tobsr((3, 3))
+        small = rows_in_blocks(problem.N)
         self._indptr, self._indices = small.indptr, small.indices
         self.matrix = square_block_matrix(problem.comm, self._padded(small.data))
         self.matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -64,27 +63,20 @@ class KKTForm:
         blocks[:, :3, :3] += np.maximum(k[:, 0], 0.0)[:, None, None] * weakest[:, :, None] * weakest[:, None, :]
         blocks[:, :3, 3:] = scale * V[:, :, 1:]
         blocks[:, 3:, :3] = scale * V[:, :, 1:].transpose(0, 2, 1)
-        tiny = np.finfo(float).tiny
-        blocks[:, [3, 4], [3, 4]] = -(scale**2) / np.maximum(k[:, 1:], tiny**0.5)
+        blocks[:, [3, 4], [3, 4]] = -(scale**2) / np.maximum(k[:, 1:], TINY**0.5)
         put_diagonal_blocks(self.matrix, blocks)
         set_diagonal_blocks(self.matrix, blocks)
 
     def entries(self) -> PETSc.Mat:
         return self.matrix
 
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None = None) -> Array:
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         out = np.zeros((len(q), 5))
         out[:, :3] = q if r_v is None else q + self.problem.velocity_of(r_v)
         return out.ravel()
 
-    def impulses(self, x: Array, q: Array, uncoupled: Array | None = None) -> Array:
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
         return np.ascontiguousarray(x.reshape(-1, 5)[:, :3])
-
-    def momentum(self, x: Array, dg: Array, r_v: Array) -> Array:
-        return self.problem.momentum(dg) - r_v
-
-    def tolerance(self, tol: float) -> float:
-        return tol * float(np.sqrt(self.problem.mean_diagonal))
 
     def destroy(self) -> None:
         self.matrix.destroy()

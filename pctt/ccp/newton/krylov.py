@@ -14,8 +14,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
+from pctt.ccp.newton.form import NewtonForm
 from pctt.ksp_options import entered, prefer_mumps, to_enter
 from pctt.pc.base import PythonPC
+from pctt.pc.mat import residual_norm
 from pctt.petsc import own_errors
 from pctt.shell import is_shell
 
@@ -192,10 +194,8 @@ class Krylov:
             self._formed = None
 
     def destroy(self) -> None:
+        self.forget()
         self.ksp.destroy()
-        if self._formed is not None:
-            self._formed.destroy()
-            self._formed = None
 
 
 class KrylovFamily:
@@ -216,6 +216,43 @@ class KrylovFamily:
         self._krylov.clear()
 
 
+class LinearSolver(KrylovFamily):
+    """Solves the systems of a `NewtonForm`. Subclasses define new_matrix, solve and factored.
+
+    Attributes
+    ----------
+    iterations, fallbacks : of the present problem: Krylov iterations, systems not solved in the first way
+    takes_any : whether matrices need not be symmetric
+    """
+
+    takes_any = False
+
+    def __init__(self, comm: MPI.Comm):
+        super().__init__(comm)
+        self.begin()
+
+    def begin(self) -> None:
+        """Another problem."""
+        self.iterations = self.fallbacks = 0
+
+    def new_matrix(self, system: NewtonForm) -> None:
+        """The system has new values."""
+        raise NotImplementedError
+
+    def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
+        """x = A^-1 b to a relative residual of rtol; whether that was reached."""
+        raise NotImplementedError
+
+    @property
+    def factored(self) -> bool:
+        """Whether the present matrix has been factorised, and another solve costs little."""
+        raise NotImplementedError
+
+    def report(self) -> list[str]:
+        """Lines about the preconditioner, if it is one of this package."""
+        return []
+
+
 _REASONS = {
     value: name.lower() for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)
 }
@@ -223,11 +260,7 @@ _REASONS = {
 
 def _true_residual(S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:
     """||b - S x|| / ||b||; an x that is no number is replaced by zero, and leaves 1."""
-    residual = b.duplicate()
-    S.mult(x, residual)
-    residual.aypx(-1.0, b)
-    norm, reference = residual.norm(), b.norm()
-    residual.destroy()
+    norm, reference = residual_norm(S, b, x), b.norm()
     if not np.isfinite(norm):
         x.zeroEntries()
         return 1.0

@@ -7,8 +7,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.ccp.newton.compare import Comparison
-from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve
-from pctt.ccp.newton.protocols import NewtonForm
+from pctt.ccp.newton.form import NewtonForm
+from pctt.ccp.newton.krylov import Krylov, LinearSolver, Solve
 
 CHOLESKY_LIMIT = 50_000  # contacts: above, a factor of the contact matrix takes more than the rest of the step
 
@@ -19,19 +19,13 @@ LADDER = {
 }
 
 
-class UsersSolver(KrylovFamily):
+class UsersSolver(LinearSolver):
     """A `LinearSolver` by the KSP without prefix, with the user's options. Systems that it does not solve to twice the
     tolerance go down the ladder."""
 
-    takes_any = False
-
-    def __init__(self, comm: MPI.Comm, defaults: dict[str, str], compare: Comparison | None = None, prefix: str = ""):
+    def __init__(self, comm: MPI.Comm, defaults: dict[str, str], compare: Comparison | None, prefix: str):
         super().__init__(comm)
         self.defaults, self.compare, self.prefix = defaults, compare, prefix
-        self.iterations = self.fallbacks = 0
-
-    def begin(self) -> None:
-        self.iterations = self.fallbacks = 0
 
     def new_matrix(self, system: NewtonForm) -> None:
         self.system = system

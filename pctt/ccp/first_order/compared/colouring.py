@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from pctt.contact_map import Ghosts
 from pctt.exchange import offsets
@@ -36,23 +35,6 @@ class Adjacency:
 
     def destroy(self) -> None:
         self._ghosts.destroy()
-
-
-class Halo:
-    """Copies values of owners to ghosts, of which ``remote`` (ghosts, 2) has the owners and their positions there."""
-
-    def __init__(self, comm: MPI.Comm, roots: int, remote: np.ndarray):
-        self._sf = PETSc.SF().create(comm)
-        leaves = np.arange(len(remote), dtype=PETSc.IntType)
-        self._sf.setGraph(roots, leaves, remote.astype(PETSc.IntType).ravel())
-        self._sf.setUp()
-
-    def __call__(self, own: np.ndarray, ghosts: np.ndarray, unit: MPI.Datatype) -> None:
-        self._sf.bcastBegin(unit, own, ghosts, MPI.REPLACE)
-        self._sf.bcastEnd(unit, own, ghosts, MPI.REPLACE)
-
-    def destroy(self) -> None:
-        self._sf.destroy()
 
 
 def colours(graph: Adjacency) -> np.ndarray:

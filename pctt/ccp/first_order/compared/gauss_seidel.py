@@ -19,15 +19,18 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from pctt.blocks import HUB
 from pctt.ccp import cone
 from pctt.ccp.cone import Array
-from pctt.ccp.first_order.compared.colouring import Adjacency, Halo, colours
+from pctt.ccp.delassus import rows_in_blocks
+from pctt.ccp.first_order.compared.colouring import Adjacency, colours
 from pctt.ccp.first_order.progress import FirstOrder, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
+from pctt.contact_map.ghosts import star_forest
 from pctt.log import phase
 from pctt.options import OptionError, option
 
@@ -71,7 +74,7 @@ class Colour:
     steps: Array  # (n, 3)
     b: Array  # (n, 3)
     mu: Array
-    halo: Halo | None
+    halo: PETSc.SF | None  # from the owners to the ghosts
     ghosts: slice
 
 
@@ -80,7 +83,9 @@ class Sweep:
 
     def __init__(self, problem: ScaledProblem, relaxation: float):
         comm = problem.problem.comm
-        rows = _block_rows(problem)
+        matrix = problem.matrix()
+        rows = rows_in_blocks(matrix)
+        matrix.destroy()
         graph = Adjacency(comm, rows.indptr, rows.indices)
         colour = colours(graph)
         own, ghost = colour[: graph.own], colour[graph.own :]
@@ -101,7 +106,7 @@ class Sweep:
         for k in range(count):
             part = slice(ends[k], ends[k + 1])
             away = slice(ghost_ends[k], ghost_ends[k + 1])
-            halo = Halo(comm, graph.own, remote[away]) if comm.size > 1 else None
+            halo = star_forest(comm, graph.own, remote[away]) if comm.size > 1 else None
             ghosts = slice(graph.own + away.start, graph.own + away.stop)
             picked = _picked(A, self._order[part])
             self._colours.append(Colour(part, picked, steps[part], b[part], mu[part], halo, ghosts))
@@ -128,22 +133,15 @@ class Sweep:
     def _send(self, colour: Colour) -> None:
         if colour.halo is not None:
             own = np.ascontiguousarray(self._x[: len(self._order)])
-            colour.halo(own, self._x[colour.ghosts], self._unit)
+            arguments = (self._unit, own, self._x[colour.ghosts], MPI.REPLACE)
+            colour.halo.bcastBegin(*arguments)
+            colour.halo.bcastEnd(*arguments)
 
     def destroy(self) -> None:
         for colour in self._colours:
             if colour.halo is not None:
                 colour.halo.destroy()
         self._unit.Free()
-
-
-def _block_rows(problem: ScaledProblem) -> sp.bsr_matrix:
-    """This rank's rows of A in blocks, their columns global."""
-    A = problem.matrix()
-    indptr, indices, values = A.getValuesCSR()
-    shape = (A.getLocalSize()[0], A.getSize()[1])
-    A.destroy()
-    return sp.csr_matrix((values, indices, indptr), shape=shape).tobsr((3, 3))
 
 
 def _picked(A: sp.bsr_matrix, rows: np.ndarray) -> sp.bsr_matrix:
