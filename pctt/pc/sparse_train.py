@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt import memory
 from pctt.pc.ordering import grid_slots
 from pctt.pc.positivity import finds_negative
 from pctt.pc.refresh_schedule import RefreshSchedule
@@ -23,6 +24,8 @@ from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.inverse import Inverse, invert, invert_near_identity
 from pctt.tt.quantise import choose_modes
 from pctt.tt.sparse import SparseHierarchy
+
+TABLES = 10.0  # memory that a first set-up takes, over that of the entries; measured at 142,000 contacts
 
 
 class SparseTrain:
@@ -72,6 +75,8 @@ class SparseTrain:
             self._forget_trains()
         first = not self._begun
         if first:
+            if not self._fits(P):
+                return self._refuse("there is no memory for the tables of a train")
             self._take_slots(P)
         try:
             self.slots.scale(P)
@@ -92,6 +97,11 @@ class SparseTrain:
         if first:
             self._opening = self.inverse
         return True
+
+    def _fits(self, P: PETSc.Mat) -> bool:
+        """Whether the memory has room for the tables of a new structure; collective."""
+        entries = self.comm.allreduce(8.0 * P.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_used"], op=MPI.MAX)
+        return TABLES * entries < memory.available(self.comm)
 
     def _try_new(self, P: PETSc.Mat, rank: int, kept: Inverse | None) -> bool:
         """Make a train for P and use it, or use the kept train if it is as good; False if no train is positive."""

@@ -13,6 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from systems import contact_matrix, contacts, dense, poisson
 
+from pctt import memory
 from pctt.pc import TensorTrain, sparse_train
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -75,6 +76,21 @@ def test_full_ranks_give_the_inverse():
     assert context(ksp).rank == 64
     assert context(ksp).made.compression.error < 1e-6
     assert np.linalg.norm(operator(ksp) @ dense(mat) - np.eye(64)) / 8 < 0.05
+
+
+@pytest.mark.parallel(1, 2)
+def test_without_memory_for_a_train_block_jacobi_takes_over(monkeypatch):
+    monkeypatch.setattr(memory, "available", lambda comm: 1e4)
+    mat = poisson(16)
+    ksp = solver(mat, rank="fixed", max_rank=4)
+    _, left = solve(ksp)
+    assert left < 1e-7
+    assert context(ksp).rank == 1
+    assert "fell back: there is no memory for the tables of a train (1 times)" in context(ksp).report()
+    monkeypatch.undo()
+    again = solver(mat, rank="fixed", max_rank=4)
+    again.setUp()
+    assert context(again).rank == 4
 
 
 def test_rank_one_is_block_jacobi():
