@@ -36,6 +36,7 @@ DEFAULTS = {
     "mg_coarse_ksp_type": "preonly",
     "mg_coarse_pc_type": "bjacobi",
     "mg_coarse_sub_pc_type": "cholesky",
+    "mg_coarse_sub_pc_factor_shift_type": "nonzero",  # a pivot counts as zero relative to its row, not to 1
 }
 
 
@@ -101,6 +102,7 @@ class TwoLevel(PythonPC):
         rows = PETSc.Mat().createAIJ(P.getSizes(), csr=P.getValuesCSR(), comm=P.comm)
         coarse = rows.ptap(self._Z)
         rows.destroy()
+        coarse.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)  # P need not store its diagonal
         diagonal = coarse.getDiagonal()
         diagonal.array[:] += self._dependent
         coarse.setDiagonal(diagonal)

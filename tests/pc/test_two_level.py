@@ -172,6 +172,50 @@ def test_rows_that_have_no_modes():
     assert not np.allclose(M[:32, :32], np.eye(32) / 4)
 
 
+def test_the_unit_of_the_matrix_does_not_matter():
+    """No pivot of a small matrix counts as zero: all solves take the same iterations."""
+    counts = []
+    for factor in (1.0, 1e-15, 1e15):
+        mat = poisson(12)
+        mat.scale(factor)
+        counts.append(iterations(solver(mat, boxes=16)))
+    assert len(set(counts)) == 1
+
+
+def test_a_singular_matrix_with_its_null_space():
+    """Poisson's equation without boundary values: the graph Laplacian of a grid, and its constants."""
+    mat = poisson(12)
+    diagonal, ones = mat.createVecs()
+    ones.set(1.0)
+    mat.mult(ones, diagonal)  # what the boundary adds to the diagonal
+    diagonal.scale(-1.0)
+    mat.setDiagonal(diagonal, PETSc.InsertMode.ADD_VALUES)
+    mat.setNullSpace(PETSc.NullSpace().create(constant=True, comm=mat.comm))
+    x, b = mat.createVecs()
+    b.array[:] = np.sin(np.arange(144))
+    b.shift(-b.sum() / 144)
+    solver(mat, boxes=16).solve(b, x)
+    assert (b - mat * x).norm() <= 1.1e-6 * b.norm()
+
+
+@pytest.mark.parallel(2)
+def test_a_matrix_that_stores_no_diagonal_leaves_no_rank_waiting():
+    """Its blocks are singular, so the set-up has failed: on all ranks."""
+    mat = poisson(8)
+    indptr, indices, values = mat.getValuesCSR()
+    first, last = mat.getOwnershipRange()
+    row = np.repeat(np.arange(first, last), np.diff(indptr))
+    kept = indices != row
+    indptr = np.concatenate([[0], np.cumsum(np.bincount(row[kept] - first, minlength=last - first))])
+    csr = (indptr.astype(PETSc.IntType), indices[kept], values[kept])
+    hollow = PETSc.Mat().createAIJ(mat.getSizes(), csr=csr, comm=mat.comm)
+    ksp = solver(hollow, boxes=32)
+    x, b = hollow.createVecs()
+    b.set(1.0)
+    ksp.solve(b, x)
+    assert ksp.getConvergedReason() < 0
+
+
 @pytest.mark.parametrize(("name", "value"), [("boxes", "0"), ("box", "3")])
 def test_bad_options(name, value):
     with pytest.raises((OptionError, PETSc.Error)) as error:
