@@ -18,7 +18,7 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
-from dem.checks import finite, finite_vector, positive, unit_vector
+from dem.checks import finite, finite_vector, positive, rows, unit_quaternions, unit_vector
 
 
 @dataclass(frozen=True)
@@ -213,14 +213,23 @@ Prescribed = Union[Fixed, Rotation, Oscillation, Glide, Path]
 Motion = Union[Dynamic, Prescribed]
 
 
+def checked_pose(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
+    """The pose of a motion, also of one that is not of this module, as arrays of its own, the quaternion of unit norm.
+    ValueError if it is no pose."""
+    place, turn = motion.pose(time, position.copy(), orientation.copy())
+    what = f"of the pose of {type(motion).__name__} at {time:g} s"
+    return rows(f"position {what}", place, 1, 3)[0], unit_quaternions(f"quaternion {what}", turn, 1)[0]
+
+
 def mean_velocity(
     motion: Prescribed, time: float, dt: float, position: Floats, orientation: Floats
 ) -> Floats:
     """Velocity (6,) from `time` to `time + dt` of a body with the given pose at time zero."""
-    start, before = motion.pose(time, position, orientation)
-    end, after = motion.pose(time + dt, position, orientation)
+    start, before = checked_pose(motion, time, position, orientation)
+    end, after = checked_pose(motion, time + dt, position, orientation)
     given = getattr(motion, "angular_velocity", None)
     turning = quaternion.rotation_vector(before, after) / dt if given is None else given()
+    turning = rows(f"angular velocity of {type(motion).__name__}", turning, 1, 3)[0]
     return np.concatenate([(end - start) / dt, turning])
 
 

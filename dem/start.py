@@ -14,17 +14,19 @@ from dem.bodies import Bodies
 from dem.contact import find_contacts
 from dem.partition import redistribute
 from dem.scene import Scene
+from dem.stepper import follow_motions
 from dem.world import World
 
 
 def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     """The scene at time zero, distributed; collective.
 
-    ValueError if there is no grain, or if grains overlap each other or a large body by more than `overlap`
-    radii.
+    Bodies of prescribed motion are where their motions put them at time zero. ValueError if there is no grain, or if
+    grains overlap each other or a large body by more than `overlap` radii; SceneError if a motion fails.
     """
     grains = scene.grains()
     world = _world(scene, comm, grains.take(even_slice(len(grains), comm)))
+    follow_motions(world)
     redistribute(world)
     _refuse_overlap(world, overlap)
     return world

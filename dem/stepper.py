@@ -8,7 +8,7 @@ from dataclasses import replace
 from dem import quaternion
 from dem.arrays import Floats
 from dem.bodies import Bodies
-from dem.motion import Dynamic
+from dem.motion import Dynamic, checked_pose
 from dem.together import together
 from dem.world import World
 
@@ -23,7 +23,7 @@ def advance(world: World, velocity: Floats, dt: float) -> None:
     _move(world.large, large_velocity, dt)
     world.time += dt
     world.step += 1
-    together(world.comm, "motion of a large body", lambda: _follow_motions(world))
+    follow_motions(world)
 
 
 def advanced(world: World, velocity: Floats, dt: float) -> World:
@@ -34,12 +34,16 @@ def advanced(world: World, velocity: Floats, dt: float) -> World:
     return after
 
 
-def _follow_motions(world: World) -> None:
-    """Put the bodies of prescribed motion where they are to be now."""
-    for row, body in enumerate(world.large_bodies):
-        if not isinstance(body.motion, Dynamic):
-            pose = body.motion.pose(world.time, body.position, body.quaternion)
-            world.large.position[row], world.large.quaternion[row] = pose
+def follow_motions(world: World) -> None:
+    """Put the bodies of prescribed motion where they are to be now; collective. SceneError if a motion fails."""
+
+    def follow() -> None:
+        for row, body in enumerate(world.large_bodies):
+            if not isinstance(body.motion, Dynamic):
+                pose = checked_pose(body.motion, world.time, body.position, body.quaternion)
+                world.large.position[row], world.large.quaternion[row] = pose
+
+    together(world.comm, "motion of a large body", follow)
 
 
 def _move(table: Bodies, velocity: Floats, dt: float) -> None:

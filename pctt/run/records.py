@@ -45,7 +45,10 @@ class Records:
         header = ",".join(row)
         if self._header not in (None, header):
             path = self._place.folder / "records.csv"
-            raise FileError(f"{path}: has other columns than this run, choose another -output")
+            old, new = self._header.split(","), list(row)
+            odd = ", ".join([name for name in old if name not in new] + [name for name in new if name not in old])
+            remedy = "record must return the same names in all steps; for a run with others choose another -output"
+            raise FileError(f"{path}: has other columns than step {row['step']:g} ({odd or 'their order'}); {remedy}")
         if self._comm.rank == 0:
             line = _row(*row.values())
             self._lines.add(line if self._header else f"{header}\n{line}")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dem import quaternion
-from dem.motion import Fixed, Glide, Oscillation, Path, Rotation, mean_velocity
+from dem.motion import Fixed, Glide, Oscillation, Path, Rotation, checked_pose, mean_velocity
 
 PLACE, TURN = np.array([1.0, 2.0, 3.0]), quaternion.normalized(np.array([1.0, 0.5, 0.0, 0.2]))
 MOTIONS = [Fixed(), Rotation((0.1, 0.0, 1.0), (2.0, 0.0, 0.0)), Oscillation((1.0, 2.0, 0.0), 0.3, 4.0, 0.7)]
@@ -78,6 +78,36 @@ def test_a_motion_of_ones_own_is_a_pose_alone():
     turning = mean_velocity(Rocking(), 0.4, 1e-4, PLACE, TURN)[3:]
     np.testing.assert_allclose(turning, [0.3 * np.cos(0.4), 0, 0], atol=1e-4)
     np.testing.assert_array_equal(mean_velocity(Belt(), 0.4, 0.1, PLACE, TURN), [0, 0, 0, 0, 7, 0])
+
+
+@pytest.mark.parametrize(
+    ("pose", "words"),
+    [
+        ((np.full(3, np.nan), TURN), "position of the pose of Own at 0.4 s: NaN"),
+        ((PLACE[:2], TURN), "position of the pose of Own at 0.4 s must have shape"),
+        ((PLACE, np.zeros(4)), "quaternion of the pose of Own at 0.4 s: zero quaternion"),
+        ((PLACE, PLACE), "quaternion of the pose of Own at 0.4 s must have shape"),
+    ],
+)
+def test_what_is_no_pose_is_refused(pose, words):
+    class Own:
+        def pose(self, time, position, orientation):
+            return pose
+
+    with pytest.raises(ValueError, match=words):
+        mean_velocity(Own(), 0.4, 0.1, PLACE, TURN)
+
+
+def test_a_motion_may_give_lists_and_work_in_the_arrays_that_it_gets():
+    class Own:
+        def pose(self, time, position, orientation):
+            position += [0, 0, 0.5 * time]
+            return list(position), [2.0, 0, 0, 0]
+
+    place, turn = PLACE.copy(), TURN.copy()
+    np.testing.assert_allclose(mean_velocity(Own(), 2.0, 0.1, place, turn), [0, 0, 0.5, 0, 0, 0], atol=1e-14)
+    np.testing.assert_array_equal([*place, *turn], [*PLACE, *TURN])
+    np.testing.assert_array_equal(checked_pose(Own(), 2.0, place, turn)[1], [1, 0, 0, 0])
 
 
 def test_a_path_goes_straight_from_place_to_place():

@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from cases import heap, step
 from mpi4py import MPI
 
 from dem import quaternion
 from dem.contact import find_contacts
-from dem.motion import Rotation
+from dem.motion import Glide, Rotation
 from dem.scene import Scene
 from dem.shapes import Box
 from dem.start import new_world
@@ -76,6 +77,20 @@ def test_prescribed_bodies_follow_their_motion_exactly_at_any_step():
         np.testing.assert_allclose(world.large.position[0], position, atol=1e-14)
         np.testing.assert_allclose(world.large.quaternion[0], turn, atol=1e-14)
         np.testing.assert_allclose(world.large.velocity[0, 3:], [0, 0.2, 1.0])
+
+
+def test_a_body_is_where_its_motion_puts_it_from_the_start_on():
+    """A motion that began before time zero: no jump in the first step, and overlaps are seen at the true place."""
+    scene = Scene(friction=0.3)
+    scene.add_spheres([[0, 0, 5]], 0.1, 1000.0)
+    scene.add_body("plate", [Box((0.1, 0.1, 0.1))], Glide((0.0, 0.0, -2.0), start=-0.5), position=(1, 0, 4))
+    world = new_world(scene, SELF)
+    np.testing.assert_allclose(world.large.position[0], [1, 0, 3])
+    fly(world, 0.01, 1)
+    np.testing.assert_allclose(world.large.position[0], [1, 0, 3 - 0.02])
+    scene.add_body("press", [Box((0.1, 0.1, 0.1))], Glide((0.0, 0.0, -2.0), start=-0.5), position=(0, 0, 6))
+    with pytest.raises(ValueError, match="grain 0 and body 'press' overlap"):
+        new_world(scene, SELF)
 
 
 def test_a_step_changes_no_array_of_the_step_before():

@@ -64,7 +64,7 @@ def test_records_with_other_columns_are_not_continued(tmp_path):
     place = Place(tmp_path, MPI.COMM_SELF)
     Records(place, MPI.COMM_SELF, 0).add({"step": 1, "time [s]": 0.5, "a [m]": 2.0})
     other = {"step": 2, "time [s]": 1.0, "b [m]": 2.0}
-    with pytest.raises(FileError, match="other columns"):
+    with pytest.raises(FileError, match=r"other columns than step 2 \(a \[m\], b \[m\]\); record must return"):
         Records(place, MPI.COMM_SELF, 1).add(other)
     (tmp_path / "records.csv").write_text("step,time\nnonsense\n")
     with pytest.raises(FileError, match="cannot be continued"):
