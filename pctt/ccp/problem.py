@@ -10,7 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.blocks import BlockRows, dense_columns, diagonal_blocks, without_hubs
-from pctt.ccp.cone import Array, add_opening, projected_move
+from pctt.ccp.cone import Array, add_opening, dot, projected_move
 from pctt.ccp.delassus import delassus, in_blocks, local_blocks
 from pctt.contact_map import CompactRows, ContactMap, contact_map
 from pctt.exchange import refuse
@@ -123,12 +123,12 @@ class ConeProblem:
         residual = float(distance / norm) if norm > 0 else np.inf
         return residual if residual == residual else np.inf
 
-    def closing_work(self, g: Array, y: Array) -> float:
-        """Work of the normal impulses at contacts that still close, sum of g_n max(-y_n, 0), over 1/2 g'Ng; velocities
-        y = N g + r. 0 without impulses, inf if it is no number."""
-        closing = float(g[:, 0] @ np.maximum(-y[:, 0], 0.0))
-        closing, energy = self.sum(np.array([closing, 0.5 * np.vdot(g, y - self.r)]))
-        work = float(closing / energy) if energy > 0 else 0.0
+    def wrong_work(self, g: Array, y: Array) -> float:
+        """The larger of the closing and the opening work, over 1/2 g'Ng: the sums of g_n max(-y_n, 0) and of
+        max(g.y, 0) over the contacts; velocities y = N g + r. 0 without impulses, inf if it is no number."""
+        closing, opening = g[:, 0] @ np.maximum(-y[:, 0], 0.0), np.maximum(dot(g, y), 0.0).sum()
+        closing, opening, energy = self.sum(np.array([closing, opening, 0.5 * np.vdot(g, y - self.r)]))
+        work = float(np.maximum(closing, opening) / energy) if energy > 0 else 0.0
         return work if work == work else np.inf
 
     @cached_property
