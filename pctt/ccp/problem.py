@@ -55,6 +55,8 @@ class ConeProblem:
     ):
         if (G is None) == (N is None):
             raise ValueError("a cone problem is given by either the map G or the matrix N")
+        if not 0.0 <= compliance < np.inf:
+            raise ValueError(f"compliance {compliance}: allowed is a number >= 0")
         self.comm, self.point, self.key = comm, point, key
         refuse(comm, _wrong(r, mu, G, N, point, key))
         self.r = np.ascontiguousarray(r, dtype=float).reshape(-1, 3)
@@ -67,11 +69,20 @@ class ConeProblem:
         self._given: PETSc.Mat = N  # where there is no G
         if N is not None:
             self._in, self._out = N.createVecs()
+        self._refuse_wrong_blocks()
         self.softness = float(compliance)
         along_normal = np.where(self.mu > 0, self.mu**2, 1.0)
         ones = np.ones_like(along_normal)
         self.compliance = np.stack([along_normal, ones, ones], axis=1)
         self.compliance *= compliance * self.mean_diagonal if compliance else 0.0
+
+    def _refuse_wrong_blocks(self) -> None:
+        """ValueError on all ranks if N is no number, or the diagonal blocks, which have squares of all numbers of G."""
+        wrong = self.sum((~np.isfinite(self._rigid_blocks).all(axis=(1, 2))).sum())
+        if wrong or self._given is not None and not np.isfinite(self._given.norm()):
+            name, where = ("G", f" in {wrong} contacts") if self._given is None else ("N", "")
+            self.destroy()
+            raise ValueError(f"{name} has a NaN or an infinite number{where}")
 
     def __repr__(self) -> str:
         given = "N" if self.contact_map is None else "G"
