@@ -70,8 +70,12 @@ def solve(
     the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
     from one problem to the next. A problem without a solution has the status UNBOUNDED.
     """
+    if type not in SOLVERS:
+        raise ValueError(f"the solver {type!r}: allowed are {', '.join(SOLVERS)}")
     solver = SOLVERS[type]
     limits = limits or Limits()
+    if not limits.tol > 0.0:
+        raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
     if limits.max_it < 0:
         limits = dataclasses.replace(limits, max_it=solver.iterations)
     guess = _start(problem, guess)
@@ -99,10 +103,13 @@ def solve(
 
 
 def _start(problem: ConeProblem, guess: Array | None) -> Array:
-    """The guess as an array (nc, 3) of float64, zero without one; ValueError on all ranks for another shape."""
+    """The guess as an array (nc, 3) of float64, zero without one; ValueError on all ranks for another shape or if it is
+    no number."""
     start = np.zeros_like(problem.r) if guess is None else np.ascontiguousarray(guess, dtype=float)
-    fits = start.shape == problem.r.shape
-    refuse(problem.comm, "" if fits else f"a guess of shape {start.shape}; allowed is {problem.r.shape}")
+    wrong = "" if np.isfinite(start).all() else "a guess with a NaN or an infinite number"
+    if start.shape != problem.r.shape:
+        wrong = f"a guess of shape {start.shape}; allowed is {problem.r.shape}"
+    refuse(problem.comm, wrong)
     return start
 
 

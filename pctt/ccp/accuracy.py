@@ -30,6 +30,8 @@ class Accuracy:
     closing_work : work of the normal impulses at contacts that still close, sum of g_n max(-y_n, 0), as a part of
         1/2 g'Ng; 0 without impulses. About as large as the relative error of the objective, or larger: as that is
         convex, f(g) - min f <= g'y + the work of optimal impulses on the velocities that y lacks to the dual cone
+    opening_work : the same of the work of impulses on velocities along them, sum of max(g.y, 0): contacts that open
+        though impulses push. The natural residual does not see it where bodies are much heavier than most
     impulse_norm, velocity_norm : ||g||, ||y||
     """
 
@@ -41,6 +43,7 @@ class Accuracy:
     dual_violation: float
     complementarity: float
     closing_work: float
+    opening_work: float
     impulse_norm: float
     velocity_norm: float
 
@@ -55,6 +58,7 @@ def measure(problem: ConeProblem, g: Array) -> Accuracy:
     with_opening[:, 0] += problem.mu * sliding
     natural = _residual(problem, g, y)
     closing = problem.dot(g[:, 0], np.maximum(-y[:, 0], 0.0))
+    opening = problem.sum(np.maximum((g * y).sum(axis=1), 0.0).sum())
     energy = problem.dot(g, 0.5 * (y - problem.r))
     return Accuracy(
         natural_residual=natural,
@@ -65,6 +69,7 @@ def measure(problem: ConeProblem, g: Array) -> Accuracy:
         dual_violation=max(0.0, problem.max((problem.mu * sliding - y[:, 0]).max(initial=0.0))),
         complementarity=problem.max(np.abs(dot(g, y)).max(initial=0.0)),
         closing_work=closing / energy if energy > 0 else 0.0,
+        opening_work=opening / energy if energy > 0 else 0.0,
         impulse_norm=norm,
         velocity_norm=problem.norm(y),
     )

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.blocks import BlockRows, dense_columns, diagonal_blocks, without_hubs
-from pctt.ccp.cone import Array, add_opening, projected_move
+from pctt.ccp.cone import Array, add_opening, dot, projected_move
 from pctt.ccp.delassus import delassus, in_blocks, local_blocks
 from pctt.contact_map import CompactRows, ContactMap, contact_map
 from pctt.exchange import refuse
@@ -55,6 +55,8 @@ class ConeProblem:
     ):
         if (G is None) == (N is None):
             raise ValueError("a cone problem is given by either the map G or the matrix N")
+        if not 0.0 <= compliance < np.inf:
+            raise ValueError(f"compliance {compliance}: allowed is a number >= 0")
         self.comm, self.point, self.key = comm, point, key
         refuse(comm, _wrong(r, mu, G, N, point, key))
         self.r = np.ascontiguousarray(r, dtype=float).reshape(-1, 3)
@@ -67,11 +69,20 @@ class ConeProblem:
         self._given: PETSc.Mat = N  # where there is no G
         if N is not None:
             self._in, self._out = N.createVecs()
+        self._refuse_wrong_blocks()
         self.softness = float(compliance)
         along_normal = np.where(self.mu > 0, self.mu**2, 1.0)
         ones = np.ones_like(along_normal)
         self.compliance = np.stack([along_normal, ones, ones], axis=1)
         self.compliance *= compliance * self.mean_diagonal if compliance else 0.0
+
+    def _refuse_wrong_blocks(self) -> None:
+        """ValueError on all ranks if N is no number, or the diagonal blocks, which have squares of all numbers of G."""
+        wrong = self.sum((~np.isfinite(self._rigid_blocks).all(axis=(1, 2))).sum())
+        if wrong or self._given is not None and not np.isfinite(self._given.norm()):
+            name, where = ("G", f" in {wrong} contacts") if self._given is None else ("N", "")
+            self.destroy()
+            raise ValueError(f"{name} has a NaN or an infinite number{where}")
 
     def __repr__(self) -> str:
         given = "N" if self.contact_map is None else "G"
@@ -123,12 +134,12 @@ class ConeProblem:
         residual = float(distance / norm) if norm > 0 else np.inf
         return residual if residual == residual else np.inf
 
-    def closing_work(self, g: Array, y: Array) -> float:
-        """Work of the normal impulses at contacts that still close, sum of g_n max(-y_n, 0), over 1/2 g'Ng; velocities
-        y = N g + r. 0 without impulses, inf if it is no number."""
-        closing = float(g[:, 0] @ np.maximum(-y[:, 0], 0.0))
-        closing, energy = self.sum(np.array([closing, 0.5 * np.vdot(g, y - self.r)]))
-        work = float(closing / energy) if energy > 0 else 0.0
+    def wrong_work(self, g: Array, y: Array) -> float:
+        """The larger of the closing and the opening work, over 1/2 g'Ng: the sums of g_n max(-y_n, 0) and of
+        max(g.y, 0) over the contacts; velocities y = N g + r. 0 without impulses, inf if it is no number."""
+        closing, opening = g[:, 0] @ np.maximum(-y[:, 0], 0.0), np.maximum(dot(g, y), 0.0).sum()
+        closing, opening, energy = self.sum(np.array([closing, opening, 0.5 * np.vdot(g, y - self.r)]))
+        work = float(np.maximum(closing, opening) / energy) if energy > 0 else 0.0
         return work if work == work else np.inf
 
     @cached_property

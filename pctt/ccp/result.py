@@ -28,18 +28,18 @@ class Limits:
     )
     closing_work: float = option(
         0.05,
-        "closing work at which a cone problem counts as solved; inf: any",
+        "closing and opening work at which a cone problem counts as solved; inf: any",
         check=("a positive number, or inf", lambda x: x > 0),
     )
 
     def residual(self, natural: float, problem: ConeProblem, g: Array, y: Array) -> float:
-        """What ``tol`` is for: the natural residual of impulses g (nc, 3) with y = N g + r, or their closing work in
-        units in which its limit is ``tol``, whichever is larger. It is at most ENOUGH times the natural residual: where
-        bodies are squeezed no accuracy may bring the closing work below its limit."""
+        """What ``tol`` is for: the natural residual of impulses g (nc, 3) with y = N g + r, or their closing or opening
+        work in units in which its limit is ``tol``, whichever is larger. It is at most ENOUGH times the natural
+        residual: where bodies are squeezed no accuracy may bring the closing work below its limit."""
         if math.isinf(self.closing_work):
             return natural
-        closing = self.tol / self.closing_work * problem.closing_work(g, y)
-        return min(max(natural, closing), ENOUGH * natural)
+        work = self.tol / self.closing_work * problem.wrong_work(g, y)
+        return min(max(natural, work), ENOUGH * natural)
 
     @property
     def met(self) -> str:

@@ -13,7 +13,7 @@ from pctt.ccp.problem import ConeProblem
 
 AMPLIFICATION = 1e3  # change of velocity per speed of the contacts that no step is believed to need
 ELSEWHERE = 1e-3  # how much speeds of contacts count that have no part in it
-ROUNDING = 1e-15  # of d'Nd, in units of mean diag N
+ROUNDING = 1e-15  # of d'Nd, in units of d' diag(N) d
 
 
 def why_unbounded(problem: ConeProblem, g: Array) -> str:
@@ -22,18 +22,37 @@ def why_unbounded(problem: ConeProblem, g: Array) -> str:
 
     A solution has velocities y = G v + r in the dual cones, so that d.y >= 0 and ||v|| >= -r.d / ||G'd||. In an
     unbounded problem impulses grow along a d with G'd = 0 and r.d < 0, and this bound is infinite. The problem counts
-    as unbounded if the bound is more than AMPLIFICATION times ||r|| / sqrt(mean diag N), the size that the data
+    as unbounded if the bound is more than AMPLIFICATION times ||r|| / sqrt(d' diag(N) d), the size that the data
     suggest; a contact counts in ||r|| by its share in d. Self-stress, G'd = 0 with r.d >= 0, does not count, however
     large. With compliance no problem is unbounded, as d'Nd includes it.
+
+    A heavy body, too, has a small part in G'd: a press on a light grain. So where G is known, the impulses of d must
+    cancel on every body in units of its own mass, see `_left_over`.
     """
     r = problem.r.copy()
     r[problem.mu == 0, 1:] = 0.0  # sliding that no impulse answers
     sizes, speeds = np.sqrt(dot(g, g)), dot(r, r)
     weight = np.maximum(sizes / max(problem.max(sizes.max(initial=0.0)), 1e-300), ELSEWHERE**2)
-    parts = (np.vdot(r, g), weight @ speeds, np.vdot(problem.product(g), g), sizes @ sizes)
-    along, closing, bent, length = problem.sum(np.array(parts))
-    bent = max(bent / problem.mean_diagonal, ROUNDING * length)
-    if not -along > AMPLIFICATION * np.sqrt(closing * bent):
+    alone = np.einsum("ni,nij,nj->", g, problem.diagonal_blocks, g)
+    parts = (np.vdot(r, g), weight @ speeds, np.vdot(problem.product(g), g), sizes @ sizes, alone)
+    along, closing, bent, length, alone = problem.sum(np.array(parts))
+    size, speed = np.sqrt(length), np.sqrt(closing)
+    bound = (along / (AMPLIFICATION * size * speed)) ** 2 if along < 0 < size * speed else 0.0
+    if not bound > max(bent / alone if alone > 0 else 0.0, ROUNDING):
         return ""
-    size = np.sqrt(length)
+    if problem.contact_map is not None and not bound > _left_over(problem, g / size):
+        return ""
     return f"unbounded: impulses grow without limit (norm {size:.1e} N s, {-along / size:.1e} J for each N s more)"
+
+
+def _left_over(problem: ConeProblem, d: Array) -> float:
+    """How much impulses d (nc, 3) leave on the bodies: the sum of |G_b' d|^2 / |G_b|^2 over the bodies b, with G_b the
+    columns of a body, of which the mass drops out; between 0 and 2 for ||d|| = 1. Collective."""
+    assert problem.contact_map is not None
+    G = problem.contact_map.block_rows
+    bodies = problem.sum(G.columns)
+    momenta = np.einsum("kij,ki->jk", G.blocks, d[np.repeat(np.arange(G.rows), np.diff(G.indptr))])
+    columns = [*momenta, (G.blocks**2).sum(axis=(1, 2))]
+    *momenta, size = problem.sum(np.array([np.bincount(G.indices, column, bodies) for column in columns]))
+    momentum = np.sum(np.square(momenta), axis=0)
+    return float(np.divide(momentum, size, out=np.zeros(bodies), where=size > 0).sum())

@@ -72,11 +72,8 @@ class BodySchur(PythonPC):
         self._formed: PETSc.Mat | None = None  # the matrix of the inner preconditioner, if it is not the stiff part
 
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        G = P.getAttr("contact_map")
-        if G is None:
-            raise ValueError("pctt.pc.BodySchur: the Mat has no attribute contact_map; see docs/preconditioners.md")
         self.release()
-        self._take_map(P, G)
+        self._take_map(P, P.getAttr("contact_map"))
         self.K = BodyOperator(self._G)
         points = P.getAttr("coordinates")
         self._y, self._rhs = self.K.mat.createVecs()
@@ -163,12 +160,16 @@ class BodySchur(PythonPC):
             self._release_map()
             self.ksp = self._formed = None
 
-    def _take_map(self, P: PETSc.Mat, given: ContactMap | BlockRows | CompactRows) -> None:
-        """ValueError on all ranks if the map does not fit P."""
+    def _take_map(self, P: PETSc.Mat, given: ContactMap | BlockRows | CompactRows | None) -> None:
+        """ValueError on all ranks if the map does not fit P, or is missing."""
         comm, rows = P.comm.tompi4py(), P.getLocalSize()[0]
         count = getattr(given, "rows", None)
         words = "" if count is not None and 3 * count == rows else f"the map of contacts has {count} rows, S has {rows}"
-        refuse(comm, words and f"{self.name}: {words}; allowed are three rows of S for each contact of the map")
+        words = words and f"{words}; allowed are three rows of S for each contact of the map"
+        missing = "the Mat has no attribute contact_map; see docs/preconditioners.md"
+        words = missing if given is None else words
+        refuse(comm, words and f"{self.name}: {words}")
+        assert given is not None
         self._given = given
         self._G = contact_map(comm, given) if isinstance(given, (BlockRows, CompactRows)) else given
 

@@ -90,6 +90,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
         "dual_violation": accuracy.dual_violation,
         "complementarity": accuracy.complementarity,
         "closing_work": accuracy.closing_work,
+        "opening_work": accuracy.opening_work,
         "velocity_norm": accuracy.velocity_norm,
         "references": {
             name: _distance(problem, result.impulse, impulse)

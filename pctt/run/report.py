@@ -78,7 +78,7 @@ def accuracy_lines(line: Mapping[str, Any], history: Sequence[float]) -> str:
         f"       objective {line['objective']:.6g} J, outside the cone {line['cone_violation']:.1e} N s, outside the"
         f" dual cone {line['dual_violation']:.1e} m/s, complementarity {line['complementarity']:.1e} J"
     )
-    figures += f"\n       closing work {line['closing_work']:.1e}"
+    figures += f"\n       closing work {line['closing_work']:.1e}, opening work {line['opening_work']:.1e}"
     figures += f", residual of Coulomb's law {line['coulomb_residual']:.1e}"
     if line["rigid_residual"] != line["natural_residual"]:
         figures += f", of rigid contacts {line['rigid_residual']:.1e}"
@@ -221,10 +221,10 @@ def law_line(steps: Sequence[Mapping[str, Any]], tol: float) -> str:
 def forces_line(steps: Sequence[Mapping[str, Any]], limit: float) -> str:
     """A line about the accuracy of the forces on bodies, with a warning where they may be far off; ``limit`` is
     ``-ccp_closing_work``."""
-    worst = max(steps, key=lambda line: line["closing_work"])
-    middle = median(line["closing_work"] for line in steps)
-    said = f"closing work {middle:.1e} (median), {worst['closing_work']:.1e} at most, in step {worst['step']}"
-    if worst["closing_work"] <= LARGE_CLOSING_WORK:
+    kind = max(("closing_work", "opening_work"), key=lambda kind: max(line[kind] for line in steps))
+    worst, middle = max(steps, key=lambda line: line[kind]), median(line[kind] for line in steps)
+    said = f"{kind.replace('_', ' ')} {middle:.1e} (median), {worst[kind]:.1e} at most, in step {worst['step']}"
+    if worst[kind] <= LARGE_CLOSING_WORK:
         return said
     hint = f"-ccp_closing_work {LARGE_CLOSING_WORK}" if limit > LARGE_CLOSING_WORK else "a smaller -ccp_tol"
     return f"WARNING: {said}: forces on bodies may be far off; try {hint} (docs/ccp.md)"

@@ -38,6 +38,7 @@ def test_two_contacts_worked_out_by_hand():
     assert figures.cone_violation == pytest.approx(1.0)  # 3 - 2; the second is out by 0.5
     assert figures.dual_violation == 0.0  # y = (1, 0, 0) and (1.5, -3.7, 0.4)
     assert figures.closing_work == 0.0
+    assert figures.opening_work == pytest.approx(2.0 / (0.5 * 13.5))
     assert figures.complementarity == pytest.approx(2.0)  # of the first; that of the second is -0.2
     assert figures.velocity_norm == pytest.approx(np.sqrt(1 + 1.5**2 + 3.7**2 + 0.4**2))
 
@@ -73,6 +74,20 @@ def test_the_closing_work_shows_what_the_natural_residual_hides():
         assert figures.natural_residual <= tol
         assert (figures.objective - least) / abs(least) < 10 * figures.closing_work
         assert figures.closing_work > tol or tol == 1e-2
+
+
+@pytest.mark.parametrize("solver", ["apgd", "conic", "pdip", "auto", "gauss_seidel"])
+@pytest.mark.parametrize("mass", [1e4, 1e5, 1e6])
+@pytest.mark.parametrize("coulomb", [None, ccp.Coulomb()])
+def test_a_heavy_body_among_light_ones_comes_to_rest(solver, mass, coulomb):
+    """Point masses that strike the ground: each contact alone has the impulse mass times speed. The natural residual
+    is relative to the heavy one, and in units of the light ones."""
+    masses = np.append(np.ones(50), mass)
+    struck = problem(np.repeat(1.0 / masses, 3), np.tile([-1.0, 0.0, 0.0], (51, 1)), np.full(51, 0.5))
+    result = ccp.solve(struck, type=solver, coulomb=coulomb)
+    assert result.converged, result.reason
+    assert result.impulse[-1] == pytest.approx([mass, 0, 0], rel=0.05, abs=0.05 * mass)
+    assert ccp.measure(struck, result.impulse).opening_work <= 0.05
 
 
 @pytest.mark.parametrize("solver", ["apgd", "conic", "pdip", "auto"])
@@ -138,4 +153,4 @@ def test_the_measure_agrees_with_the_stop_test_of_the_solvers():
 
 def test_a_problem_without_contacts():
     figures = ccp.measure(problem([], np.zeros((0, 3)), []), np.zeros((0, 3)))
-    assert figures == ccp.Accuracy(*[0.0] * 10)
+    assert figures == ccp.Accuracy(*[0.0] * 11)

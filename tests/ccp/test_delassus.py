@@ -9,9 +9,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from problems import SELF, Graph, from_graph, heap, matrix, part, random_graph
 
-from pctt.blocks import block_matrix, diagonal_blocks, square_block_matrix
+from pctt.blocks import BlockRows, block_matrix, diagonal_blocks, square_block_matrix
 from pctt.ccp import ConeProblem, Limits, solve
 from pctt.ccp.delassus import delassus, local_blocks
+from pctt.contact_map import OPERATORS
 
 GRAPHS = {
     "sparse": {"contacts": 30, "bodies": 25},
@@ -132,6 +133,41 @@ def test_a_problem_needs_one_operator_and_matching_finite_data():
         data[name][3] = value
         with pytest.raises(ValueError, match="1 contacts with a NaN, infinite or negative coefficient"):
             ConeProblem(SELF, data["r"], data["mu"], G=G)
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("operator", OPERATORS)
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_operators_that_are_no_numbers_are_refused_on_all_ranks(operator, number):
+    comm = MPI.COMM_WORLD
+    known, graph = heap()
+    problem = from_graph(known, graph, comm)
+    G = problem.contact_map.given
+    values = known.N.copy()
+    values[0, 7] = number
+    if comm.rank == 0:
+        blocks = G.blocks.copy()
+        blocks[5, 1, 2] = number
+        G = BlockRows(G.indptr, G.indices, blocks, G.columns)
+    with pytest.raises(ValueError, match="G has a NaN or an infinite number in"), np.errstate(invalid="ignore"):
+        ConeProblem(comm, problem.r, problem.mu, G=G, operator=operator)
+    with pytest.raises(ValueError, match="N has a NaN or an infinite number"):
+        ConeProblem(comm, problem.r, problem.mu, N=matrix(comm, values))
+
+
+def test_numbers_that_make_no_sense_are_refused():
+    known, graph = heap()
+    for compliance in (-1e-3, np.nan, np.inf):
+        with pytest.raises(ValueError, match="compliance"):
+            ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF), compliance=compliance)
+    problem = from_graph(known, graph)
+    for words, arguments in (
+        ("the solver 'newton': allowed are pdip, conic", {"type": "newton"}),
+        ("the tolerance -1: allowed is a positive number", {"limits": Limits(-1)}),
+        ("a guess with a NaN", {"guess": np.full_like(known.r, np.nan)}),
+    ):
+        with pytest.raises(ValueError, match=words):
+            solve(problem, **arguments)
 
 
 def test_shapes_that_do_not_fit_are_refused():

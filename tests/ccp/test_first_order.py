@@ -214,9 +214,10 @@ def test_an_accuracy_that_cannot_be_reached_ends_with_a_reason(method, monkeypat
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_a_matrix_with_a_nan_does_not_converge(method):
     known, _ = heap(contacts=6, bodies=4)
-    N = known.N.copy()
-    N[0, 5] = N[5, 0] = np.nan
-    problem = ccp.ConeProblem(SELF, known.r, known.mu, N=matrix(SELF, N))
+    N = matrix(SELF, known.N)
+    problem = ccp.ConeProblem(SELF, known.r, known.mu, N=N)
+    N.setValue(0, 5, np.nan)  # a problem with a NaN is refused; this one gets it afterwards
+    N.assemble()
     result = ccp.solve(problem, type=method, limits=Limits(1e-6))
     assert not result.converged
     assert "not a number" in result.reason

@@ -97,6 +97,45 @@ def test_problems_with_a_solution_are_never_named(seed):
         assert why_unbounded(problem, g) == ""
 
 
+def body_on(contacts, mass):
+    """Blocks of G of one body, for contacts that push it up or down at their place: (sign, place)."""
+    normal = [np.array([0.0, 0.0, sign]) for sign, _ in contacts]
+    frame = [np.stack([n, [1.0, 0, 0], np.cross(n, [1.0, 0, 0])]) for n in normal]
+    turns = [np.cross(place, f) / np.sqrt(0.4) for (_, place), f in zip(contacts, frame)]
+    return [np.hstack(pair) / np.sqrt(mass) for pair in zip(frame, turns)]
+
+
+@SOLVERS
+@pytest.mark.parametrize("ratio", [1e6, 1e8])
+def test_a_heavy_body_is_no_sign_of_it(solver, ratio):
+    """A sphere of mass ``ratio`` strikes the ground beside fifty of mass 1: it needs the impulse ratio. And one of mass
+    1 lies under a press of mass ``ratio`` that comes down: the ground bears both."""
+    down = (1.0, np.array([0.0, 0.0, -1.0]))
+    blocks = np.array([body_on([down], mass)[0] for mass in [1.0] * 50 + [ratio]])
+    r = np.tile([-1.0, 0.0, 0.0], (51, 1))
+    beside = ccp.ConeProblem(SELF, r, np.full(51, 0.5), G=BlockRows(np.arange(52), np.arange(51), blocks, 51))
+    (light, top), (press,) = body_on([down, (-1.0, np.array([0.0, 0, 1.0]))], 1.0), body_on([(1.0, np.zeros(3))], ratio)
+    under = ccp.ConeProblem(
+        SELF, np.array([[0.0, 0, 0], [-1.0, 0, 0]]), np.full(2, 0.5),
+        G=BlockRows(np.array([0, 1, 3]), np.array([0, 0, 1]), np.array([light, top, press]), 2),
+    )  # fmt: skip
+    for problem, known in ((beside, ratio), (under, ratio)):
+        result = ccp.solve(problem, type=solver, limits=Limits(1e-6))
+        assert result.status is not Status.UNBOUNDED, result.reason
+        g = np.zeros_like(problem.r)
+        g[:, 0] = known if problem is under else np.append(np.ones(50), ratio)
+        assert why_unbounded(problem, g) == ""
+
+
+@SOLVERS
+@pytest.mark.parametrize("speed", [1e-100, 1e-60])
+def test_the_unit_of_speeds_does_not_matter(solver, speed):
+    problem = squeezed((speed, speed), 0.3, 0.2)
+    assert ccp.solve(problem, type=solver, limits=Limits(1e-4)).converged
+    problem = squeezed((speed, speed), 0.0, 0.5)
+    assert ccp.solve(problem, type=solver, limits=Limits(1e-6)).status is Status.UNBOUNDED
+
+
 def test_a_problem_given_by_its_matrix_is_recognised_too():
     """Two contacts with N = (1, -1; -1, 1) in their normals."""
     N = np.kron(np.eye(2), np.diag([1.0, 1.0, 1.0]))

@@ -115,6 +115,35 @@ def test_a_matrix_that_does_not_say_what_it_is_made_of_is_refused():
         solve(poisson(4), "preonly", 1e-3)
 
 
+def test_a_matrix_that_has_forgotten_it_is_refused():
+    """``MatCopy`` from another pattern takes the attributes away."""
+    mat = contact_matrix(*contacts(30, 20))
+    ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOperators(mat)
+    ksp.pc.setType("python")
+    ksp.pc.setPythonType("pctt.pc.BodySchur")
+    ksp.setUp()
+    mat.setAttr("contact_map", None)
+    mat.scale(2.0)
+    with pytest.raises(ValueError, match="no attribute contact_map"), own_errors():
+        ksp.pc.setUp()
+
+
+@pytest.mark.parallel(2)
+def test_a_part_that_one_rank_lacks_is_missed_on_all():
+    comm = MPI.COMM_WORLD
+    mat = PETSc.Mat().createAIJ(((6, None), (6, None)), nnz=1, comm=comm)
+    first = mat.getOwnershipRange()[0]
+    for row in range(first, first + 6):
+        mat[row, row] = 2.0
+    mat.assemble()
+    blocks = np.hstack([np.eye(3), np.zeros((3, 3))])[None].repeat(2, axis=0)
+    mat.setAttr("barrier", np.tile(np.eye(3), (2, 1, 1)))
+    mat.setAttr("contact_map", BlockRows(np.arange(3), np.arange(2), blocks, 2) if comm.rank == 0 else None)
+    with pytest.raises(ValueError, match="no attribute contact_map"), own_errors():
+        solve(mat, "fgmres", 1e-3)
+
+
 def test_bodies_are_numbered_in_64_bits():
     """G of a file has 32 bits; 70,000 squared has more."""
     bodies = 70_000

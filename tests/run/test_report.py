@@ -55,7 +55,8 @@ def test_a_large_overlap_is_a_warning():
 
 def test_accuracy_shows_the_course_of_the_residual():
     line = {"objective": -1.5, "cone_violation": 0.0, "dual_violation": 1e-3, "complementarity": 1e-4}
-    line |= {"closing_work": 3e-2, "coulomb_residual": 1e-2, "natural_residual": 1e-5, "rigid_residual": 1e-5}
+    line |= {"closing_work": 3e-2, "opening_work": 1e-2}
+    line |= {"coulomb_residual": 1e-2, "natural_residual": 1e-5, "rigid_residual": 1e-5}
     line |= {"solver": "conic", "asked_solver": "auto", "reason": "apgd given up"}
     assert "of rigid contacts 2.0e-03" in report.accuracy_lines({**line, "rigid_residual": 2e-3}, [])
     text = report.accuracy_lines(line, [10.0**-k for k in range(41)])
@@ -63,13 +64,16 @@ def test_accuracy_shows_the_course_of_the_residual():
     assert text.endswith("40: 1.0e-40")
     assert "by conic: apgd given up" in text
     assert "by iteration" not in report.accuracy_lines(line, [])
-    assert "closing work 3.0e-02" in text
+    assert "closing work 3.0e-02, opening work 1.0e-02" in text
 
 
 def test_forces_that_may_be_far_off_are_a_warning():
-    steps = [{"step": 3 + k, "closing_work": work} for k, work in enumerate((1e-3, 2e-2, 4e-3))]
+    works = enumerate((1e-3, 2e-2, 4e-3))
+    steps = [{"step": 3 + k, "closing_work": work, "opening_work": 0.5 * work} for k, work in works]
     assert report.forces_line(steps, 0.05) == "closing work 4.0e-03 (median), 2.0e-02 at most, in step 4"
-    far_off = [*steps, {"step": 9, "closing_work": 0.2}]
+    far_off = [*steps, {"step": 9, "closing_work": 0.2, "opening_work": 0.1}]
+    opening = [*steps, {"step": 9, "closing_work": 0.0, "opening_work": 0.3}]
+    assert report.forces_line(opening, 0.05).startswith("WARNING: opening work 6.0e-03 (median), 3.0e-01 at most")
     assert report.forces_line(far_off, float("inf")).startswith("WARNING: closing work")
     assert "try -ccp_closing_work 0.05" in report.forces_line(far_off, float("inf"))
     assert "try a smaller -ccp_tol" in report.forces_line(far_off, 0.05)
