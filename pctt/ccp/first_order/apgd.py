@@ -59,7 +59,7 @@ def solve(
     With compiled products the first iterations have single precision. The last ones, and the residual of the result,
     always have double precision.
     """
-    momentum = Momentum(bounded=coulomb)
+    momentum = Momentum(problem.max(problem.mu.max(initial=0.0)) if coulomb else None)
     progress = None
     if problem.free_map is not None:
         enough = STEERING.single / np.sqrt(max(problem.size, 1))

@@ -12,19 +12,23 @@ class Steering:
     """How the bound of momentum is found; without unit but where one is given. docs/notebook_ccp.md has what was
     measured."""
 
-    damping: float = 0.05  #: 1 - the greatest momentum, at first
+    damping: float = 0.08  #: 1 - the greatest momentum, at first
+    range: tuple[float, float] = (0.02, 0.3)  #: the least and the most damping
     window: int = 100  #: between two changes of the damping [iterations]
+    burst: int = 20  #: without damping, at the beginning of a window [iterations]
     little: float = 0.8  #: there is too much momentum if a window leaves more than this part of the residual
     much: float = 0.6  #: there is room for more if it leaves less than this part
-    heavier: float = 2.0  #: factor on the damping if there is too much momentum
-    lighter: float = 0.9  #: factor on the damping if there is room for more
+    heavier: float = 1.5  #: factor on the damping if there is too much momentum
+    lighter: float = 0.8  #: factor on the damping if there is room for more
 
 
 STEERING = Steering()
+#: where friction is above 1: there what a burst excites does not die
+STEEP = Steering(damping=0.05, range=(0.0, 1.0), burst=0, heavier=2.0, lighter=0.9)
 
 
 class Momentum:
-    """beta, the momentum of the next step.
+    """beta, the momentum of the next step; for Coulomb's law with ``friction``, the largest coefficient.
 
     For a convex problem it may come arbitrarily near to 1. The projected step of Coulomb's law is no gradient step: the
     opening mu |y_t| is not the derivative of any function of the impulses. Linearised, the step is an unsymmetric map
@@ -33,13 +37,19 @@ class Momentum:
     sliding contacts. So the bound is found on the way: more damping if a window of iterations has brought little, less
     if it has brought much.
 
+    Chains of force converge slowly, and need more momentum than that. So every window begins with a burst without a
+    bound. What oscillates by then dies in the rest of the window.
+
     On large problems a window brings little whatever the damping is. So if more damping has made it worse, the next
     change is less damping, and the other way round. If the residual has grown, more damping is always right."""
 
-    def __init__(self, bounded: bool):
-        self.bounded, self.damping = bounded, STEERING.damping if bounded else 0.0
-        self._end, self._looks, self._last = STEERING.window, 0, np.inf
-        self._left, self._change = np.inf, STEERING.heavier  # by the last window; factor of the last change
+    def __init__(self, friction: float | None = None):
+        self._bounded = friction is not None
+        self._steering = steering = STEEP if friction is not None and friction > 1.0 else STEERING
+        self._damping = steering.damping  # after the burst of a window
+        self._end, self._looks, self._last = steering.window, 0, np.inf
+        self._left, self._change = np.inf, steering.heavier  # by the last window; factor of the last change
+        self._burst = steering.burst > 0
         self.restart()
 
     def restart(self) -> None:
@@ -51,22 +61,32 @@ class Momentum:
             self.restart()
             return
         last, self._theta = self._theta, self._theta * (np.sqrt(self._theta**2 + 4) - self._theta) / 2
-        self.beta = min(last * (1 - last) / (last**2 + self._theta), 1.0 - self.damping)
+        self.beta = last * (1 - last) / (last**2 + self._theta)
+        if self._bounded and not self._burst:
+            self.beta = min(self.beta, 1.0 - self._damping)
 
     def look(self, iterations: int, residuals: list[float]) -> None:
-        """Choose the damping by the residuals that were looked at; nothing happens within a window."""
-        if not self.bounded or iterations < self._end:
+        """Note the iterations so far, and at the end of a window choose the damping by the residuals looked at."""
+        if not self._bounded:
             return
+        if iterations >= self._end:
+            self._choose(residuals)
+            self._end = iterations + self._steering.window
+        self._burst = iterations < self._end - self._steering.window + self._steering.burst
+
+    def _choose(self, residuals: list[float]) -> None:
+        steering = self._steering
         least = min(residuals[self._looks :], default=self._last)
-        self._end, self._looks = iterations + STEERING.window, len(residuals)
+        self._looks = len(residuals)
         left = least / self._last
-        if left > STEERING.little:
+        if left > steering.little:
             if left >= 1:
-                self._change = STEERING.heavier
+                self._change = steering.heavier
             elif left > self._left:
                 self._change = 1 / self._change
-            self.damping = min(self._change * self.damping, 1.0)
-        elif left < STEERING.much:
-            self.damping *= STEERING.lighter
-            self._change = STEERING.heavier
+            self._damping *= self._change
+        elif left < steering.much:
+            self._damping *= steering.lighter
+            self._change = steering.heavier
+        self._damping = float(np.clip(self._damping, *steering.range))
         self._last, self._left = least, left
