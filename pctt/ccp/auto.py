@@ -52,6 +52,7 @@ class Steering:
     earliest: float = 0.1  #: part of the conic method's cost before which there is no forecast
     looks: int = 8  #: looks at the natural residual before which there is no forecast
     saved: float = 0.3  #: part of the conic method's cost, at most, by beginning at APGD's point
+    law: float = 6.0  #: factor on the conic method's cost for Coulomb's law, whose Newton systems are unsymmetric
     far: float = 4.0  #: times that cost: more iterations of APGD than this need not be told apart
     #: complementarity of the conic method's start, by APGD's natural residual; its own default at most
     start: float = 3e4
@@ -90,7 +91,7 @@ def solve(
     """Impulses, of the cone problem or of Coulomb's law, by the method that is expected to be faster; ``solver`` of the
     result names it, ``reason`` says why."""
     memory = _memory(newton) if options.remember else Memory()
-    model = conic_cost(problem.size, problem.softness, limits.tol)
+    model = conic_cost(problem.size, problem.softness, limits.tol) * (STEERING.law if coulomb else 1.0)
     cost = options.bias * memory.factor.get(decade(limits.tol), 1.0) * model
     watch = Watch(limits.tol, cost, memory.needed.get(decade(limits.tol)), problem.comm)
 
@@ -179,9 +180,9 @@ def expected(forecast: float, last: Needed | None, iterations: int, cost: float)
 
 def conic_cost(contacts: int, softness: float, tol: float) -> float:
     """The cost of the conic method from a cold start, in iterations of APGD. It grows as the cube root of the number of
-    contacts, measured on settled mixers of 18,525 and 144,658 (docs/measurements.md). Small problems have fixed
+    contacts, measured on settled mixers of 18,483 and 142,175 (docs/measurements.md). Small problems have fixed
     costs."""
-    accuracy, rigid, soft = [-8, -7, -6, -4, -2], [195, 175, 150, 90, 28], [165, 150, 130, 75, 25]
+    accuracy, rigid, soft = [-8, -7, -6, -4, -2], [375, 340, 300, 185, 60], [345, 305, 265, 155, 52]
     per_root = np.interp(np.log10(tol), accuracy, soft if softness >= 1e-6 else rigid)
     return float(per_root * np.cbrt(max(contacts, 400)))
 

@@ -147,7 +147,7 @@ def test_a_sequence_of_problems_is_learnt_from(monkeypatch):
     for step in range(4):
         r = known.r * (1 + 0.01 * step)
         problem = ConeProblem(SELF, r, known.mu, G=graph.part(SELF))
-        result = ccp.solve(problem, None, "auto", Limits(1e-6), Auto(bias=0.5), newton)
+        result = ccp.solve(problem, None, "auto", Limits(1e-6), Auto(bias=0.25), newton)
         assert result.converged
         picked.append(result.solver)
     assert picked == ["conic", "apgd", "apgd", "apgd"]
