@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 from pathlib import Path
 
 from mpi4py import MPI
 
+from pctt.disk import Lock
 from pctt.run.hdf5 import FileError, told
 
 HARD = "hard"  # folder of the cone problems that were not solved
@@ -47,13 +47,16 @@ class Place:
     def __init__(self, folder: Path, comm: MPI.Comm, restart: str = "", overwrite: bool = False):
         """``restart`` and ``overwrite`` are the values of the options; collective. FileError on all ranks if another
         run is writing to the folder, or has written there since the options were read."""
-        self.folder, self._comm, self._lock = folder, comm, -1
+        self.folder, self._comm, self._lock = folder, comm, Lock(folder)
         self.goes_on, replaces, refused = False, False, ""
         hidden = folder / ".new"
         if comm.rank == 0:
             with told(folder):
                 folder.mkdir(parents=True, exist_ok=True)
-            refused = self._lock_out_others() or refusal(folder, restart, overwrite)
+            if self._lock.take():
+                refused = refusal(folder, restart, overwrite)
+            else:
+                refused = f"-output {folder}: another run is writing there; allowed is another folder"
             self.goes_on = is_checkpoint_of(folder, restart)
             replaces = not self.goes_on and bool(held(folder))
             if not refused:
@@ -72,21 +75,7 @@ class Place:
 
     def leave(self) -> None:
         """Let other runs have the folder."""
-        if self._lock >= 0:
-            os.close(self._lock)
-        self._lock = -1
-
-    def _lock_out_others(self) -> str:
-        """Lock the folder while this process lives; why that cannot be, if another run has it. File systems without
-        locks let all runs in."""
-        try:
-            self._lock = os.open(self.folder, os.O_RDONLY)
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return f"-output {self.folder}: another run is writing there; allowed is another folder"
-        except OSError:
-            pass
-        return ""
+        self._lock.release()
 
     def make(self, *names: str) -> None:
         """Make the folder, and folders within it; collective."""
