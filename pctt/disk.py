@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -34,6 +35,40 @@ def whole(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+class Lock:
+    """The lock of a folder, or of a file that is made for it. One process has it at a time, until it releases it or
+    ends. On a file system without locks every process has it."""
+
+    def __init__(self, path: Path):
+        self._path, self._file = path, -1
+
+    def take(self) -> bool:
+        """Whether this process has the lock from now on."""
+        try:
+            self._file = os.open(self._path, os.O_RDONLY if self._path.is_dir() else os.O_RDWR | os.O_CREAT, 0o666)
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if self._path.exists() and os.path.samestat(os.fstat(self._file), os.stat(self._path)):
+                return True
+        except BlockingIOError:
+            pass
+        except OSError:
+            return True
+        self._close()  # another process has it, or has removed the file
+        return False
+
+    def release(self) -> None:
+        """Let others have the lock that this process has, and remove the file that was made for it."""
+        if self._file >= 0 and self._path.is_file():
+            with suppress(OSError):
+                self._path.unlink()
+        self._close()
+
+    def _close(self) -> None:
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = -1
 
 
 def append(path: Path, line: str) -> None:

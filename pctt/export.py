@@ -29,6 +29,7 @@ from pctt.look.program import add_steps, chosen, made_folder, parser, run, whole
 
 SERIES = ("bodies", "contacts", "large")
 FORMATS = ("vtp", "vtkhdf")
+OF_RUN = ("state.h5", "checkpoint.h5", "records.csv", "steps.jsonl", "analysis.csv", "summary.json")
 
 
 def arguments() -> argparse.Namespace:
@@ -100,8 +101,11 @@ def write_vtkhdf(target: Path, folder: Folder, steps: list[int], box: np.ndarray
 def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
     """Write one HDF5 file with the data of these steps to which state.h5 links.
 
-    FolderError if a file cannot be read or written.
+    FolderError if a file cannot be read or written, or belongs to the run.
     """
+    frames = folder.bodies_path.parent.resolve()
+    if path.resolve().parent == frames or path.resolve() in [(folder.path / name).resolve() for name in OF_RUN]:
+        raise FolderError(f"-single {path}: is a file of the run; allowed is another name")
     groups = {"bodies": folder.bodies_path, **{f"steps/{step:06d}": folder.frame_path(step) for step in steps}}
     with whole(path) as temporary:
         make_hdf5(temporary, sum(source.stat().st_size for source in groups.values()), items=0)

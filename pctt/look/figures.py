@@ -125,15 +125,18 @@ def curves(records: Mapping[str, np.ndarray], analysis: Mapping[str, np.ndarray]
             continue
         figure = Figure(figsize=(9, 4.8 if strain is None else 7.2))
         axes, *below = figure.subplots(1 if strain is None else 2, 1, sharex=True, squeeze=False)[:, 0]
+        shown = []
         for k, head in enumerate(heads):
             filtered = analysis.get(head.replace(" [", "_filtered [", 1))
             name, raw = head.rpartition(" [")[0].replace("_", " "), records[head]
             axes.plot(records[way], raw, color=f"C{k}", alpha=1 if filtered is None else 0.3, linewidth=0.9,
                       label=name if filtered is None else f"{name}, raw")
+            shown.append(np.nanpercentile(raw, [0.5, 99.5]))  # peaks would flatten the rest
             if filtered is not None:
                 axes.plot(records[way], filtered, color=f"C{k}", linewidth=1.6, label=f"{name}, filtered")
-        low, high = np.nanpercentile([records[head] for head in heads], [0.5, 99.5])
-        axes.set_ylim(low - 0.08 * (high - low), high + 0.08 * (high - low) or 1.0)  # peaks would flatten the rest
+                shown.append(np.nanpercentile(filtered, [0, 100]))
+        low, high = np.nanmin(shown), np.nanmax(shown)
+        axes.set_ylim(low - 0.08 * (high - low), high + 0.08 * (high - low) or 1.0)
         axes.set_ylabel(f"{UNITS[unit]} [{unit}]")
         axes.legend(fontsize="small")
         for panel in below:

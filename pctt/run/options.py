@@ -25,7 +25,7 @@ from pctt.petsc import own_errors
 from pctt.run.dump import dump_steps
 from pctt.run.hdf5 import refuse_serial
 from pctt.run.leftovers import OF_SOLVERS, refuse_misspelt
-from pctt.run.place import held, is_checkpoint_of
+from pctt.run.place import refusal
 from pctt.run.settings import DEMO, Options, Run, find_scene
 
 #: Options of simulations, beside those of the scene.
@@ -227,14 +227,7 @@ def _refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
 
 def _refuse_occupied(run: Run, comm: MPI.Comm) -> None:
     """OptionError if the output folder holds a run, unless this run continues it or has ``-overwrite``."""
-    folder = Path(run.output)
-    there: list[str] = []
-    if comm.rank == 0 and not run.overwrite and not (is_checkpoint_of(folder, run.restart) and not run.problem):
-        there = held(folder)
-    there = comm.bcast(there)
-    if there:
-        goes_on = f", or -restart {folder / 'checkpoint.h5'} to go on with it" * ("checkpoint.h5" in there)
-        raise OptionError(
-            f"-output {folder}: holds a run ({', '.join(there)}); allowed is another folder, -overwrite to replace "
-            f"that run{goes_on}"
-        )
+    restart = run.restart if not run.problem else ""
+    refused = comm.bcast(refusal(Path(run.output), restart, run.overwrite) if comm.rank == 0 else "")
+    if refused:
+        raise OptionError(refused)

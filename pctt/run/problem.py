@@ -39,11 +39,11 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         progress.say(f"NOT CONVERGED: {summary['reason']}")
     if left := leftovers.remark():
         progress.say(left)
-    place = Place(Path(options.run.output), comm)
-    place.make()
-    if comm.rank == 0:
-        write_text(place.now / "summary.json", figures_json.dumps(summary, indent=1) + "\n")
-    place.take()
+    with Place(Path(options.run.output), comm, overwrite=options.run.overwrite) as place:
+        place.make()
+        if comm.rank == 0:
+            write_text(place.now / "summary.json", figures_json.dumps(summary, indent=1) + "\n")
+        place.take()
 
 
 def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[str, Any]:

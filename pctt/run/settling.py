@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from dem.start import new_world
 from dem.together import together
 from dem.world import World
 from pctt import ccp
+from pctt.disk import Lock
 from pctt.options import OptionError
 from pctt.run import checkpoint, interrupt, report
 from pctt.run.hdf5 import told
@@ -34,10 +37,38 @@ def settled_state(
     path, made_with = cache(options, scene)
     if not anew and comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
         return path
-    progress.say(f"settling {options.run.scene}, {steps(options)} steps with APGD to {options.run.settle_tol:g}:")
     if comm.rank == 0:
         with told(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
+    with _alone(path, comm, progress):
+        if anew or not comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
+            _make(path, made_with, options, scene, comm, progress)
+    return path
+
+
+@contextmanager
+def _alone(path: Path, comm: MPI.Comm, progress: report.Progress) -> Iterator[None]:
+    """Other runs that settle the same scene have ended, and wait for the end of the block; collective."""
+    lock = Lock(path.with_suffix(".lock"))
+    try:
+        waits = False
+        while not comm.bcast(comm.rank > 0 or lock.take()):
+            if not waits:
+                progress.say(f"waits for another run that settles the same scene, {path}")
+            waits = True
+            if interrupt.asked(comm):
+                raise interrupt.InterruptError("interrupted while another run settled the scene")
+            time.sleep(0.2)
+        yield
+    finally:
+        lock.release()
+
+
+def _make(
+    path: Path, made_with: dict[str, str], options: Options, scene: Scene, comm: MPI.Comm, progress: report.Progress
+) -> None:
+    """Settle the scene and keep the state, with its checksum."""
+    progress.say(f"settling {options.run.scene}, {steps(options)} steps with APGD to {options.run.settle_tol:g}:")
     if comm.bcast(unfinished(path).exists()):
         world, memory = checkpoint.load(unfinished(path), scene, made_with, comm)
         progress.say(f"  goes on after step {world.step}, from {unfinished(path)}")
@@ -49,7 +80,6 @@ def settled_state(
         checkpoint.write_checksum(path)
         unfinished(path).unlink(missing_ok=True)
     comm.Barrier()
-    return path
 
 
 def cache(options: Options, scene: Scene) -> tuple[Path, dict[str, str]]:

@@ -34,7 +34,14 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     if options.demo:
         progress.say("no options: the demo; -help lists the options")
     world, memory = first_state(options, comm, progress)
-    place = Place(Path(options.run.output), comm, options.run.restart)
+    with Place(Path(options.run.output), comm, options.run.restart, options.run.overwrite) as place:
+        _make_steps(options, comm, progress, world, memory, place)
+
+
+def _make_steps(
+    options: Options, comm: MPI.Comm, progress: report.Progress, world: World, memory: ImpulseMemory, place: Place
+) -> None:
+    """The steps of a run and its output."""
     dump = Dump(options, world, place)
     compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
     output = Output(options, place, world, memory, compare)

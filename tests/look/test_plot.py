@@ -52,6 +52,15 @@ def test_stresses_against_displacement_and_forces_against_position():
     assert figures.curves({"time [s]": way, "worst_overlap [m]": way, "force_x [N]": way}, {}) == {}
 
 
+def test_filtered_values_that_raw_ones_do_not_reach_are_in_the_figure():
+    way, raw, filtered = np.arange(4.0), np.array([3.0, 6, 6, 5]), np.array([1.0, 2, 8, 2])
+    rows = {"blade_position [m]": way, "draft_force [N]": raw}
+    (axes,) = figures.curves(rows, {"draft_force_filtered [N]": filtered})["blade_force"].axes
+    low, high = axes.get_ylim()
+    assert low < 1
+    assert high > 8
+
+
 def test_the_energy_figure_is_a_balance():
     """Energies that obey the balance but for a drift of 1 J per step, in the figure's curves."""
     time, work, friction, impact = np.arange(1.0, 6.0), np.arange(5.0) ** 2, np.arange(5.0), np.full(5, 0.5)

@@ -39,6 +39,18 @@ def test_one_file_holds_what_the_links_lead_to(folder, show, tmp_path):
         assert list(file["steps"]) == ["000002", "000004"]
 
 
+def test_the_files_of_the_run_are_refused_as_target(show, tmp_path):
+    made = handmade.write(tmp_path / "made", handmade.FLOOR, steps=2)
+    (made / "checkpoint.h5").write_text("what a run goes on from")
+    before = {path: path.read_bytes() for path in made.rglob("*") if path.is_file()}
+    for name in ("state.h5", "checkpoint.h5", "frames/000002.h5", "../made/state.h5"):
+        said = show("export", "-single", made / name, folder=made, status=2).stderr
+        assert f"{name}: is a file of the run; allowed is another name" in said
+    assert {path: path.read_bytes() for path in made.rglob("*") if path.is_file()} == before
+    for _ in range(2):  # a result of the program's own is replaced
+        show("export", "-single", made / "one.h5", folder=made)
+
+
 def test_a_copy_of_the_links_alone_says_that_it_is_empty(folder, tmp_path):
     shutil.copy(folder / "state.h5", tmp_path)
     with h5py.File(tmp_path / "state.h5") as file:

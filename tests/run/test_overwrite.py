@@ -13,7 +13,9 @@ from program import arrays, recorded_steps, steps_of, table
 from dem.together import SceneError
 from pctt.ccp import BlockRows, ConeProblem, fclib
 from pctt.options import OptionError
+from pctt.run.hdf5 import FileError
 from pctt.run.options import read_options
+from pctt.run.place import Place
 from pctt.run.problem import solve_file
 from pctt.run.settings import DEMO
 from pctt.run.simulate import simulate
@@ -170,3 +172,32 @@ def test_the_demo_has_a_folder_of_its_own_that_it_replaces(tmp_path, monkeypatch
     options = read_options({}, SELF)
     assert (options.demo, options.run.overwrite, options.run.output) == (True, True, DEMO["output"])
     assert read_options({"steps": "1"}, SELF).run.output == "results" != DEMO["output"]
+
+
+def test_a_folder_to_which_a_run_is_writing_is_refused_until_it_ends(run, tmp_path):
+    with Place(tmp_path / "out", SELF), pytest.raises(FileError, match="another run is writing there"):
+        run(overwrite="true")
+    assert not contents(tmp_path / "out")
+    run()
+    before = contents(tmp_path / "out")
+    with Place(tmp_path / "out", SELF, "out/checkpoint.h5"), pytest.raises(FileError, match="another run"):
+        run(restart="out/checkpoint.h5")
+    assert contents(tmp_path / "out") == before
+
+
+def test_a_run_does_not_replace_one_that_came_while_it_began(run, tmp_path):
+    (tmp_path / "drop.py").write_text(DROP)
+    late = read_options({"scene": "drop.py", "ccp_type": "apgd", "output": "out", "quiet": "true"}, SELF)
+    run()
+    before = contents(tmp_path / "out")
+    with pytest.raises(FileError, match="-output out: holds a run"):
+        simulate(late, SELF)
+    assert contents(tmp_path / "out") == before
+
+
+@pytest.mark.parallel(2)
+def test_a_folder_in_use_is_refused_on_all_ranks(tmp_path):
+    comm = MPI.COMM_WORLD
+    with Place(tmp_path / "out", comm), pytest.raises(FileError, match="another run is writing there"):
+        Place(tmp_path / "out", comm)
+    Place(tmp_path / "out", comm).leave()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import threading
 
 import h5py
 import numpy as np
@@ -14,6 +15,7 @@ from program import SETTLED, SMALL, arrays, assert_same_bits, database, recorded
 
 from dem.experiment import Experiment
 from dem.scenes import Mixer
+from pctt.disk import Lock
 from pctt.options import OptionError
 from pctt.run.checkpoint import scene_record, settled_path
 from pctt.run.options import read_options
@@ -106,6 +108,26 @@ def test_the_settled_state_is_made_once_and_used_again(program, tmp_path):
     assert state.stat().st_mtime_ns == made
     assert_same_bits(tmp_path / "first" / "state.h5", tmp_path / "second" / "state.h5")
     assert not list(tmp_path.glob("first/*.tmp"))
+
+
+def test_a_scene_that_another_run_settles_is_waited_for(program, settled, tmp_path):
+    folder = tmp_path / "cache" / "pctt"
+    folder.mkdir(parents=True)
+    other = Lock((folder / settled.name).with_suffix(".lock"))
+    assert other.take()
+
+    def end():
+        for path in settled.parent.iterdir():
+            shutil.copy(path, folder)
+        other.release()
+
+    timer = threading.Timer(2.0, end)
+    timer.start()
+    done = program(*SETTLED, "-steps", 1, "-ccp_type", "apgd", cache=tmp_path / "cache")
+    timer.join()
+    assert "waits for another run that settles the same scene" in done.stdout
+    assert "settling mixer" not in done.stdout
+    assert sorted(path.name for path in folder.iterdir()) == [settled.name, f"{settled.name}.sha256"]
 
 
 @pytest.mark.mpi
