@@ -44,7 +44,7 @@ def environment(**more: str) -> dict[str, str]:
     own = {
         name: value
         for name, value in os.environ.items()
-        if not name.startswith(("PETSC_OPT", "PYTEST_", "OMPI_MCA_ess", "OMPI_COMM_WORLD", "DISPLAY"))
+        if not name.startswith(("PETSC_OPT", "PYTEST_", "OMPI_MCA_ess", "OMPI_COMM_WORLD", "PMI", "DISPLAY"))
     }
     defaults = {
         "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), own.get("PYTHONPATH")])),
