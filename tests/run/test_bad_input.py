@@ -179,6 +179,17 @@ def test_a_bad_option_is_refused_before_any_work(options, results, monkeypatch):
     assert contents(results) == before
 
 
+@pytest.mark.parametrize("text", [None, "-steps 1 -dt 0.01\n"])
+def test_a_file_of_options_that_petsc_refuses_is_named(text, program, results, tmp_path):
+    if text:
+        (tmp_path / "options").write_text(text)
+    before = contents(results)
+    done = program("-options_file", "options", own=True, status=2)  # PETSc says more before
+    assert done.stderr.splitlines()[-1].startswith("pctt.run: PETSc refuses -options_file")
+    assert "Traceback" not in done.stderr
+    assert contents(results) == before
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [
