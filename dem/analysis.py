@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import ceil
 
 import numpy as np
 
@@ -12,18 +13,20 @@ from dem.arrays import Bools, Floats
 def low_pass(time: Floats, values: Floats, cutoff: float) -> Floats:
     """Values (n,) at equally spaced times (n,) [s], without their parts of higher frequency than `cutoff` [Hz].
 
-    Butterworth filter of second order, forwards and backwards, so that nothing is shifted in time. The values come back
-    unchanged if there are fewer than three, or if they do not resolve the cutoff.
+    Butterworth filter of second order, forwards and backwards, so that nothing is shifted in time. The series goes on
+    beyond its ends, mirrored at the end points, for as long as the filter remembers. The values come back unchanged if
+    they last no longer than that, 1 / `cutoff`, or if they do not resolve the cutoff.
     """
     if len(values) < 3:
         return values.copy()
     from scipy import signal  # here, as its import would slow down every start
 
     rate = 1.0 / float(np.median(np.diff(time)))
-    if cutoff >= 0.5 * rate:
+    memory = ceil(rate / cutoff)
+    if cutoff >= 0.5 * rate or len(values) <= memory:
         return values.copy()
     sections = signal.butter(2, cutoff, fs=rate, output="sos")
-    return signal.sosfiltfilt(sections, values, padlen=min(9, len(values) - 1))
+    return signal.sosfiltfilt(sections, values, padlen=memory)
 
 
 def filtered(records: Mapping[str, Floats], names: list[str], cutoff: float) -> dict[str, Floats]:

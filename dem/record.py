@@ -116,8 +116,8 @@ def energy_balance(step: Step) -> dict[str, float]:
         "kinetic_energy [J]": whole[2],
         "potential_energy [J]": whole[3],
         "work_of_motions [J]": work,
-        "friction_loss [J]": -whole[5],
-        "impact_loss [J]": -whole[4],
+        "friction_loss [J]": 0.0 - whole[5],  # nothing is zero, not -0
+        "impact_loss [J]": 0.0 - whole[4],
         "time_stepping [J]": change - work - whole[4] - whole[5],
     }
 
@@ -141,5 +141,5 @@ def contact_statistics(step: Step) -> dict[str, float]:
         "active_contacts": sums[0],
         "coordination_number": sums[2] / step.world.slabs[-1],
         "sliding_fraction": sums[1] / max(sums[0], 1),
-        "worst_overlap [m]": comm.allreduce(float((-contacts.gap).max(initial=0.0)), MPI.MAX),
+        "worst_overlap [m]": comm.allreduce(float((0.0 - contacts.gap).max(initial=0.0)), MPI.MAX),
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from functools import partial
+from math import isfinite
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,8 @@ def arguments() -> argparse.Namespace:
     given = line.parse_args()
     if not -90 < given.elevation < 90:
         line.error(f"argument -elevation: {given.elevation:g}: allowed is a number between -90 and 90")
+    if not isfinite(given.azimuth):
+        line.error(f"argument -azimuth: {given.azimuth:g}: allowed is a finite number")
     if not 0 <= given.opacity <= 1:
         line.error(f"argument -opacity: {given.opacity:g}: allowed is a number from 0 to 1")
     if given.range and given.color == "material":

@@ -53,7 +53,8 @@ class Drum(SmallSpheres):
             raise ValueError(f"length must be at least 2 sphere diameters, got {self.length:g}")
         if self.spheres > len(self._lattice()):
             raise ValueError(
-                f"fill {self.fill:g}: {self.spheres} spheres, but only {len(self._lattice())} have room at the start"
+                f"fill {self.fill:g}: {self.spheres} spheres, but only {len(self._lattice())} have room at the start; "
+                "take a smaller fill or a larger n"
             )
 
     @property

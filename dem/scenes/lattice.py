@@ -23,7 +23,7 @@ class Spheres(Experiment):
     density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)", positive)
     friction: float = option(0.25, "", "friction coefficient of all contacts", not_negative)
     perturbation: float = option(0.02, "m", "greatest displacement of a sphere from its lattice point, per axis")
-    seed: int = option(1, "", "seed of the perturbation")
+    seed: int = option(1, "", "seed of the perturbation", not_negative)
     gravity: float = option(9.81, "m/s^2", "gravity, downwards", positive)
 
     least_n: ClassVar[int] = 1

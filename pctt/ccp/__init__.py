@@ -116,15 +116,22 @@ def _start(problem: ConeProblem, guess: Array | None) -> Array:
 def _once(
     problem: ConeProblem, guess: Array, solver: Solver, limits: Limits, options: Any, newton: Newton | None, law: bool
 ) -> Result:
-    """Solve the cone problem as it is, or with ``law`` have the method find Coulomb's law."""
+    """Solve the cone problem as it is, or with ``law`` have the method find Coulomb's law. Impulses that are no numbers
+    become zero."""
     nothing = np.zeros_like(problem.r)
     if problem.size == 0:
         return Result(nothing, Status.CONVERGED, "no contacts", 0.0, 0)
-    if problem.natural_residual(nothing, problem.r) == 0:
+    cold = problem.natural_residual(nothing, problem.r)
+    if cold == 0:
         return Result(nothing, Status.CONVERGED, "no contact closes", 0.0, 0)
     arguments = (problem, guess, limits, options, *([newton] if solver.newton else []))
     with phase("CCPSolve"):
         result = solver.function(*arguments, **({"coulomb": True} if law else {}))
+        if problem.sum(np.count_nonzero(~np.isfinite(result.impulse))):
+            reason = f"impulses are no numbers: {result.reason}"
+            return dataclasses.replace(
+                result, impulse=nothing, status=Status.BREAKDOWN, reason=reason, residual=cold
+            )
         unbounded = why_unbounded(problem, result.impulse)
         if unbounded:
             result.status, result.reason = Status.UNBOUNDED, unbounded

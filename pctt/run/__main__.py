@@ -10,7 +10,13 @@ import petsc4py
 
 HELP, VERSION = {"-help", "--help", "-h"}, {"-version", "--version"}
 # before anything else imports PETSc; these are answered here, without PETSc's own hundred lines
-petsc4py.init([word for word in sys.argv if word not in HELP | VERSION])
+try:
+    petsc4py.init([word for word in sys.argv if word not in HELP | VERSION])
+except RuntimeError as error:  # of PETSc, which has printed more
+    code = str(error).splitlines()[0]
+    where = "-options_file, PETSC_OPTIONS or .petscrc"
+    sys.stderr.write(f"pctt.run: PETSc refuses {where}: no file, or a bad line ({code})\n")
+    sys.exit(2)
 
 from mpi4py import MPI
 from petsc4py import PETSc

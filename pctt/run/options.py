@@ -78,6 +78,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
             is_free(run.ccp_operator)
         except ValueError as error:
             raise OptionError(str(error)) from None
+    _refuse_tolerances(database)
     dump_steps(run)  # refuses what is no list of steps
     _refuse_places(run, comm)
     return options
@@ -167,6 +168,19 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb:
         for name, value in database.items():
             if applies and (name in names or name.startswith(starts)):
                 raise OptionError(f"{f'-{name} {value or str()}'.rstrip()}: {reason}")
+
+
+def _refuse_tolerances(database: Mapping[str, str]) -> None:
+    """OptionError for a relative tolerance of a KSP that PETSc would refuse at the first Newton system, or worse,
+    take."""
+    for name, text in database.items():
+        if name.endswith("ksp_rtol"):
+            try:
+                wrong = not 0.0 <= float(text or "nan") < 1.0
+            except ValueError:  # PETSc knows other words, and refuses the rest
+                continue
+            if wrong:
+                raise OptionError(f"{f'-{name} {text or str()}'.rstrip()}: allowed is a number >= 0 and below 1")
 
 
 def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) -> None:

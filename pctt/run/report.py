@@ -242,4 +242,4 @@ def overlap_line(worst: Mapping[str, float]) -> str:
 def figure_table(figures: Mapping[str, float]) -> str:
     """A line per number of the scene's analysis."""
     width = max(map(len, figures), default=0)
-    return "\n".join(f"{name:{width}}  {value:.6g}" for name, value in figures.items())
+    return "\n".join(f"{name:{width}}  {value + 0.0:.6g}" for name, value in figures.items())

@@ -114,6 +114,14 @@ def test_one_contact_worked_out_by_hand(solver):
         assert np.allclose(result.impulse, [expected], atol=1e-7)
 
 
+@pytest.mark.parametrize("solver", ["pdip", "apgd", "gauss_seidel"])
+def test_impulses_are_numbers_where_their_squares_overflow(solver):
+    known, _ = heap()
+    problem = from_matrix(dataclasses.replace(known, r=1e300 * known.r))
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-4))
+    assert np.isfinite(result.impulse).all()
+
+
 @EVERY
 def test_no_contacts_are_solved(solver):
     graph = random_graph(0, 0, 3)

@@ -24,6 +24,19 @@ def test_the_filter_halves_the_amplitude_at_the_cutoff():
     assert np.abs(filtered).max() == pytest.approx(0.5, abs=5e-3)
 
 
+@pytest.mark.parametrize("place", [1, 5, 9])
+def test_a_peak_near_the_start_is_spread_as_any_other(place):
+    """There its mirror image, of the other sign, comes to it: in all at most twice the height."""
+    height = analysis.low_pass(TIME, (np.arange(len(TIME)) == 400).astype(float), 2.0).max()
+    near = analysis.low_pass(TIME, (np.arange(len(TIME)) == place).astype(float), 2.0)
+    assert np.abs(near).max() <= 2 * height
+
+
+def test_a_series_shorter_than_the_filter_remembers_is_left_alone():
+    values = np.random.default_rng(0).normal(size=50)
+    np.testing.assert_array_equal(analysis.low_pass(TIME[:50], values, 2.0), values)
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 5, 30])
 def test_few_records_are_filtered_too(count):
     assert analysis.low_pass(TIME[:count], np.ones(count), 2.0) == pytest.approx(np.ones(count))

@@ -84,6 +84,7 @@ def test_a_run_without_recorded_steps_is_refused(program, show, tmp_path):
         ("render", ("-size", "3x5"), ("-size", "3x5")),
         ("render", ("-color", "material", "-range", 0, 1), ("-range", "material")),
         ("render", ("-elevation", 95), ("-elevation", "95")),
+        ("render", ("-azimuth", "nan"), ("-azimuth", "finite number")),
     ],
 )
 def test_a_bad_option_is_named(program, options, words, show):

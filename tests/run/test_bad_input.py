@@ -40,6 +40,7 @@ BAD_OPTIONS = {
     "-scene_radius nan": ["nan", "finite number"],
     "-scene_radius -0.1": ["-0.1", "positive"],
     "-scene_friction -1": ["-1", "not be negative"],
+    "-scene_seed -1": ["-1", "not be negative"],
     "-scene_perturbation 0.03": ["0.03", "0.025"],  # the spheres could overlap
     "-scene_clearance 0.15": ["0.15", "jam"],
     "-scene_paddle_length 1.5": ["1.5", "does not fit", "below 1"],
@@ -57,6 +58,10 @@ BAD_OPTIONS = {
     "-ksp_type nosuch": ["nosuch"],
     "-pc_type nosuch": ["nosuch"],
     "-ksp_rtol abc": ["abc"],
+    "-ksp_rtol 1e3": ["1e3", "below 1"],  # a typing error for 1e-3
+    "-ksp_rtol -1": ["-1", ">= 0"],
+    "-ksp_rtol nan": ["nan", ">= 0"],
+    "-compare_ilu_ksp_rtol 1 -compare ilu": ["1", "below 1"],
     "-pc_python_type nosuch.Thing -pc_type python": ["nosuch.Thing"],
     "-restart missing.h5": ["missing.h5", "no such file"],
     "-restart .": ["no such file"],
@@ -171,6 +176,17 @@ def test_a_bad_option_is_refused_before_any_work(options, results, monkeypatch):
     with pytest.raises(OptionError) as refusal:
         read_options(database, MPI.COMM_SELF)
     check_words(str(refusal.value), options)
+    assert contents(results) == before
+
+
+@pytest.mark.parametrize("text", [None, "-steps 1 -dt 0.01\n"])
+def test_a_file_of_options_that_petsc_refuses_is_named(text, program, results, tmp_path):
+    if text:
+        (tmp_path / "options").write_text(text)
+    before = contents(results)
+    done = program("-options_file", "options", own=True, status=2)  # PETSc says more before
+    assert done.stderr.splitlines()[-1].startswith("pctt.run: PETSc refuses -options_file")
+    assert "Traceback" not in done.stderr
     assert contents(results) == before
 
 

@@ -36,7 +36,7 @@ def test_a_row_per_step_that_state_and_summary_know_too(program, settled, tmp_pa
             assert recorded == {name: column[k] for name, column in rows.items()}
     (figure,) = summary["analysis"].items()
     assert figure == ("mean_torque [N m]", pytest.approx(-rows["torque_mixer_z [N m]"].mean()))
-    assert f"{figure[0]}  {figure[1]:.6g}" in done.stdout
+    assert f"{figure[0]}  {figure[1] + 0.0:.6g}" in done.stdout
     weight = 27 * 2500.0 * 4 / 3 * np.pi * 0.1**3 * 9.81
     carried = -(rows["force_box_z [N]"] + rows["force_mixer_z [N]"])
     np.testing.assert_allclose(carried.mean(), weight, rtol=0.1)  # settled, and stirred slowly

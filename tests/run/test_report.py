@@ -20,6 +20,10 @@ def test_the_time_left_goes_on_as_before(spent, done, steps, words):
     assert report.remaining(spent, done, steps) == words
 
 
+def test_a_figure_of_nothing_has_no_sign():
+    assert report.figure_table({"torque": -0.0}) == "torque  0"
+
+
 def test_the_table_counts_what_did_not_converge():
     line = {
         "phases": {"solve": 3.0, "search": 1.0}, "seconds": 4.0, "contacts": 7, "newton_its": 2, "ksp_its": 5,
