@@ -70,6 +70,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         demo,
     )
     compare = ccp.Comparison(comm, options.compare_names())  # refuses unknown names
+    _refuse_tolerances(database)  # newer releases of PETSc refuse them too, in other words
     if solver.newton and not run.settle:
         form = ccp.newton_for(comm, run.ccp_type, run.ccp_newton, compare).form
         _refuse_for_petsc(database, form, comm)
@@ -78,7 +79,6 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
             is_free(run.ccp_operator)
         except ValueError as error:
             raise OptionError(str(error)) from None
-    _refuse_tolerances(database)
     dump_steps(run)  # refuses what is no list of steps
     _refuse_places(run, comm)
     return options
