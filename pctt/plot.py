@@ -39,7 +39,7 @@ def main(comm: MPI.Comm) -> None:
 
     import matplotlib as mpl
 
-    from pctt.look import figures
+    from pctt.look import figures, structure
 
     with mpl.rc_context(figures.STYLE):  # type: ignore[arg-type]
         made = {}
@@ -54,8 +54,8 @@ def main(comm: MPI.Comm) -> None:
             made["compare"] = figures.compare(folder.summary["compare"])
         frame = _frame(folder, given.step)
         if frame is not None:
-            made["sparsity"] = figures.sparsity(folder, frame)
-            made["graphs"] = figures.graphs(folder, frame)
+            made["sparsity"] = structure.sparsity(folder, frame)
+            made["graphs"] = structure.graphs(folder, frame)
         if not made:
             raise FolderError(f"{folder.path}: nothing to plot: no steps, no comparison, no recorded contacts")
         for name, figure in made.items():

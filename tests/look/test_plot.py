@@ -12,7 +12,7 @@ pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
 from matplotlib.image import imread
 
-from pctt.look import figures
+from pctt.look import figures, structure
 
 
 def test_all_figures_are_drawn(show, folder, tmp_path):
@@ -107,14 +107,14 @@ def test_the_pattern_is_that_of_the_delassus_matrix(folder):
             blocks[c, :, body] = rng.uniform(size=(3, 6))
     G = blocks.reshape(3 * len(pair), -1)
     there = (np.abs(G @ G.T).reshape(len(pair), 3, len(pair), 3).max(axis=(1, 3)) > 0) | np.eye(len(pair), dtype=bool)
-    np.testing.assert_array_equal(figures._coupling(read, frame).toarray() > 0, there)
+    np.testing.assert_array_equal(structure._coupling(read, frame).toarray() > 0, there)
 
 
 def test_the_example_is_a_cluster_of_few_grains(folder):
     read = Folder(folder)
     read.require_frames()
     frame = read.frame(4)
-    rows = figures.example(read, frame)
+    rows = structure.example(read, frame)
     grains = np.unique(frame.contacts.body[rows])
     assert 1 <= (grains < 125).sum() <= 13
     assert len(rows) >= 1
