@@ -14,6 +14,9 @@ import h5py
 #: Bytes for HDF5 beside the numbers: per file, and per data set or attribute. HDF5 was seen to use a quarter of them.
 PER_FILE, PER_ITEM = 16384, 2048
 
+#: The files of a run in its folder.
+RUN_FILES = ("state.h5", "records.csv", "steps.jsonl", "analysis.csv", "summary.json", "checkpoint.h5")
+
 
 def temporary_name(path: Path) -> Path:
     """The name under which a file is written until it is complete."""

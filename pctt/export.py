@@ -23,13 +23,12 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from pctt.disk import make_hdf5
+from pctt.disk import RUN_FILES, make_hdf5
 from pctt.look.folder import Folder, FolderError, Frame
 from pctt.look.program import add_steps, chosen, made_folder, parser, run, whole
 
 SERIES = ("bodies", "contacts", "large")
 FORMATS = ("vtp", "vtkhdf")
-OF_RUN = ("state.h5", "checkpoint.h5", "records.csv", "steps.jsonl", "analysis.csv", "summary.json")
 
 
 def arguments() -> argparse.Namespace:
@@ -104,7 +103,7 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
     FolderError if a file cannot be read or written, or belongs to the run.
     """
     frames = folder.bodies_path.parent.resolve()
-    if path.resolve().parent == frames or path.resolve() in [(folder.path / name).resolve() for name in OF_RUN]:
+    if path.resolve().parent == frames or path.resolve() in [(folder.path / name).resolve() for name in RUN_FILES]:
         raise FolderError(f"-single {path}: is a file of the run; allowed is another name")
     groups = {"bodies": folder.bodies_path, **{f"steps/{step:06d}": folder.frame_path(step) for step in steps}}
     with whole(path) as temporary:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from pctt.disk import Lock
+from pctt.disk import RUN_FILES, Lock
 from pctt.run.hdf5 import FileError, told
 
 HARD = "hard"  # folder of the cone problems that were not solved
 #: What a run leaves in its folder.
-FILES = ("state.h5", "records.csv", "steps.jsonl", "analysis.csv", "summary.json", "checkpoint.h5", "frames", HARD)
+FILES = (*RUN_FILES, "frames", HARD)
 
 
 def held(folder: Path) -> list[str]:
