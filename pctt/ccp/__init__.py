@@ -94,7 +94,7 @@ def solve(
             return by(solver, problem, guess, limits.tol)
         methods = [solver] if solver.has_law or problem.size == 0 else []
         if solver.has_law and solver.newton:
-            methods += [SOLVERS[name] for name in ("apgd", "conic", "apgd")]
+            methods = [SOLVERS[name] for name in ("auto", "conic", "apgd")]
         ways = [partial(by, method, law=True) for method in methods]
         return coulombs_law.ladder(problem, guess, limits, coulomb, partial(by, solver), ways)
     finally:

@@ -9,6 +9,9 @@ Costs are in iterations of APGD: the conic method's by a table (`conic_cost`), A
    which saves about as much as APGD has cost so far (up to 0.3 of its own cost): trying APGD is almost free.
 3. If it stalls, go back to APGD, from the better of the two points, to the end.
 
+For Coulomb's law the conic method stalls often, but the path that it follows leads to the neighbourhood of a solution.
+There it begins at the first guess, is stopped at the residual ``basin``, and APGD goes on from the end of its path.
+
 From the second cone problem on, a `Memory` helps. It holds the iterations that APGD needed, or was expected to need,
 and the measured cost of the conic method. Without it (``-ccp_auto_remember false``) the rules count iterations only, so
 that a repeated run repeats its choices. docs/measurements.md compares the cost of these rules with that of the better
@@ -30,7 +33,7 @@ from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.result import Limits, Result
+from pctt.ccp.result import Limits, Result, Status
 from pctt.options import POSITIVE, option
 
 
@@ -52,10 +55,12 @@ class Steering:
     earliest: float = 0.1  #: part of the conic method's cost before which there is no forecast
     looks: int = 8  #: looks at the natural residual before which there is no forecast
     saved: float = 0.3  #: part of the conic method's cost, at most, by beginning at APGD's point
-    law: float = 6.0  #: factor on the conic method's cost for Coulomb's law, whose Newton systems are unsymmetric
+    law: float = 4.0  #: factor on the conic method's cost for Coulomb's law, whose Newton systems are unsymmetric
     far: float = 4.0  #: times that cost: more iterations of APGD than this need not be told apart
     #: complementarity of the conic method's start, by APGD's natural residual; its own default at most
     start: float = 3e4
+    #: Coulomb residual at which its path for Coulomb's law has come so near to a solution that APGD gets there soon
+    basin: float = 3e-4
 
 
 STEERING = Steering()
@@ -102,23 +107,43 @@ def solve(
         memory.needed[decade(limits.tol)] = Needed(first.iterations, True)
         words = f"{first.reason}; conic would have cost about {cost:.0f} iterations"
         return dataclasses.replace(first, solver="apgd", reason=words)
-    inner = dataclasses.replace(limits, max_it=min(STEERING.conic_it, limits.max_it))
-    begin = conic.Conic(start=min(conic.Conic().start, STEERING.start * first.residual))
-    result = second = conic.solve(problem, first.impulse, inner, begin, newton, coulomb)
-    words = f"{first.reason}; conic: {second.reason}"
-    solver = "conic"
+    second = _conic(problem, guess, first, limits, newton, coulomb)
+    if second.status is Status.GIVEN_UP:  # these Newton systems take no unsymmetric matrices
+        return dataclasses.replace(first, status=Status.GIVEN_UP, reason=f"{first.reason}; conic: {second.reason}")
+    result, solver, words = second, "conic", f"{first.reason}; conic: {second.reason}"
     if not (second.final or limits.max_it <= STEERING.conic_it):
-        best = min(first, second, key=lambda result: result.residual)
-        result = apgd.solve(problem, best.impulse, limits, apgd.APGD(), None, coulomb)
+        # with Coulomb's law the end of a path is a better beginning than a point with a smaller residual
+        begin = second if coulomb else min(first, second, key=lambda result: result.residual)
+        result = apgd.solve(problem, begin.impulse, limits, apgd.APGD(), None, coulomb)
         result.ksp_its, result.fallbacks = second.ksp_its, second.fallbacks
         result.history = second.history + result.history
         words, solver = f"{words}; apgd: {result.reason}", "apgd"
+        if coulomb and first.residual < result.residual:
+            result = dataclasses.replace(result, impulse=first.impulse, residual=first.residual)
     # the slowest rank's seconds, the same on all
     before, after = (problem.max(s) for s in (switched - start, perf_counter() - switched))
     done = first.iterations
     memory.needed[decade(limits.tol)] = Needed(watch.needed, False)
     memory.keep_cost(limits.tol, (after * max(done, 1) / before + min(done, STEERING.saved * model)) / model)
     return dataclasses.replace(result, solver=solver, reason=words)
+
+
+def _conic(
+    problem: ConeProblem, guess: Array, first: Result, limits: Limits, newton: Newton, coulomb: bool
+) -> Result:
+    """By the conic method what APGD has given up at its result ``first``. For Coulomb's law the path from the first
+    guess, which is not at its end where its status is STALLED."""
+    inner = dataclasses.replace(limits, max_it=min(STEERING.conic_it, limits.max_it))
+    if not coulomb:
+        begin = conic.Conic(start=min(conic.Conic().start, STEERING.start * first.residual))
+        return conic.solve(problem, first.impulse, inner, begin, newton, coulomb)
+    near = limits.tol < STEERING.basin
+    if near:
+        inner = dataclasses.replace(inner, tol=STEERING.basin, closing_work=np.inf)
+    path = conic.solve(problem, guess, inner, conic.Conic(), newton, coulomb)
+    if near and path.converged:
+        path.status = Status.STALLED
+    return path
 
 
 class Watch:

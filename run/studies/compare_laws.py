@@ -22,7 +22,7 @@ from pctt import ccp
 from pctt.run.stepper import cone_problem
 
 SCENES = ("mixer", "blade", "shear")
-METHODS = {("apgd", "1e-4"): 20, ("conic", "1e-6"): 3}  # and how many steps
+METHODS = {("apgd", "1e-4"): 20, ("conic", "1e-6"): 5}  # and how many steps
 MOST = 10  # cone problems where a method's own way to the law ends early
 DT = 0.01
 

@@ -13,7 +13,8 @@ from several_ranks import alone
 from test_accuracy import column
 
 from pctt import ccp
-from pctt.ccp import Coulomb, Limits, Status, coulomb, fclib
+from pctt.ccp import Coulomb, Limits, Status, auto, coulomb, fclib
+from pctt.ccp.first_order.momentum import Momentum
 from pctt.ccp.interior import conic, lorentz, slip
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "fclib"
@@ -32,6 +33,16 @@ def by_cone_problems(problem, tol=1e-8, guess=None, **options):
         return ccp.solve(problem, guess, "apgd", Limits(tol))
 
     return coulomb.solve(problem, guess, Limits(tol), Coulomb(**options), convex)
+
+
+def newton_steps(problem, tol=1e-8, guess=None):
+    """The Newton steps of `conic` alone."""
+    newton = ccp.newton_for(problem.comm, "conic")
+    guess = np.zeros_like(problem.r) if guess is None else guess
+    try:
+        return conic.solve(problem, guess, Limits(tol, 60), conic.Conic(), newton, coulomb=True)
+    finally:
+        newton.destroy()
 
 
 @SOLVERS
@@ -83,8 +94,8 @@ def test_contacts_obey_coulombs_law(solver):
 
 def test_all_solvers_find_the_same():
     problem = sliding_heap(0.3, seed=2)
-    found = [solve(problem, name, 1e-7).impulse for name in ("apgd", "conic")]
-    assert problem.product(found[0]) == pytest.approx(problem.product(found[1]), abs=1e-4)
+    found = [problem.product(result.impulse) for result in (solve(problem, tol=1e-7), newton_steps(problem, 1e-7))]
+    assert found[0] == pytest.approx(found[1], abs=1e-4)
 
 
 @pytest.mark.parametrize("mu", [0.8, 1.5])
@@ -97,11 +108,27 @@ def test_one_run_finds_it_at_high_friction(mu):
         assert result.iterations < 2500
 
 
+def test_near_a_solution_the_bound_of_momentum_stays():
+    """Far from it every window begins without a bound."""
+
+    def beta(friction, residuals, iterations=0):
+        momentum = Momentum(friction)
+        momentum.look(iterations, residuals)
+        for _ in range(1000):
+            momentum.advance(uphill=False)
+        return momentum.beta
+
+    assert beta(0.5, [1e-3]) > 0.99
+    for stalled in (0, 500):
+        assert beta(0.5, [2e-5, 1e-3, 1e-3], stalled) == pytest.approx(0.97)
+    assert beta(1.5, [2e-5]) == pytest.approx(0.95)
+    assert beta(None, [2e-5]) > 0.99  # without the law there is none
+
+
 def test_the_newton_steps_of_conic_end_fast():
     """The derivative of the opening is that: the last five steps take three digits off the residual."""
-    result = solve(sliding_heap(0.3, seed=1), "conic", tol=1e-9)
+    result = newton_steps(sliding_heap(0.3, seed=1), tol=1e-9)
     assert result.converged, result.reason
-    assert (result.law, result.cone_problems) == ("Coulomb", 1)
     assert result.iterations < 20
     assert result.history[-1] < 1e-3 * result.history[-6]
 
@@ -142,24 +169,45 @@ def test_each_way_begins_where_the_one_before_has_ended():
     assert (result.converged, result.law, result.iterations) == (True, "Coulomb", 21)
 
 
-def test_where_conic_stalls_apgd_goes_on_from_its_point(monkeypatch):
-    """And `conic` begins near the point at which that has ended."""
-    problem = sliding_heap(0.3)
-    monkeypatch.setattr(conic, "STEERING", dataclasses.replace(conic.STEERING, patience_with_law=-1))
-    result = ccp.solve(problem, None, "conic", Limits(1e-6), coulomb=Coulomb())
+def test_where_the_path_of_conic_ends_early_apgd_goes_on(monkeypatch):
+    """`apgd` begins, is given up, `conic` follows its path from the first guess, and `apgd` goes on from its end."""
+    problem, starts = sliding_heap(0.3), {"apgd": [], "conic": []}
+    guess = 0.5 * solve(problem, tol=1e-3).impulse
+
+    def noted(name, module):
+        original = module.solve
+
+        def noting(problem, guess, *rest):
+            result = original(problem, guess, *rest)
+            starts[name].append((guess, result))
+            return result
+
+        monkeypatch.setattr(module, "solve", noting)
+
+    noted("apgd", auto.apgd)
+    noted("conic", auto.conic)
+    monkeypatch.setattr(auto, "STEERING", dataclasses.replace(auto.STEERING, law=1e-6))
+    result = solve(problem, "conic", 1e-8, guess=guess)
     assert (result.converged, result.law, result.solver) == (True, "Coulomb", "apgd")
-    assert ccp.measure(problem, result.impulse).coulomb_residual < 1e-5
+    (first, given_up), (second, _) = starts["apgd"]
+    (path, ended), = starts["conic"]
+    assert given_up.status is Status.GIVEN_UP
+    assert np.array_equal(path, guess)
+    assert np.array_equal(first, guess)
+    assert 1e-8 < ended.residual <= auto.STEERING.basin
+    assert np.array_equal(second, ended.impulse)
+    assert ccp.measure(problem, result.impulse).coulomb_residual < 1e-7
 
 
 def test_conic_begins_near_a_good_guess(monkeypatch):
     """And inside the cones also where the guess is exact."""
     problem = sliding_heap(0.3)
     guess = solve(problem, "apgd", tol=1e-11).impulse
-    cold = solve(problem, "conic", tol=1e-6).iterations
-    assert solve(problem, "conic", tol=1e-6, guess=guess).iterations < cold
+    cold = newton_steps(problem, 1e-6).iterations
+    assert newton_steps(problem, 1e-6, guess).iterations < cold
     monkeypatch.setattr(problem, "natural_residual", lambda g, y, law=False: 0.0 if g is guess else original(g, y, law))
     original = type(problem).natural_residual.__get__(problem)
-    result = solve(problem, "conic", tol=1e-6, guess=guess)
+    result = newton_steps(problem, 1e-6, guess)
     assert result.converged, result.reason
     assert result.iterations < cold
 

@@ -20,11 +20,13 @@ class Steering:
     much: float = 0.6  #: there is room for more if it leaves less than this part
     heavier: float = 1.5  #: factor on the damping if there is too much momentum
     lighter: float = 0.8  #: factor on the damping if there is room for more
+    near: float = 1e-4  #: residual below which the damping stays the same, and there are no bursts
+    damping_near: float = 0.03  #: 1 - the greatest momentum there
 
 
 STEERING = Steering()
 #: where friction is above 1: there what a burst excites does not die
-STEEP = Steering(damping=0.05, range=(0.0, 1.0), burst=0, heavier=2.0, lighter=0.9)
+STEEP = Steering(damping=0.05, range=(0.0, 1.0), burst=0, heavier=2.0, lighter=0.9, near=0.0)
 
 
 class Momentum:
@@ -48,6 +50,7 @@ class Momentum:
         self._steering = steering = STEEP if friction is not None and friction > 1.0 else STEERING
         self._damping = steering.damping  # after the burst of a window
         self._end, self._looks, self._last = steering.window, 0, np.inf
+        self._least, self._seen = np.inf, 0  # of the residuals seen so far, and how many
         self._left, self._change = np.inf, steering.heavier  # by the last window; factor of the last change
         self._burst = steering.burst > 0
         self.restart()
@@ -68,6 +71,11 @@ class Momentum:
     def look(self, iterations: int, residuals: list[float]) -> None:
         """Note the iterations so far, and at the end of a window choose the damping by the residuals looked at."""
         if not self._bounded:
+            return
+        self._least = min(self._least, *residuals[self._seen :], np.inf)
+        self._seen = len(residuals)
+        if self._least < self._steering.near:
+            self._damping, self._burst = self._steering.damping_near, False
             return
         if iterations >= self._end:
             self._choose(residuals)

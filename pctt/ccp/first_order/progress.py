@@ -21,7 +21,6 @@ class Steering:
     """When a method has stalled."""
 
     patience: int = 5000  #: without progress [iterations]: these methods have plateaus of thousands
-    patience_with_law: int = 3000  #: the same for Coulomb's law, where another method takes over [iterations]
     patience_in_single: int = 300  #: the same in single precision, where double precision takes over [iterations]
     progress: float = 0.99  #: a natural residual below this part of the best one is progress; rounding alone is not
 
@@ -57,9 +56,7 @@ class Progress:
         self.history: list[float] = before.history if before else []
         self.status, self.reason = Status.STALLED, ""
         self._best, self._point = np.inf, np.zeros((0, 3))
-        self._patience = STEERING.patience_with_law if problem.opening else STEERING.patience
-        if problem.precision == np.float32:
-            self._patience = STEERING.patience_in_single
+        self._patience = STEERING.patience if problem.precision == np.float64 else STEERING.patience_in_single
         self._looks = self._next_look = 0
         self._suspicious, self._unbounded = limits.tol, ""
         self._gain = (np.inf, self.iterations)  # residual and iteration of the last progress
