@@ -32,6 +32,8 @@ class Steering:
     inner: float = 0.3
     first: float = 1e-2  #: accuracy of the first cone problem, whose opening is a guess [natural residual]
     restart: float = 3.0  #: growth of the residual over its best at which Anderson's earlier openings are forgotten
+    #: natural residual of Coulomb's law, over the tolerance, from which cone problems would only lead away
+    near: float = 10.0
     singular: float = 1e-12  #: singular values of Anderson's system below this part of the largest count as zero
 
 
@@ -75,7 +77,7 @@ def ladder(
         if tried[-1].status is Status.GIVEN_UP:
             break
     tried.sort(key=lambda result: -result.residual)
-    if tried and _only_closes(problem, limits, tried[-1]):
+    if tried and _near(problem, limits, tried[-1]):
         return _last_of(tried)
     tried.append(solve(problem, tried[-1].impulse if tried else guess, limits, options, convex))
     if tried[-1].final:
@@ -88,12 +90,13 @@ def ladder(
     return _last_of(sorted(tried, key=lambda result: -result.residual))
 
 
-def _only_closes(problem: ConeProblem, limits: Limits, found: Result) -> bool:
-    """Whether only the closing work of a result is too large. Then cone problems would not do better."""
+def _near(problem: ConeProblem, limits: Limits, found: Result) -> bool:
+    """Whether a result is so near to Coulomb's law that cone problems would not do better. Its closing work may be too
+    large all the same."""
     if found.status is Status.GIVEN_UP:
         return False
     y = problem.product(found.impulse) + problem.r
-    return problem.natural_residual(found.impulse, y, coulomb=True) <= limits.tol
+    return problem.natural_residual(found.impulse, y, coulomb=True) <= STEERING.near * limits.tol
 
 
 def _residual(problem: ConeProblem, limits: Limits, g: Array, y: Array) -> float:

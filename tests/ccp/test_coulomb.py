@@ -155,6 +155,26 @@ def test_the_last_rung_is_the_relaxation(monkeypatch):
     assert result.residual == pytest.approx(ccp.measure(problem, result.impulse).coulomb_residual, rel=1e-6)
 
 
+@pytest.mark.parametrize(("tol", "tried"), [(1e-7, False), (1e-9, True)])
+def test_no_cone_problems_from_a_point_near_the_law(monkeypatch, tol, tried):
+    """They would lead away from it."""
+    problem, calls = sliding_heap(0.3), []
+    found = solve(problem, tol=5e-7)
+    assert 1e-8 < found.residual < 1e-6
+
+    def by_cone_problems(problem, guess, *rest):
+        calls.append(guess)
+        return ccp.Result(guess, Status.CONVERGED, "as it happens", 0.5 * tol, 7)
+
+    def stalling(problem, guess, tol):
+        return dataclasses.replace(found, status=Status.STALLED)
+
+    monkeypatch.setattr(coulomb, "solve", by_cone_problems)
+    result = coulomb.ladder(problem, np.zeros_like(problem.r), Limits(tol), Coulomb(), stalling, [stalling])
+    assert bool(calls) == result.converged == tried
+    assert np.array_equal(result.impulse, found.impulse)
+
+
 def test_each_way_begins_where_the_one_before_has_ended():
     problem = sliding_heap(0.3)
     starts = []

@@ -42,6 +42,9 @@ class Momentum:
     Chains of force converge slowly, and need more momentum than that. So every window begins with a burst without a
     bound. What oscillates by then dies in the rest of the window.
 
+    Near a solution only chains of force are left. A window then brings little whatever the damping is, and the rule
+    would choose too much: below ``near`` the damping is ``damping_near``.
+
     On large problems a window brings little whatever the damping is. So if more damping has made it worse, the next
     change is less damping, and the other way round. If the residual has grown, more damping is always right."""
 
