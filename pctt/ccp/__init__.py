@@ -60,11 +60,11 @@ def solve(
 ) -> Result:
     """Solve a cone problem by a method of SOLVERS; with ``coulomb`` find impulses of Coulomb's law.
 
-    For Coulomb's law there is a ladder. The first rung is the method's own way, if it has one (`Solver.has_law`). Where
-    `conic` or `auto` stall, `apgd` goes on from there, and where that stalls, `conic` and `apgd` once more. If none of
-    them converges, the second rung is a sequence of cone problems (`pctt.ccp.coulomb`). If that does not converge
-    either, the result is the best of all and of the relaxation, by the Coulomb residual, and counts as not converged.
-    ``law`` of the result names the rung.
+    For Coulomb's law there is a ladder. The first rung is the method's own way, if it has one (`Solver.has_law`). That
+    of `conic` and `auto` is the way of `auto`: `apgd`, then the path of `conic` and `apgd` from its end; where that
+    fails, `conic` and `apgd` once more. If none of them comes near the law, the second rung is a sequence of cone
+    problems (`pctt.ccp.coulomb`). If that does not converge either, the result is the best of all and of the
+    relaxation, by the Coulomb residual, and counts as not converged. ``law`` of the result names the rung.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
     the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
