@@ -20,13 +20,15 @@ class Steering:
     much: float = 0.6  #: there is room for more if it leaves less than this part
     heavier: float = 1.5  #: factor on the damping if there is too much momentum
     lighter: float = 0.8  #: factor on the damping if there is room for more
-    near: float = 1e-4  #: residual below which the damping stays the same, and there are no bursts
-    damping_near: float = 0.03  #: 1 - the greatest momentum there
 
 
 STEERING = Steering()
+#: below these residuals, where chains of force are left, which converge slowly whatever the damping is
+NEAR = Steering(damping=0.03, range=(0.03, 0.3), window=1000, burst=0, heavier=2.0)
+NEARER = Steering(damping=0.03, range=(0.03, 0.03), window=1000, burst=0)
+STAGES = {np.inf: STEERING, 1e-4: NEAR, 1e-5: NEARER}
 #: where friction is above 1: there what a burst excites does not die
-STEEP = Steering(damping=0.05, range=(0.0, 1.0), burst=0, heavier=2.0, lighter=0.9, near=0.0)
+STEEP = {np.inf: Steering(damping=0.05, range=(0.0, 1.0), burst=0, heavier=2.0, lighter=0.9)}
 
 
 class Momentum:
@@ -42,21 +44,26 @@ class Momentum:
     Chains of force converge slowly, and need more momentum than that. So every window begins with a burst without a
     bound. What oscillates by then dies in the rest of the window.
 
-    Near a solution only chains of force are left. A window then brings little whatever the damping is, and the rule
-    would choose too much: below ``near`` the damping is ``damping_near``.
+    Near a solution such chains are all that is left. There windows are longer, without bursts, and the damping begins
+    anew, with a small one; at last it stays.
 
     On large problems a window brings little whatever the damping is. So if more damping has made it worse, the next
     change is less damping, and the other way round. If the residual has grown, more damping is always right."""
 
     def __init__(self, friction: float | None = None):
         self._bounded = friction is not None
-        self._steering = steering = STEEP if friction is not None and friction > 1.0 else STEERING
-        self._damping = steering.damping  # after the burst of a window
-        self._end, self._looks, self._last = steering.window, 0, np.inf
+        self._stages = dict(STEEP if friction is not None and friction > 1.0 else STAGES)
         self._least, self._seen = np.inf, 0  # of the residuals seen so far, and how many
+        self._enter(self._stages.pop(np.inf), 0)
+        self.restart()
+
+    def _enter(self, steering: Steering, iterations: int) -> None:
+        """Begin a stage."""
+        self._steering = steering
+        self._damping = steering.damping  # after the burst of a window
+        self._end, self._looks, self._last = iterations + steering.window, self._seen, self._least
         self._left, self._change = np.inf, steering.heavier  # by the last window; factor of the last change
         self._burst = steering.burst > 0
-        self.restart()
 
     def restart(self) -> None:
         self._theta, self.beta = 1.0, 0.0
@@ -75,11 +82,10 @@ class Momentum:
         """Note the iterations so far, and at the end of a window choose the damping by the residuals looked at."""
         if not self._bounded:
             return
-        self._least = min(self._least, *residuals[self._seen :], np.inf)
+        self._least = min([self._least, *residuals[self._seen :]])
         self._seen = len(residuals)
-        if self._least < self._steering.near:
-            self._damping, self._burst = self._steering.damping_near, False
-            return
+        while self._stages and self._least < max(self._stages):
+            self._enter(self._stages.pop(max(self._stages)), iterations)
         if iterations >= self._end:
             self._choose(residuals)
             self._end = iterations + self._steering.window
