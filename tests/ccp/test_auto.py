@@ -120,6 +120,12 @@ def test_the_cost_grows_with_size_and_accuracy():
     assert conic_cost(10, 0, 1e-6) == conic_cost(300, 0, 1e-6)  # small problems have fixed costs
 
 
+def test_coulombs_law_costs_conic_more_in_large_problems():
+    assert auto.law_factor(100) == auto.law_factor(1000) == 2.0
+    assert 2.0 <= auto.law_factor(3_800) < 3.0
+    assert 6.0 < auto.law_factor(19_000) < auto.law_factor(27_000) < 12.0
+
+
 # -- memory ------------------------------------------------------------------------------------------------
 
 

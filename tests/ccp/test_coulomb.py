@@ -206,7 +206,7 @@ def test_where_the_path_of_conic_ends_early_apgd_goes_on(monkeypatch):
 
     noted("apgd", auto.apgd)
     noted("conic", auto.conic)
-    monkeypatch.setattr(auto, "STEERING", dataclasses.replace(auto.STEERING, law=1e-6))
+    monkeypatch.setattr(auto, "STEERING", dataclasses.replace(auto.STEERING, law=1e-6, law_contacts=1e12))
     result = solve(problem, "conic", 1e-8, guess=guess)
     assert (result.converged, result.law, result.solver) == (True, "Coulomb", "apgd")
     (first, given_up), (second, _) = starts["apgd"]
