@@ -17,6 +17,7 @@ from mpi4py import MPI
 from pctt.blocks import BlockRows
 from pctt.ccp import coulomb as coulombs_law
 from pctt.ccp.accuracy import Accuracy, measure
+from pctt.ccp.auto import Auto
 from pctt.ccp.cone import Array
 from pctt.ccp.coulomb import Coulomb
 from pctt.ccp.newton import FORMS, Newton
@@ -85,7 +86,9 @@ def solve(
         if method is solver:
             return _once(problem, guess, method, limits.to(tol), options or method.options(), newton or own, law)
         to = dataclasses.replace(limits.to(tol), max_it=method.iterations)
-        result = _once(problem, guess, method, to, method.options(), newton or own, law)
+        # without a look at the clock, so that a repeated run of `conic` repeats its choices
+        defaults = Auto(remember=False) if method.name == "auto" else method.options()
+        result = _once(problem, guess, method, to, defaults, newton or own, law)
         result.solver = result.solver or method.name
         return result
 

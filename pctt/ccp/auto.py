@@ -55,14 +55,14 @@ class Steering:
     earliest: float = 0.1  #: part of the conic method's cost before which there is no forecast
     looks: int = 8  #: looks at the natural residual before which there is no forecast
     saved: float = 0.3  #: part of the conic method's cost, at most, by beginning at APGD's point
-    #: factor on the conic method's cost for Coulomb's law, at least: its Newton systems are unsymmetric
-    law: float = 2.0
-    law_contacts: float = 1000.0  #: the factor is the 2/3 power of contacts over this: LU factors fill in
     far: float = 4.0  #: times that cost: more iterations of APGD than this need not be told apart
     #: complementarity of the conic method's start, by APGD's natural residual; its own default at most
     start: float = 3e4
-    #: Coulomb residual at which its path for Coulomb's law has come so near to a solution that APGD gets there soon
+    #: Coulomb residual at which the conic method's path has come so near to a solution that APGD gets there soon
     basin: float = 3e-4
+    #: factor on the conic method's cost for Coulomb's law, at least: its Newton systems are unsymmetric
+    law: float = 2.0
+    law_contacts: float = 1000.0  #: the factor is the 2/3 power of contacts over this: LU factors fill in
 
 
 STEERING = Steering()
