@@ -20,7 +20,7 @@ PRECONDITIONERS = {
     "incomplete Cholesky": {"pc_type": "icc"},
     "algebraic multigrid": {"pc_type": "gamg"},
     "tensor train, rank 24": {
-        "pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain", "pc_tt_rank": "fixed", "pc_tt_max_rank": "24",
+        "pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain", "pc_tt_rank": "24",
         "pc_tt_order": "morton",
     },
 }  # fmt: skip

@@ -1,6 +1,6 @@
 """The base class of the project's preconditioners of type python.
 
-    -pc_type python -pc_python_type pctt.pc.TensorTrain -pc_tt_max_rank 10
+    -pc_type python -pc_python_type pctt.pc.TensorTrain -pc_tt_rank 10
 
 A subclass names its group of options (a dataclass, see ``pctt.options``) and their prefix. The base class turns the
 calls of PETSc into ``build`` (a matrix with a new structure), ``update`` (new values in the same structure) and

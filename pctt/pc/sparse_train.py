@@ -61,7 +61,7 @@ class SparseTrain:
         """Begin a new structure; ValueError on all ranks if the grid does not fit it."""
         grid_slots(P, self.options.order)
         self._forget_structure()
-        if self.options.reuse != "steps" or P.getBlockSize() != self._block:
+        if self.options.reuse not in ("steps", "trains") or P.getBlockSize() != self._block:
             self._forget_trains()
         self._block = P.getBlockSize()
 
@@ -88,7 +88,7 @@ class SparseTrain:
         if self._cap != rank:
             self.compression = self.inverse = self._opening = None
             self._cap = rank
-        kept = (self._opening if first else self.inverse) if self.options.keep else None
+        kept = (self._opening if first else self.inverse) if self.options.reuse == "trains" else None
         if kept is not None and not self._schedule.over():
             self._use(kept)
             self.account.kept += 1

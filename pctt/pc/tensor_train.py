@@ -25,7 +25,7 @@ from pctt.pc.sparse_train import SparseTrain
 from pctt.pc.train_options import ENTRIES_RANK, SPARSE_RANK, Account, Options
 
 NOT_SYMMETRIC = "the matrix is not symmetric, so a train for its inverse may be useless"
-LOWER = 3  # if the cap fails or does not pay, the policy tries the cap divided by this
+LOWER = 3  # auto tries the cap and the cap divided by this
 POOR = 0.5  # an inverse with a larger residual causes a warning
 #: Reasons for the end of a Krylov method whose preconditioner is not positive definite.
 SPOILT = {
@@ -77,7 +77,8 @@ class TensorTrain(PythonPC):
         else:
             cap = self.options.cap(SPARSE_RANK)
             self.made = self.sparse_train(self.comm, self.options, self.account)
-            self.policy = RankPolicy((max(1, cap // LOWER), cap), self.options.rank == "auto")
+            ladder = (max(1, cap // LOWER), cap) if self.options.automatic else (cap,)
+            self.policy = RankPolicy(ladder, self.options.automatic)
         assert isinstance(self.made, SparseTrain)
         self.made.begin(P)
         self._say_symmetry(is_symmetric(P))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Optional
 
-from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, option
+from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, OptionError, option
 
 SPARSE_RANK, ENTRIES_RANK = 10, 100  # default caps
 
@@ -18,11 +18,14 @@ class Options:
         1e-2, "a compression ends at this relative Frobenius error, an inverse at this residual",
         check=FRACTION,
     )
-    max_rank: Optional[int] = option(
-        None, f"cap of the ranks of matrix and inverse; none: {SPARSE_RANK}, or {ENTRIES_RANK} for a matrix given by "
-        "its entries", check=AT_LEAST_ONE,
+    rank: str = option(
+        "auto", "cap of the ranks of matrix and inverse; auto: the rank that pays, 1 included, up to max_rank",
+        check=("auto or a whole number >= 1", lambda x: x == "auto" or (x.isdecimal() and int(x) >= 1)),
     )
-    rank: str = option("auto", "auto: the rank that pays, 1 included; fixed: max_rank", choices=("auto", "fixed"))
+    max_rank: Optional[int] = option(
+        None, f"largest rank that auto takes; none: {SPARSE_RANK}, or {ENTRIES_RANK} for a matrix given by its entries",
+        check=AT_LEAST_ONE,
+    )
     compress: str = option(
         "als", "for sparse matrices; als: alternating least squares over the nonzeros; cross: AMEn cross (the paper)",
         choices=("als", "cross"),
@@ -40,19 +43,30 @@ class Options:
     )
     leaf: int = option(16, "least number of blocks in the first and last mode", check=AT_LEAST_ONE)
     reuse: str = option(
-        "steps",
-        "newton: use cores, index sets and block pairs of the last matrix with the same structure; steps: use its "
-        "slots and cores for the next structure too; none: compute everything anew",
-        choices=("none", "newton", "steps"),
-    )
-    keep: bool = option(
-        True, "keep a train, with the new matrix's scaling, while new trains are hardly better; not with reuse none"
+        "trains",
+        "none: compute everything anew; newton: start from cores, index sets and block pairs of the last matrix with "
+        "the same structure; steps: take its slots and cores for the next structure too; trains: also keep a whole "
+        "train, with the new matrix's scaling, while new ones are hardly better",
+        choices=("none", "newton", "steps", "trains"),
     )
     seed: int = option(0, "seed of the random starts", check=COUNT)
     monitor: bool = option(False, "print a line per set-up")
 
+    def __post_init__(self) -> None:
+        if self.automatic or self.max_rank is None:
+            return
+        raise OptionError(
+            f"-pc_tt_max_rank {self.max_rank}: has no effect with -pc_tt_rank {self.rank}; allowed is one of the two"
+        )
+
+    @property
+    def automatic(self) -> bool:
+        """Whether the rank is chosen here."""
+        return self.rank == "auto"
+
     def cap(self, default: int) -> int:
-        return self.max_rank or default
+        """The largest rank that is allowed; ``default`` if the user has not said one."""
+        return (self.max_rank or default) if self.automatic else int(self.rank)
 
 
 @dataclass

@@ -12,7 +12,7 @@ from measure import figure, record, say_machine
 from mpi4py import MPI
 from newton_systems import Replay, replay_steps, set_up, settled, train_pc
 
-LEVELS = ("none", "newton", "steps")
+LEVELS = ("none", "newton", "trains")
 WHAT = ("first Newton step", "whole PDIP")
 BIN = 0.05  # of log10 Nc
 
@@ -49,11 +49,11 @@ def main(given: argparse.Namespace) -> None:
     about = say_machine()
     rows: list[dict[str, Any]] = []
     ratios = [f"{level} {what}" for what in WHAT for level in LEVELS[1:]]
-    print("seconds of set-up without reuse / with reuse within a time step (newton) and from step to step (steps)")
+    print("seconds of set-up without reuse / with reuse within a time step (newton) and from step to step (trains)")
     heads = " ".join(f"{name:>24}" for name in ratios)
     print(f"{'n':>3} {'step':>5} {'contacts':>9} {'Newton':>7} {'none s':>8} {heads}")
     for n in given.n:
-        options = {"max_rank": given.rank, "eps": 1e-2, "scaling": given.scaling}
+        options = {"rank": given.rank, "eps": 1e-2, "scaling": given.scaling}
         watch = Watch(n, options)
         replay_steps(settled(n), given.steps, watch, given.newton)
         watch.destroy()

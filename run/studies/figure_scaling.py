@@ -59,7 +59,7 @@ def measure(first: PETSc.Mat, second: PETSc.Mat, rank: int) -> dict[str, Any]:
     for _ in range(REPEAT):
         run: dict[str, float] = {}
         for way in ("als", "cross"):
-            pc, _ = train_pc(MPI.COMM_WORLD, compress=way, max_rank=rank, eps=1e-2, keep=False)
+            pc, _ = train_pc(MPI.COMM_WORLD, compress=way, rank=rank, eps=1e-2, reuse="steps")
             for state, matrix in (("cold", first), ("warm", second)):
                 matrix.copy(work, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
                 done = set_up(pc, work)
@@ -68,14 +68,14 @@ def measure(first: PETSc.Mat, second: PETSc.Mat, rank: int) -> dict[str, Any]:
                     run |= {f"invert {state}": done["invert_s"], f"set-up {state}": done["setup_s"]}
                     run[f"rank {state}"] = done["rank"]
             pc.destroy()
-        pc, _ = train_pc(MPI.COMM_WORLD, max_rank=rank, eps=1e-2)
+        pc, _ = train_pc(MPI.COMM_WORLD, rank=rank, eps=1e-2)
         for matrix in (first, second):
             matrix.copy(work, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
             run["set-up kept"] = set_up(pc, work)["setup_s"]
         pc.destroy()
         runs.append(run)
     row: dict[str, Any] = {name: statistics.median(run[name] for run in runs) for name in runs[0]}
-    pc, _ = train_pc(MPI.COMM_WORLD, max_rank=rank, eps=1e-2)
+    pc, _ = train_pc(MPI.COMM_WORLD, rank=rank, eps=1e-2)
     if set_up(pc, work)["rank"] == rank:
         row["apply"] = median_seconds(lambda: pc.apply(x, y))
     pc.destroy()

@@ -180,13 +180,13 @@ def mean_rank(ranks: tuple[int, ...]) -> float:
 
 
 def train_pc(comm: MPI.Comm, **options: Any) -> tuple[PETSc.PC, WatchedTrain]:
-    """A fixed-rank train with these options -pc_tt_*."""
+    """A train with these options -pc_tt_*, of a fixed rank if they have one."""
     context = WatchedTrain()
     pc = PETSc.PC().create(comm)
     pc.setOptionsPrefix("watched_")
     pc.setType("python")
     pc.setPythonContext(context)
-    with entered({f"watched_pc_tt_{name}": str(value) for name, value in {"rank": "fixed", **options}.items()}):
+    with entered({f"watched_pc_tt_{name}": str(value) for name, value in options.items()}):
         pc.setFromOptions()
     return pc, context
 

@@ -20,12 +20,12 @@ PARTS = (0.15, 0.5, 0.85)  # of the Newton steps: the systems that are solved
 CAPS = (1, 2, 4, 10, 20, 40)
 NAMES = ("none", "pbjacobi", "ilu", "ilu-shifted", "sor", "icc-shifted", "gamg", "hypre", "cholesky")
 FACTORS = 50_000  # contacts above which nothing is factorised completely: memory
-TRAIN = {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain", "pc_tt_rank": "fixed"}
+TRAIN = {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain"}
 
 
 def methods() -> dict[str, dict[str, str]]:
     """PETSc options of each by name."""
-    trains = {f"tt {cap}": {**TRAIN, "pc_tt_max_rank": str(cap)} for cap in CAPS}
+    trains = {f"tt {cap}": {**TRAIN, "pc_tt_rank": str(cap)} for cap in CAPS}
     return {**{name: NAMED.get(name, {"pc_type": name}) for name in NAMES}, **trains}
 
 
@@ -59,7 +59,7 @@ def solve(matrix: PETSc.Mat, b: PETSc.Vec, name: str, given: argparse.Namespace)
     row["reason"] = done.reason if done.solve_s < given.seconds or done.converged else f"{given.seconds:g} s"
     if name.startswith("tt"):
         train = krylov.ksp.pc.getPythonContext()
-        row |= {"cap": train.options.max_rank, "rank": train.rank, "fallbacks": train.account.fallbacks}
+        row |= {"cap": int(train.options.rank), "rank": train.rank, "fallbacks": train.account.fallbacks}
     krylov.destroy()
     x.destroy()
     return row

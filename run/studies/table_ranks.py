@@ -25,7 +25,7 @@ HEAD = ("scaling", "eps", "cap", "ranks S/X", "paper", "error", "residual", "pos
 
 def figures(replay: Replay, eps: float, cap: int, scaling: str, every: int, limit: float) -> dict[str, Any]:
     """Averages over the systems, and seconds per PDIP solve: means times all its Newton steps."""
-    pc, train = train_pc(MPI.COMM_WORLD, eps=eps, max_rank=cap, scaling=scaling, keep=False)
+    pc, train = train_pc(MPI.COMM_WORLD, eps=eps, rank=cap, scaling=scaling, reuse="steps")
     for k, (matrix, _) in enumerate(replay.matrices()):
         spent = sum(row["setup_s"] for row in train.rows)
         if k % every == 0 and spent < limit:
@@ -49,7 +49,7 @@ def uncapped(replay: Replay, scaling: str) -> list[dict[str, Any]]:
     """Average ranks that each eps asks for, of a Newton system of the middle and of its inverse as dense matrices: by
     the singular values of their unfoldings, as TT-SVD takes them (paper, Algorithm 1)."""
     matrix = replay.matrix(replay.systems[len(replay.systems) // 2])
-    pc, train = train_pc(MPI.COMM_WORLD, max_rank=2, scaling=scaling, keep=False)
+    pc, train = train_pc(MPI.COMM_WORLD, rank=2, scaling=scaling, reuse="steps")
     set_up(pc, matrix)
     slots, hierarchy = train.made.slots, train.made.hierarchy
     assert slots is not None

@@ -42,7 +42,7 @@ def filled(kind: str) -> PETSc.Mat:
 def test_all_types_of_matrices_give_the_same_preconditioner(rank):
     its = []
     for kind in ("baij", "aij", "sbaij", "dense"):
-        ksp = solver(filled(kind), rank="fixed", max_rank=rank)
+        ksp = solver(filled(kind), rank=rank)
         for _ in range(2):  # the second time with new values
             count, left = solve(ksp)
             assert left < 1e-7
@@ -109,7 +109,7 @@ def test_a_matrix_that_is_not_symmetric_is_said_to_be_so():
 def test_a_solve_that_a_train_has_spoilt_is_made_again(method):
     """With a train of which half the entries have another sign: the solve at hand succeeds, and the next as well."""
     mat = poisson(16)
-    ksp = solver(mat, method, rank="fixed", max_rank=6)
+    ksp = solver(mat, method, rank=6)
     ksp.setUp()
     assert context(ksp).rank == 6
     spoil = context(ksp).made._from_slots

@@ -46,7 +46,7 @@ def preconditioner(krylov: Krylov, mat: PETSc.Mat) -> np.ndarray:
     return np.array(columns).T
 
 
-TT = {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain", "pc_tt_rank": "fixed"}
+TT = {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain"}
 WAYS = {
     "pbjacobi": {"pc_type": "pbjacobi"},
     "sor": {"pc_type": "sor"},
@@ -54,8 +54,8 @@ WAYS = {
     "pbjacobi within": {"pc_type": "bjacobi", "sub_pc_type": "pbjacobi"},
     "sor within": {"pc_type": "asm", "sub_pc_type": "sor"},
     "cholesky": {"pc_type": "cholesky"},
-    "train of rank 1": {**TT, "pc_tt_max_rank": "1"},
-    "train": {**TT, "pc_tt_max_rank": "50", "pc_tt_reuse": "none"},
+    "train of rank 1": {**TT, "pc_tt_rank": "1"},
+    "train": {**TT, "pc_tt_rank": "50", "pc_tt_reuse": "none"},
     "two levels": {"pc_type": "python", "pc_python_type": "pctt.pc.TwoLevel", "pc_two_boxes": "2"},
 }
 

@@ -12,7 +12,7 @@ from petsc4py import PETSc
 from systems import dense, poisson, spd
 
 NAMES = ("TensorTrain", "TwoLevel", "BodySchur")
-SMALL = {"pc_tt_rank": "fixed", "pc_tt_max_rank": "20"}
+SMALL = {"pc_tt_rank": "20"}
 
 
 def stored(A: np.ndarray, kind: str = "aij", block: int = 1, pattern: np.ndarray | None = None) -> PETSc.Mat:
@@ -106,9 +106,9 @@ def test_options_for_all_levels_are_those_of_each():
 
 
 def test_new_options_are_those_of_the_next_set_up():
-    ksp = solver(poisson(8), pc_tt_rank="fixed", pc_tt_max_rank="2")
+    ksp = solver(poisson(8), pc_tt_rank="2")
     assert left(ksp) < 1e-8
-    PETSc.Options()["pc_tt_max_rank"] = "12"
+    PETSc.Options()["pc_tt_rank"] = "12"
     ksp.setFromOptions()
     ksp.setOperators(poisson(8))
     assert left(ksp) < 1e-8
@@ -137,7 +137,7 @@ def test_zeros_that_are_stored(block):
 
 def test_another_pattern_with_as_many_nonzeros():
     mat = stored(ring(40, 1))
-    ksp = solver(mat, pc_tt_keep="false", **SMALL)
+    ksp = solver(mat, pc_tt_reuse="steps", **SMALL)
     left(ksp)
     other = sp.csr_matrix(ring(40, 7))
     mat.setPreallocationCSR((other.indptr, other.indices, other.data))

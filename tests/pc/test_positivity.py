@@ -65,7 +65,7 @@ def test_no_train_of_a_poisson_matrix_breaks_the_solve(max_rank):
     """Inverses of rank 20 of this matrix that were not positive passed as such, by the arithmetic of some processors,
     and by the seeds 1 and 2 of others."""
     for seed in range(3):
-        ksp = solver(poisson(64), rank="fixed", max_rank=max_rank, seed=seed)
+        ksp = solver(poisson(64), rank=max_rank, seed=seed)
         ksp.setUp()
         _, residual = solve(ksp)
         assert residual < 1e-6
@@ -76,7 +76,7 @@ def test_trains_in_use_are_positive():
     """Of ranks at which some trains are not."""
     used = 0
     for seed, rank in product(range(3), (4, 8, 12)):
-        ksp = solver(poisson(16), rank="fixed", max_rank=rank, seed=seed)
+        ksp = solver(poisson(16), rank=rank, seed=seed)
         ksp.setUp()
         used += context(ksp).rank > 1
         assert np.linalg.eigvalsh(operator(ksp))[0] > 0

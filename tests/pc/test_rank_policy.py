@@ -82,7 +82,7 @@ rank_policy.BUDGET = 0.5 # trials are frequent
 mat = poisson(24)
 chosen = set()
 for refuse in (False, True):
-    ksp = solver(mat, max_rank=6, rank="auto")
+    ksp = solver(mat, max_rank=6)
     ksp.setUp()
     if refuse: # the train that is refused reports what the trial took
         context(ksp).made._is_positive = lambda P: False
@@ -98,6 +98,7 @@ for refuse in (False, True):
     ksp.destroy()
 assert len(chosen) > 1, chosen
 
+PETSc.Options().delValue("pc_tt_max_rank")
 # processors that round differently: ranks of trains, pivots of crosses, numbers of inverses
 mat.shift(4.0)
 round_here, dominant, invert = Train.round, cross._dominant, module.invert_near_identity
@@ -112,7 +113,7 @@ Train.round = lambda self, eps=1e-14, max_rank=None: round_here(self, max(eps, 0
 cross._dominant = lambda C, most, eps: dominant(C, most if comm.rank == 0 else max(1, most - 1), eps)
 module.invert_near_identity = invert_here
 for way in ("als", "cross"):
-    ksp = solver(mat, max_rank=6, rank="fixed", compress=way)
+    ksp = solver(mat, rank=6, compress=way)
     assert solve(ksp)[1] < 1e-6
     trains = comm.allgather([core.tobytes() for core in context(ksp).made.inverse.applied.cores])
     assert trains == [trains[0]] * comm.size, way

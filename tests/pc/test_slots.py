@@ -166,7 +166,7 @@ def test_empty_slots_leave_the_preconditioner_as_it_is(block, scaling):
     identity = np.eye(40 * block)
     for names in (keys, None):
         mat = springs(points, names, block)
-        ksp = solver(mat, rank="fixed", max_rank=400, eps=1e-12, leaf=4, scaling=scaling)
+        ksp = solver(mat, rank=400, eps=1e-12, leaf=4, scaling=scaling)
         ksp.setUp()
         pc = context(ksp)
         assert pc.rank == 400, pc.account.fallbacks
@@ -193,7 +193,7 @@ def follow_up(ksp: PETSc.KSP, mat: PETSc.Mat) -> None:
 
 def test_the_next_structure_starts_from_the_last_train():
     first, second = contact_steps(1500)
-    options = {"rank": "fixed", "max_rank": 8, "keep": "false"}
+    options = {"rank": 8, "reuse": "steps"}
     warm = solver(first, **options)
     warm.setUp()
     cold_passes = context(warm).made.compression.passes
@@ -214,7 +214,7 @@ def test_the_next_structure_starts_from_the_last_train():
 @pytest.mark.parametrize(("reuse", "reused"), [("none", 0), ("newton", 0), ("steps", 1)])
 def test_reuse_goes_as_far_as_asked(reuse, reused):
     first, second = contact_steps(600)
-    ksp = solver(first, rank="fixed", max_rank=4, reuse=reuse, keep="false")
+    ksp = solver(first, rank=4, reuse=reuse)
     ksp.setUp()
     follow_up(ksp, second)
     assert context(ksp).account.reused == reused
@@ -224,7 +224,7 @@ def test_reuse_goes_as_far_as_asked(reuse, reused):
 
 def test_the_train_of_the_first_matrix_of_a_structure_opens_the_next():
     first, second = contact_steps(600)
-    ksp = solver(first, rank="fixed", max_rank=4)
+    ksp = solver(first, rank=4)
     ksp.setUp()
     opening = context(ksp).made.inverse
     follow_up(ksp, second)
@@ -232,13 +232,13 @@ def test_the_train_of_the_first_matrix_of_a_structure_opens_the_next():
     assert context(ksp).made.hierarchy is None  # block pairs are not listed for nothing
     its, residual = solve(ksp)
     assert residual < 1e-7
-    cold_its, _ = solve(solver(second, rank="fixed", max_rank=4))
+    cold_its, _ = solve(solver(second, rank=4))
     assert its <= 1.2 * cold_its + 1
 
 
 def test_an_overflow_makes_a_new_tree():
     first, second = springs(*cloud(600)), springs(*cloud(800))
-    ksp = solver(first, rank="fixed", max_rank=4)
+    ksp = solver(first, rank=4)
     ksp.setUp()
     follow_up(ksp, second)
     assert context(ksp).account.resets == 1
@@ -266,7 +266,7 @@ def test_rows_that_change_ranks(ranks):
         return mat
 
     everything = np.arange(n * n)
-    ksp = solver(matrix(everything[:-8], 0), rank="fixed", max_rank=6, keep="false")
+    ksp = solver(matrix(everything[:-8], 0), rank=6, reuse="steps")
     solve(ksp)
     pc = context(ksp)
     for offset, keep in ((3, everything[4:-4]), (-3, everything[8:]), (n**3, everything)):  # n^3: all on the first rank

@@ -71,7 +71,7 @@ def operator(ksp: PETSc.KSP) -> np.ndarray:
 
 def test_full_ranks_give_the_inverse():
     mat = poisson(8)
-    ksp = solver(mat, rank="fixed", max_rank=64, eps=1e-12, leaf=4)
+    ksp = solver(mat, rank=64, eps=1e-12, leaf=4)
     ksp.setUp()
     assert context(ksp).rank == 64
     assert context(ksp).made.compression.error < 1e-6
@@ -82,13 +82,13 @@ def test_full_ranks_give_the_inverse():
 def test_without_memory_for_a_train_block_jacobi_takes_over(monkeypatch):
     monkeypatch.setattr(memory, "available", lambda comm: 1e4)
     mat = poisson(16)
-    ksp = solver(mat, rank="fixed", max_rank=4)
+    ksp = solver(mat, rank=4)
     _, left = solve(ksp)
     assert left < 1e-7
     assert context(ksp).rank == 1
     assert "fell back: there is no memory for the tables of a train (1 times)" in context(ksp).report()
     monkeypatch.undo()
-    again = solver(mat, rank="fixed", max_rank=4)
+    again = solver(mat, rank=4)
     again.setUp()
     assert context(again).rank == 4
 
@@ -108,7 +108,7 @@ def test_rank_one_is_block_jacobi():
 def test_applied_operator_is_symmetric_and_positive(block):
     G, barrier = contacts(60, 25)
     mat = poisson(12) if block == 1 else contact_matrix(G, 30 * barrier)
-    ksp = solver(mat, rank="fixed", max_rank=6)
+    ksp = solver(mat, rank=6)
     ksp.setUp()
     M = operator(ksp)
     assert context(ksp).rank == 6
@@ -118,10 +118,10 @@ def test_applied_operator_is_symmetric_and_positive(block):
 
 @pytest.mark.parametrize("ksp_type", ["cg", "bcgs", "gmres", "fgmres"])
 def test_solves_under_every_method_with_fewer_iterations_than_jacobi(ksp_type):
-    plain = solver(poisson(32), ksp_type, max_rank=1)
-    train = solver(poisson(32), ksp_type, rank="fixed", max_rank=24)
+    plain = solver(poisson(32), ksp_type, rank=1)
+    train = solver(poisson(32), ksp_type, rank=24)
     jacobi_its, _ = solve(plain)
-    PETSc.Options()["pc_tt_max_rank"] = "24"
+    PETSc.Options()["pc_tt_rank"] = "24"
     train_its, residual = solve(train)
     assert residual < 1e-6
     assert train_its < jacobi_its
@@ -130,7 +130,7 @@ def test_solves_under_every_method_with_fewer_iterations_than_jacobi(ksp_type):
 def test_refines_by_itself():
     """The inverse as a direct solver, and in iterative refinement."""
     mat = poisson(8)
-    options = {"rank": "fixed", "max_rank": 64, "eps": 1e-12, "leaf": 4}
+    options = {"rank": 64, "eps": 1e-12, "leaf": 4}
     direct = solver(mat, "preonly", **options)
     _, once = solve(direct)
     refined = solver(mat, "richardson", **options)
@@ -142,7 +142,7 @@ def test_refines_by_itself():
 def test_works_without_coordinates():
     mat = poisson(16)
     mat.setAttr("coordinates", None)
-    ksp = solver(mat, rank="fixed", max_rank=8)
+    ksp = solver(mat, rank=8)
     _, residual = solve(ksp)
     assert context(ksp).rank == 8
     assert residual < 1e-6
@@ -150,21 +150,21 @@ def test_works_without_coordinates():
 
 def test_new_values_start_from_the_old_train():
     mat = poisson(16)
-    ksp = solver(mat, rank="fixed", max_rank=8, keep="false")
+    ksp = solver(mat, rank=8, reuse="steps")
     solve(ksp)
     mat.shift(0.5)
     _, residual = solve(ksp)
     assert residual < 1e-6
     assert context(ksp).account.reused == 1
     assert context(ksp).account.kept == 0
-    cold = solver(mat, rank="fixed", max_rank=8)
+    cold = solver(mat, rank=8)
     cold.setUp()
     assert context(ksp).made.compression.error <= 1.2 * context(cold).made.compression.error
 
 
 def test_a_train_is_kept_for_a_matrix_that_differs_by_its_scaling():
     mat = poisson(16)
-    ksp = solver(mat, rank="fixed", max_rank=8)
+    ksp = solver(mat, rank=8)
     its, _ = solve(ksp)
     train = context(ksp).made.inverse
     scaling = mat.createVecLeft()
@@ -182,7 +182,7 @@ def test_a_train_is_kept_for_a_matrix_that_differs_by_its_scaling():
 
 def test_a_kept_train_goes_where_a_new_one_is_better():
     mat = poisson(16)
-    ksp = solver(mat, rank="fixed", max_rank=8)
+    ksp = solver(mat, rank=8)
     solve(ksp)
     train = context(ksp).made.inverse
     rows, columns, values = mat.getValuesCSR()
@@ -196,14 +196,14 @@ def test_a_kept_train_goes_where_a_new_one_is_better():
     assert context(ksp).made.inverse is not train
     assert "kept 1 times" in "\n".join(context(ksp).report())
     its, _ = solve(ksp)
-    cold_its, _ = solve(solver(mat, rank="fixed", max_rank=8))
+    cold_its, _ = solve(solver(mat, rank=8))
     assert its <= 1.2 * cold_its + 1
 
 
 @pytest.mark.parametrize("way", [{"compress": "cross"}, {"scaling": "none"}])
 def test_other_ways_to_a_train(way):
-    ksp = solver(poisson(16), rank="fixed", max_rank=8, **way)
-    jacobi_its, _ = solve(solver(poisson(16), max_rank=8, rank="auto"))
+    ksp = solver(poisson(16), rank=8, **way)
+    jacobi_its, _ = solve(solver(poisson(16), rank=1))
     its, residual = solve(ksp)
     assert context(ksp).rank == 8, context(ksp).account.fallbacks
     assert residual < 1e-6
@@ -216,7 +216,7 @@ def test_a_diagonal_that_is_not_positive_falls_back_to_block_jacobi(entry):
     diagonal = mat.getDiagonal()
     diagonal.array[5] = entry
     mat.setDiagonal(diagonal)
-    ksp = solver(mat, "gmres", rank="fixed")
+    ksp = solver(mat, "gmres", rank=10)
     ksp.setUp()
     assert context(ksp).rank == 1
     assert any("not positive definite" in why for why in context(ksp).account.fallbacks)
@@ -246,7 +246,7 @@ def test_the_example_of_the_documentation_runs():
 
 @pytest.mark.parallel(1, 2, 3, 4)
 def test_any_number_of_ranks():
-    ksp = solver(poisson(20), rank="fixed", max_rank=8)
+    ksp = solver(poisson(20), rank=8)
     its, residual = solve(ksp)
     assert context(ksp).rank == 8, context(ksp).account.fallbacks
     assert its < 60
@@ -269,7 +269,7 @@ def test_all_ranks_have_the_inverse_of_one_also_where_they_round_otherwise(monke
         return found
 
     monkeypatch.setattr(sparse_train, "invert_near_identity", rounded)
-    ksp = solver(poisson(16), rank="fixed", max_rank=6)
+    ksp = solver(poisson(16), rank=6)
     _, residual = solve(ksp)
     assert residual < 1e-6
     assert context(ksp).rank == 6
