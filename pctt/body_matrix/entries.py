@@ -68,7 +68,7 @@ class BodyMatrix:
         sizes = ((6 * own, PETSc.DETERMINE), (6 * own, PETSc.DETERMINE))
         self.mat = new_matrix(self.comm, sizes, 6, (self._indptr, self._indices))
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        self._stiff: dict[tuple[bool, bool], StiffPart] = {}  # keys: in scalar format or not, symmetric or not
+        self._stiff: dict[bool, StiffPart] = {}  # by whether it is symmetric
 
     def update(self, inverse: np.ndarray) -> None:
         """Compute K for the blocks B^-1 (nc, 3, 3)."""
@@ -84,18 +84,16 @@ class BodyMatrix:
         self.mat.assemble()
         set_diagonal_blocks(self.mat, self._values[self._diagonal_places])
 
-    def stiff_part(
-        self, least: float, shift: float = 0.0, scalar: bool = False, symmetric: bool = True
-    ) -> PETSc.Mat:
-        """K without the blocks between two bodies whose entries are all below ``least`` (in units of the mass).
+    def stiff_part(self, least: float, symmetric: bool = True) -> PETSc.Mat:
+        """K without the blocks between two bodies whose entries are all below ``least`` (in units of the mass), as AIJ.
 
-        Diagonal blocks are multiplied by 1 + shift. The Mat is kept and gets new values at the next call; there is one
-        for each combination of ``scalar`` and ``symmetric``.
+        The Mat is kept and gets new values at the next call; there is one for each value of ``symmetric``.
         """
-        form = (scalar, symmetric)
-        if form not in self._stiff:
-            self._stiff[form] = StiffPart(self.mat, self._indptr, self._indices, self._diagonal_places, *form)
-        return self._stiff[form].update(self._values, least, shift)
+        if symmetric not in self._stiff:
+            self._stiff[symmetric] = StiffPart(
+                self.mat, self._indptr, self._indices, self._diagonal_places, symmetric
+            )
+        return self._stiff[symmetric].update(self._values, least)
 
     def places(self, points: np.ndarray) -> np.ndarray:
         """Places (n, 3) of this rank's bodies: the means of their contact points. ``points`` (nc, 3); collective."""
@@ -113,38 +111,6 @@ class BodyMatrix:
         sums.destroy()
         counts.destroy()
         return places
-
-    def set_rigid_modes(self, points: np.ndarray) -> None:
-        """Give ``mat`` the six rigid motions as near null space; ``points`` (nc, 3) are the contact points; collective.
-
-        A motion u(p) = t + w x p moves the contact point p of a body by F u in the contact frame F. The mass-scaled
-        velocity z of the body is the least squares solution of (block of G) z = F u over its contacts. So masses,
-        inertias and places of the bodies are not needed. F is given by the first three columns of the block, with its
-        rows scaled to unit vectors.
-        """
-        blocks, body = self.G.blocks, np.asarray(self.G.indices, np.int64)
-        contact = np.repeat(np.arange(len(points)), np.diff(self.G.indptr))
-        centre = self.comm.allreduce(points.sum(axis=0)) / max(self.comm.allreduce(len(points)), 1)
-        x, y, z = (points[contact] - centre).T
-        zero = np.zeros_like(x)
-        turn = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)  # w -> w x p
-        frame = blocks[:, :, :3] / np.linalg.norm(blocks[:, :, :3], axis=2, keepdims=True)
-        motion = frame @ np.concatenate([np.tile(np.eye(3), (len(x), 1, 1)), turn], axis=2)
-        both = blocks.transpose(0, 2, 1) @ np.concatenate([blocks, motion], axis=2)  # (n, 6, 12)
-        starts = offsets(self.comm, self.mat.getLocalSize()[0] // 6)
-        (own, both), _ = send_rows(self.comm, [body, both], np.searchsorted(starts, body, side="right") - 1)
-        sums = np.zeros((self.mat.getLocalSize()[0] // 6, 6, 12))
-        np.add.at(sums, own - starts[self.comm.rank], both)
-        size = np.trace(sums[:, :, :6], axis1=1, axis2=2)
-        normal = sums[:, :, :6] + np.where(size > 0, 1e-10 * size, 1.0)[:, None, None] * np.eye(6)
-        modes = np.linalg.solve(normal, sums[:, :, 6:]).reshape(-1, 6)
-        values, vectors = np.linalg.eigh(self.comm.allreduce(modes.T @ modes))
-        kept = values > 1e-12 * values[-1]
-        modes = modes @ (vectors[:, kept] / np.sqrt(values[kept]))
-        columns = [self.mat.createVecRight() for _ in range(modes.shape[1])]
-        for vec, mode in zip(columns, modes.T):
-            vec.array_w[:] = mode
-        self.mat.setNearNullSpace(PETSc.NullSpace().create(constant=False, vectors=columns, comm=self.comm))
 
     def destroy(self) -> None:
         self.mat.destroy()

@@ -17,8 +17,8 @@ EXCESS = 1.15  # largest ratio of the blocks in a kept pattern to the wanted blo
 
 
 class StiffPart:
-    """A Mat with some of the blocks of a block matrix: the diagonal blocks, and the blocks with an entry of at least
-    ``least``.
+    """An AIJ Mat with some of the blocks of a block matrix: the diagonal blocks, and those with an entry of at least
+    ``least``. AIJ, because Cholesky has no code for blocks.
 
     The pattern is kept while it has all these blocks and few others. Then the symbolic part of a factor can be kept
     too.
@@ -26,7 +26,6 @@ class StiffPart:
     whole : the block matrix
     indptr, indices : block CSR pattern of this rank's block rows
     diagonal : indices of the diagonal blocks
-    scalar : make an AIJ Mat, for solvers that have no code for blocks; otherwise a BAIJ Mat
     symmetric : whether the matrix is symmetric
     """
 
@@ -36,31 +35,22 @@ class StiffPart:
         indptr: np.ndarray,
         indices: np.ndarray,
         diagonal: np.ndarray,
-        scalar: bool,
         symmetric: bool,
     ):
         self.comm: MPI.Comm = whole.comm.tompi4py()
         self._indptr, self._indices, self._diagonal = indptr, indices, diagonal
-        self._size, self._sizes, self._scalar = whole.getBlockSize(), whole.getSizes(), scalar
+        self._size, self._sizes = whole.getBlockSize(), whole.getSizes()
         self._symmetric = symmetric
         self.mat: PETSc.Mat = None  # before the first `update`
 
-    def update(self, values: np.ndarray, least: float, shift: float) -> PETSc.Mat:
-        """The Mat for the blocks ``values`` (n, size, size) of the whole matrix.
-
-        Diagonal blocks are multiplied by 1 + shift.
-        """
+    def update(self, values: np.ndarray, least: float) -> PETSc.Mat:
+        """The Mat for the blocks ``values`` (n, size, size) of the whole matrix."""
         wanted = np.abs(values).max(axis=(1, 2), initial=0.0) >= least
         wanted[self._diagonal] = True
         if self.mat is None or not self._holds(wanted):
             self._take_pattern(wanted)
-        blocks = values[self._kept]
-        blocks[self._kept_diagonal] *= 1.0 + shift
-        if self._scalar:
-            rows = self._scalar_rows(blocks)
-            self.mat.setValuesCSR(rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType), rows.data)
-        elif len(blocks):
-            self.mat.setValuesBlockedCSR(self._kept_indptr, self._kept_indices, blocks.ravel())
+        rows = self._scalar_rows(values[self._kept])
+        self.mat.setValuesCSR(rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType), rows.data)
         self.mat.assemble()
         return self.mat
 
@@ -73,14 +63,11 @@ class StiffPart:
     def _take_pattern(self, kept: np.ndarray) -> None:
         self.destroy()
         self._kept, before = kept, np.concatenate([[0], np.cumsum(kept)])
-        self._kept_diagonal = before[self._diagonal]
         self._kept_indptr = before[self._indptr].astype(PETSc.IntType)
         self._kept_indices = self._indices[kept].astype(PETSc.IntType)
-        pattern, kind = (self._kept_indptr, self._kept_indices), PETSc.Mat.Type.BAIJ
-        if self._scalar:
-            rows = self._scalar_rows(np.ones((int(kept.sum()), self._size, self._size)))
-            pattern, kind = (rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType)), PETSc.Mat.Type.AIJ
-        self.mat = new_matrix(self.comm, self._sizes, self._size, pattern, kind)
+        rows = self._scalar_rows(np.ones((int(kept.sum()), self._size, self._size)))
+        pattern = (rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType))
+        self.mat = new_matrix(self.comm, self._sizes, self._size, pattern, PETSc.Mat.Type.AIJ)
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
 
     def _scalar_rows(self, blocks: np.ndarray) -> sp.csr_matrix:

@@ -15,7 +15,6 @@ from petsc4py import PETSc
 
 from pctt.context import Context
 from pctt.options import describe, no_such_option, read
-from pctt.shell import is_shell
 
 
 class PythonPC(Context):
@@ -28,7 +27,6 @@ class PythonPC(Context):
     options_class: type
     options_prefix: str
     without = PETSc.PC.Type.NONE
-    needs_entries = True  # if False, a matrix given by a function is enough
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
@@ -68,10 +66,10 @@ class PythonPC(Context):
         if rows == 0:
             self.P, self._structure = None, (handle, 0)
             return
-        if not self.takes(P) and (self.needs_entries or not is_shell(P)):
+        if not self.takes(P):
             P = self._as_sparse(P)
         self.P = P
-        structure = (handle, rows, 0 if is_shell(P) or self.takes(P) else P.getInfo()["nz_used"])
+        structure = (handle, rows, 0 if self.takes(P) else P.getInfo()["nz_used"])
         if structure != self._structure:
             self.build(pc, P)
             self._structure = structure
@@ -163,4 +161,4 @@ class PythonPC(Context):
 
 
 #: The attributes that a user's Mat may have, see docs/preconditioners.md.
-ATTRIBUTES = ("coordinates", "grid", "key", "contact_map", "barrier")
+ATTRIBUTES = ("coordinates", "grid", "key")

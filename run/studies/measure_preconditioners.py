@@ -7,7 +7,7 @@ import sys
 
 from measure import record, results, say_machine
 
-NAMES = "none,ilu,ilu-shifted,pbjacobi,sor,icc-shifted,gamg,hypre,cholesky,body-ilu,tt"
+NAMES = "none,ilu,ilu-shifted,pbjacobi,sor,icc-shifted,gamg,hypre,cholesky,tt"
 
 
 def main(n: int, every: int, names: str, options: list[str]) -> None:

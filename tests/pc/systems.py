@@ -38,13 +38,10 @@ def contacts(count: int, bodies: int, seed: int = 0) -> tuple[BlockRows, np.ndar
 
 
 def contact_matrix(G: BlockRows, barrier: np.ndarray) -> PETSc.Mat:
-    """S = G G' + B, BAIJ of block size 3, with what it is made of as attributes."""
+    """S = G G' + B, BAIJ of block size 3."""
     rows = sp.bsr_matrix((G.blocks, G.indices, G.indptr), shape=(3 * G.rows, 6 * G.columns))
     B = sp.bsr_matrix((barrier, np.arange(G.rows), np.arange(G.rows + 1)))
-    S = square_block_matrix(MPI.COMM_WORLD, sp.bsr_matrix(rows @ rows.T + B, blocksize=(3, 3)))
-    S.setAttr("contact_map", G)
-    S.setAttr("barrier", barrier)
-    return S
+    return square_block_matrix(MPI.COMM_WORLD, sp.bsr_matrix(rows @ rows.T + B, blocksize=(3, 3)))
 
 
 def dense(mat: PETSc.Mat) -> np.ndarray:

@@ -56,7 +56,6 @@ WAYS = {
     "cholesky": {"pc_type": "cholesky"},
     "train of rank 1": {**TT, "pc_tt_rank": "1"},
     "train": {**TT, "pc_tt_rank": "50", "pc_tt_reuse": "none"},
-    "two levels": {"pc_type": "python", "pc_python_type": "pctt.pc.TwoLevel", "pc_two_boxes": "2"},
 }
 
 
@@ -74,33 +73,6 @@ def test_new_values_make_the_preconditioner_that_a_new_matrix_gets(way, kind):
         assert np.allclose(preconditioner(krylov, mat), expected, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
         new.destroy()
     krylov.destroy()
-
-
-def test_the_inner_preconditioner_of_body_schur_follows():
-    """As many inner iterations as with a matrix of its own."""
-    its = []
-    for again in (True, False):
-        G, barrier = contacts(40, 12)
-        options = {"pc_type": "python", "pc_python_type": "pctt.pc.BodySchur", "ksp_type": "preonly"}
-        krylov = Krylov(MPI.COMM_SELF, f"schur{again}_", options, 1e-8)
-        scales = np.exp(4 * np.random.default_rng(3).standard_normal(40))
-        if again:
-            mat = contact_matrix(G, barrier)
-            x, b = mat.createVecs()
-            b.set(1.0)
-            krylov.solve(mat, b, x)
-            last = contact_matrix(G, barrier * scales[:, None, None])
-            last.copy(mat, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-            mat.setAttr("barrier", barrier * scales[:, None, None])
-        else:
-            mat = contact_matrix(G, barrier * scales[:, None, None])
-            x, b = mat.createVecs()
-            b.set(1.0)
-        before = krylov.ksp.pc.getPythonContext().its if again else 0
-        assert krylov.solve(mat, b, x).true_residual < 1e-7
-        its.append(krylov.ksp.pc.getPythonContext().its - before)
-        krylov.destroy()
-    assert abs(its[0] - its[1]) <= 2
 
 
 @pytest.mark.parametrize("kind", ["baij", "aij"])

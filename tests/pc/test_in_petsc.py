@@ -11,7 +11,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from systems import dense, poisson, spd
 
-NAMES = ("TensorTrain", "TwoLevel", "BodySchur")
 SMALL = {"pc_tt_rank": "20"}
 
 
@@ -29,7 +28,7 @@ def stored(A: np.ndarray, kind: str = "aij", block: int = 1, pattern: np.ndarray
     return mat if kind == "aij" else mat.convert(kind, PETSc.Mat())
 
 
-def solver(mat: PETSc.Mat, name="TensorTrain", method="cg", prefix="", **options: str) -> PETSc.KSP:
+def solver(mat: PETSc.Mat, method="cg", prefix="", **options: str) -> PETSc.KSP:
     for option, value in options.items():
         PETSc.Options()[prefix + option] = value
     ksp = PETSc.KSP().create(mat.comm)
@@ -39,7 +38,7 @@ def solver(mat: PETSc.Mat, name="TensorTrain", method="cg", prefix="", **options
     ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
     ksp.setTolerances(rtol=1e-9, max_it=500)
     ksp.pc.setType("python")
-    ksp.pc.setPythonType(f"pctt.pc.{name}")
+    ksp.pc.setPythonType("pctt.pc.TensorTrain")
     ksp.setFromOptions()
     return ksp
 
@@ -70,15 +69,14 @@ def test_a_dense_matrix_is_set_up_once():
 
 
 @pytest.mark.parametrize("kind", ["aij", "baij", "sbaij", "dense"])
-@pytest.mark.parametrize("name", NAMES[:2])
-def test_a_matrix_without_rows(kind, name):
+def test_a_matrix_without_rows(kind):
     """Block Jacobi has such blocks on ranks without rows."""
     mat = PETSc.Mat().create(PETSc.COMM_SELF)
     mat.setSizes((0, 0))
     mat.setType(kind)
     mat.setUp()
     mat.assemble()
-    ksp = solver(mat, name)
+    ksp = solver(mat)
     x, b = mat.createVecs()
     ksp.solve(b, x)
     assert ksp.getConvergedReason() > 0
@@ -87,22 +85,15 @@ def test_a_matrix_without_rows(kind, name):
     assert left(ksp) < 1e-8
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_view_before_the_set_up(name, capfd):
-    solver(stored(ring(20, 1)), name).view()
-    assert f"pctt.pc.{name}" in capfd.readouterr().out
+def test_a_view_before_the_set_up(capfd):
+    solver(stored(ring(20, 1))).view()
+    assert "pctt.pc.TensorTrain" in capfd.readouterr().out
 
 
 def test_options_for_all_levels_are_those_of_each():
-    database = PETSc.Options()
-    database.insertString("-mg_levels_pc_tt_max_rank 7 -fieldsplit_pc_two_boxes 4")
-    database.insertString("-fieldsplit_two_mg_levels_pc_type jacobi")
+    PETSc.Options().insertString("-mg_levels_pc_tt_max_rank 7")
     ksp = solver(poisson(8), prefix="mg_levels_1_")
     assert ksp.pc.getPythonContext().options.max_rank == 7
-    ksp = solver(poisson(8), "TwoLevel", prefix="fieldsplit_0_")
-    ksp.setUp()
-    assert ksp.pc.getPythonContext().boxes == 4
-    assert ksp.pc.getPythonContext().multigrid.getMGSmoother(1).pc.getType() == "jacobi"
 
 
 def test_new_options_are_those_of_the_next_set_up():
@@ -120,8 +111,6 @@ def test_a_new_context_of_a_solver_in_use():
     ksp = solver(poisson(8), pc_type="python", pc_python_type="pctt.pc.TensorTrain", **SMALL)
     assert left(ksp) < 1e-8
     ksp.setFromOptions()
-    assert left(ksp) < 1e-8
-    ksp.pc.setPythonType("pctt.pc.TwoLevel")
     assert left(ksp) < 1e-8
 
 
@@ -175,28 +164,15 @@ def test_methods_that_need_the_transpose(transposed):
         assert left(ksp, transposed) < 1e-7
 
 
-@pytest.mark.parametrize(("count", "block"), [(8, 1), (16, 3), (4, 2), (1, 1)])
-def test_no_coarse_space_is_as_large_as_the_matrix(count, block):
-    """If Z is square, PETSc does not know a restriction from an interpolation by its shape."""
-    A = spd(count * block, 0)
-    mat = stored(A, block=block)
-    mat.setAttr("coordinates", np.random.default_rng(0).random((count, 2)))
-    ksp = solver(mat, "TwoLevel")
-    assert left(ksp) < 1e-8
-    context = ksp.pc.getPythonContext()
-    assert context.boxes * context.modes < len(A)
-
-
 @pytest.mark.parallel(2, 3)
-@pytest.mark.parametrize("name", NAMES[:2])
 @pytest.mark.parametrize("size", [1, 2, 5])
-def test_ranks_without_rows(name, size):
+def test_ranks_without_rows(size):
     comm = MPI.COMM_WORLD
     own = size if comm.rank == comm.size - 1 else 0
     csr = sp.csr_matrix(ring(size, 1)[:own] if size > 2 else 2.0 * np.eye(size)[:own])
     mat = PETSc.Mat().createAIJ(((own, size), (own, size)), csr=(csr.indptr, csr.indices, csr.data), comm=comm)
     mat.setAttr("coordinates", np.arange(3.0 * own).reshape(own, 3))
-    ksp = solver(mat, name)
+    ksp = solver(mat)
     x, b = mat.createVecs()
     b.set(1.0)
     ksp.solve(b, x)

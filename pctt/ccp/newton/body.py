@@ -54,7 +54,7 @@ class BodyForm:
 
     def stiff_part(self) -> PETSc.Mat:
         """What is worth factorising of K, in scalar rows."""
-        return self.operator.entries().stiff_part(LEAST, scalar=True, symmetric=self.symmetric)
+        return self.operator.entries().stiff_part(LEAST, self.symmetric)
 
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         push = self.problem.momentum(times(self._inverse, q) if uncoupled is None else uncoupled)

@@ -14,24 +14,12 @@ from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve, Source
 from pctt.options import OptionError
 from pctt.shell import is_shell
 
-_BODY = {
-    "ksp_type": "richardson", "ksp_norm_type": "unpreconditioned", "ksp_max_it": "4", "pc_type": "python",
-    "pc_python_type": "pctt.pc.BodySchur",
-}  # fmt: skip
-
 # names beside PETSc's own PC types: options that make them
 NAMED: dict[str, dict[str, str]] = {
     "ilu-shifted": {"pc_type": "ilu", "pc_factor_shift_type": "positive_definite"},
     "icc-shifted": {"pc_type": "icc", "pc_factor_shift_type": "positive_definite"},
     "cholesky": {"pc_type": "cholesky", "ksp_type": "gmres"},
     "tt": {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain"},
-    "body-pbjacobi": _BODY,
-    "body-ilu": {**_BODY, "body_pc_type": "ilu", "body_pc_factor_levels": "1"},
-    "body-two": {
-        **_BODY, "body_pc_type": "python", "body_pc_python_type": "pctt.pc.TwoLevel", "pc_body_shift": "0",
-    },
-    "body-gamg": {**_BODY, "body_pc_type": "gamg", "pc_body_shift": "0"},
-    "body-cholesky": {**_BODY, "body_pc_type": "cholesky", "pc_body_shift": "0"},
 }
 
 

@@ -50,10 +50,8 @@ class ContactForm:
         self._made = False
         G = self.problem.free_map
         if G is not None:
-            whole = barrier + self.problem.compliance_blocks
-            self._local = G.pack(whole)
+            self._local = G.pack(barrier + self.problem.compliance_blocks)
             describe(self.matrix, self.problem)
-            self.matrix.setAttr("barrier", whole)
             set_diagonal_blocks(self.matrix, self.problem.diagonal_blocks + barrier)
             self.matrix.stateIncrease()
             return
@@ -108,7 +106,6 @@ class Entries:
     def update(self, barrier: Array) -> None:
         """Put the barrier blocks (nc, 3, 3) in."""
         describe(self.mat, self.problem)
-        self.mat.setAttr("barrier", barrier + self.problem.compliance_blocks)
         blocks = self.problem.diagonal_blocks + barrier
         put_diagonal_blocks(self.mat, blocks)
         set_diagonal_blocks(self.mat, blocks)
@@ -124,8 +121,7 @@ def _with_low_rank(A: PETSc.Mat, U: PETSc.Mat) -> PETSc.Mat:
 
 
 def describe(mat: PETSc.Mat, problem: ConeProblem) -> None:
-    """What preconditioners may ask for: the places and names of the contacts, and what S is made of."""
-    for name in ("point", "key", "contact_map"):
-        value = getattr(problem, name)
+    """What preconditioners may ask for: the places and names of the contacts."""
+    for name, value in (("coordinates", problem.point), ("key", problem.key)):
         if value is not None:
-            mat.setAttr("coordinates" if name == "point" else name, value)
+            mat.setAttr(name, value)

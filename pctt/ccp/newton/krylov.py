@@ -151,8 +151,6 @@ class Krylov:
     @property
     def needs_entries(self) -> bool:
         """Whether the preconditioner reads entries beside the diagonal blocks."""
-        if self.kind == PETSc.PC.Type.PYTHON:
-            return getattr(self.ksp.pc.getPythonContext(), "needs_entries", True)
         return self.kind not in _BY_PRODUCTS
 
     def _form(self, P: PETSc.Mat) -> PETSc.Mat:
