@@ -1,12 +1,17 @@
-"""Differences between builds and releases of PETSc: the scalars, and the way in which errors return to Python."""
+"""Differences between builds and releases of PETSc: the scalars, the way in which errors return to Python, and
+functions that petsc4py has no name for in every release."""
 
 from __future__ import annotations
 
+import ctypes
 import gc
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 
@@ -58,3 +63,44 @@ def origin(error: BaseException) -> BaseException:
     while isinstance(error, PETSc.Error) and error.__cause__ is not None:
         error = error.__cause__
     return error
+
+
+def warn(comm: MPI.Comm, words: str) -> None:
+    """A warning of Python, once for all ranks; collective. If it is an error there (``-W error``), all ranks raise it."""
+    raised = None
+    if comm.rank == 0:
+        try:
+            warnings.warn(words, stacklevel=3)
+        except Warning as warning:
+            raised = warning
+    raised = comm.bcast(raised)
+    if raised is not None:
+        raise raised
+
+
+# -- functions of the library that petsc4py stands on ----------------------------------------------------------------
+
+_library = ctypes.CDLL(PETSc.__file__)
+_INT = ctypes.c_int64 if np.dtype(PETSc.IntType).itemsize == 8 else ctypes.c_int32
+_SET_COORDINATES = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, _INT, _INT, ctypes.POINTER(ctypes.c_double))
+_FAILED = {False: 0, True: -1}  # PC_NOERROR, PC_SETUP_ERROR
+
+
+def set_failed(pc: PETSc.PC, failed: bool) -> None:
+    """``PCSetFailedReason``: a KSP with this PC ends with KSP_DIVERGED_PC_FAILED, or not any more."""
+    _library.PCSetFailedReason(ctypes.c_void_p(pc.handle), ctypes.c_int(_FAILED[failed]))
+
+
+def on_coordinates(pc: PETSc.PC, take: Callable[[np.ndarray], None] | None) -> Any:
+    """Let ``PCSetCoordinates`` call ``take`` with the points (n, d); None: nothing is called any more.
+
+    The result has to live as long as ``take`` is to be called.
+    """
+
+    def called(_: Any, width: int, count: int, points: Any) -> int:
+        take(np.ctypeslib.as_array(points, (count, width)).copy() if count else np.zeros((0, width)))  # type: ignore
+        return 0
+
+    function = _SET_COORDINATES(called) if take is not None else ctypes.c_void_p(None)
+    _library.PetscObjectComposeFunction_Private(ctypes.c_void_p(pc.handle), b"PCSetCoordinates_C", function)
+    return function

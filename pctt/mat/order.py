@@ -1,55 +1,140 @@
-"""The grid to which the rows of a Mat belong, and the order of the rows in a train.
+"""What is known of the places of a Mat's rows, and the order of the rows in a train.
 
     grid      the attribute ``grid`` = (n_1, n_2, ...), the shape of a vector as an array (row i at
-              numpy.unravel_index(i, grid)), or the DMDA of the Mat: one axis after the other
-    morton    along a space-filling curve through the points of the attribute ``coordinates``
+              numpy.unravel_index(i, grid)), or a DMDA: one axis after the other
+    morton    along a space-filling curve through points (`Places.points`)
     natural   the given order of the rows
 """
 
 from __future__ import annotations
 
 import numbers
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import prod
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.morton import morton_codes
 from pctt.tt.grid import GridDigits
 from pctt.tt.train import Array
 
+FLAT = 1e-10  # directions of a near null space with a smaller part of its squares are rounding
 
-def grid_of(P: PETSc.Mat) -> tuple[tuple[int, ...], Array | None] | None:
-    """The shape of the grid of P's block rows, and the block row at each point of the grid; collective.
 
-    The second is None if the block rows are in the order of the points. The result is None if there is no grid.
-    ValueError on all ranks if the grid does not fit.
+@dataclass(frozen=True)
+class Places:
+    """Where the block rows of a Mat are; the same sources on all ranks.
+
+    grid : shape of the grid of the block rows, or None
+    row_at : block row at each point of the grid, on all ranks; None if the block rows are in the order of the points
+    points : (n, d) points of this rank's block rows, or None
+    source : where the grid, or else the points, come from, in words
     """
-    count = P.getSize()[0] // P.getBlockSize()
+
+    grid: tuple[int, ...] | None = None
+    row_at: Array | None = None
+    points: Array | None = None
+    source: str = "nothing"
+
+
+def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), given: Array | None = None) -> Places:
+    """All that is known of the places of P's block rows; collective.
+
+    dms : DMs that may describe the rows, beside that of P
+    given : points of this rank's block rows from elsewhere (``PCSetCoordinates``); the attribute ``coordinates`` of P
+        goes before
+
+    ValueError on all ranks if an attribute of P does not fit P.
+    """
     comm = P.comm.tompi4py()
+    fitting = [dm for dm in (P.getDM(), *dms) if dm.handle and _fits(dm, P, comm)]
+    shape, row_at, source = _attribute_grid(P, comm), None, "the attribute grid"
+    if shape is None:
+        shape, row_at, source = _dmda_grid(fitting, P, comm)
+    points, whence = P.getAttr("coordinates"), "the attribute coordinates"
+    check_points(points, P, "coordinates of the Mat")
+    if points is not None:
+        points = np.asarray(points, dtype=float)
+    elif _on_all(given is not None, comm):
+        points, whence = given, "PCSetCoordinates"
+        check_points(points, P, "PCSetCoordinates: points")
+    else:
+        points, whence = _other_points(fitting, P, comm)
+    return Places(shape, row_at, points, source if shape is not None else whence)
+
+
+def _on_all(here: bool, comm: MPI.Comm) -> bool:
+    return bool(comm.allreduce(here, op=MPI.LAND))
+
+
+def check_points(points: object, P: PETSc.Mat, name: str) -> None:
+    """ValueError on all ranks if points are wrong; collective.
+
+    Allowed are finite numbers, a row per local block row. Points may also be None on all ranks.
+    """
+    count = P.getLocalSize()[0] // P.getBlockSize()
+    wrong = ""
+    if points is not None:
+        try:
+            array = np.asarray(points, dtype=float)
+        except (TypeError, ValueError):
+            wrong = "are no numbers"
+        else:
+            if array.shape not in {(count, d) for d in (1, 2, 3)}:
+                wrong = f"have the shape {array.shape}"
+            elif not np.isfinite(array).all():
+                wrong = "have a NaN or infinity"
+    found = P.comm.tompi4py().allgather((points is not None, wrong, count))
+    for rank, (given, wrong, count) in enumerate(found):
+        if wrong or given != found[0][0]:
+            raise ValueError(
+                f"{name} {wrong or 'are missing'} on rank {rank}; allowed are finite numbers of shape "
+                f"({count}, 1), ({count}, 2) or ({count}, 3), a row per local block row"
+            )
+
+
+def _attribute_grid(P: PETSc.Mat, comm: MPI.Comm) -> tuple[int, ...] | None:
     given = P.getAttr("grid")
     words = comm.allgather(None if given is None else repr(given))
     if any(word != words[0] for word in words):
         raise ValueError(f"the attribute grid of the Mat differs between ranks: {', '.join(map(str, words))}")
-    if given is not None:
-        try:
-            shape = tuple(int(n) for n in given if isinstance(n, numbers.Integral))
-            fits = len(shape) == len(tuple(given)) > 0 and min(shape) >= 1 and prod(shape) == count
-        except TypeError:
-            fits = False
-        if not fits:
-            raise ValueError(
-                f"the attribute grid of the Mat is {given!r}; allowed are whole numbers whose product is the number of "
-                f"block rows, {count}"
-            )
-        return shape, None
-    dm = P.getDM()
-    if not dm.handle or dm.getType() != PETSc.DM.Type.DA or dm.getDof() != P.getBlockSize():
+    if given is None:
         return None
-    shape = tuple(dm.getSizes())[::-1]  # the first coordinate is the fastest
-    if comm.size == 1:
-        return shape, None
-    return shape, _natural_order(dm, P.getBlockSize())
+    count = P.getSize()[0] // P.getBlockSize()
+    try:
+        shape = tuple(int(n) for n in given if isinstance(n, numbers.Integral))
+        fits = len(shape) == len(tuple(given)) > 0 and min(shape) >= 1 and prod(shape) == count
+    except TypeError:
+        fits = False
+    if not fits:
+        raise ValueError(
+            f"the attribute grid of the Mat is {given!r}; allowed are whole numbers whose product is the number of "
+            f"block rows, {count}"
+        )
+    return shape
+
+
+def _fits(dm: PETSc.DM, P: PETSc.Mat, comm: MPI.Comm) -> bool:
+    """Whether a DM has points, and its global vectors the rows of P."""
+    if dm.getType() != PETSc.DM.Type.DA and not dm.getCoordinates().handle:
+        return False
+    vec = dm.createGlobalVec()
+    same = vec.getLocalSize() == P.getLocalSize()[0] and vec.getSize() == P.getSize()[0]
+    vec.destroy()
+    return _on_all(same, comm)
+
+
+def _dmda_grid(
+    dms: Sequence[PETSc.DM], P: PETSc.Mat, comm: MPI.Comm
+) -> tuple[tuple[int, ...] | None, Array | None, str]:
+    for dm in dms:
+        if dm.getType() == PETSc.DM.Type.DA and dm.getDof() == P.getBlockSize():
+            shape = tuple(dm.getSizes())[::-1]  # the first coordinate is the fastest
+            return shape, _natural_order(dm, P.getBlockSize()) if comm.size > 1 else None, "a DMDA"
+    return None, None, ""
 
 
 def _natural_order(dm: PETSc.DM, block: int) -> Array:
@@ -64,30 +149,77 @@ def _natural_order(dm: PETSc.DM, block: int) -> Array:
     return (np.concatenate(parts) / block).round().astype(np.int64)
 
 
-def digits_of(P: PETSc.Mat, order: str, name: str) -> tuple[GridDigits, Array | None, str]:
+def _other_points(dms: Sequence[PETSc.DM], P: PETSc.Mat, comm: MPI.Comm) -> tuple[Array | None, str]:
+    """Points from the coordinates of a DM, or from a near null space; None if there are none."""
+    count = P.getLocalSize()[0] // P.getBlockSize()
+    for dm in dms:
+        coordinates = dm.getCoordinates()
+        if not coordinates.handle:
+            continue
+        width = dm.getCoordinateDim()
+        if _on_all(coordinates.getLocalSize() == width * count, comm):
+            return coordinates.array_r.reshape(count, width).copy(), "the coordinates of a DM"
+    points = _points_of_modes(P, comm)
+    return points, "nothing" if points is None else "a near null space"
+
+
+def _points_of_modes(P: PETSc.Mat, comm: MPI.Comm) -> Array | None:
+    """Points from the near null space of P, up to an affine map; None if it is the same in all block rows.
+
+    The rigid motions of a block row at x are affine functions of x. So the entries of all modes in a block row are an
+    affine image of x, and their principal components are coordinates.
+    """
+    near = P.getNearNullSpace()
+    vectors = near.getVecs() if near.handle else []
+    if not vectors:
+        return None
+    block = P.getBlockSize()
+    values = np.concatenate([v.array_r.reshape(-1, block) for v in vectors], axis=1)
+    count = comm.allreduce(len(values))
+    total = float(comm.allreduce(np.vdot(values, values)))
+    values = values - comm.allreduce(values.sum(axis=0)) / count
+    gram = comm.allreduce(values.T @ values)
+    square, direction = comm.bcast(np.linalg.eigh(gram))  # signs may differ between processors
+    kept = np.flatnonzero(square > FLAT * total)[-3:]
+    if len(kept) == 0:
+        return None
+    return values @ (direction[:, kept] / np.sqrt(square[kept] / count))
+
+
+def rows_by_curve(points: Array, comm: MPI.Comm) -> Array:
+    """The block rows of all ranks along a Morton curve through points (n, d) of this rank's block rows; collective."""
+    codes = morton_codes(np.concatenate(comm.allgather(points)))
+    return np.argsort(codes, kind="stable")
+
+
+def digits_of(P: PETSc.Mat, order: str, name: str, places: Places | None = None) -> tuple[GridDigits, Array | None, str]:
     """The digits of P's rows, the row at each point (None if rows are in the order of points), and the chosen order.
 
-    order : auto, grid, morton or natural; auto takes the first of the others for which P has the data
-    name : name of the option, for the ValueError if P lacks the data
+    order : auto, grid, morton or natural; auto takes the first of the others for which the places are known
+    name : name of the option, for the ValueError if they are not
     """
     block = P.getBlockSize()
-    grid = grid_of(P) if order in ("auto", "grid") else None
-    if grid is not None:
-        shape, rows = grid
-        return GridDigits(shape, block=block), _scalar(rows, block), "grid"
+    places = places or places_of(P)
+    if places.grid is not None and order in ("auto", "grid"):
+        return GridDigits(places.grid, block=block), scalar_rows(places.row_at, block), "grid"
     count = P.getSize()[0] // block
-    points = P.getAttr("coordinates")  # it was checked: all ranks have it or none
-    if points is not None and order in ("auto", "morton"):
-        parts = P.comm.tompi4py().allgather(np.asarray(points, dtype=float).reshape(-1, np.shape(points)[-1]))
-        codes = morton_codes(np.concatenate(parts))
-        return GridDigits((count,), block=block), _scalar(np.argsort(codes, kind="stable"), block), "morton"
+    if places.points is not None and order in ("auto", "morton"):
+        rows = rows_by_curve(places.points, P.comm.tompi4py())
+        return GridDigits((count,), block=block), scalar_rows(rows, block), "morton"
     if order in ("auto", "natural"):
         return GridDigits((count,), block=block), None, "natural"
-    lacks = {"grid": "grid (its shape), or a DMDA", "morton": "coordinates", "rcm": "entries that are stored"}
-    raise ValueError(f"{name} {order}: the Mat has no {lacks[order]}; allowed without is auto or natural")
+    raise ValueError(f"{name} {order}: {LACKS[order]}; allowed without is auto or natural")
 
 
-def _scalar(rows: Array | None, block: int) -> Array | None:
+LACKS = {
+    "grid": "the Mat has no grid (its shape), or a DMDA",
+    "morton": "the Mat has no coordinates",
+    "rcm": "the Mat has no entries that are stored",
+}
+
+
+def scalar_rows(rows: Array | None, block: int) -> Array | None:
+    """Rows of a Mat, from its block rows."""
     if rows is None or block == 1:
         return rows
     return np.add.outer(rows * block, np.arange(block)).ravel()

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from pctt.context import Context
 from pctt.mat.entries import Entries, is_symmetric
-from pctt.mat.order import digits_of
+from pctt.mat.order import Places, digits_of
 from pctt.mat.product import TrainProduct
 from pctt.petsc import own_errors
 from pctt.tt.cross import Cross, compress_cross
@@ -36,12 +36,12 @@ class CompressedEntries:
 
     def __init__(
         self, P: PETSc.Mat, eps: float, max_rank: int, order: str = "auto", name: str = "order",
-        start: CompressedEntries | None = None, seed: int = 0,
+        start: CompressedEntries | None = None, seed: int = 0, places: Places | None = None,
     ) -> None:  # fmt: skip
         """Collective; EntriesError or ValueError on all ranks for bad entries or a bad grid."""
         comm = P.comm.tompi4py()
         self.entries = Entries.of(P)
-        self.digits, self.rows, self.order = digits_of(P, order, name)
+        self.digits, self.rows, self.order = digits_of(P, order, name, places)
         self.counts = np.array(comm.allgather(P.getLocalSize()[0]))
         self.comm = comm
         matrix = EntryMatrix(self.entries, self.digits, self.rows, comm.bcast)
@@ -71,7 +71,11 @@ class CompressedEntries:
 
     def product(self, train: Train) -> TrainProduct:
         """The product with a train, with rows in the order of the Mat."""
-        return TrainProduct(self.comm, self.counts, self.digits, self.rows, train)
+        slots = self.digits.places
+        if self.rows is not None:
+            slots = np.empty_like(slots)
+            slots[self.rows] = self.digits.places
+        return TrainProduct(self.comm, self.counts, slots, self.digits.size, train)
 
     def words(self) -> str:
         """Ranks, bytes, compression, error."""

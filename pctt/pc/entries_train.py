@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import DTypeLike
 from petsc4py import PETSc
 
+from pctt.mat.order import Places
 from pctt.mat.tensor_train import CompressedEntries, compressed
 from pctt.pc.positivity import CERTAIN, finds_negative, has_inertia_of
 from pctt.pc.train_options import Account, Options
@@ -14,7 +16,6 @@ from pctt.tt.inverse import Inverse, invert_near_identity
 from pctt.tt.lowest import lowest
 from pctt.tt.train import identity
 
-SINGLE = 1e-5  # with this eps or a larger one, products of the inverse use single precision
 WORTH = 0.25  # smallest part of eps that is asked for to get a certificate
 TIGHTER, TRIES = 0.05, 4  # eps is lowered if the train of the matrix or of its inverse is not positive
 
@@ -25,10 +26,16 @@ class EntriesTrain:
     compressed, inverse : trains of the present matrix and of its inverse; None before `make`, and after a failure
     """
 
+    places: Places
+
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
         self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
         self.compressed: CompressedEntries | None = None
         self.inverse: Inverse | None = None
+
+    def begin(self, places: Places) -> None:
+        """Begin a matrix whose rows are at other places."""
+        self.places = places
 
     def make(self, P: PETSc.Mat, rank: int) -> bool:
         """Make a train. If there is no positive inverse, return False and write the reason to the account.
@@ -56,7 +63,7 @@ class EntriesTrain:
         if known is not None and known.error <= eps and self.options.order in ("auto", known.order):
             return known.rounded(0.5 * eps, rank)
         name = f"-{self.prefix}pc_tt_order"
-        return CompressedEntries(P, eps, rank, self.options.order, name, start, self.options.seed)
+        return CompressedEntries(P, eps, rank, self.options.order, name, start, self.options.seed, self.places)
 
     def _invert(self, rank: int, eps: float) -> Inverse | None:
         """The inverse; None if the train of the matrix turns out not to be positive."""
@@ -77,7 +84,7 @@ class EntriesTrain:
         """
         assert self.compressed is not None
         Z, T = inverse.applied, self.compressed.train
-        self._product = self.compressed.product(Z.astype(np.float32) if self.options.eps >= SINGLE else Z)
+        self._product = self.compressed.product(Z)
         if inverse.repaired == 0 and self.comm.bcast(has_inertia_of(inverse.residual * T.norm())):
             return True
         product = self.compressed.product(T)
@@ -85,13 +92,22 @@ class EntriesTrain:
         return not finds_negative(lambda x: x + self._product(x), lambda x: x + product(x), count, self.comm)
 
     def _refuse(self, why: str) -> bool:
-        self.account.fallbacks.append(why)
+        self.account.fall_back(why)
         self.compressed = self.inverse = None
         return False
 
     def distrust(self) -> bool:
         """False, because every matrix has a train of its own."""
         return False
+
+    def use(self, dtype: DTypeLike) -> None:
+        """Multiply in this precision."""
+        self._product.use(dtype)
+
+    @property
+    def flops(self) -> int:
+        """Operations of this rank in `times`."""
+        return self._product.flops
 
     def times(self, x: np.ndarray) -> np.ndarray:
         """This rank's part of (x + Z x) / c, from its part of x."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.mat.order import grid_of
+from pctt.mat.order import LACKS, Places
 from pctt.morton import morton_codes
 from pctt.tt.grid import GridDigits
 from pctt.tt.quantise import group_modes
@@ -13,11 +13,10 @@ from pctt.tt.quantise import group_modes
 ENDS = 16  # largest number of slots in the first and in the last mode of a grid
 
 
-def block_order(P: PETSc.Mat, order: str = "auto") -> np.ndarray:
+def block_order(P: PETSc.Mat, places: Places, order: str = "auto") -> np.ndarray:
     """Places (n,) of the local block rows of P among those of this rank, a permutation of 0 ... n-1.
 
-    morton : along a Morton curve through the points in the Mat's attribute ``coordinates``, an array (n, 3), (n, 2) or
-        (n, 1) with a row per local block row (``P.setAttr("coordinates", points)``)
+    morton : along a Morton curve through the points of ``places``
     rcm : reverse Cuthill-McKee order of this rank's part
     natural : the given order
     auto : morton if there are points, else rcm
@@ -26,14 +25,12 @@ def block_order(P: PETSc.Mat, order: str = "auto") -> np.ndarray:
     """
     bs = P.getBlockSize()
     count = P.getLocalSize()[0] // bs
-    points = P.getAttr("coordinates")  # on all ranks or on none
-    if order == "morton" and points is None:
-        raise ValueError("-pc_tt_order morton: the Mat has no coordinates; allowed without is auto, rcm or natural")
+    if order == "morton" and places.points is None:
+        raise ValueError(f"-pc_tt_order morton: {LACKS[order]}; allowed without is auto, rcm or natural")
     if order == "natural" or count == 0:
         return np.arange(count)
-    if points is not None and order != "rcm":
-        codes = morton_codes(np.asarray(points, dtype=float).reshape(count, -1))
-        rows = np.argsort(codes, kind="stable")
+    if places.points is not None and order != "rcm":
+        rows = np.argsort(morton_codes(places.points), kind="stable")
     else:
         given, _ = P.getDiagonalBlock().getOrdering(PETSc.Mat.OrderingType.RCM)
         rows = given.getIndices().astype(np.int64)
@@ -44,25 +41,24 @@ def block_order(P: PETSc.Mat, order: str = "auto") -> np.ndarray:
     return place
 
 
-def grid_slots(P: PETSc.Mat, order: str) -> tuple[np.ndarray, int, tuple[int, ...]] | None:
-    """The slot of each local block row among those of this rank, the number of slots, and the slot modes, in the order
-    of a grid. None if P has no grid, or if ``order`` does not ask for it. Collective.
+def grid_slots(P: PETSc.Mat, places: Places, order: str) -> tuple[np.ndarray, int, tuple[int, ...]] | None:
+    """The slot of each local block row, the number of slots of all ranks, and the slot modes, in the order of a grid.
 
-    ValueError on all ranks if the grid does not fit. The same if ``order`` asks for a grid and P has none, or if the
-    points of the grid are distributed over the ranks in another order.
+    None if P has no grid, or if ``order`` does not ask for it. ValueError on all ranks if ``order`` asks for a grid and
+    P has none.
     """
     if order not in ("auto", "grid") or (order == "auto" and P.getAttr("key") is not None):
         return None
-    grid = grid_of(P)
-    if grid is None or grid[1] is not None:
+    if places.grid is None:
         if order == "auto":
             return None
-        lacks = "grid (its shape), or a DMDA" if grid is None else "rows in the order of its grid"
-        raise ValueError(f"-pc_tt_order grid: the Mat has no {lacks}; allowed without is auto, morton, rcm or natural")
-    digits = GridDigits(grid[0])
+        raise ValueError(f"-pc_tt_order grid: {LACKS[order]}; allowed without is auto, morton, rcm or natural")
+    digits = GridDigits(places.grid)
+    slots = digits.places
+    if places.row_at is not None:
+        slots = np.empty_like(slots)
+        slots[places.row_at] = digits.places
     first, last = (row // P.getBlockSize() for row in P.getOwnershipRange())
-    places = np.append(digits.places, digits.size)
-    start, end = (int(places[row]) if row else 0 for row in (first, last))
     groups = np.cumsum([0, *group_modes(digits.modes, ENDS)])
     modes = tuple(int(np.prod(digits.modes[a:b])) for a, b in zip(groups[:-1], groups[1:]))
-    return places[first:last] - start, end - start, modes
+    return slots[first:last], digits.size, modes

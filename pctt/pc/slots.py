@@ -1,7 +1,7 @@
 """Slots for the block rows of a sequence of matrices: the tree of the paper's evolving hierarchies.
 
-A slot is a place in the order along which a train is quantised. Each rank has a contiguous range of slots, in boxes of
-equal size along a Morton curve. If the block rows have names (the Mat's attribute ``key``), a few slots stay empty. So
+A slot is a place in the order along which a train is quantised. With a grid it is the place of a point. Otherwise each
+rank has a contiguous range of slots, in boxes of equal size along a Morton curve. If the block rows have names (the Mat's attribute ``key``), a few slots stay empty. So
 the rows of the next matrix can take and leave places: a row that stays near its box keeps its slot, and a new row gets
 the nearest empty slot. Then the cores of the last train are a start for the next train.
 """
@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from petsc4py import PETSc
 
+from pctt.mat.order import Places
 from pctt.morton import Frame, morton_codes
 from pctt.pc.ordering import block_order, grid_slots
 
@@ -27,28 +28,32 @@ class Slots:
 
     Attributes
     ----------
-    place : (n,) slot of each block row of the present matrix
-    capacity : number of slots of this rank
+    place : (n,) slot of each block row of the present matrix, counted from ``first``
+    first, size : first slot of this rank (0 with a grid), number of slots of all ranks
+    capacity : number of slots of this rank; with a grid, of all ranks
     modes : slot modes of a grid; empty without a grid
     moved, entered, left : numbers of rows that got another slot, were new, or were gone at the last `follow`
     """
 
-    def __init__(self, P: PETSc.Mat, box: int, order: str = "auto"):
-        """Put the rows in the order of a grid, or evenly along the curve. ``box`` slots make a box."""
+    def __init__(self, P: PETSc.Mat, places: Places, box: int, order: str = "auto"):
+        """Put the rows in the order of a grid, or evenly along the curve; collective. ``box`` slots make a box."""
         count = P.getLocalSize()[0] // P.getBlockSize()
-        keys, points = P.getAttr("key"), P.getAttr("coordinates")
+        keys, points = P.getAttr("key"), places.points
         self.box = box
         self.modes: tuple[int, ...] = ()
         self.moved = self.entered = self.left = 0
         self.evolving = False
-        grid = grid_slots(P, order)
+        grid = grid_slots(P, places, order)
         if grid is not None:
-            self.place, self.capacity, self.modes = grid
+            self.place, self.size, self.modes = grid
+            self.first, self.capacity = 0, self.size
             return
         self.evolving = keys is not None and points is not None and order in ("auto", "morton")
-        rows = np.argsort(block_order(P, order), kind="stable")
+        rows = np.argsort(block_order(P, places, order), kind="stable")
         spare = -(-int(np.ceil(count * (1 + SPARE))) // box) * box
         self.capacity = spare if self.evolving else count
+        capacities = P.comm.tompi4py().allgather(self.capacity)
+        self.first, self.size = sum(capacities[: P.comm.rank]), sum(capacities)
         self.place = np.empty(count, np.int64)
         self.place[rows] = np.arange(count) * self.capacity // max(count, 1)
         if self.evolving:
@@ -63,13 +68,18 @@ class Slots:
         by_key = np.argsort(keys)
         self._keys, self._key_places = np.asarray(keys)[by_key], self.place[by_key]
 
-    def follow(self, P: PETSc.Mat, agree: Callable[[bool], bool]) -> bool:
+    @property
+    def slots(self) -> np.ndarray:
+        """(n,) slot of each block row of the present matrix, among those of all ranks."""
+        return self.first + self.place
+
+    def follow(self, P: PETSc.Mat, places: Places, agree: Callable[[bool], bool]) -> bool:
         """Take the rows of another matrix.
 
         If they do not fit or few rows would keep their slots, return False and change nothing. ``agree`` tells whether
         all ranks say yes.
         """
-        keys, points = P.getAttr("key"), P.getAttr("coordinates")
+        keys, points = P.getAttr("key"), places.points
         place = None
         if self.evolving and keys is not None and points is not None:
             place = self._follow(np.asarray(keys), np.asarray(points, dtype=float))

@@ -13,7 +13,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.block_diagonal import inverse_diagonal_blocks
+from pctt.mat.product import TrainProduct
 from pctt.pc.slots import Slots
+from pctt.tt.train import Train
 
 CSR = tuple[np.ndarray, np.ndarray, np.ndarray]  # row pointers, columns, values of this rank's rows
 
@@ -26,10 +28,10 @@ class SlottedMatrix:
 
     Attributes
     ----------
-    place : (n,) slot of each local block row, counted from ``first``
-    first, capacity, size : first slot of this rank, number of its slots, number of slots of all ranks
-    rows, columns : (nb,) global slots of the local off-diagonal blocks
-    root : (capacity, bs, bs) R_i = L_i^-1 of each local slot, in slot order; identities without scaling
+    size : number of slots of all ranks
+    places : (rows,) slot of each block row of all ranks
+    rows, columns : (nb,) slots of the local off-diagonal blocks
+    root : (n, bs, bs) R_i = L_i^-1 of each local block row; identities without scaling
     """
 
     def __init__(self, P: PETSc.Mat, slots: Slots, comm: MPI.Comm, scaled: bool):
@@ -37,10 +39,9 @@ class SlottedMatrix:
         count = P.getLocalSize()[0] // self.block
         self._counts = np.array(comm.allgather(count))
         self._total = int(self._counts.sum())
-        self._capacities = np.array(comm.allgather(slots.capacity))
-        self.first, self.size = int(self._capacities[: comm.rank].sum()), int(self._capacities.sum())
-        self.place, self.capacity = slots.place, slots.capacity
-        self.root = np.tile(np.eye(self.block), (self.capacity, 1, 1))
+        self.size, self._slots = slots.size, slots.slots
+        self.places = self._gathered(self._slots)
+        self.root = np.tile(np.eye(self.block), (count, 1, 1))
         self._csr: tuple[np.ndarray, ...] | None = None  # the pattern that is listed
 
     def lists(self, csr: CSR) -> bool:
@@ -52,16 +53,16 @@ class SlottedMatrix:
         """Find the blocks of P: ``rows`` and ``columns``."""
         self._csr = csr[:2]
         own = int(self._counts[: self.comm.rank].sum())  # the first block row of this rank
-        slot = self._gathered(self.first + self.place)  # slot of every global block row
         pattern = self._pattern(csr)
         self._order = pattern.data - 1  # index of each entry of the blocks in P's values, -1 if P does not store it
-        row = np.repeat(np.arange(len(self.place)), np.diff(pattern.indptr))
+        row = np.repeat(np.arange(len(self._slots)), np.diff(pattern.indptr))
         self._pointers, self._column = pattern.indptr, pattern.indices
         self._kept = pattern.indices != own + row if self.scaled else np.ones(len(row), bool)
-        self.rows = self.first + self.place[row[self._kept]]
-        self.columns = slot[pattern.indices[self._kept]]
-        if not self.scaled:  # empty slots hold a multiple of the identity
-            empty = self.first + np.setdiff1d(np.arange(self.capacity), self.place)
+        self.rows = self._slots[row[self._kept]]
+        self.columns = self.places[pattern.indices[self._kept]]
+        if not self.scaled:  # empty slots hold a multiple of the identity; each rank has a share of them
+            empty = np.setdiff1d(np.arange(self.size), self.places)
+            empty = np.array_split(empty, self.comm.size)[self.comm.rank]
             self._empty = len(empty)
             self.rows, self.columns = np.append(self.rows, empty), np.append(self.columns, empty)
 
@@ -72,7 +73,7 @@ class SlottedMatrix:
         """
         if not self.scaled:
             return
-        self.root[self.place] = np.linalg.cholesky(inverse_diagonal_blocks(P)).transpose(0, 2, 1)
+        self.root = np.linalg.cholesky(inverse_diagonal_blocks(P)).transpose(0, 2, 1)
 
     def load(self, P: PETSc.Mat, csr: CSR) -> np.ndarray:
         """The present blocks (nb, bs, bs) of P at ``rows`` and ``columns``, with scaling multiplied by the roots of
@@ -81,14 +82,13 @@ class SlottedMatrix:
         if not self.scaled:
             typical = P.getDiagonal().sum() / P.getSize()[0]
             return np.concatenate([blocks, np.tile(typical * np.eye(self.block), (self._empty, 1, 1))])
-        roots = self.root[self.place]
-        everywhere = self._gathered(roots)
+        everywhere = self._gathered(self.root)
         if self.block == 1:  # scipy drops stored zeros from products of matrices of single numbers
-            scaled = np.repeat(roots, np.diff(self._pointers), axis=0) * blocks * everywhere[self._column]
+            scaled = np.repeat(self.root, np.diff(self._pointers), axis=0) * blocks * everywhere[self._column]
             return scaled[self._kept]
-        shape = (self.block * len(self.place), self.block * self._total)
+        shape = (self.block * len(self._slots), self.block * self._total)
         rows = sp.bsr_matrix((blocks, self._column, self._pointers), shape=shape)
-        scaled = _diagonal(roots) @ rows @ _diagonal(everywhere.transpose(0, 2, 1))
+        scaled = _diagonal(self.root) @ rows @ _diagonal(everywhere.transpose(0, 2, 1))
         return scaled.data[self._kept]  # scipy keeps the order of the blocks, because each has one factor
 
     def _pattern(self, csr: CSR) -> sp.bsr_matrix:
@@ -108,9 +108,18 @@ class SlottedMatrix:
         self.comm.Allgatherv(np.ascontiguousarray(local), [out, self._counts * width])
         return out
 
-    def gather_slots(self, local: np.ndarray, out: np.ndarray) -> None:
-        """Gather a vector in slot order: ``local`` (n bs,) is this rank's part, ``out`` (size bs,) the whole vector."""
-        self.comm.Allgatherv(local, [out, self._capacities * self.block])
+    def scaled_vector(self, x: np.ndarray) -> np.ndarray:
+        """This rank's part (n bs,) of L^-1 x."""
+        return np.matmul(self.root, x.reshape(-1, self.block, 1)).ravel()
+
+    def unscaled(self, z: np.ndarray) -> np.ndarray:
+        """This rank's part (n bs,) of L^-T z."""
+        return np.matmul(self.root.transpose(0, 2, 1), z.reshape(-1, self.block, 1)).ravel()
+
+    def product(self, train: Train) -> TrainProduct:
+        """The product with a train of the slots, with rows in the order of the Mat."""
+        slots = np.add.outer(self.places * self.block, np.arange(self.block)).ravel()
+        return TrainProduct(self.comm, self._counts * self.block, slots, self.size * self.block, train)
 
 
 def _diagonal(blocks: np.ndarray) -> sp.bsr_matrix:

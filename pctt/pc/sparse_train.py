@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import DTypeLike
 from petsc4py import PETSc
 
 from pctt import memory
-from pctt.pc.ordering import grid_slots
+from pctt.mat.order import Places
+from pctt.mat.product import TrainProduct
+from pctt.pc.ordering import block_order, grid_slots
 from pctt.pc.positivity import finds_negative
 from pctt.pc.refresh_schedule import RefreshSchedule
 from pctt.pc.slots import Slots
 from pctt.pc.slotted import CSR, SlottedMatrix
 from pctt.pc.train_options import Account, Options
 from pctt.tt.als import Compression, compress
-from pctt.tt.apply import Apply
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.inverse import Inverse, invert, invert_near_identity
 from pctt.tt.quantise import choose_modes
@@ -37,6 +39,7 @@ class SparseTrain:
     """
 
     slots: SlottedMatrix
+    places: Places
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account) -> None:
         self.comm, self.options, self.account = comm, options, account
@@ -55,11 +58,13 @@ class SparseTrain:
         self._opening: Inverse | None = None  # the inverse for the first matrix of a structure
         self._cap = 0  # of the ranks of these
         self._schedule = RefreshSchedule()
-        self._apply: Apply | None = None
+        self._product: TrainProduct | None = None
 
-    def begin(self, P: PETSc.Mat) -> None:
-        """Begin a new structure; ValueError on all ranks if the grid does not fit it."""
-        grid_slots(P, self.options.order)
+    def begin(self, P: PETSc.Mat, places: Places) -> None:
+        """Begin a new structure; ValueError on all ranks if it lacks what the order needs."""
+        grid_slots(P, places, self.options.order)
+        block_order(P, places, self.options.order)
+        self.places = places
         self._forget_structure()
         if self.options.reuse not in ("steps", "trains") or P.getBlockSize() != self._block:
             self._forget_trains()
@@ -150,26 +155,26 @@ class SparseTrain:
     def _left(self, P: PETSc.Mat) -> float:
         """||w - S X w|| / ||w|| for a random vector w, where S is the scaled matrix."""
         slots = self.slots
-        w = np.zeros((slots.capacity, slots.block))
-        w[slots.place] = np.random.default_rng(self.options.seed).standard_normal((len(slots.place), slots.block))
         x, y = P.createVecs()
-        x.array_w[:] = self._from_slots(self._inverse_times(w.ravel()))
+        w = np.random.default_rng(self.options.seed).standard_normal(x.getLocalSize())
+        x.array_w[:] = slots.unscaled(self._inverse_times(w))
         P.mult(x, y)
-        left = w.ravel() - self._to_slots(y.array_r)
-        squares = self.comm.allreduce(np.array([left @ left, w.ravel() @ w.ravel()]))
+        left = w - slots.scaled_vector(y.array_r)
+        squares = self.comm.allreduce(np.array([left @ left, w @ w]))
         x.destroy()
         y.destroy()
         return float(np.sqrt(squares[0] / squares[1]))
 
     def _take_slots(self, P: PETSc.Mat) -> None:
         """Give slots to P's block rows; use those of the last structure if they fit."""
-        if self.tree is not None and not self.tree.follow(P, lambda fits: self.comm.allreduce(fits, op=MPI.LAND)):
+        if self.tree is not None and not self.tree.follow(P, self.places, self._all):
             self.account.resets += 1
             self._forget_trains()
         if self.tree is None:
-            self.tree = Slots(P, self.options.leaf, self.options.order)
+            self.tree = Slots(P, self.places, self.options.leaf, self.options.order)
         self.slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaling == "block")
         self._begun = True
+        self._product = None  # rows have other slots
 
     def _block_pairs(self, csr: CSR) -> SparseHierarchy:
         assert self.tree is not None
@@ -195,23 +200,29 @@ class SparseTrain:
         return method(self.compression.train, rank, start, eps=options.eps, rng=rng)
 
     def _refuse(self, why: str) -> bool:
-        self.account.fallbacks.append(why)
+        self.account.fall_back(why)
         self.compression = self.inverse = None
         return False
 
     # -- application ----------------------------------------------------------------------------------------
 
     def _use(self, inverse: Inverse) -> None:
-        self.inverse, slots = inverse, self.slots
-        if self._apply is None:
-            bs = slots.block
-            rows = (slots.first * bs, (slots.first + slots.capacity) * bs)
-            self._apply = Apply(inverse.applied, slots.size * bs, rows)
-            self._local = np.empty((slots.capacity, bs))
-            self._scaled = np.empty((slots.capacity, bs, 1))
-            self._whole = np.empty(slots.size * bs)
+        self.inverse = inverse
+        if self._product is None:
+            self._product = self.slots.product(inverse.applied)
         else:
-            self._apply.set_train(inverse.applied)
+            self._product.set_train(inverse.applied)
+
+    def use(self, dtype: DTypeLike) -> None:
+        """Multiply in this precision."""
+        assert self._product is not None
+        self._product.use(dtype)
+
+    @property
+    def flops(self) -> int:
+        """Operations of this rank in `times`."""
+        assert self._product is not None
+        return self._product.flops + 4 * self.slots.root.size
 
     def distrust(self) -> bool:
         """Whether a train of an earlier matrix is in use. If so, the next set-up tries another train."""
@@ -222,35 +233,21 @@ class SparseTrain:
 
     def times(self, x: np.ndarray) -> np.ndarray:
         """This rank's part of L^-T X L^-1 x, from its part of x."""
-        return self._from_slots(self._inverse_times(self._to_slots(x)))
-
-    def _to_slots(self, x: np.ndarray) -> np.ndarray:
-        """L^-1 x in slot order (capacity bs,), in a buffer that the next call overwrites."""
-        slots = self.slots
-        if slots.capacity > len(slots.place):
-            self._local[:] = 0.0
-        self._local[slots.place] = x.reshape(-1, slots.block)
-        np.matmul(slots.root, self._local[:, :, None], out=self._scaled)
-        return self._scaled.ravel()
-
-    def _from_slots(self, z: np.ndarray) -> np.ndarray:
-        """L^-T z in the order of the block rows."""
-        slots = self.slots
-        np.matmul(slots.root.transpose(0, 2, 1), z.reshape(self._scaled.shape), out=self._scaled)
-        return self._scaled[slots.place].ravel()
+        return self.slots.unscaled(self._inverse_times(self.slots.scaled_vector(x)))
 
     def _inverse_times(self, x: np.ndarray) -> np.ndarray:
-        """This rank's part of X x in slot order, from its part of x."""
+        """This rank's part of X x, from its part of x."""
         assert self.inverse is not None
-        assert self._apply is not None
-        self.slots.gather_slots(x, self._whole)
-        self._apply.x[: self._apply.n] = self._whole
-        product = self._apply.product()
+        assert self._product is not None
+        product = self._product(x)
         return x + product if self.inverse.identity else product
+
+    def _all(self, here: bool) -> bool:
+        return bool(self.comm.allreduce(here, op=MPI.LAND))
 
     def _add(self, x: np.ndarray) -> np.ndarray:
         if self.comm.size > 1:
-            out = np.empty_like(x)
+            out = np.empty(x.shape, x.dtype)
             self.comm.Allreduce(np.ascontiguousarray(x), out)
             return out
         return x

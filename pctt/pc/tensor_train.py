@@ -9,7 +9,6 @@ Mat) is compressed by cross approximation and inverted (``entries_train.py``).
 from __future__ import annotations
 
 import time
-import warnings
 
 import numpy as np
 from mpi4py import MPI
@@ -17,16 +16,26 @@ from petsc4py import PETSc
 
 from pctt.block_diagonal import block_diagonal
 from pctt.mat.entries import diagonal_blocks, has_entries
+from pctt.mat.order import Places, places_of
 from pctt.pc.base import PythonPC
 from pctt.pc.entries_train import EntriesTrain
-from pctt.pc.mat import check_coordinates, is_symmetric, residual_norm
+from pctt.pc.mat import is_symmetric, residual_norm
 from pctt.pc.rank_policy import RankPolicy
 from pctt.pc.sparse_train import SparseTrain
 from pctt.pc.train_options import ENTRIES_RANK, SPARSE_RANK, Account, Options
+from pctt.petsc import on_coordinates, set_failed, warn
 
 NOT_SYMMETRIC = "the matrix is not symmetric, so a train for its inverse may be useless"
+NOWHERE = (
+    "nothing is known of the places of its rows (no grid, coordinates, DM or near null space), so they are in reverse "
+    "Cuthill-McKee order"
+)
 LOWER = 3  # auto tries the cap and the cap divided by this
 POOR = 0.5  # an inverse with a larger residual causes a warning
+SINGLE = 1e-5  # with this eps or a larger one, products of the inverse may use single precision
+#: Krylov methods that are as accurate with a preconditioner that rounds to single precision: the residual that they
+#: update is that of x, and no vector of theirs is the preconditioner of a sum of earlier ones.
+UNHARMED = {"cg", "fcg", "fgmres", "gcr", "fbcgs", "fbcgsr"}
 #: Reasons for the end of a Krylov method whose preconditioner is not positive definite.
 SPOILT = {
     getattr(PETSc.KSP.ConvergedReason, f"DIVERGED_{name}")
@@ -48,8 +57,23 @@ class TensorTrain(PythonPC):
         super().create(pc)
         self.account = Account()
         self.rank = 1
+        self.failed = False  # whether there is no preconditioner, by -pc_tt_fallback none
         self.symmetric = True
+        self.places = Places()
         self._own: list[PETSc.Object] = []  # block Jacobi and its matrix
+        self._warned: set[str] = set()
+        self._points: np.ndarray | None = None
+        self._last_precision: type = np.float64  # of the last solve
+        self._on_coordinates = on_coordinates(pc, self._take_points)
+
+    def destroy(self, pc: PETSc.PC) -> None:
+        on_coordinates(pc, None)
+        super().destroy(pc)
+
+    def _take_points(self, points: np.ndarray) -> None:
+        """The points (n, d) of this rank's block rows, from ``PCSetCoordinates``."""
+        self._points = points
+        self._structure = None
 
     # -- set-up ---------------------------------------------------------------------------------------------
 
@@ -59,9 +83,10 @@ class TensorTrain(PythonPC):
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """ValueError on all ranks if coordinates, grid or modes do not fit the matrix."""
         self.comm = P.comm.tompi4py()
-        check_coordinates(P)
+        self.places = places_of(P, (pc.getDM(), pc.getOperators()[0].getDM()), self._points)
         if has_entries(P):
             self.made = EntriesTrain(self.comm, self.options, self.account, self.prefix)
+            self.made.begin(self.places)
             self.policy = RankPolicy((self.options.cap(ENTRIES_RANK),), automatic=False)
         else:
             self._begin_sparse(P)
@@ -80,43 +105,58 @@ class TensorTrain(PythonPC):
             ladder = (max(1, cap // LOWER), cap) if self.options.automatic else (cap,)
             self.policy = RankPolicy(ladder, self.options.automatic)
         assert isinstance(self.made, SparseTrain)
-        self.made.begin(P)
-        self._say_symmetry(is_symmetric(P))
+        self.made.begin(P, self.places)
+        self._judge_symmetry(is_symmetric(P))
 
-    def _say_symmetry(self, symmetric: bool) -> None:
+    def _judge_symmetry(self, symmetric: bool) -> None:
         self.symmetric = symmetric
-        if not symmetric and self.comm.rank == 0:
-            warnings.warn(f"{self.name}: {NOT_SYMMETRIC}", stacklevel=2)
+        if not symmetric:
+            self._warn(NOT_SYMMETRIC)
+
+    def _warn(self, words: str) -> None:
+        """Warn, once in the life of this preconditioner; collective."""
+        if words not in self._warned:
+            self._warned.add(words)
+            warn(self.comm, f"{self.name}: {words}")
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        """Make a preconditioner of the rank that the policy chooses; if this fails, use block Jacobi."""
+        """Make a preconditioner of the rank that the policy chooses; if this fails, fall back."""
         start = time.perf_counter()
         # all take the first process's choice, because figures may differ in the last bit
         self.rank = self.comm.bcast(self.policy.choose())
+        self.failed = False
         if self.rank > 1 and not self.made.make(P, self.rank):
             self.policy.report(self.rank, self._slowest(time.perf_counter() - start), 0.0, sound=False)
             self.rank = 1
-        if self.rank == 1:
+        if isinstance(self.made, EntriesTrain) and self.made.compressed is not None:
+            self._judge_symmetry(self.made.compressed.symmetric)
+        if self._lacks_rank():
+            self._fall_back(self.account.last)
+        elif self.rank == 1:
             self._make_block_jacobi(P)
+        set_failed(pc, self.failed)
         self._setup_seconds = self._slowest(time.perf_counter() - start)
         self.account.setups += 1
         self.account.setup_s += self._setup_seconds
-        if isinstance(self.made, EntriesTrain):
-            self._judge_entries(self.made)
+        inverse = self.made.inverse
+        if isinstance(self.made, EntriesTrain) and inverse is not None and inverse.residual > POOR:
+            self._warn(f"the inverse of rank {self.rank} leaves {inverse.residual:.2g} of the residual")
         if self.options.monitor:
             PETSc.Sys.Print(f"  {self.name}: {self._line()}", comm=P.comm)
 
-    def _judge_entries(self, made: EntriesTrain) -> None:
-        """Warn if the train of a matrix given by its entries is bad or missing, or if the matrix is not symmetric."""
-        if made.compressed is not None and self.symmetric != made.compressed.symmetric:
-            self._say_symmetry(made.compressed.symmetric)
-        word = ""
-        if self.rank == 1 and self.account.fallbacks:
-            word = f"{self.account.fallbacks[-1]}: the diagonal takes over"
-        elif made.inverse is not None and made.inverse.residual > POOR:
-            word = f"the inverse of rank {self.rank} leaves {made.inverse.residual:.2g} of the residual"
-        if word and self.comm.rank == 0:
-            warnings.warn(f"{self.name}: {word}", stacklevel=2)
+    def _lacks_rank(self) -> bool:
+        """Whether a rank that was asked for is not used."""
+        asked = isinstance(self.made, EntriesTrain) or not self.options.automatic
+        return asked and self.rank == 1 and max(self.policy.ladder) > 1
+
+    def _fall_back(self, why: str) -> None:
+        """Make block Jacobi, or nothing, in place of a train; and say why."""
+        self.failed = self.options.fallback == "none"
+        takes_over = "there is no preconditioner" if self.failed else "block Jacobi takes over"
+        lost = not isinstance(self.made, EntriesTrain) and self.places.source == "nothing"
+        self._warn(f"{why}: {takes_over}" + (f"; {NOWHERE}" if lost and self.options.order == "auto" else ""))
+        if not self.failed:
+            self._make_block_jacobi(self.P)
 
     def _make_block_jacobi(self, P: PETSc.Mat) -> None:
         old = self._own[1:]
@@ -130,16 +170,19 @@ class TensorTrain(PythonPC):
     # -- application ----------------------------------------------------------------------------------------
 
     def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = M x, where M is block Jacobi or the train."""
-        if self.rank == 1:
+        """y = M x, where M is block Jacobi or the train; if the set-up failed, y has no numbers."""
+        if self.failed:
+            y.set(np.inf)
+        elif self.rank == 1:
             self._jacobi.apply(x, y)
-            return
-        with PETSc.Log.Event("TTApply"):
-            y.array_w[:] = self.made.times(x.array_r)
+        else:
+            with PETSc.Log.Event("TTApply"):
+                y.array_w[:] = self.made.times(x.array_r)
+                PETSc.Log.logFlops(self.made.flops)
 
     def multiply_transpose(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M' x; trains are symmetric, blocks of a matrix may be not."""
-        if self.rank == 1:
+        if self.rank == 1 and not self.failed:
             self._jacobi.applyTranspose(x, y)
         else:
             self.multiply(x, y)
@@ -148,17 +191,33 @@ class TensorTrain(PythonPC):
 
     def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         self._solve_start = time.perf_counter()
+        if self.P is not None and self.rank > 1:
+            self.made.use(self._precision(ksp.getType()))
+
+    def _precision(self, method: str) -> type:
+        """The precision of products under this Krylov method."""
+        if self.options.precision != "auto":
+            return np.float32 if self.options.precision == "single" else np.float64
+        harmless = isinstance(self.made, EntriesTrain) and self.options.eps >= SINGLE and method in UNHARMED
+        return np.float32 if harmless else np.float64
 
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Report the seconds and the accuracy of the solve to the policy; ban a rank with which the method stalled."""
-        if self.P is None:
+        if self.P is None or self.failed:
             return
+        if self.rank > 1:  # whoever calls next may be another method
+            self._last_precision = self._precision(ksp.getType())
+            self.made.use(self._precision(""))
         reason, rank = ksp.getConvergedReason(), self.rank
         spoilt = rank > 1 and reason in SPOILT and self.symmetric  # otherwise it may have been a transpose solve
         if spoilt:
-            self._solve_again(ksp, b, x)
             what = f"{ksp.getType()} broke down ({reason}) at rank {rank}"
-            self.account.fallbacks.append(f"{what}, solved again with block Jacobi")
+            again = self.options.fallback == "jacobi"
+            self.account.fall_back(f"{what}, solved again with block Jacobi" if again else what)
+            if not self.options.automatic or isinstance(self.made, EntriesTrain):
+                self._warn(self.account.last)
+            if again:
+                self._solve_again(ksp, b, x)
         seconds = self._slowest(time.perf_counter() - self._solve_start)
         reference = b.norm()
         if reference == 0 or ksp.getIterationNumber() == 0:
@@ -167,7 +226,7 @@ class TensorTrain(PythonPC):
         stalled = ksp.getConvergedReason() < 0 and ksp.getType() not in ("preonly", "richardson")
         digits = -np.log10(max(true, 1e-16)) if np.isfinite(true) else 0.0
         if stalled and rank > 1 and not spoilt:
-            self.account.fallbacks.append(f"{ksp.getType()} stalled at rank {rank}")
+            self.account.fall_back(f"{ksp.getType()} stalled at rank {rank}")
         sound = not (spoilt or stalled)
         if not sound and self.made.distrust():  # it was a train of an earlier matrix; a new train may work
             sound = True
@@ -205,18 +264,21 @@ class TensorTrain(PythonPC):
             f"tensor train: {self._line()}",
             f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, kept {a.kept} times, "
             f"trees made anew {a.resets}",
-            f"scaling {self.options.scaling}",
+            f"scaling {self.options.scaling}, rows ordered by {self.places.source}",
         ]
         lines += [] if self.symmetric else [NOT_SYMMETRIC]
-        lines += [f"fell back: {why} ({a.fallbacks.count(why)} times)" for why in dict.fromkeys(a.fallbacks)]
+        lines += [f"fell back: {why} ({count} times)" for why, count in a.fallbacks.items()]
         figures = self.policy.figures.items()
         costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
         return [*lines, f"seconds per digit: {costs or 'none measured yet'}"]
 
     def _line(self) -> str:
+        if self.failed:
+            return f"none: {self.account.last}"
         if self.rank == 1:
             return f"rank 1 (block Jacobi), set up in {self._setup_seconds:.2e} s"
-        return f"{self.made.words()}, {self._setup_seconds:.2e} s"
+        digits = "single" if self._last_precision is np.float32 else "double"
+        return f"{self.made.words()}, {digits} precision, set up in {self._setup_seconds:.2e} s"
 
     def release(self) -> None:
         for thing in self._own:

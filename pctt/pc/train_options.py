@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Optional
 
@@ -49,6 +50,18 @@ class Options:
         "train, with the new matrix's scaling, while new ones are hardly better",
         choices=("none", "newton", "steps", "trains"),
     )
+    precision: str = option(
+        "auto",
+        "of products with the inverse; auto: single where that can do no harm (entries, eps >= 1e-5, a Krylov method of "
+        "CG's kind or a flexible one), else double",
+        choices=("auto", "single", "double"),
+    )
+    fallback: str = option(
+        "jacobi",
+        "if a train cannot be used; jacobi: block Jacobi takes over; none: the set-up fails, and the KSP ends with "
+        "PETSc's reason",
+        choices=("jacobi", "none"),
+    )
     seed: int = option(0, "seed of the random starts", check=COUNT)
     monitor: bool = option(False, "print a line per set-up")
 
@@ -78,4 +91,9 @@ class Account:
     kept: int = 0
     resets: int = 0
     setup_s: float = 0.0
-    fallbacks: list[str] = field(default_factory=list)
+    fallbacks: Counter[str] = field(default_factory=Counter)
+    last: str = ""  # the last reason of a fall-back
+
+    def fall_back(self, why: str) -> None:
+        self.fallbacks[why] += 1
+        self.last = why

@@ -111,9 +111,9 @@ def test_a_solve_that_a_train_has_spoilt_is_made_again(method):
     ksp = solver(mat, method, rank=6)
     ksp.setUp()
     assert context(ksp).rank == 6
-    spoil = context(ksp).made._from_slots
+    spoil = context(ksp).made.slots.unscaled
     sign = np.nan if method == "bcgs" else np.resize([1.0, -1.0], 256)
-    context(ksp).made._from_slots = lambda z: sign * spoil(z)
+    context(ksp).made.slots.unscaled = lambda z: sign * spoil(z)
     for _ in range(2):
         assert solve(ksp)[1] < 1e-6
         assert ksp.getConvergedReason() > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -12,6 +14,7 @@ from systems import dense
 from test_tensor_train import context, operator, solve, solver
 
 from pctt.blocks import square_block_matrix
+from pctt.mat.order import places_of
 from pctt.pc.slots import NEAR, REACH, Slots
 
 BOX = 16
@@ -39,6 +42,14 @@ def springs(points: np.ndarray, keys: np.ndarray | None, block: int = 1, shift: 
     return mat
 
 
+def slots_of(mat: PETSc.Mat) -> Slots:
+    return Slots(mat, places_of(mat), BOX)
+
+
+def follow(slots: Slots, mat: PETSc.Mat, agree: Callable[[bool], bool]) -> bool:
+    return slots.follow(mat, places_of(mat), agree)
+
+
 def yes(here: bool) -> bool:
     return here
 
@@ -49,7 +60,7 @@ def by_key(slots: Slots, keys: np.ndarray) -> dict[int, int]:
 
 def test_every_row_has_a_slot_of_its_own_and_the_spare_ones_are_spread():
     points, keys = cloud(1000)
-    slots = Slots(springs(points, keys), BOX)
+    slots = slots_of(springs(points, keys))
     assert len(np.unique(slots.place)) == 1000
     assert slots.capacity % BOX == 0
     assert 1040 <= slots.capacity <= 1100
@@ -60,15 +71,15 @@ def test_every_row_has_a_slot_of_its_own_and_the_spare_ones_are_spread():
 
 def test_without_keys_there_are_no_spare_slots_and_nothing_is_followed():
     points, _ = cloud(100)
-    slots = Slots(springs(points, None), BOX)
+    slots = slots_of(springs(points, None))
     assert sorted(slots.place) == list(range(100))
     assert slots.capacity == 100
-    assert not slots.follow(springs(points, None), yes)
+    assert not follow(slots, springs(points, None), yes)
 
 
 def test_rows_that_stay_keep_their_slots_whatever_comes_and_goes():
     points, keys = cloud(1000)
-    slots = Slots(springs(points, keys), BOX)
+    slots = slots_of(springs(points, keys))
     before = by_key(slots, keys)
     rng = np.random.default_rng(1)
     stay = np.sort(rng.permutation(1000)[:970])
@@ -76,7 +87,7 @@ def test_rows_that_stay_keep_their_slots_whatever_comes_and_goes():
     mixed = rng.permutation(995)  # rows come in another order
     points = np.concatenate([points[stay], new_points])[mixed]
     keys_then = np.concatenate([keys[stay], new_keys])[mixed]
-    assert slots.follow(springs(points, keys_then), yes)
+    assert follow(slots, springs(points, keys_then), yes)
     after = by_key(slots, keys_then)
     assert all(after[key] == before[key] for key in keys[stay].tolist())
     assert len(set(after.values())) == 995
@@ -85,10 +96,10 @@ def test_rows_that_stay_keep_their_slots_whatever_comes_and_goes():
 
 def test_new_rows_get_slots_near_their_neighbours():
     points, keys = cloud(2000)
-    slots = Slots(springs(points, keys), BOX)
+    slots = slots_of(springs(points, keys))
     twins = np.arange(0, 2000, 100)  # new rows where these are
     more = np.concatenate([points, points[twins]])
-    slots.follow(springs(more + 0.0, np.concatenate([keys, 50_000 + twins])), yes)
+    follow(slots, springs(more + 0.0, np.concatenate([keys, 50_000 + twins])), yes)
     assert slots.entered == len(twins)
     off = np.abs(slots.place[2000:] // BOX - slots.place[twins] // BOX)
     assert off.max() <= NEAR + 1
@@ -96,12 +107,12 @@ def test_new_rows_get_slots_near_their_neighbours():
 
 def test_rows_that_move_far_move_to_another_slot():
     points, keys = cloud(1000)
-    slots = Slots(springs(points, keys), BOX)
+    slots = slots_of(springs(points, keys))
     before = slots.place.copy()
     wanderers, hosts = np.array([3, 500]), np.array([700, 10])
     moved = points + 1e-6
     moved[wanderers] = points[hosts]
-    assert slots.follow(springs(moved, keys), yes)
+    assert follow(slots, springs(moved, keys), yes)
     others = np.setdiff1d(np.arange(1000), wanderers)
     assert np.array_equal(slots.place[others], before[others])
     assert slots.moved == 2
@@ -110,11 +121,11 @@ def test_rows_that_move_far_move_to_another_slot():
 
 def test_a_few_rows_that_find_no_room_nearby_go_further_away():
     points, keys = cloud(4000)
-    slots = Slots(springs(points, keys), BOX)
+    slots = slots_of(springs(points, keys))
     before = slots.place.copy()
     crowd = np.full((60, 3), 0.01) + 1e-4 * np.arange(60)[:, None]
     more = springs(np.concatenate([points, crowd]), np.concatenate([keys, 50_000 + np.arange(60)]))
-    assert slots.follow(more, yes)
+    assert follow(slots, more, yes)
     assert np.array_equal(slots.place[:4000], before)
     assert len(set(slots.place)) == 4060
     assert np.ptp(slots.place[4000:]) > 2 * REACH * BOX
@@ -123,7 +134,7 @@ def test_a_few_rows_that_find_no_room_nearby_go_further_away():
 @pytest.mark.parametrize("what", ["too many", "too many in one place", "strangers", "another rank refuses"])
 def test_what_does_not_fit_changes_nothing(what):
     points, keys = cloud(1000)
-    slots = Slots(springs(points, keys), BOX)
+    slots = slots_of(springs(points, keys))
     before = slots.place.copy()
     more = {"too many": slots.capacity - 999, "too many in one place": slots.capacity - 1000}.get(what, 0)
     crowd = np.full((more, 3), 0.01) + 1e-4 * np.arange(more)[:, None]
@@ -133,17 +144,17 @@ def test_what_does_not_fit_changes_nothing(what):
     if what == "strangers":
         names = 20_000 + names
     agree = (lambda here: False) if what == "another rank refuses" else yes
-    assert not slots.follow(springs(points, names), agree)
+    assert not follow(slots, springs(points, names), agree)
     assert np.array_equal(slots.place, before)
-    assert slots.follow(springs(*cloud(1000)), yes)  # and it still knows the rows that it had
+    assert follow(slots, springs(*cloud(1000)), yes)  # and it still knows the rows that it had
     assert np.array_equal(slots.place, before)
 
 
 def test_rows_of_the_same_name_never_share_a_slot():
     points, keys = cloud(200)
-    slots = Slots(springs(points, keys), BOX)
+    slots = slots_of(springs(points, keys))
     keys[7] = keys[8]
-    assert not slots.follow(springs(points, keys), yes)
+    assert not follow(slots, springs(points, keys), yes)
 
 
 def test_no_rows_at_all():
@@ -152,10 +163,10 @@ def test_no_rows_at_all():
     empty.assemble()
     empty.setAttr("coordinates", points)
     empty.setAttr("key", keys)
-    slots = Slots(empty, BOX)
+    slots = slots_of(empty)
     assert slots.capacity == 0
-    assert slots.follow(empty, yes)
-    assert not slots.follow(springs(*cloud(10)), yes)
+    assert follow(slots, empty, yes)
+    assert not follow(slots, springs(*cloud(10)), yes)
 
 
 @pytest.mark.parametrize("scaling", ["block", "none"])

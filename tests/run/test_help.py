@@ -16,12 +16,12 @@ from program import ROOT, SMALL
 import pctt
 from dem.scenes import Mixer
 from pctt import ccp
-from pctt.pc import PRECONDITIONERS
+from pctt.pc import TensorTrain
 from pctt.run.settings import Run
 
 GROUPS = [(Run, ""), (Mixer, "scene_"), (ccp.Limits, "ccp_"), (ccp.Coulomb, "ccp_coulomb_")]
 GROUPS += [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
-GROUPS += [(pc.options_class, pc.options_prefix) for pc in PRECONDITIONERS]
+GROUPS += [(TensorTrain.options_class, TensorTrain.options_prefix)]
 
 
 @pytest.mark.parallel(1, 2)
