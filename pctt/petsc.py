@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -70,12 +71,20 @@ def warn(comm: MPI.Comm, words: str) -> None:
     raised = None
     if comm.rank == 0:
         try:
-            warnings.warn(words, stacklevel=3)
+            warnings.warn(words, stacklevel=_levels_of_ours())
         except Warning as warning:
             raised = warning
     raised = comm.bcast(raised)
     if raised is not None:
         raise raised
+
+
+def _levels_of_ours() -> int:
+    """The ``stacklevel`` with which a warning of the caller shows the line outside of this package."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "pctt":
+        frame, level = frame.f_back, level + 1
+    return level
 
 
 # -- functions of the library that petsc4py stands on ----------------------------------------------------------------

@@ -1,7 +1,7 @@
 """What is known of the places of a Mat's rows, and the order of the rows in a train.
 
     grid      the attribute ``grid`` = (n_1, n_2, ...), the shape of a vector as an array (row i at
-              numpy.unravel_index(i, grid)), or a DMDA: one axis after the other
+              numpy.unravel_index(i, grid)), a DMDA, or points that fill a grid: one axis after the other
     morton    along a space-filling curve through points (`Places.points`)
     natural   the given order of the rows
 """
@@ -21,6 +21,7 @@ from pctt.morton import morton_codes
 from pctt.tt.grid import GridDigits
 from pctt.tt.train import Array
 
+TICK = 1e-9  # coordinates that differ by less than this part of the extent are equal
 FLAT = 1e-10  # directions of a near null space with a smaller part of its squares are rounding
 
 
@@ -63,6 +64,9 @@ def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), given: Array | None = 
         check_points(points, P, "PCSetCoordinates: points")
     else:
         points, whence = _other_points(fitting, P, comm)
+    if shape is None and points is not None:
+        shape, row_at = _grid_of_points(points, comm)
+        source = f"the grid of {whence}"
     return Places(shape, row_at, points, source if shape is not None else whence)
 
 
@@ -184,6 +188,32 @@ def _points_of_modes(P: PETSc.Mat, comm: MPI.Comm) -> Array | None:
     if len(kept) == 0:
         return None
     return values @ (direction[:, kept] / np.sqrt(square[kept] / count))
+
+
+def _grid_of_points(points: Array, comm: MPI.Comm) -> tuple[tuple[int, ...] | None, Array | None]:
+    """The shape of the grid that points (n, d) of all ranks fill, and the row at each point; None if they fill none."""
+    count = comm.allreduce(len(points))
+    ticks = []
+    for axis in points.T:
+        low = comm.allreduce(axis.min(initial=np.inf), op=MPI.MIN)
+        extent = comm.allreduce(axis.max(initial=-np.inf), op=MPI.MAX) - low
+        tick = np.round((axis - low) / (extent or 1.0) / TICK).astype(np.int64)
+        own = np.unique(tick)
+        if comm.allreduce(len(own), op=MPI.MAX) > max(1, count // 2) and points.shape[1] > 1:
+            return None, None  # scattered; their numbers need not be gathered
+        all_ticks = np.unique(np.concatenate(comm.allgather(own)))
+        ticks.append((all_ticks, np.searchsorted(all_ticks, tick)))
+    shape = tuple(len(found) for found, _ in ticks)
+    if prod(shape) != count:
+        return None, None
+    places = np.zeros(len(points), np.int64)
+    for n, (_, index) in zip(shape, ticks):
+        places = places * n + index
+    order = np.concatenate(comm.allgather(places))
+    rows = np.argsort(order, kind="stable")
+    if not np.array_equal(order[rows], np.arange(count)):
+        return None, None  # two rows at one point
+    return shape, None if np.array_equal(rows, np.arange(count)) else rows
 
 
 def rows_by_curve(points: Array, comm: MPI.Comm) -> Array:

@@ -33,9 +33,11 @@ NOWHERE = (
 LOWER = 3  # auto tries the cap and the cap divided by this
 POOR = 0.5  # an inverse with a larger residual causes a warning
 SINGLE = 1e-5  # with this eps or a larger one, products of the inverse may use single precision
-#: Krylov methods that are as accurate with a preconditioner that rounds to single precision: the residual that they
-#: update is that of x, and no vector of theirs is the preconditioner of a sum of earlier ones.
-UNHARMED = {"cg", "fcg", "fgmres", "gcr", "fbcgs", "fbcgsr"}
+#: Krylov methods that are as accurate if the preconditioner rounds to single precision: they multiply by A each vector
+#: that they add to x. Others take a product M A p for the preconditioner of a vector that they never formed.
+UNHARMED = {"cg", "cgne", "fcg", "fgmres", "fbcgs", "fbcgsr", "gcr", "pipefcg", "pipefgmres"}
+#: Methods that compute the residual of x anew. If they are part of another preconditioner, that must be linear.
+REFINING = {"richardson", "chebyshev"}
 #: Reasons for the end of a Krylov method whose preconditioner is not positive definite.
 SPOILT = {
     getattr(PETSc.KSP.ConvergedReason, f"DIVERGED_{name}")
@@ -192,13 +194,20 @@ class TensorTrain(PythonPC):
     def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         self._solve_start = time.perf_counter()
         if self.P is not None and self.rank > 1:
-            self.made.use(self._precision(ksp.getType()))
+            self._last_precision = self._precision(self._is_unharmed(ksp))
+            self.made.use(self._last_precision)
 
-    def _precision(self, method: str) -> type:
-        """The precision of products under this Krylov method."""
+    @staticmethod
+    def _is_unharmed(ksp: PETSc.KSP) -> bool:
+        """Whether a Krylov method is as accurate with products in single precision."""
+        outermost = ksp.getTabLevel() == 0
+        return ksp.getType() in UNHARMED or (outermost and ksp.getType() in REFINING)
+
+    def _precision(self, unharmed: bool) -> type:
+        """The precision of products, for a Krylov method that single precision harms or not."""
         if self.options.precision != "auto":
             return np.float32 if self.options.precision == "single" else np.float64
-        harmless = isinstance(self.made, EntriesTrain) and self.options.eps >= SINGLE and method in UNHARMED
+        harmless = unharmed and isinstance(self.made, EntriesTrain) and self.options.eps >= SINGLE
         return np.float32 if harmless else np.float64
 
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
@@ -206,8 +215,7 @@ class TensorTrain(PythonPC):
         if self.P is None or self.failed:
             return
         if self.rank > 1:  # whoever calls next may be another method
-            self._last_precision = self._precision(ksp.getType())
-            self.made.use(self._precision(""))
+            self.made.use(self._precision(unharmed=False))
         reason, rank = ksp.getConvergedReason(), self.rank
         spoilt = rank > 1 and reason in SPOILT and self.symmetric  # otherwise it may have been a transpose solve
         if spoilt:
