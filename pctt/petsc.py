@@ -67,7 +67,7 @@ def origin(error: BaseException) -> BaseException:
 
 
 def warn(comm: MPI.Comm, words: str) -> None:
-    """A warning of Python, once for all ranks; collective. If it is an error there (``-W error``), all ranks raise it."""
+    """A warning of Python, once for all ranks; collective. If the filters make it an error, all ranks raise it."""
     raised = None
     if comm.rank == 0:
         try:

@@ -222,7 +222,9 @@ def rows_by_curve(points: Array, comm: MPI.Comm) -> Array:
     return np.argsort(codes, kind="stable")
 
 
-def digits_of(P: PETSc.Mat, order: str, name: str, places: Places | None = None) -> tuple[GridDigits, Array | None, str]:
+def digits_of(
+    P: PETSc.Mat, order: str, name: str, places: Places | None = None
+) -> tuple[GridDigits, Array | None, str]:
     """The digits of P's rows, the row at each point (None if rows are in the order of points), and the chosen order.
 
     order : auto, grid, morton or natural; auto takes the first of the others for which the places are known

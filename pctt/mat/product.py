@@ -32,7 +32,8 @@ class TrainProduct:
         rows = len(slots)
         if comm.size > 1 and rows > LONG:
             warn(
-                comm, f"pctt: each of {comm.size} ranks gathers whole vectors of {rows} numbers, with {BYTES * rows:.1e} "
+                comm,
+                f"pctt: each of {comm.size} ranks gathers whole vectors of {rows} numbers and takes {BYTES * rows:.1e} "
                 "bytes for them; fewer ranks or a smaller grid take less",
             )
         ends = np.cumsum(self.counts)

@@ -1,9 +1,10 @@
 """Slots for the block rows of a sequence of matrices: the tree of the paper's evolving hierarchies.
 
 A slot is a place in the order along which a train is quantised. With a grid it is the place of a point. Otherwise each
-rank has a contiguous range of slots, in boxes of equal size along a Morton curve. If the block rows have names (the Mat's attribute ``key``), a few slots stay empty. So
-the rows of the next matrix can take and leave places: a row that stays near its box keeps its slot, and a new row gets
-the nearest empty slot. Then the cores of the last train are a start for the next train.
+rank has a contiguous range of slots, in boxes of equal size along a Morton curve. If the block rows have names (the
+Mat's attribute ``key``), a few slots stay empty. So the rows of the next matrix can take and leave places: a row that
+stays near its box keeps its slot, and a new row gets the nearest empty slot. Then the cores of the last train are a
+start for the next train.
 """
 
 from __future__ import annotations
@@ -48,15 +49,16 @@ class Slots:
             self.place, self.size, self.modes = grid
             self.first, self.capacity = 0, self.size
             return
-        self.evolving = keys is not None and points is not None and order in ("auto", "morton")
         rows = np.argsort(block_order(P, places, order), kind="stable")
         spare = -(-int(np.ceil(count * (1 + SPARE))) // box) * box
+        self.evolving = keys is not None and points is not None and order in ("auto", "morton")
         self.capacity = spare if self.evolving else count
         capacities = P.comm.tompi4py().allgather(self.capacity)
         self.first, self.size = sum(capacities[: P.comm.rank]), sum(capacities)
         self.place = np.empty(count, np.int64)
         self.place[rows] = np.arange(count) * self.capacity // max(count, 1)
         if self.evolving:
+            assert points is not None
             self._frame = Frame.of(points)
             codes = morton_codes(points, self._frame)[rows]
             boxes = np.arange(self.capacity // box) * box

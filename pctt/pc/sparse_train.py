@@ -111,6 +111,8 @@ class SparseTrain:
     def _try_new(self, P: PETSc.Mat, rank: int, kept: Inverse | None) -> bool:
         """Make a train for P and use it, or use the kept train if it is as good; False if no train is positive."""
         csr = P.getValuesCSR()
+        if not self._all(bool(np.isfinite(csr[2]).all())):
+            return self._refuse("the matrix has entries that are no numbers")
         if self.hierarchy is None or not self.slots.lists(csr):
             with PETSc.Log.Event("TTBuild"):
                 self.hierarchy = self._block_pairs(csr)

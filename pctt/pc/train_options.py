@@ -52,8 +52,8 @@ class Options:
     )
     precision: str = option(
         "auto",
-        "of products with the inverse; auto: single where that can do no harm (entries, eps >= 1e-5, a Krylov method of "
-        "CG's kind or a flexible one), else double",
+        "of products with the inverse; auto: single where that can do no harm (entries, eps >= 1e-5, CG or a flexible "
+        "Krylov method), else double",
         choices=("auto", "single", "double"),
     )
     fallback: str = option(

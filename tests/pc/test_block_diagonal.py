@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from systems import contact_matrix, contacts, dense, spd
+from systems import contacts, dense, spd
 
 from pctt.block_diagonal import block_diagonal, inverse_diagonal_blocks, set_diagonal_blocks
 from pctt.blocks import block_csr_matrix
