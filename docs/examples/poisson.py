@@ -21,7 +21,6 @@ PRECONDITIONERS = {
     "algebraic multigrid": {"pc_type": "gamg"},
     "tensor train, rank 24": {
         "pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain", "pc_tt_rank": "24",
-        "pc_tt_order": "morton",
     },
 }  # fmt: skip
 
