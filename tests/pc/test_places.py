@@ -67,8 +67,7 @@ def test_a_grid_is_found_wherever_it_is_known(known):
         copy = without_dm(mat)
         ksp.setOperators(mat if known == "other Mat" else copy, copy)
         if known == "KSP":
-            ksp.setDM(da)
-            ksp.setDMActive(False)
+            ksp.pc.setDM(da)  # as KSPSetDM does
         elif known == "attribute":
             copy.setAttr("coordinates", coordinates(da))
         elif known == "PCSetCoordinates":
