@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Optional
 
@@ -71,7 +72,10 @@ class Options:
 
 @dataclass
 class Account:
-    """What the preconditioner has done so far, for ``-ksp_view`` and the summary of the run."""
+    """What the preconditioner has done so far, for ``-ksp_view`` and the summary of the run.
+
+    used : solves by the greatest rank of the inverse that they ended with; 0: block Jacobi
+    """
 
     setups: int = 0
     reused: int = 0
@@ -79,3 +83,14 @@ class Account:
     resets: int = 0
     setup_s: float = 0.0
     fallbacks: list[str] = field(default_factory=list)
+    used: Counter[int] = field(default_factory=Counter)
+
+    def what(self) -> str:
+        """What most of the solves used, and how many something else; empty if there were none."""
+        trains = sorted(self.used.keys() - {0})
+        ranks = f"{trains[0]} to {trains[-1]}" if len(trains) > 1 else "".join(map(str, trains))
+        counts = Counter({"rank 1: block Jacobi": self.used[0], f"rank {ranks}": sum(self.used[r] for r in trains)})
+        (most, _), (other, fewer) = counts.most_common()
+        if not self.used.total():
+            return ""
+        return most + (f", {fewer} of {self.used.total()} systems {other}" if fewer else "")
