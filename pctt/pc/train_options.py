@@ -91,6 +91,7 @@ class Account:
         ranks = f"{trains[0]} to {trains[-1]}" if len(trains) > 1 else "".join(map(str, trains))
         counts = Counter({"rank 1: block Jacobi": self.used[0], f"rank {ranks}": sum(self.used[r] for r in trains)})
         (most, _), (other, fewer) = counts.most_common()
-        if not self.used.total():
+        total = sum(self.used.values())
+        if total == 0:
             return ""
-        return most + (f", {fewer} of {self.used.total()} systems {other}" if fewer else "")
+        return most + (f", {fewer} of {total} systems {other}" if fewer else "")

@@ -55,13 +55,14 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
             result = ccp.solve(
                 problem, guess, options.run.ccp_type, options.limits, options.solver, newton, options.coulomb
             )
+        used = result.solver or options.run.ccp_type
+        by_newton = ccp.SOLVERS[used].newton
+        systems = "; ".join(filter(None, (newton.words(), newton.what()))) if by_newton else ""
     finally:
         newton.destroy()
     seconds = log.take_seconds(("solve", "compare"))
     accuracy = ccp.measure(problem, result.impulse)
-    used = result.solver or options.run.ccp_type
     solves = compare.take_solves()
-    by_newton = ccp.SOLVERS[used].newton
     return {
         "problem": options.run.problem,
         "format": stored.form,
@@ -81,7 +82,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
         "newton_its": result.iterations if by_newton else 0,
         "iterations": result.iterations,
         "ksp_its": result.ksp_its,
-        "newton_systems": "; ".join(filter(None, (newton.words(), newton.what()))) if by_newton else "",
+        "newton_systems": systems,
         "seconds": seconds["solve"],
         **({"compare_seconds": seconds["compare"]} if compare.names else {}),
         "converged": result.converged,

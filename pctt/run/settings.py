@@ -98,8 +98,8 @@ class Run:
     )
     compare: str = option(
         "",
-        "preconditioners TYPE or LABEL:TYPE, with commas between, that each solve the same Newton systems; options of one "
-        "have the prefix compare_LABEL_",
+        "preconditioners TYPE or LABEL:TYPE, with commas between, that each solve the same Newton systems; options of "
+        "one have the prefix compare_LABEL_",
     )
     compare_every: int = option(1, "compare on every k-th Newton system", check=AT_LEAST_ONE)
     monitor: int = option(

@@ -55,7 +55,7 @@ BAD_OPTIONS = {
     "-compare a:nosuch": ["nosuch", "ilu"],
     "-compare a:ilu,a:icc": ["a is there twice"],
     "-compare a.b:ilu": ["a.b:ilu", "letters, digits"],
-    "-compare_ten_pc_tt_rank 3 -compare ten:tt,tent:tt,tt,x:ilu,x_pc:ilu": ["compare_x_pc_"],
+    "-compare ten:tt,tent:tt,tt,x:ilu,x_pc:ilu": ["-compare_x_pc_... would be an option of x too"],
     "-compare_ten_pc_tt_rank 3 -compare auto:tt": ["not compared", "-compare lists auto:tt"],
     "-compare none,nosuch": ["nosuch", "ilu", "pbjacobi"],
     "-compare ilu -ccp_type apgd": ["apgd", "pdip"],

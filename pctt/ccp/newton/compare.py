@@ -169,8 +169,8 @@ def prefix(label: str) -> str:
 
 
 def labelled(entries: Sequence[str]) -> dict[str, str]:
-    """The types of the preconditioners by label: of entries LABEL:TYPE, or TYPE, which is its own label. OptionError for
-    a bad label, for one that is there twice, and for one whose options another one would take for its own."""
+    """The types of the preconditioners by label: of entries LABEL:TYPE, or TYPE, which is its own label. OptionError
+    for a bad label, for one that is there twice, and for one whose options another one would take for its own."""
     kinds: dict[str, str] = {}
     for entry in entries:
         before, colon, kind = entry.rpartition(":")
