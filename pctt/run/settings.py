@@ -25,7 +25,7 @@ DEMO = {
     "restart": "settled",
     "steps": "5",
     "compare": "auto:tt,ten:tt,pbjacobi,ilu,none",
-    "compare_every": "4",
+    "compare_every": "6",
     "output": "results/demo",
     "overwrite": "true",  # nothing but the demo writes to its folder
     **DEMO_SOLVERS,
