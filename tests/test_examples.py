@@ -141,11 +141,26 @@ def test_pictures_of_solutions(name, tmp_path, monkeypatch):
     assert (tmp_path / "picture.png").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("name", ["fredholm", "gaussian_process", "lippmann_schwinger"])
+@pytest.mark.parametrize("name", ["fredholm", "gaussian_process", "lippmann_schwinger", "yukawa"])
 def test_comparisons_on_small_grids(name, capsys):
     problem = getattr(importlib.import_module("integral_problems"), name)
     importlib.import_module("comparison").compare(problem(8), eps=1e-6)
     said = capsys.readouterr().out
     assert "CG + train, FFT products" in said
     assert "dense Cholesky" in said
+    assert ("CG + circulant" in said) == (name != "lippmann_schwinger")  # no convolution
     assert "compare(" in (EXAMPLES / f"{name}.py").read_text()
+
+
+@pytest.mark.parametrize(("name", "n"), [("gaussian_process", 6), ("yukawa", 4)])
+def test_the_circulant_has_the_means_of_the_matrix(name, n):
+    """It is the circulant nearest to A (T. Chan): each entry the mean of those of A that it stands for."""
+    problem = getattr(importlib.import_module("integral_problems"), name)(n)
+    i, j = (k.ravel() for k in np.indices((problem.size, problem.size)))
+    A = problem.entries(i, j)
+    x, y = (np.array(np.unravel_index(k, problem.grid)) for k in (i, j))
+    offset = np.ravel_multi_index(tuple((x - y) % n), problem.grid)
+    means = np.bincount(offset, A) / np.bincount(offset)
+    C = means[offset].reshape(problem.size, -1)
+    v = np.random.default_rng(0).standard_normal(problem.size)
+    np.testing.assert_allclose(problem.circulant()(C @ v), v, atol=1e-10)

@@ -55,6 +55,16 @@ class Shell:
         y.array_w[:] = self.product(x.array_r)
 
 
+class Inverse:
+    """A PC that multiplies by a function."""
+
+    def __init__(self, product: Callable[[np.ndarray], np.ndarray]) -> None:
+        self.product = product
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        y.array_w[:] = self.product(x.array_r)
+
+
 def seconds(work: Callable[[], Any]) -> tuple[float, Any]:
     """CPU seconds of one thread, which other work on the machine does not change, and what came out."""
     start = time.process_time()
@@ -76,23 +86,27 @@ def right_side(size: int) -> np.ndarray:
     return np.random.default_rng(0).standard_normal(size)
 
 
-def cg(mat: PETSc.Mat, way: str, preconditioned: bool, true: Callable, setup: float = 0.0, bytes_: float = 0.0) -> Row:
-    """CG to RTOL of the true residual, without or with the train of the entries."""
+def cg(
+    mat: PETSc.Mat, way: str, pc: str | Inverse, true: Callable, setup: float = 0.0, bytes_: float = 0.0
+) -> Row:  # fmt: skip
+    """CG to RTOL of the true residual with a preconditioner: none, tt (the train of the entries) or a function."""
     ksp = PETSc.KSP().create(PETSc.COMM_SELF)
     ksp.setOperators(mat)
     ksp.setType("cg")
     ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
     ksp.setTolerances(rtol=RTOL, max_it=5000)
-    ksp.pc.setType("python" if preconditioned else "none")
-    if preconditioned:
+    ksp.pc.setType("none" if pc == "none" else "python")
+    if isinstance(pc, Inverse):
+        ksp.pc.setPythonContext(pc)
+    elif pc == "tt":
         ksp.pc.setPythonType("pctt.pc.TensorTrain")
-    ksp.setFromOptions()
+        ksp.setFromOptions()
     x, b = mat.createVecs()
     b.array[:] = right_side(b.getLocalSize())
     setup += seconds(ksp.setUp)[0]
     solve = seconds(lambda: ksp.solve(b, x))[0]
     note = ""
-    if preconditioned:
+    if pc == "tt":
         made = ksp.pc.getPythonContext().made
         note = "no positive train: diagonal"
         if made.inverse is not None:
@@ -136,10 +150,11 @@ def dense_products(problem: Problem, its: int) -> Row:
     return Row("CG, dense products", 0.0, its * one * problem.size**2, its, RTOL, 8.0 * problem.size**2, "extrapolated")
 
 
-def compare(problem: Problem, eps: float | None = 1e-6) -> list[Row]:
+def compare(problem: Problem, eps: float | None = 1e-6, dense: bool = True) -> list[Row]:
     """All ways; prints a table.
 
     eps : of the train that is the operator itself; None: there is none
+    dense : also dense products and Cholesky factors
     """
     print(f"{problem.name}: {problem.size} unknowns, CG to {RTOL:g}, CPU seconds of one thread")
     print(HEAD)
@@ -152,17 +167,21 @@ def compare(problem: Problem, eps: float | None = 1e-6) -> list[Row]:
         print(row, flush=True)
         return row
 
-    add(cg(fast, "CG + train, FFT products", True, true))
+    add(cg(fast, "CG + train, FFT products", "tt", true))
     if eps is not None:
         setup, slow = seconds(lambda: from_entries(problem.entries, problem.grid, eps, comm=PETSc.COMM_SELF))
         compressed = slow.getPythonContext().compressed
-        row = cg(slow, "CG + train, train products", True, true, setup, 8 * compressed.train.storage)
+        row = cg(slow, "CG + train, train products", "tt", true, setup, 8 * compressed.train.storage)
         row.note += f"; operator: rank {max(compressed.train.ranks)}, error {compressed.error:.0e}"
         add(row)
         slow.destroy()
-    plain = add(cg(fast, "CG, FFT products", False, true))
-    add(dense_products(problem, plain.iterations))
-    add(cholesky(problem, true))
+    if problem.weight is None:
+        setup, inverse = seconds(problem.circulant)
+        add(cg(fast, "CG + circulant, FFT products", Inverse(inverse), true, setup, bytes_=4.0 * problem.size))
+    plain = add(cg(fast, "CG, FFT products", "none", true))
+    if dense:
+        add(dense_products(problem, plain.iterations))
+        add(cholesky(problem, true))
     fast.destroy()
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
     return rows

@@ -54,6 +54,20 @@ class Problem:
 
         return times
 
+    def circulant(self) -> Callable[[Array], Array]:
+        """C^-1 v by FFT, where C is the circulant nearest to A in the Frobenius norm (T. Chan 1988), axis by axis.
+        ValueError where A is no convolution."""
+        if self.weight is not None:
+            raise ValueError("the weight varies: A is no convolution")
+        n, d = self.n, len(self.grid)
+        squares = sum(np.meshgrid(*[(np.arange(n + 1) / n) ** 2] * d, indexing="ij", sparse=True))
+        means, near = self.kernel(np.sqrt(squares)), 1 - np.arange(n) / n
+        for _ in range(d):  # each turn averages the first axis over its diagonals and makes it the last one
+            axis = np.moveaxis(means, 0, -1)
+            means = near * axis[..., :n] + (1 - near) * axis[..., n:0:-1]
+        eigenvalues = self.nugget + fft.rfftn(means).real
+        return lambda v: fft.irfftn(fft.rfftn(v.reshape(self.grid)) / eigenvalues, self.grid).ravel()
+
 
 def fredholm(n: int) -> Problem:
     """u(x) + 100 int exp(-|x - y|^2 / 2 w^2) u(y) dy = f(x) on a square, w = .1: of the second kind."""
@@ -67,6 +81,16 @@ def potential(n: int) -> Problem:
         return 40 / (4 * np.pi) / n**3 * np.where(r > 0, 1 / np.maximum(r, 1 / n), 2.38 * n)
 
     return Problem(f"1/r {n}^3", n, 3, kernel)
+
+
+def yukawa(n: int) -> Problem:
+    """u(x) + 1000 int exp(-10 |x - y|) / (4 pi |x - y|) u(y) dy = f(x) in a cube, a screened potential."""
+
+    def kernel(r: Array) -> Array:
+        near = np.where(r > 0, 1 / np.maximum(r, 1 / n), 2.38 * n)
+        return 1000 / (4 * np.pi) / n**3 * np.exp(-10 * r) * near
+
+    return Problem(f"Yukawa {n}^3", n, 3, kernel)
 
 
 def lippmann_schwinger(n: int, screening: float = 5.0) -> Problem:

@@ -159,6 +159,10 @@ class PythonPC(Context):
         """Lines for ``-ksp_view``."""
         return []
 
+    def what(self) -> str:
+        """What the preconditioner really was over its solves, in a few words, where its name does not say it."""
+        return ""
+
 
 #: The attributes that a user's Mat may have, see docs/preconditioners.md.
 ATTRIBUTES = ("coordinates", "grid", "key")

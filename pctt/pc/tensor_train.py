@@ -226,6 +226,7 @@ class TensorTrain(PythonPC):
                 self._warn(self.account.last)
             if again:
                 self._solve_again(ksp, b, x)
+        self.account.used[self._applied_rank()] += 1
         seconds = self._slowest(time.perf_counter() - self._solve_start)
         reference = b.norm()
         if reference == 0 or ksp.getIterationNumber() == 0:
@@ -279,6 +280,13 @@ class TensorTrain(PythonPC):
         figures = self.policy.figures.items()
         costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
         return [*lines, f"seconds per digit: {costs or 'none measured yet'}"]
+
+    def what(self) -> str:
+        return self.account.what()
+
+    def _applied_rank(self) -> int:
+        """The greatest rank of the train of the inverse; 0 for block Jacobi."""
+        return max(self.made.inverse.applied.ranks) if self.rank > 1 and self.made.inverse is not None else 0
 
     def _line(self) -> str:
         if self.failed:

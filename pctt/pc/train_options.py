@@ -84,7 +84,10 @@ class Options:
 
 @dataclass
 class Account:
-    """What the preconditioner has done so far, for ``-ksp_view`` and the summary of the run."""
+    """What the preconditioner has done so far, for ``-ksp_view`` and the summary of the run.
+
+    used : solves by the greatest rank of the inverse that they ended with; 0: block Jacobi
+    """
 
     setups: int = 0
     reused: int = 0
@@ -93,7 +96,19 @@ class Account:
     setup_s: float = 0.0
     fallbacks: Counter[str] = field(default_factory=Counter)
     last: str = ""  # the last reason of a fall-back
+    used: Counter[int] = field(default_factory=Counter)
 
     def fall_back(self, why: str) -> None:
         self.fallbacks[why] += 1
         self.last = why
+
+    def what(self) -> str:
+        """What most of the solves used, and how many something else; empty if there were none."""
+        trains = sorted(self.used.keys() - {0})
+        ranks = f"{trains[0]} to {trains[-1]}" if len(trains) > 1 else "".join(map(str, trains))
+        counts = Counter({"rank 1: block Jacobi": self.used[0], f"rank {ranks}": sum(self.used[r] for r in trains)})
+        (most, _), (other, fewer) = counts.most_common()
+        total = sum(self.used.values())
+        if total == 0:
+            return ""
+        return most + (f", {fewer} of {total} systems {other}" if fewer else "")

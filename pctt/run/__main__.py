@@ -27,6 +27,7 @@ except ImportError as error:
     sys.exit(str(error))
 
 from dem.together import SceneError
+from pctt.ksp_options import entered
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError
 from pctt.run.help import help_text
@@ -34,6 +35,7 @@ from pctt.run.interrupt import InterruptError, heed
 from pctt.run.leftovers import keep_from_petsc, refuse_stray
 from pctt.run.options import read_options
 from pctt.run.problem import solve_file
+from pctt.run.settings import DEMO_SOLVERS
 from pctt.run.simulate import simulate
 
 
@@ -53,7 +55,8 @@ def main(comm: MPI.Comm) -> None:
     if options.run.problem:
         solve_file(options, comm)
     else:
-        simulate(options, comm)
+        with entered(DEMO_SOLVERS if options.demo else {}):
+            simulate(options, comm)
 
 
 def _topic(words: list[str]) -> str:

@@ -17,6 +17,7 @@ from dem.experiment import Experiment
 from dem.together import together
 from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
+from pctt.ccp.newton.compare import labelled, prefix
 from pctt.ccp.newton.users_solver import LADDER
 from pctt.contact_map import is_free
 from pctt.ksp_options import entered, to_enter
@@ -69,7 +70,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         read(ccp.Coulomb, database, "ccp_coulomb_") if obeys_coulomb else None,
         demo,
     )
-    compare = ccp.Comparison(comm, options.compare_names())  # refuses unknown names
+    compare = ccp.Comparison(comm, run.compared())  # refuses unknown names
     _refuse_tolerances(database)  # newer releases of PETSc refuse them too, in other words
     if solver.newton and not run.settle:
         form = ccp.newton_for(comm, run.ccp_type, run.ccp_newton, compare).form
@@ -138,7 +139,7 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb:
     solver = ccp.SOLVERS[run.ccp_type]
     newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
     of_others = tuple(other.prefix for other in ccp.SOLVERS.values() if other is not solver)
-    compared = tuple(f"compare_{name}_" for name in run.compare.split(",") if name)
+    compared = tuple(map(prefix, labelled(run.compared())))
     ladder = tuple(f"fallback_{name}_" for name in LADDER)
     own = {field.name for field in dataclasses.fields(Run)}
 
@@ -156,7 +157,7 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb:
         (not run.problem, {"problem_guess"}, (), "allowed with -problem only"),
         (unsettled, {"settle_delta", "settle_tol"}, (), "allowed with -settle or -restart settled only"),
         (run.restart in ("", "settled"), {"restart_changed_file"}, (), "allowed with -restart FILE only"),
-        (run.quiet, {"monitor"}, (), "-quiet prints nothing; allowed is one of the two"),
+        (run.quiet and run.monitor > 0, {"monitor"}, (), "-quiet prints nothing; allowed is one of the two"),
         (not solver.newton, {"compare", "ccp_newton"}, OF_SOLVERS, no_newton),
         (not run.compare, {"compare_every"}, (), "allowed with -compare only"),
         (True, strangers("compare_", compared) - {"compare_every"}, (), not_compared),

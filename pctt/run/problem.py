@@ -21,7 +21,7 @@ from pctt.run.settings import Options
 def solve_file(options: Options, comm: MPI.Comm) -> None:
     """Solve, print the figures, and write them to summary.json in the output folder."""
     stored = _load(options.run.problem, comm, options.run.ccp_compliance, options.run.ccp_operator)
-    compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
+    compare = ccp.Comparison(comm, options.run.compared(), options.run.compare_every)
     with stored.problem:
         summary = _solve(stored, options, compare)
     progress = Progress(comm.rank == 0 and not options.run.quiet)
@@ -34,7 +34,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         listed = ", ".join(f"{word} {figure:.6g}" for word, figure in figures.items())
         progress.say(f"the file's {name}: {listed}")
     if compare.names:
-        progress.say("\n" + compare_table(compare.summary(), compare.labels()))
+        progress.say("\n" + compare_table(compare.summary()))
     if not summary["converged"]:
         progress.say(f"NOT CONVERGED: {summary['reason']}")
     if left := leftovers.remark():
@@ -55,13 +55,14 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
             result = ccp.solve(
                 problem, guess, options.run.ccp_type, options.limits, options.solver, newton, options.coulomb
             )
+        used = result.solver or options.run.ccp_type
+        by_newton = ccp.SOLVERS[used].newton
+        systems = "; ".join(filter(None, (newton.words(), newton.what()))) if by_newton else ""
     finally:
         newton.destroy()
     seconds = log.take_seconds(("solve", "compare"))
     accuracy = ccp.measure(problem, result.impulse)
-    used = result.solver or options.run.ccp_type
     solves = compare.take_solves()
-    by_newton = ccp.SOLVERS[used].newton
     return {
         "problem": options.run.problem,
         "format": stored.form,
@@ -81,6 +82,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
         "newton_its": result.iterations if by_newton else 0,
         "iterations": result.iterations,
         "ksp_its": result.ksp_its,
+        "newton_systems": systems,
         "seconds": seconds["solve"],
         **({"compare_seconds": seconds["compare"]} if compare.names else {}),
         "converged": result.converged,

@@ -167,16 +167,17 @@ def _terminal() -> bool:
         return False
 
 
-def compare_table(summary: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]) -> str:
-    """The compared preconditioners over all systems of the run, the losers too."""
-    width = max(len("preconditioner"), *(len(label) for label in labels.values()))
+def compare_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
+    """The compared preconditioners over all systems of the run, the losers too, and what they really were."""
+    entries = {name: name if s["type"] == name else f"{name}:{s['type']}" for name, s in summary.items()}
+    width = max(map(len, ["preconditioner", *entries.values()]))
     head = (
         f"{'preconditioner':{width}}  systems  converged  its mean   its max"
-        "  set-up s   solve s  residual/asked"
+        "  set-up s   solve s  residual/asked  what it was"
     )
     rows = [
-        f"{labels[name]:{width}} {s['systems']:8d} {s['converged']:10d} {s['ksp_its_mean']:9.1f}"
-        f" {s['ksp_its_max']:9d} {s['setup_s']:9.3f} {s['solve_s']:9.3f} {s['excess_max']:15.2g}"
+        f"{entries[name]:{width}} {s['systems']:8d} {s['converged']:10d} {s['ksp_its_mean']:9.1f}"
+        f" {s['ksp_its_max']:9d} {s['setup_s']:9.3f} {s['solve_s']:9.3f} {s['excess_max']:15.2g}  {s['what']}".rstrip()
         for name, s in summary.items()
     ]
     return "\n".join([head, "-" * len(head), *rows])

@@ -12,16 +12,23 @@ from pctt import ccp
 from pctt.contact_map import OPERATORS
 from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, NOT_NEGATIVE, POSITIVE, OptionError, nearest, option
 
+# options of PETSc and of preconditioners in the demo
+DEMO_SOLVERS = {
+    "pc_type": "python",
+    "pc_python_type": "pctt.pc.TensorTrain",
+    "compare_ten_pc_tt_rank": "10",
+}
 # what runs when no option is given
 DEMO = {
     "scene": "mixer",
     "scene_n": "4",
     "restart": "settled",
     "steps": "5",
-    "compare": "ilu,ilu-shifted,pbjacobi,none",
-    "compare_every": "4",
+    "compare": "auto:tt,ten:tt,pbjacobi,ilu,none",
+    "compare_every": "6",
     "output": "results/demo",
     "overwrite": "true",  # nothing but the demo writes to its folder
+    **DEMO_SOLVERS,
 }
 
 
@@ -89,7 +96,11 @@ class Run:
         "true: Coulomb's law; false: its relaxation by the cone problem, whose sliding contacts open; none: Coulomb's "
         "law where that costs about the same, in scenes with apgd or auto at -ccp_tol 1e-4 and above (docs/ccp.md)",
     )
-    compare: str = option("", "preconditioners, with commas between, that each solve the same Newton systems")
+    compare: str = option(
+        "",
+        "preconditioners TYPE or LABEL:TYPE, with commas between, that each solve the same Newton systems; options of "
+        "one have the prefix compare_LABEL_",
+    )
     compare_every: int = option(1, "compare on every k-th Newton system", check=AT_LEAST_ONE)
     monitor: int = option(
         1,
@@ -97,6 +108,10 @@ class Run:
         check=("0, 1 or 2", lambda x: 0 <= x <= 2),
     )
     quiet: bool = option(False, "print nothing but errors")
+
+    def compared(self) -> list[str]:
+        """The entries of ``compare``."""
+        return [entry for entry in self.compare.split(",") if entry]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,8 +131,6 @@ class Options:
     coulomb: ccp.Coulomb | None
     demo: bool
 
-    def compare_names(self) -> list[str]:
-        return [name for name in self.run.compare.split(",") if name]
 
 
 def find_scene(name: str) -> type[Experiment]:

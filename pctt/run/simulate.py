@@ -43,10 +43,10 @@ def _make_steps(
 ) -> None:
     """The steps of a run and its output."""
     dump = Dump(options, world, place)
-    compare = ccp.Comparison(comm, options.compare_names(), options.run.compare_every)
+    compare = ccp.Comparison(comm, options.run.compared(), options.run.compare_every)
     output = Output(options, place, world, memory, compare)
     newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
-    _say_start(options, world, bool(compare.names), progress)
+    _say_start(options, world, newton, progress)
     start, end = world.step, world.step + options.run.steps
     with Stepper(options, world, memory, newton, dump) as stepper:
         while world.step < end:
@@ -61,8 +61,10 @@ def _make_steps(
                 raise interrupt.InterruptError(_how_to_go_on(options, world.step, output.results.checkpoint, end))
         if world.step > start:
             output.end(progress)
-        if compare.names:
-            progress.say("\n" + report.compare_table(compare.summary(), compare.labels()))
+            if what := newton.what():
+                progress.say(f"Newton systems: {what}")
+        if compare.names and world.step > start:
+            progress.say("\n" + report.compare_table(compare.summary()))
     if left := leftovers.remark():
         progress.say(left)
     if world.step > start:
@@ -118,12 +120,15 @@ class Output:
             progress.say(f"{self._outside:.0f} grains have left the domain of the scene")
 
 
-def _say_start(options: Options, world: World, compares: bool, progress: report.Progress) -> None:
+def _say_start(options: Options, world: World, newton: ccp.Newton, progress: report.Progress) -> None:
     method = f"{options.run.ccp_type} to {options.limits.tol:g}, {report.law(options.coulomb is not None)}"
     progress.say(f"{world.body_count} bodies on {world.comm.size} ranks, {method}")
     if ccp.SOLVERS[options.run.ccp_type].needs != ccp.NEWTON and options.limits.tol > ccp.Limits().tol:
         progress.say(report.loose_line(options.limits.tol))
-    progress.say(report.columns(compares), level=1)
+    if ccp.SOLVERS[options.run.ccp_type].newton:
+        progress.say(f"Newton systems: {newton.words()}")
+    if options.run.steps:
+        progress.say(report.columns(newton.compare is not None), level=1)
     progress.start(options.run.steps)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 
 import numpy as np
@@ -14,8 +15,9 @@ from pctt import ccp, log
 from pctt.ccp import Comparison, Limits
 from pctt.ccp.newton.krylov import Krylov
 from pctt.options import OptionError
+from pctt.run.report import compare_table
 
-FIELDS = {"systems", "converged", "ksp_its_mean", "ksp_its_max", "setup_s", "solve_s", "entries_s"}
+FIELDS = {"type", "what", "systems", "converged", "ksp_its_mean", "ksp_its_max", "setup_s", "solve_s", "entries_s"}
 FIELDS |= {"true_residual_max", "excess_max"}
 
 
@@ -181,9 +183,48 @@ def test_names_that_petsc_does_not_know_are_refused():
             Comparison(SELF, ["none", name])
 
 
-def test_a_name_given_twice_counts_once():
-    summary = compared(["jacobi", "jacobi"]).summary()
-    assert summary["jacobi"]["systems"] == 1
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [
+        ("jacobi,jacobi", "the label jacobi is there twice; allowed is LABEL:jacobi"),
+        ("a:jacobi,a:ilu", "the label a is there twice"),
+        ("tt,tt:ilu", "the label tt is there twice"),
+        (":jacobi", "allowed is TYPE or LABEL:TYPE"),
+        ("a b:jacobi", "letters, digits, _ and -"),
+        ("a:b:jacobi", "letters, digits, _ and -"),
+        ("é:jacobi", "letters, digits, _ and -"),
+        ("a:nosuch", "-compare nosuch: PETSc has no such preconditioner"),
+        ("a:", "PETSc has no such preconditioner"),
+        ("a_b:jacobi,a:jacobi", r"-compare a_b:jacobi,a:jacobi: -compare_a_b_... would be an option of a too"),
+    ],
+)
+def test_bad_labels_are_refused(entries, words):
+    with pytest.raises(OptionError, match=words):
+        Comparison(SELF, entries.split(","))
+
+
+def test_a_type_stands_in_the_table_several_times_with_options_of_its_own(database):
+    database["compare_ten_pc_tt_rank"] = "10"
+    database["compare_f-2_pc_factor_levels"] = "2"
+    entries = ["one:tt", "ten:tt", "ilu", "f-2:ilu"]
+    comparison = Comparison(SELF, entries)
+    _, S, b, x = system()
+    comparison.run(S, b, x, 1e-6)
+    summary = comparison.summary()
+    assert [(name, figures["type"]) for name, figures in summary.items()] == [
+        ("one", "tt"), ("ten", "tt"), ("ilu", "ilu"), ("f-2", "ilu"),
+    ]  # fmt: skip
+    what = [figures["what"] for figures in summary.values()]
+    assert what[0] == "rank 1: block Jacobi"
+    assert re.fullmatch("rank ([2-9]|10)", what[1])
+    assert what[2:] == ["", ""]
+    assert summary["f-2"]["ksp_its_mean"] < summary["ilu"]["ksp_its_mean"]
+    assert summary["ten"]["ksp_its_mean"] != summary["one"]["ksp_its_mean"]
+    rows = compare_table(summary).splitlines()
+    assert rows[0].endswith("what it was")
+    assert [row.split()[0] for row in rows[2:]] == entries
+    assert rows[2].endswith("  rank 1: block Jacobi")
+    assert rows[3].endswith(f"  {what[1]}")
 
 
 def test_an_empty_comparison_has_an_empty_summary():
@@ -217,26 +258,23 @@ def test_the_iteration_cap_acts_on_all(database):
     assert not any(record.solves[0].converged for record in records.values())
 
 
-def test_labels_say_what_a_name_means_here():
-    assert Comparison(SELF, ["ilu", "jacobi"]).labels() == {"ilu": "ilu", "jacobi": "jacobi"}
-
-
 @pytest.mark.parallel(2)
 def test_on_two_ranks_factorisations_work_within_each_rank_and_say_so(database):
     comm = MPI.COMM_WORLD
-    comparison = Comparison(comm, ["ilu", "ilu-shifted", "icc", "pbjacobi", "python"])
+    comparison = Comparison(comm, ["ilu", "ilu-shifted", "icc", "own:sor", "pbjacobi", "python"])
     known, graph = heap(bodies=30)
     newton = ccp.newton_for(comm, "pdip", compare=comparison)
     result = ccp.solve(from_graph(known, graph, comm), limits=Limits(1e-5), newton=newton)
     with pytest.raises(OptionError):
         Comparison(comm, ["nonsense"])
     assert result.converged
-    assert comparison.labels() == {
-        "ilu": "ilu (within each rank)",
-        "ilu-shifted": "ilu-shifted (within each rank)",
-        "icc": "icc (within each rank)",
-        "pbjacobi": "pbjacobi",
-        "python": "python",
+    assert {name: figures["what"] for name, figures in comparison.summary().items()} == {
+        "ilu": "within each rank",
+        "ilu-shifted": "within each rank",
+        "icc": "within each rank",
+        "own": "within each rank",
+        "pbjacobi": "",
+        "python": "",
     }
     counts = {n: (s["systems"], s["converged"], s["ksp_its_mean"]) for n, s in comparison.summary().items()}
     assert comm.allgather(counts) == [counts] * comm.size

@@ -118,6 +118,7 @@ def test_a_solve_that_a_train_has_spoilt_is_made_again(method):
         assert solve(ksp)[1] < 1e-6
         assert ksp.getConvergedReason() > 0
     assert "solved again" in " ".join(context(ksp).report())
+    assert context(ksp).what() == "rank 1: block Jacobi"
 
 
 CRASH = """

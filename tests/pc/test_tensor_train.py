@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from systems import contact_matrix, contacts, dense, poisson
 
 from pctt import memory
 from pctt.pc import TensorTrain, sparse_train
+from pctt.pc.train_options import Account
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -227,6 +229,31 @@ def test_auto_keeps_to_block_jacobi_until_a_trial_can_be_paid_for():
     solve(ksp)
     assert context(ksp).rank == 1
     assert "rank 1" in "\n".join(context(ksp).report())
+
+
+def test_it_says_what_it_was():
+    for rank, words in (("1", "rank 1: block Jacobi"), ("8", "rank [2-8]")):
+        ksp = solver(poisson(16), rank=rank)
+        assert context(ksp).what() == ""  # set up, but no system solved
+        for _ in range(2):
+            solve(ksp)
+        assert re.fullmatch(words, context(ksp).what())
+
+
+@pytest.mark.parametrize(
+    ("used", "words"),
+    [
+        ({}, ""),
+        ({0: 3}, "rank 1: block Jacobi"),
+        ({1: 2}, "rank 1"),  # a train of rank 1 beside the identity
+        ({0: 4, 10: 32}, "rank 10, 4 of 36 systems rank 1: block Jacobi"),
+        ({0: 9, 3: 1}, "rank 1: block Jacobi, 1 of 10 systems rank 3"),
+        ({8: 2, 3: 1, 10: 5}, "rank 3 to 10"),
+        ({8: 2, 3: 1, 0: 9}, "rank 1: block Jacobi, 3 of 12 systems rank 3 to 8"),
+    ],
+)
+def test_what_many_solves_used(used, words):
+    assert Account(used=Counter(used)).what() == words
 
 
 @pytest.mark.parametrize("name", ["max_rnk", "epsilon"])

@@ -9,6 +9,8 @@ import pytest
 from program import SETTLED, steps_of
 
 FIELDS = {
+    "type": str,
+    "what": str,
     "systems": int,
     "converged": int,
     "ksp_its_mean": float,
@@ -28,8 +30,8 @@ def compared(program, folder, *options):
     summary = json.loads((folder / "results" / "summary.json").read_text())
     assert summary["newton_its"] == sum(line["newton_its"] for line in steps_of(folder / "results"))
     table = done.stdout.partition("preconditioner  ")[2].splitlines()
-    rows = [line for line in table[2:] if line.strip()]
-    return summary, {tuple(row.rsplit(maxsplit=7)[:1])[0].strip(): row.rsplit(maxsplit=7)[1:] for row in rows[:-1]}
+    rows = [line.split(maxsplit=8) for line in table[2:] if line.strip()]
+    return summary, {entry: [*cells, ""][:8] for entry, *cells in rows[:-1]}
 
 
 def test_all_see_the_same_systems_and_the_table_agrees_with_the_summary(program, settled, tmp_path):
@@ -49,7 +51,8 @@ def test_all_see_the_same_systems_and_the_table_agrees_with_the_summary(program,
         assert math.isfinite(record["true_residual_max"])
         assert record["setup_s"] >= 0
         assert record["solve_s"] > 0
-        systems, converged, mean, most, _, _, worst = table[name]
+        systems, converged, mean, most, _, _, worst, what = table[name]
+        assert (record["type"], what) == (name, record["what"])
         assert (int(systems), int(converged), int(most)) == (count, record["converged"], record["ksp_its_max"])
         assert float(mean) == pytest.approx(record["ksp_its_mean"], abs=0.06)
         assert float(worst) == pytest.approx(record["excess_max"], rel=0.06)
@@ -83,7 +86,7 @@ def test_a_compared_preconditioner_takes_options_of_its_own(program, settled, tm
 def test_on_two_ranks_ilu_is_said_to_work_within_each(program, settled, tmp_path):
     summary, table = compared(program, tmp_path, "-compare", "none,ilu,pbjacobi")
     assert list(summary["compare"]) == ["none", "ilu", "pbjacobi"]
-    assert list(table) == ["none", "ilu (within each rank)", "pbjacobi"]
+    assert [row[-1] for row in table.values()] == ["", "within each rank", ""]
     (systems,) = {record["systems"] for record in summary["compare"].values()}
     assert systems >= summary["newton_its"]
 
@@ -102,10 +105,13 @@ def test_without_options_the_program_is_the_demo(program, tmp_path):
     done = program(ranks=2, cache=tmp_path / "cache")
     summary = json.loads((tmp_path / "results" / "demo" / "summary.json").read_text())
     assert (summary["bodies"], summary["ranks"], summary["steps"]) == (731, 2, 5)
-    assert {"none", "ilu"} <= set(summary["compare"])
+    kinds = {name: record["type"] for name, record in summary["compare"].items()}
+    assert kinds == {"auto": "tt", "ten": "tt", "pbjacobi": "pbjacobi", "ilu": "ilu", "none": "none"}
     assert summary["natural_residual"] <= 1e-4
     assert "NOT CONVERGED" not in done.stdout
-    assert "ilu (within each rank)" in done.stdout
+    assert "\nNewton systems: BiCGStab (right), pctt.pc.TensorTrain\n" in done.stdout
+    assert "\nNewton systems: pctt.pc.TensorTrain was rank " in done.stdout
+    assert "options without effect" not in done.stdout
     assert "results: " in done.stdout.splitlines()[-1]
 
 
@@ -120,3 +126,43 @@ def test_fallbacks_of_a_train_reach_the_summary(program, settled, tmp_path):
     program(*SETTLED, "-steps", 1, *train, "-output", "train")
     (step,) = steps_of(tmp_path / "train")
     assert step["pc_report"][0].startswith("tensor train")
+
+
+def test_two_trains_stand_in_one_table(program, settled, tmp_path):
+    options = ("-compare", "auto:tt,ten:tt", "-compare_ten_pc_tt_rank", "10", "-ksp_rtol", "1e-3", "-ksp_max_it", "300")
+    summary, table = compared(program, tmp_path, *options)
+    assert list(table) == ["auto:tt", "ten:tt"]
+    assert table["auto:tt"][-1].startswith("rank 1: block Jacobi")
+    assert table["ten:tt"][-1] == summary["compare"]["ten"]["what"] != table["auto:tt"][-1]
+    assert table["ten:tt"][-1].startswith("rank ")
+
+
+TRAIN = ("-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")
+
+@pytest.mark.parametrize(
+    ("options", "start", "end"),
+    [
+        ((), "BiCGStab (right), pbjacobi", None),
+        (("-ksp_type", "cg", "-pc_type", "ilu"), "CG, ilu", None),
+        (("-ccp_newton", "kkt"), "preonly, cholesky", None),
+        (("-ccp_type", "conic"), "CG, pbjacobi or cholesky by expected cost", None),
+        (TRAIN, "BiCGStab (right), pctt.pc.TensorTrain", "pctt.pc.TensorTrain was rank 1: block Jacobi"),
+        (("-ccp_type", "apgd"), None, None),
+    ],
+)
+def test_a_run_says_what_solves_its_newton_systems(options, start, end, program, settled):
+    said = program(*SETTLED, "-steps", 1, "-overwrite", *options).stdout
+    lines = [line.partition(": ")[2] for line in said.splitlines() if line.startswith("Newton systems: ")]
+    assert lines == [words for words in (start, end) if words]
+
+
+@pytest.mark.parallel(2)
+def test_on_two_ranks_the_start_says_that_ilu_works_within_each(program, settled):
+    said = program(*SETTLED, "-steps", 1, "-overwrite", "-pc_type", "ilu").stdout
+    assert "\nNewton systems: BiCGStab (right), ilu within each rank\n" in said
+
+
+def test_a_run_without_steps_prints_no_empty_tables(program, settled):
+    said = program(*SETTLED, "-steps", 0, "-compare", "none").stdout
+    assert "Newton systems: " in said
+    assert "residual" not in said.replace("to 0.0001", "")

@@ -39,6 +39,7 @@ def test_the_known_optimum_is_found(name, solver, ranks, program, tmp_path):
     assert summary["objective"] >= objective * (1 + 1e-9)  # no better than the optimum
     assert summary["velocity_norm"] == pytest.approx(speed, rel=3e-5)
     assert (summary["newton_its"] > 0) == (solver == "pdip")
+    assert summary["newton_systems"] == ("BiCGStab (right), pbjacobi" if solver == "pdip" else "")
     assert summary["newton_its"] < 60
     assert sorted(p.name for p in (tmp_path / "results").iterdir()) == ["summary.json"]
 

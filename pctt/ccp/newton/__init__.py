@@ -126,6 +126,14 @@ class Newton:
         """Lines about the preconditioner and its fallbacks so far, if it is one of this package."""
         return [line for linear in self._linear.values() for line in linear.report()]
 
+    def words(self) -> str:
+        """Krylov method and preconditioner of the present form."""
+        return self.linear.words()
+
+    def what(self) -> str:
+        """What preconditioners of this package really were so far; empty if there are none."""
+        return "; ".join(filter(None, (linear.what() for linear in self._linear.values())))
+
     @property
     def takes_any(self) -> bool:
         """Whether the present systems may be unsymmetric."""

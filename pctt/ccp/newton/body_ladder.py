@@ -134,6 +134,9 @@ class BodyLadder(LinearSolver):
         self._growth = min(max(hardness / self._hardness, 1.0), STEERING.growth)
         self._hardness = hardness
 
+    def words(self) -> str:
+        return "CG, pbjacobi or cholesky by expected cost"
+
     @property
     def factored(self) -> bool:
         return self._rung == "cholesky" and not self._keep

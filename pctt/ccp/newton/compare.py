@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +23,9 @@ NAMED: dict[str, dict[str, str]] = {
     "cholesky": {"pc_type": "cholesky", "ksp_type": "gmres"},
     "tt": {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain"},
 }
+
+
+LABEL = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @dataclass
@@ -68,17 +73,19 @@ class Record:
 
 
 class Comparison(KrylovFamily):
-    """Solves every ``every``-th Newton system by each of ``names`` (``-compare``, ``-compare_every``).
+    """Solves every ``every``-th Newton system by each of ``entries`` (``-compare``, ``-compare_every``), of the form
+    TYPE or LABEL:TYPE (`labelled`).
 
-    A name is a PETSc PC type or one of NAMED; its KSP has the prefix ``compare_<name>_`` for further options.
-    Raises OptionError for a name that PETSc does not know.
+    A type is a PETSc PC type or one of NAMED. Its KSP has the prefix ``compare_<label>_`` for further options.
+    Raises OptionError for a type that PETSc does not know.
     """
 
-    def __init__(self, comm: MPI.Comm, names: list[str], every: int = 1):
-        for name in names:
-            _check_name(name, comm)
+    def __init__(self, comm: MPI.Comm, entries: Sequence[str], every: int = 1):
+        self.kinds = labelled(entries)
+        for kind in self.kinds.values():
+            _check_kind(kind, comm)
         super().__init__(comm)
-        self.names, self.every = list(dict.fromkeys(names)), every
+        self.names, self.every = list(self.kinds), every
         self.records = {name: Record() for name in self.names}
         self._seen = 0
         self._entries_s = 0.0
@@ -96,6 +103,7 @@ class Comparison(KrylovFamily):
         """
         chosen: Solve | None = None
         with log.phase("CCPCompare"):
+            A.mult(b, x)  # no one's seconds: the first product on a machine compiles its loops
             self._make_entries(A, P)
             for name in self.names:
                 done = self._solver(name).solve(A, b, x, rtol, P)
@@ -119,32 +127,57 @@ class Comparison(KrylovFamily):
             self._entries_s += time.perf_counter() - start
 
     def summary(self) -> dict[str, dict[str, Any]]:
-        """Figures by name. ``entries_s``: seconds that the matrix's entries took, of a preconditioner that reads them;
-        they are made once for all, and in no one's ``setup_s``. ``pc_report``: lines, of the project's own."""
-        figures: dict[str, dict[str, Any]] = {name: record.summary() for name, record in self.records.items()}
+        """Figures by label. ``what``: what the preconditioner really was, where its type does not say it.
+        ``entries_s``: seconds that the matrix's entries took, of a preconditioner that reads them; they are made once
+        for all, and in no one's ``setup_s``. ``pc_report``: lines, of the project's own."""
+        figures: dict[str, dict[str, Any]] = {
+            name: {"type": self.kinds[name], "what": "", **record.summary()} for name, record in self.records.items()
+        }
         for name, krylov in self._krylov.items():
+            figures[name]["what"] = krylov.what()
             figures[name]["entries_s"] = self._entries_s if krylov.needs_entries else 0.0
             if lines := krylov.report():
                 figures[name]["pc_report"] = lines
         return figures
 
     def take_solves(self) -> dict[str, list[list[Any]]]:
-        """The solves by name, as of `Record.take_solves`."""
+        """The solves by label, as of `Record.take_solves`."""
         return {name: record.take_solves() for name, record in self.records.items()}
-
-    def labels(self) -> dict[str, str]:
-        """What each name means on this number of ranks, where that is not plain from the name."""
-        remark = " (within each rank)" if self.comm.size > 1 else ""
-        return {name: name + remark * name.startswith(("ilu", "icc")) for name in self.names}
 
     def _solver(self, name: str) -> Krylov:
         if name not in self._krylov:
-            defaults = NAMED.get(name, {"pc_type": name})
-            self._krylov[name] = Krylov(self.comm, f"compare_{name}_", defaults)
+            kind = self.kinds[name]
+            self._krylov[name] = Krylov(self.comm, prefix(name), NAMED.get(kind, {"pc_type": kind}))
         return self._krylov[name]
 
 
-def _check_name(name: str, comm: MPI.Comm) -> None:
+def prefix(label: str) -> str:
+    """The prefix of the options of a compared preconditioner."""
+    return f"compare_{label}_"
+
+
+def labelled(entries: Sequence[str]) -> dict[str, str]:
+    """The types of the preconditioners by label: of entries LABEL:TYPE, or TYPE, which is its own label. OptionError
+    for a bad label, for one that is there twice, and for one whose options another one would take for its own."""
+    kinds: dict[str, str] = {}
+    for entry in entries:
+        before, colon, kind = entry.rpartition(":")
+        label = before if colon else kind
+        if colon and not LABEL.fullmatch(label):
+            allowed = "TYPE or LABEL:TYPE with a label of letters, digits, _ and -"
+            raise OptionError(f"-compare {entry}: allowed is {allowed}")
+        if label in kinds:
+            raise OptionError(f"-compare {entry}: the label {label} is there twice; allowed is LABEL:{kind}")
+        kinds[label] = kind
+    for label in kinds:
+        for other in kinds:
+            if other != label and prefix(other).startswith(prefix(label)):
+                clash = f"-{prefix(other)}... would be an option of {label} too"
+                raise OptionError(f"-compare {','.join(entries)}: {clash}; allowed are other labels")
+    return kinds
+
+
+def _check_kind(name: str, comm: MPI.Comm) -> None:
     pc = PETSc.PC().create(comm)
     try:
         pc.setType(NAMED.get(name, {"pc_type": name})["pc_type"])

@@ -28,6 +28,9 @@ _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
 # what wants scalar rows; others switch when PETSc says so
 _SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu", "eisenstat"}
 _BY_PRODUCTS = {"none", "jacobi", "pbjacobi"}  # these need no entries beside the diagonal blocks
+WITHIN = "within each rank"
+_WITHIN_RANKS = {"bjacobi", "sor", "eisenstat"}  # of several ranks each works on its own rows
+_NAMES = {"bcgs": "BiCGStab", "cg": "CG", "gmres": "GMRES", "fgmres": "FGMRES", "minres": "MINRES"}
 WAIT_FOR_OTHERS = 10.0  # seconds that a rank that has failed waits for the others
 # preconditioners of parts of the matrix; ours have inner ones too, but of other matrices
 _OF_PARTS = re.compile(r"(sub|mg|fieldsplit|composite|telescope)_.*pc_type")
@@ -73,6 +76,7 @@ class Krylov:
 
     def _configure(self, options: PETSc.Options, rtol: float) -> None:
         self.method, self.kind = options.getString("ksp_type"), options.getString("pc_type")
+        self._pc_name = options.getString("sub_pc_type", self.kind) if self.kind == "bjacobi" else self.kind
         within = {value for name, value in options.getAll().items() if _OF_PARTS.fullmatch(name)}
         self._remembers_within = bool(BY_DIAGONAL_BLOCKS & within)
         # block Gauss-Seidel over several ranks crashes in PETSc 3.18, parts of a matrix of blocks have none
@@ -177,11 +181,29 @@ class Krylov:
             return rows
         return without_memory(P, self.kind)
 
-    def report(self) -> list[str]:
-        """What a preconditioner of the project tells of itself and its fallbacks, as in ``-ksp_view``."""
+    @property
+    def own(self) -> PythonPC | None:
+        """The preconditioner, if it is one of the project."""
         pc = self.ksp.pc
         context = pc.getPythonContext() if pc.getType() == PETSc.PC.Type.PYTHON else None
-        return context.report() if isinstance(context, PythonPC) else []
+        return context if isinstance(context, PythonPC) else None
+
+    def report(self) -> list[str]:
+        """What a preconditioner of the project tells of itself and its fallbacks, as in ``-ksp_view``."""
+        return self.own.report() if self.own else []
+
+    def what(self) -> str:
+        """What the preconditioner really was, where its name does not say it."""
+        if self.own:
+            return self.own.what()
+        return WITHIN if self.comm.size > 1 and self.kind in _WITHIN_RANKS else ""
+
+    def words(self) -> str:
+        """Krylov method and preconditioner."""
+        own, right = self.own, self.ksp.getPCSide() == PETSc.PC.Side.RIGHT
+        remark = f" {WITHIN}" if not own and self.what() else ""
+        method = _NAMES.get(self.method, self.method) + " (right)" * right
+        return f"{method}, {own.name if own else self._pc_name}{remark}"
 
     def forget(self) -> None:
         """Prepare for a matrix of another structure. A python preconditioner keeps the data that may serve it too."""
@@ -249,6 +271,14 @@ class LinearSolver(KrylovFamily):
     def report(self) -> list[str]:
         """Lines about the preconditioner, if it is one of this package."""
         return []
+
+    def words(self) -> str:
+        """Krylov method and preconditioner."""
+        raise NotImplementedError
+
+    def what(self) -> str:
+        """What a preconditioner of this package really was; empty for others."""
+        return ""
 
 
 _REASONS = {

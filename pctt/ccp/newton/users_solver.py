@@ -49,6 +49,13 @@ class UsersSolver(LinearSolver):
     def report(self) -> list[str]:
         return self._krylov[""].report() if "" in self._krylov else []
 
+    def words(self) -> str:
+        return self._solver("").words()
+
+    def what(self) -> str:
+        own = self._krylov[""].own if "" in self._krylov else None
+        return f"{own.name} was {own.what()}" if own and own.what() else ""
+
     def _climb_down(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float, done: Solve) -> bool:
         """Try the ladder; keep in x what has the smallest true residual, or zero if nothing is below 1."""
         A, P = self.system.matrix, self.system.entries
