@@ -1,19 +1,23 @@
 """The grid to which the rows of a Mat belong, and the order of the rows in a train.
 
-    grid      the attribute ``grid`` = (n_1, n_2, ...), the shape of a vector as an array (row i at
-              numpy.unravel_index(i, grid)), or the DMDA of the Mat: one axis after the other
-    morton    along a space-filling curve through the points of the attribute ``coordinates``
+    grid      ``grid`` = (n_1, n_2, ...), the shape of a vector as an array (row i at numpy.unravel_index(i, grid)), or
+              the DMDA of the Mat: one axis after the other
+    morton    along a space-filling curve through the points ``coordinates``
     natural   the given order of the rows
+
+`pctt.mat.entries.given` says where a user gives grid and coordinates.
 """
 
 from __future__ import annotations
 
 import numbers
 from math import prod
+from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
 
+from pctt.mat.entries import given
 from pctt.morton import morton_codes
 from pctt.tt.grid import GridDigits
 from pctt.tt.train import Array
@@ -27,19 +31,15 @@ def grid_of(P: PETSc.Mat) -> tuple[tuple[int, ...], Array | None] | None:
     """
     count = P.getSize()[0] // P.getBlockSize()
     comm = P.comm.tompi4py()
-    given = P.getAttr("grid")
-    words = comm.allgather(None if given is None else repr(given))
+    grid = given(P, "grid")
+    words = comm.allgather(None if grid is None else repr(grid))
     if any(word != words[0] for word in words):
         raise ValueError(f"the attribute grid of the Mat differs between ranks: {', '.join(map(str, words))}")
-    if given is not None:
-        try:
-            shape = tuple(int(n) for n in given if isinstance(n, numbers.Integral))
-            fits = len(shape) == len(tuple(given)) > 0 and min(shape) >= 1 and prod(shape) == count
-        except TypeError:
-            fits = False
-        if not fits:
+    if grid is not None:
+        shape = whole_numbers(grid)
+        if shape is None or prod(shape) != count:
             raise ValueError(
-                f"the attribute grid of the Mat is {given!r}; allowed are whole numbers whose product is the number of "
+                f"the attribute grid of the Mat is {grid!r}; allowed are whole numbers whose product is the number of "
                 f"block rows, {count}"
             )
         return shape, None
@@ -50,6 +50,16 @@ def grid_of(P: PETSc.Mat) -> tuple[tuple[int, ...], Array | None] | None:
     if comm.size == 1:
         return shape, None
     return shape, _natural_order(dm, P.getBlockSize())
+
+
+def whole_numbers(grid: Any) -> tuple[int, ...] | None:
+    """The shape of a grid; None if it is not a sequence of whole numbers >= 1."""
+    try:
+        numbers_of = tuple(grid)
+    except TypeError:
+        return None
+    whole = all(isinstance(n, numbers.Integral) and n >= 1 for n in numbers_of)
+    return tuple(int(n) for n in numbers_of) if numbers_of and whole else None
 
 
 def _natural_order(dm: PETSc.DM, block: int) -> Array:
@@ -76,7 +86,7 @@ def digits_of(P: PETSc.Mat, order: str, name: str) -> tuple[GridDigits, Array | 
         shape, rows = grid
         return GridDigits(shape, block=block), _scalar(rows, block), "grid"
     count = P.getSize()[0] // block
-    points = P.getAttr("coordinates")  # it was checked: all ranks have it or none
+    points = given(P, "coordinates")  # it was checked: all ranks have it or none
     if points is not None and order in ("auto", "morton"):
         parts = P.comm.tompi4py().allgather(np.asarray(points, dtype=float).reshape(-1, np.shape(points)[-1]))
         codes = morton_codes(np.concatenate(parts))

@@ -14,6 +14,18 @@ from pctt.tt.train import Array, Train
 LONG = 1_000_000  # several ranks that gather longer vectors cause a warning
 
 
+def places_of_rows(digits: GridDigits, order: Array | None) -> Array:
+    """The place of each row of the Mat among the rows of a train.
+
+    order : row at each point of the grid, or None
+    """
+    if order is None:
+        return digits.places
+    places = np.empty(digits.rows, np.int64)
+    places[order] = digits.places
+    return places
+
+
 class TrainProduct:
     """This rank's rows of y = T x, from its rows of x.
 
@@ -23,6 +35,8 @@ class TrainProduct:
 
     Every rank gathers x and multiplies with its part of the rows of the train. If the order of the rows in the train
     differs from the order in the Mat, the ranks also gather the product.
+
+    flops : operations of a product on this rank
     """
 
     def __init__(
@@ -32,11 +46,7 @@ class TrainProduct:
         rows = digits.rows
         if comm.size > 1 and rows > LONG and comm.rank == 0:
             warnings.warn(f"pctt: each of {comm.size} ranks gathers whole vectors of {rows} numbers", stacklevel=2)
-        places = digits.places
-        if order is not None:
-            of_row = np.empty(rows, np.int64)
-            of_row[order] = places
-            places = of_row
+        places = places_of_rows(digits, order)
         first = int(self.counts[: comm.rank].sum())
         self.mine = slice(first, first + int(self.counts[comm.rank]))
         ranks = np.linspace(0, digits.size, comm.size + 1).astype(int)
@@ -50,6 +60,10 @@ class TrainProduct:
         self.whole = np.empty(rows)
         self.product = np.empty(digits.size)
         self.apply = Apply(train, digits.size, bounds)
+
+    @property
+    def flops(self) -> int:
+        return self.apply.flops
 
     def __call__(self, x: Array) -> Array:
         """The product; the array is valid until the next call."""

@@ -39,6 +39,8 @@ class Apply:
     n : length of the vectors
     rows : the range (start, stop) of rows that this rank owns, by default all rows
 
+    flops : additions and multiplications of a product on this rank
+
     >>> from pctt.tt.train import random
     >>> T = random([3, 2, 4], 5, [3, 2, 4])
     >>> x = np.arange(22.0)
@@ -98,6 +100,8 @@ class Apply:
             following = shapes[k + 1] if k + 1 < len(self._middle) else shapes[k + 1][:2]
             self._steps.append((W, flat.reshape(count, len(W), rest), flat.reshape(following)))
         self._outputs = list(self._y.reshape(len(self._boxes), box // modes[-1], modes[-1]))
+        per_box = rank * box * boxes + sum(product.size * W.shape[1] for W, product, _ in self._steps)
+        self.flops = 2 * len(self._boxes) * (per_box + box * len(self._last))
 
     def __call__(self, x: Array) -> Array:
         """This rank's rows of T x, from the whole x."""
