@@ -22,8 +22,8 @@ from pctt.petsc import remember
 
 #: The methods that PETSc calls by name.
 CALLED = (
-    "setFromOptions", "setUp", "apply", "applyTranspose", "mult", "multTranspose", "getDiagonal", "view", "scale", "shift",
-    "zeroEntries", "diagonalScale", "norm", "duplicate", "copy",
+    "setFromOptions", "setUp", "apply", "applyTranspose", "mult", "multTranspose", "getDiagonal", "view",
+    "scale", "shift", "zeroEntries", "diagonalScale", "norm", "duplicate", "copy",
 )
 
 

@@ -138,7 +138,7 @@ def rounded(train: Train, eps: float, max_rank: int) -> tuple[Train, float]:
 
 def _inside(digits: GridDigits) -> Train:
     """The train of a vector: 1 at the points of the grid, 0 at those that fill it up."""
-    cores = []
+    cores: list[Array] = []
     for n, padded in zip(digits.shape, digits.padded):
         if padded > 1:
             cores += decompose((np.arange(padded) < n).astype(float), 1e-14, modes=bases(n)).cores

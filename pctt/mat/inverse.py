@@ -82,8 +82,9 @@ def _train_of(A: PETSc.Mat, options: Options) -> GridTrain:
         matrix = CompressedEntries(A, options.eps, options.max_rank)
     if matrix.error > MISSED * options.eps:
         raise ValueError(
-            f"pctt.mat.inverse: the train of the matrix has an error of {matrix.error:.1e} at rank {max(matrix.ranks)}, "
-            f"{options.eps:.1e} was asked for; allowed is a max_rank above {options.max_rank} or a larger eps"
+            f"pctt.mat.inverse: the train of the matrix has an error of {matrix.error:.1e} at rank "
+            f"{max(matrix.ranks)}, {options.eps:.1e} was asked for; allowed is a max_rank above {options.max_rank} "
+            "or a larger eps"
         )
     return matrix
 

@@ -55,11 +55,10 @@ def grid_of(P: PETSc.Mat) -> tuple[tuple[int, ...], Array | None] | None:
 def whole_numbers(grid: Any) -> tuple[int, ...] | None:
     """The shape of a grid; None if it is not a sequence of whole numbers >= 1."""
     try:
-        numbers_of = tuple(grid)
+        shape = tuple(int(n) for n in grid if isinstance(n, numbers.Integral))
+        return shape if len(shape) == len(tuple(grid)) > 0 and min(shape) >= 1 else None
     except TypeError:
         return None
-    whole = all(isinstance(n, numbers.Integral) and n >= 1 for n in numbers_of)
-    return tuple(int(n) for n in numbers_of) if numbers_of and whole else None
 
 
 def _natural_order(dm: PETSc.DM, block: int) -> Array:
