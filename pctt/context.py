@@ -21,7 +21,10 @@ from petsc4py import PETSc
 from pctt.petsc import remember
 
 #: The methods that PETSc calls by name.
-CALLED = ("setFromOptions", "setUp", "apply", "applyTranspose", "mult", "multTranspose", "getDiagonal", "view")
+CALLED = (
+    "setFromOptions", "setUp", "apply", "applyTranspose", "mult", "multTranspose", "getDiagonal", "view",
+    "scale", "shift", "zeroEntries", "diagonalScale", "norm", "duplicate", "copy",
+)
 
 
 class Context:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import numpy as np
 from mpi4py import MPI
+
+Out = TypeVar("Out")
 
 
 def offsets(comm: MPI.Comm, count: int) -> np.ndarray:
@@ -16,6 +21,20 @@ def refuse(comm: MPI.Comm, wrong: str) -> None:
     for rank, words in enumerate(comm.allgather(wrong)):
         if words:
             raise ValueError(words + (f" (on rank {rank})" if comm.size > 1 else ""))
+
+
+def on_first(comm: MPI.Comm, work: Callable[[], Out]) -> Out:
+    """What `work` gives on the first rank, on all ranks, or the error that it raises there. Collective."""
+    value, error = None, None
+    if comm.rank == 0:
+        try:
+            value = work()
+        except Exception as raised:
+            error = raised
+    value, error = comm.bcast((value, error))
+    if error is not None:
+        raise error
+    return value  # type: ignore[return-value]
 
 
 def send_rows(

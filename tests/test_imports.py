@@ -56,7 +56,10 @@ BELOW = {
     "pctt.tt": {"pctt.compiled"},
     "pctt.contact_map": {"pctt.blocks", "pctt.compiled", "pctt.exchange", "pctt.petsc"},
     "pctt.body_matrix": {"pctt.block_diagonal", "pctt.blocks", "pctt.contact_map", "pctt.exchange", "pctt.shell"},
-    "pctt.mat": {"pctt.context", "pctt.exchange", "pctt.morton", "pctt.petsc", "pctt.shell", "pctt.tt"},
+    "pctt.mat": {
+        "pctt.context", "pctt.disk", "pctt.exchange", "pctt.morton", "pctt.options", "pctt.petsc", "pctt.shell",
+        "pctt.tt",
+    },
     "pctt.look": {"dem", "pctt.disk", "pctt.figures_json", "pctt.petsc"},
 }
 

@@ -1,5 +1,7 @@
 """Mats that are given by functions: `-mat_type python -mat_python_type pctt.mat.TensorTrain`."""
 
-from pctt.mat.tensor_train import TensorTrain, from_entries
+from pctt.mat.files import load, save
+from pctt.mat.inverse import inverse
+from pctt.mat.tensor_train import TensorTrain, axpy, from_entries
 
-__all__ = ["TensorTrain", "from_entries"]
+__all__ = ["TensorTrain", "axpy", "from_entries", "inverse", "load", "save"]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -20,11 +22,55 @@ class EntriesError(ValueError):
     """Entries are not numbers, or the function for them fails; raised on all ranks."""
 
 
+def given(P: PETSc.Mat, name: str) -> Any:
+    """What the user has said about a Mat under a name (``entries``, ``grid``, ``coordinates``), or None.
+
+    It is the attribute of the Mat (``setAttr``). If the Mat is of type python, it may also be an attribute or a method
+    of its context, or be in a dict ``appctx`` of the context, as Firedrake has it. A method is called without the Mat.
+    """
+    value = P.getAttr(name)
+    if value is not None or P.getType() != PETSc.Mat.Type.PYTHON:
+        return value
+    context = P.getPythonContext()
+    value = getattr(context, name, None)
+    more = getattr(context, "appctx", None)
+    if value is None and isinstance(more, Mapping):
+        value = more.get(name)
+    return value() if callable(value) and name != "entries" else value
+
+
 def has_entries(P: PETSc.Mat) -> bool:
-    """Whether P gives its entries one by one: P has the attribute ``entries``, or it is dense and has a grid or no
+    """Whether P gives its entries one by one: the user has given ``entries``, or P is dense and has a grid or no
     blocks."""
-    dense = P.getType() in DENSE and (P.getBlockSize() == 1 or P.getAttr("grid") is not None)
-    return dense or P.getAttr("entries") is not None
+    dense = P.getType() in DENSE and (P.getBlockSize() == 1 or given(P, "grid") is not None)
+    return dense or given(P, "entries") is not None
+
+
+@dataclass(frozen=True)
+class Combination:
+    """The function of the entries of c I + f_1 A_1 + f_2 A_2 + ...; the terms are (f_k, the entries of A_k)."""
+
+    added: float
+    terms: Sequence[tuple[float, Callable[[Array, Array], Array]]]
+
+    @classmethod
+    def of(cls, function: Callable[[Array, Array], Array]) -> Combination:
+        return function if isinstance(function, cls) else cls(0.0, ((1.0, function),))
+
+    def __call__(self, i: Array, j: Array) -> Array:
+        values = np.where(i == j, self.added, 0.0)
+        for factor, function in self.terms:
+            values = values + factor * np.asarray(function(i.copy(), j.copy()))
+        return values
+
+    def plus(self, added: float, factor: float, other: Combination) -> Combination:
+        """This matrix + added I + factor times another one."""
+        terms = list(self.terms)
+        for weight, function in other.terms:
+            known = [k for k, (_, one) in enumerate(terms) if one is function]
+            before = terms.pop(known[0])[0] if known else 0.0
+            terms.append((before + factor * weight, function))
+        return Combination(self.added + added + factor * other.added, tuple(term for term in terms if term[0]))
 
 
 class Entries:
@@ -42,14 +88,15 @@ class Entries:
     @classmethod
     def of(cls, P: PETSc.Mat) -> Entries:
         """The entries of a Mat for which `has_entries` is true."""
-        comm, function = P.comm.tompi4py(), P.getAttr("entries")
-        given = comm.allgather(None if function is None else callable(function))
-        if len(set(given)) > 1 or given[0] is False:
+        comm, function = P.comm.tompi4py(), given(P, "entries")
+        found = comm.allgather(None if function is None else callable(function))
+        lacking = found[0] is None and P.getType() not in DENSE
+        if len(set(found)) > 1 or found[0] is False or lacking:
             raise EntriesError(
-                f"the attribute entries of the Mat is {given} by rank (None: missing, False: no function); allowed is "
+                f"the attribute entries of the Mat is {found} by rank (None: missing, False: no function); allowed is "
                 "a function of two integer arrays, on all ranks"
             )
-        return cls(comm, function) if given[0] else DenseEntries(P)
+        return cls(comm, function) if found[0] else DenseEntries(P)
 
     def __call__(self, i: Array, j: Array) -> Array:
         share = self._share(i)
@@ -84,7 +131,7 @@ class Entries:
     def _evaluate(self, i: Array, j: Array) -> Array:
         if len(i) == 0:
             return np.zeros(0)
-        raw = np.asarray(self.function(i, j))
+        raw = np.asarray(self.function(i.copy(), j.copy()))  # copies, because the function may change them
         if raw.shape != i.shape:
             raise EntriesError(f"an array of shape {raw.shape} for {len(i)} indices")
         if raw.dtype.kind not in "fiub":

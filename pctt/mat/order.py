@@ -4,6 +4,8 @@
               numpy.unravel_index(i, grid)), a DMDA, or points that fill a grid: one axis after the other
     morton    along a space-filling curve through points (`Places.points`)
     natural   the given order of the rows
+
+`pctt.mat.entries.given` says where a user gives grid and coordinates.
 """
 
 from __future__ import annotations
@@ -12,11 +14,13 @@ import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.mat.entries import given
 from pctt.morton import morton_codes
 from pctt.tt.grid import GridDigits
 from pctt.tt.train import Array
@@ -41,26 +45,26 @@ class Places:
     source: str = "nothing"
 
 
-def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), given: Array | None = None) -> Places:
+def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), told: Array | None = None) -> Places:
     """All that is known of the places of P's block rows; collective.
 
     dms : DMs that may describe the rows, beside that of P
-    given : points of this rank's block rows from elsewhere (``PCSetCoordinates``); the attribute ``coordinates`` of P
+    told : points of this rank's block rows from elsewhere (``PCSetCoordinates``); the attribute ``coordinates`` of P
         goes before
 
     ValueError on all ranks if an attribute of P does not fit P.
     """
     comm = P.comm.tompi4py()
     fitting = [dm for dm in (P.getDM(), *dms) if dm.handle and _fits(dm, P, comm)]
-    shape, row_at, source = _attribute_grid(P, comm), None, "the attribute grid"
+    shape, row_at, source = _given_grid(P, comm), None, "the attribute grid"
     if shape is None:
         shape, row_at, source = _dmda_grid(fitting, P, comm)
-    points, whence = P.getAttr("coordinates"), "the attribute coordinates"
+    points, whence = given(P, "coordinates"), "the attribute coordinates"
     check_points(points, P, "coordinates of the Mat")
     if points is not None:
         points = np.asarray(points, dtype=float)
-    elif _on_all(given is not None, comm):
-        points, whence = given, "PCSetCoordinates"
+    elif _on_all(told is not None, comm):
+        points, whence = told, "PCSetCoordinates"
         check_points(points, P, "PCSetCoordinates: points")
     else:
         points, whence = _other_points(fitting, P, comm)
@@ -92,30 +96,26 @@ def check_points(points: object, P: PETSc.Mat, name: str) -> None:
             elif not np.isfinite(array).all():
                 wrong = "have a NaN or infinity"
     found = P.comm.tompi4py().allgather((points is not None, wrong, count))
-    for rank, (given, wrong, count) in enumerate(found):
-        if wrong or given != found[0][0]:
+    for rank, (here, wrong, count) in enumerate(found):
+        if wrong or here != found[0][0]:
             raise ValueError(
                 f"{name} {wrong or 'are missing'} on rank {rank}; allowed are finite numbers of shape "
                 f"({count}, 1), ({count}, 2) or ({count}, 3), a row per local block row"
             )
 
 
-def _attribute_grid(P: PETSc.Mat, comm: MPI.Comm) -> tuple[int, ...] | None:
-    given = P.getAttr("grid")
-    words = comm.allgather(None if given is None else repr(given))
+def _given_grid(P: PETSc.Mat, comm: MPI.Comm) -> tuple[int, ...] | None:
+    grid = given(P, "grid")
+    words = comm.allgather(None if grid is None else repr(grid))
     if any(word != words[0] for word in words):
         raise ValueError(f"the attribute grid of the Mat differs between ranks: {', '.join(map(str, words))}")
-    if given is None:
+    if grid is None:
         return None
     count = P.getSize()[0] // P.getBlockSize()
-    try:
-        shape = tuple(int(n) for n in given if isinstance(n, numbers.Integral))
-        fits = len(shape) == len(tuple(given)) > 0 and min(shape) >= 1 and prod(shape) == count
-    except TypeError:
-        fits = False
-    if not fits:
+    shape = whole_numbers(grid)
+    if shape is None or prod(shape) != count:
         raise ValueError(
-            f"the attribute grid of the Mat is {given!r}; allowed are whole numbers whose product is the number of "
+            f"the attribute grid of the Mat is {grid!r}; allowed are whole numbers whose product is the number of "
             f"block rows, {count}"
         )
     return shape
@@ -139,6 +139,15 @@ def _dmda_grid(
             shape = tuple(dm.getSizes())[::-1]  # the first coordinate is the fastest
             return shape, _natural_order(dm, P.getBlockSize()) if comm.size > 1 else None, "a DMDA"
     return None, None, ""
+
+
+def whole_numbers(grid: Any) -> tuple[int, ...] | None:
+    """The shape of a grid; None if it is not a sequence of whole numbers >= 1."""
+    try:
+        shape = tuple(int(n) for n in grid if isinstance(n, numbers.Integral))
+        return shape if len(shape) == len(tuple(grid)) > 0 and min(shape) >= 1 else None
+    except TypeError:
+        return None
 
 
 def _natural_order(dm: PETSc.DM, block: int) -> Array:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from copy import copy
-from dataclasses import replace
 from math import prod
 
 import numpy as np
@@ -13,104 +11,130 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.context import Context
-from pctt.mat.entries import Entries, is_symmetric
-from pctt.mat.order import Places, digits_of
+from pctt.exchange import on_first, refuse
+from pctt.mat.entries import Combination, Entries, given, is_symmetric
+from pctt.mat.grid_train import GridTrain, rounded
+from pctt.mat.options import MAX_RANK, Options
+from pctt.mat.order import Places, digits_of, whole_numbers
 from pctt.mat.product import TrainProduct
 from pctt.petsc import own_errors
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.entries import EntryMatrix
 from pctt.tt.train import Array, Train
 
-MAX_RANK = 200
-ROUNDING = 0.1  # tolerance for rounding a symmetric part, divided by eps
+ROUNDING = 0.1  # tolerance for rounding a symmetric part or a sum, divided by eps
+MISSED = 10  # an error above this times eps is told
+MOST = 2**31  # number of rows that is too large, because pairs of rows are keys of 64 bits
 
 
-class CompressedEntries:
-    """The train T of a matrix A = c (I + T) that is given by its entries; c is the mean of the diagonal.
+class CompressedEntries(GridTrain):
+    """A = c (I + T) for a matrix A that is given by its entries; c is the mean of the diagonal.
 
-    Both the Mat and the PC use it.
-
-    shift, scale : A = shift I + scale T; both are c, or 0 and 1 if the mean is not positive
-    error : ||A - c (I + T)||_F / ||A - c I||_F, estimated from entries that the compression has not used
+    Both the Mat and the PC use it. If the mean is not positive, shift is 0 and scale is 1. The error is estimated from
+    entries that the compression has not used.
     """
 
     def __init__(
         self, P: PETSc.Mat, eps: float, max_rank: int, order: str = "auto", name: str = "order",
-        start: CompressedEntries | None = None, seed: int = 0, places: Places | None = None,
+        start: GridTrain | None = None, seed: int = 0, places: Places | None = None,
     ) -> None:  # fmt: skip
         """Collective; EntriesError or ValueError on all ranks for bad entries or a bad grid."""
         comm = P.comm.tompi4py()
-        self.entries = Entries.of(P)
-        self.digits, self.rows, self.order = digits_of(P, order, name, places)
-        self.counts = np.array(comm.allgather(P.getLocalSize()[0]))
-        self.comm = comm
-        matrix = EntryMatrix(self.entries, self.digits, self.rows, comm.bcast)
-        self.shift, self.scale = matrix.shift, 1 / matrix.scale
-        known = start.found if start is not None and start.digits.modes == self.digits.modes else None
-        self.found: Cross = compress_cross(matrix, max_rank, eps, known, rng=np.random.default_rng(seed))
-        self.symmetric = is_symmetric(self.entries, self.digits.rows)
-        if self.symmetric:
-            train = comm.bcast(self.train.symmetric_part(ROUNDING * eps))
-            self.found = replace(self.found, train=train)
-
-    def rounded(self, eps: float, max_rank: int) -> CompressedEntries:
-        """The same matrix with lower rank and accuracy, without evaluating entries."""
-        coarse = copy(self)
-        train = self.train.round(eps, max_rank)
-        left = float((train - self.train).norm() / (self.train.norm() or 1.0))
-        coarse.found = replace(self.found, train=train, error=float(np.hypot(self.error, left)))
-        return coarse
-
-    @property
-    def train(self) -> Train:
-        return self.found.train
-
-    @property
-    def error(self) -> float:
-        return self.found.error
-
-    def product(self, train: Train) -> TrainProduct:
-        """The product with a train, with rows in the order of the Mat."""
-        slots = self.digits.places
-        if self.rows is not None:
-            slots = np.empty_like(slots)
-            slots[self.rows] = self.digits.places
-        return TrainProduct(self.comm, self.counts, slots, self.digits.size, train)
-
-    def words(self) -> str:
-        """Ranks, bytes, compression, error."""
-        size = 8 * self.train.storage
-        return (
-            f"{self.order} order, {len(self.train)} modes, ranks {'-'.join(map(str, self.train.ranks))}, {size} bytes "
-            f"({8 * float(self.digits.rows) ** 2 / size:.3g} times less than dense), error {self.error:.2g} estimated "
-            f"from fresh entries, {self.found.evaluations} entries evaluated"
+        entries = Entries.of(P)
+        digits, rows, order = digits_of(P, order, name, places)
+        counts = np.array(comm.allgather(P.getLocalSize()[0]))
+        matrix = EntryMatrix(entries, digits, rows, comm.bcast)
+        known = start.found if start is not None and start.digits.modes == digits.modes else None
+        found: Cross = compress_cross(matrix, max_rank, eps, known, rng=np.random.default_rng(seed))
+        train, error = found.train, found.error
+        symmetric = is_symmetric(entries, digits.rows)
+        if symmetric:
+            train, left = on_first(comm, lambda: _symmetric(found.train, eps, max_rank))
+            error = float(np.hypot(error, left))
+        origin = f"estimated from fresh entries, {found.evaluations} entries evaluated"
+        super().__init__(
+            comm, counts, digits, rows, order, train, matrix.shift, 1 / matrix.scale, error, symmetric, origin
         )
+        self.found = found
+
+
+def _symmetric(train: Train, eps: float, max_rank: int) -> tuple[Train, float]:
+    """The symmetric part with ranks at most `max_rank`, and what this cap leaves out, relative to the norm."""
+    whole = train.symmetric_part(ROUNDING * eps)
+    return rounded(whole, 0.0, max_rank) if max(whole.ranks) > max_rank else (whole, 0.0)
 
 
 class TensorTrain(Context):
     """The context of a Mat that multiplies with a train; see `from_entries`.
 
     You can also make such a Mat yourself, of type python and ``pctt.mat.TensorTrain``. Then give it the attributes
-    ``entries`` and ``grid`` or ``coordinates`` before ``setUp``.
+    ``entries`` and ``grid`` or ``coordinates`` before ``setUp``. Its options are ``-mat_tt_*``.
+
+    compressed : the matrix, after ``setUp``
+    options : eps and max_rank
     """
 
     without = PETSc.Mat.Type.AIJ
-    compressed: CompressedEntries  #: after ``setUp``
+    compressed: GridTrain
 
     def __init__(self, eps: float = 1e-8, max_rank: int = MAX_RANK) -> None:
-        self.eps, self.max_rank = eps, max_rank
+        self.options = Options(eps, max_rank)
+
+    # -- figures --------------------------------------------------------------------------------------------
+
+    @property
+    def ranks(self) -> tuple[int, ...]:
+        """The ranks r_0, ..., r_d of the train."""
+        return self.compressed.ranks
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the train, which every rank has."""
+        return self.compressed.bytes
+
+    @property
+    def error(self) -> float:
+        """The error relative to ||A - c I||_F; of an inverse X, ||b - A X b|| / ||b|| for a random b."""
+        return self.compressed.error
+
+    @property
+    def residual(self) -> float | None:
+        """Of an inverse: ||I - S X||_F / ||S - I||_F for the train S of the matrix; otherwise None."""
+        return self.compressed.residual
+
+    # -- set-up ---------------------------------------------------------------------------------------------
+
+    def setFromOptions(self, mat: PETSc.Mat) -> None:
+        """Read the options; OptionError for a bad value or a misspelt name. They have no effect after ``setUp``."""
+        self.options = self.options.given_for(mat)
+        if PETSc.Options().hasName("help"):
+            PETSc.Sys.Print("\n".join(Options.help(mat)), comm=mat.comm)
 
     def setUp(self, mat: PETSc.Mat) -> None:
-        self.compressed = CompressedEntries(mat, self.eps, self.max_rank)
-        if self.compressed.error > 10 * self.eps and self.compressed.comm.rank == 0:
-            warnings.warn(
-                f"pctt.mat.TensorTrain: an error of {self.compressed.error:.1e} is left at rank {self.max_rank}, "
-                f"{self.eps:.1e} was asked for",
-                stacklevel=2,
-            )
-        self._product = self.compressed.product(self.compressed.train)
-        self._transposed: TrainProduct | None = None
-        mat.setOption(PETSc.Mat.Option.SYMMETRIC, self.compressed.symmetric)
+        """ValueError on all ranks for bad options, entries or a bad grid. It does nothing if there is a train."""
+        if not hasattr(self, "compressed"):
+            self.options = self.options.given_for(mat)
+            self.options.check(mat.comm.tompi4py())
+            found = CompressedEntries(mat, self.options.eps, self.options.max_rank)
+            if found.error > MISSED * self.options.eps and found.comm.rank == 0:
+                warnings.warn(
+                    f"pctt.mat.TensorTrain: an error of {found.error:.1e} is left at rank {self.options.max_rank}, "
+                    f"{self.options.eps:.1e} was asked for",
+                    stacklevel=2,
+                )
+            self.compressed = found
+        self.take(mat, self.compressed)
+
+    def take(self, mat: PETSc.Mat, matrix: GridTrain) -> None:
+        """Become another matrix; the caller says which entries it has."""
+        old = getattr(self, "_product", None)
+        if old is None or matrix.train is not self.compressed.train:
+            self._product = matrix.product(matrix.train)
+            self._transposed: TrainProduct | None = None
+        self.compressed = matrix
+        mat.setOption(PETSc.Mat.Option.SYMMETRIC, matrix.symmetric)
+
+    # -- products and entries -------------------------------------------------------------------------------
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         self._times(self._product, x, y)
@@ -125,20 +149,172 @@ class TensorTrain(Context):
         with PETSc.Log.Event("TTMult"):
             local = x.array_r
             y.array_w[:] = self.compressed.shift * local + self.compressed.scale * product(local)
+            PETSc.Log.logFlops(product.flops + 3 * len(local))
 
     def getDiagonal(self, mat: PETSc.Mat, diagonal: PETSc.Vec) -> None:
         here = np.arange(*mat.getOwnershipRange())
-        diagonal.array_w[:] = self.compressed.entries.own(here, here)
+        diagonal.array_w[:] = Entries.of(mat).own(here, here)
+
+    # -- arithmetic -----------------------------------------------------------------------------------------
+
+    def scale(self, mat: PETSc.Mat, factor: float) -> None:
+        self._change(mat, self.compressed.scaled(factor), Combination(0.0, ()).plus(0.0, factor, _entries(mat)))
+
+    def shift(self, mat: PETSc.Mat, more: float) -> None:
+        self._change(mat, self.compressed.shifted(more), _entries(mat).plus(more, 0.0, Combination(0.0, ())))
+
+    def zeroEntries(self, mat: PETSc.Mat) -> None:
+        self._change(mat, self.compressed.zero(), Combination(0.0, ()))
+
+    def diagonalScale(self, mat: PETSc.Mat, left: PETSc.Vec | None, right: PETSc.Vec | None) -> None:
+        """ValueError on all ranks for vectors that are not constant, because they would change the ranks."""
+        factor = 1.0
+        for vec in (left, right):
+            if vec:
+                least, largest = vec.min()[1], vec.max()[1]
+                if least != largest:
+                    raise ValueError(
+                        f"pctt.mat.TensorTrain: diagonalScale by a vector with values from {least:g} to {largest:g}; "
+                        "allowed are constant vectors (otherwise scale the function of the entries)"
+                    )
+                factor *= least
+        self.scale(mat, factor)
+
+    def add(self, mat: PETSc.Mat, factor: float, other: PETSc.Mat) -> None:
+        """mat + factor other; see `axpy`."""
+        matrix = compressed(other)
+        if matrix is None:
+            self.shift(mat, factor * _multiple_of_identity(other))
+            return
+        total = self.compressed.plus(factor, matrix, ROUNDING * self.options.eps, self.options.max_rank)
+        self._change(mat, total, _entries(mat).plus(0.0, factor, _entries(other)))
+
+    def _change(self, mat: PETSc.Mat, matrix: GridTrain, entries: Combination) -> None:
+        self.take(mat, matrix)
+        mat.setAttr("entries", entries)
+
+    def norm(self, mat: PETSc.Mat, kind: int) -> float:
+        """The Frobenius norm of the train; ValueError for other norms."""
+        if kind != PETSc.NormType.FROBENIUS:
+            raise ValueError(f"pctt.mat.TensorTrain: a norm of type {kind}; allowed is PETSc.NormType.FROBENIUS")
+        return self.compressed.norm()
+
+    def duplicate(self, mat: PETSc.Mat, what: int) -> PETSc.Mat:
+        """A copy, or without MAT_COPY_VALUES the zero matrix on the same grid."""
+        values = what == COPY_VALUES
+        matrix, entries = (self.compressed, given(mat, "entries")) if values else (self.compressed.zero(), None)
+        other = mat_of(matrix, self.options, entries or Combination(0.0, ()))
+        for name in ("grid", "coordinates"):
+            other.setAttr(name, given(mat, name))
+        return other
+
+    def copy(self, mat: PETSc.Mat, other: PETSc.Mat, structure: int) -> None:
+        """ValueError on all ranks if the other Mat is not a train with the same distribution of rows."""
+        context = _context(other)
+        if context is None or not np.array_equal(context.compressed.counts, self.compressed.counts):
+            raise ValueError(
+                f"pctt.mat.TensorTrain: a copy into a Mat of type {other.getType()}; allowed is a Mat of "
+                "pctt.mat.TensorTrain with the same rows on each rank, for example a duplicate"
+            )
+        context.options = self.options
+        context.take(other, self.compressed)
+        for name in ("entries", "grid", "coordinates"):
+            other.setAttr(name, given(mat, name))
+
+    # -- words ----------------------------------------------------------------------------------------------
 
     def view(self, mat: PETSc.Mat, viewer: PETSc.Viewer | None = None) -> None:
-        if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII and hasattr(self, "compressed"):
+        """ValueError for a viewer that would have to save the train."""
+        if viewer is None or not hasattr(self, "compressed"):
+            return
+        if viewer.getType() == PETSc.Viewer.Type.ASCII:
             viewer.printfASCII(f"  tensor train: {self.compressed.words()}\n")
+        elif viewer.getType() in STORES:
+            raise ValueError(
+                f"pctt.mat.TensorTrain: a viewer of type {viewer.getType()} does not save trains; "
+                "pctt.mat.save(mat, path) does"
+            )
 
 
-def compressed(P: PETSc.Mat) -> CompressedEntries | None:
-    """The compressed entries of P, if P is a Mat of this module; otherwise None."""
-    context = P.getPythonContext() if P.getType() == PETSc.Mat.Type.PYTHON else None
-    return getattr(context, "compressed", None) if isinstance(context, TensorTrain) else None
+STORES = (PETSc.Viewer.Type.BINARY, PETSc.Viewer.Type.HDF5, PETSc.Viewer.Type.VTK, PETSc.Viewer.Type.MATLAB)
+COPY_VALUES = 1  # MAT_COPY_VALUES of PETSc's MatDuplicateOption
+IDENTITY = 1e-14  # a Mat is c I if it turns a random vector by no more than this
+
+
+def _context(mat: PETSc.Mat) -> TensorTrain | None:
+    """The context of a Mat of this module that is set up; otherwise None."""
+    context = mat.getPythonContext() if mat.getType() == PETSc.Mat.Type.PYTHON else None
+    return context if isinstance(context, TensorTrain) and hasattr(context, "compressed") else None
+
+
+def _entries(mat: PETSc.Mat) -> Combination:
+    return Combination.of(given(mat, "entries"))
+
+
+def compressed(P: PETSc.Mat) -> GridTrain | None:
+    """The train of P, if P is a Mat of this module; otherwise None."""
+    context = _context(P)
+    return None if context is None else context.compressed
+
+
+def mat_of(
+    matrix: GridTrain, options: Options, entries: Callable[[Array, Array], Array] | None = None
+) -> PETSc.Mat:
+    """A new Mat for a train; without `entries` those of the train count as exact. Collective."""
+    rows, here = matrix.digits.rows, int(matrix.counts[matrix.comm.rank])
+    context = TensorTrain()
+    context.compressed, context.options = matrix, options
+    mat = PETSc.Mat().create(comm=matrix.comm)
+    mat.setSizes(((here, rows), (here, rows)), matrix.digits.block)
+    mat.setType(PETSc.Mat.Type.PYTHON)
+    mat.setPythonContext(context)
+    mat.setAttr("entries", entries or matrix.entries)
+    if matrix.order == "grid" and matrix.rows is None:
+        mat.setAttr("grid", matrix.digits.shape)
+    mat.setUp()
+    return mat
+
+
+def axpy(Y: PETSc.Mat, factor: float, X: PETSc.Mat) -> None:
+    """Y + factor X in place of Y, for a train Y; X is a train on the same grid, or any Mat that is c I.
+
+    PETSc's own ``Y.axpy`` cannot do this, because it does not ask a Mat of type python. The sum of two trains is
+    rounded to a tenth of eps of Y, with ranks at most its max_rank. ValueError on all ranks for other Mats. Collective.
+
+    >>> A = from_entries(lambda i, j: (i == j) + 0.1 / (1.0 + abs(i - j)), (64,))
+    >>> B = A.duplicate(copy=True)
+    >>> axpy(B, -1.0, A)
+    >>> B.norm() < 1e-8 * A.norm()
+    True
+    """
+    context = _context(Y)
+    if context is None:
+        raise ValueError(f"pctt.mat.axpy: Y is a Mat of type {Y.getType()}; allowed is a Mat of pctt.mat.TensorTrain")
+    if Y == X:
+        context.scale(Y, 1.0 + factor)
+    else:
+        context.add(Y, factor, X)
+    Y.stateIncrease()
+
+
+def _multiple_of_identity(X: PETSc.Mat) -> float:
+    """c, if X is c I. ValueError on all ranks otherwise; collective."""
+    try:
+        diagonal = X.getDiagonal()
+        c, largest = diagonal.min()[1], diagonal.max()[1]
+        v, w = X.createVecs()
+        v.array_w[:] = np.random.default_rng(X.comm.rank).standard_normal(v.getLocalSize())
+        X.mult(v, w)
+        w.axpy(-c, v)
+        multiple = c == largest and w.norm() <= IDENTITY * abs(c) * v.norm()
+    except PETSc.Error:
+        multiple = False
+    if not multiple:
+        raise ValueError(
+            f"pctt.mat.axpy: X is a Mat of type {X.getType()}; allowed is a Mat of pctt.mat.TensorTrain, or a multiple "
+            "of the identity"
+        )
+    return float(c)
 
 
 def from_entries(
@@ -147,6 +323,7 @@ def from_entries(
     eps: float = 1e-8,
     max_rank: int = MAX_RANK,
     comm: MPI.Comm | PETSc.Comm | None = None,
+    prefix: str = "",
 ) -> PETSc.Mat:
     """The matrix A(i, j) = entries(i, j) for the points of a grid, as a Mat that multiplies with a tensor train.
 
@@ -154,19 +331,24 @@ def from_entries(
     grid : (n_1, n_2, ...), the shape of a vector as an array: row i is at numpy.unravel_index(i, grid)
     eps : the compression ends at this error relative to ||A - c I||_F, where c is the mean of the diagonal
     max_rank : largest allowed rank
+    prefix : of the options of the Mat, -PREFIXmat_tt_eps and -PREFIXmat_tt_max_rank, which win over the arguments
 
     The Mat keeps the function as its attribute ``entries``, and the preconditioners of `pctt.pc` use it. Raises
-    EntriesError (a ValueError) on all ranks if entries are not finite numbers, and ValueError for a bad grid.
+    EntriesError (a ValueError) on all ranks if entries are not finite numbers, and ValueError for a bad grid or other
+    bad arguments.
 
     >>> A = from_entries(lambda i, j: (i == j) + 0.1 / (1.0 + abs(i - j)), (64,))
-    >>> A.getPythonContext().compressed.error < 1e-8
+    >>> A.getPythonContext().error < 1e-8
     True
     """
-    shape = tuple(int(n) for n in grid)
-    if not shape or min(shape) < 1:
-        raise ValueError(f"a grid of shape {shape}; allowed are whole numbers >= 1")
-    rows = prod(shape)
     mat = PETSc.Mat().create(comm=comm or PETSc.COMM_WORLD)
+    shape = whole_numbers(grid)
+    wrong = f"a grid of shape {grid!r}; allowed are whole numbers >= 1" if shape is None else ""
+    rows = prod(shape or ())
+    if rows >= MOST:
+        wrong = f"a grid of shape {grid!r} with {rows} points; allowed are fewer than 2^31"
+    refuse(mat.comm.tompi4py(), wrong)
+    mat.setOptionsPrefix(prefix)
     mat.setSizes(((PETSc.DECIDE, rows), (PETSc.DECIDE, rows)))
     mat.setType(PETSc.Mat.Type.PYTHON)
     mat.setPythonContext(TensorTrain(eps, max_rank))

@@ -8,6 +8,7 @@ from mpi4py import MPI
 from numpy.typing import DTypeLike
 from petsc4py import PETSc
 
+from pctt.mat.grid_train import GridTrain
 from pctt.mat.order import Places
 from pctt.mat.tensor_train import CompressedEntries, compressed
 from pctt.pc.positivity import CERTAIN, finds_negative, has_inertia_of
@@ -30,7 +31,7 @@ class EntriesTrain:
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
         self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
-        self.compressed: CompressedEntries | None = None
+        self.compressed: GridTrain | None = None
         self.inverse: Inverse | None = None
 
     def begin(self, places: Places) -> None:
@@ -58,7 +59,7 @@ class EntriesTrain:
                 break  # the rank cannot reach this accuracy, and even less a higher one
         return self._refuse(f"the inverse of rank {rank} is not positive")
 
-    def _compress(self, P: PETSc.Mat, rank: int, eps: float, start: CompressedEntries | None) -> CompressedEntries:
+    def _compress(self, P: PETSc.Mat, rank: int, eps: float, start: GridTrain | None) -> GridTrain:
         known = compressed(P)
         if known is not None and known.error <= eps and self.options.order in ("auto", known.order):
             return known.rounded(0.5 * eps, rank)

@@ -199,9 +199,9 @@ class Train:
         """Transpose of a matrix."""
         return Train([core.transpose(0, 2, 1, 3) for core in self._matrix().cores])
 
-    def symmetric_part(self, eps: float) -> Train:
+    def symmetric_part(self, eps: float, max_rank: int | None = None) -> Train:
         """(T + T') / 2 of a square matrix, rounded to eps. It approximates a symmetric matrix at least as well as T."""
-        return (0.5 * (self + self.T)).round(eps)
+        return (0.5 * (self + self.T)).round(eps, max_rank)
 
     def astype(self, dtype: DTypeLike) -> Train:
         return Train([core.astype(dtype) for core in self.cores])
