@@ -43,6 +43,7 @@ def test_pages_name_studies_that_there_are():
         "table_ranks 1 -every 8 -uncapped",
         "figure_reuse 1 -steps 2 -newton 3",
         "study_ranks 1 -seconds 1",
+        "direct_solver -n 4",
         pytest.param("law_overlaps blade 2 4 2", marks=pytest.mark.slow),
         pytest.param("operators 1", marks=pytest.mark.slow),
         pytest.param("figure_scaling 1 2 -contacts 1000", marks=pytest.mark.slow),

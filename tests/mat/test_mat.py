@@ -411,7 +411,7 @@ def test_the_order_of_the_rows_is_saved(tmp_path):
     mat.setType("python")
     mat.setPythonContext(TensorTrain(EPS))
     mat.setAttr("entries", lambda i, j: kernel(at[i], at[j]))
-    points = np.stack(np.unravel_index(at, (5, 7)), axis=1).astype(float)
+    points = np.stack(np.unravel_index(at, (5, 7)), axis=1) + 0.1 * np.random.default_rng(1).random((35, 2))
     share = [35 // mat.comm.size + (r < 35 % mat.comm.size) for r in range(mat.comm.size)]
     first = sum(share[: mat.comm.rank])
     mat.setAttr("coordinates", points[first : first + share[mat.comm.rank]])
