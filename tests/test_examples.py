@@ -12,11 +12,9 @@ import pytest
 from mpi4py import MPI
 
 from dem.experiment import from_file
-from dem.impulses import ImpulseMemory
 from dem.scene import Scene
-from dem.start import new_world
 from pctt.run.options import read_options
-from pctt.run.stepper import Stepper
+from pctt.simulation import Simulation
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
@@ -36,11 +34,8 @@ def run(name: str, steps: int, **options: str) -> tuple[object, dict[str, np.nda
     """The scene of an example and the records of its first steps."""
     words = {"scene": str(EXAMPLES / f"{name}.py"), "ccp_type": "apgd", **options}
     given = read_options(words, MPI.COMM_SELF)
-    stepper = Stepper(given, new_world(given.scene.build(), MPI.COMM_SELF), ImpulseMemory(MPI.COMM_SELF))
-    rows = []
-    for _ in range(steps):
-        stepper.step()
-        rows.append(stepper.records())
+    with Simulation(given.scene, given.settings, comm=MPI.COMM_SELF) as sim:
+        rows = [sim.step() for _ in range(steps)]
     return given.scene, {column: np.array([row[column] for row in rows]) for column in rows[0]}
 
 

@@ -26,7 +26,7 @@ from pctt.run.dump import dump_steps
 from pctt.run.hdf5 import refuse_serial
 from pctt.run.leftovers import OF_SOLVERS, refuse_misspelt
 from pctt.run.place import refusal
-from pctt.run.settings import DEMO, Options, Run, find_scene
+from pctt.run.settings import DEMO, Options, Run, Settings, find_scene, obeys_coulomb
 
 #: Options of simulations, beside those of the scene.
 OF_STEPS = {
@@ -53,22 +53,20 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     for name in known:
         PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
     limits = read(ccp.Limits, database, "ccp_")
-    obeys_coulomb = _obeys_coulomb(run, limits)
-    _refuse_without_effect(database, run, obeys_coulomb)
+    # a file of -problem is solved as a plain cone problem by default
+    coulomb = bool(run.ccp_coulomb) if run.problem else obeys_coulomb(run.ccp_coulomb, run.ccp_type, limits.tol)
+    _refuse_without_effect(database, run, coulomb)
     what = f"options of the scene {scene_class.__name__}"
-    scene, dt, delta = together(comm, what, lambda: _read_scene(run.scene, scene_class, database), own=(OptionError,))
+    scene = together(comm, what, lambda: _read_scene(run.scene, scene_class, database), own=(OptionError,))
     if "settle_delta" not in database:
         run = dataclasses.replace(run, settle_delta=scene.settle_delta)
-    options = Options(
-        run,
-        scene,
-        run.dt if run.dt is not None else dt,
-        run.delta if run.delta is not None else delta,
-        limits,
+    settings = Settings(
+        run.dt, run.delta, run.ccp_type, limits.tol, limits.max_it, limits.closing_work,
         read(solver.options, database, solver.prefix),
-        read(ccp.Coulomb, database, "ccp_coulomb_") if obeys_coulomb else None,
-        demo,
-    )
+        coulomb and read(ccp.Coulomb, database, "ccp_coulomb_"),
+        run.ccp_newton, run.recovery_speed, run.ccp_compliance, run.ccp_operator,
+    )  # fmt: skip
+    options = Options(run, scene, settings.of(scene), demo)
     compare = ccp.Comparison(comm, options.compare_names())  # refuses unknown names
     _refuse_tolerances(database)  # newer releases of PETSc refuse them too, in other words
     if solver.newton and not run.settle:
@@ -84,11 +82,8 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     return options
 
 
-def _read_scene(
-    name: str, scene_class: type[Experiment], database: Mapping[str, str]
-) -> tuple[Experiment, float, float]:
-    """The scene with the options of the database, its time step and its contact distance. OptionError if the scene
-    refuses an option, or has bad ones of its own."""
+def _read_scene(name: str, scene_class: type[Experiment], database: Mapping[str, str]) -> Experiment:
+    """The scene with the options of the database. OptionError if it refuses one, or has bad numbers of its own."""
     try:
         scene = read(scene_class, database, "scene_")
     except OptionError:
@@ -98,7 +93,7 @@ def _read_scene(
             raise
         raise OptionError(f"-scene_{error}") from None
     _refuse_bad_numerics(name, scene)
-    return scene, scene.dt, scene.delta
+    return scene
 
 
 def _refuse_bad_numerics(name: str, scene: Experiment) -> None:
@@ -126,14 +121,7 @@ def option_groups(scene: type[Experiment]) -> list[tuple[type, str]]:
     return [(Run, ""), (scene, "scene_"), *laws, *solvers]
 
 
-def _obeys_coulomb(run: Run, limits: ccp.Limits) -> bool:
-    """Whether the steps obey Coulomb's law. A file of ``-problem`` is solved as a plain cone problem by default."""
-    if run.ccp_coulomb is not None:
-        return run.ccp_coulomb
-    return not run.problem and limits.tol >= ccp.SOLVERS[run.ccp_type].law_tol
-
-
-def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb: bool) -> None:
+def _refuse_without_effect(database: Mapping[str, str], run: Run, coulomb: bool) -> None:
     """OptionError for the first option that means nothing beside the others."""
     solver = ccp.SOLVERS[run.ccp_type]
     newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
@@ -162,7 +150,7 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb:
         (True, strangers("compare_", compared) - {"compare_every"}, (), not_compared),
         (True, strangers("fallback_", ladder), (), f"no such fallback; there are {', '.join(LADDER)}"),
         (True, set(), of_others, f"belongs to another -ccp_type than {run.ccp_type}"),
-        (not obeys_coulomb, set(), ("ccp_coulomb_",), "allowed with -ccp_coulomb only"),
+        (not coulomb, set(), ("ccp_coulomb_",), "allowed with -ccp_coulomb only"),
     ]
     for applies, names, starts, reason in rules:
         for name, value in database.items():
@@ -211,9 +199,9 @@ def _refuse_places(run: Run, comm: MPI.Comm) -> None:
     _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
     _refuse_missing("-problem", run.problem, comm)
     if not run.settle:
-        _refuse_unwritable("-output", Path(run.output), comm)
+        refuse_unwritable("-output", Path(run.output), comm)
         if run.dump_problem:
-            _refuse_unwritable("-dump_problem", Path(run.dump_problem), comm)
+            refuse_unwritable("-dump_problem", Path(run.dump_problem), comm)
         _refuse_occupied(run, comm)
 
 
@@ -223,7 +211,8 @@ def _refuse_missing(name: str, path: str, comm: MPI.Comm) -> None:
         raise OptionError(f"{name} {path}: no such file, or not readable")
 
 
-def _refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
+def refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
+    """Make a folder; OptionError for the option ``name`` if files cannot be written there; collective."""
     error = None
     if comm.rank == 0:
         try:

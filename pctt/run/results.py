@@ -25,10 +25,9 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
-from dem.contact import Contacts
 from dem.exchange import exchange
 from dem.shapes import described
-from dem.system import ContactSystem
+from dem.step import Step
 from dem.world import World
 from pctt import disk, figures_json
 from pctt.run import totals
@@ -82,15 +81,13 @@ class Results:
     def checkpoint(self) -> Path:
         return self.place.now / "checkpoint.h5"
 
-    def record_step(
-        self, world: World, contacts: Contacts, system: ContactSystem, impulse: np.ndarray, row: dict[str, float]
-    ) -> None:
+    def record_step(self, step: Step, row: dict[str, float]) -> None:
         """Write the state at the end of a step, the contacts and impulses that led to it, and the row of its records
         as attributes of the group `record`; collective.
 
         Bodies are in the order of their ids (grains, then large bodies).
         """
-        frames = self.place.now / "frames"
+        world, contacts, frames = step.world, step.contacts, self.place.now / "frames"
         if self._first_frame is None:
             self.place.make("frames")
             with written(frames / "bodies.h5", self.comm) as file:
@@ -104,10 +101,10 @@ class Results:
             file.rows("contact/key", contacts.key)
             file.rows("contact/body", np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1))
             file.rows("contact/point", contacts.point)
-            file.rows("contact/frame", system.frame)
+            file.rows("contact/frame", step.system.frame)
             file.rows("contact/gap", contacts.gap)
-            file.rows("contact/impulse", impulse)
-            file.attributes("contact", {"dt": system.dt})
+            file.rows("contact/impulse", step.impulse)
+            file.attributes("contact", {"dt": step.system.dt})
         self._unlinked += 1
         if self._unlinked >= LAG * self._links:
             self.link(world)
@@ -200,12 +197,17 @@ def _write_constants(file: RowWriter, world: World) -> None:
     """Write the data that are the same in all steps: columns of the table of bodies, the names of the materials, and
     the shapes of the large bodies as JSON."""
     _write_by_id(file, world, ("shape", "size", "mass", "material"))
+    file.texts("materials", world.materials)
+    file.whole("large", np.bytes_(json.dumps(described_bodies(world))))
+
+
+def described_bodies(world: World) -> list[dict[str, Any]]:
+    """The names and shapes of the large bodies, as JSON has them."""
     large = [
         {"name": body.name, "shapes": [described(shape) for shape in body.shapes]}
         for body in world.large_bodies
     ]
-    file.texts("materials", world.materials)
-    file.whole("large", np.bytes_(json.dumps(large, default=list)))  # arrays as lists
+    return json.loads(json.dumps(large, default=list))  # arrays as lists
 
 
 def _write_by_id(file: RowWriter, world: World, names: Sequence[str]) -> None:
