@@ -37,11 +37,13 @@ def changed(motion: Motion, time: float, **values: Any) -> Motion:
     return after
 
 
-def set_motion(world: World, name: str, motion: Motion) -> None:
-    """Give a large body another motion, which it begins where it is now. ValueError for one that it cannot have: if
-    forces move the body, they go on doing so along the same line or about the same axis; else they cannot begin to."""
+def set_motion(world: World, name: str, motion: Motion | None = None, **values: Any) -> None:
+    """Give a large body another motion, or its own one with other `values` as of `changed`; it begins where it is now.
+    ValueError for one that it cannot have: if forces move the body, they go on doing so along the same line or about
+    the same axis; else they cannot begin to."""
     row = world.large_row(name)
     body = world.large_bodies[row]
+    motion = changed(body.motion, world.time, **values) if motion is None else motion
     pose = body.position, body.quaternion
     if isinstance(body.motion, Dynamic) or isinstance(motion, Dynamic):
         if type(motion) is not type(body.motion) or not np.allclose(_kept(motion), _kept(body.motion), atol=1e-12):

@@ -8,20 +8,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pctt.run.settings import Settings as Settings
+    from pctt.simulation import Settings as Settings
     from pctt.simulation import Simulation as Simulation
 
 __version__ = "0.2.0"
 
 
 def __getattr__(name: str) -> Any:
-    """`Simulation` and `Settings` at their first use: they start PETSc, which ``petsc4py.init`` may be to do before."""
-    if name == "Simulation":
-        from pctt.simulation import Simulation
+    """`Simulation` and `Settings`, at first use: they start PETSc, and ``petsc4py.init`` may have to come before."""
+    if name not in ("Simulation", "Settings"):
+        raise AttributeError(f"module 'pctt' has no attribute {name!r}")
+    from pctt import simulation
 
-        return Simulation
-    if name == "Settings":
-        from pctt.run.settings import Settings
-
-        return Settings
-    raise AttributeError(f"module 'pctt' has no attribute {name!r}")
+    return getattr(simulation, name)

@@ -15,7 +15,6 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Callable, Collection
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,7 +28,7 @@ from dem.bodies import Bodies
 from dem.experiment import Experiment, Given
 from dem.impulses import ImpulseMemory
 from dem.motion import Motion
-from dem.scene import Scene
+from dem.scene import LargeBody, Scene
 from dem.step import Step
 from dem.together import meet, together
 from pctt import ccp, log
@@ -40,9 +39,8 @@ from pctt.run import checkpoint, report
 from pctt.run.dump import Dump
 from pctt.run.hdf5 import refuse_serial
 from pctt.run.options import refuse_unwritable
-from pctt.run.output import Output
 from pctt.run.place import Place
-from pctt.run.results import described_bodies
+from pctt.run.results import Results, described_bodies
 from pctt.run.settings import Settings, scene_name
 from pctt.run.settling import Settling, built, settled_state, world_at_start
 from pctt.run.stepper import Stepper
@@ -63,7 +61,7 @@ class Simulation:
     last : the last step, a `dem.step.Step` with this rank's contacts and impulses; None before the first
     figures : of the last step, as in steps.jsonl and records.csv: ``iterations``, ``natural_residual``, ``converged``,
         ``seconds``, ``phases``, ``kinetic_energy [J]``, ``worst_overlap [m]`` and so on; empty before the first
-    output : the `Output` of `write`; None before
+    output : the files of `write`, a `pctt.run.results.Results`; None before
     """
 
     def __init__(
@@ -104,7 +102,8 @@ class Simulation:
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
         self.last: Step | None = None
         self.figures: dict[str, Any] = {}
-        self.output: Output | None = None
+        self.output: Results | None = None
+        self._closed = False
 
     @classmethod
     def load(cls, path: str | Path, scene: Scene | Experiment, *given: Any, **more: Any) -> Simulation:
@@ -132,6 +131,8 @@ class Simulation:
         return self._step(last=False)
 
     def _step(self, last: bool) -> dict[str, Any]:
+        if self._closed:
+            raise ValueError("this simulation is closed")
         stepper, output, self.last = self.stepper, self.output, None  # frees the arrays of the last step
         figures = stepper.step()
         self.last = Step(self.world, stepper.contacts, stepper.system, stepper.impulse)
@@ -262,7 +263,7 @@ class Simulation:
     @property
     def _last(self) -> Step:
         if self.last is None:
-            raise ValueError("no step was made, so there are no contacts and forces")
+            raise ValueError("there are no contacts and forces yet: no step was made, or the last one failed")
         return self.last
 
     # -- files -----------------------------------------------------------------------------------------------
@@ -300,7 +301,7 @@ class Simulation:
             if path:
                 refuse_unwritable(name, Path(path), self.comm)
         place = Place(Path(folder), self.comm, self._restart, overwrite)
-        self.output = Output(place, self.world, self.memory, self._origin, self._compare, every, checkpoint_every)
+        self.output = Results(place, self.world, self.memory, self._origin, self._compare, every, checkpoint_every)
         self.stepper.dump = Dump(
             self.settings, self.experiment, self.world, place, _check("hard", hard, COUNT), str(problems), problem_steps
         )
@@ -319,12 +320,14 @@ class Simulation:
     def close(self) -> None:
         """Complete and analyse the folder of `write`, leave it to others, and free the solver. The state can still be
         looked at. A simulation in a ``with`` block is closed at its end."""
-        self.complete()
-        if self.output and self.last and not self.output.analysed:
-            self.analyse()
+        if self.output and self.last and not self._closed:
+            self.complete()
+            if not self.output.analysed:
+                self.analyse()
         self._free()
 
     def _free(self) -> None:
+        self._closed = True
         self.stepper.destroy()
         if self.output:
             self.output.place.leave()
@@ -340,8 +343,8 @@ class Simulation:
 
     def _repr_html_(self) -> str:
         """The figures of the last step as a table, for notebooks."""
-        shown = {name: value for name, value in self.figures.items() if isinstance(value, (int, float, str)) and value}
-        texts = [(name, f"{value:.6g}" if isinstance(value, float) else str(value)) for name, value in shown.items()]
+        shown = [(name, value) for name, value in self.figures.items() if isinstance(value, (int, float, str))]
+        texts = [(name, f"{value:.6g}" if isinstance(value, float) else str(value)) for name, value in shown]
         rows = "".join(f"<tr><th>{html.escape(name)}</th><td>{html.escape(text)}</td></tr>" for name, text in texts)
         return f"<p>{html.escape(repr(self)[1:-1])}</p><table>{rows}</table>"
 
@@ -378,7 +381,11 @@ class Body:
 
     @property
     def name(self) -> str:
-        return self._sim.world.large_bodies[self._row].name
+        return self._large.name
+
+    @property
+    def _large(self) -> LargeBody:
+        return self._sim.world.large_bodies[self._row]
 
     @property
     def position(self) -> Floats:
@@ -414,11 +421,14 @@ class Body:
 
     @motion.setter
     def motion(self, motion: Motion) -> None:
-        world, comm = self._sim.world, self._sim.comm
-        meet(comm, f"motion of {self.name!r}")
-        motion = comm.bcast(motion)
-        what = f"motion of the body {self.name}"
-        together(comm, what, lambda: control.set_motion(world, self.name, motion), own=(ValueError, TypeError))
+        self._move(motion)
+
+    def _move(self, motion: Motion | None, **values: Any) -> None:
+        """Set the motion, or these parameters of the present one, as the first rank says."""
+        world, comm, what = self._sim.world, self._sim.comm, f"motion of the body {self.name}"
+        meet(comm, what)
+        motion, values = comm.bcast((motion, values))
+        together(comm, what, lambda: control.set_motion(world, self.name, motion, **values), own=(ValueError, TypeError))
 
 
 class BodyMotion:
@@ -427,23 +437,14 @@ class BodyMotion:
     def __init__(self, body: Body):
         object.__setattr__(self, "_body", body)
 
-    @property
-    def _motion(self) -> Motion:
-        return self._body._sim.world.large_bodies[self._body._row].motion
-
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._motion, name)
+        return getattr(self._body._large.motion, name)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        sim = self._body._sim
-        meet(sim.comm, f"motion of {self._body.name!r}")
-        value = sim.comm.bcast(value)
-        what = f"motion of the body {self._body.name}"
-        change = partial(control.changed, self._motion, sim.time, **{name: value})
-        self._body.motion = together(sim.comm, what, change, own=(ValueError, TypeError))
+        self._body._move(None, **{name: value})
 
     def __repr__(self) -> str:
-        return repr(self._motion)
+        return repr(self._body._large.motion)
 
 
 def _check(name: str, value: Any, check: tuple[str, Callable[[Any], bool]]) -> int:

@@ -20,7 +20,7 @@ from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.users_solver import LADDER
 from pctt.contact_map import is_free
 from pctt.ksp_options import entered, to_enter
-from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read, refuse_unknown
+from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, made, read, refuse_unknown
 from pctt.petsc import own_errors
 from pctt.run.dump import dump_steps
 from pctt.run.hdf5 import refuse_serial
@@ -60,13 +60,15 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     scene = together(comm, what, lambda: _read_scene(run.scene, scene_class, database), own=(OptionError,))
     if "settle_delta" not in database:
         run = dataclasses.replace(run, settle_delta=scene.settle_delta)
-    settings = Settings(
-        run.dt, run.delta, run.ccp_type, limits.tol, limits.max_it, limits.closing_work,
-        read(solver.options, database, solver.prefix),
-        coulomb and read(ccp.Coulomb, database, "ccp_coulomb_"),
-        run.ccp_newton, run.recovery_speed, run.ccp_compliance, run.ccp_operator,
-    )  # fmt: skip
-    options = Options(run, scene, settings.of(scene), demo)
+    given = {
+        **{name: getattr(run, name) for name in ("dt", "delta", "recovery_speed")},
+        **{name: getattr(run, f"ccp_{name}") for name in ("newton", "compliance", "operator")},
+        **vars(limits),
+        "solver": run.ccp_type,
+        "options": read(solver.options, database, solver.prefix),
+        "coulomb": coulomb and read(ccp.Coulomb, database, "ccp_coulomb_"),
+    }
+    options = Options(run, scene, made(Settings, given).of(scene), demo)
     compare = ccp.Comparison(comm, options.compare_names())  # refuses unknown names
     _refuse_tolerances(database)  # newer releases of PETSc refuse them too, in other words
     if solver.newton and not run.settle:

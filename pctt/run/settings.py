@@ -123,8 +123,8 @@ def _as(group: type, name: str, *default: Any) -> Any:
 class Settings:
     """How a simulation makes its steps. The program's options of the same meaning are in parentheses."""
 
-    dt: Any = _as(Run, "dt")  #: time step; None: the scene's own [s] (``-dt``)
-    delta: Any = _as(Run, "delta")  #: gap below which a pair is a contact; None: the scene's own [m] (``-delta``)
+    dt: float = _as(Run, "dt")  #: time step; None: the scene's own [s] (``-dt``)
+    delta: float = _as(Run, "delta")  #: gap below which a pair is a contact; None: the scene's own [m] (``-delta``)
     solver: str = _as(Run, "ccp_type", "auto")  #: method of ``pctt.ccp.SOLVERS`` (``-ccp_type``, with another default)
     tol: float = _as(ccp.Limits, "tol")  #: residual at which a step counts as solved (``-ccp_tol``)
     max_it: int = _as(ccp.Limits, "max_it")  #: iterations before the solver gives up; -1: its own (``-ccp_max_it``)
@@ -153,11 +153,15 @@ class Settings:
         if not isinstance(options, kind):
             raise OptionError(f"options {options!r}: allowed for {self.solver} is a dict or a {kind.__name__}")
         refuse_bad(options)
+        if not isinstance(coulomb, (bool, ccp.Coulomb, type(None))):
+            raise OptionError(f"coulomb {coulomb!r}: allowed is true, false or a Coulomb")
         if not isinstance(coulomb, ccp.Coulomb):
             coulomb = obeys_coulomb(coulomb, self.solver, self.tol) and ccp.Coulomb()
         refuse_bad(coulomb or ccp.Coulomb())
         dt, delta = (scene.dt if self.dt is None else self.dt, scene.delta if self.delta is None else self.delta)
-        return dataclasses.replace(self, dt=dt, delta=delta, options=options, coulomb=coulomb)
+        whole = dataclasses.replace(self, dt=dt, delta=delta, options=options, coulomb=coulomb)
+        refuse_bad(whole)
+        return whole
 
 
 def obeys_coulomb(asked: bool | None, solver: str, tol: float) -> bool:

@@ -53,7 +53,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     sim.run(steps=options.run.steps, call=say, stop=lambda sim: interrupt.asked(sim.comm))
     assert sim.output is not None
     if sim.steps < end:
-        raise interrupt.InterruptError(_how_to_go_on(options, sim.steps, sim.output.results.checkpoint, end))
+        raise interrupt.InterruptError(_how_to_go_on(options, sim.steps, sim.output.checkpoint, end))
     if sim.last:
         _say_end(options, sim, progress)
     if compare.names:
@@ -78,7 +78,7 @@ def _say_start(options: Options, sim: Simulation, compares: bool, progress: repo
 def _say_end(options: Options, sim: Simulation, progress: report.Progress) -> None:
     """What the steps have taken and shown."""
     assert sim.output is not None
-    figures, results = sim.analyse(), sim.output.results
+    figures, results = sim.analyse(), sim.output
     if sim.comm.rank == 0:
         lines = [line for line in results.steps() if line["step"] > sim.steps - options.run.steps]
         progress.say("\n" + report.phase_table(lines))
