@@ -15,6 +15,7 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -428,7 +429,8 @@ class Body:
         world, comm, what = self._sim.world, self._sim.comm, f"motion of the body {self.name}"
         meet(comm, what)
         motion, values = comm.bcast((motion, values))
-        together(comm, what, lambda: control.set_motion(world, self.name, motion, **values), own=(ValueError, TypeError))
+        change = partial(control.set_motion, world, self.name, motion, **values)
+        together(comm, what, change, own=(ValueError, TypeError))
 
 
 class BodyMotion:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
+import json
 import re
 import sys
 from pathlib import Path
 
+import notebook as notebooks
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -106,6 +108,31 @@ def test_the_bucket_is_a_scene_with_a_tool_from_a_file(tmp_path, monkeypatch):
     assert [body.name for body in scene.large_bodies] == ["tray", "bucket"]
     _, records = run("bucket", 2, scene_file=str(tmp_path / "bucket.stl"))
     assert records["lifted [kg]"].tolist() == [0.0, 0.0]
+
+
+def test_the_accelerations_of_the_sweep_are_those_of_theory():
+    """The relaxation lifts the box off the slope in the first step, which it then loses."""
+    rows = importlib.import_module("sweep").main()
+    assert len(rows) == 8
+    for friction, law, value, theory in rows:
+        assert value == pytest.approx(theory, abs=1e-6 if law == "Coulomb" or friction in (0.0, 0.6) else 0.01)
+
+
+def test_the_notebook_runs_and_shows_what_its_file_has(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = EXAMPLES / "simulation.ipynb"
+    pictures = importlib.util.find_spec("vtkmodules") and importlib.util.find_spec("PIL")
+    notebook, names = notebooks.run(path, skipped=() if pictures else ("pictures",))
+    stored = json.loads(path.read_text())
+    for here, there in zip(notebook["cells"], stored["cells"]):
+        assert here["source"] == there["source"]
+        outputs = [cell.get("outputs", []) for cell in (here, there)]
+        one, two = ([(output["output_type"], sorted(output.get("data", {}))) for output in each] for each in outputs)
+        assert one == two
+    assert names["run"].output.analysed
+    assert abs(names["stirrer"].velocity[5]) < 0.2  # the servo stands still
+    assert names["means"][2.0] > names["means"][8.0]  # the bed resists
+    assert path.stat().st_size < PICTURE_BYTES
 
 
 def test_poisson(tmp_path, capsys):
