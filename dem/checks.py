@@ -55,12 +55,12 @@ def finite_vector(name: str, values: Sequence[float]) -> tuple[float, ...]:
 
 
 def unit_vector(name: str, values: Sequence[float]) -> tuple[float, ...]:
-    """Three finite numbers, not all zero, scaled to unit length."""
+    """Three finite numbers, not all zero, scaled to unit length. A vector of that length, to rounding, comes back."""
     vector = np.array(finite_vector(name, values))
     length = np.linalg.norm(vector)
     if length == 0.0:
         raise ValueError(f"{name} is the zero vector")
-    return tuple((vector / length).tolist())
+    return tuple((vector / (1.0 if abs(length - 1.0) < 1e-15 else length)).tolist())
 
 
 def unit_quaternions(name: str, values: ArrayLike, count: int) -> Floats:

@@ -33,7 +33,7 @@ from dem import checks
 from dem.arrays import Floats
 from dem.scene import Scene
 from dem.step import Step
-from dem.together import told
+from dem.together import SCENE_FILE, told
 
 #: Types that an option can have.
 KINDS = (int, float, bool, str)
@@ -96,6 +96,13 @@ class Experiment:
         return {}
 
 
+class Given(Experiment):
+    """A scene that is built already."""
+
+    def __init__(self, scene: Scene):
+        self.build = lambda: scene  # type: ignore[method-assign]
+
+
 class SceneFileError(ValueError):
     """A file that holds no scene, or more than one."""
 
@@ -108,7 +115,7 @@ def from_file(path: Path) -> type[Experiment]:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no text"
         raise SceneFileError(f"cannot be read ({reason})") from None
-    name = f"scene_file_{path.stem}"  # by which `together` knows the code of a scene
+    name = f"{SCENE_FILE}{path.stem}"
     module = ModuleType(name)
     module.__file__ = str(path.absolute())
     sys.modules[name] = module  # dataclasses and type hints look their module up

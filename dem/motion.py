@@ -114,7 +114,7 @@ class Rotation:
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """As of `Fixed`."""
-        turn = quaternion.exponential(_gone(time, self.start, self.end) * np.array(self.velocity))
+        turn = quaternion.exponential(time_gone(time, self.start, self.end) * np.array(self.velocity))
         center = np.array(self.center)
         turned = quaternion.normalized(quaternion.multiply(turn, orientation))
         return center + quaternion.rotate(turn, position - center), turned
@@ -140,7 +140,7 @@ class Oscillation:
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """As of `Fixed`."""
-        angle = 2.0 * np.pi * _gone(time, self.start, self.end) / self.period
+        angle = 2.0 * np.pi * time_gone(time, self.start, self.end) / self.period
         swing = np.sin(angle + self.phase) - np.sin(self.phase)
         return position + self.amplitude * swing * np.array(self.direction), orientation
 
@@ -159,7 +159,7 @@ class Glide:
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """As of `Fixed`."""
-        return position + _gone(time, self.start, self.end) * np.array(self.velocity), orientation
+        return position + time_gone(time, self.start, self.end) * np.array(self.velocity), orientation
 
 
 @dataclass(frozen=True)
@@ -233,14 +233,14 @@ def mean_velocity(
     return np.concatenate([(end - start) / dt, turning])
 
 
-def _gone(time: float, start: float, end: float) -> float:
+def time_gone(time: float, start: float, end: float) -> float:
     """How much of the time between start and end has gone by [s]."""
     return max(min(time, end) - start, 0.0)
 
 
 def _driven(body: Guided | Hinged, strength: float, time: float, dt: float, lack: float) -> float:
     """The mean force or torque of a drive of this strength from `time` to `time + dt` [s]; of a servo what lacks."""
-    share = (_gone(time + dt, body.start, body.end) - _gone(time, body.start, body.end)) / dt
+    share = (time_gone(time + dt, body.start, body.end) - time_gone(time, body.start, body.end)) / dt
     most = strength * share
     return most if body.speed is None else min(max(lack, -most), most)
 

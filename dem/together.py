@@ -17,7 +17,8 @@ from mpi4py import MPI
 Result = TypeVar("Result")
 
 #: What the names of modules begin with that hold scenes: those of files, and those of the package.
-SCENE_MODULES = ("scene_file_", "dem.scenes.")
+SCENE_FILE = "scene_file_"
+SCENE_MODULES = (SCENE_FILE, "dem.scenes.")
 
 
 class SceneError(RuntimeError):

@@ -36,6 +36,8 @@ class World:
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
     only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
 
+    changed: set[str] = field(init=False, default_factory=set)  #: large bodies with another motion than the scene gave
+
     #: By time and dt [s] the mean velocities of prescribed motions, by row; of the last question alone.
     _followed: dict[tuple[float, float], dict[int, Floats]] = field(init=False, repr=False, default_factory=dict)
 
@@ -72,6 +74,13 @@ class World:
         if name not in names:
             raise KeyError(f"no large body {name!r}; there are: {', '.join(names) or 'none'}")
         return names.index(name)
+
+    def replace_large(self, body: LargeBody) -> None:
+        """Put this large body in the place of that of its name; the same on all ranks."""
+        row = self.large_row(body.name)
+        self.large_bodies = (*self.large_bodies[:row], body, *self.large_bodies[row + 1 :])
+        self.changed.add(body.name)
+        self._followed.clear()
 
     def large_velocity(self, velocity: Floats) -> Floats:
         """Those (large, 6) of the large bodies, on all ranks, of the velocities (owned, 6) of the bodies whose rows

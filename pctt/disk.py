@@ -68,6 +68,9 @@ class Lock:
                 self._path.unlink()
         self._close()
 
+    def __del__(self) -> None:
+        self._close()
+
     def _close(self) -> None:
         if self._file >= 0:
             os.close(self._file)

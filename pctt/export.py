@@ -159,8 +159,8 @@ def contacts(folder: Folder, frame: Frame) -> Any:
     from pctt.look import surfaces
 
     contact = frame.contacts
-    ends = frame.position[contact.body]
-    far = contact.body >= folder.grains
+    ends = frame.position[contact.bodies]
+    far = contact.bodies >= folder.grains
     ends[far] = np.repeat(contact.point[:, None], 2, axis=1)[far]
     data = surfaces.polydata(ends.reshape(-1, 3), "lines", 2 * np.arange(1, len(ends) + 1))
     size = np.linalg.norm(contact.force, axis=1)
@@ -170,7 +170,7 @@ def contacts(folder: Folder, frame: Frame) -> Any:
         "force": size,
         "gap": contact.gap,
         "point": contact.point,
-        "bodies": contact.body,
+        "bodies": contact.bodies,
     }
     surfaces.add_arrays(data.GetCellData(), columns)
     surfaces.add_arrays(data.GetPointData(), {"force": np.repeat(size, 2)})  # tubes take their width from points

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import numbers
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
@@ -88,22 +89,61 @@ def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "
 
 def _value(name: str, text: str | None, kind: Any, metadata: Mapping[str, Any]) -> Any:
     text = text or ""  # the database has None for an option without a value
-    choices, check = metadata.get("choices"), metadata.get("check")
-    inner = [k for k in typing.get_args(kind) if k is not type(None)]  # the X of Optional[X]
-    kind = inner[0] if inner else kind
-    kinds = {int: "a whole number", float: "a number", bool: "true or false"}
-    allowed = check[0] if check else kinds.get(kind)
+    kind = _kind(kind)
     try:
         value = _truth(text) if kind is bool else kind(text)
     except ValueError:
-        raise OptionError(f"-{name} {text}: allowed is {allowed}") from None
-    if choices and value not in choices:
-        raise OptionError(f"-{name} {text}: allowed is one of {', '.join(choices)}{nearest(text, choices)}")
-    if kind is float and not math.isfinite(value) and not check:
-        raise OptionError(f"-{name} {text}: allowed is a finite number")
-    if check and not check[1](value):
-        raise OptionError(f"-{name} {text}: allowed is {allowed}")
+        raise OptionError(f"-{name} {text}: allowed is {_allowed(kind, metadata)}") from None
+    _refuse(f"-{name} {text}", value, kind, metadata)
     return value
+
+
+def made(group: type[Group], values: Mapping[str, Any]) -> Group:
+    """A group with these values of fields, of the right types or not; OptionError for a name that it does not have."""
+    known = [f.name for f in dataclasses.fields(group)]  # type: ignore[arg-type]
+    for name in values:
+        if name not in known:
+            raise OptionError(f"{name}: no such setting; allowed are {', '.join(known)}{nearest(name, known)}")
+    return group(**values)
+
+
+def refuse_bad(group: Any) -> None:
+    """OptionError for a value of a group, made in Python, that `read` would refuse, or that has another type."""
+    kinds = typing.get_type_hints(type(group))
+    for f in dataclasses.fields(group):
+        value, kind = getattr(group, f.name), _kind(kinds[f.name])
+        if value is f.default or kind not in _TYPES:
+            continue
+        if not isinstance(value, _TYPES[kind]):
+            raise OptionError(f"{f.name} {value!r}: allowed is {_allowed(kind, f.metadata)}")
+        _refuse(f"{f.name} {value}", value, kind, f.metadata)
+
+
+#: What an option of each type may be in Python.
+_TYPES: dict[Any, type] = {int: numbers.Integral, float: numbers.Real, bool: bool, str: str}
+
+
+def _kind(hint: Any) -> Any:
+    """The X of Optional[X], or of any other X."""
+    inner = [kind for kind in typing.get_args(hint) if kind is not type(None)]
+    return inner[0] if inner else hint
+
+
+def _allowed(kind: Any, metadata: Mapping[str, Any]) -> str:
+    check, choices = metadata.get("check"), metadata.get("choices")
+    kinds = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
+    return f"one of {', '.join(choices)}" if choices else check[0] if check else kinds[kind]
+
+
+def _refuse(given: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> None:
+    """OptionError for a value of the right type that is none of the choices or fails the check."""
+    choices, check = metadata.get("choices"), metadata.get("check")
+    if choices and value not in choices:
+        raise OptionError(f"{given}: allowed is {_allowed(kind, metadata)}{nearest(value, choices)}")
+    if kind is float and not math.isfinite(value) and not check:
+        raise OptionError(f"{given}: allowed is a finite number")
+    if check and not check[1](value):
+        raise OptionError(f"{given}: allowed is {check[0]}")
 
 
 def _truth(text: str) -> bool:

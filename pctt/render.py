@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping, Sequence
 from functools import partial
 from math import isfinite
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
 from pctt.look.folder import Folder, Frame
+from pctt.look.picture import Picture
 from pctt.look.program import add_steps, chosen, made_folder, parser, positive, run, whole
+from pctt.options import OptionError, made, refuse_bad
+
+if TYPE_CHECKING:
+    from pctt.look.stage import Paint
 
 SAMPLE = 12  # frames that decide the camera and the range of the colours
 FILMS = ("mp4", "gif", "none")
@@ -76,16 +83,13 @@ def main(comm: MPI.Comm) -> None:
     from pctt.look import stage  # imported here, because it needs vtk and -help does not
 
     sample = [folder.frame(steps[k]) for k in np.unique(np.linspace(0, len(steps) - 1, SAMPLE).astype(int))]
-    title, name, ends = COLOURS[given.color]
-    low, high = given.range or _range(given.color, [_value(given.color, folder, frame) for frame in sample])
-    names = [folder.materials[k] for k in _materials(folder)] if given.color == "material" else []
     width, height = given.size
     view = stage.View(given.azimuth, given.elevation, given.zoom, width, height, given.opacity, given.cut)
-    theatre = stage.Stage(folder, sample, view, stage.Paint(title, low, high, name, ends, names))
+    theatre = stage.Stage(folder, sample, view, _paint(folder, sample, given.color, given.range))
     pictures = [target / f"{step:06d}.png" for step in steps]
     for step, picture in list(zip(steps, pictures))[comm.rank :: comm.size]:
         frame = folder.frame(step)
-        write_png(picture, theatre.draw(frame, _value(given.color, folder, frame)))
+        Picture(theatre.draw(frame, _value(given.color, folder, frame))).save(picture)
     comm.Barrier()
     if comm.rank == 0:
         print(f"{len(pictures)} pictures: {target}/{pictures[0].name} to {pictures[-1].name}")
@@ -93,6 +97,34 @@ def main(comm: MPI.Comm) -> None:
             film = target / f"film.{given.film}"
             {"mp4": write_mp4, "gif": write_gif}[given.film](film, pictures, given.fps)
             print(f"film: {film}")
+
+
+def picture(folder: Folder, color: str, view: Mapping[str, Any]) -> Picture:
+    """The first recorded step, seen as the fields of `pctt.look.stage.View` say. OptionError for a bad one."""
+    from pctt.look import stage, surfaces
+
+    if color not in COLOURS:
+        raise OptionError(f"color {color!r}: allowed is one of {', '.join(COLOURS)}")
+    seen = made(stage.View, view)
+    refuse_bad(seen)
+    sharp = seen.zoom > 0 and min(seen.width, seen.height) >= 32
+    if not (sharp and -90 < seen.elevation < 90 and isfinite(seen.azimuth)):
+        raise OptionError(f"{seen}: allowed are elevation between -90 and 90, zoom above 0, width and height from 32")
+    frame = folder.frame(folder.steps[0])
+    theatre = stage.Stage(folder, [frame], seen, _paint(folder, [frame], color))
+    pixels = theatre.draw(frame, _value(color, folder, frame))
+    surfaces.is_shell.cache_clear()  # it would keep the folder
+    return Picture(pixels)
+
+
+def _paint(folder: Folder, sample: list[Frame], colour: str, given: Sequence[float] | None = None) -> Paint:
+    """The meaning of a colour in the frames of a sample, with the ends of its range or without."""
+    from pctt.look import stage
+
+    title, name, ends = COLOURS[colour]
+    low, high = given or _range(colour, [_value(colour, folder, frame) for frame in sample])
+    names = [folder.materials[k] for k in _materials(folder)] if colour == "material" else []
+    return stage.Paint(title, low, high, name, ends, names)
 
 
 def _value(colour: str, folder: Folder, frame: Frame) -> np.ndarray:
@@ -130,14 +162,6 @@ def _range(colour: str, values: list[np.ndarray]) -> tuple[float, float]:
     high = float(np.quantile(together, 0.99)) or 1.0
     step = 10 ** np.floor(np.log10(high))
     return 0.0, step * min(k for k in (1, 2, 4, 6, 8, 10) if k * step >= high)  # a quarter has few digits
-
-
-def write_png(path: Path, picture: np.ndarray) -> None:
-    """Write a picture (height, width, 3), whole or not at all."""
-    from PIL import Image
-
-    with whole(path) as temporary:
-        Image.fromarray(np.ascontiguousarray(picture)).save(temporary, format="png", compress_level=4)
 
 
 def write_mp4(path: Path, pictures: list[Path], fps: float) -> None:

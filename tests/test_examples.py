@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
+import json
 import re
 import sys
 from pathlib import Path
 
+import notebook as notebooks
 import numpy as np
 import pytest
 from mpi4py import MPI
 
 from dem.experiment import from_file
-from dem.impulses import ImpulseMemory
 from dem.scene import Scene
-from dem.start import new_world
 from pctt.run.options import read_options
-from pctt.run.stepper import Stepper
+from pctt.simulation import Simulation
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
@@ -36,11 +36,8 @@ def run(name: str, steps: int, **options: str) -> tuple[object, dict[str, np.nda
     """The scene of an example and the records of its first steps."""
     words = {"scene": str(EXAMPLES / f"{name}.py"), "ccp_type": "apgd", **options}
     given = read_options(words, MPI.COMM_SELF)
-    stepper = Stepper(given, new_world(given.scene.build(), MPI.COMM_SELF), ImpulseMemory(MPI.COMM_SELF))
-    rows = []
-    for _ in range(steps):
-        stepper.step()
-        rows.append(stepper.records())
+    with Simulation(given.scene, given.settings, comm=MPI.COMM_SELF) as sim:
+        rows = [sim.step() for _ in range(steps)]
     return given.scene, {column: np.array([row[column] for row in rows]) for column in rows[0]}
 
 
@@ -111,6 +108,31 @@ def test_the_bucket_is_a_scene_with_a_tool_from_a_file(tmp_path, monkeypatch):
     assert [body.name for body in scene.large_bodies] == ["tray", "bucket"]
     _, records = run("bucket", 2, scene_file=str(tmp_path / "bucket.stl"))
     assert records["lifted [kg]"].tolist() == [0.0, 0.0]
+
+
+def test_the_accelerations_of_the_sweep_are_those_of_theory():
+    """The relaxation lifts the box off the slope in the first step, which it then loses."""
+    rows = importlib.import_module("sweep").main()
+    assert len(rows) == 8
+    for friction, law, value, theory in rows:
+        assert value == pytest.approx(theory, abs=1e-6 if law == "Coulomb" or friction in (0.0, 0.6) else 0.01)
+
+
+def test_the_notebook_runs_and_shows_what_its_file_has(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = EXAMPLES / "simulation.ipynb"
+    pictures = importlib.util.find_spec("vtkmodules") and importlib.util.find_spec("PIL")
+    notebook, names = notebooks.run(path, skipped=() if pictures else ("pictures",))
+    stored = json.loads(path.read_text())
+    for here, there in zip(notebook["cells"], stored["cells"]):
+        assert here["source"] == there["source"]
+        outputs = [cell.get("outputs", []) for cell in (here, there)]
+        one, two = ([(output["output_type"], sorted(output.get("data", {}))) for output in each] for each in outputs)
+        assert one == two
+    assert names["run"].output.analysed
+    assert abs(names["stirrer"].velocity[5]) < 0.2  # the servo stands still
+    assert names["means"][2.0] > names["means"][8.0]  # the bed resists
+    assert path.stat().st_size < PICTURE_BYTES
 
 
 def test_poisson(tmp_path, capsys):

@@ -46,6 +46,19 @@ def test_the_scene_of_the_readme_is_one(in_folder):
     assert [body.name for body in scene.large_bodies] == ["floor"]
 
 
+def test_the_simulation_of_its_page_runs(in_folder, capsys):
+    (text,) = blocks("docs/python.md")
+    before = PETSc.Options().getAll()
+    names: dict[str, Any] = {}
+    exec(text, names)
+    assert PETSc.Options().getAll() == before
+    said = capsys.readouterr().out.splitlines()
+    assert "at rest after 0.255 s" in said[0]
+    assert [line.split()[:2] for line in said[1:]] == [["2", "rad/s:"], ["4", "rad/s:"], ["8", "rad/s:"]]
+    words = {"dt": 0.005, "delta": 0.005, "solver": "apgd", "tol": 1e-4}
+    assert names["pctt"].Simulation.load("stirred.h5", names["scene"], **words).time == names["sim"].time
+
+
 def test_the_program_of_the_readme_solves_by_a_train(in_folder, capfd):
     """In the iterations that the text says, by a train that is not block Jacobi."""
     names: dict[str, Any] = {}

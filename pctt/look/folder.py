@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,12 +24,26 @@ class FolderError(RuntimeError):
 class Contacts:
     """The contacts of a step between bodies a and b, and the impulses that acted in the step."""
 
-    body: np.ndarray  #: (nc, 2) ids of a and b
-    point: np.ndarray  #: (nc, 3) [m]
+    bodies: np.ndarray  #: (nc, 2) numbers of a and b in the order of the scene: grains, then large bodies
+    point: np.ndarray  #: (nc, 3) in the middle between the surfaces, at the start of the step [m]
     frame: np.ndarray  #: (nc, 3, 3) with rows normal (from a to b), t1, t2
-    gap: np.ndarray  #: (nc,) [m]
+    gap: np.ndarray  #: (nc,) at the start of the step, negative if the bodies overlap [m]
     impulse: np.ndarray  #: (nc, 3) on b, in the contact frame [N s]
     dt: float  #: length of the step in which the impulses acted [s]
+
+    @classmethod
+    def none(cls) -> Contacts:
+        """Those of no step."""
+        vectors = np.zeros((0, 3))
+        return cls(np.zeros((0, 2), np.int64), vectors, np.zeros((0, 3, 3)), np.zeros(0), vectors, 1.0)
+
+    def __len__(self) -> int:
+        return len(self.gap)
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit vectors (nc, 3) from a to b."""
+        return self.frame[:, 0]
 
     @property
     def force(self) -> np.ndarray:
@@ -56,7 +71,7 @@ class Frame:
     def load(self) -> np.ndarray:
         """Sums (n,) of the magnitudes of the contact forces on each body [N]."""
         size = np.linalg.norm(self.contacts.force, axis=1)
-        return np.bincount(self.contacts.body.ravel(), np.repeat(size, 2), minlength=len(self.position))
+        return np.bincount(self.contacts.bodies.ravel(), np.repeat(size, 2), minlength=len(self.position))
 
 
 class Folder:
@@ -109,8 +124,8 @@ class Folder:
         try:
             with h5py.File(path, "r") as group:
                 contact = group["contact"]
-                columns = {name: contact[name][()] for name in ("body", "point", "frame", "gap", "impulse")}
-                contacts = Contacts(**columns, dt=float(contact.attrs["dt"]))
+                rows = [contact[name][()] for name in ("body", "point", "frame", "gap", "impulse")]
+                contacts = Contacts(*rows, float(contact.attrs["dt"]))  # type: ignore[call-arg]
                 bodies = {name: group[name][()] for name in ("position", "quaternion", "velocity")}
                 return Frame(step, float(group.attrs["time"]), **bodies, contacts=contacts)
         except (KeyError, OSError) as error:
@@ -158,3 +173,18 @@ class Folder:
         except (IndexError, KeyError, ValueError) as error:
             raise FolderError(f"{path}: no table of numbers with a column time [s] ({error})") from None
         return columns
+
+
+class Snapshot(Folder):
+    """The present state of a simulation, as a folder with one recorded step."""
+
+    def __init__(
+        self, frame: Frame, shape: np.ndarray, size: np.ndarray, material: np.ndarray, materials: Sequence[str],
+        large: list[dict[str, Any]],
+    ):  # fmt: skip
+        self.path, self.steps, self._present = Path(), [frame.step], frame
+        self.shape, self.size, self.material, self.materials, self.large = shape, size, material, [*materials], large
+        self.grains = len(shape) - len(large)
+
+    def frame(self, step: int) -> Frame:
+        return self._present

@@ -45,13 +45,13 @@ STAGE = 0.86  # part of the width for the scene; the rest is for the colour bar
 class View:
     """How a scene is shown."""
 
-    azimuth: float  #: of the camera about the vertical, from the x axis [degrees]
-    elevation: float  #: of the camera above the horizon [degrees]
-    zoom: float  #: with 1 the whole scene fits into the picture
-    width: int  #: [pixels]
-    height: int  #: [pixels]
-    opacity: float  #: of large bodies without their planes
-    cut: bool  #: leave out the grains in the half that is nearer to the camera
+    azimuth: float = -60.0  #: of the camera about the vertical, from the x axis [degrees]
+    elevation: float = 25.0  #: of the camera above the horizon, between -90 and 90 [degrees]
+    zoom: float = 1.0  #: with 1 the whole scene fits into the picture
+    width: int = 1280  #: [pixels]
+    height: int = 960  #: [pixels]
+    opacity: float = 1.0  #: of large bodies without their planes, 0 to 1
+    cut: bool = False  #: leave out the grains in the half that is nearer to the camera
 
 
 @dataclass(frozen=True)

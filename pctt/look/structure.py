@@ -45,7 +45,7 @@ def graphs(folder: Folder, frame: Frame) -> Figure:
     The cluster is seen along the direction in which it is thinnest.
     """
     few = example(folder, frame)
-    pair, point = frame.contacts.body[few], frame.contacts.point[few]
+    pair, point = frame.contacts.bodies[few], frame.contacts.point[few]
     grains = np.unique(pair[pair < folder.grains])
     middle = frame.position[grains].mean(axis=0)
     axes3 = np.linalg.svd(frame.position[grains] - middle, full_matrices=True)[2][:2]
@@ -103,7 +103,7 @@ def example(folder: Folder, frame: Frame) -> np.ndarray:
     grains if none touches one. The cluster has this grain, its NEIGHBOURS nearest neighbours and the large bodies. The
     contacts are those between these bodies.
     """
-    pair = frame.contacts.body
+    pair = frame.contacts.bodies
     degree = np.bincount(pair.ravel(), minlength=len(frame.position))[: folder.grains]
     at_large = np.unique(pair[(pair >= folder.grains).any(axis=1)].min(axis=1, initial=folder.grains))
     at_large = at_large[at_large < folder.grains]
@@ -119,7 +119,7 @@ def example(folder: Folder, frame: Frame) -> np.ndarray:
 
 def _coupling(folder: Folder, frame: Frame) -> sp.csr_matrix:
     """Pattern (nc, nc) of the blocks of N: pairs of contacts that share a body of finite mass, and the diagonal."""
-    pair = frame.contacts.body
+    pair = frame.contacts.bodies
     row, body = np.repeat(np.arange(len(pair)), 2), pair.ravel()
     moves = np.isfinite(folder.mass[body])
     touch = sp.csr_matrix(

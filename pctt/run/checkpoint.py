@@ -15,6 +15,7 @@ from mpi4py import MPI
 
 from dem.arrays import Floats
 from dem.bodies import Bodies
+from dem.control import changed_motions, restore_motions
 from dem.experiment import Experiment
 from dem.impulses import ImpulseMemory
 from dem.mesh import Mesh
@@ -24,6 +25,7 @@ from dem.start import even_slice, restart_rows, restored_world
 from dem.world import World
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError, raise_together, readable, write_text, written
+from pctt.run.settings import scene_name
 
 FORMAT = "pctt checkpoint 1"
 
@@ -36,10 +38,10 @@ def scene_record(name: str, scene: Any) -> str:
     return json.dumps({"scene": name, **dataclasses.asdict(scene)}, sort_keys=True)
 
 
-def origin(name: str, scene: Experiment, dt: float) -> dict[str, Any]:
+def origin(scene: Experiment, dt: float) -> dict[str, Any]:
     """What a run must share with the run whose checkpoint it continues, as attributes of a checkpoint: the
     `scene_record`, the time step [s], and the digest of the user's scene file or ""."""
-    return {"scene": scene_record(name, scene), "dt": dt, "scene_file": scene.digest}
+    return {"scene": scene_record(scene_name(scene), scene), "dt": dt, "scene_file": scene.digest}
 
 
 def surfaces(large_bodies: Iterable[LargeBody]) -> dict[str, list[float]]:
@@ -74,6 +76,8 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
         for name, array in replicated.items():
             file.whole(f"world/{name}", array)
         file.texts("world/materials", world.materials)
+        if motions := changed_motions(world):
+            file.texts("world/motions", [motions])
         file.rows("contacts/key", key)
         file.rows("contacts/impulse", impulse)
         about = {"format": FORMAT, **made_with}
@@ -100,6 +104,7 @@ def load(
             triangles = json.loads(file.attrs.get("surfaces", "{}"))
             stored = {name: file.attrs[name] for name in made_with if name in file.attrs}
             replicated = {n: file[f"world/{n}"][()] for n in (*_LARGE, "slabs", "time", "step")}
+            motions = file["world/motions"].asstr()[0] if "world/motions" in file else "{}"
             rows = restart_rows(replicated["slabs"], comm)
             local = {n: file[f"grains/{n}"][rows] for n in _COLUMNS}
             part = even_slice(len(file["contacts/key"]), comm)
@@ -112,7 +117,8 @@ def load(
         _refuse_other_surfaces(path, triangles, surfaces(scene.large_bodies))
     try:
         world = restored_world(scene, comm, local, replicated)
-    except ValueError as error:  # another text of the scene file may build other bodies
+        restore_motions(world, motions)
+    except (KeyError, TypeError, ValueError) as error:  # another text of the scene file may build other bodies
         raise OptionError(f"-restart {path}: {error}") from None
     memory = ImpulseMemory(comm)
     memory.restore(key, impulse)

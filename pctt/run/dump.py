@@ -12,7 +12,7 @@ A guided body has only the part of D along its guide. Nothing turns it, so its m
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from dem import bodies, quaternion
+from dem.experiment import Experiment
 from dem.free_motion import free_directions
 from dem.system import ContactSystem
 from dem.world import World
@@ -32,23 +33,19 @@ from pctt.exchange import offsets
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError
 from pctt.run.place import HARD, Place
-from pctt.run.settings import Options, Run
+from pctt.run.settings import Run, Settings, scene_name
 
 
 class Dump:
-    """Writes the cone problems of a run's steps; raises OptionError for a step that the run does not make."""
+    """Writes the cone problems of a simulation's steps: the ``hard`` first that its solver does not solve, and to
+    ``folder``, if there is one, those of the ``steps``, none: of all."""
 
-    def __init__(self, options: Options, world: World, place: Place):
-        self._options, self._world, self._place = options, world, place
-        run = self.run = options.run
-        self._steps = dump_steps(run)
-        outside = [step for step in self._steps if not world.step < step <= world.step + run.steps]
-        if outside:
-            raise OptionError(
-                f"-dump_steps {run.dump_steps}: there is no step {outside[0]}; "
-                f"this run makes steps {world.step + 1} to {world.step + run.steps}"
-            )
-        self._hard_left = run.dump_hard
+    def __init__(
+        self, settings: Settings, experiment: Experiment, world: World, place: Place,
+        hard: int, folder: str = "", steps: Collection[int] = (),
+    ):  # fmt: skip
+        self._settings, self._experiment, self._world, self._place = settings, experiment, world, place
+        self._hard_left, self._folder, self._steps = hard, folder, steps
 
     def step(
         self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result, asked: ccp.Result
@@ -59,7 +56,7 @@ class Dump:
         entries for the step's figures. FileError if a file cannot be written.
         """
         number = self._world.step + 1
-        wanted = self.run.dump_problem and (not self._steps or number in self._steps)
+        wanted = self._folder and (not self._steps or number in self._steps)
         hard = not asked.converged and self._hard_left > 0
         files: dict[str, Any] = {"dumped": [], "hard_problem": ""}
 
@@ -67,7 +64,7 @@ class Dump:
             self._write_fclib(path, system, problem, guess, result, asked)
 
         if problem.size and wanted:
-            path = Path(self.run.dump_problem) / f"step{number:06d}_{problem.size}contacts.h5"
+            path = Path(self._folder) / f"step{number:06d}_{problem.size}contacts.h5"
             binary = path.with_suffix(".petsc")
             _write(path, as_fclib)
             files["dumped"] = [str(path)]
@@ -116,16 +113,15 @@ class Dump:
             petsc_object.destroy()
 
     def _info(self, problem: ccp.ConeProblem, result: ccp.Result, asked: ccp.Result) -> fclib.Info:
-        options, world = self._options, self._world
-        scene, solver = options.run.scene, options.run.ccp_type
+        settings, world, scene = self._settings, self._world, self._experiment
         stored = f"The solution has natural residual {result.residual:.3g}." if result.converged else ""
         return fclib.Info(
-            f"{scene}, step {world.step + 1}",
-            f"{problem.size} contacts of {options.scene!r}, from time {world.time:g} s over {options.dt:g} s. "
-            f"{solver} with -ccp_tol {options.limits.tol:g}: {asked.reason}, {asked.iterations} iterations, "
+            f"{scene_name(scene)}, step {world.step + 1}",
+            f"{problem.size} contacts of {scene!r}, from time {world.time:g} s over {settings.dt:g} s. "
+            f"{settings.solver} with -ccp_tol {settings.tol:g}: {asked.reason}, {asked.iterations} iterations, "
             f"natural residual {asked.residual:.3g}. {stored}",
             "Solution and guess are those of Coulomb's law (mu |u_t| is added to the normal velocity)."
-            if options.coulomb
+            if settings.coulomb
             else "Solution and guess are those of the convex cone problem, min 1/2 r'Wr + q'r over the friction cones "
             "(no mu |u_t| in the normal velocity). W is positive semidefinite; r need not be unique, u is.",
         )
@@ -175,6 +171,16 @@ def _map(system: ContactSystem, world: World, dynamic: np.ndarray) -> PETSc.Mat:
     H = transposed.transpose(PETSc.Mat())
     transposed.destroy()
     return H
+
+
+def refuse_absent(run: Run, first: int) -> None:
+    """OptionError for a step of ``-dump_steps`` that the run, from the step ``first`` on, does not make."""
+    outside = [step for step in dump_steps(run) if not first < step <= first + run.steps]
+    if outside:
+        raise OptionError(
+            f"-dump_steps {run.dump_steps}: there is no step {outside[0]}; "
+            f"this run makes steps {first + 1} to {first + run.steps}"
+        )
 
 
 def dump_steps(run: Run) -> list[int]:

@@ -21,13 +21,13 @@ from pctt.ccp.newton.compare import labelled, prefix
 from pctt.ccp.newton.users_solver import LADDER
 from pctt.contact_map import is_free
 from pctt.ksp_options import entered, to_enter
-from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read, refuse_unknown
+from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, made, read, refuse_unknown
 from pctt.petsc import own_errors
 from pctt.run.dump import dump_steps
 from pctt.run.hdf5 import refuse_serial
 from pctt.run.leftovers import OF_SOLVERS, refuse_misspelt
 from pctt.run.place import refusal
-from pctt.run.settings import DEMO, Options, Run, find_scene
+from pctt.run.settings import DEMO, Options, Run, Settings, find_scene, obeys_coulomb
 
 #: Options of simulations, beside those of the scene.
 OF_STEPS = {
@@ -54,22 +54,22 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     for name in known:
         PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
     limits = read(ccp.Limits, database, "ccp_")
-    obeys_coulomb = _obeys_coulomb(run, limits)
-    _refuse_without_effect(database, run, obeys_coulomb)
+    # a file of -problem is solved as a plain cone problem by default
+    coulomb = bool(run.ccp_coulomb) if run.problem else obeys_coulomb(run.ccp_coulomb, run.ccp_type, limits.tol)
+    _refuse_without_effect(database, run, coulomb)
     what = f"options of the scene {scene_class.__name__}"
-    scene, dt, delta = together(comm, what, lambda: _read_scene(run.scene, scene_class, database), own=(OptionError,))
+    scene = together(comm, what, lambda: _read_scene(run.scene, scene_class, database), own=(OptionError,))
     if "settle_delta" not in database:
         run = dataclasses.replace(run, settle_delta=scene.settle_delta)
-    options = Options(
-        run,
-        scene,
-        run.dt if run.dt is not None else dt,
-        run.delta if run.delta is not None else delta,
-        limits,
-        read(solver.options, database, solver.prefix),
-        read(ccp.Coulomb, database, "ccp_coulomb_") if obeys_coulomb else None,
-        demo,
-    )
+    given = {
+        **{name: getattr(run, name) for name in ("dt", "delta", "recovery_speed")},
+        **{name: getattr(run, f"ccp_{name}") for name in ("newton", "compliance", "operator")},
+        **vars(limits),
+        "solver": run.ccp_type,
+        "options": read(solver.options, database, solver.prefix),
+        "coulomb": coulomb and read(ccp.Coulomb, database, "ccp_coulomb_"),
+    }
+    options = Options(run, scene, made(Settings, given).of(scene), demo)
     compare = ccp.Comparison(comm, run.compared())  # refuses unknown names
     _refuse_tolerances(database)  # newer releases of PETSc refuse them too, in other words
     if solver.newton and not run.settle:
@@ -85,11 +85,8 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     return options
 
 
-def _read_scene(
-    name: str, scene_class: type[Experiment], database: Mapping[str, str]
-) -> tuple[Experiment, float, float]:
-    """The scene with the options of the database, its time step and its contact distance. OptionError if the scene
-    refuses an option, or has bad ones of its own."""
+def _read_scene(name: str, scene_class: type[Experiment], database: Mapping[str, str]) -> Experiment:
+    """The scene with the options of the database. OptionError if it refuses one, or has bad numbers of its own."""
     try:
         scene = read(scene_class, database, "scene_")
     except OptionError:
@@ -99,7 +96,7 @@ def _read_scene(
             raise
         raise OptionError(f"-scene_{error}") from None
     _refuse_bad_numerics(name, scene)
-    return scene, scene.dt, scene.delta
+    return scene
 
 
 def _refuse_bad_numerics(name: str, scene: Experiment) -> None:
@@ -127,14 +124,7 @@ def option_groups(scene: type[Experiment]) -> list[tuple[type, str]]:
     return [(Run, ""), (scene, "scene_"), *laws, *solvers]
 
 
-def _obeys_coulomb(run: Run, limits: ccp.Limits) -> bool:
-    """Whether the steps obey Coulomb's law. A file of ``-problem`` is solved as a plain cone problem by default."""
-    if run.ccp_coulomb is not None:
-        return run.ccp_coulomb
-    return not run.problem and limits.tol >= ccp.SOLVERS[run.ccp_type].law_tol
-
-
-def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb: bool) -> None:
+def _refuse_without_effect(database: Mapping[str, str], run: Run, coulomb: bool) -> None:
     """OptionError for the first option that means nothing beside the others."""
     solver = ccp.SOLVERS[run.ccp_type]
     newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
@@ -163,7 +153,7 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, obeys_coulomb:
         (True, strangers("compare_", compared) - {"compare_every"}, (), not_compared),
         (True, strangers("fallback_", ladder), (), f"no such fallback; there are {', '.join(LADDER)}"),
         (True, set(), of_others, f"belongs to another -ccp_type than {run.ccp_type}"),
-        (not obeys_coulomb, set(), ("ccp_coulomb_",), "allowed with -ccp_coulomb only"),
+        (not coulomb, set(), ("ccp_coulomb_",), "allowed with -ccp_coulomb only"),
     ]
     for applies, names, starts, reason in rules:
         for name, value in database.items():
@@ -212,9 +202,9 @@ def _refuse_places(run: Run, comm: MPI.Comm) -> None:
     _refuse_missing("-restart", run.restart if run.restart != "settled" else "", comm)
     _refuse_missing("-problem", run.problem, comm)
     if not run.settle:
-        _refuse_unwritable("-output", Path(run.output), comm)
+        refuse_unwritable("-output", Path(run.output), comm)
         if run.dump_problem:
-            _refuse_unwritable("-dump_problem", Path(run.dump_problem), comm)
+            refuse_unwritable("-dump_problem", Path(run.dump_problem), comm)
         _refuse_occupied(run, comm)
 
 
@@ -224,7 +214,8 @@ def _refuse_missing(name: str, path: str, comm: MPI.Comm) -> None:
         raise OptionError(f"{name} {path}: no such file, or not readable")
 
 
-def _refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
+def refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
+    """Make a folder; OptionError for the option ``name`` if files cannot be written there; collective."""
     error = None
     if comm.rank == 0:
         try:

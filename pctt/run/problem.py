@@ -49,13 +49,14 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
 def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[str, Any]:
     """The figures of solving a stored problem as the options say."""
     problem, guess, comm = stored.problem, stored.guess if options.run.problem_guess else None, stored.problem.comm
-    newton = ccp.newton_for(comm, options.run.ccp_type, options.run.ccp_newton, compare)
+    settings = options.settings
+    newton = ccp.newton_for(comm, settings.solver, settings.newton, compare)
     try:
         with log.phase("solve"):
             result = ccp.solve(
-                problem, guess, options.run.ccp_type, options.limits, options.solver, newton, options.coulomb
+                problem, guess, settings.solver, settings.limits, settings.options, newton, settings.coulomb or None
             )
-        used = result.solver or options.run.ccp_type
+        used = result.solver or settings.solver
         by_newton = ccp.SOLVERS[used].newton
         systems = "; ".join(filter(None, (newton.words(), newton.what()))) if by_newton else ""
     finally:
@@ -72,7 +73,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
         "contacts": problem.size,
         "ranks": comm.size,
         "solver": used,
-        "law": "Coulomb" if options.coulomb else "cone problem",
+        "law": "Coulomb" if settings.coulomb else "cone problem",
         "compliance": problem.softness,
         "objective": accuracy.objective,
         "natural_residual": accuracy.natural_residual,

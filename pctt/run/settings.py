@@ -1,16 +1,30 @@
-"""The options of ``python -m pctt.run`` as data; `pctt.run.options` reads and checks them."""
+"""The settings of a simulation, and the options of ``python -m pctt.run`` as data; `pctt.run.options` reads them."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Optional
 
-from dem.experiment import Experiment, SceneFileError, from_file
+from dem.experiment import SCENE_FILE, Experiment, Given, SceneFileError, from_file
 from dem.scenes import SCENES
 from pctt import ccp
 from pctt.contact_map import OPERATORS
-from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, NOT_NEGATIVE, POSITIVE, OptionError, nearest, option
+from pctt.options import (
+    AT_LEAST_ONE,
+    COUNT,
+    FRACTION,
+    NOT_NEGATIVE,
+    POSITIVE,
+    OptionError,
+    made,
+    nearest,
+    option,
+    refuse_bad,
+)
+
+SETTLE_TOL = 1e-3  #: natural residual of the steps that settle a scene
 
 # options of PETSc and of preconditioners in the demo
 DEMO_SOLVERS = {
@@ -62,7 +76,7 @@ class Run:
         unit="m",
         check=NOT_NEGATIVE,
     )
-    settle_tol: float = option(1e-3, "natural residual of the steps of -settle", check=FRACTION)
+    settle_tol: float = option(SETTLE_TOL, "natural residual of the steps of -settle", check=FRACTION)
     output: str = option("results", "folder for state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
     overwrite: bool = option(
         False, "let the run replace another one in the folder of -output, once its first step is written"
@@ -114,21 +128,70 @@ class Run:
         return [entry for entry in self.compare.split(",") if entry]
 
 
+def _as(group: type, name: str, *default: Any) -> Any:
+    """A field with the meaning, unit and check of an option, and another default if one is given."""
+    (of,) = (field for field in dataclasses.fields(group) if field.name == name)
+    return dataclasses.field(default=default[0] if default else of.default, metadata=of.metadata)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How a simulation makes its steps. The program's options of the same meaning are in parentheses."""
+
+    dt: float = _as(Run, "dt")  #: time step; None: the scene's own [s] (``-dt``)
+    delta: float = _as(Run, "delta")  #: gap below which a pair is a contact; None: the scene's own [m] (``-delta``)
+    solver: str = _as(Run, "ccp_type", "auto")  #: method of ``pctt.ccp.SOLVERS`` (``-ccp_type``, with another default)
+    tol: float = _as(ccp.Limits, "tol")  #: residual at which a step counts as solved (``-ccp_tol``)
+    max_it: int = _as(ccp.Limits, "max_it")  #: iterations before the solver gives up; -1: its own (``-ccp_max_it``)
+    closing_work: float = _as(ccp.Limits, "closing_work")  #: the same of the closing work (``-ccp_closing_work``)
+    #: options of the solver, an instance of its class or a dict of its fields (``-ccp_apgd_...``); None: the defaults
+    options: Any = None
+    #: Coulomb's law or its relaxation, or a `pctt.ccp.Coulomb`; None: the law where it costs little (``-ccp_coulomb``)
+    coulomb: Any = _as(Run, "ccp_coulomb")
+    newton: str = _as(Run, "ccp_newton")  #: unknowns of the Newton systems (``-ccp_newton``)
+    recovery_speed: float = _as(Run, "recovery_speed")  #: that pushes overlaps apart [m/s] (``-recovery_speed``)
+    compliance: Optional[float] = _as(Run, "ccp_compliance")  #: of the contacts (``-ccp_compliance``)
+    operator: str = _as(Run, "ccp_operator")  #: products with the contact map (``-ccp_operator``)
+
+    @property
+    def limits(self) -> ccp.Limits:
+        """When the solver stops."""
+        return ccp.Limits(self.tol, self.max_it, self.closing_work)
+
+    def of(self, scene: Experiment) -> Settings:
+        """The same, with what a scene and a solver have of their own where nothing is given; then ``options`` is an
+        instance, and ``coulomb`` one or False. OptionError for a bad value."""
+        refuse_bad(self)
+        kind, options, coulomb = ccp.SOLVERS[self.solver].options, self.options, self.coulomb
+        if options is None or isinstance(options, Mapping):
+            options = made(kind, options or {})
+        if not isinstance(options, kind):
+            raise OptionError(f"options {options!r}: allowed for {self.solver} is a dict or a {kind.__name__}")
+        refuse_bad(options)
+        if not isinstance(coulomb, (bool, ccp.Coulomb, type(None))):
+            raise OptionError(f"coulomb {coulomb!r}: allowed is true, false or a Coulomb")
+        if not isinstance(coulomb, ccp.Coulomb):
+            coulomb = obeys_coulomb(coulomb, self.solver, self.tol) and ccp.Coulomb()
+        refuse_bad(coulomb or ccp.Coulomb())
+        dt, delta = (scene.dt if self.dt is None else self.dt, scene.delta if self.delta is None else self.delta)
+        whole = dataclasses.replace(self, dt=dt, delta=delta, options=options, coulomb=coulomb)
+        refuse_bad(whole)
+        return whole
+
+
+def obeys_coulomb(asked: bool | None, solver: str, tol: float) -> bool:
+    """Whether steps obey Coulomb's law: as asked, or where that costs about the same."""
+    return tol >= ccp.SOLVERS[solver].law_tol if asked is None else asked
+
+
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Everything that a run needs to know, with the scene's own values filled in.
-
-    ``scene`` is an instance of a class of ``dem.scenes.SCENES`` or of the user's class, ``solver`` one of the options
-    class of ``ccp_type``. ``coulomb`` is None if the steps obey the relaxation.
-    """
+    """Everything that a run of the program needs to know, with the scene's own values filled in; ``scene`` is an
+    instance of a class of ``dem.scenes.SCENES`` or of the user's class."""
 
     run: Run
     scene: Any
-    dt: float
-    delta: float
-    limits: ccp.Limits
-    solver: Any
-    coulomb: ccp.Coulomb | None
+    settings: Settings
     demo: bool
 
 
@@ -146,6 +209,10 @@ def find_scene(name: str) -> type[Experiment]:
     return SCENES[name]
 
 
-def scene_name(name: str) -> str:
-    """How results name a scene: a file of the user's without folder and suffix."""
-    return Path(name).stem
+def scene_name(scene: Experiment) -> str:
+    """How results name a scene: as the program does, a file of the user's without folder and suffix."""
+    kind = type(scene)
+    names = [name for name, known in SCENES.items() if known is kind]
+    if isinstance(scene, Given):
+        return "scene"
+    return names[0] if names else kind.__module__.removeprefix(SCENE_FILE) if scene.digest else kind.__name__

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -18,23 +18,46 @@ from dem.scene import Scene
 from dem.start import new_world
 from dem.together import together
 from dem.world import World
-from pctt import ccp
 from pctt.disk import Lock
 from pctt.options import OptionError
 from pctt.run import checkpoint, interrupt, report
 from pctt.run.hdf5 import told
-from pctt.run.settings import Options, scene_name
+from pctt.run.settings import SETTLE_TOL, Options, Settings, scene_name
 from pctt.run.stepper import Stepper
 
 
+class Settling(NamedTuple):
+    """What settles how."""
+
+    experiment: Experiment
+    settings: Settings  #: of the run that is to begin with the settled state
+    delta: float  #: contact distance in the first nine tenths [m]
+    tol: float = SETTLE_TOL  #: natural residual in the first nine tenths
+    name: str = ""  #: of the scene in messages; none: that of the experiment
+
+    @classmethod
+    def asked(cls, options: Options) -> Settling:
+        """As the options of the program say."""
+        return cls(options.scene, options.settings, options.run.settle_delta, options.run.settle_tol, options.run.scene)
+
+    @property
+    def steps(self) -> int:
+        """The steps of a settling from the start."""
+        return math.ceil(self.experiment.settling_time / self.settings.dt * (1 - 1e-12))
+
+    @property
+    def title(self) -> str:
+        return self.name or scene_name(self.experiment)
+
+
 def settled_state(
-    options: Options, scene: Scene, comm: MPI.Comm, progress: report.Progress, anew: bool = False
+    how: Settling, scene: Scene, comm: MPI.Comm, progress: report.Progress, anew: bool = False
 ) -> Path:
-    """The cached settled state of ``scene``, which the experiment of the options has `built`. It is made if it is
-    missing, or with ``anew``. Settling takes the settling time with APGD. The last tenth has the contact distance of
-    the scene and ten times the accuracy: otherwise overlaps remain, and the first accurate step of a run would push
-    them apart. An interrupted or killed settling is continued."""
-    path, made_with = cache(options, scene)
+    """The cached settled state of ``scene``, which the experiment has `built`. It is made if it is missing, or with
+    ``anew``. Settling takes the settling time with APGD. The last tenth has the contact distance of the scene and ten
+    times the accuracy: otherwise overlaps remain, and the first accurate step of a run would push them apart. An
+    interrupted or killed settling is continued."""
+    path, made_with = cache(how, scene)
     if not anew and comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
         return path
     if comm.rank == 0:
@@ -42,7 +65,7 @@ def settled_state(
             path.parent.mkdir(parents=True, exist_ok=True)
     with _alone(path, comm, progress):
         if anew or not comm.bcast(checkpoint.intact(path) if comm.rank == 0 else None):
-            _make(path, made_with, options, scene, comm, progress)
+            _make(path, made_with, how, scene, comm, progress)
     return path
 
 
@@ -65,16 +88,16 @@ def _alone(path: Path, comm: MPI.Comm, progress: report.Progress) -> Iterator[No
 
 
 def _make(
-    path: Path, made_with: dict[str, str], options: Options, scene: Scene, comm: MPI.Comm, progress: report.Progress
+    path: Path, made_with: dict[str, Any], how: Settling, scene: Scene, comm: MPI.Comm, progress: report.Progress
 ) -> None:
     """Settle the scene and keep the state, with its checksum."""
-    progress.say(f"settling {options.run.scene}, {steps(options)} steps with APGD to {options.run.settle_tol:g}:")
+    progress.say(f"settling {how.title}, {how.steps} steps with APGD to {how.tol:g}:")
     if comm.bcast(unfinished(path).exists()):
         world, memory = checkpoint.load(unfinished(path), scene, made_with, comm)
         progress.say(f"  goes on after step {world.step}, from {unfinished(path)}")
     else:
-        world, memory = world_at_start(options.scene, scene, comm), ImpulseMemory(comm)
-    _settle(options, world, memory, unfinished(path), made_with, progress)
+        world, memory = world_at_start(how.experiment, scene, comm), ImpulseMemory(comm)
+    _settle(how, world, memory, unfinished(path), made_with, progress)
     checkpoint.save(path, made_with, world, memory)
     if comm.rank == 0:
         checkpoint.write_checksum(path)
@@ -82,19 +105,19 @@ def _make(
     comm.Barrier()
 
 
-def cache(options: Options, scene: Scene) -> tuple[Path, dict[str, str]]:
+def cache(how: Settling, scene: Scene) -> tuple[Path, dict[str, Any]]:
     """The file of a scene's settled state, and what it is made with; OptionError if the scene never settles."""
-    if not options.scene.settling_time:
-        raise OptionError(f"-scene {options.run.scene}: has no settling_time and so no settled state")
-    made_with = checkpoint.origin(scene_name(options.run.scene), options.scene, options.dt)
+    if not how.experiment.settling_time:
+        raise OptionError(f"-scene {how.title}: has no settling_time and so no settled state")
+    made_with = checkpoint.origin(how.experiment, how.settings.dt)
     settings: dict[str, Any] = {
-        "dt": options.dt,
-        "delta": [options.run.settle_delta, options.delta],
-        "recovery_speed": options.run.recovery_speed,
-        "tol": options.run.settle_tol,
+        "dt": how.settings.dt,
+        "delta": [how.delta, how.settings.delta],
+        "recovery_speed": how.settings.recovery_speed,
+        "tol": how.tol,
     }
-    if options.scene.digest:
-        settings["file"] = options.scene.digest  # a file that was changed may build another scene
+    if how.experiment.digest:
+        settings["file"] = how.experiment.digest  # a file that was changed may build another scene
     if triangles := checkpoint.surfaces(scene.large_bodies):
         settings["surfaces"] = {name: [f"{value:.5g}" for value in figures] for name, figures in triangles.items()}
     return checkpoint.settled_path(made_with["scene"], settings), made_with
@@ -105,38 +128,29 @@ def unfinished(path: Path) -> Path:
     return path.with_suffix(".unfinished.h5")
 
 
-def steps(options: Options) -> int:
-    """The steps of a settling from the start."""
-    return math.ceil(options.scene.settling_time / options.dt * (1 - 1e-12))
-
-
 def _settle(
-    options: Options,
+    how: Settling,
     world: World,
     memory: ImpulseMemory,
     path: Path,
-    made_with: dict[str, str],
+    made_with: dict[str, Any],
     progress: report.Progress,
 ) -> None:
     """The steps of settling, with a checkpoint ``path`` after every tenth of them."""
-    settling = dataclasses.replace(
-        options,
-        run=dataclasses.replace(options.run, ccp_type="apgd", ccp_compliance=None),
-        delta=options.run.settle_delta,
-        limits=ccp.Limits(tol=options.run.settle_tol),
-        solver=ccp.SOLVERS["apgd"].options(),
-        coulomb=None,
-    )
-    end = steps(options)
+    given = how.settings
+    loose = Settings(
+        given.dt, how.delta, "apgd", how.tol, coulomb=False, recovery_speed=given.recovery_speed,
+        operator=given.operator,
+    ).of(how.experiment)  # fmt: skip
+    end = how.steps
     tenth = max(1, end // 10)
     start = time.perf_counter()
     progress.start(end - world.step)
-    with Stepper(settling, world, memory) as stepper:
+    with Stepper(loose, world, memory) as stepper:
         while world.step < end:
             progress.doing(f"settling, time {world.time:.3f} s")
             if world.step + 1 >= end - end // 10:
-                limits = ccp.Limits(tol=0.1 * options.run.settle_tol)
-                stepper.options = dataclasses.replace(settling, delta=options.delta, limits=limits)
+                stepper.settings = dataclasses.replace(loose, delta=given.delta, tol=0.1 * how.tol)
             line = stepper.step()
             interrupted = interrupt.asked(world.comm)
             if world.step % tenth == 0 or world.step == end or interrupted:

@@ -10,11 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from dem import record as recording
 from dem.contact import Contacts, find_contacts, find_overrun
 from dem.impulses import ImpulseMemory
 from dem.partition import rebalance
-from dem.step import Step
 from dem.stepper import advance
 from dem.system import ContactSystem
 from dem.together import SceneError
@@ -22,7 +20,7 @@ from dem.turning import find_turned
 from dem.world import World
 from pctt import ccp, log
 from pctt.run.dump import Dump
-from pctt.run.settings import Options
+from pctt.run.settings import Settings
 
 #: An overlap by a contact that the search did not foresee is solved for if it would be deeper than this part of delta.
 OVERRUN = 0.01
@@ -60,13 +58,13 @@ class Stepper:
 
     def __init__(
         self,
-        options: Options,
+        settings: Settings,
         world: World,
         memory: ImpulseMemory,
         newton: ccp.Newton | None = None,
         dump: Dump | None = None,
     ):
-        self.options, self.world, self.memory, self.newton, self.dump = options, world, memory, newton, dump
+        self.settings, self.world, self.memory, self.newton, self.dump = settings, world, memory, newton, dump
         self._problem: ccp.ConeProblem | None = None
         self._corrections = 0  # of the present step
 
@@ -111,7 +109,7 @@ class Stepper:
             files = self.dump.step(self.system, problem, guess, result, solved.asked) if self.dump else {}
         with log.phase("advance"):
             self.impulse, self.history = result.impulse, result.history
-            advance(self.world, self.system.velocity(self.impulse), self.options.dt)
+            advance(self.world, self.system.velocity(self.impulse), self.settings.dt)
             self.memory.remember(self.system.key, self.impulse, self.system.frame)
         self._release()
         return self._figures(problem.size, solved, accuracy, files)
@@ -120,7 +118,7 @@ class Stepper:
         """The contacts of the step."""
         with log.phase("search"):
             rebalance(self.world)
-            return find_contacts(self.world, self.options.delta, self.options.dt)
+            return find_contacts(self.world, self.settings.delta, self.settings.dt)
 
     def _figures(
         self, contacts: int, solved: Solved, accuracy: ccp.Accuracy, files: dict[str, Any]
@@ -145,8 +143,8 @@ class Stepper:
             "fallbacks": result.fallbacks,
             "solver": solved.solver,
             "law": result.law,
-            "asked_solver": self.options.run.ccp_type,
-            "tolerance": self.options.limits.tol,
+            "asked_solver": self.settings.solver,
+            "tolerance": self.settings.tol,
             **({"pc_report": pc_report} if pc_report else {}),
             **files,
             **({"compare": compare.take_solves()} if compare else {}),
@@ -156,13 +154,13 @@ class Stepper:
 
     def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, np.ndarray]:
         """The problem of these contacts, which takes the place of the last, and the impulses remembered."""
-        options = self.options
+        settings = self.settings
         with log.phase("assembly"):
             self._release()
             self.contacts = contacts
-            self.system = ContactSystem(self.world, contacts, options.dt, options.run.recovery_speed)
+            self.system = ContactSystem(self.world, contacts, settings.dt, settings.recovery_speed)
             self._problem = cone_problem(
-                self.system, self.world.comm, options.run.ccp_compliance or 0.0, options.run.ccp_operator
+                self.system, self.world.comm, settings.compliance or 0.0, settings.operator
             )
             guess, _ = memory.recall(self.system.key, self.system.frame)
         return self._problem, guess
@@ -170,18 +168,18 @@ class Stepper:
     def _overrun(self, problem: ccp.ConeProblem, impulse: np.ndarray) -> tuple[Contacts, ImpulseMemory] | None:
         """The contacts together with those that the search did not foresee, because an impulse of this step sends a
         grain further than its margin, and the impulses so far. None if no such grain meets anything."""
-        world, options = self.world, self.options
+        world, settings = self.world, self.settings
         with log.phase("search"):
             velocity = self.system.velocity(impulse)
-            wider = find_overrun(world, self.contacts, velocity, options.delta, options.dt)
+            wider = find_overrun(world, self.contacts, velocity, settings.delta, settings.dt)
         if wider is None:
             return None
         with log.phase("assembly"):
             unseen = wider.take(~np.isin(wider.key, self.contacts.key))
-            system = ContactSystem(world, unseen, options.dt, options.run.recovery_speed)
+            system = ContactSystem(world, unseen, settings.dt, settings.recovery_speed)
             with cone_problem(system, world.comm) as beyond:
                 opening = (beyond.velocity_of(problem.momentum(impulse)) + beyond.r)[:, 0]
-                closes = options.dt * beyond.min(opening.min(initial=0.0)) < -OVERRUN * options.delta
+                closes = settings.dt * beyond.min(opening.min(initial=0.0)) < -OVERRUN * settings.delta
         return (wider, self._remembered(impulse)) if closes else None
 
     def _turned(self, impulse: np.ndarray) -> tuple[Contacts, ImpulseMemory] | None:
@@ -189,10 +187,10 @@ class Stepper:
         None if there are none, or after so many corrections."""
         if self._corrections == CORRECTIONS:
             return None
-        options = self.options
+        settings = self.settings
         with log.phase("search"):
-            velocity, depth = self.system.velocity(impulse), TURNED * options.delta
-            found = find_turned(self.world, self.contacts, velocity, options.dt, depth, options.run.recovery_speed)
+            velocity, depth = self.system.velocity(impulse), TURNED * settings.delta
+            found = find_turned(self.world, self.contacts, velocity, settings.dt, depth, settings.recovery_speed)
         if found is None:
             return None
         self._corrections += 1
@@ -204,22 +202,17 @@ class Stepper:
         memory.remember(self.system.key, impulse, self.system.frame)
         return memory
 
-    def records(self) -> dict[str, float]:
-        """The records of the last step by name; collective. SceneError if the scene's own `record` fails."""
-        step = Step(self.world, self.contacts, self.system, self.impulse)
-        return recording.row(step, self.options.scene)
-
     def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> Solved:
         """Solve as asked; where that does not converge, go on with APGD from there and keep the better."""
-        options = self.options
-        wanted = options.run.ccp_type
-        asked = ccp.solve(problem, guess, wanted, options.limits, options.solver, self.newton, options.coulomb)
+        settings, coulomb = self.settings, self.settings.coulomb or None
+        wanted, limits = settings.solver, settings.limits
+        asked = ccp.solve(problem, guess, wanted, limits, settings.options, self.newton, coulomb)
         used = asked.solver or wanted
         newton_its = asked.iterations if ccp.SOLVERS[used].newton else 0
         if asked.final or used == "apgd":
             return Solved(asked, asked, used, newton_its)
-        limits = dataclasses.replace(options.limits, max_it=-1)
-        second = ccp.solve(problem, asked.impulse, "apgd", limits, coulomb=options.coulomb)
+        limits = dataclasses.replace(limits, max_it=-1)
+        second = ccp.solve(problem, asked.impulse, "apgd", limits, coulomb=coulomb)
         if second.residual < asked.residual:
             second.ksp_its, second.fallbacks = asked.ksp_its, asked.fallbacks
             return Solved(second, asked, "apgd", newton_its)

@@ -10,7 +10,6 @@ import json
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from typing import Any
 
@@ -21,14 +20,13 @@ from petsc4py import PETSc
 
 from dem.contact import find_contacts
 from dem.partition import imbalance, rebalance
+from dem.scenes import Mixer
 from dem.system import ContactSystem
 from pctt import ccp
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.exchange import offsets
-from pctt.run.options import read_options
-from pctt.run.report import Progress
-from pctt.run.simulate import first_state
 from pctt.run.stepper import cone_problem
+from pctt.simulation import Simulation
 
 TOL = 1e-6
 SOLVERS = ("apgd", "conic")
@@ -43,15 +41,14 @@ SMALL, LARGE = 8, 2**20  # bytes of the messages that latency and bandwidth are 
 def count(n: int) -> dict[str, Any]:
     """The figures of the first step after the settled state of a mixer; collective."""
     comm = MPI.COMM_WORLD
-    database = {"scene": "mixer", "scene_n": str(n), "restart": "settled"}
     for name, value in {"ksp_type": "cg", "pc_type": "pbjacobi"}.items():  # factors are another story
         PETSc.Options().setValue(name, value)
-    options = read_options(database | {"output": tempfile.gettempdir(), "overwrite": "true"}, comm)
-    world, _ = first_state(options, comm, Progress(False))
-    contacts = find_contacts(world, options.delta, options.dt)
+    sim = Simulation(Mixer(n=n), restart="settled")
+    world, settings = sim.world, sim.settings
+    contacts = find_contacts(world, settings.delta, settings.dt)
     if rebalance(world):
-        contacts = find_contacts(world, options.delta, options.dt)
-    system = ContactSystem(world, contacts, options.dt, options.run.recovery_speed)
+        contacts = find_contacts(world, settings.delta, settings.dt)
+    system = ContactSystem(world, contacts, settings.dt, settings.recovery_speed)
     with cone_problem(system, comm) as problem:
         row = {"ranks": comm.size, "imbalance": imbalance(world), **shares(problem)}
         for solver in SOLVERS if comm.size <= SOLVED else ():

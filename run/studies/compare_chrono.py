@@ -52,14 +52,13 @@ from dem.bodies import SPHERE
 from dem.contact import Contacts, find_contacts
 from dem.motion import Fixed
 from dem.scene import Scene
+from dem.scenes import Mixer
 from dem.shapes import Box, Plane
 from dem.start import new_world
 from dem.system import ContactSystem, contact_frames, relative_velocity
 from dem.world import World
 from pctt import ccp
-from pctt.run.options import read_options
-from pctt.run.report import Progress
-from pctt.run.simulate import first_state
+from pctt.simulation import Simulation
 
 COMM = MPI.COMM_SELF
 TOLERANCES = (1e-4, 1e-6)
@@ -85,18 +84,16 @@ class State(NamedTuple):
 
 def settled_mixer(n: int) -> State:
     """The settled mixer, with a body for each of its walls: so two bodies have one contact at most."""
-    database = {"scene": "mixer", "scene_n": str(n), "restart": "settled"}
-    database |= {"output": tempfile.gettempdir(), "overwrite": "true"}  # where nothing is written
-    options = read_options(database, COMM)
-    found, _ = first_state(options, COMM, Progress(True))
-    grains, density = found.grains, options.scene.density
-    scene = Scene(options.scene.friction, found.gravity.tolist())
+    mixer = Mixer(n=n)
+    sim = Simulation(mixer, restart="settled")
+    found, grains, density = sim.world, sim.world.grains, mixer.density
+    scene = Scene(mixer.friction, found.gravity.tolist())
     _add_spheres(scene, grains.position, grains.velocity, grains.size[:, 0], density)
     for row, body in enumerate(found.large_bodies):
         place = {"position": found.large.position[row], "quaternion": found.large.quaternion[row]}
         for number, part in enumerate(body.shapes):
             scene.add_body(f"{body.name} {number}", [part], body.motion, **place)
-    return State(f"mixer n = {n}", new_world(scene, COMM, np.inf), options.dt, options.delta)
+    return State(f"mixer n = {n}", new_world(scene, COMM, np.inf), sim.settings.dt, sim.settings.delta)
 
 
 def stored_box(path: str) -> State:

@@ -25,12 +25,11 @@ from mpi4py import MPI
 from peers import PEERS
 
 from dem.contact import find_contacts
+from dem.scenes import Mixer
 from dem.system import ContactSystem
 from pctt import ccp
-from pctt.run.options import read_options
-from pctt.run.report import Progress
-from pctt.run.simulate import first_state
 from pctt.run.stepper import cone_problem
+from pctt.simulation import Simulation
 
 COMM = MPI.COMM_SELF
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8)
@@ -47,17 +46,14 @@ VARIANTS = {
 
 def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
     """The cone problem of the first step after the settled state of a mixer."""
-    database = {"scene": "mixer", "scene_n": str(n), "restart": "settled"}
-    database |= {"output": tempfile.gettempdir(), "overwrite": "true"}  # where nothing is written
-    options = read_options(database, COMM)
-    world, _ = first_state(options, COMM, Progress(True))
-    grains = world.grains
+    sim = Simulation(Mixer(n=n), restart="settled")
+    world, settings, grains = sim.world, sim.settings, sim.world.grains
     if variant == "loose":
         rng = np.random.default_rng(0)
         grains.position[:, 2] *= 1.01
         grains.velocity[:, :3] += 0.5 * rng.normal(size=(len(grains), 3)) - np.array([0, 0, 0.5])
-    contacts = find_contacts(world, options.delta, options.dt)
-    system = ContactSystem(world, contacts, options.dt, options.run.recovery_speed)
+    contacts = find_contacts(world, settings.delta, settings.dt)
+    system = ContactSystem(world, contacts, settings.dt, settings.recovery_speed)
     problem = cone_problem(system, COMM, compliance)
     mu, G = problem.mu, problem.contact_map.given
     if variant == "friction":

@@ -21,7 +21,6 @@ from dem.scenes import Mixer
 from dem.start import new_world
 from pctt.run import checkpoint, settling
 from pctt.run.options import read_options
-from pctt.run.settings import Options
 
 LANDING = 1.75  # s: the layers land within .6 s, the bed comes to rest, the last tenth of the settling is accurate
 
@@ -53,26 +52,27 @@ def spread(places: Floats, spheres: int, scene: Mixer) -> Floats:
 
 def main(n: int) -> None:
     small = Mixer(n=n)
-    settled, _ = settling.cache(_options(n), small.build())
+    settled, _ = settling.cache(_settling(n), small.build())
     if not checkpoint.intact(settled):
         raise FileNotFoundError(f"no settled mixer of size {n} in {settled.parent}: run/settle mixer {n} makes it")
     with h5py.File(settled) as file:
         bed = file["grains/position"][:]
-    options = _options(2 * n)
-    large, scene = options.scene, options.scene.build()
+    how = _settling(2 * n)
+    large, scene = how.experiment, how.experiment.build()
     places = copies(bed, small.radius, small.width)
     places = spread(places[fits(places, large)], (4 * n + 1) ** 3, large)
     world = new_world(scene, MPI.COMM_SELF)
     world.grains.position[:] = places
-    world.step = settling.steps(options) - round(LANDING / options.dt)  # at time zero the paddle is where `fits` has it
-    path, made_with = settling.cache(options, scene)
+    world.step = how.steps - round(LANDING / how.settings.dt)  # at time zero the paddle is where `fits` has it
+    path, made_with = settling.cache(how, scene)
     checkpoint.save(settling.unfinished(path), made_with, world, ImpulseMemory(MPI.COMM_SELF))
     print(f"{settling.unfinished(path)}: {len(places)} spheres, of copies of {settled}")
 
 
-def _options(n: int) -> Options:
-    """The options of `run/settle mixer n`."""
-    return read_options({"scene": "mixer", "scene_n": str(n), "settle": "true"}, MPI.COMM_SELF)
+def _settling(n: int) -> settling.Settling:
+    """What `run/settle mixer n` does."""
+    options = read_options({"scene": "mixer", "scene_n": str(n), "settle": "true"}, MPI.COMM_SELF)
+    return settling.Settling.asked(options)
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ class Compared(Stepper):
 
     def overlaps(self, problem: ccp.ConeProblem, result: ccp.Result) -> dict[str, float]:
         """The deepest overlap that the velocities make, and that of the velocities less the openings [mm]."""
-        y, unit = problem.product(result.impulse) + problem.r, -1e3 * self.options.dt
+        y, unit = problem.product(result.impulse) + problem.r, -1e3 * self.settings.dt
         closing = (y[:, 0], y[:, 0] - problem.mu * tangential(y))
         made, net = (unit * float(values.min(initial=0.0)) for values in closing)
         return {"overlap [mm]": made, "less opening [mm]": net, "converged": result.converged}
@@ -51,7 +51,8 @@ def main(scene: str, n: str, steps: int, every: int) -> None:
     about = say_machine()
     words = {"scene": scene, "scene_n": n, "restart": "settled", "ccp_type": "apgd", "ccp_coulomb": "true"}
     options = read_options({**words, "output": "results", "overwrite": "true"}, MPI.COMM_WORLD)
-    with Compared(options, *first_state(options, MPI.COMM_WORLD, Progress(False))) as stepper:
+    sim = first_state(options, MPI.COMM_WORLD, Progress(False))
+    with Compared(sim.settings, sim.world, sim.memory) as stepper:
         stepper.every = every
         for _ in range(steps):
             stepper.step()

@@ -26,7 +26,7 @@ from pctt.pc import TensorTrain
 from pctt.pc.sparse_train import SparseTrain
 from pctt.run.options import read_options
 from pctt.run.report import Progress
-from pctt.run.settings import Options
+from pctt.run.settings import Settings
 from pctt.run.simulate import first_state
 from pctt.run.stepper import Solved, Stepper
 
@@ -82,22 +82,22 @@ class ReplayingStepper(Stepper):
     """
 
     def __init__(
-        self, options: Options, world: World, memory: ImpulseMemory, look: Callable[[Replay], None],
+        self, settings: Settings, world: World, memory: ImpulseMemory, look: Callable[[Replay], None],
         newton_steps: int | None = None,
     ):  # fmt: skip
-        super().__init__(options, world, memory, Recorder(world.comm))
+        super().__init__(settings, world, memory, Recorder(world.comm))
         self.look, self.newton_steps = look, newton_steps
 
     def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> Solved:
         assert isinstance(self.newton, Recorder)
-        options = self.options
-        limits = options.limits if self.newton_steps is None else replace(options.limits, max_it=self.newton_steps)
-        result = ccp.solve(problem, guess, "pdip", limits, options.solver, self.newton)
+        limits, options = self.settings.limits, self.settings.options
+        few = limits if self.newton_steps is None else replace(limits, max_it=self.newton_steps)
+        result = ccp.solve(problem, guess, "pdip", few, options, self.newton)
         replay = Replay(problem, self.newton.systems)
         self.look(replay)
         replay.destroy()
         if self.newton_steps is not None:
-            result = ccp.solve(problem, guess, "apgd", options.limits)
+            result = ccp.solve(problem, guess, "apgd", limits)
         return Solved(result, result, "pdip" if self.newton_steps is None else "apgd", result.iterations)
 
 
@@ -115,8 +115,8 @@ def replay_steps(
         options = read_options(database | {"output": "results", "overwrite": "true"}, comm)
     except OptionError as error:
         sys.exit(str(error))
-    world, memory = first_state(options, comm, Progress(False))
-    with ReplayingStepper(options, world, memory, look, newton_steps) as stepper:
+    sim = first_state(options, comm, Progress(False))
+    with ReplayingStepper(sim.settings, sim.world, sim.memory, look, newton_steps) as stepper:
         return [stepper.step() for _ in range(steps)]
 
 

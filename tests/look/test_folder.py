@@ -43,8 +43,8 @@ def test_forces_of_the_contacts_change_the_momentum(folder):
     assert contacts.dt == 0.1
     assert len(contacts.gap) > 10
     total = np.zeros((127, 3))
-    np.add.at(total, contacts.body[:, 1], contacts.force)
-    np.subtract.at(total, contacts.body[:, 0], contacts.force)
+    np.add.at(total, contacts.bodies[:, 1], contacts.force)
+    np.subtract.at(total, contacts.bodies[:, 0], contacts.force)
     mass = read.mass[:125, None]
     gained = mass * (after.velocity - before.velocity)[:125, :3] / contacts.dt + mass * [0, 0, 9.81]
     np.testing.assert_allclose(gained, total[:125], atol=1e-8)

@@ -99,7 +99,7 @@ def test_the_pattern_is_that_of_the_delassus_matrix(folder):
     read = Folder(folder)
     read.require_frames()
     frame = read.frame(4)
-    pair = frame.contacts.body
+    pair = frame.contacts.bodies
     blocks = np.zeros((len(pair), 3, 127, 6))
     rng = np.random.default_rng(1)
     for c, bodies in enumerate(pair):
@@ -115,6 +115,6 @@ def test_the_example_is_a_cluster_of_few_grains(folder):
     read.require_frames()
     frame = read.frame(4)
     rows = structure.example(read, frame)
-    grains = np.unique(frame.contacts.body[rows])
+    grains = np.unique(frame.contacts.bodies[rows])
     assert 1 <= (grains < 125).sum() <= 13
     assert len(rows) >= 1

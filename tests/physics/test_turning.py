@@ -9,35 +9,31 @@ from mpi4py import MPI
 from several_ranks import alone
 
 from dem.contact import find_contacts
-from dem.impulses import ImpulseMemory
 from dem.record import energy
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world
 from dem.stepper import advanced
 from dem.turning import find_turned
-from pctt.run.options import read_options
-from pctt.run.stepper import Stepper
+from pctt.simulation import Simulation
 
 DT, DELTA = 0.01, 0.1 * RADIUS
 
 
-def stepper_of(scene):
-    words = {"scene_n": "1", "dt": str(DT), "delta": str(DELTA), "ccp_type": "apgd", "ccp_tol": "1e-6"}
-    world = new_world(scene, MPI.COMM_SELF)
-    return Stepper(read_options(words, MPI.COMM_SELF), world, ImpulseMemory(MPI.COMM_SELF))
+def simulation_of(scene):
+    return Simulation(scene, dt=DT, delta=DELTA, solver="apgd", tol=1e-6, comm=MPI.COMM_SELF)
 
 
 @pytest.mark.parametrize("shape", ["capsules", "boxes"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_spinning_grains_do_not_run_into_each_other(shape, seed):
     """Without a correction capsules overlap by up to .05 of the radius, boxes by .15 of the least half extent."""
-    stepper = stepper_of(spinning(shape, 1 / 3, seed))
-    kinetic, _ = energy(stepper.world.grains, stepper.world.gravity)
+    sim = simulation_of(spinning(shape, 1 / 3, seed))
+    kinetic, _ = energy(sim.world.grains, sim.world.gravity)
     for _ in range(40):
-        assert stepper.step()["converged"]
-        assert stepper.contacts.gap.min(initial=0.0) > -0.03 * RADIUS
-        now, _ = energy(stepper.world.grains, stepper.world.gravity)
+        assert sim.step()["converged"]
+        assert sim.contacts.gap.min(initial=0.0) > -0.03 * RADIUS
+        now, _ = energy(sim.world.grains, sim.world.gravity)
         assert now < (1 + 1e-9) * kinetic
         kinetic = now
 
@@ -55,10 +51,10 @@ def test_a_lever_stops_with_its_tip_on_the_floor(angle):
     turn = (np.cos(lean / 2), 0, -np.sin(lean / 2), 0)
     motion = {"quaternions": turn, "velocity": np.cross(spin, middle), "angular_velocity": spin}
     scene.add_boxes(middle, (0.5 * length, RADIUS, thick), 1000.0, **motion)
-    stepper = stepper_of(scene)
-    stepper.step()
-    stepper.step()  # whose contacts are those of the end of the first
-    assert stepper.contacts.gap.min() > -0.1 * DELTA - 1e-6
+    sim = simulation_of(scene)
+    sim.step()
+    sim.step()  # whose contacts are those of the end of the first
+    assert sim.contacts.gap.min() > -0.1 * DELTA - 1e-6
 
 
 def test_bodies_that_keep_apart_are_left_alone():

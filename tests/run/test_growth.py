@@ -60,9 +60,9 @@ def test_two_hundred_steps(tmp_path, monkeypatch):
         stands(results, *arguments)
         seen.append(written())
 
-    def count(results, world, steps):
+    def count(results, steps):
         linked.append(len(steps))
-        link(results, world, steps)
+        link(results, steps)
 
     monkeypatch.setattr(Results, "stands", look)
     monkeypatch.setattr(Results, "_link", count)

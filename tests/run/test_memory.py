@@ -16,25 +16,26 @@ PROGRAM = """
 import json, os, sys
 from pathlib import Path
 from mpi4py import MPI
-from pctt.run import simulate as program
+from pctt import simulation
 from pctt.run.options import read_options
+from pctt.run.simulate import simulate
 
 comm = MPI.COMM_WORLD
 options, steps, warm = json.loads(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 os.fsync = lambda descriptor: None
 page = 4096 / 2**20
 
-class Watched(program.Stepper):
+class Watched(simulation.Stepper):
     def step(self):
         line = super().step()
         if self.world.step in (warm, steps):
             resident.append(int(Path("/proc/self/statm").read_text().split()[1]) * page)
         return line
 
-program.Stepper = Watched
+simulation.Stepper = Watched
 resident = []
 words = {"scene_n": "1", "scene_margin": "0.7", "quiet": None, "steps": str(steps), "output": options["ccp_type"]}
-program.simulate(read_options({**words, **options}, comm), comm)
+simulate(read_options({**words, **options}, comm), comm)
 growth = comm.gather(resident[1] - resident[0])
 if comm.rank == 0:
     print(json.dumps(growth))

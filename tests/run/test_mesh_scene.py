@@ -30,7 +30,7 @@ def test_a_drum_runs_goes_on_and_is_written(program, tmp_path):
     assert [shape["kind"] for shape in drum["shapes"] + ends["shapes"]] == ["Mesh"] * 3
     assert np.shape(drum["shapes"][0]["vertices"]) == (2 * Drum.sides, 3)
     assert np.shape(drum["shapes"][0]["triangles"]) == (2 * Drum.sides, 3)
-    assert (folder.frame(6).contacts.body >= folder.grains).any()
+    assert (folder.frame(6).contacts.bodies >= folder.grains).any()
     files = sorted(path.name for path in (tmp_path / "problems").iterdir())
     assert files
     if MPI.COMM_WORLD.size == 1:

@@ -11,14 +11,11 @@ import pytest
 from mpi4py import MPI
 from program import SETTLED, SMALL, steps_of, table
 
-from dem.impulses import ImpulseMemory
 from dem.scenes import Shear
-from dem.start import new_world
 from pctt.run.hdf5 import FileError
-from pctt.run.options import read_options
 from pctt.run.place import Place
 from pctt.run.records import Records
-from pctt.run.stepper import Stepper
+from pctt.simulation import Simulation
 
 APGD = ("-ccp_type", "apgd")
 
@@ -101,15 +98,10 @@ def test_the_series_of_the_analysis_go_to_a_file(program, tmp_path):
 def test_the_settled_press_is_carried_and_smooth_walls_leave_its_whole_weight_to_the_floor(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scene = Shear(n=1, wall_friction=0.0)
-    world = new_world(scene.build(), MPI.COMM_SELF)
-    words = {"scene": "shear", "scene_n": "1", "scene_wall_friction": "0", "ccp_type": "apgd", "ccp_tol": "1e-3"}
-    words["dt"] = "0.02"
-    stepper = Stepper(read_options(words, MPI.COMM_SELF), world, ImpulseMemory(MPI.COMM_SELF))
-    rows = []
-    while world.time < scene.settling_time - 1e-9:
-        stepper.step()
-        rows.append(stepper.records())
-    mean = {name: np.mean([row[name] for row in rows[-40:]]) for name in rows[0]}
+    sim, rows = Simulation(scene, dt=0.02, solver="apgd", tol=1e-3, comm=MPI.COMM_SELF), []
+    sim.run(until=scene.settling_time, call=lambda sim: rows.append(sim.figures))
+    mean = {name: np.mean([row[name] for row in rows[-40:]]) for name in rows[0] if "[" in name}
+    world = sim.world
     press, grains = world.large.mass[2] * 9.81, world.grains.mass.sum() * 9.81
     assert mean["press_stress [Pa]"] * scene.area == pytest.approx(press, rel=0.02)
     assert mean["force_press_z [N]"] == pytest.approx(press, rel=0.02)

@@ -7,7 +7,6 @@ import pytest
 from mpi4py import MPI
 
 from dem.bodies import Bodies
-from dem.impulses import ImpulseMemory
 from dem.motion import Dynamic, Glide, Guided
 from dem.scene import Scene
 from dem.scenes import Mixer
@@ -16,16 +15,13 @@ from dem.start import new_world
 from dem.together import SceneError
 from pctt import ccp
 from pctt.options import OptionError
-from pctt.run.options import read_options
 from pctt.run.settling import world_at_start
-from pctt.run.stepper import Stepper
+from pctt.simulation import Simulation
 
 
-def stepper_of(scene, **options):
-    """The time stepper of the program for a scene of our own."""
-    words = {"scene_n": "1", **{name: str(value) for name, value in options.items()}}
-    world = new_world(scene, MPI.COMM_SELF)
-    return Stepper(read_options(words, MPI.COMM_SELF), world, ImpulseMemory(MPI.COMM_SELF))
+def simulation_of(scene, **settings):
+    """A simulation with the solver of the program."""
+    return Simulation(scene, comm=MPI.COMM_SELF, **{"solver": "pdip", "dt": Mixer.dt, "delta": Mixer.delta, **settings})
 
 
 @pytest.fixture(autouse=True)
@@ -38,17 +34,17 @@ def test_one_body_falls_and_lands(solver):
     scene = Scene(0.3)
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_spheres([0, 0, 0.2], 0.1, 1000.0)
-    stepper = stepper_of(scene, ccp_type=solver, ccp_tol=1e-8)
-    lines = [stepper.step() for _ in range(12)]
+    sim = simulation_of(scene, solver=solver, tol=1e-8)
+    lines = [sim.step() for _ in range(12)]
     assert [line["contacts"] for line in lines[:3]] == [0, 0, 0]
     assert lines[-1]["contacts"] == 1
     for line in lines:
         assert line["converged"]
         assert line["natural_residual"] <= 1e-8
         assert np.isfinite(line["objective"])
-    np.testing.assert_allclose(stepper.world.grains.position[0], [0, 0, 0.1], atol=1e-8)
-    weight = stepper.world.grains.mass[0] * 9.81
-    np.testing.assert_allclose(stepper.impulse, [[weight * stepper.options.dt, 0, 0]], rtol=1e-7)
+    np.testing.assert_allclose(sim.world.grains.position[0], [0, 0, 0.1], atol=1e-8)
+    weight = sim.world.grains.mass[0] * 9.81
+    np.testing.assert_allclose(sim.last.impulse, [[weight * sim.settings.dt, 0, 0]], rtol=1e-7)
 
 
 @pytest.mark.parametrize("solver", ["pdip", "apgd"])
@@ -57,15 +53,15 @@ def test_what_a_struck_grain_strikes_is_seen(solver):
     scene = Scene(0.0, gravity=(0, 0, 0))
     scene.add_body("tool", [Box((0.02, 0.3, 0.3))], Glide((2.0, 0, 0)))
     scene.add_spheres([[0.12, 0, 0], [0.32, 0, 0], [0.55, 0, 0]], 0.1, 1000.0)
-    stepper = stepper_of(scene, ccp_type=solver, ccp_tol=1e-8)
-    line = stepper.step()
+    sim = simulation_of(scene, solver=solver, tol=1e-8)
+    line = sim.step()
     assert line["contacts"] == 3
     assert line["newton_its"] == (line["iterations"] if solver == "pdip" else 0)
-    order = np.argsort(stepper.world.grains.id)
-    np.testing.assert_allclose(stepper.world.grains.position[order, 0], [0.17, 0.37, 0.57], atol=1e-6)
-    assert stepper.records()["worst_overlap [m]"] < 1e-9
-    stepper.step()
-    assert stepper.records()["worst_overlap [m]"] < 1e-6
+    order = np.argsort(sim.world.grains.id)
+    np.testing.assert_allclose(sim.world.grains.position[order, 0], [0.17, 0.37, 0.57], atol=1e-6)
+    assert sim.figures["worst_overlap [m]"] < 1e-9
+    sim.step()
+    assert sim.figures["worst_overlap [m]"] < 1e-6
 
 
 @pytest.mark.parametrize("motion", [Dynamic(), Guided((0, 0, 1))], ids=["free", "guided"])
@@ -74,33 +70,33 @@ def test_what_a_struck_plate_strikes_is_seen(motion):
     scene = Scene(0.0, gravity=(0, 0, 0))
     scene.add_body("plate", [Box((0.3, 0.3, 0.01))], motion, density=10.0)
     scene.add_spheres([[0, 0, 0.13], [0, 0, -0.17]], 0.1, 5000.0, velocity=[[0, 0, -10.0], [0, 0, 0]])
-    stepper = stepper_of(scene, ccp_type="apgd", ccp_tol=1e-8, delta=0.01, dt=0.01)
+    sim = simulation_of(scene, solver="apgd", tol=1e-8, delta=0.01, dt=0.01)
     for _ in range(2):
-        stepper.step()
-        places = stepper.world.grains.position[np.argsort(stepper.world.grains.id), 2]
-        gaps = np.abs(places - stepper.world.large.position[0, 2]) - 0.11
+        sim.step()
+        places = sim.world.grains.position[np.argsort(sim.world.grains.id), 2]
+        gaps = np.abs(places - sim.world.large.position[0, 2]) - 0.11
         assert gaps.min() > -1e-6
     mass = 5000.0 * 4e-3 / 3 * np.pi
     speed = 10.0 * mass / (2 * mass + 10.0 * 0.6 * 0.6 * 0.02)
-    np.testing.assert_allclose(stepper.world.grains.velocity[:, 2], -speed, rtol=1e-5)
+    np.testing.assert_allclose(sim.world.grains.velocity[:, 2], -speed, rtol=1e-5)
 
 
 def test_one_body_alone_has_no_contacts():
     scene = Scene(0.3)
     scene.add_spheres([0, 0, 0], 0.1, 1000.0, velocity=(1, 2, 3))
-    stepper = stepper_of(scene)
-    line = stepper.step()
+    sim = simulation_of(scene)
+    line = sim.step()
     assert (line["contacts"], line["newton_its"], line["ksp_its"]) == (0, 0, 0)
     assert line["natural_residual"] == 0.0
     assert line["reason"] == "no contacts"
     expected = [1, 2, 3 - 9.81 * Mixer.dt, 0, 0, 0]
-    np.testing.assert_allclose(stepper.world.grains.velocity[0], expected, rtol=1e-14)
+    np.testing.assert_allclose(sim.world.grains.velocity[0], expected, rtol=1e-14)
 
 
 def test_a_contact_that_does_not_close_needs_no_impulse():
     scene = Scene(0.3, gravity=(0, 0, 0))
     scene.add_spheres([[0, 0, 0], [0.21, 0, 0]], 0.1, 1000.0)
-    line = stepper_of(scene).step()
+    line = simulation_of(scene).step()
     assert (line["contacts"], line["newton_its"], line["natural_residual"]) == (1, 0, 0.0)
 
 
@@ -135,26 +131,26 @@ def test_a_problem_with_a_number_that_is_none_is_refused():
 def test_a_body_that_is_lost_ends_the_run():
     scene = Scene(0.3)
     scene.add_spheres([[0, 0, 0], [1, 0, 0]], 0.1, 1000.0)
-    stepper = stepper_of(scene)
-    columns = {name: column.copy() for name, column in stepper.world.grains.columns().items()}
+    sim = simulation_of(scene)
+    columns = {name: column.copy() for name, column in sim.world.grains.columns().items()}
     columns["position"][1, 0] = np.nan
-    stepper.world.set_grains(Bodies(**columns))
+    sim.world.set_grains(Bodies(**columns))
     with pytest.raises(SceneError, match="step 1"):
-        stepper.step()
+        sim.step()
 
 
 def test_a_body_that_is_lost_within_a_step_ends_the_run_too(monkeypatch):
     """The search at the end of a step, which turns bodies, may be the first to see it."""
     scene = Scene(0.3)
     scene.add_spheres([0, 0, 0], 0.1, 1000.0)
-    stepper = stepper_of(scene)
+    sim = simulation_of(scene)
 
     def lost(*arguments):
         raise FloatingPointError("no finite position")
 
     monkeypatch.setattr("pctt.run.stepper.find_turned", lost)
     with pytest.raises(SceneError, match="step 1: no finite position"):
-        stepper.step()
+        sim.step()
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")

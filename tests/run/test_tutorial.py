@@ -10,14 +10,12 @@ from mpi4py import MPI
 from program import ROOT, database, table
 
 from dem.experiment import from_file
-from dem.impulses import ImpulseMemory
-from dem.start import new_world
 from dem.together import SceneError
 from pctt.options import OptionError
 from pctt.run.options import read_options
 from pctt.run.settings import find_scene
 from pctt.run.simulate import simulate
-from pctt.run.stepper import Stepper
+from pctt.simulation import Simulation
 
 LOOSE = ("-ccp_type", "apgd", "-ccp_tol", "1e-3")
 
@@ -34,15 +32,11 @@ def hopper(tmp_path, monkeypatch):
 
 def test_grains_flow_out_of_the_hopper_and_none_is_lost(hopper):
     scene = from_file(hopper)(n=4, settling_time=0.3)
-    world = new_world(scene.build(), MPI.COMM_SELF)
     words = {"scene": str(hopper), "scene_n": "4", "scene_settling_time": "0.3", "ccp_type": "apgd", "ccp_tol": "1e-3"}
     options = read_options(words, MPI.COMM_SELF)
     assert repr(options.scene) == repr(scene)
-    stepper = Stepper(options, world, ImpulseMemory(MPI.COMM_SELF))
-    rows = []
-    for _ in range(90):
-        stepper.step()
-        rows.append(stepper.records())
+    sim = Simulation(options.scene, options.settings, comm=MPI.COMM_SELF)
+    rows, world = [sim.step() for _ in range(90)], sim.world
     out = np.array([row["grains_out"] for row in rows])
     assert (out[:32] == 0).all()
     assert out[-1] > 10
@@ -51,7 +45,7 @@ def test_grains_flow_out_of_the_hopper_and_none_is_lost(hopper):
     assert len(world.grains) == world.slabs[-1] == 64
     door = np.array([row["force_door_z [N]"] for row in rows])
     assert door[:30].min() < 0  # grains lay on it
-    records = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    records = {name: np.array([row[name] for row in rows]) for name in rows[0] if "phases" not in name}
     assert scene.analyse(records)["mean_discharge_rate [1/s]"] == pytest.approx(out[-1] / 0.89)
 
 

@@ -1,0 +1,456 @@
+"""A simulation as an object: make steps, look at bodies and forces, change motions, write the files of a run.
+
+    import pctt
+
+    sim = pctt.Simulation(scene, dt=0.005)  # a dem.scene.Scene, or a dem.experiment.Experiment
+    sim.run(until=2.0)
+    print(sim.time, sim.positions, sim.body("paddle").force)
+
+``python -m pctt.run`` does nothing else. On several ranks every rank makes the same calls; all members are collective
+that do not say otherwise. Quantities are in SI units.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Callable, Collection
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import control
+from dem import record as recording
+from dem.arrays import Floats
+from dem.bodies import Bodies
+from dem.experiment import Experiment, Given
+from dem.impulses import ImpulseMemory
+from dem.motion import Motion
+from dem.scene import LargeBody, Scene
+from dem.step import Step
+from dem.together import meet, together
+from pctt import ccp, log
+from pctt.look.folder import Contacts, FolderError, Frame, Snapshot
+from pctt.look.picture import Picture
+from pctt.options import AT_LEAST_ONE, COUNT, OptionError, made
+from pctt.run import checkpoint, report
+from pctt.run.dump import Dump
+from pctt.run.hdf5 import refuse_serial
+from pctt.run.options import refuse_unwritable
+from pctt.run.place import Place
+from pctt.run.results import Results, described_bodies
+from pctt.run.settings import Settings, scene_name
+from pctt.run.settling import Settling, built, settled_state, world_at_start
+from pctt.run.stepper import Stepper
+
+Result = TypeVar("Result")
+
+
+class Simulation:
+    """The bodies of a scene and the solver that moves them.
+
+    Attributes
+    ----------
+    comm : the communicator
+    settings : the `Settings`, with what the scene and the solver have of their own filled in
+    experiment : the scene as an `Experiment`
+    world : the bodies of this rank and the time, a `dem.world.World`
+    memory, stepper : the impulses of the last step, and what makes the next, a `pctt.run.stepper.Stepper`
+    last : the last step, a `dem.step.Step` with this rank's contacts and impulses; None before the first
+    figures : of the last step, as in steps.jsonl and records.csv: ``iterations``, ``natural_residual``, ``converged``,
+        ``seconds``, ``phases``, ``kinetic_energy [J]``, ``worst_overlap [m]`` and so on; empty before the first
+    output : the files of `write`, a `pctt.run.results.Results`; None before
+    """
+
+    def __init__(
+        self,
+        scene: Scene | Experiment,
+        settings: Settings | None = None,
+        *,
+        comm: MPI.Comm = MPI.COMM_WORLD,
+        restart: str | Path = "",
+        changed_file: bool = False,
+        compare: ccp.Comparison | None = None,
+        **changes: Any,
+    ):
+        """The scene at time zero, or as the checkpoint ``restart`` has it; "settled": in its settled state, which is
+        made at first use.
+
+        The settings may be given one by one, as ``dt=0.01, solver="apgd", tol=1e-5``. ``changed_file`` lets a
+        checkpoint of another text of the scene file pass; ``compare`` solves the Newton systems with other
+        preconditioners too. Raises OptionError (a ValueError) for a bad setting, SceneError if the scene fails, and
+        FileError for a bad file, each on all ranks.
+        """
+        if not isinstance(scene, (Scene, Experiment)):
+            raise OptionError(f"scene {scene!r}: allowed is a dem.scene.Scene or an instance of an Experiment")
+        self.comm = comm
+        self.experiment = scene if isinstance(scene, Experiment) else Given(scene)
+        self.settings = together(comm, "settings", lambda: self._settings(settings, changes), own=(OptionError,))
+        scene = built(self.experiment, comm)
+        if restart == "settled":
+            how = Settling(self.experiment, self.settings, self.experiment.settle_delta)
+            restart = settled_state(how, scene, comm, report.Progress(False))
+        if restart:
+            self.world, self.memory = checkpoint.load(Path(restart), scene, self._origin, comm, changed_file)
+        else:
+            self.world, self.memory = world_at_start(self.experiment, scene, comm), ImpulseMemory(comm)
+        self._restart = str(restart)
+        self._compare = compare or ccp.Comparison(comm, [])
+        newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
+        self.stepper = Stepper(self.settings, self.world, self.memory, newton)
+        self.last: Step | None = None
+        self.figures: dict[str, Any] = {}
+        self.output: Results | None = None
+        self._closed = False
+
+    @classmethod
+    def load(cls, path: str | Path, scene: Scene | Experiment, *given: Any, **more: Any) -> Simulation:
+        """The simulation that `save` kept, or a checkpoint.h5 of a run, with the same scene and time step; the other
+        arguments are those of a new one. On as many ranks it goes on with the same bits."""
+        return cls(scene, *given, restart=path, **more)
+
+    def _settings(self, settings: Settings | None, changes: dict[str, Any]) -> Settings:
+        return made(Settings, {**(vars(settings) if settings else {}), **changes}).of(self.experiment)
+
+    @property
+    def _origin(self) -> dict[str, Any]:
+        return checkpoint.origin(self.experiment, self.settings.dt)
+
+    def __enter__(self) -> Simulation:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *more: object) -> None:
+        self.close() if kind is None else self._free()
+
+    # -- steps -----------------------------------------------------------------------------------------------
+
+    def step(self) -> dict[str, Any]:
+        """Make a step of dt; its `figures`. SceneError if a body is lost, or if code of the scene fails."""
+        return self._step(last=False)
+
+    def _step(self, last: bool) -> dict[str, Any]:
+        if self._closed:
+            raise ValueError("this simulation is closed")
+        stepper, output, self.last = self.stepper, self.output, None  # frees the arrays of the last step
+        figures = stepper.step()
+        self.last = Step(self.world, stepper.contacts, stepper.system, stepper.impulse)
+        with log.phase("output"):
+            self._row = recording.row(self.last, self.experiment)
+            figures["worst_overlap"] = self._row["worst_overlap [m]"]
+            if output:
+                output.record(self.last, self._row, last)
+        # a step's checkpoint is written after its figures, so its seconds count in the next step
+        figures["phases"] |= log.take_seconds(("output",))
+        figures["seconds"] = sum(figures["phases"].values())
+        if output:
+            with log.phase("output"):
+                output.add(figures, last)
+        self.figures = self._row | figures
+        return self.figures
+
+    def run(
+        self,
+        until: float | None = None,
+        *,
+        steps: int | None = None,
+        stop: Callable[[Simulation], bool] | None = None,
+        every: int = 1,
+        call: Callable[[Simulation], object] | None = None,
+    ) -> None:
+        """Make steps until the time ``until`` [s], or so many ``steps``, or until ``stop(self)`` is true after one,
+        whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`."""
+        if until is steps is stop is None:
+            raise OptionError("run: without an end; allowed are until, steps and stop")
+        _check("every", every, AT_LEAST_ONE)
+        left = math.inf if steps is None else _check("steps", steps, COUNT)
+        if until is not None:
+            left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
+        first, end, ends = self.steps, self.steps + left, False
+        while self.steps < end and not ends:
+            self._step(last=self.steps + 1 == end)
+            if call is not None and (self.steps - first) % every == 0:
+                self._told("call of run", call)
+            ends = stop is not None and self.comm.bcast(bool(self._told("stop of run", stop)))
+        self.complete()
+
+    def _told(self, what: str, call: Callable[[Simulation], Result]) -> Result:
+        """What the user's function returns; on several ranks an error of one is one of all."""
+        return call(self) if self.comm.size == 1 else together(self.comm, what, lambda: call(self))
+
+    # -- what there is ---------------------------------------------------------------------------------------
+
+    @property
+    def time(self) -> float:
+        """[s]; not collective."""
+        return self.world.time
+
+    @property
+    def steps(self) -> int:
+        """Steps made since time zero; not collective."""
+        return self.world.step
+
+    @property
+    def positions(self) -> Floats:
+        """Centres (n, 3) of all grains on every rank, in the order in which the scene added them [m]."""
+        return self._of_grains("position")
+
+    @property
+    def orientations(self) -> Floats:
+        """Quaternions (n, 4) (w, x, y, z) of all grains on every rank, in the order of the scene."""
+        return self._of_grains("quaternion")
+
+    @property
+    def velocities(self) -> Floats:
+        """Linear and angular velocities (n, 6) of all grains on every rank, in the order of the scene [m/s, rad/s]."""
+        return self._of_grains("velocity")
+
+    @property
+    def local(self) -> Bodies:
+        """The grains of this rank, a table with the columns ``id``, ``position``, ``velocity`` and so on, in any order;
+        ``id`` is the number in the order of the scene. Not collective."""
+        return self.world.grains
+
+    def _of_grains(self, name: str) -> np.ndarray:
+        grains = self.world.grains
+        found = self._gathered(name, id=grains.id, values=getattr(grains, name))
+        return found["values"][np.argsort(found["id"])]
+
+    def _gathered(self, what: str, **columns: np.ndarray) -> dict[str, np.ndarray]:
+        """The rows of all ranks, on every rank."""
+        meet(self.comm, f"{what} of a Simulation")
+        parts = self.comm.allgather(columns)
+        return {name: np.concatenate([part[name] for part in parts]) for name in columns}
+
+    @property
+    def kinetic_energy(self) -> float:
+        """Of all bodies that forces move [J]."""
+        meet(self.comm, "kinetic_energy of a Simulation")
+        tables = [self.world.grains] + [self.world.large] * (self.comm.rank == 0)
+        return float(self.comm.allreduce(sum(recording.energy(table, self.world.gravity)[0] for table in tables)))
+
+    @property
+    def contacts(self) -> Contacts:
+        """The contacts of the last step of all ranks, on every rank, in an order that does not depend on the ranks:
+        their ``bodies``, ``point``, ``normal``, ``gap`` and ``force``. ValueError before the first step."""
+        step = self._last
+        own, id = step.contacts, step.contacts.near.bodies.id
+        found = self._gathered(
+            "contacts",
+            key=own.key,
+            bodies=np.stack([id[own.a], id[own.b]], axis=1),
+            point=own.point,
+            frame=step.system.frame,
+            gap=own.gap,
+            impulse=step.impulse,
+        )
+        order = np.argsort(found.pop("key"))
+        return Contacts(**{name: column[order] for name, column in found.items()}, dt=step.system.dt)
+
+    @property
+    def history(self) -> list[float]:
+        """Residual by iteration of the last step's solver; not collective."""
+        return self.stepper.history
+
+    def body(self, name: str) -> Body:
+        """A large body; ValueError if there is none of that name. Not collective."""
+        try:
+            return Body(self, self.world.large_row(name))
+        except KeyError as error:
+            raise ValueError(error.args[0]) from None
+
+    @property
+    def _last(self) -> Step:
+        if self.last is None:
+            raise ValueError("there are no contacts and forces yet: no step was made, or the last one failed")
+        return self.last
+
+    # -- files -----------------------------------------------------------------------------------------------
+
+    def save(self, path: str | Path) -> None:
+        """Keep the state in a checkpoint, from which `load` and ``-restart`` go on. FileError if that fails."""
+        refuse_serial(self.comm)
+        refuse_unwritable("save", Path(path).parent, self.comm)
+        checkpoint.save(Path(path), self._origin, self.world, self.memory)
+
+    def write(
+        self,
+        folder: str | Path,
+        *,
+        overwrite: bool = False,
+        every: int = 1,
+        checkpoint_every: int = 1,
+        hard: int = 5,
+        problems: str | Path = "",
+        problem_steps: Collection[int] = (),
+    ) -> None:
+        """From now on write the files of a run (docs/files.md) to a folder, as ``-output`` does: a frame every so many
+        steps (0: none), a checkpoint every so many, and the first ``hard`` cone problems that the solver leaves; to the
+        folder ``problems`` those of ``problem_steps`` (none: of all steps).
+
+        ``overwrite`` replaces another run there once a step is made. A simulation loaded from the folder's own
+        checkpoint goes on with its files. FileError if another run has the folder.
+        """
+        if self.output is not None:
+            raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
+        for name, value, check in (("every", every, COUNT), ("checkpoint_every", checkpoint_every, AT_LEAST_ONE)):
+            _check(name, value, check)
+        refuse_serial(self.comm)
+        for name, path in {"write": folder, "problems": problems}.items():
+            if path:
+                refuse_unwritable(name, Path(path), self.comm)
+        place = Place(Path(folder), self.comm, self._restart, overwrite)
+        self.output = Results(place, self.world, self.memory, self._origin, self._compare, every, checkpoint_every)
+        self.stepper.dump = Dump(
+            self.settings, self.experiment, self.world, place, _check("hard", hard, COUNT), str(problems), problem_steps
+        )
+
+    def complete(self) -> None:
+        """Write what the folder of `write` lacks of the last step."""
+        if self.output and self.last:
+            self.output.complete(self.last, self._row)
+
+    def analyse(self) -> dict[str, float]:
+        """The numbers that the scene finds in the records that `write` wrote; they also go to summary.json."""
+        if not (self.output and self.last):
+            raise ValueError("analyse: no step was written, so there are no records")
+        return self.output.analyse(self.experiment)
+
+    def close(self) -> None:
+        """Complete and analyse the folder of `write`, leave it to others, and free the solver. The state can still be
+        looked at. A simulation in a ``with`` block is closed at its end."""
+        if self.output and self.last and not self._closed:
+            self.complete()
+            if not self.output.analysed:
+                self.analyse()
+        self._free()
+
+    def _free(self) -> None:
+        self._closed = True
+        self.stepper.destroy()
+        if self.output:
+            self.output.place.leave()
+
+    # -- pictures --------------------------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        law = report.law(bool(self.settings.coulomb))
+        return (
+            f"<Simulation of {scene_name(self.experiment)}: {self.world.body_count} bodies on {self.comm.size} ranks, "
+            f"step {self.steps}, time {self.time:g} s, {self.settings.solver} to {self.settings.tol:g}, {law}>"
+        )
+
+    def _repr_html_(self) -> str:
+        """The figures of the last step as a table, for notebooks."""
+        shown = [(name, value) for name, value in self.figures.items() if isinstance(value, (int, float, str))]
+        texts = [(name, f"{value:.6g}" if isinstance(value, float) else str(value)) for name, value in shown]
+        rows = "".join(f"<tr><th>{html.escape(name)}</th><td>{html.escape(text)}</td></tr>" for name, text in texts)
+        return f"<p>{html.escape(repr(self)[1:-1])}</p><table>{rows}</table>"
+
+    def render(self, color: str = "speed", **view: Any) -> Picture:
+        """A picture of the present state, which a notebook shows and ``save`` writes. ``color`` is one of
+        `pctt.render.COLOURS`; what else may be given are fields of `pctt.look.stage.View`, such as azimuth=30.0.
+        ImportError without VTK (the extra `pictures`), OptionError for a bad name or value."""
+        from pctt import render  # here, as most simulations need no pictures
+
+        snapshot = self._snapshot()
+
+        def draw() -> Picture | None:
+            return render.picture(snapshot, color, view) if self.comm.rank == 0 else None
+
+        return self.comm.bcast(together(self.comm, "render", draw, own=(ImportError, OptionError, FolderError)))
+
+    def _snapshot(self) -> Snapshot:
+        """All bodies and contacts on every rank, for those that draw."""
+        world, large = self.world, self.world.large
+        names = ("position", "quaternion", "velocity", "shape", "size", "material")
+        table = {name: np.concatenate([self._of_grains(name), getattr(large, name)]) for name in names}
+        position, turn, velocity = (table.pop(name) for name in names[:3])
+        contacts = self.contacts if self.last else Contacts.none()
+        frame = Frame(self.steps, self.time, position, turn, velocity, contacts)
+        return Snapshot(frame, **table, materials=world.materials, large=described_bodies(world))
+
+
+class Body:
+    """A large body of a simulation, as it is now. Vectors are in the world frame; nothing but the motion is
+    collective."""
+
+    def __init__(self, sim: Simulation, row: int):
+        self._sim, self._row = sim, row
+
+    @property
+    def name(self) -> str:
+        return self._large.name
+
+    @property
+    def _large(self) -> LargeBody:
+        return self._sim.world.large_bodies[self._row]
+
+    @property
+    def position(self) -> Floats:
+        """Centre of mass (3,); of a body with prescribed motion its reference point [m]."""
+        return self._sim.world.large.position[self._row].copy()
+
+    @property
+    def orientation(self) -> Floats:
+        """Quaternion (4,) (w, x, y, z)."""
+        return self._sim.world.large.quaternion[self._row].copy()
+
+    @property
+    def velocity(self) -> Floats:
+        """Linear and angular velocity (6,) in the last step [m/s, rad/s]."""
+        return self._sim.world.large.velocity[self._row].copy()
+
+    @property
+    def force(self) -> Floats:
+        """Sum of the contact forces (3,), their mean over the last step [N]. ValueError before the first step."""
+        return self._sim._last.force_on(self.name)[:3]
+
+    @property
+    def torque(self) -> Floats:
+        """Torque of the contact forces (3,) about the position, their mean over the last step [N m]."""
+        return self._sim._last.force_on(self.name)[3:]
+
+    @property
+    def motion(self) -> BodyMotion:
+        """How the body moves. Set a parameter, ``body.motion.speed = 2.0``, or another motion, ``body.motion =
+        Glide((0, 0, 1))``, on all ranks; the first rank's value counts. The body goes on from where it is, and
+        checkpoints keep the change. ValueError for what the body cannot do (`dem.control.set_motion`)."""
+        return BodyMotion(self)
+
+    @motion.setter
+    def motion(self, motion: Motion) -> None:
+        self._move(motion)
+
+    def _move(self, motion: Motion | None, **values: Any) -> None:
+        """Set the motion, or these parameters of the present one, as the first rank says."""
+        world, comm, what = self._sim.world, self._sim.comm, f"motion of the body {self.name}"
+        meet(comm, what)
+        motion, values = comm.bcast((motion, values))
+        change = partial(control.set_motion, world, self.name, motion, **values)
+        together(comm, what, change, own=(ValueError, TypeError))
+
+
+class BodyMotion:
+    """The parameters of the motion of a body, to read and to set."""
+
+    def __init__(self, body: Body):
+        object.__setattr__(self, "_body", body)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._body._large.motion, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        self._body._move(None, **{name: value})
+
+    def __repr__(self) -> str:
+        return repr(self._body._large.motion)
+
+
+def _check(name: str, value: Any, check: tuple[str, Callable[[Any], bool]]) -> int:
+    """A whole number that passes a check; OptionError if it does not."""
+    if not isinstance(value, (int, np.integer)) or not check[1](value):
+        raise OptionError(f"{name} {value!r}: allowed is {check[0]}")
+    return int(value)
