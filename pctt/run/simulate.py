@@ -37,7 +37,9 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
 
 def _make_steps(options: Options, sim: Simulation, progress: report.Progress, compare: ccp.Comparison) -> None:
     """The steps of a run, and what is said about them."""
-    _say_start(options, sim, progress)
+    newton = sim.stepper.newton
+    assert newton is not None
+    _say_start(options, sim, newton, progress)
     end = sim.steps + options.run.steps
 
     def doing(sim: Simulation) -> None:
@@ -56,7 +58,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         raise interrupt.InterruptError(_how_to_go_on(options, sim.steps, sim.output.checkpoint, end))
     if sim.last:
         _say_end(options, sim, progress)
-        if what := sim.stepper.newton.what():
+        if what := newton.what():
             progress.say(f"Newton systems: {what}")
     if compare.names and sim.last:
         progress.say("\n" + report.compare_table(compare.summary()))
@@ -67,8 +69,8 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         progress.say(f"\nresults: {folder}/state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
 
 
-def _say_start(options: Options, sim: Simulation, progress: report.Progress) -> None:
-    settings, newton = sim.settings, sim.stepper.newton
+def _say_start(options: Options, sim: Simulation, newton: ccp.Newton, progress: report.Progress) -> None:
+    settings = sim.settings
     method = f"{settings.solver} to {settings.tol:g}, {report.law(bool(settings.coulomb))}"
     progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {method}")
     if ccp.SOLVERS[settings.solver].needs != ccp.NEWTON and settings.tol > ccp.Limits().tol:
