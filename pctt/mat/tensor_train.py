@@ -278,8 +278,9 @@ def mat_of(
 def axpy(Y: PETSc.Mat, factor: float, X: PETSc.Mat) -> None:
     """Y + factor X in place of Y, for a train Y; X is a train on the same grid, or any Mat that is c I.
 
-    PETSc's own ``Y.axpy`` cannot do this, because it does not ask a Mat of type python. The sum of two trains is
-    rounded to a tenth of eps of Y, with ranks at most its max_rank. ValueError on all ranks for other Mats. Collective.
+    PETSc's own ``Y.axpy`` cannot do this: petsc4py does not ask contexts for it, and PETSc 3.18 ends with a
+    segmentation fault, as for any Mat of type python. The sum of two trains is rounded to a tenth of eps of Y, with
+    ranks at most its max_rank. ValueError on all ranks for other Mats. Collective.
 
     >>> A = from_entries(lambda i, j: (i == j) + 0.1 / (1.0 + abs(i - j)), (64,))
     >>> B = A.duplicate(copy=True)
@@ -348,7 +349,8 @@ def from_entries(
     if rows >= MOST:
         wrong = f"a grid of shape {grid!r} with {rows} points; allowed are fewer than 2^31"
     refuse(mat.comm.tompi4py(), wrong)
-    mat.setOptionsPrefix(prefix)
+    if prefix:
+        mat.setOptionsPrefix(prefix)
     mat.setSizes(((PETSc.DECIDE, rows), (PETSc.DECIDE, rows)))
     mat.setType(PETSc.Mat.Type.PYTHON)
     mat.setPythonContext(TensorTrain(eps, max_rank))

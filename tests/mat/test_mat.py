@@ -345,6 +345,23 @@ def test_the_inverse_solves_directly(grid, way):
     is_matrix(X, 2 * exact, 1e-7)
 
 
+@pytest.mark.parallel(1, 2, 3)
+def test_the_inverse_is_the_preconditioner_of_pcmat():
+    kernel = Kernel((12, 9))
+    A = from_entries(kernel, (12, 9), EPS)
+    ksp = PETSc.KSP().create(A.comm)
+    ksp.setOperators(A, inverse(A, 1e-6))
+    ksp.setType("cg")
+    ksp.setTolerances(rtol=1e-10)
+    ksp.pc.setType("mat")
+    x, b = A.createVecs()
+    b.array[:] = np.arange(*b.getOwnershipRange())
+    ksp.solve(b, x)
+    assert ksp.getIterationNumber() <= 2
+    expected = np.linalg.solve(kernel.dense, np.arange(108.0))[slice(*x.getOwnershipRange())]
+    np.testing.assert_allclose(x.array, expected, rtol=1e-7, atol=1e-7)
+
+
 @pytest.mark.parallel(1, 2)
 def test_an_inverse_that_is_not_there_is_refused_in_words():
     def sparse() -> PETSc.Mat:
