@@ -20,6 +20,7 @@ from pctt.petsc import own_errors
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.entries import EntryMatrix
 from pctt.tt.train import Array, Train
+from pctt.tt.work import Work
 
 MAX_RANK = 200
 ROUNDING = 0.1  # tolerance for rounding a symmetric part, divided by eps
@@ -36,9 +37,10 @@ class CompressedEntries:
 
     def __init__(
         self, P: PETSc.Mat, eps: float, max_rank: int, order: str = "auto", name: str = "order",
-        start: CompressedEntries | None = None, seed: int = 0,
+        start: CompressedEntries | None = None, seed: int = 0, work: Work | None = None,
     ) -> None:  # fmt: skip
-        """Collective; EntriesError or ValueError on all ranks for bad entries or a bad grid."""
+        """Collective; on all ranks EntriesError or ValueError for bad entries or a bad grid, TooMuchWork at the limit
+        of `work`."""
         comm = P.comm.tompi4py()
         self.entries = Entries.of(P)
         self.digits, self.rows, self.order = digits_of(P, order, name)
@@ -47,7 +49,7 @@ class CompressedEntries:
         matrix = EntryMatrix(self.entries, self.digits, self.rows, comm.bcast)
         self.shift, self.scale = matrix.shift, 1 / matrix.scale
         known = start.found if start is not None and start.digits.modes == self.digits.modes else None
-        self.found: Cross = compress_cross(matrix, max_rank, eps, known, rng=np.random.default_rng(seed))
+        self.found: Cross = compress_cross(matrix, max_rank, eps, known, rng=np.random.default_rng(seed), work=work)
         self.symmetric = is_symmetric(self.entries, self.digits.rows)
         if self.symmetric:
             train = comm.bcast(self.train.symmetric_part(ROUNDING * eps))

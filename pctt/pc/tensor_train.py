@@ -110,10 +110,8 @@ class TensorTrain(PythonPC):
         """Warn if the train of a matrix given by its entries is bad or missing, or if the matrix is not symmetric."""
         if made.compressed is not None and self.symmetric != made.compressed.symmetric:
             self._say_symmetry(made.compressed.symmetric)
-        word = ""
-        if self.rank == 1 and self.account.fallbacks:
-            word = f"{self.account.fallbacks[-1]}: the diagonal takes over"
-        elif made.inverse is not None and made.inverse.residual > POOR:
+        word = made.warning
+        if not word and made.inverse is not None and made.inverse.residual > POOR:
             word = f"the inverse of rank {self.rank} leaves {made.inverse.residual:.2g} of the residual"
         if word and self.comm.rank == 0:
             warnings.warn(f"{self.name}: {word}", stacklevel=2)
@@ -215,7 +213,8 @@ class TensorTrain(PythonPC):
 
     def _line(self) -> str:
         if self.rank == 1:
-            return f"rank 1 (block Jacobi), set up in {self._setup_seconds:.2e} s"
+            note = f", because {self.made.note}" if isinstance(self.made, EntriesTrain) and self.made.note else ""
+            return f"rank 1 (block Jacobi{note}), set up in {self._setup_seconds:.2e} s"
         return f"{self.made.words()}, {self._setup_seconds:.2e} s"
 
     def release(self) -> None:

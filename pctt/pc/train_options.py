@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Optional
 
-from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, OptionError, option
+from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, POSITIVE, OptionError, option
 
 SPARSE_RANK, ENTRIES_RANK = 10, 100  # default caps
 
@@ -50,6 +50,12 @@ class Options:
         choices=("none", "newton", "steps", "trains"),
     )
     seed: int = option(0, "seed of the random starts", check=COUNT)
+    setup_limit: Optional[float] = option(
+        None,
+        "for matrices given by their entries: operations (about a nanosecond each) that the set-up of a train may take; "
+        "none: as many as the solution would take without a train",
+        check=POSITIVE,
+    )
     monitor: bool = option(False, "print a line per set-up")
 
     def __post_init__(self) -> None:
