@@ -86,6 +86,9 @@ def cg(mat: PETSc.Mat, way: str, preconditioned: bool, true: Callable, setup: fl
     ksp.pc.setType("python" if preconditioned else "none")
     if preconditioned:
         ksp.pc.setPythonType("pctt.pc.TensorTrain")
+        database = PETSc.Options()
+        if not database.hasName("pc_tt_rank"):  # auto might take a fast transform
+            database.setValue("pc_tt_rank", 100)
     ksp.setFromOptions()
     x, b = mat.createVecs()
     b.array[:] = right_side(b.getLocalSize())
@@ -94,7 +97,7 @@ def cg(mat: PETSc.Mat, way: str, preconditioned: bool, true: Callable, setup: fl
     note = ""
     if preconditioned:
         made = ksp.pc.getPythonContext().made
-        note = "no positive train: diagonal"
+        note = made.used
         if made.inverse is not None:
             Z = made.inverse.train
             bytes_ += 8 * (Z.storage + made.compressed.train.storage)

@@ -166,7 +166,11 @@ class EntriesTrain:
         assert self.compressed is not None
         if apply_operations(self.compressed.train) > EXPENSIVE * product:
             return UNKNOWN
-        times, dot = self.compressed.product(self.compressed.train), lambda u, v: self.comm.allreduce(float(u @ v))
+        times = self.compressed.product(self.compressed.train.astype(np.float32))
+
+        def dot(u: np.ndarray, v: np.ndarray) -> float:
+            return float(self.comm.allreduce(float(u @ v)))
+
         r = np.random.default_rng(self.comm.rank).standard_normal(int(self.compressed.counts[self.comm.rank]))
         p, square = r, dot(r, r)
         first = square
