@@ -52,8 +52,8 @@ class DifferencesInverse:
         if even is None or not is_symmetric(entries, digits.rows):
             return None
         differences = means_of_differences(entries, digits.shape, rows, even)
-        # the transforms that other ranks find best may differ by rounding
-        found = comm.bcast(_kind_and_iterations(differences) if comm.rank == 0 else None)
+        # what other ranks find best may differ by rounding
+        found = comm.bcast(best(differences) if comm.rank == 0 else None)
         if found is None:
             return None
         counts = np.array(comm.allgather(P.getLocalSize()[0]))
@@ -70,12 +70,7 @@ class DifferencesInverse:
         return self._whole[self._mine]
 
     def words(self) -> str:
-        return f"{self.transform.kind} transform of a grid of {' x '.join(map(str, self.shape))}"
-
-
-def _kind_and_iterations(differences: Array) -> tuple[str, int] | None:
-    found = best(differences)
-    return None if found is None else (found[0].kind, found[1])
+        return f"{self.transform.name} of a grid of {' x '.join(map(str, self.shape))}"
 
 
 def depend_on_differences(

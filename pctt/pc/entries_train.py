@@ -24,6 +24,7 @@ from pctt.mat.tensor_train import CompressedEntries, compressed
 from pctt.pc.differences import DifferencesInverse
 from pctt.pc.positivity import CERTAIN, finds_negative, has_inertia_of
 from pctt.pc.train_options import Account, Options
+from pctt.tt.cross import CROSS
 from pctt.tt.inverse import Inverse, invert_near_identity
 from pctt.tt.lowest import lowest
 from pctt.tt.train import identity
@@ -38,7 +39,7 @@ SHORT = 5e8  # the same with the diagonal
 PART = 0.25  # a train may take this part of the operations with a fast transform
 ALWAYS = 5e8  # operations that a set-up may take in any case
 OPENING, PRODUCTS = 1.5e8, 10  # auto: operations that the compression may take in any case, and products besides
-TRANSFORM = 1.3  # operations of an iteration with a fast transform, in products
+TRANSFORM = 1.3  # an iteration with a fast transform, in products
 PROBE = 6  # iterations of conjugate gradients from which their number is extrapolated
 DIGITS = 8.0  # to which it is
 MOST = 500  # largest number of them
@@ -88,7 +89,7 @@ class EntriesTrain:
         self.account.fallbacks.append(why)
         if not self.options.automatic:
             self.transform = self._find_transform(P)
-        instead = "diagonal" if self.transform is None else f"{self.transform.transform.kind} transform"
+        instead = "diagonal" if self.transform is None else self.transform.transform.name
         self.warning = f"{why}: the {instead} takes over"
         return self.transform is not None
 
@@ -144,10 +145,13 @@ class EntriesTrain:
                     break  # the rank cannot reach this accuracy, and even less a higher one
             return self._why_not_positive(rank)
         except TooMuchWork as stopped:
-            return (
-                f"{stopped} takes more than {work.limit:.1e} operations (-{self.prefix}pc_tt_setup_limit), more than a "
-                "train can save; this is hopeless in this order of the points"
-            )
+            return self._too_much(str(stopped), work)
+
+    def _too_much(self, where: str, work: Work) -> str:
+        limit = f"the limit of {work.limit:.1e} operations (-{self.prefix}pc_tt_setup_limit) ends {where}"
+        if where == CROSS:
+            return f"{limit}: the ranks of the matrix grow, which is hopeless in this order of the points"
+        return f"{limit}: a train costs more than one solution without it; raise the limit for many right-hand sides"
 
     def _why_not_positive(self, rank: int) -> str:
         assert self.compressed is not None
@@ -237,7 +241,7 @@ class EntriesTrain:
     def used(self) -> str:
         """What the preconditioner really is, in few words."""
         if self.transform is not None:
-            return f"{self.transform.transform.kind} transform"
+            return self.transform.transform.name
         if self.inverse is None or self.compressed is None:
             return "rank 1: diagonal"
         return f"train of ranks {max(self.compressed.train.ranks)}, {max(self.inverse.train.ranks)}"

@@ -23,7 +23,7 @@ import numpy as np
 
 from pctt.tt.projection import Projection, columns, rows
 from pctt.tt.train import Array, Train, full_ranks, identity, random
-from pctt.tt.work import Work, inner_operations, local_operations, svd_operations
+from pctt.tt.work import TooMuchWork, Work, inner_operations, local_operations, svd_operations
 
 LOCAL_GAIN, LOCAL_ITS = 0.1, 20  # conjugate gradients: factor by which they reduce a local residual, most iterations
 LOCAL_EPS = 0.1  # a local system needs no smaller residual than this part of the tolerance
@@ -192,6 +192,11 @@ class Growing:
         z[0] = self.residual.rest(0, x[0])
         self.estimate = float(np.linalg.norm(z[0]))
 
+    def words(self, norm: float) -> str:
+        """How far it is, for a message. norm : ||B||"""
+        left = f", leaves about {self.estimate / norm:.1e} of the residual" if self.estimate else ""
+        return f"{INVERSION}, at rank {max(x.shape[3] for x in self.x)}{left}"
+
     def _solve(self, k: int) -> None:
         """Compute nearly the symmetric core of least energy by conjugate gradients, from the present core.
 
@@ -255,8 +260,11 @@ def _solve(
     norm, count, before, enough = B.norm(), 0, np.inf, ENOUGH * eps
     while count < sweeps:
         begun = work.spent
-        growing.forward()
-        growing.backward()
+        try:
+            growing.forward()
+            growing.backward()
+        except TooMuchWork:
+            raise TooMuchWork(growing.words(norm)) from None
         count += 1
         if growing.estimate <= enough * norm:
             X = Train(growing.x)
@@ -272,7 +280,7 @@ def _solve(
             growing.drop *= 0.3
         before = growing.estimate
         if count < sweeps:
-            work.foresee(GROWTH * (work.spent - begun), INVERSION)
+            work.foresee(GROWTH * (work.spent - begun), growing.words(norm))
     X = Train(growing.x)
     work.spend(inner_operations(S, X, HIGH), INVERSION)
     return Inverse(X, False, residual(S, X, B), count, growing.repaired)

@@ -17,7 +17,7 @@ PIVOTS = 5.0  # the search for pivots, in singular value decompositions
 
 
 class TooMuchWork(Exception):
-    """The limit of the operations is reached; the message says in which phase."""
+    """The limit of the operations is reached; the message says where."""
 
 
 class Work:

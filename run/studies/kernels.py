@@ -259,8 +259,8 @@ def score(rows: list[dict[str, Any]], words: str) -> dict[str, Any]:
     fastest, close, far = (sum(r <= most for r in ratios.values()) for most in (1.0, CLOSE, FAR))
     silent = [row["name"] for row in rows if ratios.get(row["name"], 0) > FAR and not row["ways"]["train"].get("warned")]
     print(
-        f"{words}: TensorTrain is the fastest in {fastest} of {len(ratios)}, within {CLOSE:g} times the fastest in {close}, "
-        f"within {FAR:g} in {far}; worst ratio {ratios[worst]:.3g} ({worst}); beyond {FAR:g} without a warning: "
+        f"{words}: TensorTrain is the fastest in {fastest} of {len(ratios)}, within {CLOSE:g} times the fastest in "
+        f"{close}, within {FAR:g} in {far}; worst ratio {ratios[worst]:.3g} ({worst}); beyond {FAR:g} without a warning: "
         f"{', '.join(silent) or 'none'}"
     )
     return {"set": words, "fastest": fastest, "close": close, "of": len(ratios), "ratios": ratios, "silent": silent}

@@ -98,12 +98,12 @@ def test_means_are_those_over_all_signs(entries, even):
 @pytest.mark.parametrize("entries", [covariance, oblique])
 def test_the_preconditioner_is_the_transform(entries):
     ksp = preconditioner(entries)
-    kind = made(ksp).transform.transform.kind
-    assert made(ksp).used == f"{kind} transform"
-    assert f"{kind} transform of a grid of 10 x 7" in "\n".join(ksp.pc.getPythonContext().report())
+    name, share = made(ksp).transform.transform.name, made(ksp).transform.transform.share
+    assert made(ksp).used == name
+    assert f"{name} of a grid of 10 x 7" in "\n".join(ksp.pc.getPythonContext().report())
     v = np.random.default_rng(1).standard_normal(SIZE)
     differences = means_of_differences(entries, GRID, None, entries is covariance)
-    np.testing.assert_allclose(applied(ksp, v), FastTransform(differences, kind).solve(v), rtol=1e-12)
+    np.testing.assert_allclose(applied(ksp, v), FastTransform(differences, share).solve(v), rtol=1e-12)
     x, b = ksp.getOperators()[0].createVecs()
     b.set(1.0)
     ksp.solve(b, x)
@@ -125,16 +125,16 @@ def test_a_limit_stops_the_set_up_and_says_so():
         warnings.simplefilter("always")
         ksp = preconditioner(weighted, rank=30, setup_limit=1e6)
     words = " ".join(str(w.message) for w in said)
-    assert MPI.COMM_WORLD.bcast("takes more than 1.0e+06 operations (-pc_tt_setup_limit)" in words)
+    assert MPI.COMM_WORLD.bcast("the limit of 1.0e+06 operations (-pc_tt_setup_limit) ends" in words)
     assert MPI.COMM_WORLD.bcast("the diagonal takes over" in words)
     assert made(ksp).used == "rank 1: diagonal"
     np.testing.assert_allclose(applied(ksp, np.ones(SIZE)), 1 / np.diag(dense(weighted)))
 
 
 def test_without_a_train_a_transform_takes_over():
-    with pytest.warns(UserWarning, match="the cosine transform takes over"):
+    with pytest.warns(UserWarning, match="transform takes over"):
         ksp = preconditioner(covariance, rank=30, setup_limit=1e6)
-    assert made(ksp).used == "cosine transform"
+    assert "cosine" in made(ksp).used
 
 
 @pytest.mark.parallel(1, 2)

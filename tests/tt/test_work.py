@@ -16,6 +16,11 @@ def smooth(i: np.ndarray, j: np.ndarray) -> np.ndarray:
 
 def test_a_limit_ends_compression_and_inversion_at_the_same_place() -> None:
     digits = tt.GridDigits((256,))
+
+    def both(work: Work) -> None:
+        T = tt.compress_cross(tt.EntryMatrix(smooth, digits), 40, 1e-6, work=work).train.symmetric_part(1e-8)
+        invert_near_identity(T, 40, eps=1e-6, work=work)
+
     free = [Work(), Work()]
     for work in free:
         found = tt.compress_cross(tt.EntryMatrix(smooth, digits), 40, 1e-6, work=work)
@@ -27,6 +32,5 @@ def test_a_limit_ends_compression_and_inversion_at_the_same_place() -> None:
     for limit, phase in ((0.5 * before, "the compression"), (0.5 * (before + free[0].spent), "the inversion")):
         work = Work(limit)
         with pytest.raises(TooMuchWork, match=phase):
-            T = tt.compress_cross(tt.EntryMatrix(smooth, digits), 40, 1e-6, work=work).train.symmetric_part(1e-8)
-            invert_near_identity(T, 40, eps=1e-6, work=work)
+            both(work)
         assert work.spent < 2 * free[0].spent
