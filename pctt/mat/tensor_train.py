@@ -39,8 +39,8 @@ class CompressedEntries:
         self, P: PETSc.Mat, eps: float, max_rank: int, order: str = "auto", name: str = "order",
         start: CompressedEntries | None = None, seed: int = 0, work: Work | None = None,
     ) -> None:  # fmt: skip
-        """Collective; on all ranks EntriesError or ValueError for bad entries or a bad grid, TooMuchWork at the limit
-        of `work`."""
+        """Collective; on all ranks EntriesError or ValueError for bad entries or a bad grid, TooMuchWorkError at the
+        limit of `work`."""
         comm = P.comm.tompi4py()
         self.entries = Entries.of(P)
         self.digits, self.rows, self.order = digits_of(P, order, name)

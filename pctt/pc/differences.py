@@ -56,8 +56,11 @@ class DifferencesInverse:
         found = comm.bcast(best(differences) if comm.rank == 0 else None)
         if found is None:
             return None
+        transform = FastTransform(differences, found[0])
+        if not comm.bcast(transform.positive):
+            return None
         counts = np.array(comm.allgather(P.getLocalSize()[0]))
-        return cls(comm, counts, rows, FastTransform(differences, found[0]), found[1])
+        return cls(comm, counts, rows, transform, found[1])
 
     def __call__(self, x: Array) -> Array:
         """This rank's part of the product, from its part of x. Every rank transforms the whole vector."""

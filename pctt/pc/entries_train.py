@@ -4,8 +4,8 @@ Where the entries depend on differences of points only, a cosine or sine transfo
 nothing. Otherwise cross approximation compresses the matrix, which is not scaled, and its inverse is computed.
 -pc_tt_rank auto follows this rule, in operations (about a nanosecond each, `pctt.tt.work`), never by a clock:
 
-1. Entries depend on differences, and conjugate gradients with a transform take less than LONG operations: the transform.
-2. The same, but they take longer: a train, if a quarter of these operations are enough to set it up; else the transform.
+1. Entries depend on differences, and conjugate gradients with a transform take less than LONG operations: this.
+2. The same, but they take longer: a train, if a quarter of these operations are enough to set it up; otherwise 1.
 3. Entries are of another kind, and conjugate gradients take less than SHORT operations without a train: the diagonal.
 4. Otherwise a train, if its set-up takes no more operations than these conjugate gradients; else the diagonal.
 
@@ -28,7 +28,7 @@ from pctt.tt.cross import CROSS
 from pctt.tt.inverse import Inverse, invert_near_identity
 from pctt.tt.lowest import lowest
 from pctt.tt.train import identity
-from pctt.tt.work import TooMuchWork, Work, apply_operations, dense_operations, product_operations
+from pctt.tt.work import TooMuchWorkError, Work, apply_operations, dense_operations, product_operations
 
 SINGLE = 1e-5  # with this eps or a larger one, products of the inverse use single precision
 WORTH = 0.25  # smallest part of eps that is asked for to get a certificate
@@ -136,7 +136,7 @@ class EntriesTrain:
                 with PETSc.Log.Event("TTInvert"):
                     # every rank inverts the same train, but results may differ in the last bit: all take the first's
                     found, work.spent = self.comm.bcast((self._invert(rank, eps, work), work.spent))
-                    if isinstance(found, TooMuchWork):
+                    if isinstance(found, TooMuchWorkError):
                         raise found
                     self.inverse = found
                     if self.inverse is not None and self._is_positive(self.inverse):
@@ -144,7 +144,7 @@ class EntriesTrain:
                 if self.inverse is not None and self.inverse.residual > eps:
                     break  # the rank cannot reach this accuracy, and even less a higher one
             return self._why_not_positive(rank)
-        except TooMuchWork as stopped:
+        except TooMuchWorkError as stopped:
             return self._too_much(str(stopped), work)
 
     def _too_much(self, where: str, work: Work) -> str:
@@ -197,7 +197,7 @@ class EntriesTrain:
             return known.rounded(0.5 * eps, rank)
         return CompressedEntries(P, eps, rank, self.options.order, self._order_option, start, self.options.seed, work)
 
-    def _invert(self, rank: int, eps: float, work: Work) -> Inverse | TooMuchWork | None:
+    def _invert(self, rank: int, eps: float, work: Work) -> Inverse | TooMuchWorkError | None:
         """The inverse; None if the train of the matrix turns out not to be positive."""
         assert self.compressed is not None
         T = self.compressed.train
@@ -209,7 +209,7 @@ class EntriesTrain:
         rng = np.random.default_rng(self.options.seed)
         try:
             return invert_near_identity(T, rank, eps=eps, rng=rng, work=work)
-        except TooMuchWork as stopped:  # perhaps on this rank only
+        except TooMuchWorkError as stopped:  # perhaps on this rank only
             return stopped
 
     def _is_positive(self, inverse: Inverse) -> bool:

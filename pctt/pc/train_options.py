@@ -52,8 +52,8 @@ class Options:
     seed: int = option(0, "seed of the random starts", check=COUNT)
     setup_limit: Optional[float] = option(
         None,
-        "for matrices given by their entries: operations (about a nanosecond each) that the set-up of a train may take; "
-        "none: as many as the solution would take without a train",
+        "for matrices given by their entries: operations (about a nanosecond each) that the set-up of a train may "
+        "take; none: as many as a solution without a train takes",
         check=POSITIVE,
     )
     monitor: bool = option(False, "print a line per set-up")

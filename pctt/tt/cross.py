@@ -68,7 +68,7 @@ def compress_cross(
     sweeps : largest number of sweeps. They end earlier if the estimated error is below eps, or if it falls by less than
         a tenth in two consecutive sweeps.
     rng : must give the same numbers on all ranks
-    work : counts entries and factorisations; raises TooMuchWork on all ranks at its limit
+    work : counts entries and factorisations; raises TooMuchWorkError on all ranks at its limit
 
     >>> i = np.arange(63)
     >>> A = SparseHierarchy(np.r_[i, i + 1], np.r_[i + 1, i], [4, 4, 4])

@@ -2,16 +2,16 @@
 
 A(x, y) = a(x - y) for the points of a grid (a Toeplitz matrix on each axis). Of all matrices that a cosine or a sine
 transform Q diagonalises, the nearest one to A in Frobenius' norm has the eigenvalues diag(Q A Q'). They are Rayleigh
-quotients of A, so this matrix is positive definite if A is. The quotients of all basis vectors of an axis are transforms
-of the weighted differences: with v_k(i) v_k(j) = (cos t (i - j) +- cos t (i + j + 1)) / n, t = pi k / n, and the sum of
-the second cosines over all pairs of difference s, which is -sin(t s) / sin(t),
+quotients of A, so this matrix is positive definite if A is. The quotients of all basis vectors of an axis are
+transforms of the weighted differences: with v_k(i) v_k(j) = (cos t (i - j) +- cos t (i + j + 1)) / n, t = pi k / n, and
+the sum of the second cosines over all pairs of difference s, which is -sin(t s) / sin(t),
 
     lambda_k = 1/n sum_s a(s) ((n - |s|) cos t s  -+  sin t |s| / sin t).
 
 (For circulants: T. Chan, SIAM J. Sci. Stat. Comput. 9, 1988; for the cosine transform R. Chan, T. Chan & Wong, 1999.) A
-cosine transform reflects at the boundary of the grid, where a circulant continues at the opposite side; a sine transform
-reflects with the other sign. So errors at the boundary have opposite signs, and a mean of both inverses is often nearer
-to that of A.
+cosine transform reflects at the boundary of the grid, where a circulant continues at the opposite side; a sine
+transform reflects with the other sign. So errors at the boundary have opposite signs, and a mean of both inverses is
+often nearer to that of A.
 """
 
 from __future__ import annotations
@@ -136,11 +136,12 @@ def trial(differences: Array, transform: FastTransform) -> int:
 def best(differences: Array) -> tuple[float, int] | None:
     """The share of the cosine transform with which a solution costs least, and its iterations, on a part of the grid.
 
-    None if A is not positive.
+    None if this part of A is not positive.
     """
-    if not all(FastTransform(differences, share).positive for share in (0.0, 1.0)):
-        return None
     part = window(differences)
-    its = {share: trial(part, FastTransform(part, share)) for share in SHARES}
+    transforms = {share: FastTransform(part, share) for share in SHARES}
+    if not all(transform.positive for transform in transforms.values()):
+        return None
+    its = {share: trial(part, transform) for share, transform in transforms.items()}
     share = min(SHARES, key=lambda share: its[share] * (1 + TRANSFORM * (1 if share in (0.0, 1.0) else 2)))
     return share, its[share]

@@ -23,7 +23,7 @@ import numpy as np
 
 from pctt.tt.projection import Projection, columns, rows
 from pctt.tt.train import Array, Train, full_ranks, identity, random
-from pctt.tt.work import TooMuchWork, Work, inner_operations, local_operations, svd_operations
+from pctt.tt.work import TooMuchWorkError, Work, inner_operations, local_operations, svd_operations
 
 LOCAL_GAIN, LOCAL_ITS = 0.1, 20  # conjugate gradients: factor by which they reduce a local residual, most iterations
 LOCAL_EPS = 0.1  # a local system needs no smaller residual than this part of the tolerance
@@ -103,8 +103,9 @@ def invert_near_identity(
 ) -> Inverse:
     """The inverse of S = I + T as X = I + Z, with an exact identity.
 
-    The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z. All other
-    arguments are those of `invert`; `work` counts operations and raises TooMuchWork at its limit. Z is cheaper to apply than X: it takes `Apply(Z)` and one addition.
+    The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z. `work`
+    counts operations; TooMuchWorkError at its limit. All other arguments are those of `invert`. Z is cheaper to apply
+    than X: it takes `Apply(Z)` and one addition.
     """
     unit = identity(T.rows, T.dtype)
     if max_rank <= 1 or T.norm() == 0:
@@ -263,8 +264,8 @@ def _solve(
         try:
             growing.forward()
             growing.backward()
-        except TooMuchWork:
-            raise TooMuchWork(growing.words(norm)) from None
+        except TooMuchWorkError:
+            raise TooMuchWorkError(growing.words(norm)) from None
         count += 1
         if growing.estimate <= enough * norm:
             X = Train(growing.x)

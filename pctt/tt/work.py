@@ -16,12 +16,12 @@ FACTOR = 0.7  # the same in a singular value decomposition
 PIVOTS = 5.0  # the search for pivots, in singular value decompositions
 
 
-class TooMuchWork(Exception):
+class TooMuchWorkError(Exception):
     """The limit of the operations is reached; the message says where."""
 
 
 class Work:
-    """Operations that were spent; `spend` raises TooMuchWork beyond the limit.
+    """Operations that were spent; `spend` raises TooMuchWorkError beyond the limit.
 
     All ranks must spend the same if the work is collective.
     """
@@ -32,12 +32,12 @@ class Work:
     def spend(self, operations: float, phase: str) -> None:
         self.spent += operations
         if self.spent > self.limit:
-            raise TooMuchWork(phase)
+            raise TooMuchWorkError(phase)
 
     def foresee(self, operations: float, phase: str) -> None:
-        """Raise TooMuchWork already now if so many more operations would reach the limit."""
+        """Raise TooMuchWorkError already now if so many more operations would reach the limit."""
         if self.spent + operations > self.limit:
-            raise TooMuchWork(phase)
+            raise TooMuchWorkError(phase)
 
 
 def product_operations(shape: tuple[int, ...]) -> float:

@@ -48,7 +48,7 @@ class Differences:
 
 @dataclass
 class General:
-    """A matrix without a structure that an FFT could use alone. ``times``: its product, None if there is no fast one."""
+    """A matrix whose entries do not depend on differences. ``times``: its product, None if there is no fast one."""
 
     name: str
     grid: tuple[int, ...]
@@ -180,8 +180,9 @@ def weighted(n: int, name: str, weight: Callable[[Array, Array], Array]) -> Gene
 def scattered(n: int, name: str, points: Array) -> General:
     """The inverse multiquadric of width 1 between points on a line, plus .01 I."""
     return General(
-        f"inverse multiquadric, {name}, {n}", (n,), lambda i, j: 0.01 * (i == j) + 1 / np.hypot(1, points[i] - points[j])
-    )
+        f"inverse multiquadric, {name}, {n}", (n,),
+        lambda i, j: 0.01 * (i == j) + 1 / np.hypot(1, points[i] - points[j]),
+    )  # fmt: skip
 
 
 def hard() -> dict[str, Callable[[], General]]:

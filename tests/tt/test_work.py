@@ -7,7 +7,7 @@ import pytest
 
 from pctt import tt
 from pctt.tt.inverse import invert_near_identity
-from pctt.tt.work import TooMuchWork, Work
+from pctt.tt.work import TooMuchWorkError, Work
 
 
 def smooth(i: np.ndarray, j: np.ndarray) -> np.ndarray:
@@ -31,6 +31,6 @@ def test_a_limit_ends_compression_and_inversion_at_the_same_place() -> None:
     assert whole.residual <= 1e-6
     for limit, phase in ((0.5 * before, "the compression"), (0.5 * (before + free[0].spent), "the inversion")):
         work = Work(limit)
-        with pytest.raises(TooMuchWork, match=phase):
+        with pytest.raises(TooMuchWorkError, match=phase):
             both(work)
         assert work.spent < 2 * free[0].spent
