@@ -61,6 +61,7 @@ class EntriesTrain:
         self.inverse: Inverse | None = None
         self.warning = ""
         self.note = ""  # why auto takes no train
+        self._refused = ""  # why there was no train of an earlier matrix; it is not tried again
 
     def make(self, P: PETSc.Mat, rank: int) -> bool:
         """Make a preconditioner. False: the diagonal is better, or nothing else worked; `warning` or `note` say why.
@@ -76,7 +77,8 @@ class EntriesTrain:
             if alternative < LONG:
                 self.compressed = self.inverse = None
                 return True
-        why = self._make_train(P, rank, product, PART * alternative)
+        why = self._refused or self._make_train(P, rank, product, PART * alternative)
+        self._refused = why
         if not why:
             self.transform = None
             return True
@@ -117,17 +119,17 @@ class EntriesTrain:
         limit : of the operations of the set-up; 0: those of conjugate gradients without a train
         """
         given = self.options.setup_limit
-        opening = (OPENING if self.options.automatic else ALWAYS) + PRODUCTS * product
-        work = Work(given or opening)
+        work = Work(given or (OPENING if self.options.automatic else ALWAYS) + PRODUCTS * product)
         try:
-            for eps in self.options.eps * TIGHTER ** np.arange(TRIES):
+            for attempt in range(TRIES):
+                eps = self.options.eps * TIGHTER**attempt
                 warm = self.compressed is not None and self.options.reuse != "none"
                 with PETSc.Log.Event("TTCompress"):
                     self.compressed = self._compress(P, rank, eps, self.compressed if warm else None, work)
                 if self.compressed.shift <= 0:
                     return "the mean of the diagonal is not positive"
                 self.account.reused += warm
-                if work.limit == opening:
+                if attempt == 0 and not given:
                     iterations = self._iterations_without(product) if not limit else 0
                     if self.options.automatic and not limit and iterations * product < SHORT:
                         self.note = f"conjugate gradients take about {iterations} iterations, so a train does not pay"

@@ -149,3 +149,21 @@ def test_unsymmetric_and_indefinite_entries_get_no_transform():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             assert made(preconditioner(entries)).transform is None
+
+
+def test_a_train_that_failed_is_not_tried_again():
+    calls = []
+
+    def entries(i, j):
+        calls.append(len(i))
+        return covariance(i, j)
+
+    with pytest.warns(UserWarning, match="transform takes over"):
+        ksp = preconditioner(entries, rank=30, setup_limit=1e6)
+    first = sum(calls)
+    calls.clear()
+    ksp.getOperators()[0].stateIncrease()
+    ksp.setOperators(ksp.getOperators()[0])
+    ksp.setUp()
+    assert "transform" in made(ksp).used
+    assert sum(calls) < first
