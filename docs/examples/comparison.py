@@ -100,6 +100,9 @@ def cg(
         ksp.pc.setPythonContext(pc)
     elif pc == "tt":
         ksp.pc.setPythonType("pctt.pc.TensorTrain")
+        database = PETSc.Options()
+        if not database.hasName("pc_tt_rank"):  # auto might take a fast transform
+            database.setValue("pc_tt_rank", 100)
         ksp.setFromOptions()
     x, b = mat.createVecs()
     b.array[:] = right_side(b.getLocalSize())
@@ -108,7 +111,7 @@ def cg(
     note = ""
     if pc == "tt":
         made = ksp.pc.getPythonContext().made
-        note = "no positive train: diagonal"
+        note = made.used
         if made.inverse is not None:
             Z = made.inverse.train
             bytes_ += 8 * (Z.storage + made.compressed.train.storage)

@@ -175,7 +175,7 @@ def test_a_changed_mat_is_preconditioned_as_it_is_now():
         ksp.setOperators(mat)
         ksp.pc.setType("python")
         ksp.pc.setPythonType("pctt.pc.TensorTrain")
-        PETSc.Options()["pc_tt_eps"] = str(eps)
+        PETSc.Options().insertString(f"-pc_tt_rank 100 -pc_tt_eps {eps}")
         ksp.setFromOptions()
         x, y = mat.createVecs()
         x.set(1.0)
