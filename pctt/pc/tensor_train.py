@@ -137,7 +137,7 @@ class TensorTrain(PythonPC):
         if self.rank == 1 and not self.failed:
             self._make_block_jacobi(P)
         set_failed(pc, self.failed)
-        self._setup_seconds = self._slowest(time.perf_counter() - start)
+        self._setup_seconds = self._made_in = self._slowest(time.perf_counter() - start)
         self.account.setups += 1
         self.account.setup_s += self._setup_seconds
         inverse = self.made.inverse
@@ -278,13 +278,15 @@ class TensorTrain(PythonPC):
             f"tensor train: {self._line()}",
             f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, kept {a.kept} times, "
             f"trees made anew {a.resets}",
-            f"scaling {self.options.scaling}, rows ordered by {self.places.source}",
+            f"rows ordered by {self.places.source}",
         ]
         lines += [] if self.symmetric else [NOT_SYMMETRIC]
         lines += [f"fell back: {why} ({count} times)" for why, count in a.fallbacks.items()]
-        figures = self.policy.figures.items()
-        costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
-        return [*lines, f"seconds per digit: {costs or 'none measured yet'}"]
+        if isinstance(self.made, SparseTrain):
+            figures = self.policy.figures.items()
+            costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
+            lines.append(f"scaling {self.options.scaling}, seconds per digit: {costs or 'none measured yet'}")
+        return lines
 
     def what(self) -> str:
         return self.account.what()
@@ -300,9 +302,9 @@ class TensorTrain(PythonPC):
             return f"none: {self.account.last}"
         if self.rank == 1:
             note = f", because {self.made.note}" if isinstance(self.made, EntriesTrain) and self.made.note else ""
-            return f"rank 1 (block Jacobi{note}), set up in {self._setup_seconds:.2e} s"
-        digits = "single" if self._last_precision is np.float32 else "double"
-        return f"{self.made.words()}, {digits} precision, set up in {self._setup_seconds:.2e} s"
+            return f"rank 1 (block Jacobi{note}), set up in {self._made_in:.2e} s"
+        digits = "single" if self._last_precision is np.float32 and self.made.inverse is not None else "double"
+        return f"{self.made.words()}, {digits} precision, set up in {self._made_in:.2e} s"
 
     def release(self) -> None:
         for thing in self._own:
