@@ -81,7 +81,7 @@ class EntriesTrain:
         self.failure = self.note = ""
         coarse = self.options.automatic and self.options.eps >= COARSE
         self.transform = transform = self._find_transform(P) if coarse else None
-        product = self._product_operations(P)
+        product = self._product_operations(P, transform)
         alternative = 0.0
         if transform is not None:
             alternative = TRANSFORM * product * transform.iterations
@@ -112,7 +112,7 @@ class EntriesTrain:
     def _order_option(self) -> str:
         return f"-{self.prefix}pc_tt_order"
 
-    def _product_operations(self, P: PETSc.Mat) -> float:
+    def _product_operations(self, P: PETSc.Mat, transform: DifferencesInverse | None) -> float:
         """Of a product with P, by FFT if P does not show how it multiplies."""
         known = compressed(P)
         if known is not None:
@@ -120,6 +120,8 @@ class EntriesTrain:
         rows = P.getSize()[0]
         if P.getType() in DENSE:
             return dense_operations(rows)
+        if transform is not None:
+            return product_operations(transform.shape)
         return product_operations(digits_of(P, self.options.order, self._order_option, self.places)[0].shape)
 
     def _make_train(self, P: PETSc.Mat, rank: int, product: float, limit: float) -> str:
@@ -161,6 +163,8 @@ class EntriesTrain:
 
     def _too_much(self, where: str, work: Work) -> str:
         limit = f"the limit of {work.limit:.1e} operations (-{self.prefix}pc_tt_setup_limit) ends {where}"
+        if self.options.setup_limit:
+            return f"{limit}: raise it, if the ranks do not grow"
         if where == CROSS:
             return f"{limit}: the ranks of the matrix grow, which is hopeless in this order of the points"
         return f"{limit}: a train costs more than one solution without it; raise the limit for many right-hand sides"

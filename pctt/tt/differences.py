@@ -113,13 +113,13 @@ def window(differences: Array) -> Array:
     return differences[tuple(slice(side) for _ in differences.shape)]
 
 
-def trial(differences: Array, transform: FastTransform) -> int:
-    """Iterations of conjugate gradients with this preconditioner and a random right-hand side; TRIAL_ITS at most."""
+def trial(differences: Array, transform: FastTransform, most: int = TRIAL_ITS) -> int:
+    """Iterations of conjugate gradients with this preconditioner and a random right-hand side; `most` at most."""
     times = product(differences)
     r = np.random.default_rng(0).standard_normal(prod(differences.shape))
     enough = TRIAL_RTOL * float(np.linalg.norm(r))
     p, rz = np.zeros_like(r), np.inf
-    for its in range(TRIAL_ITS):
+    for its in range(most):
         z = transform.solve(r)
         old, rz = rz, float(r @ z)
         p = z + rz / old * p
@@ -130,7 +130,7 @@ def trial(differences: Array, transform: FastTransform) -> int:
         r = r - rz / curvature * q
         if float(np.linalg.norm(r)) <= enough:
             return its + 1
-    return TRIAL_ITS
+    return most
 
 
 def best(differences: Array) -> tuple[float, int] | None:
@@ -142,6 +142,10 @@ def best(differences: Array) -> tuple[float, int] | None:
     transforms = {share: FastTransform(part, share) for share in SHARES}
     if not all(transform.positive for transform in transforms.values()):
         return None
-    its = {share: trial(part, transform) for share, transform in transforms.items()}
-    share = min(SHARES, key=lambda share: its[share] * (1 + TRANSFORM * (1 if share in (0.0, 1.0) else 2)))
-    return share, its[share]
+    found, least = (SHARES[0], TRIAL_ITS), np.inf
+    for share, transform in transforms.items():
+        each = 1 + TRANSFORM * (1 if share in (0.0, 1.0) else 2)  # the cost of an iteration in products
+        its = trial(part, transform, int(min(TRIAL_ITS, least // each + 1)))
+        if its * each < least:
+            found, least = (share, its), its * each
+    return found
