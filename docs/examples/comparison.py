@@ -17,6 +17,7 @@ petsc4py.init(sys.argv)
 from integral_problems import Problem
 from petsc4py import PETSc
 
+from pctt.ksp_options import entered
 from pctt.mat import from_entries
 
 RTOL = 1e-8
@@ -89,7 +90,8 @@ def right_side(size: int) -> np.ndarray:
 def cg(
     mat: PETSc.Mat, way: str, pc: str | Inverse, true: Callable, setup: float = 0.0, bytes_: float = 0.0
 ) -> Row:  # fmt: skip
-    """CG to RTOL of the true residual with a preconditioner: none, tt (the train of the entries) or a function."""
+    """CG to RTOL of the true residual with a preconditioner: none, tt (a train of the entries), auto (what TensorTrain
+    takes by itself) or a function."""
     ksp = PETSc.KSP().create(PETSc.COMM_SELF)
     ksp.setOperators(mat)
     ksp.setType("cg")
@@ -98,17 +100,18 @@ def cg(
     ksp.pc.setType("none" if pc == "none" else "python")
     if isinstance(pc, Inverse):
         ksp.pc.setPythonContext(pc)
-    elif pc == "tt":
+    elif pc != "none":
         ksp.pc.setPythonType("pctt.pc.TensorTrain")
-        ksp.setFromOptions()
+        with entered({"pc_tt_rank": "100" if pc == "tt" else "auto"} | PETSc.Options().getAll()):
+            ksp.setFromOptions()
     x, b = mat.createVecs()
     b.array[:] = right_side(b.getLocalSize())
     setup += seconds(ksp.setUp)[0]
     solve = seconds(lambda: ksp.solve(b, x))[0]
     note = ""
-    if pc == "tt":
+    if pc in ("tt", "auto"):
         made = ksp.pc.getPythonContext().made
-        note = "no positive train: diagonal"
+        note = made.used
         if made.inverse is not None:
             Z = made.inverse.train
             bytes_ += 8 * (Z.storage + made.compressed.train.storage)
@@ -167,6 +170,7 @@ def compare(problem: Problem, eps: float | None = 1e-6, dense: bool = True) -> l
         print(row, flush=True)
         return row
 
+    add(cg(fast, "CG + TensorTrain auto, FFT products", "auto", true))
     add(cg(fast, "CG + train, FFT products", "tt", true))
     if eps is not None:
         setup, slow = seconds(lambda: from_entries(problem.entries, problem.grid, eps, comm=PETSc.COMM_SELF))

@@ -21,6 +21,7 @@ from pctt.petsc import own_errors
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.entries import EntryMatrix
 from pctt.tt.train import Array, Train
+from pctt.tt.work import Work
 
 ROUNDING = 0.1  # tolerance for rounding a symmetric part or a sum, divided by eps
 MISSED = 10  # an error above this times eps is told
@@ -36,16 +37,17 @@ class CompressedEntries(GridTrain):
 
     def __init__(
         self, P: PETSc.Mat, eps: float, max_rank: int, order: str = "auto", name: str = "order",
-        start: GridTrain | None = None, seed: int = 0, places: Places | None = None,
+        start: GridTrain | None = None, seed: int = 0, places: Places | None = None, work: Work | None = None,
     ) -> None:  # fmt: skip
-        """Collective; EntriesError or ValueError on all ranks for bad entries or a bad grid."""
+        """Collective; on all ranks EntriesError or ValueError for bad entries or a bad grid, TooMuchWorkError at the
+        limit of `work`."""
         comm = P.comm.tompi4py()
         entries = Entries.of(P)
         digits, rows, order = digits_of(P, order, name, places)
         counts = np.array(comm.allgather(P.getLocalSize()[0]))
         matrix = EntryMatrix(entries, digits, rows, comm.bcast)
         known = start.found if start is not None and start.digits.modes == digits.modes else None
-        found: Cross = compress_cross(matrix, max_rank, eps, known, rng=np.random.default_rng(seed))
+        found: Cross = compress_cross(matrix, max_rank, eps, known, rng=np.random.default_rng(seed), work=work)
         train, error = found.train, found.error
         symmetric = is_symmetric(entries, digits.rows)
         if symmetric:
@@ -278,8 +280,9 @@ def mat_of(
 def axpy(Y: PETSc.Mat, factor: float, X: PETSc.Mat) -> None:
     """Y + factor X in place of Y, for a train Y; X is a train on the same grid, or any Mat that is c I.
 
-    PETSc's own ``Y.axpy`` cannot do this, because it does not ask a Mat of type python. The sum of two trains is
-    rounded to a tenth of eps of Y, with ranks at most its max_rank. ValueError on all ranks for other Mats. Collective.
+    PETSc's own ``Y.axpy`` cannot do this: petsc4py does not ask contexts for it, and PETSc 3.18 ends with a
+    segmentation fault, as for any Mat of type python. The sum of two trains is rounded to a tenth of eps of Y, with
+    ranks at most its max_rank. ValueError on all ranks for other Mats. Collective.
 
     >>> A = from_entries(lambda i, j: (i == j) + 0.1 / (1.0 + abs(i - j)), (64,))
     >>> B = A.duplicate(copy=True)
@@ -348,7 +351,8 @@ def from_entries(
     if rows >= MOST:
         wrong = f"a grid of shape {grid!r} with {rows} points; allowed are fewer than 2^31"
     refuse(mat.comm.tompi4py(), wrong)
-    mat.setOptionsPrefix(prefix)
+    if prefix:
+        mat.setOptionsPrefix(prefix)
     mat.setSizes(((PETSc.DECIDE, rows), (PETSc.DECIDE, rows)))
     mat.setType(PETSc.Mat.Type.PYTHON)
     mat.setPythonContext(TensorTrain(eps, max_rank))

@@ -27,6 +27,8 @@ from pctt.tt.inverse import Inverse, invert, invert_near_identity
 from pctt.tt.quantise import choose_modes
 from pctt.tt.sparse import SparseHierarchy
 
+LEAF = 16  # least number of blocks in the first and in the last mode
+SEED = 0  # of the random starts
 TABLES = 10.0  # memory that a first set-up takes, over that of the entries; measured at 142,000 contacts
 
 
@@ -158,7 +160,7 @@ class SparseTrain:
         """||w - S X w|| / ||w|| for a random vector w, where S is the scaled matrix."""
         slots = self.slots
         x, y = P.createVecs()
-        w = np.random.default_rng(self.options.seed).standard_normal(x.getLocalSize())
+        w = np.random.default_rng(SEED).standard_normal(x.getLocalSize())
         x.array_w[:] = slots.unscaled(self._inverse_times(w))
         P.mult(x, y)
         left = w - slots.scaled_vector(y.array_r)
@@ -173,7 +175,7 @@ class SparseTrain:
             self.account.resets += 1
             self._forget_trains()
         if self.tree is None:
-            self.tree = Slots(P, self.places, self.options.leaf, self.options.order)
+            self.tree = Slots(P, self.places, LEAF, self.options.order)
         self.slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaling == "block")
         self._begun = True
         self._product = None  # rows have other slots
@@ -182,12 +184,12 @@ class SparseTrain:
         assert self.tree is not None
         slots = self.slots
         slots.list_blocks(csr)
-        modes = self.tree.modes or choose_modes(slots.size, self.options.leaf)
+        modes = self.tree.modes or choose_modes(slots.size, LEAF)
         return SparseHierarchy(slots.rows, slots.columns, modes, slots.block, self._add, self.comm.bcast)
 
     def _compress(self, rank: int, warm: bool) -> Compression | Cross:
         assert self.hierarchy is not None
-        options, rng = self.options, np.random.default_rng(self.options.seed)
+        options, rng = self.options, np.random.default_rng(SEED)
         if options.compress == "cross":
             start = self.compression if warm and isinstance(self.compression, Cross) else None
             return compress_cross(self.hierarchy, rank, options.eps, start, rng=rng)
@@ -196,7 +198,7 @@ class SparseTrain:
 
     def _invert(self, rank: int, warm: bool) -> Inverse:
         assert self.compression is not None
-        options, rng = self.options, np.random.default_rng(self.options.seed)
+        options, rng = self.options, np.random.default_rng(SEED)
         start = self.inverse.applied if warm and self.inverse is not None else None
         method = invert_near_identity if options.scaling == "block" else invert  # block scaling has unit blocks
         return method(self.compression.train, rank, start, eps=options.eps, rng=rng)

@@ -132,12 +132,12 @@ class TensorTrain(PythonPC):
             self.rank = 1
         if isinstance(self.made, EntriesTrain) and self.made.compressed is not None:
             self._judge_symmetry(self.made.compressed.symmetric)
-        if self._lacks_rank():
-            self._fall_back(self.account.last)
-        elif self.rank == 1:
+        if failure := self._failure():
+            self._fall_back(failure)
+        if self.rank == 1 and not self.failed:
             self._make_block_jacobi(P)
         set_failed(pc, self.failed)
-        self._setup_seconds = self._slowest(time.perf_counter() - start)
+        self._setup_seconds = self._made_in = self._slowest(time.perf_counter() - start)
         self.account.setups += 1
         self.account.setup_s += self._setup_seconds
         inverse = self.made.inverse
@@ -146,19 +146,24 @@ class TensorTrain(PythonPC):
         if self.options.monitor:
             PETSc.Sys.Print(f"  {self.name}: {self._line()}", comm=P.comm)
 
-    def _lacks_rank(self) -> bool:
-        """Whether a rank that was asked for is not used."""
-        asked = isinstance(self.made, EntriesTrain) or not self.options.automatic
-        return asked and self.rank == 1 and max(self.policy.ladder) > 1
+    def _failure(self) -> str:
+        """Why a train that was asked for is not used; empty if nothing failed."""
+        if isinstance(self.made, EntriesTrain):
+            return self.made.failure
+        lacking = not self.options.automatic and self.rank == 1 and max(self.policy.ladder) > 1
+        return self.account.last if lacking else ""
 
     def _fall_back(self, why: str) -> None:
-        """Make block Jacobi, or nothing, in place of a train; and say why."""
+        """Take what there is in place of a train, or nothing; and say why."""
         self.failed = self.options.fallback == "none"
-        takes_over = "there is no preconditioner" if self.failed else "block Jacobi takes over"
+        takes_over = "there is no preconditioner" if self.failed else f"{self._base()} takes over"
         lost = not isinstance(self.made, EntriesTrain) and self.places.source == "nothing"
         self._warn(f"{why}: {takes_over}" + (f"; {NOWHERE}" if lost and self.options.order == "auto" else ""))
-        if not self.failed:
-            self._make_block_jacobi(self.P)
+
+    def _base(self) -> str:
+        """What is used where no train is."""
+        transform = self.made.transform if isinstance(self.made, EntriesTrain) else None
+        return "block Jacobi" if transform is None else f"the {transform.transform.name}"
 
     def _make_block_jacobi(self, P: PETSc.Mat) -> None:
         old = self._own[1:]
@@ -226,7 +231,7 @@ class TensorTrain(PythonPC):
                 self._warn(self.account.last)
             if again:
                 self._solve_again(ksp, b, x)
-        self.account.used[self._applied_rank()] += 1
+        self.account.used[self._used()] += 1
         seconds = self._slowest(time.perf_counter() - self._solve_start)
         reference = b.norm()
         if reference == 0 or ksp.getIterationNumber() == 0:
@@ -273,28 +278,33 @@ class TensorTrain(PythonPC):
             f"tensor train: {self._line()}",
             f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, kept {a.kept} times, "
             f"trees made anew {a.resets}",
-            f"scaling {self.options.scaling}, rows ordered by {self.places.source}",
+            f"rows ordered by {self.places.source}",
         ]
         lines += [] if self.symmetric else [NOT_SYMMETRIC]
         lines += [f"fell back: {why} ({count} times)" for why, count in a.fallbacks.items()]
-        figures = self.policy.figures.items()
-        costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
-        return [*lines, f"seconds per digit: {costs or 'none measured yet'}"]
+        if isinstance(self.made, SparseTrain):
+            figures = self.policy.figures.items()
+            costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
+            lines.append(f"scaling {self.options.scaling}, seconds per digit: {costs or 'none measured yet'}")
+        return lines
 
     def what(self) -> str:
         return self.account.what()
 
-    def _applied_rank(self) -> int:
-        """The greatest rank of the train of the inverse; 0 for block Jacobi."""
-        return max(self.made.inverse.applied.ranks) if self.rank > 1 and self.made.inverse is not None else 0
+    def _used(self) -> int | str:
+        """The greatest rank of the train of the inverse, or what is used in its place."""
+        if self.rank > 1 and self.made.inverse is not None:
+            return max(self.made.inverse.applied.ranks)
+        return "rank 1: block Jacobi" if self.rank == 1 else self._base()
 
     def _line(self) -> str:
         if self.failed:
             return f"none: {self.account.last}"
         if self.rank == 1:
-            return f"rank 1 (block Jacobi), set up in {self._setup_seconds:.2e} s"
-        digits = "single" if self._last_precision is np.float32 else "double"
-        return f"{self.made.words()}, {digits} precision, set up in {self._setup_seconds:.2e} s"
+            note = f", because {self.made.note}" if isinstance(self.made, EntriesTrain) and self.made.note else ""
+            return f"rank 1 (block Jacobi{note}), set up in {self._made_in:.2e} s"
+        digits = "single" if self._last_precision is np.float32 and self.made.inverse is not None else "double"
+        return f"{self.made.words()}, {digits} precision, set up in {self._made_in:.2e} s"
 
     def release(self) -> None:
         for thing in self._own:

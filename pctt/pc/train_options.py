@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Optional
 
-from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, OptionError, option
+from pctt.options import AT_LEAST_ONE, FRACTION, POSITIVE, OptionError, option
 
 SPARSE_RANK, ENTRIES_RANK = 10, 100  # default caps
 
@@ -42,7 +42,6 @@ class Options:
         "which the matrix has the data (with names of rows: morton)",
         choices=("auto", "grid", "morton", "rcm", "natural"),
     )
-    leaf: int = option(16, "least number of blocks in the first and last mode", check=AT_LEAST_ONE)
     reuse: str = option(
         "trains",
         "none: compute everything anew; newton: start from cores, index sets and block pairs of the last matrix with "
@@ -62,7 +61,12 @@ class Options:
         "PETSc's reason",
         choices=("jacobi", "none"),
     )
-    seed: int = option(0, "seed of the random starts", check=COUNT)
+    setup_limit: Optional[float] = option(
+        None,
+        "for matrices given by their entries: operations (about a nanosecond each) that the set-up of a train may "
+        "take; none: as many as a solution without a train takes",
+        check=POSITIVE,
+    )
     monitor: bool = option(False, "print a line per set-up")
 
     def __post_init__(self) -> None:
@@ -86,7 +90,7 @@ class Options:
 class Account:
     """What the preconditioner has done so far, for ``-ksp_view`` and the summary of the run.
 
-    used : solves by the greatest rank of the inverse that they ended with; 0: block Jacobi
+    used : solves by the greatest rank of the inverse that they ended with, or by what else they ended with
     """
 
     setups: int = 0
@@ -96,7 +100,7 @@ class Account:
     setup_s: float = 0.0
     fallbacks: Counter[str] = field(default_factory=Counter)
     last: str = ""  # the last reason of a fall-back
-    used: Counter[int] = field(default_factory=Counter)
+    used: Counter[int | str] = field(default_factory=Counter)
 
     def fall_back(self, why: str) -> None:
         self.fallbacks[why] += 1
@@ -104,11 +108,13 @@ class Account:
 
     def what(self) -> str:
         """What most of the solves used, and how many something else; empty if there were none."""
-        trains = sorted(self.used.keys() - {0})
-        ranks = f"{trains[0]} to {trains[-1]}" if len(trains) > 1 else "".join(map(str, trains))
-        counts = Counter({"rank 1: block Jacobi": self.used[0], f"rank {ranks}": sum(self.used[r] for r in trains)})
-        (most, _), (other, fewer) = counts.most_common()
-        total = sum(self.used.values())
-        if total == 0:
+        ranks = sorted(kind for kind in self.used if isinstance(kind, int))
+        counts = Counter({kind: count for kind, count in self.used.items() if isinstance(kind, str)})
+        if ranks:
+            name = f"rank {ranks[0]} to {ranks[-1]}" if len(ranks) > 1 else f"rank {ranks[0]}"
+            counts[name] = sum(self.used[rank] for rank in ranks)
+        if not counts:
             return ""
-        return most + (f", {fewer} of {total} systems {other}" if fewer else "")
+        (most, _), *others = counts.most_common()
+        total, fewer = sum(counts.values()), sum(count for _, count in others)
+        return most + (f", {fewer} of {total} systems {' or '.join(name for name, _ in others)}" if others else "")

@@ -22,11 +22,13 @@ from pctt.tt.als import relative_error
 from pctt.tt.entries import EntryMatrix
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Array, Train, low_rank, matrix_train, zeros
+from pctt.tt.work import ENTRY, Work, pivot_operations
 
 SAMPLES = 1024  # a train is validated on this number of stored entries and on as many others
 EXTRA = 32  # largest number of stored entries, those where the train is worst, that enrich the next sweep
 TIGHTER = 0.1  # if a sweep misses eps, the tolerance of the single cores is multiplied by this
 WORTH = 0.9  # a sweep that leaves more than this part of the error was idle
+CROSS = "the compression"  # the phase for `Work`
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ def compress_cross(
     start: Cross | None = None,
     sweeps: int = 10,
     rng: np.random.Generator | None = None,
+    work: Work | None = None,
 ) -> Cross:
     """A train with ranks at most `max_rank` from entries of the matrix. Its error is about eps if the rank allows it.
 
@@ -65,6 +68,7 @@ def compress_cross(
     sweeps : largest number of sweeps. They end earlier if the estimated error is below eps, or if it falls by less than
         a tenth in two consecutive sweeps.
     rng : must give the same numbers on all ranks
+    work : counts entries and factorisations; raises TooMuchWorkError on all ranks at its limit
 
     >>> i = np.arange(63)
     >>> A = SparseHierarchy(np.r_[i, i + 1], np.r_[i + 1, i], [4, 4, 4])
@@ -73,7 +77,7 @@ def compress_cross(
     (1, 3, 3, 1)
     """
     rng = np.random.default_rng(0) if rng is None else rng
-    entries = _Entries(matrix, rng)
+    entries = _Entries(matrix, rng, Work() if work is None else work)
     if entries.norm == 0:
         nothing = [np.zeros(1, np.int64)] * len(entries.width)
         return Cross(zeros(matrix.modes, matrix.modes, matrix.dtype), 0.0, 0, 0, nothing, nothing)
@@ -107,9 +111,8 @@ class _Entries:
     A prefix of length k and a suffix are keys of their own digits: key = prefix * width[k] + suffix.
     """
 
-    def __init__(self, matrix: SparseHierarchy | EntryMatrix, rng: np.random.Generator) -> None:
-        self.matrix = matrix
-        self.rng = rng
+    def __init__(self, matrix: SparseHierarchy | EntryMatrix, rng: np.random.Generator, work: Work) -> None:
+        self.matrix, self.rng, self.work = matrix, rng, work
         self.squares = [m * m for m in matrix.modes]
         self.width = [1]
         for square in self.squares[::-1]:
@@ -119,12 +122,16 @@ class _Entries:
 
     def at(self, keys: Array) -> Array:
         """The entries at keys of any shape."""
-        self.evaluations += keys.size
+        self._count(keys.size)
         return self.matrix.lookup(keys)
+
+    def _count(self, evaluations: int) -> None:
+        self.evaluations += evaluations
+        self.work.spend(ENTRY * evaluations, CROSS)
 
     def block(self, k: int, prefixes: Array, suffixes: Array) -> Array:
         """Entries (prefixes, m_k^2, suffixes) around digit k."""
-        self.evaluations += len(prefixes) * self.squares[k] * len(suffixes)
+        self._count(len(prefixes) * self.squares[k] * len(suffixes))
         digits = np.arange(self.squares[k]) * self.width[k + 1]
         return self.matrix.crosses(prefixes * self.width[k], digits, suffixes)
 
@@ -159,6 +166,7 @@ def _forward(
     for k in range(d - 1):
         columns = np.union1d(suffixes[k + 1], extra % entries.width[k + 1])
         C = entries.block(k, prefixes[k], columns)
+        entries.work.spend(pivot_operations(C.size // len(columns), len(columns)), CROSS)
         U, pivots = entries.matrix.agree(_dominant(C.reshape(-1, len(columns)), max_rank, eps / d))
         cores.append(U.reshape(len(prefixes[k]), -1, len(pivots)))
         prefixes.append(prefixes[k][pivots // entries.squares[k]] * entries.squares[k] + pivots % entries.squares[k])
@@ -175,6 +183,7 @@ def _backward(
     for k in range(d - 1, 0, -1):
         rows = np.union1d(prefixes[k], extra // entries.width[k])
         C = entries.block(k, rows, suffixes[0])
+        entries.work.spend(pivot_operations(C.size // len(rows), len(rows)), CROSS)
         pivots = entries.matrix.agree(_dominant(C.reshape(len(rows), -1).T, max_rank, eps / d)[1])
         digits, old = pivots // len(suffixes[0]), pivots % len(suffixes[0])
         suffixes.insert(0, digits * entries.width[k + 1] + suffixes[0][old])

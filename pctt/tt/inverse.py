@@ -23,6 +23,7 @@ import numpy as np
 
 from pctt.tt.projection import Projection, columns, rows
 from pctt.tt.train import Array, Train, full_ranks, identity, random
+from pctt.tt.work import TooMuchWorkError, Work, inner_operations, local_operations, svd_operations
 
 LOCAL_GAIN, LOCAL_ITS = 0.1, 20  # conjugate gradients: factor by which they reduce a local residual, most iterations
 LOCAL_EPS = 0.1  # a local system needs no smaller residual than this part of the tolerance
@@ -34,6 +35,9 @@ NOISE = 1e-7  # a smaller part of the residual counts as rounding
 COARSEST, FINER, STEPS = 4.0, 0.84, 32  # tolerances for rounding / eps: the first, its factor per step, number of steps
 LEAP = 8  # the first trials go this number of steps at a time
 SKETCH = 64  # rank of the random train for the estimate of a residual of high rank
+REST = 6  # the other work for a core, in products with the local matrix
+GROWTH = 4  # work of a pass, relative to the last one: its ranks are up to twice as large
+INVERSION = "the inversion"  # the phase for `Work`
 HIGH = 300  # with a larger product of the ranks of S and X, the residual is estimated
 
 
@@ -95,16 +99,18 @@ def invert_near_identity(
     sweeps: int | None = None,
     eps: float = 0.0,
     rng: np.random.Generator | None = None,
+    work: Work | None = None,
 ) -> Inverse:
     """The inverse of S = I + T as X = I + Z, with an exact identity.
 
-    The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z. All other
-    arguments are those of `invert`. Z is cheaper to apply than X: it takes `Apply(Z)` and one addition.
+    The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z. `work`
+    counts operations; TooMuchWorkError at its limit. All other arguments are those of `invert`. Z is cheaper to apply
+    than X: it takes `Apply(Z)` and one addition.
     """
     unit = identity(T.rows, T.dtype)
     if max_rank <= 1 or T.norm() == 0:
         return Inverse(0 * unit, True, float(max_rank <= 1) if T.norm() else 0.0, 0, 0)
-    return replace(_solve(unit + T, -T, start, max_rank - 1, sweeps, eps, rng), identity=True)
+    return replace(_solve(unit + T, -T, start, max_rank - 1, sweeps, eps, rng, work), identity=True)
 
 
 def residual(S: Train, X: Train, B: Train | None = None) -> float:
@@ -149,8 +155,10 @@ class Growing:
     estimate : the part of ||B - S x|| that z has seen in the last pass
     """
 
-    def __init__(self, S: Train, B: Train, x: Train, most: list[int], eps: float, rng: np.random.Generator) -> None:
-        self.most, self.goal = most, LOCAL_EPS * eps
+    def __init__(
+        self, S: Train, B: Train, x: Train, most: list[int], eps: float, rng: np.random.Generator, work: Work,
+    ) -> None:  # fmt: skip
+        self.most, self.goal, self.work = most, LOCAL_EPS * eps, work
         width = min(MOST_GROWTH, max(most, default=1))
         self.x, self.signs = _with_signs(x, most)
         self.z = list(random(S.rows, width, S.columns, rng, S.dtype).right_orthogonal().cores)
@@ -185,6 +193,11 @@ class Growing:
         z[0] = self.residual.rest(0, x[0])
         self.estimate = float(np.linalg.norm(z[0]))
 
+    def words(self, norm: float) -> str:
+        """How far it is, for a message. norm : ||B||"""
+        left = f", leaves about {self.estimate / norm:.1e} of the residual" if self.estimate else ""
+        return f"{INVERSION}, at rank {max(x.shape[3] for x in self.x)}{left}"
+
     def _solve(self, k: int) -> None:
         """Compute nearly the symmetric core of least energy by conjugate gradients, from the present core.
 
@@ -206,9 +219,12 @@ class Growing:
         z = r / weight
         p, rz = z, float(np.vdot(r, z))
         enough = max(LOCAL_GAIN * float(np.linalg.norm(r)), self.goal * float(np.linalg.norm(f)))
+        one = local_operations(galerkin.left[k], galerkin.S[k], galerkin.right[k], y)
+        self.work.spend(REST * one + 2 * svd_operations(len(y) * y.shape[1] * y.shape[2], 2 * y.shape[3]), INVERSION)
         for _ in range(LOCAL_ITS):
             if np.linalg.norm(r) <= enough:
                 break
+            self.work.spend(one, INVERSION)
             q = symmetric(galerkin.times(k, p))
             curvature = float(np.vdot(p, q))
             if curvature <= 0:
@@ -230,6 +246,7 @@ def _solve(
     sweeps: int | None,
     eps: float,
     rng: np.random.Generator | None,
+    work: Work | None = None,
 ) -> Inverse:
     """The symmetric solution of S X = B with its relative residual."""
     if S.rows != S.columns:
@@ -239,17 +256,23 @@ def _solve(
     if sweeps is None:
         sweeps = 1 if start is not None else 2 + int(np.ceil(0.5 * np.log2(max(1.0, max(most, default=1)))))
     first = B if start is None else start.astype(S.dtype)
-    growing = Growing(S, B, first.round(0.0, max_rank), most, eps, rng)
+    work = Work() if work is None else work
+    growing = Growing(S, B, first.round(0.0, max_rank), most, eps, rng, work)
     norm, count, before, enough = B.norm(), 0, np.inf, ENOUGH * eps
     while count < sweeps:
-        growing.forward()
-        growing.backward()
+        begun = work.spent
+        try:
+            growing.forward()
+            growing.backward()
+        except TooMuchWorkError:
+            raise TooMuchWorkError(growing.words(norm)) from None
         count += 1
         if growing.estimate <= enough * norm:
             X = Train(growing.x)
+            work.spend(inner_operations(S, X, HIGH), INVERSION)
             left = residual(S, X, B)
             if left <= eps:
-                X, left = _rounded(S, B, X, left, eps)
+                X, left = _rounded(S, B, X, left, eps, work)
                 return Inverse(X, False, left, count, growing.repaired)
             enough *= 0.5 * eps / left  # the estimate sees only a part of the residual
         if growing.estimate > IDLE * before:
@@ -257,11 +280,14 @@ def _solve(
                 break
             growing.drop *= 0.3
         before = growing.estimate
+        if count < sweeps:
+            work.foresee(GROWTH * (work.spent - begun), growing.words(norm))
     X = Train(growing.x)
+    work.spend(inner_operations(S, X, HIGH), INVERSION)
     return Inverse(X, False, residual(S, X, B), count, growing.repaired)
 
 
-def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Train, float]:
+def _rounded(S: Train, B: Train, X: Train, left: float, eps: float, work: Work) -> tuple[Train, float]:
     """X rounded so that its residual stays below eps, and this residual.
 
     A few trials search for the coarsest tolerance. The tolerances fall in leaps until one is fine enough. Then the
@@ -270,6 +296,7 @@ def _rounded(S: Train, B: Train, X: Train, left: float, eps: float) -> tuple[Tra
 
     def trial(step: int) -> tuple[Train, float]:
         smaller = X.round(COARSEST * FINER**step * eps)
+        work.spend(inner_operations(S, smaller, HIGH), INVERSION)
         return smaller, residual(S, smaller, B)
 
     step = 0

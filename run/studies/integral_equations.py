@@ -28,8 +28,8 @@ GROWTH = {"Fredholm": (fredholm, (64, 128, 256, 512, 1024, 2048)), "1/r": (poten
 def solved(problem: Problem) -> dict[str, Any]:
     """CG with the train and without, medians of CPU seconds."""
     true, mat = problem.product(), operator(problem)
-    rows = [cg(mat, "train", True, true) for _ in range(REPEAT)]
-    plain = cg(mat, "plain", False, true)
+    rows = [cg(mat, "train", "tt", true) for _ in range(REPEAT)]
+    plain = cg(mat, "plain", "none", true)
     mat.destroy()
     row = {"problem": problem.name, "unknowns": problem.size, "iterations": rows[0].iterations}
     row |= {"without": plain.iterations, "setup_s": statistics.median(r.setup_s for r in rows)}

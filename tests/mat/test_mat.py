@@ -175,7 +175,7 @@ def test_a_changed_mat_is_preconditioned_as_it_is_now():
         ksp.setOperators(mat)
         ksp.pc.setType("python")
         ksp.pc.setPythonType("pctt.pc.TensorTrain")
-        PETSc.Options()["pc_tt_eps"] = str(eps)
+        PETSc.Options().insertString(f"-pc_tt_rank 100 -pc_tt_eps {eps}")
         ksp.setFromOptions()
         x, y = mat.createVecs()
         x.set(1.0)
@@ -343,6 +343,23 @@ def test_the_inverse_solves_directly(grid, way):
     is_matrix(inverse(X, 1e-9), A, 1e-6)
     X.scale(2.0)
     is_matrix(X, 2 * exact, 1e-7)
+
+
+@pytest.mark.parallel(1, 2, 3)
+def test_the_inverse_is_the_preconditioner_of_pcmat():
+    kernel = Kernel((12, 9))
+    A = from_entries(kernel, (12, 9), EPS)
+    ksp = PETSc.KSP().create(A.comm)
+    ksp.setOperators(A, inverse(A, 1e-6))
+    ksp.setType("cg")
+    ksp.setTolerances(rtol=1e-10)
+    ksp.pc.setType("mat")
+    x, b = A.createVecs()
+    b.array[:] = np.arange(*b.getOwnershipRange())
+    ksp.solve(b, x)
+    assert ksp.getIterationNumber() <= 2
+    expected = np.linalg.solve(kernel.dense, np.arange(108.0))[slice(*x.getOwnershipRange())]
+    np.testing.assert_allclose(x.array, expected, rtol=1e-7, atol=1e-7)
 
 
 @pytest.mark.parallel(1, 2)

@@ -29,7 +29,7 @@ def mat():
 
 def made(mat: PETSc.Mat, precision: str) -> PETSc.PC:
     """The preconditioner, which all methods share."""
-    PETSc.Options()["pc_tt_precision"] = precision
+    PETSc.Options().insertString(f"-pc_tt_rank 100 -pc_tt_precision {precision}")
     pc = PETSc.PC().create(mat.comm)
     pc.setOperators(mat)
     pc.setType("python")
@@ -91,7 +91,7 @@ def test_a_method_within_another_preconditioner_uses_double_precision(mat):
     assert "richardson" in REFINING
     assert "gmres" not in UNHARMED
     PETSc.Options().insertString("-pc_type ksp -ksp_ksp_type richardson -ksp_ksp_max_it 2 -ksp_ksp_norm_type none")
-    PETSc.Options().insertString("-ksp_pc_type python -ksp_pc_python_type pctt.pc.TensorTrain")
+    PETSc.Options().insertString("-ksp_pc_type python -ksp_pc_python_type pctt.pc.TensorTrain -ksp_pc_tt_rank 100")
     ksp = PETSc.KSP().create(mat.comm)
     ksp.setOperators(mat)
     ksp.setType("gmres")

@@ -177,7 +177,7 @@ def test_empty_slots_leave_the_preconditioner_as_it_is(block, scaling):
     identity = np.eye(40 * block)
     for names in (keys, None):
         mat = springs(points, names, block)
-        ksp = solver(mat, rank=400, eps=1e-12, leaf=4, scaling=scaling)
+        ksp = solver(mat, rank=400, eps=1e-12, scaling=scaling)
         ksp.setUp()
         pc = context(ksp)
         assert pc.rank == 400, pc.account.fallbacks

@@ -73,7 +73,7 @@ def operator(ksp: PETSc.KSP) -> np.ndarray:
 
 def test_full_ranks_give_the_inverse():
     mat = poisson(8)
-    ksp = solver(mat, rank=64, eps=1e-12, leaf=4)
+    ksp = solver(mat, rank=64, eps=1e-12)
     ksp.setUp()
     assert context(ksp).rank == 64
     assert context(ksp).made.compression.error < 1e-6
@@ -132,7 +132,7 @@ def test_solves_under_every_method_with_fewer_iterations_than_jacobi(ksp_type):
 def test_refines_by_itself():
     """The inverse as a direct solver, and in iterative refinement."""
     mat = poisson(8)
-    options = {"rank": 64, "eps": 1e-12, "leaf": 4}
+    options = {"rank": 64, "eps": 1e-12}
     direct = solver(mat, "preonly", **options)
     _, once = solve(direct)
     refined = solver(mat, "richardson", **options)
@@ -240,16 +240,19 @@ def test_it_says_what_it_was():
         assert re.fullmatch(words, context(ksp).what())
 
 
+BLOCKS = "rank 1: block Jacobi"
+
+
 @pytest.mark.parametrize(
     ("used", "words"),
     [
         ({}, ""),
-        ({0: 3}, "rank 1: block Jacobi"),
+        ({BLOCKS: 3}, "rank 1: block Jacobi"),
         ({1: 2}, "rank 1"),  # a train of rank 1 beside the identity
-        ({0: 4, 10: 32}, "rank 10, 4 of 36 systems rank 1: block Jacobi"),
-        ({0: 9, 3: 1}, "rank 1: block Jacobi, 1 of 10 systems rank 3"),
+        ({BLOCKS: 4, 10: 32}, "rank 10, 4 of 36 systems rank 1: block Jacobi"),
+        ({BLOCKS: 9, 3: 1}, "rank 1: block Jacobi, 1 of 10 systems rank 3"),
         ({8: 2, 3: 1, 10: 5}, "rank 3 to 10"),
-        ({8: 2, 3: 1, 0: 9}, "rank 1: block Jacobi, 3 of 12 systems rank 3 to 8"),
+        ({8: 2, 3: 1, BLOCKS: 9}, "rank 1: block Jacobi, 3 of 12 systems rank 3 to 8"),
     ],
 )
 def test_what_many_solves_used(used, words):

@@ -1,0 +1,169 @@
+"""What pctt.pc.TensorTrain makes of matrices given by their entries: fast transforms, trains, the diagonal."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.pc.differences import depend_on_differences, means_of_differences
+from pctt.tt.differences import FastTransform
+
+GRID = (10, 7)
+SIZE = 70
+
+
+def covariance(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    apart = np.subtract(np.unravel_index(i, GRID), np.unravel_index(j, GRID))
+    return 0.1 * (i == j) + np.exp(-np.sqrt((apart**2).sum(axis=0)) / 4)
+
+
+def oblique(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Of differences, but other for (1, 1) than for (1, -1)."""
+    x, y = np.subtract(np.unravel_index(i, GRID), np.unravel_index(j, GRID))
+    return 1.0 * (i == j) + 0.3 * np.exp(-np.abs(x - 0.7 * y))
+
+
+def weighted(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    return (i == j) + 0.1 * np.sqrt((1 + i) * (1 + j)) * covariance(i, j)
+
+
+def dense(entries) -> np.ndarray:
+    return entries(*(k.ravel() for k in np.meshgrid(np.arange(SIZE), np.arange(SIZE), indexing="ij"))).reshape(SIZE, -1)
+
+
+def preconditioner(entries, order: np.ndarray | None = None, **options: object) -> PETSc.KSP:
+    """CG set up for a dense matrix of PETSc's type python, with rows in the order of the points or in another one."""
+    A = dense(entries)
+
+    class Shell:
+        def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+            y.array_w[:] = A[slice(*y.getOwnershipRange())] @ np.concatenate(mat.comm.tompi4py().allgather(x.array_r))
+
+    mat = PETSc.Mat().createPython(((PETSc.DECIDE, SIZE), (PETSc.DECIDE, SIZE)), Shell(), comm=PETSc.COMM_WORLD)
+    mat.setUp()
+    mat.setAttr("entries", entries)
+    mat.setAttr("grid", GRID)
+    for name, value in options.items():
+        PETSc.Options()[f"pc_tt_{name}"] = str(value)
+    ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOperators(mat)
+    ksp.setType("cg")
+    ksp.setTolerances(rtol=1e-10)
+    ksp.pc.setType("python")
+    ksp.pc.setPythonType("pctt.pc.TensorTrain")
+    ksp.setFromOptions()
+    ksp.setUp()
+    return ksp
+
+
+def made(ksp: PETSc.KSP):
+    return ksp.pc.getPythonContext().made
+
+
+def applied(ksp: PETSc.KSP, v: np.ndarray) -> np.ndarray:
+    """The whole product of the preconditioner with a vector."""
+    x, y = ksp.getOperators()[0].createVecs()
+    x.array[:] = v[slice(*x.getOwnershipRange())]
+    ksp.pc.apply(x, y)
+    return np.concatenate(MPI.COMM_WORLD.allgather(y.array_r.copy()))
+
+
+def test_differences_are_recognised():
+    rng = np.random.default_rng(0)
+    assert depend_on_differences(covariance, GRID, None, rng) is True
+    assert depend_on_differences(oblique, GRID, None, rng) is False
+    for entries in (weighted, lambda i, j: covariance(i, j) + 1e-3 * i * (i == j), lambda i, j: 1.0 / (1 + i + j)):
+        assert depend_on_differences(entries, GRID, None, rng) is None
+    order = rng.permutation(SIZE)
+    of_row = np.argsort(order)
+    assert depend_on_differences(lambda i, j: covariance(of_row[i], of_row[j]), GRID, order, rng) is True
+    assert depend_on_differences(lambda i, j: covariance(of_row[i], of_row[j]), GRID, None, rng) is None
+
+
+@pytest.mark.parametrize(("entries", "even"), [(covariance, True), (oblique, False)])
+def test_means_are_those_over_all_signs(entries, even):
+    A = dense(entries)
+    x, y = np.unravel_index(np.arange(SIZE), GRID)
+    found = means_of_differences(entries, GRID, None, even)
+    for a, b in ((0, 0), (3, 2), (9, 6), (0, 4)):
+        each = [A[(x[:, None] - x == s * a) & (y[:, None] - y == t * b)].mean() for s in (1, -1) for t in (1, -1)]
+        assert found[a, b] == pytest.approx(np.mean(each))
+
+
+@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parametrize("entries", [covariance, oblique])
+def test_the_preconditioner_is_the_transform(entries):
+    ksp = preconditioner(entries)
+    name, share = made(ksp).transform.transform.name, made(ksp).transform.transform.share
+    assert made(ksp).used == name
+    assert f"{name} of a grid of 10 x 7" in "\n".join(ksp.pc.getPythonContext().report())
+    v = np.random.default_rng(1).standard_normal(SIZE)
+    differences = means_of_differences(entries, GRID, None, entries is covariance)
+    np.testing.assert_allclose(applied(ksp, v), FastTransform(differences, share).solve(v), rtol=1e-12)
+    x, b = ksp.getOperators()[0].createVecs()
+    b.set(1.0)
+    ksp.solve(b, x)
+    assert ksp.getIterationNumber() <= 16
+    found = np.concatenate(MPI.COMM_WORLD.allgather(x.array_r.copy()))
+    np.testing.assert_allclose(found, np.linalg.solve(dense(entries), np.ones(SIZE)), rtol=1e-7)
+
+
+@pytest.mark.parallel(1, 3)
+def test_a_rank_asks_for_a_train():
+    ksp = preconditioner(covariance, rank=30)
+    assert made(ksp).transform is None
+    assert made(ksp).used.startswith("train of ranks")
+
+
+@pytest.mark.parallel(1, 2)
+def test_a_limit_stops_the_set_up_and_says_so():
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        ksp = preconditioner(weighted, rank=30, setup_limit=1e6)
+    words = MPI.COMM_WORLD.bcast(" ".join(str(w.message) for w in said))
+    assert "the limit of 1.0e+06 operations (-pc_tt_setup_limit) ends" in words
+    assert "block Jacobi takes over" in words
+    assert made(ksp).used == "rank 1: block Jacobi"
+    np.testing.assert_allclose(applied(ksp, np.ones(SIZE)), 1 / np.diag(dense(weighted)))
+
+
+def test_without_a_train_a_transform_takes_over():
+    with pytest.warns(UserWarning, match="transform takes over"):
+        ksp = preconditioner(covariance, rank=30, setup_limit=1e6)
+    assert "cosine" in made(ksp).used
+
+
+@pytest.mark.parallel(1, 2)
+def test_auto_takes_no_train_that_does_not_pay():
+    ksp = preconditioner(weighted)
+    assert made(ksp).used == "rank 1: block Jacobi"
+    assert "so a train does not pay" in "\n".join(ksp.pc.getPythonContext().report())
+
+
+def test_unsymmetric_and_indefinite_entries_get_no_transform():
+    for entries in (lambda i, j: covariance(i, j) + 0.3 * (i > j), lambda i, j: covariance(i, j) - 1.2 * (i == j)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            assert made(preconditioner(entries)).transform is None
+
+
+def test_a_train_that_failed_is_not_tried_again():
+    calls = []
+
+    def entries(i, j):
+        calls.append(len(i))
+        return covariance(i, j)
+
+    with pytest.warns(UserWarning, match="transform takes over"):
+        ksp = preconditioner(entries, rank=30, setup_limit=1e6)
+    first = sum(calls)
+    calls.clear()
+    ksp.getOperators()[0].stateIncrease()
+    ksp.setOperators(ksp.getOperators()[0])
+    ksp.setUp()
+    assert "transform" in made(ksp).used
+    assert sum(calls) < first
