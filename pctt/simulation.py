@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -45,8 +45,6 @@ from pctt.run.results import Results, described_bodies
 from pctt.run.settings import Settings, scene_name
 from pctt.run.settling import Settling, built, settled_state, world_at_start
 from pctt.run.stepper import Stepper
-
-Result = TypeVar("Result")
 
 
 class Simulation:
@@ -169,16 +167,19 @@ class Simulation:
         if until is not None:
             left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
         first, end, ends = self.steps, self.steps + left, False
+
+        def tell() -> bool:
+            if call is not None and (self.steps - first) % every == 0:
+                call(self)
+            return stop is not None and bool(stop(self))
+
         while self.steps < end and not ends:
             self._step(last=self.steps + 1 == end)
-            if call is not None and (self.steps - first) % every == 0:
-                self._told("call of run", call)
-            ends = stop is not None and self.comm.bcast(bool(self._told("stop of run", stop)))
+            if self.comm.size == 1:
+                ends = tell()
+            elif call or stop:  # an error of one rank is one of all, and the first rank decides
+                ends = self.comm.bcast(together(self.comm, "call or stop of run", tell))
         self.complete()
-
-    def _told(self, what: str, call: Callable[[Simulation], Result]) -> Result:
-        """What the user's function returns; on several ranks an error of one is one of all."""
-        return call(self) if self.comm.size == 1 else together(self.comm, what, lambda: call(self))
 
     # -- what there is ---------------------------------------------------------------------------------------
 
