@@ -296,7 +296,9 @@ class Simulation:
         """
         if self.output is not None:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
-        for name, value, check in (("every", every, COUNT), ("checkpoint_every", checkpoint_every, AT_LEAST_ONE)):
+        for name, value, check in (
+            ("every", every, COUNT), ("checkpoint_every", checkpoint_every, AT_LEAST_ONE), ("hard", hard, COUNT)
+        ):  # fmt: skip
             _check(name, value, check)
         refuse_serial(self.comm)
         for name, path in {"write": folder, "problems": problems}.items():
@@ -304,9 +306,8 @@ class Simulation:
                 refuse_unwritable(name, Path(path), self.comm)
         place = Place(Path(folder), self.comm, self._restart, overwrite)
         self.output = Results(place, self.world, self.memory, self._origin, self._compare, every, checkpoint_every)
-        self.stepper.dump = Dump(
-            self.settings, self.experiment, self.world, place, _check("hard", hard, COUNT), str(problems), problem_steps
-        )
+        where = str(problems)
+        self.stepper.dump = Dump(self.settings, self.experiment, self.world, place, hard, where, problem_steps)
 
     def complete(self) -> None:
         """Write what the folder of `write` lacks of the last step."""
@@ -451,7 +452,7 @@ class BodyMotion:
 
 
 def _check(name: str, value: Any, check: tuple[str, Callable[[Any], bool]]) -> int:
-    """A whole number that passes a check; OptionError if it does not."""
+    """The value; OptionError if it is no whole number, or fails the check."""
     if not isinstance(value, (int, np.integer)) or not check[1](value):
         raise OptionError(f"{name} {value!r}: allowed is {check[0]}")
     return int(value)
