@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from program import ROOT, arrays, assert_same_bits, database, table
+from program import ROOT, SMALL, arrays, assert_same_bits, database, table
 
 import pctt
 from dem.experiment import Experiment, option
@@ -188,7 +188,7 @@ def test_a_path_that_would_let_the_body_jump_is_refused():
     with pytest.raises(ValueError, match="Fixed has no speed"):
         sim.body("tool").motion.speed = 1.0
     with pytest.raises(ValueError, match="no large body 'paddle'; there are: tool"):
-        sim.body("mixer")
+        sim.body("paddle")
 
 
 # -- the loop -----------------------------------------------------------------------------------------------
@@ -365,7 +365,7 @@ def test_the_program_goes_on_from_what_a_simulation_saved(tmp_path, monkeypatch)
     sim.body("mixer").motion.velocity = (0.0, 0.0, 3.0)
     sim.run(steps=2)
     sim.save("half.h5")
-    words = ["-scene_n", "1", "-scene_margin", "0.7", "-ccp_type", "apgd", "-restart", "half.h5", "-steps", "2", "-quiet"]
+    words = [*SMALL, "-ccp_type", "apgd", "-restart", "half.h5", "-steps", "2", "-quiet"]
     simulate(read_options(database(words), SELF), SELF)
     sim.run(steps=2)
     sim.save("whole.h5")
