@@ -34,8 +34,8 @@ from dem.step import Step
 from dem.together import meet, together
 from pctt import ccp, log
 from pctt.look.folder import Contacts, FolderError, Frame, Snapshot
-from pctt.look.picture import Picture
 from pctt.options import AT_LEAST_ONE, COUNT, OptionError, made
+from pctt.render import Picture, picture
 from pctt.run import checkpoint, report
 from pctt.run.dump import Dump
 from pctt.run.hdf5 import refuse_serial
@@ -86,7 +86,10 @@ class Simulation:
             raise OptionError(f"scene {scene!r}: allowed is a dem.scene.Scene or an instance of an Experiment")
         self.comm = comm
         self.experiment = scene if isinstance(scene, Experiment) else Given(scene)
-        self.settings = together(comm, "settings", lambda: self._settings(settings, changes), own=(OptionError,))
+        given = {**(vars(settings) if settings else {}), **changes}
+        self.settings = together(
+            comm, "settings", lambda: made(Settings, given).of(self.experiment), own=(OptionError,)
+        )
         scene = built(self.experiment, comm)
         if restart == "settled":
             how = Settling(self.experiment, self.settings, self.experiment.settle_delta)
@@ -109,9 +112,6 @@ class Simulation:
         """The simulation that `save` kept, or a checkpoint.h5 of a run, with the same scene and time step; the other
         arguments are those of a new one. On as many ranks it goes on with the same bits."""
         return cls(scene, *given, restart=path, **more)
-
-    def _settings(self, settings: Settings | None, changes: dict[str, Any]) -> Settings:
-        return made(Settings, {**(vars(settings) if settings else {}), **changes}).of(self.experiment)
 
     @property
     def _origin(self) -> dict[str, Any]:
@@ -250,11 +250,6 @@ class Simulation:
         order = np.argsort(found.pop("key"))
         return Contacts(**{name: column[order] for name, column in found.items()}, dt=step.system.dt)
 
-    @property
-    def history(self) -> list[float]:
-        """Residual by iteration of the last step's solver; not collective."""
-        return self.stepper.history
-
     def body(self, name: str) -> Body:
         """A large body; ValueError if there is none of that name. Not collective."""
         try:
@@ -355,12 +350,10 @@ class Simulation:
         """A picture of the present state, which a notebook shows and ``save`` writes. ``color`` is one of
         `pctt.render.COLOURS`; what else may be given are fields of `pctt.look.stage.View`, such as azimuth=30.0.
         ImportError without VTK (the extra `pictures`), OptionError for a bad name or value."""
-        from pctt import render  # here, as most simulations need no pictures
-
         snapshot = self._snapshot()
 
         def draw() -> Picture | None:
-            return render.picture(snapshot, color, view) if self.comm.rank == 0 else None
+            return picture(snapshot, color, view) if self.comm.rank == 0 else None
 
         return self.comm.bcast(together(self.comm, "render", draw, own=(ImportError, OptionError, FolderError)))
 
