@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
+from io import BytesIO
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,6 @@ import numpy as np
 from mpi4py import MPI
 
 from pctt.look.folder import Folder, Frame
-from pctt.look.picture import Picture
 from pctt.look.program import add_steps, chosen, made_folder, parser, positive, run, whole
 from pctt.options import OptionError, made, refuse_bad
 
@@ -97,6 +97,26 @@ def main(comm: MPI.Comm) -> None:
             film = target / f"film.{given.film}"
             {"mp4": write_mp4, "gif": write_gif}[given.film](film, pictures, given.fps)
             print(f"film: {film}")
+
+
+class Picture:
+    """``pixels`` (height, width, 3), 0 to 255; a notebook shows them."""
+
+    def __init__(self, pixels: np.ndarray):
+        self.pixels = pixels
+
+    def _repr_png_(self) -> bytes:
+        """The picture as a file in PNG format."""
+        from PIL import Image
+
+        file = BytesIO()
+        Image.fromarray(np.ascontiguousarray(self.pixels)).save(file, format="png", compress_level=4)
+        return file.getvalue()
+
+    def save(self, path: str | Path) -> None:
+        """Write a PNG file, whole or not at all; FolderError if that fails."""
+        with whole(Path(path)) as temporary:
+            temporary.write_bytes(self._repr_png_())
 
 
 def picture(folder: Folder, color: str, view: Mapping[str, Any]) -> Picture:

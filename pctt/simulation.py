@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -34,8 +34,8 @@ from dem.step import Step
 from dem.together import meet, together
 from pctt import ccp, log
 from pctt.look.folder import Contacts, FolderError, Frame, Snapshot
-from pctt.look.picture import Picture
 from pctt.options import AT_LEAST_ONE, COUNT, OptionError, made
+from pctt.render import Picture, picture
 from pctt.run import checkpoint, report
 from pctt.run.dump import Dump
 from pctt.run.hdf5 import refuse_serial
@@ -45,8 +45,6 @@ from pctt.run.results import Results, described_bodies
 from pctt.run.settings import Settings, scene_name
 from pctt.run.settling import Settling, built, settled_state, world_at_start
 from pctt.run.stepper import Stepper
-
-Result = TypeVar("Result")
 
 
 class Simulation:
@@ -88,7 +86,10 @@ class Simulation:
             raise OptionError(f"scene {scene!r}: allowed is a dem.scene.Scene or an instance of an Experiment")
         self.comm = comm
         self.experiment = scene if isinstance(scene, Experiment) else Given(scene)
-        self.settings = together(comm, "settings", lambda: self._settings(settings, changes), own=(OptionError,))
+        given = {**(vars(settings) if settings else {}), **changes}
+        self.settings = together(
+            comm, "settings", lambda: made(Settings, given).of(self.experiment), own=(OptionError,)
+        )
         scene = built(self.experiment, comm)
         if restart == "settled":
             how = Settling(self.experiment, self.settings, self.experiment.settle_delta)
@@ -111,9 +112,6 @@ class Simulation:
         """The simulation that `save` kept, or a checkpoint.h5 of a run, with the same scene and time step; the other
         arguments are those of a new one. On as many ranks it goes on with the same bits."""
         return cls(scene, *given, restart=path, **more)
-
-    def _settings(self, settings: Settings | None, changes: dict[str, Any]) -> Settings:
-        return made(Settings, {**(vars(settings) if settings else {}), **changes}).of(self.experiment)
 
     @property
     def _origin(self) -> dict[str, Any]:
@@ -169,16 +167,19 @@ class Simulation:
         if until is not None:
             left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
         first, end, ends = self.steps, self.steps + left, False
+
+        def tell() -> bool:
+            if call is not None and (self.steps - first) % every == 0:
+                call(self)
+            return stop is not None and bool(stop(self))
+
         while self.steps < end and not ends:
             self._step(last=self.steps + 1 == end)
-            if call is not None and (self.steps - first) % every == 0:
-                self._told("call of run", call)
-            ends = stop is not None and self.comm.bcast(bool(self._told("stop of run", stop)))
+            if self.comm.size == 1:
+                ends = tell()
+            elif call or stop:  # an error of one rank is one of all, and the first rank decides
+                ends = self.comm.bcast(together(self.comm, "call or stop of run", tell))
         self.complete()
-
-    def _told(self, what: str, call: Callable[[Simulation], Result]) -> Result:
-        """What the user's function returns; on several ranks an error of one is one of all."""
-        return call(self) if self.comm.size == 1 else together(self.comm, what, lambda: call(self))
 
     # -- what there is ---------------------------------------------------------------------------------------
 
@@ -249,11 +250,6 @@ class Simulation:
         order = np.argsort(found.pop("key"))
         return Contacts(**{name: column[order] for name, column in found.items()}, dt=step.system.dt)
 
-    @property
-    def history(self) -> list[float]:
-        """Residual by iteration of the last step's solver; not collective."""
-        return self.stepper.history
-
     def body(self, name: str) -> Body:
         """A large body; ValueError if there is none of that name. Not collective."""
         try:
@@ -295,7 +291,9 @@ class Simulation:
         """
         if self.output is not None:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
-        for name, value, check in (("every", every, COUNT), ("checkpoint_every", checkpoint_every, AT_LEAST_ONE)):
+        for name, value, check in (
+            ("every", every, COUNT), ("checkpoint_every", checkpoint_every, AT_LEAST_ONE), ("hard", hard, COUNT)
+        ):  # fmt: skip
             _check(name, value, check)
         refuse_serial(self.comm)
         for name, path in {"write": folder, "problems": problems}.items():
@@ -303,9 +301,8 @@ class Simulation:
                 refuse_unwritable(name, Path(path), self.comm)
         place = Place(Path(folder), self.comm, self._restart, overwrite)
         self.output = Results(place, self.world, self.memory, self._origin, self._compare, every, checkpoint_every)
-        self.stepper.dump = Dump(
-            self.settings, self.experiment, self.world, place, _check("hard", hard, COUNT), str(problems), problem_steps
-        )
+        where = str(problems)
+        self.stepper.dump = Dump(self.settings, self.experiment, self.world, place, hard, where, problem_steps)
 
     def complete(self) -> None:
         """Write what the folder of `write` lacks of the last step."""
@@ -353,12 +350,10 @@ class Simulation:
         """A picture of the present state, which a notebook shows and ``save`` writes. ``color`` is one of
         `pctt.render.COLOURS`; what else may be given are fields of `pctt.look.stage.View`, such as azimuth=30.0.
         ImportError without VTK (the extra `pictures`), OptionError for a bad name or value."""
-        from pctt import render  # here, as most simulations need no pictures
-
         snapshot = self._snapshot()
 
         def draw() -> Picture | None:
-            return render.picture(snapshot, color, view) if self.comm.rank == 0 else None
+            return picture(snapshot, color, view) if self.comm.rank == 0 else None
 
         return self.comm.bcast(together(self.comm, "render", draw, own=(ImportError, OptionError, FolderError)))
 
@@ -450,7 +445,7 @@ class BodyMotion:
 
 
 def _check(name: str, value: Any, check: tuple[str, Callable[[Any], bool]]) -> int:
-    """A whole number that passes a check; OptionError if it does not."""
+    """The value; OptionError if it is no whole number, or fails the check."""
     if not isinstance(value, (int, np.integer)) or not check[1](value):
         raise OptionError(f"{name} {value!r}: allowed is {check[0]}")
     return int(value)

@@ -48,7 +48,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
 
     def say(sim: Simulation) -> None:
         progress.say(report.step_line(sim.figures), level=1)
-        progress.say(report.accuracy_lines(sim.figures, sim.history), level=2)
+        progress.say(report.accuracy_lines(sim.figures, sim.stepper.history), level=2)
         doing(sim)
 
     doing(sim)

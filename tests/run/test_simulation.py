@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from program import ROOT, arrays, assert_same_bits, database, table
+from program import ROOT, SMALL, arrays, assert_same_bits, database, table
 
 import pctt
 from dem.experiment import Experiment, option
@@ -313,6 +313,9 @@ def test_a_loaded_simulation_goes_on_with_the_same_bits(tmp_path):
         sim.run(steps=3)
         sim.save(tmp_path / f"{sim is whole}.h5")
     assert_same_bits(tmp_path / "True.h5", tmp_path / "False.h5")
+    if WORLD.size == 1:
+        alone = pctt.Simulation.load(tmp_path / "half.h5", Lidded(), solver="apgd", tol=1e-6, comm=SELF)
+        assert alone.body("lid").motion.velocity == (0.0, 0.0, 1.0)
     with pytest.raises(OptionError, match=r"-dt 0\.02: .* was made with -dt 0\.01"):
         pctt.Simulation.load(tmp_path / "half.h5", Lidded(), dt=0.02)
     with pytest.raises(FileError, match="no readable HDF5 file"):
@@ -352,6 +355,23 @@ def test_it_does_what_the_program_does(words, scene, solver, tmp_path, monkeypat
     assert names == {path.name for path in (tmp_path / "object").iterdir()}
     for name in {"records.csv", "analysis.csv"} & names:
         assert (tmp_path / "program" / name).read_bytes() == (tmp_path / "object" / name).read_bytes()
+
+
+def test_the_program_goes_on_from_what_a_simulation_saved(tmp_path, monkeypatch):
+    """With the motion that was changed."""
+    monkeypatch.chdir(tmp_path)
+    scene = Mixer(n=1, margin=0.7)
+    sim = pctt.Simulation(scene, solver="apgd", comm=SELF)
+    sim.body("mixer").motion.velocity = (0.0, 0.0, 3.0)
+    sim.run(steps=2)
+    sim.save("half.h5")
+    words = [*SMALL, "-ccp_type", "apgd", "-restart", "half.h5", "-steps", "2", "-quiet"]
+    simulate(read_options(database(words), SELF), SELF)
+    sim.run(steps=2)
+    sim.save("whole.h5")
+    assert_same_bits(tmp_path / "whole.h5", tmp_path / "results" / "checkpoint.h5")
+    turn = sim.body("mixer").orientation
+    np.testing.assert_allclose(2 * np.arccos(abs(turn[0])), 3.0 * sim.time, rtol=1e-9)
 
 
 def test_the_folder_of_a_run_is_written_from_then_on(tmp_path):
@@ -447,7 +467,7 @@ def test_an_error_of_one_rank_is_one_of_all():
             raise KeyError("mine")
         return sim.positions.sum() > 0
 
-    with pytest.raises(SceneError, match="stop of run: KeyError: 'mine' .rank 1 of 2."):
+    with pytest.raises(SceneError, match="call or stop of run: KeyError: 'mine' .rank 1 of 2."):
         sim.run(steps=2, stop=bad)
     with pytest.raises(OptionError, match="tol"):
         pctt.Simulation(Stirred(), tol=2.0 if WORLD.rank else 1e-3)
