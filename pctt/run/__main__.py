@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import sys
 import traceback
+from importlib.metadata import version
 
 import petsc4py
 
@@ -64,13 +65,8 @@ def _topic(words: list[str]) -> str:
 
 def versions() -> str:
     """This program and what it stands on."""
-    try:
-        import numba
-
-        loops = f"numba {numba.__version__}"
-    except ImportError:
-        loops = "no numba"
     petsc = ".".join(map(str, PETSc.Sys.getVersion()))
+    loops = f"numba {version('numba')}"
     return f"pctt {pctt.__version__} (PETSc {petsc}, Python {platform.python_version()}, {loops})"
 
 

@@ -18,7 +18,6 @@ from dem.together import together
 from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.users_solver import LADDER
-from pctt.contact_map import is_free
 from pctt.ksp_options import entered, to_enter
 from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read, refuse_unknown
 from pctt.petsc import own_errors
@@ -74,11 +73,6 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     if solver.newton and not run.settle:
         form = ccp.newton_for(comm, run.ccp_type, run.ccp_newton, compare).form
         _refuse_for_petsc(database, form, comm)
-    if run.ccp_operator == "free":
-        try:
-            is_free(run.ccp_operator)
-        except ValueError as error:
-            raise OptionError(str(error)) from None
     dump_steps(run)  # refuses what is no list of steps
     _refuse_places(run, comm)
     return options

@@ -9,7 +9,6 @@ from typing import Any, Optional
 from dem.experiment import Experiment, SceneFileError, from_file
 from dem.scenes import SCENES
 from pctt import ccp
-from pctt.contact_map import OPERATORS
 from pctt.options import AT_LEAST_ONE, COUNT, FRACTION, NOT_NEGATIVE, POSITIVE, OptionError, nearest, option
 
 # what runs when no option is given
@@ -72,12 +71,6 @@ class Run:
     ccp_type: str = option("pdip", "solver of the cone problems", choices=ccp.SOLVERS)
     ccp_newton: str = option(
         "auto", "unknowns of the Newton systems; auto: contact for pdip, body for conic", choices=("auto", *ccp.FORMS)
-    )
-    ccp_operator: str = option(
-        "auto",
-        "products with the contact map: free, by compiled loops without matrices, or assembled, by matrices of PETSc; "
-        "auto: free where numba is installed",
-        choices=OPERATORS,
     )
     ccp_compliance: Optional[float] = option(
         None,

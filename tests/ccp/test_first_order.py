@@ -238,7 +238,7 @@ def test_apgd_begins_in_single_precision_and_ends_in_double(size, monkeypatch):
 
     monkeypatch.setattr(apgd, "_descend", watched)
     result = ccp.solve(problem, type="apgd", limits=Limits(1e-12))
-    assert stages == ([np.float32] if problem.free_map is not None else []) + [np.float64]
+    assert stages == [np.float32, np.float64]
     assert result.converged
     assert result.impulse.dtype == np.float64
     assert ccp.measure(problem, result.impulse).natural_residual <= 1.01e-12
