@@ -214,10 +214,9 @@ def test_an_accuracy_that_cannot_be_reached_ends_with_a_reason(method, monkeypat
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_a_matrix_with_a_nan_does_not_converge(method):
     known, _ = heap(contacts=6, bodies=4)
-    N = matrix(SELF, known.N)
-    problem = ccp.ConeProblem(SELF, known.r, known.mu, N=N)
-    N.setValue(0, 5, np.nan)  # a problem with a NaN is refused; this one gets it afterwards
-    N.assemble()
+    problem = from_matrix(known)
+    problem.operator.mat.setValue(0, 5, np.nan)  # a problem with a NaN is refused; this one gets it afterwards
+    problem.operator.mat.assemble()
     result = ccp.solve(problem, type=method, limits=Limits(1e-6))
     assert not result.converged
     assert "not a number" in result.reason
