@@ -127,6 +127,7 @@ class ContactSystem:
         """D g of the local grains (grains, 6), and of the large bodies (large, 6), the same on all ranks, from
         the impulses (nc, 3) of all ranks [N s, N m s]; collective."""
         near = self._near
+        impulse = np.ascontiguousarray(impulse, dtype=np.float64).reshape(len(self.frame), 3)  # the loop trusts it
         load = sum_of_impulses(self.frame, self._arm, self._row, impulse, len(near.bodies))
         ghosts = slice(near.grains, near.grains + near.ghosts)
         index = near.index[ghosts]
