@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from mpi4py import MPI
-from problems import SELF, from_graph, from_matrix, heap, matrix
+from problems import SELF, from_graph, from_matrix, heap
 
 from pctt import ccp
 from pctt.ccp import Limits
