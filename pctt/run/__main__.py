@@ -5,7 +5,6 @@ from __future__ import annotations
 import platform
 import sys
 import traceback
-from importlib.metadata import version
 
 import petsc4py
 
@@ -65,8 +64,10 @@ def _topic(words: list[str]) -> str:
 
 def versions() -> str:
     """This program and what it stands on."""
+    import numba  # takes half a second
+
     petsc = ".".join(map(str, PETSc.Sys.getVersion()))
-    loops = f"numba {version('numba')}"
+    loops = f"numba {numba.__version__}"
     return f"pctt {pctt.__version__} (PETSc {petsc}, Python {platform.python_version()}, {loops})"
 
 
