@@ -6,13 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dem import bodies, quaternion
+from dem import bodies
 from dem.arrays import Floats
 from dem.bodies import SPHERE, Bodies
-from dem.loops import loops
+from dem.compiled import unfused
 from dem.motion import Dynamic, Guided, Hinged
 from dem.neighbourhood import Neighbourhood
-from dem.quaternion import cross
 from dem.scene import LargeBody
 from dem.world import World
 
@@ -39,6 +38,7 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
     return velocity
 
 
+@unfused
 def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
     """Angular velocities (n, 3) [rad/s] after dt [s] without torque, from `spin` (n, 3), of bodies with orientations
     `turn` (n, 4) at the start of the step and principal moments (n, 3). All vectors are in the world frame.
@@ -50,51 +50,91 @@ def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
     in Engineering 31, 1991. A body that turns by much more than a radian in a step, for which Newton's method does not
     converge, keeps its spin: no such step resolves its motion.
     """
-    if compiled := loops():
-        arrays = (np.ascontiguousarray(array) for array in (turn, spin, moments))
-        return compiled.free_spin(*arrays, dt, NEWTON_STEPS, LAST_CHANGE, CONVERGED)
+    out = spin.copy()
     half = 0.5 * dt
-    moments = moments / moments.max(axis=1, keepdims=True)  # nothing but their ratios counts
-    # The search finds lost bodies. A body that turns too far may have a singular slope: its spin is no number then.
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        start = quaternion.rotate(quaternion.conjugate(turn), spin)
-        momentum, new = _turned(-half * start, moments * start), start
+    for n in range(len(spin)):
+        frame, twice = (turn[n, 1], turn[n, 2], turn[n, 3]), 2.0 * turn[n, 0]
+        w = _turned((spin[n, 0], spin[n, 1], spin[n, 2]), frame, -twice, 2.0)
+        largest = max(moments[n, 0], moments[n, 1], moments[n, 2])
+        inertia = (moments[n, 0] / largest, moments[n, 1] / largest, moments[n, 2] / largest)
+        rotation = _times(half, w)
+        sine, versed = _shares(rotation)
+        momentum, new = _turned(_each(inertia, w), rotation, -sine, versed), w
         for _ in range(NEWTON_STEPS):
-            middle = _turned(half * new, moments * new)
-            change = _solve(_slope(new, moments, middle, half), momentum - middle)
-            new = new + change
-            if (quaternion.length(change) <= LAST_CHANGE * quaternion.length(start)).all():
+            middle = _turned(_each(inertia, new), rotation, sine, versed)
+            change = _solve(
+                _slope((inertia[0], 0.0, 0.0), (1.0, 0.0, 0.0), rotation, sine, versed, middle, half),
+                _slope((0.0, inertia[1], 0.0), (0.0, 1.0, 0.0), rotation, sine, versed, middle, half),
+                _slope((0.0, 0.0, inertia[2]), (0.0, 0.0, 1.0), rotation, sine, versed, middle, half),
+                _plus(momentum, _times(-1.0, middle)),
+            )
+            new = _plus(new, change)
+            rotation = _times(half, new)
+            sine, versed = _shares(rotation)
+            if _dot(change, change) <= LAST_CHANGE**2 * _dot(w, w):
                 break
-        solved = _turned(-half * new, momentum) / moments
-        error = quaternion.length(moments * (solved - new))
-        converged = (error <= CONVERGED * quaternion.length(momentum))[:, None]
-        return np.where(converged, quaternion.rotate(turn, solved), spin)
+        back = _turned(momentum, rotation, -sine, versed)
+        error = _plus(back, _times(-1.0, _each(inertia, new)))
+        if _dot(error, error) <= CONVERGED**2 * _dot(momentum, momentum):
+            solved = back[0] / inertia[0], back[1] / inertia[1], back[2] / inertia[2]
+            out[n, 0], out[n, 1], out[n, 2] = _turned(solved, frame, twice, 2.0)
+    return out
 
 
-def _slope(spin: Floats, moments: Floats, middle: Floats, half: float) -> Floats:
-    """Derivatives (n, 3, 3) of the angular momenta `middle` (n, 3) in the middle of the step by the spins (n, 3)."""
-    across = half * _cross_matrix(spin)
-    turn = np.eye(3) + across / 2 + across @ across / 6  # a turn by v changes with v by 1 + [v]/2 + [v]^2/6 + ...
-    matrix = quaternion.matrix(quaternion.exponential(half * spin))
-    return matrix * moments[:, None, :] - half * _cross_matrix(middle) @ turn
+@unfused
+def _slope(along, axis, rotation, sine, versed, middle, half):
+    """How the angular momentum in the middle of the step changes with the spin about an axis."""
+    turned = _turned(axis, rotation, 0.5, 1.0 / 6.0)
+    return _plus(_turned(along, rotation, sine, versed), _times(-half, _cross(middle, turned)))
 
 
-def _solve(matrices: Floats, right: Floats) -> Floats:
-    """Solutions (n, 3) for matrices (n, 3, 3), by Cramer's rule; no numbers where they are singular."""
-    a, b, c = np.moveaxis(matrices, 2, 0)
-    across = cross(b, c)
-    parts = [across, cross(c, a), cross(a, b)]
-    return np.einsum("knj,nj->nk", parts, right) / np.einsum("nj,nj->n", a, across)[:, None]
+@unfused
+def _turned(v, r, sine, versed):
+    """v + sine r x v + versed r x (r x v): the vector v, turned by the rotation vector r with its `_shares`, or by the
+    quaternion (w, r) with 2 w and 2; with -sine the other way."""
+    once = _cross(r, v)
+    return _plus(v, _plus(_times(sine, once), _times(versed, _cross(r, once))))
 
 
-def _turned(rotation: Floats, vectors: Floats) -> Floats:
-    """Vectors (n, 3), turned by rotation vectors (n, 3)."""
-    return quaternion.rotate(quaternion.exponential(rotation), vectors)
+@unfused
+def _shares(rotation):
+    """sin(a) / a and (1 - cos(a)) / a^2 of the angle a of a rotation vector."""
+    square = _dot(rotation, rotation)
+    angle = np.sqrt(square)
+    return (np.sin(angle) / angle, (1.0 - np.cos(angle)) / square) if angle > 1e-8 else (1.0, 0.5)
 
 
-def _cross_matrix(v: Floats) -> Floats:
-    """Matrices (n, 3, 3) of the cross products with vectors (n, 3)."""
-    return cross(v[:, None, :], np.eye(3)).transpose(0, 2, 1)
+@unfused
+def _solve(a, b, c, right):
+    """The solution of a matrix with columns a, b, c, by Cramer's rule."""
+    across = _cross(b, c)
+    scale = 1.0 / _dot(a, across)
+    return _times(scale, (_dot(right, across), _dot(a, _cross(right, c)), _dot(a, _cross(b, right))))
+
+
+@unfused
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@unfused
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@unfused
+def _plus(a, b):
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@unfused
+def _each(a, b):
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
+
+
+@unfused
+def _times(a, b):
+    return a * b[0], a * b[1], a * b[2]
 
 
 def free_velocities(world: World, near: Neighbourhood, dt: float) -> Floats:

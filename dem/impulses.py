@@ -10,24 +10,31 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Bools, Floats, Ints
+from dem.compiled import loop
 from dem.exchange import exchange
-from dem.loops import loops
 
 
+@loop
 def in_the_world(impulse: Floats, frame: Floats) -> Floats:
     """Normal impulses and tangential vectors in the world (nc, 4), of impulses (nc, 3) in frames (nc, 3, 3)."""
-    if compiled := loops():
-        return compiled.in_the_world(np.ascontiguousarray(impulse, dtype=np.float64), np.ascontiguousarray(frame))
-    tangential = impulse[:, 1:2] * frame[:, 1] + impulse[:, 2:] * frame[:, 2]
-    return np.hstack([impulse[:, :1], tangential])
+    out = np.empty((len(frame), 4))
+    for c in range(len(frame)):
+        out[c, 0] = impulse[c, 0]
+        for k in range(3):
+            out[c, 1 + k] = impulse[c, 1] * frame[c, 1, k] + impulse[c, 2] * frame[c, 2, k]
+    return out
 
 
+@loop
 def in_frames(stored: Floats, frame: Floats) -> Floats:
     """Impulses (nc, 3) in frames (nc, 3, 3), from rows (nc, 4) as `in_the_world` returns them; of the tangential
     vectors only the part that is tangential in these frames."""
-    if compiled := loops():
-        return compiled.in_frames(stored, np.ascontiguousarray(frame))
-    return np.hstack([stored[:, :1], np.einsum("cij,cj->ci", frame[:, 1:], stored[:, 1:])])
+    out = np.empty((len(frame), 3))
+    for c in range(len(frame)):
+        out[c, 0] = stored[c, 0]
+        for i in range(1, 3):
+            out[c, i] = stored[c, 1] * frame[c, i, 0] + stored[c, 2] * frame[c, i, 1] + stored[c, 3] * frame[c, i, 2]
+    return out
 
 
 class ImpulseMemory:

@@ -1,6 +1,6 @@
 """Unit quaternions (w, x, y, z) as rotations from the body frame to the world frame.
 
-Every function works on stacks: quaternions have shape (..., 4), vectors (..., 3).
+Every function but `integrate` works on stacks: quaternions have shape (..., 4), vectors (..., 3).
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from dem.arrays import Floats
-from dem.loops import loops
+from dem.compiled import loop
 
 
 def cross(a: Floats, b: Floats) -> Floats:
@@ -99,12 +99,22 @@ def rotation_vector(before: Floats, after: Floats) -> Floats:
     return turn[..., 1:] * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0.0)
 
 
+@loop
 def integrate(q: Floats, angular_velocity: Floats, dt: float) -> Floats:
-    """Orientations (..., 4) after the time `dt` [s] at a constant world-frame angular velocity (..., 3)
-    [rad/s].
+    """Orientations (n, 4) after the time `dt` [s] at constant world-frame angular velocities (n, 3) [rad/s].
 
     q <- exp(dt w) q, renormalised so that the rounding of many steps does not add up.
     """
-    if (compiled := loops()) and q.ndim == 2:
-        return compiled.integrate(np.ascontiguousarray(q), np.ascontiguousarray(angular_velocity), float(dt))
-    return normalized(multiply(exponential(dt * angular_velocity), q))
+    out = np.empty((len(q), 4))
+    for n in range(len(q)):
+        x, y, z = dt * angular_velocity[n, 0], dt * angular_velocity[n, 1], dt * angular_velocity[n, 2]
+        angle = np.sqrt(x * x + y * y + z * z)
+        w = np.cos(0.5 * angle)
+        share = np.sin(0.5 * angle) / angle if angle > 0.0 else 0.5
+        x, y, z = share * x, share * y, share * z
+        a, b, c, d = q[n, 0], q[n, 1], q[n, 2], q[n, 3]
+        e, f = w * a - x * b - y * c - z * d, w * b + a * x + y * d - z * c
+        g, h = w * c + a * y + z * b - x * d, w * d + a * z + x * c - y * b
+        size = 1.0 / np.sqrt(e * e + f * f + g * g + h * h)
+        out[n, 0], out[n, 1], out[n, 2], out[n, 3] = size * e, size * f, size * g, size * h
+    return out

@@ -24,10 +24,10 @@ from mpi4py import MPI
 from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.checks import positive
+from dem.compiled import loop
 from dem.contact import Contacts
 from dem.exchange import exchange
 from dem.free_motion import drive_impulses, free_directions, free_velocities
-from dem.loops import loops
 from dem.quaternion import cross
 from dem.world import World
 
@@ -127,6 +127,7 @@ class ContactSystem:
         """D g of the local grains (grains, 6), and of the large bodies (large, 6), the same on all ranks, from
         the impulses (nc, 3) of all ranks [N s, N m s]; collective."""
         near = self._near
+        impulse = np.ascontiguousarray(impulse, dtype=np.float64).reshape(len(self.frame), 3)  # the loop trusts it
         load = sum_of_impulses(self.frame, self._arm, self._row, impulse, len(near.bodies))
         ghosts = slice(near.grains, near.grains + near.ghosts)
         index = near.index[ghosts]
@@ -140,51 +141,75 @@ class ContactSystem:
         return local, large
 
 
+@loop
 def contact_frames(normal: Floats) -> Floats:
     """Orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
 
     Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
     but where the sign of its z component changes.
     """
-    if compiled := loops():
-        return compiled.contact_frames(np.ascontiguousarray(normal))
-    x, y, z = normal.T
-    sign = np.copysign(1.0, z)
-    p = -1.0 / (sign + z)
-    q = x * y * p
     frame = np.empty((len(normal), 3, 3))
-    frame[:, 0] = normal
-    frame[:, 1, 0], frame[:, 1, 1], frame[:, 1, 2] = 1.0 + sign * x * x * p, sign * q, -sign * x
-    frame[:, 2, 0], frame[:, 2, 1], frame[:, 2, 2] = q, sign + y * y * p, -y
+    for c in range(len(normal)):
+        x, y, z = normal[c, 0], normal[c, 1], normal[c, 2]
+        sign = np.copysign(1.0, z)
+        p = -1.0 / (sign + z)
+        q = x * y * p
+        frame[c, 0, 0], frame[c, 0, 1], frame[c, 0, 2] = x, y, z
+        frame[c, 1, 0], frame[c, 1, 1], frame[c, 1, 2] = 1.0 + sign * x * x * p, sign * q, -sign * x
+        frame[c, 2, 0], frame[c, 2, 1], frame[c, 2, 2] = q, sign + y * y * p, -y
     return frame
 
 
+@loop
 def contact_arms(point: Floats, position: Floats, row: Ints) -> Floats:
     """Vectors (nc, 6) from the centres of the two bodies of each contact to its point (nc, 3); `row` (nc, 2) are the
     bodies' rows in a table of positions (rows, 3)."""
-    if compiled := loops():
-        return compiled.contact_arms(point, position, row)
-    return (point[:, None] - position[row]).reshape(-1, 6)
+    arm = np.empty((len(point), 6))
+    for c in range(len(point)):
+        a, b = row[c, 0], row[c, 1]
+        for k in range(3):
+            arm[c, k], arm[c, 3 + k] = point[c, k] - position[a, k], point[c, k] - position[b, k]
+    return arm
 
 
+@loop
 def relative_velocity(frame: Floats, arm: Floats, row: Ints, velocity: Floats) -> Floats:
     """D' v (nc, 3) for the velocities (rows, 6) of the bodies of a table, of which `row` (nc, 2) are those in contact,
     with frames (nc, 3, 3) and arms (nc, 6)."""
-    if compiled := loops():
-        return compiled.relative_velocity(frame, arm, row, velocity)
-    at_point = [
-        velocity[rows, :3] + cross(velocity[rows, 3:], arms) for rows, arms in zip(row.T, (arm[:, :3], arm[:, 3:]))
-    ]
-    return np.einsum("cij,cj->ci", frame, at_point[1] - at_point[0])
+    out = np.empty((len(frame), 3))
+    for c in range(len(frame)):
+        v, w, r = velocity[row[c, 0]], velocity[row[c, 1]], arm[c]
+        x = w[0] + w[4] * r[5] - w[5] * r[4] - (v[0] + v[4] * r[2] - v[5] * r[1])
+        y = w[1] + w[5] * r[3] - w[3] * r[5] - (v[1] + v[5] * r[0] - v[3] * r[2])
+        z = w[2] + w[3] * r[4] - w[4] * r[3] - (v[2] + v[3] * r[1] - v[4] * r[0])
+        for k in range(3):
+            out[c, k] = frame[c, k, 0] * x + frame[c, k, 1] * y + frame[c, k, 2] * z
+    return out
 
 
+@loop
 def sum_of_impulses(frame: Floats, arm: Floats, row: Ints, impulse: Floats, count: int) -> Floats:
     """D g (count, 6) for the impulses (nc, 3) of contacts as in `relative_velocity`, on the bodies of a table."""
-    if compiled := loops():
-        return compiled.sum_of_impulses(frame, arm, row, np.ascontiguousarray(impulse, dtype=np.float64), count)
-    push = np.einsum("ci,cij->cj", impulse, frame)
-    a, b = (np.hstack([push, cross(arms, push)]) for arms in (arm[:, :3], arm[:, 3:]))
-    return sum_rows(row[:, 1], b, count) - sum_rows(row[:, 0], a, count)
+    out = np.zeros((count, 6))
+    for c in range(len(frame)):
+        n, s, t = impulse[c, 0], impulse[c, 1], impulse[c, 2]
+        x = n * frame[c, 0, 0] + s * frame[c, 1, 0] + t * frame[c, 2, 0]
+        y = n * frame[c, 0, 1] + s * frame[c, 1, 1] + t * frame[c, 2, 1]
+        z = n * frame[c, 0, 2] + s * frame[c, 1, 2] + t * frame[c, 2, 2]
+        a, b, r = out[row[c, 0]], out[row[c, 1]], arm[c]
+        a[0] -= x
+        a[1] -= y
+        a[2] -= z
+        a[3] -= r[1] * z - r[2] * y
+        a[4] -= r[2] * x - r[0] * z
+        a[5] -= r[0] * y - r[1] * x
+        b[0] += x
+        b[1] += y
+        b[2] += z
+        b[3] += r[4] * z - r[5] * y
+        b[4] += r[5] * x - r[3] * z
+        b[5] += r[3] * y - r[4] * x
+    return out
 
 
 def sum_rows(row: Ints, values: Floats, count: int) -> Floats:

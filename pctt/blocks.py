@@ -37,7 +37,15 @@ class BlockRows:
         return len(self.indptr) - 1
 
 
-HUB = 500  # a body with more contacts is a hub: its columns of G are stored separately
+def shaped(name: str, x: Array, rows: int, width: int) -> Array:
+    """x as an array (rows, width), of this shape or flat. ValueError for others, on this rank alone: products are too
+    frequent to ask the other ranks."""
+    if x.shape not in ((rows, width), (rows * width,)):
+        raise ValueError(f"{name} of the shape {x.shape}; allowed is {(rows, width)}")
+    return x.reshape(rows, width)
+
+
+HUB = 500  # a body with more contacts is a hub: its columns of G would fill N
 
 
 def without_hubs(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, np.ndarray]:
@@ -54,20 +62,6 @@ def without_hubs(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, np.ndarray]:
     kept = ~np.isin(G.indices, hubs)
     before = np.concatenate([[0], np.cumsum(kept)])
     return BlockRows(before[G.indptr], G.indices[kept], G.blocks[kept], G.columns), hubs
-
-
-def dense_columns(comm: MPI.Comm, G: BlockRows, bodies: np.ndarray) -> PETSc.Mat | None:
-    """The columns of G for ``bodies`` (global block columns) as a dense Mat (3Nc x 6 per body); None without bodies."""
-    if len(bodies) == 0:
-        return None
-    columns = np.zeros((G.rows, 3, len(bodies), 6))
-    row = np.repeat(np.arange(G.rows), np.diff(G.indptr))
-    chosen = np.isin(G.indices, bodies)
-    columns[row[chosen], :, np.searchsorted(bodies, G.indices[chosen])] = G.blocks[chosen]
-    size = ((3 * G.rows, PETSc.DETERMINE), (PETSc.DECIDE, 6 * len(bodies)))
-    mat = PETSc.Mat().createDense(size, array=columns.reshape(3 * G.rows, -1), comm=comm)
-    mat.assemble()
-    return mat
 
 
 def diagonal_blocks(G: BlockRows) -> Array:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
+from dem.compiled import loop
 from dem.quaternion import cross, length
 
 
@@ -98,6 +99,34 @@ def sphere_sphere(first: Spheres, second: Spheres) -> Touch:
     normal[distance == 0.0] = (0.0, 0.0, 1.0)
     gap = distance - first.radius - second.radius
     return Touch(first.center + (first.radius + 0.5 * gap)[:, None] * normal, normal, gap)
+
+
+@loop
+def spheres_within(
+    center: Floats, size: Floats, i: Ints, j: Ints, delta: Floats
+) -> tuple[Ints, Floats, Floats, Floats]:
+    """Of the pairs of rows i, j (m,) of centres (n, 3) and sizes (n, 3), whose first column has the radii, those of
+    which the gap is at most `delta` (m,): their numbers, points, normals and gaps as of `sphere_sphere`."""
+    pair = np.empty(len(i), np.int64)
+    point, normal, gap = np.empty((len(i), 3)), np.empty((len(i), 3)), np.empty(len(i))
+    found = 0
+    for k in range(len(i)):
+        p, q = center[i[k]], center[j[k]]
+        radius = size[i[k], 0]
+        x, y, z = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+        distance = np.sqrt(x * x + y * y + z * z)
+        apart = distance - radius - size[j[k], 0]
+        if apart <= delta[k]:
+            if distance > 0.0:
+                x, y, z = x / distance, y / distance, z / distance
+            else:
+                z = 1.0
+            middle = radius + 0.5 * apart
+            pair[found], gap[found] = k, apart
+            normal[found, 0], normal[found, 1], normal[found, 2] = x, y, z
+            point[found, 0], point[found, 1], point[found, 2] = p[0] + middle * x, p[1] + middle * y, p[2] + middle * z
+            found += 1
+    return pair[:found], point[:found], normal[:found], gap[:found]
 
 
 def sphere_capsule(ball: Spheres, capsule: Capsules) -> Touch:

@@ -27,9 +27,8 @@ from dem.contact.narrow import (
     sphere_box,
     sphere_capsule,
     sphere_plane,
-    sphere_sphere,
+    spheres_within,
 )
-from dem.loops import loops
 from dem.mesh import Mesh, Surface
 from dem.neighbourhood import Neighbourhood
 from dem.shapes import Box, Plane, Shape, Sphere
@@ -175,10 +174,8 @@ def _single(touch: Touch, delta: Floats) -> Manifold:
 
 
 def _spheres(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
-    if compiled := loops():
-        pair, *touch = compiled.sphere_sphere(table.center, table.size, i, j, delta)
-        return Manifold(pair, np.zeros_like(pair), Touch(*touch))
-    return _single(sphere_sphere(table.sphere(i), table.sphere(j)), delta)
+    pair, *touch = spheres_within(table.center, table.size, i, j, delta)
+    return Manifold(pair, np.zeros_like(pair), Touch(*touch))
 
 
 def _box_plane(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:

@@ -12,11 +12,11 @@ from dem import bodies, quaternion
 from dem.arrays import Floats, Ints
 from dem.bodies import BOX, SPHERE, Bodies
 from dem.checks import not_negative
+from dem.compiled import unfused
 from dem.contact.broad import close_pairs
 from dem.contact.narrow import Touch
 from dem.contact.primitives import MESH, PLANE, Primitives, extents, primitives, touches
 from dem.free_motion import free_directions, free_velocity, large_free_velocity
-from dem.loops import loops
 from dem.motion import Hinged
 from dem.neighbourhood import Neighbourhood, neighbourhood, without_ghosts
 from dem.quaternion import cross, length
@@ -125,9 +125,40 @@ def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints
         foreign[near.grains + near.ghosts :] = bodies.is_dynamic(world.large)
     owner = np.minimum(a, b)  # the local grains are the first rows, and ghosts come from higher ranks only
     major = owner + rows * (foreign[a] | foreign[b])
-    if compiled := loops():
-        return compiled.lexsort(key, major, 2 * rows)
-    return np.lexsort((key, major))
+    return lexsort(key, major, 2 * rows)
+
+
+@unfused
+def lexsort(key: Ints, major: Ints, count: int) -> Ints:
+    """`numpy.lexsort((key, major))` of distinct keys (n,), with `major` (n,) in 0 ... count - 1."""
+    start = np.zeros(count + 1, np.int64)
+    for k in range(len(major)):
+        start[major[k] + 1] += 1
+    for k in range(count):
+        start[k + 1] += start[k]
+    order, free = np.empty(len(major), np.int64), start[:-1].copy()
+    for k in range(len(major)):
+        order[free[major[k]]] = k
+        free[major[k]] += 1
+    for m in range(count):
+        _shell_sort(order[start[m] : start[m + 1]], key)
+    return order
+
+
+@unfused
+def _shell_sort(rows, key):
+    """Sort a few rows by their keys, in place."""
+    gap = 1
+    while 3 * gap < len(rows):
+        gap = 3 * gap + 1
+    while gap > 0:
+        for k in range(gap, len(rows)):
+            row, place = rows[k], k
+            while place >= gap and key[rows[place - gap]] > key[row]:
+                rows[place] = rows[place - gap]
+                place -= gap
+            rows[place] = row
+        gap //= 3
 
 
 def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Contacts | None:

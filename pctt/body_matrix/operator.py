@@ -1,11 +1,7 @@
-"""The Newton operator in the velocities of the bodies, K = I + G' H G.
-
-With compiled loops it is a function. Preconditioners that need entries get its matrix.
-"""
+"""The Newton operator in the velocities of the bodies, K = I + G' H G: a function, and for preconditioners that need
+entries a matrix."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from petsc4py import PETSc
@@ -15,9 +11,6 @@ from pctt.blocks import Array
 from pctt.body_matrix.entries import BodyMatrix
 from pctt.contact_map import ContactMap
 from pctt.shell import symmetric_shell
-
-if TYPE_CHECKING:
-    from pctt.contact_map.free import FreeMap
 
 
 def inverse_blocks(blocks: Array) -> Array:
@@ -31,24 +24,13 @@ class BodyOperator:
 
     Attributes
     ----------
-    mat : K as a Mat of block size 6; a shell if the map is free of matrices
+    mat : K as a shell of block size 6
     """
 
     def __init__(self, contact_map: ContactMap):
         self.contact_map = contact_map
         self._matrix: BodyMatrix | None = None
-        if contact_map.free:
-            self.mat = symmetric_shell(contact_map.comm, 6 * contact_map.columns, 6, self._product)
-        else:
-            self.mat = self.whole.mat
-
-    @property
-    def whole(self) -> BodyMatrix:
-        """The matrix of K, perhaps without its present values; collective at its first use."""
-        if self._matrix is None:
-            self._matrix = BodyMatrix(self.contact_map.comm, self.contact_map.block_rows)
-            self._loaded, self._made = True, False
-        return self._matrix
+        self.mat = symmetric_shell(contact_map.comm, 6 * contact_map.columns, 6, self._product)
 
     def load(self, contact_map: ContactMap) -> None:
         """Take another map of the same structure."""
@@ -59,27 +41,24 @@ class BodyOperator:
         """Take the blocks H (nc, 3, 3) of K, which may be unsymmetric."""
         self._inverse, self._made = inverse, False
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
-        if not self.contact_map.free:
-            self.entries()
-            return
-        G = cast("FreeMap", self.contact_map)
-        self._weight = G.weights(inverse, symmetric)
-        set_diagonal_blocks(self.mat, G.body_blocks(self._weight))
+        self._weight = self.contact_map.weights(inverse, symmetric)
+        set_diagonal_blocks(self.mat, self.contact_map.body_blocks(self._weight))
         self.mat.stateIncrease()
 
     def _product(self, v: Array, out: Array) -> None:
-        cast("FreeMap", self.contact_map).through(self._weight, v, out)
+        self.contact_map.through(self._weight, v, out)
 
     def entries(self) -> BodyMatrix:
         """The matrix of K with its present values; collective."""
-        matrix = self.whole
-        if not self._loaded:
-            matrix.load(self.contact_map.block_rows)
-            self._loaded = True
+        if self._matrix is None:
+            self._matrix = BodyMatrix(self.contact_map.comm, self.contact_map.block_rows)
+        elif not self._loaded:
+            self._matrix.load(self.contact_map.block_rows)
+        self._loaded = True
         if not self._made:
-            matrix.update(self._inverse)
+            self._matrix.update(self._inverse)
             self._made = True
-        return matrix
+        return self._matrix
 
     def destroy(self) -> None:
         self.mat.destroy()

@@ -1,4 +1,4 @@
-"""The Delassus matrix N = G G' from the block rows of G, over the ranks.
+"""The Delassus matrix: as it was given, or N = G G' from the block rows of G, over the ranks.
 
 PETSc multiplies only scalar formats; on one block row per contact scipy's block product is several times
 faster (n = 16, 134,547 contacts, one core: 0.45 s against 1.4 s and a slow conversion), so each rank
@@ -8,47 +8,80 @@ its two bodies: those of other ranks come through the owners of the bodies' colu
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, block_csr_matrix, square_block_matrix
+from pctt.blocks import BlockRows, block_csr_matrix, shaped, square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.exchange import offsets, send_rows
 
 
-def local_blocks(N: PETSc.Mat) -> Array:
-    """Diagonal 3 x 3 blocks of this rank's rows of a Mat (nc, 3, 3)."""
-    first, last = N.getOwnershipRange()
-    local = N.getDiagonalBlock()
-    if local.getType() != PETSc.Mat.Type.SEQAIJ:
-        local = local.convert(PETSc.Mat.Type.SEQAIJ, PETSc.Mat())
-    indptr, indices, values = local.getValuesCSR()
-    row = np.repeat(np.arange(last - first), np.diff(indptr))
-    near = row // 3 == indices // 3
-    out = np.zeros(((last - first) // 3, 3, 3))
-    out[row[near] // 3, row[near] % 3, indices[near] % 3] = values[near]
-    return out
-
-
-def in_blocks(N: PETSc.Mat) -> PETSc.Mat:
-    """A new Mat in BAIJ of block size 3 with the entries of N, a Mat of type AIJ, BAIJ, SBAIJ or dense."""
-    kind = N.getType()
-    if kind.endswith("baij") and not kind.endswith("sbaij") and N.getBlockSize() == 3:
-        return N.duplicate(copy=True)
-    rows = N if kind.endswith(("seqaij", "mpiaij")) else N.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
-    local = rows_in_blocks(rows)
-    if rows is not N:
-        rows.destroy()
-    return square_block_matrix(N.comm.tompi4py(), local)
-
-
 def rows_in_blocks(N: PETSc.Mat) -> sp.bsr_matrix:
-    """This rank's rows of a Mat of type AIJ or BAIJ in 3 x 3 blocks, their columns global."""
-    indptr, indices, values = N.getValuesCSR()
+    """This rank's rows of a Mat of type AIJ, BAIJ, SBAIJ or dense in 3 x 3 blocks, their columns global."""
+    plain = N.getType() in ("seqaij", "mpiaij", "seqbaij", "mpibaij")
+    rows = N if plain else N.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
+    indptr, indices, values = rows.getValuesCSR()
+    if not plain:
+        rows.destroy()
     shape = (N.getLocalSize()[0], N.getSize()[1])
     return sp.csr_matrix((values, indices, indptr), shape=shape).tobsr((3, 3))
+
+
+class GivenMatrix:
+    """N itself, of a problem that knows no bodies, with the members of `ContactMap` that it can have: impulses take the
+    place of momenta, and N g that of the velocities of contacts. A copy in 3 x 3 blocks (BAIJ) of a Mat of type AIJ,
+    BAIJ, SBAIJ or dense. ValueError on all ranks if it has a NaN or an infinite number."""
+
+    def __init__(self, comm: MPI.Comm, N: PETSc.Mat):
+        rows = rows_in_blocks(N)
+        if comm.allreduce(not np.isfinite(rows.data).all(), MPI.LOR):
+            raise ValueError("N has a NaN or an infinite number")
+        self.rows, self._first = len(rows.indptr) - 1, N.getOwnershipRange()[0] // 3
+        self._local: sp.bsr_matrix = rows
+        self._size: Array | float = 1.0
+        self.mat = square_block_matrix(comm, rows)
+        self._in, self._out = self.mat.createVecs()
+
+    def velocities(self, g: Array) -> Array:
+        """N g (nc, 3)."""
+        self._in.array[:] = shaped("impulses", g, self.rows, 3).ravel()
+        self.mat.mult(self._in, self._out)
+        return self._out.array.reshape(-1, 3).copy()
+
+    def momenta(self, g: Array) -> Array:
+        """g (nc, 3)."""
+        return shaped("impulses", g, self.rows, 3).copy()
+
+    def add_delassus(self, g: Array, y: Array) -> None:
+        """y += N g; y (nc, 3)."""
+        y += self._size * self.velocities(self._size * g)
+
+    def contact_blocks(self) -> Array:
+        """The diagonal blocks of N (nc, 3, 3)."""
+        row = np.repeat(np.arange(self.rows), np.diff(self._local.indptr))
+        near = self._first + row == self._local.indices
+        out = np.zeros((self.rows, 3, 3))
+        out[row[near]] = self._local.data[near]
+        return out
+
+    def scaled(self, size: Array, precision: type[np.floating] = np.float64) -> GivenMatrix:
+        """N with rows and columns multiplied by ``size`` (nc, 3), for products with impulses of this precision; it is
+        valid until this object is destroyed."""
+        other = copy.copy(self)
+        other._size = size.astype(precision, copy=False)
+        return other
+
+    def structure(self) -> tuple[np.ndarray, ...]:
+        """Arrays of this rank that are equal where the places of the blocks are."""
+        return self._local.indptr, self._local.indices
+
+    def destroy(self) -> None:
+        for thing in (self.mat, self._in, self._out):
+            thing.destroy()
 
 
 def delassus(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:

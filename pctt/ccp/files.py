@@ -12,7 +12,7 @@ from pctt.ccp.stored import Stored
 FORMATS = {"PETSc binary": petsc_binary, "Siconos": siconos, "FCLIB": fclib}
 
 
-def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None, operator: str = "auto") -> Stored:
+def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> Stored:
     """The cone problem of a file, its contacts in equal parts over the ranks; collective. ``compliance`` takes the
     place of the file's.
 
@@ -20,7 +20,7 @@ def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None, oper
     of no other, or cannot be read.
     """
     name = comm.bcast(_format(path) if comm.rank == 0 else "")
-    return FORMATS[name].load(path, comm, compliance, operator)
+    return FORMATS[name].load(path, comm, compliance)
 
 
 def _format(path: str | Path) -> str:

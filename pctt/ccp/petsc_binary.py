@@ -62,13 +62,13 @@ def write(path: str | Path, problem: ConeProblem) -> None:
     write_whole(path, problem.comm, write_it)
 
 
-def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None, operator: str = "auto") -> Stored:
+def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> Stored:
     """The cone problem of a file, its contacts in equal parts over the ranks; collective. ``compliance`` takes the
     place of the file's.
 
     Raises FileFormatError on every rank where the file cannot be read as one.
     """
-    return spread(comm, path, "PETSc binary", lambda: _whole(path), compliance, operator)
+    return spread(comm, path, "PETSc binary", lambda: _whole(path), compliance)
 
 
 def _whole(path: str | Path) -> Whole:

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, dense_columns, diagonal_blocks, without_hubs
+from pctt.blocks import BlockRows, without_hubs
 from pctt.ccp.cone import Array, add_opening, dot, projected_move
-from pctt.ccp.delassus import delassus, in_blocks, local_blocks
-from pctt.contact_map import CompactRows, ContactMap, contact_map
+from pctt.ccp.delassus import GivenMatrix, delassus
+from pctt.contact_map import CompactRows, ContactMap
 from pctt.exchange import refuse
-
-if TYPE_CHECKING:
-    from pctt.contact_map.free import FreeMap
 
 
 class ConeProblem:
@@ -30,14 +26,13 @@ class ConeProblem:
     ----------
     r : (nc, 3) velocities of the contacts without impulses, plus gap/dt (m/s)
     mu : (nc,) friction coefficients
-    contact_map : G with its products, or None
+    operator : G or N, with its products; a copy of what was given
+    contact_map : the operator if it is G, and the bodies are known; or None
     point : (nc, 3) contact points (m) or None; orders the unknowns of hierarchical preconditioners
     key : (nc,) persistent names of the contacts or None
     compliance : (nc, 3) the diagonal of C
     softness : e, the same on all ranks; 0 for rigid contacts
     size : contacts on all ranks, Nc
-
-    ``operator`` is how products are made, of ``pctt.contact_map.OPERATORS``.
     """
 
     def __init__(
@@ -51,7 +46,6 @@ class ConeProblem:
         point: Array | None = None,
         key: np.ndarray | None = None,
         compliance: float = 0.0,
-        operator: str = "auto",
     ):
         if (G is None) == (N is None):
             raise ValueError("a cone problem is given by either the map G or the matrix N")
@@ -65,60 +59,40 @@ class ConeProblem:
         if count := self.sum(bad.sum()):
             raise ValueError(f"{count} contacts with a NaN, infinite or negative coefficient")
         self.size = self.sum(len(self.mu))
-        self.contact_map: ContactMap | None = None if G is None else contact_map(comm, G, operator)
-        self._given: PETSc.Mat = N  # where there is no G
-        if N is not None:
-            self._in, self._out = N.createVecs()
-        self._refuse_wrong_blocks()
+        self.operator: ContactMap | GivenMatrix = GivenMatrix(comm, N) if G is None else ContactMap(comm, G)
+        self.contact_map = self.operator if isinstance(self.operator, ContactMap) else None
+        # the diagonal blocks have squares of all numbers of G
+        if wrong := self.sum((~np.isfinite(self._rigid_blocks).all(axis=(1, 2))).sum()):
+            self.destroy()
+            raise ValueError(f"G has a NaN or an infinite number in {wrong} contacts")
         self.softness = float(compliance)
         along_normal = np.where(self.mu > 0, self.mu**2, 1.0)
         ones = np.ones_like(along_normal)
         self.compliance = np.stack([along_normal, ones, ones], axis=1)
         self.compliance *= compliance * self.mean_diagonal if compliance else 0.0
 
-    def _refuse_wrong_blocks(self) -> None:
-        """ValueError on all ranks if N is no number, or the diagonal blocks, which have squares of all numbers of G."""
-        wrong = self.sum((~np.isfinite(self._rigid_blocks).all(axis=(1, 2))).sum())
-        if wrong or self._given is not None and not np.isfinite(self._given.norm()):
-            name, where = ("G", f" in {wrong} contacts") if self._given is None else ("N", "")
-            self.destroy()
-            raise ValueError(f"{name} has a NaN or an infinite number{where}")
-
     def __repr__(self) -> str:
         given = "N" if self.contact_map is None else "G"
         return f"ConeProblem({self.size} contacts, {self.comm.size} ranks, given by {given})"
-
-    @property
-    def free_map(self) -> FreeMap | None:
-        """The contact map, if its products are made without matrices."""
-        return cast("FreeMap", self.contact_map) if self.contact_map is not None and self.contact_map.free else None
 
     # -- the operator ---------------------------------------------------------------------------------------
 
     def product(self, g: Array) -> Array:
         """N g for impulses g (nc, 3): velocities of the contacts (nc, 3)."""
-        y: Array = self.compliance * g
-        if self.contact_map is None:
-            y += self._given_product(g)
-        else:
-            self.contact_map.add_delassus(g, y)
+        y = np.zeros_like(self.r)
+        self.operator.add_delassus(g, y)
+        if self.softness:
+            y += self.compliance * g
         return y
 
     def momentum(self, g: Array) -> Array:
         """G' g (6m,): the change of the mass-scaled velocities of this rank's bodies by impulses g (nc, 3). A problem
         given by N has no bodies: g itself."""
-        return g.ravel().copy() if self.contact_map is None else self.contact_map.momenta(g).ravel()
+        return self.operator.momenta(g).ravel()
 
     def velocity_of(self, momentum: Array) -> Array:
         """G v: velocities of the contacts (nc, 3) for those of the bodies; N g where the problem is given by N."""
-        if self.contact_map is None:
-            return self._given_product(momentum)
-        return self.contact_map.velocities(momentum)
-
-    def _given_product(self, g: Array) -> Array:
-        self._in.array[:] = g.ravel()
-        self._given.mult(self._in, self._out)
-        return self._out.array.reshape(-1, 3).copy()
+        return self.operator.velocities(momentum)
 
     def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
         """||g - P(g - y / mean diag N)|| / ||g||, velocities y = N g + r: the stop test of every solver. For Coulomb's
@@ -144,7 +118,7 @@ class ConeProblem:
 
     @cached_property
     def N(self) -> PETSc.Mat:
-        """N as a Mat of block size 3 (BAIJ), but for the low-rank term; built at its first use and kept."""
+        """N as a Mat of block size 3 (BAIJ), without the columns of hubs; built at its first use and kept."""
         N = self.rigid_matrix()
         if self.softness:
             diagonal = N.createVecLeft()
@@ -154,16 +128,15 @@ class ConeProblem:
         return N
 
     def rigid_matrix(self) -> PETSc.Mat:
-        """A new Mat like ``N`` without the compliance; the low-rank term is not in it."""
-        return in_blocks(self._given) if self.contact_map is None else delassus(self.comm, self._split[0])
+        """A new Mat like ``N`` without the compliance."""
+        if isinstance(self.operator, GivenMatrix):
+            return self.operator.mat.duplicate(copy=True)
+        return delassus(self.comm, self._split[0])
 
-    @cached_property
-    def low_rank(self) -> PETSc.Mat | None:
-        """The columns U (3Nc x 6 per body, dense) of G of bodies with more than HUB contacts, or None: they would
-        fill N, which is ``N`` + U U'."""
-        if self.contact_map is None:
-            return None
-        return dense_columns(self.comm, self.contact_map.block_rows, self._split[1])
+    @property
+    def has_hubs(self) -> bool:
+        """Whether some bodies have more than HUB contacts and would fill N: ``N`` is without their columns of G."""
+        return self.contact_map is not None and len(self._split[1]) > 0
 
     @cached_property
     def _split(self) -> tuple[BlockRows, np.ndarray]:
@@ -172,15 +145,8 @@ class ConeProblem:
 
     @cached_property
     def diagonal_blocks(self) -> Array:
-        """The 3 x 3 diagonal blocks of N (nc, 3, 3), the low-rank term and the compliance included."""
+        """The 3 x 3 diagonal blocks of N (nc, 3, 3), hubs and the compliance included."""
         return self._rigid_blocks + self.compliance_blocks if self.softness else self._rigid_blocks
-
-    @cached_property
-    def sparse_diagonal_blocks(self) -> Array:
-        """The same without the low-rank term."""
-        if self.contact_map is None:
-            return self.diagonal_blocks
-        return diagonal_blocks(self._split[0]) + self.compliance_blocks
 
     @cached_property
     def compliance_blocks(self) -> Array:
@@ -189,16 +155,12 @@ class ConeProblem:
 
     @cached_property
     def _rigid_blocks(self) -> Array:
-        return local_blocks(self._given) if self.contact_map is None else self.contact_map.contact_blocks()
+        return self.operator.contact_blocks()
 
     def structure(self) -> tuple[np.ndarray, ...]:
         """Arrays of this rank that are equal where contacts, their bodies and all sizes are."""
         key = np.zeros(0) if self.key is None else self.key
-        if self.contact_map is None:
-            return (key, np.array([self._given.handle, self.size]))
-        G = self.contact_map.given
-        graph = (G.body,) if isinstance(G, CompactRows) else (G.indptr, G.indices)
-        return (key, *graph, np.array([G.columns, self.size]))
+        return (key, *self.operator.structure(), np.array([self.size]))
 
     @cached_property
     def mean_diagonal(self) -> float:
@@ -242,9 +204,9 @@ class ConeProblem:
 
     def destroy(self) -> None:
         """Free the PETSc objects now, not when the garbage collector finds the cycle."""
-        for thing in (self.contact_map, *(self.__dict__.pop(name, None) for name in ("_in", "_out", "N", "low_rank"))):
-            if thing is not None:
-                thing.destroy()
+        self.operator.destroy()
+        if "N" in self.__dict__:
+            self.__dict__.pop("N").destroy()
 
 
 def _wrong(

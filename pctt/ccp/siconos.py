@@ -47,14 +47,14 @@ def is_one(path: str | Path) -> bool:
     return Path(path).suffix == ".dat" or (first != [] and first[0].isdigit())
 
 
-def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None, operator: str = "auto") -> Stored:
+def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> Stored:
     """The cone problem of a file, its contacts in equal parts over the ranks; collective. ``compliance`` makes them
     yield.
 
     A problem is given by N or by the map G of bodies, as those of `fclib.read` are. Raises FileFormatError on every
     rank where the file cannot be read as one.
     """
-    return spread(comm, path, "Siconos", lambda: _whole(path), compliance, operator)
+    return spread(comm, path, "Siconos", lambda: _whole(path), compliance)
 
 
 def _whole(path: str | Path) -> Whole:

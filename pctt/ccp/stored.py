@@ -108,7 +108,7 @@ def sparse_matrix(problem: ConeProblem) -> PETSc.Mat:
 
     Raises ValueError on all ranks if a body has so many contacts that it would fill N.
     """
-    if problem.low_rank is not None:
+    if problem.has_hubs:
         raise ValueError(
             f"a body has more than {HUB} contacts and would fill N; allowed is a format of masses and contact map "
             "(fclib.write_global)"
@@ -122,11 +122,10 @@ def spread(
     format: str,
     read: Callable[[], Whole],
     compliance: float | None = None,
-    operator: str = "auto",
 ) -> Stored:
     """The problem that ``read`` finds on rank 0, contacts (and bodies) in equal parts over the ranks; collective.
 
-    ``compliance`` takes the place of the file's; ``operator`` is that of `ConeProblem`.
+    ``compliance`` takes the place of the file's.
 
     Raises FileFormatError on every rank if ``read`` raises any error: bad data surprise h5py, numpy and scipy.
     """
@@ -149,7 +148,9 @@ def spread(
     else:
         N = square_block_matrix(comm, rows)
     e = part.compliance if compliance is None else compliance
-    problem = ConeProblem(comm, part.r, part.mu, G=G, N=N, point=part.point, compliance=e, operator=operator)
+    problem = ConeProblem(comm, part.r, part.mu, G=G, N=N, point=part.point, compliance=e)
+    if N is not None:
+        N.destroy()  # the problem has a copy
     return Stored(problem, part.form, part.title, part.solution, part.guess, part.note)
 
 

@@ -67,13 +67,10 @@ def _topic(words: list[str]) -> str:
 
 def versions() -> str:
     """This program and what it stands on."""
-    try:
-        import numba
+    import numba  # takes half a second
 
-        loops = f"numba {numba.__version__}"
-    except ImportError:
-        loops = "no numba"
     petsc = ".".join(map(str, PETSc.Sys.getVersion()))
+    loops = f"numba {numba.__version__}"
     return f"pctt {pctt.__version__} (PETSc {petsc}, Python {platform.python_version()}, {loops})"
 
 

@@ -68,7 +68,7 @@ class Dump:
             binary = path.with_suffix(".petsc")
             _write(path, as_fclib)
             files["dumped"] = [str(path)]
-            if problem.low_rank is None:  # else N is no sparse matrix
+            if not problem.has_hubs:  # else N is no sparse matrix
                 _write(binary, lambda path: petsc_binary.write(path, problem))
                 files["dumped"].append(str(binary))
         if problem.size and hard:

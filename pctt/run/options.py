@@ -19,7 +19,6 @@ from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
 from pctt.ccp.newton.users_solver import LADDER
-from pctt.contact_map import is_free
 from pctt.ksp_options import entered, to_enter
 from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, made, read, refuse_unknown
 from pctt.petsc import own_errors
@@ -63,7 +62,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         run = dataclasses.replace(run, settle_delta=scene.settle_delta)
     given = {
         **{name: getattr(run, name) for name in ("dt", "delta", "recovery_speed")},
-        **{name: getattr(run, f"ccp_{name}") for name in ("newton", "compliance", "operator")},
+        **{name: getattr(run, f"ccp_{name}") for name in ("newton", "compliance")},
         **vars(limits),
         "solver": run.ccp_type,
         "options": read(solver.options, database, solver.prefix),
@@ -75,11 +74,6 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     if solver.newton and not run.settle:
         form = ccp.newton_for(comm, run.ccp_type, run.ccp_newton, compare).form
         _refuse_for_petsc(database, form, comm)
-    if run.ccp_operator == "free":
-        try:
-            is_free(run.ccp_operator)
-        except ValueError as error:
-            raise OptionError(str(error)) from None
     dump_steps(run)  # refuses what is no list of steps
     _refuse_places(run, comm)
     return options

@@ -20,7 +20,7 @@ from pctt.run.settings import Options
 
 def solve_file(options: Options, comm: MPI.Comm) -> None:
     """Solve, print the figures, and write them to summary.json in the output folder."""
-    stored = _load(options.run.problem, comm, options.run.ccp_compliance, options.run.ccp_operator)
+    stored = _load(options.run.problem, comm, options.run.ccp_compliance)
     compare = ccp.Comparison(comm, options.run.compared(), options.run.compare_every)
     with stored.problem:
         summary = _solve(stored, options, compare)
@@ -106,11 +106,11 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
     }
 
 
-def _load(path: str, comm: MPI.Comm, compliance: float | None, operator: str) -> Stored:
+def _load(path: str, comm: MPI.Comm, compliance: float | None) -> Stored:
     """The problem in a file, with another compliance if one is given. FileError on all ranks if the file holds no
     problem."""
     try:
-        return files.load(path, comm, compliance, operator)
+        return files.load(path, comm, compliance)
     except FileFormatError as error:
         raise FileError(str(error)) from None
 

@@ -10,7 +10,6 @@ from typing import Any, Optional
 from dem.experiment import SCENE_FILE, Experiment, Given, SceneFileError, from_file
 from dem.scenes import SCENES
 from pctt import ccp
-from pctt.contact_map import OPERATORS
 from pctt.options import (
     AT_LEAST_ONE,
     COUNT,
@@ -94,12 +93,6 @@ class Run:
     ccp_newton: str = option(
         "auto", "unknowns of the Newton systems; auto: contact for pdip, body for conic", choices=("auto", *ccp.FORMS)
     )
-    ccp_operator: str = option(
-        "auto",
-        "products with the contact map: free, by compiled loops without matrices, or assembled, by matrices of PETSc; "
-        "auto: free where numba is installed",
-        choices=OPERATORS,
-    )
     ccp_compliance: Optional[float] = option(
         None,
         "compliance of the contacts, as a part of mean diag N; none: 0, rigid, or that of the file of -problem",
@@ -151,7 +144,6 @@ class Settings:
     newton: str = _as(Run, "ccp_newton")  #: unknowns of the Newton systems (``-ccp_newton``)
     recovery_speed: float = _as(Run, "recovery_speed")  #: that pushes overlaps apart [m/s] (``-recovery_speed``)
     compliance: Optional[float] = _as(Run, "ccp_compliance")  #: of the contacts (``-ccp_compliance``)
-    operator: str = _as(Run, "ccp_operator")  #: products with the contact map (``-ccp_operator``)
 
     @property
     def limits(self) -> ccp.Limits:

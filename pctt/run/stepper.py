@@ -159,9 +159,7 @@ class Stepper:
             self._release()
             self.contacts = contacts
             self.system = ContactSystem(self.world, contacts, settings.dt, settings.recovery_speed)
-            self._problem = cone_problem(
-                self.system, self.world.comm, settings.compliance or 0.0, settings.operator
-            )
+            self._problem = cone_problem(self.system, self.world.comm, settings.compliance or 0.0)
             guess, _ = memory.recall(self.system.key, self.system.frame)
         return self._problem, guess
 
@@ -219,14 +217,10 @@ class Stepper:
         return Solved(asked, asked, used, newton_its)
 
 
-def cone_problem(
-    system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0, operator: str = "auto"
-) -> ccp.ConeProblem:
+def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
     G = ccp.CompactRows(*system.contact_map, columns=system.owned_bodies)
-    return ccp.ConeProblem(
-        comm, system.r, system.mu, G=G, point=system.point, key=system.key, compliance=compliance, operator=operator
-    )
+    return ccp.ConeProblem(comm, system.r, system.mu, G=G, point=system.point, key=system.key, compliance=compliance)
 
 
 def _peak_memory(comm: MPI.Comm) -> int:

@@ -377,7 +377,7 @@ def main(given: Sequence[str] | None = None) -> None:
     try:
         driver()
         about = say_machine()
-        warm_up("apgd", "auto")
+        warm_up("apgd")
         state = stored_box(words.state) if words.state else settled_mixer(words.n)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "scene.txt"

@@ -84,10 +84,8 @@ def copied(problem: ccp.ConeProblem, count: int) -> ccp.ConeProblem:
 
 
 def run(path: Path, method: str, tol: float, seconds: float) -> dict[str, Any]:
-    """What solve_one.py says; {"reason": ...} alone where it was ended or failed. A method that ends in ` assembled`
-    has its products made by matrices of PETSc."""
-    name = method.removesuffix(" assembled")
-    words = [str(path), name, str(tol), str(seconds), "auto" if name == method else "assembled"]
+    """What solve_one.py says; {"reason": ...} alone where it was ended or failed."""
+    words = [str(path), method, str(tol), str(seconds)]
     command = [sys.executable, str(Path(__file__).with_name("solve_one.py")), *words]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=2 * seconds + 15, check=True)
@@ -178,8 +176,7 @@ def main() -> None:
     parser.add_argument("--copies", type=int, default=1, help="of the problem, side by side: n = 32 has 8 of n = 16")
     words = parser.parse_args()
     everything = [*ccp.SOLVERS, *COULOMB, *(name for name, peer in PEERS.items() if peer.installed)]
-    everything += [f"{name} assembled" for name in ccp.SOLVERS]
-    methods = words.methods.split(",") if words.methods else [m for m in everything if not m.endswith(" assembled")]
+    methods = words.methods.split(",") if words.methods else everything
     variants = words.variants.split(",")
     for kind, given, allowed in (("--methods", methods, everything), ("--variants", variants, VARIANTS)):
         for name in given:

@@ -1,4 +1,4 @@
-"""Products with the contact map, S and K, by compiled loops and by matrices of PETSc, on settled mixer steps:
+"""Products with the contact map, S and K, of frames and arms and of 3 x 6 blocks, on settled mixer steps:
 run/study operators [N ...], default 8 16. Prints milliseconds, megabytes and GB/s; writes results/operators.json.
 
 Megabytes are what a product has to bring from memory at least once and to write back: the storage of the map,
@@ -33,19 +33,18 @@ NUMBER = 8.0  # bytes
 
 
 def ways(problem: ccp.ConeProblem) -> dict[str, ccp.ConeProblem]:
-    """The problem with its map in both storages, and as a matrix."""
+    """The problem with its map in both storages."""
     G = problem.contact_map
     rest = {"point": problem.point, "compliance": problem.softness}
     return {
-        "loops, frames and arms": problem,
-        "loops, 3 x 6 blocks": ccp.ConeProblem(COMM, problem.r, problem.mu, G=G.block_rows, **rest),
-        "matrices of PETSc": ccp.ConeProblem(COMM, problem.r, problem.mu, G=G.given, operator="assembled", **rest),
+        "frames and arms": problem,
+        "3 x 6 blocks": ccp.ConeProblem(COMM, problem.r, problem.mu, G=G.block_rows, **rest),
     }
 
 
 def storage(problem: ccp.ConeProblem) -> float:
     """Bytes of the map's rows."""
-    if problem.free_map is None or not isinstance(problem.contact_map.given, ccp.CompactRows):
+    if not isinstance(problem.contact_map.given, ccp.CompactRows):
         G = problem.contact_map.block_rows
         return len(G.blocks) * (18 * NUMBER + 4) + 8 * G.rows
     given = problem.contact_map.given
@@ -65,21 +64,14 @@ def products(problem: ccp.ConeProblem) -> dict[str, tuple[Callable[[], Any], flo
     of_contacts, of_bodies = contact.matrix.createVecs(), body.matrix.createVecs()
     of_contacts[0].array[:], of_bodies[0].array[:] = g.ravel(), v.ravel()
     rows, contacts, bodies = storage(problem), g.nbytes, v.nbytes
-    S, K = (
-        mat.getInfo()["nz_used"] * NUMBER * 1.05 if problem.free_map is None else 0
-        for mat in (contact.matrix, body.matrix)
-    )
     return {
         "G v": (lambda: G.velocities(v), rows + bodies + 2 * contacts),
         "G'g": (lambda: G.momenta(g), rows + 2 * bodies + contacts),
         "S g": (
             lambda: contact.matrix.mult(*of_contacts),
-            S + 2 * contacts if S else 2 * rows + 6 * NUMBER * problem.size + 3 * contacts + 4 * bodies,
+            2 * rows + 6 * NUMBER * problem.size + 3 * contacts + 4 * bodies,
         ),
-        "K v": (
-            lambda: body.matrix.mult(*of_bodies),
-            K + 2 * bodies if K else rows - 3 * NUMBER * problem.size + 5 * bodies,
-        ),
+        "K v": (lambda: body.matrix.mult(*of_bodies), rows - 3 * NUMBER * problem.size + 5 * bodies),
         "S of a new barrier": (lambda: contact.update(barrier), 0.0),
         "K of a new barrier": (lambda: body.update(barrier), 0.0),
         "CG on K, block Jacobi": (iteration_of_cg(body, of_bodies), 0.0),

@@ -77,7 +77,7 @@ def fastest(path: str, law: str, solver: str, tol: float, seconds: float) -> dic
 
 
 def once(path: str, law: str, solver: str, tol: float, seconds: float) -> dict[str, Any]:
-    with solve_one.read(path, "auto") as problem:
+    with solve_one.read(path) as problem:
         if solver in PEERS:
             found = solve_one.peer(problem, solver, tol, seconds)
             if found["seconds"] > seconds:

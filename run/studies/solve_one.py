@@ -47,11 +47,10 @@ class Watch:
 def own(problem: ccp.ConeProblem, name: str, tol: float, seconds: float, coulomb: bool) -> dict[str, Any]:
     """A solver of the registry from a cold start."""
     newton = ccp.newton_for(problem.comm, name) if ccp.SOLVERS[name].newton else None
-    counted = [] if problem.contact_map is None else ["add_delassus"]
     limits = ccp.Limits(tol, 10_000_000 if not newton else -1, math.inf)
     law = ccp.Coulomb() if coulomb else None
     impulse = None
-    with Counter(type(problem.contact_map), *counted) as products:
+    with Counter(type(problem.operator), "add_delassus") as products:
         watch = Watch(problem, newton, products, seconds)
         try:
             result = ccp.solve(problem, None, name, limits, None, newton, law)
@@ -78,17 +77,17 @@ def write(path: Path, problem: ccp.ConeProblem) -> None:
     np.savez(path, r=problem.r, mu=problem.mu, point=problem.point, compliance=problem.softness, **G)
 
 
-def read(path: str, operator: str) -> ccp.ConeProblem:
+def read(path: str) -> ccp.ConeProblem:
     """The problem in a file of `write`, or in any format of `pctt.ccp.files`."""
     if not path.endswith(".npz"):
-        return files.load(path, MPI.COMM_SELF, operator=operator).problem
+        return files.load(path, MPI.COMM_SELF).problem
     with np.load(path) as file:
         G = ccp.CompactRows(*(file[name] for name in ("frame", "arm", "body", "root")), int(file["columns"]))
-        rest = {"point": file["point"], "compliance": float(file["compliance"]), "operator": operator}
+        rest = {"point": file["point"], "compliance": float(file["compliance"])}
         return ccp.ConeProblem(MPI.COMM_SELF, file["r"], file["mu"], G=G, **rest)
 
 
-def warm_up(method: str, operator: str) -> None:
+def warm_up(method: str) -> None:
     """Have compiled loops come before the clock runs: solve a chain of five spheres."""
     name = method.rpartition(" ")[2]
     if name not in ccp.SOLVERS:
@@ -98,13 +97,13 @@ def warm_up(method: str, operator: str) -> None:
     pairs = np.arange(4)[:, None] + [0, 1]
     G = ccp.CompactRows(normal, arm, pairs, np.ones((5, 6)), 5)
     r = np.tile([-1.0, 0.1, 0.0], (4, 1))
-    with ccp.ConeProblem(MPI.COMM_SELF, r, np.full(4, 0.3), G=G, operator=operator) as problem:
+    with ccp.ConeProblem(MPI.COMM_SELF, r, np.full(4, 0.3), G=G) as problem:
         ccp.solve(problem, None, name, ccp.Limits(1e-8))
 
 
-def main(path: str, method: str, tol: float, seconds: float, operator: str = "auto") -> None:
-    problem = read(path, operator)
-    warm_up(method, operator)
+def main(path: str, method: str, tol: float, seconds: float) -> None:
+    problem = read(path)
+    warm_up(method)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     if method in peers.PEERS:
         found = peer(problem, method, tol, seconds)
@@ -120,5 +119,5 @@ def main(path: str, method: str, tol: float, seconds: float, operator: str = "au
 
 
 if __name__ == "__main__":
-    path, method, tol, seconds, *operator = sys.argv[1:]
-    main(path, method, float(tol), float(seconds), *operator)
+    path, method, tol, seconds = sys.argv[1:]
+    main(path, method, float(tol), float(seconds))

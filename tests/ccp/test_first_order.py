@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from mpi4py import MPI
-from problems import SELF, from_graph, from_matrix, heap, matrix
+from problems import SELF, from_graph, from_matrix, heap
 
 from pctt import ccp
 from pctt.ccp import Limits
@@ -214,10 +214,9 @@ def test_an_accuracy_that_cannot_be_reached_ends_with_a_reason(method, monkeypat
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_a_matrix_with_a_nan_does_not_converge(method):
     known, _ = heap(contacts=6, bodies=4)
-    N = matrix(SELF, known.N)
-    problem = ccp.ConeProblem(SELF, known.r, known.mu, N=N)
-    N.setValue(0, 5, np.nan)  # a problem with a NaN is refused; this one gets it afterwards
-    N.assemble()
+    problem = from_matrix(known)
+    problem.operator.mat.setValue(0, 5, np.nan)  # a problem with a NaN is refused; this one gets it afterwards
+    problem.operator.mat.assemble()
     result = ccp.solve(problem, type=method, limits=Limits(1e-6))
     assert not result.converged
     assert "not a number" in result.reason
@@ -238,7 +237,7 @@ def test_apgd_begins_in_single_precision_and_ends_in_double(size, monkeypatch):
 
     monkeypatch.setattr(apgd, "_descend", watched)
     result = ccp.solve(problem, type="apgd", limits=Limits(1e-12))
-    assert stages == ([np.float32] if problem.free_map is not None else []) + [np.float64]
+    assert stages == [np.float32, np.float64]
     assert result.converged
     assert result.impulse.dtype == np.float64
     assert ccp.measure(problem, result.impulse).natural_residual <= 1.01e-12

@@ -6,10 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 import several_ranks
-
-from pctt import compiled
 
 SOLVE = """
 import hashlib
@@ -27,7 +24,6 @@ for rows, solver, law in ((frames_and_arms, "apgd", ccp.Coulomb(max_it=1)), (blo
 """
 
 
-@pytest.mark.skipif(not compiled.available(), reason="numba is not installed")
 def test_the_first_run_on_a_machine_has_the_bits_of_the_next(tmp_path):
     here = str(Path(__file__).parent)
     env = several_ranks.environment(NUMBA_CACHE_DIR=str(tmp_path))

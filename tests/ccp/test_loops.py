@@ -1,149 +1,143 @@
-"""The compiled loops on cones against the numpy functions in whose place they run."""
+"""The compiled loops on cones against short formulas of numpy."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from importlib import import_module
 
 import numpy as np
 import pytest
 
-from pctt import compiled
 from pctt.ccp import cone
+from pctt.ccp.accuracy import _nearest_in_cone
 from pctt.ccp.interior import lorentz
 
-needs_numba = pytest.mark.skipif(not compiled.available(), reason="numba is not installed")
-MODULES = {"cone": cone, "lorentz": lorentz}
 COUNTS = [0, 1, 7, 256, 1000]  # also of whole strips, and not
 
 
+def projected_move(x, y, step, mu):
+    return _nearest_in_cone(x - step * y, mu) - x
+
+
+def accelerated_step(x, last_x, y, last_y, beta, step, mu, opening):
+    """What the loop returns, and what it leaves in its last argument."""
+    z, y_z = x + beta * (x - last_x), y + beta * (y - last_y)
+    y_z[:, 0] += opening * mu * np.hypot(y_z[:, 1], y_z[:, 2])
+    out = _nearest_in_cone(z - step * y_z, mu)
+    return np.vdot(out - z, out - z), np.vdot(y_z, out - x), out
+
+
+def accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta):
+    return np.vdot(new_x - x - beta * (x - last_x), new_y - y - beta * (y - last_y))
+
+
+def times(blocks, x):
+    return np.einsum("nij,nj->ni", blocks, x)
+
+
+def scaling(root, eta):
+    """W (nc, 3, 3)."""
+    return eta[:, None, None] * (2 * root[:, :, None] * root[:, None, :] - np.diag([1.0, -1.0, -1.0]))
+
+
+def barrier_blocks(direction, eta, spread, scale, compliance, proximal):
+    u, v = direction.T
+    one, zero = np.ones_like(u), np.zeros_like(u)
+    axes = np.moveaxis(np.array([[one, u, v], [one, -u, -v], [zero, v, -u]]), 2, 0)
+    axes /= np.linalg.norm(axes, axis=2)[:, :, None]
+    values = 1 / np.stack([eta * spread, eta / spread, eta], axis=1) ** 2
+    inverse_square = np.einsum("nki,nk,nkj->nij", axes, values, axes)  # W^-2
+    sides = scale[:, :, None] * scale[:, None, :]
+    whole = np.linalg.inv(inverse_square + compliance[:, None, None] * np.eye(3))
+    return (inverse_square + proximal * np.eye(3)) * sides, whole / sides, whole @ inverse_square
+
+
 class Sample:
-    """Random arguments of the functions: points anywhere, on the axis and at the apex, friction that is zero or not."""
+    """Random arguments: points anywhere, on the axis and at the apex, friction that is zero or not."""
 
     def __init__(self, count: int, seed: int = 0):
         rng = np.random.default_rng(seed)
-        self.count = count
-        self.mu = rng.uniform(0.05, 2.0, count) * (np.arange(count) % 5 > 0)
-        self.x, self.dx, self.y, self.dy, self.z, self.dz = rng.normal(size=(6, count, 3))
-        self.x[::7] = 0.0
-        self.x[3::7, 1:] = 0.0
-        self.blocks = rng.normal(size=(count, 3, 3))
-        self.positive = rng.uniform(0.1, 2.0, (3, count))
-        self.sizes = rng.uniform(0.1, 2.0, (count, 3))
-        angle, depth = rng.uniform(0, 2 * np.pi, (2, count)), 1 - 10.0 ** -rng.uniform(0, 12, (2, count))
-        unit = np.stack([np.ones_like(angle), depth * np.cos(angle), depth * np.sin(angle)], axis=2)
-        self.s = unit[0] * self.positive[0, :, None]  # inside the cones of friction 1, some by little
-        self.s[::3, 1:] = 0.0
-        self.inside = self.s * np.stack([np.ones(count), self.mu, self.mu], axis=1)
-        self.direction = np.ascontiguousarray(unit[0, :, 1:])
-
-    def arguments(self) -> dict[str, tuple]:
-        """By module and function."""
-        a = self.positive
-        return {
-            "cone.project_to": (self.x, self.mu, np.zeros_like(self.x)),
-            "cone.projected_move": (self.x, self.y, 0.3, self.mu),
-            "cone.accelerated_step": (self.x, self.dx, self.y, self.dy, 0.7, 0.3, self.mu, 1.0, np.zeros_like(self.x)),
-            "cone.accelerated_curvature": (self.x, self.dx, self.z, self.y, self.dy, self.dz, 0.7),
-            "cone.times": (self.blocks, self.x),
-            "cone.step_to_boundary": (self.inside, self.dx, self.mu),
-            "cone.step_to_zero": (a[0], np.ascontiguousarray(self.dx[:, 0])),
-            "lorentz.step_to_boundary": (self.s, self.dx),
-            "lorentz.scale": (self.x, a[0], self.y),
-            "lorentz.unscale": (self.x, a[0], self.y),
-            "lorentz.barrier_blocks": (self.direction, a[0], 1 + a[1], self.sizes, a[2], 0.1),
-        }
+        mu = rng.uniform(0.05, 2.0, count) * (np.arange(count) % 5 > 0)
+        x, dx, y, dy, z, dz = rng.normal(size=(6, count, 3))
+        x[::7] = 0.0
+        x[3::7, 1:] = 0.0
+        a, sizes = rng.uniform(0.1, 2.0, (3, count)), rng.uniform(0.1, 2.0, (count, 3))
+        angle = rng.uniform(0, 2 * np.pi, count)
+        direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        blocks = rng.normal(size=(count, 3, 3))
+        self.cases = {
+            "project": (cone.project, _nearest_in_cone, (x, mu)),
+            "move": (cone.projected_move, projected_move, (x, y, 0.3, mu)),
+            "step": (stepped, accelerated_step, (x, dx, y, dy, 0.7, 0.3, mu, 1.0)),
+            "curvature": (cone.accelerated_curvature, accelerated_curvature, (x, dx, z, y, dy, dz, 0.7)),
+            "times": (cone.times, times, (blocks, x)),
+            "scale": (lorentz.scale, lambda root, eta, x: times(scaling(root, eta), x), (x, a[0], y)),
+            "unscale": (lorentz.unscale, unscale, (hyperbolic(x), a[0], y)),
+            "barrier": (lorentz.barrier_blocks, barrier_blocks, (direction, a[0], 1 + a[1], sizes, a[2], 0.1)),
+        }  # fmt: skip
 
 
-NAMES = list(Sample(0).arguments())
-IN_SINGLE = ["cone.project_to", "cone.projected_move", "cone.accelerated_step", "cone.accelerated_curvature"]
-EVERY = pytest.mark.parametrize("name", NAMES)
-# what is left of numbers close to the boundary is a root of rounding
-TOLERANCES = {"lorentz.step_to_boundary": 1e-6, "cone.step_to_boundary": 1e-6}
+def stepped(x, last_x, y, last_y, beta, step, mu, opening):
+    out = np.zeros_like(x)
+    return *cone.accelerated_step(x, last_x, y, last_y, beta, step, mu, opening, out), out
 
 
-def both(name: str, arguments: tuple) -> list[list[np.ndarray]]:
-    """What the loop and the numpy function return and leave in their last argument."""
-    module, function = name.split(".")
-    plain = getattr(MODULES[module], function).__wrapped__
-    found = []
-    for call in (compiled.loop_of(plain), plain):
-        own = tuple(a.copy() if isinstance(a, np.ndarray) else a for a in arguments)
-        with np.errstate(all="ignore"):
-            returned = call(*own)
-        parts = returned if isinstance(returned, tuple) else (returned,)
-        found.append([np.asarray(part) for part in (*parts, own[-1])])
-    return found
+def unscale(root, eta, x):
+    return times(np.linalg.inv(scaling(root, eta)), x)
 
 
-@needs_numba
-@EVERY
+def hyperbolic(x):
+    """Points with x_0^2 - |x_1:|^2 = 1, for which the scaling has a simple inverse."""
+    return np.column_stack([np.sqrt(1 + x[:, 1] ** 2 + x[:, 2] ** 2), x[:, 1:]])
+
+
+NAMES = list(Sample(0).cases)
+
+
+def parts(returned):
+    return [np.asarray(part) for part in (returned if isinstance(returned, tuple) else (returned,))]
+
+
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("count", COUNTS)
-def test_a_loop_gives_what_numpy_gives(name, count):
-    for one, other in zip(*both(name, Sample(count).arguments()[name])):
+def test_a_loop_gives_what_its_formula_gives(name, count):
+    loop, formula, arguments = Sample(count).cases[name]
+    for one, other in zip(parts(loop(*arguments)), parts(formula(*arguments))):
         assert one.shape == other.shape
-        assert one.dtype == other.dtype
-        size = np.abs(other[np.isfinite(other)]).max(initial=1.0)
-        np.testing.assert_allclose(one, other, rtol=TOLERANCES.get(name, 1e-12), atol=1e-13 * size)
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12 * np.abs(other).max(initial=1.0))
 
 
-@needs_numba
-@pytest.mark.parametrize("name", [name for name in NAMES if name in IN_SINGLE])
+@pytest.mark.parametrize("name", NAMES[:4])
 @pytest.mark.parametrize("count", COUNTS)
 def test_a_loop_in_single_precision_stays_in_it(name, count):
-    arguments = Sample(count).arguments()[name]
-    rounded = tuple(a.astype(np.float32) if isinstance(a, np.ndarray) else a for a in arguments)
-    for one, other in zip(both(name, rounded)[0], both(name, arguments)[1]):
+    loop, formula, arguments = Sample(count).cases[name]
+    rounded = [a.astype(np.float32) if isinstance(a, np.ndarray) else a for a in arguments]
+    for one, other in zip(parts(loop(*rounded)), parts(formula(*arguments))):
         assert one.ndim == 0 or one.dtype == np.float32
-        size = np.abs(other).max(initial=1.0)
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * size)
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(other).max(initial=1.0))
 
 
-@needs_numba
-@EVERY
+@pytest.mark.parametrize("name", NAMES[:-1])
 def test_a_number_that_is_none_stays_none(name):
-    """Where numpy gives NaN the loop does, for a NaN at any place of any argument."""
-    arguments = Sample(6).arguments()[name]
+    """A NaN at any place of any argument, wherever the formula has one."""
+    loop, formula, arguments = Sample(6).cases[name]
     for k, argument in enumerate(arguments):
-        if not isinstance(argument, np.ndarray):
-            continue
-        for place in range(argument.size):
+        for place in range(np.size(argument) if isinstance(argument, np.ndarray) else 0):
             broken = [a.copy() if isinstance(a, np.ndarray) else a for a in arguments]
             broken[k].flat[place] = np.nan
-            for one, other in zip(*both(name, tuple(broken))):
-                assert np.array_equal(np.isnan(one), np.isnan(other)), (k, place)
+            for one, other in zip(parts(loop(*broken)), parts(formula(*broken))):
+                assert np.isnan(one[np.isnan(other)]).all(), (k, place)
 
 
-@needs_numba
-def test_every_loop_is_compared():
-    for name, module in MODULES.items():
-        loops = import_module(f"{module.__name__}_loops")
-        found = {f"{name}.{key}" for key, value in vars(loops).items() if hasattr(value, "py_func") and key[0] != "_"}
-        assert found == {listed for listed in NAMES if listed.startswith(f"{name}.")}
-
-
-@needs_numba
-def test_a_loop_is_compiled_once_for_each_precision():
-    """Arrays of another type, order or place go to numpy, with the same result."""
+def test_a_loop_takes_arrays_of_other_layouts():
     x, mu = np.random.default_rng(0).normal(size=(10, 3)), np.full(10, 0.5)
     frozen = x.copy()
     frozen.flags.writeable = False
     expected = cone.project(x, mu)
     for other in (np.asfortranarray(x), np.repeat(x, 2, axis=0)[::2], frozen):
         np.testing.assert_allclose(cone.project(other, mu), expected, rtol=1e-14)
-    signatures = compiled.loop_of(cone.project_to.__wrapped__).signatures
-    assert len({str(signature) for signature in signatures}) == len(signatures) <= 2
-
-
-def test_without_numba_numpy_does_the_work(monkeypatch):
-    x, mu = np.random.default_rng(0).normal(size=(10, 3)), np.full(10, 0.5)
-    expected = cone.project(x, mu)
-    monkeypatch.setattr(compiled, "available", lambda: False)
-    monkeypatch.setattr(compiled, "loop_of", lambda function: pytest.fail("the loop was asked for"))
-    np.testing.assert_allclose(cone.project(x, mu), expected, rtol=1e-14)
 
 
 def test_numba_is_imported_at_the_first_call_only():
-    code = "import sys, pctt.ccp; assert 'numba' not in sys.modules"
+    code = "import sys, pctt.ccp, pctt.run.simulate; assert 'numba' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,4 +1,4 @@
-"""Products with the contact map, in both storages and both ways, against dense algebra."""
+"""Products with the contact map, in both storages, against dense algebra."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from problems import part, random_graph
 
 from pctt.blocks import BlockRows
 from pctt.body_matrix import BodyOperator
-from pctt.contact_map import CompactRows, contact_map, is_free
+from pctt.ccp import ConeProblem
+from pctt.contact_map import CompactRows, ContactMap
 
-WAYS = ["assembled", pytest.param("free", marks=pytest.mark.skipif(not is_free("auto"), reason="no numba"))]
 CLOSE = {"rtol": 1e-13, "atol": 1e-13}
 
 
@@ -49,7 +49,7 @@ def own_part(whole: CompactRows, comm: MPI.Comm, ends=None, body_ends=None) -> C
     return CompactRows(*near, whole.root[bodies], bodies.stop - bodies.start)
 
 
-def check(comm: MPI.Comm, rows: CompactRows | BlockRows, G: np.ndarray, here: slice, way: str) -> None:
+def check(comm: MPI.Comm, rows: CompactRows | BlockRows, G: np.ndarray, here: slice) -> None:
     """All products and blocks of the map of these rows."""
     rng = np.random.default_rng(1)
     contacts, bodies = G.shape[0] // 3, G.shape[1] // 6
@@ -58,7 +58,7 @@ def check(comm: MPI.Comm, rows: CompactRows | BlockRows, G: np.ndarray, here: sl
     v, g = rng.standard_normal((bodies, 6)), rng.standard_normal((contacts, 3))
     any_H = rng.standard_normal((contacts, 3, 3))
     H = any_H @ any_H.transpose(0, 2, 1)
-    product = contact_map(comm, rows, way)
+    product = ContactMap(comm, rows)
     np.testing.assert_allclose(product.velocities(v[own].ravel()), (G @ v.ravel()).reshape(-1, 3)[here], **CLOSE)
     np.testing.assert_allclose(product.momenta(g[here]), (G.T @ g.ravel()).reshape(-1, 6)[own], **CLOSE)
     y = g[here].copy()
@@ -71,11 +71,10 @@ def check(comm: MPI.Comm, rows: CompactRows | BlockRows, G: np.ndarray, here: sl
     product.scaled(size[here]).add_delassus(g[here], y)
     expected = size.ravel() * (G @ G.T @ (size * g).ravel())
     np.testing.assert_allclose(y, expected.reshape(-1, 3)[here], rtol=1e-12, atol=1e-12)
-    if product.free:
-        y = np.zeros_like(y, dtype=np.float32)
-        product.scaled(size[here], np.float32).add_delassus(g[here].astype(np.float32), y)
-        close = {"rtol": 1e-4, "atol": 1e-5 * np.abs(expected).max(initial=0.0)}
-        np.testing.assert_allclose(y, expected.reshape(-1, 3)[here], **close)
+    y = np.zeros_like(y, dtype=np.float32)
+    product.scaled(size[here], np.float32).add_delassus(g[here].astype(np.float32), y)
+    close = {"rtol": 1e-4, "atol": 1e-5 * np.abs(expected).max(initial=0.0)}
+    np.testing.assert_allclose(y, expected.reshape(-1, 3)[here], **close)
 
     operator = BodyOperator(product)
     x, out = operator.mat.createVecs()
@@ -96,53 +95,48 @@ def check(comm: MPI.Comm, rows: CompactRows | BlockRows, G: np.ndarray, here: sl
 
 
 @pytest.mark.parallel(1, 2, 3, 4)
-@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("wide", [False, True], ids=["diagonal roots", "full roots"])
-def test_frames_and_arms(wide, way):
+def test_frames_and_arms(wide):
     comm = MPI.COMM_WORLD
     rows, G = random_contacts(3, 40, 12, wide)
-    check(comm, own_part(rows, comm), G, part(comm, 40), way)
+    check(comm, own_part(rows, comm), G, part(comm, 40))
 
 
 @pytest.mark.parallel(1, 3)
-@pytest.mark.parametrize("way", WAYS)
-def test_blocks(way):
+def test_blocks():
     comm = MPI.COMM_WORLD
     graph = random_graph(4, 30, 8, hub=True)
-    check(comm, graph.part(comm), graph.dense(), part(comm, 30), way)
+    check(comm, graph.part(comm), graph.dense(), part(comm, 30))
 
 
 @pytest.mark.parallel(2, 3)
-@pytest.mark.parametrize("way", WAYS)
-def test_ranks_without_contacts_or_bodies(way):
+def test_ranks_without_contacts_or_bodies():
     comm = MPI.COMM_WORLD
     rows, G = random_contacts(5, 10, 4, False)
     all_last = [0] * (comm.size - 1)
     ends, body_ends = [*all_last, 10], [*[4] * (comm.size - 1), 4]  # contacts on the last rank, bodies on the first
-    check(comm, own_part(rows, comm, ends, body_ends), G, part(comm, 10, ends), way)
+    check(comm, own_part(rows, comm, ends, body_ends), G, part(comm, 10, ends))
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_no_contacts_at_all(way):
+def test_no_contacts_at_all():
     rows, G = random_contacts(5, 0, 4, False)
-    check(MPI.COMM_SELF, rows, G, slice(0, 0), way)
+    check(MPI.COMM_SELF, rows, G, slice(0, 0))
 
 
 def test_a_number_that_is_none_comes_out():
     """The compiler must not take for granted that there are none."""
     rows, _ = random_contacts(6, 20, 5, False)
-    product = contact_map(MPI.COMM_SELF, rows)
+    product = ContactMap(MPI.COMM_SELF, rows)
     v = np.zeros((5, 6))
     v[rows.body[0].max(), 4] = np.nan
     assert np.isnan(product.velocities(v)).any()
     assert np.isfinite(product.velocities(np.zeros((5, 6)))).all()
 
 
-@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("compact", [True, False])
-def test_a_product_repeats_itself_bit_for_bit(compact, way):
+def test_a_product_repeats_itself_bit_for_bit(compact):
     rows, _ = random_contacts(7, 60, 9, True)
-    product = contact_map(MPI.COMM_SELF, rows if compact else rows.block_rows(MPI.COMM_SELF), way)
+    product = ContactMap(MPI.COMM_SELF, rows if compact else rows.block_rows(MPI.COMM_SELF))
     g = np.random.default_rng(0).standard_normal((60, 3))
     first, second = np.zeros((2, 60, 3))
     product.add_delassus(g, first)
@@ -150,20 +144,25 @@ def test_a_product_repeats_itself_bit_for_bit(compact, way):
     assert first.tobytes() == second.tobytes()
 
 
-def test_unknown_ways_are_refused(monkeypatch):
-    rows, _ = random_contacts(8, 3, 3, False)
-    with pytest.raises(ValueError, match=r"-ccp_operator quick: allowed are auto, free, assembled"):
-        contact_map(MPI.COMM_SELF, rows, "quick")
-    monkeypatch.setattr("pctt.contact_map.available", lambda: False)
-    with pytest.raises(ValueError, match="numba is not installed"):
-        contact_map(MPI.COMM_SELF, rows, "free")
-    assert not is_free("auto")
+def test_arrays_of_a_wrong_size_are_refused():
+    """The compiled loops would read and write outside of their arrays."""
+    rows, G = random_contacts(8, 9, 4, False)
+    N = PETSc.Mat().createDense((27, 27), array=G @ G.T, comm=PETSc.COMM_SELF)
+    N.assemble()
+    for given in ({"G": rows}, {"G": rows.block_rows(MPI.COMM_SELF)}, {"N": N}):
+        with ConeProblem(MPI.COMM_SELF, np.ones((9, 3)), np.ones(9), **given) as problem:
+            for wrong in (np.ones((1, 3)), np.ones((10, 3)), np.ones((3, 9)), np.ones(28)):
+                for function in (problem.product, problem.momentum, problem.velocity_of):
+                    with pytest.raises(ValueError, match="allowed is"):
+                        function(wrong)
+            with pytest.raises(ValueError, match=r"of the shape \(8, 3\); allowed is \(9, 3\)|broadcast"):
+                problem.operator.add_delassus(np.ones((9, 3)), np.zeros((8, 3)))
+            assert np.array_equal(problem.momentum(np.ones(27)), problem.momentum(np.ones((9, 3))))
 
 
-@pytest.mark.skipif(not is_free("auto"), reason="no numba")
 def test_flops_are_logged():
     rows, _ = random_contacts(9, 20, 5, False)
-    product = contact_map(MPI.COMM_SELF, rows)
+    product = ContactMap(MPI.COMM_SELF, rows)
     before = PETSc.Log.getFlops()
     product.velocities(np.zeros((5, 6)))
     assert PETSc.Log.getFlops() - before == 45 * 20 + 6 * 5
@@ -179,15 +178,14 @@ OTHER_FORMS = {
 
 
 @pytest.mark.parametrize("form", OTHER_FORMS)
-@pytest.mark.parametrize("way", WAYS)
-def test_arrays_of_other_forms(way, form):
+def test_arrays_of_other_forms(form):
     whole, G = random_contacts(0, 12, 7, wide=False)
     other = OTHER_FORMS[form]
     g = np.random.default_rng(0).standard_normal((12, 3))
     rows = CompactRows(other(whole.frame), other(whole.arm), other(whole.body), other(whole.root), 7)
     blocks = whole.block_rows(MPI.COMM_SELF)
     for given in (rows, BlockRows(other(blocks.indptr), other(blocks.indices), other(blocks.blocks), 7)):
-        product = contact_map(MPI.COMM_SELF, given, way)
+        product = ContactMap(MPI.COMM_SELF, given)
         close = {"atol": 1e-4} if form == "single precision" else CLOSE
         np.testing.assert_allclose(product.momenta(np.asfortranarray(g)).ravel(), G.T @ g.ravel(), **close)
 
@@ -212,7 +210,7 @@ def test_rows_that_do_not_fit_are_refused_on_all_ranks(name, wrong, words):
     if comm.rank == comm.size - 1:
         rows = dataclasses.replace(rows, **{name: wrong(getattr(rows, name))})
     with pytest.raises(ValueError, match=words):
-        contact_map(comm, rows)
+        ContactMap(comm, rows)
 
 
 @pytest.mark.parametrize(
@@ -228,4 +226,4 @@ def test_rows_that_do_not_fit_are_refused_on_all_ranks(name, wrong, words):
 def test_blocks_that_do_not_fit_are_refused(name, value, words):
     rows = BlockRows(np.array([0, 1, 1, 2]), np.array([0, 1]), np.ones((2, 3, 6)), 2)
     with pytest.raises(ValueError, match=words):
-        contact_map(MPI.COMM_SELF, dataclasses.replace(rows, **{name: value}))
+        ContactMap(MPI.COMM_SELF, dataclasses.replace(rows, **{name: value}))

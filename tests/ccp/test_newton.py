@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mpi4py import MPI
-from problems import SELF, from_graph, from_matrix, heap, part
+from problems import SELF, from_graph, from_matrix, heap, matrix, part
 
 from pctt import blocks, ccp
 from pctt.ccp.newton.body import BodyForm
@@ -66,7 +66,7 @@ def test_the_forms_agree_with_dense_algebra(many, monkeypatch):
         ]
         assert max(parts) < 1e-6, form
         assert newton.fallbacks == 0
-        assert (problem.low_rank is not None) == (many == 20)
+        assert problem.has_hubs == (many == 20)
         newton.destroy()
 
 
@@ -80,6 +80,31 @@ def test_every_form_gives_the_optimum(form, solver):
     result = ccp.solve(problem, type=solver, limits=ccp.Limits(tol), newton=newton)
     assert result.converged, result.reason
     assert np.linalg.norm(problem.product(result.impulse) + problem.r - known.y) < 1e-3 * np.linalg.norm(known.y)
+    newton.destroy()
+
+
+@pytest.mark.parallel(1, 2)
+@FORMS
+def test_a_matrix_with_entries_in_other_places_is_another_one(form):
+    """The first N is destroyed: the second one may have its address."""
+    comm = MPI.COMM_WORLD
+    newton = ccp.newton_for(comm, "pdip", form)
+    r, mu = np.tile([-1.0, 0.3, 0.2], (4, 1)), np.full(4, 0.5)
+    here = part(comm, 4)
+    for seed, pairs in enumerate((((0, 1), (2, 3)), ((0, 3), (1, 2)))):
+        dense = 10.0 * np.eye(12)
+        for i, j in pairs:
+            block = np.random.default_rng(seed).standard_normal((3, 3))
+            dense[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = block
+            dense[3 * j : 3 * j + 3, 3 * i : 3 * i + 3] = block.T
+        N = matrix(comm, dense)
+        with ccp.ConeProblem(comm, r[here], mu[here], N=N) as problem:
+            result = ccp.solve(problem, type="pdip", limits=ccp.Limits(1e-8), newton=newton)
+            alone = ccp.solve(problem, type="pdip", limits=ccp.Limits(1e-8))
+            assert result.converged
+            assert result.fallbacks == alone.fallbacks == 0
+            assert np.allclose(result.impulse, alone.impulse, atol=1e-7)
+        N.destroy()
     newton.destroy()
 
 

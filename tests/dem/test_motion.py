@@ -28,7 +28,7 @@ def test_mean_velocity_takes_the_body_exactly_to_the_next_pose(motion):
     end, end_turn = motion.pose(time + dt, PLACE, TURN)
     velocity = mean_velocity(motion, time, dt, PLACE, TURN)
     np.testing.assert_allclose(start + dt * velocity[:3], end, atol=1e-14)
-    np.testing.assert_allclose(quaternion.integrate(turn, velocity[3:], dt), end_turn, atol=1e-14)
+    np.testing.assert_allclose(quaternion.integrate(turn[None], velocity[None, 3:], dt)[0], end_turn, atol=1e-14)
 
 
 def test_rotation_is_a_circle_about_its_axis():

@@ -25,11 +25,11 @@ def read(path: str | Path, comm: MPI.Comm) -> ConeProblem:
     return load(path, comm).problem
 
 
-def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None, operator: str = "auto") -> Stored:
+def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> Stored:
     """The cone problem as ``read`` gives it, with the solution and the first guess of the file if it has
     impulses there: all published files have the groups, many with nothing but zeros in them. ``compliance`` takes
     the place of the file's."""
-    return spread(comm, path, "FCLIB", lambda: _whole(path), compliance, operator)
+    return spread(comm, path, "FCLIB", lambda: _whole(path), compliance)
 
 
 def _whole(path: str | Path) -> Whole:

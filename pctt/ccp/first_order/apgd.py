@@ -56,12 +56,12 @@ def solve(
 ) -> Result:
     """Impulses from a first guess (nc, 3): of the cone problem, or of Coulomb's law.
 
-    With compiled products the first iterations have single precision. The last ones, and the residual of the result,
+    If the bodies are known, the first iterations have single precision. The last ones, and the residual of the result,
     always have double precision.
     """
     momentum = Momentum(problem.max(problem.mu.max(initial=0.0)) if coulomb else None)
     progress = None
-    if problem.free_map is not None:
+    if problem.contact_map is not None:
         enough = STEERING.single / np.sqrt(max(problem.size, 1))
         rough = limits.to(max(limits.tol, enough))
         progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, options, give_up)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -13,10 +12,6 @@ from pctt.ccp import cone
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits
-
-if TYPE_CHECKING:
-    from pctt.contact_map.assembled import ScaledRows
-    from pctt.contact_map.free import FreeMap
 
 
 class ScaledProblem:
@@ -29,7 +24,7 @@ class ScaledProblem:
     With ``coulomb`` it is Coulomb's law, in the same variables: x is a solution if the projected step from x along the
     gradient *with its opening* (mu |y_t|, 0, 0) leads back to x. The natural residual measures how far it leads away.
 
-    In single ``precision`` products move half of the bytes. A problem whose map needs no matrix can have it.
+    In single ``precision`` products with a contact map move half of the bytes.
     """
 
     def __init__(self, problem: ConeProblem, coulomb: bool = False, precision: type[np.floating] = np.float64):
@@ -43,11 +38,7 @@ class ScaledProblem:
         self.mu = self._rounded(problem.mu * self._scale[:, 1] / self._scale[:, 0])
         self.b = self._rounded(problem.r * self._shrink)
         self._compliance = self._rounded(problem.compliance * self._shrink**2)
-        self._map: FreeMap | ScaledRows | None = None
-        if problem.free_map is not None:
-            self._map = problem.free_map.scaled(self._shrink, precision)
-        elif problem.contact_map is not None:
-            self._map = problem.contact_map.scaled(self._shrink)
+        self._operator = problem.operator.scaled(self._shrink, precision)
 
     def _rounded(self, x: Array) -> Array:
         return x.astype(self.precision, copy=False)
@@ -61,21 +52,19 @@ class ScaledProblem:
 
     def product(self, x: Array, out: Array | None = None) -> Array:
         """A x (nc, 3)."""
-        if self._map is None:
-            return np.multiply(self.problem.product(x * self._shrink), self._shrink, out=out)
         out = np.multiply(self._compliance, x, out=out)
-        self._map.add_delassus(x, out)
+        self._operator.add_delassus(x, out)
         return out
 
     def gradient(self, x: Array, out: Array | None = None) -> Array:
         """A x + b (nc, 3)."""
-        if self._map is None or self.problem.softness:
+        if self.problem.softness:
             out = self.product(x, out)
             out += self.b
             return out
         out = np.empty_like(x) if out is None else out
         out[:] = self.b
-        self._map.add_delassus(x, out)
+        self._operator.add_delassus(x, out)
         return out
 
     def project(self, x: Array) -> Array:

@@ -4,8 +4,6 @@ The product x o y = (x'y, x_0 y_1: + y_0 x_1:) has the unit e = (1, 0, 0); x has
 Nesterov-Todd scaling of a pair (s, z) inside the cones is the symmetric W with W z = W^-1 s, of which W^2 and W^-2
 have the eigenvectors (1, u), (1, -u) and (0, u'), u the direction of the scaling point.
 
-Functions marked ``compiled`` have a twin in ``lorentz_loops``.
-
 Source: Nesterov and Todd (1997); Andersen, Roos and Terlaky (2003); Domahidi, Chu and Boyd (2013).
 """
 
@@ -16,21 +14,32 @@ from dataclasses import dataclass
 import numpy as np
 
 from pctt.ccp.cone import TINY, Array, dot, tangential
-from pctt.compiled import compiled
+from pctt.compiled import inlined, loop
 
 LEAST = 1e-17  # determinant of a unit point that rounding has put on or outside the boundary
 ROUND = 1e-14  # tangential part of a unit scaling point below which it has no direction
 
 
+@loop
 def determinant(x: Array) -> Array:
     """x_0^2 - |x_1:|^2 (nc,) of points inside, kept positive in spite of rounding.
 
     Near the boundary rounding is at most 1.5 eps x_0^2: the first difference is exact, and neither the product nor the
     square is larger than x_0^2 / 2."""
-    one, two = np.abs(x[:, 1]), np.abs(x[:, 2])
-    large, small = np.maximum(one, two), np.minimum(one, two)
-    found = (x[:, 0] - large) * (x[:, 0] + large) - small * small
-    return np.maximum(found, np.maximum(LEAST * x[:, 0] ** 2, TINY))
+    out = np.empty(len(x))
+    for c in range(len(x)):
+        out[c] = _determinant(x[c, 0], x[c, 1], x[c, 2])
+    return out
+
+
+@inlined
+def _determinant(x_0, x_1, x_2):
+    small, large = abs(x_1), abs(x_2)
+    if small > large:
+        small, large = large, small
+    found = (x_0 - large) * (x_0 + large) - small * small
+    least = max(LEAST * x_0 * x_0, TINY)
+    return least if found < least else found
 
 
 def product(x: Array, y: Array) -> Array:
@@ -51,18 +60,26 @@ def divide(x: Array, y: Array) -> Array:
     return out
 
 
-@compiled
+@loop
 def step_to_boundary(x: Array, dx: Array) -> float:
     """Largest a such that x + a dx is in the cones of this rank (inf where nothing limits it); x is inside.
 
     By the smallest spectral value of dx seen from x (Vandenberghe, "The CVXOPT linear and quadratic cone program
     solvers", 2010).
     """
-    size = np.sqrt(determinant(x))
-    inner = (x[:, 0] * dx[:, 0] - x[:, 1] * dx[:, 1] - x[:, 2] * dx[:, 2]) / size
-    along = (inner + dx[:, 0]) / (x[:, 0] + size)
-    turned_1, turned_2 = (dx[:, k] - along * x[:, k] for k in (1, 2))
-    fastest = ((np.sqrt(turned_1 * turned_1 + turned_2 * turned_2) - inner) / size).max(initial=0.0)
+    fastest = 0.0
+    for c in range(len(x)):
+        x_0, x_1, x_2 = x[c, 0], x[c, 1], x[c, 2]
+        dx_0, dx_1, dx_2 = dx[c, 0], dx[c, 1], dx[c, 2]
+        size = np.sqrt(_determinant(x_0, x_1, x_2))
+        inner = (x_0 * dx_0 - x_1 * dx_1 - x_2 * dx_2) / size
+        along = (inner + dx_0) / (x_0 + size)
+        turned_1, turned_2 = dx_1 - along * x_1, dx_2 - along * x_2
+        speed = (np.sqrt(turned_1 * turned_1 + turned_2 * turned_2) - inner) / size
+        if not speed <= fastest:
+            fastest = speed
+            if speed != speed:  # no other is larger
+                break
     return 1.0 / fastest if fastest > 0 else np.inf
 
 
@@ -91,55 +108,64 @@ def central_pair(x: Array, tau: Array, complementarity: Array | float) -> tuple[
     return s, z
 
 
-@compiled
+@loop
 def scale(root: Array, eta: Array, x: Array) -> Array:
     """W x."""
-    twice = 2.0 * dot(root, x)
     out = np.empty_like(x)
-    out[:, 0] = eta * (twice * root[:, 0] - x[:, 0])
-    for k in (1, 2):
-        out[:, k] = eta * (twice * root[:, k] + x[:, k])
+    for c in range(len(x)):
+        twice = 2.0 * (root[c, 0] * x[c, 0] + root[c, 1] * x[c, 1] + root[c, 2] * x[c, 2])
+        out[c, 0] = eta[c] * (twice * root[c, 0] - x[c, 0])
+        out[c, 1] = eta[c] * (twice * root[c, 1] + x[c, 1])
+        out[c, 2] = eta[c] * (twice * root[c, 2] + x[c, 2])
     return out
 
 
-@compiled
+@loop
 def unscale(root: Array, eta: Array, x: Array) -> Array:
     """W^-1 x."""
-    twice = 2.0 * (root[:, 0] * x[:, 0] - root[:, 1] * x[:, 1] - root[:, 2] * x[:, 2])
     out = np.empty_like(x)
-    out[:, 0] = (twice * root[:, 0] - x[:, 0]) / eta
-    for k in (1, 2):
-        out[:, k] = (x[:, k] - twice * root[:, k]) / eta
+    for c in range(len(x)):
+        twice = 2.0 * (root[c, 0] * x[c, 0] - root[c, 1] * x[c, 1] - root[c, 2] * x[c, 2])
+        out[c, 0] = (twice * root[c, 0] - x[c, 0]) / eta[c]
+        out[c, 1] = (x[c, 1] - twice * root[c, 1]) / eta[c]
+        out[c, 2] = (x[c, 2] - twice * root[c, 2]) / eta[c]
     return out
 
 
-@compiled
+@loop
 def barrier_blocks(
     direction: Array, eta: Array, spread: Array, scale: Array, compliance: Array, proximal: float
 ) -> tuple[Array, Array, Array]:
     """What the method of ``NesterovTodd`` returns."""
-    square = eta * eta
-    squares = square * spread**2, square / spread**2, square
-    both = scale[:, :, None] * scale[:, None, :]
-    B = _blocks(direction, *(1.0 / k + proximal for k in squares))
-    B *= both
-    inverse = _blocks(direction, *(k / (1.0 + compliance * k) for k in squares))
-    inverse /= both
-    return B, inverse, _blocks(direction, *(1.0 / (1.0 + compliance * k) for k in squares))
+    count = len(eta)
+    B, inverse, share = np.empty((count, 3, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3))
+    for c in range(count):
+        square = eta[c] * eta[c]
+        along, against = square * (spread[c] * spread[c]), square / (spread[c] * spread[c])
+        u, v = direction[c, 0], direction[c, 1]
+        _block(u, v, 1.0 / along + proximal, 1.0 / against + proximal, 1.0 / square + proximal, B[c])
+        e = compliance[c]
+        shares = 1.0 / (1.0 + e * along), 1.0 / (1.0 + e * against), 1.0 / (1.0 + e * square)
+        _block(u, v, along * shares[0], against * shares[1], square * shares[2], inverse[c])
+        _block(u, v, shares[0], shares[1], shares[2], share[c])
+        for i in range(3):
+            for j in range(3):
+                both = scale[c, i] * scale[c, j]
+                B[c, i, j] *= both
+                inverse[c, i, j] /= both
+    return B, inverse, share
 
 
-def _blocks(direction: Array, along: Array, against: Array, across: Array) -> Array:
-    """Symmetric blocks (nc, 3, 3) with given eigenvalues for (1, u), (1, -u), (0, u')."""
-    u, v = direction.T
+@inlined
+def _block(u, v, along, against, across, out):
+    """A symmetric block (3, 3) with given eigenvalues for (1, u), (1, -u), (0, u')."""
     mean, half = 0.5 * (along + against), 0.5 * (along - against)
-    out = np.empty((len(mean), 3, 3))
-    out[:, 0, 0] = mean
-    out[:, 0, 1] = out[:, 1, 0] = half * u
-    out[:, 0, 2] = out[:, 2, 0] = half * v
-    out[:, 1, 1] = mean * u * u + across * v * v
-    out[:, 2, 2] = mean * v * v + across * u * u
-    out[:, 1, 2] = out[:, 2, 1] = (mean - across) * u * v
-    return out
+    out[0, 0] = mean
+    out[0, 1] = out[1, 0] = half * u
+    out[0, 2] = out[2, 0] = half * v
+    out[1, 1] = mean * u * u + across * v * v
+    out[2, 2] = mean * v * v + across * u * u
+    out[1, 2] = out[2, 1] = (mean - across) * u * v
 
 
 def towards_interval(x: Array, low: float, high: float) -> Array:

@@ -80,7 +80,7 @@ class Newton:
         """Continue this problem in the form that rounding hurts least, `kkt`. False if it has that form already, or is
         too large for it. Body systems of rigid contacts lose a natural residual of 1e-8: (B + C)^-1 grows like its
         inverse."""
-        if self._present == "kkt" or self.problem.size > SHARP_LIMIT or self.problem.low_rank is not None:
+        if self._present == "kkt" or self.problem.size > SHARP_LIMIT or self.problem.has_hubs:
             return False
         self._take("kkt")
         self._structure = None

@@ -31,7 +31,7 @@ class KKTForm:
     definite = False
 
     def __init__(self, problem: ConeProblem):
-        if problem.low_rank is not None:
+        if problem.has_hubs:
             raise OptionError("-ccp_newton kkt: a body has too many contacts; allowed are contact and body")
         self.problem = problem
         small = rows_in_blocks(problem.N)

@@ -48,7 +48,7 @@ class GaussSeidel(FirstOrder):
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: GaussSeidel) -> Result:
     """Impulses from a first guess (nc, 3)."""
-    if problem.low_rank is not None:
+    if problem.has_hubs:
         raise OptionError(
             f"-ccp_type gauss_seidel: a body has more than {HUB} contacts, whose rows of N would be full; "
             "allowed are the others"

@@ -15,23 +15,22 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import Array, BlockRows, diagonal_blocks
+from pctt.blocks import Array, BlockRows, diagonal_blocks, shaped
 from pctt.contact_map import block_loops, compact_loops
 from pctt.contact_map.ghosts import Ghosts
-from pctt.contact_map.rows import CompactRows, block_rows, packed, root_blocks
+from pctt.contact_map.rows import CompactRows, block_rows, checked, packed, root_blocks
 
 
-class FreeMap:
+class ContactMap:
     """The contact map G of all ranks.
 
     Impulses and velocities of contacts are arrays (nc, 3), mass-scaled velocities of bodies are arrays (columns, 6).
-    Flat arrays are allowed too. All products are collective.
+    Flat arrays are allowed too; a ValueError for other shapes comes on this rank alone. All products are collective.
 
-    given : the rows, `CompactRows` or `BlockRows`
+    given : the rows, `CompactRows` or `BlockRows`; ValueError on all ranks for wrong ones
+    ghosts : those of another map between the same bodies, whose rows need no check
     precision : of the arrays that products take and return; single precision moves half of the bytes
     """
-
-    free = True  # it needs no matrix
 
     def __init__(
         self,
@@ -40,6 +39,7 @@ class FreeMap:
         ghosts: Ghosts | None = None,
         precision: type[np.floating] = np.float64,
     ):
+        given = checked(comm, given) if ghosts is None else given
         self.comm, self.given, self.precision = comm, given, precision
         self.rows, self.columns = given.rows, given.columns
         if isinstance(given, CompactRows):
@@ -88,34 +88,24 @@ class FreeMap:
     def velocities(self, v: Array) -> Array:
         """G v (nc, 3)."""
         y = np.zeros((self.rows, 3), self.precision)
-        self._enter(self._root, v.reshape(-1, 6))
+        self._enter(self._root, shaped("velocities of bodies", v, self.columns, 6))
         self._add_velocities(y)
         PETSc.Log.logFlops(self._flops["single"])
         return y
 
     def momenta(self, g: Array) -> Array:
         """G' g (columns, 6)."""
-        self._collect(g.reshape(-1, 3))
+        self._collect(g)
         PETSc.Log.logFlops(self._flops["single"])
         return self._left(self._root)
 
     def add_delassus(self, g: Array, y: Array) -> None:
         """y += G G' g; y (nc, 3) is C-contiguous."""
-        self._collect(g.reshape(-1, 3))
+        y = shaped("velocities of contacts", y, self.rows, 3)
+        self._collect(g)
         self._enter(self._mass, self._m)
         self._add_velocities(y)
         PETSc.Log.logFlops(2 * self._flops["single"])
-
-    def pack(self, H: Array) -> Array:
-        """Symmetric blocks H (nc, 3, 3) in the format (nc, 6) of `local_product`."""
-        weight = np.empty((self.rows, 6), self.precision)
-        block_loops.pack(self._floats(H), weight)
-        return weight
-
-    def local_product(self, weight: Array, g: Array, y: Array) -> None:
-        """y = H g (nc, 3)."""
-        block_loops.local_product(weight, g, y)
-        PETSc.Log.logFlops(15 * self.rows)
 
     def weights(self, H: Array, symmetric: bool = True) -> Array:
         """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""
@@ -156,7 +146,7 @@ class FreeMap:
 
     def _collect(self, g: Array) -> None:
         """Collect the momenta that the impulses give to the bodies, not yet scaled by masses."""
-        g = self._floats(g)
+        g = self._floats(shaped("impulses", g, self.rows, 3))
         self._m[:] = 0.0
         self._away.add_momenta(g, self._m)
         self._ghosts.begin_add(self._m)
@@ -202,14 +192,20 @@ class FreeMap:
         own[:, range(6), range(6)] += 1.0
         return own
 
-    def scaled(self, size: Array, precision: type[np.floating] = np.float64) -> FreeMap:
+    def scaled(self, size: Array, precision: type[np.floating] = np.float64) -> ContactMap:
         """The map with its rows multiplied by ``size`` (nc, 3); it is valid until this map is destroyed."""
         if isinstance(self.given, CompactRows):
             frame = (self.given.frame.reshape(-1, 3, 3) * size[:, :, None]).reshape(-1, 9)
-            return FreeMap(self.comm, dataclasses.replace(self.given, frame=frame), self._ghosts, precision)
+            return ContactMap(self.comm, dataclasses.replace(self.given, frame=frame), self._ghosts, precision)
         each = np.repeat(size, np.diff(self.given.indptr), axis=0)
         given = dataclasses.replace(self.given, blocks=self.given.blocks * each[:, :, None])
-        return FreeMap(self.comm, given, self._ghosts, precision)
+        return ContactMap(self.comm, given, self._ghosts, precision)
+
+    def structure(self) -> tuple[np.ndarray, ...]:
+        """Arrays that are equal where contacts and their bodies are."""
+        given = self.given
+        graph = (given.body,) if isinstance(given, CompactRows) else (given.indptr, given.indices)
+        return (*graph, np.array([self.columns]))
 
     @cached_property
     def block_rows(self) -> BlockRows:
@@ -232,7 +228,7 @@ class Contacts:
     arrays: tuple[np.ndarray, ...]
 
     @classmethod
-    def of(cls, whole: FreeMap, first: int, last: int) -> Contacts:
+    def of(cls, whole: ContactMap, first: int, last: int) -> Contacts:
         return cls(whole._loops, slice(first, last), whole._cut(first, last))
 
     def add_velocities(self, w: Array, y: Array) -> None:
