@@ -140,7 +140,6 @@ def _settle(
     given = how.settings
     loose = Settings(
         given.dt, how.delta, "apgd", how.tol, coulomb=False, recovery_speed=given.recovery_speed,
-        operator=given.operator,
     ).of(how.experiment)  # fmt: skip
     end = how.steps
     tenth = max(1, end // 10)
