@@ -73,7 +73,7 @@ def in_process(n: int, eps: float, limit: float) -> dict[str, Any]:
         return {"note": f"not finished after {limit:g} s"}
     if done.returncode:
         return {"note": (done.stderr.strip().splitlines() or ["failed"])[-1]}
-    return json.loads(done.stdout.splitlines()[-1])
+    return json.loads(next(line for line in done.stdout.splitlines() if line.startswith("{")))  # PETSc may add words
 
 
 def hmat_program(folder: Path) -> Path | None:
