@@ -224,7 +224,7 @@ class TensorTrain(PythonPC):
         reason, rank = ksp.getConvergedReason(), self.rank
         spoilt = rank > 1 and reason in SPOILT and self.symmetric  # otherwise it may have been a transpose solve
         if spoilt:
-            what = f"{ksp.getType()} broke down ({reason}) at rank {rank}"
+            what = f"{ksp.getType()} broke down ({reason}) with {self._used_words()}"
             again = self.options.fallback == "jacobi"
             self.account.fall_back(f"{what}, solved again with block Jacobi" if again else what)
             if not self.options.automatic or isinstance(self.made, EntriesTrain):
@@ -236,11 +236,13 @@ class TensorTrain(PythonPC):
         reference = b.norm()
         if reference == 0 or ksp.getIterationNumber() == 0:
             return
-        true = self.comm.bcast(residual_norm(pc.getOperators()[0], b, x) / reference)
+        digits = 0.0
+        if self.policy.automatic:  # else nobody asks, and the product would be for nothing
+            true = self.comm.bcast(residual_norm(pc.getOperators()[0], b, x) / reference)
+            digits = -np.log10(max(true, 1e-16)) if np.isfinite(true) else 0.0
         stalled = ksp.getConvergedReason() < 0 and ksp.getType() not in ("preonly", "richardson")
-        digits = -np.log10(max(true, 1e-16)) if np.isfinite(true) else 0.0
         if stalled and rank > 1 and not spoilt:
-            self.account.fall_back(f"{ksp.getType()} stalled at rank {rank}")
+            self.account.fall_back(f"{ksp.getType()} stalled with {self._used_words()}")
         sound = not (spoilt or stalled)
         if not sound and self.made.distrust():  # it was a train of an earlier matrix; a new train may work
             sound = True
@@ -283,9 +285,11 @@ class TensorTrain(PythonPC):
         lines += [] if self.symmetric else [NOT_SYMMETRIC]
         lines += [f"fell back: {why} ({count} times)" for why, count in a.fallbacks.items()]
         if isinstance(self.made, SparseTrain):
+            lines.append(f"scaling {self.options.scaling}")
+        if self.policy.automatic:
             figures = self.policy.figures.items()
             costs = ", ".join(f"rank {r}: {f.cost:.2e} s ({f.uses} uses)" for r, f in figures if f.uses)
-            lines.append(f"scaling {self.options.scaling}, seconds per digit: {costs or 'none measured yet'}")
+            lines.append(f"seconds per digit: {costs or 'none measured yet'}")
         return lines
 
     def what(self) -> str:
@@ -296,6 +300,10 @@ class TensorTrain(PythonPC):
         if self.rank > 1 and self.made.inverse is not None:
             return max(self.made.inverse.applied.ranks)
         return "rank 1: block Jacobi" if self.rank == 1 else self._base()
+
+    def _used_words(self) -> str:
+        used = self._used()
+        return f"rank {used}" if isinstance(used, int) else used
 
     def _line(self) -> str:
         if self.failed:
