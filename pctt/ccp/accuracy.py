@@ -68,11 +68,19 @@ def measure(problem: ConeProblem, g: Array) -> Accuracy:
         cone_violation=max(0.0, problem.max((tangential - problem.mu * g[:, 0]).max(initial=0.0))),
         dual_violation=max(0.0, problem.max((problem.mu * sliding - y[:, 0]).max(initial=0.0))),
         complementarity=problem.max(np.abs(dot(g, y)).max(initial=0.0)),
-        closing_work=closing / energy if energy > 0 else 0.0,
-        opening_work=opening / energy if energy > 0 else 0.0,
+        closing_work=_part(closing, energy),
+        opening_work=_part(opening, energy),
         impulse_norm=norm,
         velocity_norm=problem.norm(y),
     )
+
+
+def _part(work: float, energy: float) -> float:
+    """work / energy; 0 without impulses, inf if it is no number."""
+    if energy <= 0:
+        return 0.0
+    part = work / energy
+    return part if part == part else np.inf
 
 
 def _residual(problem: ConeProblem, g: Array, y: Array) -> float:

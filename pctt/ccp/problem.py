@@ -113,7 +113,7 @@ class ConeProblem:
         max(g.y, 0) over the contacts; velocities y = N g + r. 0 without impulses, inf if it is no number."""
         closing, opening = g[:, 0] @ np.maximum(-y[:, 0], 0.0), np.maximum(dot(g, y), 0.0).sum()
         closing, opening, energy = self.sum(np.array([closing, opening, 0.5 * np.vdot(g, y - self.r)]))
-        work = float(np.maximum(closing, opening) / energy) if energy > 0 else 0.0
+        work = 0.0 if energy <= 0 else float(np.maximum(closing, opening) / energy)
         return work if work == work else np.inf
 
     @cached_property

@@ -43,6 +43,14 @@ def test_two_contacts_worked_out_by_hand():
     assert figures.velocity_norm == pytest.approx(np.sqrt(1 + 1.5**2 + 3.7**2 + 0.4**2))
 
 
+def test_impulses_that_are_no_numbers_have_no_small_figures():
+    three = problem(2 * np.ones(9), np.zeros((3, 3)), [0.5, 0.5, 0])
+    g = np.full((3, 3), np.nan)
+    figures = ccp.measure(three, g)
+    assert figures.closing_work == figures.opening_work == np.inf
+    assert three.wrong_work(g, three.product(g)) == np.inf
+
+
 def test_the_closing_work_of_three_contacts_worked_out_by_hand():
     """N = 2, so 1/2 g'Ng = 1 + 4 + 9; y_n = 2 g_n + r_n = -0.5, 0.3 and -0.2."""
     three = problem(2 * np.ones(9), [[-2.5, 0, 0], [-3.7, 0, 0], [-6.2, 0, 0]], [0.5, 0.5, 0])
