@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import sys
 import traceback
+import warnings
 
 import petsc4py
 
@@ -103,4 +104,6 @@ def run() -> int:
 
 
 if __name__ == "__main__":
+    # a line of the user's program would be one of ours here
+    warnings.formatwarning = lambda message, *_: f"WARNING: {message}\n"
     sys.exit(run())
