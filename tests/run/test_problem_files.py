@@ -41,11 +41,9 @@ def test_the_problem_of_a_step_is_written_and_solved_again(program, settled, tmp
     first, second, third = steps_of(tmp_path / "results")
     assert second["dumped"] == []
     names = {f"problems/step{line['step']:06d}_{line['contacts']}contacts" for line in (first, third)}
-    assert {name for line in (first, third) for name in line["dumped"]} == {
-        name + ".h5" for name in names
-    }
+    assert {name for line in (first, third) for name in line["dumped"]} == {f"{name}.h5" for name in names}
     assert {str(path.relative_to(tmp_path)) for path in (tmp_path / "problems").iterdir()} == {
-        name + ".h5" for name in names
+        f"{name}.h5" for name in names
     }
     done = program("-problem", *third["dumped"], *TOL, "-output", "again", "-overwrite")  # from the file's guess
     again = summary(tmp_path / "again")
@@ -167,7 +165,7 @@ def test_a_file_of_another_format_is_refused_with_the_name_of_the_converter(prog
         "pctt.run: two.dat: no FCLIB problem: it is not HDF5; run/study convert_problems makes FCLIB files of Siconos' "
         "text and of PETSc's binary files\n"
     )
-    assert not (tmp_path / "results").exists()
+    assert not list((tmp_path / "results").glob("*"))
 
 
 def test_a_step_that_the_run_does_not_make_is_refused(program, settled, tmp_path):
