@@ -12,7 +12,7 @@ A guided body has only the part of D along its guide. Nothing turns it, so its m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
 from pctt.blocks import BlockRows, block_csr_matrix, block_matrix
-from pctt.ccp import fclib, petsc_binary
+from pctt.ccp import fclib
 from pctt.ccp.cone import Array
 from pctt.exchange import offsets
 from pctt.options import OptionError
@@ -60,26 +60,25 @@ class Dump:
         hard = not asked.converged and self._hard_left > 0
         files: dict[str, Any] = {"dumped": [], "hard_problem": ""}
 
-        def as_fclib(path: Path) -> None:
-            self._write_fclib(path, system, problem, guess, result, asked)
+        def write(path: Path) -> None:
+            try:
+                self._write(path, system, problem, guess, result, asked)
+            except OSError as error:  # raised on all ranks alike
+                raise FileError(str(error)) from None
 
         if problem.size and wanted:
             path = Path(self._folder) / f"step{number:06d}_{problem.size}contacts.h5"
-            binary = path.with_suffix(".petsc")
-            _write(path, as_fclib)
+            write(path)
             files["dumped"] = [str(path)]
-            if not problem.has_hubs:  # else N is no sparse matrix
-                _write(binary, lambda path: petsc_binary.write(path, problem))
-                files["dumped"].append(str(binary))
         if problem.size and hard:
             self._hard_left -= 1
             name = f"step{number:06d}_{problem.size}contacts_{asked.iterations}its.h5"
             self._place.make(HARD)
-            _write(self._place.now / HARD / name, as_fclib)
+            write(self._place.now / HARD / name)
             files["hard_problem"] = str(self._place.folder / HARD / name)
         return files
 
-    def _write_fclib(
+    def _write(
         self,
         path: Path,
         system: ContactSystem,
@@ -125,14 +124,6 @@ class Dump:
             else "Solution and guess are those of the convex cone problem, min 1/2 r'Wr + q'r over the friction cones "
             "(no mu |u_t| in the normal velocity). W is positive semidefinite; r need not be unique, u is.",
         )
-
-
-def _write(path: Path, write: Callable[[Path], None]) -> None:
-    """Let ``write`` make a file; collective. FileError if that fails."""
-    try:
-        write(path)
-    except OSError as error:  # raised on all ranks alike
-        raise FileError(str(error)) from None
 
 
 def _mass(world: World) -> tuple[np.ndarray, PETSc.Mat]:

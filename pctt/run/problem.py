@@ -1,4 +1,4 @@
-"""Solve the cone problem of an FCLIB, PETSc binary or Siconos file: ``python -m pctt.run -problem FILE``."""
+"""Solve the cone problem of an FCLIB file: ``python -m pctt.run -problem FILE``."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 from mpi4py import MPI
 
 from pctt import ccp, figures_json, log
-from pctt.ccp import files
+from pctt.ccp import fclib
 from pctt.ccp.cone import Array
-from pctt.ccp.stored import FileFormatError, Stored
+from pctt.ccp.fclib import FileFormatError, Stored
 from pctt.run import leftovers
 from pctt.run.hdf5 import FileError, write_text
 from pctt.run.place import Place
@@ -110,7 +110,7 @@ def _load(path: str, comm: MPI.Comm, compliance: float | None) -> Stored:
     """The problem in a file, with another compliance if one is given. FileError on all ranks if the file holds no
     problem."""
     try:
-        return files.load(path, comm, compliance)
+        return fclib.load(path, comm, compliance)
     except FileFormatError as error:
         raise FileError(str(error)) from None
 

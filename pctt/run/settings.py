@@ -82,9 +82,9 @@ class Run:
     )
     output_every: int = option(1, "steps between two records in state.h5; 0: none", check=COUNT)
     checkpoint_every: int = option(1, "steps between two checkpoints", check=AT_LEAST_ONE)
-    problem: str = option("", "FCLIB, PETSc binary or Siconos file with a cone problem to solve instead of a scene")
+    problem: str = option("", "FCLIB file with a cone problem to solve instead of a scene")
     problem_guess: bool = option(True, "start -problem from the guess in the file, if there is one")
-    dump_problem: str = option("", "folder for the steps' cone problems as FCLIB and PETSc binary files")
+    dump_problem: str = option("", "folder for the steps' cone problems as FCLIB files")
     dump_steps: str = option("", "steps that -dump_problem writes, with commas between; none: every step")
     dump_hard: int = option(
         5, "how many cone problems that -ccp_type does not solve are written to the folder hard of -output", check=COUNT

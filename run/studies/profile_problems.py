@@ -1,8 +1,8 @@
-"""All problems in folders of files (docs/files.md) by all solvers: run/study profile_problems DIR [DIR ...] [SOLVER
-...] [options]; --help lists the options. Seconds to 1e-4, 1e-6 and 1e-8 of the convex problem and of Coulomb's
+"""All problems in folders of FCLIB files (docs/files.md) by all solvers: run/study profile_problems DIR [DIR ...]
+[SOLVER ...] [options]; --help lists the options. Seconds to 1e-4, 1e-6 and 1e-8 of the convex problem and of Coulomb's
 law, performance profiles, failures counted. Peers (Siconos, Clarabel) are in it where they are installed: apt-get
 install python3-siconos, .venv/bin/pip install -e '.[peers]'. Writes results/profile.json, results/profile.md and
-results/profile.png.
+results/profile.png. Siconos' text (.dat) and PETSc's binary files (.petsc) are converted first, in a temporary folder.
 
 A solver works on a problem in a process of its own, cold and on one core, to one tolerance after the other. A
 tolerance counts as reached where `pctt.ccp.measure`, which shares no code with any solver, finds the natural
@@ -16,21 +16,24 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import solve_one
+from convert_problems import convert
 from measure import figure, record, say_machine
 from mpi4py import MPI
 from peers import PEERS
 
 from pctt import ccp
-from pctt.ccp import files
-from pctt.ccp.stored import FileFormatError
+from pctt.ccp import fclib
+from pctt.ccp.fclib import FileFormatError
 
-SUFFIXES = (".dat", ".hdf5", ".h5", ".petsc")
+CONVERTED = (".dat", ".petsc")
+SUFFIXES = (*CONVERTED, ".hdf5", ".h5")
 TOLERANCES = (1e-4, 1e-6, 1e-8)
 ROUNDING = 1.01  # of a residual that another formula finds
 AGAIN, TIMES = 2.0, 5  # seconds up to which a solve is repeated, and how often at most
@@ -114,13 +117,15 @@ def run(path: Path, law: str, solver: str, seconds: float) -> Rows:
     return rows + [{"tol": tol, **missing} for tol in TOLERANCES[len(rows) :]]
 
 
-def problems(folders: list[Path]) -> tuple[list[tuple[Path, int]], list[str]]:
-    """The files of these folders that are problems, with their contacts, and what is wrong with the others."""
+def problems(folders: list[Path], converted: Path) -> tuple[list[tuple[str, Path, int]], list[str]]:
+    """The problems of these folders, each with its file's name, the FCLIB file of it, which may be one in
+    ``converted``, and its contacts; and what is wrong with the other files."""
     found, refused = [], []
-    for path in sorted(path for folder in folders for path in folder.iterdir() if path.suffix in SUFFIXES):
+    for k, path in enumerate(sorted(p for folder in folders for p in folder.iterdir() if p.suffix in SUFFIXES)):
         try:
-            with files.load(path, MPI.COMM_SELF).problem as problem:
-                found.append((path, problem.size))
+            as_fclib = convert(path, converted / str(k))[0] if path.suffix in CONVERTED else path
+            with fclib.read(as_fclib, MPI.COMM_SELF) as problem:
+                found.append((path.name, as_fclib, problem.size))
         except FileFormatError as error:  # noqa: PERF203 - as many files as a folder has
             refused.append(str(error))
     return found, refused
@@ -235,7 +240,16 @@ def read_words() -> tuple[list[Path], dict[str, list[str]], float]:
 
 def main() -> None:
     folders, solvers, seconds = read_words()
-    found, refused = problems(folders)
+    with tempfile.TemporaryDirectory() as converted:
+        rows = solve_all(*problems(folders, Path(converted)), folders, solvers, seconds)
+    show(rows)
+
+
+def solve_all(
+    found: list[tuple[str, Path, int]], refused: list[str], folders: list[Path], solvers: dict[str, list[str]],
+    seconds: float,
+) -> Rows:  # fmt: skip
+    """The rows of all solves, which are recorded as they come."""
     for error in refused:
         print(f"left out: {error}")
     if not found:
@@ -244,17 +258,17 @@ def main() -> None:
     about = say_machine() | {"limit": seconds, "refused": refused}
     rows: Rows = []
     for law, names in solvers.items():
-        for path, contacts in found:
-            print(f"\n{path.name}, {contacts} contacts, {LAWS[law]}; limit {seconds:g} s\n{'':18}"
+        for name, path, contacts in found:
+            print(f"\n{name}, {contacts} contacts, {LAWS[law]}; limit {seconds:g} s\n{'':18}"
                   + "".join(f"{tol:>10.0e}" for tol in TOLERANCES), flush=True)  # fmt: skip
             for solver in names:
                 mine = run(path, law, solver, seconds)
-                case = {"law": law, "problem": path.name, "contacts": contacts, "method": solver}
+                case = {"law": law, "problem": name, "contacts": contacts, "method": solver}
                 rows += [case | row for row in mine]
                 print(f"{solver:18}{''.join(f'{_seconds(row):>10}' for row in mine)}"
                       f"{'' if mine[-1]['reached'] else '  ' + mine[-1]['reason']}", flush=True)  # fmt: skip
             record("profile", about, rows)
-    show(rows)
+    return rows
 
 
 def show(rows: Rows) -> None:

@@ -18,7 +18,7 @@ from measure import Counter
 from mpi4py import MPI
 
 from pctt import ccp
-from pctt.ccp import files
+from pctt.ccp import fclib
 
 
 class OutOfTimeError(Exception):
@@ -78,9 +78,9 @@ def write(path: Path, problem: ccp.ConeProblem) -> None:
 
 
 def read(path: str) -> ccp.ConeProblem:
-    """The problem in a file of `write`, or in any format of `pctt.ccp.files`."""
+    """The problem in a file of `write`, or in an FCLIB file."""
     if not path.endswith(".npz"):
-        return files.load(path, MPI.COMM_SELF).problem
+        return fclib.read(path, MPI.COMM_SELF)
     with np.load(path) as file:
         G = ccp.CompactRows(*(file[name] for name in ("frame", "arm", "body", "root")), int(file["columns"]))
         rest = {"point": file["point"], "compliance": float(file["compliance"])}

@@ -1,4 +1,4 @@
-"""Cone problems in files: FCLIB, read and written, broken files, three published problems; PETSc binary files."""
+"""Cone problems in files: FCLIB, read and written, broken files, three published problems."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from problems import SELF, Known, dense_of, from_graph, from_matrix, heap, part
 
 from pctt import blocks, ccp
-from pctt.ccp import ConeProblem, Limits, fclib, petsc_binary
+from pctt.ccp import ConeProblem, Limits, fclib
 from pctt.ccp.fclib import FileFormatError, Info, Solution
 from pctt.options import OptionError
 
@@ -417,16 +417,15 @@ def test_a_solution_of_another_size_is_refused(tmp_path):
         fclib.read(path, SELF)
 
 
-@pytest.mark.parametrize("write", [fclib.write_local, petsc_binary.write], ids=["FCLIB", "PETSc"])
-def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path, write):
+def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path):
     problem = from_matrix(heap(0, 12, 8)[0])
     with pytest.raises(OSError, match=r"nowhere/local\.h5: cannot write"):
-        write(tmp_path / "nowhere" / "local.h5", problem)
+        fclib.write_local(tmp_path / "nowhere" / "local.h5", problem)
     path = tmp_path / "there.h5"
     path.write_text("old")
     (tmp_path / ".there.h5.tmp").mkdir()  # in the way
     with pytest.raises(OSError, match=r"there\.h5: cannot write"):
-        write(path, problem)
+        fclib.write_local(path, problem)
     assert path.read_text() == "old"
 
 
@@ -456,11 +455,10 @@ def test_a_global_problem_with_a_crowded_body_is_the_same_when_read_again(tmp_pa
     np.testing.assert_allclose(again.diagonal_blocks, problem.diagonal_blocks, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("write", [fclib.write_local, petsc_binary.write], ids=["FCLIB", "PETSc"])
-def test_a_crowded_body_is_refused_where_it_would_fill_the_matrix(tmp_path, crowded, write):
+def test_a_crowded_body_is_refused_where_it_would_fill_the_matrix(tmp_path, crowded):
     """N without its low-rank term would be another problem."""
     with pytest.raises(ValueError, match="would fill N; allowed is"):
-        write(tmp_path / "file", crowded[0])
+        fclib.write_local(tmp_path / "file", crowded[0])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -469,42 +467,7 @@ def test_gauss_seidel_refuses_a_crowded_body(crowded):
         ccp.solve(crowded[0], type="gauss_seidel")
 
 
-# -- PETSc binary files ------------------------------------------------------------------------------------
-
-
-def test_a_petsc_file_is_written_loaded_by_petsc_and_read_again(tmp_path):
-    known, graph = heap(0, 12, 8)
-    path = tmp_path / "problem.petsc"
-    petsc_binary.write(path, from_graph(known, graph))
-    assert [file.name for file in tmp_path.iterdir()] == ["problem.petsc"]
-    assert petsc_binary.is_one(path)
-    assert not petsc_binary.is_one(write_local(tmp_path / "local.hdf5", known))
-    viewer = PETSc.Viewer().createBinary(str(path), "r", comm=PETSc.COMM_SELF)
-    N = PETSc.Mat().create(PETSc.COMM_SELF).load(viewer)
-    r, mu = (PETSc.Vec().create(PETSc.COMM_SELF).load(viewer) for _ in range(2))
-    assert np.allclose(dense_of(N), known.N, atol=1e-14 * np.abs(known.N).max())
-    assert np.array_equal(r.array, known.r.ravel())
-    assert np.array_equal(mu.array, known.mu)
-    stored = petsc_binary.load(path, SELF)
-    assert stored.form == "PETSc binary"
-    assert np.allclose(dense(stored.problem), known.N, atol=1e-14 * np.abs(known.N).max())
-    assert np.array_equal(stored.problem.r, known.r)
-    assert np.array_equal(stored.problem.mu, known.mu)
-
-
-def test_broken_petsc_files_are_refused_by_name(tmp_path):
-    known, _ = heap(0, 12, 8)
-    path = tmp_path / "whole.petsc"
-    petsc_binary.write(path, from_matrix(known))
-    whole = path.read_bytes()
-    broken = tmp_path / "broken.petsc"
-    for length in (8, 100, len(whole) // 2, len(whole) - 4):
-        broken.write_bytes(whole[:length])
-        with pytest.raises(FileFormatError, match=r"broken\.petsc: no PETSc binary problem: [^\n]+$"):
-            petsc_binary.load(broken, SELF)
-    broken.write_bytes(whole[:-8] + np.array(-0.1, ">f8").tobytes())  # the last friction coefficient
-    with pytest.raises(FileFormatError, match="negative friction"):
-        petsc_binary.load(broken, SELF)
+# -- several ranks ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parallel(2, 4)
@@ -516,7 +479,6 @@ def test_files_written_and_read_by_several_ranks(tmp_path, monkeypatch):
     mine = part(comm, 12)
     solution = Solution(known.g[mine], known.y[mine])
     fclib.write_local("local.h5", problem, Info(), solution, solution)
-    petsc_binary.write("local.petsc", problem)
 
     H = graph.dense().T
     rows, columns = part(comm, 8), part(comm, 12)
@@ -534,8 +496,8 @@ def test_files_written_and_read_by_several_ranks(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="nowhere"):
         fclib.write_local("nowhere/local.h5", problem)
 
-    for load, name in ((fclib.load, "local.h5"), (petsc_binary.load, "local.petsc"), (fclib.load, "global.h5")):
-        stored = load(name, comm)
+    for name in ("local.h5", "global.h5"):
+        stored = fclib.load(name, comm)
         assert np.array_equal(stored.problem.mu, known.mu[mine])
         if name == "local.h5":
             assert np.array_equal(stored.solution, known.g[mine])
@@ -552,9 +514,9 @@ def test_files_written_and_read_by_several_ranks(tmp_path, monkeypatch):
         assert np.allclose(stored.problem.product(g), (W @ known.g.ravel()).reshape(-1, 3)[mine], atol=1e-11)
     comm.Barrier()
     if comm.rank == 0:
-        for alone in (fclib.read("local.h5", SELF), petsc_binary.load("local.petsc", SELF).problem):
-            assert np.allclose(dense(alone), known.N, atol=1e-13 * np.abs(known.N).max())
-            assert np.array_equal(alone.r, known.r)
+        alone = fclib.read("local.h5", SELF)
+        assert np.allclose(dense(alone), known.N, atol=1e-13 * np.abs(known.N).max())
+        assert np.array_equal(alone.r, known.r)
 
 
 # -- published problems ------------------------------------------------------------------------------------
@@ -614,24 +576,22 @@ def test_published_problems_are_written_and_read_again(tmp_path, name):
     assert stored.solution is None  # nothing but zeros there
     assert np.allclose(dense(stored.problem), W, atol=1e-13 * np.abs(W).max())
     assert np.allclose(stored.problem.r.ravel(), q, atol=1e-13 * np.abs(q).max())
-    for write, load in ((fclib.write_local, fclib.load), (petsc_binary.write, petsc_binary.load)):
-        write(tmp_path / "copy", stored.problem)
-        again = load(tmp_path / "copy", SELF).problem
-        assert np.allclose(dense(again), W, atol=1e-13 * np.abs(W).max())
-        assert np.array_equal(again.r, stored.problem.r)
-        assert np.array_equal(again.mu, stored.problem.mu)
+    fclib.write_local(tmp_path / "copy", stored.problem)
+    again = fclib.read(tmp_path / "copy", SELF)
+    assert np.allclose(dense(again), W, atol=1e-13 * np.abs(W).max())
+    assert np.array_equal(again.r, stored.problem.r)
+    assert np.array_equal(again.mu, stored.problem.mu)
 
 
-@pytest.mark.parametrize("format", [fclib, petsc_binary], ids=["FCLIB", "PETSc"])
 @pytest.mark.parametrize("compliance", [0.0, 0.03])
-def test_compliance_is_kept_beside_the_rigid_matrix(tmp_path, format, compliance):
+def test_compliance_is_kept_beside_the_rigid_matrix(tmp_path, compliance):
     known, graph = heap(0, 12, 8)
     problem = ccp.ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF), compliance=compliance)
     path = tmp_path / "problem"
-    (format.write_local if format is fclib else format.write)(path, problem)
+    fclib.write_local(path, problem)
     for asked, expected in ((None, compliance), (0.0, 0.0), (0.5, 0.5)):
-        again = format.load(path, SELF, asked).problem
+        again = fclib.load(path, SELF, asked).problem
         assert again.softness == expected
         np.testing.assert_allclose(dense(again) - np.diag(again.compliance.ravel()), known.N, atol=1e-12)
-    again = format.load(path, SELF).problem
+    again = fclib.load(path, SELF).problem
     np.testing.assert_allclose(again.compliance, problem.compliance, rtol=1e-12)

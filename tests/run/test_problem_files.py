@@ -41,31 +41,24 @@ def test_the_problem_of_a_step_is_written_and_solved_again(program, settled, tmp
     first, second, third = steps_of(tmp_path / "results")
     assert second["dumped"] == []
     names = {f"problems/step{line['step']:06d}_{line['contacts']}contacts" for line in (first, third)}
-    assert {name for line in (first, third) for name in line["dumped"]} == {
-        name + suffix for name in names for suffix in (".h5", ".petsc")
-    }
+    assert {name for line in (first, third) for name in line["dumped"]} == {f"{name}.h5" for name in names}
     assert {str(path.relative_to(tmp_path)) for path in (tmp_path / "problems").iterdir()} == {
-        name + suffix for name in names for suffix in (".h5", ".petsc")
+        f"{name}.h5" for name in names
     }
-    for path in third["dumped"]:
-        # from the file's guess; PETSc's has none
-        done = program("-problem", path, *TOL, "-output", "again", "-overwrite")
-        again = summary(tmp_path / "again")
-        assert again["converged"]
-        assert again["contacts"] == third["contacts"]
-        assert again["objective"] == pytest.approx(third["objective"], rel=1e-6)
-        assert again["velocity_norm"] == pytest.approx(third["velocity_norm"], rel=1e-5)
-        if path.endswith(".h5"):
-            assert again["format"] == "FCLIB global"
-            assert again["title"] == f"mixer, step {third['step']}"
-            assert again["start"] == "the guess in the file"
-            reference = again["references"]["solution"]
-            assert reference["relative_distance"] < 1e-6
-            assert reference["natural_residual"] == pytest.approx(third["natural_residual"], rel=1e-3, abs=1e-12)
-            assert again["references"]["guess"]["relative_distance"] > 1e-4
-            assert "the file's solution: velocity_distance" in done.stdout
-        else:
-            assert (again["format"], again["start"], again["references"]) == ("PETSc binary", "cold", {})
+    done = program("-problem", *third["dumped"], *TOL, "-output", "again", "-overwrite")  # from the file's guess
+    again = summary(tmp_path / "again")
+    assert again["converged"]
+    assert again["contacts"] == third["contacts"]
+    assert again["objective"] == pytest.approx(third["objective"], rel=1e-6)
+    assert again["velocity_norm"] == pytest.approx(third["velocity_norm"], rel=1e-5)
+    assert again["format"] == "FCLIB global"
+    assert again["title"] == f"mixer, step {third['step']}"
+    assert again["start"] == "the guess in the file"
+    reference = again["references"]["solution"]
+    assert reference["relative_distance"] < 1e-6
+    assert reference["natural_residual"] == pytest.approx(third["natural_residual"], rel=1e-3, abs=1e-12)
+    assert again["references"]["guess"]["relative_distance"] > 1e-4
+    assert "the file's solution: velocity_distance" in done.stdout
     check_mechanics(third, tmp_path)
 
 
@@ -118,7 +111,7 @@ def test_names_a_start_without_guess_and_a_broken_file(program, settled, tmp_pat
     steps = steps_of(tmp_path / "results")
     for line in steps:
         path = tmp_path / "all" / f"step{line['step']:06d}_{line['contacts']}contacts.h5"
-        assert line["dumped"] == [str(p.relative_to(tmp_path)) for p in (path, path.with_suffix(".petsc"))]
+        assert line["dumped"] == [str(path.relative_to(tmp_path))]
         assert path.exists()
     cold = ("-problem_guess", "false", "-ccp_type", "apgd", "-ccp_tol", 1e-10, "-output", "cold")
     program("-problem", steps[1]["dumped"][0], *cold)
@@ -127,10 +120,11 @@ def test_names_a_start_without_guess_and_a_broken_file(program, settled, tmp_pat
     assert cold["converged"]
     assert cold["natural_residual"] <= 1.1e-10
     assert not (tmp_path / "results" / "hard").exists()  # no step was hard
-    whole = (tmp_path / steps[1]["dumped"][1]).read_bytes()
-    (tmp_path / "cut.petsc").write_bytes(whole[:1000])
-    done = program("-problem", "cut.petsc", "-output", "cut", status=2)
-    assert done.stderr == "pctt.run: cut.petsc: no PETSc binary problem: Read past end of file\n"
+    whole = (tmp_path / steps[1]["dumped"][0]).read_bytes()
+    (tmp_path / "cut.h5").write_bytes(whole[:1000])
+    done = program("-problem", "cut.h5", "-output", "cut", status=2)
+    assert done.stderr.startswith("pctt.run: cut.h5: no FCLIB problem: ")
+    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parallel(1, 2)
@@ -164,19 +158,14 @@ def test_hard_problems_of_another_run_are_replaced_and_of_this_one_kept(program,
 
 
 @pytest.mark.parallel(1, 2)
-def test_a_problem_of_siconos_is_solved_and_a_broken_one_refused(program, tmp_path):
-    """Two contacts apart: one is pressed and slides, one opens. The projection of (1, -2, 0) on the cone."""
-    text = "3\n2\n0\n6\n6\n6 6\n" + " ".join("1" if i == j else "0" for i in range(6) for j in range(6))
-    text += "\n-1 2 0  1 0 0\n0.3 0.3\n1\n"
-    (tmp_path / "two.dat").write_text(text)
-    program("-problem", "two.dat", *TOL)
-    found = summary(tmp_path / "results")
-    assert (found["format"], found["contacts"]) == ("Siconos local", 2)
-    assert found["objective"] == pytest.approx(-0.5 * (1 + 0.3 * 2) ** 2 / 1.09, rel=1e-7)
-    (tmp_path / "cut.dat").write_text(text[:60])
-    done = program("-problem", "cut.dat", "-output", "cut", status=2)
-    assert "cut.dat: no Siconos problem: line 7: it ends too early" in done.stderr
-    assert not list((tmp_path / "cut").glob("*"))
+def test_a_file_of_another_format_is_refused_with_the_name_of_the_converter(program, tmp_path):
+    (tmp_path / "two.dat").write_text("3 1 0 3 3 3 3  1 0 0  0 1 0  0 0 1  -1 2 0  0.3")
+    done = program("-problem", "two.dat", status=2)
+    assert done.stderr == (
+        "pctt.run: two.dat: no FCLIB problem: it is not HDF5; run/study convert_problems makes FCLIB files of Siconos' "
+        "text and of PETSc's binary files\n"
+    )
+    assert not list((tmp_path / "results").glob("*"))
 
 
 def test_a_step_that_the_run_does_not_make_is_refused(program, settled, tmp_path):

@@ -50,11 +50,11 @@ def test_a_problem_of_a_folder_is_solved_to_every_tolerance(profile, tmp_path, l
     (tmp_path / "good.dat").write_text(SLIDES)
     (tmp_path / "plane.dat").write_text("2" + SLIDES[1:])
     (tmp_path / "notes.md").write_text("no problem")
-    found, refused = profile.problems([tmp_path])
-    assert found == [(tmp_path / "good.dat", 1)]
+    found, refused = profile.problems([tmp_path], tmp_path / "converted")
+    assert [(name, contacts) for name, _, contacts in found] == [("good.dat", 1)]
     assert len(refused) == 1
     assert "plane.dat: no Siconos problem: line 1: dimension 2" in refused[0]
-    lines = list(profile.solve(str(found[0][0]), law, solver, 10.0))
+    lines = list(profile.solve(str(found[0][1]), law, solver, 10.0))
     assert [line["tol"] for line in lines] == [1e-4, 1e-6, 1e-8]
     assert all(line["reached"] and line["residual"] <= 1.01 * line["tol"] for line in lines)
     if law == "convex":

@@ -9,7 +9,7 @@ convex one without that term. The data of the two are the same, the solutions ar
 """
 
 from pctt.ccp.fclib.reader import load, read
+from pctt.ccp.fclib.stored import FileFormatError, Stored
 from pctt.ccp.fclib.writer import Info, Solution, write_global, write_local
-from pctt.ccp.stored import FileFormatError, Stored
 
 __all__ = ["FileFormatError", "Info", "Solution", "Stored", "load", "read", "write_global", "write_local"]

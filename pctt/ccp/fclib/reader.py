@@ -10,9 +10,9 @@ import scipy.sparse as sp
 from mpi4py import MPI
 
 from pctt.ccp.cone import Array
-from pctt.ccp.global_form import without_velocities
+from pctt.ccp.fclib.global_form import without_velocities
+from pctt.ccp.fclib.stored import FileFormatError, Stored, Whole, spread, symmetric_blocks
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.stored import FileFormatError, Stored, Whole, spread, symmetric_blocks
 
 
 def read(path: str | Path, comm: MPI.Comm) -> ConeProblem:
@@ -29,10 +29,14 @@ def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> S
     """The cone problem as ``read`` gives it, with the solution and the first guess of the file if it has
     impulses there: all published files have the groups, many with nothing but zeros in them. ``compliance`` takes
     the place of the file's."""
-    return spread(comm, path, "FCLIB", lambda: _whole(path), compliance)
+    return spread(comm, path, lambda: _whole(path), compliance)
 
 
 def _whole(path: str | Path) -> Whole:
+    if Path(path).is_file() and not h5py.is_hdf5(path):
+        raise FileFormatError(
+            "it is not HDF5; run/study convert_problems makes FCLIB files of Siconos' text and of PETSc's binary files"
+        )
     with h5py.File(path, "r") as file:
         form = next((form for form in ("local", "global") if f"fclib_{form}" in file), None)
         if form is None:

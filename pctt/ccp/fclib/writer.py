@@ -16,10 +16,10 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.blocks import HUB
 from pctt.ccp.cone import Array
-from pctt.ccp.gather import gather_matrix, gather_rows, write_whole
+from pctt.ccp.fclib.gather import gather_matrix, gather_rows, write_whole
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.stored import sparse_matrix
 from pctt.disk import make_hdf5
 
 
@@ -58,7 +58,9 @@ def write_local(
     W is that of rigid contacts; the compliance is kept outside the groups of FCLIB. Raises OSError on all ranks if
     the file cannot be written, ValueError if a body has so many contacts that it would fill W.
     """
-    N = sparse_matrix(problem)
+    if problem.has_hubs:
+        raise ValueError(f"a body has more than {HUB} contacts and would fill N; allowed is fclib.write_global")
+    N = problem.rigid_matrix()
     matrices, vectors = {"W": N}, {"q": problem.r, "mu": problem.mu}
     _write(path, problem.comm, "local", matrices, vectors, info, solution, guess, problem.point, problem.softness)
     N.destroy()

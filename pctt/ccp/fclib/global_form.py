@@ -10,26 +10,24 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import MatrixRankWarning, spsolve
 
 from pctt.ccp.cone import Array
-from pctt.ccp.stored import MIRRORED, FileFormatError, mirrored, symmetric_blocks
+from pctt.ccp.fclib.stored import MIRRORED, FileFormatError, mirrored, symmetric_blocks
 
 #: M_ij and M_ji of a symmetric M differ by no more than this part of sqrt(M_ii M_jj), which bounds both.
 ROUNDING = 1e-8
 
 
-def without_velocities(
-    M: sp.csr_matrix, H: sp.csr_matrix, f: Array, w: Array, rounding: float = ROUNDING
-) -> tuple[sp.bsr_matrix, Array, str]:
+def without_velocities(M: sp.csr_matrix, H: sp.csr_matrix, f: Array, w: Array) -> tuple[sp.bsr_matrix, Array, str]:
     """G or N of a global problem, q = w + H' M^-1 f, and in words what was done to M.
 
     M (n, n) masses, H (n, 3 nc), f (n,), w (3 nc,). The matrix is the map G = H' L^-T of bodies, with M = L L', where M
     has 6 x 6 blocks on its diagonal and nothing else, and otherwise N = H' M^-1 H. Raises FileFormatError where sizes
-    do not fit together and where M is no matrix of masses up to ``rounding``.
+    do not fit together and where M is no matrix of masses.
     """
     if M.shape != (len(f), len(f)) or H.shape != (len(f), len(w)) or len(w) % 3:
         raise FileFormatError(f"M {M.shape}, H {H.shape}, f {f.shape} and w {w.shape} do not fit together")
     if not (np.isfinite(M.data).all() and (M.diagonal() > 0).all()):
         raise FileFormatError("its mass matrix is not positive")
-    M, note = _symmetric(M, rounding)
+    M, note = symmetric_masses(M)
     roots = _inverse_roots(M)
     if roots is None:
         H_over_M = _solve(M, H)
@@ -41,7 +39,7 @@ def without_velocities(
     return G, w + G @ (roots @ f.reshape(-1, 6, 1)).ravel(), note
 
 
-def _symmetric(M: sp.csr_matrix, rounding: float) -> tuple[sp.csr_matrix, str]:
+def symmetric_masses(M: sp.csr_matrix, rounding: float = ROUNDING) -> tuple[sp.csr_matrix, str]:
     """M made exactly symmetric, and MIRRORED if it was one triangle; FileFormatError if it is neither that nor
     symmetric up to rounding."""
     whole = mirrored(M)

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
-from petsc4py import PETSc
 
-from pctt.blocks import HUB, BlockRows, square_block_matrix
+from pctt.blocks import BlockRows, square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 
@@ -20,7 +19,7 @@ MIRRORED = "{} is stored as one triangle, which was mirrored"
 
 
 class FileFormatError(ValueError):
-    """A file that is no cone problem in a format known here; raised on all ranks alike."""
+    """A file that is no cone problem; raised on all ranks alike."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class Whole:
 
     Attributes
     ----------
-    form, title : the file's format in words, and what it says of itself
+    form, title : FCLIB local or FCLIB global, and what the file says of itself
     matrix : (3 nc, 6 bodies) the map G in 3 x 6 blocks, or (3 nc, 3 nc) the matrix N in 3 x 3 blocks
     r : (3 nc,) velocities without impulses (m/s)
     mu : (nc,) friction coefficients
@@ -103,26 +102,7 @@ def mirrored(A: sp.spmatrix) -> sp.csr_matrix | None:
     return (A + (above + below).T).tocsr()
 
 
-def sparse_matrix(problem: ConeProblem) -> PETSc.Mat:
-    """A new Mat, all of N without compliance, for the formats that hold a sparse N and nothing beside it.
-
-    Raises ValueError on all ranks if a body has so many contacts that it would fill N.
-    """
-    if problem.has_hubs:
-        raise ValueError(
-            f"a body has more than {HUB} contacts and would fill N; allowed is a format of masses and contact map "
-            "(fclib.write_global)"
-        )
-    return problem.rigid_matrix()
-
-
-def spread(
-    comm: MPI.Comm,
-    path: str | Path,
-    format: str,
-    read: Callable[[], Whole],
-    compliance: float | None = None,
-) -> Stored:
+def spread(comm: MPI.Comm, path: str | Path, read: Callable[[], Whole], compliance: float | None = None) -> Stored:
     """The problem that ``read`` finds on rank 0, contacts (and bodies) in equal parts over the ranks; collective.
 
     ``compliance`` takes the place of the file's.
@@ -137,7 +117,7 @@ def spread(
             whole.check()
             parts = [_part(whole, rank, comm.size) for rank in range(comm.size)]
         except Exception as reason:  # of any kind: the other ranks wait for the parts
-            error = f"{path}: no {format} problem: {reason}"
+            error = f"{path}: no FCLIB problem: {reason}"
     error = comm.bcast(error)
     if error:
         raise FileFormatError(error)

@@ -25,69 +25,45 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import h5py
 import numpy as np
 import scipy.sparse as sp
-from mpi4py import MPI
 
 from pctt.ccp.cone import Array
-from pctt.ccp.global_form import without_velocities
-from pctt.ccp.stored import FileFormatError, Stored, Whole, spread, symmetric_blocks
-
-#: Of masses: %g and %e print six and seven digits.
-ROUNDING = 1e-5
+from pctt.ccp.fclib import FileFormatError
 
 
-def is_one(path: str | Path) -> bool:
-    """Whether a file is such a text: by its name or by the whole number that it begins with."""
-    if h5py.is_hdf5(path):
-        return False
-    with open(path, "rb") as file:
-        first = file.read(32).split()[:1]
-    return Path(path).suffix == ".dat" or (first != [] and first[0].isdigit())
+def read(path: Path) -> tuple[dict[str, sp.csr_matrix], dict[str, Array]]:
+    """Matrices and vectors of a file by FCLIB's names: W; q, mu of a local problem, M, H; f, w, mu of a global one.
 
-
-def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> Stored:
-    """The cone problem of a file, its contacts in equal parts over the ranks; collective. ``compliance`` makes them
-    yield.
-
-    A problem is given by N or by the map G of bodies, as those of `fclib.read` are. Raises FileFormatError on every
-    rank where the file cannot be read as one.
+    Raises FileFormatError, which names the line, where the file cannot be read as one.
     """
-    return spread(comm, path, "Siconos", lambda: _whole(path), compliance)
-
-
-def _whole(path: str | Path) -> Whole:
-    words = _Words(Path(path).read_bytes())
+    words = Words(path.read_bytes())
     dimension, contacts = words.count("the dimension"), words.count("the number of contacts")
     if dimension != 3:
         kind = {2: "contacts in the plane", 5: "rolling friction"}.get(dimension, "unknown")
         raise words.wrong(0, f"dimension {dimension} ({kind}); allowed is 3, contacts in space with sliding friction")
-    first = _matrix(words, "W or M")
+    first = matrix(words, "W or M")
     rows, global_form = 3 * contacts, _begins_matrix(words, first.shape[0], 3 * contacts)
-    if first.shape == (rows, rows) and not global_form:
-        q, mu = words.numbers(rows, "q"), words.numbers(contacts, "mu")
-        words.end()
-        matrix, note = symmetric_blocks(first.tocsr())
-        return Whole("Siconos local", "", matrix, q, mu, note=note)
-    if not global_form:
+    if global_form:
+        matrices = {"M": first, "H": matrix(words, "H")}
+        vectors = {"f": words.numbers(first.shape[0], "q"), "w": words.numbers(rows, "b")}
+    elif first.shape == (rows, rows):
+        matrices, vectors = {"W": first}, {"q": words.numbers(rows, "q")}
+    else:
         allowed = f"W {rows, rows}, or M and then H {first.shape[0], rows}"
         raise words.wrong(words.taken, f"a matrix {first.shape} alone, for {contacts} contacts; allowed is {allowed}")
-    H = _matrix(words, "H")
-    f, w = words.numbers(first.shape[0], "q"), words.numbers(rows, "b")
-    mu = words.numbers(contacts, "mu")
+    vectors["mu"] = words.numbers(contacts, "mu")
     words.end()
-    matrix, q, note = without_velocities(first.tocsr(), H.tocsr(), f, w, ROUNDING)
-    return Whole("Siconos global", "", matrix, q, mu, note=note)
+    return matrices, vectors
 
 
-def _begins_matrix(words: _Words, rows: int, columns: int) -> bool:
+def _begins_matrix(words: Words, rows: int, columns: int) -> bool:
     """Whether H (rows, columns) is next. After W it would be q and mu, which may be whole numbers too."""
     q_and_mu = rows == columns and words.left <= rows + rows // 3 + 1
     return not q_and_mu and words.words[words.taken + 1 : words.taken + 3] == [b"%d" % rows, b"%d" % columns]
 
 
-class _Words:
+class Words:
     """The words of a file, taken one after the other."""
 
     def __init__(self, text: bytes):
@@ -155,7 +131,7 @@ def _as_numbers(words: list[bytes], whole: bool) -> np.ndarray | None:
     return numbers if np.isfinite(numbers).all() else None
 
 
-def _matrix(words: _Words, name: str) -> sp.coo_matrix:
+def matrix(words: Words, name: str) -> sp.csr_matrix:
     """The matrix that comes next."""
     begin = words.taken
     storage, rows, columns = (words.count(f"the {what} of {name}") for what in ("storage", "rows", "columns"))
@@ -169,20 +145,20 @@ def _matrix(words: _Words, name: str) -> sp.coo_matrix:
     outside = (row < 0) | (row >= rows) | (column < 0) | (column >= columns)
     if outside.any():
         raise words.wrong(begin, f"{name} {shape} has {outside.sum()} entries outside its rows and columns")
-    return sp.coo_matrix((values, (row, column)), shape=shape)
+    return sp.coo_matrix((values, (row, column)), shape=shape).tocsr()
 
 
 _Entries = tuple[np.ndarray, np.ndarray, Array, tuple[int, int]]  # rows, columns, values; and the shape
 
 
-def _dense(words: _Words, name: str, shape: tuple[int, int]) -> _Entries:
+def _dense(words: Words, name: str, shape: tuple[int, int]) -> _Entries:
     rows, columns = words.count(f"the rows of {name}"), words.count(f"the columns of {name}")
     values = words.numbers(rows * columns, name)
     k = np.flatnonzero(values)
     return k % max(rows, 1), k // max(rows, 1), values[k], (rows, columns)
 
 
-def _blocks(words: _Words, name: str, shape: tuple[int, int]) -> _Entries:
+def _blocks(words: Words, name: str, shape: tuple[int, int]) -> _Entries:
     blocks = words.count(f"the number of blocks of {name}")
     if blocks == 0:  # nothing more is written then
         return np.zeros(0, int), np.zeros(0, int), np.zeros(0), shape
@@ -224,7 +200,7 @@ def _blocks(words: _Words, name: str, shape: tuple[int, int]) -> _Entries:
     return row, column, values, shape
 
 
-def _sparse(words: _Words, name: str, shape: tuple[int, int]) -> _Entries:
+def _sparse(words: Words, name: str, shape: tuple[int, int]) -> _Entries:
     """As CSparse prints it: ``i j : value`` for each of the triplets, or after ``col j : locations a to b`` the
     column's entries, ``i : value``."""
     origin = words.count(f"the kind of {name}")

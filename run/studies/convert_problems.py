@@ -1,0 +1,157 @@
+"""FCLIB files of cone problems in Siconos' text files and PETSc's binary files (docs/files.md): run/study
+convert_problems FILE [FILE ...] -to DIR. DIR/NAME.h5 holds what FILE NAME.* does. A file there is not replaced.
+
+A local problem of Siconos stays local and a global one global. W is made symmetric, and so is M, whose entries have six
+digits; where only one triangle is stored, it is mirrored. A file of PETSc has the Mat N of rigid contacts and the Vecs
+r and mu, and where there is compliance a Vec of length 1 with it; releases of pctt before FCLIB was their only format
+wrote such files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+import siconos_text
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt.blocks import square_block_matrix
+from pctt.ccp import ConeProblem, fclib
+from pctt.ccp.cone import Array
+from pctt.ccp.fclib import FileFormatError
+from pctt.ccp.fclib.global_form import symmetric_masses
+from pctt.ccp.fclib.stored import symmetric_blocks
+
+#: Of masses in Siconos' files, as `symmetric_masses` takes it: %g and %e print six and seven digits.
+ROUNDING = 1e-5
+
+# the first number of a file that begins with a Mat, MAT_FILE_CLASSID of petscmat.h, with 32- and 64-bit indices
+PETSC_BEGINNINGS = tuple((1211216).to_bytes(size, "big") for size in (4, 8))
+HDF5_BEGINNING = b"\x89HDF\r\n\x1a\n"
+
+
+def convert(path: Path, folder: Path) -> tuple[Path, str]:
+    """Write ``folder``/NAME.h5 for ``path`` NAME.*; the new file, and what was done to the data in words.
+
+    Raises FileFormatError with the path if there is no problem in the file, OSError if a file cannot be read or
+    written, or is there already.
+    """
+    target = folder / f"{path.stem}.h5"
+    if target.exists():
+        raise FileExistsError(f"{target} is there already, and is not replaced")
+    with open(path, "rb") as file:
+        beginning = file.read(8)
+    if beginning == HDF5_BEGINNING:
+        raise FileFormatError(f"{path}: it is HDF5; pctt.run -problem reads FCLIB files as they are")
+    form, write = ("PETSc binary", _from_petsc) if beginning.startswith(PETSC_BEGINNINGS) else ("Siconos", _from_text)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder) as temporary:
+        made = Path(temporary) / target.name
+        try:
+            note = write(path, made)
+            fclib.read(made, MPI.COMM_SELF).destroy()
+        except OSError:
+            raise
+        except Exception as error:  # of any kind: bad data surprise numpy and scipy
+            reason = str(error).replace(f"{made}: no FCLIB problem: ", "")
+            raise FileFormatError(f"{path}: no {form} problem: {reason}") from None
+        os.replace(made, target)
+    return target, note
+
+
+def _from_text(path: Path, made: Path) -> str:
+    """Write the problem of a text file of Siconos; what was done to its matrix."""
+    matrices, vectors = siconos_text.read(path)
+    if "W" in matrices:
+        return _write_local(path, made, matrices["W"], vectors["q"], vectors["mu"])
+    M, H, f, w, mu = matrices["M"], matrices["H"], vectors["f"], vectors["w"], vectors["mu"]
+    if M.shape != (len(f), len(f)):
+        raise FileFormatError(f"its mass matrix {M.shape} is not square")
+    if not (M.diagonal() > 0).all():
+        raise FileFormatError("its mass matrix is not positive")
+    M, note = symmetric_masses(M, ROUNDING)
+    mats = [PETSc.Mat().createAIJ(A.shape, csr=_csr(A), comm=PETSc.COMM_SELF) for A in (M, H)]
+    fclib.write_global(made, *mats, f, w.reshape(-1, 3), mu, _info(path, note))
+    for mat in mats:
+        mat.destroy()
+    return note
+
+
+def _from_petsc(path: Path, made: Path) -> str:
+    """Write the problem of a binary file of PETSc; what was done to its matrix."""
+    viewer = None
+    try:
+        viewer = PETSc.Viewer().createBinary(str(path), "r", comm=PETSc.COMM_SELF)
+        N = PETSc.Mat().create(PETSc.COMM_SELF)
+        N.setType(PETSc.Mat.Type.AIJ)
+        N.load(viewer)
+        indptr, indices, values = N.getValuesCSR()
+        r, mu = (_vector(viewer) for _ in range(2))
+        integers = 4 + len(indptr) - 1 + len(indices) + 2 * 2
+        rigid = np.dtype(PETSc.IntType).itemsize * integers + 8 * (len(values) + len(r) + len(mu))
+        compliance = _vector(viewer) if path.stat().st_size > rigid else np.zeros(1)
+    except PETSc.Error as error:  # its last line states the reason, the lines above it functions of PETSc
+        raise FileFormatError(str(error).splitlines()[-1].rpartition("] ")[2]) from None
+    finally:
+        if viewer is not None:
+            viewer.destroy()
+    if len(compliance) != 1:
+        raise FileFormatError(f"a vector of length {len(compliance)} follows mu; allowed is its compliance, a number")
+    W = sp.csr_matrix((values, indices, indptr), shape=N.getSize())
+    return _write_local(path, made, W, r, mu, float(compliance[0]))
+
+
+def _write_local(path: Path, made: Path, W: sp.csr_matrix, q: Array, mu: Array, compliance: float = 0.0) -> str:
+    """Write W (3 nc, 3 nc), made symmetric, q (3 nc,) and mu (nc,); what was done to W."""
+    if W.shape[0] != 3 * len(mu) or len(q) != 3 * len(mu):
+        raise FileFormatError(f"{len(mu)} friction coefficients, but a matrix {W.shape} and a vector {q.shape}")
+    blocks, note = symmetric_blocks(W)
+    N = square_block_matrix(MPI.COMM_SELF, blocks)
+    with ConeProblem(MPI.COMM_SELF, q.reshape(-1, 3), mu, N=N, compliance=compliance) as problem:
+        fclib.write_local(made, problem, _info(path, note))
+    N.destroy()
+    return note
+
+
+def _vector(viewer: PETSc.Viewer) -> Array:
+    vector = PETSc.Vec().create(PETSc.COMM_SELF)
+    vector.setType(PETSc.Vec.Type.SEQ)
+    return np.array(vector.load(viewer).array)
+
+
+def _csr(A: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    A.sort_indices()
+    return A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data
+
+
+def _info(path: Path, note: str) -> fclib.Info:
+    return fclib.Info(path.name, f"Converted from {path.name}. {note}".strip())
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        prog="run/study convert_problems", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("files", nargs="+", metavar="FILE", help="text file of Siconos, or binary file of PETSc")
+    parser.add_argument("-to", required=True, metavar="DIR", help="folder for the FCLIB files, made if need be")
+    words = parser.parse_args()
+    here = Path(os.environ.get("CALLED_FROM", "."))
+    status = 0
+    for name in words.files:
+        try:
+            target, note = convert(Path(os.path.normpath(here / name)), Path(os.path.normpath(here / words.to)))
+            print(f"{target}{note and ': ' + note}")
+        except (FileFormatError, OSError) as error:  # noqa: PERF203 - as many files as there are
+            print(f"run/study convert_problems: {error}", file=sys.stderr)
+            status = 1
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())
