@@ -15,6 +15,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.options import describe, no_such_option
+
 
 def require_real_double(scalar: type = PETSc.ScalarType) -> None:
     """Raise ImportError with a clear message if this build of PETSc has other scalars."""
@@ -64,6 +66,20 @@ def origin(error: BaseException) -> BaseException:
     while isinstance(error, PETSc.Error) and error.__cause__ is not None:
         error = error.__cause__
     return error
+
+
+def given_options(group: type, prefix: str) -> dict[str, str]:
+    """The values that the options database has for a group of options (`pctt.options`), by their names with the prefix.
+
+    OptionError for a name with this prefix that the group does not have. PETSc looks the names up, because the options
+    of mg_levels_ are also those of mg_levels_1_.
+    """
+    database = PETSc.Options()
+    known = [line.name for line in describe(group, prefix)]
+    for name in database.getAll():
+        if name.startswith(prefix) and name not in known:
+            raise no_such_option(name, known)
+    return {name: database.getString(name) for name in known if database.hasName(name)}
 
 
 def warn(comm: MPI.Comm, words: str) -> None:

@@ -10,7 +10,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.exchange import refuse
-from pctt.options import AT_LEAST_ONE, FRACTION, describe, no_such_option, option, read
+from pctt.options import AT_LEAST_ONE, FRACTION, describe, option, read
+from pctt.petsc import given_options
 
 PREFIX = "mat_tt_"
 MAX_RANK = 200
@@ -43,12 +44,7 @@ class Options:
     def given_for(self, mat: PETSc.Mat) -> Options:
         """These options with those of the database; OptionError for a bad value or a misspelt name."""
         prefix = (mat.getOptionsPrefix() or "") + PREFIX
-        database = PETSc.Options()
-        known = [line.name for line in describe(Options, prefix)]
-        for name in database.getAll():
-            if name.startswith(prefix) and name not in known:
-                raise no_such_option(name, known)
-        given = {name: database.getString(name) for name in known if database.hasName(name)}
+        given = given_options(Options, prefix)
         found = dataclasses.asdict(read(Options, given, prefix))
         return dataclasses.replace(self, **{name: found[name] for name in found if prefix + name in given})
 

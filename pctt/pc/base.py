@@ -14,7 +14,8 @@ from typing import Any
 from petsc4py import PETSc
 
 from pctt.context import Context
-from pctt.options import describe, no_such_option, read
+from pctt.options import describe, read
+from pctt.petsc import given_options
 
 
 class PythonPC(Context):
@@ -43,17 +44,11 @@ class PythonPC(Context):
         """
         self.prefix = pc.getOptionsPrefix() or ""
         prefix = self.prefix + self.options_prefix
-        database = PETSc.Options()
-        known = [line.name for line in describe(self.options_class, prefix)]
-        for name in database.getAll():
-            if name.startswith(prefix) and name not in known:
-                raise no_such_option(name, known)
-        # PETSc looks them up, because the options of mg_levels_ are also those of mg_levels_1_
-        given = {name: database.getString(name) for name in known if database.hasName(name)}
+        given = given_options(self.options_class, prefix)
         before, self.options = self.options, read(self.options_class, given, prefix)
         if self.options != before:
             self._structure = None
-        if database.hasName("help"):
+        if PETSc.Options().hasName("help"):
             PETSc.Sys.Print("\n".join(map(str, describe(self.options_class, prefix))), comm=pc.comm)
 
     def setUp(self, pc: PETSc.PC) -> None:
