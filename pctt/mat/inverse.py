@@ -23,11 +23,15 @@ ACCURACY = 0.5  # tolerance for rounding a train that is more accurate than eps,
 def inverse(A: PETSc.Mat, eps: float = 1e-6, max_rank: int = MAX_RANK) -> PETSc.Mat:
     """The inverse X of a symmetric positive definite A; ``X.mult(b, x)`` solves A x = b. Collective.
 
+    Parameters
+    ----------
     A : a Mat of `from_entries` or `load`, or any Mat with entries (see docs/trains.md)
     eps : ||I - S X||_F <= eps ||S - I||_F for the train S of A / c, where c is the mean of the diagonal. If A is no
         train, S has an error of eps too. A smaller eps is taken where eps does not show that X is positive.
     max_rank : largest allowed rank of both trains
 
+    Notes
+    -----
     X is a Mat like those of `from_entries`. Its context has the figures ``ranks``, ``bytes``, ``residual``
     (||I - S X||_F / ||S - I||_F) and ``error`` (||b - A X b|| / ||b|| for a random b, with the product of A).
 
