@@ -129,3 +129,46 @@ def on_coordinates(pc: PETSc.PC, take: Callable[[np.ndarray], None] | None) -> A
     function = _SET_COORDINATES(called) if take is not None else ctypes.c_void_p(None)
     _library.PetscObjectComposeFunction_Private(ctypes.c_void_p(pc.handle), b"PCSetCoordinates_C", function)
     return function
+
+
+_MAT = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p)
+_pointer = ctypes.pythonapi.PyCapsule_GetPointer
+_pointer.restype, _pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+_mat_of = _MAT(_pointer(PETSc.__pyx_capi__["PyPetscMat_New"], b"PyObject *(Mat)"))
+_AXPY = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_void_p, ctypes.c_int)
+_GETINFO = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int, ctypes.POINTER(ctypes.c_double))
+_MATOP_GETINFO, _MATOP_AXPY = 15, 39
+_PETSC_ERR_USER = 83
+_INFO = 10  # numbers of a MatInfo
+_USED, _MEMORY = 2, 4  # the places of nz_used and memory among them
+
+
+def on_axpy(mat: PETSc.Mat, add: Callable[[PETSc.Mat, float, PETSc.Mat], None]) -> Any:
+    """Let ``MatAXPY`` call ``add(Y, factor, X)``, for which petsc4py does not ask contexts. The result has to live as
+    long as the Mat has this context."""
+
+    def called(Y: int, factor: float, X: int, structure: int) -> int:
+        try:
+            add(_mat_of(Y), factor, _mat_of(X))
+        except Exception as error:
+            remember(error)
+            return _PETSC_ERR_USER
+        return 0
+
+    function = _AXPY(called)
+    _library.MatSetOperation(ctypes.c_void_p(mat.handle), _MATOP_AXPY, function)
+    return function
+
+
+def on_getinfo(mat: PETSc.Mat, figures: Callable[[], tuple[float, float]]) -> Any:
+    """Let ``MatGetInfo`` tell the numbers that are stored, and their bytes, by ``figures``; else as `on_axpy`."""
+
+    def called(A: int, kind: int, info: Any) -> int:
+        for place in range(_INFO):
+            info[place] = 0.0
+        info[_USED], info[_MEMORY] = figures()
+        return 0
+
+    function = _GETINFO(called)
+    _library.MatSetOperation(ctypes.c_void_p(mat.handle), _MATOP_GETINFO, function)
+    return function

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from math import prod
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -17,7 +18,7 @@ from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.options import MAX_RANK, Options
 from pctt.mat.order import Places, digits_of, whole_numbers
 from pctt.mat.product import TrainProduct
-from pctt.petsc import own_errors
+from pctt.petsc import on_axpy, on_getinfo, own_errors
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.entries import EntryMatrix
 from pctt.tt.train import Array, Train
@@ -81,6 +82,17 @@ class TensorTrain(Context):
 
     def __init__(self, eps: float = 1e-8, max_rank: int = MAX_RANK) -> None:
         self.options = Options(eps, max_rank)
+
+    def create(self, mat: PETSc.Mat) -> None:
+        super().create(mat)
+        self._operations: tuple[Any, ...] = (on_axpy(mat, axpy), on_getinfo(mat, self._info))
+
+    def destroy(self, mat: PETSc.Mat) -> None:
+        self._operations = ()  # they refer to this context
+        super().destroy(mat)
+
+    def _info(self) -> tuple[float, float]:
+        return float(self.compressed.train.storage), float(self.bytes)
 
     # -- figures --------------------------------------------------------------------------------------------
 
@@ -280,8 +292,8 @@ def mat_of(
 def axpy(Y: PETSc.Mat, factor: float, X: PETSc.Mat) -> None:
     """Y + factor X in place of Y, for a train Y; X is a train on the same grid, or any Mat that is c I.
 
-    PETSc's own ``Y.axpy`` cannot do this: petsc4py does not ask contexts for it, and PETSc 3.18 ends with a
-    segmentation fault, as for any Mat of type python. The sum of two trains is rounded to a tenth of eps of Y, with
+    ``Y.axpy(factor, X)`` does the same for two trains; other Mats it refuses in PETSc's words, or with a segmentation
+    fault in PETSc 3.18, as for any Mat of type python. The sum of two trains is rounded to a tenth of eps of Y, with
     ranks at most its max_rank. ValueError on all ranks for other Mats. Collective.
 
     >>> A = from_entries(lambda i, j: (i == j) + 0.1 / (1.0 + abs(i - j)), (64,))

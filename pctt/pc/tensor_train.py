@@ -69,7 +69,7 @@ class TensorTrain(PythonPC):
         self._on_coordinates = on_coordinates(pc, self._take_points)
 
     def destroy(self, pc: PETSc.PC) -> None:
-        on_coordinates(pc, None)
+        self._on_coordinates = on_coordinates(pc, None)  # the function refers to this context
         super().destroy(pc)
 
     def _take_points(self, points: np.ndarray) -> None:
