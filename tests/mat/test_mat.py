@@ -498,3 +498,15 @@ def test_rounding_is_relative():
     train, left = rounded(T, 0.0, 3)
     assert max(train.ranks) == 3
     assert left == pytest.approx((train - T).norm() / T.norm())
+
+
+@pytest.mark.parallel(1, 2)
+def test_axpy_and_info_as_petsc_calls_them():
+    kernel, other = Kernel((5, 6)), Kernel((5, 6), 3.0, 2.0)
+    mat, more = from_entries(kernel, (5, 6), EPS), from_entries(other, (5, 6), EPS)
+    mat.axpy(-2.0, more)
+    is_matrix(mat, kernel.dense - 2.0 * other.dense)
+    mat.axpy(1.0, mat)
+    is_matrix(mat, 2.0 * kernel.dense - 4.0 * other.dense)
+    context, info = mat.getPythonContext(), mat.getInfo(PETSc.Mat.InfoType.LOCAL)
+    assert (info["memory"], info["nz_used"]) == (context.bytes, context.bytes / 8)
