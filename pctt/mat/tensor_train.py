@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any
@@ -18,7 +17,7 @@ from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.options import MAX_RANK, Options
 from pctt.mat.order import Places, digits_of, whole_numbers
 from pctt.mat.product import TrainProduct
-from pctt.petsc import on_axpy, on_getinfo, own_errors
+from pctt.petsc import on_axpy, on_getinfo, own_errors, warn
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.entries import EntryMatrix
 from pctt.tt.train import Array, Train
@@ -130,11 +129,11 @@ class TensorTrain(Context):
             self.options = self.options.given_for(mat)
             self.options.check(mat.comm.tompi4py())
             found = CompressedEntries(mat, self.options.eps, self.options.max_rank)
-            if found.error > MISSED * self.options.eps and found.comm.rank == 0:
-                warnings.warn(
+            if found.error > MISSED * self.options.eps:
+                warn(
+                    found.comm,
                     f"pctt.mat.TensorTrain: an error of {found.error:.1e} is left at rank {self.options.max_rank}, "
                     f"{self.options.eps:.1e} was asked for",
-                    stacklevel=2,
                 )
             self.compressed = found
         self.take(mat, self.compressed)
