@@ -84,7 +84,7 @@ def check_points(points: object, P: PETSc.Mat, name: str) -> None:
     Allowed are finite numbers, a row per local block row. Points may also be None on all ranks.
     """
     count = P.getLocalSize()[0] // P.getBlockSize()
-    wrong = ""
+    wrong, width = "", 0
     if points is not None:
         try:
             array = np.asarray(points, dtype=float)
@@ -95,11 +95,14 @@ def check_points(points: object, P: PETSc.Mat, name: str) -> None:
                 wrong = f"have the shape {array.shape}"
             elif not np.isfinite(array).all():
                 wrong = "have a NaN or infinity"
-    found = P.comm.tompi4py().allgather((points is not None, wrong, count))
-    for rank, (here, wrong, count) in enumerate(found):
-        if wrong or here != found[0][0]:
+            else:
+                width = array.shape[1]
+    found = P.comm.tompi4py().allgather((width, wrong, count))
+    for rank, (width, wrong, count) in enumerate(found):
+        if wrong or width != found[0][0]:
+            other = f"have {width} columns, on rank 0 {found[0][0]}," if width and found[0][0] else "are missing"
             raise ValueError(
-                f"{name} {wrong or 'are missing'} on rank {rank}; allowed are finite numbers of shape "
+                f"{name} {wrong or other} on rank {rank}; allowed are finite numbers of shape "
                 f"({count}, 1), ({count}, 2) or ({count}, 3), a row per local block row"
             )
 

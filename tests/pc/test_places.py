@@ -166,3 +166,12 @@ def test_points_that_fill_a_grid_in_any_order():
     places = places_of(mat)
     assert places.grid == shape
     assert np.array_equal(rows[places.row_at], np.arange(60))
+
+
+@pytest.mark.parallel(2)
+def test_points_of_another_width_on_one_rank_are_refused():
+    """Else the ranks would compare different numbers of axes, and wait for each other."""
+    mat = without_dm(laplacian(plane()))
+    mat.setAttr("coordinates", np.zeros((mat.getLocalSize()[0], 2 + MPI.COMM_WORLD.rank)))
+    with pytest.raises(ValueError, match="have 3 columns, on rank 0 2, on rank 1"):
+        places_of(mat)
