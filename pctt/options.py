@@ -34,6 +34,15 @@ def option(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def number(default: Any, why: str) -> Any:
+    """A dataclass field that steers a method and is set from Python only; ``why`` is its derivation or measurement."""
+    return dataclasses.field(default=default, metadata={"help": why, "python_only": True})
+
+
+def _of_the_database(group: type) -> list[dataclasses.Field]:
+    return [f for f in dataclasses.fields(group) if not f.metadata.get("python_only")]
+
+
 POSITIVE = ("a positive number", lambda x: math.isfinite(x) and x > 0)
 NOT_NEGATIVE = ("a number >= 0", lambda x: math.isfinite(x) and x >= 0)
 FRACTION = ("a number between 0 and 1, both excluded", lambda x: 0 < x < 1)
@@ -69,7 +78,7 @@ def describe(group: type, prefix: str = "") -> list[Description]:
             f.metadata.get("help", ""),  # fields of a user's scene may be plain
             f.metadata.get("choices"),
         )
-        for f in dataclasses.fields(group)
+        for f in _of_the_database(group)
     ]
 
 
@@ -81,7 +90,7 @@ def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "
     types = typing.get_type_hints(group)
     values = {
         f.name: _value(prefix + f.name, database[prefix + f.name], types[f.name], f.metadata)
-        for f in dataclasses.fields(group)  # type: ignore[arg-type]
+        for f in _of_the_database(group)
         if prefix + f.name in database
     }
     return group(**values)
