@@ -7,7 +7,7 @@ from math import ceil
 
 import numpy as np
 
-from dem.arrays import Bools, Floats
+from dem.arrays import Floats
 
 
 def low_pass(time: Floats, values: Floats, cutoff: float) -> Floats:
@@ -36,18 +36,6 @@ def filtered(records: Mapping[str, Floats], names: list[str], cutoff: float) -> 
         stem, bracket, unit = name.partition(" [")
         out[f"{stem}_filtered{bracket}{unit}"] = low_pass(records["time [s]"], records[name], cutoff)
     return out
-
-
-def steady_part(time: Floats, start: float, period: float) -> Bools:
-    """Mask (n,) of the first stroke of a sinusoidal motion where its speed is above 1/sqrt(2) of the greatest: from
-    1/8 to 3/8 of the period after `start` [s]."""
-    phase = (time - start) / period
-    return (phase >= 1 / 8) & (phase <= 3 / 8)
-
-
-def swing(values: Floats, filtered_values: Floats) -> float:
-    """Standard deviation of the part of a series (n,) that the filter removes, relative to the mean of the series."""
-    return float(np.std(values - filtered_values) / np.mean(values))
 
 
 def friction_angle(shear: Floats, normal: Floats) -> float:

@@ -10,8 +10,9 @@ import numpy as np
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
 
-#: Kinds of bodies (the column `shape`); a COMPOUND is a large body, its primitives are kept elsewhere.
-SPHERE, BOX, COMPOUND, CAPSULE = 0, 1, 2, 3
+#: Kinds of bodies (the column `shape`); a COMPOUND is a large body, its primitives are kept elsewhere. Half spaces and
+#: meshes are parts of large bodies only.
+SPHERE, BOX, COMPOUND, CAPSULE, PLANE, MESH = range(6)
 
 
 @dataclass
@@ -62,9 +63,7 @@ def bounding_radius(bodies: Bodies) -> Floats:
 
 def enclosing_radius(kind: Ints, size: Floats) -> Floats:
     """Radius (n,) of the sphere about the centre that encloses a shape of kind (n,) and size (n, 3) [m]."""
-    radius, capsules = quaternion.length(size), np.flatnonzero(kind == CAPSULE)
-    radius[capsules] = size[capsules].sum(axis=1)
-    return radius
+    return np.where(kind == CAPSULE, size[:, 0] + size[:, 1], quaternion.length(size))
 
 
 def least_half_thickness(bodies: Bodies) -> Floats:
@@ -80,5 +79,5 @@ def inverse_root_inertia(bodies: Bodies) -> Floats:
 
 def inverse_inertia(bodies: Bodies) -> Floats:
     """Inverse inertia tensors (n, 3, 3) in the world frame [1/(kg m^2)]."""
-    turn = quaternion.matrix(bodies.quaternion)
-    return (turn / bodies.inertia[:, None, :]) @ turn.transpose(0, 2, 1)
+    root = inverse_root_inertia(bodies)
+    return root @ root

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -33,34 +34,37 @@ def not_negative(name: str, values: ArrayLike) -> Floats:
     return array
 
 
-def positive_column(name: str, values: ArrayLike, count: int) -> Floats:
-    """`values` as positive numbers (count,); a single one stands for all."""
-    array = positive(name, values)
-    if array.shape not in ((), (count,)):
-        raise ValueError(f"{name} must have shape () or ({count},), got {array.shape}")
-    return np.broadcast_to(array, (count,)).copy()
+def between(low: float, high: float = np.inf) -> Callable[[str, float], None]:
+    """A check that a number is not below `low` and not above `high`."""
+
+    def check(name: str, value: float) -> None:
+        if not low <= value <= high:
+            allowed = f"at least {low:g}" if high == np.inf else f"from {low:g} to {high:g}"
+            raise ValueError(f"{name} must be {allowed}, got {value:g}")
+
+    return check
 
 
-def rows(name: str, values: ArrayLike, count: int, width: int) -> Floats:
-    """`values` as finite rows (count, width); one row (width,) stands for all."""
+def rows(name: str, values: ArrayLike, count: int, *row: int) -> Floats:
+    """`values` as finite numbers (count, *row); one row stands for all."""
     array = finite(name, values)
-    if array.shape not in ((width,), (count, width)):
-        raise ValueError(f"{name} must have shape ({width},) or ({count}, {width}), got {array.shape}")
-    return np.broadcast_to(array, (count, width)).copy()
+    if array.shape not in (row, (count, *row)):
+        raise ValueError(f"{name} must have shape {row} or {(count, *row)}, got {array.shape}")
+    return np.broadcast_to(array, (count, *row)).copy()
 
 
-def finite_vector(name: str, values: Sequence[float]) -> tuple[float, ...]:
-    """Three finite numbers as a tuple."""
-    return tuple(rows(name, values, 1, 3)[0].tolist())
+def vector(name: str, values: ArrayLike) -> Floats:
+    """Three finite numbers."""
+    return rows(name, values, 1, 3)[0]
 
 
-def unit_vector(name: str, values: Sequence[float]) -> tuple[float, ...]:
+def unit_vector(name: str, values: ArrayLike) -> Floats:
     """Three finite numbers, not all zero, scaled to unit length. A vector of that length, to rounding, comes back."""
-    vector = np.array(finite_vector(name, values))
-    length = np.linalg.norm(vector)
+    array = vector(name, values)
+    length = np.linalg.norm(array)
     if length == 0.0:
         raise ValueError(f"{name} is the zero vector")
-    return tuple((vector / (1.0 if abs(length - 1.0) < 1e-15 else length)).tolist())
+    return array if abs(length - 1.0) < 1e-15 else array / length
 
 
 def unit_quaternions(name: str, values: ArrayLike, count: int) -> Floats:
@@ -72,6 +76,13 @@ def unit_quaternions(name: str, values: ArrayLike, count: int) -> Floats:
     return array / norm
 
 
-def unit_quaternion(name: str, values: ArrayLike) -> tuple[float, ...]:
-    """One quaternion as a tuple of unit norm."""
-    return tuple(unit_quaternions(name, values, 1)[0].tolist())
+def unit_quaternion(name: str, values: ArrayLike) -> Floats:
+    """One quaternion (4,), scaled to unit norm."""
+    return unit_quaternions(name, values, 1)[0]
+
+
+def check_fields(instance: Any, **checks: Callable[[str, Any], Floats]) -> None:
+    """Put numbers, or tuples of numbers, that have passed a check of this module into fields of a frozen dataclass."""
+    for name, check in checks.items():
+        value = check(f"{type(instance).__name__}.{name}", getattr(instance, name)).tolist()
+        object.__setattr__(instance, name, tuple(value) if isinstance(value, list) else value)

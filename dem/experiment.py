@@ -33,7 +33,7 @@ from dem import checks
 from dem.arrays import Floats
 from dem.scene import Scene
 from dem.step import Step
-from dem.together import SCENE_FILE, told
+from dem.together import SCENE_FILE, in_words
 
 #: Types that an option can have.
 KINDS = (int, float, bool, str)
@@ -125,7 +125,7 @@ def from_file(path: Path) -> type[Experiment]:
         own = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
         if isinstance(error, SyntaxError) and error.filename == str(path):
             raise SceneFileError(f"line {error.lineno}: {error.msg}") from None
-        raise SceneFileError(f"line {own[-1] if own else '?'}: {told(error)}") from None
+        raise SceneFileError(f"line {own[-1] if own else '?'}: {in_words(error)}") from None
     classes = dict.fromkeys(item for item in vars(module).values() if isinstance(item, type))  # one may have two names
     found = [item for item in classes if issubclass(item, Experiment) and item.__module__ == name]
     if len(found) != 1:

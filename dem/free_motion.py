@@ -10,14 +10,10 @@ from dem import bodies
 from dem.arrays import Floats
 from dem.bodies import SPHERE, Bodies
 from dem.compiled import unfused
-from dem.motion import Dynamic, Guided, Hinged
+from dem.motion import Driven, Dynamic, Guided
 from dem.neighbourhood import Neighbourhood
 from dem.scene import LargeBody
 from dem.world import World
-
-#: Newton steps for the spin of a body at most, the relative change of the spin after which the next one would change
-#: nothing, and the relative error of the angular momentum at which they have converged.
-NEWTON_STEPS, LAST_CHANGE, CONVERGED = 4, 1e-8, 1e-6
 
 
 def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
@@ -60,7 +56,7 @@ def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
         rotation = _times(half, w)
         sine, versed = _shares(rotation)
         momentum, new = _turned(_each(inertia, w), rotation, -sine, versed), w
-        for _ in range(NEWTON_STEPS):
+        for _ in range(4):  # enough below half a radian a step
             middle = _turned(_each(inertia, new), rotation, sine, versed)
             change = _solve(
                 _slope((inertia[0], 0.0, 0.0), (1.0, 0.0, 0.0), rotation, sine, versed, middle, half),
@@ -71,11 +67,11 @@ def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
             new = _plus(new, change)
             rotation = _times(half, new)
             sine, versed = _shares(rotation)
-            if _dot(change, change) <= LAST_CHANGE**2 * _dot(w, w):
-                break
+            if _dot(change, change) <= 1e-16 * _dot(w, w):
+                break  # the next change would be its square
         back = _turned(momentum, rotation, -sine, versed)
         error = _plus(back, _times(-1.0, _each(inertia, new)))
-        if _dot(error, error) <= CONVERGED**2 * _dot(momentum, momentum):
+        if _dot(error, error) <= 1e-12 * _dot(momentum, momentum):  # else a step does not resolve the motion
             solved = back[0] / inertia[0], back[1] / inertia[1], back[2] / inertia[2]
             out[n, 0], out[n, 1], out[n, 2] = _turned(solved, frame, twice, 2.0)
     return out
@@ -150,7 +146,7 @@ def large_free_velocity(world: World, dt: float) -> Floats:
     free, drive = free_velocity(table, world.gravity, dt), drive_impulses(world, dt)
     free[:, :3] += drive[:, :3] / table.mass[:, None]
     free[:, 3:] += drive[:, 3:] / table.inertia[:, 2:]  # the z axis of a hinged body is that of its hinge
-    free[:, :3] = project(free_directions(world.large_bodies), free[:, :3])
+    free[:, :3] = (free_directions(world.large_bodies) @ free[:, :3, None])[:, :, 0]
     prescribed = ~bodies.is_dynamic(table)
     free[prescribed] = world.prescribed_velocity(dt)[prescribed]
     return free
@@ -162,12 +158,10 @@ def drive_impulses(world: World, dt: float) -> Floats:
     free = free_velocity(world.large, world.gravity, dt)
     for row, body in enumerate(world.large_bodies):
         motion = body.motion
-        if isinstance(motion, Guided):
-            lack = body.mass / dt * ((motion.speed or 0.0) - float(free[row, :3] @ motion.direction))
-            impulse[row, :3] = dt * motion.mean_force(world.time, dt, lack)
-        elif isinstance(motion, Hinged):
-            lack = body.inertia[2] / dt * ((motion.speed or 0.0) - float(free[row, 3:] @ motion.axis))
-            impulse[row, 3:] = dt * motion.mean_torque(world.time, dt, lack)
+        if isinstance(motion, Driven):
+            part, inertia = (slice(0, 3), body.mass) if isinstance(motion, Guided) else (slice(3, 6), body.inertia[2])
+            lack = inertia / dt * ((motion.speed or 0.0) - float(free[row, part] @ motion.line))
+            impulse[row, part] = dt * motion.mean_drive(world.time, dt, lack)
     return impulse
 
 
@@ -175,8 +169,3 @@ def free_directions(members: Sequence[LargeBody]) -> Floats:
     """Projectors (large, 3, 3) on the directions that are open to the velocities of large bodies."""
     open_to = [body.motion.free_directions() if isinstance(body.motion, Dynamic) else np.eye(3) for body in members]
     return np.array(open_to).reshape(len(members), 3, 3)
-
-
-def project(projectors: Floats, vectors: Floats) -> Floats:
-    """Products (n, 3) of matrices (n, 3, 3) and vectors (n, 3)."""
-    return (projectors @ vectors[:, :, None])[:, :, 0]

@@ -10,22 +10,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, QhullError
 
 from dem.arrays import ArrayLike, Floats, Ints
-from dem.checks import finite, finite_vector, positive, unit_quaternion
+from dem.checks import check_fields, finite, positive, unit_quaternion, vector
 from dem.quaternion import cross, length
-
-#: Vertices of a file that are closer than this share of the extent are one: numbers of STL files have seven digits.
-SAME = 1e-6
-
-#: Pairs of cells and triangles beyond which the cells of a surface are not made any smaller.
-MOST_PAIRS = 30_000
 
 
 class Closest(NamedTuple):
@@ -71,8 +63,8 @@ class Surface:
         area = length(across)
         flat = area <= 1e-10 * longest**2
         self.normal = np.where(flat[:, None], 0.0, across / np.where(flat, 1.0, area)[:, None])
-        self._directed = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
-        self.edge, side = np.unique(np.sort(self._directed, axis=1), axis=0, return_inverse=True)
+        ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
+        self.edge, side = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
         self.side = side.reshape(-1, 3)
         self.features = len(triangles) + len(self.edge) + len(vertices)
         self._cells: dict[int, Cells] = {}
@@ -92,14 +84,11 @@ class Surface:
     def ridges(self) -> np.ndarray:
         """Which edges (edges,) are no mere lines in a flat face: open ones, and those where faces meet at an angle."""
         count = np.bincount(self.side.ravel(), minlength=len(self.edge))
-        total = np.zeros((len(self.edge), 3))
-        outer = np.zeros((len(self.edge), 3, 3))
-        normal = np.repeat(self.normal, 3, axis=0)
-        np.add.at(total, self.side.ravel(), normal)
-        np.add.at(outer, self.side.ravel(), normal[:, :, None] * normal[:, None, :])
-        # Parallel normals, whatever their signs, make a matrix of rank one: its trace is its greatest eigenvalue.
-        trace = np.trace(outer, axis1=1, axis2=2)
-        return (count != 2) | (trace - np.linalg.eigvalsh(outer)[:, 2] > 1e-10)
+        face = np.argsort(self.side.ravel(), kind="stable") // 3  # edge by edge
+        first = np.cumsum(count) - count
+        second = np.minimum(first + 1, len(face) - 1)
+        sine = length(cross(self.normal[face[first]], self.normal[face[second]]))
+        return (count != 2) | (sine > 1e-5)
 
     @cached_property
     def hull(self) -> Ints:
@@ -108,37 +97,6 @@ class Surface:
             return np.sort(ConvexHull(self.vertex).vertices).astype(np.int64)
         except QhullError:
             return np.arange(len(self.vertex))
-
-    def refuse_unless_solid(self) -> None:
-        """ValueError unless the surface is closed, of one orientation and with its normals outwards."""
-        count = np.bincount(self.side.ravel(), minlength=len(self.edge))
-        if (count != 2).any():
-            e = int(np.flatnonzero(count != 2)[0])
-            x, y, z = self.middle + self.vertex[self.edge[e]].mean(axis=0)
-            raise ValueError(
-                f"a mesh that is not closed has no mass: {np.count_nonzero(count != 2)} of {len(count)} edges belong "
-                f"to one triangle or to more than two, such as that at ({x:g}, {y:g}, {z:g})"
-            )
-        forward = np.bincount(self.side.ravel(), self._directed[:, 0] < self._directed[:, 1], len(self.edge))
-        if (forward != 1).any():
-            raise ValueError(
-                "a mesh whose triangles are turned both ways has no mass: across "
-                f"{np.count_nonzero(forward != 1)} edges the normals change sides"
-            )
-        if self.integrals()[0] <= 0.0:
-            raise ValueError("a mesh whose normals point inwards has no mass: reverse its triangles")
-
-    def integrals(self) -> tuple[float, Floats, Floats]:
-        """Volume [m^3] and the integrals over it of x (3,) [m^4] and x x' (3, 3) [m^5], about the middle.
-
-        By the divergence theorem: sums over the tetrahedra between the origin and each triangle, whose volumes have
-        signs (Tonon 2004, "Explicit exact formulas for the 3-D tetrahedron inertia tensor").
-        """
-        six = np.einsum("mi,mi->m", self.corner[:, 0], cross(self.corner[:, 1], self.corner[:, 2]))
-        total = self.corner.sum(axis=1)
-        products = np.einsum("m,mki,mkj->ij", six, self.corner, self.corner)
-        products += np.einsum("m,mi,mj->ij", six, total, total)
-        return float(six.sum() / 6.0), six @ total / 24.0, products / 120.0
 
     def near(self, points: Floats, reach: Floats) -> tuple[Ints, Ints]:
         """Pairs (rows of points, triangles): all triangles within reach (n,) [m] of points (n, 3), and some more."""
@@ -185,7 +143,7 @@ class Surface:
 
     def _table(self, level: int) -> Cells:
         """The cells for reaches up to 2^level [m]: halved, with the triangles that come near, until they are half as
-        wide as the reach or there are many."""
+        wide as the reach or there are many pairs of both, which would fill the memory."""
         if level in self._cells:
             return self._cells[level]
         reach = 2.0**level
@@ -193,7 +151,7 @@ class Surface:
         low = np.full(3, -0.5 * width)
         place = np.zeros((len(self.triangle), 3), np.int64)
         triangle = np.arange(len(self.triangle))
-        while width > 0.5 * reach and len(triangle) < MOST_PAIRS:
+        while width > 0.5 * reach and len(triangle) < 30_000:
             width *= 0.5
             place = (2 * place[:, None] + _EIGHT).reshape(-1, 3)
             triangle = np.repeat(triangle, 8)
@@ -261,9 +219,26 @@ class Mesh:
         used, rows = np.unique(triangles, return_inverse=True)
         object.__setattr__(self, "vertices", vertices[used])
         object.__setattr__(self, "triangles", rows.reshape(-1, 3))
-        object.__setattr__(self, "center", finite_vector("centre of a mesh", self.center))
-        object.__setattr__(self, "quaternion", unit_quaternion("quaternion of a mesh", self.quaternion))
         object.__setattr__(self, "surface", Surface(vertices[used], rows.reshape(-1, 3)))
+        check_fields(self, center=vector, quaternion=unit_quaternion)
+
+    def solid(self) -> tuple[float, Floats, Floats]:
+        """Volume [m^3], centre of mass (3,) and inertia tensor (3, 3) about it at density one, in the frame of the
+        vertices. ValueError unless the surface is closed, of one orientation and with its normals outwards."""
+        surface = self.surface
+        body = _trimesh("the mass of a mesh is computed").Trimesh(surface.vertex, surface.triangle, process=False)
+        if not body.is_watertight:
+            wrong = np.flatnonzero(np.bincount(surface.side.ravel()) != 2)
+            x, y, z = surface.middle + surface.vertex[surface.edge[wrong[0]]].mean(axis=0)
+            raise ValueError(
+                f"a mesh that is not closed has no mass: {len(wrong)} of {len(surface.edge)} edges belong to one "
+                f"triangle or to more than two, such as that at ({x:g}, {y:g}, {z:g})"
+            )
+        if not body.is_winding_consistent:
+            raise ValueError("a mesh whose triangles are turned both ways has no mass: normals change sides")
+        if body.volume <= 0.0:
+            raise ValueError("a mesh whose normals point inwards has no mass: reverse its triangles")
+        return float(body.volume), surface.middle + body.center_mass, np.asarray(body.moment_inertia)
 
     @classmethod
     def read(
@@ -280,25 +255,20 @@ class Mesh:
         ValueError, which names the file, if it cannot be read, has no triangle or if trimesh is not there.
         """
         positive(f"scale of {file}", scale)
-        try:
-            import trimesh
-        except ImportError:
-            remedy = "pip install 'pctt[meshes]', or trimesh"
-            raise ValueError(f"{file}: meshes are read by trimesh, which is not there: {remedy}") from None
+        trimesh = _trimesh(f"{file}: meshes are read")
         if not Path(file).is_file():
             raise ValueError(f"{file}: no such file")
         try:
             loaded = trimesh.load(str(file), force="mesh", process=False)
+            if len(loaded.faces):  # the numbers of STL files have seven digits
+                loaded.merge_vertices(digits_vertex=6 - int(np.ceil(np.log10(loaded.extents.max()))))
             vertices, triangles = np.array(loaded.vertices, dtype=float), np.array(loaded.faces, dtype=np.int64)
         except Exception as error:  # whatever a damaged file makes of the reader
             raise ValueError(f"{file}: cannot be read as a mesh ({type(error).__name__}: {error})") from None
         if not len(triangles):
             raise ValueError(f"{file}: has no triangle")
-        if not np.isfinite(vertices).all():
-            raise ValueError(f"{file}: NaN or infinite number")
-        vertices, triangles = merged(scale * vertices, triangles)
         try:
-            return cls(vertices, triangles, center, quaternion)
+            return cls(scale * vertices, triangles, center, quaternion)
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from None
 
@@ -337,18 +307,15 @@ class Mesh:
         return cls(vertices.reshape(-1, 3), np.concatenate(triangles).reshape(-1, 3), center, quaternion)
 
     def write(self, file: str | Path) -> None:
-        """Write the triangles, in their own frame and in metres, as a binary STL file."""
-        corner = np.asarray(self.vertices)[np.asarray(self.triangles)]
-        facet = np.zeros(len(corner), dtype=[("vectors", "<f4", (4, 3)), ("attribute", "<u2")])
-        facet["vectors"][:, 0], facet["vectors"][:, 1:] = self.surface.normal, corner
-        Path(file).write_bytes(b"pctt".ljust(80) + np.array(len(corner), "<u4").tobytes() + facet.tobytes())
+        """Write the triangles, in their own frame and in metres, as an STL or OBJ file, by the end of its name."""
+        trimesh = _trimesh(f"{file}: meshes are written")
+        trimesh.Trimesh(self.vertices, self.triangles, process=False).export(str(file))
 
 
-def merged(vertices: Floats, triangles: Ints) -> tuple[Floats, Ints]:
-    """The same triangles (m, 3) with one vertex for all of `vertices` (n, 3) that are in the same place."""
-    vertices, row = np.unique(vertices, axis=0, return_inverse=True)
-    pairs = cKDTree(vertices).query_pairs(SAME * float(np.ptp(vertices, axis=0).max()), output_type="ndarray")
-    links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices), len(vertices)))
-    _, group = connected_components(links, directed=False)
-    _, first = np.unique(group, return_index=True)
-    return vertices[first], group[row.ravel()[triangles]]
+def _trimesh(what: str) -> Any:
+    """The optional package; ValueError if it is not there."""
+    try:
+        import trimesh
+    except ImportError:
+        raise ValueError(f"{what} by trimesh, which is not there: pip install 'pctt[meshes]', or trimesh") from None
+    return trimesh

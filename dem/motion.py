@@ -9,16 +9,32 @@ contacts see that one instead, at all times.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import Union
+from typing import Any, ClassVar, Union
 
 import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
-from dem.checks import finite, finite_vector, positive, rows, unit_quaternions, unit_vector
+from dem.checks import check_fields, finite, positive, rows, unit_quaternions, unit_vector, vector
+
+
+class Timed:
+    """What lasts from one time to another."""
+
+    start: float  #: [s]
+    end: float  #: [s]
+
+    def _check_times(self) -> None:
+        if not (np.isfinite(self.start) and self.start <= self.end):
+            raise ValueError(f"{type(self).__name__} cannot begin at {self.start:g} s and end at {self.end:g} s")
+
+    def gone(self, time: float) -> float:
+        """How much of the time between start and end has gone by [s]."""
+        return max(min(time, self.end) - self.start, 0.0)
 
 
 @dataclass(frozen=True)
@@ -30,8 +46,35 @@ class Dynamic:
         return np.eye(3)
 
 
+class Driven(Dynamic, Timed):
+    """Moved by forces along one line of the world only, or by torques about one only, with a drive that acts on it."""
+
+    speed: float | None
+    _line: ClassVar[str]  #: the name of the field with the line
+    _strength: ClassVar[str]  #: the name of the field with the force or torque of the drive
+
+    def __post_init__(self) -> None:
+        check_fields(self, **{self._line: unit_vector, self._strength: finite})
+        self._check_times()
+        most, kind = getattr(self, self._strength), type(self).__name__
+        finite(f"{kind}.speed", self.speed or 0.0)
+        if self.speed is not None and most <= 0.0:
+            raise ValueError(f"{kind}.{self._strength} of a servo, with a speed, must be above zero, got {most:g}")
+
+    @property
+    def line(self) -> Floats:
+        """Unit vector (3,) of the line."""
+        return np.array(getattr(self, self._line))
+
+    def mean_drive(self, time: float, dt: float, lack: float) -> Floats:
+        """Mean force or torque (3,) of the drive from `time` to `time + dt` [s]; of a servo what lacks to the speed at
+        the end of the step, `lack` [N or N m], as far as its strength goes."""
+        most = getattr(self, self._strength) * (self.gone(time + dt) - self.gone(time)) / dt
+        return (most if self.speed is None else min(max(lack, -most), most)) * self.line
+
+
 @dataclass(frozen=True)
-class Guided(Dynamic):
+class Guided(Driven):
     """Moved by forces along one direction of the world only, without turning: a piston, a press.
 
     The guide takes all other forces and all torques: the inverse mass of the other five degrees of freedom is zero. A
@@ -46,23 +89,15 @@ class Guided(Dynamic):
     start: float = 0.0  #: [s]
     end: float = np.inf  #: [s]
     speed: float | None = None  #: along the direction, that a servo keeps [m/s]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "direction", unit_vector("direction of a guide", self.direction))
-        _check_drive("guide", "force", self.force, self.start, self.end, self.speed)
+    _line, _strength = "direction", "force"
 
     def free_directions(self) -> Floats:
         """Projector (3, 3) on the direction of the guide."""
         return np.outer(self.direction, self.direction)
 
-    def mean_force(self, time: float, dt: float, lack: float = 0.0) -> Floats:
-        """Mean force of the drive (3,) from `time` to `time + dt` [s]. `lack` [N] is the force that takes the body to
-        the speed of the servo at the end of the step."""
-        return _driven(self, self.force, time, dt, lack) * np.array(self.direction)
-
 
 @dataclass(frozen=True)
-class Hinged(Dynamic):
+class Hinged(Driven):
     """Moved by torques about one axis of the world only, on which its centre of mass is: a wheel, a roller, a stirrer.
 
     The bearing takes all forces and all other torques. A drive may turn it with a constant torque, or as a servo with
@@ -74,18 +109,11 @@ class Hinged(Dynamic):
     start: float = 0.0  #: [s]
     end: float = np.inf  #: [s]
     speed: float | None = None  #: about the axis, that a servo keeps [rad/s]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "axis", unit_vector("axis of a hinge", self.axis))
-        _check_drive("hinge", "torque", self.torque, self.start, self.end, self.speed)
+    _line, _strength = "axis", "torque"
 
     def free_directions(self) -> Floats:
         """Projector (3, 3) on nothing: the axis stays where it is."""
         return np.zeros((3, 3))
-
-    def mean_torque(self, time: float, dt: float, lack: float = 0.0) -> Floats:
-        """Mean torque of the drive (3,) from `time` to `time + dt` [s]; `lack` [N m] as of `Guided.mean_force`."""
-        return _driven(self, self.torque, time, dt, lack) * np.array(self.axis)
 
 
 @dataclass(frozen=True)
@@ -98,7 +126,7 @@ class Fixed:
 
 
 @dataclass(frozen=True)
-class Rotation:
+class Rotation(Timed):
     """Constant rotation about an axis through a fixed point of the world from one time to another; at rest before and
     after."""
 
@@ -108,20 +136,19 @@ class Rotation:
     end: float = np.inf  #: [s]
 
     def __post_init__(self) -> None:
-        _ordered("rotation", self.start, self.end)
-        object.__setattr__(self, "velocity", finite_vector("angular velocity", self.velocity))
-        object.__setattr__(self, "center", finite_vector("centre of rotation", self.center))
+        self._check_times()
+        check_fields(self, velocity=vector, center=vector)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """As of `Fixed`."""
-        turn = quaternion.exponential(time_gone(time, self.start, self.end) * np.array(self.velocity))
+        turn = quaternion.exponential(self.gone(time) * np.array(self.velocity))
         center = np.array(self.center)
         turned = quaternion.normalized(quaternion.multiply(turn, orientation))
         return center + quaternion.rotate(turn, position - center), turned
 
 
 @dataclass(frozen=True)
-class Oscillation:
+class Oscillation(Timed):
     """Sinusoidal translation: displacement amplitude * (sin(2 pi t / period + phase) - sin(phase)), where t is the time
     since `start`. The body rests before `start`, and after `end` in its last place."""
 
@@ -133,20 +160,18 @@ class Oscillation:
     end: float = np.inf  #: [s]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "direction", unit_vector("direction of oscillation", self.direction))
-        _ordered("oscillation", self.start, self.end)
-        finite_vector("amplitude, phase and start", (self.amplitude, self.phase, self.start))
-        positive("period of oscillation", self.period)
+        self._check_times()
+        check_fields(self, direction=unit_vector, amplitude=finite, period=positive, phase=finite)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """As of `Fixed`."""
-        angle = 2.0 * np.pi * time_gone(time, self.start, self.end) / self.period
+        angle = 2.0 * np.pi * self.gone(time) / self.period
         swing = np.sin(angle + self.phase) - np.sin(self.phase)
         return position + self.amplitude * swing * np.array(self.direction), orientation
 
 
 @dataclass(frozen=True)
-class Glide:
+class Glide(Timed):
     """Translation at constant velocity from one time to another; at rest before and after."""
 
     velocity: Sequence[float]  #: (3,) [m/s]
@@ -154,12 +179,12 @@ class Glide:
     end: float = np.inf  #: [s]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "velocity", finite_vector("velocity of a glide", self.velocity))
-        _ordered("glide", self.start, self.end)
+        self._check_times()
+        check_fields(self, velocity=vector)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """As of `Fixed`."""
-        return position + time_gone(time, self.start, self.end) * np.array(self.velocity), orientation
+        return position + self.gone(time) * np.array(self.velocity), orientation
 
 
 @dataclass(frozen=True)
@@ -178,28 +203,27 @@ class Path:
         if len(self.positions) != len(times):
             raise ValueError(f"a path has {len(times)} times but {len(self.positions)} positions")
         object.__setattr__(self, "times", times)
-        places = tuple(finite_vector("position of a path", place) for place in self.positions)
-        object.__setattr__(self, "positions", places)
+        places = rows("positions of a path", self.positions, len(times), 3)
+        object.__setattr__(self, "positions", tuple(map(tuple, places.tolist())))
 
     @classmethod
     def read(cls, file: str | FilePath) -> Path:
         """From a text file with time [s] and x, y, z [m] in each line, between them commas or blanks; # begins a
-        remark. ValueError, with file and line, for any other line."""
-        rows: list[tuple[float, ...]] = []
+        remark. ValueError, which names the file, for any other line."""
+        found = []
         for number, line in enumerate(FilePath(file).read_text().splitlines(), 1):
             words = line.partition("#")[0].replace(",", " ").split()
+            if not words:
+                continue
             try:
-                row = tuple(map(float, words))
+                time, *place = map(float, words)
+                found.append((time, vector("place", place)))
             except ValueError:
-                row = ()
-            if words and (len(row) != 4 or not np.isfinite(row).all()):
-                raise ValueError(f"{file}, line {number}: not a time and three coordinates: {line.strip()}")
-            if words and rows and row[0] <= rows[-1][0]:
-                raise ValueError(f"{file}, line {number}: time {row[0]:g} s does not come after {rows[-1][0]:g} s")
-            rows += [row] if words else []
-        if not rows:
-            raise ValueError(f"{file}: no line with a time and three coordinates")
-        return cls([row[0] for row in rows], [row[1:] for row in rows])
+                raise ValueError(f"{file}, line {number}: not a time and three coordinates: {line.strip()}") from None
+        try:
+            return cls(*zip(*found)) if found else cls((), ())
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from None
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """As of `Fixed`."""
@@ -221,38 +245,26 @@ def checked_pose(motion: Prescribed, time: float, position: Floats, orientation:
     return rows(f"position {what}", place, 1, 3)[0], unit_quaternions(f"quaternion {what}", turn, 1)[0]
 
 
-def mean_velocity(
-    motion: Prescribed, time: float, dt: float, position: Floats, orientation: Floats
-) -> Floats:
+def mean_velocity(motion: Prescribed, time: float, dt: float, position: Floats, orientation: Floats) -> Floats:
     """Velocity (6,) from `time` to `time + dt` of a body with the given pose at time zero."""
     start, before = checked_pose(motion, time, position, orientation)
     end, after = checked_pose(motion, time + dt, position, orientation)
     given = getattr(motion, "angular_velocity", None)
     turning = quaternion.rotation_vector(before, after) / dt if given is None else given()
-    turning = rows(f"angular velocity of {type(motion).__name__}", turning, 1, 3)[0]
-    return np.concatenate([(end - start) / dt, turning])
+    return np.concatenate([(end - start) / dt, vector(f"angular velocity of {type(motion).__name__}", turning)])
 
 
-def time_gone(time: float, start: float, end: float) -> float:
-    """How much of the time between start and end has gone by [s]."""
-    return max(min(time, end) - start, 0.0)
-
-
-def _driven(body: Guided | Hinged, strength: float, time: float, dt: float, lack: float) -> float:
-    """The mean force or torque of a drive of this strength from `time` to `time + dt` [s]; of a servo what lacks."""
-    share = (time_gone(time + dt, body.start, body.end) - time_gone(time, body.start, body.end)) / dt
-    most = strength * share
-    return most if body.speed is None else min(max(lack, -most), most)
-
-
-def _ordered(what: str, start: float, end: float) -> None:
-    if not (np.isfinite(start) and start <= end):
-        raise ValueError(f"the {what} cannot begin at {start:g} s and end at {end:g} s")
-
-
-def _check_drive(what: str, strength: str, most: float, start: float, end: float, speed: float | None) -> None:
-    finite(f"{strength} of a {what}", most)
-    _ordered(f"{strength} of a {what}", start, end)
-    finite(f"speed of a {what}", speed or 0.0)
-    if speed is not None and most <= 0.0:
-        raise ValueError(f"a {what} with a speed needs the greatest {strength} of its servo, above zero, got {most:g}")
+def changed(motion: Motion, time: float, **values: Any) -> Motion:
+    """The motion with other parameters from `time` [s] on. An oscillation of another period stays in its phase, unless
+    a phase is given. ValueError for a parameter that the motion does not have, or a bad value."""
+    if not dataclasses.is_dataclass(motion):
+        raise ValueError(f"{type(motion).__name__} is no dataclass, so its parameters cannot be changed within a run")
+    names = [field.name for field in dataclasses.fields(motion)]
+    for name in values:
+        if name not in names:
+            raise ValueError(f"{type(motion).__name__} has no {name}; it has {', '.join(names) or 'no parameters'}")
+    after = dataclasses.replace(motion, **values)
+    if isinstance(motion, Oscillation) and isinstance(after, Oscillation) and "phase" not in values:
+        turns = motion.gone(time) / motion.period - after.gone(time) / after.period
+        after = dataclasses.replace(after, phase=motion.phase + 2.0 * np.pi * turns)
+    return after

@@ -6,9 +6,13 @@ Every function but `integrate` works on stacks: quaternions have shape (..., 4),
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dem.arrays import Floats
 from dem.compiled import loop
+
+#: scipy takes and gives (x, y, z, w); its `scalar_first` came with 1.14.
+_TO_SCIPY, _FROM_SCIPY = [1, 2, 3, 0], [3, 0, 1, 2]
 
 
 def cross(a: Floats, b: Floats) -> Floats:
@@ -18,6 +22,14 @@ def cross(a: Floats, b: Floats) -> Floats:
     out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
     out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return out
+
+
+def across(axis: Floats) -> Floats:
+    """Unit vectors (m, 3) normal to the given ones (m, 3)."""
+    other = np.zeros_like(axis)
+    other[np.arange(len(axis)), np.abs(axis).argmin(axis=1)] = 1.0
+    normal = cross(axis, other)
+    return normal / length(normal)[:, None]
 
 
 def length(v: Floats) -> Floats:
@@ -67,36 +79,19 @@ def matrix(q: Floats) -> Floats:
 
 
 def from_matrix(r: Floats) -> Floats:
-    """Unit quaternion (4,) of one rotation matrix (3, 3), after Bar-Itzhack (2000).
-
-    The quaternion is the eigenvector of the largest eigenvalue of a symmetric 4x4 matrix: no case
-    distinction.
-    """
-    trace = np.trace(r)
-    skew = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    k = np.empty((4, 4))
-    k[0, 0] = trace
-    k[0, 1:] = k[1:, 0] = skew
-    k[1:, 1:] = r + r.T - trace * np.eye(3)
-    q = np.linalg.eigh(k)[1][:, -1]
-    return q if q[0] >= 0 else -q
+    """Unit quaternion (4,) of one rotation matrix (3, 3)."""
+    return Rotation.from_matrix(r).as_quat()[_FROM_SCIPY]
 
 
 def exponential(rotation: Floats) -> Floats:
     """Quaternions (..., 4) of rotation vectors (..., 3): angle in radians times unit axis."""
-    half = 0.5 * length(rotation)[..., None]
-    # np.sinc(x) = sin(pi x) / (pi x) has the right limit at zero.
-    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * rotation], axis=-1)
+    return Rotation.from_rotvec(rotation).as_quat()[..., _FROM_SCIPY]
 
 
 def rotation_vector(before: Floats, after: Floats) -> Floats:
     """Rotation vectors (..., 3), angle [rad] times unit axis in the world frame, of the shortest turns from one
     orientation (..., 4) to another; exact also for tiny angles."""
-    turn = multiply(after, conjugate(before))
-    turn = np.where(turn[..., :1] < 0.0, -turn, turn)
-    sine = length(turn[..., 1:])[..., None]
-    angle = 2.0 * np.arctan2(sine, turn[..., :1])
-    return turn[..., 1:] * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0.0)
+    return Rotation.from_quat(multiply(after, conjugate(before))[..., _TO_SCIPY]).as_rotvec()
 
 
 @loop

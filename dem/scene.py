@@ -19,8 +19,8 @@ from dem import bodies, checks, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.bodies import BOX, CAPSULE, COMPOUND, SPHERE, Bodies
 from dem.mesh import Mesh
-from dem.motion import Dynamic, Fixed, Guided, Hinged, Motion
-from dem.quaternion import length
+from dem.motion import Driven, Dynamic, Fixed, Guided, Hinged, Motion
+from dem.quaternion import across, length
 from dem.shapes import Box, Shape
 
 
@@ -44,7 +44,7 @@ class Scene:
 
     def __init__(self, friction: float, gravity: Sequence[float] = (0.0, 0.0, -9.81)) -> None:
         """`friction`: coefficient of all pairs of materials not set otherwise; `gravity`: (3,) [m/s^2]."""
-        self.gravity = np.array(checks.finite_vector("gravity", gravity))
+        self.gravity = checks.vector("gravity", gravity)
         self.large_bodies: list[LargeBody] = []
         self._friction = float(checks.not_negative("friction", friction))
         self._pairs: dict[tuple[int, int], float] = {}
@@ -65,11 +65,8 @@ class Scene:
 
         positions (n, 3) [m]; radius [m] and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3).
         """
-        centers = _points("positions of spheres", positions)
-        radii = checks.positive_column("radius", radius, len(centers))
-        mass, inertia = shapes.sphere_mass(radii, checks.positive_column("density", density, len(centers)))
-        size, speeds = radii[:, None] * [1.0, 0.0, 0.0], _velocities(velocity, angular_velocity, len(centers))
-        return self._add_grains(SPHERE, centers, (1.0, 0.0, 0.0, 0.0), speeds, mass, inertia, material, size)
+        upright, lengths = (1.0, 0.0, 0.0, 0.0), {"radius": radius}
+        return self._add_grains(SPHERE, positions, lengths, density, upright, material, velocity, angular_velocity)
 
     def add_boxes(
         self,
@@ -87,11 +84,8 @@ class Scene:
         positions (n, 3) and half extents (3,) or (n, 3) [m]; density [kg/m^3] one for all or (n,);
         quaternions (4,) or (n, 4); velocities (3,) or (n, 3).
         """
-        centers = _points("positions of boxes", positions)
-        size = checks.rows("half extents", checks.positive("half extents", half_extents), len(centers), 3)
-        mass, inertia = shapes.box_mass(size, checks.positive_column("density", density, len(centers)))
-        speeds = _velocities(velocity, angular_velocity, len(centers))
-        return self._add_grains(BOX, centers, quaternions, speeds, mass, inertia, material, size)
+        lengths = {"half extents": half_extents}
+        return self._add_grains(BOX, positions, lengths, density, quaternions, material, velocity, angular_velocity)
 
     def add_capsules(
         self,
@@ -110,13 +104,8 @@ class Scene:
         positions (n, 3) [m]; radius, half length of the core segment [m] and density [kg/m^3] one for all or (n,);
         quaternions (4,) or (n, 4); velocities (3,) or (n, 3).
         """
-        centers = _points("positions of capsules", positions)
-        count = len(centers)
-        radii = checks.positive_column("radius", radius, count)
-        halves = checks.positive_column("half length", half_length, count)
-        mass, inertia = shapes.capsule_mass(radii, halves, checks.positive_column("density", density, count))
-        size, speeds = np.stack([radii, halves, 0 * radii], axis=1), _velocities(velocity, angular_velocity, count)
-        return self._add_grains(CAPSULE, centers, quaternions, speeds, mass, inertia, material, size)
+        lengths = {"radius": radius, "half length": half_length}
+        return self._add_grains(CAPSULE, positions, lengths, density, quaternions, material, velocity, angular_velocity)
 
     def add_body(
         self,
@@ -145,8 +134,8 @@ class Scene:
             raise ValueError(f"large bodies need distinct names, got {name!r}")
         if not shapes:
             raise ValueError(f"large body {name!r} has no shape")
-        place = np.array(checks.finite_vector(f"position of {name!r}", position))
-        turn = np.array(checks.unit_quaternion(f"quaternion of {name!r}", quaternion))
+        place = checks.vector(f"position of {name!r}", position)
+        turn = checks.unit_quaternion(f"quaternion of {name!r}", quaternion)
         speed = _velocities(velocity, angular_velocity, 1)[0]
         _refuse_speed(name, motion, speed)
         parts, weight, moments = tuple(shapes), np.inf, np.full(3, np.inf)
@@ -158,16 +147,16 @@ class Scene:
         elif density is None and mass is not None and (inertia is not None or isinstance(motion, Guided)):
             weight = float(checks.positive(f"mass of {name!r}", mass))
             if inertia is not None:
-                moments = checks.rows("inertia", checks.positive(f"inertia of {name!r}", inertia), 1, 3)[0]
+                moments = checks.vector(f"inertia of {name!r}", checks.positive(f"inertia of {name!r}", inertia))
         else:
             raise ValueError(f"dynamic body {name!r} needs either its density or both mass and inertia")
         if isinstance(motion, Guided):
             moments = np.full(3, np.inf)
         if isinstance(motion, Hinged):
-            along, arm = np.array(motion.axis), place - np.array(position)
-            if length(np.cross(along, arm)) > 1e-6 * max(length(arm), np.sqrt(moments.max() / weight)):
+            arm = place - np.array(position)
+            if length(np.cross(motion.line, arm)) > 1e-6 * max(length(arm), np.sqrt(moments.max() / weight)):
                 raise ValueError(f"{name!r} is hinged: its centre of mass must be on the axis through its position")
-            parts, turn, moments = _on_hinge(parts, turn, moments, along)
+            parts, turn, moments = _on_hinge(parts, turn, moments, motion.line)
         number = self._material(material)
         self.large_bodies.append(LargeBody(name, parts, motion, number, place, turn, speed, weight, moments))
 
@@ -219,47 +208,50 @@ class Scene:
     def _add_grains(
         self,
         kind: int,
-        position: Floats,
+        positions: ArrayLike,
+        lengths: dict[str, ArrayLike],
+        density: ArrayLike,
         quaternions: ArrayLike,
-        velocity: Floats,
-        mass: Floats,
-        inertia: Floats,
         material: str,
-        size: Floats,
+        velocity: ArrayLike,
+        angular_velocity: ArrayLike,
     ) -> Ints:
-        first = sum(len(part) for part in self._grains)
-        ids = np.arange(first, first + len(position))
-        same = np.ones(len(ids), dtype=np.int64)
-        number = self._material(material)
-        self._grains.append(
-            Bodies(
-                id=ids,
-                position=position,
-                quaternion=checks.unit_quaternions("quaternions", quaternions, len(ids)),
-                velocity=velocity,
-                mass=mass,
-                inertia=inertia,
-                material=number * same,
-                shape=kind * same,
-                size=size,
-                weight=np.zeros(len(ids)),
-            )
+        """Add grains of one kind, of which `lengths` has the columns of `size` by name; their ids."""
+        centers = np.atleast_2d(checks.finite("positions", positions))
+        count, first = len(centers), sum(len(part) for part in self._grains)
+        size = np.zeros((count, 3))
+        for k, (name, values) in enumerate(lengths.items()):
+            values = checks.positive(name, values)
+            if kind == BOX:
+                size[:] = checks.rows(name, values, count, 3)
+            else:
+                size[:, k] = checks.rows(name, values, count)
+        mass, inertia = shapes.solid(kind, size, checks.rows("density", checks.positive("density", density), count))
+        table = Bodies(
+            id=np.arange(first, first + count),
+            position=checks.rows("positions", centers, count, 3),
+            quaternion=checks.unit_quaternions("quaternions", quaternions, count),
+            velocity=_velocities(velocity, angular_velocity, count),
+            mass=mass,
+            inertia=inertia,
+            material=np.full(count, self._material(material)),
+            shape=np.full(count, kind),
+            size=size,
+            weight=np.zeros(count),
         )
-        return ids
+        self._grains.append(table)
+        return table.id
 
 
 def _refuse_speed(name: str, motion: Motion, speed: Floats) -> None:
     """ValueError for an initial velocity (6,) that the motion does not allow."""
     if not isinstance(motion, Dynamic) and speed.any():
         raise ValueError(f"the motion of {name!r} is prescribed: it takes no initial velocity")
-    if isinstance(motion, Guided):
-        across = speed[:3] - motion.free_directions() @ speed[:3]
-        if speed[3:].any() or length(across) > 1e-12 * length(speed):
-            raise ValueError(f"{name!r} is guided: its initial velocity must be along the guide")
-    if isinstance(motion, Hinged):
-        across = np.cross(motion.axis, speed[3:])
-        if speed[:3].any() or length(across) > 1e-12 * length(speed[3:]):
-            raise ValueError(f"{name!r} is hinged: its initial velocity must be an angular one about the hinge")
+    if isinstance(motion, Driven):
+        allowed, other = (speed[:3], speed[3:]) if isinstance(motion, Guided) else (speed[3:], speed[:3])
+        if other.any() or length(np.cross(motion.line, allowed)) > 1e-12 * length(allowed):
+            kind, along = ("guided", "along the guide") if isinstance(motion, Guided) else ("hinged", "about the hinge")
+            raise ValueError(f"{name!r} is {kind}: its initial velocity must be {along}")
 
 
 def _on_hinge(
@@ -267,9 +259,8 @@ def _on_hinge(
 ) -> tuple[tuple[Shape, ...], Floats, Floats]:
     """The same body in a frame whose z axis is the axis (3,) of its hinge, and its moments: infinite but about that."""
     moment = float(moments @ quaternion.rotate(quaternion.conjugate(turn), axis) ** 2)
-    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    across /= np.linalg.norm(across)
-    upright = quaternion.from_matrix(np.stack([across, np.cross(axis, across), axis], axis=1))
+    x = across(axis[None])[0]
+    upright = quaternion.from_matrix(np.stack([x, np.cross(axis, x), axis], axis=1))
     inner = quaternion.multiply(quaternion.conjugate(turn), upright)
     moved = tuple(shapes.moved(part, np.zeros(3), inner) for part in parts)
     return moved, upright, np.array([np.inf, np.inf, moment])
@@ -292,17 +283,8 @@ def _refuse_beside_meshes(members: Sequence[LargeBody], box_grains: bool) -> Non
                 )
 
 
-def _points(name: str, values: ArrayLike) -> Floats:
-    array = np.atleast_2d(checks.finite(name, values))
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"{name} must have shape (n, 3), got {array.shape}")
-    return array.copy()
-
-
 def _velocities(linear: ArrayLike, angular: ArrayLike, count: int) -> Floats:
-    return np.hstack(
-        [checks.rows("velocity", linear, count, 3), checks.rows("angular velocity", angular, count, 3)]
-    )
+    return np.hstack([checks.rows("velocity", linear, count, 3), checks.rows("angular velocity", angular, count, 3)])
 
 
 def _centered(

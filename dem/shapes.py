@@ -10,7 +10,8 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
-from dem.checks import finite_vector, positive, unit_quaternion, unit_vector
+from dem.bodies import BOX, CAPSULE, MESH, PLANE, SPHERE
+from dem.checks import check_fields, positive, unit_quaternion, unit_vector, vector
 from dem.mesh import Mesh
 
 
@@ -22,8 +23,7 @@ class Plane:
     center: Sequence[float] = (0.0, 0.0, 0.0)  #: a point of the surface (3,) [m]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "normal", unit_vector("normal of a plane", self.normal))
-        object.__setattr__(self, "center", finite_vector("point of a plane", self.center))
+        check_fields(self, normal=unit_vector, center=vector)
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,8 @@ class Box:
     quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0)  #: (4,)
 
     def __post_init__(self) -> None:
-        positive("half extents of a box", self.half_extents)
-        object.__setattr__(self, "half_extents", finite_vector("half extents of a box", self.half_extents))
-        object.__setattr__(self, "center", finite_vector("centre of a box", self.center))
-        object.__setattr__(self, "quaternion", unit_quaternion("quaternion of a box", self.quaternion))
+        check_fields(self, half_extents=positive)
+        check_fields(self, half_extents=vector, center=vector, quaternion=unit_quaternion)
 
 
 @dataclass(frozen=True)
@@ -49,8 +47,7 @@ class Sphere:
     center: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) [m]
 
     def __post_init__(self) -> None:
-        positive("radius of a sphere", self.radius)
-        object.__setattr__(self, "center", finite_vector("centre of a sphere", self.center))
+        check_fields(self, radius=positive, center=vector)
 
 
 @dataclass(frozen=True)
@@ -64,10 +61,7 @@ class Capsule:
     quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0)  #: (4,)
 
     def __post_init__(self) -> None:
-        positive("radius of a capsule", self.radius)
-        positive("half length of a capsule", self.half_length)
-        object.__setattr__(self, "center", finite_vector("centre of a capsule", self.center))
-        object.__setattr__(self, "quaternion", unit_quaternion("quaternion of a capsule", self.quaternion))
+        check_fields(self, radius=positive, half_length=positive, center=vector, quaternion=unit_quaternion)
 
 
 Shape = Union[Plane, Box, Sphere, Capsule, Mesh]
@@ -81,52 +75,51 @@ def described(shape: Shape) -> dict[str, Any]:
     return {"kind": type(shape).__name__, **asdict(shape)}
 
 
-def sphere_mass(radius: Floats, density: Floats) -> tuple[Floats, Floats]:
-    """Masses (n,) and principal moments (n, 3) of solid spheres of radius (n,) and density (n,)."""
-    mass = density * (4.0 / 3.0) * np.pi * radius**3
-    return mass, np.repeat((0.4 * mass * radius**2)[:, None], 3, axis=1)
+def placed(shape: Shape) -> tuple[int, Floats, Floats, Floats]:
+    """Kind, centre (3,), quaternion (4,) and size (3,), as of `Bodies`, of a shape in the frame of its body; of a mesh
+    those of the box about it, and as the size of a half space its normal."""
+    center, turn = np.array(shape.center), np.array(getattr(shape, "quaternion", (1.0, 0.0, 0.0, 0.0)))
+    if isinstance(shape, Plane):
+        return PLANE, center, turn, np.array(shape.normal)
+    if isinstance(shape, Sphere):
+        return SPHERE, center, turn, np.array([shape.radius, 0.0, 0.0])
+    if isinstance(shape, Box):
+        return BOX, center, turn, np.array(shape.half_extents)
+    if isinstance(shape, Capsule):
+        return CAPSULE, center, turn, np.array([shape.radius, shape.half_length, 0.0])
+    return MESH, center + quaternion.rotate(turn, shape.surface.middle), turn, shape.surface.half
 
 
-def box_mass(half_extents: Floats, density: Floats) -> tuple[Floats, Floats]:
-    """Masses (n,) and principal moments (n, 3) of solid boxes of half extents (n, 3) and density (n,)."""
-    mass = density * 8.0 * half_extents.prod(axis=1)
-    squares = half_extents**2
-    return mass, mass[:, None] / 3.0 * (squares.sum(axis=1, keepdims=True) - squares)
+def solid(kind: int, size: Floats, density: Floats) -> tuple[Floats, Floats]:
+    """Masses (n,) and principal moments (n, 3) of solid boxes, spheres or capsules of sizes (n, 3) and densities (n,).
 
-
-def capsule_mass(radius: Floats, half_length: Floats, density: Floats) -> tuple[Floats, Floats]:
-    """Masses (n,) and principal moments (n, 3), the axis last, of solid capsules of radius, half length of the core
-    segment and density (n,): a cylinder and two half balls, each with its centre of mass 3/8 radius off its base."""
-    cylinder = density * 2.0 * np.pi * radius**2 * half_length
-    ball, moments = sphere_mass(radius, density)
-    axial = 0.5 * cylinder * radius**2 + moments[:, 0]
-    lateral = cylinder * (radius**2 / 4.0 + half_length**2 / 3.0)
-    lateral += moments[:, 0] + ball * (half_length**2 + 0.75 * half_length * radius)
-    return cylinder + ball, np.stack([lateral, lateral, axial], axis=1)
+    A capsule is a cylinder and two half balls, each with its centre of mass 3/8 radius off its base; a sphere is a
+    capsule of length zero.
+    """
+    if kind == BOX:
+        mass, squares = density * 8.0 * size.prod(axis=1), size**2
+        return mass, mass[:, None] / 3.0 * (squares.sum(axis=1, keepdims=True) - squares)
+    radius, half_length = size[:, 0], size[:, 1]
+    cylinder, ball = density * 2.0 * np.pi * radius**2 * half_length, density * (4.0 / 3.0) * np.pi * radius**3
+    moment = 0.4 * ball * radius**2
+    axial = moment + 0.5 * cylinder * radius**2
+    lateral = moment + ball * (half_length**2 + 0.75 * half_length * radius)
+    lateral += cylinder * (radius**2 / 4.0 + half_length**2 / 3.0)
+    return ball + cylinder, np.stack([lateral, lateral, axial], axis=1)
 
 
 def solid_properties(shape: Shape, density: float) -> tuple[float, Floats, Floats]:
     """Mass, centre of mass (3,) and inertia tensor (3, 3) about it of one shape, in the body frame; ValueError as of
     `mass_properties`."""
+    kind, place, turn, size = placed(shape)
+    frame = quaternion.matrix(turn)
     if isinstance(shape, Plane):
         raise ValueError("a half space has no finite mass: give mass and inertia, or a prescribed motion")
-    place = np.array(shape.center)
-    turn = np.eye(3) if isinstance(shape, Sphere) else quaternion.matrix(np.array(shape.quaternion))
     if isinstance(shape, Mesh):
-        shape.surface.refuse_unless_solid()
-        volume, first, second = shape.surface.integrals()
-        center = first / volume
-        spread = second - volume * np.outer(center, center)
-        tensor = density * turn @ (np.trace(spread) * np.eye(3) - spread) @ turn.T
-        return density * volume, place + turn @ (shape.surface.middle + center), tensor
-    solid = np.array([density])
-    if isinstance(shape, Sphere):
-        mass, moments = sphere_mass(np.array([shape.radius]), solid)
-    elif isinstance(shape, Box):
-        mass, moments = box_mass(np.array([shape.half_extents]), solid)
-    else:
-        mass, moments = capsule_mass(np.array([shape.radius]), np.array([shape.half_length]), solid)
-    return float(mass[0]), place, (turn * moments[0]) @ turn.T
+        volume, center, tensor = shape.solid()
+        return density * volume, np.array(shape.center) + frame @ center, density * frame @ tensor @ frame.T
+    mass, moments = solid(kind, size[None], np.array([density]))
+    return float(mass[0]), place, (frame * moments[0]) @ frame.T
 
 
 def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Floats, Floats]:

@@ -41,7 +41,7 @@ def together(
     except own as error:
         failure = (type(error), str(error))
     except BaseException as error:  # also SystemExit, which would end this rank alone
-        failure = (SceneError, f"{_place(error)}{what}: {told(error)}")
+        failure = (SceneError, f"{_place(error)}{what}: {in_words(error)}")
     meet(comm, f"the end of the {what}", failure)
     return result
 
@@ -61,7 +61,7 @@ def meet(comm: MPI.Comm, where: str, failure: tuple[type[Exception], str] | None
         raise SceneError(f"the code of a scene must make the same calls on all ranks, but {listed}")
 
 
-def told(error: BaseException) -> str:
+def in_words(error: BaseException) -> str:
     """The kind of an exception and its words."""
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 

@@ -1,16 +1,23 @@
-"""The state of a simulation on one rank."""
+"""The state of a simulation on one rank, and changes of the motion of large bodies within a run.
+
+The functions of a change are called on all ranks alike, with the same arguments.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies
+from dem import bodies, quaternion
+from dem import motion as motions
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
-from dem.motion import Dynamic, mean_velocity
+from dem.motion import Driven, Dynamic, Motion, Prescribed, changed, checked_pose, mean_velocity
 from dem.scene import LargeBody
 from dem.together import together
 
@@ -109,3 +116,67 @@ class World:
             for row, body in enumerate(self.large_bodies)
             if not isinstance(body.motion, Dynamic)
         }
+
+
+def set_motion(world: World, name: str, motion: Motion | None = None, **values: Any) -> None:
+    """Give a large body another motion, or its own one with other `values` as of `changed`; it begins where it is now.
+    ValueError for one that it cannot have: if forces move the body, they go on doing so along the same line or about
+    the same axis; else they cannot begin to."""
+    row = world.large_row(name)
+    body = world.large_bodies[row]
+    motion = changed(body.motion, world.time, **values) if motion is None else motion
+    pose = body.position, body.quaternion
+    if isinstance(body.motion, Dynamic) or isinstance(motion, Dynamic):
+        if not _same_line(motion, body.motion):
+            kind = f"{type(body.motion).__name__} with another drive" if isinstance(body.motion, Dynamic) else "a path"
+            raise ValueError(f"body {name!r} cannot change its motion to {motion!r}: allowed is {kind}")
+    else:
+        pose = _leading_to(motion, world.time, world.large.position[row], world.large.quaternion[row])
+    world.replace_large(dataclasses.replace(body, motion=motion, position=pose[0], quaternion=pose[1]))
+
+
+def _same_line(motion: Motion, other: Motion) -> bool:
+    """Whether forces move a body alike: freely, or both along or about one line, on which its frame depends."""
+    if not (isinstance(motion, Driven) and isinstance(other, Driven)):
+        return type(motion) is type(other)
+    return type(motion) is type(other) and np.allclose(motion.line, other.line, atol=1e-12)
+
+
+def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
+    """The pose at time zero of a body that the motion brings to this pose at `time`. ValueError if there is none."""
+    shift, turn = checked_pose(motion, time, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+    back = quaternion.conjugate(turn)
+    start = quaternion.rotate(back, position - shift), quaternion.multiply(back, orientation)
+    place, turned = checked_pose(motion, time, *start)
+    size = np.abs([place, position]).max() + np.abs(shift).max()
+    if np.abs(place - position).max() > 1e-9 * size or abs(turned @ orientation) < 1.0 - 1e-9:
+        raise ValueError(f"{type(motion).__name__} does not displace the pose at time zero: the body would jump")
+    return start
+
+
+def changed_motions(world: World) -> str:
+    """The motions that were changed as text, for `restore_motions`; empty if there are none."""
+    found = {
+        body.name: {
+            "motion": type(body.motion).__name__,
+            "values": {field.name: getattr(body.motion, field.name) for field in dataclasses.fields(body.motion)},
+            "position": body.position,
+            "quaternion": body.quaternion,
+        }
+        for body in world.large_bodies
+        if body.name in world.changed
+    }
+    return json.dumps(found, default=lambda array: array.tolist()) if found else ""
+
+
+def restore_motions(world: World, text: str) -> None:
+    """Give the bodies of a world, made from its scene, the motions of `changed_motions`. ValueError if that fails."""
+    for name, entry in json.loads(text).items():
+        body = world.large_bodies[world.large_row(name)]
+        own = type(body.motion)
+        kind = own if own.__name__ == entry["motion"] else getattr(motions, entry["motion"], None)
+        if kind is None:
+            raise ValueError(f"body {name!r}: neither the scene nor dem.motion has the motion {entry['motion']}")
+        place, turn = np.array(entry["position"]), np.array(entry["quaternion"])
+        moved = dataclasses.replace(body, motion=kind(**entry["values"]), position=place, quaternion=turn)
+        world.replace_large(moved)

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem import control
 from dem import record as recording
 from dem.arrays import Floats
 from dem.bodies import Bodies
@@ -32,6 +31,7 @@ from dem.motion import Motion
 from dem.scene import LargeBody, Scene
 from dem.step import Step
 from dem.together import meet, together
+from dem.world import set_motion
 from pctt import ccp, log
 from pctt.look.folder import Contacts, FolderError, Frame, Snapshot
 from pctt.options import AT_LEAST_ONE, COUNT, OptionError, made
@@ -412,7 +412,7 @@ class Body:
     def motion(self) -> BodyMotion:
         """How the body moves. Set a parameter, ``body.motion.speed = 2.0``, or another motion, ``body.motion =
         Glide((0, 0, 1))``, on all ranks; the first rank's value counts. The body goes on from where it is, and
-        checkpoints keep the change. ValueError for what the body cannot do (`dem.control.set_motion`)."""
+        checkpoints keep the change. ValueError for what the body cannot do (`dem.world.set_motion`)."""
         return BodyMotion(self)
 
     @motion.setter
@@ -424,7 +424,7 @@ class Body:
         world, comm, what = self._sim.world, self._sim.comm, f"motion of the body {self.name}"
         meet(comm, what)
         motion, values = comm.bcast((motion, values))
-        change = partial(control.set_motion, world, self.name, motion, **values)
+        change = partial(set_motion, world, self.name, motion, **values)
         together(comm, what, change, own=(ValueError, TypeError))
 
 

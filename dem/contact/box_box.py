@@ -15,7 +15,6 @@ import numpy as np
 from dem.arrays import Bools, Floats, Ints
 from dem.contact.narrow import (
     CORNERS,
-    FLUSH,
     Boxes,
     Manifold,
     Spheres,
@@ -26,10 +25,14 @@ from dem.contact.narrow import (
     reversed_touch,
     sphere_box,
 )
-from dem.quaternion import cross
+from dem.quaternion import cross, length
 
-#: Corners and edges that are closer to each other across the normal than this share of the least half extent of
-#: the two boxes count as one on top of the other.
+#: Boxes touch on faces if the smallest gap there is within this share of the contact distance of the distance of the
+#: boxes; if not, in the closest points alone.
+FLUSH = 0.1
+
+#: Corners and edges that are closer to each other across the normal than this share of the least half extent of the
+#: two boxes count as one on top of the other.
 SNAP = 1e-3
 
 #: Lengths that differ by less than this share of the least half extent are equal: what is chosen among equals does
@@ -72,19 +75,13 @@ class _Pairs(NamedTuple):
 
     first: Boxes
     second: Boxes
-    faces: Floats  # (m, 6) along the axes of the first and of the second box
+    offset: Floats  # (m, 3) from the first centres to the second
+    size: Floats  # (m,) least half extents
+    faces: Floats  # (m, 6) separations along the axes of the first and of the second box
     edges: Floats  # (m, 9) along the cross products, -inf for parallel edges
 
     def take(self, rows: Ints | Bools) -> _Pairs:
-        return _Pairs(self.first.take(rows), self.second.take(rows), self.faces[rows], self.edges[rows])
-
-    def offset(self) -> Floats:
-        """From the first centres to the second (m, 3)."""
-        return self.second.center - self.first.center
-
-    def size(self) -> Floats:
-        """Least half extents (m,)."""
-        return np.minimum(self.first.half.min(axis=1), self.second.half.min(axis=1))
+        return _Pairs(self.first.take(rows), self.second.take(rows), *(column[rows] for column in self[2:]))
 
 
 def box_box(first: Boxes, second: Boxes, delta: Floats) -> Manifold:
@@ -94,22 +91,18 @@ def box_box(first: Boxes, second: Boxes, delta: Floats) -> Manifold:
     """
     rows, pairs = _separated_within(first, second, delta)
     delta = delta[rows]
-    face, edge = pairs.faces.max(axis=1), pairs.edges.max(axis=1)
-    least = np.maximum(face, edge)  # not more than the distance, and the very distance of overlapping boxes
-    tolerance = FLUSH * delta + 2.0 * SNAP * pairs.size()
+    least = np.maximum(pairs.faces.max(axis=1), pairs.edges.max(axis=1))  # the distance at most, or just the overlap
+    tolerance = FLUSH * delta + 2.0 * SNAP * pairs.size
 
-    flat = np.flatnonzero(face >= least - tolerance)
-    laid = _faces_laid_over(pairs.take(flat))
+    flat = np.flatnonzero(pairs.faces.max(axis=1) >= least - tolerance)
+    feature, laid = _faces_laid_over(pairs.take(flat))
     flush = laid.gap.min(axis=1) <= (least + tolerance)[flat]
     pair, point = np.nonzero(flush[:, None] & (laid.gap <= delta[flat, None]))
-    on_faces = Manifold(
-        rows[flat[pair]],
-        laid.feature[pair, point],
-        Touch(laid.point[pair, point], laid.normal[pair], laid.gap[pair, point]),
-    )
+    touch = Touch(laid.point[pair, point], laid.normal[pair], laid.gap[pair, point])
+    on_faces = Manifold(rows[flat[pair]], feature[pair, point], touch)
 
     pointed = np.setdiff1d(np.arange(len(rows)), flat[flush])
-    pair, feature, touch = _closest_points(pairs.take(pointed), tolerance[pointed])
+    pair, feature, touch = _closest_points(pairs.take(pointed), least[pointed], tolerance[pointed])
     near = np.flatnonzero(touch.gap <= delta[pointed[pair]])
     return joined([on_faces, Manifold(rows[pointed[pair[near]]], feature[near], touch.take(near))])
 
@@ -137,26 +130,20 @@ def _separated_within(first: Boxes, second: Boxes, reach: Floats) -> tuple[Ints,
             apart = np.abs(place[:, i2] * cosines[:, i1, j] - place[:, i1] * cosines[:, i2, j])
             apart -= h[:, i1] * absolute[:, i2, j] + h[:, i2] * absolute[:, i1, j]
             apart -= g[:, j1] * absolute[:, i, j2] + g[:, j2] * absolute[:, i, j1]
-            length = np.hypot(cosines[:, i1, j], cosines[:, i2, j])
-            edges[:, 3 * i + j] = np.where(length > PARALLEL, apart / np.maximum(length, PARALLEL), -np.inf)
+            sine = np.hypot(cosines[:, i1, j], cosines[:, i2, j])
+            edges[:, 3 * i + j] = np.where(sine > PARALLEL, apart / np.maximum(sine, PARALLEL), -np.inf)
     kept = np.flatnonzero(edges.max(axis=1) <= reach[rows])
     rows = rows[kept]
-    return rows, _Pairs(first.take(rows), second.take(rows), faces[rows], edges[kept])
+    size = np.minimum(h[kept].min(axis=1), g[kept].min(axis=1))
+    return rows, _Pairs(first.take(rows), second.take(rows), offset[rows], size, faces[rows], edges[kept])
 
 
-class _Laid(NamedTuple):
-    """Contacts of two faces laid over each other: the corners of both, and the crossings of their edges."""
-
-    point: Floats  # (m, 24, 3)
-    normal: Floats  # (m, 3)
-    gap: Floats  # (m, 24), infinite where there is no contact
-    feature: Ints  # (m, 24)
-
-
-def _faces_laid_over(pairs: _Pairs) -> _Laid:
-    """The corners of the polygon that is common to two faces, seen along the normal of one of them."""
-    rows, offset, snap = np.arange(len(pairs.faces)), pairs.offset(), SNAP * pairs.size()
-    best = _first_largest(pairs.faces, TIE * pairs.size())
+def _faces_laid_over(pairs: _Pairs) -> tuple[Ints, Touch]:
+    """The corners of the polygon that is common to two faces, seen along the normal (m, 3) of one of them: the corners
+    of both and the crossings of their edges, features (m, 24), points (m, 24, 3) and gaps (m, 24), infinite where there
+    is no contact."""
+    rows, offset, snap = np.arange(len(pairs.faces)), pairs.offset, SNAP * pairs.size
+    best = _first_largest(pairs.faces, TIE * pairs.size)
     axes = np.concatenate([pairs.first.turn.transpose(0, 2, 1), pairs.second.turn.transpose(0, 2, 1)], axis=1)
     box, k = 3 * (best // 3), best % 3
     normal = axes[rows, best]
@@ -178,7 +165,7 @@ def _faces_laid_over(pairs: _Pairs) -> _Laid:
     other_corners = np.concatenate([q[..., :2], q_opposite[..., None], q[..., 2:]], axis=2)
 
     # A corner on a corner is one contact, in the middle of the two.
-    apart = np.linalg.norm(p[:, :, None, :2] - q[:, None, :, :2], axis=3)
+    apart = length(p[:, :, None, :2] - q[:, None, :, :2])
     same = (apart <= 2.0 * thick) & p_in[:, :, None] & q_in[:, None, :]
     partner = other_corners[rows[:, None], same.argmax(axis=2)]
     corners = np.where(same.any(axis=2)[..., None], 0.5 * (corners + partner), corners)
@@ -204,7 +191,7 @@ def _faces_laid_over(pairs: _Pairs) -> _Laid:
     )
     middle = np.concatenate([found[..., :2], found[..., 2:].mean(axis=2, keepdims=True)], axis=2)
     gap = np.where(valid, found[..., 3] - found[..., 2], np.inf)
-    return _Laid(pairs.first.center[:, None] + middle @ frame, normal, gap, feature)
+    return feature, Touch(pairs.first.center[:, None] + middle @ frame, normal, gap)
 
 
 def _first_largest(values: Floats, tie: Floats) -> Ints:
@@ -229,27 +216,26 @@ def _outside(points: Floats, polygon: Floats) -> Floats:
     """Distances (m, 4, 4) of points (m, 4, 2 or more) beyond the lines of the sides of convex polygons (m, 4, 2 or
     more), negative inside."""
     side = np.roll(polygon, -1, axis=1)[..., :2] - polygon[..., :2]
-    outward = np.stack([side[..., 1], -side[..., 0]], axis=2) / np.linalg.norm(side, axis=2, keepdims=True)
+    outward = np.stack([side[..., 1], -side[..., 0]], axis=2) / length(side)[..., None]
     level = np.einsum("mei,mei->me", outward, polygon[..., :2])
     turned = np.copysign(1.0, level - np.einsum("mei,mi->me", outward, polygon[..., :2].mean(axis=1)))
     return turned[:, None] * (points[..., :2] @ outward.transpose(0, 2, 1) - level[:, None])
 
 
-def _closest_points(pairs: _Pairs, tolerance: Floats) -> Manifold:
+def _closest_points(pairs: _Pairs, separation: Floats, tolerance: Floats) -> Manifold:
     """The contact of two edges where boxes overlap or these are closest; else the closest corner, and others that
     are as close but for the tolerance (m,), as where two edges are parallel."""
     edge, touch = _edge_edge(pairs)
-    separation = np.maximum(pairs.faces.max(axis=1), pairs.edges.max(axis=1))
-    tip = np.flatnonzero(separation > TIE * pairs.size())
-    corners = _corners(pairs.take(tip))
-    smallest, size = corners.gap.min(axis=1), pairs.size()[tip]
+    tip = np.flatnonzero(separation > TIE * pairs.size)
+    corners, size = _corners(pairs.take(tip)), pairs.size[tip]
+    smallest = corners.gap.min(axis=1)
     least = np.minimum(smallest, touch.gap[tip])
     on_edges = np.ones(len(edge), dtype=bool)
     on_edges[tip] = touch.gap[tip] < smallest - TIE * size
 
     shown = corners.gap <= (least + tolerance[tip])[:, None]
-    apart = np.linalg.norm(corners.point[:, :8, None] - corners.point[:, None, 8:], axis=3)
-    same = (apart <= 1e-6 * size[:, None, None]) & shown[:, :8, None]
+    apart = length(corners.point[:, :8, None] - corners.point[:, None, 8:])
+    same = (apart <= 1e-6 * size[:, None, None]) & shown[:, :8, None]  # one corner on the other, to rounding
     shown[:, 8:] &= ~same.any(axis=1)
     pair, corner = np.nonzero(shown)
     edges = np.flatnonzero(on_edges)
@@ -260,11 +246,10 @@ def _closest_points(pairs: _Pairs, tolerance: Floats) -> Manifold:
 def _corners(pairs: _Pairs) -> Touch:
     """Contacts (m, 16, ...) of the corners of the first box with the second, and of those of the second with the
     first."""
-    count, offset = len(pairs.faces), pairs.offset()  # places about the first centre
-    rows = np.repeat(np.arange(count), 8)
-    first = pairs.first._replace(center=np.zeros_like(offset)).take(rows)
-    second = pairs.second._replace(center=offset).take(rows)
-    none, sign = np.zeros(8 * count), np.tile(CORNERS, (count, 1))
+    rows = np.repeat(np.arange(len(pairs.size)), 8)
+    first = pairs.first._replace(center=0.0 * pairs.offset).take(rows)  # places about the first centre
+    second = pairs.second._replace(center=pairs.offset).take(rows)
+    none, sign = np.zeros(len(rows)), np.tile(CORNERS, (len(pairs.size), 1))
     sides = []
     for one, two in ((first, second), (second, first)):
         tips = one.center + (one.turn @ (one.half * sign)[:, :, None])[:, :, 0]
@@ -281,11 +266,11 @@ def _edge_edge(pairs: _Pairs) -> tuple[Ints, Touch]:
     edges are parallel.
     """
     rows, (center, turn, half), (_, other_turn, other_half) = np.arange(len(pairs.faces)), pairs.first, pairs.second
-    offset, separation = pairs.offset(), pairs.edges.max(axis=1)
-    i, j = np.divmod(_first_largest(pairs.edges, TIE * pairs.size()), 3)
+    offset, separation = pairs.offset, pairs.edges.max(axis=1)
+    i, j = np.divmod(_first_largest(pairs.edges, TIE * pairs.size), 3)
     axis, other_axis = turn[rows, :, i], other_turn[rows, :, j]
     normal = cross(axis, other_axis)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), PARALLEL)
+    normal /= np.maximum(length(normal), PARALLEL)[:, None]
     normal *= np.copysign(1.0, dot(normal, offset))[:, None]
 
     sign = np.copysign(1.0, (normal[:, None, :] @ turn)[:, 0])
@@ -301,8 +286,8 @@ def _edge_edge(pairs: _Pairs) -> tuple[Ints, Touch]:
     two = other_middle + np.clip(t, -other_limit, other_limit)[:, None] * other_axis
 
     between = two - one
-    distance = np.linalg.norm(between, axis=1)
-    apart = separation > TIE * pairs.size()  # in contact, the two points are too close to give a direction
+    distance = length(between)
+    apart = separation > TIE * pairs.size  # in contact, the two points are too close to give a direction
     normal = np.where(apart[:, None], between / np.where(apart, distance, 1.0)[:, None], normal)
     gap = np.where(apart, distance, np.where(np.isfinite(separation), separation, np.inf))
     return feature, Touch(center + 0.5 * (one + two), normal, gap)

@@ -18,18 +18,17 @@ from dem.contact.narrow import (
     Planes,
     Spheres,
     Touch,
-    across,
     closest_on_lines,
     dot,
-    joined,
+    manifold,
     reversed_touch,
     sphere_box,
     sphere_capsule,
     sphere_plane,
 )
-from dem.quaternion import cross
+from dem.quaternion import across, cross, length
 
-#: Ends of core segments that face each other within this share of the length are one contact.
+#: Ends of core segments that face each other within this share of the length are one contact: above rounding.
 SNAP = 1e-6
 #: The closest point is a contact of its own if it is closer than the ends by this share of the lesser radius (of the
 #: least half extent). Bodies at rest side by side, which rock by less, keep the contacts of their ends alone.
@@ -43,8 +42,7 @@ def end_ball(capsule: Capsules, side: float) -> Spheres:
 
 def capsule_plane(capsule: Capsules, plane: Planes, delta: Floats) -> Manifold:
     """The two end balls, features 0 and 1."""
-    ends = [sphere_plane(end_ball(capsule, side), plane) for side in (-1.0, 1.0)]
-    return _manifold(ends, [end.gap <= delta for end in ends])
+    return manifold(delta, [sphere_plane(end_ball(capsule, side), plane) for side in (-1.0, 1.0)])
 
 
 def capsule_capsule(first: Capsules, second: Capsules, delta: Floats) -> Manifold:
@@ -65,8 +63,7 @@ def capsule_capsule(first: Capsules, second: Capsules, delta: Floats) -> Manifol
     closest = _least([*ends, crossing])
     lowest = np.min([np.where(mask, end.gap, np.inf) for end, mask in zip(ends, beside)], axis=0)
     distinct = lowest > closest.gap + DISTINCT * np.minimum(first.radius, second.radius)
-    shown = [mask & (end.gap <= delta) for end, mask in zip(ends, beside)]
-    return _manifold([*ends, closest], [*shown, distinct & (closest.gap <= delta)])
+    return manifold(delta, [*ends, closest], [*beside, distinct])
 
 
 def capsule_box(capsule: Capsules, box: Boxes, delta: Floats) -> Manifold:
@@ -86,35 +83,27 @@ def capsule_box(capsule: Capsules, box: Boxes, delta: Floats) -> Manifold:
     face = (apart >= apart.max(axis=1, keepdims=True) - SNAP * slack[:, None]).argmax(axis=1)
     k, sign = face % 3, np.where(face < 3, 1.0, -1.0)
 
-    at = _closest_to_box(start, way, half)
-    closest = sphere_box(Spheres(center + ((2.0 * at - 1.0) * half_length)[:, None] * axis, radius), box)
-    meets = closest.gap <= -radius
+    def ball(share: Floats) -> Spheres:
+        """At shares (m,) of the way from the start of the core to its end."""
+        return Spheres(center + ((2.0 * share - 1.0) * half_length)[:, None] * axis, radius)
+
+    closest = sphere_box(ball(_closest_to_box(start, way, half)), box)
 
     # The stretch of the core over the face: clipped with the slabs of the two other axes.
-    begin, end = np.zeros(len(center)), np.ones(len(center))
-    for other in ((k + 1) % 3, (k + 2) % 3):
-        enter, leave = _slab(start[rows, other], way[rows, other], half[rows, other] + slack)
-        begin, end = np.maximum(begin, enter), np.minimum(end, leave)
+    enter, leave = _slabs(start, way, half + slack[:, None])
+    enter[rows, k], leave[rows, k] = 0.0, 1.0
+    begin, end = np.maximum(enter.max(axis=1), 0.0), np.minimum(leave.min(axis=1), 1.0)
     over = begin <= end
     normal = -sign[:, None] * turn[rows, :, k]
     stretch = []
-    for place in (begin, end):
-        place = np.where(over, place, 0.0)
+    for place in (np.where(over, begin, 0.0), np.where(over, end, 0.0)):
         gap = sign * (start[rows, k] + place * way[rows, k]) - half[rows, k] - radius
-        ball = center + ((2.0 * place - 1.0) * half_length)[:, None] * axis
-        stretch.append(Touch(ball + (radius + 0.5 * gap)[:, None] * normal, normal, gap))
+        stretch.append(Touch(ball(place).center + (radius + 0.5 * gap)[:, None] * normal, normal, gap))
     lowest = np.where(over, np.minimum(stretch[0].gap, stretch[1].gap), np.inf)
-    distinct = (lowest > closest.gap + DISTINCT * np.minimum(radius, half.min(axis=1))) & ~(over & meets)
+    meets = over & (closest.gap <= -radius)
+    distinct = (lowest > closest.gap + DISTINCT * np.minimum(radius, half.min(axis=1))) & ~meets
     long = (end - begin) * half_length > slack
-    near = [touch.gap <= delta for touch in (*stretch, closest)]
-    return _manifold([*stretch, closest], [over & near[0], over & near[1] & long, distinct & near[2]])
-
-
-def _manifold(touches: list[Touch], shown: list[np.ndarray]) -> Manifold:
-    """Feature f of the pairs in the mask shown[f] has the geometry touches[f]."""
-    pair = [np.flatnonzero(mask) for mask in shown]
-    parts = zip(pair, touches)
-    return joined([Manifold(rows, np.full(len(rows), f), touch.take(rows)) for f, (rows, touch) in enumerate(parts)])
+    return manifold(delta, [*stretch, closest], [over, over & long, distinct])
 
 
 def _least(touches: list[Touch]) -> Touch:
@@ -130,9 +119,9 @@ def _crossing(first: Capsules, second: Capsules) -> Touch:
     other, other_axis, other_half, other_radius = second
     s, t = closest_on_lines(center, axis, other, other_axis)
     normal = cross(axis, other_axis)
-    length = np.sqrt(dot(normal, normal))
-    inside = (np.abs(s) <= half_length) & (np.abs(t) <= other_half) & (length > SNAP)
-    normal = np.where(inside[:, None], normal / np.where(inside, length, 1.0)[:, None], across(axis))
+    sine = length(normal)
+    inside = (np.abs(s) <= half_length) & (np.abs(t) <= other_half) & (sine > SNAP)
+    normal = np.where(inside[:, None], normal / np.where(inside, sine, 1.0)[:, None], across(axis))
     offset = dot(other - center, normal)
     normal *= np.copysign(1.0, offset)[:, None]
     gap = np.where(inside, np.abs(offset) - radius - other_radius, np.inf)
@@ -140,8 +129,9 @@ def _crossing(first: Capsules, second: Capsules) -> Touch:
     return Touch(center + np.where(inside, s, 0.0)[:, None] * axis + ahead[:, None] * normal, normal, gap)
 
 
-def _slab(start: Floats, way: Floats, half: Floats) -> tuple[Floats, Floats]:
-    """Parameters between which start + t way (m,) stays within +-half; the first is the greater where it never does."""
+def _slabs(start: Floats, way: Floats, half: Floats) -> tuple[Floats, Floats]:
+    """Parameters t (m, 3) between which the coordinates of start + t way (m, 3) stay within +-half (m, 3), each; the
+    first is the greater where one never does."""
     moving = np.abs(way) > 1e-12 * half
     divisor = np.where(moving, way, 1.0)
     one, two = (-half - start) / divisor, (half - start) / divisor
@@ -156,11 +146,8 @@ def _closest_to_box(start: Floats, way: Floats, half: Floats) -> Floats:
     The squared distance is convex in t, and its derivative is linear between the parameters at which the segment
     crosses the planes of the faces: the root is found exactly.
     """
-    divisor = np.where(way == 0.0, 1.0, way)
-    with np.errstate(over="ignore"):  # a way next to nothing: the crossing is far away on either side
-        crossings = np.concatenate([(-half - start) / divisor, (half - start) / divisor], axis=1)
-    crossings = np.concatenate([np.zeros((len(start), 1)), crossings, np.ones((len(start), 1))], axis=1)
-    t = np.sort(np.clip(crossings, 0.0, 1.0), axis=1)
+    ends = np.tile([0.0, 1.0], (len(start), 1))
+    t = np.sort(np.clip(np.concatenate([ends, *_slabs(start, way, half)], axis=1), 0.0, 1.0), axis=1)
     place = start[:, None, :] + t[:, :, None] * way[:, None, :]
     beyond = place - np.clip(place, -half[:, None], half[:, None])
     slope = dot(beyond, way[:, None, :])

@@ -15,7 +15,7 @@ import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
 from dem.contact.capsules import end_ball
-from dem.contact.narrow import Capsules, Manifold, Planes, Spheres, Touch, closest_on_lines, dot, sphere_plane
+from dem.contact.narrow import Capsules, Manifold, Planes, Spheres, Touch, closest_on_lines, dot
 from dem.mesh import Closest, Surface, spread
 from dem.quaternion import length
 
@@ -72,12 +72,14 @@ def capsule_mesh(capsule: Capsules, mesh: PlacedMesh, delta: Floats) -> Manifold
     return _placed(row[kept], feature[kept], point[kept], away[kept], gap[kept], mesh)
 
 
-def mesh_plane(mesh: PlacedMesh, plane: Planes, delta: float) -> Manifold:
-    """One surface and one half space, whose arrays are (3,)."""
-    tip = mesh.middle + mesh.surface.vertex[mesh.surface.hull] @ mesh.turn.T
-    touch = sphere_plane(Spheres(tip, np.zeros(len(tip))), plane)
-    near = np.flatnonzero(touch.gap <= delta)
-    return Manifold(np.zeros_like(near), mesh.surface.hull[near], touch.take(near))
+def plane_mesh(plane: Planes, mesh: PlacedMesh, delta: Floats) -> Manifold:
+    """Half spaces and the corners of the hull of one surface."""
+    hull = mesh.surface.hull
+    tip = mesh.middle + mesh.surface.vertex[hull] @ mesh.turn.T
+    gap = plane.outward @ tip.T - dot(plane.outward, plane.origin)[:, None]
+    pair, corner = np.nonzero(gap <= delta[:, None])
+    gap, normal = gap[pair, corner], plane.outward[pair]
+    return Manifold(pair, hull[corner], Touch(tip[corner] - 0.5 * gap[:, None] * normal, normal, gap))
 
 
 def _feet(center: Floats, radius: Floats, reach: Floats, surface: Surface) -> tuple[Ints, Ints, Floats, Floats, Floats]:

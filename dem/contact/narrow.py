@@ -1,4 +1,4 @@
-"""Narrow phase: where two shapes touch in one point.
+"""Narrow phase: where two shapes touch in one point, and what the other narrow phases share.
 
 Each function takes m pairs of a first and a second shape. Pairs that touch in several points are in `capsules`,
 `box_box` and `meshes`; they return a `Manifold`.
@@ -12,7 +12,7 @@ import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
 from dem.compiled import loop
-from dem.quaternion import cross, length
+from dem.quaternion import across, cross, length
 
 
 class Spheres(NamedTuple):
@@ -76,9 +76,15 @@ def joined(parts: list[Manifold]) -> Manifold:
     return Manifold(np.concatenate(pair), np.concatenate(feature), Touch(*columns))
 
 
-#: Shapes touch in several points if the smallest gap among these is within this share of the contact distance
-#: of the distance of the shapes; if not, in the closest point alone.
-FLUSH = 0.1
+def manifold(delta: Floats, touches: list[Touch], where: list[Bools] | None = None) -> Manifold:
+    """Feature f of the pairs has the geometry touches[f], where its gap is at most `delta` (m,) [m] and the mask
+    where[f] (m,) is set."""
+    parts = []
+    for feature, touch in enumerate(touches):
+        near = touch.gap <= delta
+        pair = np.flatnonzero(near & where[feature] if where else near)
+        parts.append(Manifold(pair, np.full(len(pair), feature), touch.take(pair)))
+    return joined(parts)
 
 
 def dot(a: Floats, b: Floats) -> Floats:
@@ -91,22 +97,13 @@ def reversed_touch(touch: Touch) -> Touch:
     return touch._replace(normal=-touch.normal)
 
 
-def sphere_sphere(first: Spheres, second: Spheres) -> Touch:
-    """Concentric spheres are parted along z."""
-    offset = second.center - first.center
-    distance = length(offset)
-    normal = offset / np.where(distance > 0.0, distance, 1.0)[:, None]
-    normal[distance == 0.0] = (0.0, 0.0, 1.0)
-    gap = distance - first.radius - second.radius
-    return Touch(first.center + (first.radius + 0.5 * gap)[:, None] * normal, normal, gap)
-
-
 @loop
 def spheres_within(
     center: Floats, size: Floats, i: Ints, j: Ints, delta: Floats
 ) -> tuple[Ints, Floats, Floats, Floats]:
-    """Of the pairs of rows i, j (m,) of centres (n, 3) and sizes (n, 3), whose first column has the radii, those of
-    which the gap is at most `delta` (m,): their numbers, points, normals and gaps as of `sphere_sphere`."""
+    """Of the pairs of rows i, j (m,) of spheres of centres (n, 3) and sizes (n, k), whose first column has the radii,
+    those of which the gap is at most `delta` (m,): their numbers, points, normals and gaps. Concentric ones are parted
+    along z."""
     pair = np.empty(len(i), np.int64)
     point, normal, gap = np.empty((len(i), 3)), np.empty((len(i), 3)), np.empty(len(i))
     found = 0
@@ -129,26 +126,23 @@ def spheres_within(
     return pair[:found], point[:found], normal[:found], gap[:found]
 
 
+def sphere_sphere(first: Spheres, second: Spheres) -> Touch:
+    """As `spheres_within`, of all pairs."""
+    rows = np.arange(len(first.center))
+    center, radius = (np.concatenate(both) for both in zip(first, second))
+    return Touch(*spheres_within(center, radius[:, None], rows, len(rows) + rows, np.full(len(rows), np.inf))[1:])
+
+
 def sphere_capsule(ball: Spheres, capsule: Capsules) -> Touch:
     """A centre on the core is pushed out across it."""
-    center, radius = ball
     other, axis, half_length, other_radius = capsule
-    along = np.clip(dot(center - other, axis), -half_length, half_length)
+    along = np.clip(dot(ball.center - other, axis), -half_length, half_length)
     foot = other + along[:, None] * axis
     touch = sphere_sphere(ball, Spheres(foot, other_radius))
-    on_core = np.flatnonzero((center == foot).all(axis=1))
+    on_core = np.flatnonzero((ball.center == foot).all(axis=1))
     touch.normal[on_core] = across(axis[on_core])
-    touch.point[on_core] = center[on_core] + (radius + 0.5 * touch.gap)[on_core, None] * touch.normal[on_core]
+    touch.point[on_core] = foot[on_core] + (ball.radius + 0.5 * touch.gap)[on_core, None] * touch.normal[on_core]
     return touch
-
-
-def across(axis: Floats) -> Floats:
-    """Unit vectors (m, 3) normal to the given ones."""
-    rows = np.arange(len(axis))
-    other = np.zeros_like(axis)
-    other[rows, np.abs(axis).argmin(axis=1)] = 1.0
-    normal = cross(axis, other)
-    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
 def closest_on_lines(point: Floats, axis: Floats, other: Floats, other_axis: Floats) -> tuple[Floats, Floats]:
@@ -191,7 +185,8 @@ def sphere_box(ball: Spheres, box: Boxes) -> Touch:
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def corner_plane(box: Boxes, corner: Ints, plane: Planes) -> Touch:
-    """One corner (m,) of each box, and a half space."""
-    tip = box.center + (box.turn @ (box.half * CORNERS[corner])[:, :, None])[:, :, 0]
-    return sphere_plane(Spheres(tip, np.zeros(len(tip))), plane)
+def box_plane(box: Boxes, plane: Planes, delta: Floats) -> Manifold:
+    """The corners of the boxes."""
+    none = np.zeros(len(box.center))
+    tips = [box.center + (box.turn @ (box.half * corner)[:, :, None])[:, :, 0] for corner in CORNERS]
+    return manifold(delta, [sphere_plane(Spheres(tip, none), plane) for tip in tips])

@@ -9,20 +9,21 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats, Ints
-from dem.bodies import BOX, CAPSULE, SPHERE, enclosing_radius
-from dem.contact.box_box import BOX_FEATURES, box_box
+from dem.bodies import BOX, CAPSULE, MESH, PLANE, SPHERE, enclosing_radius
+from dem.contact.box_box import BOX_FEATURES as FEATURES
+from dem.contact.box_box import box_box
 from dem.contact.capsules import capsule_box, capsule_capsule, capsule_plane
-from dem.contact.meshes import PARTS, PlacedMesh, capsule_mesh, mesh_plane, sphere_mesh
+from dem.contact.meshes import PARTS, PlacedMesh, capsule_mesh, plane_mesh, sphere_mesh
 from dem.contact.narrow import (
-    CORNERS,
     Boxes,
     Capsules,
     Manifold,
     Planes,
     Spheres,
     Touch,
-    corner_plane,
+    box_plane,
     joined,
+    manifold,
     reversed_touch,
     sphere_box,
     sphere_capsule,
@@ -31,14 +32,7 @@ from dem.contact.narrow import (
 )
 from dem.mesh import Mesh, Surface
 from dem.neighbourhood import Neighbourhood
-from dem.shapes import Box, Plane, Shape, Sphere
-
-#: Kinds of the half spaces and of the meshes; those of the others are the kinds of grains.
-PLANE, MESH = 4, 5
-
-#: Features that the contacts of one pair of primitives without meshes can have. A mesh has as many numbers as its
-#: features need.
-FEATURES = BOX_FEATURES
+from dem.shapes import Shape, placed
 
 
 class Primitives(NamedTuple):
@@ -50,7 +44,7 @@ class Primitives(NamedTuple):
     kind: Ints  #: (n,) SPHERE, BOX, CAPSULE, PLANE or MESH
     center: Floats  #: (n, 3); a point of the surface of a half space, the middle of a mesh [m]
     quaternion: Floats  #: (n, 4)
-    size: Floats  #: (n, 3) as of `Bodies` [m]; the outward normal of a half space; of a mesh half its extents
+    size: Floats  #: (n, 3) as of `dem.shapes.placed` [m]; the normals of half spaces are those in the world
     radius: Floats  #: (n,) of the sphere about the centre that encloses it, without meaning for half spaces [m]
     surfaces: dict[int, Surface]  #: of the meshes, by row
     numbers: int  #: more than any of `number`, and those that meshes take after theirs
@@ -65,7 +59,7 @@ class Primitives(NamedTuple):
         axis = quaternion.rotate(self.quaternion[rows], np.array([0.0, 0.0, 1.0]))
         return Capsules(self.center[rows], axis, self.size[rows, 1], self.size[rows, 0])
 
-    def plane(self, rows: Ints | int) -> Planes:
+    def plane(self, rows: Ints) -> Planes:
         return Planes(self.size[rows], self.center[rows])
 
     def mesh(self, row: int) -> PlacedMesh:
@@ -86,23 +80,25 @@ def primitives(near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int
     table, count = near.bodies, near.grains + near.ghosts
     row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
     members = [shape for body in shapes for shape in body]
-    parts = [_placed(shape) for shape in members]
-    surfaces = {count + n: shape.surface for n, shape in enumerate(members) if isinstance(shape, Mesh)}
-    spans = [_numbers_of(shape) for shape in members]
-    kind, center, turn, size = (np.array(column) for column in zip(*parts)) if parts else _NOTHING
-    body_turn = table.quaternion[row]
-    size = np.where((kind == PLANE)[:, None], quaternion.rotate(body_turn, size), size)
-    sizes, kinds = np.concatenate([table.size[:count], size]), np.concatenate([table.shape[:count], kind])
+    kinds, centers, turns, sizes = zip(*(placed(shape) for shape in members)) if members else [()] * 4
+    body_turn, kind = table.quaternion[row], np.array(kinds, np.int64)
+    center, turn, size = (np.reshape(c, (len(row), k)) for c, k in ((centers, 3), (turns, 4), (sizes, 3)))
     center = table.position[row] + quaternion.rotate(body_turn, center)
+    size = np.where((kind == PLANE)[:, None], quaternion.rotate(body_turn, size), size)
+    spans = [_numbers_of(shape) for shape in members]
+    columns = {
+        "number": (table.id, grains + np.cumsum([0, *spans])[:-1]),
+        "row": (np.arange(count), row),
+        "kind": (table.shape, kind),
+        "center": (table.position, center),
+        "quaternion": (table.quaternion, quaternion.multiply(body_turn, turn)),
+        "size": (table.size, size),
+    }
+    both = {name: np.concatenate([of_grains[:count], of_parts]) for name, (of_grains, of_parts) in columns.items()}
     return Primitives(
-        number=np.concatenate([table.id[:count], grains + np.cumsum([0, *spans[:-1]])[: len(row)]]).astype(np.int64),
-        row=np.concatenate([np.arange(count), row]),
-        kind=kinds,
-        center=np.concatenate([table.position[:count], center]),
-        quaternion=np.concatenate([table.quaternion[:count], quaternion.multiply(body_turn, turn)]),
-        size=sizes,
-        radius=enclosing_radius(kinds, sizes),
-        surfaces=surfaces,
+        **both,
+        radius=enclosing_radius(both["kind"], both["size"]),
+        surfaces={count + n: shape.surface for n, shape in enumerate(members) if isinstance(shape, Mesh)},
         numbers=grains + sum(spans),
     )
 
@@ -112,34 +108,15 @@ def extents(shapes: list[tuple[Shape, ...]]) -> Floats:
     have none, count with a metre."""
 
     def extent(shape: Shape) -> float:
-        kind, center, _, size = _placed(shape)
+        kind, center, _, size = placed(shape)
         return float(np.linalg.norm(center) + enclosing_radius(np.array([kind]), size[None])[0])
 
     return np.array([max(extent(shape) for shape in parts) for parts in shapes])
 
 
 def _numbers_of(shape: Shape) -> int:
-    """How many numbers a part takes, that its features may be distinct."""
+    """How many numbers a part takes, that its features may be distinct: boxes have the most but for meshes."""
     return 1 + (PARTS * shape.surface.features - 1) // FEATURES if isinstance(shape, Mesh) else 1
-
-
-_UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
-_NOTHING = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3))
-
-
-def _placed(shape: Shape) -> tuple[int, Floats, Floats, Floats]:
-    """Kind, centre, quaternion and size of a shape in the frame of its body."""
-    center = np.array(shape.center)
-    if isinstance(shape, Sphere):
-        return SPHERE, center, _UPRIGHT, np.array([shape.radius, 0.0, 0.0])
-    if isinstance(shape, Plane):
-        return PLANE, center, _UPRIGHT, np.array(shape.normal)
-    turn = np.array(shape.quaternion)
-    if isinstance(shape, Box):
-        return BOX, center, turn, np.array(shape.half_extents)
-    if isinstance(shape, Mesh):
-        return MESH, center + quaternion.rotate(turn, shape.surface.middle), turn, shape.surface.half
-    return CAPSULE, center, turn, np.array([shape.radius, shape.half_length, 0.0])
 
 
 def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
@@ -166,11 +143,8 @@ _NO_CONTACT = Manifold(
     np.zeros(0, np.int64), np.zeros(0, np.int64), Touch(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 )
 
-
-def _single(touch: Touch, delta: Floats) -> Manifold:
-    """The manifold of pairs that touch in one point."""
-    pair = np.flatnonzero(touch.gap <= delta)
-    return Manifold(pair, np.zeros_like(pair), touch.take(pair))
+#: Contacts of pairs of rows of a table within gaps.
+_Touching = Callable[[Primitives, Ints, Ints, Floats], Manifold]
 
 
 def _spheres(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
@@ -178,44 +152,39 @@ def _spheres(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     return Manifold(pair, np.zeros_like(pair), Touch(*touch))
 
 
-def _box_plane(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
-    corner = np.tile(np.arange(len(CORNERS)), len(i))
-    pair = np.repeat(np.arange(len(i)), len(CORNERS))
-    manifold = _single(corner_plane(table.box(i[pair]), corner, table.plane(j[pair])), delta[pair])
-    return Manifold(pair[manifold.pair], corner[manifold.pair], manifold.touch)
+def _in_one_point(touch: Callable[[Any, Any], Touch], first: Any, second: Any) -> _Touching:
+    return lambda table, i, j, delta: manifold(delta, [touch(first(table, i), second(table, j))])
 
 
-def _on_meshes(
-    contacts: Callable[..., Manifold], shapes: Callable[[Ints], Any], table: Primitives, i: Ints, j: Ints, delta: Floats
-) -> Manifold:
-    """The manifolds of ``shapes(rows)``, of the rows i (m,), with the meshes of rows j (m,), mesh by mesh."""
-    found = []
-    for mesh in np.unique(j):
-        rows = np.flatnonzero(j == mesh)
-        manifold = contacts(shapes(i[rows]), table.mesh(int(mesh)), delta[rows])
-        found.append(manifold._replace(pair=rows[manifold.pair]))
-    return joined(found)
+def _in_points(contacts: Callable[[Any, Any, Floats], Manifold], first: Any, second: Any) -> _Touching:
+    return lambda table, i, j, delta: contacts(first(table, i), second(table, j), delta)
 
 
-def _meshes_plane(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
-    found = []
-    for pair, (mesh, plane) in enumerate(zip(i.tolist(), j.tolist())):
-        manifold = mesh_plane(table.mesh(mesh), table.plane(plane), delta[pair])
-        found.append(manifold._replace(pair=manifold.pair + pair))
-    return joined(found)
+def _on_meshes(contacts: Callable[[Any, PlacedMesh, Floats], Manifold], shapes: Any) -> _Touching:
+    """Mesh by mesh."""
+
+    def touching(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
+        found = []
+        for mesh in np.unique(j):
+            rows = np.flatnonzero(j == mesh)
+            contact = contacts(shapes(table, i[rows]), table.mesh(int(mesh)), delta[rows])
+            found.append(contact._replace(pair=rows[contact.pair]))
+        return joined(found)
+
+    return touching
 
 
-_TOUCH: dict[tuple[int, int], Callable[[Primitives, Ints, Ints, Floats], Manifold]] = {
+_TOUCH: dict[tuple[int, int], _Touching] = {
     (SPHERE, SPHERE): _spheres,
-    (SPHERE, BOX): lambda t, i, j, delta: _single(sphere_box(t.sphere(i), t.box(j)), delta),
-    (SPHERE, CAPSULE): lambda t, i, j, delta: _single(sphere_capsule(t.sphere(i), t.capsule(j)), delta),
-    (SPHERE, PLANE): lambda t, i, j, delta: _single(sphere_plane(t.sphere(i), t.plane(j)), delta),
-    (CAPSULE, CAPSULE): lambda t, i, j, delta: capsule_capsule(t.capsule(i), t.capsule(j), delta),
-    (CAPSULE, BOX): lambda t, i, j, delta: capsule_box(t.capsule(i), t.box(j), delta),
-    (CAPSULE, PLANE): lambda t, i, j, delta: capsule_plane(t.capsule(i), t.plane(j), delta),
-    (BOX, BOX): lambda t, i, j, delta: box_box(t.box(i), t.box(j), delta),
-    (BOX, PLANE): _box_plane,
-    (SPHERE, MESH): lambda t, i, j, delta: _on_meshes(sphere_mesh, t.sphere, t, i, j, delta),
-    (CAPSULE, MESH): lambda t, i, j, delta: _on_meshes(capsule_mesh, t.capsule, t, i, j, delta),
-    (MESH, PLANE): _meshes_plane,
+    (SPHERE, BOX): _in_one_point(sphere_box, Primitives.sphere, Primitives.box),
+    (SPHERE, CAPSULE): _in_one_point(sphere_capsule, Primitives.sphere, Primitives.capsule),
+    (SPHERE, PLANE): _in_one_point(sphere_plane, Primitives.sphere, Primitives.plane),
+    (CAPSULE, CAPSULE): _in_points(capsule_capsule, Primitives.capsule, Primitives.capsule),
+    (CAPSULE, BOX): _in_points(capsule_box, Primitives.capsule, Primitives.box),
+    (CAPSULE, PLANE): _in_points(capsule_plane, Primitives.capsule, Primitives.plane),
+    (BOX, BOX): _in_points(box_box, Primitives.box, Primitives.box),
+    (BOX, PLANE): _in_points(box_plane, Primitives.box, Primitives.plane),
+    (SPHERE, MESH): _on_meshes(sphere_mesh, Primitives.sphere),
+    (CAPSULE, MESH): _on_meshes(capsule_mesh, Primitives.capsule),
+    (PLANE, MESH): _on_meshes(plane_mesh, Primitives.plane),
 }

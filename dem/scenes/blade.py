@@ -5,29 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
-from typing import ClassVar
 
 import numpy as np
 
-from dem import analysis
 from dem.arrays import Corners, Floats
 from dem.checks import not_negative, positive
 from dem.experiment import option
-from dem.motion import Oscillation
 from dem.scene import Scene
-from dem.scenes.lattice import LargeSpheres, perturbed, rest_after_fall
-from dem.shapes import Box, Plane
+from dem.scenes.lattice import ToAndFro, perturbed, rest_after_fall
+from dem.shapes import Box
 from dem.step import Step
 
 
 @dataclass(frozen=True)
-class Blade(LargeSpheres):
+class Blade(ToAndFro):
     """(2n+1)^3 spheres settle in a closed box, then a blade goes from one end to the other and back.
 
     The blade spans the width of the box, as in the bin of Melanz et al. (2017), and stands upright, its lower edge at
     about two thirds of the height of the bed and its upper edge above the surface. It starts at rest near one end;
-    the spheres start beside it, so that only those that flow under it come behind it. Its velocity is
-    v = pi travel / period * sin(2 pi t / period), with t since the end of settling. It stops short of both ends, so
+    the spheres start beside it, so that only those that flow under it come behind it. It stops short of both ends, so
     that the spheres in front can flow under it and are not crushed; in small boxes some jam all the same, and the
     force has peaks. With the box and the blade there are (2n+1)^3 + 2 bodies; lengths given in box widths keep the
     experiment similar for all n.
@@ -38,10 +34,6 @@ class Blade(LargeSpheres):
     blade_height: float = option(0.3, "box widths", "height of the blade", positive)
     clearance: float = option(0.3, "box widths", "gap between the floor and the blade")
     end_gap: float = option(0.3, "box widths", "gap between the blade and the end walls where it turns")
-    period: float = option(4.0, "s", "period of the velocity of the blade: it crosses the box in half of it", positive)
-    cutoff: float = option(2.0, "Hz", "cutoff frequency of the low-pass filter of the forces", positive)
-
-    dt: ClassVar[float] = 0.01
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -72,7 +64,7 @@ class Blade(LargeSpheres):
     @property
     def height(self) -> float:
         """Height of the lid [m]."""
-        return (2 * self.n + 2) * self.pitch + self.margin
+        return self.width + self.pitch
 
     @property
     def travel(self) -> float:
@@ -108,18 +100,11 @@ class Blade(LargeSpheres):
 
     def build(self) -> Scene:
         """The scene, with the large bodies "box" and "blade"."""
-        scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
-        scene.add_spheres(self.positions(), self.radius, self.density)
-        low, high = np.array(self.domain)
-        scene.add_body("box", [Plane(way, low) for way in np.eye(3)] + [Plane(-way, high) for way in np.eye(3)])
-        tall = self.blade_height * self.width
-        scene.add_body(
-            "blade",
-            [Box((self.thickness / 2, self.width / 2, tall / 2))],
-            # from rest at one end: displacement travel / 2 (1 - cos(2 pi t / period))
-            Oscillation((1, 0, 0), self.travel / 2, self.period, phase=-pi / 2, start=self.settling_time),
-            position=(self.start, 0, self.clearance * self.width + tall / 2),
-        )
+        scene = self.spheres_alone(self.radius)
+        scene.add_body("box", self.walls())
+        half = (self.thickness / 2, self.width / 2, self.blade_height * self.width / 2)
+        middle = (self.start, 0, self.clearance * self.width + half[2])
+        scene.add_body("blade", [Box(half)], self.to_and_fro(), position=middle)
         return scene
 
     def record(self, step: Step) -> dict[str, float]:
@@ -132,14 +117,12 @@ class Blade(LargeSpheres):
 
     def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
         """Filtered forces and torques, and mean, median and standard deviation of the draft force while the blade is
-        fast on its first way, see `dem.analysis.steady_part`."""
+        fast on its first way."""
         names = ["draft_force [N]"]
         names += [f"force_blade_{axis} [N]" for axis in "xyz"] + [f"torque_blade_{axis} [N m]" for axis in "xyz"]
-        out: dict[str, float | Floats] = {"blade_position [m]": records["blade_position [m]"]}
-        out |= analysis.filtered(records, names, self.cutoff)
-        steady = analysis.steady_part(records["time [s]"], self.settling_time, self.period)
-        if steady.any():
-            force = records["draft_force [N]"][steady]
+        out = {"blade_position [m]": records["blade_position [m]"], **self.filtered(records, names)}
+        force = records["draft_force [N]"][self.steady(records["time [s]"])]
+        if len(force):
             out["steady_draft_force [N]"] = float(force.mean())
             out["median_draft_force [N]"] = float(np.median(force))
             out["draft_force_deviation [N]"] = float(force.std())

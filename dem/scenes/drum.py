@@ -5,21 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import atan2, ceil, degrees, pi, sin, sqrt
-from typing import ClassVar
 
 import numpy as np
 
 from dem.arrays import Corners, Floats
-from dem.checks import not_negative, positive
+from dem.checks import between, not_negative, positive
 from dem.experiment import option
 from dem.mesh import Mesh
 from dem.motion import Rotation
 from dem.scene import Scene
-from dem.scenes.lattice import SmallSpheres, perturbed, rest_after_fall
+from dem.scenes.lattice import SmallSpheres, rest_after_fall
 from dem.step import Step
-
-#: The z axis turned to the y axis.
-ALONG_Y = (sqrt(0.5), -sqrt(0.5), 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -32,35 +28,25 @@ class Drum(SmallSpheres):
     torque of the bed's weight.
     """
 
-    n: int = option(8, "", "size: radius of the drum in diameters of a sphere")
-    length: float = option(6.0, "sphere diameters", "length of the drum", positive)
+    n: int = option(8, "", "size: radius of the drum in diameters of a sphere", between(3))
+    length: float = option(6.0, "sphere diameters", "length of the drum", between(2))
     fill: float = option(0.3, "", "part of the drum that the settled bed fills, at most about a third", positive)
-    spread: float = option(0.2, "", "part by which the smallest spheres are smaller; equal ones order themselves")
+    spread: float = option(
+        0.2, "", "part by which the smallest spheres are smaller; equal ones order themselves", between(0, 0.9)
+    )
     friction: float = option(0.5, "", "friction coefficient between spheres", not_negative)
     wall_friction: float = option(0.9, "", "friction coefficient on the side of the drum", not_negative)
     end_friction: float = option(0.0, "", "friction coefficient on the ends of the drum", not_negative)
     froude: float = option(0.01, "", "speed: Froude number omega^2 R / g", positive)
-    sides: int = option(48, "", "flat sides of the drum")
-    perturbation: float = option(0.0004, "m", "greatest displacement of a sphere from its lattice point, per axis")
-
-    dt: ClassVar[float] = 0.005
+    sides: int = option(48, "", "flat sides of the drum", between(12))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0.0 <= self.spread < 1.0:
-            raise ValueError(f"spread must be below 1 and not negative, got {self.spread:g}")
-        if self.length < 2.0:
-            raise ValueError(f"length must be at least 2 sphere diameters, got {self.length:g}")
         if self.spheres > len(self._lattice()):
             raise ValueError(
                 f"fill {self.fill:g}: {self.spheres} spheres, but only {len(self._lattice())} have room at the start; "
                 "take a smaller fill or a larger n"
             )
-
-    @property
-    def pitch(self) -> float:
-        """Spacing of the lattice on which the spheres start [m]."""
-        return 2.2 * self.radius
 
     @property
     def width(self) -> float:
@@ -74,11 +60,11 @@ class Drum(SmallSpheres):
 
     @property
     def spheres(self) -> int:
-        """Number of the spheres: with a packing fraction of 0.58 they fill their part of the drum."""
+        """Number of the spheres: they fill their part of the drum."""
         area = 0.5 * self.sides * self.container_radius**2 * sin(2 * pi / self.sides)
         s = self.spread
         mean_cube = 1 - 3 / 2 * s + s**2 - s**3 / 4  # of radii from 1 - s to 1
-        return ceil(0.58 * self.fill * area * self.width / (4 / 3 * pi * self.radius**3 * mean_cube))
+        return ceil(self.packing * self.fill * area * self.width / (4 / 3 * pi * self.radius**3 * mean_cube))
 
     @property
     def settling_time(self) -> float:
@@ -102,21 +88,19 @@ class Drum(SmallSpheres):
         across = np.arange(-count, count + 1) * self.pitch
         slots = max(int((self.width - 2 * self.radius - 2 * self.perturbation) / self.pitch) + 1, 1)
         along = (np.arange(slots) - (slots - 1) / 2) * self.pitch
-        places = perturbed(across, along, across, self.perturbation, self.seed)
-        places = places[np.hypot(places[:, 0], places[:, 2]) <= room]
-        return places[np.argsort(places[:, 2], kind="stable")]
+        return self.in_circle(across, along, across, 1, room)
 
     def build(self) -> Scene:
         """The scene, with the large bodies "drum" and "ends"."""
-        scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
+        radii = self.radius * np.random.default_rng(self.seed).uniform(1.0 - self.spread, 1.0, self.spheres)
+        scene = self.spheres_alone(radii, "spheres")
         scene.set_friction(self.wall_friction, "spheres", "side")
         scene.set_friction(self.end_friction, "spheres", "ends")
-        radii = self.radius * np.random.default_rng(self.seed).uniform(1.0 - self.spread, 1.0, self.spheres)
-        scene.add_spheres(self.positions(), radii, self.density, material="spheres")
         half, wide = self.width / 2, self.container_radius
         turning = Rotation((0.0, self.speed, 0.0), start=self.settling_time)
-        side = Mesh.revolved([(wide, -half), (wide, half)], self.sides, quaternion=ALONG_Y)
-        ends = [Mesh.revolved([(0.0, z), (wide, z)], self.sides, quaternion=ALONG_Y) for z in (-half, half)]
+        along_y = (sqrt(0.5), -sqrt(0.5), 0.0, 0.0)  # where the z axis is turned to
+        side = Mesh.revolved([(wide, -half), (wide, half)], self.sides, quaternion=along_y)
+        ends = [Mesh.revolved([(0.0, z), (wide, z)], self.sides, quaternion=along_y) for z in (-half, half)]
         scene.add_body("drum", [side], turning, material="side")
         scene.add_body("ends", ends, turning, material="ends")
         return scene

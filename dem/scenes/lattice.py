@@ -1,46 +1,66 @@
-"""What the scenes share: options, the perturbed cubic lattice on which spheres start, lengths in scenes of small
-spheres."""
+"""What the scenes share: options, the perturbed cubic lattice on which spheres start, walls, a body that goes to and
+fro, and lengths in scenes of small spheres."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from math import ceil, sqrt
+from math import ceil, pi, sqrt
 from typing import Any, ClassVar
 
 import numpy as np
 
-from dem.arrays import Floats
-from dem.checks import not_negative, positive
+from dem import analysis
+from dem.arrays import Bools, Floats
+from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
+from dem.motion import Oscillation
+from dem.quaternion import length
+from dem.scene import Scene
+from dem.shapes import Plane, Shape
 
 
 @dataclass(frozen=True)
 class Spheres(Experiment):
-    """Options of all scenes: spheres that start on a perturbed lattice."""
+    """Options of all scenes: spheres that start on a perturbed lattice. A scene has the method `positions`."""
 
-    n: int = option(4, "", "size: there are (2n+1)^3 spheres")
+    n: int = option(4, "", "size: there are (2n+1)^3 spheres", between(1))
     radius: float = option(0.1, "m", "radius of the spheres", positive)
     density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)", positive)
     friction: float = option(0.25, "", "friction coefficient of all contacts", not_negative)
-    perturbation: float = option(0.02, "m", "greatest displacement of a sphere from its lattice point, per axis")
+    perturbation: float = option(
+        0.02, "m", "greatest displacement of a sphere from its lattice point, per axis", not_negative
+    )
     seed: int = option(1, "", "seed of the perturbation", not_negative)
     gravity: float = option(9.81, "m/s^2", "gravity, downwards", positive)
 
-    least_n: ClassVar[int] = 1
     pitch: ClassVar[Any]  #: spacing of the lattice [m]
 
     def __post_init__(self) -> None:
         """ValueError unless the spheres cannot touch at the start, however they are moved."""
         super().__post_init__()
-        if self.n < self.least_n:
-            raise ValueError(f"n must be at least {self.least_n}, got {self.n}")
-        not_negative("perturbation", self.perturbation)
         free = self.pitch / 2 - self.radius
         if self.perturbation >= free:
             raise ValueError(
                 f"perturbation {self.perturbation:g} m must be less than pitch / 2 - radius = {free:g} m, "
                 "half the free space between spheres of the lattice"
             )
+
+    def positions(self) -> Floats:
+        """Centres (spheres, 3) of the spheres at the start [m]."""
+        raise NotImplementedError
+
+    def spheres_alone(self, radius: float | Floats, material: str = "default") -> Scene:
+        """A scene with the spheres, of one radius or of radii (spheres,) [m]."""
+        scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
+        scene.add_spheres(self.positions(), radius, self.density, material=material)
+        return scene
+
+    def walls(self) -> list[Shape]:
+        """The floor, the walls and, if it is not open at the top, the lid of the domain."""
+        low, high = np.array(self.domain)
+        tops = [Plane(-way, tuple(np.where(way, high, 0.0))) for way, top in zip(np.eye(3), high) if np.isfinite(top)]
+        return [*(Plane(way, low) for way in np.eye(3)), *tops]
 
 
 @dataclass(frozen=True)
@@ -51,19 +71,50 @@ class LargeSpheres(Spheres):
 
 
 @dataclass(frozen=True)
+class ToAndFro(LargeSpheres):
+    """A scene in which a body goes along x and back, from rest, when the spheres have settled.
+
+    Its velocity is v = pi travel / period * sin(2 pi t / period), with t since the end of settling.
+    """
+
+    period: float = option(4.0, "s", "period of the velocity of the body that moves: half of it is one way", positive)
+    cutoff: float = option(2.0, "Hz", "cutoff frequency of the low-pass filter of the forces", positive)
+
+    travel: ClassVar[Any]  #: way of the body from one end to the other [m]
+
+    def to_and_fro(self) -> Oscillation:
+        """The motion: displacement travel / 2 (1 - cos(2 pi t / period))."""
+        return Oscillation((1, 0, 0), self.travel / 2, self.period, phase=-pi / 2, start=self.settling_time)
+
+    def filtered(self, records: Mapping[str, Floats], names: list[str]) -> dict[str, float | Floats]:
+        """The named records through the filter, see `dem.analysis.filtered`."""
+        return dict(analysis.filtered(records, names, self.cutoff))
+
+    def steady(self, time: Floats) -> Bools:
+        """Mask (n,) of the times of the first way at which the speed is above 1/sqrt(2) of the greatest."""
+        phase = (time - self.settling_time) / self.period
+        return (phase >= 1 / 8) & (phase <= 3 / 8)
+
+
+@dataclass(frozen=True)
 class SmallSpheres(Spheres):
     """Lengths of scenes whose container is round, with a radius of n sphere diameters."""
 
+    n: int = option(6, "", "size: radius of the container in diameters of a sphere", between(3))
     friction: float = option(0.5, "", "friction coefficient of all contacts", not_negative)
     radius: float = option(0.005, "m", "radius of the greatest spheres", positive)
-    sides: int = option(32, "", "flat sides of the container")
+    perturbation: float = option(
+        0.0004, "m", "greatest displacement of a sphere from its lattice point, per axis", not_negative
+    )
+    sides: int = option(32, "", "flat sides of the container", between(12))
 
-    least_n: ClassVar[int] = 3
+    dt: ClassVar[float] = 0.005
+    packing: ClassVar[float] = 0.58  #: share of the volume that settled spheres take
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.sides < 12:
-            raise ValueError(f"sides must be at least 12, got {self.sides}")
+    @property
+    def pitch(self) -> float:
+        """Spacing of the lattice on which the spheres start [m]."""
+        return 2.2 * self.radius
 
     @property
     def delta(self) -> float:
@@ -79,6 +130,12 @@ class SmallSpheres(Spheres):
     def container_radius(self) -> float:
         """Radius of the container, to the corners between its sides [m]."""
         return 2 * self.n * self.radius
+
+    def in_circle(self, x: Floats, y: Floats, z: Floats, axis: int, room: float) -> Floats:
+        """The places of the perturbed lattice of these coordinates within `room` [m] of an axis, the lowest first."""
+        places = perturbed(x, y, z, self.perturbation, self.seed)
+        places = places[length(np.delete(places, axis, axis=1)) <= room]
+        return places[np.argsort(places[:, 2], kind="stable")]
 
 
 def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -> Floats:

@@ -15,7 +15,7 @@ from dem.experiment import option
 from dem.motion import Rotation
 from dem.scene import Scene
 from dem.scenes.lattice import LargeSpheres, perturbed
-from dem.shapes import Box, Plane
+from dem.shapes import Box
 
 
 @dataclass(frozen=True)
@@ -82,22 +82,11 @@ class Mixer(LargeSpheres):
 
     def build(self) -> Scene:
         """The scene, with the large bodies "box" and "mixer"."""
-        scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
-        scene.add_spheres(self.positions(), self.radius, self.density)
-        wall = self.width / 2
-        walls = [
-            Plane((-sx, -sy, 0), (sx * wall, sy * wall, 0)) for sx, sy in ((1, 0), (-1, 0), (0, 1), (0, -1))
-        ]
-        scene.add_body("box", [Plane((0, 0, 1)), *walls])
-        length, height, thickness = (
-            share * self.width for share in (self.paddle_length, self.paddle_height, self.paddle_thickness)
-        )
-        scene.add_body(
-            "mixer",
-            [Box((length / 2, thickness / 2, height / 2))],
-            Rotation((0, 0, self.angular_velocity)),
-            position=(0, 0, self.clearance + height / 2),
-        )
+        scene = self.spheres_alone(self.radius)
+        scene.add_body("box", self.walls())
+        half = self.width / 2 * np.array([self.paddle_length, self.paddle_thickness, self.paddle_height])
+        turning, middle = Rotation((0, 0, self.angular_velocity)), (0, 0, self.clearance + half[2])
+        scene.add_body("mixer", [Box(tuple(half))], turning, position=middle)
         return scene
 
     def analyse(self, records: Mapping[str, Floats]) -> Mapping[str, float | Floats]:

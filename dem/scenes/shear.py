@@ -5,47 +5,37 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
-from typing import ClassVar
 
 import numpy as np
 
 from dem import analysis
 from dem.arrays import Corners, Floats
-from dem.checks import not_negative, positive
+from dem.checks import between, not_negative, positive
 from dem.experiment import option
-from dem.motion import Guided, Oscillation
+from dem.motion import Guided
 from dem.scene import Scene
-from dem.scenes.lattice import LargeSpheres, perturbed, rest_after_fall
+from dem.scenes.lattice import ToAndFro, perturbed, rest_after_fall
 from dem.shapes import Box, Plane, Shape
 from dem.step import Step
 
-#: Share of the volume that spheres take in the bed, by which the plane between the halves is placed in its middle.
-PACKING = 0.6
-
 
 @dataclass(frozen=True)
-class Shear(LargeSpheres):
+class Shear(ToAndFro):
     """(3n+1)(2n+1)^2 spheres settle in a box under a press; then the lower half of the box moves along x and back.
 
     The box is 3n+1 lattice cells long, along x, and 2n+1 wide. Its halves have thick walls, so that no gap opens where
     one is displaced against the other; the floor moves with the lower half. The upper half is clamped. The press fills
     the cross-section, can only move vertically, and lies on the spheres by its weight; it starts on top of the lattice
-    and falls with it. The velocity of the lower half is v = pi stroke / period * sin(2 pi t / period), with t since
-    the end of settling, up to the greatest displacement, the stroke, at half the period. With both halves and the
-    press there are (3n+1)(2n+1)^2 + 3 bodies; all lengths grow with n.
+    and falls with it. With both halves and the press there are (3n+1)(2n+1)^2 + 3 bodies; all lengths grow with n.
     """
 
-    n: int = option(4, "", "size: there are (3n+1)(2n+1)^2 spheres")
+    n: int = option(4, "", "size: there are (3n+1)(2n+1)^2 spheres", between(1))
     friction: float = option(0.25, "", "friction coefficient between spheres", not_negative)
     wall_friction: float = option(0.25, "", "friction coefficient of spheres on walls, floor and press", not_negative)
     press_density: float = option(10.0, "densities of the spheres", "density of the press", positive)
     press_thickness: float = option(0.05, "box widths", "thickness of the press", positive)
     split: float = option(0.5, "bed depths", "height of the plane between the halves; packing fraction 0.6", positive)
     stroke: float = option(0.1, "box lengths", "greatest displacement of the lower half", positive)
-    period: float = option(4.0, "s", "period of the velocity of the lower half", positive)
-    cutoff: float = option(2.0, "Hz", "cutoff frequency of the low-pass filter of the stresses", positive)
-
-    dt: ClassVar[float] = 0.01
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -64,8 +54,8 @@ class Shear(LargeSpheres):
 
     @property
     def split_height(self) -> float:
-        """Height of the plane between the halves above the floor [m]."""
-        depth = self.width * 4 / 3 * pi * (self.radius / self.pitch) ** 3 / PACKING
+        """Height of the plane between the halves above the floor [m], for a bed with a packing fraction of 0.6."""
+        depth = self.width * 4 / 3 * pi * (self.radius / self.pitch) ** 3 / 0.6
         return self.split * depth
 
     @property
@@ -74,7 +64,7 @@ class Shear(LargeSpheres):
         return self.length * self.width
 
     @property
-    def way(self) -> float:
+    def travel(self) -> float:
         """Greatest displacement of the lower half [m]."""
         return self.stroke * self.length
 
@@ -86,7 +76,7 @@ class Shear(LargeSpheres):
     @property
     def domain(self) -> Corners:
         """The inside of the box at the greatest displacement [m]."""
-        return (-self.length / 2, -self.width / 2, 0.0), (self.length / 2 + self.way, self.width / 2, self.width)
+        return (-self.length / 2, -self.width / 2, 0.0), (self.length / 2 + self.travel, self.width / 2, self.width)
 
     def positions(self) -> Floats:
         """Centres ((3n+1)(2n+1)^2, 3) of the spheres at the start [m]; the floor is z = 0."""
@@ -97,31 +87,20 @@ class Shear(LargeSpheres):
 
     def build(self) -> Scene:
         """The scene, with the large bodies "lower", "upper" and "press"."""
-        scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
+        scene = self.spheres_alone(self.radius, "spheres")
         scene.set_friction(self.wall_friction, "spheres", "walls")
-        scene.add_spheres(self.positions(), self.radius, self.density, material="spheres")
         thickness = self.press_thickness * self.width
-        scene.add_body(
-            "lower",
-            [Plane((0, 0, 1)), *self._walls(-2 * self.radius, self.split_height)],
-            # from rest: displacement way / 2 (1 - cos(2 pi t / period))
-            Oscillation((1, 0, 0), self.way / 2, self.period, phase=-pi / 2, start=self.settling_time),
-            material="walls",
-        )
-        scene.add_body("upper", self._walls(self.split_height, self.width + thickness), material="walls")
-        scene.add_body(
-            "press",
-            [Box((self.length / 2, self.width / 2, thickness / 2))],
-            Guided((0, 0, 1)),
-            position=(0, 0, self.width + thickness / 2),
-            density=self.press_density * self.density,
-            material="walls",
-        )
+        lower = [Plane((0, 0, 1)), *self._side_walls(-2 * self.radius, self.split_height)]
+        scene.add_body("lower", lower, self.to_and_fro(), material="walls")
+        scene.add_body("upper", self._side_walls(self.split_height, self.width + thickness), material="walls")
+        press, middle = Box((self.length / 2, self.width / 2, thickness / 2)), (0, 0, self.width + thickness / 2)
+        density = self.press_density * self.density
+        scene.add_body("press", [press], Guided((0, 0, 1)), position=middle, density=density, material="walls")
         return scene
 
-    def _walls(self, bottom: float, top: float) -> list[Shape]:
+    def _side_walls(self, bottom: float, top: float) -> list[Shape]:
         """The four walls of a half, thick enough that they cover each other at the greatest displacement."""
-        thick, tall, middle = self.way + 4 * self.radius, (top - bottom) / 2, (top + bottom) / 2
+        thick, tall, middle = self.travel + 4 * self.radius, (top - bottom) / 2, (top + bottom) / 2
         x, y = self.length / 2, self.width / 2
         ends = [Box((thick / 2, y + thick, tall), (side * (x + thick / 2), 0, middle)) for side in (-1, 1)]
         sides = [Box((x, thick / 2, tall), (0, side * (y + thick / 2), middle)) for side in (-1, 1)]
@@ -144,15 +123,14 @@ class Shear(LargeSpheres):
 
     def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
         """Filtered stresses, the volume strain since the first record, and friction angles: that of the peak in the
-        first stroke, and the steady one while the lower half is fast, see `dem.analysis.steady_part`."""
+        first stroke, and the steady one while the lower half is fast."""
         time, height = records["time [s]"], records["sample_height [m]"]
         stresses = ["shear_stress [Pa]", "normal_stress [Pa]"]
-        out: dict[str, float | Floats] = {"shear_displacement [m]": records["shear_displacement [m]"]}
-        out |= analysis.filtered(records, stresses, self.cutoff)
+        out = {"shear_displacement [m]": records["shear_displacement [m]"], **self.filtered(records, stresses)}
         shear, normal = (np.asarray(out[f"{name}_stress_filtered [Pa]"]) for name in ("shear", "normal"))
         out["volume_strain"] = height / height[0] - 1.0
         stroke = (time > self.settling_time) & (time <= self.settling_time + self.period / 2)
-        steady = analysis.steady_part(time, self.settling_time, self.period)
+        steady = self.steady(time)
         if stroke.any():
             peak = np.flatnonzero(stroke)[np.argmax(shear[stroke])]
             out["peak_shear_stress [Pa]"] = float(shear[peak])
@@ -160,6 +138,6 @@ class Shear(LargeSpheres):
         if steady.any():
             raw = [records[name][steady] for name in stresses]
             out["steady_shear_stress [Pa]"], out["steady_normal_stress [Pa]"] = (float(values.mean()) for values in raw)
-            out["normal_stress_swing"] = analysis.swing(raw[1], normal[steady])
+            out["normal_stress_swing"] = float(np.std(raw[1] - normal[steady]) / np.mean(raw[1]))
             out["steady_friction_angle [degrees]"] = analysis.friction_angle(*raw)
         return out

@@ -5,25 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import ceil, pi, radians, sqrt, tan
-from typing import ClassVar
 
 import numpy as np
 
 from dem.arrays import Floats
-from dem.checks import positive
+from dem.checks import between, positive
 from dem.experiment import option
 from dem.mesh import Mesh
 from dem.motion import Glide
 from dem.scene import Scene
-from dem.scenes.lattice import SmallSpheres, perturbed, rest_after_fall
+from dem.scenes.lattice import SmallSpheres, rest_after_fall
 from dem.shapes import Plane
 from dem.step import Step
-
-#: Constants of Beverloo, Leniger and van de Velde (1961): of the flow, and diameters of a grain that the outlet lacks.
-BEVERLOO_C, BEVERLOO_K = 0.58, 1.5
-
-#: Share of the volume that settled spheres take.
-PACKING = 0.58
 
 
 @dataclass(frozen=True)
@@ -36,14 +29,10 @@ class Silo(SmallSpheres):
     beside it, for the bulk density of a packing fraction of 0.58.
     """
 
-    n: int = option(6, "", "size: radius of the cylinder in diameters of a sphere")
     filling: float = option(1.5, "silo diameters", "height of the settled bed if it were all in the cylinder", positive)
     outlet: float = option(5.0, "sphere diameters", "diameter of the outlet", positive)
-    half_angle: float = option(30.0, "degrees", "of the cone, from the vertical; 90: flat bottom")
+    half_angle: float = option(30.0, "degrees", "of the cone, from the vertical; 90: flat bottom", between(5, 90))
     drop: float = option(1.0, "silo diameters", "height of the outlet above the floor", positive)
-    perturbation: float = option(0.0005, "m", "greatest displacement of a sphere from its lattice point, per axis")
-
-    dt: ClassVar[float] = 0.005
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -51,13 +40,6 @@ class Silo(SmallSpheres):
             raise ValueError(
                 f"outlet {self.outlet:g} must be between 1 sphere diameter and the {2 * self.n} of the silo"
             )
-        if not 5.0 <= self.half_angle <= 90.0:
-            raise ValueError(f"half_angle must be between 5 and 90 degrees, got {self.half_angle:g}")
-
-    @property
-    def pitch(self) -> float:
-        """Spacing of the lattice on which the spheres start [m]."""
-        return 2.3 * self.radius
 
     @property
     def outlet_radius(self) -> float:
@@ -79,7 +61,7 @@ class Silo(SmallSpheres):
     def spheres(self) -> int:
         """Number of the spheres."""
         bed = pi * self.container_radius**2 * 2 * self.filling * self.container_radius
-        return ceil(PACKING * bed / (4 / 3 * pi * self.radius**3))
+        return ceil(self.packing * bed / (4 / 3 * pi * self.radius**3))
 
     @property
     def top(self) -> float:
@@ -93,9 +75,10 @@ class Silo(SmallSpheres):
 
     @property
     def beverloo(self) -> float:
-        """Flow by Beverloo's law [kg/s]: C rho_bulk sqrt(g) (D - k d)^(5/2)."""
-        opening = max(2 * self.outlet_radius - 2 * BEVERLOO_K * self.radius, 0.0)
-        return BEVERLOO_C * PACKING * self.density * sqrt(self.gravity) * opening**2.5
+        """Flow by the law of Beverloo, Leniger and van de Velde (1961) [kg/s]: C rho_bulk sqrt(g) (D - k d)^(5/2), with
+        C = 0.58 and k = 1.5, the diameters of a grain that the outlet lacks."""
+        opening = max(2 * self.outlet_radius - 1.5 * 2 * self.radius, 0.0)
+        return 0.58 * self.packing * self.density * sqrt(self.gravity) * opening**2.5
 
     def positions(self) -> Floats:
         """Centres (spheres, 3) of the spheres at the start [m], a lattice in the cylinder above the cone."""
@@ -103,19 +86,12 @@ class Silo(SmallSpheres):
         count = int(room / self.pitch)
         across = np.arange(-count, count + 1) * self.pitch
         per_layer = int((np.hypot(*np.meshgrid(across, across)) <= room).sum())
-        layers = ceil(self.spheres / per_layer)
-        up = self.cone_height + (np.arange(layers) + 0.6) * self.pitch
-        # Of the lattice before it is perturbed, those in the cylinder.
-        places = perturbed(across, across, up, 0.0, self.seed)
-        places = places[np.hypot(places[:, 0], places[:, 1]) <= room]
-        places = places[np.argsort(places[:, 2], kind="stable")][: self.spheres]
-        noise = np.random.default_rng(self.seed).uniform(-1.0, 1.0, places.shape)
-        return places + self.perturbation * noise
+        up = self.cone_height + (np.arange(ceil(self.spheres / per_layer)) + 0.6) * self.pitch
+        return self.in_circle(across, across, up, 2, room + 1.5 * self.perturbation)[: self.spheres]
 
     def build(self) -> Scene:
         """The scene, with the large bodies "silo", "gate" and "floor"."""
-        scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
-        scene.add_spheres(self.positions(), self.radius, self.density)
+        scene = self.spheres_alone(self.radius)
         wide, hole = self.container_radius, self.outlet_radius
         profile = [(hole, 0.0), (wide, self.cone_height), (wide, self.top)]
         scene.add_body("silo", [Mesh.revolved(profile, self.sides)])

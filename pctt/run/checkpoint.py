@@ -15,14 +15,13 @@ from mpi4py import MPI
 
 from dem.arrays import Floats
 from dem.bodies import Bodies
-from dem.control import changed_motions, restore_motions
 from dem.experiment import Experiment
 from dem.impulses import ImpulseMemory
 from dem.mesh import Mesh
 from dem.quaternion import cross
 from dem.scene import LargeBody, Scene
 from dem.start import even_slice, restart_rows, restored_world
-from dem.world import World
+from dem.world import World, changed_motions, restore_motions
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError, raise_together, readable, write_text, written
 from pctt.run.settings import scene_name

@@ -52,10 +52,6 @@ def test_the_friction_angle_is_that_of_the_means():
     assert angle == pytest.approx(np.degrees(np.arctan(0.5)))
 
 
-def test_the_swing_is_what_the_filter_takes_away():
-    assert analysis.swing(np.array([4.0, 0.0, 6.0, 2.0]), np.array([3.0, 1.0, 5.0, 3.0])) == pytest.approx(1 / 3)
-
-
 def test_the_steady_draft_force_is_the_mean_while_the_blade_is_fast():
     scene = Blade(n=4)
     time = np.arange(0.0, scene.settling_time + 5.0, scene.dt)

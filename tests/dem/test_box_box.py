@@ -9,8 +9,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from dem import quaternion
-from dem.contact.box_box import CORNER_OF_SECOND, EDGES, SNAP, box_box
-from dem.contact.narrow import FLUSH, Boxes
+from dem.contact.box_box import CORNER_OF_SECOND, EDGES, FLUSH, SNAP, box_box
+from dem.contact.narrow import Boxes
 
 DELTA = 0.1
 

@@ -9,9 +9,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from dem import quaternion
+from dem.bodies import CAPSULE
 from dem.contact.capsules import DISTINCT, capsule_box, capsule_capsule, capsule_plane
 from dem.contact.narrow import Boxes, Capsules, Planes
-from dem.shapes import Capsule, Sphere, capsule_mass, mass_properties, moved
+from dem.shapes import Capsule, Sphere, mass_properties, moved, solid
 
 DELTA = 0.1
 
@@ -221,7 +222,7 @@ def test_contacts_of_capsules_do_not_depend_on_their_order(pair):
 
 def test_mass_and_moments_by_sampling():
     rng, radius, half = np.random.default_rng(4), 0.3, 0.5
-    mass, moments = capsule_mass(np.array([radius]), np.array([half]), np.array([1000.0]))
+    mass, moments = solid(CAPSULE, np.array([[radius, half, 0.0]]), np.array([1000.0]))
     points = rng.uniform(-1, 1, (400_000, 3)) * [radius, radius, half + radius]
     beyond = np.maximum(np.abs(points[:, 2]) - half, 0.0)
     inside = points[points[:, 0] ** 2 + points[:, 1] ** 2 + beyond**2 <= radius**2]
@@ -229,7 +230,7 @@ def test_mass_and_moments_by_sampling():
     assert mass[0] == pytest.approx(1000.0 * volume * len(inside) / len(points), rel=0.01)
     squares = (inside**2).mean(axis=0)
     np.testing.assert_allclose(moments[0], mass[0] * (squares.sum() - squares), rtol=0.01)
-    short = capsule_mass(np.array([radius]), np.array([1e-9]), np.array([1000.0]))
+    short = solid(CAPSULE, np.array([[radius, 1e-9, 0.0]]), np.array([1000.0]))
     np.testing.assert_allclose(short[1][0], mass_properties([Sphere(radius)], 1000.0)[2].diagonal(), rtol=1e-6)
 
 
@@ -242,5 +243,5 @@ def test_capsules_as_parts_of_bodies():
     back = moved(part, np.array([1.0, 0, 0]), turn)
     np.testing.assert_allclose(back.center, 0.0, atol=1e-15)
     np.testing.assert_allclose(back.quaternion, [1, 0, 0, 0], atol=1e-15)
-    with pytest.raises(ValueError, match="half length of a capsule must be positive"):
+    with pytest.raises(ValueError, match="Capsule.half_length must be positive"):
         Capsule(0.1, 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import builtins
+import sys
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from dem.contact import find_contacts
 from dem.contact.capsules import capsule_plane
 from dem.contact.meshes import PlacedMesh, capsule_mesh, sphere_mesh
 from dem.contact.narrow import Boxes, Capsules, Planes, Spheres, sphere_box
-from dem.mesh import Mesh, merged
+from dem.mesh import Mesh
 from dem.motion import Dynamic, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere, mass_properties, moved
@@ -213,17 +213,14 @@ def test_a_capsule_through_a_face_is_pushed_back_the_shorter_way():
     np.testing.assert_allclose(gaps, [-0.25])
 
 
-def test_mass_of_a_block_of_triangles_as_of_a_box():
+def test_mass_of_a_block_of_triangles_as_of_a_box_and_of_a_cone_by_its_formulas():
+    pytest.importorskip("trimesh")
     turn = quaternion.exponential(np.array([0.3, -0.4, 0.5]))
     pair, place = (block(center=(1, 2, 3)), Box((0.5, 0.4, 0.3), (1, 2, 3))), np.array([0.2, 0, 1])
     for mesh, box in (pair, [moved(shape, place, turn) for shape in pair]):
         for found, right in zip(mass_properties([mesh], 1000.0), mass_properties([box], 1000.0)):
             np.testing.assert_allclose(found, right, atol=1e-10)
-
-
-def test_mass_of_a_cone_by_its_formulas():
-    mesh, factor = Mesh.revolved([(0, 0), (2, 0), (0, 3)], 400), 1.0
-    mass, center, tensor = mass_properties([mesh], factor)
+    mass, center, tensor = mass_properties([Mesh.revolved([(0, 0), (2, 0), (0, 3)], 400)], 1.0)
     volume = np.pi * 4 * 3 / 3
     np.testing.assert_allclose(mass, volume, rtol=1e-4)
     np.testing.assert_allclose(center, [0, 0, 0.75], atol=1e-12)
@@ -231,26 +228,32 @@ def test_mass_of_a_cone_by_its_formulas():
     np.testing.assert_allclose(tensor, np.diag([across, across, 0.3 * volume * 4]), rtol=2e-4, atol=1e-10)
 
 
-def test_meshes_without_mass_and_bad_meshes_are_refused():
-    mesh = block()
-    with pytest.raises(ValueError, match="not closed has no mass: 3 of 18 edges"):
-        mass_properties([Mesh(mesh.vertices, mesh.triangles[1:])], 1.0)
-    with pytest.raises(ValueError, match="turned both ways"):
-        mass_properties([Mesh(mesh.vertices, np.concatenate([mesh.triangles[:1, ::-1], mesh.triangles[1:]]))], 1.0)
-    with pytest.raises(ValueError, match="normals point inwards"):
-        mass_properties([Mesh(mesh.vertices, mesh.triangles[:, ::-1])], 1.0)
-    with pytest.raises(ValueError, match="rows of its 8 vertices, got 0 to 8"):
-        Mesh(mesh.vertices, mesh.triangles + (mesh.triangles == 7))
-    with pytest.raises(ValueError, match=r"shape \(n, 3\), got \(4, 2\)"):
-        Mesh(np.zeros((4, 2)), [[0, 1, 2]])
-    with pytest.raises(ValueError, match="must be integers"):
-        Mesh(np.zeros((4, 3)), [[0.0, 1, 2]])
-    with pytest.raises(ValueError, match="no triangle of the mesh has three corners"):
-        Mesh(np.zeros((4, 3)), [[0, 1, 1]])
-    with pytest.raises(ValueError, match="at least 3 sides"):
-        Mesh.revolved([(1, 0), (1, 1)], 2)
-    with pytest.raises(ValueError, match="radii of a profile"):
-        Mesh.revolved([(1, 0), (-1, 1)])
+def test_meshes_without_mass_are_refused():
+    pytest.importorskip("trimesh")
+    corners, triangles = block().vertices, block().triangles
+    for chosen, words in (
+        (triangles[1:], "not closed has no mass: 3 of 18 edges"),
+        (np.concatenate([triangles[:1, ::-1], triangles[1:]]), "turned both ways"),
+        (triangles[:, ::-1], "normals point inwards"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            mass_properties([Mesh(corners, chosen)], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Mesh(np.eye(3), [[0, 1, 3]]), "rows of its 3 vertices, got 0 to 3"),
+        (lambda: Mesh(np.zeros((4, 2)), [[0, 1, 2]]), r"shape \(n, 3\), got \(4, 2\)"),
+        (lambda: Mesh(np.zeros((4, 3)), [[0.0, 1, 2]]), "must be integers"),
+        (lambda: Mesh(np.zeros((4, 3)), [[0, 1, 1]]), "no triangle of the mesh has three corners"),
+        (lambda: Mesh.revolved([(1, 0), (1, 1)], 2), "at least 3 sides"),
+        (lambda: Mesh.revolved([(1, 0), (-1, 1)]), "radii of a profile"),
+    ],
+)
+def test_bad_meshes_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
 
 
 def test_bodies_that_cannot_touch_a_mesh_are_refused():
@@ -261,7 +264,7 @@ def test_bodies_that_cannot_touch_a_mesh_are_refused():
         new_world(scene, SELF)
     for shape, word in ((Box((1, 1, 1)), "box"), (block(), "mesh")):
         scene = Scene(friction=0.3)
-        scene.add_body("tool", [block()], Dynamic(), density=1000.0)
+        scene.add_body("tool", [block()], Dynamic(), mass=1.0, inertia=(1, 1, 1))
         scene.add_body("wall", [shape], position=(0, 0, -5))
         scene.add_spheres([0, 0, 2], 0.1, 1000.0)
         with pytest.raises(ValueError, match=f"the {word} of 'wall' cannot touch the mesh of 'tool'"):
@@ -275,52 +278,46 @@ def test_files_are_read_written_scaled_and_refused(tmp_path):
     read = Mesh.read(tmp_path / "wheel.stl", 1e-3, center=(0, 0, 1))
     assert len(read.vertices) == len(mesh.vertices)  # the corners of the file are one vertex again
     np.testing.assert_allclose(mass_properties([read], 1.0)[0], 1e-9 * mass_properties([mesh], 1.0)[0], rtol=1e-6)
-    lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices] + [f"f {a} {b} {c}" for a, b, c in mesh.triangles + 1]
-    (tmp_path / "wheel.obj").write_text("\n".join(lines))
+    mesh.write(tmp_path / "wheel.obj")
     np.testing.assert_allclose(Mesh.read(tmp_path / "wheel.obj").surface.half, [10, 10, 10])
+    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1e-8, 0), (1, 1, 0), (0, 1, 1e-8)]
+    (tmp_path / "near.obj").write_text("\n".join([*("v {} {} {}".format(*c) for c in corners), "f 1 2 3", "f 4 5 6"]))
+    assert len(Mesh.read(tmp_path / "near.obj").vertices) == 4
     (tmp_path / "words.stl").write_text("no mesh")
-    with pytest.raises(ValueError, match="words.stl: (cannot be read as a mesh|has no triangle)"):
-        Mesh.read(tmp_path / "words.stl")
     (tmp_path / "cut.stl").write_bytes((tmp_path / "wheel.stl").read_bytes()[:1000])
-    with pytest.raises(ValueError, match="cut.stl: cannot be read as a mesh"):
-        Mesh.read(tmp_path / "cut.stl")
-    with pytest.raises(ValueError, match="none.stl: no such file"):
-        Mesh.read(tmp_path / "none.stl")
+    for name, words in (
+        ("words.stl", "words.stl: (cannot be read as a mesh|has no triangle)"),
+        ("cut.stl", "cut.stl: cannot be read as a mesh"),
+        ("none.stl", "none.stl: no such file"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            Mesh.read(tmp_path / name)
     with pytest.raises(ValueError, match="scale of .*wheel.stl must be positive"):
         Mesh.read(tmp_path / "wheel.stl", 0.0)
 
 
-def test_without_the_reader_a_file_is_refused(tmp_path, monkeypatch):
-    block().write(tmp_path / "block.stl")
-    whole = builtins.__import__
-
-    def without(name, *rest):
-        if name == "trimesh":
-            raise ImportError(name)
-        return whole(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ValueError, match=r"block.stl: meshes are read by trimesh, .* pip install"):
-        Mesh.read(tmp_path / "block.stl")
+def test_without_trimesh_a_mesh_has_contacts_but_no_mass_and_no_file(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    assert len(on(block(), [0, 0, 0.39], 0.1).pair) == 1
+    for call in (lambda: Mesh.read(tmp_path / "block.stl"), lambda: mass_properties([block()], 1.0)):
+        with pytest.raises(ValueError, match="by trimesh, which is not there: pip install"):
+            call()
 
 
-def test_corners_in_the_same_place_become_one_vertex():
-    corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1e-8, 0), (1, 1, 0), (0, 1, 1e-8)])
-    vertices, triangles = merged(corners, np.array([[0, 1, 2], [3, 4, 5]]))
-    assert len(vertices) == 4
-    assert len(np.intersect1d(*triangles)) == 2
-
-
-def rolled(scene, steps=40, dt=0.01, delta=0.01):
-    """Places (steps, 3) and spins of the only grain."""
-    world, places = new_world(scene, SELF), []
+def moved_on(world, steps, dt=0.01):
+    """After each step by Coulomb's law the system and its impulses."""
     for _ in range(steps):
-        system = ContactSystem(world, find_contacts(world, delta, dt), dt)
+        system = ContactSystem(world, find_contacts(world, 0.01, dt), dt)
         with cone_problem(system, SELF) as problem:
             result = ccp.solve(problem, None, "apgd", ccp.Limits(1e-9), coulomb=ccp.Coulomb())
         advance(world, system.velocity(result.impulse), dt)
-        places.append(np.concatenate([world.grains.position[0], world.grains.velocity[0]]))
-    return np.array(places)
+        yield system, result.impulse
+
+
+def rolled(scene):
+    """Places (steps, 3) and velocities (steps, 6) of the only grain."""
+    world = new_world(scene, SELF)
+    return np.array([[*world.grains.position[0], *world.grains.velocity[0]] for _ in moved_on(world, 40)])
 
 
 def thrown(floor):
@@ -349,27 +346,19 @@ def test_fast_grains_do_not_fly_through_a_sheet(shape):
         scene.add_capsules(places, 0.1, 0.1, 1000.0, quaternions=(0.5, 0.5, 0.5, 0.5), velocity=velocity)
     world = new_world(scene, SELF)
     order = np.argsort(world.grains.id)
-    for _ in range(5):
-        system = ContactSystem(world, find_contacts(world, 0.01, 0.01), 0.01)
-        with cone_problem(system, SELF) as problem:
-            result = ccp.solve(problem, None, "apgd", ccp.Limits(1e-8), coulomb=ccp.Coulomb())
-        advance(world, system.velocity(result.impulse), 0.01)
+    list(moved_on(world, 5))
     np.testing.assert_allclose(world.grains.position[order, 2], [0.1, -0.1], atol=1e-3)
 
 
 def test_a_solid_of_triangles_falls_and_rests_on_a_plane():
     scene = Scene(friction=0.5)
     scene.add_body("floor", [Plane((0, 0, 1))])
-    scene.add_body("tool", [block()], Dynamic(), density=1000.0, position=(0, 0, 0.32))
+    scene.add_body("tool", [block()], Dynamic(), mass=480.0, inertia=(40.0, 54.4, 65.6), position=(0, 0, 0.32))
     scene.add_spheres([0, 5, 0.1], 0.1, 1000.0)
     world = new_world(scene, SELF)
-    for _ in range(30):
-        system = ContactSystem(world, find_contacts(world, 0.01, 0.01), 0.01)
-        with cone_problem(system, SELF) as problem:
-            result = ccp.solve(problem, None, "apgd", ccp.Limits(1e-8), coulomb=ccp.Coulomb())
-        advance(world, system.velocity(result.impulse), 0.01)
+    *_, (system, impulse) = moved_on(world, 30)
     np.testing.assert_allclose(world.large.position[1], [0, 0, 0.3], atol=1e-3)
-    force = force_on(world, system, "floor", result.impulse)
+    force = force_on(world, system, "floor", impulse)
     np.testing.assert_allclose(force[2], -9.81 * (480 + 4 / 3 * np.pi), rtol=1e-5)
 
 

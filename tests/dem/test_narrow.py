@@ -13,8 +13,8 @@ from dem.contact.narrow import (
     Capsules,
     Planes,
     Spheres,
+    box_plane,
     closest_on_lines,
-    corner_plane,
     sphere_box,
     sphere_capsule,
     sphere_plane,
@@ -109,11 +109,12 @@ def test_sphere_and_rotated_boxes_against_sampling():
 
 
 def test_corners_of_a_box_on_a_plane():
-    q = quaternion.exponential(np.array([[0.0, np.pi / 4, 0.0]]))
-    turn = np.repeat(quaternion.matrix(q), 8, axis=0)
-    center, half = np.tile([0.0, 0, 1.5], (8, 1)), np.tile([1.0, 2.0, 1.0], (8, 1))
-    touch = corner_plane(Boxes(center, turn, half), np.arange(8), Planes(np.array([0.0, 0, 1]), np.zeros(3)))
+    turn = quaternion.matrix(quaternion.exponential(np.array([[0.0, np.pi / 4, 0.0]])))
+    center, half = np.array([[0.0, 0, 1.5]]), np.array([[1.0, 2.0, 1.0]])
+    plane = Planes(np.array([[0.0, 0, 1]]), np.zeros((1, 3)))
+    feature, touch = box_plane(Boxes(center, turn, half), plane, np.array([9.0]))[1:]
     tip = center + (half * CORNERS) @ turn[0].T
+    np.testing.assert_array_equal(feature, np.arange(8))
     np.testing.assert_allclose(touch.gap, tip[:, 2], atol=1e-14)
     np.testing.assert_allclose(np.sort(touch.gap)[:2], 1.5 - np.sqrt(2.0))
     np.testing.assert_allclose(touch.point, tip * [1, 1, 0.5], atol=1e-14)

@@ -18,9 +18,9 @@ SELF = MPI.COMM_SELF
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([[0, 0, np.nan]], 0.1, 1000.0), "positions of spheres: NaN or infinite"),
-        (([[0, 0, np.inf]], 0.1, 1000.0), "positions of spheres: NaN or infinite"),
-        (([[0, 0]], 0.1, 1000.0), r"positions of spheres must have shape \(n, 3\)"),
+        (([[0, 0, np.nan]], 0.1, 1000.0), "positions: NaN or infinite"),
+        (([[0, 0, np.inf]], 0.1, 1000.0), "positions: NaN or infinite"),
+        (([[0, 0]], 0.1, 1000.0), r"positions must have shape \(3,\) or \(1, 3\)"),
         (([[0, 0, 0]], 0.0, 1000.0), "radius must be positive, got 0"),
         (([[0, 0, 0]], [-0.1], 1000.0), "radius must be positive, got -0.1"),
         (([[0, 0, 0]], np.nan, 1000.0), "radius: NaN"),
@@ -72,11 +72,11 @@ def test_bad_large_bodies():
         scene.add_body("press", floor, Dynamic(), density=100.0)
     with pytest.raises(ValueError, match="prescribed: it takes no initial velocity"):
         scene.add_body("press", floor, velocity=(0, 0, 1))
-    with pytest.raises(ValueError, match="normal of a plane is the zero vector"):
+    with pytest.raises(ValueError, match="Plane.normal is the zero vector"):
         Plane((0, 0, 0))
-    with pytest.raises(ValueError, match="half extents of a box must be positive"):
+    with pytest.raises(ValueError, match="Box.half_extents must be positive"):
         Box((1, -1, 1))
-    with pytest.raises(ValueError, match="radius of a sphere must be positive"):
+    with pytest.raises(ValueError, match="Sphere.radius must be positive"):
         Sphere(0.0)
     assert [body.name for body in scene.large_bodies] == ["floor"]
 

@@ -1,6 +1,8 @@
-"""The scenes blade, shear, drum and silo; see test_mixer for the mixer."""
+"""The scenes of the package."""
 
 from __future__ import annotations
+
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from mpi4py import MPI
 
 from dem.contact import find_contacts
 from dem.motion import Guided
-from dem.scenes import Blade, Drum, Mixer, Shear, Silo
+from dem.scenes import SCENES, Blade, Drum, Mixer, Shear, Silo
 from dem.start import new_world
 
 SELF = MPI.COMM_SELF
@@ -27,6 +29,31 @@ def test_bodies_of_the_paper(scene, count):
     assert built.friction_table() == pytest.approx(0.25)
 
 
+def test_every_option_has_help_unit_and_default():
+    for scene in SCENES.values():
+        for option in fields(scene):
+            assert option.metadata["help"]
+            assert isinstance(option.metadata["unit"], str)
+            assert getattr(scene(), option.name) == option.default
+
+
+def test_the_paddle_of_the_mixer_turns_below_all_spheres():
+    scene = Mixer(n=3, perturbation=0.024)
+    world = new_world(scene.build(), SELF)
+    assert [body.name for body in world.large_bodies] == ["box", "mixer"]
+    np.testing.assert_allclose(world.prescribed_velocity(0.025)[1], [0, 0, 0, 0, 0, np.pi / 3])
+    paddle_top = scene.clearance + scene.paddle_height * scene.width
+    assert (world.grains.position[:, 2] - scene.radius > paddle_top).all()
+    assert scene.settling_time > np.sqrt(2 * scene.positions()[:, 2].max() / 9.81)
+    assert Mixer(n=8).width / Mixer(n=4).width == pytest.approx(17 / 9)
+
+
+def test_the_seed_decides_the_start():
+    np.testing.assert_array_equal(Mixer(seed=3).positions(), Mixer(seed=3).positions())
+    shift = Mixer(seed=3).positions() - Mixer(seed=4).positions()
+    assert 0.01 < np.abs(shift).max() <= 0.04
+
+
 @pytest.mark.parametrize("scene", SMALL, ids=repr)
 def test_spheres_start_inside_without_contact(scene):
     world = new_world(scene.build(), SELF)
@@ -42,9 +69,8 @@ def test_nothing_moves_before_the_end_of_settling(scene):
     world.time = scene.settling_time - scene.dt
     np.testing.assert_allclose(world.prescribed_velocity(scene.dt), 0.0, atol=1e-12)
     world.time = scene.settling_time + scene.period / 4 - scene.dt / 2
-    way = scene.travel if isinstance(scene, Blade) else scene.way
     fastest = np.abs(world.prescribed_velocity(scene.dt)).max()
-    assert fastest == pytest.approx(np.pi * way / scene.period, rel=1e-4)
+    assert fastest == pytest.approx(np.pi * scene.travel / scene.period, rel=1e-4)
     assert fastest * scene.dt <= scene.delta * (1 + 1e-4)  # no sphere is run over
 
 
@@ -76,15 +102,25 @@ def test_walls_of_the_halves_cover_each_other_at_the_greatest_displacement():
     left, right = (max(x for x in xs) for xs in zip(*((-b.center[0], b.center[0]) for b in upper.shapes[:2])))
     thick = upper.shapes[0].half_extents[0]
     assert left - thick == right - thick == pytest.approx(scene.length / 2)
-    assert 2 * thick > scene.way + 2 * scene.radius
+    assert 2 * thick > scene.travel + 2 * scene.radius
     moved = lower.motion.pose(scene.settling_time + scene.period / 2, lower.position, lower.quaternion)[0]
-    np.testing.assert_allclose(moved, [scene.way, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(moved, [scene.travel, 0, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("scene", "options", "message"),
     [
         (Blade, {"n": 0}, "n must be at least 1"),
+        (Mixer, {"radius": -0.1}, "radius must be positive"),
+        (Mixer, {"density": 0.0}, "density must be positive"),
+        (Mixer, {"friction": -1.0}, "friction must not be negative"),
+        (Mixer, {"perturbation": 0.025}, "perturbation 0.025 m must be less than"),
+        (Mixer, {"pitch": 0.2}, "perturbation"),
+        (Mixer, {"gravity": np.nan}, "gravity: NaN"),
+        (Mixer, {"gravity": 0.0}, "gravity must be positive"),
+        (Mixer, {"clearance": 0.15}, "jam"),
+        (Mixer, {"paddle_length": 1.0}, "does not fit"),
+        (Mixer, {"margin": -1.0}, "margin must not be negative"),
         (Blade, {"n": 1, "clearance": 0.2}, "clearance 0.2 box widths is 0.15 m"),
         (Blade, {"end_gap": 0.01}, "end_gap 0.01 box widths is 0.0225 m"),
         (Blade, {"end_gap": 1.0}, "end_gap 1 box widths leaves"),
@@ -98,13 +134,13 @@ def test_walls_of_the_halves_cover_each_other_at_the_greatest_displacement():
         (Shear, {"period": 0.0}, "period must be positive"),
         (Drum, {"n": 2}, "n must be at least 3"),
         (Drum, {"fill": 0.9}, "fill 0.9: .* spheres, but only"),
-        (Drum, {"spread": 1.0}, "spread must be below 1"),
+        (Drum, {"spread": 1.0}, "spread must be from 0 to 0.9"),
         (Drum, {"sides": 3}, "sides must be at least 12"),
         (Drum, {"froude": 0.0}, "froude must be positive"),
         (Drum, {"length": 1.0}, "length must be at least 2"),
         (Silo, {"n": 1}, "n must be at least 3"),
         (Silo, {"outlet": 12.0}, "outlet 12 must be between 1 sphere diameter and the 12"),
-        (Silo, {"half_angle": 100.0}, "half_angle must be between 5 and 90 degrees, got 100"),
+        (Silo, {"half_angle": 100.0}, "half_angle must be from 5 to 90, got 100"),
         (Silo, {"filling": 0.0}, "filling must be positive"),
     ],
 )

@@ -42,6 +42,7 @@ def step(world, tol=1e-9):
 
 
 def test_a_wheel_on_a_hinge_turns_by_its_torque_and_stays_in_its_place():
+    pytest.importorskip("trimesh")
     wheel = Mesh.revolved([(0, -0.1), (0.5, -0.1), (0.5, 0.1), (0, 0.1)], 60)
     tilt = (0.5, 0.5, -0.5, 0.5)
     world = world_of([wheel], Hinged(AXIS, torque=3.0, end=0.2), density=100.0, position=(1, 2, 3), quaternion=tilt)
@@ -145,15 +146,15 @@ def test_the_mass_scaled_map_of_a_hinged_body_has_one_direction():
 
 
 def test_bad_drives_are_refused():
-    with pytest.raises(ValueError, match="a guide with a speed needs the greatest force of its servo"):
+    with pytest.raises(ValueError, match="Guided.force of a servo"):
         Guided((0, 0, 1), speed=1.0)
-    with pytest.raises(ValueError, match="a hinge with a speed needs the greatest torque of its servo"):
+    with pytest.raises(ValueError, match="Hinged.torque of a servo"):
         Hinged((0, 0, 1), torque=-1.0, speed=1.0)
-    with pytest.raises(ValueError, match="axis of a hinge is the zero vector"):
+    with pytest.raises(ValueError, match="Hinged.axis is the zero vector"):
         Hinged((0, 0, 0))
-    with pytest.raises(ValueError, match="speed of a hinge: NaN"):
+    with pytest.raises(ValueError, match="Hinged.speed: NaN"):
         Hinged((0, 0, 1), torque=1.0, speed=np.nan)
     with pytest.raises(ValueError, match="'tool' is hinged: its centre of mass must be on the axis"):
         world_of([Sphere(0.5, (0.1, 0, 0))], Hinged((0, 0, 1)), density=100.0)
-    with pytest.raises(ValueError, match="'tool' is hinged: its initial velocity must be an angular one"):
+    with pytest.raises(ValueError, match="'tool' is hinged: its initial velocity must be about the hinge"):
         world_of([Sphere(0.5)], Hinged((0, 0, 1)), density=100.0, velocity=(0, 0, 1))
