@@ -1,20 +1,7 @@
-"""The interface between a scene and the program: options, recommended numerics, bodies, quantities to record::
+"""The interface between a scene and the program: options, recommended numerics, bodies, quantities to record.
 
-    @dataclass(frozen=True)
-    class Drop(Experiment):
-        '''One sphere falls onto a floor.'''
-
-        height: float = option(1.0, "m", "height of the centre at the start")
-        settling_time = 2.0
-
-        def build(self) -> Scene:
-            scene = Scene(friction=0.3)
-            scene.add_body("floor", [Plane(normal=(0, 0, 1))])
-            scene.add_spheres([0, 0, self.height], radius=0.1, density=2500.0)
-            return scene
-
-In a file `drop.py` of its own this is simulated by `python -m pctt.run -scene drop.py -scene_height 2`. The scenes of
-the package, `dem.scenes`, are written in the same way and need nothing else.
+A scene of one's own is a class derived from `Experiment`; docs/tutorial.md writes one. The scenes of the package,
+`dem.scenes`, are written in the same way and need nothing else.
 """
 
 from __future__ import annotations
@@ -76,6 +63,11 @@ class Experiment:
                 checks.finite(field.name, value)
             if test is not None:
                 test(field.name, value)
+
+    def refuse(self, name: str, why: str) -> None:
+        """ValueError with the name of an option, its value and its unit before the reason."""
+        unit = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(self)}[name]
+        raise ValueError(" ".join([name, f"{getattr(self, name):g}", *([unit] if unit else []), why]))
 
     def build(self) -> Scene:
         """The bodies, materials and motions at time zero."""

@@ -53,7 +53,7 @@ def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
         w = _turned((spin[n, 0], spin[n, 1], spin[n, 2]), frame, -twice, 2.0)
         largest = max(moments[n, 0], moments[n, 1], moments[n, 2])
         inertia = (moments[n, 0] / largest, moments[n, 1] / largest, moments[n, 2] / largest)
-        rotation = _times(half, w)
+        rotation = _sum(_ZERO, half, w)
         sine, versed = _shares(rotation)
         momentum, new = _turned(_each(inertia, w), rotation, -sine, versed), w
         for _ in range(4):  # enough below half a radian a step
@@ -62,26 +62,29 @@ def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
                 _slope((inertia[0], 0.0, 0.0), (1.0, 0.0, 0.0), rotation, sine, versed, middle, half),
                 _slope((0.0, inertia[1], 0.0), (0.0, 1.0, 0.0), rotation, sine, versed, middle, half),
                 _slope((0.0, 0.0, inertia[2]), (0.0, 0.0, 1.0), rotation, sine, versed, middle, half),
-                _plus(momentum, _times(-1.0, middle)),
+                _sum(momentum, -1.0, middle),
             )
-            new = _plus(new, change)
-            rotation = _times(half, new)
+            new = _sum(new, 1.0, change)
+            rotation = _sum(_ZERO, half, new)
             sine, versed = _shares(rotation)
             if _dot(change, change) <= 1e-16 * _dot(w, w):
                 break  # the next change would be its square
         back = _turned(momentum, rotation, -sine, versed)
-        error = _plus(back, _times(-1.0, _each(inertia, new)))
+        error = _sum(back, -1.0, _each(inertia, new))
         if _dot(error, error) <= 1e-12 * _dot(momentum, momentum):  # else a step does not resolve the motion
             solved = back[0] / inertia[0], back[1] / inertia[1], back[2] / inertia[2]
             out[n, 0], out[n, 1], out[n, 2] = _turned(solved, frame, twice, 2.0)
     return out
 
 
+_ZERO = (0.0, 0.0, 0.0)
+
+
 @unfused
 def _slope(along, axis, rotation, sine, versed, middle, half):
     """How the angular momentum in the middle of the step changes with the spin about an axis."""
     turned = _turned(axis, rotation, 0.5, 1.0 / 6.0)
-    return _plus(_turned(along, rotation, sine, versed), _times(-half, _cross(middle, turned)))
+    return _sum(_turned(along, rotation, sine, versed), -half, _cross(middle, turned))
 
 
 @unfused
@@ -89,7 +92,7 @@ def _turned(v, r, sine, versed):
     """v + sine r x v + versed r x (r x v): the vector v, turned by the rotation vector r with its `_shares`, or by the
     quaternion (w, r) with 2 w and 2; with -sine the other way."""
     once = _cross(r, v)
-    return _plus(v, _plus(_times(sine, once), _times(versed, _cross(r, once))))
+    return _sum(_sum(v, sine, once), versed, _cross(r, once))
 
 
 @unfused
@@ -104,8 +107,8 @@ def _shares(rotation):
 def _solve(a, b, c, right):
     """The solution of a matrix with columns a, b, c, by Cramer's rule."""
     across = _cross(b, c)
-    scale = 1.0 / _dot(a, across)
-    return _times(scale, (_dot(right, across), _dot(a, _cross(right, c)), _dot(a, _cross(b, right))))
+    over = 1.0 / _dot(a, across)
+    return over * _dot(right, across), over * _dot(a, _cross(right, c)), over * _dot(a, _cross(b, right))
 
 
 @unfused
@@ -119,18 +122,13 @@ def _dot(a, b):
 
 
 @unfused
-def _plus(a, b):
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+def _sum(a, share, b):
+    return a[0] + share * b[0], a[1] + share * b[1], a[2] + share * b[2]
 
 
 @unfused
 def _each(a, b):
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
-
-
-@unfused
-def _times(a, b):
-    return a * b[0], a * b[1], a * b[2]
 
 
 def free_velocities(world: World, near: Neighbourhood, dt: float) -> Floats:

@@ -18,12 +18,6 @@ from dem.experiment import Experiment
 from dem.step import Step
 from dem.together import SceneError, together
 
-#: A contact is active if its normal impulse exceeds this part of the mean: solvers leave small impulses at others.
-ACTIVE = 0.01
-
-#: A contact slides if its tangential impulse exceeds this part of what friction can bear.
-SLIDING = 0.99
-
 
 def row(step: Step, scene: Experiment) -> dict[str, float]:
     """All quantities of a step by name, with units in brackets. SceneError if the scene's `record` fails or returns
@@ -44,8 +38,14 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
     what = f"record of the scene {type(scene).__name__}"
 
     def record() -> dict[str, float]:
-        own = scene.record(step)
-        _refuse_bad_names(own, taken)
+        own: Any = scene.record(step)
+        if not isinstance(own, Mapping):
+            raise ValueError(f"record must return a dict of numbers by name, not {type(own).__name__}")
+        for name, value in own.items():
+            if not isinstance(name, str) or name in taken or not name or set(name) & set(',"\n'):
+                raise ValueError(f"record returns the name {name!r}: allowed is text without comma that is not in use")
+            if np.ndim(value) != 0:
+                raise ValueError(f"record returns {name!r} = {value!r}: allowed is a number")
         return {name: float(value) for name, value in own.items()}
 
     own = together(step.world.comm, what, record)
@@ -53,16 +53,6 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
     if any(other != names[0] for other in names):
         raise SceneError(f"{what}: it must return the same names on all ranks, in the same order")
     return own
-
-
-def _refuse_bad_names(own: Any, taken: Mapping[str, float]) -> None:
-    if not isinstance(own, Mapping):
-        raise ValueError(f"record must return a dict of numbers by name, not {type(own).__name__}")
-    for name, value in own.items():
-        if not isinstance(name, str) or name in taken or not name or set(name) & set(',"\n'):
-            raise ValueError(f"record returns the name {name!r}: allowed is text without comma that is not in use")
-        if np.ndim(value) != 0:
-            raise ValueError(f"record returns {name!r} = {value!r}: allowed is a number")
 
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
@@ -126,13 +116,15 @@ def contact_statistics(step: Step) -> dict[str, float]:
     """Statistics of the contacts: how many there are, how many bear forces and slide. Overlaps are those at the start
     of the step.
 
-    The coordination number is the mean number of active contacts per grain.
+    A contact is active if its normal impulse exceeds 1 % of the mean, as solvers leave small impulses at others. It
+    slides if its tangential impulse is 99 % of what friction can bear, or more. The coordination number is the mean
+    number of active contacts per grain.
     """
     comm, contacts = step.world.comm, step.contacts
     normal, tangential = step.impulse[:, 0], np.hypot(step.impulse[:, 1], step.impulse[:, 2])
     count, weight = comm.allreduce(np.array([len(contacts), normal.sum()]))
-    active = normal > ACTIVE * weight / max(count, 1.0)
-    sliding = active & (tangential >= SLIDING * contacts.friction * normal)
+    active = normal > 0.01 * weight / max(count, 1.0)
+    sliding = active & (tangential >= 0.99 * contacts.friction * normal)
     shape = contacts.near.bodies.shape
     ends = sum((shape[rows] != COMPOUND).astype(int) for rows in (contacts.a, contacts.b))  # grains of a contact
     sums = comm.allreduce(np.array([active.sum(), sliding.sum(), ends[active].sum()]))

@@ -40,16 +40,11 @@ class Blade(ToAndFro):
         for name in ("clearance", "end_gap"):
             gap = getattr(self, name) * self.width
             if gap < 2 * self.radius:
-                raise ValueError(
-                    f"{name} {getattr(self, name):g} box widths is {gap:g} m: spheres of radius {self.radius:g} m "
-                    "would jam; make it or the margin of the box wider"
-                )
+                self.refuse(name, f"is {gap:g} m: spheres would jam; make it or the margin of the box wider")
         if self.end_gap >= 1.0:
-            raise ValueError(f"end_gap {self.end_gap:g} box widths leaves the blade no way to go, must be below 1")
+            self.refuse("end_gap", "leaves the blade no way to go, must be below 1")
         if (self.clearance + self.blade_height) * self.width > self.height:
-            raise ValueError(
-                f"blade_height {self.blade_height:g} box widths: the blade reaches above the lid at {self.height:g} m"
-            )
+            self.refuse("blade_height", f"takes the blade above the lid at {self.height:g} m")
 
     @property
     def width(self) -> float:

@@ -43,10 +43,8 @@ class Drum(SmallSpheres):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.spheres > len(self._lattice()):
-            raise ValueError(
-                f"fill {self.fill:g}: {self.spheres} spheres, but only {len(self._lattice())} have room at the start; "
-                "take a smaller fill or a larger n"
-            )
+            room = f"{self.spheres} spheres, but only {len(self._lattice())} have room at the start"
+            self.refuse("fill", f"needs {room}; take a smaller fill or a larger n")
 
     @property
     def width(self) -> float:
@@ -83,12 +81,8 @@ class Drum(SmallSpheres):
 
     def _lattice(self) -> Floats:
         """All places of the lattice in the drum, the lowest first."""
-        room = self.container_radius - self.radius - 2 * self.perturbation - 0.02 * self.container_radius
-        count = int(room / self.pitch)
-        across = np.arange(-count, count + 1) * self.pitch
         slots = max(int((self.width - 2 * self.radius - 2 * self.perturbation) / self.pitch) + 1, 1)
-        along = (np.arange(slots) - (slots - 1) / 2) * self.pitch
-        return self.in_circle(across, along, across, 1, room)
+        return self.in_container((np.arange(slots) - (slots - 1) / 2) * self.pitch, axis=1)
 
     def build(self) -> Scene:
         """The scene, with the large bodies "drum" and "ends"."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import ceil, pi, sqrt
+from math import ceil, cos, pi, sqrt
 from typing import Any, ClassVar
 
 import numpy as np
@@ -41,10 +41,8 @@ class Spheres(Experiment):
         super().__post_init__()
         free = self.pitch / 2 - self.radius
         if self.perturbation >= free:
-            raise ValueError(
-                f"perturbation {self.perturbation:g} m must be less than pitch / 2 - radius = {free:g} m, "
-                "half the free space between spheres of the lattice"
-            )
+            way = "half the free space between spheres of the lattice"
+            self.refuse("perturbation", f"must be less than pitch / 2 - radius = {free:g} m, {way}")
 
     def positions(self) -> Floats:
         """Centres (spheres, 3) of the spheres at the start [m]."""
@@ -131,10 +129,19 @@ class SmallSpheres(Spheres):
         """Radius of the container, to the corners between its sides [m]."""
         return 2 * self.n * self.radius
 
-    def in_circle(self, x: Floats, y: Floats, z: Floats, axis: int, room: float) -> Floats:
-        """The places of the perturbed lattice of these coordinates within `room` [m] of an axis, the lowest first."""
-        places = perturbed(x, y, z, self.perturbation, self.seed)
-        places = places[length(np.delete(places, axis, axis=1)) <= room]
+    @property
+    def room(self) -> float:
+        """Greatest distance of a lattice point from the axis of the container [m]."""
+        return self.container_radius * cos(pi / self.sides) - self.radius - 2 * self.perturbation
+
+    def in_container(self, along: Floats, axis: int) -> Floats:
+        """The places of the perturbed lattice in the container, at the coordinates `along` its axis (of this number),
+        the lowest first."""
+        count = int(self.room / self.pitch)
+        grid = [np.arange(-count, count + 1) * self.pitch] * 3
+        grid[axis] = along
+        places = perturbed(*grid, self.perturbation, self.seed)
+        places = places[length(np.delete(places, axis, axis=1)) <= self.room]
         return places[np.argsort(places[:, 2], kind="stable")]
 
 

@@ -40,16 +40,10 @@ class Mixer(LargeSpheres):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.radius <= self.clearance <= 2 * self.radius:
-            raise ValueError(
-                f"clearance {self.clearance:g} m between one and two radii ({self.radius:g} m): "
-                "the paddle would jam spheres against the floor"
-            )
+            self.refuse("clearance", f"would jam spheres of radius {self.radius:g} m below the paddle")
         reach = sqrt(self.paddle_length**2 + self.paddle_thickness**2)
         if reach >= 1.0:
-            raise ValueError(
-                f"paddle_length {self.paddle_length:g} box widths does not fit into the box: the paddle sweeps "
-                f"{reach:g} box widths, and must stay below 1"
-            )
+            self.refuse("paddle_length", f"does not fit: the paddle sweeps {reach:g}, and must stay below 1")
 
     @property
     def width(self) -> float:

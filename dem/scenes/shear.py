@@ -40,7 +40,7 @@ class Shear(ToAndFro):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.split >= 1.0:
-            raise ValueError(f"split {self.split:g} bed depths puts all spheres into the lower half, must be below 1")
+            self.refuse("split", "puts all spheres into the lower half, must be below 1")
 
     @property
     def length(self) -> float:

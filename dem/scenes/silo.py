@@ -37,9 +37,7 @@ class Silo(SmallSpheres):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 1.0 < self.outlet < 2 * self.n:
-            raise ValueError(
-                f"outlet {self.outlet:g} must be between 1 sphere diameter and the {2 * self.n} of the silo"
-            )
+            self.refuse("outlet", f"must be between 1 sphere diameter and the {2 * self.n} of the silo")
 
     @property
     def outlet_radius(self) -> float:
@@ -64,36 +62,21 @@ class Silo(SmallSpheres):
         return ceil(self.packing * bed / (4 / 3 * pi * self.radius**3))
 
     @property
-    def top(self) -> float:
-        """Height of the cylinder's rim, above all spheres at the start [m]."""
-        return float(self.positions()[:, 2].max()) + 2 * self.radius
-
-    @property
     def settling_time(self) -> float:
         """Time [s] after which the gate opens."""
         return rest_after_fall(2 * self.filling * self.container_radius, self.gravity) - 1.4
 
-    @property
-    def beverloo(self) -> float:
-        """Flow by the law of Beverloo, Leniger and van de Velde (1961) [kg/s]: C rho_bulk sqrt(g) (D - k d)^(5/2), with
-        C = 0.58 and k = 1.5, the diameters of a grain that the outlet lacks."""
-        opening = max(2 * self.outlet_radius - 1.5 * 2 * self.radius, 0.0)
-        return 0.58 * self.packing * self.density * sqrt(self.gravity) * opening**2.5
-
     def positions(self) -> Floats:
         """Centres (spheres, 3) of the spheres at the start [m], a lattice in the cylinder above the cone."""
-        room = self.container_radius * np.cos(pi / self.sides) - self.radius - 2 * self.perturbation
-        count = int(room / self.pitch)
-        across = np.arange(-count, count + 1) * self.pitch
-        per_layer = int((np.hypot(*np.meshgrid(across, across)) <= room).sum())
-        up = self.cone_height + (np.arange(ceil(self.spheres / per_layer)) + 0.6) * self.pitch
-        return self.in_circle(across, across, up, 2, room + 1.5 * self.perturbation)[: self.spheres]
+        layers = ceil(self.spheres * self.pitch**2 / (2 * self.room**2))  # more than enough: pi > 2
+        return self.in_container(self.cone_height + (np.arange(layers) + 0.6) * self.pitch, axis=2)[: self.spheres]
 
     def build(self) -> Scene:
         """The scene, with the large bodies "silo", "gate" and "floor"."""
         scene = self.spheres_alone(self.radius)
         wide, hole = self.container_radius, self.outlet_radius
-        profile = [(hole, 0.0), (wide, self.cone_height), (wide, self.top)]
+        top = scene.grains().position[:, 2].max() + 2 * self.radius
+        profile = [(hole, 0.0), (wide, self.cone_height), (wide, top)]
         scene.add_body("silo", [Mesh.revolved(profile, self.sides)])
         # Down and through the floor, in a twentieth of a second. Drawn aside it would wedge spheres against the rim.
         away = Glide((0.0, 0.0, 20 * (self.floor - hole)), self.settling_time, self.settling_time + 0.05)
@@ -108,11 +91,14 @@ class Silo(SmallSpheres):
         return {"discharged [kg]": step.total(grains.mass[grains.position[:, 2] < 0.0])}
 
     def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
-        """The flow while a tenth to a half of the mass runs out, and that of Beverloo's law."""
+        """The flow while a tenth to a half of the mass runs out, and that by the law of Beverloo, Leniger and van de
+        Velde (1961), C rho_bulk sqrt(g) (D - k d)^(5/2), with C = 0.58 and k = 1.5."""
         time, out = records["time [s]"], records["discharged [kg]"]
         total = self.spheres * self.density * 4 / 3 * pi * self.radius**3
         steady = (out > 0.1 * total) & (out < 0.5 * total)
         if np.count_nonzero(steady) < 3:
             return {}
         flow = float(np.polyfit(time[steady], out[steady], 1)[0])
-        return {"mass_flow [kg/s]": flow, "beverloo_flow [kg/s]": self.beverloo}
+        opening = max(2 * self.outlet_radius - 1.5 * 2 * self.radius, 0.0)
+        beverloo = 0.58 * self.packing * self.density * sqrt(self.gravity) * opening**2.5
+        return {"mass_flow [kg/s]": flow, "beverloo_flow [kg/s]": beverloo}

@@ -32,24 +32,9 @@ def test_a_peak_near_the_start_is_spread_as_any_other(place):
     assert np.abs(near).max() <= 2 * height
 
 
-def test_a_series_shorter_than_the_filter_remembers_is_left_alone():
-    values = np.random.default_rng(0).normal(size=50)
-    np.testing.assert_array_equal(analysis.low_pass(TIME[:50], values, 2.0), values)
-
-
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 5, 30])
 def test_few_records_are_filtered_too(count):
     assert analysis.low_pass(TIME[:count], np.ones(count), 2.0) == pytest.approx(np.ones(count))
-
-
-def test_a_cutoff_that_is_not_resolved_changes_nothing():
-    values = np.random.default_rng(0).normal(size=20)
-    np.testing.assert_array_equal(analysis.low_pass(TIME[:20], values, 60.0), values)
-
-
-def test_the_friction_angle_is_that_of_the_means():
-    angle = analysis.friction_angle(np.array([1.0, 3.0]), np.array([3.0, 5.0]))
-    assert angle == pytest.approx(np.degrees(np.arctan(0.5)))
 
 
 def test_the_steady_draft_force_is_the_mean_while_the_blade_is_fast():

@@ -8,7 +8,7 @@ from cases import crude_impulse, dense_map, dense_scaled_map, force_on
 from mpi4py import MPI
 
 from dem.contact import find_contacts
-from dem.motion import Dynamic, Guided
+from dem.motion import Guided
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
@@ -75,34 +75,6 @@ def test_the_force_of_a_drive_acts_while_it_lasts(direction):
         velocity = system.free_velocity[5] @ [*unit, 0, 0, 0]
         assert velocity == pytest.approx(before + 0.01 * (weight + force / 40.0), abs=1e-12)
         advance(world, system.free_velocity, 0.01)
-    with pytest.raises(ValueError, match="Guided.force"):
-        Guided(direction, force=np.nan)
-
-
-def test_a_free_press_differs_from_a_guided_one():
-    free, guided = pressed(Dynamic(), density=500.0), pressed(Guided((0, 0, 1)), density=500.0)
-    velocity = [system_of(world).velocity(crude_impulse(system_of(world)))[5] for world in (free, guided)]
-    assert velocity[0][2] == pytest.approx(velocity[1][2])
-    assert np.abs(velocity[0][[0, 3, 4, 5]]).min() > 1e-6
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"density": 500.0, "velocity": (0.1, 0, 0)}, "along the guide"),
-        ({"density": 500.0, "angular_velocity": (0, 0, 1)}, "along the guide"),
-        ({}, "density or both mass"),
-        ({"mass": -1.0}, "mass of 'press' must be positive"),
-    ],
-)
-def test_bad_guided_bodies_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        pressed(Guided((0, 0, 1)), **options)
-
-
-def test_a_guide_needs_a_direction():
-    with pytest.raises(ValueError, match="Guided.direction is the zero vector"):
-        Guided((0, 0, 0))
 
 
 def test_what_holds_a_guided_body_across_its_guide_makes_no_contact():

@@ -44,12 +44,6 @@ def test_oscillation_is_periodic_with_its_amplitude():
     np.testing.assert_allclose(motion.pose(4.0, PLACE, TURN)[0], PLACE, atol=1e-15)
 
 
-def test_motions_with_a_start_rest_until_then():
-    later, at_once = (Oscillation((0, 1, 0), 0.3, 4.0, 0.7, start) for start in (2.5, 0.0))
-    np.testing.assert_array_equal(later.pose(2.5, PLACE, TURN)[0], PLACE)
-    np.testing.assert_allclose(later.pose(3.1, PLACE, TURN)[0], at_once.pose(0.6, PLACE, TURN)[0], atol=1e-14)
-
-
 def test_rotation_and_oscillation_rest_before_and_after():
     upright = np.array([1.0, 0.0, 0.0, 0.0])
     turning = Rotation((0, 0, np.pi), start=1.0, end=1.5)
@@ -132,25 +126,3 @@ def test_a_path_from_a_file(tmp_path):
         with pytest.raises(ValueError, match=words) as error:
             Path.read(file)
         assert str(file) in str(error.value)
-
-
-def test_a_glide_rests_before_and_after():
-    motion = Glide((1.0, 0.0, -2.0), start=0.5, end=1.5)
-    for time, gone in ((0.2, 0.0), (0.75, 0.25), (1.5, 1.0), (9.0, 1.0)):
-        np.testing.assert_allclose(motion.pose(time, PLACE, TURN)[0] - PLACE, [gone, 0, -2 * gone], atol=1e-15)
-
-
-def test_bad_motions_are_refused():
-    for kind in (Glide, Rotation):
-        with pytest.raises(ValueError, match="cannot begin at 2 s and end at 1 s"):
-            kind((1, 0, 0), start=2.0, end=1.0)
-    with pytest.raises(ValueError, match="must ascend from zero or later, got 0, 2, 1"):
-        Path((0, 2, 1), np.zeros((3, 3)))
-    with pytest.raises(ValueError, match="2 times but 3 positions"):
-        Path((0, 2), np.zeros((3, 3)))
-    with pytest.raises(ValueError, match="period"):
-        Oscillation((1, 0, 0), 0.1, 0.0)
-    with pytest.raises(ValueError, match="zero vector"):
-        Oscillation((0, 0, 0), 0.1, 1.0)
-    with pytest.raises(ValueError, match="Rotation.velocity: NaN"):
-        Rotation((0, 0, np.nan))

@@ -33,17 +33,11 @@ def check_consistency(touch, center, radius):
 
 
 def test_spheres():
-    x, y = np.array([[0.0, 0, 0], [0, 0, 0]]), np.array([[3.0, 4, 0], [0, 0, 1]])
-    touch = sphere_sphere(Spheres(x, np.array([2.0, 1.0])), Spheres(y, np.array([2.0, 0.5])))
-    np.testing.assert_allclose(touch.gap, [1.0, -0.5])
-    np.testing.assert_allclose(touch.normal, [[0.6, 0.8, 0], [0, 0, 1]])
-    np.testing.assert_allclose(touch.point, [[1.5, 2.0, 0], [0, 0, 0.75]])
-
-
-def test_concentric_spheres_are_parted_along_z():
-    touch = sphere_sphere(*[Spheres(np.zeros((1, 3)), np.ones(1))] * 2)
-    np.testing.assert_array_equal(touch.normal, [[0, 0, 1]])
-    assert touch.gap[0] == -2.0
+    x, y = np.zeros((3, 3)), np.array([[3.0, 4, 0], [0, 0, 1], [0, 0, 0]])  # the last are concentric
+    touch = sphere_sphere(Spheres(x, np.array([2.0, 1.0, 1.0])), Spheres(y, np.array([2.0, 0.5, 1.0])))
+    np.testing.assert_allclose(touch.gap, [1.0, -0.5, -2.0])
+    np.testing.assert_allclose(touch.normal, [[0.6, 0.8, 0], [0, 0, 1], [0, 0, 1]])
+    np.testing.assert_allclose(touch.point, [[1.5, 2.0, 0], [0, 0, 0.75], [0, 0, 0]])
 
 
 def test_sphere_above_and_below_a_tilted_plane():

@@ -101,35 +101,6 @@ def test_a_bearing_bears_what_presses_on_the_axis():
     assert world.large.velocity[1, 4] == pytest.approx(2.0, rel=1e-9)
 
 
-def test_a_load_slows_a_servo_by_what_it_takes_away_in_a_step():
-    """A bar that turns pushes a ball before it: the torque of that makes the bar slower in the step."""
-    scene = Scene(0.3)
-    bar = Hinged((0, 0, 1), torque=1e5, speed=1.0)
-    scene.add_body("tool", [Capsule(0.2, 1.0, (0, 0, 0), (np.sqrt(0.5), 0, np.sqrt(0.5), 0))], bar, density=100.0)
-    scene.add_body("floor", [Plane((0, 0, 1), (0, 0, -0.2))])
-    scene.add_spheres([0.8, 0.35, -0.1], 0.1, 5000.0)
-    world = new_world(scene, SELF)
-    moment = world.large.inertia[0, 2]
-    torques = []
-    for _ in range(30):
-        torques.append(step(world)[5])
-        assert world.large.velocity[0, 5] == pytest.approx(1.0 + DT * torques[-1] / moment, abs=1e-9)
-    assert min(torques) < -1.0
-
-
-def test_a_drum_on_a_hinge_is_turned_back_by_its_bed():
-    """Without drive: a sphere on the side of a free drum turns it by its weight."""
-    scene = Scene(0.8)
-    drum = Mesh.revolved([(1.0, -0.3), (1.0, 0.3)], 96, quaternion=(np.sqrt(0.5), -np.sqrt(0.5), 0, 0))
-    scene.add_body("tool", [drum], Hinged((0, 1, 0)), mass=50.0, inertia=(50.0, 50.0, 50.0))
-    scene.add_spheres([0.899 * np.sin(0.5), 0, -0.896 * np.cos(0.5)], 0.1, 1000.0)
-    world = new_world(scene, SELF)
-    for _ in range(15):
-        step(world, 1e-7)
-    assert world.large.velocity[0, 4] > 1e-3  # down on the side of the sphere
-    np.testing.assert_allclose(world.large.velocity[0, [0, 1, 2, 3, 5]], 0.0, atol=1e-12)
-
-
 def test_the_mass_scaled_map_of_a_hinged_body_has_one_direction():
     scene = Scene(0.3)
     scene.add_body("tool", [Sphere(0.5)], Hinged(AXIS), density=100.0)
@@ -143,18 +114,3 @@ def test_the_mass_scaled_map_of_a_hinged_body_has_one_direction():
     compact = system.contact_map.root[-1, 6:]
     moment = 0.4 * 0.25 * 100.0 * 4 / 3 * np.pi * 0.125
     np.testing.assert_allclose(compact, (np.outer(AXIS, AXIS) / np.sqrt(moment))[np.triu_indices(3)], atol=1e-15)
-
-
-def test_bad_drives_are_refused():
-    with pytest.raises(ValueError, match="Guided.force of a servo"):
-        Guided((0, 0, 1), speed=1.0)
-    with pytest.raises(ValueError, match="Hinged.torque of a servo"):
-        Hinged((0, 0, 1), torque=-1.0, speed=1.0)
-    with pytest.raises(ValueError, match="Hinged.axis is the zero vector"):
-        Hinged((0, 0, 0))
-    with pytest.raises(ValueError, match="Hinged.speed: NaN"):
-        Hinged((0, 0, 1), torque=1.0, speed=np.nan)
-    with pytest.raises(ValueError, match="'tool' is hinged: its centre of mass must be on the axis"):
-        world_of([Sphere(0.5, (0.1, 0, 0))], Hinged((0, 0, 1)), density=100.0)
-    with pytest.raises(ValueError, match="'tool' is hinged: its initial velocity must be about the hinge"):
-        world_of([Sphere(0.5)], Hinged((0, 0, 1)), density=100.0, velocity=(0, 0, 1))

@@ -215,8 +215,3 @@ def test_errors_reach_all_ranks_and_one_body_is_enough():
         if height < 1:
             np.testing.assert_allclose(force[2], -1000 * 4 / 3 * np.pi * 0.1**3 * 9.81)
             assert comm.allreduce(float(np.abs(world.grains.velocity).sum())) < 1e-12
-
-
-def test_restart_rows_cover_all_grains_once():
-    assert restart_rows(np.array([0, 7]), SELF) == slice(0, 7)
-    assert restart_rows(np.array([0, 3, 7]), SELF) == slice(0, 7)

@@ -16,7 +16,7 @@ from dem.scene import Scene
 from dem.start import new_world
 
 MASSES = [(1000.0, 1000.0), (500.0, 4000.0)]
-RUBS = [(0.5, 1.0), (0.3, 1.9), (0.3, 4.0), (0.1, 2.0), (0.0, 1.0)]  #: friction coefficient, sliding speed
+RUBS = [(0.3, 0.0), (0.5, 1.0), (0.3, 1.9), (0.3, 4.0), (0.1, 2.0), (0.0, 1.0)]  #: friction coefficient, sliding speed
 
 
 def pair(closing, sliding, densities, friction, gap=0.0, axis=(1.0, 0.0, 0.0)):
@@ -35,19 +35,6 @@ def pair(closing, sliding, densities, friction, gap=0.0, axis=(1.0, 0.0, 0.0)):
 def in_order(world):
     order = np.argsort(world.grains.id)
     return world.grains.mass[order], world.grains.velocity[order]
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("densities", MASSES)
-@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 0, -1), (1, 2, -3)])
-def test_a_head_on_impact_is_perfectly_inelastic(solver, densities, axis):
-    world, normal, _ = pair(2.0, 0.0, densities, 0.3, axis=axis)
-    before = momentum(world)
-    make_steps(world, 1, 0.01, solver)
-    mass, velocity = in_order(world)
-    common = 2.0 * mass[0] / mass.sum() * normal
-    np.testing.assert_allclose(velocity, np.tile([*common, 0, 0, 0], (2, 1)), atol=1e-7)
-    np.testing.assert_allclose(momentum(world), before, atol=1e-12 * np.abs(before).max())
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -88,18 +75,3 @@ def test_an_oblique_impact_sticks_or_slides_at_the_cone(solver, densities, frict
     np.testing.assert_allclose(velocity[:, 3:], spin, atol=1e-5)
     assert np.hypot(*last.impulse[0, 1:]) <= friction * last.impulse[0, 0] * (1 + 1e-9)
     np.testing.assert_allclose(momentum(world), before, atol=1e-12 * np.abs(before).max())
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_an_impact_gives_no_energy(solver):
-    for sliding in (0.0, 1.0, 4.0, 20.0):
-        world, *_ = pair(2.0, sliding, MASSES[1], 0.6, axis=(1, 2, -3))
-        mass, velocity = in_order(world)
-        inertia = 0.4 * mass * RADIUS**2
-
-        def energy(velocity, mass=mass, inertia=inertia):
-            return mass @ (velocity[:, :3] ** 2).sum(1) / 2 + inertia @ (velocity[:, 3:] ** 2).sum(1) / 2
-
-        before = energy(velocity)
-        make_steps(world, 1, 0.01, solver)
-        assert energy(in_order(world)[1]) < before

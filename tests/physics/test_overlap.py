@@ -34,13 +34,6 @@ def test_overlapping_spheres_part_at_the_recovery_speed_at_most(solver, depth, s
     assert np.less(gaps[:needed], -1e-6).all()
 
 
-def test_without_recovery_an_overlap_stays_and_does_not_grow():
-    world = overlapping_pair(0.02)
-    for step in steps(world, 5, 0.01, recovery_speed=0.0):
-        np.testing.assert_allclose(world.grains.velocity, 0.0, atol=1e-9)
-        assert step.contacts.gap[0] == pytest.approx(-0.02)
-
-
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_sphere_sunk_into_the_floor_comes_up_at_the_recovery_speed_and_rests(solver):
     depth, speed, dt = 0.03, 0.4, 0.01

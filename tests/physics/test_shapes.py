@@ -97,38 +97,6 @@ def test_a_capsule_rolls_down_an_incline_at_the_acceleration_of_its_inertia(solv
     np.testing.assert_allclose(step.impulse[:, 0], world.grains.mass[0] * G * np.cos(slope) * DT / 2, rtol=1e-4)
 
 
-def test_a_capsule_that_leans_falls_over_and_comes_to_rest_on_both_ends():
-    radius, half, tilt = 0.1, 0.3, 0.3
-    scene = floor(0.4)
-    turn = quaternion.exponential(np.array([0.0, np.pi / 2 - tilt, 0.0]))
-    scene.add_capsules([[0, 0, radius + half * np.sin(tilt)]], radius, half, 1000.0, quaternions=turn)
-    world = world_of(scene)
-    last = make_steps(world, 100, DT, tol=1e-8, delta=0.05)
-    assert world.grains.position[0, 2] == pytest.approx(radius, abs=1e-5)
-    axis = quaternion.rotate(world.grains.quaternion[0], np.array([0.0, 0, 1]))
-    assert axis[2] == pytest.approx(0.0, abs=1e-4)
-    np.testing.assert_allclose(world.grains.velocity[0], 0.0, atol=1e-4)
-    np.testing.assert_allclose(last.impulse[:, 0], world.grains.mass[0] * G * DT / 2, rtol=1e-3)
-
-
-def test_a_box_bridges_two_lying_capsules():
-    radius, start = 0.1, np.array([[-0.3, 0, 0.1], [0.3, 0, 0.1], [0.1, 0, 0.25]])
-    scene = floor(0.5)
-    turn = quaternion.exponential(np.array([np.pi / 2, 0.0, 0.0]))
-    scene.add_capsules(start[:2], radius, 0.2, 1000.0, quaternions=turn)
-    scene.add_boxes(start[2:], (0.5, 0.1, 0.05), 1000.0)
-    world = world_of(scene)
-    last = make_steps(world, 30, DT)
-    np.testing.assert_allclose(by_id(world)["position"], start, atol=1e-6)
-    # Two points on each capsule, the lever from the centre of the box: shares 1/3 and 2/3.
-    weight = 1000.0 * 8 * 0.5 * 0.1 * 0.05 * G * DT
-    top = last.contacts.point[:, 2] > 0.15
-    x, normal = last.contacts.point[top, 0], last.impulse[top, 0]
-    assert top.sum() == 4
-    assert normal[x < 0].sum() == pytest.approx(weight / 3, rel=1e-4)
-    assert normal[x > 0].sum() == pytest.approx(2 * weight / 3, rel=1e-4)
-
-
 @pytest.mark.parallel(1, 3)
 def test_a_free_press_rests_on_grains_and_on_another_large_body():
     scene = Scene(0.3)
@@ -143,17 +111,3 @@ def test_a_free_press_rests_on_grains_and_on_another_large_body():
     np.testing.assert_allclose(step.force_on("press")[2], G * world.large.mass[2], rtol=1e-5)
     np.testing.assert_allclose(world.large.position[1:], [[0, 0, 0.1], [0, 0, 0.25]], atol=1e-6)
     assert world.comm.allreduce(len(step.contacts)) == 16
-
-
-def test_a_free_large_box_falls_along_a_smooth_wall():
-    """Flush with the wall, free fall until the floor."""
-    scene = Scene(0.0)
-    scene.add_spheres([[0.5, 0, 0.1]], 0.1, 1000.0)
-    scene.add_body("corner", [Plane((0, 0, 1)), Plane((1, 0, 0), (-0.3, 0, 0))])
-    scene.add_body("block", [Box((0.3, 0.2, 0.1))], Dynamic(), density=1000.0, position=(0, 0, 0.5))
-    world = world_of(scene)
-    for step in steps(world, 20, DT):
-        assert len(step.contacts) == 5
-        np.testing.assert_allclose(world.large.velocity[1], [0, 0, -G * DT * world.step, 0, 0, 0], atol=1e-6)
-    make_steps(world, 20, DT, delta=0.1)
-    np.testing.assert_allclose(world.large.position[1], [0, 0, 0.1], atol=1e-6)

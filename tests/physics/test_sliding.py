@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from drive import HALF, SOLVERS, G, block, make_steps, on_incline, steps
 
-from pctt import ccp
-
 MU = 0.3
 
 
@@ -57,21 +55,6 @@ def test_from_rest_the_plain_cone_costs_a_lag_of_mu_squared_steps(solver):
         assert world.grains.velocity[0, 0] == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_lift_and_its_effects_are_of_first_order_in_the_step():
-    slope, mu, time = 0.5, 0.3, 0.4
-    acceleration = G * (np.sin(slope) - mu * np.cos(slope))
-    lifts, lags = [], []
-    for dt in (0.02, 0.01, 0.005):
-        world = block(on_incline(slope, mu))
-        make_steps(world, round(time / dt), dt)
-        lifts.append(world.grains.position[0, 2] - HALF[2])
-        lags.append(acceleration * time - world.grains.velocity[0, 0])
-        assert lifts[-1] == pytest.approx(dt * mu * world.grains.velocity[0, 0], rel=1e-6)
-    for errors in (lifts, lags):
-        assert min(errors) > 0.0
-        np.testing.assert_allclose(np.divide(errors[:-1], errors[1:]), 2.0, rtol=0.02)
-
-
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("flush", [False, True])
 def test_a_sliding_block_comes_to_rest_after_its_braking_distance(solver, flush):
@@ -87,28 +70,6 @@ def test_a_sliding_block_comes_to_rest_after_its_braking_distance(solver, flush)
         errors.append(distance - world.grains.position[0, 0])
         assert errors[-1] == pytest.approx(dt * start / 2, rel=0.02)
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.02)
-
-
-def test_a_block_thrown_flush_on_the_floor_is_thrown_up_by_the_plain_cone():
-    """The first step gives the normal velocity mu v: v = (v0 - mu g dt) / (1 + mu^2)."""
-    start, dt = 1.0, 0.01
-    world = block(on_incline(0.0, MU), velocity=(start, 0.0, 0.0))
-    make_steps(world, 1, dt)
-    speed = (start - MU * G * dt) / (1 + MU**2)
-    np.testing.assert_allclose(world.grains.velocity[0], [speed, 0, MU * speed, 0, 0, 0], atol=1e-8)
-
-
-@pytest.mark.parametrize("solver", [*SOLVERS, "conic"])
-def test_with_coulombs_law_a_block_slides_without_a_gap(solver):
-    """From rest, exactly v_k = a dt k; the plain cone opens a gap of dt mu v, of first order in dt (above)."""
-    slope, mu = 0.5, 0.3
-    acceleration = G * (np.sin(slope) - mu * np.cos(slope))
-    for dt in (0.02, 0.01):
-        world = block(on_incline(slope, mu))
-        for _ in steps(world, 10, dt, solver, tol=1e-8, coulomb=ccp.Coulomb()):
-            speed = acceleration * dt * world.step
-            np.testing.assert_allclose(world.grains.velocity[0], [speed, 0, 0, 0, 0, 0], atol=1e-6)
-            assert world.grains.position[0, 2] == pytest.approx(HALF[2], abs=1e-8)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
