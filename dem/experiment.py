@@ -22,9 +22,6 @@ from dem.scene import Scene
 from dem.step import Step
 from dem.together import SCENE_FILE, in_words
 
-#: Types that an option can have.
-KINDS = (int, float, bool, str)
-
 
 def option(default: Any, unit: str, text: str, test: Callable[[str, Any], Any] | None = None) -> Any:
     """A field of an experiment: its default, unit ("" if it has none) and meaning, which `-help` shows.
@@ -140,6 +137,5 @@ def _check_options(scene: type[Experiment]) -> None:
     for field in dataclasses.fields(scene):
         if field.default is dataclasses.MISSING:
             raise SceneFileError(f"option {field.name} of {scene.__name__} has no default")
-        if kinds[field.name] not in KINDS:
-            allowed = ", ".join(kind.__name__ for kind in KINDS)
-            raise SceneFileError(f"option {field.name} of {scene.__name__}: the type must be one of {allowed}")
+        if kinds[field.name] not in (int, float, bool, str):
+            raise SceneFileError(f"option {field.name} of {scene.__name__}: the type must be int, float, bool or str")

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from dem.arrays import ArrayLike, Floats, Ints
-from dem.checks import check_fields, finite, positive, unit_quaternion, vector
+from dem.checks import between, check_fields, finite, not_negative, positive, rows, unit_quaternion, vector
 from dem.quaternion import cross, length
 
 
@@ -103,14 +103,14 @@ class Surface:
         found = [(np.zeros(0, np.int64), np.zeros(0, np.int64))]
         level = np.frexp(reach)[1]
         for k in np.unique(level):
-            cells, rows = self._table(int(k)), np.flatnonzero(level == k)
-            place = np.floor((points[rows] - cells.low) / cells.width)
-            inside = ((place >= 0.0) & (place < _SIDE)).all(axis=1)
-            code = _code(np.where(inside[:, None], place, 0.0).astype(np.int64))
+            cells, at_level = self._table(int(k)), np.flatnonzero(level == k)
+            place = np.floor((points[at_level] - cells.low) / cells.width)
+            inside = ((place >= 0.0) & (place < _CODE[1])).all(axis=1)
+            code = np.where(inside[:, None], place, 0.0).astype(np.int64) @ _CODE
             at = np.minimum(np.searchsorted(cells.code, code), len(cells.code) - 1)
             hit = np.flatnonzero(inside & (cells.code[at] == code))
             row, entry = spread(cells.start, at[hit])
-            found.append((rows[hit[row]], cells.triangle[entry]))
+            found.append((at_level[hit[row]], cells.triangle[entry]))
         row, triangle = (np.concatenate(parts) for parts in zip(*found))
         height = np.einsum("ij,ij->i", points[row] - self.corner[triangle, 0], self.normal[triangle])
         close = np.abs(height) <= reach[row] * (1.0 + 1e-9)
@@ -128,17 +128,17 @@ class Surface:
         along = np.clip(along / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
         foot = corner + along[:, :, None] * side
         distance = length(points[:, None] - foot)
-        rows, k = np.arange(len(points)), distance.argmin(axis=1)
+        every, k = np.arange(len(points)), distance.argmin(axis=1)
         height = np.einsum("mi,mi->m", normal, offset[:, 0])
-        share = along[rows, k]
+        share = along[every, k]
         end = np.where(share == 0.0, k, (k + 1) % 3)
         edges, vertices = len(self.triangle), len(self.triangle) + len(self.edge)
         at_end = (share == 0.0) | (share == 1.0)
         rim = np.where(at_end, vertices + self.triangle[triangle, end], edges + self.side[triangle, k])
         return Closest(
-            np.where(face[:, None], points - height[:, None] * normal, foot[rows, k]),
+            np.where(face[:, None], points - height[:, None] * normal, foot[every, k]),
             np.where(face, triangle, rim),
-            np.where(face, np.abs(height), distance[rows, k]),
+            np.where(face, np.abs(height), distance[every, k]),
         )
 
     def _table(self, level: int) -> Cells:
@@ -153,7 +153,7 @@ class Surface:
         triangle = np.arange(len(self.triangle))
         while width > 0.5 * reach and len(triangle) < 30_000:
             width *= 0.5
-            place = (2 * place[:, None] + _EIGHT).reshape(-1, 3)
+            place = (2 * place[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T).reshape(-1, 3)
             triangle = np.repeat(triangle, 8)
             far = 0.5 * np.sqrt(3.0) * width + reach * (1.0 + 1e-9)
             middle = low + (place + 0.5) * width
@@ -161,7 +161,7 @@ class Surface:
             close = np.flatnonzero(np.abs(height) <= far)
             close = close[self.closest(middle[close], triangle[close]).distance <= far]
             place, triangle = place[close], triangle[close]
-        codes = _code(place)
+        codes = place @ _CODE
         order = np.argsort(codes, kind="stable")
         code, start = np.unique(codes[order], return_index=True)
         cells = Cells(low, width, code, np.append(start, len(order)), triangle[order])
@@ -169,16 +169,8 @@ class Surface:
         return cells
 
 
-#: The eight halves of a cube.
-_EIGHT = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
-
-#: More cubes than any side of a neighbourhood has.
-_SIDE = 1 << 20
-
-
-def _code(place: Ints) -> Ints:
-    """One number (n,) for each cube at the integer coordinates (n, 3)."""
-    return (place[:, 0] * _SIDE + place[:, 1]) * _SIDE + place[:, 2]
+#: One number for the integer coordinates of a cube: more than any side of a neighbourhood has.
+_CODE = np.array([1 << 40, 1 << 20, 1])
 
 
 def spread(start: Ints, of: Ints) -> tuple[Ints, Ints]:
@@ -206,20 +198,18 @@ class Mesh:
             raise ValueError(f"vertices of a mesh must have shape (n, 3), got {vertices.shape}")
         if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles) or triangles.dtype.kind not in "iu":
             raise ValueError(f"triangles of a mesh must be integers (m, 3), got {triangles.shape} of {triangles.dtype}")
-        if triangles.min() < 0 or triangles.max() >= len(vertices):
-            raise ValueError(
-                f"triangles of a mesh must be rows of its {len(vertices)} vertices, "
-                f"got {triangles.min()} to {triangles.max()}"
-            )
+        low, high, count = triangles.min(), triangles.max(), len(vertices)
+        if low < 0 or high >= count:
+            raise ValueError(f"triangles of a mesh must be rows of its {count} vertices, got {low} to {high}")
         triangles = triangles.astype(np.int64)
         a, b, c = triangles.T
         triangles = triangles[(a != b) & (b != c) & (c != a)]
         if not len(triangles):
             raise ValueError("no triangle of the mesh has three corners")
-        used, rows = np.unique(triangles, return_inverse=True)
+        used, row = np.unique(triangles, return_inverse=True)
         object.__setattr__(self, "vertices", vertices[used])
-        object.__setattr__(self, "triangles", rows.reshape(-1, 3))
-        object.__setattr__(self, "surface", Surface(vertices[used], rows.reshape(-1, 3)))
+        object.__setattr__(self, "triangles", row.reshape(-1, 3))
+        object.__setattr__(self, "surface", Surface(vertices[used], row.reshape(-1, 3)))
         check_fields(self, center=vector, quaternion=unit_quaternion)
 
     def solid(self) -> tuple[float, Floats, Floats]:
@@ -287,13 +277,10 @@ class Mesh:
         Normals point to the right of the way along the profile, outwards where z grows on the outside: a profile from
         (0, 0) by (r, 0) and (r, h) to (0, h) makes a solid cylinder.
         """
-        places = finite("profile of a mesh", profile)
-        if places.ndim != 2 or places.shape[1] != 2 or len(places) < 2:
-            raise ValueError(f"a profile must have places (k, 2), two at least, got {places.shape}")
-        if (places[:, 0] < 0.0).any():
-            raise ValueError(f"radii of a profile must not be negative, got {places[:, 0].min():g}")
-        if sides < 3:
-            raise ValueError(f"a surface of revolution must have at least 3 sides, got {sides}")
+        places = rows("profile of a mesh", profile, len(profile), 2)
+        not_negative("radii of a profile", places[:, 0])
+        between(2)("places of a profile", len(places))
+        between(3)("sides of a surface of revolution", sides)
         angle = 2.0 * np.pi * np.arange(sides) / sides
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         vertices = np.empty((len(places), sides, 3))

@@ -11,7 +11,7 @@ A scene is the same on every rank and knows nothing of ranks; `dem.start.new_wor
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -66,7 +66,7 @@ class Scene:
         positions (n, 3) [m]; radius [m] and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3).
         """
         upright, lengths = (1.0, 0.0, 0.0, 0.0), {"radius": radius}
-        return self._add_grains(SPHERE, positions, lengths, density, upright, material, velocity, angular_velocity)
+        return self._add_grains(SPHERE, positions, lengths, density, material, upright, velocity, angular_velocity)
 
     def add_boxes(
         self,
@@ -85,7 +85,7 @@ class Scene:
         quaternions (4,) or (n, 4); velocities (3,) or (n, 3).
         """
         lengths = {"half extents": half_extents}
-        return self._add_grains(BOX, positions, lengths, density, quaternions, material, velocity, angular_velocity)
+        return self._add_grains(BOX, positions, lengths, density, material, quaternions, velocity, angular_velocity)
 
     def add_capsules(
         self,
@@ -105,7 +105,7 @@ class Scene:
         quaternions (4,) or (n, 4); velocities (3,) or (n, 3).
         """
         lengths = {"radius": radius, "half length": half_length}
-        return self._add_grains(CAPSULE, positions, lengths, density, quaternions, material, velocity, angular_velocity)
+        return self._add_grains(CAPSULE, positions, lengths, density, material, quaternions, velocity, angular_velocity)
 
     def add_body(
         self,
@@ -138,27 +138,23 @@ class Scene:
         turn = checks.unit_quaternion(f"quaternion of {name!r}", quaternion)
         speed = _velocities(velocity, angular_velocity, 1)[0]
         _refuse_speed(name, motion, speed)
-        parts, weight, moments = tuple(shapes), np.inf, np.full(3, np.inf)
+        body = LargeBody(name, tuple(shapes), motion, -1, place, turn, speed, np.inf, np.full(3, np.inf))
         if not isinstance(motion, Dynamic):
             pass
         elif density is not None and mass is None and inertia is None:
-            solid = float(checks.positive(f"density of {name!r}", density))
-            parts, place, turn, weight, moments = _centered(parts, place, turn, solid)
+            body = _centered(body, float(checks.positive(f"density of {name!r}", density)))
         elif density is None and mass is not None and (inertia is not None or isinstance(motion, Guided)):
-            weight = float(checks.positive(f"mass of {name!r}", mass))
+            body = replace(body, mass=float(checks.positive(f"mass of {name!r}", mass)))
             if inertia is not None:
-                moments = checks.vector(f"inertia of {name!r}", checks.positive(f"inertia of {name!r}", inertia))
+                moments = checks.positive(f"inertia of {name!r}", inertia)
+                body = replace(body, inertia=checks.vector(f"inertia of {name!r}", moments))
         else:
             raise ValueError(f"dynamic body {name!r} needs either its density or both mass and inertia")
         if isinstance(motion, Guided):
-            moments = np.full(3, np.inf)
+            body = replace(body, inertia=np.full(3, np.inf))
         if isinstance(motion, Hinged):
-            arm = place - np.array(position)
-            if length(np.cross(motion.line, arm)) > 1e-6 * max(length(arm), np.sqrt(moments.max() / weight)):
-                raise ValueError(f"{name!r} is hinged: its centre of mass must be on the axis through its position")
-            parts, turn, moments = _on_hinge(parts, turn, moments, motion.line)
-        number = self._material(material)
-        self.large_bodies.append(LargeBody(name, parts, motion, number, place, turn, speed, weight, moments))
+            body = _on_hinge(body, motion.line, body.position - place)
+        self.large_bodies.append(replace(body, material=self._material(material)))
 
     def set_friction(self, friction: float, material: str, other: str) -> None:
         """Friction coefficient between two materials (which may be the same one)."""
@@ -187,16 +183,15 @@ class Scene:
 
     def large(self) -> Bodies:
         """The table of the large bodies at time zero, in the order in which they were added."""
-        count, members = len(self.large_bodies), self.large_bodies
-        first = sum(len(part) for part in self._grains)
+        count, first = len(self.large_bodies), sum(len(part) for part in self._grains)
         return Bodies(
             id=np.arange(first, first + count),
-            position=np.array([body.position for body in members]).reshape(count, 3),
-            quaternion=np.array([body.quaternion for body in members]).reshape(count, 4),
-            velocity=np.array([body.velocity for body in members]).reshape(count, 6),
-            mass=np.array([body.mass for body in members]),
-            inertia=np.array([body.inertia for body in members]).reshape(count, 3),
-            material=np.array([body.material for body in members], dtype=np.int64),
+            **{
+                name: np.array([getattr(body, name) for body in self.large_bodies]).reshape(count, *row)
+                for name, row in {"position": (3,), "quaternion": (4,), "velocity": (6,), "inertia": (3,)}.items()
+            },
+            mass=np.array([body.mass for body in self.large_bodies]),
+            material=np.array([body.material for body in self.large_bodies], dtype=np.int64),
             shape=np.full(count, COMPOUND),
             size=np.zeros((count, 3)),
             weight=np.zeros(count),
@@ -206,26 +201,16 @@ class Scene:
         return self._materials.setdefault(name, len(self._materials))
 
     def _add_grains(
-        self,
-        kind: int,
-        positions: ArrayLike,
-        lengths: dict[str, ArrayLike],
-        density: ArrayLike,
-        quaternions: ArrayLike,
-        material: str,
-        velocity: ArrayLike,
-        angular_velocity: ArrayLike,
-    ) -> Ints:
+        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike, material: str,
+        quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
+    ) -> Ints:  # fmt: skip
         """Add grains of one kind, of which `lengths` has the columns of `size` by name; their ids."""
         centers = np.atleast_2d(checks.finite("positions", positions))
         count, first = len(centers), sum(len(part) for part in self._grains)
         size = np.zeros((count, 3))
         for k, (name, values) in enumerate(lengths.items()):
-            values = checks.positive(name, values)
-            if kind == BOX:
-                size[:] = checks.rows(name, values, count, 3)
-            else:
-                size[:, k] = checks.rows(name, values, count)
+            column, row = (slice(None), (3,)) if kind == BOX else (k, ())
+            size[:, column] = checks.rows(name, checks.positive(name, values), count, *row)
         mass, inertia = shapes.solid(kind, size, checks.rows("density", checks.positive("density", density), count))
         table = Bodies(
             id=np.arange(first, first + count),
@@ -254,16 +239,34 @@ def _refuse_speed(name: str, motion: Motion, speed: Floats) -> None:
             raise ValueError(f"{name!r} is {kind}: its initial velocity must be {along}")
 
 
-def _on_hinge(
-    parts: tuple[Shape, ...], turn: Floats, moments: Floats, axis: Floats
-) -> tuple[tuple[Shape, ...], Floats, Floats]:
-    """The same body in a frame whose z axis is the axis (3,) of its hinge, and its moments: infinite but about that."""
-    moment = float(moments @ quaternion.rotate(quaternion.conjugate(turn), axis) ** 2)
+def _reframed(body: LargeBody, center: Floats, inner: Floats) -> LargeBody:
+    """The same body with its frame at `center` (3,) and in the orientation `inner` (4,) in its present frame."""
+    moved = tuple(shapes.moved(part, center, inner) for part in body.shapes)
+    place = body.position + quaternion.rotate(body.quaternion, center)
+    return replace(body, shapes=moved, position=place, quaternion=quaternion.multiply(body.quaternion, inner))
+
+
+def _centered(body: LargeBody, density: float) -> LargeBody:
+    """The same body with its frame at the centre of mass along the principal axes, with mass and moments."""
+    mass, center, tensor = shapes.mass_properties(body.shapes, density)
+    moments, axes = np.diag(tensor).copy(), np.eye(3)
+    if np.abs(tensor - np.diag(moments)).max() > 1e-12 * moments.max():
+        moments, axes = np.linalg.eigh(tensor)
+        axes[:, 2] *= np.linalg.det(axes)  # right-handed
+    return replace(_reframed(body, center, quaternion.from_matrix(axes)), mass=mass, inertia=moments)
+
+
+def _on_hinge(body: LargeBody, axis: Floats, arm: Floats) -> LargeBody:
+    """The same body in a frame whose z axis is the axis (3,) of its hinge, with a moment about that alone. ValueError
+    if its centre of mass, at `arm` (3,) from a point of the axis, is not on it."""
+    if length(np.cross(axis, arm)) > 1e-6 * max(length(arm), np.sqrt(body.inertia.max() / body.mass)):
+        raise ValueError(f"{body.name!r} is hinged: its centre of mass must be on the axis through its position")
+    back = quaternion.conjugate(body.quaternion)
+    moment = float(body.inertia @ quaternion.rotate(back, axis) ** 2)
     x = across(axis[None])[0]
     upright = quaternion.from_matrix(np.stack([x, np.cross(axis, x), axis], axis=1))
-    inner = quaternion.multiply(quaternion.conjugate(turn), upright)
-    moved = tuple(shapes.moved(part, np.zeros(3), inner) for part in parts)
-    return moved, upright, np.array([np.inf, np.inf, moment])
+    turned = _reframed(body, np.zeros(3), quaternion.multiply(back, upright))
+    return replace(turned, quaternion=upright, inertia=np.array([np.inf, np.inf, moment]))
 
 
 def _refuse_beside_meshes(members: Sequence[LargeBody], box_grains: bool) -> None:
@@ -285,22 +288,3 @@ def _refuse_beside_meshes(members: Sequence[LargeBody], box_grains: bool) -> Non
 
 def _velocities(linear: ArrayLike, angular: ArrayLike, count: int) -> Floats:
     return np.hstack([checks.rows("velocity", linear, count, 3), checks.rows("angular velocity", angular, count, 3)])
-
-
-def _centered(
-    parts: tuple[Shape, ...], position: Floats, turn: Floats, density: float
-) -> tuple[tuple[Shape, ...], Floats, Floats, float, Floats]:
-    """The same body with its frame at the centre of mass along the principal axes, with mass and moments."""
-    mass, center, tensor = shapes.mass_properties(parts, density)
-    moments, axes = np.diag(tensor).copy(), np.eye(3)
-    if np.abs(tensor - np.diag(moments)).max() > 1e-12 * moments.max():
-        moments, axes = np.linalg.eigh(tensor)
-        axes[:, 2] *= np.linalg.det(axes)  # right-handed
-    inner = quaternion.from_matrix(axes)
-    return (
-        tuple(shapes.moved(part, center, inner) for part in parts),
-        position + quaternion.rotate(turn, center),
-        quaternion.multiply(turn, inner),
-        mass,
-        moments,
-    )

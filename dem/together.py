@@ -16,9 +16,8 @@ from mpi4py import MPI
 
 Result = TypeVar("Result")
 
-#: What the names of modules begin with that hold scenes: those of files, and those of the package.
+#: What the names of modules made of the files of scenes begin with.
 SCENE_FILE = "scene_file_"
-SCENE_MODULES = (SCENE_FILE, "dem.scenes.")
 
 
 class SceneError(RuntimeError):
@@ -71,7 +70,7 @@ def _place(error: BaseException) -> str:
     frames = [
         (frame.f_code.co_filename, line)
         for frame, line in traceback.walk_tb(error.__traceback__)
-        if frame.f_globals.get("__name__", "").startswith(SCENE_MODULES)
+        if frame.f_globals.get("__name__", "").startswith((SCENE_FILE, "dem.scenes."))
     ]
     return f"{frames[-1][0]}, line {frames[-1][1]}: " if frames else ""
 

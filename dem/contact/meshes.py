@@ -25,9 +25,6 @@ ROUNDING = 1e-6
 #: The same for the side of a capsule on an edge: one that rocks a little on two edges keeps the contacts of both.
 ROCKING = 0.1
 
-#: Places that are closer to each other than this share of the radius are one contact.
-SAME = 1e-4
-
 #: Features of a capsule on a surface: those of the surface for each end ball, and for the core between.
 PARTS = 3
 
@@ -113,8 +110,9 @@ def _within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, s
 
 
 def _one_for_each(row: Ints, triangle: Ints, found: Closest, least: Ints, radius: Floats, surface: Surface) -> Ints:
-    """Which of the entries `least` are contacts of their own: not those that rounding made twice, nor places of edges
-    that lie in another triangle, as where the corners of one meet the side of another."""
+    """Which of the entries `least` are contacts of their own: not those that rounding made twice, closer to each other
+    than 1e-4 of the radius, nor places of edges that lie in another triangle, as where the corners of one meet the side
+    of another."""
     point, feature, distance = found
     count = np.bincount(row[least], minlength=len(radius))
     several = np.flatnonzero(count[row[least]] > 1)
@@ -129,7 +127,7 @@ def _one_for_each(row: Ints, triangle: Ints, found: Closest, least: Ints, radius
     one, two = spread(start, row[entry])
     pair = np.flatnonzero(two < one)  # the closer one stays
     one, two = one[pair], two[pair]
-    same = length(point[entry[one]] - point[entry[two]]) <= SAME * radius[row[entry[one]]]
+    same = length(point[entry[one]] - point[entry[two]]) <= 1e-4 * radius[row[entry[one]]]
     dropped[several[one[same]]] = True
 
     edge = np.flatnonzero(feature[entry] >= len(surface.triangle))
@@ -139,7 +137,7 @@ def _one_for_each(row: Ints, triangle: Ints, found: Closest, least: Ints, radius
     one, two = entry[edge[one]], by_row[two]
     closer = np.flatnonzero(distance[two] < distance[one] * (1.0 - 1e-9))
     at = surface.closest(point[one[closer]], triangle[two[closer]]).distance
-    inside = one[closer[at <= 1e-2 * SAME * radius[row[one[closer]]]]]
+    inside = one[closer[at <= 1e-6 * radius[row[one[closer]]]]]
     dropped[np.isin(least, inside)] = True
     return np.flatnonzero(~dropped)
 
@@ -147,11 +145,15 @@ def _one_for_each(row: Ints, triangle: Ints, found: Closest, least: Ints, radius
 _Found = tuple[Ints, Ints, Floats, Floats, Floats, Bools]  # rows, features, points, directions, gaps, which are kept
 
 
+def _each_once(row: Ints, items: Ints, wanted: Bools) -> tuple[Ints, Ints]:
+    """The distinct pairs of rows (k,) and of those of the three items (k, 3) of their triangles that are wanted."""
+    return np.divmod(np.unique((row[:, None] * len(wanted) + items)[wanted[items]]), len(wanted))  # type: ignore
+
+
 def _across_edges(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> _Found:
     """Where cores pass over edges, each between its ends."""
     center, axis, half_length, radius = core
-    side = surface.side[triangle]
-    row, edge = np.divmod(np.unique((row[:, None] * len(surface.edge) + side)[surface.ridges[side]]), len(surface.edge))
+    row, edge = _each_once(row, surface.side[triangle], surface.ridges)
     start, end = surface.vertex[surface.edge[edge, 0]], surface.vertex[surface.edge[edge, 1]]
     size = length(end - start)
     along = (end - start) / size[:, None]
@@ -163,14 +165,12 @@ def _across_edges(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surf
 
 def _over_vertices(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> _Found:
     """Vertices that are beside cores, between their ends."""
-    center, axis, half_length, radius = core
     sharp = np.zeros(len(surface.vertex), dtype=bool)
     sharp[surface.edge[surface.ridges]] = True
-    corner = surface.triangle[triangle]
-    row, vertex = np.divmod(np.unique((row[:, None] * len(sharp) + corner)[sharp[corner]]), len(sharp))
+    row, vertex = _each_once(row, surface.triangle[triangle], sharp)
     point = surface.vertex[vertex]
-    s = dot(point - center[row], axis[row])
-    beside = np.abs(s) < half_length[row]
+    s = dot(point - core.center[row], core.axis[row])
+    beside = np.abs(s) < core.half_length[row]
     feature = len(surface.triangle) + len(surface.edge) + vertex
     return _from_core(row[beside], feature[beside], point[beside], s[beside], ROUNDING, core, reach, surface)
 

@@ -56,9 +56,10 @@ class Spheres(Experiment):
 
     def walls(self) -> list[Shape]:
         """The floor, the walls and, if it is not open at the top, the lid of the domain."""
-        low, high = np.array(self.domain)
-        tops = [Plane(-way, tuple(np.where(way, high, 0.0))) for way, top in zip(np.eye(3), high) if np.isfinite(top)]
-        return [*(Plane(way, low) for way in np.eye(3)), *tops]
+        (low, high), (x, y, z) = np.array(self.domain), np.eye(3)
+        sides = [(z, low), (-x, high), (x, low), (-y, high), (y, low), (-z, high)]
+        places = [(normal, tuple(np.where(normal, corner, 0.0))) for normal, corner in sides]
+        return [Plane(normal, place) for normal, place in places if np.isfinite(place).all()]
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ class SmallSpheres(Spheres):
         count = int(self.room / self.pitch)
         grid = [np.arange(-count, count + 1) * self.pitch] * 3
         grid[axis] = along
-        places = perturbed(*grid, self.perturbation, self.seed)
+        places = perturbed(grid[0], grid[1], grid[2], self.perturbation, self.seed)
         places = places[length(np.delete(places, axis, axis=1)) <= self.room]
         return places[np.argsort(places[:, 2], kind="stable")]
 

@@ -247,7 +247,7 @@ def test_meshes_without_mass_are_refused():
         (lambda: Mesh(np.zeros((4, 2)), [[0, 1, 2]]), r"shape \(n, 3\), got \(4, 2\)"),
         (lambda: Mesh(np.zeros((4, 3)), [[0.0, 1, 2]]), "must be integers"),
         (lambda: Mesh(np.zeros((4, 3)), [[0, 1, 1]]), "no triangle of the mesh has three corners"),
-        (lambda: Mesh.revolved([(1, 0), (1, 1)], 2), "at least 3 sides"),
+        (lambda: Mesh.revolved([(1, 0), (1, 1)], 2), "sides of .* must be at least 3"),
         (lambda: Mesh.revolved([(1, 0), (-1, 1)]), "radii of a profile"),
     ],
 )
