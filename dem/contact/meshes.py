@@ -9,13 +9,12 @@ of its faces.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
-from dem.contact.capsules import end_ball
-from dem.contact.narrow import Capsules, Manifold, Planes, Spheres, Touch, closest_on_lines, dot
+from dem.contact.narrow import Capsules, Manifold, Planes, Spheres, Touch, closest_on_lines, dot, end_ball
 from dem.mesh import Closest, Surface, spread
 from dem.quaternion import length
 
@@ -37,11 +36,30 @@ class PlacedMesh(NamedTuple):
     turn: Floats  #: (3, 3) its frame
 
 
+class _Found(NamedTuple):
+    """Contacts of bodies and one surface, in its frame."""
+
+    row: Ints  #: (k,) of the body
+    feature: Ints  #: (k,) of the surface, and more than all these for each part of a capsule before
+    point: Floats  #: (k, 3) of the surface [m]
+    away: Floats  #: (k, 3) unit vector from there to the body
+    gap: Floats  #: (k,) [m]
+
+    def take(self, rows: Ints | Bools) -> _Found:
+        columns: Any = self
+        return _Found(*(column[rows] for column in columns))
+
+    def manifold(self, mesh: PlacedMesh) -> Manifold:
+        """The same in the world."""
+        between = self.point + 0.5 * self.gap[:, None] * self.away
+        touch = Touch(mesh.middle + between @ mesh.turn.T, -self.away @ mesh.turn.T, self.gap)
+        return Manifold(self.row, self.feature, touch)
+
+
 def sphere_mesh(ball: Spheres, mesh: PlacedMesh, delta: Floats) -> Manifold:
     """Spheres and one surface."""
-    local = (ball.center - mesh.middle) @ mesh.turn
-    row, feature, point, away, distance = _feet(local, ball.radius, ball.radius + delta, mesh.surface)
-    return _placed(row, feature, point, away, distance - ball.radius[row], mesh)
+    local = ball._replace(center=(ball.center - mesh.middle) @ mesh.turn)
+    return _feet(local, delta, mesh.surface).manifold(mesh)
 
 
 def capsule_mesh(capsule: Capsules, mesh: PlacedMesh, delta: Floats) -> Manifold:
@@ -49,24 +67,23 @@ def capsule_mesh(capsule: Capsules, mesh: PlacedMesh, delta: Floats) -> Manifold
 
     A core that goes through a face is pushed back across it the shorter way.
     """
-    surface, radius, reach = mesh.surface, capsule.radius, capsule.radius + delta
+    surface, reach = mesh.surface, capsule.radius + delta
     core = capsule._replace(center=(capsule.center - mesh.middle) @ mesh.turn, axis=capsule.axis @ mesh.turn)
-    found = []
+    parts = []
     for end, side in enumerate((-1.0, 1.0)):
-        row, feature, point, away, distance = _feet(end_ball(core, side).center, radius, reach, surface)
+        feet = _feet(end_ball(core, side), delta, surface)
         # Where the side of the capsule is clearly closer to an edge than its end is, the end is no contact.
-        beyond = side * dot(away, core.axis[row]) <= ROCKING
-        kept = (feature < len(surface.triangle)) | beyond
-        found.append((row, feature + end * surface.features, point, away, distance - radius[row], kept))
+        beyond = side * dot(feet.away, core.axis[feet.row]) <= ROCKING
+        feet = feet.take((feet.feature < len(surface.triangle)) | beyond)
+        parts.append(feet._replace(feature=feet.feature + end * surface.features))
     row, triangle = surface.near(core.center, core.half_length + reach)
-    found += [_across_edges(row, triangle, core, reach, surface), _over_vertices(row, triangle, core, reach, surface)]
     through = _through_faces(row, triangle, core, surface)
-    found.append(through)
-    row, feature, point, away, gap, kept = (np.concatenate([part[k] for part in found]) for k in range(6))
-    # The end on the wrong side of a face that the core goes through would be held there.
-    stuck = np.isin(row * PARTS * surface.features + feature, _short_ends(through, core, surface))
-    kept &= ~stuck
-    return _placed(row[kept], feature[kept], point[kept], away[kept], gap[kept], mesh)
+    parts += [_across_edges(row, triangle, core, reach, surface), _over_vertices(row, triangle, core, reach, surface)]
+    found = _Found(*(np.concatenate(columns) for columns in zip(*parts, through)))
+    # The end on the wrong side of a face that the core goes through would be held there; the first is at the start.
+    short = (dot(through.away, core.axis[through.row]) < 0.0).astype(np.int64)
+    stuck = PARTS * surface.features * through.row + through.feature + (short - 2) * surface.features
+    return found.take(~np.isin(PARTS * surface.features * found.row + found.feature, stuck)).manifold(mesh)
 
 
 def plane_mesh(plane: Planes, mesh: PlacedMesh, delta: Floats) -> Manifold:
@@ -79,22 +96,24 @@ def plane_mesh(plane: Planes, mesh: PlacedMesh, delta: Floats) -> Manifold:
     return Manifold(pair, hull[corner], Touch(tip[corner] - 0.5 * gap[:, None] * normal, normal, gap))
 
 
-def _feet(center: Floats, radius: Floats, reach: Floats, surface: Surface) -> tuple[Ints, Ints, Floats, Floats, Floats]:
-    """The places of the surface at distances from centres (m, 3) that are least around them and within reach (m,): rows
-    of the centres, features, points, unit vectors from there to the centre, distances."""
-    row, triangle = surface.near(center, reach)
+def _feet(ball: Spheres, delta: Floats, surface: Surface) -> _Found:
+    """The places of the surface at distances from the centres of balls (m,) that are least around them, with gaps of
+    at most `delta` (m,)."""
+    center, radius = ball
+    row, triangle = surface.near(center, radius + delta)
     found = surface.closest(center[row], triangle)
-    close = np.flatnonzero(found.distance <= reach[row])
+    close = np.flatnonzero(found.distance <= (radius + delta)[row])
     row, triangle = row[close], triangle[close]
-    point, feature, distance = found.point[close], found.feature[close], found.distance[close]
-    _, first = np.unique(row * surface.features + feature, return_index=True)  # triangles share edges and vertices
-    away = center[row[first]] - point[first]
-    size = distance[first, None]
-    away = np.where(size > 0.0, away / np.where(size > 0.0, size, 1.0), surface.normal[triangle[first]])
-    least = first[_within_cone(surface, feature[first], point[first], np.where(size > 0.0, away, 0.0), ROUNDING)]
-    away = away[np.isin(first, least)]
-    chosen = _one_for_each(row, triangle, Closest(point, feature, distance), least, radius, surface)
-    return row[least][chosen], feature[least][chosen], point[least][chosen], away[chosen], distance[least][chosen]
+    found = Closest(found.point[close], found.feature[close], found.distance[close])
+    _, first = np.unique(row * surface.features + found.feature, return_index=True)  # triangles share edges, vertices
+    size = found.distance[first, None]
+    away = (center[row[first]] - found.point[first]) / np.where(size > 0.0, size, 1.0)  # zero where there is no way
+    within = _within_cone(surface, found.feature[first], found.point[first], away, ROUNDING)
+    away = np.where(size > 0.0, away, surface.normal[triangle[first]])
+    least, away = first[within], away[within]
+    chosen = _one_for_each(row, triangle, found, least, radius, surface)
+    row, gap = row[least], found.distance[least] - radius[row[least]]
+    return _Found(row, found.feature[least], found.point[least], away, gap).take(chosen)
 
 
 def _within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, slack: float) -> Bools:
@@ -142,9 +161,6 @@ def _one_for_each(row: Ints, triangle: Ints, found: Closest, least: Ints, radius
     return np.flatnonzero(~dropped)
 
 
-_Found = tuple[Ints, Ints, Floats, Floats, Floats, Bools]  # rows, features, points, directions, gaps, which are kept
-
-
 def _each_once(row: Ints, items: Ints, wanted: Bools) -> tuple[Ints, Ints]:
     """The distinct pairs of rows (k,) and of those of the three items (k, 3) of their triangles that are wanted."""
     return np.divmod(np.unique((row[:, None] * len(wanted) + items)[wanted[items]]), len(wanted))  # type: ignore
@@ -183,9 +199,9 @@ def _from_core(
     away = center[row] + s[:, None] * axis[row] - point
     distance = length(away)
     away = away / np.where(distance > 0.0, distance, 1.0)[:, None]
-    kept = (distance > 0.0) & (distance <= reach[row])
-    kept[kept] = _within_cone(surface, feature[kept], point[kept], away[kept], slack)
-    return row, feature + 2 * surface.features, point, away, distance - radius[row], kept
+    found = _Found(row, feature + 2 * surface.features, point, away, distance - radius[row])
+    near = np.flatnonzero((distance > 0.0) & (distance <= reach[row]))
+    return found.take(near[_within_cone(surface, feature[near], point[near], away[near], slack)])
 
 
 def _through_faces(row: Ints, triangle: Ints, core: Capsules, surface: Surface) -> _Found:
@@ -197,20 +213,6 @@ def _through_faces(row: Ints, triangle: Ints, core: Capsules, surface: Surface) 
     row, triangle, normal, height, slope = (values[through] for values in (row, triangle, normal, height, slope))
     point = center[row] - (height / slope * half_length[row])[:, None] * axis[row]
     in_face = surface.closest(point, triangle).feature == triangle
-    depth = np.abs(slope) - np.abs(height)
+    gap = np.abs(height) - np.abs(slope) - radius[row]
     away = np.copysign(1.0, height)[:, None] * normal
-    return row, triangle + 2 * surface.features, point, away, -depth - radius[row], in_face
-
-
-def _short_ends(through: _Found, core: Capsules, surface: Surface) -> Ints:
-    """Numbers, of the row and the feature, of the contacts of ends beyond faces that their cores go through."""
-    row, feature, _, away, _, kept = through
-    row, triangle, away = row[kept], feature[kept] - 2 * surface.features, away[kept]
-    end = (dot(away, core.axis[row]) < 0.0).astype(np.int64)  # the first end is at the start of the axis
-    return row * PARTS * surface.features + end * surface.features + triangle
-
-
-def _placed(row: Ints, feature: Ints, point: Floats, away: Floats, gap: Floats, mesh: PlacedMesh) -> Manifold:
-    """The manifold of contacts in the frame of the surface: its points, and unit vectors from there."""
-    between = point + 0.5 * gap[:, None] * away
-    return Manifold(row, feature, Touch(mesh.middle + between @ mesh.turn.T, -away @ mesh.turn.T, gap))
+    return _Found(row, triangle + 2 * surface.features, point, away, gap).take(in_face)

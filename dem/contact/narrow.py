@@ -1,7 +1,13 @@
-"""Narrow phase: where two shapes touch in one point, and what the other narrow phases share.
+"""Narrow phase of spheres, capsules and half spaces, and what that of boxes and of meshes shares with it.
 
-Each function takes m pairs of a first and a second shape. Pairs that touch in several points are in `capsules`,
-`box_box` and `meshes`; they return a `Manifold`.
+Each function takes m pairs of a first and a second shape, and returns a `Touch` if they touch in one point, else a
+`Manifold`. Boxes on boxes are in `box_box`, surfaces of triangles in `meshes`.
+
+Capsules touch at the ends of what lies side by side, and at the closest point between them. Every point within reach is
+a contact, not only the closest: capsules that turn may touch in another point at the end of the step. Ends alone do not
+hold apart capsules that cross between them, as their normals lean to the side: an end that moves sideways gets away
+from the other core while the crossing comes closer. The closest point alone does not hold back an end that turns
+towards the other.
 """
 
 from __future__ import annotations
@@ -13,6 +19,16 @@ import numpy as np
 from dem.arrays import Bools, Floats, Ints
 from dem.compiled import loop
 from dem.quaternion import across, cross, length
+
+#: Corners (8, 3) of the box with half extents one; the row number is the feature of a contact.
+CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+
+#: Ends of core segments that face each other within this share of the length are one contact: above rounding.
+SNAP = 1e-6
+
+#: The closest point is a contact of its own if it is closer than the ends by this share of the lesser radius (of the
+#: least half extent). Bodies at rest side by side, which rock by less, keep the contacts of their ends alone.
+DISTINCT = 1e-4
 
 
 class Spheres(NamedTuple):
@@ -181,12 +197,132 @@ def sphere_box(ball: Spheres, box: Boxes) -> Touch:
     return Touch(center + (radius + 0.5 * gap)[:, None] * normal, normal, gap)
 
 
-#: Corners (8, 3) of the box with half extents one; the row number is the feature of a contact.
-CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-
-
 def box_plane(box: Boxes, plane: Planes, delta: Floats) -> Manifold:
     """The corners of the boxes."""
     none = np.zeros(len(box.center))
     tips = [box.center + (box.turn @ (box.half * corner)[:, :, None])[:, :, 0] for corner in CORNERS]
     return manifold(delta, [sphere_plane(Spheres(tip, none), plane) for tip in tips])
+
+
+def end_ball(capsule: Capsules, side: float) -> Spheres:
+    """The balls at the end (side 1) or the start (side -1) of the cores."""
+    return Spheres(capsule.center + (side * capsule.half_length)[:, None] * capsule.axis, capsule.radius)
+
+
+def capsule_plane(capsule: Capsules, plane: Planes, delta: Floats) -> Manifold:
+    """The two end balls, features 0 and 1."""
+    return manifold(delta, [sphere_plane(end_ball(capsule, side), plane) for side in (-1.0, 1.0)])
+
+
+def capsule_capsule(first: Capsules, second: Capsules, delta: Floats) -> Manifold:
+    """Features 0 and 1 are the end balls of the first capsule that lie beside the core of the second, 2 and 3 those of
+    the second beside the core of the first. Where none of them is as close as the capsules are, feature 4 is the
+    closest point, at the crossing of the cores or between two ends.
+    """
+    ends, beside = [], []
+    for one, two, margin in ((first, second, SNAP), (second, first, -SNAP)):
+        for side in (-1.0, 1.0):
+            ball = end_ball(one, side)
+            touch = sphere_capsule(ball, two)
+            ends.append(touch if one is first else reversed_touch(touch))
+            slack = margin * (first.half_length + second.half_length)
+            beside.append(np.abs(dot(ball.center - two.center, two.axis)) <= two.half_length + slack)
+
+    crossing = _crossing(first, second)
+    closest = _least([*ends, crossing])
+    lowest = np.min([np.where(mask, end.gap, np.inf) for end, mask in zip(ends, beside)], axis=0)
+    distinct = lowest > closest.gap + DISTINCT * np.minimum(first.radius, second.radius)
+    return manifold(delta, [*ends, closest], [*beside, distinct])
+
+
+def capsule_box(capsule: Capsules, box: Boxes, delta: Floats) -> Manifold:
+    """A capsule that lies over a face touches it at both ends of the stretch that is over the face, features 0 and 1.
+    Where neither is as close as the capsule is, feature 2 is the point where it is closest to the box. A core that
+    meets the box is pushed out through the face for which that is the shortest way.
+    """
+    (center, axis, half_length, radius), turn, half = capsule, box.turn, box.half
+    rows = np.arange(len(center))
+    middle = ((center - box.center)[:, None, :] @ turn)[:, 0]
+    reach = half_length[:, None] * (axis[:, None, :] @ turn)[:, 0]
+    start, way = middle - reach, 2.0 * reach  # of the core, in the frame of the box
+
+    low = np.minimum(start, start + way)
+    apart = np.concatenate([low - half, -(low + np.abs(way)) - half], axis=1)  # of the six faces
+    slack = SNAP * (half_length + half.min(axis=1))
+    face = (apart >= apart.max(axis=1, keepdims=True) - SNAP * slack[:, None]).argmax(axis=1)
+    k, sign = face % 3, np.where(face < 3, 1.0, -1.0)
+
+    def ball(share: Floats) -> Spheres:
+        """At shares (m,) of the way from the start of the core to its end."""
+        return Spheres(center + ((2.0 * share - 1.0) * half_length)[:, None] * axis, radius)
+
+    closest = sphere_box(ball(_closest_to_box(start, way, half)), box)
+
+    # The stretch of the core over the face: clipped with the slabs of the two other axes.
+    enter, leave = _slabs(start, way, half + slack[:, None])
+    enter[rows, k], leave[rows, k] = 0.0, 1.0
+    begin, end = np.maximum(enter.max(axis=1), 0.0), np.minimum(leave.min(axis=1), 1.0)
+    over = begin <= end
+    normal = -sign[:, None] * turn[rows, :, k]
+    stretch = []
+    for place in (np.where(over, begin, 0.0), np.where(over, end, 0.0)):
+        gap = sign * (start[rows, k] + place * way[rows, k]) - half[rows, k] - radius
+        stretch.append(Touch(ball(place).center + (radius + 0.5 * gap)[:, None] * normal, normal, gap))
+    lowest = np.where(over, np.minimum(stretch[0].gap, stretch[1].gap), np.inf)
+    meets = over & (closest.gap <= -radius)
+    distinct = (lowest > closest.gap + DISTINCT * np.minimum(radius, half.min(axis=1))) & ~meets
+    long = (end - begin) * half_length > slack
+    return manifold(delta, [*stretch, closest], [over, over & long, distinct])
+
+
+def _least(touches: list[Touch]) -> Touch:
+    """For each pair the touch of the least gap."""
+    best: Ints = np.argmin([touch.gap for touch in touches], axis=0)
+    rows = np.arange(len(best))
+    return Touch(*(np.stack(values)[best, rows] for values in zip(*touches)))
+
+
+def _crossing(first: Capsules, second: Capsules) -> Touch:
+    """Where both core segments have the closest point of their lines inside; the gap is infinite elsewhere."""
+    center, axis, half_length, radius = first
+    other, other_axis, other_half, other_radius = second
+    s, t = closest_on_lines(center, axis, other, other_axis)
+    normal = cross(axis, other_axis)
+    sine = length(normal)
+    inside = (np.abs(s) <= half_length) & (np.abs(t) <= other_half) & (sine > SNAP)
+    normal = np.where(inside[:, None], normal / np.where(inside, sine, 1.0)[:, None], across(axis))
+    offset = dot(other - center, normal)
+    normal *= np.copysign(1.0, offset)[:, None]
+    gap = np.where(inside, np.abs(offset) - radius - other_radius, np.inf)
+    ahead = np.where(inside, radius + 0.5 * gap, 0.0)
+    return Touch(center + np.where(inside, s, 0.0)[:, None] * axis + ahead[:, None] * normal, normal, gap)
+
+
+def _slabs(start: Floats, way: Floats, half: Floats) -> tuple[Floats, Floats]:
+    """Parameters t (m, 3) between which the coordinates of start + t way (m, 3) stay within +-half (m, 3), each; the
+    first is the greater where one never does."""
+    moving = np.abs(way) > 1e-12 * half
+    divisor = np.where(moving, way, 1.0)
+    one, two = (-half - start) / divisor, (half - start) / divisor
+    outside = np.where(np.abs(start) <= half, -np.inf, np.inf)
+    return np.where(moving, np.minimum(one, two), outside), np.where(moving, np.maximum(one, two), -outside)
+
+
+def _closest_to_box(start: Floats, way: Floats, half: Floats) -> Floats:
+    """Parameters t in [0, 1] (m,) of the points of segments start + t way (m, 3) that are closest to boxes about the
+    origin.
+
+    The squared distance is convex in t, and its derivative is linear between the parameters at which the segment
+    crosses the planes of the faces: the root is found exactly.
+    """
+    ends = np.tile([0.0, 1.0], (len(start), 1))
+    t = np.sort(np.clip(np.concatenate([ends, *_slabs(start, way, half)], axis=1), 0.0, 1.0), axis=1)
+    place = start[:, None, :] + t[:, :, None] * way[:, None, :]
+    beyond = place - np.clip(place, -half[:, None], half[:, None])
+    slope = dot(beyond, way[:, None, :])
+    rows, last = np.arange(len(t)), t.shape[1] - 1
+    after = np.clip((slope <= 0.0).sum(axis=1), 1, last)  # the first crossing at which the distance grows
+    before = after - 1
+    rise = slope[rows, after] - slope[rows, before]
+    share = np.clip(-slope[rows, before] / np.where(rise > 0.0, rise, 1.0), 0.0, 1.0)
+    return t[rows, before] + share * (t[rows, after] - t[rows, before])

@@ -12,7 +12,6 @@ from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, MESH, PLANE, SPHERE, enclosing_radius
 from dem.contact.box_box import BOX_FEATURES as FEATURES
 from dem.contact.box_box import box_box
-from dem.contact.capsules import capsule_box, capsule_capsule, capsule_plane
 from dem.contact.meshes import PARTS, PlacedMesh, capsule_mesh, plane_mesh, sphere_mesh
 from dem.contact.narrow import (
     Boxes,
@@ -22,6 +21,9 @@ from dem.contact.narrow import (
     Spheres,
     Touch,
     box_plane,
+    capsule_box,
+    capsule_capsule,
+    capsule_plane,
     joined,
     manifold,
     reversed_touch,

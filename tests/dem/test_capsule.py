@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from dem import quaternion
 from dem.bodies import CAPSULE
-from dem.contact.capsules import DISTINCT, capsule_box, capsule_capsule, capsule_plane
-from dem.contact.narrow import Boxes, Capsules, Planes
+from dem.contact.narrow import DISTINCT, Boxes, Capsules, Planes, capsule_box, capsule_capsule, capsule_plane
 from dem.shapes import Capsule, Sphere, mass_properties, moved, solid
 
 DELTA = 0.1

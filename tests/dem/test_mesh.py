@@ -12,9 +12,8 @@ from mpi4py import MPI
 
 from dem import quaternion
 from dem.contact import find_contacts
-from dem.contact.capsules import capsule_plane
 from dem.contact.meshes import PlacedMesh, capsule_mesh, sphere_mesh
-from dem.contact.narrow import Boxes, Capsules, Planes, Spheres, sphere_box
+from dem.contact.narrow import Boxes, Capsules, Planes, Spheres, capsule_plane, sphere_box
 from dem.mesh import Mesh
 from dem.motion import Dynamic, Rotation
 from dem.scene import Scene
