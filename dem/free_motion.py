@@ -41,10 +41,9 @@ def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
 
     A step turns a body by exp(dt w). In the middle of it the body has the angular momentum exp(dt/2 w) I w in the frame
     of its start, and in the middle of the last step it had exp(-dt/2 w_old) I w_old. Newton's method makes the two
-    equal. So the angular momentum is kept (to rounding below half a radian a step), and the energy to O(dt^2): with
-    an explicit torque it would grow without bound. Compare Simo and Wong, International Journal for Numerical Methods
-    in Engineering 31, 1991. A body that turns by much more than a radian in a step, for which Newton's method does not
-    converge, keeps its spin: no such step resolves its motion.
+    equal: the angular momentum is kept, and the energy to O(dt^2) (compare Simo and Wong, International Journal for
+    Numerical Methods in Engineering 31, 1991). A body that turns by much more than a radian, for which it does not
+    converge, keeps its spin.
     """
     out = spin.copy()
     half = 0.5 * dt

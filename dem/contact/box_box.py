@@ -14,7 +14,6 @@ import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
 from dem.contact.narrow import (
-    CORNERS,
     Boxes,
     Manifold,
     Spheres,
@@ -157,12 +156,9 @@ def _faces_laid_over(pairs: _Pairs) -> tuple[Ints, Touch]:
     p_out, q_out = _outside(p, q), _outside(q, p)  # (m, corner, edge of the other face)
     thick = snap[:, None, None]
     p_in, q_in = (p_out <= thick).all(axis=2), (q_out <= thick).all(axis=2)
-
-    # Opposite each corner, the height of the other face.
-    p_opposite = q[:, :1, 2] + ((p - q[:, :1])[..., :2] @ q_slope[:, :, None])[:, :, 0]
-    q_opposite = p[:, :1, 2] + ((q - p[:, :1])[..., :2] @ p_slope[:, :, None])[:, :, 0]
-    corners = np.concatenate([p[..., :2], p[..., 2:], p_opposite[..., None]], axis=2)
-    other_corners = np.concatenate([q[..., :2], q_opposite[..., None], q[..., 2:]], axis=2)
+    # Two coordinates, and the heights of both faces there.
+    corners = np.concatenate([p, _height(p, q, q_slope)], axis=2)
+    other_corners = np.concatenate([q[..., :2], _height(q, p, p_slope), q[..., 2:]], axis=2)
 
     # A corner on a corner is one contact, in the middle of the two.
     apart = length(p[:, :, None, :2] - q[:, None, :, :2])
@@ -212,6 +208,11 @@ def _face_towards(turn: Floats, half: Floats, side: float) -> tuple[Ints, Floats
     return face, corners, -outward[:, :2] / outward[:, 2:]
 
 
+def _height(points: Floats, face: Floats, slope: Floats) -> Floats:
+    """The heights (m, 4, 1) of faces of corners (m, 4, 3) and gradients (m, 2) opposite points (m, 4, 3)."""
+    return face[:, :1, 2:] + (points - face[:, :1])[..., :2] @ slope[:, :, None]
+
+
 def _outside(points: Floats, polygon: Floats) -> Floats:
     """Distances (m, 4, 4) of points (m, 4, 2 or more) beyond the lines of the sides of convex polygons (m, 4, 2 or
     more), negative inside."""
@@ -249,12 +250,9 @@ def _corners(pairs: _Pairs) -> Touch:
     rows = np.repeat(np.arange(len(pairs.size)), 8)
     first = pairs.first._replace(center=0.0 * pairs.offset).take(rows)  # places about the first centre
     second = pairs.second._replace(center=pairs.offset).take(rows)
-    none, sign = np.zeros(len(rows)), np.tile(CORNERS, (len(pairs.size), 1))
-    sides = []
-    for one, two in ((first, second), (second, first)):
-        tips = one.center + (one.turn @ (one.half * sign)[:, :, None])[:, :, 0]
-        sides.append(sphere_box(Spheres(tips, none), two))
-    sides[1] = reversed_touch(sides[1])
+    tips = [box.take(slice(None, None, 8)).corners().reshape(-1, 3) for box in (first, second)]
+    balls = [Spheres(tip, np.zeros(len(rows))) for tip in tips]
+    sides = sphere_box(balls[0], second), reversed_touch(sphere_box(balls[1], first))
     touch = Touch(*(np.concatenate([v.reshape(-1, 8, *v.shape[1:]) for v in both], axis=1) for both in zip(*sides)))
     return touch._replace(point=pairs.first.center[:, None] + touch.point)
 

@@ -14,7 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
-from dem.contact.narrow import Capsules, Manifold, Planes, Spheres, Touch, closest_on_lines, dot, end_ball
+from dem.contact.narrow import (
+    Capsules,
+    Manifold,
+    Planes,
+    Spheres,
+    Touch,
+    balls_plane,
+    closest_on_lines,
+    dot,
+    end_ball,
+    reversed_touch,
+)
 from dem.mesh import Closest, Surface, spread
 from dem.quaternion import length
 
@@ -88,12 +99,10 @@ def capsule_mesh(capsule: Capsules, mesh: PlacedMesh, delta: Floats) -> Manifold
 
 def plane_mesh(plane: Planes, mesh: PlacedMesh, delta: Floats) -> Manifold:
     """Half spaces and the corners of the hull of one surface."""
-    hull = mesh.surface.hull
+    hull, none = mesh.surface.hull, np.zeros(len(delta))
     tip = mesh.middle + mesh.surface.vertex[hull] @ mesh.turn.T
-    gap = plane.outward @ tip.T - dot(plane.outward, plane.origin)[:, None]
-    pair, corner = np.nonzero(gap <= delta[:, None])
-    gap, normal = gap[pair, corner], plane.outward[pair]
-    return Manifold(pair, hull[corner], Touch(tip[corner] - 0.5 * gap[:, None] * normal, normal, gap))
+    pair, corner, touch = balls_plane(np.broadcast_to(tip, (len(delta), *tip.shape)), none, plane, delta)
+    return Manifold(pair, hull[corner], reversed_touch(touch))
 
 
 def _feet(ball: Spheres, delta: Floats, surface: Surface) -> _Found:

@@ -45,8 +45,12 @@ class Boxes(NamedTuple):
     turn: Floats  #: (m, 3, 3) from the frame of the box to the world
     half: Floats  #: (m, 3) half extents [m]
 
-    def take(self, rows: Ints | Bools) -> Boxes:
+    def take(self, rows: Ints | Bools | slice) -> Boxes:
         return Boxes(*(column[rows] for column in self))
+
+    def corners(self) -> Floats:
+        """Places (m, 8, 3), in the order of CORNERS [m]."""
+        return self.center[:, None] + (self.half[:, None] * CORNERS) @ self.turn.transpose(0, 2, 1)
 
 
 class Capsules(NamedTuple):
@@ -171,10 +175,23 @@ def closest_on_lines(point: Floats, axis: Floats, other: Floats, other_axis: Flo
     return (b - a * c) / square, (a * b - c) / square
 
 
-def sphere_plane(ball: Spheres, plane: Planes) -> Touch:
-    gap = dot(ball.center - plane.origin, plane.outward) - ball.radius
-    point = ball.center - (ball.radius + 0.5 * gap)[:, None] * plane.outward
-    return Touch(point, np.broadcast_to(-plane.outward, point.shape), gap)
+def balls_plane(center: Floats, radius: Floats, plane: Planes, delta: Floats) -> Manifold:
+    """Bodies with balls of centres (m, k, 3) and radii (m,), and half spaces; the features are the numbers of the
+    balls."""
+    gap = np.einsum("mki,mi->mk", center - plane.origin[:, None], plane.outward) - radius[:, None]
+    pair, feature = np.nonzero(gap <= delta[:, None])
+    gap, normal = gap[pair, feature], -plane.outward[pair]
+    ahead = radius[pair] + 0.5 * gap
+    return Manifold(pair, feature, Touch(center[pair, feature] + ahead[:, None] * normal, normal, gap))
+
+
+def sphere_plane(ball: Spheres, plane: Planes, delta: Floats) -> Manifold:
+    return balls_plane(ball.center[:, None], ball.radius, plane, delta)
+
+
+def box_plane(box: Boxes, plane: Planes, delta: Floats) -> Manifold:
+    """The corners."""
+    return balls_plane(box.corners(), np.zeros(len(box.center)), plane, delta)
 
 
 def sphere_box(ball: Spheres, box: Boxes) -> Touch:
@@ -197,13 +214,6 @@ def sphere_box(ball: Spheres, box: Boxes) -> Touch:
     return Touch(center + (radius + 0.5 * gap)[:, None] * normal, normal, gap)
 
 
-def box_plane(box: Boxes, plane: Planes, delta: Floats) -> Manifold:
-    """The corners of the boxes."""
-    none = np.zeros(len(box.center))
-    tips = [box.center + (box.turn @ (box.half * corner)[:, :, None])[:, :, 0] for corner in CORNERS]
-    return manifold(delta, [sphere_plane(Spheres(tip, none), plane) for tip in tips])
-
-
 def end_ball(capsule: Capsules, side: float) -> Spheres:
     """The balls at the end (side 1) or the start (side -1) of the cores."""
     return Spheres(capsule.center + (side * capsule.half_length)[:, None] * capsule.axis, capsule.radius)
@@ -211,7 +221,8 @@ def end_ball(capsule: Capsules, side: float) -> Spheres:
 
 def capsule_plane(capsule: Capsules, plane: Planes, delta: Floats) -> Manifold:
     """The two end balls, features 0 and 1."""
-    return manifold(delta, [sphere_plane(end_ball(capsule, side), plane) for side in (-1.0, 1.0)])
+    ends = np.stack([end_ball(capsule, side).center for side in (-1.0, 1.0)], axis=1)
+    return balls_plane(ends, capsule.radius, plane, delta)
 
 
 def capsule_capsule(first: Capsules, second: Capsules, delta: Floats) -> Manifold:

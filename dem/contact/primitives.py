@@ -180,7 +180,7 @@ _TOUCH: dict[tuple[int, int], _Touching] = {
     (SPHERE, SPHERE): _spheres,
     (SPHERE, BOX): _in_one_point(sphere_box, Primitives.sphere, Primitives.box),
     (SPHERE, CAPSULE): _in_one_point(sphere_capsule, Primitives.sphere, Primitives.capsule),
-    (SPHERE, PLANE): _in_one_point(sphere_plane, Primitives.sphere, Primitives.plane),
+    (SPHERE, PLANE): _in_points(sphere_plane, Primitives.sphere, Primitives.plane),
     (CAPSULE, CAPSULE): _in_points(capsule_capsule, Primitives.capsule, Primitives.capsule),
     (CAPSULE, BOX): _in_points(capsule_box, Primitives.capsule, Primitives.box),
     (CAPSULE, PLANE): _in_points(capsule_plane, Primitives.capsule, Primitives.plane),

@@ -43,7 +43,8 @@ def test_spheres():
 def test_sphere_above_and_below_a_tilted_plane():
     outward, origin = np.array([0.6, 0.0, 0.8]), np.array([1.0, 2.0, 3.0])
     center = origin + np.outer([1.5, -4.0], outward) + np.array([0.8, 5.0, -0.6])
-    touch = sphere_plane(Spheres(center, np.array([1.0, 1.0])), Planes(outward, origin))
+    plane = Planes(np.array([outward] * 2), np.array([origin] * 2))
+    touch = sphere_plane(Spheres(center, np.array([1.0, 1.0])), plane, np.ones(2)).touch
     np.testing.assert_allclose(touch.gap, [0.5, -5.0])
     np.testing.assert_allclose(touch.normal, -np.tile(outward, (2, 1)))
     check_consistency(touch, center, np.ones(2))
