@@ -77,11 +77,10 @@ class Driven(Dynamic, Timed):
 class Guided(Driven):
     """Moved by forces along one direction of the world only, without turning: a piston, a press.
 
-    The guide takes all other forces and all torques: the inverse mass of the other five degrees of freedom is zero. A
-    drive may push along it with a constant force, beside gravity, from one time to another: at rest the contacts then
-    bear that force, and the weight as far as it is along the guide. With a `speed` the drive is a servo: it pushes,
-    either way, with the force that would bring the body to that speed at the end of the step if nothing touched it, but
-    with `force` at most. A load L makes the body slower by dt L / mass.
+    The guide takes all other forces and all torques. A drive may push along it with a constant force, beside gravity,
+    from one time to another. With a `speed` the drive is a servo: it pushes, either way, with the force that would
+    bring the body to that speed at the end of the step if nothing touched it, but with `force` at most. A load L makes
+    the body slower by dt L / mass.
     """
 
     direction: Sequence[float]  #: (3,), normalised
@@ -140,7 +139,6 @@ class Rotation(Timed):
         check_fields(self, velocity=vector, center=vector)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
-        """As of `Fixed`."""
         turn = quaternion.exponential(self.gone(time) * np.array(self.velocity))
         center = np.array(self.center)
         turned = quaternion.normalized(quaternion.multiply(turn, orientation))
@@ -164,7 +162,6 @@ class Oscillation(Timed):
         check_fields(self, direction=unit_vector, amplitude=finite, period=positive, phase=finite)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
-        """As of `Fixed`."""
         angle = 2.0 * np.pi * self.gone(time) / self.period
         swing = np.sin(angle + self.phase) - np.sin(self.phase)
         return position + self.amplitude * swing * np.array(self.direction), orientation
@@ -183,7 +180,6 @@ class Glide(Timed):
         check_fields(self, velocity=vector)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
-        """As of `Fixed`."""
         return position + self.gone(time) * np.array(self.velocity), orientation
 
 
@@ -226,7 +222,6 @@ class Path:
             raise ValueError(f"{file}: {error}") from None
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
-        """As of `Fixed`."""
         places = np.array(self.positions)
         place = np.array([np.interp(time, self.times, axis) for axis in places.T])
         return position + place - places[0], orientation

@@ -1,10 +1,8 @@
 """Narrow phase of surfaces made of triangles.
 
 The contacts of a ball are the places of the surface where the distance from its centre is least among the places
-around them: over a face, on an edge or at a vertex, each once, however many triangles share it. A ball that rolls over
-a flat surface of many triangles has one contact, and one in a groove has two. In the words of Ericson (2005),
-"Real-Time Collision Detection", section 5.1: the centre is in the Voronoi region of the feature with respect to each
-of its faces.
+around them: over a face, on an edge or at a vertex, each once, however many triangles share it (Ericson 2005,
+"Real-Time Collision Detection", section 5.1: the centre is in the Voronoi region of the feature).
 """
 
 from __future__ import annotations

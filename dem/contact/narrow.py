@@ -3,11 +3,7 @@
 Each function takes m pairs of a first and a second shape, and returns a `Touch` if they touch in one point, else a
 `Manifold`. Boxes on boxes are in `box_box`, surfaces of triangles in `meshes`.
 
-Capsules touch at the ends of what lies side by side, and at the closest point between them. Every point within reach is
-a contact, not only the closest: capsules that turn may touch in another point at the end of the step. Ends alone do not
-hold apart capsules that cross between them, as their normals lean to the side: an end that moves sideways gets away
-from the other core while the crossing comes closer. The closest point alone does not hold back an end that turns
-towards the other.
+Capsules touch at the ends of what lies side by side, and at the closest point between them; docs/mechanics.md says why.
 """
 
 from __future__ import annotations

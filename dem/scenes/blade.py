@@ -12,7 +12,7 @@ from dem.arrays import Corners, Floats
 from dem.checks import not_negative, positive
 from dem.experiment import option
 from dem.scene import Scene
-from dem.scenes.lattice import ToAndFro, perturbed, rest_after_fall
+from dem.scenes.lattice import ToAndFro, perturbed
 from dem.shapes import Box
 from dem.step import Step
 
@@ -22,11 +22,9 @@ class Blade(ToAndFro):
     """(2n+1)^3 spheres settle in a closed box, then a blade goes from one end to the other and back.
 
     The blade spans the width of the box, as in the bin of Melanz et al. (2017), and stands upright, its lower edge at
-    about two thirds of the height of the bed and its upper edge above the surface. It starts at rest near one end;
-    the spheres start beside it, so that only those that flow under it come behind it. It stops short of both ends, so
-    that the spheres in front can flow under it and are not crushed; in small boxes some jam all the same, and the
-    force has peaks. With the box and the blade there are (2n+1)^3 + 2 bodies; lengths given in box widths keep the
-    experiment similar for all n.
+    about two thirds of the height of the bed and its upper edge above the surface. It starts near one end, beside the
+    spheres, and stops short of both ends, so that the spheres in front can flow under it and are not crushed. Lengths
+    given in box widths keep the experiment similar for all n.
     """
 
     margin: float = option(0.0, "m", "width of the box beyond (2n+1) pitch", not_negative)
@@ -75,11 +73,6 @@ class Blade(ToAndFro):
     def delta(self) -> float:
         """Contact distance [m]: not less than the way of the blade in a step, that no sphere is run over."""
         return max(0.02, self.dt * pi * self.travel / self.period)
-
-    @property
-    def settling_time(self) -> float:
-        """Time [s] after which the blade starts."""
-        return rest_after_fall(self.height, self.gravity)
 
     @property
     def domain(self) -> Corners:

@@ -22,10 +22,8 @@ from dem.step import Step
 class Drum(SmallSpheres):
     """Spheres fall into a drum of radius n sphere diameters; when they are at rest it begins to turn about its axis.
 
-    The drum is a mesh of flat sides with a horizontal axis, along y; its ends are discs, without friction unless
-    `end_friction` says otherwise, so that a short drum stands for a piece of a long one. The angle of the bed is that
-    of its centre of mass about the axis; for a plane surface it is the slope. The torque on the drum balances the
-    torque of the bed's weight.
+    The drum is a mesh of flat sides with a horizontal axis, along y; its ends are discs, without friction by default,
+    so that a short drum stands for a piece of a long one.
     """
 
     n: int = option(8, "", "size: radius of the drum in diameters of a sphere", between(3))

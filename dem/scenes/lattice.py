@@ -81,6 +81,11 @@ class ToAndFro(LargeSpheres):
 
     travel: ClassVar[Any]  #: way of the body from one end to the other [m]
 
+    @property
+    def settling_time(self) -> float:
+        """Time [s] after which the body starts: spheres fall from the top of the domain at most."""
+        return rest_after_fall(self.domain[1][2], self.gravity)
+
     def to_and_fro(self) -> Oscillation:
         """The motion: displacement travel / 2 (1 - cos(2 pi t / period))."""
         return Oscillation((1, 0, 0), self.travel / 2, self.period, phase=-pi / 2, start=self.settling_time)

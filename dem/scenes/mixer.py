@@ -22,10 +22,8 @@ from dem.shapes import Box
 class Mixer(LargeSpheres):
     """(2n+1)^3 spheres on a randomly perturbed cubic lattice fall into a fixed box onto a turning paddle.
 
-    The box is open at the top, and its width grows as 2n+1, so that the number of spheres per floor area and
-    the filling height relative to the width do not depend on n. With the box and the paddle there are
-    (2n+1)^3 + 2 bodies. The shape of the paddle relative to the box and its speed are those of the mixer
-    benchmark of Chrono.
+    The box is open at the top, and its width grows as 2n+1. The shape of the paddle relative to the box and its speed
+    are those of the mixer benchmark of Chrono.
     """
 
     margin: float = option(0.0, "m", "width of the box beyond (2n+1) pitch", not_negative)

@@ -14,7 +14,7 @@ from dem.checks import between, not_negative, positive
 from dem.experiment import option
 from dem.motion import Guided
 from dem.scene import Scene
-from dem.scenes.lattice import ToAndFro, perturbed, rest_after_fall
+from dem.scenes.lattice import ToAndFro, perturbed
 from dem.shapes import Box, Plane, Shape
 from dem.step import Step
 
@@ -24,9 +24,8 @@ class Shear(ToAndFro):
     """(3n+1)(2n+1)^2 spheres settle in a box under a press; then the lower half of the box moves along x and back.
 
     The box is 3n+1 lattice cells long, along x, and 2n+1 wide. Its halves have thick walls, so that no gap opens where
-    one is displaced against the other; the floor moves with the lower half. The upper half is clamped. The press fills
-    the cross-section, can only move vertically, and lies on the spheres by its weight; it starts on top of the lattice
-    and falls with it. With both halves and the press there are (3n+1)(2n+1)^2 + 3 bodies; all lengths grow with n.
+    one is displaced against the other; the floor moves with the lower half. The press fills the cross-section, can only
+    move vertically, and lies on the spheres by its weight.
     """
 
     n: int = option(4, "", "size: there are (3n+1)(2n+1)^2 spheres", between(1))
@@ -67,11 +66,6 @@ class Shear(ToAndFro):
     def travel(self) -> float:
         """Greatest displacement of the lower half [m]."""
         return self.stroke * self.length
-
-    @property
-    def settling_time(self) -> float:
-        """Time [s] after which the lower half starts to move."""
-        return rest_after_fall(self.width, self.gravity)
 
     @property
     def domain(self) -> Corners:

@@ -24,9 +24,7 @@ class Silo(SmallSpheres):
     """Spheres settle in a cylinder with a cone below, whose outlet is shut; then the gate drops away, and they flow out
     onto a floor.
 
-    Cylinder and cone are one mesh, of flat sides. With `half_angle` 90 the bottom is flat. The mass below the outlet is
-    recorded. Its slope, while a tenth to a half of the mass runs out, is the flow. The flow by Beverloo's law stands
-    beside it, for the bulk density of a packing fraction of 0.58.
+    Cylinder and cone are one mesh, of flat sides. The mass below the outlet is recorded; its slope is the flow.
     """
 
     filling: float = option(1.5, "silo diameters", "height of the settled bed if it were all in the cylinder", positive)
