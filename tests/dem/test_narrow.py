@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cases import random_quaternions
 
 from dem import quaternion
 from dem.contact.narrow import (
@@ -68,38 +67,6 @@ def test_sphere_on_faces_edges_corners_and_inside_a_box(center, outward, distanc
     touch = sphere_box(Spheres(center, radius), Boxes(np.zeros((1, 3)), UNIT, np.array([[1.0, 2.0, 3.0]])))
     np.testing.assert_allclose(touch.gap, distance - 0.25, atol=1e-14)
     np.testing.assert_allclose(touch.normal, -np.array([outward]), atol=1e-14)
-    check_consistency(touch, center, radius)
-
-
-def box_surface(half, resolution=80):
-    """Points on the surface of a box, including its edges and corners."""
-    side = np.linspace(-1.0, 1.0, resolution)
-    grid = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
-    faces = [np.insert(grid, axis, sign, axis=1) for axis in range(3) for sign in (-1.0, 1.0)]
-    return np.concatenate(faces) * half
-
-
-def test_sphere_and_rotated_boxes_against_sampling():
-    count = 60
-    turn = quaternion.matrix(random_quaternions(RNG, count))
-    half, box_center = RNG.uniform(0.3, 1.0, (count, 3)), RNG.normal(size=(count, 3))
-    local = RNG.uniform(-1.6, 1.6, (count, 3)) * half
-    center = box_center + np.einsum("mij,mj->mi", turn, local)
-    radius = RNG.uniform(0.1, 0.3, count)
-    touch = sphere_box(Spheres(center, radius), Boxes(box_center, turn, half))
-    inside = (np.abs(local) < half).all(axis=1)
-    assert 5 < inside.sum() < count - 5
-    for k in range(count):
-        surface = box_center[k] + box_surface(half[k]) @ turn[k].T
-        sampled = np.linalg.norm(surface - center[k], axis=1)
-        distance = touch.gap[k] + radius[k]
-        assert np.sign(distance) == (-1 if inside[k] else 1)
-        spacing = 2 * half[k].max() / 79
-        # The nearest sample is at most half a cell diagonal away from the nearest point.
-        assert abs(distance) <= sampled.min() + 1e-12
-        assert sampled.min() <= np.hypot(abs(distance), spacing * np.sqrt(0.5)) + 1e-12
-        foot = center[k] + distance * touch.normal[k]
-        assert np.linalg.norm(surface - foot, axis=1).min() <= spacing * np.sqrt(0.5)
     check_consistency(touch, center, radius)
 
 

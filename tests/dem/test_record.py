@@ -142,18 +142,6 @@ def test_contact_statistics_count_what_the_impulses_say():
     assert found["worst_overlap [m]"] == pytest.approx(1e-4)
 
 
-def test_nothing_has_no_sign():
-    """A sphere that touches the floor, without an impulse."""
-    scene = Scene(0.5)
-    scene.add_body("floor", [Plane((0, 0, 1))])
-    scene.add_spheres([0, 0, 0.1], 0.1, 1000.0)
-    before = new_world(scene, SELF)
-    step = made(before, solve=lambda system: np.zeros((len(system.key), 3)))
-    found = {**record.contact_statistics(step), **record.energy_balance(step)}
-    for name in ("worst_overlap [m]", "friction_loss [J]", "impact_loss [J]"):
-        assert str(float(found[name])) == "0.0"
-
-
 @dataclass(frozen=True)
 class Here(Experiment):
     domain = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))

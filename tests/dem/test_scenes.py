@@ -9,7 +9,6 @@ import pytest
 from mpi4py import MPI
 
 from dem.contact import find_contacts
-from dem.motion import Guided
 from dem.scenes import SCENES, Blade, Drum, Mixer, Shear, Silo
 from dem.start import new_world
 
@@ -86,14 +85,6 @@ def test_the_blade_goes_from_one_end_to_the_other_and_back():
     assert start[0] == pytest.approx(-scene.length / 2 + gap)
     assert far[0] == pytest.approx(scene.length / 2 - gap)
     np.testing.assert_array_equal(far[1:], start[1:])
-
-
-def test_the_press_is_guided_and_ten_times_denser_than_the_grains():
-    scene = Shear(n=3)
-    press = scene.build().large_bodies[2]
-    assert press.motion == Guided((0, 0, 1))
-    volume = scene.area * scene.press_thickness * scene.width
-    assert press.mass == pytest.approx(10 * scene.density * volume)
 
 
 def test_walls_of_the_halves_cover_each_other_at_the_greatest_displacement():

@@ -22,30 +22,6 @@ from dem.system import ContactSystem
 SELF = MPI.COMM_SELF
 
 
-def whole_state(world):
-    local, replicated = world.state()
-    return {k: v.copy() for k, v in local.items()}, {k: v.copy() for k, v in replicated.items()}
-
-
-def test_a_restored_world_goes_on_the_same_to_the_last_bit():
-    scene = heap(1, side=4)
-    world = new_world(scene, SELF)
-    for _ in range(5):
-        step(world)
-    local, replicated = whole_state(world)
-    restored = restored_world(scene, SELF, local, replicated)
-    assert restored.time == world.time
-    assert restored.step == 5
-    for _ in range(5):
-        step(world)
-        step(restored)
-    for name, column in world.grains.columns().items():
-        np.testing.assert_array_equal(getattr(restored.grains, name), column)
-    for name, column in world.large.columns().items():
-        np.testing.assert_array_equal(getattr(restored.large, name), column)
-    assert restored.time == world.time
-
-
 def test_a_state_of_another_scene_is_refused():
     local, replicated = new_world(heap(1, side=3), SELF).state()
     with pytest.raises(ValueError, match="the state has 27 grains and 4 large bodies, the scene 64 and 4"):

@@ -74,7 +74,7 @@ def test_a_box_on_a_box_holds_below_the_friction_angle_and_slides_above(solver, 
         np.testing.assert_allclose(end["position"][1], [-0.2, 0, 0.15], atol=1e-6)
         assert len(step.contacts) == 8
     else:
-        # From rest, see test_sliding: v = a dt (k - mu^2) but for terms that die away.
+        # From rest the plain cone lags by mu^2 steps: v = a dt (k - mu^2), but for terms that die away.
         speed = G * (np.sin(slope) - friction * np.cos(slope)) * DT * (count - friction**2)
         assert end["velocity"][1, 0] == pytest.approx(speed, rel=1e-3)
         np.testing.assert_allclose(end["velocity"][1, 3:], 0.0, atol=1e-5)

@@ -43,19 +43,6 @@ def test_a_block_that_slides_steadily_is_exactly_implicit_euler(solver, slope, f
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_from_rest_the_plain_cone_costs_a_lag_of_mu_squared_steps(solver):
-    """The lift has to be climbed first: v_k = a dt (k - mu^2 (1 - q^k)) with q = mu^2 / (1 + mu^2)."""
-    slope, dt, mu = 0.5, 0.01, 0.4
-    acceleration = G * (np.sin(slope) - mu * np.cos(slope))
-    world = block(on_incline(slope, mu))
-    q = mu**2 / (1 + mu**2)
-    for _ in steps(world, 30, dt, solver):
-        k = world.step
-        expected = acceleration * dt * (k - mu**2 * (1 - q**k))
-        assert world.grains.velocity[0, 0] == pytest.approx(expected, abs=1e-6)
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("flush", [False, True])
 def test_a_sliding_block_comes_to_rest_after_its_braking_distance(solver, flush):
     """v0^2 / (2 mu g), short by dt v0 / 2, also from a flush start, where the plain CCP makes it hop."""
