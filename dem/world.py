@@ -127,19 +127,13 @@ def set_motion(world: World, name: str, motion: Motion | None = None, **values: 
     motion = changed(body.motion, world.time, **values) if motion is None else motion
     pose = body.position, body.quaternion
     if isinstance(body.motion, Dynamic) or isinstance(motion, Dynamic):
-        if not _same_line(motion, body.motion):
+        line, now = (each.line if isinstance(each, Driven) else np.zeros(3) for each in (motion, body.motion))
+        if type(motion) is not type(body.motion) or not np.allclose(line, now, atol=1e-12):
             kind = f"{type(body.motion).__name__} with another drive" if isinstance(body.motion, Dynamic) else "a path"
             raise ValueError(f"body {name!r} cannot change its motion to {motion!r}: allowed is {kind}")
     else:
         pose = _leading_to(motion, world.time, world.large.position[row], world.large.quaternion[row])
     world.replace_large(dataclasses.replace(body, motion=motion, position=pose[0], quaternion=pose[1]))
-
-
-def _same_line(motion: Motion, other: Motion) -> bool:
-    """Whether forces move a body alike: freely, or both along or about one line, on which its frame depends."""
-    if not (isinstance(motion, Driven) and isinstance(other, Driven)):
-        return type(motion) is type(other)
-    return type(motion) is type(other) and np.allclose(motion.line, other.line, atol=1e-12)
 
 
 def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:

@@ -126,14 +126,14 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
 
     Two half spaces have none, nor have meshes with boxes or meshes: `dem.scene` refuses those.
     """
-    found = [_NO_CONTACT]
+    found = [Manifold(i[:0], j[:0], Touch(table.center[:0], table.center[:0], delta[:0]))]
     code = 8 * table.kind[i] + table.kind[j]
     for one, two in (divmod(int(kinds), 8) for kinds in np.flatnonzero(np.bincount(code))):
         rows = np.flatnonzero(code == 8 * one + two)
         if (one, two) in _TOUCH:
-            pair, feature, touch = _TOUCH[one, two](table, i[rows], j[rows], delta[rows])
+            pair, feature, touch = _touching(table, one, two, i[rows], j[rows], delta[rows])
         elif (two, one) in _TOUCH:
-            pair, feature, touch = _TOUCH[two, one](table, j[rows], i[rows], delta[rows])
+            pair, feature, touch = _touching(table, two, one, j[rows], i[rows], delta[rows])
             touch = reversed_touch(touch)
         else:
             continue
@@ -141,12 +141,19 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     return joined(found)
 
 
-_NO_CONTACT = Manifold(
-    np.zeros(0, np.int64), np.zeros(0, np.int64), Touch(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-)
-
-#: Contacts of pairs of rows of a table within gaps.
-_Touching = Callable[[Primitives, Ints, Ints, Floats], Manifold]
+def _touching(table: Primitives, one: int, two: int, i: Ints, j: Ints, delta: Floats) -> Manifold:
+    """The contacts of pairs of rows i, j (m,) of the kinds `one` and `two`; with meshes mesh by mesh."""
+    contacts, first = _TOUCH[one, two], _SHAPE[one]
+    if one == two == SPHERE:
+        return contacts(table, i, j, delta)  # without copies of the many spheres
+    if two != MESH:
+        return contacts(first(table, i), _SHAPE[two](table, j), delta)
+    found = []
+    for mesh in np.unique(j):
+        rows = np.flatnonzero(j == mesh)
+        contact = contacts(first(table, i[rows]), table.mesh(int(mesh)), delta[rows])
+        found.append(contact._replace(pair=rows[contact.pair]))
+    return joined(found)
 
 
 def _spheres(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
@@ -154,39 +161,24 @@ def _spheres(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     return Manifold(pair, np.zeros_like(pair), Touch(*touch))
 
 
-def _in_one_point(touch: Callable[[Any, Any], Touch], first: Any, second: Any) -> _Touching:
-    return lambda table, i, j, delta: manifold(delta, [touch(first(table, i), second(table, j))])
+def _in_one_point(touch: Callable[[Any, Any], Touch]) -> Callable[..., Manifold]:
+    return lambda first, second, delta: manifold(delta, [touch(first, second)])
 
 
-def _in_points(contacts: Callable[[Any, Any, Floats], Manifold], first: Any, second: Any) -> _Touching:
-    return lambda table, i, j, delta: contacts(first(table, i), second(table, j), delta)
-
-
-def _on_meshes(contacts: Callable[[Any, PlacedMesh, Floats], Manifold], shapes: Any) -> _Touching:
-    """Mesh by mesh."""
-
-    def touching(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
-        found = []
-        for mesh in np.unique(j):
-            rows = np.flatnonzero(j == mesh)
-            contact = contacts(shapes(table, i[rows]), table.mesh(int(mesh)), delta[rows])
-            found.append(contact._replace(pair=rows[contact.pair]))
-        return joined(found)
-
-    return touching
-
-
-_TOUCH: dict[tuple[int, int], _Touching] = {
+_SHAPE: dict[int, Callable[..., Any]] = {
+    SPHERE: Primitives.sphere, BOX: Primitives.box, CAPSULE: Primitives.capsule, PLANE: Primitives.plane
+}  # fmt: skip
+_TOUCH: dict[tuple[int, int], Callable[..., Manifold]] = {
     (SPHERE, SPHERE): _spheres,
-    (SPHERE, BOX): _in_one_point(sphere_box, Primitives.sphere, Primitives.box),
-    (SPHERE, CAPSULE): _in_one_point(sphere_capsule, Primitives.sphere, Primitives.capsule),
-    (SPHERE, PLANE): _in_points(sphere_plane, Primitives.sphere, Primitives.plane),
-    (CAPSULE, CAPSULE): _in_points(capsule_capsule, Primitives.capsule, Primitives.capsule),
-    (CAPSULE, BOX): _in_points(capsule_box, Primitives.capsule, Primitives.box),
-    (CAPSULE, PLANE): _in_points(capsule_plane, Primitives.capsule, Primitives.plane),
-    (BOX, BOX): _in_points(box_box, Primitives.box, Primitives.box),
-    (BOX, PLANE): _in_points(box_plane, Primitives.box, Primitives.plane),
-    (SPHERE, MESH): _on_meshes(sphere_mesh, Primitives.sphere),
-    (CAPSULE, MESH): _on_meshes(capsule_mesh, Primitives.capsule),
-    (PLANE, MESH): _on_meshes(plane_mesh, Primitives.plane),
+    (SPHERE, BOX): _in_one_point(sphere_box),
+    (SPHERE, CAPSULE): _in_one_point(sphere_capsule),
+    (SPHERE, PLANE): sphere_plane,
+    (CAPSULE, CAPSULE): capsule_capsule,
+    (CAPSULE, BOX): capsule_box,
+    (CAPSULE, PLANE): capsule_plane,
+    (BOX, BOX): box_box,
+    (BOX, PLANE): box_plane,
+    (SPHERE, MESH): sphere_mesh,
+    (CAPSULE, MESH): capsule_mesh,
+    (PLANE, MESH): plane_mesh,
 }

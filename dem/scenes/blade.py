@@ -8,6 +8,7 @@ from math import pi
 
 import numpy as np
 
+from dem import analysis
 from dem.arrays import Corners, Floats
 from dem.checks import not_negative, positive
 from dem.experiment import option
@@ -108,7 +109,8 @@ class Blade(ToAndFro):
         fast on its first way."""
         names = ["draft_force [N]"]
         names += [f"force_blade_{axis} [N]" for axis in "xyz"] + [f"torque_blade_{axis} [N m]" for axis in "xyz"]
-        out = {"blade_position [m]": records["blade_position [m]"], **self.filtered(records, names)}
+        out: dict[str, float | Floats] = {"blade_position [m]": records["blade_position [m]"]}
+        out |= analysis.filtered(records, names, self.cutoff)
         force = records["draft_force [N]"][self.steady(records["time [s]"])]
         if len(force):
             out["steady_draft_force [N]"] = float(force.mean())

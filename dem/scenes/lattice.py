@@ -3,14 +3,12 @@ fro, and lengths in scenes of small spheres."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import ceil, cos, pi, sqrt
 from typing import Any, ClassVar
 
 import numpy as np
 
-from dem import analysis
 from dem.arrays import Bools, Floats
 from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
@@ -89,10 +87,6 @@ class ToAndFro(LargeSpheres):
     def to_and_fro(self) -> Oscillation:
         """The motion: displacement travel / 2 (1 - cos(2 pi t / period))."""
         return Oscillation((1, 0, 0), self.travel / 2, self.period, phase=-pi / 2, start=self.settling_time)
-
-    def filtered(self, records: Mapping[str, Floats], names: list[str]) -> dict[str, float | Floats]:
-        """The named records through the filter, see `dem.analysis.filtered`."""
-        return dict(analysis.filtered(records, names, self.cutoff))
 
     def steady(self, time: Floats) -> Bools:
         """Mask (n,) of the times of the first way at which the speed is above 1/sqrt(2) of the greatest."""

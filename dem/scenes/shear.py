@@ -120,7 +120,8 @@ class Shear(ToAndFro):
         first stroke, and the steady one while the lower half is fast."""
         time, height = records["time [s]"], records["sample_height [m]"]
         stresses = ["shear_stress [Pa]", "normal_stress [Pa]"]
-        out = {"shear_displacement [m]": records["shear_displacement [m]"], **self.filtered(records, stresses)}
+        out: dict[str, float | Floats] = {"shear_displacement [m]": records["shear_displacement [m]"]}
+        out |= analysis.filtered(records, stresses, self.cutoff)
         shear, normal = (np.asarray(out[f"{name}_stress_filtered [Pa]"]) for name in ("shear", "normal"))
         out["volume_strain"] = height / height[0] - 1.0
         stroke = (time > self.settling_time) & (time <= self.settling_time + self.period / 2)
