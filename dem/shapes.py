@@ -140,10 +140,9 @@ def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Flo
 def moved(shape: Shape, center: Floats, turn: Floats) -> Shape:
     """The shape in a frame with origin `center` (3,) and orientation `turn` (4,) in the present one."""
     back = quaternion.conjugate(turn)
-    place = tuple(quaternion.rotate(back, np.array(shape.center) - center).tolist())
+    changes: dict[str, Any] = {"center": quaternion.rotate(back, np.array(shape.center) - center)}
     if isinstance(shape, Plane):
-        return Plane(tuple(quaternion.rotate(back, np.array(shape.normal)).tolist()), place)
-    if isinstance(shape, Sphere):
-        return replace(shape, center=place)
-    orientation = quaternion.multiply(back, np.array(shape.quaternion))
-    return replace(shape, center=place, quaternion=tuple(orientation.tolist()))
+        changes["normal"] = quaternion.rotate(back, np.array(shape.normal))
+    elif not isinstance(shape, Sphere):
+        changes["quaternion"] = quaternion.multiply(back, np.array(shape.quaternion))
+    return replace(shape, **changes)
