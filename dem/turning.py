@@ -11,9 +11,10 @@ from dem import bodies
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import SPHERE
 from dem.contact import Contacts, contact_order, find_contacts
+from dem.contact_map.loops import relative_velocities
 from dem.quaternion import length
-from dem.stepper import advanced
-from dem.system import contact_arms, contact_frames, relative_velocity
+from dem.step import advanced
+from dem.system import contact_arms, contact_frames
 from dem.world import World
 
 
@@ -58,7 +59,8 @@ def _at_start(end: Contacts, dt: float) -> tuple[Contacts, Floats]:
     velocity, row = end.near.bodies.velocity, np.stack([end.a, end.b], axis=1)
     point = end.point - 0.5 * dt * velocity[row, :3].sum(axis=1)
     arm = contact_arms(point, end.near.bodies.position - dt * velocity[:, :3], row)
-    growth = dt * relative_velocity(contact_frames(end.normal), arm, row, velocity)[:, 0]
+    frame = contact_frames(end.normal).reshape(-1, 9)
+    growth = dt * relative_velocities(frame, arm, row.astype(np.uint32), velocity)[:, 0]
     return replace(end, point=point, gap=end.gap - growth), growth
 
 

@@ -12,7 +12,6 @@ from dem import bodies, quaternion
 from dem.arrays import Floats, Ints
 from dem.bodies import BOX, SPHERE, Bodies
 from dem.checks import not_negative
-from dem.compiled import unfused
 from dem.contact.broad import close_pairs
 from dem.contact.narrow import Touch
 from dem.contact.primitives import MESH, PLANE, Primitives, extents, primitives, touches
@@ -118,47 +117,12 @@ def find_contacts(
 def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints) -> Ints:
     """The order of contacts of bodies in the rows a, b (nc,): first those whose solution needs no other rank, of bodies
     that this rank owns or whose motion is prescribed; each part by the row of the owner and by key."""
-    rows = len(near.bodies)
-    foreign = np.zeros(rows, dtype=bool)
+    foreign = np.zeros(len(near.bodies), dtype=bool)
     foreign[near.grains : near.grains + near.ghosts] = True
     if world.comm.rank < world.comm.size - 1:
         foreign[near.grains + near.ghosts :] = bodies.is_dynamic(world.large)
     owner = np.minimum(a, b)  # the local grains are the first rows, and ghosts come from higher ranks only
-    major = owner + rows * (foreign[a] | foreign[b])
-    return lexsort(key, major, 2 * rows)
-
-
-@unfused
-def lexsort(key: Ints, major: Ints, count: int) -> Ints:
-    """`numpy.lexsort((key, major))` of distinct keys (n,), with `major` (n,) in 0 ... count - 1."""
-    start = np.zeros(count + 1, np.int64)
-    for k in range(len(major)):
-        start[major[k] + 1] += 1
-    for k in range(count):
-        start[k + 1] += start[k]
-    order, free = np.empty(len(major), np.int64), start[:-1].copy()
-    for k in range(len(major)):
-        order[free[major[k]]] = k
-        free[major[k]] += 1
-    for m in range(count):
-        _shell_sort(order[start[m] : start[m + 1]], key)
-    return order
-
-
-@unfused
-def _shell_sort(rows, key):
-    """Sort a few rows by their keys, in place."""
-    gap = 1
-    while 3 * gap < len(rows):
-        gap = 3 * gap + 1
-    while gap > 0:
-        for k in range(gap, len(rows)):
-            row, place = rows[k], k
-            while place >= gap and key[rows[place - gap]] > key[row]:
-                rows[place] = rows[place - gap]
-                place -= gap
-            rows[place] = row
-        gap //= 3
+    return np.lexsort((key, owner, foreign[a] | foreign[b]))
 
 
 def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Contacts | None:

@@ -9,7 +9,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from problems import SELF, Graph, from_graph, heap, matrix, part, random_graph
 
-from pctt.blocks import BlockRows, block_matrix, diagonal_blocks, square_block_matrix
+from dem.contact_map import BlockRows
+from pctt.blocks import square_block_matrix
 from pctt.ccp import ConeProblem, Limits, solve
 from pctt.ccp.delassus import GivenMatrix, delassus
 
@@ -41,10 +42,6 @@ def graph(request) -> Graph:
 
 def blocks_of(N: np.ndarray) -> np.ndarray:
     return np.array([N[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] for c in range(len(N) // 3)]).reshape(-1, 3, 3)
-
-
-def test_block_matrix_is_the_contact_map(graph):
-    assert np.array_equal(dense(block_matrix(SELF, graph.part(SELF))), graph.dense())
 
 
 def test_delassus_is_the_gram_matrix(graph):
@@ -86,7 +83,6 @@ def test_diagonal_blocks_and_their_mean(graph):
     problem = ConeProblem(
         SELF, np.ones((graph.contacts, 3)), np.ones(graph.contacts), G=graph.part(SELF)
     )
-    assert np.allclose(diagonal_blocks(graph.part(SELF)), blocks_of(N))
     assert np.allclose(problem.diagonal_blocks, blocks_of(N))
     assert problem.mean_diagonal == pytest.approx(np.diag(N).mean() if len(N) else 1.0)
 
@@ -262,7 +258,6 @@ def test_delassus_over_the_ranks():
             rows = part(comm, nc, contact_ends)
             near = slice(3 * rows.start, 3 * rows.stop)
             local = graph.part(comm, contact_ends, body_ends)
-            assert np.array_equal(own(block_matrix(comm, local), 6), G[near])
             assert np.allclose(own(delassus(comm, local), 3), N[near], rtol=0, atol=1e-13 * scale)
             count = rows.stop - rows.start
             problem = ConeProblem(comm, np.ones((count, 3)), np.ones(count), G=local)

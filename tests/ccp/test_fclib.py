@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from mpi4py import MPI
-from petsc4py import PETSc
 from problems import SELF, Known, dense_of, from_graph, from_matrix, heap, part
 
-from pctt import blocks, ccp
-from pctt.ccp import ConeProblem, Limits, fclib
+from pctt import ccp
+from pctt.ccp import ConeProblem, Limits, delassus, fclib
 from pctt.ccp.fclib import FileFormatError, Info, Solution
 from pctt.options import OptionError
 
@@ -319,11 +318,6 @@ def test_every_rank_gets_its_part_and_the_same_error(contacts, tmp_path):
 # -- writing -----------------------------------------------------------------------------------------------
 
 
-def sparse_mat(A: np.ndarray) -> PETSc.Mat:
-    rows = sp.csr_matrix(A)
-    return PETSc.Mat().createAIJ(A.shape, csr=(rows.indptr, rows.indices, rows.data), comm=SELF)
-
-
 def random_solution(known: Known, n: int | None = None) -> Solution:
     rng = np.random.default_rng(5)
     u = (known.N @ known.g.ravel()).reshape(-1, 3) + known.r
@@ -380,7 +374,8 @@ def test_a_global_problem_is_written_and_read_again(tmp_path, bodies_alone):
     M = roots @ roots.T + np.eye(n)
     f, w = rng.normal(size=n), rng.normal(size=(15, 3))
     state = random_solution(known, n)
-    fclib.write_global(tmp_path / "g.h5", sparse_mat(M), sparse_mat(H), f, w, known.mu, Info("bodies"), state, state)
+    matrices = sp.csr_matrix(M), sp.csr_matrix(H.T)
+    fclib.write_global(tmp_path / "g.h5", SELF, *matrices, f, w, known.mu, Info("bodies"), state, state)
     stored = fclib.load(tmp_path / "g.h5", SELF)
     assert (stored.problem.contact_map is not None) == bodies_alone
     W = H.T @ np.linalg.solve(M, H)
@@ -435,7 +430,7 @@ def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path):
 @pytest.fixture
 def crowded(monkeypatch):
     """A problem with a body of 11 contacts and more, where N has a low-rank term, and its N."""
-    monkeypatch.setattr(blocks, "HUB", 10)
+    monkeypatch.setattr(delassus, "HUB", 10)
     known, graph = heap(1, 30, 12, hub=True)
     problem = ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF), compliance=1e-3)
     assert problem.has_hubs
@@ -447,7 +442,8 @@ def test_a_global_problem_with_a_crowded_body_is_the_same_when_read_again(tmp_pa
     H = graph.dense().T
     zeros, ones = np.zeros(len(H)), np.eye(len(H))
     path = tmp_path / "global.h5"
-    fclib.write_global(path, sparse_mat(ones), sparse_mat(H), zeros, problem.r, problem.mu, compliance=1e-3)
+    matrices = sp.csr_matrix(ones), sp.csr_matrix(H.T)
+    fclib.write_global(path, SELF, *matrices, zeros, problem.r, problem.mu, compliance=1e-3)
     again = fclib.read(path, SELF)
     assert again.has_hubs
     x = np.random.default_rng(0).normal(size=problem.r.shape)
@@ -481,18 +477,12 @@ def test_files_written_and_read_by_several_ranks(tmp_path, monkeypatch):
     fclib.write_local("local.h5", problem, Info(), solution, solution)
 
     H = graph.dense().T
-    rows, columns = part(comm, 8), part(comm, 12)
-    height, width = 6 * (rows.stop - rows.start), 3 * (columns.stop - columns.start)
-    M = PETSc.Mat().createAIJ(((height, None), (height, None)), nnz=1, comm=comm)
-    D = PETSc.Mat().createAIJ(((height, None), (width, None)), nnz=36, comm=comm)
-    for i in range(6 * rows.start, 6 * rows.stop):
-        M[i, i] = 1.0 + i
-        for j in np.flatnonzero(H[i]):
-            D[i, j] = H[i, j]
-    M.assemble()
-    D.assemble()
-    f = np.arange(48.0)[6 * rows.start : 6 * rows.stop]
-    fclib.write_global("global.h5", M, D, f, known.r[mine], known.mu[mine], point=known.g[mine])
+    bodies = part(comm, 8)
+    rows = slice(6 * bodies.start, 6 * bodies.stop)
+    M = sp.diags(1.0 + np.arange(48)).tocsr()[rows]
+    D = sp.csr_matrix(H.T[3 * mine.start : 3 * mine.stop])
+    f = np.arange(48.0)[rows]
+    fclib.write_global("global.h5", comm, M, D, f, known.r[mine], known.mu[mine], point=known.g[mine])
     with pytest.raises(OSError, match="nowhere"):
         fclib.write_local("nowhere/local.h5", problem)
 

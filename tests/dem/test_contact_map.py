@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cases import dense_scaled_map, heap, step
+from cases import bodies_of, dense_scaled_map, heap, step
 from mpi4py import MPI
 
 from dem.contact import find_contacts
+from dem.contact_map import root_blocks
 from dem.motion import Dynamic, Guided, Oscillation
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
-from dem.system import SYMMETRIC, ContactSystem
+from dem.system import ContactSystem
 
 
 def cross_matrix(vector):
@@ -25,16 +26,20 @@ def root_matrix(row):
     if len(row) == 6:
         return np.diag(row)
     matrix = np.zeros((6, 6))
-    matrix[:3, :3], matrix[3:, 3:] = row[:6][SYMMETRIC], row[6:][SYMMETRIC]
+    matrix[:3, :3], matrix[3:, 3:] = root_blocks(row[None])[0]
     return matrix
+
+
+def arrays_of(rows):
+    return rows.frame, rows.arm, rows.body, rows.root
 
 
 def from_compact(system, comm):
     """G (3 nc, 6 bodies) of the local contacts."""
-    rows = system.contact_map
+    rows = system.contact_map.given
     roots = [root_matrix(row) for part in comm.allgather(rows.root) for row in part]
-    assert len(roots) == system.total_bodies
-    blocks = np.zeros((len(system.key), 3, system.total_bodies, 6))
+    assert len(roots) == bodies_of(system)
+    blocks = np.zeros((len(system.key), 3, bodies_of(system), 6))
     for c in range(len(system.key)):
         frame = rows.frame[c].reshape(3, 3)
         for side, sign in ((0, -1.0), (1, 1.0)):
@@ -84,10 +89,10 @@ def test_compact_rows_are_g(case):
     make, width = CASES[case]
     world = make(comm)
     system = ContactSystem(world, find_contacts(world, 0.03), 0.01)
-    rows = system.contact_map
+    rows = system.contact_map.given
     assert comm.allreduce(len(system.key)) > 40
     assert rows.root.shape == (world.owned, width)
-    for array, shape, kind in zip(rows, [(9,), (6,), (2,), (width,)], "ffif"):
+    for array, shape, kind in zip(arrays_of(rows), [(9,), (6,), (2,), (width,)], "ffif"):
         assert array.shape[1:] == shape
         assert array.dtype == np.dtype(f"{kind}8")
         assert array.flags.c_contiguous
@@ -99,5 +104,5 @@ def test_without_contacts():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 5]], 0.1, 1000.0)
     world = new_world(scene, MPI.COMM_SELF)
-    rows = ContactSystem(world, find_contacts(world, 0.01), 0.01).contact_map
-    assert [array.shape for array in rows] == [(0, 9), (0, 6), (0, 2), (1, 6)]
+    rows = ContactSystem(world, find_contacts(world, 0.01), 0.01).contact_map.given
+    assert [array.shape for array in arrays_of(rows)] == [(0, 9), (0, 6), (0, 2), (1, 6)]

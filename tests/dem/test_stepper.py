@@ -11,7 +11,7 @@ from dem.motion import Glide, Rotation
 from dem.scene import Scene
 from dem.shapes import Box
 from dem.start import new_world
-from dem.stepper import advance
+from dem.step import advance
 from dem.system import ContactSystem
 
 SELF = MPI.COMM_SELF

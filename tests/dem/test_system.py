@@ -14,7 +14,7 @@ from dem.motion import Dynamic, Fixed
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
-from dem.stepper import advance
+from dem.step import advance
 from dem.system import ContactSystem, contact_frames
 
 SELF = MPI.COMM_SELF

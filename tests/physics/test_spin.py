@@ -11,7 +11,7 @@ from dem import quaternion
 from dem.free_motion import free_spin, free_velocity
 from dem.scene import Scene
 from dem.start import new_world
-from dem.stepper import advance
+from dem.step import advance
 
 
 def test_quaternions_stay_unit_quaternions_over_two_thousand_steps():
