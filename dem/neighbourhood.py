@@ -30,13 +30,6 @@ class Neighbourhood:
     ghosts: int  #: number of ghosts
 
 
-def without_ghosts(world: World, margin: Floats) -> Neighbourhood:
-    """The local grains, of which `margin` (grains,) [m] is, and the large bodies."""
-    count, large = len(world.grains), world.slabs[-1] + np.arange(len(world.large))
-    index = np.concatenate([world.slabs[world.comm.rank] + np.arange(count), large])
-    return Neighbourhood(bodies.concatenate([world.grains, world.large]), margin, index, count, 0)
-
-
 def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
     """All bodies whose margin may meet the margin of a local grain; `margin` (grains,) [m] of the local grains;
     collective.
@@ -52,16 +45,16 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
             f"a grain has no finite position or velocity at step {world.step} (time {world.time:g} s), or its square "
             "overflows"
         )
-    alone, count = without_ghosts(world, margin), len(grains)
-    columns = dict(grains.columns(), margin=margin, index=alone.index[:count])
+    own, large = world.slabs[comm.rank] + np.arange(len(grains)), world.slabs[-1] + np.arange(len(world.large))
+    columns = dict(grains.columns(), margin=margin, index=own)
     row, rank = _touched(grains.position, radius, boxes[: comm.rank])
     ghosts = exchange(comm, {name: column[row] for name, column in columns.items()}, rank)
     index, ghost_margin = ghosts.pop("index"), ghosts.pop("margin")
     return Neighbourhood(
         bodies=bodies.concatenate([grains, Bodies(**ghosts), world.large]),
         margin=np.concatenate([margin, ghost_margin]),
-        index=np.concatenate([alone.index[:count], index, alone.index[count:]]),
-        grains=count,
+        index=np.concatenate([own, index, large]),
+        grains=len(grains),
         ghosts=len(index),
     )
 

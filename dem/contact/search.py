@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -17,7 +16,7 @@ from dem.contact.narrow import Touch
 from dem.contact.primitives import MESH, PLANE, Primitives, extents, primitives, touches
 from dem.free_motion import free_directions, free_velocity, large_free_velocity
 from dem.motion import Hinged
-from dem.neighbourhood import Neighbourhood, neighbourhood, without_ghosts
+from dem.neighbourhood import Neighbourhood, neighbourhood
 from dem.quaternion import cross, length
 from dem.world import World
 
@@ -61,10 +60,9 @@ def find_contacts(
 
     The margin of a body is delta/2 [m], or the way that it goes in dt [s] without contact forces if that is longer. So
     a gap of at most `delta` is a contact, and so is a wider one that may close within the step, also when a third body
-    stops one of the two. A large body may strike a grain in its margin and send it on; so such a grain gets the margin
-    of the large body, if that is wider. `margin` (grains,) [m] are the least margins of the local grains, `shifts` (k,
-    large, 6) [m, rad] further ways and turns of the large bodies that their margins are to cover. A contact belongs to
-    the rank that owns the body of lower global index. The numbers of contacts that the grains own are left in
+    stops one of the two. `margin` (grains,) [m] are the least margins of the local grains, `shifts` (k, large, 6)
+    [m, rad] further ways and turns of the large bodies that their margins are to cover. A contact belongs to the rank
+    that owns the body of lower global index. The numbers of contacts that the grains own are left in
     `world.grains.weight`.
     """
     not_negative("contact distance delta", delta)
@@ -74,16 +72,9 @@ def find_contacts(
     free = free_velocity(world.grains, world.gravity, dt) if dt else world.grains.velocity
     way = _way(world.grains, free, dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
-    alone = without_ghosts(world, margin)
-    table = primitives(alone, shapes, total)
-    widest = np.maximum(margin, WIDEST * table.radius[: len(margin)])
-    beside = _grains_beside_parts(alone, table, delta, shifts, widest)
-    if dt:
-        margin = _margins_of_struck(table, margin, beside, widest)
     near = neighbourhood(world, margin)
-    if near.ghosts:
-        table = primitives(near, shapes, total)
-    found = [_grain_pairs(near, table), _grains_on_parts(near, beside)]
+    table = primitives(near, shapes, total)
+    found = [_grain_pairs(near, table), _grains_on_parts(near, table, delta, shifts)]
     if world.comm.rank == world.comm.size - 1:
         found.append(_large_pairs(world, near, table, delta, shifts))
     pairs, reach = (np.concatenate(columns) for columns in zip(*found))
@@ -166,33 +157,6 @@ def _way(grains: Bodies, velocity: Floats, dt: float) -> Floats:
     return way if finite.all() else np.where(finite.all(axis=1), way, np.nan)
 
 
-class _Beside(NamedTuple):
-    """Local grains and parts of large bodies that come close."""
-
-    grain: Ints  #: (m,) row of the grain
-    part: Ints  #: (m,) number of the part
-    margin: Floats  #: (m,) of the part there [m]
-    room: Floats  #: (m,) at least, between the grain and the margin of the part: a grain's wider margin meets that [m]
-
-    def within(self, margin: Floats) -> _Beside:
-        """Those for which the margins (grains,) of the grains suffice."""
-        return self.take(self.room <= margin[self.grain])
-
-    def take(self, rows: np.ndarray) -> _Beside:
-        return _Beside(*(column[rows] for column in self))
-
-
-def _margins_of_struck(table: Primitives, margin: Floats, beside: _Beside, widest: Floats) -> Floats:
-    """The margins (grains,) of the grains, those in reach of a large body at least as wide as its own there."""
-    close = beside.within(margin)
-    close = close.take(close.margin > margin[close.grain])
-    parts = len(margin) + close.part
-    struck = close.take(touches(table, close.grain, parts, margin[close.grain] + close.margin).pair)
-    margin = margin.copy()
-    np.maximum.at(margin, struck.grain, struck.margin)
-    return np.minimum(margin, widest)
-
-
 def _grain_pairs(near: Neighbourhood, table: Primitives) -> tuple[Ints, Floats]:
     """Rows (m, 2) of local grains, and of a local grain and a ghost, whose margins may meet, and the gaps (m,) within
     which they do."""
@@ -203,31 +167,23 @@ def _grain_pairs(near: Neighbourhood, table: Primitives) -> tuple[Ints, Floats]:
     return pairs, near.margin[pairs[:, 0]] + near.margin[pairs[:, 1]]
 
 
-def _grains_on_parts(near: Neighbourhood, beside: _Beside) -> tuple[Ints, Floats]:
+def _grains_on_parts(
+    near: Neighbourhood, table: Primitives, delta: float, shifts: Floats
+) -> tuple[Ints, Floats]:
     """Rows (m, 2) of a local grain and a part of a large body whose margins may meet, and the gaps (m,) within which
-    they do."""
-    close = beside.within(near.margin)
-    pairs = np.stack([close.grain, near.grains + near.ghosts + close.part], axis=1)
-    return pairs, near.margin[close.grain] + close.margin
-
-
-def _grains_beside_parts(
-    alone: Neighbourhood, table: Primitives, delta: float, shifts: Floats, widest: Floats
-) -> _Beside:
-    """The parts of large bodies, which move and turn by `shifts` (k, large bodies, 6), whose margins the local grains
-    might meet with margins of at most `widest` (grains,)."""
-    count = alone.grains
+    they do. The bodies move and turn by `shifts` (k, large bodies, 6)."""
+    count, first = near.grains, near.grains + near.ghosts
     center, radius = table.center[:count], table.radius[:count]
-    found = [_Beside(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))]
-    for body in np.unique(table.row[count:]):
-        margin = _part_margin(shifts[:, [body - count]], alone.bodies.position[[body]], center, radius, delta)
-        beyond = margin + (1.0 + 1e-9) * radius  # where the rounding matters, the narrow phase is to decide
-        margin = np.broadcast_to(margin, count)
-        for part in count + np.flatnonzero(table.row[count:] == body):
-            room = _distance_at_least(table, part, center) - beyond
-            rows = np.flatnonzero(room <= widest)
-            found.append(_Beside(rows, np.full(len(rows), part - count), margin[rows], room[rows]))
-    return _Beside(*(np.concatenate(columns) for columns in zip(*found)))
+    found = [(np.zeros((0, 2), np.int64), np.zeros(0))]
+    for body in np.unique(table.row[first:]):
+        margin = _part_margin(shifts[:, [body - first]], near.bodies.position[[body]], center, radius, delta)
+        reach = near.margin[:count] + margin
+        for part in first + np.flatnonzero(table.row[first:] == body):
+            # where the rounding matters, the narrow phase is to decide
+            rows = np.flatnonzero(_distance_at_least(table, part, center) - (1.0 + 1e-9) * radius <= reach)
+            found.append((np.stack([rows, np.full(len(rows), part)], axis=1), reach[rows]))
+    pairs, gaps = zip(*found)
+    return np.concatenate(pairs), np.concatenate(gaps)
 
 
 def _distance_at_least(table: Primitives, part: int, points: Floats) -> Floats:

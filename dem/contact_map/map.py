@@ -220,9 +220,13 @@ class ContactMap:
         blocks = np.zeros((self.halo.rows, 6, 6), self.precision)
         loops.add_body_blocks(*self._arrays, weight, blocks)
         self.halo.add(blocks)
-        roots = np.zeros((self.columns, 6, 6))
-        roots[:, :3, :3], roots[:, 3:, 3:] = root_blocks(self._root).transpose(1, 0, 2, 3)
-        own = roots @ blocks[: self.columns] @ roots
+        own = blocks[: self.columns]
+        if self._root.shape[1] == 6:
+            own *= self._root[:, :, None] * self._root[:, None, :]
+        else:
+            roots = np.zeros((self.columns, 6, 6))
+            roots[:, :3, :3], roots[:, 3:, 3:] = root_blocks(self._root).transpose(1, 0, 2, 3)
+            own = roots @ own @ roots
         own[:, range(6), range(6)] += 1.0
         return own
 

@@ -13,10 +13,9 @@ from mpi4py import MPI
 from dem.contact import Contacts, find_contacts, find_overrun
 from dem.impulses import ImpulseMemory
 from dem.partition import rebalance
-from dem.step import advance
+from dem.step import advance, find_turned
 from dem.system import ContactSystem
 from dem.together import SceneError
-from dem.turning import find_turned
 from dem.world import World
 from pctt import ccp, log
 from pctt.run.dump import Dump
