@@ -126,11 +126,6 @@ def test_ranks_without_contacts_or_bodies():
     check(comm, own_part(rows, comm, ends, body_ends), G, part(comm, 10, ends))
 
 
-def test_no_contacts_at_all():
-    rows, G = random_contacts(5, 0, 4, False)
-    check(MPI.COMM_SELF, rows, G, slice(0, 0))
-
-
 def test_a_number_that_is_none_comes_out():
     """The compiler must not take for granted that there are none."""
     rows, _ = random_contacts(6, 20, 5, False)
@@ -181,7 +176,6 @@ OTHER_FORMS = {
     "single precision": lambda a: a.astype(np.float32 if a.dtype.kind == "f" else np.int32),
     "lists": np.ndarray.tolist,
     "big-endian": lambda a: a.astype(a.dtype.newbyteorder(">")),
-    "every other row": lambda a: np.repeat(a, 2, axis=0)[::2],
 }
 
 

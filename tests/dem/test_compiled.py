@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import random_quaternions
 
-from dem import impulses, quaternion
+from dem import quaternion
 from dem import system as contact_system
 from dem.contact import broad
 from dem.contact.narrow import Spheres, sphere_sphere, spheres_within
@@ -76,30 +76,6 @@ def test_velocities_and_impulses_of_contacts():
     points = rng.normal(size=(50, 3))
     expected = (points[:, None] - v[row][:, :, :3]).reshape(-1, 6)
     np.testing.assert_array_equal(contact_system.contact_arms(points, np.ascontiguousarray(v[:, :3]), row), expected)
-
-
-def test_no_contacts():
-    none, rows = np.zeros((0, 3)), np.zeros((0, 2), np.int64)
-    frame, position = np.zeros((0, 3, 3)), np.zeros((4, 3))
-    calls = {
-        (0, 3, 3): (contact_system.contact_frames, none),
-        (0, 6): (contact_system.contact_arms, none, position, rows),
-        (0, 4): (impulses.in_the_world, none, frame),
-    }
-    for shape, (work, *arguments) in calls.items():
-        result = work(*arguments)
-        assert result.shape == shape
-        assert result.dtype == np.float64
-        assert not result.any()
-
-
-def test_impulses_in_the_world_and_back():
-    rng, frame, _, _ = random_rows()
-    impulse = rng.normal(size=(50, 3))
-    stored = impulses.in_the_world(impulse, frame)
-    in_world = np.einsum("cij,ci->cj", frame[:, 1:], impulse[:, 1:])
-    np.testing.assert_allclose(stored, np.hstack([impulse[:, :1], in_world]), atol=1e-15)
-    np.testing.assert_allclose(impulses.in_frames(stored, frame), impulse, atol=1e-14)
 
 
 def test_orientations():
