@@ -10,7 +10,7 @@ import operator
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from mpi4py import MPI
@@ -52,6 +52,15 @@ class CompactRows:
     def rows(self) -> int:
         return len(self.frame)
 
+    def checked(self) -> CompactRows:
+        """The same arrays in the types that compiled loops trust; ValueError if they do not fit together."""
+        nc, columns = len(self.frame), operator.index(self.columns)
+        frame, arm = _array("frame", self.frame, float, (nc, 9)), _array("arm", self.arm, float, (nc, 6))
+        body = _array("body", self.body, np.int64, (nc, 2))
+        if body.min(initial=0) < -1:
+            raise ValueError(f"body of the rows has {body.min()}; allowed are indices of bodies, and -1 for no body")
+        return CompactRows(frame, arm, body, _array("root", self.root, float, (columns, 6), (columns, 12)), columns)
+
 
 @dataclass(frozen=True)
 class BlockRows:
@@ -73,6 +82,18 @@ class BlockRows:
     @property
     def rows(self) -> int:
         return len(self.indptr) - 1
+
+    def checked(self) -> BlockRows:
+        """The same arrays in the types of the attributes; ValueError if they do not fit together."""
+        count = len(self.indices)
+        indptr = _array("indptr", self.indptr, np.int64, (max(len(self.indptr), 1),))
+        indices = _array("indices", self.indices, np.int64, (count,))
+        if indptr[0] != 0 or indptr[-1] != count or (np.diff(indptr) < 0).any():
+            raise ValueError(f"indptr of the rows does not ascend from 0 to the number of blocks, {count}")
+        if indices.min(initial=0) < 0:
+            raise ValueError(f"indices of the rows have {indices.min()}; allowed are indices of bodies")
+        blocks = _array("blocks", self.blocks, float, (count, 3, 6))
+        return BlockRows(indptr, indices, blocks, operator.index(self.columns))
 
 
 class ContactMap:
@@ -273,36 +294,22 @@ def shaped(name: str, x: Floats, rows: int, width: int) -> Floats:
     return x.reshape(rows, width)
 
 
-def checked(comm: MPI.Comm, rows: CompactRows) -> CompactRows:
-    """The same rows with C-contiguous arrays of float64 and int64, as the compiled loops trust. Collective.
+AnyRows = TypeVar("AnyRows", CompactRows, BlockRows)
+
+
+def checked(comm: MPI.Comm, rows: AnyRows) -> AnyRows:
+    """The same rows as C-contiguous arrays of float64 and int64, as the compiled loops trust. Collective.
 
     ValueError on all ranks if shapes do not fit or bodies do not exist.
     """
-    wrong, figures = "", np.array([0, -1, -1])
+    wrong, figures = "", np.zeros(3, np.int64)
     try:
-        nc, columns = len(rows.frame), operator.index(rows.columns)
-        rows = CompactRows(
-            as_array("frame", rows.frame, float, (nc, 9)),
-            as_array("arm", rows.arm, float, (nc, 6)),
-            as_array("body", rows.body, np.int64, (nc, 2)),
-            as_array("root", rows.root, float, (columns, 6), (columns, 12)),
-            columns,
-        )
-        figures = np.array([columns, rows.body.max(initial=-1), rows.root.shape[1]])
-        if rows.body.min(initial=0) < -1:
-            wrong = f"body of the rows has {rows.body.min()}; allowed are indices of bodies, and -1 for no body"
+        rows = rows.checked()
+        body, root = (rows.body, rows.root) if isinstance(rows, CompactRows) else (rows.indices, np.zeros((0, 0)))
+        figures[:] = rows.columns, body.max(initial=-1), root.shape[1]
     except (TypeError, ValueError) as error:
         wrong = str(error)
     refuse(comm, wrong)
-    refuse_absent_bodies(comm, figures)
-    return rows
-
-
-def refuse_absent_bodies(comm: MPI.Comm, figures: Ints) -> None:
-    """ValueError on all ranks if contacts have bodies that do not exist, or roots another width on some ranks.
-
-    figures : (3,) number of own bodies, the last index of a body, the width of the roots. Collective.
-    """
     everywhere = np.empty((comm.size, 3), np.int64)
     comm.Allgather(figures, everywhere)
     bodies, last, width = everywhere[:, 0].sum(), everywhere[:, 1].max(), everywhere[:, 2]
@@ -310,9 +317,10 @@ def refuse_absent_bodies(comm: MPI.Comm, figures: Ints) -> None:
         raise ValueError(f"a contact has the body {last}, but there are {bodies} bodies")
     if np.ptp(width):
         raise ValueError("root of the rows has another width on some ranks")
+    return rows
 
 
-def as_array(name: str, given: np.ndarray, kind: type, *shapes: tuple[int, ...]) -> np.ndarray:
+def _array(name: str, given: np.ndarray, kind: type, *shapes: tuple[int, ...]) -> np.ndarray:
     """A C-contiguous array of this type and of one of the shapes; ValueError for other data."""
     array = np.asarray(given)
     if array.shape not in shapes:

@@ -15,8 +15,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, ContactMap, Halo, find_halo
-from dem.contact_map.map import as_array, refuse_absent_bodies, shaped
-from dem.exchange import exchange, offsets, refuse
+from dem.contact_map.map import checked, shaped
+from dem.exchange import exchange, offsets
 from pctt.blocks import square_block_matrix
 from pctt.ccp.cone import Array, times
 
@@ -98,7 +98,7 @@ class BlockMap(ContactMap):
         self, comm: MPI.Comm, rows: BlockRows, halo: tuple[Halo, np.ndarray] | None = None,
         precision: type[np.floating] = np.float64,
     ):  # fmt: skip
-        rows = _checked(comm, rows) if halo is None else rows
+        rows = checked(comm, rows) if halo is None else rows
         self.comm, self.given, self.block_rows, self.precision = comm, rows, rows, precision  # type: ignore[assignment]
         self.rows, self.columns = rows.rows, rows.columns
         self._found = halo or find_halo(comm, rows.columns, rows.indices)
@@ -158,26 +158,6 @@ class BlockMap(ContactMap):
     def _contact(self) -> np.ndarray:
         """The contacts of the blocks."""
         return np.repeat(np.arange(self.rows), np.diff(self.block_rows.indptr))
-
-
-def _checked(comm: MPI.Comm, rows: BlockRows) -> BlockRows:
-    """The same rows as arrays of float64 and int64; ValueError on all ranks if they do not fit together."""
-    wrong, figures = "", np.array([0, -1, 6])
-    try:
-        count = len(rows.indices)
-        indptr = as_array("indptr", rows.indptr, np.int64, (max(len(rows.indptr), 1),))
-        indices = as_array("indices", rows.indices, np.int64, (count,))
-        rows = BlockRows(indptr, indices, as_array("blocks", rows.blocks, float, (count, 3, 6)), int(rows.columns))
-        figures = np.array([rows.columns, indices.max(initial=-1), 6])
-        if indptr[0] != 0 or indptr[-1] != count or (np.diff(indptr) < 0).any():
-            wrong = f"indptr of the rows does not ascend from 0 to the number of blocks, {count}"
-        elif indices.min(initial=0) < 0:
-            wrong = f"indices of the rows have {indices.min()}; allowed are indices of bodies"
-    except (TypeError, ValueError) as error:
-        wrong = str(error)
-    refuse(comm, wrong)
-    refuse_absent_bodies(comm, figures)
-    return rows
 
 
 def without_hubs(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, bool]:

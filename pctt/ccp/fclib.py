@@ -102,7 +102,12 @@ def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> S
     error = None
     if comm.rank == 0:
         try:
-            matrix, vectors, words = _checked(*_contents(Path(path)))
+            matrix, vectors, words = _contents(Path(path))
+            count = len(vectors["mu"])
+            for name, x in {"matrix": matrix.shape[0], **vectors}.items():
+                size = x if name == "matrix" else 3 * count if x is None or name == "mu" else np.size(x)
+                if size != 3 * count:
+                    raise FileFormatError(f"{count} friction coefficients, but its {name} has {size} rows or numbers")
             parts = [_part(matrix, vectors, rank, comm.size) | words for rank in range(comm.size)]
         except Exception as reason:  # of any kind, as bad data surprise h5py, numpy and scipy; other ranks wait
             error = f"{path}: no FCLIB problem: {reason}"
@@ -110,19 +115,22 @@ def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> S
     if error:
         raise FileFormatError(error)
     part = comm.scatter(parts)
-    rows, e = part.pop("matrix"), part.pop("compliance") if compliance is None else compliance
-    given = {"point": part["point"], "compliance": e}
-    if rows.blocksize == (3, 6):
-        G = BlockRows(rows.indptr, rows.indices, rows.data, part["columns"])
-        problem = ConeProblem(comm, part["r"], part["mu"], G=G, **given)
-    else:
-        N = square_block_matrix(comm, rows)
-        problem = ConeProblem(comm, part["r"], part["mu"], N=N, **given)
-        N.destroy()  # the problem has a copy
+    rows, e, N = part["matrix"], part["compliance"] if compliance is None else compliance, None
+    try:
+        if rows.blocksize == (3, 6):
+            operator: dict[str, Any] = {"G": BlockRows(rows.indptr, rows.indices, rows.data, part["columns"])}
+        else:
+            operator = {"N": (N := square_block_matrix(comm, rows))}
+        problem = ConeProblem(comm, part["r"], part["mu"], **operator, point=part["point"], compliance=e)
+    except ValueError as reason:  # on all ranks alike
+        raise FileFormatError(f"{path}: no FCLIB problem: {reason}") from None
+    finally:
+        if N is not None:
+            N.destroy()  # the problem has a copy
     return Stored(problem, *(part[name] for name in ("form", "title", "solution", "guess", "note")))
 
 
-def _contents(path: Path) -> tuple[sp.bsr_matrix, dict[str, Array | None], dict[str, Any]]:
+def _contents(path: Path) -> tuple[sp.bsr_matrix, dict[str, Any], dict[str, Any]]:
     """G (3 nc, 6 bodies) in 3 x 6 blocks or N (3 nc, 3 nc) in 3 x 3 blocks, the vectors, and what the file says."""
     if path.is_file() and not h5py.is_hdf5(path):
         raise FileFormatError(
@@ -154,23 +162,6 @@ def _contents(path: Path) -> tuple[sp.bsr_matrix, dict[str, Array | None], dict[
         compliance = float(file["pctt/compliance"][()]) if "pctt/compliance" in file else 0.0
         title = _text(group["info/title"][()]) if "info/title" in group else ""
         return matrix, vectors, {"form": f"FCLIB {form}", "title": title, "note": note, "compliance": compliance}
-
-
-def _checked(matrix: sp.bsr_matrix, vectors: dict[str, Any], words: dict[str, Any]) -> tuple[Any, ...]:
-    """The same; FileFormatError unless all sizes fit together and all numbers are finite."""
-    count, r, mu, compliance = len(vectors["mu"]), vectors["r"], vectors["mu"], words["compliance"]
-    if matrix.shape[0] != 3 * count or len(r) != 3 * count:
-        raise FileFormatError(f"{count} friction coefficients, but a matrix {matrix.shape} and a vector {r.shape}")
-    finite = np.isfinite(matrix.data).all() and np.isfinite(r).all()
-    if not (finite and (np.isfinite(mu) & (mu >= 0)).all()):
-        raise FileFormatError("it has a NaN, an infinite value or a negative friction coefficient")
-    if not (np.isfinite(compliance) and compliance >= 0):
-        raise FileFormatError(f"its compliance {compliance} is not a number >= 0")
-    for name in ("solution", "guess", "point"):
-        array = vectors[name]
-        if array is not None and not (np.size(array) == 3 * count and np.isfinite(array).all()):
-            raise FileFormatError(f"its {name} is not {3 * count} finite numbers")
-    return matrix, vectors, words
 
 
 def _part(A: sp.bsr_matrix, vectors: Mapping[str, Any], rank: int, ranks: int) -> dict[str, Any]:

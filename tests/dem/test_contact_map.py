@@ -74,6 +74,39 @@ def test_products_are_those_of_the_definition(case):
     assert len(again.halo.ghosts) == len(G.halo.ghosts)  # none that no contact touches
 
 
+class Counting:
+    """A communicator that counts the messages which this rank sends."""
+
+    def __init__(self, comm):
+        self._comm, self.sent = comm, 0
+
+    def __getattr__(self, name):
+        return getattr(self._comm, name)
+
+    def Isend(self, *arguments):  # noqa: N802 - as MPI names it
+        self.sent += 1
+        return self._comm.Isend(*arguments)
+
+
+@pytest.mark.parallel(2, 4)
+def test_a_product_sends_one_message_to_each_rank_that_shares_a_ghost():
+    """As docs/cluster.md counts them: momenta to the owners of ghosts, velocities to the ranks that have ghosts."""
+    comm = Counting(MPI.COMM_WORLD)
+    world = new_world(heap(3, side=4, large=False), MPI.COMM_WORLD)
+    system = ContactSystem(world, find_contacts(world, 0.05), 0.01)
+    given = system.contact_map.given
+    starts = offsets(MPI.COMM_WORLD, given.columns)
+    owners = set(np.searchsorted(starts, given.body[given.body >= 0], side="right") - 1) - {comm.rank}
+    holders = [rank for rank, theirs in enumerate(comm.allgather(owners)) if comm.rank in theirs]
+    assert comm.allreduce(len(owners)) > 0
+    G = type(system.contact_map)(comm, given, system.contact_map.halo, system.contact_map.body)
+    G.halo.comm = comm
+    G.velocities(np.zeros((G.columns, 6)))
+    assert comm.sent == len(holders)
+    G.momenta(np.zeros_like(system.r))
+    assert comm.sent == len(holders) + len(owners)
+
+
 def test_without_contacts():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 5]], 0.1, 1000.0)
