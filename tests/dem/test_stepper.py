@@ -37,16 +37,6 @@ def test_free_fall_is_the_semi_implicit_sum():
     )
 
 
-def test_a_free_sphere_keeps_its_spin():
-    scene = Scene(friction=0.3)
-    scene.add_spheres([[0, 0, 0]], 0.1, 1000.0, angular_velocity=(1.0, 2.0, -3.0))
-    world = new_world(scene, SELF)
-    fly(world, 0.01, 200)
-    np.testing.assert_array_equal(world.grains.velocity[0, 3:], [1, 2, -3])
-    expected = quaternion.exponential(2.0 * np.array([[1.0, 2, -3]]))
-    np.testing.assert_allclose(np.abs(world.grains.quaternion @ expected.T), 1.0, atol=1e-12)
-
-
 def test_a_free_box_tumbles_with_a_drift_of_angular_momentum_of_first_order():
     scene = Scene(friction=0.3, gravity=(0, 0, 0))
     scene.add_boxes([[0, 0, 0]], (0.1, 0.2, 0.3), 1000.0, angular_velocity=(0.5, 3.0, 0.2))
