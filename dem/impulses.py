@@ -6,31 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Bools, Floats, Ints
-from dem.compiled import loop
 from dem.exchange import exchange
-
-
-@loop
-def in_the_world(impulse: Floats, frame: Floats) -> Floats:
-    """Normal impulses and tangential vectors in the world (nc, 4), of impulses (nc, 3) in frames (nc, 3, 3)."""
-    out = np.empty((len(frame), 4))
-    for c in range(len(frame)):
-        out[c, 0] = impulse[c, 0]
-        for k in range(3):
-            out[c, 1 + k] = impulse[c, 1] * frame[c, 1, k] + impulse[c, 2] * frame[c, 2, k]
-    return out
-
-
-@loop
-def in_frames(stored: Floats, frame: Floats) -> Floats:
-    """Impulses (nc, 3) in frames (nc, 3, 3), from rows (nc, 4) as `in_the_world` returns them; of the tangential
-    vectors only the part that is tangential in these frames."""
-    out = np.empty((len(frame), 3))
-    for c in range(len(frame)):
-        out[c, 0] = stored[c, 0]
-        for i in range(1, 3):
-            out[c, i] = stored[c, 1] * frame[c, i, 0] + stored[c, 2] * frame[c, i, 1] + stored[c, 3] * frame[c, i, 2]
-    return out
 
 
 class ImpulseMemory:
@@ -48,7 +24,8 @@ class ImpulseMemory:
 
     def remember(self, key: Ints, impulse: Floats, frame: Floats) -> None:
         """Replace the memory by impulses (nc, 3) of contacts with keys (nc,) and frames (nc, 3, 3)."""
-        self.restore(key, in_the_world(impulse, frame))
+        tangential = np.einsum("ci,cij->cj", impulse[:, 1:], frame[:, 1:])
+        self.restore(key, np.concatenate([impulse[:, :1], tangential], axis=1))
 
     def recall(self, key: Ints, frame: Floats) -> tuple[Floats, Bools]:
         """Impulses (nc, 3) in the given frames (nc, 3, 3), zero where unknown, and the mask (nc,) of those
@@ -63,7 +40,9 @@ class ImpulseMemory:
             left[place[found]] = False
             row, impulse = self._elsewhere(key[missing], self._key[left], self._impulse[left])
             stored[missing[row]], found[missing[row]] = impulse, True
-        return in_frames(stored, frame), found
+        # of the tangential vectors only the part that is tangential in these frames
+        tangential = np.einsum("cij,cj->ci", frame[:, 1:], stored[:, 1:])
+        return np.concatenate([stored[:, :1], tangential], axis=1), found
 
     def _elsewhere(self, asked: Ints, key: Ints, impulse: Floats) -> tuple[Ints, Floats]:
         """Which of the keys `asked` (m,) other ranks offer in their `key` (n,), and their impulses; collective."""

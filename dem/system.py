@@ -21,7 +21,6 @@ from mpi4py import MPI
 from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.checks import positive
-from dem.compiled import loop
 from dem.contact import Contacts
 from dem.contact_map import CompactRows, ContactMap, Halo
 from dem.contact_map.loops import scale
@@ -107,32 +106,21 @@ def inverse_root_masses(world: World) -> Floats:
     return packed(np.stack([translation, bodies.inverse_root_inertia(owned)], axis=1))
 
 
-@loop
 def contact_frames(normal: Floats) -> Floats:
     """Orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
 
     Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
     but where the sign of its z component changes.
     """
-    frame = np.empty((len(normal), 3, 3))
-    for c in range(len(normal)):
-        x, y, z = normal[c, 0], normal[c, 1], normal[c, 2]
-        sign = np.copysign(1.0, z)
-        p = -1.0 / (sign + z)
-        q = x * y * p
-        frame[c, 0, 0], frame[c, 0, 1], frame[c, 0, 2] = x, y, z
-        frame[c, 1, 0], frame[c, 1, 1], frame[c, 1, 2] = 1.0 + sign * x * x * p, sign * q, -sign * x
-        frame[c, 2, 0], frame[c, 2, 1], frame[c, 2, 2] = q, sign + y * y * p, -y
-    return frame
+    x, y, z = normal.T
+    sign = np.copysign(1.0, z)
+    p = -1.0 / (sign + z)
+    q = x * y * p
+    rows = [x, y, z, 1.0 + sign * x * x * p, sign * q, -sign * x, q, sign + y * y * p, -y]
+    return np.stack(rows, axis=1).reshape(-1, 3, 3)
 
 
-@loop
 def contact_arms(point: Floats, position: Floats, row: Ints) -> Floats:
     """Vectors (nc, 6) from the centres of the two bodies of each contact to its point (nc, 3); `row` (nc, 2) are the
     bodies' rows in a table of positions (rows, 3)."""
-    arm = np.empty((len(point), 6))
-    for c in range(len(point)):
-        a, b = row[c, 0], row[c, 1]
-        for k in range(3):
-            arm[c, k], arm[c, 3 + k] = point[c, k] - position[a, k], point[c, k] - position[b, k]
-    return arm
+    return (point[:, None] - position[row]).reshape(-1, 6)
