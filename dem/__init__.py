@@ -11,8 +11,8 @@ The loop of a simulation, on any number of ranks::
         rebalance(world)
 
 Import from the modules: `dem.scene`, `dem.shapes`, `dem.motion` describe what there is; `dem.start`, `dem.world`,
-`dem.bodies`, `dem.partition` and `dem.neighbourhood` hold it on the ranks; `dem.contact`, `dem.system`,
-`dem.step` and `dem.impulses` are the time step; `dem.experiment` is what the program needs of a
+`dem.bodies`, `dem.partition` and `dem.neighbourhood` hold it on the ranks; `dem.contact`, `dem.system` with
+`dem.contact_map`, `dem.step` and `dem.impulses` are the time step; `dem.experiment` is what the program needs of a
 scene, and `dem.scenes` has ready-made ones; `dem.record` and `dem.analysis` say what steps and runs show.
 All quantities are in SI units.
 """

@@ -189,3 +189,26 @@ def local_product(weight, g, y):
     """y = H g (nc, 3) for the ``weight`` of `weighted`."""
     for c in range(len(weight)):
         y[c, 0], y[c, 1], y[c, 2] = weighted(weight, c, g[c, 0], g[c, 1], g[c, 2])
+
+
+@loop
+def block_velocities(blocks, start, body, w, y):
+    """y += G w (nc, 3) for blocks (nb, 3, 6): contact c has those from start[c] to start[c + 1], of bodies (nb,)."""
+    for c in range(len(y)):
+        for k in range(start[c], start[c + 1]):
+            i = body[k]
+            for n in range(6):
+                y[c, 0] += blocks[k, 0, n] * w[i, n]
+                y[c, 1] += blocks[k, 1, n] * w[i, n]
+                y[c, 2] += blocks[k, 2, n] * w[i, n]
+
+
+@loop
+def block_momenta(blocks, start, body, g, m):
+    """m += G' g for the blocks of `block_velocities` and impulses g (nc, 3)."""
+    for c in range(len(g)):
+        g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
+        for k in range(start[c], start[c + 1]):
+            i = body[k]
+            for n in range(6):
+                m[i, n] += blocks[k, 0, n] * g0 + blocks[k, 1, n] * g1 + blocks[k, 2, n] * g2

@@ -14,11 +14,10 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem.contact_map import BlockRows, ContactMap, Halo, find_halo
+from dem.contact_map import BlockRows, ContactMap, Halo, find_halo, loops
 from dem.contact_map.map import checked, shaped
 from dem.exchange import exchange, offsets
-from pctt.blocks import square_block_matrix
-from pctt.ccp.cone import Array, times
+from pctt.blocks import Array, square_block_matrix
 
 HUB = 500  # a body with more contacts is a hub: its columns of G would fill N
 
@@ -88,7 +87,7 @@ class GivenMatrix:
 
 
 class BlockMap(ContactMap):
-    """The map G given by 3 x 6 blocks, as problems in files are; scipy multiplies.
+    """The map G given by 3 x 6 blocks, as problems in files are.
 
     rows : ValueError on all ranks for wrong ones
     halo : that of another map between the same bodies, whose rows need no check
@@ -103,24 +102,23 @@ class BlockMap(ContactMap):
         self.rows, self.columns = rows.rows, rows.columns
         self._found = halo or find_halo(comm, rows.columns, rows.indices)
         self.halo, body = self._found
-        blocks = rows.blocks.astype(precision, copy=False)
-        self._G = sp.bsr_matrix((blocks, body.astype(np.int64), rows.indptr), shape=(3 * self.rows, 6 * self.halo.rows))
-        self._transposed = self._G.T.tobsr((6, 3)) if self._G.nnz else self._G.T
+        self._blocks = (np.ascontiguousarray(rows.blocks, precision), rows.indptr, body)
 
     def velocities(self, v: Array) -> Array:
         """G v (nc, 3)."""
         w = np.zeros((self.halo.rows, 6), self.precision)
         w[: self.columns] = shaped("velocities of bodies", v, self.columns, 6)
         self.halo.update(w)
-        y: Array = (self._G @ w.ravel()).reshape(-1, 3)
+        y = np.zeros((self.rows, 3), self.precision)
+        loops.block_velocities(*self._blocks, w, y)
         return y
 
     def momenta(self, g: Array) -> Array:
         """G' g (columns, 6)."""
-        m = (self._transposed @ shaped("impulses", g, self.rows, 3).ravel()).reshape(-1, 6)
+        m = np.zeros((self.halo.rows, 6), self.precision)
+        loops.block_momenta(*self._blocks, np.ascontiguousarray(shaped("impulses", g, self.rows, 3), self.precision), m)
         self.halo.add(m)
-        out: Array = m[: self.columns].copy()
-        return out
+        return m[: self.columns]
 
     def add_delassus(self, g: Array, y: Array) -> None:
         """y += G G' g; y (nc, 3)."""
@@ -132,7 +130,8 @@ class BlockMap(ContactMap):
 
     def through(self, weight: Array, v: Array, out: Array) -> None:
         """out = v + G' H G v (columns, 6)."""
-        np.add(v.reshape(-1, 6), self.momenta(times(weight, self.velocities(v))), out=out.reshape(-1, 6))
+        impulses = np.einsum("cij,cj->ci", weight, self.velocities(v))
+        np.add(v.reshape(-1, 6), self.momenta(impulses), out=out.reshape(-1, 6))
 
     def contact_blocks(self) -> Array:
         """The diagonal blocks of G G' (nc, 3, 3)."""

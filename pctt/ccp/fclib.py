@@ -35,8 +35,6 @@ from pctt.disk import make_hdf5, whole
 
 __all__ = ["FileFormatError", "Info", "Solution", "Stored", "load", "read", "write_global", "write_local"]
 
-MIRRORED = "{} is stored as one triangle, which was mirrored"
-
 #: M_ij and M_ji of a symmetric M differ by no more than this part of sqrt(M_ii M_jj), which bounds both.
 ROUNDING = 1e-8
 
@@ -247,41 +245,38 @@ def without_velocities(M: sp.csr_matrix, H: sp.csr_matrix, f: Array, w: Array) -
 
 
 def symmetric_masses(M: sp.csr_matrix, rounding: float = ROUNDING) -> tuple[sp.csr_matrix, str]:
-    """M made exactly symmetric, and MIRRORED if it was one triangle; FileFormatError if it is neither that nor
-    symmetric up to rounding."""
-    mirrored = _mirrored(M)
-    if mirrored is not None:
-        return mirrored, MIRRORED.format("M")
+    """M made exactly symmetric, and what was done to it; FileFormatError if it is neither one triangle nor symmetric
+    up to rounding."""
+    made, note = _symmetric(M, "M")
     bound = np.sqrt(M.diagonal())
     entries = abs(M - M.T).tocoo()
     off = entries.data > rounding * bound[entries.row] * bound[entries.col]
-    if off.any():
+    if off.any() and not note:
         i, j = entries.row[off][0], entries.col[off][0]
         raise FileFormatError(
             f"its mass matrix is not symmetric: M[{i}, {j}] = {M[i, j]:.9g}, M[{j}, {i}] = {M[j, i]:.9g}; allowed is "
             "one triangle, or both equal up to rounding"
         )
-    return (0.5 * (M + M.T)).tocsr(), ""
+    return made, note
 
 
 def symmetric_blocks(W: sp.spmatrix) -> tuple[sp.bsr_matrix, str]:
-    """(W + W') / 2 in 3 x 3 blocks: matrices in files are symmetric up to the rounding of their writers. One triangle
-    is mirrored; the words say so."""
+    """(W + W') / 2 in 3 x 3 blocks, and what was done to W: matrices in files are symmetric up to the rounding of their
+    writers."""
     if W.shape[0] != W.shape[1] or W.shape[0] % 3:
         raise FileFormatError(f"its matrix {W.shape} is not square with three rows per contact")
-    mirrored = _mirrored(W)
-    symmetric = (0.5 * (W + W.T)).tocsr() if mirrored is None else mirrored
-    symmetric.sort_indices()
-    return symmetric.tobsr((3, 3)), "" if mirrored is None else MIRRORED.format("W")
+    made, note = _symmetric(W, "W")
+    made.sort_indices()
+    return made.tobsr((3, 3)), note
 
 
-def _mirrored(A: sp.spmatrix) -> sp.csr_matrix | None:
-    """A square matrix that is stored as one triangle, with the mirror of that triangle. None if there are entries on
-    both sides of the diagonal, or on neither. Half the sum of a triangle and its mirror would be another matrix."""
+def _symmetric(A: sp.spmatrix, name: str) -> tuple[sp.csr_matrix, str]:
+    """(A + A') / 2. Where only one triangle is stored, half the sum would be another matrix: it is mirrored, and the
+    words say so."""
     above, below = sp.triu(A, 1), sp.tril(A, -1)
     if (above.count_nonzero() == 0) == (below.count_nonzero() == 0):
-        return None
-    return (A + (above + below).T).tocsr()
+        return (0.5 * (A + A.T)).tocsr(), ""
+    return (A + (above + below).T).tocsr(), f"{name} is stored as one triangle, which was mirrored"
 
 
 # -- writing ------------------------------------------------------------------------------------------------
