@@ -15,9 +15,6 @@ from dem.exchange import exchange
 from dem.morton import BITS, Frame, morton_codes
 from dem.world import World
 
-#: Bits of a splitter that one reduction settles: 63 / 9 = 7 reductions of 511 numbers per splitter.
-DIGIT = 9
-
 
 def splitters(comm: MPI.Comm, codes: Ints, weights: Floats) -> Ints:
     """Codes (size - 1,) at which the curve is cut into pieces of equal weight; collective.
@@ -31,8 +28,9 @@ def splitters(comm: MPI.Comm, codes: Ints, weights: Floats) -> Ints:
     total = comm.allreduce(float(cumulative[-1]))
     target = total * np.arange(1, comm.size) / comm.size
     cuts = np.zeros(comm.size - 1, dtype=np.int64)
-    for shift in range(3 * BITS - DIGIT, -1, -DIGIT):
-        candidates = cuts[:, None] + (np.arange(1, 2**DIGIT) << shift)
+    digit = 9  # bits that one reduction settles: 63 / 9 = 7 reductions of 511 numbers per splitter
+    for shift in range(3 * BITS - digit, -1, -digit):
+        candidates = cuts[:, None] + (np.arange(1, 2**digit) << shift)
         below = cumulative[np.searchsorted(ordered, candidates)]
         comm.Allreduce(MPI.IN_PLACE, below)
         cuts += np.count_nonzero(below <= target[:, None], axis=1) << shift

@@ -20,9 +20,6 @@ from dem.neighbourhood import Neighbourhood, neighbourhood
 from dem.quaternion import cross, length
 from dem.world import World
 
-#: The margin of a grain is at most so many of its radii, whatever its speed.
-WIDEST = 2.0
-
 
 @dataclass(frozen=True)
 class Contacts:
@@ -148,11 +145,11 @@ def _go_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
 
 
 def _way(grains: Bodies, velocity: Floats, dt: float) -> Floats:
-    """About how far (n,) a point of each grain goes in dt [s], at most WIDEST radii [m]. For spheres it is the centre's
-    way, as turning does not move their surface. NaN where the velocity is not finite."""
+    """About how far (n,) a point of each grain goes in dt [s], at most two of its radii [m]. For spheres it is the
+    centre's way, as turning does not move their surface. NaN where the velocity is not finite."""
     radius = bodies.bounding_radius(grains)
     turn = np.where(grains.shape == SPHERE, 0.0, radius) * length(velocity[:, 3:])
-    way = np.minimum(dt * (length(velocity[:, :3]) + turn), WIDEST * radius)
+    way = np.minimum(dt * (length(velocity[:, :3]) + turn), 2.0 * radius)
     finite = np.isfinite(velocity)
     return way if finite.all() else np.where(finite.all(axis=1), way, np.nan)
 

@@ -35,9 +35,6 @@ from pctt.disk import make_hdf5, whole
 
 __all__ = ["FileFormatError", "Info", "Solution", "Stored", "load", "read", "write_global", "write_local"]
 
-#: M_ij and M_ji of a symmetric M differ by no more than this part of sqrt(M_ii M_jj), which bounds both.
-ROUNDING = 1e-8
-
 
 class FileFormatError(ValueError):
     """A file that is no cone problem; raised on all ranks alike."""
@@ -244,9 +241,9 @@ def without_velocities(M: sp.csr_matrix, H: sp.csr_matrix, f: Array, w: Array) -
     return G, w + G @ (roots @ f.reshape(-1, 6, 1)).ravel(), note
 
 
-def symmetric_masses(M: sp.csr_matrix, rounding: float = ROUNDING) -> tuple[sp.csr_matrix, str]:
+def symmetric_masses(M: sp.csr_matrix, rounding: float = 1e-8) -> tuple[sp.csr_matrix, str]:
     """M made exactly symmetric, and what was done to it; FileFormatError if it is neither one triangle nor symmetric
-    up to rounding."""
+    up to ``rounding``, a part of sqrt(M_ii M_jj), which bounds M_ij."""
     made, note = _symmetric(M, "M")
     bound = np.sqrt(M.diagonal())
     entries = abs(M - M.T).tocoo()

@@ -21,12 +21,6 @@ from pctt import ccp, log
 from pctt.run.dump import Dump
 from pctt.run.settings import Settings
 
-#: An overlap by a contact that the search did not foresee is solved for if it would be deeper than this part of delta.
-OVERRUN = 0.01
-
-#: An overlap that bodies make as they turn is corrected if it is deeper than this part of delta, so many times a step.
-TURNED, CORRECTIONS = 0.1, 3
-
 
 class Solved(NamedTuple):
     """A step's cone problem, solved."""
@@ -175,17 +169,18 @@ class Stepper:
             unseen = wider.take(~np.isin(wider.key, self.contacts.key))
             beyond = ContactSystem(world, unseen, settings.dt, settings.recovery_speed)
             opening = (beyond.contact_map.velocities(found.momentum) + beyond.r)[:, 0]
-            closes = bool((settings.dt * opening < -OVERRUN * settings.delta).any())
+            # solved for if the overlap would be deeper than a hundredth of delta
+            closes = bool((settings.dt * opening < -0.01 * settings.delta).any())
         return (wider, self._remembered(found)) if world.comm.allreduce(closes, MPI.LOR) else None
 
     def _turned(self, found: ccp.Result) -> tuple[Contacts, ImpulseMemory] | None:
         """The contacts, with those that overlap at the end of the step because bodies turn, and the impulses so far.
         None if there are none, or after so many corrections."""
-        if self._corrections == CORRECTIONS:
+        settings, depth, most = self.settings, 0.1 * self.settings.delta, 3  # overlap that is corrected, and how often
+        if self._corrections == most:
             return None
-        settings = self.settings
         with log.phase("search"):
-            velocity, depth = self.system.velocity_with(found.momentum), TURNED * settings.delta
+            velocity = self.system.velocity_with(found.momentum)
             turned = find_turned(self.world, self.contacts, velocity, settings.dt, depth, settings.recovery_speed)
         if turned is None:
             return None
