@@ -10,7 +10,9 @@ The loop of a simulation, on any number of ranks::
         advance(world, system.velocity(impulse), dt)
         rebalance(world)
 
-`dem.scene`, `dem.shapes` and `dem.motion` describe what there is, `dem.experiment` is what the program needs of it, and
-`dem.scenes` has ready-made ones. `dem.record` and `dem.analysis` say what steps and runs show. All quantities are in SI
-units.
+Import from the modules: `dem.scene`, `dem.shapes`, `dem.motion` describe what there is; `dem.start`, `dem.world`,
+`dem.bodies`, `dem.partition` and `dem.neighbourhood` hold it on the ranks; `dem.contact`, `dem.system` with
+`dem.contact_map`, `dem.step` and `dem.impulses` are the time step; `dem.experiment` is what the program needs of a
+scene, and `dem.scenes` has ready-made ones; `dem.record` and `dem.analysis` say what steps and runs show.
+All quantities are in SI units.
 """

@@ -60,3 +60,21 @@ def unfused(function: Function) -> Function:
     compiler has seen the called loop once more. Fused differently, the first run on a machine would not have the bits
     of the later ones."""
     return cast(Function, Loop(function, {}))
+
+
+def tell_first_compilation(say: Callable[[str], None]) -> None:
+    """Call ``say``, once, when numba compiles a loop of this program because it has no machine code for it on disk."""
+    from numba.core import event
+
+    class First(event.Listener):
+        told = False
+
+        def on_start(self, event: Any) -> None:
+            if not self.told:
+                self.told = True
+                say("compiling loops for this processor: some seconds, once")
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    event.register("numba:compile", First())

@@ -1,13 +1,16 @@
-"""Sending rows of tables to other ranks."""
+"""Sending rows of tables to other ranks, and what all ranks are told together."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Ints
+
+Out = TypeVar("Out")
 
 
 def exchange(comm: MPI.Comm, columns: Mapping[str, np.ndarray], destination: Ints) -> dict[str, np.ndarray]:
@@ -42,3 +45,31 @@ def _as_bytes(column: np.ndarray) -> np.ndarray:
     """The rows of an array (n, ...) as bytes (n, bytes per row)."""
     entries = int(np.prod(column.shape[1:]))
     return np.ascontiguousarray(column).reshape(len(column), entries).view(np.uint8)
+
+
+def offsets(comm: MPI.Comm, count: int) -> Ints:
+    """The first global index of each rank's part, then the total number (size + 1,); collective."""
+    ends = np.zeros(comm.size + 1, np.int64)
+    comm.Allgather(np.array([count]), ends[1:])
+    return np.cumsum(ends)
+
+
+def refuse(comm: MPI.Comm, wrong: str) -> None:
+    """ValueError on all ranks if any rank has words for what is wrong with the user's data. Collective."""
+    for rank, words in enumerate(comm.allgather(wrong)):
+        if words:
+            raise ValueError(words + (f" (on rank {rank})" if comm.size > 1 else ""))
+
+
+def on_first(comm: MPI.Comm, work: Callable[[], Out]) -> Out:
+    """What `work` gives on the first rank, on all ranks, or the error that it raises there. Collective."""
+    value, error = None, None
+    if comm.rank == 0:
+        try:
+            value = work()
+        except Exception as raised:
+            error = raised
+    value, error = comm.bcast((value, error))
+    if error is not None:
+        raise error
+    return value  # type: ignore[return-value]

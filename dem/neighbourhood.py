@@ -15,9 +15,6 @@ from dem.bodies import Bodies
 from dem.exchange import exchange
 from dem.world import World
 
-#: Boxes by which a rank tells the others where its grains are.
-BOXES = 8
-
 
 @dataclass(frozen=True)
 class Neighbourhood:
@@ -30,13 +27,6 @@ class Neighbourhood:
     ghosts: int  #: number of ghosts
 
 
-def without_ghosts(world: World, margin: Floats) -> Neighbourhood:
-    """The local grains, of which `margin` (grains,) [m] is, and the large bodies."""
-    count, large = len(world.grains), world.slabs[-1] + np.arange(len(world.large))
-    index = np.concatenate([world.slabs[world.comm.rank] + np.arange(count), large])
-    return Neighbourhood(bodies.concatenate([world.grains, world.large]), margin, index, count, 0)
-
-
 def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
     """All bodies whose margin may meet the margin of a local grain; `margin` (grains,) [m] of the local grains;
     collective.
@@ -45,35 +35,36 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
     """
     comm, grains = world.comm, world.grains
     radius = bodies.bounding_radius(grains) + margin
-    boxes = np.empty((comm.size, BOXES, 2, 3))
-    comm.Allgather(_chunk_boxes(grains.position, radius), boxes)
+    own = _chunk_boxes(grains.position, radius, 8)  # enough to tell a piece of the curve from its bounding box
+    boxes = np.empty((comm.size, *own.shape))
+    comm.Allgather(own, boxes)
     if np.isnan(boxes).any():
         raise FloatingPointError(
             f"a grain has no finite position or velocity at step {world.step} (time {world.time:g} s), or its square "
             "overflows"
         )
-    alone, count = without_ghosts(world, margin), len(grains)
-    columns = dict(grains.columns(), margin=margin, index=alone.index[:count])
+    mine, large = world.slabs[comm.rank] + np.arange(len(grains)), world.slabs[-1] + np.arange(len(world.large))
+    columns = dict(grains.columns(), margin=margin, index=mine)
     row, rank = _touched(grains.position, radius, boxes[: comm.rank])
     ghosts = exchange(comm, {name: column[row] for name, column in columns.items()}, rank)
     index, ghost_margin = ghosts.pop("index"), ghosts.pop("margin")
     return Neighbourhood(
         bodies=bodies.concatenate([grains, Bodies(**ghosts), world.large]),
         margin=np.concatenate([margin, ghost_margin]),
-        index=np.concatenate([alone.index[:count], index, alone.index[count:]]),
-        grains=count,
+        index=np.concatenate([mine, index, large]),
+        grains=len(grains),
         ghosts=len(index),
     )
 
 
-def _chunk_boxes(position: Floats, radius: Floats) -> Floats:
-    """Bounding boxes (BOXES, 2, 3) of equal pieces of a slab; empty ones reach from +inf to -inf."""
-    boxes = np.empty((BOXES, 2, 3))
+def _chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:
+    """Bounding boxes (count, 2, 3) of equal pieces of a slab; empty ones reach from +inf to -inf."""
+    boxes = np.empty((count, 2, 3))
     boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
     if not (np.isfinite(position).all() and np.isfinite(radius).all()):
         boxes[:] = np.nan  # seen by every rank, so that all of them stop
         return boxes
-    cuts = np.linspace(0, len(position), BOXES + 1).astype(int)
+    cuts = np.linspace(0, len(position), count + 1).astype(int)
     some = cuts[:-1] < cuts[1:]
     boxes[some, 0] = np.minimum.reduceat(position - radius[:, None], cuts[:-1][some], axis=0)
     boxes[some, 1] = np.maximum.reduceat(position + radius[:, None], cuts[:-1][some], axis=0)
@@ -81,7 +72,7 @@ def _chunk_boxes(position: Floats, radius: Floats) -> Floats:
 
 
 def _touched(position: Floats, radius: Floats, boxes: Floats) -> tuple[Ints, Ints]:
-    """Pairs (row, rank) of the balls that touch a box of a rank; boxes (ranks, BOXES, 2, 3)."""
+    """Pairs (row, rank) of the balls that touch a box of a rank; boxes (ranks, k, 2, 3)."""
     rows, ranks = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     if len(position) and len(boxes):
         low, high = (position - radius[:, None]).min(axis=0), (position + radius[:, None]).max(axis=0)

@@ -12,30 +12,8 @@ from mpi4py import MPI
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.exchange import exchange
+from dem.morton import BITS, Frame, morton_codes
 from dem.world import World
-
-#: Bits of a Morton code per axis; three of them fill a signed 64 bit integer.
-BITS = 21
-
-#: Bits of a splitter that one reduction settles: 63 / 9 = 7 reductions of 511 numbers per splitter.
-DIGIT = 9
-
-
-def curve_codes(points: Floats, low: Floats, high: Floats) -> Ints:
-    """Morton codes (n,) of points (n, 3) on an integer grid over the box from `low` (3,) to `high` (3,)."""
-    # One cell size for all axes: a flat box must not get flat cells.
-    cell = max(float((high - low).max()), np.finfo(float).tiny) / (2**BITS - 1)
-    grid = np.clip(np.floor((points - low) / cell), 0, 2**BITS - 1).astype(np.int64)
-    # Spread the bits of each coordinate to every third place, halving the stride of what is moved each time.
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        grid = (grid | (grid << shift)) & mask
-    return grid[:, 0] | (grid[:, 1] << 1) | (grid[:, 2] << 2)
 
 
 def splitters(comm: MPI.Comm, codes: Ints, weights: Floats) -> Ints:
@@ -50,8 +28,9 @@ def splitters(comm: MPI.Comm, codes: Ints, weights: Floats) -> Ints:
     total = comm.allreduce(float(cumulative[-1]))
     target = total * np.arange(1, comm.size) / comm.size
     cuts = np.zeros(comm.size - 1, dtype=np.int64)
-    for shift in range(3 * BITS - DIGIT, -1, -DIGIT):
-        candidates = cuts[:, None] + (np.arange(1, 2**DIGIT) << shift)
+    digit = 9  # bits that one reduction settles: 63 / 9 = 7 reductions of 511 numbers per splitter
+    for shift in range(3 * BITS - digit, -1, -digit):
+        candidates = cuts[:, None] + (np.arange(1, 2**digit) << shift)
         below = cumulative[np.searchsorted(ordered, candidates)]
         comm.Allreduce(MPI.IN_PLACE, below)
         cuts += np.count_nonzero(below <= target[:, None], axis=1) << shift
@@ -66,12 +45,13 @@ def redistribute(world: World) -> None:
         low, high = grains.position.min(axis=0), grains.position.max(axis=0)
     comm.Allreduce(MPI.IN_PLACE, low, MPI.MIN)
     comm.Allreduce(MPI.IN_PLACE, high, MPI.MAX)
+    frame = Frame.between(low, high)
     if comm.size > 1:
-        codes = curve_codes(grains.position, low, high)
+        codes = morton_codes(grains.position, frame)
         cuts = splitters(comm, codes, grains.weight + 1.0)
         owner = np.searchsorted(cuts, codes, side="right")
         grains = Bodies(**exchange(comm, grains.columns(), owner))
-    codes = curve_codes(grains.position, low, high)
+    codes = morton_codes(grains.position, frame)
     world.set_grains(grains.take(np.lexsort((grains.id, codes))))
 
 

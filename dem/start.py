@@ -14,7 +14,7 @@ from dem.bodies import Bodies
 from dem.contact import find_contacts
 from dem.partition import redistribute
 from dem.scene import Scene
-from dem.stepper import follow_motions
+from dem.step import follow_motions
 from dem.world import World
 
 

@@ -1,22 +1,35 @@
-"""A step that was made, with its forces, places and sums: the argument of a scene's `record`."""
+"""The semi-implicit step: new velocities come from the contact problem, and positions follow them.
+
+Where bodies turn so fast that the contacts found at the start of a step do not keep them apart, `find_turned` finds
+the others.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from mpi4py import MPI
 
-from dem.arrays import ArrayLike, Floats
-from dem.contact import Contacts
-from dem.system import ContactSystem
-from dem.together import meet
+from dem import bodies, quaternion
+from dem.arrays import ArrayLike, Bools, Floats, Ints
+from dem.bodies import SPHERE, Bodies
+from dem.contact import Contacts, contact_order, find_contacts
+from dem.contact_map.loops import relative_velocities
+from dem.motion import Dynamic, checked_pose
+from dem.system import ContactSystem, contact_arms, contact_frames
+from dem.together import meet, together
 from dem.world import World
 
 
 @dataclass(frozen=True)
 class Step:
-    """A step that was just made: `advance` was called, the grains are not yet balanced anew."""
+    """A step that was just made, with its forces, places and sums: the argument of a scene's `record`.
+
+    `advance` was called, the grains are not yet balanced anew.
+    """
 
     world: World  #: at the end of the step
     contacts: Contacts
@@ -48,3 +61,106 @@ class Step:
         """Generalised impulses on grains and large bodies by the normal and by the tangential impulses."""
         normal = self.impulse * [1.0, 0.0, 0.0]
         return self.system.generalised_impulse(normal), self.system.generalised_impulse(self.impulse - normal)
+
+
+def advance(world: World, velocity: Floats, dt: float) -> None:
+    """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by dt [s]; collective.
+
+    x <- x + dt v, q <- exp(dt w) q. Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
+    """
+    large_velocity = world.large_velocity(velocity)
+    _move(world.grains, velocity[: len(world.grains)], dt)
+    _move(world.large, large_velocity, dt)
+    world.time += dt
+    world.step += 1
+    follow_motions(world)
+
+
+def advanced(world: World, velocity: Floats, dt: float) -> World:
+    """The world that `advance` leads to; this one stays as it is. Collective."""
+    after = copy(world)
+    after.grains, after.large = replace(world.grains), replace(world.large)
+    advance(after, velocity, dt)
+    return after
+
+
+def follow_motions(world: World) -> None:
+    """Put the bodies of prescribed motion where they are to be now; collective. SceneError if a motion fails."""
+
+    def follow() -> None:
+        for row, body in enumerate(world.large_bodies):
+            if not isinstance(body.motion, Dynamic):
+                pose = checked_pose(body.motion, world.time, body.position, body.quaternion)
+                world.large.position[row], world.large.quaternion[row] = pose
+
+    together(world.comm, "motion of a large body", follow)
+
+
+def _move(table: Bodies, velocity: Floats, dt: float) -> None:
+    table.velocity = velocity.copy()
+    table.position = table.position + dt * velocity[:, :3]
+    table.quaternion = quaternion.integrate(table.quaternion, velocity[:, 3:], dt)
+
+
+def find_turned(
+    world: World, contacts: Contacts, velocity: Floats, dt: float, depth: float, recovery_speed: float
+) -> Contacts | None:
+    """The contacts, with those that overlap by more than `depth` [m] if bodies go on for dt [s] with these velocities
+    (owned, 6); None if there are none, or if the grains that are no spheres turn by less than that; collective.
+
+    A step takes the gap of a contact as linear in the velocities. Where bodies turn, its point and its normal move, and
+    other points may meet. What overlaps at the end of the step is linearised there: with the normal n of the end, and
+    the gap at the start that leads to the gap of the end with these velocities. This is a step of Newton's method (of
+    sequential quadratic programming) for the gaps at the end of the step.
+    """
+    if not _turn(world, velocity[: len(world.grains)], dt, depth):
+        return None
+    end = find_contacts(advanced(world, velocity, dt), 0.0)
+    end = end.take(end.gap < -depth)
+    start, approach = _at_start(end, dt)
+    overlap = -(np.maximum(start.gap, -recovery_speed * dt) + approach)
+    a, b, known = _rows_in(contacts, end)
+    missed = known & (overlap > depth)
+    if not world.comm.allreduce(bool(missed.any()), MPI.LOR):
+        return None
+    found = replace(start, a=a, b=b, near=contacts.near).take(missed)
+    return _joined(world, contacts.take(~np.isin(contacts.key, found.key)), found)
+
+
+def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
+    """Whether points of grains that are no spheres move by more than `depth` as these turn, on any rank. False if a
+    velocity is not finite."""
+    if world.only_spheres:
+        return False
+    grains = world.grains
+    way = dt * bodies.bounding_radius(grains) * quaternion.length(velocity[:, 3:])
+    fast, finite = bool((way[grains.shape != SPHERE] > depth).any()), bool(np.isfinite(velocity).all())
+    return world.comm.allreduce(fast, MPI.LOR) and world.comm.allreduce(finite, MPI.LAND)
+
+
+def _at_start(end: Contacts, dt: float) -> tuple[Contacts, Floats]:
+    """The contacts of the end of a step as contacts of its start, and by how much (nc,) their gaps grow in it [m]."""
+    velocity, row = end.near.bodies.velocity, np.stack([end.a, end.b], axis=1)
+    point = end.point - 0.5 * dt * velocity[row, :3].sum(axis=1)
+    arm = contact_arms(point, end.near.bodies.position - dt * velocity[:, :3], row)
+    frame = contact_frames(end.normal).reshape(-1, 9)
+    growth = dt * relative_velocities(frame, arm, row.astype(np.uint32), velocity)[:, 0]
+    return replace(end, point=point, gap=end.gap - growth), growth
+
+
+def _rows_in(contacts: Contacts, end: Contacts) -> tuple[Ints, Ints, Bools]:
+    """Rows (nc,) of the bodies a and b of `end` in the table of `contacts`, and whether both are there."""
+    index = contacts.near.index
+    order = np.argsort(index)
+    place = np.searchsorted(index, end.body, sorter=order)
+    row = order[np.minimum(place, len(index) - 1)]
+    known: Bools = (index[row] == end.body).all(axis=1)
+    return row[:, 0], row[:, 1], known
+
+
+def _joined(world: World, one: Contacts, other: Contacts) -> Contacts:
+    """Both, in the order of contacts."""
+    more = other.columns()
+    both = {name: np.concatenate([column, more[name]]) for name, column in one.columns().items()}
+    order = contact_order(world, one.near, both["a"], both["b"], both["key"])
+    return replace(one, **{name: column.take(order, axis=0) for name, column in both.items()})

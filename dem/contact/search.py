@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -12,18 +11,14 @@ from dem import bodies, quaternion
 from dem.arrays import Floats, Ints
 from dem.bodies import BOX, SPHERE, Bodies
 from dem.checks import not_negative
-from dem.compiled import unfused
 from dem.contact.broad import close_pairs
 from dem.contact.narrow import Touch
 from dem.contact.primitives import MESH, PLANE, Primitives, extents, primitives, touches
 from dem.free_motion import free_directions, free_velocity, large_free_velocity
 from dem.motion import Hinged
-from dem.neighbourhood import Neighbourhood, neighbourhood, without_ghosts
+from dem.neighbourhood import Neighbourhood, neighbourhood
 from dem.quaternion import cross, length
 from dem.world import World
-
-#: The margin of a grain is at most so many of its radii, whatever its speed.
-WIDEST = 2.0
 
 
 @dataclass(frozen=True)
@@ -62,10 +57,9 @@ def find_contacts(
 
     The margin of a body is delta/2 [m], or the way that it goes in dt [s] without contact forces if that is longer. So
     a gap of at most `delta` is a contact, and so is a wider one that may close within the step, also when a third body
-    stops one of the two. A large body may strike a grain in its margin and send it on; so such a grain gets the margin
-    of the large body, if that is wider. `margin` (grains,) [m] are the least margins of the local grains, `shifts` (k,
-    large, 6) [m, rad] further ways and turns of the large bodies that their margins are to cover. A contact belongs to
-    the rank that owns the body of lower global index. The numbers of contacts that the grains own are left in
+    stops one of the two. `margin` (grains,) [m] are the least margins of the local grains, `shifts` (k, large, 6)
+    [m, rad] further ways and turns of the large bodies that their margins are to cover. A contact belongs to the rank
+    that owns the body of lower global index. The numbers of contacts that the grains own are left in
     `world.grains.weight`.
     """
     not_negative("contact distance delta", delta)
@@ -75,16 +69,9 @@ def find_contacts(
     free = free_velocity(world.grains, world.gravity, dt) if dt else world.grains.velocity
     way = _way(world.grains, free, dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
-    alone = without_ghosts(world, margin)
-    table = primitives(alone, shapes, total)
-    widest = np.maximum(margin, WIDEST * table.radius[: len(margin)])
-    beside = _grains_beside_parts(alone, table, delta, shifts, widest)
-    if dt:
-        margin = _margins_of_struck(table, margin, beside, widest)
     near = neighbourhood(world, margin)
-    if near.ghosts:
-        table = primitives(near, shapes, total)
-    found = [_grain_pairs(near, table), _grains_on_parts(near, beside)]
+    table = primitives(near, shapes, total)
+    found = [_grain_pairs(near, table), _grains_on_parts(near, table, delta, shifts)]
     if world.comm.rank == world.comm.size - 1:
         found.append(_large_pairs(world, near, table, delta, shifts))
     pairs, reach = (np.concatenate(columns) for columns in zip(*found))
@@ -118,47 +105,12 @@ def find_contacts(
 def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints) -> Ints:
     """The order of contacts of bodies in the rows a, b (nc,): first those whose solution needs no other rank, of bodies
     that this rank owns or whose motion is prescribed; each part by the row of the owner and by key."""
-    rows = len(near.bodies)
-    foreign = np.zeros(rows, dtype=bool)
+    foreign = np.zeros(len(near.bodies), dtype=bool)
     foreign[near.grains : near.grains + near.ghosts] = True
     if world.comm.rank < world.comm.size - 1:
         foreign[near.grains + near.ghosts :] = bodies.is_dynamic(world.large)
     owner = np.minimum(a, b)  # the local grains are the first rows, and ghosts come from higher ranks only
-    major = owner + rows * (foreign[a] | foreign[b])
-    return lexsort(key, major, 2 * rows)
-
-
-@unfused
-def lexsort(key: Ints, major: Ints, count: int) -> Ints:
-    """`numpy.lexsort((key, major))` of distinct keys (n,), with `major` (n,) in 0 ... count - 1."""
-    start = np.zeros(count + 1, np.int64)
-    for k in range(len(major)):
-        start[major[k] + 1] += 1
-    for k in range(count):
-        start[k + 1] += start[k]
-    order, free = np.empty(len(major), np.int64), start[:-1].copy()
-    for k in range(len(major)):
-        order[free[major[k]]] = k
-        free[major[k]] += 1
-    for m in range(count):
-        _shell_sort(order[start[m] : start[m + 1]], key)
-    return order
-
-
-@unfused
-def _shell_sort(rows, key):
-    """Sort a few rows by their keys, in place."""
-    gap = 1
-    while 3 * gap < len(rows):
-        gap = 3 * gap + 1
-    while gap > 0:
-        for k in range(gap, len(rows)):
-            row, place = rows[k], k
-            while place >= gap and key[rows[place - gap]] > key[row]:
-                rows[place] = rows[place - gap]
-                place -= gap
-            rows[place] = row
-        gap //= 3
+    return np.lexsort((key, owner, foreign[a] | foreign[b]))
 
 
 def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Contacts | None:
@@ -193,40 +145,13 @@ def _go_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
 
 
 def _way(grains: Bodies, velocity: Floats, dt: float) -> Floats:
-    """About how far (n,) a point of each grain goes in dt [s], at most WIDEST radii [m]. For spheres it is the centre's
-    way, as turning does not move their surface. NaN where the velocity is not finite."""
+    """About how far (n,) a point of each grain goes in dt [s], at most two of its radii [m]. For spheres it is the
+    centre's way, as turning does not move their surface. NaN where the velocity is not finite."""
     radius = bodies.bounding_radius(grains)
     turn = np.where(grains.shape == SPHERE, 0.0, radius) * length(velocity[:, 3:])
-    way = np.minimum(dt * (length(velocity[:, :3]) + turn), WIDEST * radius)
+    way = np.minimum(dt * (length(velocity[:, :3]) + turn), 2.0 * radius)
     finite = np.isfinite(velocity)
     return way if finite.all() else np.where(finite.all(axis=1), way, np.nan)
-
-
-class _Beside(NamedTuple):
-    """Local grains and parts of large bodies that come close."""
-
-    grain: Ints  #: (m,) row of the grain
-    part: Ints  #: (m,) number of the part
-    margin: Floats  #: (m,) of the part there [m]
-    room: Floats  #: (m,) at least, between the grain and the margin of the part: a grain's wider margin meets that [m]
-
-    def within(self, margin: Floats) -> _Beside:
-        """Those for which the margins (grains,) of the grains suffice."""
-        return self.take(self.room <= margin[self.grain])
-
-    def take(self, rows: np.ndarray) -> _Beside:
-        return _Beside(*(column[rows] for column in self))
-
-
-def _margins_of_struck(table: Primitives, margin: Floats, beside: _Beside, widest: Floats) -> Floats:
-    """The margins (grains,) of the grains, those in reach of a large body at least as wide as its own there."""
-    close = beside.within(margin)
-    close = close.take(close.margin > margin[close.grain])
-    parts = len(margin) + close.part
-    struck = close.take(touches(table, close.grain, parts, margin[close.grain] + close.margin).pair)
-    margin = margin.copy()
-    np.maximum.at(margin, struck.grain, struck.margin)
-    return np.minimum(margin, widest)
 
 
 def _grain_pairs(near: Neighbourhood, table: Primitives) -> tuple[Ints, Floats]:
@@ -239,31 +164,23 @@ def _grain_pairs(near: Neighbourhood, table: Primitives) -> tuple[Ints, Floats]:
     return pairs, near.margin[pairs[:, 0]] + near.margin[pairs[:, 1]]
 
 
-def _grains_on_parts(near: Neighbourhood, beside: _Beside) -> tuple[Ints, Floats]:
+def _grains_on_parts(
+    near: Neighbourhood, table: Primitives, delta: float, shifts: Floats
+) -> tuple[Ints, Floats]:
     """Rows (m, 2) of a local grain and a part of a large body whose margins may meet, and the gaps (m,) within which
-    they do."""
-    close = beside.within(near.margin)
-    pairs = np.stack([close.grain, near.grains + near.ghosts + close.part], axis=1)
-    return pairs, near.margin[close.grain] + close.margin
-
-
-def _grains_beside_parts(
-    alone: Neighbourhood, table: Primitives, delta: float, shifts: Floats, widest: Floats
-) -> _Beside:
-    """The parts of large bodies, which move and turn by `shifts` (k, large bodies, 6), whose margins the local grains
-    might meet with margins of at most `widest` (grains,)."""
-    count = alone.grains
+    they do. The bodies move and turn by `shifts` (k, large bodies, 6)."""
+    count, first = near.grains, near.grains + near.ghosts
     center, radius = table.center[:count], table.radius[:count]
-    found = [_Beside(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))]
-    for body in np.unique(table.row[count:]):
-        margin = _part_margin(shifts[:, [body - count]], alone.bodies.position[[body]], center, radius, delta)
-        beyond = margin + (1.0 + 1e-9) * radius  # where the rounding matters, the narrow phase is to decide
-        margin = np.broadcast_to(margin, count)
-        for part in count + np.flatnonzero(table.row[count:] == body):
-            room = _distance_at_least(table, part, center) - beyond
-            rows = np.flatnonzero(room <= widest)
-            found.append(_Beside(rows, np.full(len(rows), part - count), margin[rows], room[rows]))
-    return _Beside(*(np.concatenate(columns) for columns in zip(*found)))
+    found = [(np.zeros((0, 2), np.int64), np.zeros(0))]
+    for body in np.unique(table.row[first:]):
+        margin = _part_margin(shifts[:, [body - first]], near.bodies.position[[body]], center, radius, delta)
+        reach = near.margin[:count] + margin
+        for part in first + np.flatnonzero(table.row[first:] == body):
+            # where the rounding matters, the narrow phase is to decide
+            rows = np.flatnonzero(_distance_at_least(table, part, center) - (1.0 + 1e-9) * radius <= reach)
+            found.append((np.stack([rows, np.full(len(rows), part)], axis=1), reach[rows]))
+    pairs, gaps = zip(*found)
+    return np.concatenate(pairs), np.concatenate(gaps)
 
 
 def _distance_at_least(table: Primitives, part: int, points: Floats) -> Floats:

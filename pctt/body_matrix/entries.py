@@ -1,6 +1,6 @@
 """The Newton matrix in the velocities of the bodies, K = I + G' B^-1 G: a 6 x 6 block per body and per pair in contact.
 
-G is the mass-scaled contact map (3Nc x 6M) in block rows (``pctt.blocks.BlockRows``). B is block diagonal with a 3 x 3
+G is the mass-scaled contact map (3Nc x 6M) in block rows (`BlockRows`). B is block diagonal with a 3 x 3
 block per contact. Each rank multiplies the rows of its own contacts. It sends the blocks of bodies that other ranks own
 to these ranks, by a pattern that is computed once. The blocks are always added in the same order.
 """
@@ -12,10 +12,11 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.contact_map import BlockRows
+from dem.exchange import exchange, offsets
 from pctt.block_diagonal import set_diagonal_blocks
-from pctt.blocks import BlockRows, new_matrix
+from pctt.blocks import new_matrix
 from pctt.body_matrix.stiff_part import StiffPart
-from pctt.exchange import offsets, send_rows
 
 ADD = PETSc.InsertMode.ADD_VALUES
 
@@ -56,7 +57,8 @@ class BodyMatrix:
         self._owner = np.searchsorted(starts, row, side="right") - 1
         self._away = self._owner != self.comm.rank
         home = ~self._away
-        received, _ = send_rows(self.comm, [row[self._away], column[self._away]], self._owner[self._away])
+        away = {"row": row[self._away], "column": column[self._away]}
+        received = exchange(self.comm, away, self._owner[self._away]).values()
         diagonal = np.arange(first, first + own)
         total = max(int(starts[-1]), 1)
         names = [r * total + c for r, c in ((row[home], column[home]), received, (diagonal, diagonal))]
@@ -76,8 +78,8 @@ class BodyMatrix:
         self._values = np.zeros((len(self._indices), 6, 6))
         self._values[self._own_places] = blocks[~self._away] if self._away.any() else blocks
         if self.comm.size > 1:
-            (received,), _ = send_rows(self.comm, [blocks[self._away]], self._owner[self._away])
-            np.add.at(self._values, self._received_places, received)
+            received = exchange(self.comm, {"block": blocks[self._away]}, self._owner[self._away])
+            np.add.at(self._values, self._received_places, received["block"])
         self._values[self._diagonal_places] += np.eye(6)
         if len(self._indices):
             self.mat.setValuesBlockedCSR(self._indptr, self._indices, self._values.ravel())

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
+from dem.contact_map import ContactMap
 from pctt.block_diagonal import set_diagonal_blocks
 from pctt.blocks import Array
 from pctt.body_matrix.entries import BodyMatrix
-from pctt.contact_map import ContactMap
 from pctt.shell import symmetric_shell
 
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from pctt.blocks import BlockRows
+from dem.contact_map import BlockRows, CompactRows
+from dem.exchange import refuse
 from pctt.ccp import coulomb as coulombs_law
 from pctt.ccp.accuracy import Accuracy, measure
 from pctt.ccp.auto import Auto
@@ -26,8 +27,6 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.registry import NEWTON, SOLVERS, Solver
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
-from pctt.contact_map import CompactRows
-from pctt.exchange import refuse
 from pctt.log import phase
 
 __all__ = [
@@ -94,15 +93,21 @@ def solve(
 
     try:
         if coulomb is None:
-            return by(solver, problem, guess, limits.tol)
+            return _with_momentum(problem, by(solver, problem, guess, limits.tol))
         methods = [solver] if solver.has_law or problem.size == 0 else []
         if solver.has_law and solver.newton:
             methods = [SOLVERS[name] for name in ("auto", "conic", "apgd")]
         ways = [partial(by, method, law=True) for method in methods]
-        return coulombs_law.ladder(problem, guess, limits, coulomb, partial(by, solver), ways)
+        result = coulombs_law.ladder(problem, guess, limits, coulomb, partial(by, solver), ways)
+        return _with_momentum(problem, result)
     finally:
         if own is not None:
             own.destroy()
+
+
+def _with_momentum(problem: ConeProblem, result: Result) -> Result:
+    result.momentum = problem.momentum(result.impulse)
+    return result
 
 
 def _start(problem: ConeProblem, guess: Array | None) -> Array:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pctt.compiled import inlined, loop, unfused
+from dem.compiled import inlined, loop, unfused
 
 Array = NDArray[np.float64]
 TINY = float(np.finfo(float).tiny)

@@ -1,23 +1,25 @@
-"""The Delassus matrix: as it was given, or N = G G' from the block rows of G, over the ranks.
+"""The operators of problems that are not given by frames and arms, and the Delassus matrix N = G G' as a Mat.
 
 PETSc multiplies only scalar formats; on one block row per contact scipy's block product is several times
-faster (n = 16, 134,547 contacts, one core: 0.45 s against 1.4 s and a slow conversion), so each rank
-multiplies its own block rows and PETSc gets the finished block CSR arrays. A row of N needs all contacts of
-its two bodies: those of other ranks come through the owners of the bodies' columns.
+faster (n = 16, 134,547 contacts, one core: 0.45 s against 1.4 s and a slow conversion).
 """
 
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, block_csr_matrix, shaped, square_block_matrix
-from pctt.ccp.cone import Array
-from pctt.exchange import offsets, send_rows
+from dem.contact_map import BlockRows, ContactMap, Halo, find_halo, loops
+from dem.contact_map.map import checked, shaped
+from dem.exchange import exchange, offsets
+from pctt.blocks import Array, square_block_matrix
+
+HUB = 500  # a body with more contacts is a hub: its columns of G would fill N
 
 
 def rows_in_blocks(N: PETSc.Mat) -> sp.bsr_matrix:
@@ -84,65 +86,133 @@ class GivenMatrix:
             thing.destroy()
 
 
+class BlockMap(ContactMap):
+    """The map G given by 3 x 6 blocks, as problems in files are.
+
+    rows : ValueError on all ranks for wrong ones
+    halo : that of another map between the same bodies, whose rows need no check
+    """
+
+    def __init__(
+        self, comm: MPI.Comm, rows: BlockRows, halo: tuple[Halo, np.ndarray] | None = None,
+        precision: type[np.floating] = np.float64,
+    ):  # fmt: skip
+        rows = checked(comm, rows) if halo is None else rows
+        self.comm, self.given, self.block_rows, self.precision = comm, rows, rows, precision  # type: ignore[assignment]
+        self.rows, self.columns = rows.rows, rows.columns
+        self._found = halo or find_halo(comm, rows.columns, rows.indices)
+        self.halo, body = self._found
+        self._blocks = (np.ascontiguousarray(rows.blocks, precision), rows.indptr, body)
+
+    def velocities(self, v: Array) -> Array:
+        """G v (nc, 3)."""
+        w = np.zeros((self.halo.rows, 6), self.precision)
+        w[: self.columns] = shaped("velocities of bodies", v, self.columns, 6)
+        self.halo.update(w)
+        y = np.zeros((self.rows, 3), self.precision)
+        loops.block_velocities(*self._blocks, w, y)
+        return y
+
+    def momenta(self, g: Array) -> Array:
+        """G' g (columns, 6)."""
+        m = np.zeros((self.halo.rows, 6), self.precision)
+        loops.block_momenta(*self._blocks, np.ascontiguousarray(shaped("impulses", g, self.rows, 3), self.precision), m)
+        self.halo.add(m)
+        return m[: self.columns]
+
+    def add_delassus(self, g: Array, y: Array) -> None:
+        """y += G G' g; y (nc, 3)."""
+        y += self.velocities(self.momenta(g))
+
+    def weights(self, H: Array, symmetric: bool = True) -> Array:
+        """Blocks H (nc, 3, 3) in the format of `through`."""
+        return H
+
+    def through(self, weight: Array, v: Array, out: Array) -> None:
+        """out = v + G' H G v (columns, 6)."""
+        impulses = np.einsum("cij,cj->ci", weight, self.velocities(v))
+        np.add(v.reshape(-1, 6), self.momenta(impulses), out=out.reshape(-1, 6))
+
+    def contact_blocks(self) -> Array:
+        """The diagonal blocks of G G' (nc, 3, 3)."""
+        each = self.block_rows.blocks
+        return _sums(self._contact(), each @ each.transpose(0, 2, 1), self.rows)
+
+    def body_blocks(self, weight: Array) -> Array:
+        """The diagonal blocks of I + G' H G (columns, 6, 6)."""
+        each = self.block_rows.blocks
+        blocks = _sums(self._found[1], each.transpose(0, 2, 1) @ weight[self._contact()] @ each, self.halo.rows)
+        self.halo.add(blocks)
+        return blocks[: self.columns] + np.eye(6)
+
+    def scaled(self, size: Array, precision: type[np.floating] = np.float64) -> BlockMap:
+        """The map with its rows multiplied by ``size`` (nc, 3)."""
+        rows = replace(self.block_rows, blocks=self.block_rows.blocks * size[self._contact()][:, :, None])
+        return BlockMap(self.comm, rows, self._found, precision)
+
+    def structure(self) -> tuple[np.ndarray, ...]:
+        """Arrays that are equal where contacts and their bodies are."""
+        return self.block_rows.indptr, self.block_rows.indices, np.array([self.columns])
+
+    def _contact(self) -> np.ndarray:
+        """The contacts of the blocks."""
+        return np.repeat(np.arange(self.rows), np.diff(self.block_rows.indptr))
+
+
+def without_hubs(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, bool]:
+    """G without the columns of the bodies that have more than HUB contacts, and whether there are such. Collective."""
+    halo, body = find_halo(comm, G.columns, G.indices)
+    count = np.bincount(body, minlength=halo.rows)
+    halo.add(count)
+    halo.update(count)
+    kept = count[body] <= HUB
+    if not comm.allreduce(not kept.all(), MPI.LOR):
+        return G, False
+    before = np.concatenate([[0], np.cumsum(kept)])
+    return BlockRows(before[G.indptr], G.indices[kept], G.blocks[kept], G.columns), True
+
+
 def delassus(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
-    """N = G G' as a Mat (3Nc x 3Nc) of block size 3, rows distributed as those of G."""
-    first = offsets(comm, G.rows)[comm.rank]
-    contact = np.repeat(np.arange(first, first + G.rows), np.diff(G.indptr))
-    bodies, column = np.unique(G.indices, return_inverse=True)
-    left = sp.bsr_matrix((G.blocks, column, G.indptr), shape=(3 * G.rows, 6 * len(bodies)))
-    if comm.size == 1:
-        right, names = left, np.arange(G.rows)
-    else:
-        far_contact, far_body, far_blocks = _neighbours(comm, G, contact, bodies)
-        all_contacts = np.concatenate([contact, far_contact])
-        all_columns = np.concatenate([column, np.searchsorted(bodies, far_body)])
-        names, row = np.unique(all_contacts, return_inverse=True)
-        order = np.lexsort((all_columns, row))
-        indptr = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(names)))])
-        right = sp.bsr_matrix(
-            (np.concatenate([G.blocks, far_blocks])[order], all_columns[order], indptr),
-            shape=(3 * len(names), 6 * len(bodies)),
-        )
-    total = comm.allreduce(G.rows)
-    if G.rows == 0:
-        return block_csr_matrix(comm, 0, 0, np.zeros(1), np.zeros(0), np.zeros((0, 3, 3)))
-    near = left @ right.T
-    # contacts of bodies that are not in G (fixed, or kept apart) need a diagonal block all the same
+    """N = G G' as a Mat (3Nc x 3Nc) of block size 3, rows distributed as those of G. Collective.
+
+    The owners of the bodies multiply: N is the sum of G_b G_b' over the bodies b, with G_b the columns of a body. On
+    several ranks the owners send the blocks to the ranks of their rows.
+    """
+    starts, bodies = offsets(comm, G.rows), offsets(comm, G.columns)
+    first, total, last = starts[comm.rank], starts[-1], bodies[-1]
+    # a contact without bodies in G needs a diagonal block too: it gets a body of its own, without mass
     lonely = np.flatnonzero(np.diff(G.indptr) == 0)
-    columns = np.insert(names[near.indices] if len(near.indices) else near.indices, near.indptr[lonely], first + lonely)
-    blocks = np.insert(near.data.reshape(-1, 3, 3), near.indptr[lonely], 0.0, axis=0)
-    indptr = near.indptr + np.searchsorted(lonely, np.arange(G.rows + 1))
-    shape = (3 * G.rows, 3 * total)
-    return square_block_matrix(comm, sp.bsr_matrix((blocks, columns, indptr), shape=shape))
+    column = np.concatenate([G.indices, last + first + lonely])
+    owner = np.searchsorted(bodies, column, side="right") - 1
+    owner[len(G.indices) :] = comm.rank
+    contact = np.concatenate([np.repeat(np.arange(G.rows), np.diff(G.indptr)), lonely])
+    blocks = np.concatenate([G.blocks, np.zeros((len(lonely), 3, 6))])
+    rows = exchange(comm, {"contact": first + contact, "body": column, "block": blocks}, owner)
+    names, row = np.unique(rows["contact"], return_inverse=True)
+    _, column = np.unique(rows["body"], return_inverse=True)
+    left = _block_rows(row, column, rows["block"], len(names))
+    N = (left @ left.T).tobsr((3, 3)) if len(names) else sp.bsr_matrix((0, 0), blocksize=(3, 3))
+    columns = names[N.indices]
+    if comm.size > 1:
+        row = np.repeat(names, np.diff(N.indptr))
+        owner = np.searchsorted(starts, row, side="right") - 1
+        parts = exchange(comm, {"row": row, "column": columns, "block": N.data}, owner)
+        row, columns = np.divmod(np.unique((parts["row"] - first) * total + parts["column"]), max(total, 1))
+        place = np.searchsorted(row * total + columns, (parts["row"] - first) * total + parts["column"])
+        data = _sums(place, parts["block"], len(row))
+        N = sp.bsr_matrix((data, columns, np.searchsorted(row, np.arange(G.rows + 1))), shape=(3 * G.rows, 3 * total))
+    return square_block_matrix(comm, sp.bsr_matrix((N.data, columns, N.indptr), shape=(3 * G.rows, 3 * total)))
 
 
-def _neighbours(
-    comm: MPI.Comm, G: BlockRows, contact: np.ndarray, bodies: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Blocks of G of other ranks in the columns ``bodies`` that this rank touches: contact, body, block."""
-    starts = offsets(comm, G.columns)
-    owner = np.searchsorted(starts, G.indices, side="right") - 1
-    away = owner != comm.rank
-    entries = (contact, G.indices, G.blocks)
-    # to the owners of the bodies ...
-    (contact_in, body_in, blocks_in), source_in = send_rows(comm, [e[away] for e in entries], owner[away])
-    # ... who hold all blocks of a column, and answer each rank that touches it with those of the others
-    home = ~away
-    all_contact = np.concatenate([contact[home], contact_in])
-    all_body = np.concatenate([G.indices[home], body_in])
-    all_blocks = np.concatenate([G.blocks[home], blocks_in])
-    source = np.concatenate([np.full(home.sum(), comm.rank), source_in])
-    order = np.argsort(all_body, kind="stable")
-    sorted_body = all_body[order]
-    asked = np.unique(np.stack([body_in, source_in], axis=1), axis=0)  # (body, asking rank)
-    begin = np.searchsorted(sorted_body, asked[:, 0], side="left")
-    count = np.searchsorted(sorted_body, asked[:, 0], side="right") - begin
-    shift = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    pick = order[np.repeat(begin, count) + shift]
-    asking = np.repeat(asked[:, 1], count)
-    useful = source[pick] != asking
-    pick, asking = pick[useful], asking[useful]
-    answer, _ = send_rows(comm, [all_contact[pick], all_body[pick], all_blocks[pick]], asking)
-    touched = np.isin(body_in, bodies)  # an owner may have no contact of its own at a body
-    own = (contact_in[touched], body_in[touched], blocks_in[touched])
-    return tuple(np.concatenate(pair) for pair in zip(answer, own))  # type: ignore[return-value]
+def _sums(row: np.ndarray, blocks: Array, count: int) -> Array:
+    """Sums (count, ...) of the blocks (n, ...) of equal row. (numpy's add.at takes ten times as long.)"""
+    add = sp.csr_matrix((np.ones(len(row)), (row, np.arange(len(row)))), shape=(count, len(row)))
+    return (add @ blocks.reshape(len(row), int(np.prod(blocks.shape[1:])))).reshape(count, *blocks.shape[1:])
+
+
+def _block_rows(row: np.ndarray, column: np.ndarray, blocks: Array, count: int) -> sp.bsr_matrix:
+    """A matrix of ``count`` block rows from blocks (n, 3, 6) and their places (n,)."""
+    order = np.lexsort((column, row))
+    indptr = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=count))])
+    shape = (3 * count, 6 * (int(column.max(initial=-1)) + 1))
+    return sp.bsr_matrix((blocks[order], column[order], indptr), shape=shape)

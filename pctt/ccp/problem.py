@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Union
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, without_hubs
+from dem.contact_map import BlockRows, CompactRows, ContactMap
+from dem.exchange import refuse
 from pctt.ccp.cone import Array, add_opening, dot, projected_move
-from pctt.ccp.delassus import GivenMatrix, delassus
-from pctt.contact_map import CompactRows, ContactMap
-from pctt.exchange import refuse
+from pctt.ccp.delassus import BlockMap, GivenMatrix, delassus, without_hubs
+
+Given = Union[BlockRows, CompactRows, ContactMap]
 
 
 class ConeProblem:
@@ -26,7 +28,7 @@ class ConeProblem:
     ----------
     r : (nc, 3) velocities of the contacts without impulses, plus gap/dt (m/s)
     mu : (nc,) friction coefficients
-    operator : G or N, with its products; a copy of what was given
+    operator : G or N, with its products; a copy of what was given, unless that is a `ContactMap`
     contact_map : the operator if it is G, and the bodies are known; or None
     point : (nc, 3) contact points (m) or None; orders the unknowns of hierarchical preconditioners
     key : (nc,) persistent names of the contacts or None
@@ -41,7 +43,7 @@ class ConeProblem:
         r: Array,
         mu: Array,
         *,
-        G: BlockRows | CompactRows | None = None,
+        G: Given | None = None,
         N: PETSc.Mat | None = None,
         point: Array | None = None,
         key: np.ndarray | None = None,
@@ -59,8 +61,8 @@ class ConeProblem:
         if count := self.sum(bad.sum()):
             raise ValueError(f"{count} contacts with a NaN, infinite or negative coefficient")
         self.size = self.sum(len(self.mu))
-        self.operator: ContactMap | GivenMatrix = GivenMatrix(comm, N) if G is None else ContactMap(comm, G)
-        self.contact_map = self.operator if isinstance(self.operator, ContactMap) else None
+        self.contact_map = None if G is None else _map(comm, G)
+        self.operator: ContactMap | GivenMatrix = self.contact_map or GivenMatrix(comm, N)
         # the diagonal blocks have squares of all numbers of G
         if wrong := self.sum((~np.isfinite(self._rigid_blocks).all(axis=(1, 2))).sum()):
             self.destroy()
@@ -136,10 +138,10 @@ class ConeProblem:
     @property
     def has_hubs(self) -> bool:
         """Whether some bodies have more than HUB contacts and would fill N: ``N`` is without their columns of G."""
-        return self.contact_map is not None and len(self._split[1]) > 0
+        return self.contact_map is not None and self._split[1]
 
     @cached_property
-    def _split(self) -> tuple[BlockRows, np.ndarray]:
+    def _split(self) -> tuple[BlockRows, bool]:
         assert self.contact_map is not None
         return without_hubs(self.comm, self.contact_map.block_rows)
 
@@ -203,16 +205,24 @@ class ConeProblem:
         self.destroy()
 
     def destroy(self) -> None:
-        """Free the PETSc objects now, not when the garbage collector finds the cycle."""
+        """Free the PETSc objects now."""
         self.operator.destroy()
         if "N" in self.__dict__:
             self.__dict__.pop("N").destroy()
 
 
+def _map(comm: MPI.Comm, G: Given) -> ContactMap:
+    """The map in any of its forms, with the products of frames and arms counted by PETSc's log."""
+    if isinstance(G, BlockRows):
+        return BlockMap(comm, G)
+    contact_map = G if isinstance(G, ContactMap) else ContactMap(comm, G)
+    contact_map.log_flops = PETSc.Log.logFlops
+    return contact_map
+
+
 def _wrong(
-    r: Array, mu: Array, G: BlockRows | CompactRows | None, N: PETSc.Mat | None, point: Array | None,
-    key: np.ndarray | None,
-) -> str:  # fmt: skip
+    r: Array, mu: Array, G: Given | None, N: PETSc.Mat | None, point: Array | None, key: np.ndarray | None
+) -> str:
     """What is wrong with the shapes of a problem's data on this rank; empty if nothing is."""
     try:
         shape, friction = np.asarray(r, dtype=float).shape, np.asarray(mu, dtype=float).shape
@@ -223,8 +233,9 @@ def _wrong(
         return f"r has the shape {shape}; allowed is (nc, 3)"
     if friction != (nc,):
         return f"{nc} contacts in r but {friction[0] if len(friction) == 1 else friction} friction coefficients"
-    if G is not None and (not isinstance(G, (BlockRows, CompactRows)) or G.rows != nc):
-        rows = f"{G.rows} contacts" if isinstance(G, (BlockRows, CompactRows)) else f"the type {type(G).__name__}"
+    known = isinstance(G, (BlockRows, CompactRows, ContactMap))
+    if G is not None and (not known or G.rows != nc):
+        rows = f"{G.rows} contacts" if known else f"the type {type(G).__name__}"
         return f"{nc} contacts in r, but G has {rows}; allowed are BlockRows or CompactRows of as many"
     if N is not None and N.getLocalSize() != (3 * nc, 3 * nc):
         return f"{nc} contacts in r, but N has {N.getLocalSize()} local rows and columns"

@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass, field
 from enum import Enum
 
+import numpy as np
+
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.options import FRACTION, option
@@ -79,6 +81,7 @@ class Result:
     cone_problems : how many were solved for it: more than one for Coulomb's law
     solver : name of the method that found it, where that was chosen; "" otherwise
     law : RELAXATION, COULOMB or FIXED_POINT: the law of the impulses and of the residuals
+    momentum : (6 owned,) G' g, the change of the mass-scaled velocities of this rank's bodies, as `ccp.solve` fills in
 
     With FIXED_POINT ``history`` has one residual per cone problem.
     """
@@ -94,6 +97,7 @@ class Result:
     cone_problems: int = 1
     solver: str = ""
     law: str = RELAXATION
+    momentum: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def converged(self) -> bool:

@@ -21,8 +21,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.exchange import on_first
 from pctt.disk import whole
-from pctt.exchange import on_first
 from pctt.mat.grid_train import GridTrain
 from pctt.mat.options import Options
 from pctt.mat.tensor_train import TensorTrain, compressed, mat_of

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from pctt.exchange import on_first
+from dem.exchange import on_first
 from pctt.mat.product import TrainProduct, places_of_rows
 from pctt.tt.cross import Cross
 from pctt.tt.grid import GridDigits, bases

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.exchange import on_first
+from dem.exchange import on_first
 from pctt.mat.entries import DENSE, has_entries
 from pctt.mat.grid_train import GridTrain
 from pctt.mat.options import MAX_RANK, Options

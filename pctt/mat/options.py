@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.exchange import refuse
+from dem.exchange import refuse
 from pctt.options import AT_LEAST_ONE, FRACTION, describe, option, read
 from pctt.petsc import given_options
 

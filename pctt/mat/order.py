@@ -20,8 +20,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.morton import morton_codes
 from pctt.mat.entries import given
-from pctt.morton import morton_codes
 from pctt.tt.grid import GridDigits
 from pctt.tt.train import Array
 

@@ -10,8 +10,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.exchange import on_first, refuse
 from pctt.context import Context
-from pctt.exchange import on_first, refuse
 from pctt.mat.entries import Combination, Entries, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.options import MAX_RANK, Options

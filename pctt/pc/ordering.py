@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
+from dem.morton import morton_codes
 from pctt.mat.order import LACKS, Places
-from pctt.morton import morton_codes
 from pctt.tt.grid import GridDigits
 from pctt.tt.quantise import group_modes
 

@@ -14,8 +14,8 @@ from collections.abc import Callable
 import numpy as np
 from petsc4py import PETSc
 
+from dem.morton import Frame, morton_codes
 from pctt.mat.order import Places
-from pctt.morton import Frame, morton_codes
 from pctt.pc.ordering import block_order, grid_slots
 
 SPARE = 0.06  # part of the slots that is empty at first

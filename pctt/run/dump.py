@@ -18,18 +18,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from petsc4py import PETSc
+import scipy.sparse as sp
 
-from dem import bodies, quaternion
+from dem.contact_map import ContactMap, root_blocks
+from dem.contact_map.map import packed
+from dem.exchange import offsets
 from dem.experiment import Experiment
-from dem.free_motion import free_directions
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
-from pctt.blocks import BlockRows, block_csr_matrix, block_matrix
 from pctt.ccp import fclib
 from pctt.ccp.cone import Array
-from pctt.exchange import offsets
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError
 from pctt.run.place import HARD, Place
@@ -88,28 +87,26 @@ class Dump:
         asked: ccp.Result,
     ) -> None:
         """The global problem, the guess if there is one, and the solution if the step has one."""
-        dynamic, M = _mass(self._world)
-        H = _map(system, self._world, dynamic)
-        v_free = M.createVecLeft()
-        v_free.array = system.free_velocity[dynamic].ravel()
-        f, moved = M.createVecLeft(), H.createVecRight()
-        M.mult(v_free, f)
-        H.multTranspose(v_free, moved)
-        w = problem.r - moved.array.reshape(-1, 3)
+        dynamic, masses, D = masses_and_map(system)
+        v_free = system.free_velocity[dynamic]
+        f = np.einsum("bij,bj->bi", masses, v_free).ravel()
+        rows, bodies = D.block_rows, offsets(D.comm, D.columns)
+        own = bodies[D.comm.rank] + np.arange(D.columns)
+        width = 6 * bodies[-1]
+        M = sp.bsr_matrix((masses, own, np.arange(D.columns + 1)), shape=(6 * D.columns, width))
+        Ht = sp.bsr_matrix((rows.blocks, rows.indices, rows.indptr), shape=(3 * D.rows, width))
 
         def state(g: Array) -> fclib.Solution:
             return fclib.Solution(g, problem.product(g) + problem.r, system.velocity(g)[dynamic].ravel())
 
         fclib.write_global(
-            path, M, H, f.array, w, problem.mu,
+            path, D.comm, M, Ht, f, problem.r - D.velocities(v_free), problem.mu,
             info=self._info(problem, result, asked),
             solution=state(result.impulse) if result.converged else None,
             guess=state(guess) if problem.norm(guess) > 0 else None,
             point=system.point,
             compliance=problem.softness,
         )  # fmt: skip
-        for petsc_object in (M, H, v_free, f, moved):
-            petsc_object.destroy()
 
     def _info(self, problem: ccp.ConeProblem, result: ccp.Result, asked: ccp.Result) -> fclib.Info:
         settings, world, scene = self._settings, self._world, self._experiment
@@ -126,43 +123,29 @@ class Dump:
         )
 
 
-def _mass(world: World) -> tuple[np.ndarray, PETSc.Mat]:
-    """Mask of the bodies of this rank's rows that are dynamic, and the mass matrix (6 n x 6 n) of those."""
-    last = world.comm.rank == world.comm.size - 1
-    parts = [world.grains, world.large] if last else [world.grains]
-    owned = bodies.concatenate(parts)
-    dynamic = bodies.is_dynamic(owned)
-    owned = owned.take(dynamic)
-    owned = replace(owned, inertia=np.where(np.isfinite(owned.inertia), owned.inertia, 1.0))
-    blocks = np.zeros((len(owned), 6, 6))
-    blocks[:, range(3), range(3)] = owned.mass[:, None]
-    blocks[:, 3:, 3:] = np.linalg.inv(bodies.inverse_inertia(owned))
-    alike = np.ptp(owned.inertia, axis=1) == 0  # exactly diagonal, as for spheres
-    blocks[alike, 3:, 3:] = owned.inertia[alike, :, None] * np.eye(3)
-    count, first = len(owned), offsets(world.comm, len(owned))[world.comm.rank]
-    bodies_here = first + np.arange(count)
-    return dynamic, block_csr_matrix(world.comm, 6 * count, 6 * count, np.arange(count + 1), bodies_here, blocks)
+def masses_and_map(system: ContactSystem) -> tuple[np.ndarray, Array, ContactMap]:
+    """Mask of this rank's bodies that are dynamic, the mass matrices (n, 6, 6) of these, and the map of their
+    velocities to those of the contacts: D', with the part along the guide or about the hinge of a body. Collective.
 
-
-def _map(system: ContactSystem, world: World, dynamic: np.ndarray) -> PETSc.Mat:
-    """D (6 n x 3 nc) of the dynamic bodies alone; guided bodies have only the part along their guides. Collective."""
-    body, blocks = system.blocks()
-    grains = world.slabs[-1]
-    large = body >= grains
-    row = body[large] - grains
-    blocks[large, :, :3] = blocks[large, :, :3] @ free_directions(world.large_bodies)[row]
-    axes = quaternion.matrix(world.large.quaternion)
-    turns = np.isfinite(world.large.inertia)  # about which of its axes a body does
-    blocks[large, :, 3:] = blocks[large, :, 3:] @ ((axes * turns[:, None, :]) @ axes.transpose(0, 2, 1))[row]
-    moves = np.concatenate([np.ones(grains, dtype=bool), bodies.is_dynamic(world.large)])
-    kept = moves[body]
-    indptr = np.concatenate([[0], np.cumsum(kept.sum(axis=1))])
-    rows = BlockRows(indptr, (np.cumsum(moves) - 1)[body][kept], blocks[kept], int(dynamic.sum()))
-    transposed = block_matrix(world.comm, rows)  # a row of D' has all its entries here
-    H = transposed.transpose(PETSc.Mat())
-    transposed.destroy()
-    return H
-
+    M^-1/2 of the step says it all: a body does not move where that is zero. There its mass is arbitrary.
+    """
+    step = system.contact_map
+    value, vector = np.linalg.eigh(root_blocks(step.given.root))
+    largest = value.max(axis=-1, keepdims=True, initial=0.0)
+    moves = value > 1e-9 * np.maximum(largest, np.finfo(float).tiny)
+    turned = vector.swapaxes(-1, -2)
+    free = packed((vector * moves[..., None, :]) @ turned)
+    dynamic = moves.any(axis=(1, 2))
+    inverse = np.where(moves, value, np.where(largest > 0, largest, 1.0))
+    both = (vector / inverse[..., None, :] ** 2) @ turned
+    masses = np.zeros((len(both), 6, 6))
+    masses[:, :3, :3], masses[:, 3:, 3:] = both[:, 0], both[:, 1]
+    count = int(dynamic.sum())
+    number = np.full(step.halo.rows, -1)
+    number[: len(dynamic)][dynamic] = offsets(step.comm, count)[step.comm.rank] + np.arange(count)
+    step.halo.update(number)
+    rows = replace(step.given, body=number[step.body], root=free[dynamic], columns=count)
+    return dynamic, masses[dynamic], ContactMap(step.comm, rows)
 
 def refuse_absent(run: Run, first: int) -> None:
     """OptionError for a step of ``-dump_steps`` that the run, from the step ``first`` on, does not make."""

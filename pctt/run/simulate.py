@@ -6,8 +6,8 @@ from pathlib import Path
 
 from mpi4py import MPI
 
+from dem.compiled import tell_first_compilation
 from pctt import ccp
-from pctt.compiled import tell_first_compilation
 from pctt.run import interrupt, leftovers, report
 from pctt.run.dump import dump_steps, refuse_absent
 from pctt.run.settings import DEMO, Options

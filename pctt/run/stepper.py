@@ -13,20 +13,13 @@ from mpi4py import MPI
 from dem.contact import Contacts, find_contacts, find_overrun
 from dem.impulses import ImpulseMemory
 from dem.partition import rebalance
-from dem.stepper import advance
+from dem.step import advance, find_turned
 from dem.system import ContactSystem
 from dem.together import SceneError
-from dem.turning import find_turned
 from dem.world import World
 from pctt import ccp, log
 from pctt.run.dump import Dump
 from pctt.run.settings import Settings
-
-#: An overlap by a contact that the search did not foresee is solved for if it would be deeper than this part of delta.
-OVERRUN = 0.01
-
-#: An overlap that bodies make as they turn is corrected if it is deeper than this part of delta, so many times a step.
-TURNED, CORRECTIONS = 0.1, 3
 
 
 class Solved(NamedTuple):
@@ -98,7 +91,7 @@ class Stepper:
         with log.phase("solve"):
             solved = self.solve(problem, guess)
         self._corrections = 0
-        while again := self._overrun(problem, solved.result.impulse) or self._turned(solved.result.impulse):
+        while again := self._overrun(solved.result) or self._turned(solved.result):
             problem, guess = self._assemble(*again)
             with log.phase("solve"):
                 solved = self.solve(problem, guess).after(solved)
@@ -109,7 +102,7 @@ class Stepper:
             files = self.dump.step(self.system, problem, guess, result, solved.asked) if self.dump else {}
         with log.phase("advance"):
             self.impulse, self.history = result.impulse, result.history
-            advance(self.world, self.system.velocity(self.impulse), self.settings.dt)
+            advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt)
             self.memory.remember(self.system.key, self.impulse, self.system.frame)
         self._release()
         return self._figures(problem.size, solved, accuracy, files)
@@ -163,41 +156,41 @@ class Stepper:
             guess, _ = memory.recall(self.system.key, self.system.frame)
         return self._problem, guess
 
-    def _overrun(self, problem: ccp.ConeProblem, impulse: np.ndarray) -> tuple[Contacts, ImpulseMemory] | None:
+    def _overrun(self, found: ccp.Result) -> tuple[Contacts, ImpulseMemory] | None:
         """The contacts together with those that the search did not foresee, because an impulse of this step sends a
         grain further than its margin, and the impulses so far. None if no such grain meets anything."""
         world, settings = self.world, self.settings
         with log.phase("search"):
-            velocity = self.system.velocity(impulse)
+            velocity = self.system.velocity_with(found.momentum)
             wider = find_overrun(world, self.contacts, velocity, settings.delta, settings.dt)
         if wider is None:
             return None
         with log.phase("assembly"):
             unseen = wider.take(~np.isin(wider.key, self.contacts.key))
-            system = ContactSystem(world, unseen, settings.dt, settings.recovery_speed)
-            with cone_problem(system, world.comm) as beyond:
-                opening = (beyond.velocity_of(problem.momentum(impulse)) + beyond.r)[:, 0]
-                closes = settings.dt * beyond.min(opening.min(initial=0.0)) < -OVERRUN * settings.delta
-        return (wider, self._remembered(impulse)) if closes else None
+            beyond = ContactSystem(world, unseen, settings.dt, settings.recovery_speed)
+            opening = (beyond.contact_map.velocities(found.momentum) + beyond.r)[:, 0]
+            # solved for if the overlap would be deeper than a hundredth of delta
+            closes = bool((settings.dt * opening < -0.01 * settings.delta).any())
+        return (wider, self._remembered(found)) if world.comm.allreduce(closes, MPI.LOR) else None
 
-    def _turned(self, impulse: np.ndarray) -> tuple[Contacts, ImpulseMemory] | None:
+    def _turned(self, found: ccp.Result) -> tuple[Contacts, ImpulseMemory] | None:
         """The contacts, with those that overlap at the end of the step because bodies turn, and the impulses so far.
         None if there are none, or after so many corrections."""
-        if self._corrections == CORRECTIONS:
+        settings, depth, most = self.settings, 0.1 * self.settings.delta, 3  # overlap that is corrected, and how often
+        if self._corrections == most:
             return None
-        settings = self.settings
         with log.phase("search"):
-            velocity, depth = self.system.velocity(impulse), TURNED * settings.delta
-            found = find_turned(self.world, self.contacts, velocity, settings.dt, depth, settings.recovery_speed)
-        if found is None:
+            velocity = self.system.velocity_with(found.momentum)
+            turned = find_turned(self.world, self.contacts, velocity, settings.dt, depth, settings.recovery_speed)
+        if turned is None:
             return None
         self._corrections += 1
-        return found, self._remembered(impulse)
+        return turned, self._remembered(found)
 
-    def _remembered(self, impulse: np.ndarray) -> ImpulseMemory:
+    def _remembered(self, found: ccp.Result) -> ImpulseMemory:
         """A memory of these impulses of the present contacts."""
         memory = ImpulseMemory(self.world.comm)
-        memory.remember(self.system.key, impulse, self.system.frame)
+        memory.remember(self.system.key, found.impulse, self.system.frame)
         return memory
 
     def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> Solved:
@@ -219,8 +212,8 @@ class Stepper:
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
-    G = ccp.CompactRows(*system.contact_map, columns=system.owned_bodies)
-    return ccp.ConeProblem(comm, system.r, system.mu, G=G, point=system.point, key=system.key, compliance=compliance)
+    G, point, key = system.contact_map, system.point, system.key
+    return ccp.ConeProblem(comm, system.r, system.mu, G=G, point=point, key=key, compliance=compliance)
 
 
 def _peak_memory(comm: MPI.Comm) -> int:

@@ -19,12 +19,12 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.contact import find_contacts
+from dem.exchange import offsets
 from dem.partition import imbalance, rebalance
 from dem.scenes import Mixer
 from dem.system import ContactSystem
 from pctt import ccp
 from pctt.ccp.first_order.scaled import ScaledProblem
-from pctt.exchange import offsets
 from pctt.run.stepper import cone_problem
 from pctt.simulation import Simulation
 

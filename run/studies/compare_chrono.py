@@ -38,7 +38,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,12 +50,13 @@ from solve_one import warm_up
 from dem import quaternion
 from dem.bodies import SPHERE
 from dem.contact import Contacts, find_contacts
+from dem.contact_map import ContactMap
 from dem.motion import Fixed
 from dem.scene import Scene
 from dem.scenes import Mixer
 from dem.shapes import Box, Plane
 from dem.start import new_world
-from dem.system import ContactSystem, contact_frames, relative_velocity
+from dem.system import ContactSystem, contact_frames
 from dem.world import World
 from pctt import ccp
 from pctt.simulation import Simulation
@@ -132,8 +133,8 @@ def assembled(state: State, contacts: Contacts) -> Step:
     position = contacts.near.bodies.position
     arms = [contacts.point - half - position[contacts.a], contacts.point + half - position[contacts.b]]
     arm = np.ascontiguousarray(np.hstack(arms))
-    r = system.b + relative_velocity(system.frame, arm, contacts.body, system.free_velocity)
-    G = ccp.CompactRows(*system.contact_map._replace(arm=arm), columns=system.owned_bodies)
+    G = ContactMap(COMM, replace(system.contact_map.given, arm=arm))
+    r = system.b + G.relative_velocities(np.vstack([system.free_velocity, np.zeros(6)]))
     on_floor = contacts.body[:, 1] == world.slabs[-1] + _floor(world)
 
     def floor_force(impulse: np.ndarray) -> float:

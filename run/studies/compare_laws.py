@@ -15,7 +15,7 @@ from dem.motion import Rotation
 from dem.scene import Scene
 from dem.shapes import Box
 from dem.start import new_world
-from dem.stepper import advance
+from dem.step import advance
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp

@@ -24,9 +24,7 @@ from petsc4py import PETSc
 from pctt.blocks import square_block_matrix
 from pctt.ccp import ConeProblem, fclib
 from pctt.ccp.cone import Array
-from pctt.ccp.fclib import FileFormatError
-from pctt.ccp.fclib.global_form import symmetric_masses
-from pctt.ccp.fclib.stored import symmetric_blocks
+from pctt.ccp.fclib import FileFormatError, symmetric_blocks, symmetric_masses
 
 #: Of masses in Siconos' files, as `symmetric_masses` takes it: %g and %e print six and seven digits.
 ROUNDING = 1e-5
@@ -76,10 +74,7 @@ def _from_text(path: Path, made: Path) -> str:
     if not (M.diagonal() > 0).all():
         raise FileFormatError("its mass matrix is not positive")
     M, note = symmetric_masses(M, ROUNDING)
-    mats = [PETSc.Mat().createAIJ(A.shape, csr=_csr(A), comm=PETSc.COMM_SELF) for A in (M, H)]
-    fclib.write_global(made, *mats, f, w.reshape(-1, 3), mu, _info(path, note))
-    for mat in mats:
-        mat.destroy()
+    fclib.write_global(made, MPI.COMM_SELF, M, H.T, f, w.reshape(-1, 3), mu, _info(path, note))
     return note
 
 
@@ -123,11 +118,6 @@ def _vector(viewer: PETSc.Viewer) -> Array:
     vector = PETSc.Vec().create(PETSc.COMM_SELF)
     vector.setType(PETSc.Vec.Type.SEQ)
     return np.array(vector.load(viewer).array)
-
-
-def _csr(A: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    A.sort_indices()
-    return A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data
 
 
 def _info(path: Path, note: str) -> fclib.Info:

@@ -12,10 +12,9 @@ from dem.contact import Contacts, find_contacts
 from dem.motion import Dynamic, Oscillation, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere
-from dem.stepper import advance
+from dem.step import advance
 from dem.system import ContactSystem
 from dem.world import World
-from pctt.contact_map import CompactRows
 
 
 def force_on(world: World, system: ContactSystem, name: str, impulse: np.ndarray) -> np.ndarray:
@@ -124,17 +123,24 @@ def contacts_by_key(contacts: Contacts, comm: MPI.Comm) -> dict[str, np.ndarray]
 
 def dense_map(system: ContactSystem) -> Floats:
     """D' (3 nc, 6 bodies) of the local contacts."""
-    body, blocks = system.blocks()
-    dense = np.zeros((len(system.key), 3, system.total_bodies, 6))
-    for c, both in enumerate(body):
-        dense[c][:, both] = blocks[c].transpose(1, 0, 2)
-    return dense.reshape(3 * len(system.key), 6 * system.total_bodies)
+    body = system.near.index[system.contact_map.body]
+    dense = np.zeros((len(system.key), 3, bodies_of(system), 6))
+    contact, arms = np.arange(len(body)), system.contact_map.given.arm.reshape(-1, 2, 1, 3)
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        dense[contact, :, body[:, side], :3] = sign * system.frame
+        dense[contact, :, body[:, side], 3:] = sign * np.cross(arms[:, side], system.frame)
+    return dense.reshape(3 * len(system.key), 6 * dense.shape[2])
+
+
+def bodies_of(system: ContactSystem) -> int:
+    """The number of bodies on all ranks; collective."""
+    return int(system.contact_map.comm.allreduce(system.contact_map.columns))
 
 
 def dense_scaled_map(system: ContactSystem, comm: MPI.Comm) -> Floats:
     """G = D' M^-1/2 (3 nc, 6 bodies) of the local contacts, from the blocks that solvers make of it; collective."""
-    G = CompactRows(*system.contact_map, columns=system.owned_bodies).block_rows(comm)
-    dense = np.zeros((len(system.key), 3, system.total_bodies, 6))
+    G = system.contact_map.block_rows
+    dense = np.zeros((len(system.key), 3, bodies_of(system), 6))
     contact = np.repeat(np.arange(len(system.key)), np.diff(G.indptr))
     dense[contact, :, G.indices] = G.blocks
-    return dense.reshape(3 * len(system.key), 6 * system.total_bodies)
+    return dense.reshape(3 * len(system.key), 6 * dense.shape[2])

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from cases import random_quaternions
 
-from dem import impulses, quaternion
+from dem import quaternion
 from dem import system as contact_system
 from dem.contact import broad
 from dem.contact.narrow import Spheres, sphere_sphere, spheres_within
-from dem.contact.search import lexsort
+from dem.contact_map import loops
 from dem.free_motion import free_spin
 
 
@@ -54,13 +54,6 @@ def test_contacts_of_spheres():
         np.testing.assert_allclose(column, expected, atol=1e-14)
 
 
-def test_order():
-    rng = np.random.default_rng(1)
-    for count, groups in ((0, 1), (1, 1), (500, 1), (500, 7), (500, 1000)):
-        key, major = rng.permutation(10**6)[:count], rng.integers(0, groups, count)
-        np.testing.assert_array_equal(lexsort(key, major, groups), np.lexsort((key, major)))
-
-
 def random_rows(count=50, bodies=12):
     """Frames, arms and rows of contacts."""
     rng = np.random.default_rng(4)
@@ -74,39 +67,12 @@ def test_velocities_and_impulses_of_contacts():
     rng, frame, arm, row = random_rows()
     v, g = rng.normal(size=(12, 6)), rng.normal(size=(50, 3))
     one, two = (v[row[:, k], :3] + np.cross(v[row[:, k], 3:], arm[:, 3 * k : 3 * k + 3]) for k in (0, 1))
-    relative = contact_system.relative_velocity(frame, arm, row, v)
-    np.testing.assert_allclose(relative, np.einsum("cij,cj->ci", frame, two - one), atol=1e-14)
-    load = contact_system.sum_of_impulses(frame, arm, row, g, 12)
+    frame, row = frame.reshape(-1, 9), row.astype(np.uint32)
+    relative = loops.relative_velocities(frame, arm, row, v)
+    np.testing.assert_allclose(relative, np.einsum("cij,cj->ci", frame.reshape(-1, 3, 3), two - one), atol=1e-14)
+    load = np.zeros((12, 6))
+    loops.add_momenta(frame, arm, row, g, load)
     np.testing.assert_allclose(np.vdot(load, v), np.vdot(g, relative), rtol=1e-12)  # the transposed map
-    points = rng.normal(size=(50, 3))
-    expected = (points[:, None] - v[row][:, :, :3]).reshape(-1, 6)
-    np.testing.assert_array_equal(contact_system.contact_arms(points, np.ascontiguousarray(v[:, :3]), row), expected)
-
-
-def test_no_contacts():
-    none, rows = np.zeros((0, 3)), np.zeros((0, 2), np.int64)
-    frame, arm, position = np.zeros((0, 3, 3)), np.zeros((0, 6)), np.zeros((4, 3))
-    calls = {
-        (0, 3, 3): (contact_system.contact_frames, none),
-        (0, 6): (contact_system.contact_arms, none, position, rows),
-        (0, 3): (contact_system.relative_velocity, frame, arm, rows, np.zeros((4, 6))),
-        (4, 6): (contact_system.sum_of_impulses, frame, arm, rows, none, 4),
-        (0, 4): (impulses.in_the_world, none, frame),
-    }
-    for shape, (work, *arguments) in calls.items():
-        result = work(*arguments)
-        assert result.shape == shape
-        assert result.dtype == np.float64
-        assert not result.any()
-
-
-def test_impulses_in_the_world_and_back():
-    rng, frame, _, _ = random_rows()
-    impulse = rng.normal(size=(50, 3))
-    stored = impulses.in_the_world(impulse, frame)
-    in_world = np.einsum("cij,ci->cj", frame[:, 1:], impulse[:, 1:])
-    np.testing.assert_allclose(stored, np.hstack([impulse[:, :1], in_world]), atol=1e-15)
-    np.testing.assert_allclose(impulses.in_frames(stored, frame), impulse, atol=1e-14)
 
 
 def test_orientations():

@@ -1,48 +1,20 @@
-"""The compact form of the mass-scaled map G against its blocks."""
+"""The mass-scaled map G of a step, with the halo of the search, against its definition."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from cases import dense_scaled_map, heap, step
+from cases import bodies_of, dense_map, dense_scaled_map, heap, step
 from mpi4py import MPI
 
 from dem.contact import find_contacts
+from dem.contact_map import root_blocks
+from dem.exchange import offsets
 from dem.motion import Dynamic, Guided, Oscillation
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
-from dem.system import SYMMETRIC, ContactSystem
-
-
-def cross_matrix(vector):
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-def root_matrix(row):
-    """M^-1/2 (6, 6) of a body."""
-    if len(row) == 6:
-        return np.diag(row)
-    matrix = np.zeros((6, 6))
-    matrix[:3, :3], matrix[3:, 3:] = row[:6][SYMMETRIC], row[6:][SYMMETRIC]
-    return matrix
-
-
-def from_compact(system, comm):
-    """G (3 nc, 6 bodies) of the local contacts."""
-    rows = system.contact_map
-    roots = [root_matrix(row) for part in comm.allgather(rows.root) for row in part]
-    assert len(roots) == system.total_bodies
-    blocks = np.zeros((len(system.key), 3, system.total_bodies, 6))
-    for c in range(len(system.key)):
-        frame = rows.frame[c].reshape(3, 3)
-        for side, sign in ((0, -1.0), (1, 1.0)):
-            body, arm = rows.body[c, side], rows.arm[c, 3 * side : 3 * side + 3]
-            if body >= 0:
-                moment = frame @ -cross_matrix(arm)  # of w: F (w x r)
-                blocks[c, :, body] += sign * np.hstack([frame, moment]) @ roots[body]
-    return blocks.reshape(3 * len(system.key), -1)
+from dem.system import ContactSystem
 
 
 def mixed(comm):
@@ -64,14 +36,9 @@ def pressed(motion, comm):
     return new_world(scene, comm)
 
 
-def spheres(comm):
-    """Spheres alone with bodies of prescribed motion: the roots are diagonal."""
-    return pressed(Oscillation((0, 0, 1), 0.01, 1.0), comm)
-
-
 CASES = {
     "all shapes": (mixed, 12),
-    "spheres": (spheres, 6),
+    "spheres": (lambda comm: pressed(Oscillation((0, 0, 1), 0.01, 1.0), comm), 6),
     "guided": (lambda comm: pressed(Guided((1, 0, 2)), comm), 12),
     "dynamic large body": (lambda comm: pressed(Dynamic(), comm), 12),
 }
@@ -79,25 +46,71 @@ CASES = {
 
 @pytest.mark.parallel(1, 2, 3)
 @pytest.mark.parametrize("case", CASES)
-def test_compact_rows_are_g(case):
+def test_products_are_those_of_the_definition(case):
+    """Of D' from frames and arms, and M^-1/2 of all bodies; the halo is that of the search."""
     comm = MPI.COMM_WORLD
     make, width = CASES[case]
     world = make(comm)
     system = ContactSystem(world, find_contacts(world, 0.03), 0.01)
-    rows = system.contact_map
+    G, bodies = system.contact_map, bodies_of(system)
     assert comm.allreduce(len(system.key)) > 40
-    assert rows.root.shape == (world.owned, width)
-    for array, shape, kind in zip(rows, [(9,), (6,), (2,), (width,)], "ffif"):
-        assert array.shape[1:] == shape
-        assert array.dtype == np.dtype(f"{kind}8")
-        assert array.flags.c_contiguous
-    dense = dense_scaled_map(system, comm)
-    np.testing.assert_allclose(from_compact(system, comm), dense, atol=1e-13 * np.abs(dense).max(initial=1.0))
+    assert G.given.root.shape == (world.owned, width)
+    roots = np.concatenate(comm.allgather(root_blocks(G.given.root)))
+    D = dense_map(system).reshape(-1, bodies, 2, 3)
+    dense = np.einsum("cbpi,bpij->cbpj", D, roots).reshape(len(D), -1)
+    np.testing.assert_allclose(dense_scaled_map(system, comm), dense, atol=1e-13 * np.abs(dense).max(initial=1.0))
+    rng = np.random.default_rng(0)
+    v, g = rng.normal(size=(bodies, 6)), rng.normal(size=system.r.shape)
+    starts = offsets(comm, G.columns)
+    own = slice(starts[comm.rank], starts[comm.rank + 1])
+    close = {"rtol": 1e-11, "atol": 1e-11 * comm.allreduce(np.abs(dense).max(initial=1.0), MPI.MAX)}
+    np.testing.assert_allclose(G.velocities(v[own]).ravel(), dense @ v.ravel(), **close)
+    momenta = comm.allreduce(dense.T @ g.ravel()).reshape(-1, 6)
+    np.testing.assert_allclose(G.momenta(g), momenta[own], **close)
+    change = np.einsum("bpij,bpj->bpi", roots, momenta.reshape(-1, 2, 3)).reshape(-1, 6)[own]
+    np.testing.assert_allclose(system.velocity(g), system.free_velocity + change, **close)
+    again = type(G)(comm, G.given)  # with a halo that is found from the numbers of the bodies
+    np.testing.assert_allclose(again.momenta(g), G.momenta(g), **close)
+    assert len(again.halo.ghosts) == len(G.halo.ghosts)  # none that no contact touches
+
+
+class Counting:
+    """A communicator that counts the messages which this rank sends."""
+
+    def __init__(self, comm):
+        self._comm, self.sent = comm, 0
+
+    def __getattr__(self, name):
+        return getattr(self._comm, name)
+
+    def Isend(self, *arguments):  # noqa: N802 - as MPI names it
+        self.sent += 1
+        return self._comm.Isend(*arguments)
+
+
+@pytest.mark.parallel(2, 4)
+def test_a_product_sends_one_message_to_each_rank_that_shares_a_ghost():
+    """As docs/cluster.md counts them: momenta to the owners of ghosts, velocities to the ranks that have ghosts."""
+    comm = Counting(MPI.COMM_WORLD)
+    world = new_world(heap(3, side=4, large=False), MPI.COMM_WORLD)
+    system = ContactSystem(world, find_contacts(world, 0.05), 0.01)
+    given = system.contact_map.given
+    starts = offsets(MPI.COMM_WORLD, given.columns)
+    owners = set(np.searchsorted(starts, given.body[given.body >= 0], side="right") - 1) - {comm.rank}
+    holders = [rank for rank, theirs in enumerate(comm.allgather(owners)) if comm.rank in theirs]
+    assert comm.allreduce(len(owners)) > 0
+    G = type(system.contact_map)(comm, given, system.contact_map.halo, system.contact_map.body)
+    G.halo.comm = comm
+    G.velocities(np.zeros((G.columns, 6)))
+    assert comm.sent == len(holders)
+    G.momenta(np.zeros_like(system.r))
+    assert comm.sent == len(holders) + len(owners)
 
 
 def test_without_contacts():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 5]], 0.1, 1000.0)
     world = new_world(scene, MPI.COMM_SELF)
-    rows = ContactSystem(world, find_contacts(world, 0.01), 0.01).contact_map
-    assert [array.shape for array in rows] == [(0, 9), (0, 6), (0, 2), (1, 6)]
+    given = ContactSystem(world, find_contacts(world, 0.01), 0.01).contact_map.given
+    shapes = [array.shape for array in (given.frame, given.arm, given.body, given.root)]
+    assert shapes == [(0, 9), (0, 6), (0, 2), (1, 6)]

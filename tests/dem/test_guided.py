@@ -12,7 +12,7 @@ from dem.motion import Guided
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
-from dem.stepper import advance
+from dem.step import advance
 from dem.system import ContactSystem
 
 SELF = MPI.COMM_SELF

@@ -7,7 +7,8 @@ from mpi4py import MPI
 
 from dem.bodies import Bodies
 from dem.contact import find_contacts
-from dem.partition import curve_codes, imbalance, rebalance, splitters
+from dem.morton import Frame, morton_codes
+from dem.partition import imbalance, rebalance, splitters
 from dem.start import new_world
 
 
@@ -19,14 +20,14 @@ def test_morton_codes_interleave_the_bits():
     rng = np.random.default_rng(1)
     cells = rng.integers(0, 2**21, (200, 3))
     cells[0], cells[1] = 0, 2**21 - 1
-    codes = curve_codes(cells.astype(float), np.zeros(3), np.full(3, 2.0**21 - 1))
+    codes = morton_codes(cells.astype(float), Frame(np.zeros(3), 2.0**21 - 1))
     assert codes.tolist() == [interleave(*map(int, cell)) for cell in cells]
     assert codes.min() == 0
     assert codes.max() == 2**63 - 1
 
 
 def test_morton_codes_of_one_point():
-    assert curve_codes(np.ones((1, 3)), np.ones(3), np.ones(3)).tolist() == [0]
+    assert morton_codes(np.ones((1, 3))).tolist() == [0]
 
 
 @pytest.mark.parallel(2, 3, 4)
@@ -74,6 +75,6 @@ def test_rebalancing_keeps_the_bodies_and_spreads_the_contacts():
 
     # Sorted along one curve over all ranks.
     low, high = after.position.min(axis=0), after.position.max(axis=0)
-    codes = np.concatenate(comm.allgather(curve_codes(world.grains.position, low, high)))
+    codes = np.concatenate(comm.allgather(morton_codes(world.grains.position, Frame.between(low, high))))
     if comm.size > 1:
         assert (np.diff(codes) >= 0).all()

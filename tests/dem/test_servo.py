@@ -14,10 +14,9 @@ from dem.motion import Glide, Guided, Hinged
 from dem.scene import Scene
 from dem.shapes import Box, Capsule, Plane, Sphere, mass_properties
 from dem.start import new_world
-from dem.stepper import advance
+from dem.step import advance
 from dem.system import ContactSystem
 from pctt import ccp
-from pctt.contact_map import CompactRows
 from pctt.run.stepper import cone_problem
 
 SELF, DT = MPI.COMM_SELF, 0.01
@@ -107,10 +106,10 @@ def test_the_mass_scaled_map_of_a_hinged_body_has_one_direction():
     scene.add_spheres([[0.6, 0, 0], [0, 0.601, 0]], 0.1, 1000.0)
     world = new_world(scene, SELF)
     system = ContactSystem(world, find_contacts(world, 0.01), DT)
-    rows = CompactRows(*system.contact_map, columns=system.owned_bodies).block_rows(SELF)
+    rows = system.contact_map.block_rows
     blocks = rows.blocks[rows.indices == 2].reshape(-1, 6)
     np.testing.assert_array_equal(blocks[:, :3], 0.0)
     np.testing.assert_allclose(np.cross(blocks[:, 3:], AXIS), 0.0, atol=1e-15)
-    compact = system.contact_map.root[-1, 6:]
+    compact = system.contact_map.given.root[-1, 6:]
     moment = 0.4 * 0.25 * 100.0 * 4 / 3 * np.pi * 0.125
     np.testing.assert_allclose(compact, (np.outer(AXIS, AXIS) / np.sqrt(moment))[np.triu_indices(3)], atol=1e-15)

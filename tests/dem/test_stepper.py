@@ -11,7 +11,7 @@ from dem.motion import Glide, Rotation
 from dem.scene import Scene
 from dem.shapes import Box
 from dem.start import new_world
-from dem.stepper import advance
+from dem.step import advance
 from dem.system import ContactSystem
 
 SELF = MPI.COMM_SELF
@@ -35,16 +35,6 @@ def test_free_fall_is_the_semi_implicit_sum():
     np.testing.assert_allclose(
         world.grains.position[0], [k * dt, 0, 5 * k * dt - 9.81 * dt**2 * k * (k + 1) / 2], atol=1e-12
     )
-
-
-def test_a_free_sphere_keeps_its_spin():
-    scene = Scene(friction=0.3)
-    scene.add_spheres([[0, 0, 0]], 0.1, 1000.0, angular_velocity=(1.0, 2.0, -3.0))
-    world = new_world(scene, SELF)
-    fly(world, 0.01, 200)
-    np.testing.assert_array_equal(world.grains.velocity[0, 3:], [1, 2, -3])
-    expected = quaternion.exponential(2.0 * np.array([[1.0, 2, -3]]))
-    np.testing.assert_allclose(np.abs(world.grains.quaternion @ expected.T), 1.0, atol=1e-12)
 
 
 def test_a_free_box_tumbles_with_a_drift_of_angular_momentum_of_first_order():

@@ -16,7 +16,7 @@ from dem.partition import rebalance
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world, restart_rows, restored_world
-from dem.stepper import advance
+from dem.step import advance
 from dem.system import ContactSystem
 
 SELF = MPI.COMM_SELF

@@ -7,7 +7,8 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import BlockRows, square_block_matrix
+from dem.contact_map import BlockRows
+from pctt.blocks import square_block_matrix
 
 
 def poisson(n: int) -> PETSc.Mat:

@@ -18,7 +18,7 @@ from dem.partition import rebalance
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world
-from dem.stepper import advance
+from dem.step import advance
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp

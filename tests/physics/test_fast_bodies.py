@@ -54,12 +54,11 @@ def test_spheres_that_pass_each_other_are_left_alone():
 
 
 @pytest.mark.parametrize("motion", [Glide((2.0, 0, 0)), Rotation((0, 0, -2.0), (0.0, 1.0, 0.0))], ids=["glide", "turn"])
-@pytest.mark.parametrize("spheres", [1, 2])
-def test_a_fast_tool_does_not_run_into_spheres_at_rest(motion, spheres):
-    """Both tools move the point of contact by 5 cm a step; the gaps are 4 cm, and the first sphere strikes the next."""
+def test_a_fast_tool_does_not_run_into_spheres_at_rest(motion):
+    """Both tools move the point of contact by 5 cm a step; the gap is 4 cm."""
     scene = Scene(0.0, gravity=(0, 0, 0))
     scene.add_body("tool", [Box((0.02, 0.3, 0.3))], motion)
-    scene.add_spheres([[0.06 + RADIUS, 0, 0], [0.10 + 3 * RADIUS, 0, 0]][:spheres], RADIUS, 1000.0)
+    scene.add_spheres([0.06 + RADIUS, 0, 0], RADIUS, 1000.0)
     world = new_world(scene, MPI.COMM_SELF)
     assert worst_overlap(world, 6) < 2e-3  # a turning face is straightened over the step
 

@@ -13,8 +13,7 @@ from dem.record import energy
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world
-from dem.stepper import advanced
-from dem.turning import find_turned
+from dem.step import advanced, find_turned
 from pctt.simulation import Simulation
 
 DT, DELTA = 0.01, 0.1 * RADIUS

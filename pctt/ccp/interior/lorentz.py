@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dem.compiled import inlined, loop
 from pctt.ccp.cone import TINY, Array, dot, tangential
-from pctt.compiled import inlined, loop
 
 LEAST = 1e-17  # determinant of a unit point that rounding has put on or outside the boundary
 ROUND = 1e-14  # tangential part of a unit scaling point below which it has no direction

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
+from dem.contact_map.loops import local_product, pack
 from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
-from pctt.contact_map.block_loops import local_product, pack
 from pctt.shell import symmetric_shell
 
 

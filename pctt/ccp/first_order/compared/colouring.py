@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from pctt.contact_map import Ghosts
-from pctt.exchange import offsets
+from dem.contact_map import find_halo
+from dem.exchange import offsets
 
 
 class Adjacency:
@@ -23,18 +23,14 @@ class Adjacency:
 
     def __init__(self, comm: MPI.Comm, indptr: np.ndarray, columns: np.ndarray):
         self.comm, self.indptr, self.own = comm, indptr, len(indptr) - 1
-        self._ghosts = Ghosts(comm, self.own, columns)
-        self.columns = self._ghosts.body
+        self._halo, self.columns = find_halo(comm, self.own, columns)
 
     def fetch(self, own: np.ndarray) -> np.ndarray:
         """Whole numbers (n,) or (n, k) of own contacts and ghosts, from those of own contacts; collective."""
-        values = np.zeros((self._ghosts.nobody + 1, *own.shape[1:]))
+        values = np.zeros((self._halo.rows, *own.shape[1:]), np.int64)
         values[: self.own] = own
-        self._ghosts.update(values)
-        return values[:-1].astype(np.int64)
-
-    def destroy(self) -> None:
-        self._ghosts.destroy()
+        self._halo.update(values)
+        return values[:-1]
 
 
 def colours(graph: Adjacency) -> np.ndarray:

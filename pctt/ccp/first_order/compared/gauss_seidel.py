@@ -19,18 +19,16 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
-from petsc4py import PETSc
 
-from pctt.blocks import HUB
+from dem.contact_map import Halo
 from pctt.ccp import cone
 from pctt.ccp.cone import Array
-from pctt.ccp.delassus import rows_in_blocks
+from pctt.ccp.delassus import HUB, rows_in_blocks
 from pctt.ccp.first_order.compared.colouring import Adjacency, colours
 from pctt.ccp.first_order.progress import FirstOrder, Progress
 from pctt.ccp.first_order.scaled import ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
-from pctt.contact_map.ghosts import star_forest
 from pctt.log import phase
 from pctt.options import OptionError, option
 
@@ -61,21 +59,19 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: GaussSeid
     while progress.goes_on(x):
         x = sweep(x)
         progress.iterations += 1
-    sweep.destroy()
     return progress.result()
 
 
 @dataclass(frozen=True)
 class Colour:
-    """The contacts ``own`` of a colour, and the ghosts that get their values from other ranks."""
+    """The contacts ``own`` of a colour, and its ghosts on this rank."""
 
     own: slice
     rows: sp.bsr_matrix  # block rows of A, their columns in the order of the sweep
     steps: Array  # (n, 3)
     b: Array  # (n, 3)
     mu: Array
-    halo: PETSc.SF | None  # from the owners to the ghosts
-    ghosts: slice
+    halo: Halo  # of the ghosts of this colour
 
 
 class Sweep:
@@ -95,7 +91,6 @@ class Sweep:
         place[np.concatenate([self._order, graph.own + ghost_order])] = np.arange(len(colour))
         kept = np.stack([np.full(graph.own, comm.rank), place[: graph.own]], axis=1)
         remote = graph.fetch(kept)[graph.own :][ghost_order]  # where the ghosts' owners keep them
-        graph.destroy()
         A = sp.bsr_matrix((rows.data, place[graph.columns], rows.indptr), shape=(rows.shape[0], 3 * len(colour)))
         self._x = np.zeros((len(colour), 3))
         self._colours = []
@@ -106,20 +101,19 @@ class Sweep:
         for k in range(count):
             part = slice(ends[k], ends[k + 1])
             away = slice(ghost_ends[k], ghost_ends[k + 1])
-            halo = star_forest(comm, graph.own, remote[away]) if comm.size > 1 else None
-            ghosts = slice(graph.own + away.start, graph.own + away.stop)
+            ghosts = graph.own + np.arange(away.start, away.stop)
+            halo = Halo(comm, graph.own, len(colour), ghosts, *remote[away].T)
             picked = _picked(A, self._order[part])
-            self._colours.append(Colour(part, picked, steps[part], b[part], mu[part], halo, ghosts))
-        self._unit = MPI.DOUBLE.Create_contiguous(3).Commit()
+            self._colours.append(Colour(part, picked, steps[part], b[part], mu[part], halo))
 
     def __call__(self, x: Array) -> Array:
         """The point after the sweep, from x (nc, 3)."""
         self._x[: len(x)] = x[self._order]
         for colour in self._colours:
-            self._send(colour)
+            colour.halo.update(self._x)
         for colour in self._colours:
             self._update(colour)
-            self._send(colour)
+            colour.halo.update(self._x)
         out = np.empty_like(x)
         out[self._order] = self._x[: len(x)]
         return out
@@ -129,19 +123,6 @@ class Sweep:
         y = (colour.rows @ self._x.ravel()).reshape(-1, 3)
         y += colour.b
         cone.project(x - colour.steps * y, colour.mu, out=x)
-
-    def _send(self, colour: Colour) -> None:
-        if colour.halo is not None:
-            own = np.ascontiguousarray(self._x[: len(self._order)])
-            arguments = (self._unit, own, self._x[colour.ghosts], MPI.REPLACE)
-            colour.halo.bcastBegin(*arguments)
-            colour.halo.bcastEnd(*arguments)
-
-    def destroy(self) -> None:
-        for colour in self._colours:
-            if colour.halo is not None:
-                colour.halo.destroy()
-        self._unit.Free()
 
 
 def _picked(A: sp.bsr_matrix, rows: np.ndarray) -> sp.bsr_matrix:

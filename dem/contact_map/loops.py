@@ -1,15 +1,16 @@
-"""Compiled loops over contacts that are stored as frames and arms (`CompactRows`). The import takes half a second.
+"""Compiled loops over contacts that are stored as frames and arms (`CompactRows`).
 
-``body`` (nc, 2) has local numbers of bodies. w and m (bodies, 6) are physical velocities and momenta. The loops add to
-their last argument. They run over all contacts of their arrays, not between two given bounds, and the numbers of
-bodies are unsigned. Otherwise every index could be negative, and the test for this costs a third of a product.
+``body`` (nc, 2) has local numbers of bodies. w and m (bodies, 6) are physical velocities and momenta. The loops run
+over all contacts of their arrays, not between two given bounds, and the numbers of bodies are unsigned. Otherwise every
+index could be negative, and the test for this costs a third of a product.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from pctt.compiled import inlined, loop
+from dem.arrays import Floats
+from dem.compiled import inlined, loop
 
 
 @inlined
@@ -43,13 +44,20 @@ def push(c, arm, body, f0, f1, f2, m):
 
 
 @loop
-def add_velocities(frame, arm, body, w, y):
+def add_velocities(frame, arm, body, y, w):
     """y += D' w (nc, 3)."""
     for c in range(len(body)):
         u0, u1, u2 = velocity_at(c, arm, body, w)
         y[c, 0] += frame[c, 0] * u0 + frame[c, 1] * u1 + frame[c, 2] * u2
         y[c, 1] += frame[c, 3] * u0 + frame[c, 4] * u1 + frame[c, 5] * u2
         y[c, 2] += frame[c, 6] * u0 + frame[c, 7] * u1 + frame[c, 8] * u2
+
+
+def relative_velocities(frame, arm, body, w) -> Floats:
+    """D' w (nc, 3)."""
+    y = np.zeros((len(body), 3))
+    add_velocities(frame, arm, body, y, w)
+    return y
 
 
 @loop
@@ -165,3 +173,42 @@ def scale(root, v, out):
                 out[i, p] = root[i, q] * x + root[i, q + 1] * y + root[i, q + 2] * z
                 out[i, p + 1] = root[i, q + 1] * x + root[i, q + 3] * y + root[i, q + 4] * z
                 out[i, p + 2] = root[i, q + 2] * x + root[i, q + 4] * y + root[i, q + 5] * z
+
+
+@loop
+def pack(H, weight):
+    """The upper triangles of symmetric blocks H (nc, 3, 3) as the ``weight`` of `weighted`, (nc, 6)."""
+    for c in range(len(H)):
+        for i in range(3):
+            for j in range(i, 3):
+                weight[c, j if i == 0 else i + j + 1] = H[c, i, j]
+
+
+@loop
+def local_product(weight, g, y):
+    """y = H g (nc, 3) for the ``weight`` of `weighted`."""
+    for c in range(len(weight)):
+        y[c, 0], y[c, 1], y[c, 2] = weighted(weight, c, g[c, 0], g[c, 1], g[c, 2])
+
+
+@loop
+def block_velocities(blocks, start, body, w, y):
+    """y += G w (nc, 3) for blocks (nb, 3, 6): contact c has those from start[c] to start[c + 1], of bodies (nb,)."""
+    for c in range(len(y)):
+        for k in range(start[c], start[c + 1]):
+            i = body[k]
+            for n in range(6):
+                y[c, 0] += blocks[k, 0, n] * w[i, n]
+                y[c, 1] += blocks[k, 1, n] * w[i, n]
+                y[c, 2] += blocks[k, 2, n] * w[i, n]
+
+
+@loop
+def block_momenta(blocks, start, body, g, m):
+    """m += G' g for the blocks of `block_velocities` and impulses g (nc, 3)."""
+    for c in range(len(g)):
+        g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
+        for k in range(start[c], start[c + 1]):
+            i = body[k]
+            for n in range(6):
+                m[i, n] += blocks[k, 0, n] * g0 + blocks[k, 1, n] * g1 + blocks[k, 2, n] * g2

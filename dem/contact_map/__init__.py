@@ -1,0 +1,7 @@
+"""The contact map G = D' M^-1/2, from the velocities of bodies to the velocities of contacts, products with it, and
+the halo of bodies of other ranks that they need."""
+
+from dem.contact_map.halo import Halo, find_halo
+from dem.contact_map.map import BlockRows, CompactRows, ContactMap, root_blocks
+
+__all__ = ["BlockRows", "CompactRows", "ContactMap", "Halo", "find_halo", "root_blocks"]

@@ -1,0 +1,355 @@
+"""The contact map as frames and arms, and products with it by compiled loops over the contacts, without a matrix.
+
+A product moves 136 bytes per contact (frame, arms, bodies); PETSc's block formats move 300 to 800. While the values of
+ghosts travel, the loops work on the contacts that do not touch ghosts.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+from mpi4py import MPI
+
+from dem.arrays import Floats, Ints
+from dem.contact_map import loops
+from dem.contact_map.halo import Halo, find_halo
+from dem.exchange import refuse
+
+#: The entries (xx, xy, xz, yy, yz, zz) of a symmetric matrix among the nine, and the numbers (3, 3) of all among these.
+UPPER, SYMMETRIC = [0, 1, 2, 4, 5, 8], [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+
+
+@dataclass(frozen=True)
+class CompactRows:
+    """Contacts of rigid bodies: 15 numbers per contact, while two 3 x 6 blocks have 36 numbers.
+
+    In the frame F of a contact, body b has the velocity F (v_b + w_b x r_b - v_a - w_a x r_a) relative to body a.
+    Put the contacts between two own bodies first: a product does not wait for other ranks until it reaches the first
+    contact with a body of another rank.
+
+    Attributes
+    ----------
+    frame : (nc, 9) rows normal, tangent 1, tangent 2 of F
+    arm : (nc, 6) r_a and r_b, from the centres of the bodies to the contact point (m)
+    body : (nc, 2) global indices of a and b; -1 for a body that no impulse moves
+    root : M^-1/2 of the bodies that this rank owns: (columns, 6) with its diagonals, or (columns, 12) with its two
+        symmetric blocks, for translation and rotation, as (xx, xy, xz, yy, yz, zz) each; the same width on all ranks
+    columns : number of bodies that this rank owns
+    """
+
+    frame: Floats
+    arm: Floats
+    body: Ints
+    root: Floats
+    columns: int
+
+    @property
+    def rows(self) -> int:
+        return len(self.frame)
+
+    def checked(self) -> CompactRows:
+        """The same arrays in the types that compiled loops trust; ValueError if they do not fit together."""
+        nc, columns = len(self.frame), operator.index(self.columns)
+        frame, arm = _array("frame", self.frame, float, (nc, 9)), _array("arm", self.arm, float, (nc, 6))
+        body = _array("body", self.body, np.int64, (nc, 2))
+        if body.min(initial=0) < -1:
+            raise ValueError(f"body of the rows has {body.min()}; allowed are indices of bodies, and -1 for no body")
+        return CompactRows(frame, arm, body, _array("root", self.root, float, (columns, 6), (columns, 12)), columns)
+
+
+@dataclass(frozen=True)
+class BlockRows:
+    """Local block rows of G in block CSR format: one row of 3 x 6 blocks per contact, one block column per body.
+
+    Attributes
+    ----------
+    indptr : (nc + 1,) index of the first block of each contact, and the number of blocks
+    indices : (nnz,) global block columns (bodies)
+    blocks : (nnz, 3, 6)
+    columns : number of block columns that this rank owns
+    """
+
+    indptr: Ints
+    indices: Ints
+    blocks: Floats
+    columns: int
+
+    @property
+    def rows(self) -> int:
+        return len(self.indptr) - 1
+
+    def checked(self) -> BlockRows:
+        """The same arrays in the types of the attributes; ValueError if they do not fit together."""
+        count = len(self.indices)
+        indptr = _array("indptr", self.indptr, np.int64, (max(len(self.indptr), 1),))
+        indices = _array("indices", self.indices, np.int64, (count,))
+        if indptr[0] != 0 or indptr[-1] != count or (np.diff(indptr) < 0).any():
+            raise ValueError(f"indptr of the rows does not ascend from 0 to the number of blocks, {count}")
+        if indices.min(initial=0) < 0:
+            raise ValueError(f"indices of the rows have {indices.min()}; allowed are indices of bodies")
+        blocks = _array("blocks", self.blocks, float, (count, 3, 6))
+        return BlockRows(indptr, indices, blocks, operator.index(self.columns))
+
+
+class ContactMap:
+    """The contact map G of all ranks.
+
+    Impulses and velocities of contacts are arrays (nc, 3), mass-scaled velocities of bodies are arrays (columns, 6).
+    Flat arrays are allowed too; a ValueError for other shapes comes on this rank alone, as products are too frequent to
+    ask the other ranks. All products are collective.
+
+    given : the rows; ValueError on all ranks for wrong ones
+    halo, body : the halo, and (nc, 2) the rows of the bodies in its tables, uint32, for ``given`` that needs no check.
+        They are found from the global indices of the bodies if they are not given.
+    precision : of the arrays that products take and return; single precision moves half of the bytes
+    """
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        given: CompactRows,
+        halo: Halo | None = None,
+        body: np.ndarray | None = None,
+        precision: type[np.floating] = np.float64,
+    ):
+        if halo is None or body is None:
+            given = checked(comm, given)
+            halo, body = find_halo(comm, given.columns, given.body)
+        self.comm, self.given, self.halo, self.body, self.precision = comm, given, halo, body, precision
+        self.rows, self.columns = given.rows, given.columns
+        self.log_flops: Callable[[float], None] = lambda count: None  #: told how many operations a product took
+        self._arrays = self._floats(given.frame), self._floats(given.arm), body
+        self._root, self._mass = self._floats(given.root), self._floats(_square(given.root))
+        self._w, self._m = np.zeros((2, halo.rows, 6), precision)
+        ghost = np.zeros(halo.rows, bool)
+        ghost[halo.ghosts] = True
+        # two halves of the contacts that wait for no other rank, then the other contacts
+        first_away = _first(ghost[body].any(axis=1)) if len(halo.ghosts) else self.rows
+        ends = [0, first_away // 2, first_away, self.rows]
+        pieces = (slice(*pair) for pair in zip(ends, ends[1:]))
+        self._half, self._rest, self._away = ((here, *(x[here] for x in self._arrays)) for here in pieces)
+        self._flops = 45 * self.rows + 6 * self.columns
+
+    # -- products -------------------------------------------------------------------------------------------
+
+    def velocities(self, v: Floats) -> Floats:
+        """G v (nc, 3)."""
+        y = np.zeros((self.rows, 3), self.precision)
+        self._enter(self._root, shaped("velocities of bodies", v, self.columns, 6))
+        self._add_velocities(y)
+        self.log_flops(self._flops)
+        return y
+
+    def momenta(self, g: Floats) -> Floats:
+        """G' g (columns, 6)."""
+        self._collect(g)
+        self.log_flops(self._flops)
+        return self._left()
+
+    def add_delassus(self, g: Floats, y: Floats) -> None:
+        """y += G G' g; y (nc, 3) is C-contiguous."""
+        y = shaped("velocities of contacts", y, self.rows, 3)
+        self._collect(g)
+        self._enter(self._mass, self._m)
+        self._add_velocities(y)
+        self.log_flops(2 * self._flops)
+
+    def weights(self, H: Floats, symmetric: bool = True) -> Floats:
+        """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""
+        weight = np.empty((self.rows, 6 if symmetric else 9), self.precision)
+        loops.weights(*self._arrays, self._floats(H), weight)
+        return weight
+
+    def through(self, weight: Floats, v: Floats, out: Floats) -> None:
+        """out = v + G' H G v (columns, 6); out is C-contiguous."""
+        v = v.reshape(-1, 6)
+        self._m[:] = 0.0
+        self._enter(self._root, v)
+        self._add(loops.add_through, self._half, weight, self._w, self._m)
+        self.halo.end_update(self._w)
+        self._add(loops.add_through, self._away, weight, self._w, self._m)
+        self.halo.begin_add(self._m)
+        self._add(loops.add_through, self._rest, weight, self._w, self._m)
+        self.halo.end_add(self._m)
+        np.add(v, self._left(), out=out.reshape(-1, 6))
+        self.log_flops(72 * self.rows + 18 * self.columns)
+
+    def relative_velocities(self, v: Floats) -> Floats:
+        """D' v (nc, 3) for the velocities (rows, 6) of all rows of a table of the halo, without a message."""
+        return loops.relative_velocities(*self._arrays, v)
+
+    def sums_of_impulses(self, g: Floats) -> Floats:
+        """D g (rows, 6) of this rank's contacts, by rows of a table of the halo, without a message."""
+        sums = np.zeros((self.halo.rows, 6))
+        loops.add_momenta(*self._arrays, self._floats(shaped("impulses", g, self.rows, 3)), sums)
+        return sums
+
+    def _enter(self, scale: Floats, v: Floats) -> None:
+        """Store R v for the own bodies, and begin to send it to the ranks with ghosts of them.
+
+        The caller must call `end_update` later.
+        """
+        loops.scale(scale, v, self._w)
+        self.halo.begin_update(self._w)
+
+    def _add_velocities(self, y: Floats) -> None:
+        self._add(loops.add_velocities, self._half, y, self._w)
+        self._add(loops.add_velocities, self._rest, y, self._w)
+        self.halo.end_update(self._w)
+        self._add(loops.add_velocities, self._away, y, self._w)
+
+    def _collect(self, g: Floats) -> None:
+        """Collect the momenta that the impulses give to the bodies, not yet scaled by masses."""
+        g = self._floats(shaped("impulses", g, self.rows, 3))
+        self._m[:] = 0.0
+        self._add(loops.add_momenta, self._away, g, self._m)
+        self.halo.begin_add(self._m)
+        self._add(loops.add_momenta, self._half, g, self._m)
+        self._add(loops.add_momenta, self._rest, g, self._m)
+        self.halo.end_add(self._m)
+
+    def _add(self, loop: Callable[..., None], part: tuple[Any, ...], each: Floats, *others: Floats) -> None:
+        """Run a loop over a part of the contacts, with an array (nc, ...) that has a row for each contact."""
+        here, *arrays = part
+        if here.stop > here.start:
+            loop(*arrays, each[here], *others)
+
+    def _left(self) -> Floats:
+        """The scaled momenta of the own bodies."""
+        out = np.empty((self.columns, 6), self.precision)
+        loops.scale(self._root, self._m, out)
+        return out
+
+    # -- parts of matrices ----------------------------------------------------------------------------------
+
+    def contact_blocks(self) -> Floats:
+        """The diagonal blocks of G G' (nc, 3, 3)."""
+        out = np.empty((self.rows, 3, 3), self.precision)
+        mass = np.zeros((self.halo.rows, 12), self.precision)
+        mass[: self.columns] = packed(root_blocks(self._mass))
+        self.halo.update(mass)
+        loops.contact_blocks(*self._arrays, mass, out)
+        return out
+
+    def body_blocks(self, weight: Floats) -> Floats:
+        """The diagonal blocks of I + G' H G (columns, 6, 6)."""
+        blocks = np.zeros((self.halo.rows, 6, 6), self.precision)
+        loops.add_body_blocks(*self._arrays, weight, blocks)
+        self.halo.add(blocks)
+        own = blocks[: self.columns]
+        if self._root.shape[1] == 6:
+            own *= self._root[:, :, None] * self._root[:, None, :]
+        else:
+            roots = np.zeros((self.columns, 6, 6))
+            roots[:, :3, :3], roots[:, 3:, 3:] = root_blocks(self._root).transpose(1, 0, 2, 3)
+            own = roots @ own @ roots
+        own[:, range(6), range(6)] += 1.0
+        return own
+
+    def scaled(self, size: Floats, precision: type[np.floating] = np.float64) -> ContactMap:
+        """The map with its rows multiplied by ``size`` (nc, 3)."""
+        frame = (self.given.frame.reshape(-1, 3, 3) * size[:, :, None]).reshape(-1, 9)
+        other = ContactMap(self.comm, replace(self.given, frame=frame), self.halo, self.body, precision)
+        other.log_flops = self.log_flops
+        return other
+
+    def structure(self) -> tuple[np.ndarray, ...]:
+        """Arrays that are equal where contacts and their bodies are."""
+        return self.given.body, np.array([self.columns])
+
+    @cached_property
+    def block_rows(self) -> BlockRows:
+        """The rows as 3 x 6 blocks; collective at its first use."""
+        given = self.given
+        root = np.zeros((self.halo.rows, given.root.shape[1]))
+        root[: self.columns] = given.root
+        self.halo.update(root)
+        order = np.argsort(given.body, axis=1)
+        frame, arms = given.frame.reshape(-1, 1, 3, 3), given.arm.reshape(-1, 2, 1, 3)
+        blocks = np.concatenate(np.broadcast_arrays(frame, np.cross(arms, frame)), axis=3)
+        blocks *= np.array([-1.0, 1.0])[:, None, None]
+        body, local = (np.take_along_axis(rows, order, axis=1) for rows in (given.body, self.body))
+        moves = body >= 0
+        blocks = np.take_along_axis(blocks, order[:, :, None, None], axis=1)[moves]
+        both = root_blocks(root)[local[moves]]
+        blocks = np.concatenate([blocks[:, :, :3] @ both[:, 0], blocks[:, :, 3:] @ both[:, 1]], axis=2)
+        return BlockRows(np.concatenate([[0], np.cumsum(moves.sum(axis=1))]), body[moves], blocks, self.columns)
+
+    def _floats(self, array: Floats) -> Floats:
+        return np.ascontiguousarray(array, dtype=self.precision)
+
+    def destroy(self) -> None:
+        """Nothing to free; the other operators of a cone problem have something."""
+
+
+def shaped(name: str, x: Floats, rows: int, width: int) -> Floats:
+    """x as an array (rows, width), of this shape or flat. ValueError for others, on this rank alone."""
+    if x.shape not in ((rows, width), (rows * width,)):
+        raise ValueError(f"{name} of the shape {x.shape}; allowed is {(rows, width)}")
+    return x.reshape(rows, width)
+
+
+AnyRows = TypeVar("AnyRows", CompactRows, BlockRows)
+
+
+def checked(comm: MPI.Comm, rows: AnyRows) -> AnyRows:
+    """The same rows as C-contiguous arrays of float64 and int64, as the compiled loops trust. Collective.
+
+    ValueError on all ranks if shapes do not fit or bodies do not exist.
+    """
+    wrong, figures = "", np.zeros(3, np.int64)
+    try:
+        rows = rows.checked()
+        body, root = (rows.body, rows.root) if isinstance(rows, CompactRows) else (rows.indices, np.zeros((0, 0)))
+        figures[:] = rows.columns, body.max(initial=-1), root.shape[1]
+    except (TypeError, ValueError) as error:
+        wrong = str(error)
+    refuse(comm, wrong)
+    everywhere = np.empty((comm.size, 3), np.int64)
+    comm.Allgather(figures, everywhere)
+    bodies, last, width = everywhere[:, 0].sum(), everywhere[:, 1].max(), everywhere[:, 2]
+    if last >= bodies:
+        raise ValueError(f"a contact has the body {last}, but there are {bodies} bodies")
+    if np.ptp(width):
+        raise ValueError("root of the rows has another width on some ranks")
+    return rows
+
+
+def _array(name: str, given: np.ndarray, kind: type, *shapes: tuple[int, ...]) -> np.ndarray:
+    """A C-contiguous array of this type and of one of the shapes; ValueError for other data."""
+    array = np.asarray(given)
+    if array.shape not in shapes:
+        raise ValueError(f"{name} of the rows has the shape {array.shape}; allowed is {' or '.join(map(str, shapes))}")
+    if array.dtype.kind not in ("iu" if kind is np.int64 else "fiu") and array.size:
+        raise ValueError(f"{name} of the rows has the type {array.dtype}; allowed is {np.dtype(kind).name}")
+    return np.ascontiguousarray(array, dtype=kind)
+
+
+def root_blocks(root: Floats) -> Floats:
+    """Matrices in the format of `CompactRows.root` as blocks (n, 2, 3, 3)."""
+    if root.shape[1] == 6:
+        return root.reshape(-1, 2, 3, 1) * np.eye(3)
+    return root.reshape(-1, 2, 6)[:, :, SYMMETRIC]
+
+
+def packed(blocks: Floats) -> Floats:
+    """Symmetric blocks (n, 2, 3, 3) as (n, 12), the inverse of `root_blocks`."""
+    return blocks.reshape(-1, 2, 9)[:, :, UPPER].reshape(-1, 12)
+
+
+def _square(root: Floats) -> Floats:
+    """R^2, in the format of R."""
+    if root.shape[1] == 6:
+        return root * root
+    blocks = root_blocks(root)
+    return packed(blocks @ blocks)
+
+
+def _first(mask: np.ndarray) -> int:
+    """The index of the first True, or the length."""
+    return int(np.argmax(mask)) if mask.any() else len(mask)
