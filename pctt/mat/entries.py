@@ -14,8 +14,6 @@ from petsc4py import PETSc
 from pctt.tt.train import Array
 
 DENSE = ("dense", "seqdense", "mpidense")
-CHECKS = 256  # number of entries that are compared with those across the diagonal
-ASYMMETRY = 1e-8  # a smaller relative difference of these counts as rounding
 
 
 class EntriesError(ValueError):
@@ -37,6 +35,11 @@ def given(P: PETSc.Mat, name: str) -> Any:
     if value is None and isinstance(more, Mapping):
         value = more.get(name)
     return value() if callable(value) and name != "entries" else value
+
+
+def multiplies(A: PETSc.Mat) -> bool:
+    """Whether a Mat has products; one of type python may have none."""
+    return A.getType() != PETSc.Mat.Type.PYTHON or hasattr(A.getPythonContext(), "mult")
 
 
 def has_entries(P: PETSc.Mat) -> bool:
@@ -167,10 +170,10 @@ class DenseEntries(Entries):
 
 
 def is_symmetric(entries: Entries, rows: int) -> bool:
-    """Whether entries at some random places equal those across the diagonal; collective."""
-    i, j = np.random.default_rng(0).integers(0, rows, (2, CHECKS))
+    """Whether entries at some random places equal those across the diagonal, up to rounding; collective."""
+    i, j = np.random.default_rng(0).integers(0, rows, (2, 256))
     here, there = entries(i, j), entries(j, i)
-    return entries.comm.bcast(bool(np.linalg.norm(here - there) <= ASYMMETRY * np.linalg.norm(here)))
+    return entries.comm.bcast(bool(np.linalg.norm(here - there) <= 1e-8 * np.linalg.norm(here)))
 
 
 def diagonal_blocks(P: PETSc.Mat) -> Array:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import prod
 from typing import Any
 
@@ -14,50 +16,77 @@ from pctt.context import Context
 from pctt.exchange import on_first, refuse
 from pctt.mat.entries import Combination, Entries, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
-from pctt.mat.options import MAX_RANK, Options
 from pctt.mat.order import Places, digits_of, whole_numbers
-from pctt.mat.product import TrainProduct
-from pctt.petsc import on_axpy, on_getinfo, own_errors, warn
-from pctt.tt.cross import Cross, compress_cross
+from pctt.options import AT_LEAST_ONE, FRACTION, OptionError, describe, option, read, refuse_bad
+from pctt.petsc import given_options, on_axpy, on_getinfo, own_errors, warn
+from pctt.tt.cross import compress_cross
 from pctt.tt.entries import EntryMatrix
 from pctt.tt.train import Array, Train
 from pctt.tt.work import Work
 
 ROUNDING = 0.1  # tolerance for rounding a symmetric part or a sum, divided by eps
 MISSED = 10  # an error above this times eps is told
-MOST = 2**31  # number of rows that is too large, because pairs of rows are keys of 64 bits
+PREFIX, MAX_RANK = "mat_tt_", 200
 
 
-class CompressedEntries(GridTrain):
-    """A = c (I + T) for a matrix A that is given by its entries; c is the mean of the diagonal.
+@dataclass(frozen=True)
+class Options:
+    """Options ``-mat_tt_*`` of a Mat that is a train, after the prefix of the Mat."""
+
+    eps: float = option(
+        1e-8, "the compression ends at this error relative to ||A - c I||_F; c is the mean of the diagonal",
+        check=FRACTION,
+    )  # fmt: skip
+    max_rank: int = option(MAX_RANK, "largest allowed rank", check=AT_LEAST_ONE)
+
+    def check(self, comm: MPI.Comm) -> None:
+        """ValueError on all ranks if a value is not allowed or differs between ranks; collective."""
+        wrong = ""
+        try:
+            refuse_bad(self)
+        except OptionError as error:
+            wrong = str(error)
+        refuse(comm, wrong)
+        found = comm.allgather(repr(self))
+        if len(set(found)) > 1:
+            raise ValueError(f"eps or max_rank differ between ranks: {', '.join(found)}")
+
+    def given_for(self, mat: PETSc.Mat) -> Options:
+        """These options with those of the database; OptionError for a bad value or a misspelt name."""
+        prefix = (mat.getOptionsPrefix() or "") + PREFIX
+        given = given_options(Options, prefix)
+        found = dataclasses.asdict(read(Options, given, prefix))
+        return dataclasses.replace(self, **{name: found[name] for name in found if prefix + name in given})
+
+
+def compressed_entries(
+    P: PETSc.Mat, eps: float, max_rank: int, order: str = "auto", name: str = "order",
+    start: GridTrain | None = None, places: Places | None = None, work: Work | None = None,
+) -> GridTrain:  # fmt: skip
+    """A = c (I + T) for a matrix A that is given by its entries; c is the mean of the diagonal. Collective.
 
     Both the Mat and the PC use it. If the mean is not positive, shift is 0 and scale is 1. The error is estimated from
-    entries that the compression has not used.
-    """
+    entries that the compression has not used. On all ranks EntriesError or ValueError for bad entries or a bad grid,
+    TooMuchWorkError at the limit of `work`.
 
-    def __init__(
-        self, P: PETSc.Mat, eps: float, max_rank: int, order: str = "auto", name: str = "order",
-        start: GridTrain | None = None, seed: int = 0, places: Places | None = None, work: Work | None = None,
-    ) -> None:  # fmt: skip
-        """Collective; on all ranks EntriesError or ValueError for bad entries or a bad grid, TooMuchWorkError at the
-        limit of `work`."""
-        comm = P.comm.tompi4py()
-        entries = Entries.of(P)
-        digits, rows, order = digits_of(P, order, name, places)
-        counts = np.array(comm.allgather(P.getLocalSize()[0]))
-        matrix = EntryMatrix(entries, digits, rows, comm.bcast)
-        known = start.found if start is not None and start.digits.modes == digits.modes else None
-        found: Cross = compress_cross(matrix, max_rank, eps, known, rng=np.random.default_rng(seed), work=work)
-        train, error = found.train, found.error
-        symmetric = is_symmetric(entries, digits.rows)
-        if symmetric:
-            train, left = on_first(comm, lambda: _symmetric(found.train, eps, max_rank))
-            error = float(np.hypot(error, left))
-        origin = f"estimated from fresh entries, {found.evaluations} entries evaluated"
-        super().__init__(
-            comm, counts, digits, rows, order, train, matrix.shift, 1 / matrix.scale, error, symmetric, origin
-        )
-        self.found = found
+    order, name, places : as in `digits_of`
+    start : an earlier result for a similar matrix
+    """
+    comm, entries = P.comm.tompi4py(), Entries.of(P)
+    digits, rows, order = digits_of(P, order, name, places)
+    counts = np.array(comm.allgather(P.getLocalSize()[0]))
+    matrix = EntryMatrix(entries, digits, rows, comm.bcast)
+    known = start.found if start is not None and start.digits.modes == digits.modes else None
+    found = compress_cross(matrix, max_rank, eps, known, work=work)
+    train, error = found.train, found.error
+    symmetric = is_symmetric(entries, digits.rows)
+    if symmetric:
+        train, left = on_first(comm, lambda: _symmetric(found.train, eps, max_rank))
+        error = float(np.hypot(error, left))
+    return GridTrain(
+        comm, counts, digits, rows, order, train, matrix.shift, 1 / matrix.scale, error, symmetric,
+        f"estimated from fresh entries, {found.evaluations} entries evaluated", found,
+    )  # fmt: skip
 
 
 def _symmetric(train: Train, eps: float, max_rank: int) -> tuple[Train, float]:
@@ -121,14 +150,15 @@ class TensorTrain(Context):
         """Read the options; OptionError for a bad value or a misspelt name. They have no effect after ``setUp``."""
         self.options = self.options.given_for(mat)
         if PETSc.Options().hasName("help"):
-            PETSc.Sys.Print("\n".join(Options.help(mat)), comm=mat.comm)
+            lines = describe(Options, (mat.getOptionsPrefix() or "") + PREFIX)
+            PETSc.Sys.Print("\n".join(map(str, lines)), comm=mat.comm)
 
     def setUp(self, mat: PETSc.Mat) -> None:
         """ValueError on all ranks for bad options, entries or a bad grid. It does nothing if there is a train."""
         if not hasattr(self, "compressed"):
             self.options = self.options.given_for(mat)
             self.options.check(mat.comm.tompi4py())
-            found = CompressedEntries(mat, self.options.eps, self.options.max_rank)
+            found = compressed_entries(mat, self.options.eps, self.options.max_rank)
             if found.error > MISSED * self.options.eps:
                 warn(
                     found.comm,
@@ -140,29 +170,20 @@ class TensorTrain(Context):
 
     def take(self, mat: PETSc.Mat, matrix: GridTrain) -> None:
         """Become another matrix; the caller says which entries it has."""
-        old = getattr(self, "_product", None)
-        if old is None or matrix.train is not self.compressed.train:
-            self._product = matrix.product(matrix.train)
-            self._transposed: TrainProduct | None = None
         self.compressed = matrix
         mat.setOption(PETSc.Mat.Option.SYMMETRIC, matrix.symmetric)
 
     # -- products and entries -------------------------------------------------------------------------------
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self._times(self._product, x, y)
+        with PETSc.Log.Event("TTMult"):
+            y.array_w[:] = self.compressed.times(x.array_r)
+            PETSc.Log.logFlops(self.compressed.flops)
 
     def multTranspose(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        if self._transposed is None:
-            symmetric = self.compressed.symmetric
-            self._transposed = self._product if symmetric else self.compressed.product(self.compressed.train.T)
-        self._times(self._transposed, x, y)
-
-    def _times(self, product: TrainProduct, x: PETSc.Vec, y: PETSc.Vec) -> None:
         with PETSc.Log.Event("TTMult"):
-            local = x.array_r
-            y.array_w[:] = self.compressed.shift * local + self.compressed.scale * product(local)
-            PETSc.Log.logFlops(product.flops + 3 * len(local))
+            y.array_w[:] = self.compressed.times(x.array_r, transposed=True)
+            PETSc.Log.logFlops(self.compressed.flops)
 
     def getDiagonal(self, mat: PETSc.Mat, diagonal: PETSc.Vec) -> None:
         here = np.arange(*mat.getOwnershipRange())
@@ -214,7 +235,7 @@ class TensorTrain(Context):
 
     def duplicate(self, mat: PETSc.Mat, what: int) -> PETSc.Mat:
         """A copy, or without MAT_COPY_VALUES the zero matrix on the same grid."""
-        values = what == COPY_VALUES
+        values = what == 1  # MAT_COPY_VALUES of PETSc's MatDuplicateOption
         matrix, entries = (self.compressed, given(mat, "entries")) if values else (self.compressed.zero(), None)
         other = mat_of(matrix, self.options, entries or Combination(0.0, ()))
         for name in ("grid", "coordinates"):
@@ -242,16 +263,11 @@ class TensorTrain(Context):
             return
         if viewer.getType() == PETSc.Viewer.Type.ASCII:
             viewer.printfASCII(f"  tensor train: {self.compressed.words()}\n")
-        elif viewer.getType() in STORES:
+        elif viewer.getType() in ("binary", "hdf5", "vtk", "matlab"):
             raise ValueError(
                 f"pctt.mat.TensorTrain: a viewer of type {viewer.getType()} does not save trains; "
                 "pctt.mat.save(mat, path) does"
             )
-
-
-STORES = (PETSc.Viewer.Type.BINARY, PETSc.Viewer.Type.HDF5, PETSc.Viewer.Type.VTK, PETSc.Viewer.Type.MATLAB)
-COPY_VALUES = 1  # MAT_COPY_VALUES of PETSc's MatDuplicateOption
-IDENTITY = 1e-14  # a Mat is c I if it turns a random vector by no more than this
 
 
 def _context(mat: PETSc.Mat) -> TensorTrain | None:
@@ -320,7 +336,7 @@ def _multiple_of_identity(X: PETSc.Mat) -> float:
         v.array_w[:] = np.random.default_rng(X.comm.rank).standard_normal(v.getLocalSize())
         X.mult(v, w)
         w.axpy(-c, v)
-        multiple = c == largest and w.norm() <= IDENTITY * abs(c) * v.norm()
+        multiple = c == largest and w.norm() <= 1e-14 * abs(c) * v.norm()
     except PETSc.Error:
         multiple = False
     if not multiple:
@@ -359,7 +375,7 @@ def from_entries(
     shape = whole_numbers(grid)
     wrong = f"a grid of shape {grid!r}; allowed are whole numbers >= 1" if shape is None else ""
     rows = prod(shape or ())
-    if rows >= MOST:
+    if rows >= 2**31:  # because pairs of rows are keys of 64 bits
         wrong = f"a grid of shape {grid!r} with {rows} points; allowed are fewer than 2^31"
     refuse(mat.comm.tompi4py(), wrong)
     if prefix:

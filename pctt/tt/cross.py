@@ -18,16 +18,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from pctt.tt.als import relative_error
+from pctt.tt.sparse import relative_error
 from pctt.tt.entries import EntryMatrix
 from pctt.tt.sparse import SparseHierarchy
 from pctt.tt.train import Array, Train, low_rank, matrix_train, zeros
-from pctt.tt.work import ENTRY, Work, pivot_operations
+from pctt.tt.work import ENTRY, Work, svd_operations
 
 SAMPLES = 1024  # a train is validated on this number of stored entries and on as many others
-EXTRA = 32  # largest number of stored entries, those where the train is worst, that enrich the next sweep
-TIGHTER = 0.1  # if a sweep misses eps, the tolerance of the single cores is multiplied by this
-WORTH = 0.9  # a sweep that leaves more than this part of the error was idle
 CROSS = "the compression"  # the phase for `Work`
 
 
@@ -82,7 +79,7 @@ def compress_cross(
         nothing = [np.zeros(1, np.int64)] * len(entries.width)
         return Cross(zeros(matrix.modes, matrix.modes, matrix.dtype), 0.0, 0, 0, nothing, nothing)
     validation = matrix.validation(SAMPLES, rng)
-    most = min(max_rank, EXTRA)
+    most = min(max_rank, 32)  # stored entries, those where the train is worst, that enrich the next sweep
     extra = matrix.sample(most, rng)
     prefixes, suffixes = (start.prefixes, start.suffixes) if start else entries.split(extra)
     best: Cross | None = None
@@ -92,12 +89,12 @@ def compress_cross(
         cores, prefixes = _forward(entries, suffixes, extra, max_rank, inner)
         train = matrix.agree(matrix_train(cores, matrix.modes).round(0.3 * eps))
         error = matrix.agree(entries.error(train, *validation))
-        idle = 0 if best is None or error < WORTH * best.error else idle + 1
+        idle = 0 if best is None or error < 0.9 * best.error else idle + 1
         if best is None or error < best.error:
             best = Cross(train, error, count, entries.evaluations, prefixes, suffixes)
         if error <= eps or idle == 2:
             break
-        inner *= TIGHTER
+        inner *= 0.1  # the tolerance of the single cores
         extra = matrix.agree(entries.worst(train, most))
     assert best is not None, "there is at least one sweep"
     if isinstance(matrix, SparseHierarchy):
@@ -128,6 +125,9 @@ class _Entries:
     def _count(self, evaluations: int) -> None:
         self.evaluations += evaluations
         self.work.spend(ENTRY * evaluations, CROSS)
+
+    def spend_on_pivots(self, rows: int, columns: int) -> None:
+        self.work.spend(5 * svd_operations(rows, columns), CROSS)  # as measured
 
     def block(self, k: int, prefixes: Array, suffixes: Array) -> Array:
         """Entries (prefixes, m_k^2, suffixes) around digit k."""
@@ -166,7 +166,7 @@ def _forward(
     for k in range(d - 1):
         columns = np.union1d(suffixes[k + 1], extra % entries.width[k + 1])
         C = entries.block(k, prefixes[k], columns)
-        entries.work.spend(pivot_operations(C.size // len(columns), len(columns)), CROSS)
+        entries.spend_on_pivots(C.size // len(columns), len(columns))
         U, pivots = entries.matrix.agree(_dominant(C.reshape(-1, len(columns)), max_rank, eps / d))
         cores.append(U.reshape(len(prefixes[k]), -1, len(pivots)))
         prefixes.append(prefixes[k][pivots // entries.squares[k]] * entries.squares[k] + pivots % entries.squares[k])
@@ -183,7 +183,7 @@ def _backward(
     for k in range(d - 1, 0, -1):
         rows = np.union1d(prefixes[k], extra // entries.width[k])
         C = entries.block(k, rows, suffixes[0])
-        entries.work.spend(pivot_operations(C.size // len(rows), len(rows)), CROSS)
+        entries.spend_on_pivots(C.size // len(rows), len(rows))
         pivots = entries.matrix.agree(_dominant(C.reshape(len(rows), -1).T, max_rank, eps / d)[1])
         digits, old = pivots // len(suffixes[0]), pivots % len(suffixes[0])
         suffixes.insert(0, digits * entries.width[k + 1] + suffixes[0][old])

@@ -11,12 +11,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pctt.tt.grid import GridDigits
+from pctt.tt.quantise import GridDigits
 from pctt.tt.sparse import Agreement, on_one_rank
 from pctt.tt.train import Array
 
 Function = Callable[[Array, Array], Array]
-NORM_SAMPLES = 4096
 
 
 class EntryMatrix:
@@ -40,7 +39,7 @@ class EntryMatrix:
     ) -> None:
         self.entries, self.digits, self.order, self.agree = entries, digits, order, agree
         self.modes = digits.modes
-        keys, weights = self.validation(NORM_SAMPLES, np.random.default_rng(1))
+        keys, weights = self.validation(4096, np.random.default_rng(1))
         row, column = np.divmod(digits.pair(keys), digits.size)
         self.shift, self.scale = 0.0, 1.0
         values = self.lookup(keys)
@@ -83,45 +82,18 @@ class EntryMatrix:
         return self._pairs(2 * count, rng)
 
     def _pairs(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        sizes = [*self.digits.shape, self.digits.block]
-        rows, columns = [], []
-        weight = np.full(count, float(self.digits.rows) / count)
-        inside = np.ones(count, bool)
-        joint = rng.random(count) < 0.5  # one scale for all axes, otherwise one for each axis
-        common = rng.random(count)
-        for n in sizes:
-            scales = int(np.ceil(np.log2(n))) + 1  # for the last scale 2^s - 1 >= n - 1
-            own = rng.random(count)
-            reach = (1 << (np.where(joint, common, own) * scales).astype(np.int64)) - 1
-            row = rng.integers(0, n, count)
-            column = row + rng.integers(-reach, reach + 1)
-            inside &= (column >= 0) & (column < n)
-            rows.append(row)
-            columns.append(column)
-        offset = np.abs(np.subtract(rows, columns))
-        weight /= self._chance(offset, sizes)
-        return self.digits.key(np.array(rows)[:, inside], np.array(columns)[:, inside]), weight[inside]
-
-    def _chance(self, offset: Array, sizes: list[int]) -> Array:
-        """The probability of offsets (D + 1, p), given the row.
-
-        It is half of a product over the axes, plus half of an average over a common scale.
-        """
-        apart = np.ones(offset.shape[1])
-        edges = {0.0, 1.0}
-        for n, off in zip(sizes, offset):
-            scales = int(np.ceil(np.log2(n))) + 1
-            reach = (1 << np.arange(scales)) - 1
-            table = np.cumsum((1.0 / (2 * reach + 1))[::-1])[::-1] / scales
-            apart *= table[np.searchsorted(reach, off)]
-            edges |= {s / scales for s in range(scales)}
-        together = np.zeros(offset.shape[1])
-        cuts = np.array(sorted(edges))
-        for low, high in zip(cuts[:-1], cuts[1:]):
-            part = np.full(offset.shape[1], high - low)
-            for n, off in zip(sizes, offset):
-                scales = int(np.ceil(np.log2(n))) + 1
-                far = (1 << int(0.5 * (low + high) * scales)) - 1
-                part *= np.where(off <= far, 1.0 / (2 * far + 1), 0.0)
-            together += part
-        return 0.5 * (apart + together)
+        """Keys and weights of pairs of points. Half of them have one scale for all axes, the others one per axis."""
+        sizes = np.array([*self.digits.shape, self.digits.block])[:, None]
+        scales = int(np.ceil(np.log2(sizes.max()))) + 1  # for the last scale 2^s - 1 >= n - 1
+        reaches = np.minimum(1 << np.arange(scales), sizes) - 1  # (D + 1, scales)
+        scale = rng.integers(0, scales, (len(sizes), count))
+        scale[:, ::2] = scale[0, ::2]
+        reach = np.take_along_axis(reaches, scale, 1)
+        row = rng.integers(0, sizes, (len(sizes), count))
+        column = row + rng.integers(-reach, reach + 1)
+        inside = ((column >= 0) & (column < sizes)).all(axis=0)
+        row, column = row[:, inside], column[:, inside]
+        # the probability of an offset, given the row, for each axis, pair and scale
+        chance = (np.abs(row - column)[..., None] <= reaches[:, None]) / (2.0 * reaches[:, None] + 1)
+        chance = 0.5 * (chance.mean(axis=2).prod(axis=0) + chance.prod(axis=0).mean(axis=1))
+        return self.digits.key(row, column), self.digits.rows / (count * chance)

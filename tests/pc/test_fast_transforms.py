@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.pc.differences import depend_on_differences, means_of_differences
+from pctt.tt.differences import depend_on_differences, means_of_differences
 from pctt.tt.differences import FastTransform
 
 GRID = (10, 7)

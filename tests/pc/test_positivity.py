@@ -14,7 +14,7 @@ from test_tensor_train import context, operator, solve, solver
 
 from pctt import tt
 from pctt.pc import sparse_train
-from pctt.pc.positivity import finds_negative, has_inertia_of
+from pctt.pc.mat import finds_negative
 
 
 def laplacian(n: int) -> np.ndarray:
