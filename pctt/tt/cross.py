@@ -77,7 +77,7 @@ def compress_cross(
     entries = _Entries(matrix, rng, Work() if work is None else work)
     if entries.norm == 0:
         nothing = [np.zeros(1, np.int64)] * len(entries.width)
-        return Cross(zeros(matrix.modes, matrix.modes, matrix.dtype), 0.0, 0, 0, nothing, nothing)
+        return Cross(zeros(matrix.modes, matrix.modes), 0.0, 0, 0, nothing, nothing)
     validation = matrix.validation(SAMPLES, rng)
     most = min(max_rank, 32)  # stored entries, those where the train is worst, that enrich the next sweep
     extra = matrix.sample(most, rng)

@@ -32,8 +32,6 @@ class EntryMatrix:
     shift, scale : c and 1 / c
     """
 
-    dtype = np.dtype(float)
-
     def __init__(
         self, entries: Function, digits: GridDigits, order: Array | None = None, agree: Agreement = on_one_rank
     ) -> None:

@@ -30,6 +30,7 @@ IDLE = 0.8  # a sweep that leaves more than this part of the residual is the las
 NOISE = 1e-7  # a smaller part of the residual counts as rounding
 CERTAIN = 0.7  # bound of ||I - S X||_F; below 1, because the estimate is sometimes wrong by a third
 INVERSION = "the inversion"  # the phase for `Work`
+EPSILON = float(np.finfo(float).eps)
 HIGH = 300  # with a larger product of the ranks of S and X, the residual is estimated
 
 
@@ -57,7 +58,7 @@ class Inverse:
         """X."""
         if not self.identity:
             return self.applied
-        unit = identity(self.applied.rows, self.applied.dtype)
+        unit = identity(self.applied.rows)
         return unit + self.applied if self.applied.norm() > 0 else unit
 
 
@@ -84,7 +85,7 @@ def invert(
     >>> X.train.ranks, X.residual < 1e-6
     ((1, 5, 5, 1), True)
     """
-    return _solve(S, identity(S.rows, S.dtype), start, max_rank, sweeps, eps, rng, Work())
+    return _solve(S, identity(S.rows), start, max_rank, sweeps, eps, rng, Work())
 
 
 def invert_near_identity(
@@ -102,7 +103,7 @@ def invert_near_identity(
     counts operations; TooMuchWorkError at its limit. Z is cheaper to apply than X: it takes `Apply(Z)` and one
     addition.
     """
-    unit, norm = identity(T.rows, T.dtype), T.norm()
+    unit, norm = identity(T.rows), T.norm()
     if max_rank <= 1 or norm == 0:
         return Inverse(0 * unit, True, float(norm > 0), 0, 0, norm < CERTAIN)
     found = _solve(unit + T, -T, start, max_rank - 1, sweeps, eps, rng, work or Work())
@@ -129,13 +130,13 @@ def residual(S: Train, X: Train, B: Train | None = None) -> float:
     The cost grows with the product of the ranks of S and X. If this product is high, the result is an estimate from
     products with random trains, with an error of about a third.
     """
-    B = identity(S.rows, S.dtype) if B is None else B
+    B = identity(S.rows) if B is None else B
     if max(S.ranks) * max(X.ranks) > HIGH:
         return _sketched(S, X, B) / B.norm()
     SX = S @ X
     scale = B.norm() ** 2
     square = 1 - 2 * SX.inner(B) / scale + SX.inner(SX) / scale
-    if square > 1e4 * float(np.finfo(SX.dtype).eps):
+    if square > 1e4 * EPSILON:
         return float(square**0.5)
     return float((B - SX).norm() / scale**0.5)  # rounding spoils the difference of squares
 
@@ -172,7 +173,7 @@ class Growing:
         self.goal = 0.1 * eps  # a local system needs no smaller residual
         width = min(16, max(most, default=1))  # the largest growth of a rank in a pass
         self.x, self.signs = _with_signs(x, most)
-        self.z = list(random(S.rows, width, S.columns, rng, S.dtype).right_orthogonal().cores)
+        self.z = list(random(S.rows, width, S.columns, rng).right_orthogonal().cores)
         self.galerkin = Projection.around(S, B, self.x, self.x)
         self.residual = Projection.around(S, B, self.z, self.x)
         self.drop = 0.1 * eps / len(x) ** 0.5  # what a core may leave out
@@ -267,7 +268,7 @@ def _solve(
     most = [min(max_rank, r) for r in full_ranks([m * m for m in S.rows])]
     if sweeps is None:
         sweeps = 1 if start is not None else 2 + int(np.ceil(0.5 * np.log2(max(1.0, max(most, default=1)))))
-    first = B if start is None else start.astype(S.dtype)
+    first = B if start is None else start
     growing = Growing(S, B, first.round(0.0, max_rank), most, eps, rng, work)
     norm, before, enough = B.norm(), np.inf, 0.5 * eps
 
@@ -320,9 +321,9 @@ def _transpose(x: Array, left: Array, right: Array) -> Array:
 def _with_signs(X: Train, most: list[int]) -> tuple[list[Array], list[Array]]:
     """(X + X') / 2 with orthonormal right interfaces and ranks at most `most`, and the signs of all bonds."""
     x = list(X.left_orthogonal().cores)
-    signs = [np.ones(1, X.dtype)] * (len(x) + 1)
+    signs = [np.ones(1)] * (len(x) + 1)
     for k in range(len(x) - 1, 0, -1):
-        signs[k] = np.zeros(len(x[k]), X.dtype)  # no symmetry yet
+        signs[k] = np.zeros(len(x[k]))  # no symmetry yet
         _push_left(x, signs, k, most[k - 1], 0.0)
     x[0] = 0.5 * (x[0] + _transpose(x[0], signs[0], signs[1]))
     return x, signs
@@ -362,10 +363,10 @@ def _basis(
     size = len(x) * x.shape[1] * x.shape[2]
     parts = []
     for sign in (1.0, -1.0):
-        half = x if right.any() else 0.5 * (x + sign * _transpose(x, left, np.ones(x.shape[3], x.dtype)))
+        half = x if right.any() else _half(x, sign, left)
         mine = np.flatnonzero(right != -sign)
         U, s, V = np.linalg.svd(half[..., mine].reshape(size, -1), full_matrices=False)
-        R = np.zeros((len(s), len(right)), x.dtype)
+        R = np.zeros((len(s), len(right)))
         R[:, mine] = s[:, None] * V
         parts.append((U, s, R))
     keep = _largest([s for _, s, _ in parts], most, drop)
@@ -375,7 +376,7 @@ def _basis(
     if more is not None and room > 0:
         extra = []
         for sign, known in zip((1.0, -1.0), Q):
-            half = 0.5 * (more + sign * _transpose(more, left, np.ones(more.shape[3], x.dtype))).reshape(size, -1)
+            half = _half(more, sign, left).reshape(size, -1)
             half = half - known @ (known.T @ half)
             extra.append(np.linalg.svd(half, full_matrices=False)[:2])
         floor = NOISE * float(np.linalg.norm(more))  # smaller remains of known directions have no sign
@@ -384,8 +385,8 @@ def _basis(
         for part, (U, _) in enumerate(extra):
             U = U[:, : new[part]]
             Q[part] = np.hstack((Q[part], np.linalg.qr(U - Q[part] @ (Q[part].T @ U))[0]))
-            coefficients[part] = np.vstack((coefficients[part], np.zeros((new[part], len(right)), x.dtype)))
-    signs = np.repeat(np.array([1, -1], x.dtype), [len(R) for R in coefficients])
+            coefficients[part] = np.vstack((coefficients[part], np.zeros((new[part], len(right)))))
+    signs = np.repeat(np.array([1.0, -1.0]), [len(R) for R in coefficients])
     return np.hstack(Q), np.vstack(coefficients), signs
 
 
@@ -394,12 +395,16 @@ def _own_transposes(U: Array, sign: float, left: Array, shape: tuple[int, ...]) 
 
     With singular values near zero, rounding spoils this property.
     """
-    core = U.reshape(*shape[:3], -1)
-    half = 0.5 * (core + sign * _transpose(core, left, np.ones(U.shape[1], U.dtype))).reshape(U.shape)
+    half = _half(U.reshape(*shape[:3], -1), sign, left).reshape(U.shape)
     if np.linalg.norm(half - U) <= NOISE * U.shape[1] ** 0.5:
         return U
     Q, R = np.linalg.qr(half)
-    return Q * np.where(np.diagonal(R) < 0, -1, 1).astype(U.dtype)
+    return Q * np.where(np.diagonal(R) < 0, -1.0, 1.0)
+
+
+def _half(x: Array, sign: float, left: Array) -> Array:
+    """The part of a core that equals its own transpose times ``sign``, for a left bond with these signs."""
+    return 0.5 * (x + sign * _transpose(x, left, np.ones(x.shape[3])))
 
 
 def _largest(values: list[Array], most: int, drop: float) -> list[int]:
@@ -408,8 +413,8 @@ def _largest(values: list[Array], most: int, drop: float) -> list[int]:
     They are as small as possible if the norm of the other values must not exceed `drop` times the norm of all values.
     """
     both = np.sort(np.concatenate(values))[::-1]
-    tail = np.sqrt(np.cumsum(both[::-1].astype(float) ** 2))[::-1]
-    floor = max(drop, float(np.finfo(both.dtype).eps)) * tail[0]
+    tail = np.sqrt(np.cumsum(both[::-1] ** 2))[::-1]
+    floor = max(drop, EPSILON) * tail[0]
     rank = max(1, min(most, int(np.count_nonzero(tail > floor))))
     first = int(np.count_nonzero(values[0] > both[rank])) if len(both) > rank else len(values[0])
     return [first, min(rank - first, len(values[1]))]

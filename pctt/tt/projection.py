@@ -20,7 +20,7 @@ class Projection:
     def __init__(self, S: Train, B: Train | None, length: int) -> None:
         self.S = S.cores
         self.B = None if B is None else B.cores
-        one, one_B = np.ones((1, 1, 1), S.dtype), np.ones((1, 1), S.dtype)
+        one, one_B = np.ones((1, 1, 1)), np.ones((1, 1))
         self.left, self.right = [one] * (length + 1), [one] * length
         self.left_B, self.right_B = [one_B] * (length + 1), [one_B] * length
 
@@ -115,7 +115,7 @@ def lowest(X: Train) -> float:
     1.0
     """
     rank = 8 if max(X.rows) <= 8 else 4
-    v = list(random(X.rows, rank, [1] * len(X), dtype=X.dtype).right_orthogonal().cores)
+    v = list(random(X.rows, rank, [1] * len(X)).right_orthogonal().cores)
     galerkin = Projection.around(X, None, v, v)
     value = np.inf
 

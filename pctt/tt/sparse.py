@@ -116,7 +116,7 @@ class SparseHierarchy:
 
     def set_values(self, values: Array) -> None:
         """Take new blocks (nb, block, block), in the order in which their slots were given."""
-        values = np.asarray(values).reshape(len(self._order), self.block**2)[self._order]
+        values = np.asarray(values, float).reshape(len(self._order), self.block**2)[self._order]
         if self._starts is not None:
             values = np.add.reduceat(values, self._starts, axis=0)
         self._set_leaf(values.ravel())
@@ -133,10 +133,6 @@ class SparseHierarchy:
         return self._leaf.data.reshape(-1, self.block, self.block)
 
     @property
-    def dtype(self) -> np.dtype:
-        return self._leaf.dtype
-
-    @property
     def size(self) -> int:
         """Number of scalar rows, with padding."""
         return slots_of(self.modes)
@@ -150,7 +146,7 @@ class SparseHierarchy:
         node, leaf = np.divmod(keys, m * m)
         (i, s), (j, t) = (np.divmod(index, b) for index in np.divmod(leaf, m))
         wanted = node * (q * q) + i * q + j
-        out = np.zeros(keys.shape, self.dtype)
+        out = np.zeros(keys.shape)
         if len(self.keys):
             place = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
             found = self.keys[place] == wanted
@@ -192,7 +188,7 @@ class SparseHierarchy:
         size = float(self.size) ** 2
         others = rng.integers(0, slots_of(self.modes) ** 2, count)
         values = self.lookup(stored)
-        seen = max(float(values @ values), float(np.finfo(self.dtype).tiny))
+        seen = max(float(values @ values), float(np.finfo(float).tiny))
         weights = np.repeat([self.norm() ** 2 / seen, size / count], [len(stored), count])
         return np.concatenate((stored, others)), weights
 
@@ -221,7 +217,7 @@ class SparseHierarchy:
 
     def root(self) -> Array:
         """The left interface of bond 0."""
-        return np.ones((1, 1), self.dtype)
+        return np.ones((1, 1))
 
     def down(self, k: int, x: Array, core: Array) -> Array:
         """The left interface (nodes[k+1], r') of bond k+1, from that of bond k, x (nodes[k], r), and core k."""
@@ -231,7 +227,7 @@ class SparseHierarchy:
     def spread(self, k: int, V: Array) -> Array:
         """V (nodes[k+1], r) as an array (nodes[k], m^2 r), which has a place for every child of a node of bond k."""
         r = V.shape[1]
-        out = np.zeros((self.nodes[k] * self.slot_modes[k] ** 2, r), V.dtype)
+        out = np.zeros((self.nodes[k] * self.slot_modes[k] ** 2, r))
         out[self.places[k]] = V
         return out.reshape(self.nodes[k], self.slot_modes[k] ** 2 * r)
 
@@ -291,6 +287,10 @@ def _starts(keys: Array) -> Array:
     return np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))
 
 
+#: The smallest relative error for which a difference of squares has two or three correct digits.
+CERTAIN = 5e-7
+
+
 @dataclass(frozen=True)
 class Compression:
     """A train of a sparse matrix A.
@@ -317,8 +317,7 @@ def compress(
     Parameters
     ----------
     start : a train for a warm start; random directions fill up its ranks
-    sweeps : number of sweeps, backward and forward, after the first pass, for each rank that is tried. The default is
-        0 with a start and 1 without.
+    sweeps : number of sweeps, backward and forward, after the first pass; by default 0 with a start and 1 without
 
     >>> i = np.arange(63)
     >>> A = SparseHierarchy(np.r_[i, i + 1], np.r_[i + 1, i], [4, 4, 4])
@@ -330,35 +329,19 @@ def compress(
     norm = matrix.norm()
     if norm == 0 or len(matrix.modes) == 1:
         return _exact(matrix)
-    full = max(full_ranks([m * m for m in matrix.modes]))
-    begin = 16  # ranks begin here and are doubled up to a larger cap
-    rank = min(max_rank, begin if start is None else max(begin, *start.ranks))
-    cores = [] if start is None else start.astype(matrix.dtype).flat()
+    cores = [] if start is None else start.flat()
     sweeps = (0 if cores else 1) if sweeps is None else sweeps
-    passes = 0
-    while True:
-        cores = _passes(matrix, cores, rank, sweeps, rng)
-        passes += 1 + sweeps
-        error = matrix.agree(max(0.0, 1 - float(np.vdot(cores[-1], cores[-1])) / norm**2) ** 0.5)
-        if error <= eps or rank >= min(max_rank, full):
-            break
-        rank = min(2 * rank, max_rank)
+    wide = Train(_widen(matrix, cores, max_rank, rng)).right_orthogonal()
+    cores, x = forward(matrix, _spreads(matrix, wide.flat()))
+    for _ in range(sweeps):
+        cores, x = forward(matrix, backward(matrix, x, cores[-1]))
+    error = matrix.agree(max(0.0, 1 - float(np.vdot(cores[-1], cores[-1])) / norm**2) ** 0.5)
     train = matrix_train(cores, matrix.modes)
     slack = (eps**2 - error**2) ** 0.5 if error < eps else eps
     rounded = matrix.agree(train.round(0.99 * slack))
     if rounded.ranks == train.ranks:
-        return Compression(train, max(error, _certain(train) ** 0.5), passes)
-    return Compression(rounded, relative_error(matrix, rounded), passes)
-
-
-def _passes(
-    matrix: SparseHierarchy, cores: list[Array], rank: int, sweeps: int, rng: np.random.Generator
-) -> list[Array]:
-    """Cores of the given rank after a forward pass and ``sweeps`` sweeps; they begin with the old cores, if any."""
-    cores, x = forward(matrix, _spreads(matrix, Train(_widen(matrix, cores, rank, rng)).right_orthogonal().flat()))
-    for _ in range(sweeps):
-        cores, x = forward(matrix, backward(matrix, x, cores[-1]))
-    return cores
+        return Compression(train, max(error, CERTAIN), 1 + sweeps)
+    return Compression(rounded, relative_error(matrix, rounded), 1 + sweeps)
 
 
 def forward(matrix: SparseHierarchy, spreads: list[Array]) -> tuple[list[Array], list[Array]]:
@@ -404,24 +387,19 @@ def relative_error(matrix: SparseHierarchy, train: Train) -> float:
     """||A - T||_F / ||A||_F over all entries, including zeros.
 
     It is computed from ||A||^2 - 2 <A, T> + ||T||^2. Rounding makes this worthless below the root of the machine
-    precision; then the result is the smallest value that is certain in spite of it (5e-7).
+    precision; so the result is at least CERTAIN.
     """
     norm = matrix.norm()
     if norm == 0:
         return train.norm()
     square = 1 - 2 * matrix.inner(train.flat()) / norm**2 + (train.norm() / norm) ** 2
-    return float(max(square, _certain(train)) ** 0.5)
-
-
-def _certain(train: Train) -> float:
-    """The smallest square of a relative error for which a difference of squares has two or three correct digits."""
-    return 1e3 * float(np.finfo(train.dtype).eps)
+    return float(max(square, CERTAIN**2) ** 0.5)
 
 
 def _exact(matrix: SparseHierarchy) -> Compression:
     """The exact train of a matrix that is zero or has a single mode."""
     if len(matrix.modes) > 1:
-        return Compression(zeros(matrix.modes, matrix.modes, matrix.dtype), 0.0, 0)
+        return Compression(zeros(matrix.modes, matrix.modes), 0.0, 0)
     return Compression(matrix_train([matrix.leaf_core(matrix.root())], matrix.modes), 0.0, 0)
 
 
@@ -431,7 +409,7 @@ def _widen(matrix: SparseHierarchy, cores: list[Array], rank: int, rng: np.rando
     ranks = [1, *np.minimum(rank, full_ranks(squares)), 1]
     wide = []
     for k in range(len(squares)):
-        core = rng.standard_normal((ranks[k], squares[k], ranks[k + 1])).astype(matrix.dtype)
+        core = rng.standard_normal((ranks[k], squares[k], ranks[k + 1]))
         if cores:
             a, b = min(ranks[k], cores[k].shape[0]), min(ranks[k + 1], cores[k].shape[2])
             core[:a, :, b:] = 0
