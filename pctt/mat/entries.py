@@ -16,6 +16,10 @@ from pctt.tt.train import Array
 DENSE = ("dense", "seqdense", "mpidense")
 
 
+#: Takes rows and columns, integers (p,), and returns numbers (p,).
+Entry = Callable[[Array, Array], Array]
+
+
 class EntriesError(ValueError):
     """Entries are not numbers, or the function for them fails; raised on all ranks."""
 
@@ -54,10 +58,10 @@ class Combination:
     """The function of the entries of c I + f_1 A_1 + f_2 A_2 + ...; the terms are (f_k, the entries of A_k)."""
 
     added: float
-    terms: Sequence[tuple[float, Callable[[Array, Array], Array]]]
+    terms: Sequence[tuple[float, Entry]]
 
     @classmethod
-    def of(cls, function: Callable[[Array, Array], Array]) -> Combination:
+    def of(cls, function: Entry) -> Combination:
         return function if isinstance(function, cls) else cls(0.0, ((1.0, function),))
 
     def __call__(self, i: Array, j: Array) -> Array:
@@ -66,14 +70,17 @@ class Combination:
             values = values + factor * np.asarray(function(i.copy(), j.copy()))
         return values
 
-    def plus(self, added: float, factor: float, other: Combination) -> Combination:
-        """This matrix + added I + factor times another one."""
-        terms = list(self.terms)
-        for weight, function in other.terms:
-            known = [k for k, (_, one) in enumerate(terms) if one is function]
-            before = terms.pop(known[0])[0] if known else 0.0
-            terms.append((before + factor * weight, function))
-        return Combination(self.added + added + factor * other.added, tuple(term for term in terms if term[0]))
+    def scaled(self, factor: float) -> Combination:
+        return Combination(factor * self.added, [(factor * each, function) for each, function in self.terms])
+
+    def plus(self, factor: float, other: Combination) -> Combination:
+        """This matrix + factor times another one; terms with the same function become one."""
+        sums: dict[Entry, float] = {}
+        for each, function in (*self.terms, *other.scaled(factor).terms):
+            sums[function] = sums.get(function, 0.0) + each
+        return Combination(
+            self.added + factor * other.added, [(each, function) for function, each in sums.items() if each]
+        )
 
 
 class Entries:
@@ -81,11 +88,9 @@ class Entries:
 
     i and j are the same integers (p,) on all ranks, and each rank evaluates its share. If one rank has an error, all
     ranks raise it.
-
-    function : takes i and j (p,) and returns numbers (p,)
     """
 
-    def __init__(self, comm: MPI.Comm, function: Callable[[Array, Array], Array]) -> None:
+    def __init__(self, comm: MPI.Comm, function: Entry) -> None:
         self.comm, self.function = comm, function
 
     @classmethod

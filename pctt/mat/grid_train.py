@@ -13,6 +13,7 @@ from mpi4py import MPI
 from numpy.typing import DTypeLike
 
 from pctt.exchange import on_first
+from pctt.mat.entries import Combination, Entry
 from pctt.petsc import warn
 from pctt.tt.apply import Apply
 from pctt.tt.cross import Cross
@@ -131,6 +132,7 @@ class GridTrain:
     symmetric : whether T is symmetric up to rounding
     residual : of an inverse, ||I - S X||_F / ||T||_F in train arithmetic, for the train S = I + T; otherwise None
     found : index sets for the start of the compression of a similar matrix, if there are any
+    function : the exact entries; None if those of the train count as exact
     """
 
     comm: MPI.Comm
@@ -146,6 +148,7 @@ class GridTrain:
     origin: str
     found: Cross | None = None
     residual: float | None = None
+    function: Entry | None = None
 
     @property
     def ranks(self) -> tuple[int, ...]:
@@ -159,18 +162,22 @@ class GridTrain:
 
     def scaled(self, factor: float) -> GridTrain:
         """factor A."""
-        return replace(self, shift=factor * self.shift, scale=factor * self.scale) if factor else self.zero()
+        if factor == 0:
+            return self.zero()
+        entries = self._combination.scaled(factor)
+        return replace(self, shift=factor * self.shift, scale=factor * self.scale, function=entries)
 
     def shifted(self, more: float) -> GridTrain:
         """A + more I."""
-        return replace(self, shift=self.shift + more)
+        return replace(self, shift=self.shift + more, function=self._combination.plus(1.0, Combination(more, ())))
 
     def zero(self) -> GridTrain:
         """The zero matrix on the same grid."""
         nothing = zeros(self.train.rows, self.train.columns)
         return replace(
-            self, train=nothing, shift=0.0, scale=1.0, error=0.0, symmetric=True, origin="exact", residual=None
-        )
+            self, train=nothing, shift=0.0, scale=1.0, error=0.0, symmetric=True, origin="exact", residual=None,
+            function=Combination(0.0, ()),
+        )  # fmt: skip
 
     def plus(self, factor: float, other: GridTrain, eps: float, max_rank: int) -> GridTrain:
         """A + factor times another matrix on the same grid, rounded. ValueError if the grid is not the same."""
@@ -189,6 +196,7 @@ class GridTrain:
         return replace(
             self, train=train, shift=self.shift + factor * other.shift, scale=1.0,
             error=left / norm if norm else 0.0, symmetric=self.symmetric and other.symmetric, origin="bound for a sum", residual=None,
+            function=self._combination.plus(factor, other._combination),
         )  # fmt: skip
 
     def rounded(self, eps: float, max_rank: int) -> GridTrain:
@@ -220,8 +228,12 @@ class GridTrain:
         places[self.rows] = self.digits.places
         return places
 
+    @property
+    def _combination(self) -> Combination:
+        return Combination.of(self.function or self.entries)
+
     def entries(self, i: Array, j: Array) -> Array:
-        """The entries (p,) at rows i and columns j of the Mat."""
+        """The entries (p,) of the train at rows i and columns j of the Mat."""
         place = self._places
         return self.shift * (i == j) + self.scale * self.train.entries(place[i], place[j])
 

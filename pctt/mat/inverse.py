@@ -59,7 +59,7 @@ def inverse(A: PETSc.Mat, eps: float = 1e-6, max_rank: int = MAX_RANK) -> PETSc.
         )
     c = 1.0 / matrix.shift
     X = replace(
-        matrix, train=found.applied, shift=c, scale=c, residual=found.residual, found=None,
+        matrix, train=found.applied, shift=c, scale=c, residual=found.residual, found=None, function=None,
         origin=f"of a solve with a random right side; inverse I + Z with residual {found.residual:.2g}",
     )  # fmt: skip
     return mat_of(replace(X, error=_error_of_solve(A, matrix, X)), options)

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from pctt.context import Context
 from pctt.exchange import on_first, refuse
-from pctt.mat.entries import Combination, Entries, given, is_symmetric
+from pctt.mat.entries import Entries, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.order import Places, digits_of, whole_numbers
 from pctt.options import AT_LEAST_ONE, FRACTION, OptionError, describe, option, read, refuse_bad
@@ -85,7 +85,7 @@ def compressed_entries(
         error = float(np.hypot(error, left))
     return GridTrain(
         comm, counts, digits, rows, order, train, matrix.shift, 1 / matrix.scale, error, symmetric,
-        f"estimated from fresh entries, {found.evaluations} entries evaluated", found,
+        f"estimated from fresh entries, {found.evaluations} entries evaluated", found, function=given(P, "entries"),
     )  # fmt: skip
 
 
@@ -169,8 +169,9 @@ class TensorTrain(Context):
         self.take(mat, self.compressed)
 
     def take(self, mat: PETSc.Mat, matrix: GridTrain) -> None:
-        """Become another matrix; the caller says which entries it has."""
+        """Become another matrix."""
         self.compressed = matrix
+        mat.setAttr("entries", matrix.function or matrix.entries)
         mat.setOption(PETSc.Mat.Option.SYMMETRIC, matrix.symmetric)
 
     # -- products and entries -------------------------------------------------------------------------------
@@ -192,40 +193,32 @@ class TensorTrain(Context):
     # -- arithmetic -----------------------------------------------------------------------------------------
 
     def scale(self, mat: PETSc.Mat, factor: float) -> None:
-        self._change(mat, self.compressed.scaled(factor), Combination(0.0, ()).plus(0.0, factor, _entries(mat)))
+        self.take(mat, self.compressed.scaled(factor))
 
     def shift(self, mat: PETSc.Mat, more: float) -> None:
-        self._change(mat, self.compressed.shifted(more), _entries(mat).plus(more, 0.0, Combination(0.0, ())))
+        self.take(mat, self.compressed.shifted(more))
 
     def zeroEntries(self, mat: PETSc.Mat) -> None:
-        self._change(mat, self.compressed.zero(), Combination(0.0, ()))
+        self.take(mat, self.compressed.zero())
 
     def diagonalScale(self, mat: PETSc.Mat, left: PETSc.Vec | None, right: PETSc.Vec | None) -> None:
         """ValueError on all ranks for vectors that are not constant, because they would change the ranks."""
-        factor = 1.0
-        for vec in (left, right):
-            if vec:
-                least, largest = vec.min()[1], vec.max()[1]
-                if least != largest:
-                    raise ValueError(
-                        f"pctt.mat.TensorTrain: diagonalScale by a vector with values from {least:g} to {largest:g}; "
-                        "allowed are constant vectors (otherwise scale the function of the entries)"
-                    )
-                factor *= least
-        self.scale(mat, factor)
+        for vec in filter(None, (left, right)):
+            least, largest = vec.min()[1], vec.max()[1]
+            if least != largest:
+                raise ValueError(
+                    f"pctt.mat.TensorTrain: diagonalScale by a vector with values from {least:g} to {largest:g}; "
+                    "allowed are constant vectors (otherwise scale the function of the entries)"
+                )
+            self.scale(mat, least)
 
     def add(self, mat: PETSc.Mat, factor: float, other: PETSc.Mat) -> None:
         """mat + factor other; see `axpy`."""
         matrix = compressed(other)
         if matrix is None:
             self.shift(mat, factor * _multiple_of_identity(other))
-            return
-        total = self.compressed.plus(factor, matrix, ROUNDING * self.options.eps, self.options.max_rank)
-        self._change(mat, total, _entries(mat).plus(0.0, factor, _entries(other)))
-
-    def _change(self, mat: PETSc.Mat, matrix: GridTrain, entries: Combination) -> None:
-        self.take(mat, matrix)
-        mat.setAttr("entries", entries)
+        else:
+            self.take(mat, self.compressed.plus(factor, matrix, ROUNDING * self.options.eps, self.options.max_rank))
 
     def norm(self, mat: PETSc.Mat, kind: int) -> float:
         """The Frobenius norm of the train; ValueError for other norms."""
@@ -235,11 +228,8 @@ class TensorTrain(Context):
 
     def duplicate(self, mat: PETSc.Mat, what: int) -> PETSc.Mat:
         """A copy, or without MAT_COPY_VALUES the zero matrix on the same grid."""
-        values = what == 1  # MAT_COPY_VALUES of PETSc's MatDuplicateOption
-        matrix, entries = (self.compressed, given(mat, "entries")) if values else (self.compressed.zero(), None)
-        other = mat_of(matrix, self.options, entries or Combination(0.0, ()))
-        for name in ("grid", "coordinates"):
-            other.setAttr(name, given(mat, name))
+        other = mat_of(self.compressed if what == 1 else self.compressed.zero(), self.options)
+        _copy_places(mat, other)
         return other
 
     def copy(self, mat: PETSc.Mat, other: PETSc.Mat, structure: int) -> None:
@@ -252,8 +242,7 @@ class TensorTrain(Context):
             )
         context.options = self.options
         context.take(other, self.compressed)
-        for name in ("entries", "grid", "coordinates"):
-            other.setAttr(name, given(mat, name))
+        _copy_places(mat, other)
 
     # -- words ----------------------------------------------------------------------------------------------
 
@@ -276,8 +265,9 @@ def _context(mat: PETSc.Mat) -> TensorTrain | None:
     return context if isinstance(context, TensorTrain) and hasattr(context, "compressed") else None
 
 
-def _entries(mat: PETSc.Mat) -> Combination:
-    return Combination.of(given(mat, "entries"))
+def _copy_places(mat: PETSc.Mat, other: PETSc.Mat) -> None:
+    for name in ("grid", "coordinates"):
+        other.setAttr(name, given(mat, name))
 
 
 def compressed(P: PETSc.Mat) -> GridTrain | None:
@@ -286,10 +276,8 @@ def compressed(P: PETSc.Mat) -> GridTrain | None:
     return None if context is None else context.compressed
 
 
-def mat_of(
-    matrix: GridTrain, options: Options, entries: Callable[[Array, Array], Array] | None = None
-) -> PETSc.Mat:
-    """A new Mat for a train; without `entries` those of the train count as exact. Collective."""
+def mat_of(matrix: GridTrain, options: Options) -> PETSc.Mat:
+    """A new Mat for a train. Collective."""
     rows, here = matrix.digits.rows, int(matrix.counts[matrix.comm.rank])
     context = TensorTrain()
     context.compressed, context.options = matrix, options
@@ -297,7 +285,6 @@ def mat_of(
     mat.setSizes(((here, rows), (here, rows)), matrix.digits.block)
     mat.setType(PETSc.Mat.Type.PYTHON)
     mat.setPythonContext(context)
-    mat.setAttr("entries", entries or matrix.entries)
     if matrix.order == "grid" and matrix.rows is None:
         mat.setAttr("grid", matrix.digits.shape)
     mat.setUp()

@@ -20,7 +20,7 @@ from pctt import memory
 from pctt.mat.grid_train import TrainProduct
 from pctt.mat.order import Places, chosen_order
 from pctt.pc.mat import finds_negative, is_symmetric, product_with
-from pctt.pc.slots import CSR, SlottedMatrix, Slots
+from pctt.pc.slots import CSR, Slots, SlottedMatrix
 from pctt.pc.train_options import Account, Options
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.inverse import Inverse, invert, invert_near_identity

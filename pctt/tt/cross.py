@@ -18,9 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from pctt.tt.sparse import relative_error
 from pctt.tt.entries import EntryMatrix
-from pctt.tt.sparse import SparseHierarchy
+from pctt.tt.sparse import SparseHierarchy, relative_error
 from pctt.tt.train import Array, Train, low_rank, matrix_train, zeros
 from pctt.tt.work import ENTRY, Work, svd_operations
 

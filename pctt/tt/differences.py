@@ -107,7 +107,7 @@ def product(differences: Array) -> Callable[[Array], Array]:
 
 
 def trial(differences: Array, transform: FastTransform, most: int = TRIAL_ITS) -> int:
-    """Iterations of conjugate gradients to 1e-8 with this preconditioner and a random right-hand side; `most` at most."""
+    """Iterations of conjugate gradients to 1e-8 with this preconditioner and a random right side; `most` at most."""
     times = product(differences)
     r = np.random.default_rng(0).standard_normal(prod(differences.shape))
     enough = 1e-8 * float(np.linalg.norm(r))

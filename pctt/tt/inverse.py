@@ -121,7 +121,8 @@ def invert_positive(
     if lowest(identity(T.rows) + T) <= 0:
         return None
     certain = CERTAIN / (T.norm() or 1.0)
-    return invert_near_identity(T, max_rank, None, sweeps, min(eps, certain) if worth * eps <= certain else eps, None, work)
+    goal = min(eps, certain) if worth * eps <= certain else eps
+    return invert_near_identity(T, max_rank, sweeps=sweeps, eps=goal, work=work)
 
 
 def residual(S: Train, X: Train, B: Train | None = None) -> float:

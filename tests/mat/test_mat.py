@@ -490,7 +490,7 @@ def test_flops_are_those_of_the_merged_cores():
     x, y = mat.createVecs()
     before = PETSc.Log.getFlops()
     mat.mult(x, y)
-    assert PETSc.Log.getFlops() - before == mat.getPythonContext()._product.flops + 3 * 30
+    assert PETSc.Log.getFlops() - before == mat.getPythonContext().compressed._product.flops + 3 * 30
 
 
 def test_rounding_is_relative():

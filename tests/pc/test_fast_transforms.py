@@ -9,8 +9,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.tt.differences import depend_on_differences, means_of_differences
-from pctt.tt.differences import FastTransform
+from pctt.tt.differences import FastTransform, depend_on_differences, means_of_differences
 
 GRID = (10, 7)
 SIZE = 70
