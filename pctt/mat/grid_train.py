@@ -195,8 +195,8 @@ class GridTrain:
         train, norm, left = on_first(self.comm, total)
         return replace(
             self, train=train, shift=self.shift + factor * other.shift, scale=1.0,
-            error=left / norm if norm else 0.0, symmetric=self.symmetric and other.symmetric, origin="bound for a sum", residual=None,
-            function=self._combination.plus(factor, other._combination),
+            error=left / norm if norm else 0.0, symmetric=self.symmetric and other.symmetric,
+            origin="bound for a sum", residual=None, function=self._combination.plus(factor, other._combination),
         )  # fmt: skip
 
     def rounded(self, eps: float, max_rank: int) -> GridTrain:

@@ -67,7 +67,7 @@ class Options:
     )
     monitor: bool = option(False, "print a line per set-up")
     coarse: float = number(1e-2, "auto: a smaller eps asks for an accurate inverse, which a transform is not")
-    pays: float = number(5e8, "operations that a train may take in any case; with cheaper solutions auto looks for none")
+    pays: float = number(5e8, "operations that a train may take in any case; auto looks for none in cheaper solutions")
     part: float = number(0.25, "auto: a train may take this part of the operations of a solution with a transform")
     single_eps: float = number(1e-5, "auto: a smaller eps needs double precision, whose rounding is 1e-7 in single")
     seed: int = number(0, "of the random starts of sparse trains")
