@@ -104,35 +104,34 @@ class EntriesTrain:
     def make(self, A: PETSc.Mat, P: PETSc.Mat) -> bool:
         """Make a preconditioner. False: the diagonal is better, or nothing else worked; `failure` or `note` say why.
 
-        1. If entries depend on differences, the cost is that of conjugate gradients with a fast transform, and a train
-           may take a quarter of it. A transform of this cost takes over unless the quarter is `pays` operations.
-        2. Otherwise the cost is that of conjugate gradients with the diagonal. It takes over below `pays` operations.
-        3. A train may take `pays` operations more than this cost (or -pc_tt_setup_limit); else 1 or 2 take over.
+        1. If entries depend on differences, CG with a fast transform would do; otherwise CG with the diagonal.
+        2. A train may take a quarter of the operations of this solution, unless -pc_tt_setup_limit is given. If the
+           quarter is less than `pays`, no train is tried.
+        3. If there is no train within the limit, or if it is not positive, 1 takes over.
 
-        A number as -pc_tt_rank asks for the train of this rank; the others take over if it fails. EntriesError or
-        ValueError on all ranks for bad entries or a bad grid.
+        A number as -pc_tt_rank asks for the train of this rank. It may take `pays` operations more than a solution with
+        the diagonal, and 1 takes over if it fails. EntriesError or ValueError on all ranks for bad entries or a bad
+        grid.
         """
         self.failure, self.note, self.transform = self._distrusted, "", None
         if self.rank == 1 or self._distrusted:
             return False
-        options, product = self.options, self._product_operations(P)
+        options, iterations = self.options, 50
+        product = self._product_operations(P)
         if options.automatic and options.eps >= options.coarse:
             self.transform = self._find_transform(P)
         if self.transform is not None:  # an iteration with it takes 1.3 products
             limit = options.part * 1.3 * product * self.transform.iterations
-            if limit < options.pays:
-                return self._take_no_train(P, "")
-        elif options.setup_limit is None and multiplies(A):
-            here = np.arange(*P.getOwnershipRange())
-            diagonal = Entries.of(P).own(here, here)
-            iterations = iterations_with_the_diagonal(A, np.where(diagonal > 0, diagonal, 1.0))
-            limit = iterations * product
-            if options.automatic and limit < options.pays:
-                self.note = f"conjugate gradients take about {iterations} iterations, so a train does not pay"
-                return self._take_no_train(P, "")
         else:
-            limit = 0.0
-        self._refused = self._refused or self._make_train(P, options.setup_limit or options.pays + limit)
+            if multiplies(A) and (options.automatic or compressed(A) is None):  # products of trains may be expensive
+                iterations = self._iterations_with_the_diagonal(A, P)
+            cost = iterations * product
+            limit = options.part * cost if options.automatic else options.pays + cost
+        if options.automatic and limit < options.pays:
+            if self.transform is None:
+                self.note = f"conjugate gradients take about {iterations} iterations, so a train does not pay"
+            return self._take_no_train(P, "")
+        self._refused = self._refused or self._make_train(P, options.setup_limit or limit)
         if self._refused:
             return self._take_no_train(P, self._refused)
         self.transform = None
@@ -149,6 +148,11 @@ class EntriesTrain:
             if not self.options.automatic:
                 self.transform = self._find_transform(P)
         return self.transform is not None
+
+    def _iterations_with_the_diagonal(self, A: PETSc.Mat, P: PETSc.Mat) -> int:
+        here = np.arange(*P.getOwnershipRange())
+        diagonal = Entries.of(P).own(here, here)
+        return iterations_with_the_diagonal(A, np.where(diagonal > 0, diagonal, 1.0))
 
     def _find_transform(self, P: PETSc.Mat) -> DifferencesInverse | None:
         return DifferencesInverse.of(P, self.options.order, self._order_option, self.places)
