@@ -19,8 +19,7 @@ from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.order import Places, digits_of, whole_numbers
 from pctt.options import AT_LEAST_ONE, FRACTION, OptionError, describe, option, read, refuse_bad
 from pctt.petsc import given_options, on_axpy, on_getinfo, own_errors, warn
-from pctt.tt.cross import compress_cross
-from pctt.tt.entries import EntryMatrix
+from pctt.tt.cross import EntryMatrix, compress_cross
 from pctt.tt.train import Array, Train
 from pctt.tt.work import Work
 

@@ -274,17 +274,8 @@ class EntriesTrain:
         """What is used where no train is."""
         return "block Jacobi" if self.transform is None else f"the {self.transform.transform.name}"
 
-    @property
-    def used(self) -> str:
-        """What the preconditioner really is, in few words."""
-        if self.transform is not None:
-            return self.transform.transform.name
-        if self.inverse is None or self.compressed is None:
-            return "rank 1: block Jacobi"
-        return f"train of ranks {max(self.compressed.train.ranks)}, {max(self.inverse.train.ranks)}"
-
     def words(self) -> str:
-        """The same with ranks, errors and sizes."""
+        """What the preconditioner really is, with ranks, errors and sizes."""
         if self.transform is not None:
             reason = f", because {self.note}" if self.note else ""
             grid = " x ".join(map(str, self.transform.transform.shape))

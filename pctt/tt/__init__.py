@@ -14,8 +14,7 @@ over the ranks.
 from __future__ import annotations
 
 from pctt.tt.apply import Apply
-from pctt.tt.cross import Cross, compress_cross
-from pctt.tt.entries import EntryMatrix
+from pctt.tt.cross import Cross, EntryMatrix, compress_cross
 from pctt.tt.inverse import Inverse, invert, invert_near_identity, residual
 from pctt.tt.projection import lowest
 from pctt.tt.quantise import GridDigits, choose_modes, merge, scalar_modes, slots_of

@@ -1,18 +1,13 @@
 """Approximate inverse of a symmetric positive definite matrix, as a train.
 
-The solution X of S X = B minimises tr(X' S X) / 2 - tr(X' B), whose gradient is S X - B. The method alternates over the
-cores of X. S does not act on the column index of the present core. So with orthonormal interfaces P of the other cores
-the best core solves
+The solution X of S X = B minimises tr(X' S X) / 2 - tr(X' B). The method alternates over the cores of X (Oseledets &
+Dolgov, SIAM J. Sci. Comput. 34, 2012). With orthonormal interfaces P of the other cores the best core solves
 
     M y_j = f_j  for every column j of its mode,    M = P' S P  of order r m r'.
 
-All columns have the same symmetric positive definite M. Conjugate gradients solve these systems and never form M. The
-condition of S is not squared; minimising ||S X - B|| would square it. (Alternating energy minimisation: Oseledets &
-Dolgov, SIAM J. Sci. Comput. 34, 2012.)
-
-The ranks grow on the way. Every core gets, beside its own columns, columns of the residual B - S X, as seen through the
-interfaces of a train Z near the residual. Z is renewed with every core (AMEn: Dolgov & Savostyanov, ibid. 36, 2014).
-Each pass over the cores doubles the ranks until the residual is small enough or the cap is reached.
+Conjugate gradients solve these systems and never form M. Every core gets, beside its own columns, columns of the
+residual B - S X, as seen through the interfaces of a train Z near the residual (AMEn: Dolgov & Savostyanov, ibid. 36,
+2014). So each pass doubles the ranks until the residual is small enough or the cap is reached.
 """
 
 from __future__ import annotations
@@ -63,13 +58,9 @@ class Inverse:
 
 
 def invert(
-    S: Train,
-    max_rank: int = 10,
-    start: Train | None = None,
-    sweeps: int | None = None,
-    eps: float = 0.0,
+    S: Train, max_rank: int = 10, start: Train | None = None, sweeps: int | None = None, eps: float = 0.0,
     rng: np.random.Generator | None = None,
-) -> Inverse:
+) -> Inverse:  # fmt: skip
     """The inverse of a symmetric positive definite S with ranks at most `max_rank`.
 
     Parameters
@@ -89,14 +80,9 @@ def invert(
 
 
 def invert_near_identity(
-    T: Train,
-    max_rank: int = 10,
-    start: Train | None = None,
-    sweeps: int | None = None,
-    eps: float = 0.0,
-    rng: np.random.Generator | None = None,
-    work: Work | None = None,
-) -> Inverse:
+    T: Train, max_rank: int = 10, start: Train | None = None, sweeps: int | None = None, eps: float = 0.0,
+    rng: np.random.Generator | None = None, work: Work | None = None,
+) -> Inverse:  # fmt: skip
     """The inverse of S = I + T as X = I + Z, with an exact identity; arguments as in `invert`.
 
     The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z. `work`
@@ -253,15 +239,9 @@ class Growing:
 
 
 def _solve(
-    S: Train,
-    B: Train,
-    start: Train | None,
-    max_rank: int,
-    sweeps: int | None,
-    eps: float,
-    rng: np.random.Generator | None,
-    work: Work,
-) -> Inverse:
+    S: Train, B: Train, start: Train | None, max_rank: int, sweeps: int | None, eps: float,
+    rng: np.random.Generator | None, work: Work,
+) -> Inverse:  # fmt: skip
     """The symmetric solution of S X = B with its relative residual."""
     if S.rows != S.columns:
         raise ValueError("only a square matrix has an inverse")
