@@ -6,7 +6,7 @@ cores and whole trains again.
 
 Scaled by its own diagonal blocks, the matrix of the next Newton step or time step is similar to the last one. So the
 train of the last matrix is often as good as a new one, and costs nothing: it is kept. A new one is tried after 2
-set-ups, and after twice as many as long as this gains nothing.
+set-ups, and then after twice as many each time, as long as this gains nothing.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class SparseTrain:
             self._use(new)
             self._age, self._trial = 0, 2
         else:
-            self._trial = 2 * max(1, self._age)
+            self._trial = 2 * self._age + 1
             self.account.kept += 1
         return True
 
