@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 from systems import poisson
-from test_tensor_train import context, solve, solver
+from train_solver import context, solve, solver
 
 from pctt.pc.mat import is_symmetric
 from pctt.pc.sparse_train import SparseTrain

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.spatial import Delaunay
-from test_tensor_train import context, solver
+from train_solver import context, solver
 
 from pctt.mat.order import places_of
 from pctt.pc.sparse_train import SparseTrain

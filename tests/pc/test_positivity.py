@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 from systems import poisson
-from test_tensor_train import context, operator, solve, solver
+from train_solver import context, operator, solve, solver
 
 from pctt import tt
 from pctt.pc.mat import finds_negative

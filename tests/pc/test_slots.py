@@ -11,7 +11,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.spatial import cKDTree
 from systems import dense
-from test_tensor_train import context, operator, solve, solver
+from train_solver import context, operator, solve, solver
 
 from pctt.blocks import square_block_matrix
 from pctt.mat.order import places_of
@@ -114,18 +114,6 @@ def test_rows_that_move_far_move_to_another_slot():
     others = np.setdiff1d(np.arange(1000), wanderers)
     assert np.array_equal(slots.place[others], before[others])
     assert np.abs(slots.place[wanderers] // BOX - before[hosts] // BOX).max() <= 2
-
-
-def test_a_few_rows_that_find_no_room_nearby_go_further_away():
-    points, keys = cloud(4000)
-    slots = slots_of(springs(points, keys))
-    before = slots.place.copy()
-    crowd = np.full((60, 3), 0.01) + 1e-4 * np.arange(60)[:, None]
-    more = springs(np.concatenate([points, crowd]), np.concatenate([keys, 50_000 + np.arange(60)]))
-    assert follow(slots, more, yes)
-    assert np.array_equal(slots.place[:4000], before)
-    assert len(set(slots.place)) == 4060
-    assert np.ptp(slots.place[4000:]) > 3 * BOX
 
 
 @pytest.mark.parametrize("what", ["too many", "too many in one place", "strangers", "another rank refuses"])
