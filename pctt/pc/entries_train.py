@@ -116,14 +116,14 @@ class EntriesTrain:
         self.failure, self.note, self.transform = self._distrusted, "", None
         if self.rank == 1 or self._distrusted:
             return False
-        options, iterations = self.options, 50
+        options, iterations = self.options, 50  # if there is no estimate
         product = self._product_operations(P)
         if options.automatic and options.eps >= options.coarse:
             self.transform = self._find_transform(P)
         if self.transform is not None:  # an iteration with it takes 1.3 products
             limit = options.part * 1.3 * product * self.transform.iterations
         else:
-            if multiplies(A) and (options.automatic or compressed(A) is None):  # products of trains may be expensive
+            if multiplies(A) and (options.automatic or 20 * product < options.pays):  # six products are cheap
                 iterations = self._iterations_with_the_diagonal(A, P)
             cost = iterations * product
             limit = options.part * cost if options.automatic else options.pays + cost
