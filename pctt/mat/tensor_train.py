@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -14,13 +14,13 @@ from petsc4py import PETSc
 
 from pctt.context import Context
 from pctt.exchange import on_first, refuse
-from pctt.mat.entries import Entries, given, is_symmetric
+from pctt.mat.entries import Entries, Entry, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.order import Places, digits_of, whole_numbers
 from pctt.options import AT_LEAST_ONE, FRACTION, OptionError, describe, option, read, refuse_bad
 from pctt.petsc import given_options, on_axpy, on_getinfo, own_errors, warn
 from pctt.tt.cross import EntryMatrix, compress_cross
-from pctt.tt.train import Array, Train
+from pctt.tt.train import Train
 from pctt.tt.work import Work
 
 ROUNDING = 0.1  # tolerance for rounding a symmetric part or a sum, divided by eps
@@ -211,14 +211,6 @@ class TensorTrain(Context):
                 )
             self.scale(mat, least)
 
-    def add(self, mat: PETSc.Mat, factor: float, other: PETSc.Mat) -> None:
-        """mat + factor other; see `axpy`."""
-        matrix = compressed(other)
-        if matrix is None:
-            self.shift(mat, factor * _multiple_of_identity(other))
-        else:
-            self.take(mat, self.compressed.plus(factor, matrix, ROUNDING * self.options.eps, self.options.max_rank))
-
     def norm(self, mat: PETSc.Mat, kind: int) -> float:
         """The Frobenius norm of the train; ValueError for other norms."""
         if kind != PETSc.NormType.FROBENIUS:
@@ -303,13 +295,17 @@ def axpy(Y: PETSc.Mat, factor: float, X: PETSc.Mat) -> None:
     >>> B.norm() < 1e-8 * A.norm()
     True
     """
-    context = _context(Y)
+    context, matrix = _context(Y), compressed(X)
     if context is None:
         raise ValueError(f"pctt.mat.axpy: Y is a Mat of type {Y.getType()}; allowed is a Mat of pctt.mat.TensorTrain")
+    mine, options = context.compressed, context.options
     if Y == X:
-        context.scale(Y, 1.0 + factor)
+        total = mine.scaled(1.0 + factor)
+    elif matrix is None:
+        total = mine.shifted(factor * _multiple_of_identity(X))
     else:
-        context.add(Y, factor, X)
+        total = mine.plus(factor, matrix, ROUNDING * options.eps, options.max_rank)
+    context.take(Y, total)
     Y.stateIncrease()
 
 
@@ -334,13 +330,9 @@ def _multiple_of_identity(X: PETSc.Mat) -> float:
 
 
 def from_entries(
-    entries: Callable[[Array, Array], Array],
-    grid: Sequence[int],
-    eps: float = 1e-8,
-    max_rank: int = MAX_RANK,
-    comm: MPI.Comm | PETSc.Comm | None = None,
-    prefix: str = "",
-) -> PETSc.Mat:
+    entries: Entry, grid: Sequence[int], eps: float = 1e-8, max_rank: int = MAX_RANK,
+    comm: MPI.Comm | PETSc.Comm | None = None, prefix: str = "",
+) -> PETSc.Mat:  # fmt: skip
     """The matrix A(i, j) = entries(i, j) for the points of a grid, as a Mat that multiplies with a tensor train.
 
     entries : takes rows and columns, integer arrays (p,), and returns numbers (p,); all ranks call it

@@ -91,7 +91,8 @@ class EntriesTrain:
     single_pays = True
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str, places: Places) -> None:
-        self.comm, self.options, self.account, self.prefix, self.places = comm, options, account, prefix, places
+        self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
+        self._order = (options.order, f"-{prefix}pc_tt_order", places)
         self.rank = options.max_rank or 100 if options.automatic else int(options.rank)
         self.transform: DifferencesInverse | None = None
         self.compressed: GridTrain | None = None
@@ -119,7 +120,7 @@ class EntriesTrain:
         options, iterations = self.options, 50  # if there is no estimate
         product = self._product_operations(P)
         if options.automatic and options.eps >= options.coarse:
-            self.transform = self._find_transform(P)
+            self.transform = DifferencesInverse.of(P, *self._order)
         if self.transform is not None:  # an iteration with it takes 1.3 products
             limit = options.part * 1.3 * product * self.transform.iterations
         else:
@@ -146,20 +147,13 @@ class EntriesTrain:
             self.account.fall_back(why)
             self.failure = why
             if not self.options.automatic:
-                self.transform = self._find_transform(P)
+                self.transform = DifferencesInverse.of(P, *self._order)
         return self.transform is not None
 
     def _iterations_with_the_diagonal(self, A: PETSc.Mat, P: PETSc.Mat) -> int:
         here = np.arange(*P.getOwnershipRange())
         diagonal = Entries.of(P).own(here, here)
         return iterations_with_the_diagonal(A, np.where(diagonal > 0, diagonal, 1.0))
-
-    def _find_transform(self, P: PETSc.Mat) -> DifferencesInverse | None:
-        return DifferencesInverse.of(P, self.options.order, self._order_option, self.places)
-
-    @property
-    def _order_option(self) -> str:
-        return f"-{self.prefix}pc_tt_order"
 
     def _product_operations(self, P: PETSc.Mat) -> float:
         """Of a product with P, by FFT on a grid twice as wide if P does not show how it multiplies."""
@@ -168,7 +162,7 @@ class EntriesTrain:
             return apply_operations(known.train)
         if P.getType() in DENSE:
             return 0.5 * float(P.getSize()[0]) ** 2
-        shape = digits_of(P, self.options.order, self._order_option, self.places)[0].shape
+        shape = digits_of(P, *self._order)[0].shape
         wide = prod(2 * n for n in shape)
         return wide * log2(wide)
 
@@ -221,12 +215,10 @@ class EntriesTrain:
         return f"{why}: " + (f"raise -{self.prefix}pc_tt_rank" if self.inverse.residual < 1 else "this is hopeless")
 
     def _compress(self, P: PETSc.Mat, eps: float, start: GridTrain | None, work: Work) -> GridTrain:
-        known = compressed(P)
-        if known is not None and known.error <= eps and self.options.order in ("auto", known.order):
+        known, (order, name, places) = compressed(P), self._order
+        if known is not None and known.error <= eps and order in ("auto", known.order):
             return known.rounded(0.5 * eps, self.rank)
-        return compressed_entries(
-            P, eps, self.rank, self.options.order, self._order_option, start, self.places, work
-        )
+        return compressed_entries(P, eps, self.rank, order, name, start, places, work)
 
     def _invert(self, eps: float, work: Work) -> Inverse | TooMuchWorkError | None:
         """The inverse; None if the train of the matrix turns out not to be positive."""

@@ -64,14 +64,9 @@ class SparseHierarchy:
     """
 
     def __init__(
-        self,
-        rows: Array,
-        columns: Array,
-        modes: Sequence[int],
-        block: int = 1,
-        reduce: Reduction = on_one_rank,
+        self, rows: Array, columns: Array, modes: Sequence[int], block: int = 1, reduce: Reduction = on_one_rank,
         agree: Agreement = on_one_rank,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.slot_modes = tuple(int(m) for m in modes)
         self.modes = scalar_modes(self.slot_modes, block)
         self.block = int(block)
@@ -305,13 +300,9 @@ class Compression:
 
 
 def compress(
-    matrix: SparseHierarchy,
-    max_rank: int = 10,
-    eps: float = 1e-2,
-    start: Train | None = None,
-    sweeps: int | None = None,
-    rng: np.random.Generator | None = None,
-) -> Compression:
+    matrix: SparseHierarchy, max_rank: int = 10, eps: float = 1e-2, start: Train | None = None,
+    sweeps: int | None = None, rng: np.random.Generator | None = None,
+) -> Compression:  # fmt: skip
     """A train with ranks at most `max_rank`, with an error below eps if the rank allows it.
 
     Parameters

@@ -313,11 +313,9 @@ def zeros(rows: Sequence[int], columns: Sequence[int] | None = None) -> Train:
 
 
 def random(
-    rows: Sequence[int],
-    rank: int | Sequence[int],
-    columns: Sequence[int] | None = None,
+    rows: Sequence[int], rank: int | Sequence[int], columns: Sequence[int] | None = None,
     rng: np.random.Generator | None = None,
-) -> Train:
+) -> Train:  # fmt: skip
     """A train with normally distributed cores, whose entries have the variance 1. No rank exceeds what the modes allow.
 
     rank : the rank of all bonds, or the ranks r_1, ..., r_{d-1}.
