@@ -194,11 +194,6 @@ def test_the_inverse_multiplies_numbers_of_any_size():
     assert not y.array.any()
 
 
-def test_trains_of_symmetric_matrices_are_symmetric():
-    train = from_entries(kernel, GRID, 1e-3).getPythonContext().compressed.train
-    assert (train - train.T).norm() < 1e-12 * train.norm()
-
-
 def test_new_values_make_a_new_train():
     scale = 1.0
     mat = shell(lambda i, j: scale * kernel(i, j), grid=GRID)

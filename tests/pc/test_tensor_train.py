@@ -185,10 +185,7 @@ BLOCKS = "rank 1: block Jacobi"
     [
         ({}, ""),
         ({BLOCKS: 3}, "rank 1: block Jacobi"),
-        ({1: 2}, "rank 1"),  # a train of rank 1 beside the identity
-        ({BLOCKS: 4, 10: 32}, "rank 10, 4 of 36 systems rank 1: block Jacobi"),
         ({BLOCKS: 9, 3: 1}, "rank 1: block Jacobi, 1 of 10 systems rank 3"),
-        ({8: 2, 3: 1, 10: 5}, "rank 3 to 10"),
         ({8: 2, 3: 1, BLOCKS: 9}, "rank 1: block Jacobi, 3 of 12 systems rank 3 to 8"),
     ],
 )

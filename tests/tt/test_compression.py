@@ -73,15 +73,6 @@ def test_tolerance_is_met_where_the_rank_allows(seed: int, eps: float) -> None:
     assert max(found.train.ranks) <= 1.3 * max(optimal.ranks) + 2
 
 
-def test_best_rank_one_of_a_single_bond_is_the_svd() -> None:
-    """Of two modes the ALS passes are subspace iterations: they reach the singular vectors."""
-    triplets = positive(np.random.default_rng(3), 16, 1)
-    A = triplets.hierarchy((4, 4))
-    best = tt.decompose_matrix(triplets.dense(), [4, 4], eps=0, max_rank=2)
-    found = tt.compress(A, 2, 0.0, sweeps=30)
-    assert found.error == pytest.approx((best - tt.decompose_matrix(triplets.dense(), [4, 4])).norm() / A.norm())
-
-
 def test_warm_start_is_no_worse() -> None:
     triplets = scattered(np.random.default_rng(0), 300, 2000, 3)
     A = triplets.hierarchy(tt.choose_modes(300, leaf=8))

@@ -74,15 +74,6 @@ def test_more_rank_leaves_less() -> None:
     assert left[-1] < 1e-5
 
 
-def test_laplacian_like_inverse_has_low_rank() -> None:
-    """The inverse of a tridiagonal matrix is semiseparable: its trains have rank at most 5."""
-    for shift in (1.0, 1e-2):
-        S = exact(laplacian(256).toarray() + shift * np.eye(256), (4, 4, 4, 4))
-        found = tt.invert(S, 8, sweeps=20, eps=1e-4)
-        assert found.residual < 1e-4
-        assert max(found.train.ranks) <= 6
-
-
 def test_warm_start_of_a_near_matrix() -> None:
     rng = np.random.default_rng(0)
     dense = positive(rng, 64, 3).dense()
