@@ -75,12 +75,10 @@ class Combination:
 
     def plus(self, factor: float, other: Combination) -> Combination:
         """This matrix + factor times another one; terms with the same function become one."""
-        sums: dict[Entry, float] = {}
+        sums: dict[int, tuple[float, Entry]] = {}  # by identity, as a user's function may have no hash
         for each, function in (*self.terms, *other.scaled(factor).terms):
-            sums[function] = sums.get(function, 0.0) + each
-        return Combination(
-            self.added + factor * other.added, [(each, function) for function, each in sums.items() if each]
-        )
+            sums[id(function)] = sums.get(id(function), (0.0, function))[0] + each, function
+        return Combination(self.added + factor * other.added, [term for term in sums.values() if term[0]])
 
 
 class Entries:
