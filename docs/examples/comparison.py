@@ -111,7 +111,7 @@ def cg(
     note = ""
     if pc in ("tt", "auto"):
         made = ksp.pc.getPythonContext().made
-        note = made.used
+        note = made.base.removeprefix("the ")
         if made.inverse is not None:
             Z = made.inverse.train
             bytes_ += 8 * (Z.storage + made.compressed.train.storage)

@@ -14,8 +14,10 @@ from petsc4py import PETSc
 from pctt.tt.train import Array
 
 DENSE = ("dense", "seqdense", "mpidense")
-CHECKS = 256  # number of entries that are compared with those across the diagonal
-ASYMMETRY = 1e-8  # a smaller relative difference of these counts as rounding
+
+
+#: Takes rows and columns, integers (p,), and returns numbers (p,).
+Entry = Callable[[Array, Array], Array]
 
 
 class EntriesError(ValueError):
@@ -39,6 +41,11 @@ def given(P: PETSc.Mat, name: str) -> Any:
     return value() if callable(value) and name != "entries" else value
 
 
+def multiplies(A: PETSc.Mat) -> bool:
+    """Whether a Mat has products; one of type python may have none."""
+    return A.getType() != PETSc.Mat.Type.PYTHON or hasattr(A.getPythonContext(), "mult")
+
+
 def has_entries(P: PETSc.Mat) -> bool:
     """Whether P gives its entries one by one: the user has given ``entries``, or P is dense and has a grid or no
     blocks."""
@@ -51,10 +58,10 @@ class Combination:
     """The function of the entries of c I + f_1 A_1 + f_2 A_2 + ...; the terms are (f_k, the entries of A_k)."""
 
     added: float
-    terms: Sequence[tuple[float, Callable[[Array, Array], Array]]]
+    terms: Sequence[tuple[float, Entry]]
 
     @classmethod
-    def of(cls, function: Callable[[Array, Array], Array]) -> Combination:
+    def of(cls, function: Entry) -> Combination:
         return function if isinstance(function, cls) else cls(0.0, ((1.0, function),))
 
     def __call__(self, i: Array, j: Array) -> Array:
@@ -63,14 +70,15 @@ class Combination:
             values = values + factor * np.asarray(function(i.copy(), j.copy()))
         return values
 
-    def plus(self, added: float, factor: float, other: Combination) -> Combination:
-        """This matrix + added I + factor times another one."""
-        terms = list(self.terms)
-        for weight, function in other.terms:
-            known = [k for k, (_, one) in enumerate(terms) if one is function]
-            before = terms.pop(known[0])[0] if known else 0.0
-            terms.append((before + factor * weight, function))
-        return Combination(self.added + added + factor * other.added, tuple(term for term in terms if term[0]))
+    def scaled(self, factor: float) -> Combination:
+        return Combination(factor * self.added, [(factor * each, function) for each, function in self.terms])
+
+    def plus(self, factor: float, other: Combination) -> Combination:
+        """This matrix + factor times another one; terms with the same function become one."""
+        sums: dict[int, tuple[float, Entry]] = {}  # by identity, as a user's function may have no hash
+        for each, function in (*self.terms, *other.scaled(factor).terms):
+            sums[id(function)] = sums.get(id(function), (0.0, function))[0] + each, function
+        return Combination(self.added + factor * other.added, [term for term in sums.values() if term[0]])
 
 
 class Entries:
@@ -78,11 +86,9 @@ class Entries:
 
     i and j are the same integers (p,) on all ranks, and each rank evaluates its share. If one rank has an error, all
     ranks raise it.
-
-    function : takes i and j (p,) and returns numbers (p,)
     """
 
-    def __init__(self, comm: MPI.Comm, function: Callable[[Array, Array], Array]) -> None:
+    def __init__(self, comm: MPI.Comm, function: Entry) -> None:
         self.comm, self.function = comm, function
 
     @classmethod
@@ -167,10 +173,10 @@ class DenseEntries(Entries):
 
 
 def is_symmetric(entries: Entries, rows: int) -> bool:
-    """Whether entries at some random places equal those across the diagonal; collective."""
-    i, j = np.random.default_rng(0).integers(0, rows, (2, CHECKS))
+    """Whether entries at some random places equal those across the diagonal, up to rounding; collective."""
+    i, j = np.random.default_rng(0).integers(0, rows, (2, 256))
     here, there = entries(i, j), entries(j, i)
-    return entries.comm.bcast(bool(np.linalg.norm(here - there) <= ASYMMETRY * np.linalg.norm(here)))
+    return entries.comm.bcast(bool(np.linalg.norm(here - there) <= 1e-8 * np.linalg.norm(here)))
 
 
 def diagonal_blocks(P: PETSc.Mat) -> Array:

@@ -24,9 +24,8 @@ from petsc4py import PETSc
 from dem.exchange import on_first
 from pctt.disk import whole
 from pctt.mat.grid_train import GridTrain
-from pctt.mat.options import Options
-from pctt.mat.tensor_train import TensorTrain, compressed, mat_of
-from pctt.tt.grid import GridDigits
+from pctt.mat.tensor_train import Options, TensorTrain, compressed, mat_of
+from pctt.tt.quantise import GridDigits
 from pctt.tt.train import Train
 
 FORMAT, VERSION = "pctt train", 1
@@ -70,8 +69,8 @@ def load(path: str | os.PathLike[str], comm: MPI.Comm | PETSc.Comm | None = None
     matrix = GridTrain(
         mpi, counts * digits.block, digits, rows, values["order"], train, values["shift"], values["scale"],
         values["error"], values["symmetric"], values["origin"],
+        residual=None if np.isnan(values["residual"]) else values["residual"],
     )  # fmt: skip
-    matrix.residual = None if np.isnan(values["residual"]) else values["residual"]
     return mat_of(matrix, Options(values["eps"], values["max_rank"]))
 
 

@@ -1,21 +1,125 @@
-"""A matrix A = shift I + scale T with a train T whose rows are the points of a grid, and arithmetic with it."""
+"""Products of trains with distributed vectors, and matrices A = shift I + scale T with a train T of a grid.
+
+All ranks have the cores of the trains, and gather whole vectors.
+"""
 
 from __future__ import annotations
 
-from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import DTypeLike
 
-from dem.exchange import on_first
-from pctt.mat.product import TrainProduct, places_of_rows
+from pctt.exchange import on_first
+from pctt.mat.entries import Combination, Entry
+from pctt.petsc import warn
+from pctt.tt.apply import Apply
 from pctt.tt.cross import Cross
-from pctt.tt.grid import GridDigits, bases
+from pctt.tt.quantise import GridDigits, bases
 from pctt.tt.train import Array, Train, decompose, identity, zeros
 
 
+class WholeVectors:
+    """Gathers a distributed vector on every rank.
+
+    counts : number of rows of each rank
+    mine : the rows of this rank
+    """
+
+    def __init__(self, comm: MPI.Comm, counts: Array) -> None:
+        self.comm, self.counts = comm, np.asarray(counts)
+        first = int(self.counts[: comm.rank].sum())
+        self.mine = slice(first, first + int(self.counts[comm.rank]))
+        self._whole = np.empty(int(self.counts.sum()) if comm.size > 1 else 0)
+
+    def __call__(self, x: Array) -> Array:
+        """All of x, from this rank's part; valid until the next call."""
+        if self.comm.size == 1:
+            return x
+        self.comm.Allgatherv(np.ascontiguousarray(x), [self._whole, self.counts])
+        return self._whole
+
+
+class TrainProduct:
+    """This rank's rows of y = T x, from its rows of x.
+
+    counts : number of rows of each rank
+    slots : (rows,) slot of each row of all ranks in the train; other slots get zeros
+    size : number of slots
+    train : matrix train; `set_train` takes another one with the same modes
+    flops : operations of this rank in a product
+
+    Every rank gathers x and multiplies with its part of the rows of the train. If the slots of the ranks overlap, they
+    also gather the product.
+    """
+
+    def __init__(self, comm: MPI.Comm, counts: Array, slots: Array, size: int, train: Train) -> None:
+        self.comm, self.size = comm, size
+        rows = len(slots)
+        if comm.size > 1 and rows > 1_000_000:
+            each = 70.0 * rows  # measured at 4 million rows, 2 and 3 ranks, with a Mat, its preconditioner and CG
+            warn(
+                comm,
+                f"pctt: each of {comm.size} ranks gathers whole vectors of {rows} numbers, and takes about "
+                f"{each:.1e} bytes in a solve; fewer ranks take less in all",
+            )
+        self._gather = WholeVectors(comm, counts)
+        parts = np.split(slots, np.cumsum(counts)[:-1])
+        ranges = [(int(s.min()), int(s.max()) + 1) if len(s) else (0, 0) for s in parts]
+        filled = sorted(r for r in ranges if r[1])
+        self._apart = all(a[1] <= b[0] for a, b in zip(filled[:-1], filled[1:]))
+        if self._apart:
+            bounds = ranges[comm.rank]
+        else:
+            edges = np.linspace(0, size, comm.size + 1).astype(int)
+            bounds = int(edges[comm.rank]), int(edges[comm.rank + 1])
+            self._gather_product = WholeVectors(comm, np.diff(edges))
+        self._bounds = bounds
+        self._slots = slice(None) if rows == size and _consecutive(slots) else slots
+        here = slots[self._gather.mine] - (bounds[0] if self._apart else 0)
+        self._here = slice(None) if self._apart and _consecutive(here) else here
+        self._dtype: DTypeLike = train.dtype
+        self.set_train(train)
+
+    def set_train(self, train: Train) -> None:
+        self.train = train
+        self._applies: dict[np.dtype, Apply] = {}
+
+    def use(self, dtype: DTypeLike) -> None:
+        """Multiply in single or double precision from now on; products in single precision have errors of 1e-6."""
+        self._dtype = dtype
+
+    @property
+    def _apply(self) -> Apply:
+        dtype = np.dtype(self._dtype)
+        if dtype not in self._applies:
+            self._applies[dtype] = Apply(self.train.astype(dtype), self.size, self._bounds)
+        return self._applies[dtype]
+
+    @property
+    def flops(self) -> int:
+        return self._apply.flops
+
+    def __call__(self, x: Array) -> Array:
+        """The product; the array is valid until the next call."""
+        apply, x, largest = self._apply, self._gather(x), 1.0
+        if apply.dtype != float:
+            largest = float(np.abs(x).max(initial=0.0)) or 1.0  # single precision overflows at 1e38
+            x = x / largest
+        apply.x[self._slots] = x
+        y = apply.product()
+        if apply.dtype != float:
+            y = np.multiply(largest, y, dtype=float)
+        return (y if self._apart else self._gather_product(y))[self._here]
+
+
+def _consecutive(numbers: Array) -> bool:
+    return bool((np.diff(numbers) == 1).all())
+
+
+@dataclass(frozen=True, eq=False)
 class GridTrain:
     """A = shift I + scale T, the same on all ranks. Methods return another matrix and change none.
 
@@ -28,23 +132,23 @@ class GridTrain:
     symmetric : whether T is symmetric up to rounding
     residual : of an inverse, ||I - S X||_F / ||T||_F in train arithmetic, for the train S = I + T; otherwise None
     found : index sets for the start of the compression of a similar matrix, if there are any
+    function : the exact entries; None if those of the train count as exact
     """
 
+    comm: MPI.Comm
+    counts: Array
+    digits: GridDigits
+    rows: Array | None
+    order: str
+    train: Train
+    shift: float
+    scale: float
+    error: float
+    symmetric: bool
+    origin: str
     found: Cross | None = None
     residual: float | None = None
-
-    def __init__(
-        self, comm: MPI.Comm, counts: Array, digits: GridDigits, rows: Array | None, order: str, train: Train,
-        shift: float, scale: float, error: float, symmetric: bool, origin: str,
-    ) -> None:  # fmt: skip
-        self.comm, self.counts, self.digits, self.rows, self.order = comm, np.asarray(counts), digits, rows, order
-        self.train, self.shift, self.scale = train, shift, scale
-        self.error, self.symmetric, self.origin = error, symmetric, origin
-
-    def _with(self, **changes: Any) -> GridTrain:
-        other = copy(self)
-        vars(other).update(changes)
-        return other
+    function: Entry | None = None
 
     @property
     def ranks(self) -> tuple[int, ...]:
@@ -58,16 +162,22 @@ class GridTrain:
 
     def scaled(self, factor: float) -> GridTrain:
         """factor A."""
-        return self._with(shift=factor * self.shift, scale=factor * self.scale) if factor else self.zero()
+        if factor == 0:
+            return self.zero()
+        entries = self._combination.scaled(factor)
+        return replace(self, shift=factor * self.shift, scale=factor * self.scale, function=entries)
 
     def shifted(self, more: float) -> GridTrain:
         """A + more I."""
-        return self._with(shift=self.shift + more)
+        return replace(self, shift=self.shift + more, function=self._combination.plus(1.0, Combination(more, ())))
 
     def zero(self) -> GridTrain:
         """The zero matrix on the same grid."""
         nothing = zeros(self.train.rows, self.train.columns)
-        return self._with(train=nothing, shift=0.0, scale=1.0, error=0.0, symmetric=True, origin="exact", residual=None)
+        return replace(
+            self, train=nothing, shift=0.0, scale=1.0, error=0.0, symmetric=True, origin="exact", residual=None,
+            function=Combination(0.0, ()),
+        )  # fmt: skip
 
     def plus(self, factor: float, other: GridTrain, eps: float, max_rank: int) -> GridTrain:
         """A + factor times another matrix on the same grid, rounded. ValueError if the grid is not the same."""
@@ -83,9 +193,10 @@ class GridTrain:
             return train, train.norm(), float(np.linalg.norm(parts))
 
         train, norm, left = on_first(self.comm, total)
-        return self._with(
-            train=train, shift=self.shift + factor * other.shift, scale=1.0, error=left / norm if norm else 0.0,
-            symmetric=self.symmetric and other.symmetric, origin="bound for a sum", residual=None,
+        return replace(
+            self, train=train, shift=self.shift + factor * other.shift, scale=1.0,
+            error=left / norm if norm else 0.0, symmetric=self.symmetric and other.symmetric,
+            origin="bound for a sum", residual=None, function=self._combination.plus(factor, other._combination),
         )  # fmt: skip
 
     def rounded(self, eps: float, max_rank: int) -> GridTrain:
@@ -97,8 +208,8 @@ class GridTrain:
         train, left = on_first(self.comm, lambda: rounded(self.train, eps, max_rank))
         error = float(np.hypot(self.error, left))
         if self.shift <= 0 or self.shift == self.scale:
-            return self._with(train=train, error=error)
-        return self._with(train=(self.scale / self.shift) * train, scale=self.shift, error=error)
+            return replace(self, train=train, error=error)
+        return replace(self, train=(self.scale / self.shift) * train, scale=self.shift, error=error)
 
     def norm(self) -> float:
         """||A||_F, of the rows of the grid without padded ones."""
@@ -110,16 +221,42 @@ class GridTrain:
 
     @cached_property
     def _places(self) -> Array:
-        return places_of_rows(self.digits, self.rows)
+        """The slot of each row of the Mat in the train."""
+        if self.rows is None:
+            return self.digits.places
+        places = np.empty(self.digits.rows, np.int64)
+        places[self.rows] = self.digits.places
+        return places
+
+    @property
+    def _combination(self) -> Combination:
+        return Combination.of(self.function or self.entries)
 
     def entries(self, i: Array, j: Array) -> Array:
-        """The entries (p,) at rows i and columns j of the Mat."""
+        """The entries (p,) of the train at rows i and columns j of the Mat."""
         place = self._places
         return self.shift * (i == j) + self.scale * self.train.entries(place[i], place[j])
 
     def product(self, train: Train) -> TrainProduct:
         """The product with a train, with rows in the order of the Mat."""
         return TrainProduct(self.comm, self.counts, self._places, self.digits.size, train)
+
+    @cached_property
+    def _product(self) -> TrainProduct:
+        return self.product(self.train)
+
+    @cached_property
+    def _transposed(self) -> TrainProduct:
+        return self._product if self.symmetric else self.product(self.train.T)
+
+    def times(self, x: Array, transposed: bool = False) -> Array:
+        """This rank's part of A x, or of A' x, from its part of x."""
+        return self.shift * x + self.scale * (self._transposed if transposed else self._product)(x)
+
+    @property
+    def flops(self) -> int:
+        """Operations of this rank in `times`."""
+        return self._product.flops + 3 * int(self.counts[self.comm.rank])
 
     def words(self) -> str:
         """Ranks, bytes, compression, error."""

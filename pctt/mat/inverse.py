@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from petsc4py import PETSc
 
-from dem.exchange import on_first
-from pctt.mat.entries import DENSE, has_entries
+from pctt.exchange import on_first
+from pctt.mat.entries import has_entries, multiplies
 from pctt.mat.grid_train import GridTrain
-from pctt.mat.options import MAX_RANK, Options
-from pctt.mat.tensor_train import MISSED, CompressedEntries, compressed, mat_of
+from pctt.mat.tensor_train import MAX_RANK, MISSED, Options, compressed, compressed_entries, mat_of
 from pctt.petsc import own_errors
-from pctt.tt.inverse import Inverse, invert_near_identity
-from pctt.tt.lowest import lowest
-from pctt.tt.train import Train, identity
-
-CERTAIN = 0.7  # ||I - S X||_F below this shows that X is positive if S is; below 1, because it may be an estimate
-SWEEPS = 12  # largest number of sweeps; 6 were enough for 1e-13
-ACCURACY = 0.5  # tolerance for rounding a train that is more accurate than eps, divided by eps
+from pctt.tt.inverse import invert_positive
 
 
 def inverse(A: PETSc.Mat, eps: float = 1e-6, max_rank: int = MAX_RANK) -> PETSc.Mat:
@@ -52,7 +47,8 @@ def inverse(A: PETSc.Mat, eps: float = 1e-6, max_rank: int = MAX_RANK) -> PETSc.
     if matrix.shift <= 0:
         raise ValueError("pctt.mat.inverse: the matrix is not positive definite: the mean of its diagonal is <= 0")
     with PETSc.Log.Event("TTInvert"):
-        found = on_first(comm, lambda: _invert(matrix.train, eps, max_rank))
+        # 6 sweeps were enough for 1e-13
+        found = on_first(comm, lambda: invert_positive(matrix.train, max_rank, eps, worth=0.0, sweeps=12))
     if found is None:
         raise ValueError("pctt.mat.inverse: the matrix is not positive definite")
     if found.residual > eps:
@@ -62,28 +58,25 @@ def inverse(A: PETSc.Mat, eps: float = 1e-6, max_rank: int = MAX_RANK) -> PETSc.
             "nearly singular or not positive definite"
         )
     c = 1.0 / matrix.shift
-    X = GridTrain(
-        comm, matrix.counts, matrix.digits, matrix.rows, matrix.order, found.applied, c, c, 0.0, True,
-        f"of a solve with a random right side; inverse I + Z with residual {found.residual:.2g}",
+    X = replace(
+        matrix, train=found.applied, shift=c, scale=c, residual=found.residual, found=None, function=None,
+        origin=f"of a solve with a random right side; inverse I + Z with residual {found.residual:.2g}",
     )  # fmt: skip
-    X.residual = found.residual
-    mat = mat_of(X, options)
-    X.error = _error_of_solve(A, matrix, mat)
-    return mat
+    return mat_of(replace(X, error=_error_of_solve(A, matrix, X)), options)
 
 
 def _train_of(A: PETSc.Mat, options: Options) -> GridTrain:
     """c (I + T) for A, as accurate as eps asks for. ValueError on all ranks if there is none."""
     known = compressed(A)
     if known is not None:
-        return known.rounded(ACCURACY * options.eps if known.error <= options.eps else 0.0, options.max_rank)
+        return known.rounded(0.5 * options.eps if known.error <= options.eps else 0.0, options.max_rank)
     if not has_entries(A):
         raise ValueError(
             f"pctt.mat.inverse: a Mat of type {A.getType()} without entries; allowed are trains, dense Mats, and Mats "
             "with the attribute entries"
         )
     with own_errors(), PETSc.Log.Event("TTCompress"):
-        matrix = CompressedEntries(A, options.eps, options.max_rank)
+        matrix = compressed_entries(A, options.eps, options.max_rank)
     if matrix.error > MISSED * options.eps:
         raise ValueError(
             f"pctt.mat.inverse: the train of the matrix has an error of {matrix.error:.1e} at rank "
@@ -93,26 +86,16 @@ def _train_of(A: PETSc.Mat, options: Options) -> GridTrain:
     return matrix
 
 
-def _invert(T: Train, eps: float, max_rank: int) -> Inverse | None:
-    """The inverse of I + T with a residual that shows that it is positive; None if I + T is not positive."""
-    if lowest(identity(T.rows) + T) <= 0:
-        return None
-    norm = T.norm()
-    return invert_near_identity(T, max_rank, sweeps=SWEEPS, eps=min(eps, CERTAIN / norm) if norm else eps)
-
-
-def _error_of_solve(A: PETSc.Mat, matrix: GridTrain, X: PETSc.Mat) -> float:
+def _error_of_solve(A: PETSc.Mat, matrix: GridTrain, X: GridTrain) -> float:
     """||b - A X b|| / ||b|| for a random b. The product is that of A, or that of its train if A has none."""
-    python = A.getType() == PETSc.Mat.Type.PYTHON
-    multiplies = hasattr(A.getPythonContext(), "mult") if python else A.getType() in DENSE
-    x, b = X.createVecs()
+    x, b = A.createVecs()
     b.array_w[:] = np.random.default_rng(A.comm.rank).standard_normal(b.getLocalSize())
-    X.mult(b, x)
+    x.array_w[:] = X.times(b.array_r)
     r = b.duplicate()
-    if multiplies:
+    if multiplies(A):
         A.mult(x, r)
     else:
-        r.array_w[:] = matrix.shift * x.array_r + matrix.scale * matrix.product(matrix.train)(x.array_r)
+        r.array_w[:] = matrix.times(x.array_r)
     r.aypx(-1.0, b)
     error = float(r.norm() / b.norm())
     for vec in (x, b, r):

@@ -3,6 +3,7 @@
     grid      the attribute ``grid`` = (n_1, n_2, ...), the shape of a vector as an array (row i at
               numpy.unravel_index(i, grid)), a DMDA, or points that fill a grid: one axis after the other
     morton    along a space-filling curve through points (`Places.points`)
+    rcm       reverse Cuthill-McKee, of a matrix with stored entries
     natural   the given order of the rows
 
 `pctt.mat.entries.given` says where a user gives grid and coordinates.
@@ -20,13 +21,16 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem.morton import morton_codes
 from pctt.mat.entries import given
-from pctt.tt.grid import GridDigits
+from pctt.morton import morton_codes
+from pctt.tt.quantise import GridDigits
 from pctt.tt.train import Array
 
-TICK = 1e-9  # coordinates that differ by less than this part of the extent are equal
-FLAT = 1e-10  # directions of a near null space with a smaller part of its squares are rounding
+LACKS = {
+    "grid": "the Mat has no grid (its shape), or a DMDA",
+    "morton": "the Mat has no coordinates",
+    "rcm": "the Mat has no entries that are stored",
+}
 
 
 @dataclass(frozen=True)
@@ -57,8 +61,10 @@ def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), told: Array | None = N
     comm = P.comm.tompi4py()
     fitting = [dm for dm in (P.getDM(), *dms) if dm.handle and _fits(dm, P, comm)]
     shape, row_at, source = _given_grid(P, comm), None, "the attribute grid"
-    if shape is None:
-        shape, row_at, source = _dmda_grid(fitting, P, comm)
+    grids = [dm for dm in fitting if dm.getType() == PETSc.DM.Type.DA and dm.getDof() == P.getBlockSize()]
+    if shape is None and grids:
+        shape, source = tuple(grids[0].getSizes())[::-1], "a DMDA"  # the first coordinate is the fastest
+        row_at = _natural_order(grids[0], P.getBlockSize()) if comm.size > 1 else None
     points, whence = given(P, "coordinates"), "the attribute coordinates"
     check_points(points, P, "coordinates of the Mat")
     if points is not None:
@@ -134,16 +140,6 @@ def _fits(dm: PETSc.DM, P: PETSc.Mat, comm: MPI.Comm) -> bool:
     return _on_all(same, comm)
 
 
-def _dmda_grid(
-    dms: Sequence[PETSc.DM], P: PETSc.Mat, comm: MPI.Comm
-) -> tuple[tuple[int, ...] | None, Array | None, str]:
-    for dm in dms:
-        if dm.getType() == PETSc.DM.Type.DA and dm.getDof() == P.getBlockSize():
-            shape = tuple(dm.getSizes())[::-1]  # the first coordinate is the fastest
-            return shape, _natural_order(dm, P.getBlockSize()) if comm.size > 1 else None, "a DMDA"
-    return None, None, ""
-
-
 def whole_numbers(grid: Any) -> tuple[int, ...] | None:
     """The shape of a grid; None if it is not a sequence of whole numbers >= 1."""
     try:
@@ -196,7 +192,7 @@ def _points_of_modes(P: PETSc.Mat, comm: MPI.Comm) -> Array | None:
     values = values - comm.allreduce(values.sum(axis=0)) / count
     gram = comm.allreduce(values.T @ values)
     square, direction = comm.bcast(np.linalg.eigh(gram))  # signs may differ between processors
-    kept = np.flatnonzero(square > FLAT * total)[-3:]
+    kept = np.flatnonzero(square > 1e-10 * total)[-3:]  # the rest is rounding
     if len(kept) == 0:
         return None
     return values @ (direction[:, kept] / np.sqrt(square[kept] / count))
@@ -209,7 +205,7 @@ def _grid_of_points(points: Array, comm: MPI.Comm) -> tuple[tuple[int, ...] | No
     for axis in points.T:
         low = comm.allreduce(axis.min(initial=np.inf), op=MPI.MIN)
         extent = comm.allreduce(axis.max(initial=-np.inf), op=MPI.MAX) - low
-        tick = np.round((axis - low) / (extent or 1.0) / TICK).astype(np.int64)
+        tick = np.round(1e9 * (axis - low) / (extent or 1.0)).astype(np.int64)  # equal ones are equal coordinates
         own = np.unique(tick)
         if comm.allreduce(len(own), op=MPI.MAX) > max(1, count // 2) and points.shape[1] > 1:
             return None, None  # scattered; their numbers need not be gathered
@@ -228,10 +224,22 @@ def _grid_of_points(points: Array, comm: MPI.Comm) -> tuple[tuple[int, ...] | No
     return shape, None if np.array_equal(rows, np.arange(count)) else rows
 
 
-def rows_by_curve(points: Array, comm: MPI.Comm) -> Array:
-    """The block rows of all ranks along a Morton curve through points (n, d) of this rank's block rows; collective."""
-    codes = morton_codes(np.concatenate(comm.allgather(points)))
-    return np.argsort(codes, kind="stable")
+def chosen_order(order: str, places: Places, name: str, stored: bool = False, keyed: bool = False) -> str:
+    """grid, morton, rcm or natural; auto is the first of them for which there is what it needs.
+
+    name : name of the option, for the ValueError if there is not what an order needs
+    stored : whether the Mat has stored entries
+    keyed : whether block rows have names, which come and go, so that there is no grid
+    """
+    known = {
+        "grid": places.grid is not None and not (keyed and order == "auto"), "morton": places.points is not None,
+        "rcm": stored, "natural": True,
+    }  # fmt: skip
+    if order == "auto":
+        return next(one for one, there in known.items() if there)
+    if not known[order]:
+        raise ValueError(f"{name} {order}: {LACKS[order]}; allowed without is auto or natural")
+    return order
 
 
 def digits_of(
@@ -239,31 +247,16 @@ def digits_of(
 ) -> tuple[GridDigits, Array | None, str]:
     """The digits of P's rows, the row at each point (None if rows are in the order of points), and the chosen order.
 
-    order : auto, grid, morton or natural; auto takes the first of the others for which the places are known
-    name : name of the option, for the ValueError if they are not
+    order, name : as in `chosen_order`, without rcm
     """
-    block = P.getBlockSize()
+    block, comm = P.getBlockSize(), P.comm.tompi4py()
     places = places or places_of(P)
-    if places.grid is not None and order in ("auto", "grid"):
-        return GridDigits(places.grid, block=block), scalar_rows(places.row_at, block), "grid"
-    count = P.getSize()[0] // block
-    if places.points is not None and order in ("auto", "morton"):
-        rows = rows_by_curve(places.points, P.comm.tompi4py())
-        return GridDigits((count,), block=block), scalar_rows(rows, block), "morton"
-    if order in ("auto", "natural"):
-        return GridDigits((count,), block=block), None, "natural"
-    raise ValueError(f"{name} {order}: {LACKS[order]}; allowed without is auto or natural")
-
-
-LACKS = {
-    "grid": "the Mat has no grid (its shape), or a DMDA",
-    "morton": "the Mat has no coordinates",
-    "rcm": "the Mat has no entries that are stored",
-}
-
-
-def scalar_rows(rows: Array | None, block: int) -> Array | None:
-    """Rows of a Mat, from its block rows."""
-    if rows is None or block == 1:
-        return rows
-    return np.add.outer(rows * block, np.arange(block)).ravel()
+    order = chosen_order(order, places, name)
+    rows, shape = places.row_at, places.grid
+    if order != "grid" or shape is None:
+        rows, shape = None, (P.getSize()[0] // block,)
+    if order == "morton":
+        rows = np.argsort(morton_codes(np.concatenate(comm.allgather(places.points))), kind="stable")
+    if rows is not None and block > 1:
+        rows = np.add.outer(rows * block, np.arange(block)).ravel()
+    return GridDigits(shape, block=block), rows, order

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import prod
 from typing import Any
 
@@ -10,54 +12,80 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem.exchange import on_first, refuse
 from pctt.context import Context
-from pctt.mat.entries import Combination, Entries, given, is_symmetric
+from pctt.exchange import on_first, refuse
+from pctt.mat.entries import Entries, Entry, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
-from pctt.mat.options import MAX_RANK, Options
 from pctt.mat.order import Places, digits_of, whole_numbers
-from pctt.mat.product import TrainProduct
-from pctt.petsc import on_axpy, on_getinfo, own_errors, warn
-from pctt.tt.cross import Cross, compress_cross
-from pctt.tt.entries import EntryMatrix
-from pctt.tt.train import Array, Train
+from pctt.options import AT_LEAST_ONE, FRACTION, OptionError, describe, option, read, refuse_bad
+from pctt.petsc import given_options, on_axpy, on_getinfo, own_errors, warn
+from pctt.tt.cross import EntryMatrix, compress_cross
+from pctt.tt.train import Train
 from pctt.tt.work import Work
 
 ROUNDING = 0.1  # tolerance for rounding a symmetric part or a sum, divided by eps
 MISSED = 10  # an error above this times eps is told
-MOST = 2**31  # number of rows that is too large, because pairs of rows are keys of 64 bits
+PREFIX, MAX_RANK = "mat_tt_", 200
 
 
-class CompressedEntries(GridTrain):
-    """A = c (I + T) for a matrix A that is given by its entries; c is the mean of the diagonal.
+@dataclass(frozen=True)
+class Options:
+    """Options ``-mat_tt_*`` of a Mat that is a train, after the prefix of the Mat."""
+
+    eps: float = option(
+        1e-8, "the compression ends at this error relative to ||A - c I||_F; c is the mean of the diagonal",
+        check=FRACTION,
+    )  # fmt: skip
+    max_rank: int = option(MAX_RANK, "largest allowed rank", check=AT_LEAST_ONE)
+
+    def check(self, comm: MPI.Comm) -> None:
+        """ValueError on all ranks if a value is not allowed or differs between ranks; collective."""
+        wrong = ""
+        try:
+            refuse_bad(self)
+        except OptionError as error:
+            wrong = str(error)
+        refuse(comm, wrong)
+        found = comm.allgather(repr(self))
+        if len(set(found)) > 1:
+            raise ValueError(f"eps or max_rank differ between ranks: {', '.join(found)}")
+
+    def given_for(self, mat: PETSc.Mat) -> Options:
+        """These options with those of the database; OptionError for a bad value or a misspelt name."""
+        prefix = (mat.getOptionsPrefix() or "") + PREFIX
+        given = given_options(Options, prefix)
+        found = dataclasses.asdict(read(Options, given, prefix))
+        return dataclasses.replace(self, **{name: found[name] for name in found if prefix + name in given})
+
+
+def compressed_entries(
+    P: PETSc.Mat, eps: float, max_rank: int, order: str = "auto", name: str = "order",
+    start: GridTrain | None = None, places: Places | None = None, work: Work | None = None,
+) -> GridTrain:  # fmt: skip
+    """A = c (I + T) for a matrix A that is given by its entries; c is the mean of the diagonal. Collective.
 
     Both the Mat and the PC use it. If the mean is not positive, shift is 0 and scale is 1. The error is estimated from
-    entries that the compression has not used.
-    """
+    entries that the compression has not used. On all ranks EntriesError or ValueError for bad entries or a bad grid,
+    TooMuchWorkError at the limit of `work`.
 
-    def __init__(
-        self, P: PETSc.Mat, eps: float, max_rank: int, order: str = "auto", name: str = "order",
-        start: GridTrain | None = None, seed: int = 0, places: Places | None = None, work: Work | None = None,
-    ) -> None:  # fmt: skip
-        """Collective; on all ranks EntriesError or ValueError for bad entries or a bad grid, TooMuchWorkError at the
-        limit of `work`."""
-        comm = P.comm.tompi4py()
-        entries = Entries.of(P)
-        digits, rows, order = digits_of(P, order, name, places)
-        counts = np.array(comm.allgather(P.getLocalSize()[0]))
-        matrix = EntryMatrix(entries, digits, rows, comm.bcast)
-        known = start.found if start is not None and start.digits.modes == digits.modes else None
-        found: Cross = compress_cross(matrix, max_rank, eps, known, rng=np.random.default_rng(seed), work=work)
-        train, error = found.train, found.error
-        symmetric = is_symmetric(entries, digits.rows)
-        if symmetric:
-            train, left = on_first(comm, lambda: _symmetric(found.train, eps, max_rank))
-            error = float(np.hypot(error, left))
-        origin = f"estimated from fresh entries, {found.evaluations} entries evaluated"
-        super().__init__(
-            comm, counts, digits, rows, order, train, matrix.shift, 1 / matrix.scale, error, symmetric, origin
-        )
-        self.found = found
+    order, name, places : as in `digits_of`
+    start : an earlier result for a similar matrix
+    """
+    comm, entries = P.comm.tompi4py(), Entries.of(P)
+    digits, rows, order = digits_of(P, order, name, places)
+    counts = np.array(comm.allgather(P.getLocalSize()[0]))
+    matrix = EntryMatrix(entries, digits, rows, comm.bcast)
+    known = start.found if start is not None and start.digits.modes == digits.modes else None
+    found = compress_cross(matrix, max_rank, eps, known, work=work)
+    train, error = found.train, found.error
+    symmetric = is_symmetric(entries, digits.rows)
+    if symmetric:
+        train, left = on_first(comm, lambda: _symmetric(found.train, eps, max_rank))
+        error = float(np.hypot(error, left))
+    return GridTrain(
+        comm, counts, digits, rows, order, train, matrix.shift, 1 / matrix.scale, error, symmetric,
+        f"estimated from fresh entries, {found.evaluations} entries evaluated", found, function=given(P, "entries"),
+    )  # fmt: skip
 
 
 def _symmetric(train: Train, eps: float, max_rank: int) -> tuple[Train, float]:
@@ -121,14 +149,15 @@ class TensorTrain(Context):
         """Read the options; OptionError for a bad value or a misspelt name. They have no effect after ``setUp``."""
         self.options = self.options.given_for(mat)
         if PETSc.Options().hasName("help"):
-            PETSc.Sys.Print("\n".join(Options.help(mat)), comm=mat.comm)
+            lines = describe(Options, (mat.getOptionsPrefix() or "") + PREFIX)
+            PETSc.Sys.Print("\n".join(map(str, lines)), comm=mat.comm)
 
     def setUp(self, mat: PETSc.Mat) -> None:
         """ValueError on all ranks for bad options, entries or a bad grid. It does nothing if there is a train."""
         if not hasattr(self, "compressed"):
             self.options = self.options.given_for(mat)
             self.options.check(mat.comm.tompi4py())
-            found = CompressedEntries(mat, self.options.eps, self.options.max_rank)
+            found = compressed_entries(mat, self.options.eps, self.options.max_rank)
             if found.error > MISSED * self.options.eps:
                 warn(
                     found.comm,
@@ -139,30 +168,22 @@ class TensorTrain(Context):
         self.take(mat, self.compressed)
 
     def take(self, mat: PETSc.Mat, matrix: GridTrain) -> None:
-        """Become another matrix; the caller says which entries it has."""
-        old = getattr(self, "_product", None)
-        if old is None or matrix.train is not self.compressed.train:
-            self._product = matrix.product(matrix.train)
-            self._transposed: TrainProduct | None = None
+        """Become another matrix."""
         self.compressed = matrix
+        mat.setAttr("entries", matrix.function or matrix.entries)
         mat.setOption(PETSc.Mat.Option.SYMMETRIC, matrix.symmetric)
 
     # -- products and entries -------------------------------------------------------------------------------
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self._times(self._product, x, y)
+        with PETSc.Log.Event("TTMult"):
+            y.array_w[:] = self.compressed.times(x.array_r)
+            PETSc.Log.logFlops(self.compressed.flops)
 
     def multTranspose(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        if self._transposed is None:
-            symmetric = self.compressed.symmetric
-            self._transposed = self._product if symmetric else self.compressed.product(self.compressed.train.T)
-        self._times(self._transposed, x, y)
-
-    def _times(self, product: TrainProduct, x: PETSc.Vec, y: PETSc.Vec) -> None:
         with PETSc.Log.Event("TTMult"):
-            local = x.array_r
-            y.array_w[:] = self.compressed.shift * local + self.compressed.scale * product(local)
-            PETSc.Log.logFlops(product.flops + 3 * len(local))
+            y.array_w[:] = self.compressed.times(x.array_r, transposed=True)
+            PETSc.Log.logFlops(self.compressed.flops)
 
     def getDiagonal(self, mat: PETSc.Mat, diagonal: PETSc.Vec) -> None:
         here = np.arange(*mat.getOwnershipRange())
@@ -171,40 +192,24 @@ class TensorTrain(Context):
     # -- arithmetic -----------------------------------------------------------------------------------------
 
     def scale(self, mat: PETSc.Mat, factor: float) -> None:
-        self._change(mat, self.compressed.scaled(factor), Combination(0.0, ()).plus(0.0, factor, _entries(mat)))
+        self.take(mat, self.compressed.scaled(factor))
 
     def shift(self, mat: PETSc.Mat, more: float) -> None:
-        self._change(mat, self.compressed.shifted(more), _entries(mat).plus(more, 0.0, Combination(0.0, ())))
+        self.take(mat, self.compressed.shifted(more))
 
     def zeroEntries(self, mat: PETSc.Mat) -> None:
-        self._change(mat, self.compressed.zero(), Combination(0.0, ()))
+        self.take(mat, self.compressed.zero())
 
     def diagonalScale(self, mat: PETSc.Mat, left: PETSc.Vec | None, right: PETSc.Vec | None) -> None:
         """ValueError on all ranks for vectors that are not constant, because they would change the ranks."""
-        factor = 1.0
-        for vec in (left, right):
-            if vec:
-                least, largest = vec.min()[1], vec.max()[1]
-                if least != largest:
-                    raise ValueError(
-                        f"pctt.mat.TensorTrain: diagonalScale by a vector with values from {least:g} to {largest:g}; "
-                        "allowed are constant vectors (otherwise scale the function of the entries)"
-                    )
-                factor *= least
-        self.scale(mat, factor)
-
-    def add(self, mat: PETSc.Mat, factor: float, other: PETSc.Mat) -> None:
-        """mat + factor other; see `axpy`."""
-        matrix = compressed(other)
-        if matrix is None:
-            self.shift(mat, factor * _multiple_of_identity(other))
-            return
-        total = self.compressed.plus(factor, matrix, ROUNDING * self.options.eps, self.options.max_rank)
-        self._change(mat, total, _entries(mat).plus(0.0, factor, _entries(other)))
-
-    def _change(self, mat: PETSc.Mat, matrix: GridTrain, entries: Combination) -> None:
-        self.take(mat, matrix)
-        mat.setAttr("entries", entries)
+        for vec in filter(None, (left, right)):
+            least, largest = vec.min()[1], vec.max()[1]
+            if least != largest:
+                raise ValueError(
+                    f"pctt.mat.TensorTrain: diagonalScale by a vector with values from {least:g} to {largest:g}; "
+                    "allowed are constant vectors (otherwise scale the function of the entries)"
+                )
+            self.scale(mat, least)
 
     def norm(self, mat: PETSc.Mat, kind: int) -> float:
         """The Frobenius norm of the train; ValueError for other norms."""
@@ -214,11 +219,8 @@ class TensorTrain(Context):
 
     def duplicate(self, mat: PETSc.Mat, what: int) -> PETSc.Mat:
         """A copy, or without MAT_COPY_VALUES the zero matrix on the same grid."""
-        values = what == COPY_VALUES
-        matrix, entries = (self.compressed, given(mat, "entries")) if values else (self.compressed.zero(), None)
-        other = mat_of(matrix, self.options, entries or Combination(0.0, ()))
-        for name in ("grid", "coordinates"):
-            other.setAttr(name, given(mat, name))
+        other = mat_of(self.compressed if what == 1 else self.compressed.zero(), self.options)
+        _copy_places(mat, other)
         return other
 
     def copy(self, mat: PETSc.Mat, other: PETSc.Mat, structure: int) -> None:
@@ -231,8 +233,7 @@ class TensorTrain(Context):
             )
         context.options = self.options
         context.take(other, self.compressed)
-        for name in ("entries", "grid", "coordinates"):
-            other.setAttr(name, given(mat, name))
+        _copy_places(mat, other)
 
     # -- words ----------------------------------------------------------------------------------------------
 
@@ -242,16 +243,11 @@ class TensorTrain(Context):
             return
         if viewer.getType() == PETSc.Viewer.Type.ASCII:
             viewer.printfASCII(f"  tensor train: {self.compressed.words()}\n")
-        elif viewer.getType() in STORES:
+        elif viewer.getType() in ("binary", "hdf5", "vtk", "matlab"):
             raise ValueError(
                 f"pctt.mat.TensorTrain: a viewer of type {viewer.getType()} does not save trains; "
                 "pctt.mat.save(mat, path) does"
             )
-
-
-STORES = (PETSc.Viewer.Type.BINARY, PETSc.Viewer.Type.HDF5, PETSc.Viewer.Type.VTK, PETSc.Viewer.Type.MATLAB)
-COPY_VALUES = 1  # MAT_COPY_VALUES of PETSc's MatDuplicateOption
-IDENTITY = 1e-14  # a Mat is c I if it turns a random vector by no more than this
 
 
 def _context(mat: PETSc.Mat) -> TensorTrain | None:
@@ -260,8 +256,9 @@ def _context(mat: PETSc.Mat) -> TensorTrain | None:
     return context if isinstance(context, TensorTrain) and hasattr(context, "compressed") else None
 
 
-def _entries(mat: PETSc.Mat) -> Combination:
-    return Combination.of(given(mat, "entries"))
+def _copy_places(mat: PETSc.Mat, other: PETSc.Mat) -> None:
+    for name in ("grid", "coordinates"):
+        other.setAttr(name, given(mat, name))
 
 
 def compressed(P: PETSc.Mat) -> GridTrain | None:
@@ -270,10 +267,8 @@ def compressed(P: PETSc.Mat) -> GridTrain | None:
     return None if context is None else context.compressed
 
 
-def mat_of(
-    matrix: GridTrain, options: Options, entries: Callable[[Array, Array], Array] | None = None
-) -> PETSc.Mat:
-    """A new Mat for a train; without `entries` those of the train count as exact. Collective."""
+def mat_of(matrix: GridTrain, options: Options) -> PETSc.Mat:
+    """A new Mat for a train. Collective."""
     rows, here = matrix.digits.rows, int(matrix.counts[matrix.comm.rank])
     context = TensorTrain()
     context.compressed, context.options = matrix, options
@@ -281,7 +276,6 @@ def mat_of(
     mat.setSizes(((here, rows), (here, rows)), matrix.digits.block)
     mat.setType(PETSc.Mat.Type.PYTHON)
     mat.setPythonContext(context)
-    mat.setAttr("entries", entries or matrix.entries)
     if matrix.order == "grid" and matrix.rows is None:
         mat.setAttr("grid", matrix.digits.shape)
     mat.setUp()
@@ -301,13 +295,17 @@ def axpy(Y: PETSc.Mat, factor: float, X: PETSc.Mat) -> None:
     >>> B.norm() < 1e-8 * A.norm()
     True
     """
-    context = _context(Y)
+    context, matrix = _context(Y), compressed(X)
     if context is None:
         raise ValueError(f"pctt.mat.axpy: Y is a Mat of type {Y.getType()}; allowed is a Mat of pctt.mat.TensorTrain")
+    mine, options = context.compressed, context.options
     if Y == X:
-        context.scale(Y, 1.0 + factor)
+        total = mine.scaled(1.0 + factor)
+    elif matrix is None:
+        total = mine.shifted(factor * _multiple_of_identity(X))
     else:
-        context.add(Y, factor, X)
+        total = mine.plus(factor, matrix, ROUNDING * options.eps, options.max_rank)
+    context.take(Y, total)
     Y.stateIncrease()
 
 
@@ -320,7 +318,7 @@ def _multiple_of_identity(X: PETSc.Mat) -> float:
         v.array_w[:] = np.random.default_rng(X.comm.rank).standard_normal(v.getLocalSize())
         X.mult(v, w)
         w.axpy(-c, v)
-        multiple = c == largest and w.norm() <= IDENTITY * abs(c) * v.norm()
+        multiple = c == largest and w.norm() <= 1e-14 * abs(c) * v.norm()
     except PETSc.Error:
         multiple = False
     if not multiple:
@@ -332,13 +330,9 @@ def _multiple_of_identity(X: PETSc.Mat) -> float:
 
 
 def from_entries(
-    entries: Callable[[Array, Array], Array],
-    grid: Sequence[int],
-    eps: float = 1e-8,
-    max_rank: int = MAX_RANK,
-    comm: MPI.Comm | PETSc.Comm | None = None,
-    prefix: str = "",
-) -> PETSc.Mat:
+    entries: Entry, grid: Sequence[int], eps: float = 1e-8, max_rank: int = MAX_RANK,
+    comm: MPI.Comm | PETSc.Comm | None = None, prefix: str = "",
+) -> PETSc.Mat:  # fmt: skip
     """The matrix A(i, j) = entries(i, j) for the points of a grid, as a Mat that multiplies with a tensor train.
 
     entries : takes rows and columns, integer arrays (p,), and returns numbers (p,); all ranks call it
@@ -359,7 +353,7 @@ def from_entries(
     shape = whole_numbers(grid)
     wrong = f"a grid of shape {grid!r}; allowed are whole numbers >= 1" if shape is None else ""
     rows = prod(shape or ())
-    if rows >= MOST:
+    if rows >= 2**31:  # because pairs of rows are keys of 64 bits
         wrong = f"a grid of shape {grid!r} with {rows} points; allowed are fewer than 2^31"
     refuse(mat.comm.tompi4py(), wrong)
     if prefix:

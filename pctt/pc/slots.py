@@ -3,8 +3,12 @@
 A slot is a place in the order along which a train is quantised. With a grid it is the place of a point. Otherwise each
 rank has a contiguous range of slots, in boxes of equal size along a Morton curve. If the block rows have names (the
 Mat's attribute ``key``), a few slots stay empty. So the rows of the next matrix can take and leave places: a row that
-stays near its box keeps its slot, and a new row gets the nearest empty slot. Then the cores of the last train are a
-start for the next train.
+stays near its box keeps its slot, and a new row gets an empty slot nearby. Then the cores of the last train are a start
+for the next train.
+
+An empty slot stands for a row of the identity. Block scaling uses L_i L_i' = P_ii, where L_i^-T is the Cholesky factor
+of P_ii^-1. The matrix becomes I + T with T_ij = L_i^-1 P_ij L_j^-T. Only T, which has no diagonal, is compressed. So
+the identity stays exact, and a train of rank zero is block Jacobi.
 """
 
 from __future__ import annotations
@@ -12,16 +16,18 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem.morton import Frame, morton_codes
-from pctt.mat.order import Places
-from pctt.pc.ordering import block_order, grid_slots
+from pctt.block_diagonal import inverse_diagonal_blocks
+from pctt.mat.grid_train import TrainProduct
+from pctt.mat.order import Places, chosen_order
+from pctt.morton import Frame, morton_codes
+from pctt.tt.quantise import GridDigits, group_modes
+from pctt.tt.train import Train
 
-SPARE = 0.06  # part of the slots that is empty at first
-NEAR = 1  # a row moves only if it is more than this number of boxes from its box
-REACH = 12  # the search for an empty slot goes this number of boxes far
-FAR = 0.02  # part of the rows that may go further away
+CSR = tuple[np.ndarray, np.ndarray, np.ndarray]  # row pointers, columns, values of this rank's rows
 
 
 class Slots:
@@ -33,25 +39,24 @@ class Slots:
     first, size : first slot of this rank (0 with a grid), number of slots of all ranks
     capacity : number of slots of this rank; with a grid, of all ranks
     modes : slot modes of a grid; empty without a grid
-    moved, entered, left : numbers of rows that got another slot, were new, or were gone at the last `follow`
     """
 
     def __init__(self, P: PETSc.Mat, places: Places, box: int, order: str = "auto"):
-        """Put the rows in the order of a grid, or evenly along the curve; collective. ``box`` slots make a box."""
+        """Put the rows in the order of a grid, or evenly along the curve; collective. ``box`` slots make a box.
+
+        order : as in `chosen_order`; ValueError on all ranks if it lacks what it needs
+        """
         count = P.getLocalSize()[0] // P.getBlockSize()
         keys, points = P.getAttr("key"), places.points
         self.box = box
         self.modes: tuple[int, ...] = ()
-        self.moved = self.entered = self.left = 0
-        self.evolving = False
-        grid = grid_slots(P, places, order)
-        if grid is not None:
-            self.place, self.size, self.modes = grid
-            self.first, self.capacity = 0, self.size
+        order = chosen_order(order, places, "-pc_tt_order", stored=True, keyed=keys is not None)
+        self.evolving = keys is not None and order == "morton"
+        if order == "grid":
+            self._take_grid(P, places)
             return
-        rows = np.argsort(block_order(P, places, order), kind="stable")
-        spare = -(-int(np.ceil(count * (1 + SPARE))) // box) * box
-        self.evolving = keys is not None and points is not None and order in ("auto", "morton")
+        rows = _local_order(P, points, order)
+        spare = -(-int(np.ceil(1.06 * count)) // box) * box
         self.capacity = spare if self.evolving else count
         capacities = P.comm.tompi4py().allgather(self.capacity)
         self.first, self.size = sum(capacities[: P.comm.rank]), sum(capacities)
@@ -65,6 +70,20 @@ class Slots:
             first = np.searchsorted(self.place[rows], boxes)  # the first row at or after the start of each box
             self._starts = np.append(codes, np.iinfo(np.int64).max)[first]
             self._remember(keys)
+
+    def _take_grid(self, P: PETSc.Mat, places: Places) -> None:
+        """The modes have at most 16 slots at both ends."""
+        assert places.grid is not None
+        digits = GridDigits(places.grid)
+        slots = digits.places
+        if places.row_at is not None:
+            slots = np.empty_like(slots)
+            slots[places.row_at] = digits.places
+        groups = np.cumsum([0, *group_modes(digits.modes, 16)])
+        self.modes = tuple(int(np.prod(digits.modes[a:b])) for a, b in zip(groups[:-1], groups[1:]))
+        first, last = (row // P.getBlockSize() for row in P.getOwnershipRange())
+        self.place, self.first, self.size = slots[first:last], 0, digits.size
+        self.capacity = self.size
 
     def _remember(self, keys: np.ndarray) -> None:
         by_key = np.argsort(keys)
@@ -93,6 +112,7 @@ class Slots:
         return True
 
     def _follow(self, keys: np.ndarray, points: np.ndarray) -> np.ndarray | None:
+        """The new places: a known row stays within one box of its box; of the others 2 % may go beyond 12 boxes."""
         if len(keys) > self.capacity:
             return None
         at = np.minimum(np.searchsorted(self._keys, keys), max(len(self._keys) - 1, 0))
@@ -101,25 +121,32 @@ class Slots:
         home = np.clip(home, 0, len(self._starts) - 1)
         place = np.full(len(keys), -1)
         place[known] = self._key_places[at[known]]
-        stays = known & (np.abs(place // self.box - home) <= NEAR)
-        place[~stays] = -1
-        self.moved = int((known & ~stays).sum())
-        self.entered, self.left = int((~known).sum()), len(self._keys) - int(known.sum())
-        if stays.sum() < 0.5 * len(keys):
-            return None
+        stays = known & (np.abs(place // self.box - home) <= 1)
         free = np.ones(self.capacity, bool)
         free[place[stays]] = False
-        if free.sum() != self.capacity - stays.sum():  # two rows have the same name
+        if 2 * stays.sum() < len(keys) or free.sum() != self.capacity - stays.sum():  # two rows have the same name
             return None
-        for distance in range(REACH + 1):
-            for side in (1, -1) if distance else (1,):
-                _settle(place, home + side * distance, free, self.box)
-        far = np.flatnonzero(place < 0)
-        if len(far) > FAR * len(keys):
-            return None
-        far = far[np.argsort(home[far], kind="stable")]
-        place[far] = _nearest_in_order(home[far] * self.box, np.flatnonzero(free))
-        return place
+        others = np.flatnonzero(~stays)
+        others = others[np.argsort(home[others], kind="stable")]
+        wanted = home[others] * self.box
+        place[others] = _nearest_in_order(wanted, np.flatnonzero(free))
+        far = np.abs(place[others] - wanted) > 13 * self.box
+        return None if far.sum() > 0.02 * len(keys) else place
+
+
+def _local_order(P: PETSc.Mat, points: np.ndarray | None, order: str) -> np.ndarray:
+    """The block rows of this rank, a permutation of 0 ... n-1: along a curve, by reverse Cuthill-McKee, or as given."""
+    bs = P.getBlockSize()
+    count = P.getLocalSize()[0] // bs
+    if order == "natural" or count == 0:
+        return np.arange(count)
+    if order == "morton":
+        assert points is not None
+        return np.argsort(morton_codes(points), kind="stable")
+    given, _ = P.getDiagonalBlock().getOrdering(PETSc.Mat.OrderingType.RCM)
+    rows = given.getIndices().astype(np.int64)
+    # an order of scalar rows: a block takes the place of its first row
+    return rows if len(rows) == count else rows[rows % bs == 0] // bs
 
 
 def _nearest_in_order(wanted: np.ndarray, empty: np.ndarray) -> np.ndarray:
@@ -129,18 +156,94 @@ def _nearest_in_order(wanted: np.ndarray, empty: np.ndarray) -> np.ndarray:
     return empty[np.minimum(at, len(empty) - len(wanted) + turn)]
 
 
-def _settle(place: np.ndarray, target: np.ndarray, free: np.ndarray, box: int) -> None:
-    """Give rows without a place (-1) empty slots of their target boxes, until these are full."""
-    waiting = np.flatnonzero((place < 0) & (target >= 0) & (target < len(free) // box))
-    if len(waiting) == 0:
-        return
-    waiting = waiting[np.argsort(target[waiting], kind="stable")]
-    wanted = target[waiting]
-    turn = np.arange(len(wanted)) - np.searchsorted(wanted, wanted)  # how many rows before wait for the same box
-    empty = np.flatnonzero(free)
-    start = np.searchsorted(empty, wanted * box)
-    room = np.searchsorted(empty, (wanted + 1) * box) - start
-    served = turn < room
-    slots = empty[(start + turn)[served]]
-    place[waiting[served]] = slots
-    free[slots] = False
+class SlottedMatrix:
+    """Local block rows of a Mat P, their slots, and their scaling.
+
+    ``scale`` reads the diagonal blocks of P. ``list_blocks``, called once per pattern, and ``load`` read all blocks.
+    Both take the rows of P in CSR format (``P.getValuesCSR()``).
+
+    Attributes
+    ----------
+    size : number of slots of all ranks
+    places : (rows,) slot of each block row of all ranks
+    rows, columns : (nb,) slots of the local off-diagonal blocks
+    root : (n, bs, bs) R_i = L_i^-1 of each local block row; identities without scaling
+    """
+
+    def __init__(self, P: PETSc.Mat, slots: Slots, comm: MPI.Comm, scaled: bool):
+        self.comm, self.block, self.scaled = comm, P.getBlockSize(), scaled
+        count = P.getLocalSize()[0] // self.block
+        self._counts = np.array(comm.allgather(count))
+        self._total = int(self._counts.sum())
+        self.size, self._slots = slots.size, slots.slots
+        self.places = self._gathered(self._slots)
+        self.root = np.tile(np.eye(self.block), (count, 1, 1))
+        self._csr: tuple[np.ndarray, ...] | None = None  # the pattern that is listed
+
+    def lists(self, csr: CSR) -> bool:
+        """Whether `list_blocks` has seen this pattern; collective. A Mat may get another one with as many nonzeros."""
+        same = self._csr is not None and all(map(np.array_equal, self._csr, csr[:2]))
+        return self.comm.allreduce(same, op=MPI.LAND)
+
+    def list_blocks(self, csr: CSR) -> None:
+        """Find the blocks of P: ``rows`` and ``columns``."""
+        self._csr = csr[:2]
+        indptr, indices, values = csr
+        numbers = np.arange(1, len(values) + 1, dtype=np.int32)  # of P's values
+        scalar = sp.csr_matrix((numbers, indices, indptr), shape=(len(indptr) - 1, self.block * self._total))
+        pattern = scalar.tobsr((self.block, self.block))
+        self._order = pattern.data - 1  # index of each entry of the blocks in P's values, -1 if P does not store it
+        self._pointers, self._column = pattern.indptr, pattern.indices
+        row = np.repeat(np.arange(len(self._slots)), np.diff(pattern.indptr))
+        own = int(self._counts[: self.comm.rank].sum())  # the first block row of this rank
+        self._kept = pattern.indices != own + row if self.scaled else np.ones(len(row), bool)
+        self.rows = self._slots[row[self._kept]]
+        self.columns = self.places[pattern.indices[self._kept]]
+        if not self.scaled:  # empty slots hold a multiple of the identity; each rank has a share of them
+            empty = np.setdiff1d(np.arange(self.size), self.places)
+            empty = np.array_split(empty, self.comm.size)[self.comm.rank]
+            self._empty = len(empty)
+            self.rows, self.columns = np.append(self.rows, empty), np.append(self.columns, empty)
+
+    def scale(self, P: PETSc.Mat) -> bool:
+        """Compute the roots of the present diagonal blocks of P; False if one of them is not positive definite."""
+        good = True
+        try:
+            if self.scaled:
+                self.root = np.linalg.cholesky(inverse_diagonal_blocks(P)).transpose(0, 2, 1)
+        except np.linalg.LinAlgError:
+            good = False
+        return self.comm.allreduce(good, op=MPI.LAND)
+
+    def load(self, P: PETSc.Mat, csr: CSR) -> np.ndarray:
+        """The present blocks (nb, bs, bs) of P at ``rows`` and ``columns``, with scaling multiplied by the roots of
+        ``scale``."""
+        blocks = np.append(csr[2], 0.0)[self._order]
+        if not self.scaled:
+            typical = P.getDiagonal().sum() / P.getSize()[0]
+            return np.concatenate([blocks, np.tile(typical * np.eye(self.block), (self._empty, 1, 1))])
+        everywhere = self._gathered(self.root)
+        left = np.repeat(self.root, np.diff(self._pointers), axis=0)[self._kept]
+        return left @ blocks[self._kept] @ everywhere[self._column[self._kept]].transpose(0, 2, 1)
+
+    def _gathered(self, local: np.ndarray) -> np.ndarray:
+        """Rows (n, ...) of all ranks, in the order of the global block rows."""
+        if self.comm.size == 1:
+            return local
+        width = int(np.prod(local.shape[1:]))
+        out = np.empty((self._total, *local.shape[1:]), local.dtype)
+        self.comm.Allgatherv(np.ascontiguousarray(local), [out, self._counts * width])
+        return out
+
+    def scaled_vector(self, x: np.ndarray) -> np.ndarray:
+        """This rank's part (n bs,) of L^-1 x."""
+        return np.matmul(self.root, x.reshape(-1, self.block, 1)).ravel()
+
+    def unscaled(self, z: np.ndarray) -> np.ndarray:
+        """This rank's part (n bs,) of L^-T z."""
+        return np.matmul(self.root.transpose(0, 2, 1), z.reshape(-1, self.block, 1)).ravel()
+
+    def product(self, train: Train) -> TrainProduct:
+        """The product with a train of the slots, with rows in the order of the Mat."""
+        slots = np.add.outer(self.places * self.block, np.arange(self.block)).ravel()
+        return TrainProduct(self.comm, self._counts * self.block, slots, self.size * self.block, train)

@@ -6,9 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Optional
 
-from pctt.options import AT_LEAST_ONE, FRACTION, POSITIVE, OptionError, option
-
-SPARSE_RANK, ENTRIES_RANK = 10, 100  # default caps
+from pctt.options import AT_LEAST_ONE, FRACTION, POSITIVE, OptionError, number, option
 
 
 @dataclass(frozen=True)
@@ -20,12 +18,12 @@ class Options:
         check=FRACTION,
     )
     rank: str = option(
-        "auto", "cap of the ranks of matrix and inverse; auto: the rank that pays, 1 included, up to max_rank",
+        "auto", "cap of the ranks of matrix and inverse; auto: by counted operations up to max_rank for a matrix given "
+        "by its entries, 1 (block Jacobi) for a sparse one",
         check=("auto or a whole number >= 1", lambda x: x == "auto" or (x.isdecimal() and int(x) >= 1)),
     )
     max_rank: Optional[int] = option(
-        None, f"largest rank that auto takes; none: {SPARSE_RANK}, or {ENTRIES_RANK} for a matrix given by its entries",
-        check=AT_LEAST_ONE,
+        None, "largest rank that auto takes; none: 100", check=AT_LEAST_ONE
     )
     compress: str = option(
         "als", "for sparse matrices; als: alternating least squares over the nonzeros; cross: AMEn cross (the paper)",
@@ -68,6 +66,11 @@ class Options:
         check=POSITIVE,
     )
     monitor: bool = option(False, "print a line per set-up")
+    coarse: float = number(1e-2, "auto: a smaller eps asks for an accurate inverse, which a transform is not")
+    pays: float = number(5e8, "operations that a train may take in any case; auto looks for none in cheaper solutions")
+    part: float = number(0.25, "auto: a train may take this part of the operations of a solution with a transform")
+    single_eps: float = number(1e-5, "auto: a smaller eps needs double precision, whose rounding is 1e-7 in single")
+    seed: int = number(0, "of the random starts of sparse trains")
 
     def __post_init__(self) -> None:
         if self.automatic or self.max_rank is None:
@@ -80,10 +83,6 @@ class Options:
     def automatic(self) -> bool:
         """Whether the rank is chosen here."""
         return self.rank == "auto"
-
-    def cap(self, default: int) -> int:
-        """The largest rank that is allowed; ``default`` if the user has not said one."""
-        return (self.max_rank or default) if self.automatic else int(self.rank)
 
 
 @dataclass

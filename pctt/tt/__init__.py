@@ -13,15 +13,12 @@ over the ranks.
 
 from __future__ import annotations
 
-from pctt.tt.als import Compression, compress, relative_error
 from pctt.tt.apply import Apply
-from pctt.tt.cross import Cross, compress_cross
-from pctt.tt.entries import EntryMatrix
-from pctt.tt.grid import GridDigits
+from pctt.tt.cross import Cross, EntryMatrix, compress_cross
 from pctt.tt.inverse import Inverse, invert, invert_near_identity, residual
-from pctt.tt.lowest import lowest
-from pctt.tt.quantise import choose_modes, merge, scalar_modes, slots_of
-from pctt.tt.sparse import SparseHierarchy
+from pctt.tt.projection import lowest
+from pctt.tt.quantise import GridDigits, choose_modes, merge, scalar_modes, slots_of
+from pctt.tt.sparse import Compression, SparseHierarchy, compress, relative_error
 from pctt.tt.train import Train, decompose, decompose_matrix, identity, matrix_train, random, zeros
 
 __all__ = [

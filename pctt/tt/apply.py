@@ -6,15 +6,12 @@ in the cache. Each does this as a batch of small matrix products
 
     z (i_1 ... i_{k-1}; b_{k-1} j_k; rest)  ->  (i_1 ... i_{k-1} i_k; b_k; rest),
 
-without a transposition. Two work arrays are reused. A core of mode m between the ranks r and r' costs 2 n r m r'
-operations, and nearly all of them are in large matrix products. If the rank between two cores is large, one core for
-both modes costs less. So cores are merged such that the sum of the costs is least (`cheapest_groups`). Single precision
-takes half the seconds.
+without a transposition. A core of mode m between the ranks r and r' costs 2 n r m r' operations. If the rank between
+two cores is large, one core for both modes costs less. So cores are merged such that the sum of the costs is least
+(`cheapest_groups`). Single precision takes half the seconds.
 
-With several processes each owns a range of rows and computes only these: its share of the boxes i_1, without
-communication. It needs all of x, because every box of a train couples with every other box. No exchange costs less than
-gathering n numbers once (a sum of the z of each process's own columns would send r n). The caller of `product` gathers
-x.
+With several processes each owns a range of rows and computes only these: its share of the boxes i_1. It needs all of x,
+because every box of a train couples with every other box. The caller of `product` gathers x.
 """
 
 from __future__ import annotations
@@ -26,10 +23,6 @@ import numpy as np
 
 from pctt.tt.quantise import leading, merge, slots_of
 from pctt.tt.train import Array, Train
-
-WORK = 1 << 22  # bytes of the first intermediate result that are computed at a time
-FIRST, MOST = 32, 256  # least number of rows of the first core, and largest number of rows of a merged core
-WORD = 64  # writing and reading a number takes as long as this number of multiplications
 
 
 class Apply:
@@ -48,12 +41,7 @@ class Apply:
     True
     """
 
-    def __init__(
-        self,
-        train: Train,
-        n: int | None = None,
-        rows: tuple[int, int] | None = None,
-    ) -> None:
+    def __init__(self, train: Train, n: int | None = None, rows: tuple[int, int] | None = None) -> None:
         size = slots_of(train.columns)
         self.n = size if n is None else n
         self.rows = (0, self.n) if rows is None else rows
@@ -82,7 +70,8 @@ class Apply:
         start, stop = self.rows
         self._boxes = range(start // box, max(start // box, -(-stop // box)))
         self._y = np.empty(len(self._boxes) * box, self.dtype)
-        chunk = max(1, min(len(self._boxes), WORK // (rank * box * self.dtype.itemsize)))
+        at_a_time = 1 << 22  # bytes of the first intermediate result
+        chunk = max(1, min(len(self._boxes), at_a_time // (rank * box * self.dtype.itemsize)))
         z = np.empty((chunk, rank, box), self.dtype)
         ranks = [rank] + [len(W) // m for W, m in zip(self._middle, modes)]
         work = [np.empty(box * max(ranks), self.dtype) for _ in range(2)]
@@ -127,9 +116,9 @@ class Apply:
 def cheapest_groups(modes: Sequence[int], ranks: Sequence[int]) -> list[int]:
     """The numbers of neighbouring cores to merge into one for the least work per number of a vector.
 
-    The train has these modes and ranks (r_0, ..., r_d). A core of mode m takes r m r' multiplications, and WORD for
-    each of the r' numbers that it hands to the next core. The first core has at least FIRST rows if the modes allow it.
-    Its rows are the boxes that the processes share.
+    The train has these modes and ranks (r_0, ..., r_d). A core of mode m takes r m r' multiplications, and the time of
+    64 to write and read each of the r' numbers that it hands to the next core. The first core has at least 32 rows, the
+    boxes that the processes share, if the modes allow it, and no merged core has more than 256.
 
     >>> cheapest_groups([2] * 12, [1, 4, 8, 8, 8, 4, 4, 4, 8, 8, 8, 4, 1])
     [6, 6]
@@ -139,11 +128,11 @@ def cheapest_groups(modes: Sequence[int], ranks: Sequence[int]) -> list[int]:
     d = len(modes)
     best: list[tuple[float, list[int]]] = [(0.0, [])] * (d + 1)  # work and groups of the cores from k on
     for k in range(d - 1, -1, -1):
-        stops = list(range(k + 1, k + 1 + leading(modes[k:], MOST)))
+        stops = list(range(k + 1, k + 1 + leading(modes[k:], 256)))
         if k == 0:
-            stops = [stop for stop in stops if prod(modes[:stop]) >= FIRST] or stops[-1:]
+            stops = [stop for stop in stops if prod(modes[:stop]) >= 32] or stops[-1:]
         best[k] = min(
-            (ranks[stop] * (ranks[k] * prod(modes[k:stop]) + WORD) + best[stop][0], [stop - k, *best[stop][1]])
+            (ranks[stop] * (ranks[k] * prod(modes[k:stop]) + 64) + best[stop][0], [stop - k, *best[stop][1]])
             for stop in stops
         )
     return best[0][1]

@@ -17,6 +17,7 @@ often nearer to that of A.
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product as signs_of
 from math import prod
 
 import numpy as np
@@ -26,10 +27,8 @@ from pctt.tt.train import Array
 
 KINDS = ("cosine", "sine")
 SHARES = (1.0, 0.75, 0.5, 0.0)  # of the cosine transform, that are tried
-TRANSFORM = 0.25  # the cost of a transform there and back, in products with A by FFT
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
-WINDOW = 4096  # most points of the part of a grid on which transforms are tried
-TRIAL_RTOL, TRIAL_ITS = 1e-8, 100  # of the trial by conjugate gradients
+TRIAL_ITS = 100  # most iterations of a trial by conjugate gradients
 
 
 class FastTransform:
@@ -107,17 +106,11 @@ def product(differences: Array) -> Callable[[Array], Array]:
     return times
 
 
-def window(differences: Array) -> Array:
-    """The differences of a part of the grid with at most WINDOW points, of the same spacing."""
-    side = max(1, int(WINDOW ** (1 / differences.ndim) + 1e-9))
-    return differences[tuple(slice(side) for _ in differences.shape)]
-
-
 def trial(differences: Array, transform: FastTransform, most: int = TRIAL_ITS) -> int:
-    """Iterations of conjugate gradients with this preconditioner and a random right-hand side; `most` at most."""
+    """Iterations of conjugate gradients to 1e-8 with this preconditioner and a random right side; `most` at most."""
     times = product(differences)
     r = np.random.default_rng(0).standard_normal(prod(differences.shape))
-    enough = TRIAL_RTOL * float(np.linalg.norm(r))
+    enough = 1e-8 * float(np.linalg.norm(r))
     p, rz = np.zeros_like(r), np.inf
     for its in range(most):
         z = transform.solve(r)
@@ -136,16 +129,69 @@ def trial(differences: Array, transform: FastTransform, most: int = TRIAL_ITS) -
 def best(differences: Array) -> tuple[float, int] | None:
     """The share of the cosine transform with which a solution costs least, and its iterations, on a part of the grid.
 
-    None if this part of A is not positive.
+    The part has at most 4096 points, of the same spacing. None if this part of A is not positive.
     """
-    part = window(differences)
+    side = max(1, int(4096 ** (1 / differences.ndim) + 1e-9))
+    part = differences[tuple(slice(side) for _ in differences.shape)]
     transforms = {share: FastTransform(part, share) for share in SHARES}
     if not all(transform.positive for transform in transforms.values()):
         return None
     found, least = (SHARES[0], TRIAL_ITS), np.inf
     for share, transform in transforms.items():
-        each = 1 + TRANSFORM * (1 if share in (0.0, 1.0) else 2)  # the cost of an iteration in products
+        each = 1.25 if share in (0.0, 1.0) else 1.5  # the cost of an iteration in products by FFT
         its = trial(part, transform, int(min(TRIAL_ITS, least // each + 1)))
         if its * each < least:
             found, least = (share, its), its * each
     return found
+
+
+def depend_on_differences(
+    entries: Callable[[Array, Array], Array], shape: tuple[int, ...], order: Array | None, rng: np.random.Generator,
+    pairs: int = 512,
+) -> bool | None:  # fmt: skip
+    """Whether entries at random pairs are those at pairs of the same difference elsewhere.
+
+    None: they are not. True: they also keep their values if coordinates of the difference change their signs.
+    The offsets of the pairs are of all sizes, so that steep kernels show.
+    """
+    places = []
+    signs = rng.choice([-1, 1], (len(shape), pairs))
+    joint = rng.random(pairs)
+    for n, sign in zip(shape, signs):
+        reach = np.minimum((n ** np.where(rng.random(pairs) < 0.5, joint, rng.random(pairs))).astype(int) - 1, n - 1)
+        offset = rng.integers(0, reach + 1)
+        here, there = rng.integers(0, n - offset, (2, pairs))
+        places.append([here, here + offset, there, there + offset])
+        places[-1] += [np.where(sign > 0, there, there + offset), np.where(sign > 0, there + offset, there)]
+    points = [np.ravel_multi_index(axis, shape) for axis in zip(*places)]
+    i, j, moved_i, moved_j, turned_i, turned_j = points if order is None else [order[p] for p in points]
+    here, moved, turned = entries(i, j), entries(moved_i, moved_j), entries(turned_i, turned_j)
+    if not _alike(here, moved):
+        return None
+    return _alike(here, turned)
+
+
+def _alike(a: Array, b: Array) -> bool:
+    """Whether a and b are equal up to 1e-6, and up to 1e-12 of the largest of all."""
+    largest = np.maximum(np.abs(a), np.abs(b))
+    return bool((np.abs(a - b) <= 1e-6 * largest + 1e-12 * largest.max(initial=0.0)).all())
+
+
+def means_of_differences(
+    entries: Callable[[Array, Array], Array], shape: tuple[int, ...], order: Array | None, even: bool
+) -> Array:
+    """The means (n_1, ..., n_D) of the entries over the signs of the coordinates of differences.
+
+    even : all signs give the same entries
+    """
+    size, chunk = prod(shape), 1 << 20  # entries that are evaluated at a time
+    out = np.zeros(size)
+    turns = [(1,) * len(shape)] if even else [(1, *signs) for signs in signs_of((1, -1), repeat=len(shape) - 1)]
+    for first in range(0, size, chunk):
+        points = np.arange(first, min(first + chunk, size))
+        distance = np.unravel_index(points, shape)
+        for signs in turns:
+            i = np.ravel_multi_index(tuple(x if s > 0 else 0 * x for x, s in zip(distance, signs)), shape)
+            j = np.ravel_multi_index(tuple(x if s < 0 else 0 * x for x, s in zip(distance, signs)), shape)
+            out[points] += entries(i, j) if order is None else entries(order[i], order[j])
+    return out.reshape(shape) / len(turns)

@@ -1,43 +1,31 @@
 """Approximate inverse of a symmetric positive definite matrix, as a train.
 
-The solution X of S X = B minimises tr(X' S X) / 2 - tr(X' B), whose gradient is S X - B. The method alternates over the
-cores of X. S does not act on the column index of the present core. So with orthonormal interfaces P of the other cores
-the best core solves
+The solution X of S X = B minimises tr(X' S X) / 2 - tr(X' B). The method alternates over the cores of X (Oseledets &
+Dolgov, SIAM J. Sci. Comput. 34, 2012). With orthonormal interfaces P of the other cores the best core solves
 
     M y_j = f_j  for every column j of its mode,    M = P' S P  of order r m r'.
 
-All columns have the same symmetric positive definite M. Conjugate gradients solve these systems and never form M. The
-condition of S is not squared; minimising ||S X - B|| would square it. (Alternating energy minimisation: Oseledets &
-Dolgov, SIAM J. Sci. Comput. 34, 2012.)
-
-The ranks grow on the way. Every core gets, beside its own columns, columns of the residual B - S X, as seen through the
-interfaces of a train Z near the residual. Z is renewed with every core (AMEn: Dolgov & Savostyanov, ibid. 36, 2014).
-Each pass over the cores doubles the ranks until the residual is small enough or the cap is reached.
+Conjugate gradients solve these systems and never form M. Every core gets, beside its own columns, columns of the
+residual B - S X, as seen through the interfaces of a train Z near the residual (AMEn: Dolgov & Savostyanov, ibid. 36,
+2014). So each pass doubles the ranks until the residual is small enough or the cap is reached.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pctt.tt.projection import Projection, columns, rows
+from pctt.tt.projection import Projection, columns, lowest, rows
 from pctt.tt.train import Array, Train, full_ranks, identity, random
 from pctt.tt.work import TooMuchWorkError, Work, inner_operations, local_operations, svd_operations
 
-LOCAL_GAIN, LOCAL_ITS = 0.1, 20  # conjugate gradients: factor by which they reduce a local residual, most iterations
-LOCAL_EPS = 0.1  # a local system needs no smaller residual than this part of the tolerance
-LEAST_GROWTH, MOST_GROWTH = 4, 16  # limits of the growth of a rank in a pass
 IDLE = 0.8  # a sweep that leaves more than this part of the residual is the last, or, if ranks can grow, drops too much
-ENOUGH = 0.5  # the residual is measured when its estimate is below this part of eps
-DROP = 0.1  # a core may leave out this part of the tolerance
 NOISE = 1e-7  # a smaller part of the residual counts as rounding
-COARSEST, FINER, STEPS = 4.0, 0.84, 32  # tolerances for rounding / eps: the first, its factor per step, number of steps
-LEAP = 8  # the first trials go this number of steps at a time
-SKETCH = 64  # rank of the random train for the estimate of a residual of high rank
-REST = 6  # the other work for a core, in products with the local matrix
-GROWTH = 4  # work of a pass, relative to the last one: its ranks are up to twice as large
+CERTAIN = 0.7  # bound of ||I - S X||_F; below 1, because the estimate is sometimes wrong by a third
 INVERSION = "the inversion"  # the phase for `Work`
+EPSILON = float(np.finfo(float).eps)
 HIGH = 300  # with a larger product of the ranks of S and X, the residual is estimated
 
 
@@ -49,6 +37,8 @@ class Inverse:
     residual : ||I - S X||_F / ||I||_F, with ``identity`` ||I - S X||_F / ||S - I||_F
     sweeps : number of sweeps there and back over the cores
     repaired : number of local systems that were not positive definite, because S was not, or nearly not
+    certain : whether ||I - S X||_F is safely below 1. Then X has as many negative eigenvalues as S: on the line from
+        S^-1 to X the matrix S^-1 - t (S^-1 - X) = S^-1 (I - t (I - S X)) is never singular
     """
 
     applied: Train
@@ -56,24 +46,21 @@ class Inverse:
     residual: float
     sweeps: int
     repaired: int
+    certain: bool = False
 
     @property
     def train(self) -> Train:
         """X."""
         if not self.identity:
             return self.applied
-        unit = identity(self.applied.rows, self.applied.dtype)
+        unit = identity(self.applied.rows)
         return unit + self.applied if self.applied.norm() > 0 else unit
 
 
 def invert(
-    S: Train,
-    max_rank: int = 10,
-    start: Train | None = None,
-    sweeps: int | None = None,
-    eps: float = 0.0,
+    S: Train, max_rank: int = 10, start: Train | None = None, sweeps: int | None = None, eps: float = 0.0,
     rng: np.random.Generator | None = None,
-) -> Inverse:
+) -> Inverse:  # fmt: skip
     """The inverse of a symmetric positive definite S with ranks at most `max_rank`.
 
     Parameters
@@ -89,28 +76,39 @@ def invert(
     >>> X.train.ranks, X.residual < 1e-6
     ((1, 5, 5, 1), True)
     """
-    return _solve(S, identity(S.rows, S.dtype), start, max_rank, sweeps, eps, rng)
+    return _solve(S, identity(S.rows), start, max_rank, sweeps, eps, rng, Work())
 
 
 def invert_near_identity(
-    T: Train,
-    max_rank: int = 10,
-    start: Train | None = None,
-    sweeps: int | None = None,
-    eps: float = 0.0,
-    rng: np.random.Generator | None = None,
-    work: Work | None = None,
-) -> Inverse:
-    """The inverse of S = I + T as X = I + Z, with an exact identity.
+    T: Train, max_rank: int = 10, start: Train | None = None, sweeps: int | None = None, eps: float = 0.0,
+    rng: np.random.Generator | None = None, work: Work | None = None,
+) -> Inverse:  # fmt: skip
+    """The inverse of S = I + T as X = I + Z, with an exact identity; arguments as in `invert`.
 
     The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z. `work`
-    counts operations; TooMuchWorkError at its limit. All other arguments are those of `invert`. Z is cheaper to apply
-    than X: it takes `Apply(Z)` and one addition.
+    counts operations; TooMuchWorkError at its limit. Z is cheaper to apply than X: it takes `Apply(Z)` and one
+    addition.
     """
-    unit = identity(T.rows, T.dtype)
-    if max_rank <= 1 or T.norm() == 0:
-        return Inverse(0 * unit, True, float(max_rank <= 1) if T.norm() else 0.0, 0, 0)
-    return replace(_solve(unit + T, -T, start, max_rank - 1, sweeps, eps, rng, work), identity=True)
+    unit, norm = identity(T.rows), T.norm()
+    if max_rank <= 1 or norm == 0:
+        return Inverse(0 * unit, True, float(norm > 0), 0, 0, norm < CERTAIN)
+    found = _solve(unit + T, -T, start, max_rank - 1, sweeps, eps, rng, work or Work())
+    return replace(found, identity=True, certain=found.repaired == 0 and found.residual * norm < CERTAIN)
+
+
+def invert_positive(
+    T: Train, max_rank: int, eps: float, worth: float = 0.25, sweeps: int | None = None, work: Work | None = None
+) -> Inverse | None:
+    """`invert_near_identity`, but None if a search among trains finds that I + T is not positive definite.
+
+    If an accuracy of `worth` times eps or more is enough to make the inverse `certain`, it is computed to this
+    accuracy: that is cheaper than a test with full vectors.
+    """
+    if lowest(identity(T.rows) + T) <= 0:
+        return None
+    certain = CERTAIN / (T.norm() or 1.0)
+    goal = min(eps, certain) if worth * eps <= certain else eps
+    return invert_near_identity(T, max_rank, sweeps=sweeps, eps=goal, work=work)
 
 
 def residual(S: Train, X: Train, B: Train | None = None) -> float:
@@ -119,13 +117,13 @@ def residual(S: Train, X: Train, B: Train | None = None) -> float:
     The cost grows with the product of the ranks of S and X. If this product is high, the result is an estimate from
     products with random trains, with an error of about a third.
     """
-    B = identity(S.rows, S.dtype) if B is None else B
+    B = identity(S.rows) if B is None else B
     if max(S.ranks) * max(X.ranks) > HIGH:
         return _sketched(S, X, B) / B.norm()
     SX = S @ X
     scale = B.norm() ** 2
     square = 1 - 2 * SX.inner(B) / scale + SX.inner(SX) / scale
-    if square > 1e4 * float(np.finfo(SX.dtype).eps):
+    if square > 1e4 * EPSILON:
         return float(square**0.5)
     return float((B - SX).norm() / scale**0.5)  # rounding spoils the difference of squares
 
@@ -133,16 +131,16 @@ def residual(S: Train, X: Train, B: Train | None = None) -> float:
 def _sketched(S: Train, X: Train, B: Train) -> float:
     """An estimate of ||B - S X||_F: the root mean square of inner products with random trains. These share all cores
     except the last (Feldman et al., "Tensor train sketching", give the variance)."""
-    rng = np.random.default_rng(0)
+    rng, samples = np.random.default_rng(0), 64  # of which the error of the estimate is a third
     sketch = Projection(S, B, len(X))
     sketch.left[0] = np.ones((1, 1, 1))
     for k, x in enumerate(X.cores):
         width = len(sketch.left[k])
-        y = rng.standard_normal((width, *x.shape[1:3], SKETCH)) / width**0.5
+        y = rng.standard_normal((width, *x.shape[1:3], samples)) / width**0.5
         sketch.step_right(k, y, x)
     d = len(X)
     products = sketch.left_B[d][:, 0] - sketch.left[d][:, 0, 0]
-    return float(np.linalg.norm(products) / SKETCH**0.5)
+    return float(np.linalg.norm(products) / samples**0.5)
 
 
 class Growing:
@@ -158,13 +156,14 @@ class Growing:
     def __init__(
         self, S: Train, B: Train, x: Train, most: list[int], eps: float, rng: np.random.Generator, work: Work,
     ) -> None:  # fmt: skip
-        self.most, self.goal, self.work = most, LOCAL_EPS * eps, work
-        width = min(MOST_GROWTH, max(most, default=1))
+        self.most, self.work = most, work
+        self.goal = 0.1 * eps  # a local system needs no smaller residual
+        width = min(16, max(most, default=1))  # the largest growth of a rank in a pass
         self.x, self.signs = _with_signs(x, most)
-        self.z = list(random(S.rows, width, S.columns, rng, S.dtype).right_orthogonal().cores)
+        self.z = list(random(S.rows, width, S.columns, rng).right_orthogonal().cores)
         self.galerkin = Projection.around(S, B, self.x, self.x)
         self.residual = Projection.around(S, B, self.z, self.x)
-        self.drop = DROP * eps / len(x) ** 0.5
+        self.drop = 0.1 * eps / len(x) ** 0.5  # what a core may leave out
         self.repaired = 0
         self.estimate = 0.0
 
@@ -201,8 +200,8 @@ class Growing:
     def _solve(self, k: int) -> None:
         """Compute nearly the symmetric core of least energy by conjugate gradients, from the present core.
 
-        They are scaled by the diagonal. They stop at LOCAL_GAIN times the first residual or `goal` times the right
-        side.
+        They are scaled by the diagonal. They stop at a tenth of the first residual, at `goal` times the right side, or
+        after 20 iterations.
         """
         signs = self.signs[k : k + 2]
 
@@ -218,10 +217,11 @@ class Growing:
         r = f - symmetric(galerkin.times(k, y))
         z = r / weight
         p, rz = z, float(np.vdot(r, z))
-        enough = max(LOCAL_GAIN * float(np.linalg.norm(r)), self.goal * float(np.linalg.norm(f)))
+        enough = max(0.1 * float(np.linalg.norm(r)), self.goal * float(np.linalg.norm(f)))
         one = local_operations(galerkin.left[k], galerkin.S[k], galerkin.right[k], y)
-        self.work.spend(REST * one + 2 * svd_operations(len(y) * y.shape[1] * y.shape[2], 2 * y.shape[3]), INVERSION)
-        for _ in range(LOCAL_ITS):
+        bases = svd_operations(len(y) * y.shape[1] * y.shape[2], 2 * y.shape[3])
+        self.work.spend(6 * one + 2 * bases, INVERSION)  # all but the products of the iterations
+        for _ in range(20):
             if np.linalg.norm(r) <= enough:
                 break
             self.work.spend(one, INVERSION)
@@ -239,15 +239,9 @@ class Growing:
 
 
 def _solve(
-    S: Train,
-    B: Train,
-    start: Train | None,
-    max_rank: int,
-    sweeps: int | None,
-    eps: float,
-    rng: np.random.Generator | None,
-    work: Work | None = None,
-) -> Inverse:
+    S: Train, B: Train, start: Train | None, max_rank: int, sweeps: int | None, eps: float,
+    rng: np.random.Generator | None, work: Work,
+) -> Inverse:  # fmt: skip
     """The symmetric solution of S X = B with its relative residual."""
     if S.rows != S.columns:
         raise ValueError("only a square matrix has an inverse")
@@ -255,24 +249,26 @@ def _solve(
     most = [min(max_rank, r) for r in full_ranks([m * m for m in S.rows])]
     if sweeps is None:
         sweeps = 1 if start is not None else 2 + int(np.ceil(0.5 * np.log2(max(1.0, max(most, default=1)))))
-    first = B if start is None else start.astype(S.dtype)
-    work = Work() if work is None else work
+    first = B if start is None else start
     growing = Growing(S, B, first.round(0.0, max_rank), most, eps, rng, work)
-    norm, count, before, enough = B.norm(), 0, np.inf, ENOUGH * eps
-    while count < sweeps:
+    norm, before, enough = B.norm(), np.inf, 0.5 * eps
+
+    def measured(X: Train) -> float:
+        work.spend(inner_operations(S, X, HIGH), INVERSION)
+        return residual(S, X, B)
+
+    for count in range(1, sweeps + 1):
         begun = work.spent
         try:
             growing.forward()
             growing.backward()
         except TooMuchWorkError:
             raise TooMuchWorkError(growing.words(norm)) from None
-        count += 1
         if growing.estimate <= enough * norm:
             X = Train(growing.x)
-            work.spend(inner_operations(S, X, HIGH), INVERSION)
-            left = residual(S, X, B)
+            left = measured(X)
             if left <= eps:
-                X, left = _rounded(S, B, X, left, eps, work)
+                X, left = _rounded(X, left, eps, measured)
                 return Inverse(X, False, left, count, growing.repaired)
             enough *= 0.5 * eps / left  # the estimate sees only a part of the residual
         if growing.estimate > IDLE * before:
@@ -280,41 +276,22 @@ def _solve(
                 break
             growing.drop *= 0.3
         before = growing.estimate
-        if count < sweeps:
-            work.foresee(GROWTH * (work.spent - begun), growing.words(norm))
+        if count < sweeps:  # in the next pass ranks are up to twice as large
+            work.foresee(4 * (work.spent - begun), growing.words(norm))
     X = Train(growing.x)
-    work.spend(inner_operations(S, X, HIGH), INVERSION)
-    return Inverse(X, False, residual(S, X, B), count, growing.repaired)
+    return Inverse(X, False, measured(X), count, growing.repaired)
 
 
-def _rounded(S: Train, B: Train, X: Train, left: float, eps: float, work: Work) -> tuple[Train, float]:
-    """X rounded so that its residual stays below eps, and this residual.
-
-    A few trials search for the coarsest tolerance. The tolerances fall in leaps until one is fine enough. Then the
-    search bisects the steps of the last leap.
-    """
-
-    def trial(step: int) -> tuple[Train, float]:
-        smaller = X.round(COARSEST * FINER**step * eps)
-        work.spend(inner_operations(S, smaller, HIGH), INVERSION)
-        return smaller, residual(S, smaller, B)
-
-    step = 0
-    best = trial(step)
-    while best[1] > eps:
-        step += LEAP
-        if step > STEPS:
-            return X, left
-        best = trial(step)
-    good, bad = step, step - LEAP
-    while step and good - bad > 1:
-        middle = (good + bad) // 2
-        found = trial(middle)
-        if found[1] <= eps:
-            best, good = found, middle
-        else:
-            bad = middle
-    return best
+def _rounded(X: Train, left: float, eps: float, measured: Callable[[Train], float]) -> tuple[Train, float]:
+    """X rounded so that its residual stays below eps, and this residual. The first tolerance that does it is taken."""
+    tolerance = 4.0 * eps
+    while tolerance > 0.02 * eps:
+        smaller = X.round(tolerance)
+        found = measured(smaller)
+        if found <= eps:
+            return smaller, found
+        tolerance *= max(0.25, min(0.84, 0.97 * eps / found))  # the residual is about proportional to it
+    return X, left
 
 
 def _transpose(x: Array, left: Array, right: Array) -> Array:
@@ -325,9 +302,9 @@ def _transpose(x: Array, left: Array, right: Array) -> Array:
 def _with_signs(X: Train, most: list[int]) -> tuple[list[Array], list[Array]]:
     """(X + X') / 2 with orthonormal right interfaces and ranks at most `most`, and the signs of all bonds."""
     x = list(X.left_orthogonal().cores)
-    signs = [np.ones(1, X.dtype)] * (len(x) + 1)
+    signs = [np.ones(1)] * (len(x) + 1)
     for k in range(len(x) - 1, 0, -1):
-        signs[k] = np.zeros(len(x[k]), X.dtype)  # no symmetry yet
+        signs[k] = np.zeros(len(x[k]))  # no symmetry yet
         _push_left(x, signs, k, most[k - 1], 0.0)
     x[0] = 0.5 * (x[0] + _transpose(x[0], signs[0], signs[1]))
     return x, signs
@@ -340,26 +317,20 @@ def _push_right(
 
     The next core takes the other factor.
     """
-    a, m, n, b = x[k].shape
-    Q, R, new = _basis(x[k], signs[k], signs[k + 1], most, drop, more)
-    x[k] = Q.reshape(a, m, n, -1)
+    Q, R, signs[k + 1] = _basis(x[k], signs[k], signs[k + 1], most, drop, more)
+    x[k] = Q.reshape(*x[k].shape[:3], -1)
     x[k + 1] = np.tensordot(R, x[k + 1], 1)
-    signs[k + 1] = new
 
 
 def _push_left(
     x: list[Array], signs: list[Array], k: int, most: int, drop: float, more: Array | None = None
 ) -> None:
-    """Give core k, as a matrix (a, m n b), at most ``most`` orthonormal rows, some of them from ``more``.
-
-    The core before takes the other factor.
-    """
-    a, m, n, b = x[k].shape
-    turned = None if more is None else more.transpose(3, 1, 2, 0)
-    Q, R, new = _basis(x[k].transpose(3, 1, 2, 0), signs[k + 1], signs[k], most, drop, turned)
-    x[k] = np.ascontiguousarray(Q.reshape(b, m, n, -1).transpose(3, 1, 2, 0))
+    """The same for the rows of core k, as a matrix (a, m n b); the core before takes the other factor."""
+    turned = x[k].transpose(3, 1, 2, 0)
+    more = None if more is None else more.transpose(3, 1, 2, 0)
+    Q, R, signs[k] = _basis(turned, signs[k + 1], signs[k], most, drop, more)
+    x[k] = np.ascontiguousarray(Q.reshape(*turned.shape[:3], -1).transpose(3, 1, 2, 0))
     x[k - 1] = np.tensordot(x[k - 1], R, (3, 1))
-    signs[k] = new
 
 
 def _basis(
@@ -373,20 +344,20 @@ def _basis(
     size = len(x) * x.shape[1] * x.shape[2]
     parts = []
     for sign in (1.0, -1.0):
-        half = x if right.any() else 0.5 * (x + sign * _transpose(x, left, np.ones(x.shape[3], x.dtype)))
+        half = x if right.any() else _half(x, sign, left)
         mine = np.flatnonzero(right != -sign)
         U, s, V = np.linalg.svd(half[..., mine].reshape(size, -1), full_matrices=False)
-        R = np.zeros((len(s), len(right)), x.dtype)
+        R = np.zeros((len(s), len(right)))
         R[:, mine] = s[:, None] * V
         parts.append((U, s, R))
     keep = _largest([s for _, s, _ in parts], most, drop)
     Q = [_own_transposes(U[:, :r], sign, left, x.shape) for sign, (U, _, _), r in zip((1.0, -1.0), parts, keep)]
     coefficients = [R[:r] for (_, _, R), r in zip(parts, keep)]
-    room = min(most - sum(keep), max(LEAST_GROWTH, sum(keep)))
+    room = min(most - sum(keep), max(4, sum(keep)))
     if more is not None and room > 0:
         extra = []
         for sign, known in zip((1.0, -1.0), Q):
-            half = 0.5 * (more + sign * _transpose(more, left, np.ones(more.shape[3], x.dtype))).reshape(size, -1)
+            half = _half(more, sign, left).reshape(size, -1)
             half = half - known @ (known.T @ half)
             extra.append(np.linalg.svd(half, full_matrices=False)[:2])
         floor = NOISE * float(np.linalg.norm(more))  # smaller remains of known directions have no sign
@@ -395,8 +366,8 @@ def _basis(
         for part, (U, _) in enumerate(extra):
             U = U[:, : new[part]]
             Q[part] = np.hstack((Q[part], np.linalg.qr(U - Q[part] @ (Q[part].T @ U))[0]))
-            coefficients[part] = np.vstack((coefficients[part], np.zeros((new[part], len(right)), x.dtype)))
-    signs = np.repeat(np.array([1, -1], x.dtype), [len(R) for R in coefficients])
+            coefficients[part] = np.vstack((coefficients[part], np.zeros((new[part], len(right)))))
+    signs = np.repeat(np.array([1.0, -1.0]), [len(R) for R in coefficients])
     return np.hstack(Q), np.vstack(coefficients), signs
 
 
@@ -405,12 +376,16 @@ def _own_transposes(U: Array, sign: float, left: Array, shape: tuple[int, ...]) 
 
     With singular values near zero, rounding spoils this property.
     """
-    core = U.reshape(*shape[:3], -1)
-    half = 0.5 * (core + sign * _transpose(core, left, np.ones(U.shape[1], U.dtype))).reshape(U.shape)
+    half = _half(U.reshape(*shape[:3], -1), sign, left).reshape(U.shape)
     if np.linalg.norm(half - U) <= NOISE * U.shape[1] ** 0.5:
         return U
     Q, R = np.linalg.qr(half)
-    return Q * np.where(np.diagonal(R) < 0, -1, 1).astype(U.dtype)
+    return Q * np.where(np.diagonal(R) < 0, -1.0, 1.0)
+
+
+def _half(x: Array, sign: float, left: Array) -> Array:
+    """The part of a core that equals its own transpose times ``sign``, for a left bond with these signs."""
+    return 0.5 * (x + sign * _transpose(x, left, np.ones(x.shape[3])))
 
 
 def _largest(values: list[Array], most: int, drop: float) -> list[int]:
@@ -419,8 +394,8 @@ def _largest(values: list[Array], most: int, drop: float) -> list[int]:
     They are as small as possible if the norm of the other values must not exceed `drop` times the norm of all values.
     """
     both = np.sort(np.concatenate(values))[::-1]
-    tail = np.sqrt(np.cumsum(both[::-1].astype(float) ** 2))[::-1]
-    floor = max(drop, float(np.finfo(both.dtype).eps)) * tail[0]
+    tail = np.sqrt(np.cumsum(both[::-1] ** 2))[::-1]
+    floor = max(drop, EPSILON) * tail[0]
     rank = max(1, min(most, int(np.count_nonzero(tail > floor))))
     first = int(np.count_nonzero(values[0] > both[rank])) if len(both) > rank else len(values[0])
     return [first, min(rank - first, len(values[1]))]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import linalg
 
-from pctt.tt.train import Array, Train
+from pctt.tt.train import Array, Train, random
 
 
 class Projection:
@@ -19,7 +20,7 @@ class Projection:
     def __init__(self, S: Train, B: Train | None, length: int) -> None:
         self.S = S.cores
         self.B = None if B is None else B.cores
-        one, one_B = np.ones((1, 1, 1), S.dtype), np.ones((1, 1), S.dtype)
+        one, one_B = np.ones((1, 1, 1)), np.ones((1, 1))
         self.left, self.right = [one] * (length + 1), [one] * length
         self.left_B, self.right_B = [one_B] * (length + 1), [one_B] * length
 
@@ -101,3 +102,38 @@ def rows(x: Array) -> Array:
     """A core (a, ..., b) with orthonormal rows that span those of the given core."""
     Q = np.linalg.qr(x.reshape(len(x), -1).T)[0]
     return np.ascontiguousarray(Q.T).reshape(-1, *x.shape[1:])
+
+
+def lowest(X: Train) -> float:
+    """An upper bound of the least eigenvalue of a symmetric X; a negative value proves that X is not positive definite.
+
+    It is the least v'Xv / v'v that an alternating search over trains v finds. Their rank is 8, or 4 with modes above
+    8, which cost more.
+
+    >>> from pctt.tt.train import identity
+    >>> round(lowest(identity([4, 4, 4])), 12)
+    1.0
+    """
+    rank = 8 if max(X.rows) <= 8 else 4
+    v = list(random(X.rows, rank, [1] * len(X)).right_orthogonal().cores)
+    galerkin = Projection.around(X, None, v, v)
+    value = np.inf
+
+    def lowest_core(k: int) -> Array:
+        nonlocal value
+        w, y = linalg.eigh(galerkin.matrix(k), subset_by_index=[0, 0], check_finite=False)
+        value = float(w[0])
+        return y.reshape(len(galerkin.left[k]), -1, 1, len(galerkin.right[k]))
+
+    for _ in range(4):
+        before = value
+        for k in range(len(v) - 1):
+            v[k] = columns(lowest_core(k))
+            galerkin.step_right(k, v[k], v[k])
+        for k in range(len(v) - 1, 0, -1):
+            v[k] = rows(lowest_core(k))
+            galerkin.step_left(k, v[k], v[k])
+        lowest_core(0)
+        if value < 0 or abs(value - before) <= 1e-3 * abs(value):
+            break
+    return value

@@ -1,8 +1,12 @@
-"""Modes of a long vector: the division of its index into digits, the padding, and the merging of neighbouring modes.
+"""Modes: the division of the index of a long vector, or of a point of a grid, into digits; merging of modes.
 
 A vector has n *slots*, blocks of `block` unknowns each (a contact, a node, a body). Its modes m_1, ..., m_d satisfy
 m_1 m_2 ... m_d >= n. The last mode is the leaf, a run of neighbouring slots that no bond separates. The scalar modes of
 a train are the slot modes, with the leaf multiplied by the block size. Slots keep their order.
+
+On a grid a coordinate 0 <= c_a < n_a is written in digits. Their bases are small primes with a product p_a >= n_a, so
+there is little padding. The modes are the digits of one axis after the other. Row numbers, places in the train and keys
+of pairs of points are all sums of one number per axis, and small tables have these numbers.
 """
 
 from __future__ import annotations
@@ -14,13 +18,13 @@ import numpy as np
 
 from pctt.tt.train import Array, Train
 
-FIRST, MIDDLE = 64, 4  # the largest first mode, and the modes between the first and the last
+MIDDLE = 4  # the modes between the first and the last
 
 
 def choose_modes(n: int, leaf: int = 16) -> tuple[int, ...]:
     """Slot modes [first, MIDDLE, ..., MIDDLE, last] for n slots.
 
-    The first mode is at most FIRST. The last is the number between `leaf` and 5/4 `leaf` with the least padding. A
+    The first mode is at most 64. The last is the number between `leaf` and 5/4 `leaf` with the least padding. A
     small number of slots gets one or two modes. The application of a train of rank r with these modes costs about
     2 n r (first + r MIDDLE levels + last) operations; for this reason the ends are not larger.
 
@@ -34,15 +38,10 @@ def choose_modes(n: int, leaf: int = 16) -> tuple[int, ...]:
     if n <= 2 * leaf:
         return (n,)
     levels = 0
-    while n > FIRST * MIDDLE**levels * leaf:
+    while n > 64 * MIDDLE**levels * leaf:
         levels += 1
-    best: tuple[int, ...] = ()
-    for last in range(leaf, leaf + leaf // 4 + 1):
-        below = last * MIDDLE**levels
-        candidate = (-(-n // below), *[MIDDLE] * levels, last)
-        if not best or slots_of(candidate) < slots_of(best):
-            best = candidate
-    return best
+    ends = range(leaf, leaf + leaf // 4 + 1)
+    return min(((-(-n // (last * MIDDLE**levels)), *[MIDDLE] * levels, last) for last in ends), key=slots_of)
 
 
 def slots_of(modes: Sequence[int]) -> int:
@@ -110,3 +109,113 @@ def _join(a: Array, b: Array) -> Array:
         return core.reshape(a.shape[0], -1, b.shape[-1])
     core = core.transpose(0, 1, 3, 2, 4, 5)
     return core.reshape(a.shape[0], a.shape[1] * b.shape[1], a.shape[2] * b.shape[2], b.shape[-1])
+
+
+class GridDigits:
+    """The digits of a grid of shape (n_1, ..., n_D). Its points are numbered like the entries of a numpy array.
+
+    block : unknowns per point, the fastest digit of a row
+
+    modes : modes of the train, the same for rows and columns
+    places : (n_1 ... n_D block,) place of each row among the `slots_of(modes)` rows of the train
+
+    >>> GridDigits((8, 6)).modes
+    (2, 2, 2, 3, 2)
+    """
+
+    def __init__(self, shape: Sequence[int], block: int = 1) -> None:
+        self.shape, self.block = tuple(int(n) for n in shape), int(block)
+        if min((*self.shape, self.block)) < 1:
+            raise ValueError(f"a grid of shape {self.shape} with blocks of {self.block}; allowed are numbers >= 1")
+        axes = [bases(n) for n in self.shape]
+        modes = [base for digits in axes for base in digits] or [1]
+        self.modes = scalar_modes(modes, self.block)
+        self._tables(axes)
+
+    def _tables(self, axes: list[list[int]]) -> None:
+        """Make the tables. For each axis they have the contribution of its coordinate to a place in the train and to
+        the two halves of a key. For each mode they have the contribution of a pair of digits to the pair of padded
+        rows."""
+        self.padded = tuple(prod(digits) for digits in axes)
+        self.size = slots_of(self.modes)
+        if self.size >= 2**31:
+            raise ValueError(f"too many points for a train: a grid of shape {self.shape}")
+        width = [int(w) for w in np.cumprod([1, *self.modes[::-1]])[-2::-1]]  # weight of a digit in a place
+        square = [w * w for w in width]  # weight of a pair of digits in a key
+        stride = np.cumprod([1, *self.padded[::-1]])[-2::-1] * self.block
+        self.place, self.row_key, self.column_key = ([np.zeros(p, np.int64) for p in self.padded] for _ in range(3))
+        row_of = [np.zeros(m, np.int64) for m in self.modes]
+        k = 0
+        for a, bases_of_axis in enumerate(axes):
+            for level, base in enumerate(bases_of_axis):
+                weight = prod(bases_of_axis[level + 1 :])
+                below = self.modes[k] // base  # in the last mode the block, otherwise 1
+                digit = np.arange(self.padded[a]) // weight % base * below
+                self.place[a] += digit * width[k]
+                self.row_key[a] += digit * self.modes[k] * square[k]
+                self.column_key[a] += digit * square[k]
+                row_of[k] += np.arange(self.modes[k]) // below * (weight * int(stride[a]))
+                k += 1
+        row_of[-1] += np.arange(self.modes[-1]) % self.block
+        self._pairs = [(row[:, None] * self.size + row).ravel() for row in row_of]
+        self._square = square
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of the matrix, without padded rows."""
+        return prod(self.shape) * self.block
+
+    @property
+    def places(self) -> Array:
+        out = np.zeros(1, np.int64)
+        for table, n in zip(self.place, self.shape):
+            out = np.add.outer(out, table[:n]).ravel()
+        return np.add.outer(out, np.arange(self.block)).ravel()
+
+    def key(self, row: Array, column: Array) -> Array:
+        """Keys of pairs of points with coordinates (D + 1, ...); the last coordinate is the unknown in the block."""
+        out = row[-1] * self.modes[-1] + column[-1]
+        for a in range(len(self.shape)):
+            out = out + self.row_key[a][row[a]] + self.column_key[a][column[a]]
+        return out
+
+    def pair(self, keys: Array) -> Array:
+        """Pairs row * size + column, of padded rows and columns, for keys with the digits i_k m_k + j_k of base m_k^2.
+
+        If keys share no digit, the pair of their sum is the sum of their pairs.
+        """
+        pair = np.zeros(keys.shape, np.int64)
+        for table, square in zip(self._pairs, self._square):
+            digit, keys = np.divmod(keys, square)
+            pair += table[digit]
+        return pair
+
+    def within(self, padded: Array) -> tuple[Array, Array]:
+        """The rows of the matrix for padded rows, and a mask of those that exist; the other numbers mean nothing."""
+        if self.padded == self.shape:
+            return padded, np.ones(padded.shape, bool)
+        *coordinates, inner = np.unravel_index(padded, (*self.padded, self.block))
+        inside = np.ones(padded.shape, bool)
+        row = np.zeros(padded.shape, np.int64)
+        for c, n in zip(coordinates, self.shape):
+            inside &= c < n
+            row = row * n + c
+        return row * self.block + inner, inside
+
+
+def bases(n: int) -> list[int]:
+    """Bases of the digits of 0, ..., n - 1: primes up to 7, largest first, with the least product that is at least n.
+
+    >>> bases(64), bases(100), bases(97), bases(1)
+    ([2, 2, 2, 2, 2, 2], [5, 5, 2, 2], [7, 7, 2], [])
+    """
+    while True:
+        rest = n
+        found: list[int] = []
+        for p in (2, 3, 5, 7):
+            while rest % p == 0:
+                rest //= p
+                found.insert(0, p)
+        if rest == 1:
+            return found
+        n += 1

@@ -11,19 +11,26 @@ nonempty nodes of the product tree of the paper, section 3.2). A compression nee
 Their cost is linear in the number of nodes; for the leaf it is linear in the number of nonzeros. Each is a sum over
 nonzeros. If several processes have the entries of their own rows, the function `reduce` adds the small results of
 `middle` and `leaf_core` over the processes. Nothing else is exchanged, and all processes have the same cores.
+
+`compress` makes a train by alternating least squares (ALS). With orthonormal left and right interfaces, the best core
+between them is the matrix contracted with both. A pass over the cores, forward or backward, computes the best core at
+each bond and from it a new orthonormal interface. At the start the right interfaces are random, or those of another
+train, for example the train of the last Newton step. Each pass needs one product with all nonzeros, and so does the
+start; the rest is small.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import copy
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 
+from pctt.tt.projection import columns, rows
 from pctt.tt.quantise import scalar_modes, slots_of
-from pctt.tt.train import Array
+from pctt.tt.train import Array, Train, full_ranks, matrix_train, zeros
 
 Reduction = Callable[[Array], Array]
 Agreement = Callable[[Any], Any]
@@ -57,14 +64,9 @@ class SparseHierarchy:
     """
 
     def __init__(
-        self,
-        rows: Array,
-        columns: Array,
-        modes: Sequence[int],
-        block: int = 1,
-        reduce: Reduction = on_one_rank,
+        self, rows: Array, columns: Array, modes: Sequence[int], block: int = 1, reduce: Reduction = on_one_rank,
         agree: Agreement = on_one_rank,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.slot_modes = tuple(int(m) for m in modes)
         self.modes = scalar_modes(self.slot_modes, block)
         self.block = int(block)
@@ -77,13 +79,12 @@ class SparseHierarchy:
         self.keys = keys[new]
         self._rows = np.asarray(rows)[self._order[new]]
         self._by_row: tuple[Array, Array, Array] | None = None
-        self._index_leaf()
-        self._index_bonds()
+        self._index_bonds(self._index_leaf())
         self._set_leaf(np.zeros(len(self._leaf_columns)))
 
-    def _index_leaf(self) -> None:
-        """Make the row pointers and columns of the leaf matrix. It has a row per node of the last bond, with the
-        entries of the leaf of this node.
+    def _index_leaf(self) -> Array:
+        """Make the row pointers and columns of the leaf matrix, and return the keys of its rows. It has a row per node
+        of the last bond, with the entries of the leaf of this node.
 
         Its columns have the order (i, j, s, t), slots before places in the block, so blocks are contiguous.
         """
@@ -93,11 +94,10 @@ class SparseHierarchy:
         digit: Array = (self.keys % square).astype(wide)
         self._leaf_columns = np.add.outer(digit * bb, np.arange(bb, dtype=wide)).ravel()
         self._leaf_pointers = (np.append(starts, len(self.keys)) * bb).astype(wide)
-        self._leaf_keys = self.keys[starts] // square
+        return self.keys[starts] // square
 
-    def _index_bonds(self) -> None:
+    def _index_bonds(self, keys: Array) -> None:
         """Make, for each bond, the places parent * m^2 + digit of its nodes among all children of their parents."""
-        keys = self._leaf_keys
         self.nodes = [len(keys)]
         self.places: list[Array] = []
         for m in self.slot_modes[-2::-1]:
@@ -111,7 +111,7 @@ class SparseHierarchy:
 
     def set_values(self, values: Array) -> None:
         """Take new blocks (nb, block, block), in the order in which their slots were given."""
-        values = np.asarray(values).reshape(len(self._order), self.block**2)[self._order]
+        values = np.asarray(values, float).reshape(len(self._order), self.block**2)[self._order]
         if self._starts is not None:
             values = np.add.reduceat(values, self._starts, axis=0)
         self._set_leaf(values.ravel())
@@ -122,26 +122,10 @@ class SparseHierarchy:
         self._leaf = sparse.csr_matrix((data, self._leaf_columns, pointers), shape=shape)
         self._leaf_transposed = self._leaf.T
 
-    def thinned(self, part: int) -> SparseHierarchy:
-        """A hierarchy with one in `part` of the nodes of the last bond and all their entries. The choice depends on the
-        keys alone."""
-        hashed = self._leaf_keys.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(32)
-        kept = np.flatnonzero(hashed % np.uint64(part) == 0)
-        thin = copy(self)
-        thin._leaf_keys = self._leaf_keys[kept]
-        thin._leaf = self._leaf[kept]
-        thin._leaf_transposed = thin._leaf.T
-        thin._index_bonds()
-        return thin
-
     @property
     def values(self) -> Array:
         """The distinct blocks (number, block, block), in the order of `keys`."""
         return self._leaf.data.reshape(-1, self.block, self.block)
-
-    @property
-    def dtype(self) -> np.dtype:
-        return self._leaf.dtype
 
     @property
     def size(self) -> int:
@@ -157,7 +141,7 @@ class SparseHierarchy:
         node, leaf = np.divmod(keys, m * m)
         (i, s), (j, t) = (np.divmod(index, b) for index in np.divmod(leaf, m))
         wanted = node * (q * q) + i * q + j
-        out = np.zeros(keys.shape, self.dtype)
+        out = np.zeros(keys.shape)
         if len(self.keys):
             place = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
             found = self.keys[place] == wanted
@@ -199,7 +183,7 @@ class SparseHierarchy:
         size = float(self.size) ** 2
         others = rng.integers(0, slots_of(self.modes) ** 2, count)
         values = self.lookup(stored)
-        seen = max(float(values @ values), float(np.finfo(self.dtype).tiny))
+        seen = max(float(values @ values), float(np.finfo(float).tiny))
         weights = np.repeat([self.norm() ** 2 / seen, size / count], [len(stored), count])
         return np.concatenate((stored, others)), weights
 
@@ -228,7 +212,7 @@ class SparseHierarchy:
 
     def root(self) -> Array:
         """The left interface of bond 0."""
-        return np.ones((1, 1), self.dtype)
+        return np.ones((1, 1))
 
     def down(self, k: int, x: Array, core: Array) -> Array:
         """The left interface (nodes[k+1], r') of bond k+1, from that of bond k, x (nodes[k], r), and core k."""
@@ -238,7 +222,7 @@ class SparseHierarchy:
     def spread(self, k: int, V: Array) -> Array:
         """V (nodes[k+1], r) as an array (nodes[k], m^2 r), which has a place for every child of a node of bond k."""
         r = V.shape[1]
-        out = np.zeros((self.nodes[k] * self.slot_modes[k] ** 2, r), V.dtype)
+        out = np.zeros((self.nodes[k] * self.slot_modes[k] ** 2, r))
         out[self.places[k]] = V
         return out.reshape(self.nodes[k], self.slot_modes[k] ** 2 * r)
 
@@ -262,10 +246,6 @@ class SparseHierarchy:
     def leaf_row(self, core: Array) -> Array:
         """The last core (r, m^2, 1) as a matrix (r, m^2), in the column order of the leaf matrix."""
         return self._leaf_order(core, to_train=False)
-
-    def leaf_rows(self, part: slice) -> Array:
-        """The dense leaves of some nodes of the last bond, in the column order of the leaf matrix."""
-        return self._leaf[part].toarray()
 
     def inner(self, cores: Sequence[Array]) -> float:
         """Sum of products of the entries with those of a train."""
@@ -300,3 +280,130 @@ def _starts(keys: Array) -> Array:
     if len(keys) == 0:
         return np.zeros(0, np.int64)
     return np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))
+
+
+#: The smallest relative error for which a difference of squares has two or three correct digits.
+CERTAIN = 5e-7
+
+
+@dataclass(frozen=True)
+class Compression:
+    """A train of a sparse matrix A.
+
+    error : ||A - T||_F / ||A||_F, measured; see `relative_error`
+    passes : number of forward passes over all nonzeros
+    """
+
+    train: Train
+    error: float
+    passes: int
+
+
+def compress(
+    matrix: SparseHierarchy, max_rank: int = 10, eps: float = 1e-2, start: Train | None = None,
+    sweeps: int | None = None, rng: np.random.Generator | None = None,
+) -> Compression:  # fmt: skip
+    """A train with ranks at most `max_rank`, with an error below eps if the rank allows it.
+
+    Parameters
+    ----------
+    start : a train for a warm start; random directions fill up its ranks
+    sweeps : number of sweeps, backward and forward, after the first pass; by default 0 with a start and 1 without
+
+    >>> i = np.arange(63)
+    >>> A = SparseHierarchy(np.r_[i, i + 1], np.r_[i + 1, i], [4, 4, 4])
+    >>> A.set_values(np.ones(126))
+    >>> compress(A, eps=1e-12).train.ranks
+    (1, 3, 3, 1)
+    """
+    rng = np.random.default_rng(0) if rng is None else rng
+    norm = matrix.norm()
+    if norm == 0 or len(matrix.modes) == 1:
+        return _exact(matrix)
+    cores = [] if start is None else start.flat()
+    sweeps = (0 if cores else 1) if sweeps is None else sweeps
+    wide = Train(_widen(matrix, cores, max_rank, rng)).right_orthogonal()
+    cores, x = forward(matrix, _spreads(matrix, wide.flat()))
+    for _ in range(sweeps):
+        cores, x = forward(matrix, backward(matrix, x, cores[-1]))
+    error = matrix.agree(max(0.0, 1 - float(np.vdot(cores[-1], cores[-1])) / norm**2) ** 0.5)
+    train = matrix_train(cores, matrix.modes)
+    slack = (eps**2 - error**2) ** 0.5 if error < eps else eps
+    rounded = matrix.agree(train.round(0.99 * slack))
+    if rounded.ranks == train.ranks:
+        return Compression(train, max(error, CERTAIN), 1 + sweeps)
+    return Compression(rounded, relative_error(matrix, rounded), 1 + sweeps)
+
+
+def forward(matrix: SparseHierarchy, spreads: list[Array]) -> tuple[list[Array], list[Array]]:
+    """A pass from the first core to the last; ``spreads`` is the matrix contracted with the right interfaces.
+
+    Returns the new flat cores and their left interfaces. All cores except the last are left-orthogonal.
+    """
+    x, cores = [matrix.root()], []
+    for k, spread in enumerate(spreads):
+        rank = spread.shape[1] // matrix.slot_modes[k] ** 2
+        core = matrix.middle(x[k], spread, rank)
+        cores.append(columns(core))
+        x.append(matrix.down(k, x[k], cores[k]))
+    return [*cores, matrix.leaf_core(x[-1])], x
+
+
+def backward(matrix: SparseHierarchy, x: list[Array], last: Array) -> list[Array]:
+    """A pass from the last core to the first, from left interfaces and the best last core for them.
+
+    Returns the matrix contracted with the new right interfaces.
+    """
+    right = rows(last)
+    V = matrix.leaf_up(right)
+    spreads = [matrix.spread(len(x) - 2, V)]
+    for k in range(len(x) - 2, 0, -1):
+        right = rows(matrix.middle(x[k], spreads[0], V.shape[1]))
+        V = matrix.up(spreads[0], right)
+        spreads.insert(0, matrix.spread(k - 1, V))
+    return spreads
+
+
+def _spreads(matrix: SparseHierarchy, cores: list[Array]) -> list[Array]:
+    """The matrix contracted with the right interfaces of all cores except the first."""
+    V = matrix.leaf_up(cores[-1])
+    spreads = [matrix.spread(len(cores) - 2, V)]
+    for k in range(len(cores) - 2, 0, -1):
+        V = matrix.up(spreads[0], cores[k])
+        spreads.insert(0, matrix.spread(k - 1, V))
+    return spreads
+
+
+def relative_error(matrix: SparseHierarchy, train: Train) -> float:
+    """||A - T||_F / ||A||_F over all entries, including zeros.
+
+    It is computed from ||A||^2 - 2 <A, T> + ||T||^2. Rounding makes this worthless below the root of the machine
+    precision; so the result is at least CERTAIN.
+    """
+    norm = matrix.norm()
+    if norm == 0:
+        return train.norm()
+    square = 1 - 2 * matrix.inner(train.flat()) / norm**2 + (train.norm() / norm) ** 2
+    return float(max(square, CERTAIN**2) ** 0.5)
+
+
+def _exact(matrix: SparseHierarchy) -> Compression:
+    """The exact train of a matrix that is zero or has a single mode."""
+    if len(matrix.modes) > 1:
+        return Compression(zeros(matrix.modes, matrix.modes), 0.0, 0)
+    return Compression(matrix_train([matrix.leaf_core(matrix.root())], matrix.modes), 0.0, 0)
+
+
+def _widen(matrix: SparseHierarchy, cores: list[Array], rank: int, rng: np.random.Generator) -> list[Array]:
+    """Random cores with the given rank, as far as the modes allow it; their first rows have the old cores, if any."""
+    squares = [m * m for m in matrix.modes]
+    ranks = [1, *np.minimum(rank, full_ranks(squares)), 1]
+    wide = []
+    for k in range(len(squares)):
+        core = rng.standard_normal((ranks[k], squares[k], ranks[k + 1]))
+        if cores:
+            a, b = min(ranks[k], cores[k].shape[0]), min(ranks[k + 1], cores[k].shape[2])
+            core[:a, :, b:] = 0
+            core[:a, :, :b] = cores[k][:a, :, :b]
+        wide.append(core)
+    return wide

@@ -27,8 +27,6 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 Array = NDArray[Any]
 
-CHUNK = 1 << 15  # number of multi-indices evaluated at a time, so that their rows of cores stay in the cache
-
 
 class Train:
     """A tensor train: its cores, and arithmetic with trains.
@@ -38,7 +36,7 @@ class Train:
 
     >>> T = identity([2, 3, 4])
     >>> T
-    matrix train 24 x 24: modes 2x2 3x3 4x4, ranks 1-1-1-1, 29 numbers for 576 entries (ratio 19.9)
+    Train of shape (24, 24), ranks 1-1-1-1, 29 numbers
     >>> (T + T).ranks, (T + T).round().ranks
     ((1, 2, 2, 1), (1, 1, 1, 1))
     >>> (2 * T @ T).norm() == 2 * 24**0.5
@@ -100,14 +98,7 @@ class Train:
         return sum(core.size for core in self.cores)
 
     def __repr__(self) -> str:
-        kind = "matrix" if self.is_matrix else "vector"
-        shape = " x ".join(map(str, self.shape)) if self.is_matrix else str(prod(self.rows))
-        modes = " ".join("x".join(map(str, mode)) for mode in self.modes)
-        entries = prod(prod(mode) for mode in self.modes)
-        return (
-            f"{kind} train {shape}: modes {modes}, ranks {'-'.join(map(str, self.ranks))}, "
-            f"{self.storage} numbers for {entries} entries (ratio {entries / self.storage:.3g})"
-        )
+        return f"Train of shape {self.shape}, ranks {'-'.join(map(str, self.ranks))}, {self.storage} numbers"
 
     # Entries
 
@@ -141,8 +132,9 @@ class Train:
         """Entries at multi-indices (d, p) of the flat cores: i_k for a tensor, i_k n_k + j_k for a matrix."""
         tables = [np.ascontiguousarray(core.transpose(1, 0, 2)) for core in self.flat()]
         out = np.empty(digits.shape[1], self.dtype)
-        for start in range(0, len(out), CHUNK):
-            part = slice(start, start + CHUNK)
+        chunk = 1 << 15  # rows of cores stay in the cache
+        for start in range(0, len(out), chunk):
+            part = slice(start, start + chunk)
             x = tables[0][digits[0, part]]
             for table, digit in zip(tables[1:], digits[1:]):
                 x = x @ table[digit[part]]
@@ -155,24 +147,19 @@ class Train:
         """Sum; its ranks are the sums of the ranks."""
         if self.modes != other.modes:
             raise ValueError(f"trains of different modes: {self.modes} and {other.modes}")
-        if len(self) == 1:
-            return Train([self.cores[0] + other.cores[0]])
         last = len(self) - 1
-        dtype = np.result_type(self.dtype, other.dtype)
         cores = []
         for k, (a, b) in enumerate(zip(self.cores, other.cores)):
-            left = (0, 0) if k == 0 else (0, a.shape[0])
-            right = (0, 0) if k == last else (0, a.shape[-1])
-            rows, columns = left[1] + b.shape[0], right[1] + b.shape[-1]
-            core = np.zeros((rows, *a.shape[1:-1], columns), dtype)
-            core[: a.shape[0], ..., : a.shape[-1]] = a
-            core[left[1] :, ..., right[1] :] = b
+            left, right = len(a) * (k > 0), a.shape[-1] * (k < last)
+            core = np.zeros((left + len(b), *a.shape[1:-1], right + b.shape[-1]))
+            core[: len(a), ..., : a.shape[-1]] = a
+            core[left:, ..., right:] += b
             cores.append(core)
         return Train(cores)
 
     def __mul__(self, factor: float) -> Train:
         """Product with a number."""
-        return Train([self.cores[0] * self.dtype.type(factor), *self.cores[1:]])
+        return Train([factor * self.cores[0], *self.cores[1:]])
 
     __rmul__ = __mul__
 
@@ -199,16 +186,16 @@ class Train:
         """Transpose of a matrix."""
         return Train([core.transpose(0, 2, 1, 3) for core in self._matrix().cores])
 
-    def symmetric_part(self, eps: float, max_rank: int | None = None) -> Train:
+    def symmetric_part(self, eps: float) -> Train:
         """(T + T') / 2 of a square matrix, rounded to eps. It approximates a symmetric matrix at least as well as T."""
-        return (0.5 * (self + self.T)).round(eps, max_rank)
+        return (0.5 * (self + self.T)).round(eps)
 
     def astype(self, dtype: DTypeLike) -> Train:
         return Train([core.astype(dtype) for core in self.cores])
 
     def inner(self, other: Train) -> float:
         """Sum of the products of the entries; trace(A' B) for matrices."""
-        gram = np.ones((1, 1), np.result_type(self.dtype, other.dtype))
+        gram = np.ones((1, 1))
         for a, b in zip(self.flat(), other.flat()):
             gram = np.tensordot(a, np.tensordot(gram, b, 1), ((0, 1), (0, 1)))
         return float(gram[0, 0])
@@ -279,7 +266,7 @@ def decompose(
     >>> decompose(np.arange(64.0), modes=[4, 4, 4]).ranks
     (1, 2, 2, 1)
     """
-    tensor = _floating(tensor)
+    tensor = np.asarray(tensor, float)
     shape = tensor.shape if modes is None else tuple(modes)
     delta = eps * float(np.linalg.norm(tensor)) / max(1, len(shape) - 1) ** 0.5
     rest = tensor.reshape(1, -1)
@@ -292,12 +279,9 @@ def decompose(
 
 
 def decompose_matrix(
-    matrix: ArrayLike,
-    rows: Sequence[int],
-    columns: Sequence[int] | None = None,
-    eps: float = 1e-12,
+    matrix: ArrayLike, rows: Sequence[int], columns: Sequence[int] | None = None, eps: float = 1e-12,
     max_rank: int | None = None,
-) -> Train:
+) -> Train:  # fmt: skip
     """A train of a dense matrix (prod rows, prod columns) with an error of at most eps times its norm.
 
     >>> decompose_matrix(np.diag(np.ones(15), 1), [2, 2, 4]).ranks
@@ -305,7 +289,7 @@ def decompose_matrix(
     """
     columns = rows if columns is None else columns
     d = len(rows)
-    tensor = _floating(matrix).reshape(*rows, *columns)
+    tensor = np.asarray(matrix, float).reshape(*rows, *columns)
     tensor = tensor.transpose(sum(((k, d + k) for k in range(d)), ()))
     pairs = [m * n for m, n in zip(rows, columns)]
     train = decompose(tensor, eps, max_rank, pairs)
@@ -318,23 +302,20 @@ def matrix_train(cores: Iterable[Array], rows: Sequence[int], columns: Sequence[
     return Train(core.reshape(core.shape[0], m, n, core.shape[-1]) for core, m, n in zip(cores, rows, columns))
 
 
-def identity(modes: Sequence[int], dtype: DTypeLike = float) -> Train:
+def identity(modes: Sequence[int]) -> Train:
     """The identity matrix, of rank 1."""
-    return Train([np.eye(n, dtype=dtype)[None, :, :, None] for n in modes])
+    return Train([np.eye(n)[None, :, :, None] for n in modes])
 
 
-def zeros(rows: Sequence[int], columns: Sequence[int] | None = None, dtype: DTypeLike = float) -> Train:
+def zeros(rows: Sequence[int], columns: Sequence[int] | None = None) -> Train:
     """The zero vector, or with ``columns`` the zero matrix, of rank 1."""
-    return Train([np.zeros((1, *mode, 1), dtype) for mode in _mode_shapes(rows, columns)])
+    return Train([np.zeros((1, *mode, 1)) for mode in _mode_shapes(rows, columns)])
 
 
 def random(
-    rows: Sequence[int],
-    rank: int | Sequence[int],
-    columns: Sequence[int] | None = None,
+    rows: Sequence[int], rank: int | Sequence[int], columns: Sequence[int] | None = None,
     rng: np.random.Generator | None = None,
-    dtype: DTypeLike = float,
-) -> Train:
+) -> Train:  # fmt: skip
     """A train with normally distributed cores, whose entries have the variance 1. No rank exceeds what the modes allow.
 
     rank : the rank of all bonds, or the ranks r_1, ..., r_{d-1}.
@@ -347,7 +328,7 @@ def random(
     asked = [rank] * (len(shapes) - 1) if isinstance(rank, int) else list(rank)
     ranks = [1, *np.minimum(asked, full_ranks([prod(shape) for shape in shapes])), 1]
     return Train(
-        (rng.standard_normal((ranks[k], *shape, ranks[k + 1])) / ranks[k] ** 0.5).astype(dtype)
+        rng.standard_normal((ranks[k], *shape, ranks[k + 1])) / ranks[k] ** 0.5
         for k, shape in enumerate(shapes)
     )
 
@@ -375,8 +356,3 @@ def low_rank(matrix: Array, delta: float, max_rank: int | None = None) -> tuple[
 
 def _mode_shapes(rows: Sequence[int], columns: Sequence[int] | None) -> list[tuple[int, ...]]:
     return [(n,) for n in rows] if columns is None else list(zip(rows, columns))
-
-
-def _floating(x: ArrayLike) -> Array:
-    x = np.asarray(x)
-    return x if x.dtype in (np.float32, np.float64) else x.astype(float)

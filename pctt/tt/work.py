@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf, log2, prod
+from math import inf, prod
 
 from pctt.tt.apply import cheapest_groups
 from pctt.tt.quantise import merge
@@ -13,7 +13,6 @@ CALL = 2e4  # a step in Python on small arrays
 ENTRY = 200.0  # an entry of a matrix, from a function of the user
 MULTIPLY = 0.05  # a multiplication and an addition within a product of matrices
 FACTOR = 0.7  # the same in a singular value decomposition
-PIVOTS = 5.0  # the search for pivots, in singular value decompositions
 
 
 class TooMuchWorkError(Exception):
@@ -40,21 +39,6 @@ class Work:
             raise TooMuchWorkError(phase)
 
 
-def product_operations(shape: tuple[int, ...]) -> float:
-    """Of a product with a matrix of differences on a grid, by FFT on a grid twice as wide.
-
-    >>> product_operations((512, 512))
-    20971520.0
-    """
-    wide = prod(2 * n for n in shape)
-    return wide * log2(wide)
-
-
-def dense_operations(rows: int) -> float:
-    """Of a product with a dense matrix."""
-    return 0.5 * float(rows) ** 2
-
-
 def apply_operations(train: Train) -> float:
     """Of a product with a vector."""
     groups = merge(train, cheapest_groups(train.rows, train.ranks))
@@ -74,11 +58,6 @@ def local_operations(left: Array, S: Array, right: Array, x: Array) -> float:
 def svd_operations(rows: int, columns: int) -> float:
     """Of a thin singular value decomposition."""
     return CALL + FACTOR * rows * columns * min(rows, columns)
-
-
-def pivot_operations(rows: int, columns: int) -> float:
-    """Of the search for the dominant rows of a matrix."""
-    return PIVOTS * svd_operations(rows, columns)
 
 
 def inner_operations(S: Train, X: Train, high: int) -> float:

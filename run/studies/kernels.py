@@ -178,7 +178,7 @@ def solve(way: str, problem: Differences | General) -> dict[str, Any]:
     row = {"setup_s": setup, "solve_s": end - middle, "iterations": ksp.getIterationNumber(), "residual": left}
     row |= {"reason": ksp.getConvergedReason(), "warned": "; ".join(str(w.message) for w in said)}
     if way in OURS:
-        row["what"] = ksp.pc.getPythonContext().made.used
+        row["what"] = ksp.pc.getPythonContext().what()
     return row
 
 

@@ -130,16 +130,16 @@ class WatchedSparseTrain(SparseTrain):
 
     rows: list[dict[str, Any]]
 
-    def _compress(self, rank: int, warm: bool):
+    def _compress(self, warm: bool):
         start = time.perf_counter()
-        found = super()._compress(rank, warm)
+        found = super()._compress(warm)
         self.rows[-1] |= {"compress_s": time.perf_counter() - start, "error": found.error}
         self.rows[-1] |= {"matrix_rank": mean_rank(found.train.ranks), "warm": warm}
         return found
 
-    def _invert(self, rank: int, warm: bool):
+    def _invert(self, warm: bool):
         start = time.perf_counter()
-        inverse = super()._invert(rank, warm)
+        inverse = super()._invert(warm)
         self.rows[-1] |= {"invert_s": time.perf_counter() - start, "residual": inverse.residual}
         # what is stored of I + Z is Z, of one rank less
         self.rows[-1] |= {"inverse_rank": mean_rank(inverse.applied.ranks) + inverse.identity}
@@ -165,13 +165,11 @@ class WatchedTrain(TensorTrain):
         self.rows: list[dict[str, Any]] = []
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        assert self.policy is not None
         assert isinstance(self.made, WatchedSparseTrain)
-        self.made.rows = self.rows
-        self.policy.forgive()
+        self.made.rows, self.made.failure = self.rows, ""
         self.rows.append({})
         super().update(pc, P)
-        self.rows[-1] |= {"setup_s": self._setup_seconds, "rank": self.rank}
+        self.rows[-1] |= {"setup_s": self._made_in, "rank": self.rank}
 
 
 def mean_rank(ranks: tuple[int, ...]) -> float:

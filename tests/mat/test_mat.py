@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
+from train_solver import solver
 
 from pctt import tt
 from pctt.mat import TensorTrain, axpy, from_entries, inverse, load, save
 from pctt.mat.entries import Entries
-from pctt.mat.grid_train import rounded
 from pctt.options import OptionError
 from pctt.petsc import own_errors
 from pctt.tt.apply import cheapest_groups
@@ -171,12 +171,7 @@ def test_a_changed_mat_is_preconditioned_as_it_is_now():
     mat.shift(2.0)
     A = 5 * kernel.dense + 2 * np.eye(108)
     for eps in (1e-2, 1e-11):  # the second is beyond the accuracy of the Mat, so its entries are evaluated
-        ksp = PETSc.KSP().create(mat.comm)
-        ksp.setOperators(mat)
-        ksp.pc.setType("python")
-        ksp.pc.setPythonType("pctt.pc.TensorTrain")
-        PETSc.Options().insertString(f"-pc_tt_rank 100 -pc_tt_eps {eps}")
-        ksp.setFromOptions()
+        ksp = solver(mat, rank=100, eps=eps)
         x, y = mat.createVecs()
         x.set(1.0)
         ksp.pc.setUp()
@@ -490,14 +485,7 @@ def test_flops_are_those_of_the_merged_cores():
     x, y = mat.createVecs()
     before = PETSc.Log.getFlops()
     mat.mult(x, y)
-    assert PETSc.Log.getFlops() - before == mat.getPythonContext()._product.flops + 3 * 30
-
-
-def test_rounding_is_relative():
-    T = tt.random([2] * 6, 8, [2] * 6)
-    train, left = rounded(T, 0.0, 3)
-    assert max(train.ranks) == 3
-    assert left == pytest.approx((train - T).norm() / T.norm())
+    assert PETSc.Log.getFlops() - before == mat.getPythonContext().compressed._product.flops + 3 * 30
 
 
 @pytest.mark.parallel(1, 2)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from petsc4py import PETSc
 from systems import contact_matrix, contacts, poisson
-from test_tensor_train import context, solve, solver
+from train_solver import context, solve, solver
 
 from pctt.pc.mat import is_symmetric
 from pctt.petsc import own_errors
@@ -60,12 +60,8 @@ def test_a_matrix_without_entries_or_of_another_shape_is_refused():
         solver(shell).setUp()
     wide = PETSc.Mat().createAIJ((6, 9), nnz=1)
     wide.assemble()
-    pc = PETSc.PC().create()
-    pc.setOperators(wide)
-    pc.setType("python")
-    pc.setPythonType("pctt.pc.TensorTrain")
     with refused("6 rows and 9 columns; allowed is a square one"):
-        pc.setUp()
+        solver(wide).pc.setUp()
 
 
 @pytest.mark.parametrize(
@@ -81,10 +77,7 @@ def test_a_matrix_without_entries_or_of_another_shape_is_refused():
 def test_bad_coordinates_are_refused_at_set_up(points, words):
     mat = poisson(8)
     mat.setAttr("coordinates", points)
-    ksp = PETSc.KSP().create()
-    ksp.setOperators(mat)
-    ksp.pc.setType("python")
-    ksp.pc.setPythonType("pctt.pc.TensorTrain")
+    ksp = solver(mat)
     with refused(f"{words}.*allowed are finite numbers of shape"):
         ksp.setUp()
 

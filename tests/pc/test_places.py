@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.spatial import Delaunay
-from test_tensor_train import context, solver
+from train_solver import context, solver
 
 from pctt.mat.order import places_of
 from pctt.pc.sparse_train import SparseTrain
@@ -82,7 +82,7 @@ def test_a_grid_is_found_wherever_it_is_known(known):
 
 @pytest.mark.parallel(1, 2)
 def test_where_nothing_is_known_a_warning_says_so(recwarn, monkeypatch):
-    monkeypatch.setattr(SparseTrain, "make", lambda self, P, rank: self._refuse("it was refused"))
+    monkeypatch.setattr(SparseTrain, "make", lambda self, A, P: self._refuse("it was refused"))
     ksp = solver(without_dm(laplacian(plane())), rank=2)
     places = places_of(ksp.getOperators()[1])
     assert (places.grid, places.points, places.source) == (None, None, "nothing")

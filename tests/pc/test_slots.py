@@ -11,11 +11,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.spatial import cKDTree
 from systems import dense
-from test_tensor_train import context, operator, solve, solver
+from train_solver import context, operator, solve, solver
 
 from pctt.blocks import square_block_matrix
 from pctt.mat.order import places_of
-from pctt.pc.slots import NEAR, REACH, Slots
+from pctt.pc.slots import Slots
 
 BOX = 16
 
@@ -91,7 +91,6 @@ def test_rows_that_stay_keep_their_slots_whatever_comes_and_goes():
     after = by_key(slots, keys_then)
     assert all(after[key] == before[key] for key in keys[stay].tolist())
     assert len(set(after.values())) == 995
-    assert (slots.entered, slots.left, slots.moved) == (25, 30, 0)
 
 
 def test_new_rows_get_slots_near_their_neighbours():
@@ -100,9 +99,8 @@ def test_new_rows_get_slots_near_their_neighbours():
     twins = np.arange(0, 2000, 100)  # new rows where these are
     more = np.concatenate([points, points[twins]])
     follow(slots, springs(more + 0.0, np.concatenate([keys, 50_000 + twins])), yes)
-    assert slots.entered == len(twins)
     off = np.abs(slots.place[2000:] // BOX - slots.place[twins] // BOX)
-    assert off.max() <= NEAR + 1
+    assert off.max() <= 2
 
 
 def test_rows_that_move_far_move_to_another_slot():
@@ -115,20 +113,7 @@ def test_rows_that_move_far_move_to_another_slot():
     assert follow(slots, springs(moved, keys), yes)
     others = np.setdiff1d(np.arange(1000), wanderers)
     assert np.array_equal(slots.place[others], before[others])
-    assert slots.moved == 2
-    assert np.abs(slots.place[wanderers] // BOX - before[hosts] // BOX).max() <= NEAR + 1
-
-
-def test_a_few_rows_that_find_no_room_nearby_go_further_away():
-    points, keys = cloud(4000)
-    slots = slots_of(springs(points, keys))
-    before = slots.place.copy()
-    crowd = np.full((60, 3), 0.01) + 1e-4 * np.arange(60)[:, None]
-    more = springs(np.concatenate([points, crowd]), np.concatenate([keys, 50_000 + np.arange(60)]))
-    assert follow(slots, more, yes)
-    assert np.array_equal(slots.place[:4000], before)
-    assert len(set(slots.place)) == 4060
-    assert np.ptp(slots.place[4000:]) > 2 * REACH * BOX
+    assert np.abs(slots.place[wanderers] // BOX - before[hosts] // BOX).max() <= 2
 
 
 @pytest.mark.parametrize("what", ["too many", "too many in one place", "strangers", "another rank refuses"])

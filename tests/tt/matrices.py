@@ -30,10 +30,10 @@ class Triplets(NamedTuple):
         return A
 
 
-def scattered(rng: np.random.Generator, slots: int, number: int, block: int, dtype: type = float) -> Triplets:
+def scattered(rng: np.random.Generator, slots: int, number: int, block: int) -> Triplets:
     """Random blocks at random places, which may coincide."""
     rows, columns = rng.integers(0, slots, (2, number))
-    return Triplets(rows, columns, rng.standard_normal((number, block, block)).astype(dtype), slots)
+    return Triplets(rows, columns, rng.standard_normal((number, block, block)), slots)
 
 
 def positive(rng: np.random.Generator, slots: int, block: int, reach: int = 3) -> Triplets:

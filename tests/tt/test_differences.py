@@ -67,16 +67,3 @@ def test_the_best_share_is_chosen() -> None:
 @pytest.mark.parametrize("a", [[1.0, 2.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0]])
 def test_a_matrix_that_is_not_positive_has_none(a: list[float]) -> None:
     assert of.best(np.array(a)) is None
-
-
-def test_a_smooth_kernel_needs_few_iterations_on_any_grid() -> None:
-    for n in (8, 16, 32):
-        r = np.hypot(*np.meshgrid(np.arange(n) / n, np.arange(n) / n))
-        a = np.exp(-r / 0.3)
-        a[0, 0] += 0.1
-        A = dense(a)
-        transform = of.FastTransform(a)
-        M = np.stack([transform.solve(column) for column in np.eye(n * n)])
-        values = np.linalg.eigvals(M @ A).real
-        assert values.max() / values.min() < 0.2 * np.linalg.cond(A)
-        assert of.trial(a, transform) <= 20

@@ -96,18 +96,3 @@ def test_the_cost_does_not_grow_with_the_grid() -> None:
         assert found.error < 1e-4
         looked.append(found.evaluations)
     assert looked[1] < 6 * looked[0]
-
-
-@pytest.mark.parametrize(("n", "dimensions"), [(32, 2), (8, 3)])
-def test_inverses_are_near_the_best_of_their_rank(n: int, dimensions: int) -> None:
-    matrix = tt.EntryMatrix(gauss(n, dimensions), tt.GridDigits((n,) * dimensions))
-    T = tt.compress_cross(matrix, 60, 1e-6).train
-    S = np.eye(T.shape[0]) + T.full()
-    exact = np.linalg.inv(S) - np.eye(len(S))
-    for eps in (1e-2, 1e-3):
-        found = tt.invert_near_identity(T, 100, eps=eps)
-        assert found.residual <= eps
-        Z = tt.decompose_matrix(exact, T.rows, max_rank=max(found.applied.ranks)).full()
-        left, best = (np.linalg.norm(np.eye(len(S)) - S @ (np.eye(len(S)) + X)) for X in (found.applied.full(), Z))
-        assert left <= eps * 1.5 * T.norm()
-        assert left <= 3 * best or max(found.applied.ranks) <= 12

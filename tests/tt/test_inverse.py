@@ -74,15 +74,6 @@ def test_more_rank_leaves_less() -> None:
     assert left[-1] < 1e-5
 
 
-def test_laplacian_like_inverse_has_low_rank() -> None:
-    """The inverse of a tridiagonal matrix is semiseparable: its trains have rank at most 5."""
-    for shift in (1.0, 1e-2):
-        S = exact(laplacian(256).toarray() + shift * np.eye(256), (4, 4, 4, 4))
-        found = tt.invert(S, 8, sweeps=20, eps=1e-4)
-        assert found.residual < 1e-4
-        assert max(found.train.ranks) <= 6
-
-
 def test_warm_start_of_a_near_matrix() -> None:
     rng = np.random.default_rng(0)
     dense = positive(rng, 64, 3).dense()
@@ -102,13 +93,6 @@ def test_rank_one_near_identity_is_the_identity() -> None:
     assert found.applied.norm() == 0
 
 
-def test_inverse_of_single_precision() -> None:
-    dense = positive(np.random.default_rng(0), 24, 2).dense()
-    found = tt.invert(exact(dense, (4, 12)).astype(np.float32), 144, sweeps=4)
-    assert found.train.dtype == np.float32
-    np.testing.assert_allclose(found.train.full(), np.linalg.inv(dense), atol=1e-3)
-
-
 def test_indefinite_matrices_are_reported() -> None:
     dense = np.diag(np.r_[np.ones(60), -np.ones(4)])
     found = tt.invert(exact(dense, (4, 4, 4)), 4)
@@ -118,16 +102,16 @@ def test_indefinite_matrices_are_reported() -> None:
         tt.invert(tt.random([2, 3], 2, [3, 2]))
 
 
-@given(seed=st.integers(0, 2**32 - 1), rank=st.integers(1, 4))
+@given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=20)
-def test_lowest_eigenvalue_is_bounded_from_above(seed: int, rank: int) -> None:
+def test_lowest_eigenvalue_is_bounded_from_above(seed: int) -> None:
     X = tt.random([3, 4, 5], 3, [3, 4, 5], np.random.default_rng(seed))
     X = X + X.T
     least = np.linalg.eigvalsh(X.full())[0]
-    bound = tt.lowest(X, rank, sweeps=4)
+    bound = tt.lowest(X)
     assert bound >= least - 1e-9 * X.norm()
     assert bound < 0 < -least
-    assert tt.lowest(X, 15, sweeps=4) == pytest.approx(least, rel=0.05)
+    assert bound == pytest.approx(least, rel=0.05)
 
 
 def test_lowest_finds_what_vectors_of_rank_two_do_not_see() -> None:

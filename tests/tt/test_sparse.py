@@ -50,15 +50,14 @@ def dense_best_cores(dense: np.ndarray, train: tt.Train) -> list[np.ndarray]:
     return out
 
 
-@given(MODES, BLOCKS, st.integers(0, 40), SEEDS, st.sampled_from([np.float32, np.float64]))
-def test_inner_product_norm_and_entries(modes: tuple[int, ...], b: int, number: int, seed: int, dtype: type) -> None:
+@given(MODES, BLOCKS, st.integers(0, 40), SEEDS)
+def test_inner_product_norm_and_entries(modes: tuple[int, ...], b: int, number: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    triplets = scattered(rng, tt.slots_of(modes), number, b, dtype)
+    triplets = scattered(rng, tt.slots_of(modes), number, b)
     A, dense = triplets.hierarchy(modes), triplets.dense()
-    T = tt.random(A.modes, 3, A.modes, rng, dtype)
-    tolerance = 1e3 * np.finfo(dtype).eps * (1 + np.linalg.norm(dense))
+    T = tt.random(A.modes, 3, A.modes, rng)
+    tolerance = 1e3 * np.finfo(float).eps * (1 + np.linalg.norm(dense))
     assert A.size == len(dense)
-    assert A.dtype == dtype
     assert A.norm() == pytest.approx(np.linalg.norm(dense), abs=tolerance)
     assert A.inner(T.flat()) == pytest.approx(np.vdot(dense, T.full()), abs=tolerance * T.norm())
     i, j = np.indices(dense.shape)
@@ -112,16 +111,6 @@ def test_new_values_on_an_old_pattern(seed: int) -> None:
     sample = A.sample(40, rng)
     assert len(sample)
     assert np.all(A.lookup(sample) != 0)
-
-
-def test_thinned_parts_hold_whole_leaves() -> None:
-    triplets = scattered(np.random.default_rng(0), 1000, 5000, 1)
-    A = triplets.hierarchy((10, 10, 10))
-    thin = A.thinned(4)
-    assert 0.15 < thin.nodes[-1] / A.nodes[-1] < 0.35
-    T = tt.random(A.modes, 2, A.modes)
-    both = best_cores(A, T.flat())[0], best_cores(thin, T.flat())[0]
-    assert np.linalg.norm(both[1]) < np.linalg.norm(both[0])
 
 
 def test_too_many_slots() -> None:
