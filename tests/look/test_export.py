@@ -17,7 +17,6 @@ from pctt.look.folder import Folder
 pytest.importorskip("vtkmodules", reason="vtk is not installed (extra `pictures`)")
 
 from vtkmodules.util.numpy_support import vtk_to_numpy
-from vtkmodules.vtkCommonCore import vtkVersion
 from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
 SERIES = ("bodies", "contacts", "large")
@@ -72,8 +71,6 @@ def test_the_series_hold_what_the_run_recorded(folder, tmp_path, monkeypatch):
 
 def test_all_steps_in_one_file(show, folder, tmp_path):
     hdf = pytest.importorskip("vtkmodules.vtkIOHDF")
-    if vtkVersion.GetVTKMajorVersion() * 100 + vtkVersion.GetVTKMinorVersion() < 904:
-        pytest.skip("vtk before 9.4 reads no VTKHDF of polygons in time")
     show("export", "-output", tmp_path, "-format", "vtkhdf", folder=folder)
     run = Folder(folder)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f"{name}.vtkhdf" for name in SERIES)

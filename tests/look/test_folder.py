@@ -79,7 +79,7 @@ def test_a_run_without_recorded_steps_is_refused(program, show, tmp_path):
         ("plot", ("-step", 77), ("-step 77", "1 to 4")),
         ("plot", ("-format", "bmp"), ("-format", "png")),
         ("export", ("-first", 9), ("-first", "1 to 4")),
-        ("export", ("-every", 0), ("-every", "positive")),
+        ("export", ("-every", 0), ("-every", ">= 1")),
         ("render", ("-color", "heat"), ("-color", "speed")),
         ("render", ("-size", "3x5"), ("-size", "3x5")),
         ("render", ("-color", "material", "-range", 0, 1), ("-range", "material")),
