@@ -10,23 +10,16 @@ from mpi4py import MPI
 from pctt.look.folder import Folder, FolderError
 from pctt.look.program import made_folder, parser, run, whole
 
-TEXT = (
-    "figures of a run: its steps, the columns of records.csv, the compared preconditioners, and, for one recorded"
-    " step, the sparsity of the Newton matrix and the graphs of bodies and contacts"
-)
+TEXT = "figures of a run: its steps, the columns of records.csv, and the compared preconditioners"
 
 
 def main(comm: MPI.Comm) -> None:
     line = parser("plot", TEXT, "figures", steps=False)
-    line.add_argument("-step", type=int, help="recorded step of sparsity and graphs; without: the last with contacts")
     line.add_argument("-format", choices=("png", "pdf", "svg"), default="png", help="kind of file")
     given = line.parse_args()
     if comm.rank != 0:
         return
     folder = Folder(given.folder)
-    if given.step is not None and given.step not in folder.steps:
-        there = f"there are {folder.steps[0]} to {folder.steps[-1]}" if folder.steps else "there is none"
-        raise FolderError(f"-step {given.step}: {folder.path} has no such recorded step; {there}")
     target = made_folder(given.output or folder.path / "figures")
 
     import matplotlib as mpl
@@ -34,9 +27,9 @@ def main(comm: MPI.Comm) -> None:
     from pctt.look import figures
 
     with mpl.rc_context(figures.STYLE):  # type: ignore[arg-type]
-        made = figures.figures(folder, given.step)
+        made = figures.figures(folder)
         if not made:
-            raise FolderError(f"{folder.path}: nothing to plot: no steps, no comparison, no recorded contacts")
+            raise FolderError(f"{folder.path}: nothing to plot: no steps, no records, no comparison")
         for name, figure in made.items():
             with whole(target / f"{name}.{given.format}") as path:
                 figure.savefig(path, format=given.format)

@@ -60,18 +60,14 @@ class Stage:
 
     def __init__(self, folder: Folder, frames: Sequence[Frame], view: View, paint: Paint):
         self._window, self.scene, self.view = _window(view), surfaces.Scene(folder, frames), view
-        self._renderer, margin = vtkRenderer(), vtkRenderer()
-        self._renderer.SetViewport(0, 0, STAGE, 1)
-        margin.SetViewport(STAGE, 0, 1, 1)
-        for renderer in (self._renderer, margin):
-            renderer.SetBackground(1, 1, 1)
-            self._window.AddRenderer(renderer)
-        self._renderer.SetUseFXAA(True)
+        self._renderer = vtkRenderer(viewport=(0, 0, STAGE, 1), background=(1, 1, 1), use_fxaa=True)
         self._renderer.SetUseDepthPeeling(view.opacity < 1)
+        margin = vtkRenderer(viewport=(STAGE, 0, 1, 1), background=(1, 1, 1))
+        for renderer in (self._renderer, margin):
+            self._window.AddRenderer(renderer)
         vtkLightKit().AddLightsToRenderer(self._renderer)
         colours = _lookup_table(paint)
-        self._spheres = vtkOpenGLSphereMapper()  # round at any size, and thousands cost little
-        self._spheres.SetScaleArray("radius")
+        self._spheres = vtkOpenGLSphereMapper(scale_array="radius")  # round at any size, and thousands cost little
         self._boxes = _glyphs(surfaces.made(vtkCubeSource()))
         self._cylinders = _glyphs(surfaces.cylinder(0.5, 1.0, caps=False))
         for mapper in (self._spheres, self._boxes, self._cylinders):
@@ -88,11 +84,10 @@ class Stage:
         self._add(self._shells, color=(0.72, 0.75, 0.80), ambient=0.3, backface_culling=True)
         self._add(self._tools, color=(0.58, 0.63, 0.70), ambient=0.3, opacity=view.opacity)
         self._add(self._edges, color=(0.50, 0.52, 0.55), lighting=False, line_width=view.height / 600)
-        self._stamp = vtkTextActor()
-        self._stamp.SetPosition(0.03 * view.width, 0.03 * view.height)
-        _plain(self._stamp.GetTextProperty(), view)
+        letters = vtkTextProperty(font_size=round(view.height / 36), color=INK)
+        self._stamp = vtkTextActor(position=(0.03 * view.width, 0.03 * view.height), text_property=letters)
         self._renderer.AddViewProp(self._stamp)
-        margin.AddViewProp(_legend(colours, paint) if paint.names else _colour_bar(colours, paint.title, view))
+        margin.AddViewProp(_legend(colours, paint) if paint.names else _colour_bar(colours, paint.title, letters))
         self._aim(frames)
 
     def draw(self, frame: Frame, value: np.ndarray) -> np.ndarray:
@@ -119,10 +114,7 @@ class Stage:
         self._tools.SetInputDataObject(scene.tools(frame))
         self._stamp.SetInput(f"t = {frame.time:.3f} s")
         self._renderer.ResetCameraClippingRange()
-        grab = vtkWindowToImageFilter()
-        grab.SetInput(self._window)
-        grab.ReadFrontBufferOff()
-        image = surfaces.made(grab)
+        image = surfaces.made(vtkWindowToImageFilter(input=self._window, read_front_buffer=False))
         width, height, _ = image.GetDimensions()
         return vtk_to_numpy(image.GetPointData().GetScalars()).reshape(height, width, -1)[::-1, :, :3]
 
@@ -163,13 +155,9 @@ def _window(view: View) -> vtkRenderWindow:
 
 
 def _glyphs(source: vtkPolyData) -> vtkGlyph3DMapper:
-    mapper = vtkGlyph3DMapper()
-    mapper.SetSourceData(source)
-    mapper.SetScaleArray("extent")
-    mapper.SetScaleModeToScaleByVectorComponents()
-    mapper.SetOrientationArray("turn")
-    mapper.SetOrientationModeToQuaternion()
-    return mapper
+    by, turned = vtkGlyph3DMapper.SCALE_BY_COMPONENTS, vtkGlyph3DMapper.QUATERNION
+    arrays = {"scale_array": "extent", "orientation_array": "turn"}
+    return vtkGlyph3DMapper(source_data=source, scale_mode=by, orientation_mode=turned, **arrays)
 
 
 def _show(mapper: vtkMapper, places: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
@@ -193,42 +181,19 @@ def _lookup_table(paint: Paint) -> vtkLookupTable:
     return table
 
 
-def _colour_bar(colours: vtkLookupTable, title: str, view: View) -> vtkScalarBarActor:
-    bar = vtkScalarBarActor()
-    bar.SetLookupTable(colours)
-    bar.SetTitle(f"{title}\n ")
-    bar.SetNumberOfLabels(5)
-    bar.SetLabelFormat("%.5g")
-    bar.UnconstrainedFontSizeOn()
-    for text in (bar.GetTitleTextProperty(), bar.GetLabelTextProperty()):
-        _plain(text, view)
-    bar.SetMaximumNumberOfColors(256)
-    bar.SetPosition(0.15, 0.2)
-    bar.SetWidth(0.8)
-    bar.SetHeight(0.6)
-    bar.SetBarRatio(0.25)
-    return bar
+def _colour_bar(colours: vtkLookupTable, title: str, letters: vtkTextProperty) -> vtkScalarBarActor:
+    texts = {"title_text_property": letters, "label_text_property": letters, "unconstrained_font_size": True}
+    labels = {"title": f"{title}\n ", "number_of_labels": 5, "label_format": "%.5g", "maximum_number_of_colors": 256}
+    place = {"position": (0.15, 0.2), "width": 0.8, "height": 0.6, "bar_ratio": 0.25}
+    return vtkScalarBarActor(lookup_table=colours, **labels, **texts, **place)
 
 
 def _legend(colours: vtkLookupTable, paint: Paint) -> vtkLegendBoxActor:
     """The title, and below it a box of its colour before each name; the letters fill the width."""
-    box = vtkLegendBoxActor()
-    box.SetNumberOfEntries(len(paint.names) + 1)
+    rows = len(paint.names) + 1
+    place = {"position": (0.02, 0.4), "position2": (0.96, 0.05 * rows)}
+    box = vtkLegendBoxActor(number_of_entries=rows, border=False, padding=2, **place)
     box.SetEntry(0, vtkPolyData(), paint.title, INK)
     for row, name in enumerate(paint.names):
         box.SetEntry(row + 1, surfaces.made(vtkCubeSource()), name, colours.GetTableValue(row)[:3])
-        box.SetEntryColor(row + 1, colours.GetTableValue(row)[:3])
-    box.SetPosition(0.02, 0.4)
-    box.SetPosition2(0.96, 0.05 * (len(paint.names) + 1))
-    box.BorderOff()
-    box.SetPadding(2)
     return box
-
-
-def _plain(text: vtkTextProperty, view: View) -> None:
-    text.SetFontFamilyToArial()
-    text.SetFontSize(round(view.height / 36))
-    text.SetColor(INK)
-    text.BoldOff()
-    text.ItalicOff()
-    text.ShadowOff()

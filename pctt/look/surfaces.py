@@ -217,25 +217,18 @@ def made(source: Any, data: vtkPolyData | None = None) -> vtkPolyData:
 
 def cylinder(radius: float, length: float, caps: bool) -> vtkPolyData:
     """The side of a cylinder along z; with ``caps`` a capsule."""
-    source, turn = vtkCylinderSource(), vtkTransformFilter()
-    source.SetRadius(radius)
-    source.SetHeight(length)
-    source.SetResolution(32)
-    source.SetCapping(caps)
-    source.SetCapsuleCap(caps)
-    turn.SetTransform(vtkTransform())
-    turn.GetTransform().RotateX(90)  # from y
-    return made(turn, made(source))
+    upright = vtkCylinderSource(radius=radius, height=length, resolution=32, capping=caps, capsule_cap=caps)
+    turn = vtkTransform()
+    turn.RotateX(90)  # from y
+    return made(vtkTransformFilter(transform=turn), made(upright))
 
 
 def _placed(shape: Mapping[str, Any], place: np.ndarray, turn: np.ndarray) -> vtkPolyData:
     """The surface of a shape of a body with this pose, in the world."""
-    matrix, move = np.eye(4), vtkTransformFilter()
+    matrix = np.eye(4)
     matrix[:3, :3] = quaternion.matrix(quaternion.multiply(turn, np.array(shape.get("quaternion", (1.0, 0, 0, 0)))))
     matrix[:3, 3] = place + quaternion.rotate(turn, np.array(shape["center"]))
-    move.SetTransform(vtkTransform())
-    move.GetTransform().SetMatrix(matrix.ravel())
-    return made(move, _surface(shape))
+    return made(vtkTransformFilter(transform=vtkTransform(matrix=matrix.ravel())), _surface(shape))
 
 
 def _surface(shape: Mapping[str, Any]) -> vtkPolyData:
@@ -246,14 +239,8 @@ def _surface(shape: Mapping[str, Any]) -> vtkPolyData:
         return cylinder(shape["radius"], 2 * shape["half_length"], caps=True)
     if shape["kind"] == "Box":
         x, y, z = shape["half_extents"]
-        block = vtkCubeSource()
-        block.SetBounds(-x, x, -y, y, -z, z)
-        return made(block)
-    ball = vtkSphereSource()
-    ball.SetRadius(shape["radius"])
-    ball.SetThetaResolution(32)
-    ball.SetPhiResolution(24)
-    return made(ball)
+        return made(vtkCubeSource(bounds=(-x, x, -y, y, -z, z)))
+    return made(vtkSphereSource(radius=shape["radius"], theta_resolution=32, phi_resolution=24))
 
 
 def _before(polygon: np.ndarray, normal: np.ndarray, point: np.ndarray) -> np.ndarray:
