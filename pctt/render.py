@@ -18,6 +18,7 @@ from pctt.look.folder import Folder, Frame
 from pctt.look.program import View, checked, chosen, made_folder, parser, run, whole
 from pctt.options import POSITIVE, OptionError, made, refuse_bad
 
+PALETTE = ["-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse=dither=none"]  # of a GIF, of its own colours
 SAMPLE = 12  # frames that decide the camera and the range of the colours
 SIZE = ("WIDTHxHEIGHT with even numbers from 32, such as 1280x960", lambda size: not any(n < 32 or n % 2 for n in size))
 # title of the colour bar, colour map, part of the map that is used
@@ -74,7 +75,7 @@ def main(comm: MPI.Comm) -> None:
         print(f"{len(pictures)} pictures: {target}/{pictures[0].name} to {pictures[-1].name}")
         if len(pictures) > 1 and given.film != "none":
             film = target / f"film.{given.film}"
-            {"mp4": write_mp4, "gif": write_gif}[given.film](film, pictures, given.fps)
+            write_film(film, pictures, given.fps)
             print(f"film: {film}")
 
 
@@ -149,32 +150,21 @@ def ends_of(colour: str, values: np.ndarray) -> tuple[float, float]:
     return 0.0, step * min(k for k in (1, 2, 4, 6, 8, 10) if k * step >= high)  # a quarter has few digits
 
 
-def write_mp4(path: Path, pictures: list[Path], fps: float) -> None:
-    """Write a film in H.264. Browsers and presentation programs play it."""
+def write_film(path: Path, pictures: list[Path], fps: float) -> None:
+    """Write a film: .mp4 in H.264, which browsers and presentation programs play, or .gif, which repeats."""
     import imageio_ffmpeg
     from PIL import Image
 
+    kind: dict[str, Any] = {"quality": 7, "output_params": ["-f", "mp4"]}  # the temporary name does not end in it
+    if path.suffix == ".gif":
+        kind = {"codec": "gif", "pix_fmt_out": "pal8", "output_params": ["-f", "gif", *PALETTE]}
     with whole(path) as temporary, Image.open(pictures[0]) as first:
-        kind = ["-f", "mp4"]  # the temporary name does not end in .mp4
-        writer = imageio_ffmpeg.write_frames(
-            str(temporary), first.size, fps=fps, quality=7, macro_block_size=2, output_params=kind
-        )
+        writer = imageio_ffmpeg.write_frames(str(temporary), first.size, fps=fps, macro_block_size=2, **kind)
         writer.send(None)
         for picture in pictures:
             with Image.open(picture) as image:
                 writer.send(image.convert("RGB").tobytes())
         writer.close()
-
-
-def write_gif(path: Path, pictures: list[Path], fps: float) -> None:
-    """Write a film that repeats; its palette is that of the first picture."""
-    from PIL import Image
-
-    images = [Image.open(picture).convert("RGB") for picture in pictures]
-    palette = images[0].quantize(255)
-    first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    with whole(path) as temporary:
-        first.save(temporary, format="gif", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
 
 
 #: The command pctt-render; its exit status.

@@ -126,17 +126,23 @@ class Stage:
         self._renderer.AddActor(actor)
 
     def _aim(self, frames: Sequence[Frame]) -> None:
-        """Put the camera so near that the scene of all frames just fits into the picture."""
-        corners = np.concatenate([self.scene.box, *(surfaces.points(self.scene.walls(frame)) for frame in frames)])
-        camera, center = self._renderer.GetActiveCamera(), self.scene.box.mean(axis=0)
-        camera.SetFocalPoint(center)
+        """Put the camera as near as possible, so that it still sees the scene of all frames."""
+        walls = [surfaces.points(self.scene.walls(frame)) for frame in frames]
+        corners = np.concatenate([np.stack(np.meshgrid(*self.scene.box.T), axis=-1).reshape(-1, 3), *walls])
         ahead = _towards_camera(self.view)
-        camera.SetPosition(center + ahead)
-        camera.SetViewUp(np.cross(ahead, np.cross((0, 0, 1), ahead)))
-        bounds = np.array([corners.min(axis=0), corners.max(axis=0)]).T.ravel()
-        self._renderer.ResetCamera(bounds)
-        self._renderer.ResetCameraScreenSpace(bounds, 0.97)
-        camera.Dolly(self.view.zoom)
+        right = np.cross((0, 0, 1), ahead) / np.cos(np.radians(self.view.elevation))
+        up = np.cross(ahead, right)
+        camera, center = self._renderer.GetActiveCamera(), self.scene.box.mean(axis=0)
+        slope = np.tan(np.radians(camera.GetViewAngle() / 2))
+        wide = slope * STAGE * self.view.width / self.view.height
+        for _ in range(5):  # perspective moves the middle of the picture away from the middle of the box
+            x, y, depth = np.array([right, up, ahead]) @ (corners - center).T
+            distance = 1.05 * (depth + np.maximum(np.abs(x) / wide, np.abs(y) / slope)).max()
+            across, upright = x * distance / (distance - depth), y * distance / (distance - depth)
+            center = center + 0.5 * ((across.min() + across.max()) * right + (upright.min() + upright.max()) * up)
+        camera.SetFocalPoint(center)
+        camera.SetPosition(center + distance / self.view.zoom * ahead)
+        camera.SetViewUp(up)
 
 
 def _window(view: View) -> vtkRenderWindow:
