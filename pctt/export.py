@@ -222,10 +222,13 @@ def write_vtkhdf(path: Path, name: str, scene: Any, steps: list[int]) -> None:
     writer = vtkHDFWriter(write_all_time_steps=True, chunk_size=1000)
     writer.SetInputConnection(source.GetOutputPort())
     with whole(path) as temporary:
-        temporary.touch()  # the writer would not return if it cannot open the file
+        # VTK's writer tells no errors, and does not return if it cannot open the file, so the room is tried before
+        frames = [scene.folder.frame_path(step).stat().st_size for step in steps]
+        make_hdf5(temporary, 2 * sum(frames), items=200)
         writer.SetFileName(str(temporary))
         writer.Write()
-        with h5py.File(temporary, "r+") as file:  # OSError for half a file, which the writer does not tell
+        del writer  # VTK 9.4 closes the file then
+        with h5py.File(temporary, "r+") as file:
             root = file["VTKHDF"]
             if root["NumberOfPoints"][()].tolist() != [points[step] for step in steps]:
                 raise OSError(f"vtk {vtkVersion.GetVTKVersion()} loses data; take a newer one, or -format vtp")
