@@ -10,11 +10,10 @@ from mpi4py import MPI
 from pctt.look.folder import Folder, FolderError
 from pctt.look.program import made_folder, parser, run, whole
 
-TEXT = "figures of a run: its steps, the columns of records.csv, and the compared preconditioners"
-
 
 def main(comm: MPI.Comm) -> None:
-    line = parser("plot", TEXT, "figures", steps=False)
+    text = "figures of a run: its steps, the columns of records.csv, and the compared preconditioners"
+    line = parser("plot", text, "figures", steps=False)
     line.add_argument("-format", choices=("png", "pdf", "svg"), default="png", help="kind of file")
     given = line.parse_args()
     if comm.rank != 0:
