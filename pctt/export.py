@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,19 +23,15 @@ from mpi4py import MPI
 
 from pctt.disk import RUN_FILES, make_hdf5
 from pctt.look.folder import Folder, FolderError, Frame
-from pctt.look.program import add_steps, chosen, made_folder, parser, run, whole
+from pctt.look.program import chosen, made_folder, parser, run, whole
 
 SERIES = ("bodies", "contacts", "large")
-FORMATS = ("vtp", "vtkhdf")
 
 
 def arguments() -> argparse.Namespace:
-    line = parser("export", "the recorded steps of a run as time series for ParaView (.pvd of .vtp files)")
-    add_steps(line)
-    line.add_argument("-format", choices=FORMATS, default="vtp", help="a .vtp file per step, or one .vtkhdf for all")
-    target = line.add_mutually_exclusive_group()
-    target.add_argument("-output", metavar="DIR", help="folder to write to; without: paraview/ in the output folder")
-    target.add_argument("-single", metavar="FILE.h5", help="write one HDF5 file like state.h5 instead, with all data")
+    line = parser("export", "the recorded steps of a run as time series for ParaView (.pvd of .vtp files)", "paraview")
+    line.add_argument("-format", choices=("vtp", "vtkhdf"), default="vtp", help="a .vtp file per step, or one .vtkhdf")
+    line.add_argument("-single", type=Path, metavar="FILE.h5", help="write one HDF5 file like state.h5 instead")
     return line.parse_args()
 
 
@@ -48,53 +42,35 @@ def main(comm: MPI.Comm) -> None:
     steps = chosen(folder.steps, given)
     if given.single:
         if comm.rank == 0:
-            write_single(Path(given.single), folder, steps)
+            write_single(given.single, folder, steps)
             print(f"{len(steps)} steps: {given.single}")
         return
-    target = made_folder(Path(given.output) if given.output else folder.path / "paraview")
+    target = made_folder(given.output or folder.path / "paraview")
 
     from vtkmodules.vtkCommonCore import vtkLogger
 
-    from pctt.look import surfaces  # imported here, because it needs vtk and -help does not
+    from pctt.look.surfaces import Scene  # imported here, because it needs vtk and -help does not
 
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # write_vtp reports errors
-    box = surfaces.bounds(folder, [folder.frame(step) for step in {steps[0], steps[-1]}])
-    if given.format == "vtkhdf":
-        if comm.rank == 0:
-            write_vtkhdf(target, folder, steps, box)
-        return
-    times = {}
-    for step in steps[comm.rank :: comm.size]:
-        frame = folder.frame(step)
-        times[step] = frame.time
-        for name in SERIES:
-            write_vtp(target / f"{name}_{step:06d}.vtp", series(name, folder, frame, box), frame.time)
-    shared = comm.gather(times)
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # the writers' results are checked
+    scene = Scene(folder, [folder.frame(step) for step in (steps[0], steps[-1])])
+    if given.format == "vtp":
+        times = {}
+        for step in steps[comm.rank :: comm.size]:
+            frame = folder.frame(step)
+            times[step] = frame.time
+            for name in SERIES:
+                write_vtp(target / f"{name}_{step:06d}.vtp", series(name, scene, frame), frame.time)
+        shared = comm.gather(times)
     if comm.rank == 0:
-        together = {step: time for part in shared or [] for step, time in part.items()}
         for name in SERIES:
-            write_pvd(target / f"{name}.pvd", {f"{name}_{step:06d}.vtp": together[step] for step in steps})
-        print(f"{len(steps)} steps: {target}/" + ", ".join(f"{name}.pvd" for name in SERIES))
+            if given.format == "vtp":
+                together = {step: time for part in shared or [] for step, time in part.items()}
+                write_pvd(target / f"{name}.pvd", {f"{name}_{step:06d}.vtp": together[step] for step in steps})
+            else:
+                write_vtkhdf(target / f"{name}.vtkhdf", name, scene, steps)
+        kind = "pvd" if given.format == "vtp" else "vtkhdf"
+        print(f"{len(steps)} steps: {target}/" + ", ".join(f"{name}.{kind}" for name in SERIES))
     comm.Barrier()  # all files exist when any rank returns
-
-
-def series(name: str, folder: Folder, frame: Frame, box: np.ndarray) -> Any:
-    """One step of the series ``name``, one of SERIES, as vtkPolyData."""
-    if name == "large":
-        return large(folder, frame, box)
-    return bodies(folder, frame) if name == "bodies" else contacts(folder, frame)
-
-
-def write_vtkhdf(target: Path, folder: Folder, steps: list[int], box: np.ndarray) -> None:
-    """Write one file per series; FolderError if a file cannot be written."""
-    from pctt.look import vtkhdf
-
-    times = [folder.frame(step).time for step in steps]
-    for name in SERIES:
-        with whole(target / f"{name}.vtkhdf") as temporary:
-            frames = map(folder.frame, steps)
-            vtkhdf.write(temporary, times, (series(name, folder, frame, box) for frame in frames))
-    print(f"{len(steps)} steps: {target}/" + ", ".join(f"{name}.vtkhdf" for name in SERIES))
 
 
 def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
@@ -105,28 +81,27 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
     frames = folder.bodies_path.parent.resolve()
     if path.resolve().parent == frames or path.resolve() in [(folder.path / name).resolve() for name in RUN_FILES]:
         raise FolderError(f"-single {path}: is a file of the run; allowed is another name")
-    groups = {"bodies": folder.bodies_path, **{f"steps/{step:06d}": folder.frame_path(step) for step in steps}}
+    parts = {"bodies": folder.bodies_path, **{f"steps/{step:06d}": folder.frame_path(step) for step in steps}}
     with whole(path) as temporary:
-        make_hdf5(temporary, sum(source.stat().st_size for source in groups.values()), items=0)
+        make_hdf5(temporary, sum(source.stat().st_size for source in parts.values()), items=0)
         with h5py.File(temporary, "r+") as file:
-            with _part(folder.path / "state.h5") as links:
-                file.attrs.update({name: value for name, value in links.attrs.items() if name != "links"})
-            for name, source in groups.items():
-                with _part(source) as part:
-                    file.copy(part["/"], name)
+            source = folder.path / "state.h5"
+            try:
+                with h5py.File(source, "r") as links:
+                    file.attrs.update({name: value for name, value in links.attrs.items() if name != "links"})
+                for name, source in parts.items():
+                    with h5py.File(source, "r") as part:
+                        file.copy(part["/"], name)
+            except (OSError, RuntimeError) as error:
+                raise FolderError(f"{source}: cannot be copied ({error})") from None
 
 
-@contextmanager
-def _part(path: Path) -> Iterator[h5py.File]:
-    """A file of a run, open for copying; FolderError if it cannot be copied."""
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except (OSError, RuntimeError) as error:
-        raise FolderError(f"{path}: cannot be copied ({error})") from None
+def series(name: str, scene: Any, frame: Frame) -> Any:
+    """One step of the series ``name``, one of SERIES, as vtkPolyData; ``scene`` is a `pctt.look.surfaces.Scene`."""
+    return {"bodies": bodies, "contacts": contacts, "large": large}[name](scene, frame)
 
 
-def bodies(folder: Folder, frame: Frame) -> Any:
+def bodies(scene: Any, frame: Frame) -> Any:
     """The grains as points, with the data for glyphs.
 
     Scale a unit sphere or box by the vector `extent` and turn it by `quaternion`: the result is the grain. `radius` is
@@ -134,8 +109,8 @@ def bodies(folder: Folder, frame: Frame) -> Any:
     """
     from pctt.look import surfaces
 
-    grains = slice(folder.grains)
-    data = surfaces.polydata(frame.position[grains], "verts")
+    folder, grains = scene.folder, slice(scene.folder.grains)
+    data = surfaces.polydata(frame.position[grains], "verts", 1)
     columns = {
         "id": np.arange(folder.grains),
         "radius": folder.radius,
@@ -153,16 +128,16 @@ def bodies(folder: Folder, frame: Frame) -> Any:
     return data
 
 
-def contacts(folder: Folder, frame: Frame) -> Any:
+def contacts(scene: Any, frame: Frame) -> Any:
     """The contacts as force chains: a line joins the centres of the two bodies. A large body has no useful centre, so
     the line ends at the contact point instead."""
     from pctt.look import surfaces
 
     contact = frame.contacts
     ends = frame.position[contact.bodies]
-    far = contact.bodies >= folder.grains
+    far = contact.bodies >= scene.folder.grains
     ends[far] = np.repeat(contact.point[:, None], 2, axis=1)[far]
-    data = surfaces.polydata(ends.reshape(-1, 3), "lines", 2 * np.arange(1, len(ends) + 1))
+    data = surfaces.polydata(ends, "lines", 2)
     size = np.linalg.norm(contact.force, axis=1)
     columns = {
         "normal_impulse": contact.impulse[:, 0],
@@ -177,19 +152,18 @@ def contacts(folder: Folder, frame: Frame) -> Any:
     return data
 
 
-def large(folder: Folder, frame: Frame, box: np.ndarray) -> Any:
-    """The surfaces of the large bodies, with the id of the body. Planes are cut to the box (2, 3) of the scene."""
+def large(scene: Any, frame: Frame) -> Any:
+    """The surfaces of the large bodies, with the id of the body. Planes are cut to the size of the scene."""
     from pctt.look import surfaces
 
     parts = []
-    for row in range(len(folder.large)):
-        for part in (
-            surfaces.finite(folder, frame, row),
-            surfaces.polygon_data(surfaces.planes(folder, frame, row, box)),
-        ):
-            part.GetPointData().Initialize()
-            surfaces.add_arrays(part.GetCellData(), {"body": np.full(part.GetNumberOfCells(), folder.grains + row)})
-            parts.append(part)
+    for row in range(len(scene.folder.large)):
+        part = surfaces.joined([scene.surface(frame, row), scene.planes(frame, row)])
+        body = np.full(part.GetNumberOfCells(), scene.folder.grains + row)
+        part.GetPointData().Initialize()
+        part.GetCellData().Initialize()
+        surfaces.add_arrays(part.GetCellData(), {"body": body})
+        parts.append(part)
     return surfaces.joined(parts)
 
 
@@ -218,6 +192,48 @@ def write_pvd(path: Path, files: dict[str, float]) -> None:
     head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n  <Collection>'
     with whole(path) as temporary:
         temporary.write_text("\n".join([head, *lines, "  </Collection>", "</VTKFile>", ""]))
+
+
+def write_vtkhdf(path: Path, name: str, scene: Any, steps: list[int]) -> None:
+    """Write all steps of a series into one file; FolderError if it cannot be written."""
+    from vtkmodules.util.vtkAlgorithm import VTKPythonAlgorithmBase
+    from vtkmodules.vtkCommonCore import vtkVersion
+    from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline as Pipeline
+    from vtkmodules.vtkIOHDF import vtkHDFWriter
+
+    points: dict[int, int] = {}
+
+    class Source(VTKPythonAlgorithmBase):
+        """The steps as a series that VTK asks for by time; here the number of the step is the time."""
+
+        def RequestInformation(self, _request: Any, _inputs: Any, outputs: Any) -> int:
+            outputs.GetInformationObject(0).Set(Pipeline.TIME_STEPS(), range(len(steps)), len(steps))
+            outputs.GetInformationObject(0).Set(Pipeline.TIME_RANGE(), [0, len(steps) - 1], 2)
+            return 1
+
+        def RequestData(self, _request: Any, _inputs: Any, outputs: Any) -> int:
+            step = steps[int(outputs.GetInformationObject(0).Get(Pipeline.UPDATE_TIME_STEP()))]
+            data = series(name, scene, scene.folder.frame(step))
+            points[step] = data.GetNumberOfPoints()
+            outputs.GetInformationObject(0).Get(data.DATA_OBJECT()).ShallowCopy(data)
+            return 1
+
+    source = Source(nInputPorts=0, outputType="vtkPolyData")
+    writer = vtkHDFWriter(write_all_time_steps=True, chunk_size=1000)
+    writer.SetInputConnection(source.GetOutputPort())
+    with whole(path) as temporary:
+        # VTK's writer tells no errors, and does not return if it cannot open the file, so the room is tried before
+        frames = [scene.folder.frame_path(step).stat().st_size for step in steps]
+        make_hdf5(temporary, 2 * sum(frames), items=200)
+        writer.SetFileName(str(temporary))
+        writer.Write()
+        del writer  # VTK 9.4 closes the file then
+        with h5py.File(temporary, "r+") as file:
+            root = file["VTKHDF"]
+            if root["NumberOfPoints"][()].tolist() != [points[step] for step in steps]:
+                raise OSError(f"vtk {vtkVersion.GetVTKVersion()} loses data; take a newer one, or -format vtp")
+            del root["Steps/Values"]  # in single precision
+            root["Steps/Values"] = np.array([scene.folder.frame(step).time for step in steps])
 
 
 #: The command pctt-export; its exit status.

@@ -7,19 +7,42 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 
 from pctt import disk
 from pctt.look.folder import FolderError
+from pctt.options import AT_LEAST_ONE, POSITIVE, option
 
 LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")
 EXTRA = "the extra `pictures` has the libraries that draw: pip install -e '.[pictures]' in the project's folder"
 
+ANGLE = ("a number between -90 and 90", lambda degrees: -90 < degrees < 90)
+OPACITY = ("a number from 0 to 1", lambda opacity: 0 <= opacity <= 1)
+PIXELS = ("a whole number from 32", lambda pixels: pixels >= 32)
 
-def parser(program: str, text: str) -> argparse.ArgumentParser:
-    """The parser of a command line whose first word is the folder."""
+
+@dataclass(frozen=True)
+class View:
+    """How a scene is shown."""
+
+    azimuth: float = option(-60.0, "camera around the vertical, from x [degrees]")
+    elevation: float = option(25.0, "camera above the horizon [degrees]", check=ANGLE)
+    zoom: float = option(1.0, "1 shows the whole scene", check=POSITIVE)
+    opacity: float = option(1.0, "opacity of large bodies such as blades", check=OPACITY)
+    cut: bool = option(False, "leave out the grains in the half nearer to the camera")
+    width: int = option(1280, "of a picture [pixels]", check=PIXELS)
+    height: int = option(960, "of a picture [pixels]", check=PIXELS)
+
+
+def parser(program: str, text: str, folder: str = "", steps: bool = True) -> argparse.ArgumentParser:
+    """The parser of a command line whose first word is the folder of a run.
+
+    With ``folder``, the default of -output within that of the run; with ``steps``, the options that `chosen` reads.
+    """
     line = argparse.ArgumentParser(
         f"python -m pctt.{program}",
         description=text,
@@ -28,37 +51,37 @@ def parser(program: str, text: str) -> argparse.ArgumentParser:
         add_help=False,
     )
     line.add_argument("-help", "--help", "-h", action="help", help="print this")
-    line.add_argument("folder", help="output folder of a run (-output of python -m pctt.run)")
+    line.add_argument("folder", type=Path, help="output folder of a run (-output of python -m pctt.run)")
+    line.add_argument("-output", type=Path, metavar="DIR", help=f"folder to write to; without: {folder}/ in the folder")
+    if steps:
+        line.add_argument("-first", type=int, default=0, metavar="STEP", help="first step")
+        line.add_argument("-last", type=int, default=sys.maxsize, metavar="STEP", help="last step")
+        line.add_argument("-every", type=checked(int, AT_LEAST_ONE), default=1, metavar="K", help="one step of K")
     return line
 
 
-def add_steps(line: argparse.ArgumentParser) -> None:
-    """Add the options that choose some of the recorded steps."""
-    line.add_argument("-first", type=int, default=0, metavar="STEP", help="first step")
-    line.add_argument("-last", type=int, default=sys.maxsize, metavar="STEP", help="last step")
-    line.add_argument("-every", type=positive(int), default=1, metavar="K", help="only every k-th recorded step")
+def checked(kind: Callable[[str], Any], check: tuple[str, Callable[[Any], bool]]) -> Callable[[str], Any]:
+    """The argparse type of an option with the ``check`` of `pctt.options.option`."""
 
-
-def chosen(steps: list[int], arguments: argparse.Namespace) -> list[int]:
-    """The steps that the options of ``add_steps`` choose; FolderError if there is none."""
-    picked = [step for step in steps if arguments.first <= step <= arguments.last][:: arguments.every]
-    if not picked:
-        there = f"there are {steps[0]} to {steps[-1]}"
-        raise FolderError(f"{arguments.folder}: no recorded step from -first to -last; {there}")
-    return picked
-
-
-def positive(kind: Callable[[str], float]) -> Callable[[str], float]:
-    """The argparse type of an option whose value must be positive."""
-
-    def read(text: str) -> float:
-        value = kind(text)
-        if not 0 < value < float("inf"):
-            raise argparse.ArgumentTypeError(f"{text}: allowed is a positive number")
+    def read(text: str) -> Any:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not check[1](value):
+            raise argparse.ArgumentTypeError(f"{text}: allowed is {check[0]}")
         return value
 
-    read.__name__ = "positive number"
     return read
+
+
+def chosen(steps: list[int], given: argparse.Namespace) -> list[int]:
+    """The steps that -first, -last and -every choose; FolderError if there is none."""
+    picked = [step for step in steps if given.first <= step <= given.last][:: given.every]
+    if not picked:
+        there = f"there are {steps[0]} to {steps[-1]}"
+        raise FolderError(f"{given.folder}: no recorded step from -first to -last; {there}")
+    return picked
 
 
 def run(main: Callable[[MPI.Comm], None], program: str) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from ctypes.util import find_library
 from dataclasses import dataclass
@@ -12,9 +11,11 @@ import numpy as np
 import vtkmodules.vtkRenderingFreeType  # noqa: F401 - VTK needs it to draw text
 import vtkmodules.vtkRenderingUI  # noqa: F401 - VTK needs it for windows on a display
 from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-from vtkmodules.vtkCommonCore import vtkLogger, vtkLookupTable, vtkVersion
+from vtkmodules.vtkCommonCore import vtkLogger, vtkLookupTable
 from vtkmodules.vtkCommonDataModel import vtkPolyData
-from vtkmodules.vtkRenderingAnnotation import vtkScalarBarActor
+from vtkmodules.vtkFiltersCore import vtkFeatureEdges
+from vtkmodules.vtkFiltersSources import vtkCubeSource
+from vtkmodules.vtkRenderingAnnotation import vtkLegendBoxActor, vtkScalarBarActor
 from vtkmodules.vtkRenderingCore import (
     vtkActor,
     vtkGlyph3DMapper,
@@ -30,28 +31,13 @@ from vtkmodules.vtkRenderingCore import (
 from vtkmodules.vtkRenderingOpenGL2 import vtkOpenGLSphereMapper
 
 from dem import quaternion
-from dem.bodies import BOX, SPHERE
+from dem.bodies import BOX, CAPSULE, SPHERE
 from pctt.look import surfaces
 from pctt.look.folder import Folder, FolderError, Frame
+from pctt.look.program import View
 
-WALL = (0.88, 0.89, 0.91)
-EDGE = (0.50, 0.52, 0.55)
-TOOL = (0.58, 0.63, 0.70)
-SHELL = (0.72, 0.75, 0.80)
+INK = (0.1, 0.1, 0.1)
 STAGE = 0.86  # part of the width for the scene; the rest is for the colour bar
-
-
-@dataclass(frozen=True)
-class View:
-    """How a scene is shown."""
-
-    azimuth: float = -60.0  #: of the camera about the vertical, from the x axis [degrees]
-    elevation: float = 25.0  #: of the camera above the horizon, between -90 and 90 [degrees]
-    zoom: float = 1.0  #: with 1 the whole scene fits into the picture
-    width: int = 1280  #: [pixels]
-    height: int = 960  #: [pixels]
-    opacity: float = 1.0  #: of large bodies without their planes, 0 to 1
-    cut: bool = False  #: leave out the grains in the half that is nearer to the camera
 
 
 @dataclass(frozen=True)
@@ -69,56 +55,50 @@ class Paint:
 class Stage:
     """Draws frames of one folder, all with the same camera. The ``frames`` given at first fit into the picture.
 
-    Planes, drums and other shells are drawn on the side of the grains only, so no wall hides the grains.
+    Walls and shells such as drums are drawn on the side of the grains only, so no wall hides the grains.
     """
 
     def __init__(self, folder: Folder, frames: Sequence[Frame], view: View, paint: Paint):
-        self._window = _window(view)
-        self.folder, self.box, self.view = folder, surfaces.bounds(folder, frames), view
-        self._renderer, margin = vtkRenderer(), vtkRenderer()
-        self._renderer.SetViewport(0, 0, STAGE, 1)
-        margin.SetViewport(STAGE, 0, 1, 1)
-        for renderer in (self._renderer, margin):
-            renderer.SetBackground(1, 1, 1)
-        self._renderer.SetUseFXAA(True)
+        self._window, self.scene, self.view = _window(view), surfaces.Scene(folder, frames), view
+        self._renderer = vtkRenderer(viewport=(0, 0, STAGE, 1), background=(1, 1, 1), use_fxaa=True)
         self._renderer.SetUseDepthPeeling(view.opacity < 1)
+        margin = vtkRenderer(viewport=(STAGE, 0, 1, 1), background=(1, 1, 1))
+        for renderer in (self._renderer, margin):
+            self._window.AddRenderer(renderer)
         vtkLightKit().AddLightsToRenderer(self._renderer)
         colours = _lookup_table(paint)
-        self._spheres = vtkOpenGLSphereMapper()  # round at any size, and thousands cost little
-        self._spheres.SetScaleArray("radius")
-        self._boxes, self._cylinders = _glyphs(surfaces.cube()), _glyphs(surfaces.cylinder())
+        self._spheres = vtkOpenGLSphereMapper(scale_array="radius")  # round at any size, and thousands cost little
+        self._boxes = _glyphs(surfaces.made(vtkCubeSource()))
+        self._cylinders = _glyphs(surfaces.cylinder(0.5, 1.0, caps=False))
         for mapper in (self._spheres, self._boxes, self._cylinders):
-            self._add_grains(mapper, colours)
-        self._walls, self._edges, self._tools, self._shells = map(self._add_surface, (WALL, EDGE, TOOL, SHELL))
-        faces, edges, tools = (actor.GetProperty() for actor in (self._walls, self._edges, self._tools))
-        faces.BackfaceCullingOn()
-        self._shells.GetProperty().BackfaceCullingOn()
-        self._shells.GetProperty().SetAmbient(0.3)
-        self._walls.GetMapper().SetRelativeCoincidentTopologyPolygonOffsetParameters(4, 8)  # walls behind their edges
-        faces.SetAmbient(0.75)
-        faces.SetDiffuse(0.25)
-        edges.LightingOff()
-        edges.SetLineWidth(view.height / 600)
-        tools.SetOpacity(view.opacity)
-        tools.SetAmbient(0.3)
-        self._stamp = _stamp(view)
+            mapper.SetScalarModeToUsePointFieldData()
+            mapper.SelectColorArray("value")
+            mapper.SetLookupTable(colours)
+            mapper.UseLookupTableScalarRangeOn()
+            self._add(mapper, ambient=0.2, specular=0.15, specular_power=20)
+        self._walls, self._shells, self._tools, self._edges = (vtkPolyDataMapper() for _ in range(4))
+        for mapper in (self._walls, self._shells, self._tools, self._edges):
+            mapper.SetResolveCoincidentTopologyToPolygonOffset()
+        self._walls.SetRelativeCoincidentTopologyPolygonOffsetParameters(4, 8)  # behind their edges
+        self._add(self._walls, color=(0.88, 0.89, 0.91), ambient=0.75, diffuse=0.25, backface_culling=True)
+        self._add(self._shells, color=(0.72, 0.75, 0.80), ambient=0.3, backface_culling=True)
+        self._add(self._tools, color=(0.58, 0.63, 0.70), ambient=0.3, opacity=view.opacity)
+        self._add(self._edges, color=(0.50, 0.52, 0.55), lighting=False, line_width=view.height / 600)
+        letters = vtkTextProperty(font_size=round(view.height / 36), color=INK)
+        self._stamp = vtkTextActor(position=(0.03 * view.width, 0.03 * view.height), text_property=letters)
         self._renderer.AddViewProp(self._stamp)
-        for prop in _legend(colours, paint, view) if paint.names else [_colour_bar(colours, paint.title, view)]:
-            margin.AddViewProp(prop)
-        walls = [polygon for frame in frames for polygon in surfaces.walls(folder, frame, self.box)]
-        self._aim(np.concatenate([np.stack(np.meshgrid(*self.box.T), axis=-1).reshape(-1, 3), *walls]))
-        self._window.AddRenderer(self._renderer)
-        self._window.AddRenderer(margin)
+        margin.AddViewProp(_legend(colours, paint) if paint.names else _colour_bar(colours, paint.title, letters))
+        self._aim(frames)
 
     def draw(self, frame: Frame, value: np.ndarray) -> np.ndarray:
         """The picture (height, width, 3) of a frame; ``value`` (grains,) gives the colours of the grains."""
-        folder = self.folder
+        folder, scene = self.scene.folder, self.scene
         place, turn = (a[: folder.grains] for a in (frame.position, frame.quaternion))
         shape, extent = folder.shape[: folder.grains], surfaces.extent(folder)
         shown = np.ones(folder.grains, dtype=bool)
         if self.view.cut:
-            shown = (place - self.box.mean(axis=0)) @ _towards_camera(self.view, level=True) <= 0
-        ball, block, long = (np.flatnonzero(shown & (shape == kind)) for kind in (SPHERE, BOX, surfaces.CAPSULE))
+            shown = (place - scene.box.mean(axis=0)) @ _towards_camera(self.view, level=True) <= 0
+        ball, block, long = (np.flatnonzero(shown & (shape == kind)) for kind in (SPHERE, BOX, CAPSULE))
         # a capsule is a cylinder and two balls
         core = extent - [0, 0, 1] * extent[:, :1]
         tip = quaternion.rotate(turn[long], np.array([0, 0, 0.5]) * core[long])
@@ -127,79 +107,47 @@ class Stage:
         _show(self._spheres, centers, {"value": value[rows], "radius": extent[rows, 0].astype(np.float32) / 2})
         for mapper, rows, widths in ((self._boxes, block, extent), (self._cylinders, long, core)):
             _show(mapper, place[rows], {"value": value[rows], "extent": widths[rows], "turn": turn[rows]})
-        large = range(len(folder.large))
-        polygons = surfaces.walls(folder, frame, self.box)
-        self._walls.GetMapper().SetInputDataObject(surfaces.polygon_data(polygons))
-        self._edges.GetMapper().SetInputDataObject(surfaces.outlines(polygons))
-        self._tools.GetMapper().SetInputDataObject(
-            surfaces.joined([surfaces.finite(folder, frame, row, self.box) for row in large])
-        )
-        self._shells.GetMapper().SetInputDataObject(
-            surfaces.joined([surfaces.shell(folder, frame, row) for row in large])
-        )
+        walls = scene.walls(frame)
+        self._walls.SetInputDataObject(walls)
+        self._edges.SetInputDataObject(surfaces.made(vtkFeatureEdges(coloring=False), walls))
+        self._shells.SetInputDataObject(scene.shells(frame))
+        self._tools.SetInputDataObject(scene.tools(frame))
         self._stamp.SetInput(f"t = {frame.time:.3f} s")
         self._renderer.ResetCameraClippingRange()
-        return self._image()
+        image = surfaces.made(vtkWindowToImageFilter(input=self._window, read_front_buffer=False))
+        width, height, _ = image.GetDimensions()
+        return vtk_to_numpy(image.GetPointData().GetScalars()).reshape(height, width, -1)[::-1, :, :3]
 
-    def _add_grains(self, mapper: vtkMapper, colours: vtkLookupTable) -> None:
-        mapper.SetScalarModeToUsePointFieldData()
-        mapper.SelectColorArray("value")
-        mapper.SetLookupTable(colours)
-        mapper.UseLookupTableScalarRangeOn()
-        actor = vtkActor()
-        actor.SetMapper(mapper)
-        actor.GetProperty().SetAmbient(0.2)
-        actor.GetProperty().SetSpecular(0.15)
-        actor.GetProperty().SetSpecularPower(20)
+    def _add(self, mapper: vtkMapper, **properties: object) -> None:
+        """Add what a mapper draws to the scene, with properties of vtkProperty."""
+        actor = vtkActor(mapper=mapper)
+        for name, value in properties.items():
+            setattr(actor.GetProperty(), name, value)
         self._renderer.AddActor(actor)
 
-    def _add_surface(self, rgb: tuple[float, float, float]) -> vtkActor:
-        actor = vtkActor()
-        mapper = vtkPolyDataMapper()
-        mapper.SetResolveCoincidentTopologyToPolygonOffset()
-        actor.SetMapper(mapper)
-        actor.GetProperty().SetColor(rgb)
-        self._renderer.AddActor(actor)
-        return actor
-
-    def _aim(self, points: np.ndarray) -> None:
-        """Put the camera as near as possible, so that it still sees all points (n, 3)."""
-        camera = self._renderer.GetActiveCamera()
-        center = self.box.mean(axis=0)
-        corners = points - center
+    def _aim(self, frames: Sequence[Frame]) -> None:
+        """Put the camera as near as possible, so that it still sees the scene of all frames."""
+        walls = [surfaces.points(self.scene.walls(frame)) for frame in frames]
+        corners = np.concatenate([np.stack(np.meshgrid(*self.scene.box.T), axis=-1).reshape(-1, 3), *walls])
         ahead = _towards_camera(self.view)
-        right = np.cross((0, 0, 1), ahead)
-        right /= np.linalg.norm(right)
+        right = np.cross((0, 0, 1), ahead) / np.cos(np.radians(self.view.elevation))
         up = np.cross(ahead, right)
+        camera, center = self._renderer.GetActiveCamera(), self.scene.box.mean(axis=0)
         slope = np.tan(np.radians(camera.GetViewAngle() / 2))
         wide = slope * STAGE * self.view.width / self.view.height
         for _ in range(5):  # perspective moves the middle of the picture away from the middle of the box
-            x, y, depth = corners @ right, corners @ up, corners @ ahead
+            x, y, depth = np.array([right, up, ahead]) @ (corners - center).T
             distance = 1.05 * (depth + np.maximum(np.abs(x) / wide, np.abs(y) / slope)).max()
             across, upright = x * distance / (distance - depth), y * distance / (distance - depth)
-            shift = 0.5 * ((across.min() + across.max()) * right + (upright.min() + upright.max()) * up)
-            corners, center = corners - shift, center + shift
+            center = center + 0.5 * ((across.min() + across.max()) * right + (upright.min() + upright.max()) * up)
         camera.SetFocalPoint(center)
         camera.SetPosition(center + distance / self.view.zoom * ahead)
-        camera.SetViewUp(0, 0, 1)
-
-    def _image(self) -> np.ndarray:
-        grab = vtkWindowToImageFilter()
-        grab.SetInput(self._window)
-        grab.ReadFrontBufferOff()
-        grab.Update()
-        image = grab.GetOutput()
-        width, height, _ = image.GetDimensions()
-        return vtk_to_numpy(image.GetPointData().GetScalars()).reshape(height, width, -1)[::-1, :, :3]
+        camera.SetViewUp(up)
 
 
 def _window(view: View) -> vtkRenderWindow:
     """A window without a display; FolderError if VTK would end the process because it lacks a driver."""
-    version = vtkVersion.GetVTKVersion()
-    if not os.environ.get("DISPLAY"):
-        if tuple(map(int, version.split(".")[:2])) < (9, 4):
-            raise FolderError(f"vtk {version} cannot draw without a display: pip install 'vtk>=9.4', or set DISPLAY")
-        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # VTK warns that it tries X first, then EGL
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # without a display VTK warns that it tries X, then EGL
     window = vtkRenderWindow()
     if window.GetClassName() == "vtkOSOpenGLRenderWindow" and not find_library("OSMesa"):
         raise FolderError(
@@ -213,17 +161,13 @@ def _window(view: View) -> vtkRenderWindow:
 
 
 def _glyphs(source: vtkPolyData) -> vtkGlyph3DMapper:
-    mapper = vtkGlyph3DMapper()
-    mapper.SetSourceData(source)
-    mapper.SetScaleArray("extent")
-    mapper.SetScaleModeToScaleByVectorComponents()
-    mapper.SetOrientationArray("turn")
-    mapper.SetOrientationModeToQuaternion()
-    return mapper
+    by, turned = vtkGlyph3DMapper.SCALE_BY_COMPONENTS, vtkGlyph3DMapper.QUATERNION
+    arrays = {"scale_array": "extent", "orientation_array": "turn"}
+    return vtkGlyph3DMapper(source_data=source, scale_mode=by, orientation_mode=turned, **arrays)
 
 
-def _show(mapper: vtkMapper, points: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
-    data = surfaces.polydata(points.astype(np.float32), "verts")  # the mapper of spheres needs float32
+def _show(mapper: vtkMapper, places: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
+    data = surfaces.polydata(places.astype(np.float32), "verts", 1)  # the mapper of spheres needs float32
     surfaces.add_arrays(data.GetPointData(), columns)
     mapper.SetInputDataObject(data)
 
@@ -243,54 +187,19 @@ def _lookup_table(paint: Paint) -> vtkLookupTable:
     return table
 
 
-def _colour_bar(colours: vtkLookupTable, title: str, view: View) -> vtkScalarBarActor:
-    bar = vtkScalarBarActor()
-    bar.SetLookupTable(colours)
-    bar.SetTitle(f"{title}\n ")
-    bar.SetNumberOfLabels(5)
-    bar.SetLabelFormat("%.5g")
-    bar.UnconstrainedFontSizeOn()
-    for text in (bar.GetTitleTextProperty(), bar.GetLabelTextProperty()):
-        _plain(text, view)
-    bar.SetMaximumNumberOfColors(256)
-    bar.SetPosition(0.15, 0.2)
-    bar.SetWidth(0.8)
-    bar.SetHeight(0.6)
-    bar.SetBarRatio(0.25)
-    return bar
+def _colour_bar(colours: vtkLookupTable, title: str, letters: vtkTextProperty) -> vtkScalarBarActor:
+    texts = {"title_text_property": letters, "label_text_property": letters, "unconstrained_font_size": True}
+    labels = {"title": f"{title}\n ", "number_of_labels": 5, "label_format": "%.5g", "maximum_number_of_colors": 256}
+    place = {"position": (0.15, 0.2), "width": 0.8, "height": 0.6, "bar_ratio": 0.25}
+    return vtkScalarBarActor(lookup_table=colours, **labels, **texts, **place)
 
 
-def _legend(colours: vtkLookupTable, paint: Paint, view: View) -> list[vtkTextActor]:
-    """The title, and below it each name on its colour. The letters are so small that the longest name has room."""
-    size = min(view.height / 36, 1.6 * (1 - STAGE) * view.width / max(map(len, paint.names)))
-    lines = []
-    for row, text in enumerate([paint.title, *paint.names]):
-        line = vtkTextActor()
-        line.SetInput(text if row == 0 else f" {text} ")
-        style = line.GetTextProperty()
-        _plain(style, view)
-        style.SetFontSize(max(round(size), 1))
-        line.SetPosition(0.0, 0.75 * view.height - 2.2 * row * size)
-        if row > 0:
-            rgb = np.array(colours.GetTableValue(row - 1)[:3])
-            style.SetBackgroundColor(rgb)
-            style.SetBackgroundOpacity(1.0)
-            style.SetColor(np.full(3, 0.1 if rgb @ (0.3, 0.6, 0.1) > 0.45 else 1.0))
-        lines.append(line)
-    return lines
-
-
-def _stamp(view: View) -> vtkTextActor:
-    stamp = vtkTextActor()
-    _plain(stamp.GetTextProperty(), view)
-    stamp.SetPosition(0.03 * view.width, 0.03 * view.height)
-    return stamp
-
-
-def _plain(text: vtkTextProperty, view: View) -> None:
-    text.SetFontFamilyToArial()
-    text.SetFontSize(round(view.height / 36))
-    text.SetColor(0.1, 0.1, 0.1)
-    text.BoldOff()
-    text.ItalicOff()
-    text.ShadowOff()
+def _legend(colours: vtkLookupTable, paint: Paint) -> vtkLegendBoxActor:
+    """The title, and below it a box of its colour before each name; the letters fill the width."""
+    rows = len(paint.names) + 1
+    place = {"position": (0.02, 0.4), "position2": (0.96, 0.05 * rows)}
+    box = vtkLegendBoxActor(number_of_entries=rows, border=False, padding=2, **place)
+    box.SetEntry(0, vtkPolyData(), paint.title, INK)
+    for row, name in enumerate(paint.names):
+        box.SetEntry(row + 1, surfaces.made(vtkCubeSource()), name, colours.GetTableValue(row)[:3])
+    return box

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
-from vtkmodules.vtkCommonCore import vtkPoints
-from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
-from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
+from vtkmodules.vtkCommonCore import mutable, vtkPoints
+from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData, vtkStaticCellLocator
 from vtkmodules.vtkCommonTransforms import vtkTransform
 from vtkmodules.vtkFiltersCore import vtkAppendPolyData, vtkTriangleFilter
 from vtkmodules.vtkFiltersGeneral import vtkTransformFilter
@@ -19,28 +17,144 @@ from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSp
 
 from dem import quaternion
 from dem.bodies import BOX, CAPSULE, SPHERE
-from dem.mesh import Surface
 from pctt.look.folder import Folder, FolderError, Frame
 
-MARGIN = 0.06  # how far walls go beyond the grains, in diagonals of the scene
-HOLLOW = 0.3  # a hollow body is empty up to this part of the way from its middle to its bounds
+MARGIN = 0.06  # how far walls go beyond the scene, in diagonals of the scene
+HOLLOW = 0.2  # a hollow body is empty up to this part of the way from its middle to its bounds
+SOLID = ("Box", "Capsule", "Mesh", "Sphere")
+SHARE = 0.25  # part of the grains within the bounds of a hollow body
 
 
-def bounds(folder: Folder, frames: Sequence[Frame]) -> np.ndarray:
-    """Lowest and highest corner (2, 3) of the scene in these frames [m]. The scene has the grains and the large bodies
-    among or around them, without walls."""
-    radius = folder.radius[:, None]
-    places = [frame.position[: folder.grains] for frame in frames]
-    low = np.min([(place - radius).min(axis=0) for place in places], axis=0)
-    high = np.max([(place + radius).max(axis=0) for place in places], axis=0)
-    box = np.array([low, high])
-    corners = [low, high]
-    for frame in frames:
-        for row in range(len(folder.large)):
-            for solid in (finite(folder, frame, row, box), shell(folder, frame, row)):
-                if solid.GetNumberOfPoints():
-                    corners += list(np.reshape(solid.GetBounds(), (3, 2)).T)
-    return np.array([np.min(corners, axis=0), np.max(corners, axis=0)])
+@dataclass(frozen=True)
+class Wall:
+    """A rectangle that bounds the grains; for a plane, it is larger than the scene."""
+
+    center: np.ndarray  #: (3,) [m]
+    normal: np.ndarray  #: (3,) unit vector towards the grains
+    halves: np.ndarray  #: (2, 3) halves of two edges [m]; they and the normal are right-handed
+
+    def corners(self) -> np.ndarray:
+        """The corners (4, 3), counterclockwise as seen from the grains."""
+        return self.center + np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) @ self.halves
+
+    def covers(self, places: np.ndarray) -> bool:
+        """Whether all points (n, 3) lie in the prism over the rectangle."""
+        along = np.abs((places - self.center) @ self.halves.T)
+        return bool((along <= (1 + 1e-9) * (self.halves**2).sum(axis=1)).all())
+
+
+class Scene:
+    """The surfaces of the large bodies of a folder: walls, shells and tools.
+
+    A body is hollow if it is empty around its middle and has a good part of the grains within its bounds, in the first
+    or in the last of the ``frames``. Walls are planes and the boxes of hollow bodies, shells are the meshes of hollow
+    bodies, such as drums and silos, and tools are all else. ``box`` (2, 3) has the lowest and the highest corner of
+    grains, shells and tools in all of the frames [m].
+    """
+
+    def __init__(self, folder: Folder, frames: Sequence[Frame]):
+        self.folder, self._rows = folder, range(len(folder.large))
+        self._hollow = {row for row in self._rows for frame in (frames[0], frames[-1]) if self._is_hollow(frame, row)}
+        radius = folder.radius[:, None]
+        corners = [frame.position[: folder.grains] + sign * radius for frame in frames for sign in (-1, 1)]
+        corners += [points(data) for frame in frames for data in (self.tools(frame), self.shells(frame))]
+        self.box = _bounds(corners)
+        corners += [wall.center[None] for frame in frames for row in self._hollow for wall in self._boxes(frame, row)]
+        self.box = _bounds(corners)
+
+    def surface(self, frame: Frame, row: int, kinds: Collection[str] = SOLID) -> vtkPolyData:
+        """The surface of a large body, or of its shapes of some kinds, without its planes."""
+        pose = self._pose(frame, row)
+        return joined(_placed(shape, *pose) for shape in self.folder.large[row]["shapes"] if shape["kind"] in kinds)
+
+    def tools(self, frame: Frame) -> vtkPolyData:
+        """The surfaces of all tools."""
+        return joined(self.surface(frame, row) for row in self._rows if row not in self._hollow)
+
+    def shells(self, frame: Frame) -> vtkPolyData:
+        """The triangles of all shells, as seen from inside."""
+        found = []
+        for surface in (self.surface(frame, row, ("Mesh",)) for row in self._hollow):
+            corners, middle = triangles(surface), np.reshape(surface.GetBounds(), (3, 2)).mean(axis=1)
+            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            away = np.einsum("mi,mi->m", normal, corners.mean(axis=1) - middle) > 0.0
+            corners[away] = corners[away, ::-1]
+            found.append(polydata(corners, "polys", 3))
+        return joined(found)
+
+    def walls(self, frame: Frame) -> vtkPolyData:
+        """All planes, and the sides of boxes that the grains see, as polygons seen from inside."""
+        boxes = [wall for row in self._hollow for wall in self._boxes(frame, row)]
+        return self._cut([wall for row in self._rows for wall in self._planes(frame, row)] + boxes)
+
+    def planes(self, frame: Frame, row: int) -> vtkPolyData:
+        """The planes of a large body as polygons, as seen from their open side."""
+        return self._cut(self._planes(frame, row))
+
+    def _cut(self, walls: Sequence[Wall]) -> vtkPolyData:
+        """The parts of walls that lie at most MARGIN beyond the scene, and behind no other wall."""
+        beyond = MARGIN * np.linalg.norm(self.box[1] - self.box[0])
+        sides = [(axis, self.box[0] - beyond) for axis in np.eye(3)]
+        sides += [(-axis, self.box[1] + beyond) for axis in np.eye(3)]
+        polygons = []
+        for wall in walls:
+            polygon = wall.corners()
+            for normal, point in sides:
+                polygon = _before(polygon, normal, point) if len(polygon) else polygon
+            for other in walls:
+                if len(polygon) and other is not wall and other.covers(_before(polygon, -other.normal, other.center)):
+                    polygon = _before(polygon, other.normal, other.center)
+            polygons.append(polygon)
+        return joined(polydata(polygon, "polys", len(polygon)) for polygon in polygons if len(polygon))
+
+    def _pose(self, frame: Frame, row: int) -> tuple[np.ndarray, np.ndarray]:
+        return frame.position[self.folder.grains + row], frame.quaternion[self.folder.grains + row]
+
+    def _planes(self, frame: Frame, row: int) -> list[Wall]:
+        (place, turn), found = self._pose(frame, row), []
+        middle, size = self.box.mean(axis=0), 4 * np.linalg.norm(self.box[1] - self.box[0])
+        for shape in self.folder.large[row]["shapes"]:
+            if shape["kind"] == "Plane":
+                normal = quaternion.rotate(turn, np.array(shape["normal"]))
+                point = place + quaternion.rotate(turn, np.array(shape["center"]))
+                first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+                halves = size / np.linalg.norm(first) * np.array([first, np.cross(normal, first)])
+                found.append(Wall(middle - normal * (normal @ (middle - point)), normal, halves))
+        return found
+
+    def _boxes(self, frame: Frame, row: int) -> list[Wall]:
+        (place, turn), found = self._pose(frame, row), []
+        for shape in self.folder.large[row]["shapes"]:
+            if shape["kind"] == "Box":
+                center = place + quaternion.rotate(turn, np.array(shape["center"]))
+                axes = quaternion.matrix(quaternion.multiply(turn, np.array(shape["quaternion"]))).T
+                edges = np.array(shape["half_extents"])[:, None] * axes
+                way = axes @ (self.box.mean(axis=0) - center)
+                k = int(np.argmax(np.abs(way) - shape["half_extents"]))
+                side = np.sign(way[k])
+                halves = np.array([edges[k - 2], side * edges[k - 1]])
+                found.append(Wall(center + side * edges[k], side * axes[k], halves))
+        return found
+
+    def _is_hollow(self, frame: Frame, row: int) -> bool:
+        """Whether a large body has a good part of the grains within its bounds and is empty around its middle."""
+        corners = triangles(self.surface(frame, row))
+        if not len(corners):
+            return False
+        low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        grains = frame.position[: self.folder.grains]
+        within = ((low <= grains) & (grains <= high)).all(axis=1)
+        if (low == high).any() or np.count_nonzero(within) < SHARE * len(grains):
+            return False
+        locator, squared = vtkStaticCellLocator(), mutable(0.0)
+        locator.SetDataSet(polydata(2 * (corners - low) / (high - low) - 1, "polys", 3))
+        locator.BuildLocator()
+        locator.FindClosestPoint((0, 0, 0), [0.0] * 3, mutable(0), mutable(0), squared)
+        return squared.get() > HOLLOW**2
+
+
+def _bounds(places: Sequence[np.ndarray]) -> np.ndarray:
+    return np.array([np.concatenate(places).min(axis=0), np.concatenate(places).max(axis=0)])
 
 
 def extent(folder: Folder) -> np.ndarray:
@@ -53,21 +167,14 @@ def extent(folder: Folder) -> np.ndarray:
     return 2 * np.where(shape == BOX, size, round_ones)
 
 
-def polydata(points: np.ndarray, cells: str = "", ends: np.ndarray | None = None) -> vtkPolyData:
-    """Data with points (n, 3), and with cells `verts`, `lines` or `polys` that take the points in their order.
-
-    A cell ends before each of the indices `ends`; by default every point is a cell.
-    """
-    data = vtkPolyData()
-    place = vtkPoints()
-    place.SetData(numpy_to_vtk(np.ascontiguousarray(points).reshape(-1, 3), deep=True))
-    data.SetPoints(place)
-    if cells:
-        array = vtkCellArray()
-        offsets = np.concatenate([[0], np.arange(1, len(points) + 1) if ends is None else ends]).astype(np.int64)
-        order = np.arange(len(points), dtype=np.int64)
-        array.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(order, deep=True))
-        {"verts": data.SetVerts, "lines": data.SetLines, "polys": data.SetPolys}[cells](array)
+def polydata(places: np.ndarray, cells: str, size: int) -> vtkPolyData:
+    """Cells `verts`, `lines` or `polys` that take ``size`` points each, from the points (..., 3) in their order."""
+    places = np.ascontiguousarray(places).reshape(-1, 3)
+    data, spots, array = vtkPolyData(), vtkPoints(), vtkCellArray()
+    spots.SetData(numpy_to_vtk(places, deep=True))
+    data.SetPoints(spots)
+    array.SetData(size, numpy_to_vtkIdTypeArray(np.arange(len(places)), deep=True))
+    {"verts": data.SetVerts, "lines": data.SetLines, "polys": data.SetPolys}[cells](array)
     return data
 
 
@@ -79,314 +186,72 @@ def add_arrays(attributes: Any, arrays: Mapping[str, np.ndarray]) -> None:
         attributes.AddArray(array)
 
 
-def cube() -> vtkPolyData:
-    """The surface of a box of widths 1."""
-    return _surface({"kind": "Box", "half_extents": (0.5, 0.5, 0.5)})
+def points(data: vtkPolyData) -> np.ndarray:
+    """The points (n, 3)."""
+    return vtk_to_numpy(data.GetPoints().GetData()).astype(float) if data.GetNumberOfPoints() else np.zeros((0, 3))
 
 
-def cylinder() -> vtkPolyData:
-    """The side of a cylinder along z of diameter and length 1."""
-    source = vtkCylinderSource()
-    source.SetResolution(32)
-    source.CappingOff()
-    return _along_z(source)
-
-
-def finite(folder: Folder, frame: Frame, row: int, box: np.ndarray | None = None) -> vtkPolyData:
-    """The surface of the large body `row` without its planes.
-
-    With a box (2, 3), the surface also lacks the walls beside the box. For a `shell` it is empty then.
-    """
-    parts = _parts(folder, frame, row)
-    if box is not None and is_shell(folder, row):
-        parts = []
-    elif box is not None and len(folder.large[row]["shapes"]) > 1:  # a single shape is a tool, such as a blade
-        parts = [(shape, part) for shape, part in parts if shape["kind"] != "Box" or not _is_wall(part, box)]
-    return joined([part for _, part in parts])
-
-
-def _parts(folder: Folder, frame: Frame, row: int) -> list[tuple[Mapping[str, Any], vtkPolyData]]:
-    """The shapes of the large body `row` without its planes, and their surfaces in the world."""
-    place, turn = _pose(folder, frame, row)
-    solid = [shape for shape in folder.large[row]["shapes"] if shape["kind"] != "Plane"]
-    return [(shape, _placed(_surface(shape), shape, place, turn)) for shape in solid]
-
-
-def _is_wall(solid: vtkPolyData, box: np.ndarray) -> bool:
-    """Whether a solid stands beside the box (2, 3) and is about as long as it is in some direction."""
-    low, high = np.reshape(solid.GetBounds(), (3, 2)).T
-    middle = (low + high) / 2
-    beside = (middle < box[0]) | (middle > box[1])
-    along = np.minimum(high, box[1]) - np.maximum(low, box[0]) > 0.8 * (box[1] - box[0])
-    return bool(beside.any() and along.any())
-
-
-def shell(folder: Folder, frame: Frame, row: int) -> vtkPolyData:
-    """The triangles of the large body `row`, as seen from inside, if it is a shell, such as a drum or a silo.
-
-    Otherwise the surface is empty.
-    """
-    if not is_shell(folder, row):
-        return vtkPolyData()
-    triangles = _solid(folder, frame, row)
-    middle = 0.5 * (triangles.min(axis=(0, 1)) + triangles.max(axis=(0, 1)))
-    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    away = np.einsum("mi,mi->m", normal, triangles.mean(axis=1) - middle) > 0.0
-    if any(shape["kind"] == "Box" for shape in folder.large[row]["shapes"]):
-        triangles = triangles[~away]  # only the inner sides of thick walls
-    else:
-        triangles[away] = triangles[away, ::-1]
-    return polydata(triangles.reshape(-1, 3), "polys", 3 * np.arange(1, len(triangles) + 1))
-
-
-@lru_cache(maxsize=256)
-def is_shell(folder: Folder, row: int) -> bool:
-    """Whether the large body `row` is a hollow body around the grains.
-
-    It consists of meshes, or of boxes that stand obliquely to each other. At the first or at the last recorded step
-    half of the grains are inside.
-    """
-    solid = [shape for shape in folder.large[row]["shapes"] if shape["kind"] != "Plane"]
-    meshes = any(shape["kind"] == "Mesh" for shape in solid)
-    if not solid or {shape["kind"] for shape in solid} - {"Box", "Mesh"} or not (meshes or len(solid) > 2):
-        return False
-    turns = quaternion.matrix(np.array([shape["quaternion"] for shape in solid]))
-    if not meshes and (np.abs(turns[0].T @ turns).max(axis=2) > 1.0 - 1e-9).all():
-        return False
-    for frame in (folder.frame(step) for step in {folder.steps[0], folder.steps[-1]}):
-        triangles = _solid(folder, frame, row)
-        low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-        grains = frame.position[: folder.grains]
-        within = ((low <= grains) & (grains <= high)).all(axis=1)
-        if 2 * np.count_nonzero(within) >= folder.grains and (high > low).all() and _is_hollow(triangles, low, high):
-            return True
-    return False
-
-
-def _is_hollow(triangles: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool:
-    """Whether the triangles (m, 3, 3) leave the space around the middle of their bounds empty."""
-    corners = (triangles.reshape(-1, 3) - 0.5 * (low + high)) / (0.5 * (high - low))
-    surface = Surface(corners, np.arange(len(corners)).reshape(-1, 3))
-    middle = np.broadcast_to(-surface.middle, (len(triangles), 3))
-    return bool(surface.closest(middle, np.arange(len(triangles))).distance.min() > HOLLOW)
-
-
-def _solid(folder: Folder, frame: Frame, row: int) -> np.ndarray:
-    """The corners (m, 3, 3) of the triangles of the large body `row` without its planes."""
-    return _triangles(joined([part for _, part in _parts(folder, frame, row)]))
-
-
-def _triangles(surface: vtkPolyData) -> np.ndarray:
+def triangles(surface: vtkPolyData) -> np.ndarray:
     """The corners (m, 3, 3) of the triangles of a surface."""
-    source = vtkTriangleFilter()
-    source.SetInputData(surface)
-    source.Update()
-    data = source.GetOutput()
-    cells = vtk_to_numpy(data.GetPolys().GetConnectivityArray()).reshape(-1, 3)
-    return vtk_to_numpy(data.GetPoints().GetData()).astype(float)[cells]
+    data = made(vtkTriangleFilter(), surface)
+    cells = data.GetPolys()
+    order = vtk_to_numpy(cells.GetConnectivityArray()) if cells.GetNumberOfCells() else np.zeros(0, int)
+    return points(data)[order.reshape(-1, 3)]
 
 
-def joined(parts: Sequence[vtkPolyData]) -> vtkPolyData:
+def joined(parts: Iterable[vtkPolyData]) -> vtkPolyData:
     """Several surfaces as one."""
     whole = vtkAppendPolyData()
     for part in (vtkPolyData(), *parts):
         whole.AddInputData(part)
-    whole.Update()
-    return whole.GetOutput()
+    return made(whole)
 
 
-@dataclass(frozen=True)
-class Wall:
-    """A rectangle that bounds the grains; for a plane, it is larger than the scene."""
-
-    center: np.ndarray  #: (3,) [m]
-    normal: np.ndarray  #: (3,) unit vector towards the grains
-    first: np.ndarray  #: (3,) half of one edge [m]; normal, first and second are right-handed
-    second: np.ndarray  #: (3,) half of the other edge [m]
-
-    def corners(self) -> np.ndarray:
-        """The corners (4, 3), counterclockwise as seen from the grains [m]."""
-        first, second = self.first, self.second
-        return self.center + np.array([first + second, second - first, -first - second, first - second])
-
-    def covers(self, points: np.ndarray) -> bool:
-        """Whether all points (k, 3) lie in the prism over the rectangle."""
-        away = points - self.center
-        return all((np.abs(away @ half) <= (1 + 1e-9) * (half @ half)).all() for half in (self.first, self.second))
+def made(source: Any, data: vtkPolyData | None = None) -> vtkPolyData:
+    """What a source, or a filter of the data, makes."""
+    if data is not None:
+        source.SetInputData(data)
+    source.Update()
+    return source.GetOutput()
 
 
-def planes(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[np.ndarray]:
-    """The planes of the large body `row` as polygons (k, 3), as seen from their open side.
-
-    A plane is cut at the `room` of the box (2, 3), and where another plane of the body stands in front of it.
-    """
-    return _cut(_planes(folder, frame, row, box), box)
-
-
-def walls(folder: Folder, frame: Frame, box: np.ndarray) -> list[np.ndarray]:
-    """The walls around the grains as polygons (k, 3), as seen from inside.
-
-    Walls are the planes of all large bodies. If a large body has boxes that stand beside the scene, `box` (2, 3), the
-    faces of these boxes towards the middle of the scene are walls too. The polygons are cut like those of `planes`, and
-    also where a wall of another body stands in front of them.
-    """
-    rows = range(len(folder.large))
-    return _cut([wall for kind in (_planes, _box_walls) for row in rows for wall in kind(folder, frame, row, box)], box)
+def cylinder(radius: float, length: float, caps: bool) -> vtkPolyData:
+    """The side of a cylinder along z; with ``caps`` a capsule."""
+    upright = vtkCylinderSource(radius=radius, height=length, resolution=32, capping=caps, capsule_cap=caps)
+    turn = vtkTransform()
+    turn.RotateX(90)  # from y
+    return made(vtkTransformFilter(transform=turn), made(upright))
 
 
-def room(box: np.ndarray) -> np.ndarray:
-    """The part of space (2, 3) in which walls are drawn: MARGIN beyond the scene on all sides [m]."""
-    beyond = MARGIN * float(np.linalg.norm(box[1] - box[0]))
-    return box + np.array([[-beyond], [beyond]])
-
-
-def _planes(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[Wall]:
-    place, turn = _pose(folder, frame, row)
-    size = 4 * float(np.linalg.norm(box[1] - box[0]))
-    found = []
-    for shape in folder.large[row]["shapes"]:
-        if shape["kind"] == "Plane":
-            normal = quaternion.rotate(turn, np.array(shape["normal"]))
-            point = place + quaternion.rotate(turn, np.array(shape["center"]))
-            first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-            first *= size / np.linalg.norm(first)
-            center = box.mean(axis=0) - normal * (normal @ (box.mean(axis=0) - point))
-            found.append(Wall(center, normal, first, np.cross(normal, first)))
-    return found
-
-
-def _box_walls(folder: Folder, frame: Frame, row: int, box: np.ndarray) -> list[Wall]:
-    place, turn = _pose(folder, frame, row)
-    found: list[Wall] = []
-    if len(folder.large[row]["shapes"]) == 1 or is_shell(folder, row):
-        return found
-    for shape, part in _parts(folder, frame, row):
-        if shape["kind"] == "Box" and _is_wall(part, box):
-            center = place + quaternion.rotate(turn, np.array(shape["center"]))
-            axes = quaternion.matrix(quaternion.multiply(turn, np.array(shape["quaternion"]))).T
-            half = np.array(shape["half_extents"])
-            way = axes @ (box.mean(axis=0) - center)
-            k = int(np.argmax(np.abs(way) - half))
-            normal = np.sign(way[k]) * axes[k]
-            first, second = half[k - 2] * axes[k - 2], np.sign(way[k]) * half[k - 1] * axes[k - 1]
-            found.append(Wall(center + half[k] * normal, normal, first, second))
-    return found
-
-
-def _cut(found: Sequence[Wall], box: np.ndarray) -> list[np.ndarray]:
-    """The parts of walls, as polygons (k, 3), that lie in the `room` of a box (2, 3) and behind no other wall."""
-    low, high = room(box)
-    sides = [(axis, low) for axis in np.eye(3)] + [(-axis, high) for axis in np.eye(3)]
-    polygons = []
-    for wall in found:
-        polygon = wall.corners()
-        for normal, point in sides:
-            polygon = _before(polygon, normal, point)
-        for other in found:
-            behind = _clip(polygon, -other.normal, other.center)
-            if other is not wall and len(behind) and other.covers(behind):
-                polygon = _before(polygon, other.normal, other.center)
-        polygons.append(polygon)
-    return [polygon for polygon in polygons if len(polygon)]
-
-
-def _before(polygon: np.ndarray, normal: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """The part of a convex polygon (k, 3) in front of a plane.
-
-    A polygon that lies in the plane up to rounding is kept whole.
-    """
-    height = (polygon - point) @ normal
-    if len(polygon) and np.ptp(height) < 1e-9 * np.ptp(polygon):
-        return polygon if height[0] >= -1e-9 * np.ptp(polygon) else polygon[:0]
-    return _clip(polygon, normal, point)
-
-
-def polygon_data(polygons: Sequence[np.ndarray]) -> vtkPolyData:
-    """Polygons as one surface."""
-    if not polygons:
-        return vtkPolyData()
-    return polydata(np.concatenate(polygons), "polys", np.cumsum([len(p) for p in polygons]))
-
-
-def outlines(polygons: Sequence[np.ndarray]) -> vtkPolyData:
-    """The edges of polygons."""
-    if not polygons:
-        return vtkPolyData()
-    closed = [np.concatenate([p, p[:1]]) for p in polygons]
-    return polydata(np.concatenate(closed), "lines", np.cumsum([len(p) for p in closed]))
-
-
-def _clip(polygon: np.ndarray, normal: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """The part of a convex polygon where normal . (x - point) >= 0 (Sutherland and Hodgman, 1974)."""
-    height = (polygon - point) @ normal
-    kept = []
-    for k in range(len(polygon)):
-        here, there = height[k - 1], height[k]
-        if here * there < 0:
-            kept.append(polygon[k - 1] + here / (here - there) * (polygon[k] - polygon[k - 1]))
-        if there >= 0:
-            kept.append(polygon[k])
-    return np.array(kept).reshape(-1, 3)
-
-
-def _pose(folder: Folder, frame: Frame, row: int) -> tuple[np.ndarray, np.ndarray]:
-    return frame.position[folder.grains + row], frame.quaternion[folder.grains + row]
+def _placed(shape: Mapping[str, Any], place: np.ndarray, turn: np.ndarray) -> vtkPolyData:
+    """The surface of a shape of a body with this pose, in the world."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = quaternion.matrix(quaternion.multiply(turn, np.array(shape.get("quaternion", (1.0, 0, 0, 0)))))
+    matrix[:3, 3] = place + quaternion.rotate(turn, np.array(shape["center"]))
+    return made(vtkTransformFilter(transform=vtkTransform(matrix=matrix.ravel())), _surface(shape))
 
 
 def _surface(shape: Mapping[str, Any]) -> vtkPolyData:
     """The surface of a shape of a large body, in the frame of the shape."""
-    if shape["kind"] == "Sphere":
-        ball = vtkSphereSource()
-        ball.SetRadius(shape["radius"])
-        ball.SetThetaResolution(32)
-        ball.SetPhiResolution(24)
-        ball.Update()
-        return ball.GetOutput()
-    if shape["kind"] == "Box":
-        x, y, z = np.array(shape["half_extents"]) * 2
-        block = vtkCubeSource()
-        block.SetXLength(x)
-        block.SetYLength(y)
-        block.SetZLength(z)
-        block.Update()
-        return block.GetOutput()
     if shape["kind"] == "Mesh":
-        corners = np.array(shape["vertices"])[np.array(shape["triangles"])]
-        return polydata(corners.reshape(-1, 3), "polys", 3 * np.arange(1, len(corners) + 1))
+        return polydata(np.array(shape["vertices"])[np.ravel(shape["triangles"])], "polys", 3)
     if shape["kind"] == "Capsule":
-        core = vtkCylinderSource()
-        core.SetRadius(shape["radius"])
-        core.SetHeight(2 * shape["half_length"])
-        core.SetResolution(32)
-        core.SetCapsuleCap(True)
-        return _along_z(core)
-    raise FolderError(f"no surface is known for the shape {shape['kind']}")
+        return cylinder(shape["radius"], 2 * shape["half_length"], caps=True)
+    if shape["kind"] == "Box":
+        x, y, z = shape["half_extents"]
+        return made(vtkCubeSource(bounds=(-x, x, -y, y, -z, z)))
+    return made(vtkSphereSource(radius=shape["radius"], theta_resolution=32, phi_resolution=24))
 
 
-def _along_z(source: vtkCylinderSource) -> vtkPolyData:
-    """The surface of a source whose axis is y, turned so that its axis is z."""
-    turn = vtkTransform()
-    turn.RotateX(90)
-    return _moved(source, turn)
+def _before(polygon: np.ndarray, normal: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """The part of a convex polygon (k, 3) in front of a plane; whole if it lies in the plane.
 
-
-def _moved(source: Any, transform: vtkTransform) -> vtkPolyData:
-    source.Update()
-    moved = vtkTransformFilter()
-    moved.SetInputConnection(source.GetOutputPort())
-    moved.SetTransform(transform)
-    moved.Update()
-    return moved.GetOutput()
-
-
-def _placed(surface: vtkPolyData, shape: Mapping[str, Any], place: np.ndarray, turn: np.ndarray) -> vtkPolyData:
-    """The surface of a shape, moved into the frame of the body and then into the world frame."""
-    inner = np.array(shape.get("quaternion", (1.0, 0.0, 0.0, 0.0)))
-    matrix = np.eye(4)
-    matrix[:3, :3] = quaternion.matrix(quaternion.multiply(turn, inner))
-    matrix[:3, 3] = place + quaternion.rotate(turn, np.array(shape["center"]))
-    transform = vtkTransform()
-    transform.SetMatrix(matrix.ravel())
-    still = vtkTrivialProducer()
-    still.SetOutput(surface)
-    return _moved(still, transform)
+    vtkClipPolyData would do this in single precision.
+    """
+    height = (polygon - point) @ normal
+    height[np.abs(height) < 1e-9 * np.ptp(polygon)] = 0.0
+    after, there = np.roll(polygon, -1, axis=0), np.roll(height, -1)
+    crosses = height * there < 0
+    part = np.divide(height, height - there, out=np.zeros_like(height), where=crosses)
+    corners = np.stack([polygon, polygon + part[:, None] * (after - polygon)], axis=1)
+    return corners[np.stack([height >= 0, crosses], axis=1)]

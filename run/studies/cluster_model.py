@@ -14,9 +14,9 @@ import time
 from typing import Any
 
 import numpy as np
-from measure import Counter, median_seconds, record, say_machine
 from mpi4py import MPI
 from petsc4py import PETSc
+from shared import Counter, median_seconds, record, say_machine
 
 from dem.contact import find_contacts
 from dem.exchange import offsets

@@ -1,6 +1,6 @@
-"""The train as a direct solver, `pctt.mat.inverse`, for I + 1/(4 pi r) on n^3 points, beside the H-matrices of
-hmat-oss: run/study direct_solver [-n N ...] [-seconds S]. Each row is a process of its own with a limit of S seconds.
-hmat-oss takes part if cc and libhmat-oss-dev are there. Writes results/direct_solver.json.
+"""The train as a direct solver, `pctt.mat.inverse`, for I + 1/(4 pi r) on n^3 points:
+run/study direct_solver [-n N ...] [-seconds S]. Each row is a process of its own with a limit of S seconds. Writes
+results/direct_solver.json.
 
 The seconds of the inversion contain a product and an application, with which `inverse` measures its error."""
 
@@ -10,15 +10,13 @@ import argparse
 import json
 import os
 import resource
-import shutil
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import record, say_machine
+from shared import record, say_machine
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
 from comparison import right_side, seconds
@@ -28,9 +26,7 @@ from petsc4py import PETSc
 from pctt.mat import from_entries, inverse
 
 SIZES, EPS = (16, 32, 64, 128), (1e-3, 1e-6)
-HMAT_SIZES, HMAT_EPS = (16, 32), (1e-3, 1e-4)
 MAX_RANK = 300
-SOURCE = Path(__file__).with_name("direct_solver_hmat.c")
 HEAD = f"{'':24}{'compress s':>11}{'rank':>5}{'MB':>7}{'invert s':>10}{'rank':>5}{'MB':>7}{'apply s':>9}" \
        f"{'residual':>10}{'peak GiB':>9}"  # fmt: skip
 
@@ -76,40 +72,14 @@ def in_process(n: int, eps: float, limit: float) -> dict[str, Any]:
     return json.loads(next(line for line in done.stdout.splitlines() if line.startswith("{")))  # PETSc may add words
 
 
-def hmat_program(folder: Path) -> Path | None:
-    """The program of hmat-oss, or None if it cannot be built here."""
-    program = folder / "hmat"
-    compiler = shutil.which("cc")
-    if compiler is None:
-        return None
-    command = [compiler, "-O3", "-march=native", "-o", str(program), str(SOURCE), "-lhmat", "-lm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return program if done.returncode == 0 else None
-
-
-def hmat(program: Path, n: int, eps: float, limit: float) -> dict[str, Any]:
-    """Assembly, factors LL' and a solve."""
-    try:
-        given = right_side(n**3).tobytes()
-        command = [str(program), str(n), str(eps)]
-        done = subprocess.run(command, input=given, capture_output=True, timeout=limit, check=False)
-    except subprocess.TimeoutExpired:
-        return {"note": f"not finished after {limit:g} s"}
-    if done.returncode:
-        return {"note": "failed"}
-    figures = json.loads(done.stderr.decode().strip().splitlines()[-1])
-    return {**figures, "residual": residual(n, np.frombuffer(done.stdout))}
-
-
 def say(name: str, row: dict[str, Any]) -> None:
     if "note" in row:
         print(f"{name:24}{row['note']}", flush=True)
         return
-    peak = f"{row['peak_gib']:9.2f}" if "peak_gib" in row else ""
-    inverse_mb = f"{row['inverse_bytes'] / 1e6:7.3g}" if "inverse_bytes" in row else f"{'':7}"
     print(
-        f"{name:24}{row['compress_s']:11.3g}{row.get('rank', ''):5}{row['bytes'] / 1e6:7.3g}{row['invert_s']:10.3g}"
-        f"{row.get('inverse_rank', ''):5}{inverse_mb}{row['apply_s']:9.2g}{row['residual']:10.1e}{peak}",
+        f"{name:24}{row['compress_s']:11.3g}{row['rank']:5}{row['bytes'] / 1e6:7.3g}{row['invert_s']:10.3g}"
+        f"{row['inverse_rank']:5}{row['inverse_bytes'] / 1e6:7.3g}{row['apply_s']:9.2g}{row['residual']:10.1e}"
+        f"{row['peak_gib']:9.2f}",
         flush=True,
     )
 
@@ -118,17 +88,10 @@ def main(given: argparse.Namespace) -> None:
     about = say_machine()
     rows = []
     print(f"{problem(2).name.split(',')[0]}: CPU seconds of one thread\n{HEAD}")
-    with tempfile.TemporaryDirectory() as folder:
-        program = hmat_program(Path(folder))
-        for n in given.n:
-            for eps in EPS:
-                rows.append({"n": n, "eps": eps, "way": "train", **in_process(n, eps, given.seconds)})
-                say(f"train {n}^3, {eps:g}", rows[-1])
-            for eps in HMAT_EPS if program is not None and n in HMAT_SIZES else ():
-                rows.append({"n": n, "eps": eps, "way": "hmat-oss", **hmat(program, n, eps, given.seconds)})
-                say(f"hmat-oss {n}^3, {eps:g}", rows[-1])
-    if program is None:
-        print("no hmat-oss: apt-get install libhmat-oss-dev, and a C compiler")
+    for n in given.n:
+        for eps in EPS:
+            rows.append({"n": n, "eps": eps, **in_process(n, eps, given.seconds)})
+            say(f"train {n}^3, {eps:g}", rows[-1])
     record("direct_solver", about, rows)
 
 

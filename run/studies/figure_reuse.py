@@ -8,9 +8,9 @@ import argparse
 from typing import Any
 
 import numpy as np
-from measure import figure, record, say_machine
 from mpi4py import MPI
 from newton_systems import Replay, replay_steps, set_up, settled, train_pc
+from shared import figure, record, say_machine
 
 LEVELS = ("none", "newton", "trains")
 WHAT = ("first Newton step", "whole PDIP")

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from measure import exponent, figure, median_seconds, record, say_machine
 from mpi4py import MPI
 from newton_systems import Replay, replay_steps, set_up, settled, train_pc
 from petsc4py import PETSc
+from shared import exponent, figure, median_seconds, record, say_machine
 
 from pctt.blocks import square_block_matrix
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import exponent, figure, record, say_machine
+from shared import exponent, figure, record, say_machine
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
 from comparison import cg, cholesky, operator, seconds

@@ -3,24 +3,19 @@ defaults (auto) and as a train of rank 100 at most (train), and with its rivals:
 [-ways WAY...] [-quick]. Writes results/kernels.json.
 
 Every solution is a process of its own; CPU seconds of one thread. Rivals: CG alone, T. Chan's circulant, a block
-Nystrom preconditioner (random-pivoted Cholesky of 200 columns, plus the nugget), LL' of an H-matrix by hmat-oss, if
-libhmat-oss-dev and gcc are installed, to 1e-4, as a preconditioner.
+Nystrom preconditioner (random-pivoted Cholesky of 200 columns, plus the nugget).
 """
 
 from __future__ import annotations
 
 import argparse
-import ctypes
 import json
 import os
-import shutil
 import subprocess
 import sys
-import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -31,15 +26,14 @@ from scipy import fft, linalg
 
 petsc4py.init([sys.argv[0]])
 from kernel_problems import Array, Differences, General, Product, hard, nineteen
-from measure import record, say_machine
 from petsc4py import PETSc
+from shared import record, say_machine
 
 RTOL, MOST_ITS = 1e-8, 3000
 LIMIT = 60  # CPU seconds of a solution
 COLUMNS, BLOCK = 200, 20  # of the Nystrom preconditioner, in all and at a time
-H_EPS = 1e-4  # of the H-matrix
 REPEAT, SHORT = 3, 3.0  # a solution of less than SHORT seconds is repeated, the fastest counts
-WAYS = ("plain", "circulant", "nystrom", "hmat", "train", "auto")
+WAYS = ("plain", "circulant", "nystrom", "train", "auto")
 OURS = {"auto": "auto", "train": "100"}  # -pc_tt_rank
 QUICK = ["exp02", "yukawa50", "laplace7", "imq1", "disc"]
 CLOSE, FAR = 2.0, 3.0  # ratios to the fastest that the totals count
@@ -100,43 +94,12 @@ def nystrom(problem: Differences | General) -> Product:
     return lambda r: (r - factor @ linalg.cho_solve(small, factor.T @ r)) / problem.nugget
 
 
-def hmatrix(problem: Differences) -> Product:
-    """LL' of an H-matrix. The library is compiled here."""
-    source = Path(__file__).with_name("hmatrix.c")
-    with tempfile.TemporaryDirectory() as folder:
-        library = str(Path(folder) / "hmatrix.so")
-        subprocess.run(["gcc", "-O3", "-shared", "-fPIC", str(source), "-lhmat", "-o", library], check=True)
-        found = ctypes.CDLL(library)
-    pointers: list[Any] = [np.ctypeslib.ndpointer(kind, flags="C") for kind in (np.int32, np.int32, float)]
-    found.factorise.argtypes = [ctypes.c_int, ctypes.c_int, *pointers, ctypes.c_double, ctypes.POINTER(ctypes.c_double)]
-    found.solve.argtypes = [np.ctypeslib.ndpointer(float, flags="C")]
-    points = np.stack(np.unravel_index(np.arange(problem.size), problem.grid), axis=1).astype(np.int32)
-    shape = np.array(problem.grid, np.int32)
-    size = ctypes.c_double()
-    table = np.ascontiguousarray(problem.table)
-    begin = time.process_time()
-    if found.factorise(problem.size, len(shape), points, shape, table, H_EPS, ctypes.byref(size)):
-        raise RuntimeError("the H-matrix was not factorised")
-    hmatrix.seconds = time.process_time() - begin  # type: ignore[attr-defined]  # without the compilation
-    hmatrix.keep = points, shape, table, found  # type: ignore[attr-defined]
-
-    def times(r: Array) -> Array:
-        x = np.array(r)
-        found.solve(x)
-        return x
-
-    return times
-
-
 def applies(way: str, problem: Differences | General) -> str:
     """Why a way is no way for this problem; empty if it is one."""
-    of_differences = isinstance(problem, Differences)
-    if way in ("circulant", "hmat") and not of_differences:
-        return "entries do not depend on differences" if way == "circulant" else "not run"
+    if way == "circulant" and not isinstance(problem, Differences):
+        return "entries do not depend on differences"
     if way == "nystrom" and not problem.nugget:
         return "no nugget"
-    if way == "hmat" and not (shutil.which("gcc") and Path("/usr/include/hmat/hmat.h").exists()):
-        return "not installed"
     return ""
 
 
@@ -166,16 +129,15 @@ def solve(way: str, problem: Differences | General) -> dict[str, Any]:
                 ksp.pc.setPythonType("pctt.pc.TensorTrain")
                 PETSc.Options()["pc_tt_rank"] = OURS[way]
             else:
-                make = {"circulant": circulant, "nystrom": nystrom, "hmat": hmatrix}[way]
+                make = {"circulant": circulant, "nystrom": nystrom}[way]
                 ksp.pc.setPythonContext(Shell(make(problem)))
         ksp.setFromOptions()
         ksp.setUp()
         middle = time.process_time()
         ksp.solve(b, x)
     end = time.process_time()
-    setup = hmatrix.seconds if way == "hmat" else middle - begin  # type: ignore[attr-defined]
     left = float(np.linalg.norm(times(x.array_r) - b.array_r) / b.norm())
-    row = {"setup_s": setup, "solve_s": end - middle, "iterations": ksp.getIterationNumber(), "residual": left}
+    row = {"setup_s": middle - begin, "solve_s": end - middle, "iterations": ksp.getIterationNumber(), "residual": left}
     row |= {"reason": ksp.getConvergedReason(), "warned": "; ".join(str(w.message) for w in said)}
     if way in OURS:
         row["what"] = ksp.pc.getPythonContext().what()

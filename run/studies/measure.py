@@ -1,113 +1,89 @@
-"""What the measuring scripts share: the machine, a run of the program, the record of the result."""
+"""What a settled mixer step costs, its parts and its Newton systems:
+
+    run/study measure steps [N ...]                                       seconds per phase, 1 and 2 ranks; default 4 8
+    run/study measure preconditioners [N [-every K] [-names A,B]] [...]    what is not known goes to pctt.run
+
+Writes results/measure_steps.json or results/measure_preconditioners_nN.json.
+"""
 
 from __future__ import annotations
 
-import json
-import os
-import platform
+import argparse
 import statistics
-import subprocess
-import tempfile
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
-import numpy as np
-import petsc4py
-import scipy
+from shared import record, results, say_machine
+
+STEPS, RANKS = 3, (1, 2)
+PHASES = ("search", "assembly", "solve", "advance", "output")
+NAMES = "none,ilu,ilu-shifted,pbjacobi,sor,icc-shifted,gamg,hypre,cholesky,tt"
 
 
-def machine() -> dict[str, object]:
-    """What the figures were measured on."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "?")
-    versions = {"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__}
-    threads = os.environ.get("OMP_NUM_THREADS", "1")
-    petsc = petsc4py.__version__
-    return {"cpu": cpu, "cores": os.cpu_count(), "OMP_NUM_THREADS": threads, "petsc4py": petsc, **versions}
+def steps(sizes: list[int]) -> None:
+    """Seconds per phase of settled mixer steps, for each size and number of ranks."""
+    about = say_machine()
+    print(f"medians of {STEPS} steps, pdip to 1e-4, BiCGStab with block Jacobi; seconds")
+    heads = " ".join(f"{phase:>9}" for phase in PHASES)
+    print(f"{'n':>3} {'ranks':>5} {'contacts':>9} {'Newton':>7} {'Krylov':>7} {heads} {'total':>9} {'spread':>15}")
+    rows: list[dict] = []
+    for n in sizes:
+        for ranks in RANKS:
+            _, lines = results(ranks, "-scene_n", n, "-restart", "settled", "-steps", STEPS)
+            row: dict = {"n": n, "ranks": ranks}
+            for name in ("contacts", "newton_its", "ksp_its", "seconds"):
+                row[name] = statistics.median(line[name] for line in lines)
+            row |= {phase: statistics.median(line["phases"].get(phase, 0.0) for line in lines) for phase in PHASES}
+            least, most = (pick(line["seconds"] for line in lines) for pick in (min, max))
+            rows.append(row | {"spread": [least, most]})
+            cells = " ".join(f"{row[phase]:9.3f}" for phase in PHASES)
+            counts = f"{row['contacts']:9.0f} {row['newton_its']:7.0f} {row['ksp_its']:7.0f}"
+            print(f"{n:3d} {ranks:5d} {counts} {cells} {row['seconds']:9.2f} {least:7.2f}-{most:.2f}", flush=True)
+        print(f"    n = {n}: 1 rank / 2 ranks = {rows[-2]['seconds'] / rows[-1]['seconds']:.2f}")
+    record("measure_steps", about, rows)
 
 
-def say_machine() -> dict[str, object]:
-    about = machine()
-    print(", ".join(f"{name} {value}" for name, value in about.items()), flush=True)
-    return about
+def preconditioners(n: int, every: int, names: str, options: list[str]) -> None:
+    """All preconditioners on the same Newton systems of a settled mixer step, every EVERY-th of them."""
+    about = say_machine()
+    run = ["-scene_n", n, "-restart", "settled", "-steps", 1, "-compare", names, "-compare_every", every]
+    run += ["-ccp_closing_work", "inf"]
+    summary, (step,) = results(1, *run, *options)
+    print(
+        f"mixer n = {n}: {step['contacts']} contacts, {step['newton_its']} Newton steps to natural residual "
+        f"{step['natural_residual']:.1e}, every {every}. system, 1 rank"
+    )
+    rows = [{"name": name, **figures, "solves": step["compare"][name]} for name, figures in summary["compare"].items()]
+    base = next(row for row in rows if row["name"] == "pbjacobi")
+    total = base["setup_s"] + base["solve_s"]
+    heads = " ".join(f"{head:>9}" for head in ("its mean", "its max", "set-up s", "solve s", "total s", "/pbjacobi"))
+    print(f"{'':14} {'solved':>8} {heads}")
+    for row in sorted(rows, key=lambda row: row["setup_s"] + row["solve_s"]):
+        row["total_s"] = row["setup_s"] + row["solve_s"]
+        solved = f"{row['converged']}/{row['systems']}"
+        print(
+            f"{row['name']:14} {solved:>8} {row['ksp_its_mean']:9.1f} {row['ksp_its_max']:9d} {row['setup_s']:9.3f} "
+            f"{row['solve_s']:9.3f} {row['total_s']:9.3f} {row['total_s'] / total:9.2f}"
+        )
+    print("\niterations / seconds of each system; in brackets the true residual of one that was not solved")
+    for row in rows:
+        print(f"{row['name']:14} " + " ".join(f"{cell(*solve):>22}" for solve in row["solves"]))
+    record(f"measure_preconditioners_n{n}", about, rows)
 
 
-def results(ranks: int, *options: object) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Run pctt.run with these options; its summary.json, and the lines of its steps.jsonl."""
-    with tempfile.TemporaryDirectory() as folder:
-        command = [".venv/bin/mpiexec", "-n", str(ranks), ".venv/bin/python", "-m", "pctt.run"]
-        command += [*map(str, options), "-output", folder]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        lines = (Path(folder) / "steps.jsonl").read_text().splitlines()
-        return json.loads((Path(folder) / "summary.json").read_text()), [json.loads(line) for line in lines]
+def cell(converged: bool, iterations: int, seconds: float, residual: float) -> str:
+    return f"{iterations} / {seconds:.2f}" + f" ({residual:.0e})" * (not converged)
 
 
-def record(name: str, about: dict[str, object], rows: list[dict]) -> None:
-    """Write results/NAME.json."""
-    Path("results").mkdir(exist_ok=True)
-    path = Path("results") / f"{name}.json"
-    path.write_text(json.dumps({"machine": about, "rows": rows}, indent=1) + "\n")
-    print(path)
-
-
-class Counter:
-    """Counts the calls of methods of a class while it is entered."""
-
-    def __init__(self, of: type, *names: str):
-        self.of, self.calls, self.originals = of, 0, {name: getattr(of, name) for name in names}
-
-    def __enter__(self) -> Counter:
-        for name, original in self.originals.items():
-            setattr(self.of, name, self._counted(original))
-        return self
-
-    def _counted(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        def method(*arguments: Any) -> Any:
-            self.calls += 1
-            return original(*arguments)
-
-        return method
-
-    def __exit__(self, *exception: object) -> None:
-        for name, original in self.originals.items():
-            setattr(self.of, name, original)
-
-
-def exponent(x: Sequence[float], y: Sequence[float]) -> float:
-    """Of y ~ x^p, by least squares of the logarithms; NaN for less than two points."""
-    return float(np.polyfit(np.log(x), np.log(y), 1)[0]) if len(x) > 1 else np.nan
-
-
-def median_seconds(do: Callable[[], object], repeat: int = 5) -> float:
-    """Median time of a few runs, after one that does not count."""
-    do()
-    seconds = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        do()
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds)
-
-
-@contextmanager
-def figure(name: str, panels: int, rows: int = 1) -> Iterator[Any]:
-    """Axes side by side, row by row, saved as results/NAME.png; without matplotlib nothing is drawn."""
-    try:
-        import matplotlib as mpl
-    except ImportError:
-        print("no matplotlib: no figure")
-        yield []
-        return
-    mpl.use("agg")
-    from matplotlib import pyplot
-
-    size = 6.4 * panels, 4.8 * rows
-    drawing, axes = pyplot.subplots(rows, panels, figsize=size, layout="constrained", squeeze=False)
-    yield axes.ravel()
-    path = Path("results") / f"{name}.png"
-    drawing.savefig(path, dpi=150)
-    pyplot.close(drawing)
-    print(path)
+if __name__ == "__main__":
+    words = argparse.ArgumentParser("run/study measure", description=__doc__, allow_abbrev=False,
+                                    formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
+    kinds = words.add_subparsers(dest="what", required=True)
+    kinds.add_parser("steps").add_argument("n", type=int, nargs="*", default=[4, 8], help="sizes of the mixer (4 8)")
+    of_pcs = kinds.add_parser("preconditioners", allow_abbrev=False)
+    of_pcs.add_argument("n", type=int, nargs="?", default=4, help="size of the mixer (4)")
+    of_pcs.add_argument("-every", type=int, default=1, help="every K-th Newton system (1)")
+    of_pcs.add_argument("-names", default=NAMES, help="with commas between")
+    given, more = words.parse_known_args()
+    if given.what == "steps":
+        steps(given.n)
+    else:
+        preconditioners(given.n, given.every, given.names, more)

@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 import solve_one
 from convert_problems import convert
-from measure import figure, record, say_machine
 from mpi4py import MPI
 from peers import PEERS
+from shared import figure, record, say_machine
 
 from pctt import ccp
 from pctt.ccp import fclib

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from measure import figure, record, results, say_machine
+from shared import figure, record, results, say_machine
 
 SCENES = ("mixer", "blade", "shear")
 METHODS = {"none": "tab:red", "ilu": "tab:green", "ilu-shifted": "tab:olive", "pbjacobi": "tab:gray", "tt": "tab:blue"}

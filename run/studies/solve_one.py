@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import peers
-from measure import Counter
 from mpi4py import MPI
+from shared import Counter
 
 from pctt import ccp
 from pctt.ccp import fclib

@@ -8,10 +8,10 @@ import argparse
 import time
 from typing import Any
 
-from measure import record, say_machine
 from mpi4py import MPI
 from newton_systems import Replay, replay_steps, settled
 from petsc4py import PETSc
+from shared import record, say_machine
 
 from pctt.ccp.newton.compare import NAMED
 from pctt.ccp.newton.krylov import Krylov

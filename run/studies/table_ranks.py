@@ -9,9 +9,9 @@ import argparse
 from typing import Any
 
 import numpy as np
-from measure import record, say_machine
 from mpi4py import MPI
 from newton_systems import Replay, replay_steps, set_up, settled, train_pc
+from shared import record, say_machine
 
 # (eps, cap): average ranks of matrix and inverse, seconds of compression and inversion per PDIP solve
 PAPER = {

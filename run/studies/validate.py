@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import record, say_machine
+from shared import record, say_machine
 from validation import laws
 from validation.rows import Row
 

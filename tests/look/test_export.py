@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import sys
 import xml.etree.ElementTree as ElementTree
 
@@ -12,12 +13,11 @@ from mpi4py import MPI
 
 from pctt import export
 from pctt.look import program
-from pctt.look.folder import Folder
+from pctt.look.folder import Folder, FolderError
 
 pytest.importorskip("vtkmodules", reason="vtk is not installed (extra `pictures`)")
 
 from vtkmodules.util.numpy_support import vtk_to_numpy
-from vtkmodules.vtkCommonCore import vtkVersion
 from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
 SERIES = ("bodies", "contacts", "large")
@@ -72,8 +72,6 @@ def test_the_series_hold_what_the_run_recorded(folder, tmp_path, monkeypatch):
 
 def test_all_steps_in_one_file(show, folder, tmp_path):
     hdf = pytest.importorskip("vtkmodules.vtkIOHDF")
-    if vtkVersion.GetVTKMajorVersion() * 100 + vtkVersion.GetVTKMinorVersion() < 904:
-        pytest.skip("vtk before 9.4 reads no VTKHDF of polygons in time")
     show("export", "-output", tmp_path, "-format", "vtkhdf", folder=folder)
     run = Folder(folder)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f"{name}.vtkhdf" for name in SERIES)
@@ -97,9 +95,13 @@ def test_all_steps_in_one_file(show, folder, tmp_path):
                 assert data.GetNumberOfPolys() > 0
 
 
-def test_force_chains_join_centres_and_end_at_large_bodies(show, tmp_path):
+def test_glyphs_have_the_extents_of_the_grains_and_force_chains_join_centres(show, tmp_path):
     made = handmade.write(tmp_path / "made", handmade.FLOOR)
     show("export", folder=made)
+    _, grains, _, _ = read(made / "paraview" / "bodies_000001.vtp")
+    np.testing.assert_allclose(grains["extent"], [[1, 1, 1], [0.4, 0.8, 1.6], [0.6, 0.6, 1.8]])
+    np.testing.assert_allclose(grains["radius"], [0.5, np.linalg.norm([0.2, 0.4, 0.8]), 0.9])
+    np.testing.assert_allclose(grains["speed"], [5, 0, 2.5])
     data, ends, arrays, _ = read(made / "paraview" / "contacts_000001.vtp")
     line = points(data).reshape(2, 2, 3)
     np.testing.assert_allclose(line[0], [[0, 0, 0.5], [0, 0, 0]])  # to the contact point on the floor
@@ -109,13 +111,20 @@ def test_force_chains_join_centres_and_end_at_large_bodies(show, tmp_path):
     np.testing.assert_allclose(ends["force"], [10, 10, 4, 4])
 
 
-def test_glyphs_have_the_extents_of_the_grains(show, tmp_path):
-    made = handmade.write(tmp_path / "made", handmade.FLOOR)
-    show("export", folder=made)
-    _, arrays, _, _ = read(made / "paraview" / "bodies_000001.vtp")
-    np.testing.assert_allclose(arrays["extent"], [[1, 1, 1], [0.4, 0.8, 1.6], [0.6, 0.6, 1.8]])
-    np.testing.assert_allclose(arrays["radius"], [0.5, np.linalg.norm([0.2, 0.4, 0.8]), 0.9])
-    np.testing.assert_allclose(arrays["speed"], [5, 0, 2.5])
+def test_a_series_that_cannot_be_written_is_an_error(folder, tmp_path):
+    """Not even a part of it stays; VTK's writer of VTKHDF files alone would say nothing."""
+    from pctt.look.surfaces import Scene
+
+    run = Folder(folder)
+    run.require_frames()
+    scene, before = Scene(run, [run.frame(4)]), resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+        with pytest.raises(FolderError, match="cannot write"):
+            export.write_vtkhdf(tmp_path / "bodies.vtkhdf", "bodies", scene, run.steps)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
 
 
 def test_large_bodies_are_surfaces_where_they_are(show, folder, tmp_path):

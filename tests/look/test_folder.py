@@ -76,10 +76,9 @@ def test_a_run_without_recorded_steps_is_refused(program, show, tmp_path):
 @pytest.mark.parametrize(
     ("program", "options", "words"),
     [
-        ("plot", ("-step", 77), ("-step 77", "1 to 4")),
         ("plot", ("-format", "bmp"), ("-format", "png")),
         ("export", ("-first", 9), ("-first", "1 to 4")),
-        ("export", ("-every", 0), ("-every", "positive")),
+        ("export", ("-every", 0), ("-every", ">= 1")),
         ("render", ("-color", "heat"), ("-color", "speed")),
         ("render", ("-size", "3x5"), ("-size", "3x5")),
         ("render", ("-color", "material", "-range", 0, 1), ("-range", "material")),
@@ -92,13 +91,6 @@ def test_a_bad_option_is_named(program, options, words, show):
     for word in words:
         assert word in done.stderr
     assert "Traceback" not in done.stderr
-
-
-def test_a_damaged_frame_is_named(tmp_path):
-    read = Folder(handmade.write(tmp_path / "made", handmade.FLOOR))
-    (tmp_path / "made" / "frames" / "000001.h5").unlink()
-    with pytest.raises(FolderError, match="000001"):
-        read.frame(1)
 
 
 def no_hdf5(path):
@@ -150,9 +142,7 @@ def test_a_file_is_written_whole_or_not_at_all(kind, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["figure.png"]
 
 
-@pytest.mark.parametrize(
-    ("program", "library"), [("plot", "matplotlib"), ("render", "vtkmodules"), ("export", "vtkmodules")]
-)
+@pytest.mark.parametrize(("program", "library"), [("render", "vtkmodules"), ("export", "vtkmodules")])
 def test_a_folder_without_the_bodies_is_refused(program, library, show, tmp_path):
     pytest.importorskip(library, reason=f"{library} is not installed (extra `pictures`)")
     made = handmade.write(tmp_path / "made", handmade.FLOOR)

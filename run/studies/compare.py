@@ -1,17 +1,24 @@
-"""Every solver of the cone problem on settled mixer steps and on harder variants: run/study compare_solvers [N ...]
-[options], default 4 8 16; --help lists the options. Peers (Siconos, Clarabel) are in it where they are installed:
-apt-get install python3-siconos, .venv/bin/pip install -e '.[peers]'. Writes results/compare_solvers.json and
-results/compare_solvers.png.
+"""Solvers of the cone problem, and laws of friction, beside each other:
 
-A solver starts cold. Its seconds are those until it first looked at a natural residual below the tolerance, in a
-process of its own on one core; what has not got there after --seconds is printed as such, with where it stood.
+    run/study compare solvers [N ...] [options]     default 4 8 16
+    run/study compare laws [N ...]                  default 4
+
+`solvers`: every solver of the cone problem on settled mixer steps and on harder variants. Peers (Siconos, Clarabel) are
+in it where they are installed: apt-get install python3-siconos, .venv/bin/pip install -e '.[peers]'. A solver starts
+cold. Its seconds are those until it first looked at a natural residual below the tolerance, in a process of its own on
+one core; what has not got there after --seconds is printed as such, with where it stood.
+
+`laws`: Coulomb's law beside its relaxation, steps from settled states: seconds, iterations, overlap, Coulomb residual;
+and how high a sliding box and a sphere on a turning table fly.
+
+Writes results/compare_solvers.json and .png, or results/compare_laws.json.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -20,12 +27,15 @@ from typing import Any
 
 import numpy as np
 import solve_one
-from measure import figure, record, say_machine
 from mpi4py import MPI
 from peers import PEERS
+from shared import figure, record, results, say_machine
 
 from dem.contact import find_contacts
+from dem.motion import Rotation
+from dem.scene import Scene
 from dem.scenes import Mixer
+from dem.shapes import Box
 from dem.system import ContactSystem
 from pctt import ccp
 from pctt.run.stepper import cone_problem
@@ -36,6 +46,9 @@ TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8)
 HEAVIER = 1000.0
 COURSE_DEPENDS_ON_TOL = ("pdip", "auto")  # the others pass 1e-2 and 1e-4 on the way to 1e-8
 COULOMB = ("coulomb apgd", "coulomb conic", "coulomb auto")
+SCENES = ("mixer", "blade", "shear")
+METHODS = {("apgd", "1e-4"): 20, ("conic", "1e-6"): 5}  # and how many steps
+MOST = 10  # cone problems where a method's own way to the law ends early
 VARIANTS = {
     "settled": "a step of the settled packing",
     "friction": "the same with a friction coefficient of 0.8",
@@ -46,41 +59,23 @@ VARIANTS = {
 
 def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
     """The cone problem of the first step after the settled state of a mixer."""
-    sim = Simulation(Mixer(n=n), restart="settled")
+    sim = Simulation(Mixer(n=n), restart="settled", comm=COMM)
     world, settings, grains = sim.world, sim.settings, sim.world.grains
     if variant == "loose":
         rng = np.random.default_rng(0)
         grains.position[:, 2] *= 1.01
         grains.velocity[:, :3] += 0.5 * rng.normal(size=(len(grains), 3)) - np.array([0, 0, 0.5])
     contacts = find_contacts(world, settings.delta, settings.dt)
-    system = ContactSystem(world, contacts, settings.dt, settings.recovery_speed)
-    problem = cone_problem(system, COMM, compliance)
-    mu, G = problem.mu, problem.contact_map.given
     if variant == "friction":
-        mu = np.full_like(mu, 0.8)
+        contacts.friction[:] = 0.8
     if variant == "heavy":
-        touched = np.unique(G.body[G.body >= 0])
+        touched = np.unique(contacts.body)
         top = touched[np.argmax(grains.position[touched[touched < len(grains)], 2])]
-        root = G.root.copy()
-        root[top] /= np.sqrt(HEAVIER)
-        G = dataclasses.replace(G, root=root)
-    return ccp.ConeProblem(COMM, problem.r, mu, G=G, point=problem.point, compliance=compliance)
-
-
-def copied(problem: ccp.ConeProblem, count: int) -> ccp.ConeProblem:
-    """Copies of a problem side by side, without contact between them."""
-    if count == 1:
-        return problem
-    G = problem.contact_map.given
-    which = np.repeat(np.arange(count), G.rows)[:, None]
-    body = np.tile(G.body, (count, 1))
-    body = np.where(body >= 0, body + which * G.columns, -1)
-    many = [np.tile(column, (count, 1)) for column in (G.frame, G.arm)]
-    G = ccp.CompactRows(*many, body, np.tile(G.root, (count, 1)), count * G.columns)
-    points = np.tile(problem.point, (count, 1))
-    points[:, 0] += which[:, 0] * np.ptp(problem.point[:, 0])
-    r, mu = np.tile(problem.r, (count, 1)), np.tile(problem.mu, count)
-    return ccp.ConeProblem(COMM, r, mu, G=G, point=points, compliance=problem.softness)
+        grains.mass[top] *= HEAVIER
+        grains.inertia[top] *= HEAVIER
+        contacts = find_contacts(world, settings.delta, settings.dt)
+    system = ContactSystem(world, contacts, settings.dt, settings.recovery_speed)
+    return cone_problem(system, COMM, compliance)
 
 
 def run(path: Path, method: str, tol: float, seconds: float) -> dict[str, Any]:
@@ -165,16 +160,8 @@ def plot(name: str, title: str, table: dict[str, list[dict[str, Any]]]) -> None:
             axes.legend(fontsize=8)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="run/study compare_solvers", description=__doc__)
-    parser.add_argument("n", type=int, nargs="*", default=[4, 8, 16], help="sizes of the mixer")
-    parser.add_argument("--seconds", type=float, default=60.0, help="limit of a run")
-    parser.add_argument("--variants", default=",".join(VARIANTS), help="with commas between")
-    parser.add_argument("--compliance", default="0,1e-5", help="the later ones for `settled` only")
-    parser.add_argument("--methods", default="", help="instead of all, with commas between")
-    parser.add_argument("--peers-up-to", type=int, default=8, help="largest n that peers get")
-    parser.add_argument("--copies", type=int, default=1, help="of the problem, side by side: n = 32 has 8 of n = 16")
-    words = parser.parse_args()
+def solvers(parser: argparse.ArgumentParser, words: argparse.Namespace) -> None:
+    """Every solver of the cone problem on settled mixer steps and on harder variants."""
     everything = [*ccp.SOLVERS, *COULOMB, *(name for name, peer in PEERS.items() if peer.installed)]
     methods = words.methods.split(",") if words.methods else everything
     variants = words.variants.split(",")
@@ -189,10 +176,9 @@ def main() -> None:
     for n, variant, compliance in cases:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "problem.npz"
-            problem = copied(step_problem(n, variant, compliance), words.copies)
+            problem = step_problem(n, variant, compliance)
             solve_one.write(path, problem)
             title = f"mixer n = {n}, {problem.size} contacts, {VARIANTS[variant]}, compliance {compliance:g}"
-            title += f", {words.copies} copies" * (words.copies > 1)
             heads = " ".join(f"{tol:9.0e}" for tol in TOLERANCES)
             print(f"\n{title}; limit {words.seconds:g} s\n{'seconds to':18} {heads} products   Krylov       MB")
             table = {}
@@ -201,11 +187,101 @@ def main() -> None:
                     continue
                 rows = table[method] = (peer_rows if method in PEERS else own_rows)(path, method, words.seconds)
                 case = {"n": n, "variant": variant, "compliance": compliance, "contacts": problem.size}
-                case |= {"method": method, "copies": words.copies}
-                record_rows += [case | row for row in rows]
+                record_rows += [case | {"method": method} | row for row in rows]
                 show(method, rows)
         record("compare_solvers", about, record_rows)
         plot(f"compare_solvers_n{n}_{variant}_{compliance:g}", title, table)
+
+
+# -- laws of friction ---------------------------------------------------------------------------------------
+
+
+def laws(sizes: list[int]) -> None:
+    """Coulomb's law beside its relaxation: steps from settled states, and how high grains fly that slide."""
+    about = say_machine()
+    rows: list[dict] = []
+    print("scene   n  method      law         seconds  solve s  iterations  overlap mm  Coulomb residual", end="")
+    print("  not converged")
+    for n in sizes:
+        for scene in SCENES:
+            for (method, tol), count in METHODS.items():
+                rows += _both_laws(scene, n, method, tol, count)
+    for law in ("relaxation", "Coulomb"):
+        lifts = {name: 1e3 * lift(scene, law == "Coulomb") for name, scene in (("box", box()), ("sphere", sphere()))}
+        print(f"{law:11} lift of the sliding box {lifts['box']:.3f} mm, of the sphere {lifts['sphere']:.3f} mm")
+        rows.append({"law": law, **{f"lift_{name} [mm]": value for name, value in lifts.items()}})
+    record("compare_laws", about, rows)
+
+
+def _both_laws(scene: str, n: int, method: str, tol: str, count: int) -> list[dict]:
+    """A row per law: medians of the steps, and the worst of the run."""
+    rows = []
+    for law, flags in (("relaxation", ("false",)), ("Coulomb", ("true", "-ccp_coulomb_max_it", MOST))):
+        options = ("-scene", scene, "-scene_n", n, "-restart", "settled", "-steps", count, "-output_every", 0)
+        options += ("-ccp_closing_work", "inf")
+        _, steps = results(1, *options, "-ccp_type", method, "-ccp_tol", tol, "-ccp_coulomb", *flags)
+        row = {
+            "scene": scene,
+            "n": n,
+            "method": f"{method} {tol}",
+            "law": law,
+            "seconds": statistics.median(line["seconds"] for line in steps),
+            "solve": statistics.median(line["phases"]["solve"] for line in steps),
+            "iterations": statistics.mean(line["iterations"] for line in steps),
+            "overlap [mm]": 1e3 * max(line["worst_overlap"] for line in steps),
+            "coulomb_residual": max(line["coulomb_residual"] for line in steps),
+            "not_converged": sum(not line["converged"] for line in steps),
+            "laws": sorted({line["law"] for line in steps}),
+        }
+        print(
+            f"{scene:6} {n:2d}  {row['method']:10}  {law:10} {row['seconds']:8.3f} {row['solve']:8.3f}"
+            f" {row['iterations']:11.0f} {row['overlap [mm]']:11.2f} {row['coulomb_residual']:17.1e}"
+            f" {row['not_converged']:14d}",
+            flush=True,
+        )
+        rows.append(row)
+    return rows
+
+
+def box() -> Scene:
+    """A cube of half extent .1 m, flush on a floor, at 2 m/s."""
+    scene = Scene(friction=0.5)
+    scene.add_body("floor", [Box((2, 2, 0.1))], position=(0, 0, -0.1))
+    scene.add_boxes([0, 0, 0.1], (0.1, 0.1, 0.1), 1000.0, velocity=(2, 0, 0))
+    return scene
+
+
+def sphere() -> Scene:
+    """A sphere of .1 m at rest on a table that turns once a second, .5 m from its axis."""
+    scene = Scene(friction=0.5)
+    scene.add_body("table", [Box((2, 2, 0.1))], Rotation((0, 0, 6.2832)), position=(0, 0, -0.1))
+    scene.add_spheres([0.5, 0, 0.1], 0.1, 1000.0)
+    return scene
+
+
+def lift(scene: Scene, coulomb: bool) -> float:
+    """How high the only grain gets above z = .1 m in 30 steps [m]."""
+    sim, highest = Simulation(scene, dt=0.01, solver="apgd", tol=1e-8, coulomb=coulomb, comm=COMM), 0.0
+    for _ in range(30):
+        sim.step()
+        highest = max(highest, float(sim.positions[0, 2]) - 0.1)
+    return highest
+
+
+def main() -> None:
+    words = argparse.ArgumentParser("run/study compare", description=__doc__,
+                                    formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
+    kinds = words.add_subparsers(dest="what", required=True)
+    kinds.add_parser("laws").add_argument("n", type=int, nargs="*", default=[4], help="sizes of the scenes (4)")
+    of_solvers = kinds.add_parser("solvers")
+    of_solvers.add_argument("n", type=int, nargs="*", default=[4, 8, 16], help="sizes of the mixer")
+    of_solvers.add_argument("--seconds", type=float, default=60.0, help="limit of a run")
+    of_solvers.add_argument("--variants", default=",".join(VARIANTS), help="with commas between")
+    of_solvers.add_argument("--compliance", default="0,1e-5", help="the later ones for `settled` only")
+    of_solvers.add_argument("--methods", default="", help="instead of all, with commas between")
+    of_solvers.add_argument("--peers-up-to", type=int, default=8, help="largest n that peers get")
+    given = words.parse_args()
+    laws(given.n) if given.what == "laws" else solvers(of_solvers, given)
 
 
 if __name__ == "__main__":
