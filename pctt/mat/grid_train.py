@@ -12,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import DTypeLike
 
-from pctt.exchange import on_first
+from dem.exchange import on_first
 from pctt.mat.entries import Combination, Entry
 from pctt.petsc import warn
 from pctt.tt.apply import Apply

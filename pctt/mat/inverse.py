@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.exchange import on_first
+from dem.exchange import on_first
 from pctt.mat.entries import has_entries, multiplies
 from pctt.mat.grid_train import GridTrain
 from pctt.mat.tensor_train import MAX_RANK, MISSED, Options, compressed, compressed_entries, mat_of

@@ -22,7 +22,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.mat.entries import given
-from pctt.morton import morton_codes
+from dem.morton import morton_codes
 from pctt.tt.quantise import GridDigits
 from pctt.tt.train import Array
 

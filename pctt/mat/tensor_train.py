@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.context import Context
-from pctt.exchange import on_first, refuse
+from dem.exchange import on_first, refuse
 from pctt.mat.entries import Entries, Entry, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.order import Places, digits_of, whole_numbers

@@ -23,7 +23,7 @@ from petsc4py import PETSc
 from pctt.block_diagonal import inverse_diagonal_blocks
 from pctt.mat.grid_train import TrainProduct
 from pctt.mat.order import Places, chosen_order
-from pctt.morton import Frame, morton_codes
+from dem.morton import Frame, morton_codes
 from pctt.tt.quantise import GridDigits, group_modes
 from pctt.tt.train import Train
 
