@@ -21,8 +21,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.mat.entries import given
 from dem.morton import morton_codes
+from pctt.mat.entries import given
 from pctt.tt.quantise import GridDigits
 from pctt.tt.train import Array
 

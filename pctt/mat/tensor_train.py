@@ -12,8 +12,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.context import Context
 from dem.exchange import on_first, refuse
+from pctt.context import Context
 from pctt.mat.entries import Entries, Entry, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.order import Places, digits_of, whole_numbers

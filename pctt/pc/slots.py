@@ -20,10 +20,10 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.morton import Frame, morton_codes
 from pctt.block_diagonal import inverse_diagonal_blocks
 from pctt.mat.grid_train import TrainProduct
 from pctt.mat.order import Places, chosen_order
-from dem.morton import Frame, morton_codes
 from pctt.tt.quantise import GridDigits, group_modes
 from pctt.tt.train import Train
 
