@@ -23,8 +23,8 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from pctt.disk import RUN_FILES, make_hdf5
-from pctt.look.folder import Folder, FolderError, Frame
+from pctt.disk import make_hdf5
+from pctt.folder import RUN_FILES, Folder, FolderError, Frame
 from pctt.look.program import add_steps, chosen, made_folder, parser, run, whole
 
 SERIES = ("bodies", "contacts", "large")

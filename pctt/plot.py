@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from pctt.look.folder import Folder, FolderError
+from pctt.folder import Folder, FolderError
 from pctt.look.program import made_folder, parser, run, whole
 
 FORMATS = ("png", "pdf", "svg")

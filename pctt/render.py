@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from pctt.look.folder import Folder, Frame
+from pctt.folder import Folder, Frame
 from pctt.look.program import add_steps, chosen, made_folder, parser, positive, run, whole
 from pctt.options import OptionError, made, refuse_bad
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 from pctt import disk
-from pctt.look.folder import FolderError
+from pctt.folder import FolderError
 
 LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")
 EXTRA = "the extra `pictures` has the libraries that draw: pip install -e '.[pictures]' in the project's folder"

@@ -31,8 +31,8 @@ from vtkmodules.vtkRenderingOpenGL2 import vtkOpenGLSphereMapper
 
 from dem import quaternion
 from dem.bodies import BOX, SPHERE
+from pctt.folder import Folder, FolderError, Frame
 from pctt.look import surfaces
-from pctt.look.folder import Folder, FolderError, Frame
 
 WALL = (0.88, 0.89, 0.91)
 EDGE = (0.50, 0.52, 0.55)

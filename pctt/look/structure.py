@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from pctt.look.folder import Folder, Frame
+from pctt.folder import Folder, Frame
 
 NEIGHBOURS = 12  # number of neighbours of the middle grain in an `example`
 

@@ -20,7 +20,7 @@ from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSp
 from dem import quaternion
 from dem.bodies import BOX, CAPSULE, SPHERE
 from dem.mesh import Surface
-from pctt.look.folder import Folder, FolderError, Frame
+from pctt.folder import Folder, FolderError, Frame
 
 MARGIN = 0.06  # how far walls go beyond the grains, in diagonals of the scene
 HOLLOW = 0.3  # a hollow body is empty up to this part of the way from its middle to its bounds

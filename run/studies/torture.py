@@ -15,7 +15,7 @@ from pathlib import Path
 import h5py
 
 from pctt.disk import lines
-from pctt.look.folder import Folder
+from pctt.folder import Folder
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ("-scene", "shear", "-ccp_type", "apgd", "-ccp_tol", "1e-3", "-checkpoint_every", "2")

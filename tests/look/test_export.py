@@ -11,8 +11,8 @@ import pytest
 from mpi4py import MPI
 
 from pctt import export
+from pctt.folder import Folder
 from pctt.look import program
-from pctt.look.folder import Folder
 
 pytest.importorskip("vtkmodules", reason="vtk is not installed (extra `pictures`)")
 

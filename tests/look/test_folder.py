@@ -13,7 +13,7 @@ import pytest
 from several_ranks import environment, mpiexec
 
 from dem.scenes import Mixer
-from pctt.look.folder import Folder, FolderError
+from pctt.folder import Folder, FolderError
 from pctt.look.program import whole
 
 

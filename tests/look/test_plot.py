@@ -6,7 +6,7 @@ import handmade
 import numpy as np
 import pytest
 
-from pctt.look.folder import Folder
+from pctt.folder import Folder
 
 pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 

@@ -6,7 +6,7 @@ import handmade
 import numpy as np
 import pytest
 
-from pctt.look.folder import Folder
+from pctt.folder import Folder
 
 vtk = pytest.importorskip("vtkmodules.vtkCommonCore", reason="vtk is not installed (extra `pictures`)")
 image = pytest.importorskip("PIL.Image", reason="pillow is not installed (extra `pictures`)")

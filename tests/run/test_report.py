@@ -57,20 +57,6 @@ def test_a_large_overlap_is_a_warning():
     assert report.overlap_line({**small, "overlap [m]": 6e-3}).startswith("WARNING: worst overlap 0.006 m, 6.0%")
 
 
-def test_accuracy_shows_the_course_of_the_residual():
-    line = {"objective": -1.5, "cone_violation": 0.0, "dual_violation": 1e-3, "complementarity": 1e-4}
-    line |= {"closing_work": 3e-2, "opening_work": 1e-2}
-    line |= {"coulomb_residual": 1e-2, "natural_residual": 1e-5, "rigid_residual": 1e-5}
-    line |= {"solver": "conic", "asked_solver": "auto", "reason": "apgd given up"}
-    assert "of rigid contacts 2.0e-03" in report.accuracy_lines({**line, "rigid_residual": 2e-3}, [])
-    text = report.accuracy_lines(line, [10.0**-k for k in range(41)])
-    assert "0: 1.0e+00  4: 1.0e-04" in text
-    assert text.endswith("40: 1.0e-40")
-    assert "by conic: apgd given up" in text
-    assert "by iteration" not in report.accuracy_lines(line, [])
-    assert "closing work 3.0e-02, opening work 1.0e-02" in text
-
-
 def test_forces_that_may_be_far_off_are_a_warning():
     works = enumerate((1e-3, 2e-2, 4e-3))
     steps = [{"step": 3 + k, "closing_work": work, "opening_work": 0.5 * work} for k, work in works]

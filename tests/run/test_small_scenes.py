@@ -15,7 +15,7 @@ from dem.start import new_world
 from dem.together import SceneError
 from pctt import ccp
 from pctt.options import OptionError
-from pctt.run.settling import world_at_start
+from pctt.run.state import world_at_start
 from pctt.simulation import Simulation
 
 
