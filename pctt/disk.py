@@ -98,40 +98,32 @@ def lines(path: Path) -> Iterator[str]:
 
 
 class Lock:
-    """The lock of a folder, or of a file that is made for it. One process has it at a time, until it releases it or
-    ends. On a file system without locks every process has it."""
+    """The lock of a folder or a file. One process has it at a time, until it releases it or ends. On a file system
+    without locks every process has it."""
 
     def __init__(self, path: Path):
         self._path, self._file = path, -1
 
     def take(self) -> bool:
-        """Whether this process has the lock from now on."""
+        """Whether this process has the lock from now on; makes the file if there is none."""
         try:
             self._file = os.open(self._path, os.O_RDONLY if self._path.is_dir() else os.O_RDWR | os.O_CREAT, 0o666)
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if self._path.exists() and os.path.samestat(os.fstat(self._file), os.stat(self._path)):
-                return True
         except BlockingIOError:
-            pass
+            self.release()
+            return False
         except OSError:
-            return True
-        self._close()  # another process has it, or has removed the file
-        return False
+            pass
+        return True
 
     def release(self) -> None:
-        """Let others have the lock that this process has, and remove the file that was made for it."""
-        if self._file >= 0 and self._path.is_file():
-            with suppress(OSError):
-                self._path.unlink()
-        self._close()
-
-    def __del__(self) -> None:
-        self._close()
-
-    def _close(self) -> None:
+        """Let others have the lock."""
         if self._file >= 0:
             os.close(self._file)
         self._file = -1
+
+    def __del__(self) -> None:
+        self.release()
 
 
 def make_hdf5(path: Path, numbers: int, items: int) -> None:
@@ -183,131 +175,107 @@ def checksum(path: Path, size: int, comm: MPI.Comm) -> int:
     return int(comm.allreduce(total)[0])
 
 
-class RowWriter:
-    """The contents of a file: datasets and attributes. Datasets of ``rows`` are concatenated over the ranks, those of
-    ``whole`` are the same on each. Arrays must not change until the file is written."""
-
-    def __init__(self) -> None:
-        self._rows: dict[str, np.ndarray] = {}
-        self._whole: dict[str, np.ndarray] = {}
-        self._attributes: list[tuple[str, Mapping[str, Any]]] = []
-
-    def rows(self, name: str, local: np.ndarray) -> None:
-        """A dataset of the rows of all ranks, in their order."""
-        self._rows[name] = np.ascontiguousarray(local)
-
-    def whole(self, name: str, array: Any) -> None:
-        """A dataset of the array that every rank holds."""
-        self._whole[name] = np.asarray(array)
-
-    def texts(self, name: str, texts: Sequence[str]) -> None:
-        """A dataset of texts (n,), in UTF-8, the same on every rank."""
-        encoded = [text.encode() for text in texts]
-        width = max(map(len, encoded), default=1) or 1
-        self._whole[name] = np.array(encoded, dtype=h5py.string_dtype("utf-8", width))
-
-    def attributes(self, name: str, values: Mapping[str, Any]) -> None:
-        """Attributes of a group ('/' the file), which is made if it is not there."""
-        self._attributes.append((name, values))
-
-    def size(self, comm: MPI.Comm) -> tuple[int, int]:
-        """Bytes of all numbers and texts, and how many datasets and attributes they are; collective."""
-        own = comm.allreduce(sum(array.nbytes for array in self._rows.values()))
-        shared = [np.asarray(value) for _, values in self._attributes for value in values.values()]
-        shared += self._whole.values()
-        return own + sum(array.nbytes for array in shared), len(self._rows) + len(shared)
-
-    def write(self, file: h5py.File, comm: MPI.Comm) -> None:
-        """Put all of it into an open file; collective."""
-        for name, local in self._rows.items():
-            ends = np.cumsum(comm.allgather(len(local)))
-            data = file.create_dataset(name, (int(ends[-1]), *local.shape[1:]), local.dtype)
-            if len(local):
-                end = int(ends[comm.rank])
-                data[end - len(local) : end] = local
-        for name, array in self._whole.items():
-            data = file.create_dataset(name, array.shape, array.dtype)
-            if comm.rank == 0:
-                data[...] = array
-        for name, values in self._attributes:
-            file.require_group(name).attrs.update(values)
+def texts(words: Sequence[str]) -> np.ndarray:
+    """Words (n,) in UTF-8, for a data set."""
+    encoded = [word.encode() for word in words]
+    width = max(map(len, encoded), default=1) or 1
+    return np.array(encoded, dtype=h5py.string_dtype("utf-8", width))
 
 
-@contextmanager
-def written(path: Path, comm: MPI.Comm) -> Iterator[RowWriter]:
-    """A file for all ranks, written under a temporary name when the block ends; collective.
+def write_rows(
+    path: Path, comm: MPI.Comm, rows: Mapping[str, np.ndarray], shared: Mapping[str, Any],
+    attributes: Mapping[str, Mapping[str, Any]],
+) -> None:  # fmt: skip
+    """Write an HDF5 file with its checksum; collective. Data sets of ``rows`` are concatenated over the ranks, those
+    that are ``shared`` and the attributes of groups ("/": the file) are the same on each.
 
     Raises FileError on all ranks if the file cannot be written; an earlier file under ``path`` then stays as it is. If
     one of several ranks fails while all are writing, it prints a message and ends them all.
     """
-    contents = RowWriter()
-    yield contents
-    numbers, items = contents.size(comm)
-    with told(path) if comm.rank == 0 else nullcontext(), whole(path) if comm.rank == 0 else nullcontext():
-        failure, file = None, None
-        if comm.rank == 0:
-            try:
-                make_hdf5(temporary_name(path), numbers, items)
-            except OSError as error:
-                failure = error.strerror or str(error)
-        raise_together(f"{path}: cannot write", failure, comm)
-        parallel = {"driver": "mpio", "comm": comm} if comm.size > 1 else {}
+    what, temporary, first = f"{path}: cannot write", temporary_name(path), comm.rank == 0
+    own = comm.allreduce(sum(array.nbytes for array in rows.values()))
+    same = [np.asarray(value) for values in (shared, *attributes.values()) for value in values.values()]
+    numbers, items = own + sum(array.nbytes for array in same), len(rows) + len(same)
+    parallel = {"driver": "mpio", "comm": comm} if comm.size > 1 else {}
+    with told(path), whole(path) if first else nullcontext():
+        _together(what, comm, lambda: make_hdf5(temporary, numbers, items) if first else None)
+        file = _together(what, comm, lambda: h5py.File(temporary, "r+", **parallel))
+        failure = None
         try:
-            file = h5py.File(temporary_name(path), "r+", **parallel)
-        except OSError as error:
-            failure = str(error)
-        raise_together(f"{path}: cannot write", failure, comm)
-        assert file is not None
-        try:
-            contents.write(file, comm)
+            _fill(file, comm, rows, shared, attributes)
             file.close()
         except (OSError, RuntimeError) as error:  # h5py raises both
-            failure = str(error)
+            failure = error
             if comm.size > 1:  # the other ranks may be within a call that waits for this one
-                sys.stderr.write(f"pctt.run: {path}: cannot write ({failure})\n")
+                sys.stderr.write(f"pctt.run: {what} ({error})\n")
                 sys.stderr.flush()
                 comm.Abort(2)
             with suppress(OSError, RuntimeError):
                 file.close()
-        raise_together(f"{path}: cannot write", failure, comm)
-        size = comm.bcast(os.path.getsize(temporary_name(path)) if comm.rank == 0 else 0)
-        total = checksum(temporary_name(path), size, comm)
-        if comm.rank == 0:
-            with open(temporary_name(path), "ab") as end:
-                end.write(SEAL + total.to_bytes(8, "little"))
+        if failure:
+            raise FileError(f"{what} ({failure})")
+        size = comm.bcast(os.path.getsize(temporary) if first else 0)
+        seal = SEAL + checksum(temporary, size, comm).to_bytes(8, "little")
+        _together(what, comm, lambda: _seal(temporary, seal) if first else None)
     comm.Barrier()
+
+
+def _fill(
+    file: h5py.File, comm: MPI.Comm, rows: Mapping[str, np.ndarray], shared: Mapping[str, Any],
+    attributes: Mapping[str, Mapping[str, Any]],
+) -> None:  # fmt: skip
+    for name, local in rows.items():
+        ends = np.cumsum(comm.allgather(len(local)))
+        data = file.create_dataset(name, (int(ends[-1]), *local.shape[1:]), local.dtype)
+        if len(local):
+            end = int(ends[comm.rank])
+            data[end - len(local) : end] = local
+    for name, value in shared.items():
+        array = np.asarray(value)
+        data = file.create_dataset(name, array.shape, array.dtype)
+        if comm.rank == 0:
+            data[...] = array
+    for name, values in attributes.items():
+        file.require_group(name).attrs.update(values)
+
+
+def _seal(path: Path, seal: bytes) -> None:
+    with open(path, "ab") as file:
+        file.write(seal)
 
 
 def read(path: Path, comm: MPI.Comm, take: Callable[[h5py.File, bool], Found]) -> Found:
     """What ``take(file, sealed)`` takes of an HDF5 file on every rank, without calls of MPI; collective.
 
-    FileError on all ranks if a rank cannot read it, or if the file is not as it was `written`. A file that is not
+    FileError on all ranks if a rank cannot read it, or if the file is not as it was written. A file that is not
     ``sealed`` has no checksum, as those of earlier versions and of others."""
-    what, failure, found = f"{path}: damaged, or no such file of this program", None, None
-    body, seal = 0, b""
-    try:
-        body = os.path.getsize(path) - 16
-        with open(path, "rb") as raw:
-            raw.seek(max(body, 0))
-            seal = raw.read()
-    except OSError as error:
-        failure = error.strerror
-    raise_together(what, failure, comm)
-    body, seal = comm.bcast((body, seal))
-    sealed = seal.startswith(SEAL)
-    if sealed and checksum(path, body, comm) != int.from_bytes(seal[8:], "little"):
-        raise FileError(f"{what} (it does not agree with its checksum)")
-    try:
+    what = f"{path}: damaged, or no such file of this program"
+
+    def look() -> tuple[int, bytes]:
+        with open(path, "rb") as file:
+            size = file.seek(0, os.SEEK_END) - 16
+            file.seek(max(size, 0))
+            return size, file.read()
+
+    def call() -> Found:
         with h5py.File(path, "r") as file:
-            found = take(file, sealed)
+            return take(file, sealed)
+
+    size, seal = comm.bcast(_together(what, comm, look))
+    sealed = seal.startswith(SEAL)
+    if sealed and checksum(path, size, comm) != int.from_bytes(seal[8:], "little"):
+        raise FileError(f"{what} (it does not agree with its checksum)")
+    return _together(what, comm, call)
+
+
+def _together(what: str, comm: MPI.Comm, call: Callable[[], Found]) -> Found:
+    """What the call returns on this rank; FileError on all ranks if it fails on one: ``what``, and why; collective."""
+    failure = None
+    try:
+        found = call()
     except (KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
-        failure = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-    raise_together(what, failure, comm)
-    return found  # type: ignore[return-value]
-
-
-def raise_together(what: str, failure: str | None, comm: MPI.Comm) -> None:
-    """FileError on all ranks if one has a failure: ``what`` it is, and the words of the first; collective."""
+        failure = getattr(error, "strerror", None) or str(error)
     failures = [text for text in comm.allgather(failure) if text is not None]
     if failures:
         raise FileError(f"{what} ({failures[0]})")
+    return found

@@ -43,7 +43,7 @@ from dem.step import Step
 from dem.together import together
 from dem.world import World
 from pctt import disk
-from pctt.disk import FileError, Lock, RowWriter, told, write_text, written
+from pctt.disk import FileError, Lock, texts, told, write_rows, write_text
 
 HARD = "hard"  # folder of the cone problems that were not solved
 DERIVED = ("state.h5", "records.csv", "summary.json", "analysis.csv")
@@ -550,23 +550,23 @@ class Writer:
         world, contacts, frames = step.world, step.contacts, self.place.now / "frames"
         if self._first_frame is None:
             self.place.make("frames")
-            with written(frames / "bodies.h5", self.comm) as file:
-                _write_by_id(file, world, ("shape", "size", "mass", "material"))
-                file.texts("materials", world.materials)
-                file.whole("large", np.bytes_(json.dumps(described_bodies(world))))
+            rows = _by_id(world, ("shape", "size", "mass", "material"))
+            large = np.bytes_(json.dumps(described_bodies(world)))
+            shared = {"materials": texts(world.materials), "large": large}
+            write_rows(frames / "bodies.h5", self.comm, rows, shared, {})
             self._first_frame = world.step
-        with written(frames / f"{world.step:06d}.h5", self.comm) as file:
-            file.attributes("/", {"step": world.step, "time": world.time})
-            file.attributes("record", row)
-            _write_by_id(file, world, ("position", "quaternion", "velocity"))
-            near = contacts.near.bodies
-            file.rows("contact/key", contacts.key)
-            file.rows("contact/body", np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1))
-            file.rows("contact/point", contacts.point)
-            file.rows("contact/frame", step.system.frame)
-            file.rows("contact/gap", contacts.gap)
-            file.rows("contact/impulse", step.impulse)
-            file.attributes("contact", {"dt": step.system.dt})
+        near = contacts.near.bodies
+        rows = {
+            **_by_id(world, ("position", "quaternion", "velocity")),
+            "contact/key": contacts.key,
+            "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
+            "contact/point": contacts.point,
+            "contact/frame": step.system.frame,
+            "contact/gap": contacts.gap,
+            "contact/impulse": step.impulse,
+        }
+        about = {"/": {"step": world.step, "time": world.time}, "record": row, "contact": {"dt": step.system.dt}}
+        write_rows(frames / f"{world.step:06d}.h5", self.comm, rows, {}, about)
         self._recorded = world.step
 
     def _remove_later(self, hard: str) -> None:
@@ -592,14 +592,12 @@ def described_bodies(world: World) -> list[dict[str, Any]]:
     return json.loads(json.dumps(large, default=list))  # arrays as lists
 
 
-def _write_by_id(file: RowWriter, world: World, names: Sequence[str]) -> None:
-    """Columns of the table of all bodies, in the order of their ids."""
+def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Columns of the table of all bodies, in the order of their ids, spread over the ranks; collective."""
     grains, comm = world.grains, world.comm
     columns = {"id": grains.id, **{name: getattr(grains, name) for name in names}}
     starts = np.arange(comm.size + 1) * int(world.slabs[-1]) // comm.size
     rows = exchange(comm, columns, np.searchsorted(starts, grains.id, side="right") - 1)
-    order = np.argsort(rows["id"])
-    last = comm.rank == comm.size - 1
-    for name in names:
-        large = getattr(world.large, name)
-        file.rows(name, np.concatenate([rows[name][order], large if last else large[:0]]))
+    order, last = np.argsort(rows["id"]), comm.rank == comm.size - 1
+    large = {name: getattr(world.large, name) for name in names}
+    return {name: np.concatenate([rows[name][order], large[name] if last else large[name][:0]]) for name in names}

@@ -28,7 +28,7 @@ from dem.scene import LargeBody, Scene
 from dem.start import even_slice, new_world, restart_rows, restored_world
 from dem.together import together
 from dem.world import World
-from pctt.disk import FileError, Lock, read, told, written
+from pctt.disk import FileError, Lock, read, texts, told, write_rows
 from pctt.options import OptionError
 from pctt.petsc import warn
 from pctt.run import interrupt
@@ -101,17 +101,13 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
     complete."""
     local, replicated = world.state()
     key, impulse = memory.state()
-    with written(path, world.comm) as file:
-        for name, column in local.items():
-            file.rows(f"grains/{name}", column)
-        for name, array in replicated.items():
-            file.whole(f"world/{name}", array)
-        file.texts("world/materials", world.materials)
-        if motions := changed_motions(world):
-            file.texts("world/motions", [motions])
-        file.rows("contacts/key", key)
-        file.rows("contacts/impulse", impulse)
-        file.attributes("/", {"format": FORMAT, **made_with})
+    rows = {f"grains/{name}": column for name, column in local.items()}
+    shared = {f"world/{name}": array for name, array in replicated.items()}
+    shared["world/materials"] = texts(world.materials)
+    if motions := changed_motions(world):
+        shared["world/motions"] = texts([motions])
+    rows |= {"contacts/key": key, "contacts/impulse": impulse}
+    write_rows(path, world.comm, rows, shared, {"/": {"format": FORMAT, **made_with}})
 
 
 def load(
@@ -230,9 +226,8 @@ def settled_state(
 @contextmanager
 def _alone(path: Path, comm: MPI.Comm, say: Say) -> Iterator[None]:
     """Other runs that settle the same scene have ended, and wait for the end of the block; collective."""
-    lock = Lock(path.with_suffix(".lock"))
+    lock, waits = Lock(path.with_suffix(".lock")), False
     try:
-        waits = False
         while not comm.bcast(comm.rank > 0 or lock.take()):
             if not waits:
                 say(f"waits for another run that settles the same scene, {path}")

@@ -13,8 +13,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from program import SMALL, arrays, command, environment, recorded_steps, steps_of
 
+from pctt import disk
 from pctt.ccp import ConeProblem, fclib
-from pctt.disk import FileError, RowWriter, append, written
+from pctt.disk import FileError, append
 from pctt.run.options import read_options
 from pctt.run.simulate import simulate
 
@@ -116,15 +117,14 @@ def test_the_room_of_a_file_is_taken_until_it_is_written(tmp_path, monkeypatch):
             os.posix_fallocate(file.fileno(), 0, data.nbytes)
         except (AttributeError, OSError):
             pytest.skip("this file system takes no room in advance")
-    write = RowWriter.write
+    fill = disk._fill
 
-    def look(contents, file, comm):
+    def look(file, *contents):
         taken.append(512 * os.stat(file.filename).st_blocks)
-        write(contents, file, comm)
+        fill(file, *contents)
 
-    monkeypatch.setattr(RowWriter, "write", look)
-    with written(path, MPI.COMM_SELF) as file:
-        file.rows("data", data)
+    monkeypatch.setattr(disk, "_fill", look)
+    disk.write_rows(path, MPI.COMM_SELF, {"data": data}, {}, {})
     assert taken[0] >= data.nbytes
     np.testing.assert_array_equal(arrays(path)["data"], data)
     assert path.stat().st_size < 1.01 * data.nbytes  # what was taken beyond need is given back
