@@ -10,6 +10,8 @@ holes where their paddles were, and there is air between the layers: `LANDING` o
 from __future__ import annotations
 
 import sys
+from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -19,8 +21,8 @@ from dem.arrays import Floats
 from dem.impulses import ImpulseMemory
 from dem.scenes import Mixer
 from dem.start import new_world
-from pctt.run import checkpoint, settling
-from pctt.run.options import read_options
+from pctt.run import state
+from pctt.run.settings import Settings
 
 LANDING = 1.75  # s: the layers land within .6 s, the bed comes to rest, the last tenth of the settling is accurate
 
@@ -52,27 +54,27 @@ def spread(places: Floats, spheres: int, scene: Mixer) -> Floats:
 
 def main(n: int) -> None:
     small = Mixer(n=n)
-    settled, _ = settling.cache(_settling(n), small.build())
-    if not checkpoint.intact(settled):
+    settled = _cached(small)[0]
+    if not settled.exists():
         raise FileNotFoundError(f"no settled mixer of size {n} in {settled.parent}: run/settle mixer {n} makes it")
     with h5py.File(settled) as file:
         bed = file["grains/position"][:]
-    how = _settling(2 * n)
-    large, scene = how.experiment, how.experiment.build()
+    large = Mixer(n=2 * n)
+    path, made_with, settings = _cached(large)
     places = copies(bed, small.radius, small.width)
     places = spread(places[fits(places, large)], (4 * n + 1) ** 3, large)
-    world = new_world(scene, MPI.COMM_SELF)
+    world = new_world(large.build(), MPI.COMM_SELF)
     world.grains.position[:] = places
-    world.step = how.steps - round(LANDING / how.settings.dt)  # at time zero the paddle is where `fits` has it
-    path, made_with = settling.cache(how, scene)
-    checkpoint.save(settling.unfinished(path), made_with, world, ImpulseMemory(MPI.COMM_SELF))
-    print(f"{settling.unfinished(path)}: {len(places)} spheres, of copies of {settled}")
+    world.step = state.settling_steps(large, settings) - round(LANDING / settings.dt)  # at time zero the paddle is where `fits` has it
+    state.save(state.unfinished(path), made_with, world, ImpulseMemory(MPI.COMM_SELF))
+    print(f"{state.unfinished(path)}: {len(places)} spheres, of copies of {settled}")
 
 
-def _settling(n: int) -> settling.Settling:
-    """What `run/settle mixer n` does."""
-    options = read_options({"scene": "mixer", "scene_n": str(n), "settle": "true"}, MPI.COMM_SELF)
-    return settling.Settling.asked(options)
+def _cached(scene: Mixer) -> tuple[Path, dict[str, Any], Settings]:
+    """The file in which `run/settle` keeps the settled state of a scene, what it is made with, and how."""
+    settings = Settings().of(scene)
+    made_with = state.origin(scene, scene.build(), settings.dt)
+    return state.settled_path(scene, settings, made_with), made_with, settings
 
 
 if __name__ == "__main__":

@@ -14,9 +14,8 @@ from mpi4py import MPI
 from pctt import ccp
 from pctt.ccp.cone import tangential
 from pctt.run.options import read_options
-from pctt.run.report import Progress
-from pctt.run.simulate import first_state
 from pctt.run.stepper import Solved, Stepper
+from pctt.simulation import Simulation
 
 LAWS = {"relaxation": (None, (1e-4, 1e-5, 1e-6)), "Coulomb": (ccp.Coulomb(max_it=20), (1e-4, 1e-5))}
 
@@ -51,7 +50,7 @@ def main(scene: str, n: str, steps: int, every: int) -> None:
     about = say_machine()
     words = {"scene": scene, "scene_n": n, "restart": "settled", "ccp_type": "apgd", "ccp_coulomb": "true"}
     options = read_options({**words, "output": "results", "overwrite": "true"}, MPI.COMM_WORLD)
-    sim = first_state(options, MPI.COMM_WORLD, Progress(False))
+    sim = Simulation(options.scene, options.settings, comm=MPI.COMM_WORLD, restart="settled")
     with Compared(sim.settings, sim.world, sim.memory) as stepper:
         stepper.every = every
         for _ in range(steps):
