@@ -466,18 +466,18 @@ class Writer:
         lines = disk.lines(self.place.now / "steps.jsonl")
         return (line for line in lines if int(json.loads(line)["step"]) <= self._kept_steps)
 
-    def record(self, step: Step, row: Mapping[str, float], last: bool) -> None:
-        """Write the frame of a step, with the row of its records, if that is due or if the step is the ``last``."""
-        if self._every and (step.world.step % self._every == 0 or last):
+    def record(self, step: Step, row: Mapping[str, float]) -> None:
+        """Write the frame of a step, with the row of its records, if that is due."""
+        if self._every and step.world.step % self._every == 0:
             self._record(step, row)
 
-    def add(self, line: dict[str, Any], last: bool) -> None:
-        """Write the figures of a step, and the checkpoint if that is due."""
+    def add(self, line: Mapping[str, Any], row: Mapping[str, float]) -> None:
+        """Write the figures of a step with the row of its records, and the checkpoint if that is due."""
         self.place.make()
         if self.comm.rank == 0:
-            self._add(dumps(line))
+            self._add(dumps({**line, "record": row}))
         # after the figures: a run that goes on from the checkpoint must find the step
-        if (self._world.step - self._start) % self._checkpoint_every == 0 or last:
+        if (self._world.step - self._start) % self._checkpoint_every == 0:
             self._checkpoint()
         if not self._stands:
             self.place.take()

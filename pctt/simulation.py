@@ -70,7 +70,7 @@ class Simulation:
         comm: MPI.Comm = MPI.COMM_WORLD,
         restart: str | Path = "",
         compare: ccp.Comparison | None = None,
-        say: state.Say = print,
+        say: Callable[[str], object] = print,
         **changes: Any,
     ):
         """The scene at time zero, or as the checkpoint ``restart`` has it; "settled": in its settled state, which is
@@ -91,8 +91,7 @@ class Simulation:
         )
         scene = state.built(self.experiment, comm)
         if restart == "settled":
-            tell = say if comm.rank == 0 else _say_nothing
-            restart = state.settled_state(self.experiment, self.settings, scene, comm, tell)
+            restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
         self._origin = state.origin(self.experiment, scene, self.settings.dt)
         if restart:
             self.world, self.memory = state.load(Path(restart), scene, self._origin, comm)
@@ -123,9 +122,6 @@ class Simulation:
 
     def step(self) -> dict[str, Any]:
         """Make a step of dt; its `figures`. SceneError if a body is lost, or if code of the scene fails."""
-        return self._step(last=False)
-
-    def _step(self, last: bool) -> dict[str, Any]:
         if self._closed:
             raise ValueError("this simulation is closed")
         stepper, output, self.last = self.stepper, self.output, None  # frees the arrays of the last step
@@ -134,16 +130,15 @@ class Simulation:
         with log.phase("output"):
             self._row = recording.row(self.last, self.experiment)
             figures["worst_overlap"] = self._row["worst_overlap [m]"]
-            figures["record"] = self._row
             if output:
-                output.record(self.last, self._row, last)
+                output.record(self.last, self._row)
         # a step's checkpoint is written after its figures, so its seconds count in the next step
         figures["phases"] |= log.take_seconds(("output",))
         figures["seconds"] = sum(figures["phases"].values())
         if output:
             with log.phase("output"):
-                output.add(figures, last)
-        self.figures = self._row | {name: value for name, value in figures.items() if name != "record"}
+                output.add(figures, self._row)
+        self.figures = self._row | figures
         return self.figures
 
     def run(
@@ -171,7 +166,7 @@ class Simulation:
             return stop is not None and bool(stop(self))
 
         while self.steps < end and not ends:
-            self._step(last=self.steps + 1 == end)
+            self.step()
             if self.comm.size == 1:
                 ends = tell()
             elif call or stop:  # an error of one rank is one of all, and the first rank decides
@@ -441,10 +436,6 @@ class BodyMotion:
 
     def __repr__(self) -> str:
         return repr(self._body._large.motion)
-
-
-def _say_nothing(text: str) -> None:
-    pass
 
 
 def _check(name: str, value: Any, check: tuple[str, Callable[[Any], bool]]) -> int:

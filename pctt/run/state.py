@@ -37,7 +37,7 @@ from pctt.run.stepper import Stepper
 
 FORMAT, FIRST_FORMAT = "pctt checkpoint 2", "pctt checkpoint 1"  #: the first one had no checksums
 
-Say = Callable[[str], object]
+Say = Callable[[str], object]  #: told on the first rank
 
 
 def built(scene: Experiment, comm: MPI.Comm) -> Scene:
@@ -110,9 +110,7 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
     write_rows(path, world.comm, rows, shared, {"/": {"format": FORMAT, **made_with}})
 
 
-def load(
-    path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm
-) -> tuple[World, ImpulseMemory]:
+def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) -> tuple[World, ImpulseMemory]:
     """The world and the impulses of a checkpoint of the scene; collective.
 
     If the number of ranks is that of the writing run, the world is the same to the last bit. Raises FileError if the
@@ -210,6 +208,7 @@ def settled_state(
 ) -> Path:
     """The cached settled state of ``scene``, which the experiment has `built`. It is made if it is missing, or with
     ``anew``. An interrupted or killed settling is continued."""
+    say = say if comm.rank == 0 else lambda text: None
     made_with = origin(experiment, scene, settings.dt)
     path = settled_path(experiment, settings, made_with)
     if not anew and comm.bcast(path.exists()):

@@ -65,7 +65,8 @@ def main(n: int) -> None:
     places = spread(places[fits(places, large)], (4 * n + 1) ** 3, large)
     world = new_world(large.build(), MPI.COMM_SELF)
     world.grains.position[:] = places
-    world.step = state.settling_steps(large, settings) - round(LANDING / settings.dt)  # at time zero the paddle is where `fits` has it
+    # at time zero the paddle is where `fits` has it
+    world.step = state.settling_steps(large, settings) - round(LANDING / settings.dt)
     state.save(state.unfinished(path), made_with, world, ImpulseMemory(MPI.COMM_SELF))
     print(f"{state.unfinished(path)}: {len(places)} spheres, of copies of {settled}")
 

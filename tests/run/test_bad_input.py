@@ -11,7 +11,6 @@ from mpi4py import MPI
 from program import SMALL
 
 from pctt.options import OptionError
-from pctt.run.leftovers import refuse_stray
 from pctt.run.options import read_options
 
 # options, and what the line must name beside the first of them: value and what is allowed
@@ -220,11 +219,6 @@ def test_a_stray_word_is_refused(words, program, results):
     said = refused(program, results, *words.split())
     stray = words.split()[0] if words.startswith("- ") else words.split()[-1]
     assert said == f"pctt.run: {stray}: belongs to no option; a value follows its option, as in -output {stray}"
-
-
-def test_numbers_below_zero_and_options_of_petsc_are_no_stray_words():
-    words = "-steps -1 -dt -.5e3 --ksp_type cg -quiet -log_view :log.txt:ascii_xml -x -"
-    assert refuse_stray(words.split()) is None
 
 
 @pytest.mark.parallel(1, 2)

@@ -141,15 +141,3 @@ def test_a_checkpoint_that_lies_behind_makes_the_steps_anew(program, settled, tm
     for name, array in again.items():
         assert array.tobytes() == whole[name].tobytes()
     assert len(steps_of(tmp_path / "out")) == 5
-
-
-def test_another_run_in_the_same_folder_does_not_mix_with_the_earlier_one(program, settled, tmp_path):
-    program(*SMALL, *OPTIONS, "-steps", 3)  # steps 1 to 3, from the lattice
-    program(*SETTLED, *OPTIONS, "-steps", 2, "-overwrite")
-    start = int(arrays(settled)["world/step"])
-    assert [line["step"] for line in steps_of(tmp_path / "results")] == [start + 1, start + 2]
-    assert not (tmp_path / "results" / ".new").exists()
-    recorded = {int(name) for name in recorded_steps(arrays(tmp_path / "results" / "state.h5"))}
-    assert recorded == {start + 1, start + 2}
-    frames = {path.stem for path in (tmp_path / "results" / "frames").iterdir()}
-    assert frames == {"bodies", *(f"{step:06d}" for step in recorded)}

@@ -12,7 +12,7 @@ import subprocess
 import h5py
 import numpy as np
 import pytest
-from program import SETTLED, SMALL, arrays, command, environment, recorded_steps, steps_of
+from program import SETTLED, SMALL, arrays, command, environment, steps_of
 
 from dem.scenes import Mixer
 
@@ -156,15 +156,6 @@ def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled,
         before = data
 
 
-def test_recorded_steps_are_every_kth_and_the_last(program, settled, tmp_path):
-    program(*SETTLED, "-steps", 5, "-output_every", 2, "-checkpoint_every", 3, "-ccp_type", "apgd")
-    steps = [line["step"] for line in steps_of(tmp_path / "results")]
-    assert len(steps) == 5
-    recorded = {int(name) for name in recorded_steps(arrays(tmp_path / "results" / "state.h5"))}
-    assert recorded == {k for k in steps if k % 2 == 0} | {steps[-1]}
-    assert int(arrays(tmp_path / "results" / "checkpoint.h5")["world/step"]) == steps[-1]
-
-
 def test_no_state_is_written_if_none_is_wanted(program, settled, tmp_path):
     program(*SETTLED, "-steps", 2, "-output_every", 0, "-ccp_type", "apgd")
     assert sorted(p.name for p in (tmp_path / "results").iterdir() if p.is_file()) == [
@@ -174,18 +165,6 @@ def test_no_state_is_written_if_none_is_wanted(program, settled, tmp_path):
         "steps.jsonl",
         "summary.json",
     ]
-
-
-def test_the_same_run_again_writes_the_same_files_anew(program, settled, tmp_path):
-    options = (*SETTLED, "-ccp_type", "apgd")
-    program(*options, "-steps", 4)
-    old = arrays(tmp_path / "results" / "state.h5")
-    program(*options, "-steps", 2, "-overwrite")
-    new = arrays(tmp_path / "results" / "state.h5")
-    assert 0 < len(new) < len(old)
-    for name, array in new.items():
-        assert array.tobytes() == old[name].tobytes()
-    assert len(steps_of(tmp_path / "results")) == 2
 
 
 def test_a_step_that_is_not_solved_says_so(program, settled, tmp_path):

@@ -16,7 +16,6 @@ from pctt.disk import FileError
 from pctt.folder import Place
 from pctt.options import OptionError
 from pctt.run.options import read_options
-from pctt.run.settings import DEMO
 from pctt.run.simulate import simulate, solve_file
 
 SELF = MPI.COMM_SELF
@@ -169,15 +168,6 @@ def test_two_ranks_replace_a_run(run, program, tmp_path):
         assert file["world/step"][()] == 2
 
 
-def test_the_demo_has_a_folder_of_its_own_that_it_replaces(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / DEMO["output"]).mkdir(parents=True)
-    (tmp_path / DEMO["output"] / "summary.json").write_text("of an earlier demo")
-    options = read_options({}, SELF)
-    assert (options.demo, options.run.overwrite, options.run.output) == (True, True, DEMO["output"])
-    assert read_options({"steps": "1"}, SELF).run.output == "results" != DEMO["output"]
-
-
 def test_a_folder_to_which_a_run_is_writing_is_refused_until_it_ends(run, tmp_path):
     place = Place(tmp_path / "out", SELF)
     with pytest.raises(FileError, match="another run is writing there"):
@@ -195,13 +185,3 @@ def test_a_run_does_not_replace_one_that_came_while_it_began(run, tmp_path):
     with pytest.raises(FileError, match="-output out: holds a run"):
         simulate(late, SELF)
     assert contents(tmp_path / "out") == before
-
-
-@pytest.mark.parallel(2)
-def test_a_folder_in_use_is_refused_on_all_ranks(tmp_path):
-    comm = MPI.COMM_WORLD
-    place = Place(tmp_path / "out", comm)
-    with pytest.raises(FileError, match="another run is writing there"):
-        Place(tmp_path / "out", comm)
-    place.leave()
-    Place(tmp_path / "out", comm).leave()

@@ -20,23 +20,6 @@ def test_the_time_left_goes_on_as_before(spent, done, steps, words):
     assert report.remaining(spent, done, steps) == words
 
 
-def test_a_figure_of_nothing_has_no_sign():
-    assert report.figure_table({"torque": -0.0}) == "torque  0"
-
-
-def test_the_table_counts_what_did_not_converge():
-    line = {
-        "phases": {"solve": 3.0, "search": 1.0}, "seconds": 4.0, "contacts": 7, "newton_its": 2, "ksp_its": 5,
-        "natural_residual": 1e-5, "converged": True,
-    }
-    other = {**line, "contacts": 9, "natural_residual": 2e-3, "converged": False}
-    text = report.phase_table([line, other])
-    assert "2 steps, 7 to 9 contacts, 4 Newton steps, 10 Krylov iterations" in text
-    assert "worst residual 2.0e-03, 1 NOT CONVERGED" in text
-    solve = next(row.split() for row in text.splitlines() if row.startswith("solve"))
-    assert solve == ["solve", "6.00", "75.0%", "3.000"]
-
-
 def test_the_seconds_of_a_comparison_have_a_column():
     line = {
         "step": 3, "time": 0.1, "contacts": 7, "iterations": 2, "ksp_its": 5, "natural_residual": 1e-5, "seconds": 4.0,

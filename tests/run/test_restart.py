@@ -45,16 +45,6 @@ def test_on_as_many_ranks_the_way_is_the_same_bit_for_bit(solver, program, settl
     assert len(steps[0]) == len(steps[1]) == 6
 
 
-def test_steps_can_be_made_again_into_another_folder(program, settled, tmp_path):
-    options = (*SMALL, "-ccp_type", "apgd", "-steps", 2)
-    program(*options, "-restart", "settled", "-output", "first")
-    before = (tmp_path / "first" / "checkpoint.h5").read_bytes()
-    for name in ("second", "third"):
-        program(*options, "-restart", "first/checkpoint.h5", "-output", name)
-    assert (tmp_path / "first" / "checkpoint.h5").read_bytes() == before
-    assert_same_bits(tmp_path / "second" / "state.h5", tmp_path / "third" / "state.h5")
-
-
 @pytest.mark.parallel(3)
 def test_on_another_number_of_ranks_the_way_is_the_same_but_for_rounding(settled, tmp_path, monkeypatch, double):
     """Twenty iterations a step, solved or not: only the order of sums depends on the ranks."""
@@ -266,11 +256,6 @@ def test_a_flipped_bit_is_an_error_on_all_ranks(name, tmp_path, monkeypatch):
         path.write_bytes(whole)
     comm.Barrier()
     read()
-
-
-def test_options_of_the_solver_may_change(drop, tmp_path):
-    drop(DROP, ccp_type="pdip", ccp_tol="1e-6", delta="0.05", recovery_speed="0.5")
-    assert step_of(tmp_path / "out" / "checkpoint.h5") == 4
 
 
 def test_a_checkpoint_without_time_step_scene_file_and_checksums_is_taken(drop, tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from program import ROOT, SMALL, arrays, assert_same_bits, database, table
+from program import ROOT, arrays, assert_same_bits, database, table
 
 import pctt
 from dem.experiment import Experiment, option
@@ -355,23 +355,6 @@ def test_it_does_what_the_program_does(words, scene, solver, tmp_path, monkeypat
     assert names == {path.name for path in (tmp_path / "object").iterdir()}
     for name in {"records.csv", "analysis.csv"} & names:
         assert (tmp_path / "program" / name).read_bytes() == (tmp_path / "object" / name).read_bytes()
-
-
-def test_the_program_goes_on_from_what_a_simulation_saved(tmp_path, monkeypatch):
-    """With the motion that was changed."""
-    monkeypatch.chdir(tmp_path)
-    scene = Mixer(n=1, margin=0.7)
-    sim = pctt.Simulation(scene, solver="apgd", comm=SELF)
-    sim.body("mixer").motion.velocity = (0.0, 0.0, 3.0)
-    sim.run(steps=2)
-    sim.save("half.h5")
-    words = [*SMALL, "-ccp_type", "apgd", "-restart", "half.h5", "-steps", "2", "-quiet"]
-    simulate(read_options(database(words), SELF), SELF)
-    sim.run(steps=2)
-    sim.save("whole.h5")
-    assert_same_bits(tmp_path / "whole.h5", tmp_path / "results" / "checkpoint.h5")
-    turn = sim.body("mixer").orientation
-    np.testing.assert_allclose(2 * np.arccos(abs(turn[0])), 3.0 * sim.time, rtol=1e-9)
 
 
 def test_the_folder_of_a_run_is_written_from_then_on(tmp_path):
