@@ -8,7 +8,7 @@ import fcntl
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,11 +28,7 @@ SEAL = b"pctt sum"
 
 
 class FileError(RuntimeError):
-    """A file that cannot be read or written; raised on all ranks alike, or by the first rank only, `one_rank`."""
-
-    def __init__(self, text: str, one_rank: bool = False):
-        super().__init__(text)
-        self.one_rank = one_rank
+    """A file that cannot be read or written; raised on all ranks alike."""
 
 
 def temporary_name(path: Path) -> Path:
@@ -49,25 +45,30 @@ def whole(path: Path) -> Iterator[Path]:
     temporary = temporary_name(path)
     try:
         yield temporary
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        _replace(path)
     finally:
         with suppress(OSError):
             temporary.unlink()
 
 
+def _replace(path: Path) -> None:
+    temporary = temporary_name(path)
+    with open(temporary, "rb") as file:
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
 @contextmanager
 def told(path: Path) -> Iterator[None]:
-    """FileError for an OSError of the block, which writes ``path``; one rank."""
+    """FileError for an OSError of the block, which writes ``path``."""
     try:
         yield
     except OSError as error:
-        raise FileError(f"{path}: cannot write ({error.strerror or error})", one_rank=True) from error
+        raise FileError(f"{path}: cannot write ({error.strerror or error})") from error
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace a text file at one stroke; FileError if that fails; one rank."""
+    """Replace a text file at one stroke; FileError if that fails."""
     with told(path), whole(path) as temporary:
         temporary.write_text(text)
 
@@ -124,6 +125,22 @@ class Lock:
 
     def __del__(self) -> None:
         self.release()
+
+
+def on_first(comm: MPI.Comm, path: Path, call: Callable[[], Found]) -> Found:
+    """What the call, which writes ``path``, returns on the first rank; collective. FileError on all ranks if it raises
+    one, or an OSError."""
+    found, failure = None, ""
+    if comm.rank == 0:
+        try:
+            with told(path):
+                found = call()
+        except FileError as error:
+            failure = str(error)
+    found, failure = comm.bcast((found, failure))
+    if failure:
+        raise FileError(failure)
+    return found  # type: ignore[return-value]
 
 
 def make_hdf5(path: Path, numbers: int, items: int) -> None:
@@ -197,7 +214,7 @@ def write_rows(
     same = [np.asarray(value) for values in (shared, *attributes.values()) for value in values.values()]
     numbers, items = own + sum(array.nbytes for array in same), len(rows) + len(same)
     parallel = {"driver": "mpio", "comm": comm} if comm.size > 1 else {}
-    with told(path), whole(path) if first else nullcontext():
+    try:
         _together(what, comm, lambda: make_hdf5(temporary, numbers, items) if first else None)
         file = _together(what, comm, lambda: h5py.File(temporary, "r+", **parallel))
         failure = None
@@ -216,8 +233,11 @@ def write_rows(
             raise FileError(f"{what} ({failure})")
         size = comm.bcast(os.path.getsize(temporary) if first else 0)
         seal = SEAL + checksum(temporary, size, comm).to_bytes(8, "little")
-        _together(what, comm, lambda: _seal(temporary, seal) if first else None)
-    comm.Barrier()
+        _together(what, comm, lambda: _finish(path, seal) if first else None)
+    finally:
+        if first:
+            with suppress(OSError):
+                temporary.unlink()
 
 
 def _fill(
@@ -239,9 +259,10 @@ def _fill(
         file.require_group(name).attrs.update(values)
 
 
-def _seal(path: Path, seal: bytes) -> None:
-    with open(path, "ab") as file:
+def _finish(path: Path, seal: bytes) -> None:
+    with open(temporary_name(path), "ab") as file:
         file.write(seal)
+    _replace(path)
 
 
 def read(path: Path, comm: MPI.Comm, take: Callable[[h5py.File, bool], Found]) -> Found:

@@ -43,7 +43,7 @@ from dem.step import Step
 from dem.together import together
 from dem.world import World
 from pctt import disk
-from pctt.disk import FileError, Lock, texts, told, write_rows, write_text
+from pctt.disk import FileError, Lock, on_first, texts, told, write_rows, write_text
 
 HARD = "hard"  # folder of the cone problems that were not solved
 DERIVED = ("state.h5", "records.csv", "summary.json", "analysis.csv")
@@ -65,7 +65,7 @@ LINKS = (
 )
 
 
-class FolderError(RuntimeError):
+class FolderError(FileError):
     """The folder lacks data that a program needs; the message names the folder and says what to do."""
 
 
@@ -378,24 +378,19 @@ class Place:
         """``restart`` and ``overwrite`` are the values of the options; collective. FileError on all ranks if another
         run is writing to the folder, or has written there since the options were read."""
         self.folder, self._comm, self._lock = folder, comm, Lock(folder)
-        self.goes_on, replaces, refused = False, False, ""
-        hidden = folder / ".new"
-        if comm.rank == 0:
-            with told(folder):
-                folder.mkdir(parents=True, exist_ok=True)
-            if self._lock.take():
-                refused = refusal(folder, restart, overwrite)
-            else:
-                refused = f"-output {folder}: another run is writing there; allowed is another folder"
-            self.goes_on = _goes_on(folder, restart)
-            replaces = not self.goes_on and bool(_held(folder))
-            if not refused:
-                shutil.rmtree(hidden, ignore_errors=True)  # of a run that ended before its first step stood
-        self.goes_on, replaces, refused = comm.bcast((self.goes_on, replaces, refused))
-        self.now = hidden if replaces else folder
-        if refused:
-            self.leave()
-            raise FileError(refused)
+
+        def begin() -> tuple[bool, Path]:
+            folder.mkdir(parents=True, exist_ok=True)
+            if not self._lock.take():
+                raise FileError(f"-output {folder}: another run is writing there; allowed is another folder")
+            if refused := refusal(folder, restart, overwrite):
+                self.leave()
+                raise FileError(refused)
+            shutil.rmtree(folder / ".new", ignore_errors=True)  # of a run that ended before its first step stood
+            goes_on = _goes_on(folder, restart)
+            return goes_on, folder / ".new" if _held(folder) and not goes_on else folder
+
+        self.goes_on, self.now = on_first(comm, folder, begin)
 
     def leave(self) -> None:
         """Let other runs have the folder."""
@@ -403,24 +398,22 @@ class Place:
 
     def make(self, name: str = ".") -> None:
         """Make the folder, or one within it; collective."""
-        if self._comm.rank == 0:
-            with told(self.folder):
-                (self.now / name).mkdir(parents=True, exist_ok=True)
-        self._comm.Barrier()
+        on_first(self._comm, self.folder, lambda: (self.now / name).mkdir(parents=True, exist_ok=True))
 
     def take(self) -> None:
         """Put what was written in the place of the earlier run; collective."""
         now, self.now = self.now, self.folder
-        if now != self.folder and self._comm.rank == 0:
-            with told(self.folder):
-                old = now / ".old"
-                old.mkdir()
-                for name in FILES:  # renames come first: a kill between two of them would leave parts of both runs
-                    for source, target in ((self.folder / name, old / name), (now / name, self.folder / name)):
-                        if source.exists():
-                            os.replace(source, target)
-                shutil.rmtree(now)
-        self._comm.Barrier()
+
+        def replace() -> None:
+            (now / ".old").mkdir()
+            for name in FILES:  # renames come first: a kill between two of them would leave parts of both runs
+                for source, target in ((self.folder / name, now / ".old" / name), (now / name, self.folder / name)):
+                    if source.exists():
+                        os.replace(source, target)
+            shutil.rmtree(now)
+
+        if now != self.folder:
+            on_first(self._comm, self.folder, replace)
 
 
 class Writer:
@@ -446,11 +439,7 @@ class Writer:
         smallest = float(bodies.least_half_thickness(world.grains).min(initial=np.inf))
         radius = self.comm.allreduce(smallest, MPI.MIN)
         self._about = {**about, "bodies": world.body_count, "ranks": self.comm.size, "smallest_radius [m]": radius}
-        if self.comm.rank == 0:
-            try:
-                sum(1 for _ in self._kept())
-            except (OSError, LookupError, TypeError, ValueError) as error:
-                raise FileError(f"{place.now}/steps.jsonl: cannot be continued ({error})", one_rank=True) from None
+        on_first(self.comm, self._lines, lambda: sum(1 for _ in self._kept()))  # which can be gone on with
 
     @property
     def checkpoint(self) -> Path:
@@ -461,10 +450,19 @@ class Writer:
         """What is written so far; on rank 0."""
         return Folder(self.place.now)
 
+    @property
+    def _lines(self) -> Path:
+        return self.place.now / "steps.jsonl"
+
     def _kept(self) -> Iterator[str]:
-        """The lines of the steps that stay of an earlier run."""
-        lines = disk.lines(self.place.now / "steps.jsonl")
-        return (line for line in lines if int(json.loads(line)["step"]) <= self._kept_steps)
+        """The lines of the steps that stay of an earlier run; FileError if one is damaged."""
+        for line in disk.lines(self._lines):
+            try:
+                step = json.loads(line)["step"]
+            except (LookupError, TypeError, ValueError) as error:
+                raise FileError(f"{self._lines}: cannot be continued ({error})") from None
+            if step <= self._kept_steps:
+                yield line
 
     def record(self, step: Step, row: Mapping[str, float]) -> None:
         """Write the frame of a step, with the row of its records, if that is due."""
@@ -474,28 +472,23 @@ class Writer:
     def add(self, line: Mapping[str, Any], row: Mapping[str, float]) -> None:
         """Write the figures of a step with the row of its records, and the checkpoint if that is due."""
         self.place.make()
-        if self.comm.rank == 0:
-            self._add(dumps({**line, "record": row}))
+        on_first(self.comm, self._lines, lambda: self._add(dumps({**line, "record": row})))
         # after the figures: a run that goes on from the checkpoint must find the step
         if (self._world.step - self._start) % self._checkpoint_every == 0:
             self._checkpoint()
         if not self._stands:
             self.place.take()
-            if self.comm.rank == 0:
-                with told(self.place.folder):
-                    self._remove_later(Path(line["hard_problem"]).name)
+            on_first(self.comm, self.place.folder, lambda: self._remove_later(Path(line["hard_problem"]).name))
             self._stands = True
         self.analysis = None
 
     def _add(self, line: str) -> None:
         """The first line replaces the file, with the lines that stay; every other one is a single write."""
-        path = self.place.now / "steps.jsonl"
         if self._begun:
-            with told(path):
-                disk.append(path, line)
+            disk.append(self._lines, line)
             return
         write_text(self.place.now / "settings.json", dumps(self._about, indent=1) + "\n")
-        with told(path), disk.whole(path) as temporary, open(temporary, "w") as file:
+        with disk.whole(self._lines) as temporary, open(temporary, "w") as file:
             file.writelines(f"{text}\n" for text in chain(self._kept(), [line]))
         self._begun = True
 
@@ -527,14 +520,14 @@ class Writer:
         return figures
 
     def _derive(self) -> None:
-        if self.comm.rank == 0:
-            self.folder.derive(analysis=self.analysis or {}, compare=self._compare())
+        more = {"analysis": self.analysis or {}, "compare": self._compare()}
+        on_first(self.comm, self.place.now, lambda: self.folder.derive(**more))
 
     def leave(self) -> None:
         """Let other runs have the folder. A run that an error ends writes what follows from its files."""
         if self.comm.rank == 0 and self._stands and not (self.place.now / "summary.json").exists():
-            with suppress(FileError, FolderError):
-                self._derive()
+            with suppress(FileError):  # which has said so already
+                self.folder.derive(compare=self._compare())
         self.place.leave()
 
     def _checkpoint(self) -> None:

@@ -13,7 +13,7 @@ from pctt.ccp import fclib
 from pctt.ccp.cone import Array
 from pctt.ccp.fclib import FileFormatError, Stored
 from pctt.compiled import tell_first_compilation
-from pctt.disk import FileError, write_text
+from pctt.disk import FileError, on_first, write_text
 from pctt.folder import Place, dumps
 from pctt.run import interrupt, leftovers, report
 from pctt.run.settings import DEMO, Options
@@ -135,8 +135,8 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
     place = Place(Path(options.run.output), comm, overwrite=options.run.overwrite)
     try:
         place.make()
-        if comm.rank == 0:
-            write_text(place.now / "summary.json", dumps(summary, indent=1) + "\n")
+        path = place.now / "summary.json"
+        on_first(comm, path, lambda: write_text(path, dumps(summary, indent=1) + "\n"))
         place.take()
     finally:
         place.leave()

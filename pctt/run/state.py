@@ -28,7 +28,7 @@ from dem.scene import LargeBody, Scene
 from dem.start import even_slice, new_world, restart_rows, restored_world
 from dem.together import together
 from dem.world import World
-from pctt.disk import FileError, Lock, read, texts, told, write_rows
+from pctt.disk import FileError, Lock, on_first, read, texts, write_rows
 from pctt.options import OptionError
 from pctt.petsc import warn
 from pctt.run import interrupt
@@ -213,9 +213,7 @@ def settled_state(
     path = settled_path(experiment, settings, made_with)
     if not anew and comm.bcast(path.exists()):
         return path
-    if comm.rank == 0:
-        with told(path.parent):
-            path.parent.mkdir(parents=True, exist_ok=True)
+    on_first(comm, path.parent, lambda: path.parent.mkdir(parents=True, exist_ok=True))
     with _alone(path, comm, say):
         if anew or not comm.bcast(path.exists()):
             _settle(path, made_with, experiment, settings, scene, comm, say)
