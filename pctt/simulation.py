@@ -39,7 +39,7 @@ from pctt.disk import refuse_serial
 from pctt.folder import Contacts, FolderError, Frame, Place, Snapshot, Writer, described_bodies
 from pctt.options import AT_LEAST_ONE, COUNT, OptionError, made
 from pctt.render import Picture, picture
-from pctt.run import report, state
+from pctt.run import state
 from pctt.run.dump import Dump
 from pctt.run.options import refuse_unwritable
 from pctt.run.settings import Settings, scene_name
@@ -327,11 +327,10 @@ class Simulation:
     # -- pictures --------------------------------------------------------------------------------------------
 
     def __repr__(self) -> str:
-        law = report.law(bool(self.settings.coulomb))
-        return (
-            f"<Simulation of {scene_name(self.experiment)}: {self.world.body_count} bodies on {self.comm.size} ranks, "
-            f"step {self.steps}, time {self.time:g} s, {self.settings.solver} to {self.settings.tol:g}, {law}>"
-        )
+        settings, bodies = self.settings, f"{self.world.body_count} bodies on {self.comm.size} ranks"
+        method = f"{settings.solver} to {settings.tol:g}, {settings.law}"
+        name = scene_name(self.experiment)
+        return f"<Simulation of {name}: {bodies}, step {self.steps}, time {self.time:g} s, {method}>"
 
     def _repr_html_(self) -> str:
         """The figures of the last step as a table, for notebooks."""

@@ -14,26 +14,17 @@ from typing import Any
 from mpi4py import MPI
 
 from pctt.ccp.result import FIXED_POINT, RELAXATION
+from pctt.folder import totals
 
-#: Coulomb residuals of the relaxation above this are worth a warning.
-LARGE_OPENING = 1e-3
-#: Work of closing contacts above this part of the impulses' energy is worth a warning.
-LARGE_CLOSING_WORK = 0.05
-#: Overlaps above this part of the radius of the smallest grain are worth a warning.
-LARGE_OVERLAP = 0.05
+#: What is worth a warning: Coulomb residuals of the relaxation above the first, closing work above the second part of
+#: the impulses' energy, overlaps above the third of the radius of the smallest grain.
+LARGE_OPENING, LARGE_CLOSING_WORK, LARGE_OVERLAP = 1e-3, 0.05, 0.05
 
-
-def law(coulomb: bool) -> str:
-    """Which law of contact a run obeys."""
-    return "Coulomb's law" if coulomb else "relaxation of Coulomb's law"
-
-
-def loose_line(tol: float) -> str:
-    """A warning for a first-order method at a tolerance above the default."""
-    return (
-        f"WARNING: -ccp_tol {tol:g}: above 1e-4 first-order methods leave overlaps of millimetres; as these are pushed "
-        "apart, a packing may not come to rest"
-    )
+#: What a first-order method is warned of at a tolerance above the default.
+LOOSE = (
+    "above 1e-4 first-order methods leave overlaps of millimetres; as these are pushed apart, a packing may not come "
+    "to rest"
+)
 
 
 def residual(line: Mapping[str, Any]) -> float:
@@ -125,26 +116,22 @@ def compare_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
 
 def phase_table(steps: Sequence[Mapping[str, Any]]) -> str:
     """Seconds of each phase over the run and in a median step, and what the steps came to."""
-    names = list(dict.fromkeys(name for line in steps for name in line["phases"]))
-    columns = {name: [line["phases"].get(name, 0.0) for line in steps] for name in names}
-    columns["total"] = [line["seconds"] for line in steps]
-    whole = sum(columns["total"]) or 1.0
+    run = totals(steps)
+    names, whole = [*run["phases"], "total"], run["seconds"] or 1.0
+    columns = [[line["phases"].get(name, 0.0) for line in steps] for name in run["phases"]]
+    columns.append([line["seconds"] for line in steps])
     head = f"{'phase':14}  seconds   share  median step s"
     rows = [
         f"{name:14} {sum(column):8.2f} {sum(column) / whole:7.1%} {median(column):14.3f}"
-        for name, column in columns.items()
+        for name, column in zip(names, columns)
     ]
-    contacts = [line["contacts"] for line in steps]
-    failed = sum(not line["converged"] for line in steps)
-    figures = [
-        f"{len(steps)} steps",
-        f"{min(contacts)} to {max(contacts)} contacts",
-        f"{sum(line['newton_its'] for line in steps)} Newton steps",
-        f"{sum(line['ksp_its'] for line in steps)} Krylov iterations",
-        f"worst residual {max(map(residual, steps)):.1e}",
-        f"{failed} NOT CONVERGED" if failed else "all converged",
-    ]
-    return "\n".join([head, "-" * len(head), *rows, ", ".join(figures)])
+    failed, (least, most) = run["not_converged"], run["contacts"]
+    figures = (
+        f"{run['steps']} steps, {least} to {most} contacts, {run['newton_its']} Newton steps, {run['ksp_its']} Krylov"
+        f" iterations, worst residual {max(map(residual, steps)):.1e}, "
+        + (f"{failed} NOT CONVERGED" if failed else "all converged")
+    )
+    return "\n".join([head, "-" * len(head), *rows, figures])
 
 
 def law_line(steps: Sequence[Mapping[str, Any]], tol: float) -> str:

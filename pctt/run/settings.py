@@ -80,6 +80,11 @@ class Settings(ccp.Limits):
         """When the solver stops."""
         return ccp.Limits(**{field.name: getattr(self, field.name) for field in dataclasses.fields(ccp.Limits)})
 
+    @property
+    def law(self) -> str:
+        """Which law of contact steps obey, in words."""
+        return "Coulomb's law" if self.coulomb else "relaxation of Coulomb's law"
+
     def of(self, scene: Experiment) -> Settings:
         """The same, with what a scene and a solver have of their own where nothing is given; then ``options`` is an
         instance, and ``coulomb`` one or False. OptionError for a bad value."""

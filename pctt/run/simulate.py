@@ -51,10 +51,10 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     assert newton is not None
     assert output is not None
     end = sim.steps + options.run.steps
-    method = f"{settings.solver} to {settings.tol:g}, {report.law(bool(settings.coulomb))}"
+    method = f"{settings.solver} to {settings.tol:g}, {settings.law}"
     progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {method}")
     if ccp.SOLVERS[settings.solver].needs != ccp.NEWTON and settings.tol > ccp.Limits().tol:
-        progress.say(report.loose_line(settings.tol))
+        progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE}")
     if ccp.SOLVERS[settings.solver].newton:
         progress.say(f"Newton systems: {newton.words()}")
     if options.run.steps:
@@ -113,7 +113,10 @@ def _how_to_go_on(options: Options, state: Path, steps: int) -> str:
 
 def solve_file(options: Options, comm: MPI.Comm) -> None:
     """Solve, print the figures, and write them to summary.json in the output folder."""
-    stored = _load(options.run.problem, comm, options.settings.compliance)
+    try:
+        stored = fclib.load(options.run.problem, comm, options.settings.compliance)
+    except FileFormatError as error:
+        raise FileError(str(error)) from None
     compare = ccp.Comparison(comm, options.run.compared(), options.run.compare_every)
     with stored.problem:
         summary = _solve(stored, options, compare)
@@ -191,15 +194,6 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
             name: {**figures, "solves": solves[name]} for name, figures in compare.summary().items()
         },
     }
-
-
-def _load(path: str, comm: MPI.Comm, compliance: float | None) -> Stored:
-    """The problem in a file, with another compliance if one is given. FileError on all ranks if the file holds no
-    problem."""
-    try:
-        return fclib.load(path, comm, compliance)
-    except FileFormatError as error:
-        raise FileError(str(error)) from None
 
 
 def _distance(problem: ccp.ConeProblem, impulse: Array, reference: Array) -> dict[str, Any]:

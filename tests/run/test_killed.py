@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from program import SETTLED, SMALL, arrays, assert_same_bits, command, environment, recorded_steps, steps_of
+from program import SETTLED, SMALL, arrays, assert_same_bits, command, environment, steps_of
 
 from pctt.folder import Folder
 
@@ -124,20 +124,3 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(ranks, kills, program, 
         for field in ("natural_residual", "objective"):  # sums that no step rests on: equal but for rounding
             assert one[field] == pytest.approx(two[field], rel=1e-9)
     assert len(lines[0]) == len(lines[1]) == STEPS
-
-
-def test_a_checkpoint_that_lies_behind_makes_the_steps_anew(program, settled, tmp_path):
-    """What a run killed between two checkpoints leaves: records of steps that are made again."""
-    options = (*OPTIONS, "-output", "out")
-    program(*SETTLED, *options, "-steps", 3)
-    behind = (tmp_path / "out" / "checkpoint.h5").read_bytes()
-    program(*SMALL, *options, "-restart", "out/checkpoint.h5", "-steps", 4)
-    whole = arrays(tmp_path / "out" / "state.h5")
-    (tmp_path / "out" / "checkpoint.h5").write_bytes(behind)
-    program(*SMALL, *options, "-restart", "out/checkpoint.h5", "-steps", 2)
-    again = arrays(tmp_path / "out" / "state.h5")
-    assert len(recorded_steps(whole)) == 7
-    assert len(recorded_steps(again)) == 5
-    for name, array in again.items():
-        assert array.tobytes() == whole[name].tobytes()
-    assert len(steps_of(tmp_path / "out")) == 5

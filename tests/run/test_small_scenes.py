@@ -105,20 +105,6 @@ def test_a_body_that_is_lost_ends_the_run():
         sim.step()
 
 
-def test_a_body_that_is_lost_within_a_step_ends_the_run_too(monkeypatch):
-    """The search at the end of a step, which turns bodies, may be the first to see it."""
-    scene = Scene(0.3)
-    scene.add_spheres([0, 0, 0], 0.1, 1000.0)
-    sim = simulation_of(scene)
-
-    def lost(*arguments):
-        raise FloatingPointError("no finite position")
-
-    monkeypatch.setattr("pctt.run.stepper.find_turned", lost)
-    with pytest.raises(SceneError, match="step 1: no finite position"):
-        sim.step()
-
-
 @pytest.mark.filterwarnings("ignore:invalid value")
 def test_a_start_at_a_speed_whose_square_overflows_is_refused():
     scene = Scene(0.3)
