@@ -249,7 +249,7 @@ class Folder:
     def records(self) -> dict[str, np.ndarray]:
         """Columns of the records by their heads, such as ``force_blade_x [N]``, an entry per step; NaN where a step has
         no number."""
-        return _columns([line["record"] for line in self.lines() if line.get("record")])
+        return _records(self.lines())
 
     def analysis(self) -> dict[str, np.ndarray]:
         """Columns of analysis.csv by their heads; empty if the scene made none, or not of all these records."""
@@ -289,7 +289,7 @@ class Folder:
         ``more`` goes to the summary."""
         lines = self.lines()
         if lines:
-            _write_table(self.path / "records.csv", self.records())
+            _write_table(self.path / "records.csv", _records(lines))
         write_text(self.path / "summary.json", dumps(self._summary(lines, **more), indent=1) + "\n")
         if self.steps:
             self._link()
@@ -307,6 +307,10 @@ class Folder:
                 file["bodies"] = h5py.ExternalLink("frames/bodies.h5", "/")
                 for step in self.steps:
                     file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
+
+
+def _records(lines: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    return _columns([line["record"] for line in lines if line.get("record")])
 
 
 def _columns(rows: Sequence[Mapping[str, float | None]]) -> dict[str, np.ndarray]:
@@ -434,7 +438,7 @@ class Writer:
         self._start = self._recorded = self._saved = world.step
         self._kept_steps = world.step if place.goes_on else 0
         self._first_frame: int | None = None
-        self._begun = self._stands = False
+        self._begun = self._stands = self._stale = False
         self.analysis: dict[str, float] | None = None  #: the scene's numbers of all steps so far
         smallest = float(bodies.least_half_thickness(world.grains).min(initial=np.inf))
         radius = self.comm.allreduce(smallest, MPI.MIN)
@@ -480,7 +484,7 @@ class Writer:
             self.place.take()
             on_first(self.comm, self.place.folder, lambda: self._remove_later(Path(line["hard_problem"]).name))
             self._stands = True
-        self.analysis = None
+        self.analysis, self._stale = None, True
 
     def _add(self, line: str) -> None:
         """The first line replaces the file, with the lines that stay; every other one is a single write."""
@@ -498,7 +502,8 @@ class Writer:
             self._record(step, row)
         if self._saved < self._world.step:
             self._checkpoint()
-        self._derive()
+        if self._stale:
+            self._derive()
 
     def analyse(self, scene: Experiment) -> dict[str, float]:
         """The numbers that the scene finds in the records, which also go to summary.json; SceneError if it fails."""
@@ -522,10 +527,11 @@ class Writer:
     def _derive(self) -> None:
         more = {"analysis": self.analysis or {}, "compare": self._compare()}
         on_first(self.comm, self.place.now, lambda: self.folder.derive(**more))
+        self._stale = False
 
     def leave(self) -> None:
         """Let other runs have the folder. A run that an error ends writes what follows from its files."""
-        if self.comm.rank == 0 and self._stands and not (self.place.now / "summary.json").exists():
+        if self.comm.rank == 0 and self._stands and self._stale:
             with suppress(FileError):  # which has said so already
                 self.folder.derive(compare=self._compare())
         self.place.leave()

@@ -37,12 +37,12 @@ from dem.together import meet, together
 from pctt import ccp, log
 from pctt.disk import refuse_serial
 from pctt.folder import Contacts, FolderError, Frame, Place, Snapshot, Writer, described_bodies
-from pctt.options import AT_LEAST_ONE, COUNT, OptionError, made
+from pctt.options import OptionError, made, refuse_bad
 from pctt.render import Picture, picture
 from pctt.run import state
 from pctt.run.dump import Dump
 from pctt.run.options import refuse_unwritable
-from pctt.run.settings import Settings, scene_name
+from pctt.run.settings import Run, Settings, scene_name
 from pctt.run.stepper import Stepper
 
 
@@ -154,8 +154,8 @@ class Simulation:
         whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`."""
         if until is steps is stop is None:
             raise OptionError("run: without an end; allowed are until, steps and stop")
-        _check("every", every, AT_LEAST_ONE)
-        left = math.inf if steps is None else _check("steps", steps, COUNT)
+        refuse_bad(Run(steps=steps or 0))
+        left = math.inf if steps is None else steps
         if until is not None:
             left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
         first, end, ends = self.steps, self.steps + left, False
@@ -285,10 +285,7 @@ class Simulation:
         """
         if self.output is not None:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
-        for name, value, check in (
-            ("every", every, COUNT), ("checkpoint_every", checkpoint_every, AT_LEAST_ONE), ("hard", hard, COUNT)
-        ):  # fmt: skip
-            _check(name, value, check)
+        refuse_bad(Run(output_every=every, checkpoint_every=checkpoint_every))
         refuse_serial(self.comm)
         for name, path in {"write": folder, "problems": problems}.items():
             if path:
@@ -435,10 +432,3 @@ class BodyMotion:
 
     def __repr__(self) -> str:
         return repr(self._body._large.motion)
-
-
-def _check(name: str, value: Any, check: tuple[str, Callable[[Any], bool]]) -> int:
-    """The value; OptionError if it is no whole number, or fails the check."""
-    if not isinstance(value, (int, np.integer)) or not check[1](value):
-        raise OptionError(f"{name} {value!r}: allowed is {check[0]}")
-    return int(value)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 
 import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import SETTLED, SMALL, steps_of, table
+from program import SETTLED, steps_of, table
 
 from dem.scenes import Shear
 from pctt.simulation import Simulation
@@ -35,23 +34,6 @@ def test_a_row_per_step_that_state_and_summary_know_too(program, settled, tmp_pa
     carried = -(rows["force_box_z [N]"] + rows["force_mixer_z [N]"])
     np.testing.assert_allclose(carried.mean(), weight, rtol=0.1)  # settled, and stirred slowly
     assert (rows["grains_outside"] == 0).all()
-
-
-def test_rows_after_the_step_of_a_restart_are_made_anew(program, settled, tmp_path):
-    output = tmp_path / "results"
-    program(*SETTLED, *APGD, "-steps", 2)
-    shutil.copy(output / "checkpoint.h5", tmp_path / "early.h5")
-    again = (*SMALL, *APGD, "-restart", "results/checkpoint.h5")
-    program(*again, "-steps", 2)
-    whole = (output / "records.csv").read_text()
-    assert len(whole.splitlines()) == 1 + 4
-    shutil.copy(tmp_path / "early.h5", output / "checkpoint.h5")
-    program(*again, "-steps", 1)
-    assert (output / "records.csv").read_text().splitlines() == whole.splitlines()[:-1]
-    program(*again, "-steps", 1)
-    assert (output / "records.csv").read_text() == whole
-    program(*SETTLED, *APGD, "-steps", 1, "-overwrite")  # not a continuation
-    assert (output / "records.csv").read_text().splitlines() == whole.splitlines()[:2]
 
 
 def test_the_series_of_the_analysis_go_to_a_file(program, tmp_path):

@@ -126,16 +126,3 @@ def test_faults_of_a_scene_end_the_run(message, tmp_path, monkeypatch):
     words = {"scene": "mine.py", **how}
     with pytest.raises((OptionError, SceneError), match=re.escape(message)):
         simulate(read_options(words, MPI.COMM_SELF), MPI.COMM_SELF)
-
-
-def test_a_scene_without_large_bodies_and_analysis_runs(program, tmp_path):
-    """One sphere in free fall: energies as in the formula for the semi-implicit step."""
-    (tmp_path / "mine.py").write_text(GOOD)
-    program("-scene", "mine.py", *LOOSE, "-steps", 3, "-scene_height", 2.0)
-    rows = table(tmp_path / "results" / "records.csv")
-    assert list(rows)[:2] == ["step", "time [s]"]
-    mass, k = 1000.0 * 4 / 3 * np.pi * 0.1**3, np.arange(1, 4)
-    np.testing.assert_allclose(rows["kinetic_energy [J]"], 0.5 * mass * (9.81 * 0.01 * k) ** 2, rtol=1e-12)
-    height = 2.0 - 9.81 * 0.01**2 * k * (k + 1) / 2
-    np.testing.assert_allclose(rows["potential_energy [J]"], mass * 9.81 * height, rtol=1e-12)
-    assert not (tmp_path / "results" / "analysis.csv").exists()

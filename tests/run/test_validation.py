@@ -91,21 +91,3 @@ def test_a_wedge_has_its_angle(laws, monkeypatch):
     assert found.x == pytest.approx(0.015 + 0.01 * np.arange(11))
     assert found.height == pytest.approx(0.01 + found.x * np.tan(np.radians(25.0)), rel=0.1)
     assert found.moving == pytest.approx(0.1, abs=0.001)
-
-
-def test_the_table_gives_errors_of_means(laws):
-    from validate import table
-    from validation.rows import above, band
-
-    rows = [
-        above("heap", "growth", 0.0, 3.0, 1.0, "", "degrees"),
-        above("heap", "growth", 0.0, 1.0, 1.0, "", "degrees"),
-        band("heap", "angle", 20.0, 30.0, 25.0, "", "degrees", 0.5),
-        band("silo", "k", 1.0, 2.0, 3.0, "", ""),
-    ]
-    assert table(rows).splitlines()[2:] == [
-        "| heap | growth | above 0 degrees | 3 +- 1 degrees | +3 errors |  |",
-        "| heap | growth | above 0 degrees | 1 +- 1 degrees | **+1 errors** |  |",
-        "| heap | angle | [20, 30] degrees | 25 +- 0.5 degrees | inside |  |",
-        "| silo | k | [1, 2] | 3 | **+50 %** |  |",
-    ]
