@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from program import SETTLED, SMALL, arrays, assert_same_bits, command, environment, steps_of
+from program import SETTLED, SMALL, arrays, assert_same_bits, command, environment, recorded_steps, steps_of, table
 
 from pctt.folder import Folder
 
@@ -82,8 +82,9 @@ def check_files(folder):
         assert steps == list(range(steps[0], steps[-1] + 1))
         assert steps[0] <= step <= steps[-1]
     assert found.summary["steps"] == len(noted)
-    if (folder / "state.h5").exists():  # no link without its file
-        assert arrays(folder / "state.h5")
+    found.derive()  # what a run would write at its end
+    assert [int(name) for name in recorded_steps(arrays(folder / "state.h5"))] == found.steps
+    assert table(folder / "records.csv")["step"].tolist() == noted
     return step
 
 
