@@ -1,21 +1,34 @@
-"""Files that are whole at any moment: for a reader, after SIGKILL and on a full disk."""
+"""Files that are whole at any moment: for a reader, after SIGKILL and on a full disk; and HDF5 files whose rows are
+spread over the ranks, with a checksum each."""
 
 from __future__ import annotations
 
 import errno
 import fcntl
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any, TypeVar
 
 import h5py
+import numpy as np
+from mpi4py import MPI
+
+from pctt.options import OptionError
+
+Found = TypeVar("Found")
 
 #: Bytes for HDF5 beside the numbers: per file, and per data set or attribute. HDF5 was seen to use a quarter of them.
 PER_FILE, PER_ITEM = 16384, 2048
 
-#: The files of a run in its folder.
-RUN_FILES = ("state.h5", "records.csv", "steps.jsonl", "analysis.csv", "summary.json", "checkpoint.h5")
+#: The last bytes of a file of `written` are this word and its checksum. HDF5 does not see them.
+SEAL = b"pctt sum"
+
+
+class FileError(RuntimeError):
+    """A file that cannot be read or written; raised on all ranks alike."""
 
 
 def temporary_name(path: Path) -> Path:
@@ -32,49 +45,32 @@ def whole(path: Path) -> Iterator[Path]:
     temporary = temporary_name(path)
     try:
         yield temporary
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        _replace(path)
     finally:
         with suppress(OSError):
             temporary.unlink()
 
 
-class Lock:
-    """The lock of a folder, or of a file that is made for it. One process has it at a time, until it releases it or
-    ends. On a file system without locks every process has it."""
+def _replace(path: Path) -> None:
+    temporary = temporary_name(path)
+    with open(temporary, "rb") as file:
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
 
-    def __init__(self, path: Path):
-        self._path, self._file = path, -1
 
-    def take(self) -> bool:
-        """Whether this process has the lock from now on."""
-        try:
-            self._file = os.open(self._path, os.O_RDONLY if self._path.is_dir() else os.O_RDWR | os.O_CREAT, 0o666)
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if self._path.exists() and os.path.samestat(os.fstat(self._file), os.stat(self._path)):
-                return True
-        except BlockingIOError:
-            pass
-        except OSError:
-            return True
-        self._close()  # another process has it, or has removed the file
-        return False
+@contextmanager
+def told(path: Path) -> Iterator[None]:
+    """FileError for an OSError of the block, which writes ``path``."""
+    try:
+        yield
+    except OSError as error:
+        raise FileError(f"{path}: cannot write ({error.strerror or error})") from error
 
-    def release(self) -> None:
-        """Let others have the lock that this process has, and remove the file that was made for it."""
-        if self._file >= 0 and self._path.is_file():
-            with suppress(OSError):
-                self._path.unlink()
-        self._close()
 
-    def __del__(self) -> None:
-        self._close()
-
-    def _close(self) -> None:
-        if self._file >= 0:
-            os.close(self._file)
-        self._file = -1
+def write_text(path: Path, text: str) -> None:
+    """Replace a text file at one stroke; FileError if that fails."""
+    with told(path), whole(path) as temporary:
+        temporary.write_text(text)
 
 
 def append(path: Path, line: str) -> None:
@@ -102,6 +98,51 @@ def lines(path: Path) -> Iterator[str]:
                     yield line[:-1]
 
 
+class Lock:
+    """The lock of a folder or a file. One process has it at a time, until it releases it or ends. On a file system
+    without locks every process has it."""
+
+    def __init__(self, path: Path):
+        self._path, self._file = path, -1
+
+    def take(self) -> bool:
+        """Whether this process has the lock from now on; makes the file if there is none."""
+        try:
+            self._file = os.open(self._path, os.O_RDONLY if self._path.is_dir() else os.O_RDWR | os.O_CREAT, 0o666)
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.release()
+            return False
+        except OSError:
+            pass
+        return True
+
+    def release(self) -> None:
+        """Let others have the lock."""
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = -1
+
+    def __del__(self) -> None:
+        self.release()
+
+
+def on_first(comm: MPI.Comm, path: Path, call: Callable[[], Found]) -> Found:
+    """What the call, which writes ``path``, returns on the first rank; collective. FileError on all ranks if it raises
+    one, or an OSError."""
+    found, failure = None, ""
+    if comm.rank == 0:
+        try:
+            with told(path):
+                found = call()
+        except FileError as error:
+            failure = str(error)
+    found, failure = comm.bcast((found, failure))
+    if failure:
+        raise FileError(failure)
+    return found  # type: ignore[return-value]
+
+
 def make_hdf5(path: Path, numbers: int, items: int) -> None:
     """Make an empty HDF5 file and reserve room on the disk for ``numbers`` bytes in ``items`` data sets and attributes.
 
@@ -122,5 +163,140 @@ def _take_room(path: Path, size: int) -> None:
         try:
             os.posix_fallocate(file.fileno(), 0, size)
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # the file system cannot reserve
+            if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP, errno.EBADF):  # the file system cannot reserve
                 raise
+
+
+# -- rows of all ranks ---------------------------------------------------------------------------------------
+
+
+def refuse_serial(comm: MPI.Comm) -> None:
+    """OptionError if h5py cannot write from all ranks."""
+    if comm.size > 1 and not h5py.get_config().mpi:
+        raise OptionError(f"mpiexec -n {comm.size}: this h5py was built without MPI; allowed is 1 rank")
+
+
+def checksum(path: Path, size: int, comm: MPI.Comm) -> int:
+    """The checksum modulo 2^64 of the first ``size`` bytes of a file, of which each rank reads a part; collective.
+
+    It is the sum of (2 i + 1) u_i over the numbers u_i of eight bytes. The factors are odd, so that one flipped bit
+    always changes the sum."""
+    count, chunk, total = -(-size // 8), 1 << 20, np.zeros(1, np.uint64)
+    first, last = count * comm.rank // comm.size, count * (comm.rank + 1) // comm.size
+    with open(path, "rb") as file:
+        file.seek(8 * first)
+        for start in range(first, last, chunk):
+            data = file.read(min(8 * min(start + chunk, last), size) - 8 * start)
+            words = np.frombuffer(data + bytes(-len(data) % 8), "<u8")
+            total += np.dot(words, np.arange(2 * start + 1, 2 * (start + len(words)) + 1, 2, dtype=np.uint64))
+    return int(comm.allreduce(total)[0])
+
+
+def texts(words: Sequence[str]) -> np.ndarray:
+    """Words (n,) in UTF-8, for a data set."""
+    encoded = [word.encode() for word in words]
+    width = max(map(len, encoded), default=1) or 1
+    return np.array(encoded, dtype=h5py.string_dtype("utf-8", width))
+
+
+def write_rows(
+    path: Path, comm: MPI.Comm, rows: Mapping[str, np.ndarray], shared: Mapping[str, Any],
+    attributes: Mapping[str, Mapping[str, Any]],
+) -> None:  # fmt: skip
+    """Write an HDF5 file with its checksum; collective. Data sets of ``rows`` are concatenated over the ranks, those
+    that are ``shared`` and the attributes of groups ("/": the file) are the same on each.
+
+    Raises FileError on all ranks if the file cannot be written; an earlier file under ``path`` then stays as it is. If
+    one of several ranks fails while all are writing, it prints a message and ends them all.
+    """
+    what, temporary, first = f"{path}: cannot write", temporary_name(path), comm.rank == 0
+    own = comm.allreduce(sum(array.nbytes for array in rows.values()))
+    same = [np.asarray(value) for values in (shared, *attributes.values()) for value in values.values()]
+    numbers, items = own + sum(array.nbytes for array in same), len(rows) + len(same)
+    parallel = {"driver": "mpio", "comm": comm} if comm.size > 1 else {}
+    try:
+        _together(what, comm, lambda: make_hdf5(temporary, numbers, items) if first else None)
+        file = _together(what, comm, lambda: h5py.File(temporary, "r+", **parallel))
+        failure = None
+        try:
+            _fill(file, comm, rows, shared, attributes)
+            file.close()
+        except (OSError, RuntimeError) as error:  # h5py raises both
+            failure = error
+            if comm.size > 1:  # the other ranks may be within a call that waits for this one
+                sys.stderr.write(f"pctt.run: {what} ({error})\n")
+                sys.stderr.flush()
+                comm.Abort(2)
+            with suppress(OSError, RuntimeError):
+                file.close()
+        if failure:
+            raise FileError(f"{what} ({failure})")
+        size = comm.bcast(os.path.getsize(temporary) if first else 0)
+        seal = SEAL + checksum(temporary, size, comm).to_bytes(8, "little")
+        _together(what, comm, lambda: _finish(path, seal) if first else None)
+    finally:
+        if first:
+            with suppress(OSError):
+                temporary.unlink()
+
+
+def _fill(
+    file: h5py.File, comm: MPI.Comm, rows: Mapping[str, np.ndarray], shared: Mapping[str, Any],
+    attributes: Mapping[str, Mapping[str, Any]],
+) -> None:  # fmt: skip
+    for name, local in rows.items():
+        ends = np.cumsum(comm.allgather(len(local)))
+        data = file.create_dataset(name, (int(ends[-1]), *local.shape[1:]), local.dtype)
+        if len(local):
+            end = int(ends[comm.rank])
+            data[end - len(local) : end] = local
+    for name, value in shared.items():
+        array = np.asarray(value)
+        data = file.create_dataset(name, array.shape, array.dtype)
+        if comm.rank == 0:
+            data[...] = array
+    for name, values in attributes.items():
+        file.require_group(name).attrs.update(values)
+
+
+def _finish(path: Path, seal: bytes) -> None:
+    with open(temporary_name(path), "ab") as file:
+        file.write(seal)
+    _replace(path)
+
+
+def read(path: Path, comm: MPI.Comm, take: Callable[[h5py.File, bool], Found]) -> Found:
+    """What ``take(file, sealed)`` takes of an HDF5 file on every rank, without calls of MPI; collective.
+
+    FileError on all ranks if a rank cannot read it, or if the file is not as it was written. A file that is not
+    ``sealed`` has no checksum, as those of earlier versions and of others."""
+    what = f"{path}: damaged, or no such file of this program"
+
+    def look() -> tuple[int, bytes]:
+        with open(path, "rb") as file:
+            size = file.seek(0, os.SEEK_END) - 16
+            file.seek(max(size, 0))
+            return size, file.read()
+
+    def call() -> Found:
+        with h5py.File(path, "r") as file:
+            return take(file, sealed)
+
+    size, seal = comm.bcast(_together(what, comm, look))
+    sealed = seal.startswith(SEAL)
+    if sealed and checksum(path, size, comm) != int.from_bytes(seal[8:], "little"):
+        raise FileError(f"{what} (it does not agree with its checksum)")
+    return _together(what, comm, call)
+
+
+def _together(what: str, comm: MPI.Comm, call: Callable[[], Found]) -> Found:
+    """What the call returns on this rank; FileError on all ranks if it fails on one: ``what``, and why; collective."""
+    failure = None
+    try:
+        found = call()
+    except (KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
+        failure = getattr(error, "strerror", None) or str(error)
+    failures = [text for text in comm.allgather(failure) if text is not None]
+    if failures:
+        raise FileError(f"{what} ({failures[0]})")
+    return found

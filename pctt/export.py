@@ -21,8 +21,8 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from pctt.disk import RUN_FILES, make_hdf5
-from pctt.look.folder import Folder, FolderError, Frame
+from pctt.disk import make_hdf5
+from pctt.folder import RUN_FILES, Folder, FolderError, Frame
 from pctt.look.program import chosen, made_folder, parser, run, whole
 
 SERIES = ("bodies", "contacts", "large")
@@ -87,6 +87,8 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
         with h5py.File(temporary, "r+") as file:
             source = folder.path / "state.h5"
             try:
+                if not source.exists():  # of a run that goes on, or was killed
+                    folder.derive()
                 with h5py.File(source, "r") as links:
                     file.attrs.update({name: value for name, value in links.attrs.items() if name != "links"})
                 for name, source in parts.items():

@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 from petsc4py import PETSc
 
 _seconds: dict[str, float] = defaultdict(float)
-_watchers: list[Callable[[str], None]] = []
-
-
-def watch(callback: Callable[[str], None]) -> None:
-    """Call ``callback(name)`` at the start of every phase on this rank."""
-    _watchers.append(callback)
 
 
 @contextmanager
 def phase(name: str) -> Iterator[None]:
     """Log a phase as the event ``name``, and add its wall seconds on this rank to the account of ``name``."""
-    for tell in _watchers:
-        tell(name)
     start = time.perf_counter()
     with PETSc.Log.Event(name):
         try:

@@ -28,9 +28,12 @@ def option(
     unit: str = "",
     choices: Iterable[str] | None = None,
     check: tuple[str, Callable[[Any], bool]] | None = None,
+    name: str = "",
 ) -> Any:
-    """A dataclass field that is an option. ``check`` is a pair: the allowed values in words, and a test of a value."""
+    """A dataclass field that is an option. ``check`` is a pair: the allowed values in words, and a test of a value.
+    ``name`` is that of the option, if it is not the prefix of the group and the name of the field."""
     metadata = {"help": help, "unit": unit, "choices": tuple(choices) if choices else None, "check": check}
+    metadata["name"] = name
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -41,6 +44,10 @@ def number(default: Any, why: str) -> Any:
 
 def _of_the_database(group: type) -> list[dataclasses.Field]:
     return [f for f in dataclasses.fields(group) if not f.metadata.get("python_only")]
+
+
+def _name(prefix: str, f: dataclasses.Field) -> str:
+    return f.metadata.get("name") or prefix + f.name
 
 
 POSITIVE = ("a positive number", lambda x: math.isfinite(x) and x > 0)
@@ -72,7 +79,7 @@ def describe(group: type, prefix: str = "") -> list[Description]:
     """The options of a group, in the order of its fields."""
     return [
         Description(
-            prefix + f.name,
+            _name(prefix, f),
             f.default,
             f.metadata.get("unit", ""),
             f.metadata.get("help", ""),  # fields of a user's scene may be plain
@@ -89,9 +96,9 @@ def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "
     """
     types = typing.get_type_hints(group)
     values = {
-        f.name: _value(prefix + f.name, database[prefix + f.name], types[f.name], f.metadata)
+        f.name: _value(_name(prefix, f), database[_name(prefix, f)], types[f.name], f.metadata)
         for f in _of_the_database(group)
-        if prefix + f.name in database
+        if _name(prefix, f) in database
     }
     return group(**values)
 

@@ -7,7 +7,7 @@ from functools import partial
 
 from mpi4py import MPI
 
-from pctt.look.folder import Folder, FolderError
+from pctt.folder import Folder, FolderError
 from pctt.look.program import made_folder, parser, run, whole
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from pctt.look.folder import Folder, Frame
+from pctt.folder import Folder, Frame
 from pctt.look.program import View, checked, chosen, made_folder, parser, run, whole
 from pctt.options import POSITIVE, OptionError, made, refuse_bad
 

@@ -12,9 +12,11 @@ that do not say otherwise. Quantities are in SI units.
 
 from __future__ import annotations
 
+import dataclasses
 import html
+import json
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,17 +35,14 @@ from dem.step import Step
 from dem.together import meet, together
 from dem.world import set_motion
 from pctt import ccp, log
-from pctt.look.folder import Contacts, FolderError, Frame, Snapshot
-from pctt.options import AT_LEAST_ONE, COUNT, OptionError, made
+from pctt.disk import refuse_serial
+from pctt.folder import Contacts, FolderError, Frame, Place, Snapshot, Writer, described_bodies
+from pctt.options import OptionError, made, refuse_bad
 from pctt.render import Picture, picture
-from pctt.run import checkpoint, report
+from pctt.run import state
 from pctt.run.dump import Dump
-from pctt.run.hdf5 import refuse_serial
 from pctt.run.options import refuse_unwritable
-from pctt.run.place import Place
-from pctt.run.results import Results, described_bodies
-from pctt.run.settings import Settings, scene_name
-from pctt.run.settling import Settling, built, settled_state, world_at_start
+from pctt.run.settings import Run, Settings, scene_name
 from pctt.run.stepper import Stepper
 
 
@@ -60,7 +59,7 @@ class Simulation:
     last : the last step, a `dem.step.Step` with this rank's contacts and impulses; None before the first
     figures : of the last step, as in steps.jsonl and records.csv: ``iterations``, ``natural_residual``, ``converged``,
         ``seconds``, ``phases``, ``kinetic_energy [J]``, ``worst_overlap [m]`` and so on; empty before the first
-    output : the files of `write`, a `pctt.run.results.Results`; None before
+    output : the files of `write`, a `pctt.folder.Writer`; None before
     """
 
     def __init__(
@@ -70,17 +69,17 @@ class Simulation:
         *,
         comm: MPI.Comm = MPI.COMM_WORLD,
         restart: str | Path = "",
-        changed_file: bool = False,
         compare: ccp.Comparison | None = None,
+        say: Callable[[str], object] = print,
         **changes: Any,
     ):
         """The scene at time zero, or as the checkpoint ``restart`` has it; "settled": in its settled state, which is
         made at first use.
 
-        The settings may be given one by one, as ``dt=0.01, solver="apgd", tol=1e-5``. ``changed_file`` lets a
-        checkpoint of another text of the scene file pass; ``compare`` solves the Newton systems with other
-        preconditioners too. Raises OptionError (a ValueError) for a bad setting, SceneError if the scene fails, and
-        FileError for a bad file, each on all ranks.
+        The settings may be given one by one, as ``dt=0.01, solver="apgd", tol=1e-5``. ``compare`` solves the Newton
+        systems with other preconditioners too; ``say`` is told on the first rank how a settling goes on. Raises
+        OptionError (a ValueError) for a bad setting, SceneError if the scene fails, and FileError for a bad file, each
+        on all ranks. Warns of a checkpoint of another text of the scene file, or of other surfaces of bodies.
         """
         if not isinstance(scene, (Scene, Experiment)):
             raise OptionError(f"scene {scene!r}: allowed is a dem.scene.Scene or an instance of an Experiment")
@@ -90,21 +89,21 @@ class Simulation:
         self.settings = together(
             comm, "settings", lambda: made(Settings, given).of(self.experiment), own=(OptionError,)
         )
-        scene = built(self.experiment, comm)
+        scene = state.built(self.experiment, comm)
         if restart == "settled":
-            how = Settling(self.experiment, self.settings, self.experiment.settle_delta)
-            restart = settled_state(how, scene, comm, report.Progress(False))
+            restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
+        self._origin = state.origin(self.experiment, scene, self.settings.dt)
         if restart:
-            self.world, self.memory = checkpoint.load(Path(restart), scene, self._origin, comm, changed_file)
+            self.world, self.memory = state.load(Path(restart), scene, self._origin, comm)
         else:
-            self.world, self.memory = world_at_start(self.experiment, scene, comm), ImpulseMemory(comm)
-        self._restart = str(restart)
+            self.world, self.memory = state.world_at_start(self.experiment, scene, comm), ImpulseMemory(comm)
+        self.restart = str(restart)  #: the file from which it goes on
         self._compare = compare or ccp.Comparison(comm, [])
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
         self.last: Step | None = None
         self.figures: dict[str, Any] = {}
-        self.output: Results | None = None
+        self.output: Writer | None = None
         self._closed = False
 
     @classmethod
@@ -112,10 +111,6 @@ class Simulation:
         """The simulation that `save` kept, or a checkpoint.h5 of a run, with the same scene and time step; the other
         arguments are those of a new one. On as many ranks it goes on with the same bits."""
         return cls(scene, *given, restart=path, **more)
-
-    @property
-    def _origin(self) -> dict[str, Any]:
-        return checkpoint.origin(self.experiment, self.settings.dt)
 
     def __enter__(self) -> Simulation:
         return self
@@ -127,9 +122,6 @@ class Simulation:
 
     def step(self) -> dict[str, Any]:
         """Make a step of dt; its `figures`. SceneError if a body is lost, or if code of the scene fails."""
-        return self._step(last=False)
-
-    def _step(self, last: bool) -> dict[str, Any]:
         if self._closed:
             raise ValueError("this simulation is closed")
         stepper, output, self.last = self.stepper, self.output, None  # frees the arrays of the last step
@@ -139,13 +131,13 @@ class Simulation:
             self._row = recording.row(self.last, self.experiment)
             figures["worst_overlap"] = self._row["worst_overlap [m]"]
             if output:
-                output.record(self.last, self._row, last)
+                output.record(self.last, self._row)
         # a step's checkpoint is written after its figures, so its seconds count in the next step
         figures["phases"] |= log.take_seconds(("output",))
         figures["seconds"] = sum(figures["phases"].values())
         if output:
             with log.phase("output"):
-                output.add(figures, last)
+                output.add(figures, self._row)
         self.figures = self._row | figures
         return self.figures
 
@@ -162,8 +154,8 @@ class Simulation:
         whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`."""
         if until is steps is stop is None:
             raise OptionError("run: without an end; allowed are until, steps and stop")
-        _check("every", every, AT_LEAST_ONE)
-        left = math.inf if steps is None else _check("steps", steps, COUNT)
+        refuse_bad(Run(steps=steps or 0))
+        left = math.inf if steps is None else steps
         if until is not None:
             left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
         first, end, ends = self.steps, self.steps + left, False
@@ -174,7 +166,7 @@ class Simulation:
             return stop is not None and bool(stop(self))
 
         while self.steps < end and not ends:
-            self._step(last=self.steps + 1 == end)
+            self.step()
             if self.comm.size == 1:
                 ends = tell()
             elif call or stop:  # an error of one rank is one of all, and the first rank decides
@@ -269,7 +261,10 @@ class Simulation:
         """Keep the state in a checkpoint, from which `load` and ``-restart`` go on. FileError if that fails."""
         refuse_serial(self.comm)
         refuse_unwritable("save", Path(path).parent, self.comm)
-        checkpoint.save(Path(path), self._origin, self.world, self.memory)
+        self._save(Path(path))
+
+    def _save(self, path: Path) -> None:
+        state.save(path, self._origin, self.world, self.memory)
 
     def write(
         self,
@@ -280,29 +275,25 @@ class Simulation:
         checkpoint_every: int = 1,
         hard: int = 5,
         problems: str | Path = "",
-        problem_steps: Collection[int] = (),
     ) -> None:
         """From now on write the files of a run (docs/files.md) to a folder, as ``-output`` does: a frame every so many
         steps (0: none), a checkpoint every so many, and the first ``hard`` cone problems that the solver leaves; to the
-        folder ``problems`` those of ``problem_steps`` (none: of all steps).
+        folder ``problems`` those of all steps.
 
         ``overwrite`` replaces another run there once a step is made. A simulation loaded from the folder's own
         checkpoint goes on with its files. FileError if another run has the folder.
         """
         if self.output is not None:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
-        for name, value, check in (
-            ("every", every, COUNT), ("checkpoint_every", checkpoint_every, AT_LEAST_ONE), ("hard", hard, COUNT)
-        ):  # fmt: skip
-            _check(name, value, check)
+        refuse_bad(Run(output_every=every, checkpoint_every=checkpoint_every))
         refuse_serial(self.comm)
         for name, path in {"write": folder, "problems": problems}.items():
             if path:
                 refuse_unwritable(name, Path(path), self.comm)
-        place = Place(Path(folder), self.comm, self._restart, overwrite)
-        self.output = Results(place, self.world, self.memory, self._origin, self._compare, every, checkpoint_every)
-        where = str(problems)
-        self.stepper.dump = Dump(self.settings, self.experiment, self.world, place, hard, where, problem_steps)
+        place = Place(Path(folder), self.comm, self.restart, overwrite)
+        about = {"scene": json.loads(self._origin["scene"]), "settings": dataclasses.asdict(self.settings)}
+        self.output = Writer(place, self.world, about, self._save, self._compare.summary, every, checkpoint_every)
+        self.stepper.dump = Dump(self.settings, self.experiment, self.world, place, hard, str(problems))
 
     def complete(self) -> None:
         """Write what the folder of `write` lacks of the last step."""
@@ -320,7 +311,7 @@ class Simulation:
         looked at. A simulation in a ``with`` block is closed at its end."""
         if self.output and self.last and not self._closed:
             self.complete()
-            if not self.output.analysed:
+            if self.output.analysis is None:
                 self.analyse()
         self._free()
 
@@ -328,16 +319,15 @@ class Simulation:
         self._closed = True
         self.stepper.destroy()
         if self.output:
-            self.output.place.leave()
+            self.output.leave()
 
     # -- pictures --------------------------------------------------------------------------------------------
 
     def __repr__(self) -> str:
-        law = report.law(bool(self.settings.coulomb))
-        return (
-            f"<Simulation of {scene_name(self.experiment)}: {self.world.body_count} bodies on {self.comm.size} ranks, "
-            f"step {self.steps}, time {self.time:g} s, {self.settings.solver} to {self.settings.tol:g}, {law}>"
-        )
+        settings, bodies = self.settings, f"{self.world.body_count} bodies on {self.comm.size} ranks"
+        method = f"{settings.solver} to {settings.tol:g}, {settings.law}"
+        name = scene_name(self.experiment)
+        return f"<Simulation of {name}: {bodies}, step {self.steps}, time {self.time:g} s, {method}>"
 
     def _repr_html_(self) -> str:
         """The figures of the last step as a table, for notebooks."""
@@ -442,10 +432,3 @@ class BodyMotion:
 
     def __repr__(self) -> str:
         return repr(self._body._large.motion)
-
-
-def _check(name: str, value: Any, check: tuple[str, Callable[[Any], bool]]) -> int:
-    """The value; OptionError if it is no whole number, or fails the check."""
-    if not isinstance(value, (int, np.integer)) or not check[1](value):
-        raise OptionError(f"{name} {value!r}: allowed is {check[0]}")
-    return int(value)

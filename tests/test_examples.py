@@ -129,7 +129,7 @@ def test_the_notebook_runs_and_shows_what_its_file_has(tmp_path, monkeypatch):
         outputs = [cell.get("outputs", []) for cell in (here, there)]
         one, two = ([(output["output_type"], sorted(output.get("data", {}))) for output in each] for each in outputs)
         assert one == two
-    assert names["run"].output.analysed
+    assert names["run"].output.analysis is not None
     assert abs(names["stirrer"].velocity[5]) < 0.2  # the servo stands still
     assert names["means"][2.0] > names["means"][8.0]  # the bed resists
     assert path.stat().st_size < PICTURE_BYTES

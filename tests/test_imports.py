@@ -60,7 +60,7 @@ BELOW = {
         "pctt.context", "pctt.disk", "dem.exchange", "dem.morton", "pctt.options", "pctt.petsc", "pctt.shell",
         "pctt.tt",
     },
-    "pctt.look": {"dem", "pctt.disk", "pctt.figures_json", "pctt.options", "pctt.petsc"},
+    "pctt.look": {"dem", "pctt.disk", "pctt.folder", "pctt.options", "pctt.petsc"},
 }
 
 

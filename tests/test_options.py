@@ -214,9 +214,9 @@ def test_every_option_is_described_with_default_unit_and_meaning():
 def test_described_defaults_pass_their_own_checks():
     """Of the groups of the project: what -help shows as a default can be given as a value."""
     from pctt import ccp
-    from pctt.run.settings import Run
+    from pctt.run.settings import Asked, Run
 
-    groups = [(Run, ""), (ccp.Limits, "ccp_"), *((s.options, f"ccp_{n}_") for n, s in ccp.SOLVERS.items())]
+    groups = [(Run, ""), (Asked, "ccp_"), *((s.options, f"ccp_{n}_") for n, s in ccp.SOLVERS.items())]
     for group, prefix in groups:
         given = {line.name: str(line.default) for line in describe(group, prefix) if line.default not in (None, "")}
         assert given

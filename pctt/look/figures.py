@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from pctt.look.folder import Folder
+from pctt.folder import Folder
 
 STYLE = {
     "axes.axisbelow": True,

@@ -14,7 +14,7 @@ from typing import Any
 from mpi4py import MPI
 
 from pctt import disk
-from pctt.look.folder import FolderError
+from pctt.folder import FolderError
 from pctt.options import AT_LEAST_ONE, POSITIVE, option
 
 LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")

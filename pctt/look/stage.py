@@ -32,8 +32,8 @@ from vtkmodules.vtkRenderingOpenGL2 import vtkOpenGLSphereMapper
 
 from dem import quaternion
 from dem.bodies import BOX, CAPSULE, SPHERE
+from pctt.folder import Folder, FolderError, Frame
 from pctt.look import surfaces
-from pctt.look.folder import Folder, FolderError, Frame
 from pctt.look.program import View
 
 INK = (0.1, 0.1, 0.1)

@@ -17,7 +17,7 @@ from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSp
 
 from dem import quaternion
 from dem.bodies import BOX, CAPSULE, SPHERE
-from pctt.look.folder import Folder, FolderError, Frame
+from pctt.folder import Folder, FolderError, Frame
 
 MARGIN = 0.06  # how far walls go beyond the scene, in diagonals of the scene
 HOLLOW = 0.2  # a hollow body is empty up to this part of the way from its middle to its bounds

@@ -28,16 +28,15 @@ except ImportError as error:
     sys.exit(str(error))
 
 from dem.together import SceneError
+from pctt.disk import FileError
 from pctt.ksp_options import entered
 from pctt.options import OptionError
-from pctt.run.hdf5 import FileError
 from pctt.run.help import help_text
 from pctt.run.interrupt import InterruptError, heed
 from pctt.run.leftovers import keep_from_petsc, refuse_stray
 from pctt.run.options import read_options
-from pctt.run.problem import solve_file
 from pctt.run.settings import DEMO_SOLVERS
-from pctt.run.simulate import simulate
+from pctt.run.simulate import simulate, solve_file
 
 
 def main(comm: MPI.Comm) -> None:
@@ -75,7 +74,7 @@ def versions() -> str:
     return f"pctt {pctt.__version__} (PETSc {petsc}, Python {platform.python_version()}, {loops})"
 
 
-#: Exit status by what ends a run; raised on all ranks alike, but for a FileError of `one_rank`.
+#: Exit status by what ends a run; raised on all ranks alike.
 STATUS: dict[type[Exception], int] = {OptionError: 2, FileError: 2, SceneError: 1, InterruptError: 130}
 
 
@@ -87,11 +86,9 @@ def run() -> int:
     try:
         main(comm)
     except tuple(STATUS) as error:
-        status = STATUS[type(error)]
+        status = next(status for kind, status in STATUS.items() if isinstance(error, kind))
         if comm.rank == 0:
             print(f"pctt.run: {error}", file=sys.stderr, flush=True)
-        if comm.size > 1 and getattr(error, "one_rank", False):  # the others wait for this rank
-            comm.Abort(status)
         keep_from_petsc(PETSc.Options().getAll())
         return status
     except BaseException as error:

@@ -12,7 +12,6 @@ A guided body has only the part of D along its guide. Nothing turns it, so its m
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,22 +28,21 @@ from dem.world import World
 from pctt import ccp
 from pctt.ccp import fclib
 from pctt.ccp.cone import Array
-from pctt.options import OptionError
-from pctt.run.hdf5 import FileError
-from pctt.run.place import HARD, Place
-from pctt.run.settings import Run, Settings, scene_name
+from pctt.disk import FileError
+from pctt.folder import HARD, Place
+from pctt.run.settings import Settings, scene_name
 
 
 class Dump:
     """Writes the cone problems of a simulation's steps: the ``hard`` first that its solver does not solve, and to
-    ``folder``, if there is one, those of the ``steps``, none: of all."""
+    ``folder``, if there is one, all."""
 
     def __init__(
         self, settings: Settings, experiment: Experiment, world: World, place: Place,
-        hard: int, folder: str = "", steps: Collection[int] = (),
+        hard: int, folder: str = "",
     ):  # fmt: skip
         self._settings, self._experiment, self._world, self._place = settings, experiment, world, place
-        self._hard_left, self._folder, self._steps = hard, folder, steps
+        self._hard_left, self._folder = hard, folder
 
     def step(
         self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result, asked: ccp.Result
@@ -55,7 +53,6 @@ class Dump:
         entries for the step's figures. FileError if a file cannot be written.
         """
         number = self._world.step + 1
-        wanted = self._folder and (not self._steps or number in self._steps)
         hard = not asked.converged and self._hard_left > 0
         files: dict[str, Any] = {"dumped": [], "hard_problem": ""}
 
@@ -65,7 +62,7 @@ class Dump:
             except OSError as error:  # raised on all ranks alike
                 raise FileError(str(error)) from None
 
-        if problem.size and wanted:
+        if problem.size and self._folder:
             path = Path(self._folder) / f"step{number:06d}_{problem.size}contacts.h5"
             write(path)
             files["dumped"] = [str(path)]
@@ -146,23 +143,3 @@ def masses_and_map(system: ContactSystem) -> tuple[np.ndarray, Array, ContactMap
     step.halo.update(number)
     rows = replace(step.given, body=number[step.body], root=free[dynamic], columns=count)
     return dynamic, masses[dynamic], ContactMap(step.comm, rows)
-
-def refuse_absent(run: Run, first: int) -> None:
-    """OptionError for a step of ``-dump_steps`` that the run, from the step ``first`` on, does not make."""
-    outside = [step for step in dump_steps(run) if not first < step <= first + run.steps]
-    if outside:
-        raise OptionError(
-            f"-dump_steps {run.dump_steps}: there is no step {outside[0]}; "
-            f"this run makes steps {first + 1} to {first + run.steps}"
-        )
-
-
-def dump_steps(run: Run) -> list[int]:
-    """The steps of ``-dump_steps``; OptionError if they are not whole numbers."""
-    try:
-        steps = [int(word) for word in run.dump_steps.split(",")] if run.dump_steps else []
-    except ValueError:
-        steps = [0]
-    if min(steps, default=1) < 1:
-        raise OptionError(f"-dump_steps {run.dump_steps}: allowed are whole numbers >= 1 with commas between")
-    return steps

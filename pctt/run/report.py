@@ -8,32 +8,23 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pctt import log
+from mpi4py import MPI
+
 from pctt.ccp.result import FIXED_POINT, RELAXATION
+from pctt.folder import totals
 
-#: Coulomb residuals of the relaxation above this are worth a warning.
-LARGE_OPENING = 1e-3
-#: Work of closing contacts above this part of the impulses' energy is worth a warning.
-LARGE_CLOSING_WORK = 0.05
-#: Overlaps above this part of the radius of the smallest grain are worth a warning.
-LARGE_OVERLAP = 0.05
+#: What is worth a warning: Coulomb residuals of the relaxation above the first, closing work above the second part of
+#: the impulses' energy, overlaps above the third of the radius of the smallest grain.
+LARGE_OPENING, LARGE_CLOSING_WORK, LARGE_OVERLAP = 1e-3, 0.05, 0.05
 
-
-def law(coulomb: bool) -> str:
-    """Which law of contact a run obeys."""
-    return "Coulomb's law" if coulomb else "relaxation of Coulomb's law"
-
-
-def loose_line(tol: float) -> str:
-    """A warning for a first-order method at a tolerance above the default."""
-    return (
-        f"WARNING: -ccp_tol {tol:g}: above 1e-4 first-order methods leave overlaps of millimetres; as these are pushed "
-        "apart, a packing may not come to rest"
-    )
+#: What a first-order method is warned of at a tolerance above the default.
+LOOSE = (
+    "above 1e-4 first-order methods leave overlaps of millimetres; as these are pushed apart, a packing may not come "
+    "to rest"
+)
 
 
 def residual(line: Mapping[str, Any]) -> float:
@@ -72,78 +63,29 @@ def step_line(line: Mapping[str, Any]) -> str:
     )
 
 
-def accuracy_lines(line: Mapping[str, Any], history: Sequence[float]) -> str:
-    """The accuracy of a step, and its natural residual by iteration: ten of them, evenly spread, and the last."""
-    figures = (
-        f"       objective {line['objective']:.6g} J, outside the cone {line['cone_violation']:.1e} N s, outside the"
-        f" dual cone {line['dual_violation']:.1e} m/s, complementarity {line['complementarity']:.1e} J"
-    )
-    figures += f"\n       closing work {line['closing_work']:.1e}, opening work {line['opening_work']:.1e}"
-    figures += f", residual of Coulomb's law {line['coulomb_residual']:.1e}"
-    if line["rigid_residual"] != line["natural_residual"]:
-        figures += f", of rigid contacts {line['rigid_residual']:.1e}"
-    if line["solver"] != line["asked_solver"]:
-        figures += f"\n       by {line['solver']}: {line['reason']}"
-    if not history:
-        return figures
-    shown = sorted({round(k * (len(history) - 1) / 10) for k in range(11)})
-    course = "  ".join(f"{k}: {history[k]:.1e}" for k in shown)
-    return f"{figures}\n       residual by iteration  {course}"
-
-
 class Progress:
-    """Prints the messages of a run up to a level, and on a terminal a line about its present work.
+    """Prints the messages of a run on the first rank, and on a terminal a passing line about the present step."""
 
-    Levels: 0 the start and the end of a run, 1 a line per step, 2 the accuracy of each step.
-    """
+    def __init__(self, comm: MPI.Comm, quiet: bool = False):
+        self._active = comm.rank == 0 and not quiet
+        # under mpiexec standard output looks like a terminal even if it goes to a file
+        started = any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK"))
+        self._live = self._active and not started and sys.stdout.isatty()
+        self._begun, self._first = time.perf_counter(), -1
 
-    def __init__(self, active: bool, level: int = 1):
-        self._active, self._level = active, level
-        self._live = active and _terminal()
-        self._text, self._phase, self._systems = "", "", 0
-        self._steps = self._done = 0
-        self._begun = self._drawn = 0.0
-        if self._live:
-            log.watch(self._enter)
+    def say(self, text: str = "") -> None:
+        if self._active:
+            print("\r\033[K" * self._live + text, flush=True)
 
-    def say(self, text: str = "", level: int = 0) -> None:
-        if self._active and level <= self._level:
-            clear = "\r\033[K" if self._live else ""
-            print(clear + text, flush=True)
-
-    def start(self, steps: int) -> None:
-        """Start the clock of so many steps."""
-        self._steps, self._done, self._begun = steps, -1, time.perf_counter()
-
-    def doing(self, text: str) -> None:
-        """The next step begins; ``text`` says which, in a transient line, on a terminal only."""
-        self._done += 1
-        self._text, self._phase, self._systems = text, "", 0
-        self._draw()
-
-    def _enter(self, phase: str) -> None:
-        """Note the phase: those of a step have plain names, those within a solver names like CCPKrylov."""
-        if phase == "CCPKrylov":
-            self._systems += 1
-        elif phase.islower():
-            self._phase = phase
-        if time.perf_counter() - self._drawn > 0.1:
-            self._draw()
-
-    def _draw(self) -> None:
-        if not (self._live and self._text):
-            return
-        now = self._drawn = time.perf_counter()
-        parts = [f"{self._text} ({self._done + 1} of {self._steps})"]
-        if self._phase:
-            parts.append(self._phase)
-        if self._phase == "solve" and self._systems:
-            parts.append(f"Newton step {self._systems}")
-        if self._done > 0:
-            parts.append(remaining(now - self._begun, self._done, self._steps))
-        line = ", ".join(parts) + " ..."
-        width = shutil.get_terminal_size().columns - 1
-        print(f"\r\033[K{line[:width]}", end="", flush=True)
+    def doing(self, done: int, now: float, end: int) -> None:
+        """After so many steps, at a time ``now`` [s] of the simulation, the next one begins, unless it is the end."""
+        if self._first < 0:
+            self._first, self._begun = done, time.perf_counter()
+        if self._live and done < end:
+            spent, made = time.perf_counter() - self._begun, done - self._first
+            left = f", {remaining(spent, made, end - self._first)}" if made else ""
+            line = f"step {done + 1}, time {now:.3f} s ({made + 1} of {end - self._first}){left} ..."
+            print(f"\r\033[K{line[: shutil.get_terminal_size().columns - 1]}", end="", flush=True)
 
 
 def remaining(spent: float, done: int, steps: int) -> str:
@@ -154,17 +96,6 @@ def remaining(spent: float, done: int, steps: int) -> str:
     if hours:
         return f"about {hours} h {minutes:02d} min left"
     return f"about {minutes} min {seconds:02d} s left" if minutes else f"about {seconds} s left"
-
-
-def _terminal() -> bool:
-    """Whether a person watches. Under mpiexec standard output looks like a terminal even if it goes to a file. Then the
-    output of mpiexec, our parent process, decides; if we cannot look at it, nobody watches."""
-    if not any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK")):
-        return sys.stdout.isatty()
-    try:
-        return os.readlink(Path("/proc", str(os.getppid()), "fd/1")).startswith(("/dev/pts/", "/dev/tty"))
-    except OSError:
-        return False
 
 
 def compare_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
@@ -185,26 +116,22 @@ def compare_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
 
 def phase_table(steps: Sequence[Mapping[str, Any]]) -> str:
     """Seconds of each phase over the run and in a median step, and what the steps came to."""
-    names = list(dict.fromkeys(name for line in steps for name in line["phases"]))
-    columns = {name: [line["phases"].get(name, 0.0) for line in steps] for name in names}
-    columns["total"] = [line["seconds"] for line in steps]
-    whole = sum(columns["total"]) or 1.0
+    run = totals(steps)
+    names, whole = [*run["phases"], "total"], run["seconds"] or 1.0
+    columns = [[line["phases"].get(name, 0.0) for line in steps] for name in run["phases"]]
+    columns.append([line["seconds"] for line in steps])
     head = f"{'phase':14}  seconds   share  median step s"
     rows = [
         f"{name:14} {sum(column):8.2f} {sum(column) / whole:7.1%} {median(column):14.3f}"
-        for name, column in columns.items()
+        for name, column in zip(names, columns)
     ]
-    contacts = [line["contacts"] for line in steps]
-    failed = sum(not line["converged"] for line in steps)
-    figures = [
-        f"{len(steps)} steps",
-        f"{min(contacts)} to {max(contacts)} contacts",
-        f"{sum(line['newton_its'] for line in steps)} Newton steps",
-        f"{sum(line['ksp_its'] for line in steps)} Krylov iterations",
-        f"worst residual {max(map(residual, steps)):.1e}",
-        f"{failed} NOT CONVERGED" if failed else "all converged",
-    ]
-    return "\n".join([head, "-" * len(head), *rows, ", ".join(figures)])
+    failed, (least, most) = run["not_converged"], run["contacts"]
+    figures = (
+        f"{run['steps']} steps, {least} to {most} contacts, {run['newton_its']} Newton steps, {run['ksp_its']} Krylov"
+        f" iterations, worst residual {max(map(residual, steps)):.1e}, "
+        + (f"{failed} NOT CONVERGED" if failed else "all converged")
+    )
+    return "\n".join([head, "-" * len(head), *rows, figures])
 
 
 def law_line(steps: Sequence[Mapping[str, Any]], tol: float) -> str:

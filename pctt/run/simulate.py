@@ -1,122 +1,209 @@
-"""The simulation of a scene by the program: its options, what it says, and its end by a signal."""
+"""What the program does: it simulates or settles a scene, or solves the cone problem of an FCLIB file."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 
 from dem.compiled import tell_first_compilation
-from pctt import ccp
+from pctt import ccp, log
+from pctt.ccp import fclib
+from pctt.ccp.cone import Array
+from pctt.ccp.fclib import FileFormatError, Stored
+from pctt.disk import FileError, on_first, write_text
+from pctt.folder import Place, dumps
 from pctt.run import interrupt, leftovers, report
-from pctt.run.dump import dump_steps, refuse_absent
 from pctt.run.settings import DEMO, Options
-from pctt.run.settling import Settling, built, settled_state
+from pctt.run.state import built, settled_state
 from pctt.simulation import Simulation
 
 
 def simulate(options: Options, comm: MPI.Comm) -> None:
     """Run the scene of the options, or settle it with ``-settle``. InterruptError if a signal asks for the end."""
-    run, progress = options.run, report.Progress(comm.rank == 0 and not options.run.quiet, options.run.monitor)
+    run, progress = options.run, report.Progress(comm, options.run.quiet)
     tell_first_compilation(progress.say)
     if run.settle:
-        path = settled_state(Settling.asked(options), built(options.scene, comm), comm, progress, anew=True)
+        scene = built(options.scene, comm)
+        path = settled_state(options.scene, options.settings, scene, comm, progress.say, anew=True)
         progress.say(f"settled state: {path}")
         return
     if options.demo:
         progress.say("no options: the demo; -help lists the options")
     compare = ccp.Comparison(comm, run.compared(), run.compare_every)
-    with first_state(options, comm, progress, compare) as sim:
-        refuse_absent(run, sim.steps)
+    with Simulation(
+        options.scene, options.settings, comm=comm, restart=run.restart, compare=compare, say=progress.say
+    ) as sim:
+        if sim.restart:
+            progress.say(f"from {sim.restart}: step {sim.steps}, time {sim.time:g} s")
         sim.write(
             run.output, overwrite=run.overwrite, every=run.output_every, checkpoint_every=run.checkpoint_every,
-            hard=run.dump_hard, problems=run.dump_problem, problem_steps=dump_steps(run),
+            problems=run.dump_problem,
         )  # fmt: skip
         _make_steps(options, sim, progress, compare)
 
 
 def _make_steps(options: Options, sim: Simulation, progress: report.Progress, compare: ccp.Comparison) -> None:
     """The steps of a run, and what is said about them."""
-    newton = sim.stepper.newton
+    newton, settings, output = sim.stepper.newton, sim.settings, sim.output
     assert newton is not None
-    _say_start(options, sim, newton, progress)
+    assert output is not None
     end = sim.steps + options.run.steps
-
-    def doing(sim: Simulation) -> None:
-        if sim.steps < end:
-            progress.doing(f"step {sim.steps + 1}, time {sim.time:.3f} s")
+    method = f"{settings.solver} to {settings.tol:g}, {settings.law}"
+    progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {method}")
+    if ccp.SOLVERS[settings.solver].needs != ccp.NEWTON and settings.tol > ccp.Limits().tol:
+        progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE}")
+    if ccp.SOLVERS[settings.solver].newton:
+        progress.say(f"Newton systems: {newton.words()}")
+    if options.run.steps:
+        progress.say(report.columns(newton.compare is not None))
 
     def say(sim: Simulation) -> None:
-        progress.say(report.step_line(sim.figures), level=1)
-        progress.say(report.accuracy_lines(sim.figures, sim.stepper.history), level=2)
-        doing(sim)
+        progress.say(report.step_line(sim.figures))
+        progress.doing(sim.steps, sim.time, end)
 
-    doing(sim)
+    progress.doing(sim.steps, sim.time, end)
     sim.run(steps=options.run.steps, call=say, stop=lambda sim: interrupt.asked(sim.comm))
-    assert sim.output is not None
     if sim.steps < end:
-        raise interrupt.InterruptError(_how_to_go_on(options, sim.steps, sim.output.checkpoint, end))
+        words = _how_to_go_on(options, output.checkpoint, end - sim.steps)
+        raise interrupt.InterruptError(f"interrupted after step {sim.steps}; the same command with {words}")
     if sim.last:
         _say_end(options, sim, progress)
         if what := newton.what():
             progress.say(f"Newton systems: {what}")
-    if compare.names and sim.last:
-        progress.say("\n" + report.compare_table(compare.summary()))
+        if compare.names:
+            progress.say("\n" + report.compare_table(compare.summary()))
     if left := leftovers.remark():
         progress.say(left)
     if sim.last:
-        folder = sim.output.place.folder
+        folder = output.place.folder
         progress.say(f"\nresults: {folder}/state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
-
-
-def _say_start(options: Options, sim: Simulation, newton: ccp.Newton, progress: report.Progress) -> None:
-    settings = sim.settings
-    method = f"{settings.solver} to {settings.tol:g}, {report.law(bool(settings.coulomb))}"
-    progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {method}")
-    if ccp.SOLVERS[settings.solver].needs != ccp.NEWTON and settings.tol > ccp.Limits().tol:
-        progress.say(report.loose_line(settings.tol))
-    if ccp.SOLVERS[settings.solver].newton:
-        progress.say(f"Newton systems: {newton.words()}")
-    if options.run.steps:
-        progress.say(report.columns(newton.compare is not None), level=1)
-    progress.start(options.run.steps)
 
 
 def _say_end(options: Options, sim: Simulation, progress: report.Progress) -> None:
     """What the steps have taken and shown."""
-    assert sim.output is not None
-    figures, results = sim.analyse(), sim.output
-    if sim.comm.rank == 0:
-        lines = [line for line in results.steps() if line["step"] > sim.steps - options.run.steps]
-        progress.say("\n" + report.phase_table(lines))
-        progress.say(report.law_line(lines, sim.settings.tol))
-        progress.say(report.forces_line(lines, sim.settings.closing_work))
+    figures, output = sim.analyse(), sim.output
+    if sim.comm.rank > 0:
+        return
+    assert output is not None
+    lines = [line for line in output.folder.lines() if line["step"] > sim.steps - options.run.steps]
+    progress.say("\n" + report.phase_table(lines))
+    progress.say(report.law_line(lines, sim.settings.tol))
+    progress.say(report.forces_line(lines, sim.settings.closing_work))
     if figures:
         progress.say(report.figure_table(figures))
-    if sim.comm.rank == 0:
-        progress.say(report.overlap_line(results.worst_overlap()))
+    progress.say(report.overlap_line(output.folder.summary["worst_overlap"]))
     if outside := sim.figures.get("grains_outside"):
         progress.say(f"{outside:.0f} grains have left the domain of the scene")
 
 
-def _how_to_go_on(options: Options, step: int, state: Path, end: int) -> str:
+def _how_to_go_on(options: Options, state: Path, steps: int) -> str:
     """What a user who has interrupted a run before its end is told."""
-    words = f"-restart {state} -steps {end - step}"
+    words = f"-restart {state} -steps {steps}"
     if options.demo:
         kept = {name: value for name, value in DEMO.items() if name not in ("restart", "steps", "overwrite")}
         words = " ".join([*(f"-{name} {value}" for name, value in kept.items()), words])
-    return f"interrupted after step {step}; the same command with {words} at its end goes on"
+    return f"{words} at its end goes on"
 
 
-def first_state(
-    options: Options, comm: MPI.Comm, progress: report.Progress, compare: ccp.Comparison | None = None
-) -> Simulation:
-    """What a run begins with: the scene's own state, or that of ``-restart``."""
-    path = options.run.restart
-    if path == "settled":
-        path = str(settled_state(Settling.asked(options), built(options.scene, comm), comm, progress))
-    changed = options.run.restart_changed_file
-    sim = Simulation(options.scene, options.settings, comm=comm, restart=path, changed_file=changed, compare=compare)
-    if path:
-        progress.say(f"from {path}: step {sim.steps}, time {sim.time:g} s")
-    return sim
+# -- a problem of a file -------------------------------------------------------------------------------------
+
+
+def solve_file(options: Options, comm: MPI.Comm) -> None:
+    """Solve, print the figures, and write them to summary.json in the output folder."""
+    try:
+        stored = fclib.load(options.run.problem, comm, options.settings.compliance)
+    except FileFormatError as error:
+        raise FileError(str(error)) from None
+    compare = ccp.Comparison(comm, options.run.compared(), options.run.compare_every)
+    with stored.problem:
+        summary = _solve(stored, options, compare)
+    progress = report.Progress(comm, options.run.quiet)
+    width = max(map(len, summary))
+    for name, value in summary.items():
+        if not isinstance(value, dict) and value != "":
+            shown = f"{value:.12g}" if isinstance(value, float) else value
+            progress.say(f"{name:{width}}  {shown}")
+    for name, figures in summary["references"].items():
+        listed = ", ".join(f"{word} {figure:.6g}" for word, figure in figures.items())
+        progress.say(f"the file's {name}: {listed}")
+    if compare.names:
+        progress.say("\n" + report.compare_table(compare.summary()))
+    if not summary["converged"]:
+        progress.say(f"NOT CONVERGED: {summary['reason']}")
+    if left := leftovers.remark():
+        progress.say(left)
+    place = Place(Path(options.run.output), comm, overwrite=options.run.overwrite)
+    try:
+        place.make()
+        path = place.now / "summary.json"
+        on_first(comm, path, lambda: write_text(path, dumps(summary, indent=1) + "\n"))
+        place.take()
+    finally:
+        place.leave()
+
+
+def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[str, Any]:
+    """The figures of solving a stored problem as the options say."""
+    problem, guess, comm = stored.problem, stored.guess, stored.problem.comm
+    settings = options.settings
+    newton = ccp.newton_for(comm, settings.solver, settings.newton, compare)
+    try:
+        with log.phase("solve"):
+            result = ccp.solve(
+                problem, guess, settings.solver, settings.limits, settings.options, newton, settings.coulomb or None
+            )
+        used = result.solver or settings.solver
+        by_newton = ccp.SOLVERS[used].newton
+        systems = "; ".join(filter(None, (newton.words(), newton.what()))) if by_newton else ""
+    finally:
+        newton.destroy()
+    seconds = log.take_seconds(("solve", "compare"))
+    accuracy = ccp.measure(problem, result.impulse)
+    solves = compare.take_solves()
+    return {
+        "problem": options.run.problem,
+        "format": stored.form,
+        "title": stored.title,
+        "note": stored.note,
+        "start": "cold" if guess is None else "the guess in the file",
+        "contacts": problem.size,
+        "ranks": comm.size,
+        "solver": used,
+        "law": "Coulomb" if settings.coulomb else "cone problem",
+        "compliance": problem.softness,
+        **dataclasses.asdict(accuracy),
+        "cone_problems": result.cone_problems,
+        "newton_its": result.iterations if by_newton else 0,
+        "iterations": result.iterations,
+        "ksp_its": result.ksp_its,
+        "newton_systems": systems,
+        "seconds": seconds["solve"],
+        **({"compare_seconds": seconds["compare"]} if compare.names else {}),
+        "converged": result.converged,
+        "status": result.status.value,
+        "reason": result.reason,
+        "references": {
+            name: _distance(problem, result.impulse, impulse)
+            for name, impulse in (("solution", stored.solution), ("guess", stored.guess))
+            if impulse is not None
+        },
+        "compare": {
+            name: {**figures, "solves": solves[name]} for name, figures in compare.summary().items()
+        },
+    }
+
+
+def _distance(problem: ccp.ConeProblem, impulse: Array, reference: Array) -> dict[str, Any]:
+    """The distance of W r + q from the same vector for the impulses in the file, and how accurate those impulses are.
+    At the optimum W r + q is unique, r is not."""
+    distance = problem.norm(problem.product(impulse - reference))
+    accuracy = ccp.measure(problem, reference)
+    return {
+        "velocity_distance": distance,
+        "relative_distance": distance / (accuracy.velocity_norm or 1.0),
+        "natural_residual": accuracy.natural_residual,
+        "objective": accuracy.objective,
+    }

@@ -25,10 +25,9 @@ from pctt.options import OptionError
 from pctt.pc import TensorTrain
 from pctt.pc.sparse_train import SparseTrain
 from pctt.run.options import read_options
-from pctt.run.report import Progress
 from pctt.run.settings import Settings
-from pctt.run.simulate import first_state
 from pctt.run.stepper import Solved, Stepper
+from pctt.simulation import Simulation
 
 
 @dataclass
@@ -115,7 +114,7 @@ def replay_steps(
         options = read_options(database | {"output": "results", "overwrite": "true"}, comm)
     except OptionError as error:
         sys.exit(str(error))
-    sim = first_state(options, comm, Progress(False))
+    sim = Simulation(options.scene, options.settings, comm=comm, restart=options.run.restart)
     with ReplayingStepper(sim.settings, sim.world, sim.memory, look, newton_steps) as stepper:
         return [stepper.step() for _ in range(steps)]
 

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 from matplotlib.figure import Figure
 
-from pctt.look.folder import Folder, Frame
+from pctt.folder import Folder, Frame
 
 NEIGHBOURS = 12  # number of neighbours of the middle grain in an `example`
 

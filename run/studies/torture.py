@@ -14,8 +14,7 @@ from pathlib import Path
 
 import h5py
 
-from pctt.disk import lines
-from pctt.look.folder import Folder
+from pctt.folder import Folder
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ("-scene", "shear", "-ccp_type", "apgd", "-ccp_tol", "1e-3", "-checkpoint_every", "2")
@@ -79,16 +78,10 @@ def span(run: Folder) -> tuple[int, int]:
 
 def broken(folder: Path, first: int, done: int) -> str:
     """What is lost in a folder whose checkpoint is of the step ``done``, in words; empty if nothing is."""
-    rows = [int(row.partition(",")[0]) for row in list(lines(folder / "records.csv"))[1:]]
-    with h5py.File(folder / "state.h5", "r") as file:
-        linked = [int(name) for name in file["steps"] if file["steps"][name]["position"].shape[1] == 3]
     run = Folder(folder)
-    frames, (begun, ended) = run.steps, span(run)
-    if linked != frames[: len(linked)] or len(linked) < 0.99 * len(frames) - 1:
-        return f"state.h5 leads to the steps {linked} of {frames}"
-    figures, known = [line["step"] for line in run.lines()], list(range(begun, ended + 1))
-    found = {"records.csv": rows, "frames": frames, "steps.jsonl": figures, "summary.json": known}
-    for name, steps in found.items():
+    run.require_frames()
+    frames = [step for step in run.steps if run.frame(step).position.shape[1] == 3]
+    for name, steps in {"frames": frames, "steps.jsonl": [line["step"] for line in run.lines()]}.items():
         if steps != list(range(first, first + len(steps))) or steps[-1] < done:
             return f"{name} has the steps {steps}"
     return ""

@@ -12,8 +12,8 @@ import pytest
 from mpi4py import MPI
 
 from pctt import export
+from pctt.folder import Folder, FolderError
 from pctt.look import program
-from pctt.look.folder import Folder, FolderError
 
 pytest.importorskip("vtkmodules", reason="vtk is not installed (extra `pictures`)")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import resource
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 from several_ranks import environment, mpiexec
 
 from dem.scenes import Mixer
-from pctt.look.folder import Folder, FolderError
+from pctt.folder import Folder, FolderError
 from pctt.look.program import whole
 
 
@@ -200,13 +201,15 @@ def test_an_error_of_one_rank_ends_all():
 def test_records_are_columns_of_numbers(tmp_path):
     read = Folder(handmade.write(tmp_path / "made", handmade.FLOOR))
     assert read.records() == {}
-    table = tmp_path / "made" / "records.csv"
-    table.write_text("step,time [s],force_blade_x [N]\n1,0.5,3\n2,1.0,\n")
+    records = [{"step": 1, "time [s]": 0.5, "force_blade_x [N]": 3.0}, {"step": 2, "time [s]": 1.0, "late [N]": None}]
+    lines = [json.dumps({"step": record["step"], "record": record}) for record in records]
+    (tmp_path / "made" / "steps.jsonl").write_text("\n".join([*lines, ""]))
     columns = read.records()
     np.testing.assert_array_equal(columns["force_blade_x [N]"], [3, np.nan])
-    table.write_text("step,force\n1,many\n")
-    with pytest.raises(FolderError, match="records.csv"):
-        read.records()
+    np.testing.assert_array_equal(columns["late [N]"], [np.nan, np.nan])
+    (tmp_path / "made" / "analysis.csv").write_text("step,force\n1,many\n")
+    with pytest.raises(FolderError, match="analysis.csv"):
+        read.analysis()
 
 
 def test_figures_of_steps_that_were_no_numbers_are_infinite(tmp_path):

@@ -13,8 +13,8 @@ pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
 from matplotlib.image import imread
 
+from pctt.folder import Folder
 from pctt.look import figures
-from pctt.look.folder import Folder
 
 
 def test_all_figures_are_drawn(show, folder, tmp_path):

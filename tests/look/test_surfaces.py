@@ -9,7 +9,7 @@ import pytest
 from dem import quaternion
 from dem.mesh import Mesh
 from dem.shapes import Box, Plane, described
-from pctt.look.folder import Folder
+from pctt.folder import Folder
 
 pytest.importorskip("vtkmodules.vtkCommonCore", reason="vtk is not installed (extra `pictures`)")
 

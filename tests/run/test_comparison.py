@@ -75,13 +75,6 @@ def test_only_every_kth_system_is_compared_on(every, program, settled, tmp_path)
         assert int(table[name][0]) == expected
 
 
-def test_a_compared_preconditioner_takes_options_of_its_own(program, settled, tmp_path):
-    more = ("-compare_ilu_pc_factor_levels", "3")
-    plain, _ = compared(program, tmp_path, "-compare", "pbjacobi,ilu")
-    filled, _ = compared(program, tmp_path, "-compare", "pbjacobi,ilu", *more)
-    assert filled["compare"]["ilu"]["ksp_its_mean"] < plain["compare"]["ilu"]["ksp_its_mean"]
-
-
 @pytest.mark.parallel(2)
 def test_on_two_ranks_ilu_is_said_to_work_within_each(program, settled, tmp_path):
     summary, table = compared(program, tmp_path, "-compare", "none,ilu,pbjacobi")
@@ -154,12 +147,6 @@ def test_a_run_says_what_solves_its_newton_systems(options, start, end, program,
     said = program(*SETTLED, "-steps", 1, "-overwrite", *options).stdout
     lines = [line.partition(": ")[2] for line in said.splitlines() if line.startswith("Newton systems: ")]
     assert lines == [words for words in (start, end) if words]
-
-
-@pytest.mark.parallel(2)
-def test_on_two_ranks_the_start_says_that_ilu_works_within_each(program, settled):
-    said = program(*SETTLED, "-steps", 1, "-overwrite", "-pc_type", "ilu").stdout
-    assert "\nNewton systems: BiCGStab (right), ilu within each rank\n" in said
 
 
 def test_a_run_without_steps_prints_no_empty_tables(program, settled):

@@ -53,15 +53,3 @@ def test_a_problem_that_is_not_solved_says_so(program, tmp_path):
     assert summary["converged"] is False
     assert summary["newton_its"] == 3
     assert "NOT CONVERGED" in done.stdout
-
-
-def test_preconditioners_are_compared_on_a_problem_from_a_file(program, tmp_path):
-    path = FOLDER / "Spheres-i099-356-679.hdf5"
-    if not path.exists():
-        pytest.skip(f"no {path}")
-    done = program("-problem", path, "-compare", "pbjacobi,ilu")
-    summary = json.loads((tmp_path / "results" / "summary.json").read_text())
-    assert summary["converged"]
-    for record in summary["compare"].values():
-        assert summary["newton_its"] <= record["systems"] <= 2 * summary["newton_its"]
-    assert "preconditioner" in done.stdout

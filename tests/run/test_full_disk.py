@@ -13,11 +13,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from program import SMALL, arrays, command, environment, recorded_steps, steps_of
 
+from pctt import disk
 from pctt.ccp import ConeProblem, fclib
-from pctt.run.hdf5 import FileError, RowWriter, written
-from pctt.run.lines import StepLines
+from pctt.disk import FileError, append
 from pctt.run.options import read_options
-from pctt.run.place import Place
 from pctt.run.simulate import simulate
 
 LOOSE = ("-ccp_type", "apgd", "-ccp_tol", "1e-3")
@@ -55,7 +54,7 @@ class Limit:
     ("size", "file", "options"),
     [
         (40_000, "out/frames/000003.h5", {}),
-        (1_000, "out/records.csv", {"output_every": "0"}),
+        (500, "out/settings.json", {"output_every": "0"}),
         (2_000, "out/steps.jsonl", {"output_every": "0"}),
         (40_000, "out/checkpoint.h5", {"output_every": "0"}),
         (40_000, "problems/step000003_", {"dump_problem": "problems"}),
@@ -100,38 +99,13 @@ def test_a_run_that_cannot_write_its_first_step_leaves_the_one_that_it_was_to_re
     assert not (tmp_path / "out" / ".new").exists()
 
 
-def test_frames_stay_if_the_links_to_the_others_cannot_be_written(tmp_path, monkeypatch):
-    """Of a run that makes the third step again, and records nothing."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(**more):
-        simulate(read_options({**SCENE, "restart": "out/checkpoint.h5", **more}, MPI.COMM_SELF), MPI.COMM_SELF)
-
-    run(steps="2", restart="")
-    early = (tmp_path / "out" / "checkpoint.h5").read_bytes()
-    run(steps="1")
-    (tmp_path / "out" / "checkpoint.h5").write_bytes(early)
-    again = {"steps": "2", "checkpoint_every": "2", "output_every": "0"}
-    with Limit(15_000), pytest.raises(FileError, match=r"out/state.h5: cannot write \(File too large\)"):
-        run(**again)
-    assert check_whole(tmp_path / "out") == 2
-    assert recorded_steps(arrays(tmp_path / "out" / "state.h5")) == ["000001", "000002", "000003"]
-    run(**again)
-    assert recorded_steps(arrays(tmp_path / "out" / "state.h5")) == ["000001", "000002"]
-
-
-@pytest.mark.parametrize("old", ["", "1\n2\n"], ids=["first line", "third line"])
-def test_of_a_line_that_has_no_room_nothing_stays(old, tmp_path):
+def test_of_a_line_that_has_no_room_nothing_stays(tmp_path):
     path = tmp_path / "lines"
-    lines = StepLines(Place(tmp_path, MPI.COMM_SELF), "lines", int, last=0)
-    for line in old.split():
-        lines.add(line)
-    with Limit(10), pytest.raises(FileError, match=r"lines: cannot write \(File too large\)"):
-        lines.add("3" * 20)
-    assert (path.read_text() if path.exists() else "") == old
-    lines.add("3")
-    assert path.read_text() == old + "3\n"
-    assert [p.name for p in tmp_path.iterdir()] == ["lines"]
+    append(path, "1")
+    with Limit(10), pytest.raises(OSError, match="File too large"):
+        append(path, "3" * 20)
+    append(path, "2")
+    assert path.read_text() == "1\n2\n"
 
 
 def test_the_room_of_a_file_is_taken_until_it_is_written(tmp_path, monkeypatch):
@@ -143,15 +117,14 @@ def test_the_room_of_a_file_is_taken_until_it_is_written(tmp_path, monkeypatch):
             os.posix_fallocate(file.fileno(), 0, data.nbytes)
         except (AttributeError, OSError):
             pytest.skip("this file system takes no room in advance")
-    write = RowWriter.write
+    fill = disk._fill
 
-    def look(contents, file, comm):
+    def look(file, *contents):
         taken.append(512 * os.stat(file.filename).st_blocks)
-        write(contents, file, comm)
+        fill(file, *contents)
 
-    monkeypatch.setattr(RowWriter, "write", look)
-    with written(path, MPI.COMM_SELF) as file:
-        file.rows("data", data)
+    monkeypatch.setattr(disk, "_fill", look)
+    disk.write_rows(path, MPI.COMM_SELF, {"data": data}, {}, {})
     assert taken[0] >= data.nbytes
     np.testing.assert_array_equal(arrays(path)["data"], data)
     assert path.stat().st_size < 1.01 * data.nbytes  # what was taken beyond need is given back

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import random
 import signal
@@ -11,9 +10,10 @@ import subprocess
 import time
 from pathlib import Path
 
-import h5py
 import pytest
 from program import SETTLED, SMALL, arrays, assert_same_bits, command, environment, recorded_steps, steps_of, table
+
+from pctt.folder import Folder
 
 STEPS = 30
 OPTIONS = ("-ccp_type", "apgd", "-ccp_tol", 1e-3)
@@ -72,19 +72,19 @@ def kill_later(folder, cache, tmp_path, options, ranks, delay):
 
 def check_files(folder):
     """All files can be read; the step of the checkpoint."""
-    summary = json.loads((folder / "summary.json").read_text())
-    assert summary["last_step"] - summary["first_step"] + 1 == summary["steps"]
+    found = Folder(folder)
+    found.require_frames()
     step = int(arrays(folder / "checkpoint.h5")["world/step"])
-    with h5py.File(folder / "state.h5", "r") as file:
-        recorded = [int(name) for name in file["steps"]]
-        for name in file["steps"]:  # no link without its file
-            assert file["steps"][name]["position"].shape == (29, 3)
-            assert file["steps"][name]["contact/impulse"].shape[1] == 3
-    noted = [line["step"] for line in steps_of(folder)]
-    rows = table(folder / "records.csv")["step"].astype(int).tolist()
-    for steps in (recorded, noted, rows):  # nothing is missing up to the checkpoint
+    noted = [line["step"] for line in found.lines()]
+    for number in found.steps:
+        assert found.frame(number).position.shape == (29, 3)
+    for steps in (found.steps, noted):  # nothing is missing up to the checkpoint
         assert steps == list(range(steps[0], steps[-1] + 1))
         assert steps[0] <= step <= steps[-1]
+    assert found.summary["steps"] == len(noted)
+    found.derive()  # what a run would write at its end
+    assert [int(name) for name in recorded_steps(arrays(folder / "state.h5"))] == found.steps
+    assert table(folder / "records.csv")["step"].tolist() == noted
     return step
 
 
@@ -125,32 +125,3 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(ranks, kills, program, 
         for field in ("natural_residual", "objective"):  # sums that no step rests on: equal but for rounding
             assert one[field] == pytest.approx(two[field], rel=1e-9)
     assert len(lines[0]) == len(lines[1]) == STEPS
-
-
-def test_a_checkpoint_that_lies_behind_makes_the_steps_anew(program, settled, tmp_path):
-    """What a run killed between two checkpoints leaves: records of steps that are made again."""
-    options = (*OPTIONS, "-output", "out")
-    program(*SETTLED, *options, "-steps", 3)
-    behind = (tmp_path / "out" / "checkpoint.h5").read_bytes()
-    program(*SMALL, *options, "-restart", "out/checkpoint.h5", "-steps", 4)
-    whole = arrays(tmp_path / "out" / "state.h5")
-    (tmp_path / "out" / "checkpoint.h5").write_bytes(behind)
-    program(*SMALL, *options, "-restart", "out/checkpoint.h5", "-steps", 2)
-    again = arrays(tmp_path / "out" / "state.h5")
-    assert len(recorded_steps(whole)) == 7
-    assert len(recorded_steps(again)) == 5
-    for name, array in again.items():
-        assert array.tobytes() == whole[name].tobytes()
-    assert len(steps_of(tmp_path / "out")) == 5
-
-
-def test_another_run_in_the_same_folder_does_not_mix_with_the_earlier_one(program, settled, tmp_path):
-    program(*SMALL, *OPTIONS, "-steps", 3)  # steps 1 to 3, from the lattice
-    program(*SETTLED, *OPTIONS, "-steps", 2, "-overwrite")
-    start = int(arrays(settled)["world/step"])
-    assert [line["step"] for line in steps_of(tmp_path / "results")] == [start + 1, start + 2]
-    assert not (tmp_path / "results" / ".new").exists()
-    recorded = {int(name) for name in recorded_steps(arrays(tmp_path / "results" / "state.h5"))}
-    assert recorded == {start + 1, start + 2}
-    frames = {path.stem for path in (tmp_path / "results" / "frames").iterdir()}
-    assert frames == {"bodies", *(f"{step:06d}" for step in recorded)}

@@ -18,7 +18,7 @@ def steps(folder: Path) -> list[dict]:
 @pytest.mark.parallel(1, 2)
 def test_steps_with_coulombs_law(program, settled, tmp_path):
     """Which is the default with apgd; the relaxation says how far off it is."""
-    options = ("-ccp_type", "apgd", "-steps", 2, "-monitor", 2)
+    options = ("-ccp_type", "apgd", "-steps", 2)
     done = program(*SETTLED, *options)
     assert "apgd to 0.0001, Coulomb's law" in done.stdout
     worst = max(line["coulomb_residual"] for line in steps(tmp_path))
@@ -96,10 +96,9 @@ def test_the_law_that_holds_where_none_is_asked_for(program, settled, tmp_path):
 
 def test_compliance_is_reported_and_goes_with_the_problem(program, settled, tmp_path):
     compliant = ("-ccp_compliance", 1e-3, "-ccp_tol", 1e-6)
-    done = program(*SETTLED, "-steps", 1, *compliant, "-monitor", 2, "-dump_problem", "problems")
+    program(*SETTLED, "-steps", 1, *compliant, "-dump_problem", "problems")
     (line,) = steps(tmp_path)
     assert line["natural_residual"] <= 1.01e-6 < line["rigid_residual"] < 1e-2
-    assert f"of rigid contacts {line['rigid_residual']:.1e}" in done.stdout
     for path in line["dumped"]:
         for options, compliance in (((), 1e-3), (("-ccp_compliance", 0), 0.0)):
             program("-problem", path, "-ccp_type", "apgd", "-ccp_tol", 1e-6, *options, "-output", "again", "-overwrite")
@@ -123,10 +122,3 @@ def test_auto_says_what_it_picked(program, settled, tmp_path):
     assert line["solver"] == "conic"
     assert line["reason"].startswith("apgd at ")
     assert line["newton_its"] > 0
-
-
-@pytest.mark.parametrize("option", ["-ccp_coulomb_max_it", "-ccp_coulomb_tol", "-ccp_auto_bias"])
-def test_values_that_are_not_allowed_are_refused(program, option):
-    done = program("-ccp_coulomb", "-ccp_type", "auto", option, -1, status=None)
-    assert done.returncode != 0
-    assert f"{option} -1" in done.stdout + done.stderr

@@ -10,15 +10,14 @@ from mpi4py import MPI
 from program import assert_same_bits
 
 from dem.scenes import Drum
-from pctt.look.folder import Folder
-from pctt.run.options import read_options
+from pctt.folder import Folder
 
 DRUM = ("-scene", "drum", "-scene_n", 4, "-scene_length", 2, "-scene_fill", 0.15, "-ccp_type", "apgd", "-delta", 0.003)
 
 
 @pytest.mark.parallel(1, 2)
 def test_a_drum_runs_goes_on_and_is_written(program, tmp_path):
-    program(*DRUM, "-steps", 6, "-output", "whole", "-dump_problem", "problems", "-dump_steps", "6")
+    program(*DRUM, "-steps", 6, "-output", "whole", "-dump_problem", "problems")
     program(*DRUM, "-steps", 3, "-output", "parts")
     program(*DRUM, "-steps", 3, "-output", "parts", "-restart", "parts/checkpoint.h5")
     MPI.COMM_WORLD.Barrier()
@@ -36,12 +35,6 @@ def test_a_drum_runs_goes_on_and_is_written(program, tmp_path):
     if MPI.COMM_WORLD.size == 1:
         file = next(path for path in (tmp_path / "problems").iterdir() if path.suffix in (".hdf5", ".h5"))
         program("-problem", file, "-ccp_type", "apgd", "-output", "solved")
-
-
-def test_the_contact_distance_of_settling_is_the_scenes_own():
-    for options, distance in (({"scene": "drum"}, 0.005), ({"scene": "mixer"}, 0.1), ({"settle_delta": "0.03"}, 0.03)):
-        words = {"scene": "drum", "restart": "settled", **options}
-        assert read_options(words, MPI.COMM_SELF).run.settle_delta == distance
 
 
 def test_a_file_that_is_not_there_ends_a_run_before_any_work(program, tmp_path):

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-import shutil
 
 import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import SETTLED, SMALL, steps_of, table
+from program import SETTLED, steps_of, table
 
 from dem.scenes import Shear
-from pctt.run.hdf5 import FileError
-from pctt.run.place import Place
-from pctt.run.records import Records
 from pctt.simulation import Simulation
 
 APGD = ("-ccp_type", "apgd")
@@ -38,51 +34,6 @@ def test_a_row_per_step_that_state_and_summary_know_too(program, settled, tmp_pa
     carried = -(rows["force_box_z [N]"] + rows["force_mixer_z [N]"])
     np.testing.assert_allclose(carried.mean(), weight, rtol=0.1)  # settled, and stirred slowly
     assert (rows["grains_outside"] == 0).all()
-
-
-def test_rows_after_the_step_of_a_restart_are_made_anew(program, settled, tmp_path):
-    output = tmp_path / "results"
-    program(*SETTLED, *APGD, "-steps", 2)
-    shutil.copy(output / "checkpoint.h5", tmp_path / "early.h5")
-    again = (*SMALL, *APGD, "-restart", "results/checkpoint.h5")
-    program(*again, "-steps", 2)
-    whole = (output / "records.csv").read_text()
-    assert len(whole.splitlines()) == 1 + 4
-    shutil.copy(tmp_path / "early.h5", output / "checkpoint.h5")
-    program(*again, "-steps", 1)
-    assert (output / "records.csv").read_text().splitlines() == whole.splitlines()[:-1]
-    program(*again, "-steps", 1)
-    assert (output / "records.csv").read_text() == whole
-    program(*SETTLED, *APGD, "-steps", 1, "-overwrite")  # not a continuation
-    assert (output / "records.csv").read_text().splitlines() == whole.splitlines()[:2]
-
-
-def test_records_with_other_columns_are_not_continued(tmp_path):
-    place = Place(tmp_path, MPI.COMM_SELF)
-    Records(place, MPI.COMM_SELF, 0).add({"step": 1, "time [s]": 0.5, "a [m]": 2.0})
-    other = {"step": 2, "time [s]": 1.0, "b [m]": 2.0}
-    with pytest.raises(FileError, match=r"other columns than step 2 \(a \[m\], b \[m\]\); record must return"):
-        Records(place, MPI.COMM_SELF, 1).add(other)
-    (tmp_path / "records.csv").write_text("step,time\nnonsense\n")
-    with pytest.raises(FileError, match="cannot be continued"):
-        Records(place, MPI.COMM_SELF, 1)
-    (tmp_path / "records.csv").write_text(",".join(other) + "\n7,3.5,1.0\n")
-    Records(place, MPI.COMM_SELF, 1).add(other)
-    assert (tmp_path / "records.csv").read_text() == "step,time [s],b [m]\n2,1.0,2.0\n"
-
-
-def test_a_half_row_at_the_end_is_no_row(tmp_path):
-    """As of a machine that stopped while it was written."""
-    place, path = Place(tmp_path, MPI.COMM_SELF), tmp_path / "records.csv"
-    records = Records(place, MPI.COMM_SELF, 0)
-    for step in (1, 2):
-        records.add({"step": step, "time [s]": 0.5 * step})
-    whole = path.read_text()
-    path.write_text(whole + "3,1.")
-    again = Records(place, MPI.COMM_SELF, 3)
-    np.testing.assert_array_equal(again.columns()["step"], [1, 2])
-    again.add({"step": 3, "time [s]": 1.5})
-    assert path.read_text() == whole + "3,1.5\n"
 
 
 def test_the_series_of_the_analysis_go_to_a_file(program, tmp_path):

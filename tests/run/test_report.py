@@ -20,23 +20,6 @@ def test_the_time_left_goes_on_as_before(spent, done, steps, words):
     assert report.remaining(spent, done, steps) == words
 
 
-def test_a_figure_of_nothing_has_no_sign():
-    assert report.figure_table({"torque": -0.0}) == "torque  0"
-
-
-def test_the_table_counts_what_did_not_converge():
-    line = {
-        "phases": {"solve": 3.0, "search": 1.0}, "seconds": 4.0, "contacts": 7, "newton_its": 2, "ksp_its": 5,
-        "natural_residual": 1e-5, "converged": True,
-    }
-    other = {**line, "contacts": 9, "natural_residual": 2e-3, "converged": False}
-    text = report.phase_table([line, other])
-    assert "2 steps, 7 to 9 contacts, 4 Newton steps, 10 Krylov iterations" in text
-    assert "worst residual 2.0e-03, 1 NOT CONVERGED" in text
-    solve = next(row.split() for row in text.splitlines() if row.startswith("solve"))
-    assert solve == ["solve", "6.00", "75.0%", "3.000"]
-
-
 def test_the_seconds_of_a_comparison_have_a_column():
     line = {
         "step": 3, "time": 0.1, "contacts": 7, "iterations": 2, "ksp_its": 5, "natural_residual": 1e-5, "seconds": 4.0,
@@ -55,20 +38,6 @@ def test_a_large_overlap_is_a_warning():
     small = {"overlap [m]": 4e-4, "step": 7, "smallest_radius [m]": 0.1}
     assert report.overlap_line(small) == "worst overlap 0.0004 m, 0.4% of the smallest radius, at step 7"
     assert report.overlap_line({**small, "overlap [m]": 6e-3}).startswith("WARNING: worst overlap 0.006 m, 6.0%")
-
-
-def test_accuracy_shows_the_course_of_the_residual():
-    line = {"objective": -1.5, "cone_violation": 0.0, "dual_violation": 1e-3, "complementarity": 1e-4}
-    line |= {"closing_work": 3e-2, "opening_work": 1e-2}
-    line |= {"coulomb_residual": 1e-2, "natural_residual": 1e-5, "rigid_residual": 1e-5}
-    line |= {"solver": "conic", "asked_solver": "auto", "reason": "apgd given up"}
-    assert "of rigid contacts 2.0e-03" in report.accuracy_lines({**line, "rigid_residual": 2e-3}, [])
-    text = report.accuracy_lines(line, [10.0**-k for k in range(41)])
-    assert "0: 1.0e+00  4: 1.0e-04" in text
-    assert text.endswith("40: 1.0e-40")
-    assert "by conic: apgd given up" in text
-    assert "by iteration" not in report.accuracy_lines(line, [])
-    assert "closing work 3.0e-02, opening work 1.0e-02" in text
 
 
 def test_forces_that_may_be_far_off_are_a_warning():

@@ -68,17 +68,6 @@ def test_the_program_runs_the_file_on_any_number_of_ranks(hopper, program, tmp_p
     assert len(list((tmp_path / "cache" / "pctt").glob("hopper_n4_*.h5"))) == 1
 
 
-def test_help_lists_the_options_of_the_file(hopper, program):
-    said = program("-help", "-scene", "hopper.py").stdout
-    assert "  -scene_slot <0.4 m>: width of the slot" in said
-    assert "paddle" not in said
-
-
-def test_an_option_that_the_file_does_not_have_is_refused(hopper):
-    with pytest.raises(OptionError, match="did you mean -scene_slot"):
-        read_options({"scene": str(hopper), "scene_slott": "1"}, MPI.COMM_SELF)
-
-
 GOOD = """
 from dataclasses import dataclass
 from dem.experiment import Experiment, option
@@ -119,11 +108,6 @@ def test_a_scene_may_have_two_names(tmp_path):
     assert find_scene(str(path)).__name__ == "One"
 
 
-def test_a_scene_file_that_is_not_there_is_refused():
-    with pytest.raises(OptionError, match="missing.py: cannot be read"):
-        find_scene("missing.py")
-
-
 FAULTS = {
     "build must return a dem.scene.Scene, not NoneType": GOOD.replace("return scene", "return None"),
     "no large body 'lid'": GOOD + "    def record(self, step):\n        return {'z': step.position('lid')[2]}\n",
@@ -142,23 +126,3 @@ def test_faults_of_a_scene_end_the_run(message, tmp_path, monkeypatch):
     words = {"scene": "mine.py", **how}
     with pytest.raises((OptionError, SceneError), match=re.escape(message)):
         simulate(read_options(words, MPI.COMM_SELF), MPI.COMM_SELF)
-
-
-@pytest.mark.parallel(2)
-def test_two_ranks_speak_with_one_voice(program, tmp_path):
-    (tmp_path / "mine.py").write_text("x = 1\n")
-    done = program("-scene", "mine.py", status=2)
-    assert done.stderr.count("pctt.run: -scene mine.py: must define one scene") == 1
-
-
-def test_a_scene_without_large_bodies_and_analysis_runs(program, tmp_path):
-    """One sphere in free fall: energies as in the formula for the semi-implicit step."""
-    (tmp_path / "mine.py").write_text(GOOD)
-    program("-scene", "mine.py", *LOOSE, "-steps", 3, "-scene_height", 2.0)
-    rows = table(tmp_path / "results" / "records.csv")
-    assert list(rows)[:2] == ["step", "time [s]"]
-    mass, k = 1000.0 * 4 / 3 * np.pi * 0.1**3, np.arange(1, 4)
-    np.testing.assert_allclose(rows["kinetic_energy [J]"], 0.5 * mass * (9.81 * 0.01 * k) ** 2, rtol=1e-12)
-    height = 2.0 - 9.81 * 0.01**2 * k * (k + 1) / 2
-    np.testing.assert_allclose(rows["potential_energy [J]"], mass * 9.81 * height, rtol=1e-12)
-    assert not (tmp_path / "results" / "analysis.csv").exists()

@@ -10,8 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dem.experiment import from_file
-
 RUN = Path(__file__).resolve().parents[2] / "run" / "studies"
 
 
@@ -93,48 +91,3 @@ def test_a_wedge_has_its_angle(laws, monkeypatch):
     assert found.x == pytest.approx(0.015 + 0.01 * np.arange(11))
     assert found.height == pytest.approx(0.01 + found.x * np.tan(np.radians(25.0)), rel=0.1)
     assert found.moving == pytest.approx(0.1, abs=0.001)
-
-
-def test_the_table_gives_errors_of_means(laws):
-    from validate import table
-    from validation.rows import above, band
-
-    rows = [
-        above("heap", "growth", 0.0, 3.0, 1.0, "", "degrees"),
-        above("heap", "growth", 0.0, 1.0, 1.0, "", "degrees"),
-        band("heap", "angle", 20.0, 30.0, 25.0, "", "degrees", 0.5),
-        band("silo", "k", 1.0, 2.0, 3.0, "", ""),
-    ]
-    assert table(rows).splitlines()[2:] == [
-        "| heap | growth | above 0 degrees | 3 +- 1 degrees | +3 errors |  |",
-        "| heap | growth | above 0 degrees | 1 +- 1 degrees | **+1 errors** |  |",
-        "| heap | angle | [20, 30] degrees | 25 +- 0.5 degrees | inside |  |",
-        "| silo | k | [1, 2] | 3 | **+50 %** |  |",
-    ]
-
-
-def test_the_page_has_all_that_it_shows(laws):
-    from validate import solved
-
-    text = (RUN / "validation" / "page.md").read_text("utf-8")
-    figures = {"minutes": 9.0, "cores": 2, "cpu": "a processor", "table": "", "outlets": "4.5", "rubs": 0.24}
-    filled = text.format(**figures, solved=solved(0, 9), beds=4, scatter=1.5)
-    assert "about 9 minutes on 2 cores with nothing else to do (a processor)" in filled
-    assert "All 9 steps were solved to the tolerance." in filled
-    assert solved(1, 9).startswith("1 of the 9 steps did not reach the tolerance; the [notebook](")
-
-
-@pytest.mark.parametrize("name", ["heap", "column"])
-def test_the_scenes_build(name):
-    scene = from_file(RUN / "validation" / f"{name}.py")()
-    built = scene.build()
-    assert 500 < len(built.grains()) < 1100
-    assert len(built.large_bodies) >= 2
-
-
-def test_the_seed_makes_another_bed():
-    heap = from_file(RUN / "validation" / "heap.py")
-    one, same, other = (heap(seed=seed).build().grains() for seed in (1, 1, 2))
-    assert np.array_equal(one.position, same.position)
-    assert (one.position != other.position).all()
-    assert (one.mass != other.mass).all()

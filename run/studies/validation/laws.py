@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from validation.rows import Row, above, band, row
 
-from pctt.look.folder import Folder
+from pctt.folder import Folder
 
 BEVERLOO = "Beverloo, Leniger, van de Velde 1961; Mankoc et al. 2007 (arXiv:0707.4550)"
 JOP = "Jop, Forterre, Pouliquen 2006: glass beads, mu(I) from tan 20.9 to tan 32.8 degrees"

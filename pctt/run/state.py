@@ -1,0 +1,277 @@
+"""The state that a run begins with: of time zero, of a checkpoint, or settled and kept in the cache."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from dem.arrays import Floats
+from dem.bodies import Bodies
+from dem.experiment import Experiment
+from dem.impulses import ImpulseMemory
+from dem.mesh import Mesh
+from dem.quaternion import cross
+from dem.scene import LargeBody, Scene
+from dem.start import even_slice, new_world, restart_rows, restored_world
+from dem.together import together
+from dem.world import World, changed_motions, restore_motions
+from pctt.disk import FileError, Lock, on_first, read, texts, write_rows
+from pctt.options import OptionError
+from pctt.petsc import warn
+from pctt.run import interrupt
+from pctt.run.settings import Settings, scene_name
+from pctt.run.stepper import Stepper
+
+FORMAT, FIRST_FORMAT = "pctt checkpoint 2", "pctt checkpoint 1"  #: the first one had no checksums
+
+Say = Callable[[str], object]  #: told on the first rank
+
+
+def built(scene: Experiment, comm: MPI.Comm) -> Scene:
+    """What the scene builds; SceneError on all ranks if that fails on any."""
+
+    def build() -> Scene:
+        built = scene.build()
+        if not isinstance(built, Scene):
+            raise TypeError(f"build must return a dem.scene.Scene, not {type(built).__name__}")
+        return built
+
+    return together(comm, f"build of the scene {type(scene).__name__}", build)
+
+
+def world_at_start(experiment: Experiment, scene: Scene, comm: MPI.Comm) -> World:
+    """What the experiment built, at time zero; OptionError if it cannot start so."""
+    try:
+        return new_world(scene, comm)
+    except (ValueError, FloatingPointError) as error:  # the latter of velocities whose squares overflow
+        raise OptionError(f"scene {type(experiment).__name__}: {error}") from None
+
+
+# -- checkpoints ---------------------------------------------------------------------------------------------
+
+
+def origin(experiment: Experiment, scene: Scene, dt: float) -> dict[str, Any]:
+    """What a run should share with the run whose checkpoint it continues, as attributes of a checkpoint: the name and
+    the options of the scene as JSON, the time step [s], the digest of the user's scene file or "", and what tells the
+    surfaces of large bodies apart as JSON."""
+    return {
+        "scene": json.dumps({"scene": scene_name(experiment), **dataclasses.asdict(experiment)}, sort_keys=True),
+        "dt": dt,
+        "scene_file": experiment.digest,
+        "surfaces": json.dumps(_surfaces(scene.large_bodies), sort_keys=True),
+    }
+
+
+def _surfaces(large_bodies: Iterable[LargeBody]) -> dict[str, list[str]]:
+    """Of each body that has triangles, by its name: their number, area [m2], centroid [m] (3) and the root mean squares
+    of their places [m] (3), to five digits.
+
+    Not the digest of the vertices: those of a turned profile differ between processors in their last bits."""
+
+    def figures(corners: Floats) -> list[str]:
+        twice = np.linalg.norm(cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        middle, weight = corners.mean(axis=1), twice / twice.sum()
+        spread = np.sqrt(weight @ middle**2)
+        return [f"{value:.5g}" for value in (len(corners), 0.5 * twice.sum(), *(weight @ middle), *spread)]
+
+    found = {}
+    for body in large_bodies:
+        meshes = [shape for shape in body.shapes if isinstance(shape, Mesh)]
+        if meshes:
+            corners = [np.asarray(mesh.vertices)[np.asarray(mesh.triangles)] for mesh in meshes]
+            found[body.name] = figures(np.concatenate(corners))
+    return found
+
+
+def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMemory) -> None:
+    """Write a checkpoint with its `origin`; collective. An earlier file of this name stays until the new one is
+    complete."""
+    local, replicated = world.state()
+    key, impulse = memory.state()
+    rows = {f"grains/{name}": column for name, column in local.items()}
+    shared = {f"world/{name}": array for name, array in replicated.items()}
+    shared["world/materials"] = texts(world.materials)
+    if motions := changed_motions(world):
+        shared["world/motions"] = texts([motions])
+    rows |= {"contacts/key": key, "contacts/impulse": impulse}
+    write_rows(path, world.comm, rows, shared, {"/": {"format": FORMAT, **made_with}})
+
+
+def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) -> tuple[World, ImpulseMemory]:
+    """The world and the impulses of a checkpoint of the scene; collective.
+
+    If the number of ranks is that of the writing run, the world is the same to the last bit. Raises FileError if the
+    file is no checkpoint or damaged, and OptionError if it is of another scene, option or time step; warns of another
+    text of the scene file or surface of a body.
+    """
+    columns = [field.name for field in dataclasses.fields(Bodies)]
+
+    def take(file: h5py.File, sealed: bool) -> tuple[Any, ...]:
+        if (file.attrs.get("format"), sealed) not in ((FORMAT, True), (FIRST_FORMAT, False)):
+            raise ValueError(f"it is not marked '{FORMAT}', or has no checksum")
+        replicated = {n: file[f"world/{n}"][()] for n in (*(f"large_{n}" for n in columns), "slabs", "time", "step")}
+        motions = file["world/motions"].asstr()[0] if "world/motions" in file else "{}"
+        rows, contacts = restart_rows(replicated["slabs"], comm), even_slice(len(file["contacts/key"]), comm)
+        local = {name: file[f"grains/{name}"][rows] for name in columns}
+        old = {name: file.attrs.get(name) for name in made_with}
+        impulses = file["contacts/key"][contacts], file["contacts/impulse"][contacts]
+        return old, json.loads(file.attrs["scene"]), replicated, motions, local, impulses
+
+    try:
+        old, scene_of, replicated, motions, local, impulses = read(path, comm, take)
+    except FileError as error:
+        raise FileError(f"{error}{'; delete it to have it made again' * (path.parent == cache())}") from None
+    _refuse_other_origin(path, old, scene_of, made_with, comm)
+    try:
+        world = restored_world(scene, comm, local, replicated)
+        restore_motions(world, motions)
+    except (KeyError, TypeError, ValueError) as error:  # another text of the scene file may build other bodies
+        raise OptionError(f"-restart {path}: {error}") from None
+    memory = ImpulseMemory(comm)
+    memory.restore(*impulses)
+    return world, memory
+
+
+def _refuse_other_origin(
+    path: Path, old: dict[str, Any], old_scene: dict[str, Any], new: dict[str, Any], comm: MPI.Comm
+) -> None:
+    """OptionError for the first option in which two origins differ, and warnings of what else does. Checkpoints of
+    earlier versions lack some properties."""
+    new_scene = json.loads(new["scene"])
+    pairs = [("-scene", old_scene["scene"], new_scene["scene"])]
+    absent = "(no such option)"
+    names = [name for name in {**new_scene, **old_scene} if name != "scene"]
+    pairs += [(f"-scene_{name}", old_scene.get(name, absent), new_scene.get(name, absent)) for name in names]
+    pairs += [("-dt", old["dt"], new["dt"])]
+    for option, was, now in pairs:
+        if was is not None and was != now:
+            raise OptionError(f"{option} {now}: {path} was made with {option} {was}; allowed is the same")
+    for name, what in {"scene_file": "another text of the scene file", "surfaces": "other surfaces of bodies"}.items():
+        if old[name] not in (None, new[name]):
+            warn(comm, f"{path} was made with {what}: {old[name][:200] or 'none'}, now {new[name][:200] or 'none'}")
+
+
+# -- settled states, outside the project's folder ------------------------------------------------------------
+
+
+def cache() -> Path:
+    """The folder of settled states."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pctt"
+
+
+def settled_path(experiment: Experiment, settings: Settings, made_with: dict[str, Any]) -> Path:
+    """The file of a scene's settled state. Its name has the scene and a digest of all that influences the state.
+    OptionError if the scene never settles."""
+    scene = json.loads(made_with["scene"])
+    if not experiment.settling_time:
+        raise OptionError(f"-scene {scene['scene']}: has no settling_time and so no settled state")
+    how: dict[str, Any] = {
+        "dt": settings.dt,
+        "delta": [experiment.settle_delta, settings.delta],
+        "recovery_speed": settings.recovery_speed,
+        "tol": settings.settle_tol,
+    }
+    if experiment.digest:
+        how["file"] = experiment.digest  # a file that was changed may build another scene
+    if surfaces := json.loads(made_with["surfaces"]):
+        how["surfaces"] = surfaces
+    digest = hashlib.sha256((made_with["scene"] + json.dumps(how, sort_keys=True)).encode()).hexdigest()[:12]
+    size = f"_n{scene['n']}" if "n" in scene else ""
+    return cache() / f"{scene['scene']}{size}_{digest}.h5"
+
+
+def unfinished(path: Path) -> Path:
+    """The checkpoint that an interrupted settling leaves beside its settled state."""
+    return path.with_suffix(".unfinished.h5")
+
+
+def settling_steps(experiment: Experiment, settings: Settings) -> int:
+    """The steps of a settling from time zero."""
+    return math.ceil(experiment.settling_time / settings.dt * (1 - 1e-12))
+
+
+def settled_state(
+    experiment: Experiment, settings: Settings, scene: Scene, comm: MPI.Comm, say: Say, anew: bool = False
+) -> Path:
+    """The cached settled state of ``scene``, which the experiment has `built`. It is made if it is missing, or with
+    ``anew``. An interrupted or killed settling is continued."""
+    say = say if comm.rank == 0 else lambda text: None
+    made_with = origin(experiment, scene, settings.dt)
+    path = settled_path(experiment, settings, made_with)
+    if not anew and comm.bcast(path.exists()):
+        return path
+    on_first(comm, path.parent, lambda: path.parent.mkdir(parents=True, exist_ok=True))
+    with _alone(path, comm, say):
+        if anew or not comm.bcast(path.exists()):
+            _settle(path, made_with, experiment, settings, scene, comm, say)
+    return path
+
+
+@contextmanager
+def _alone(path: Path, comm: MPI.Comm, say: Say) -> Iterator[None]:
+    """Other runs that settle the same scene have ended, and wait for the end of the block; collective."""
+    lock, waits = Lock(path.with_suffix(".lock")), False
+    try:
+        while not comm.bcast(comm.rank > 0 or lock.take()):
+            if not waits:
+                say(f"waits for another run that settles the same scene, {path}")
+            waits = True
+            if interrupt.asked(comm):
+                raise interrupt.InterruptError("interrupted while another run settled the scene")
+            time.sleep(0.2)
+        yield
+    finally:
+        lock.release()
+
+
+def _settle(
+    path: Path, made_with: dict[str, Any], experiment: Experiment, settings: Settings, scene: Scene, comm: MPI.Comm,
+    say: Say,
+) -> None:  # fmt: skip
+    """Make steps with APGD for the settling time, with a checkpoint after every tenth of them, and keep the state.
+
+    The last tenth has the contact distance of the scene and ten times the accuracy: otherwise overlaps remain, and the
+    first accurate step of a run would push them apart."""
+    end, tol, begun = settling_steps(experiment, settings), settings.settle_tol, time.perf_counter()
+    tenth = max(1, end // 10)
+    say(f"settling {scene_name(experiment)}, {end} steps with APGD to {tol:g}:")
+    if comm.bcast(unfinished(path).exists()):
+        world, memory = load(unfinished(path), scene, made_with, comm)
+        say(f"  goes on after step {world.step}, from {unfinished(path)}")
+    else:
+        world, memory = world_at_start(experiment, scene, comm), ImpulseMemory(comm)
+    loose = Settings(
+        dt=settings.dt, delta=experiment.settle_delta, solver="apgd", tol=tol, coulomb=False,
+        recovery_speed=settings.recovery_speed,
+    ).of(experiment)  # fmt: skip
+    with Stepper(loose, world, memory) as stepper:
+        while world.step < end:
+            if world.step + 1 >= end - end // 10:
+                stepper.settings = dataclasses.replace(loose, delta=settings.delta, tol=0.1 * tol)
+            line = stepper.step()
+            interrupted = interrupt.asked(comm)
+            if world.step % tenth == 0 or world.step == end or interrupted:
+                save(unfinished(path), made_with, world, memory)
+                say(
+                    f"  step {world.step:5d}  time {line['time']:6.2f} s  contacts {line['contacts']:8d}"
+                    f"  residual {line['natural_residual']:.1e}  {time.perf_counter() - begun:7.1f} s spent"
+                )
+            if interrupted:
+                words = f"settling interrupted after step {world.step} of {end}; the same command goes on there"
+                raise interrupt.InterruptError(words)
+    save(path, made_with, world, memory)
+    if comm.rank == 0:
+        unfinished(path).unlink(missing_ok=True)
+    comm.Barrier()
