@@ -56,8 +56,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
             result = ccp.solve(
                 problem, guess, settings.solver, settings.limits, settings.options, newton, settings.coulomb or None
             )
-        used = result.solver or settings.solver
-        by_newton = ccp.SOLVERS[used].newton
+        by_newton = ccp.SOLVERS[result.solver].newton
         systems = "; ".join(filter(None, (newton.words(), newton.what()))) if by_newton else ""
     finally:
         newton.destroy()
@@ -72,7 +71,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
         "start": "cold" if guess is None else "the guess in the file",
         "contacts": problem.size,
         "ranks": comm.size,
-        "solver": used,
+        "solver": result.solver,
         "law": "Coulomb" if settings.coulomb else "cone problem",
         "compliance": problem.softness,
         "objective": accuracy.objective,
@@ -80,7 +79,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
         "rigid_residual": accuracy.rigid_residual,
         "coulomb_residual": accuracy.coulomb_residual,
         "cone_problems": result.cone_problems,
-        "newton_its": result.iterations if by_newton else 0,
+        "newton_its": result.newton_its,
         "iterations": result.iterations,
         "ksp_its": result.ksp_its,
         "newton_systems": systems,
