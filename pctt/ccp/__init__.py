@@ -76,8 +76,10 @@ def solve(
     if not limits.tol > 0.0:
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
     result = _by(type, problem, _start(problem, guess), limits, options, newton, coulomb)
-    if fallback and not result.final:
-        asked, other = result, "conic" if result.solver == "apgd" else "apgd"
+    other = "conic" if result.solver == "apgd" else "apgd"
+    hopeless = result.final or (result.status is Status.BREAKDOWN and other == "conic")  # products are no numbers
+    if fallback and not hopeless:
+        asked = result
         limits = dataclasses.replace(limits, max_it=-1)
         second = _by(other, problem, asked.impulse, limits, None, newton, coulomb)
         result = second if second.final or second.residual < asked.residual else dataclasses.replace(asked)

@@ -1,9 +1,9 @@
 """APGD for as many iterations as about half of the conic interior point method costs; then that method, from there.
 
-An iteration of the conic method costs as much as some iterations of APGD, and the number that a whole solve costs is
-regular: 48 for each digit of the tolerance and each unit of the cube root of the number of contacts, within a quarter of
-what was measured on settled mixers of 18,483 and 142,175 contacts (docs/ccp.md). So `auto` costs at most one and a half
-times as much as the faster of the two methods or, where APGD ends a little later than it is given time for, three times.
+What the conic method costs is regular: as many iterations of APGD as 48 for each digit of the tolerance, times the cube
+root of the number of contacts, within a quarter of what was measured on settled mixers of 18,483 and 142,175 contacts
+(docs/ccp.md). So a problem that is hard for APGD costs one and a half times what the conic method alone would, and one
+that is easy costs nothing more.
 
 For Coulomb's law the conic method stalls often, but the path that it follows leads to the neighbourhood of a solution.
 So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path.

@@ -34,7 +34,7 @@ class Coulomb:
         "accuracy of a cone problem, as a part of the Coulomb residual before it, or of the tolerance: more exact ones "
         "cost iterations without saving a cone problem, less exact ones hide from Anderson what the term has changed",
     )
-    restart: float = number(3.0, "growth of the residual over its best at which Anderson's earlier points are forgotten")
+    restart: float = number(3.0, "growth of the residual over its best at which earlier points are forgotten")
 
 
 def fixed_point(

@@ -32,9 +32,9 @@ class APGD(FirstOrder):
 
     margin: float = number(1.3, "L of a repeated step, over the curvature found: the next need not be repeated too")
     decay: float = number(0.99, "factor on L after each step, so that steps grow again where the curvature allows it")
-    damping: float = number(0.05, "Coulomb's law: 1 - the greatest momentum (docs/notebook_ccp.md has what was measured)")
-    near: float = number(0.03, "the same below a residual of 1e-4, where chains of force are left, which converge slowly")
-    growth: float = number(6.0, "Coulomb's law: growth of the squared step since its least at which momentum starts anew")
+    damping: float = number(0.05, "Coulomb's law: 1 - the greatest momentum; docs/notebook_ccp.md has trials")
+    near: float = number(0.03, "the same below a residual of 1e-4, where slow chains of force are left")
+    growth: float = number(6.0, "Coulomb's law: of a squared step over the least one, where momentum begins anew")
     single: float = number(
         3e-4,
         "natural residual above which single precision is enough, times the root of the number of contacts: rounding "

@@ -57,7 +57,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: GaussSeid
         sweep = Sweep(scaled, options.relaxation)
     x = scaled.start(guess)
     while progress.goes_on(x):
-        sweep(x)
+        x = sweep(x)
         progress.iterations += 1
     sweep.destroy()
     return progress.result()
@@ -133,7 +133,8 @@ def colours(graph: Neighbours) -> np.ndarray:
 
     Jones and Plassmann, "A parallel graph coloring heuristic", SIAM J. Sci. Comput. 14 (1993): a contact takes the
     smallest colour that its neighbours of higher priority have left, and all contacts that wait for nobody choose at
-    once. Priorities are a hash of the global index, so the colours do not depend on the number of ranks. PETSc has the method as MatColoring, which petsc4py does not offer.
+    once. Priorities are a hash of the global index, so the colours do not depend on the number of ranks. PETSc has the
+    method as MatColoring, which petsc4py does not offer.
     """
     first = offsets(graph.comm, graph.own)[graph.comm.rank]
     priority = _hash(graph.fetch(first + np.arange(graph.own)))
