@@ -55,13 +55,12 @@ def solve(
     options: Any = None,
     newton: Newton | None = None,
     coulomb: Coulomb | None = None,
-    fallback: bool = True,
 ) -> Result:
     """Solve a cone problem by a method of SOLVERS; with ``coulomb`` find impulses of Coulomb's law.
 
     Where the method does not solve it, one other goes on from its impulses, with its own limit of iterations: `apgd`,
     or `conic` after `apgd`. If that does not solve it either, the result is the one with the smaller residual, and its
-    status says that it is not converged. ``fallback`` false: the asked method alone.
+    status says that it is not converged. With ``limits.fallback`` false the asked method is alone.
 
     Coulomb's law is found by the method itself if it can (`Solver.has_law`), else by a sequence of cone problems
     (`pctt.ccp.coulomb`).
@@ -78,7 +77,7 @@ def solve(
     result = _by(type, problem, _start(problem, guess), limits, options, newton, coulomb)
     other = "conic" if result.solver == "apgd" else "apgd"
     hopeless = result.final or (result.status is Status.BREAKDOWN and other == "conic")  # products are no numbers
-    if fallback and not hopeless:
+    if limits.fallback and not hopeless:
         asked = result
         limits = dataclasses.replace(limits, max_it=-1)
         second = _by(other, problem, asked.impulse, limits, None, newton, coulomb)

@@ -11,14 +11,14 @@ import numpy as np
 
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
-from pctt.options import FRACTION, number, option
+from pctt.options import FRACTION, option
 
 RELAXATION, COULOMB, FIXED_POINT = "relaxation", "Coulomb", "Coulomb by cone problems"
 
 
 @dataclass(frozen=True)
 class Limits:
-    """When a solver stops; options of every solver: ``-ccp_tol``, ``-ccp_max_it``, ``-ccp_closing_work``."""
+    """When a solver stops; options of every solver: ``-ccp_tol``, ``-ccp_max_it`` and so on."""
 
     tol: float = option(1e-4, "natural residual at which a cone problem counts as solved", check=FRACTION)
     max_it: int = option(
@@ -31,16 +31,16 @@ class Limits:
         "closing and opening work at which a cone problem counts as solved; inf: any",
         check=("a positive number, or inf", lambda x: x > 0),
     )
-    enough: float = number(1000.0, "a natural residual of tol over this counts as solved, whatever the closing work is")
+    fallback: bool = option(True, "where the solver does not converge, another one goes on from its impulses")
 
     def residual(self, natural: float, problem: ConeProblem, g: Array, y: Array) -> float:
         """What ``tol`` is for: the natural residual of impulses g (nc, 3) with y = N g + r, or their closing or opening
-        work in units in which its limit is ``tol``, whichever is larger. It is at most ``enough`` times the natural
+        work in units in which its limit is ``tol``, whichever is larger. It is at most a thousand times the natural
         residual: where bodies are squeezed no accuracy may bring the closing work below its limit."""
         if math.isinf(self.closing_work):
             return natural
         work = self.tol / self.closing_work * problem.wrong_work(g, y)
-        return min(max(natural, work), self.enough * natural)
+        return min(max(natural, work), 1000.0 * natural)
 
     @property
     def met(self) -> str:

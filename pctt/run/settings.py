@@ -137,6 +137,7 @@ class Settings:
     tol: float = _as(ccp.Limits, "tol")  #: residual at which a step counts as solved (``-ccp_tol``)
     max_it: int = _as(ccp.Limits, "max_it")  #: iterations before the solver gives up; -1: its own (``-ccp_max_it``)
     closing_work: float = _as(ccp.Limits, "closing_work")  #: the same of the closing work (``-ccp_closing_work``)
+    fallback: bool = _as(ccp.Limits, "fallback")  #: another solver goes on where it does not (``-ccp_fallback``)
     #: options of the solver, an instance of its class or a dict of its fields (``-ccp_apgd_...``); None: the defaults
     options: Any = None
     #: Coulomb's law or its relaxation, or a `pctt.ccp.Coulomb`; None: the law where it costs little (``-ccp_coulomb``)
@@ -148,7 +149,7 @@ class Settings:
     @property
     def limits(self) -> ccp.Limits:
         """When the solver stops."""
-        return ccp.Limits(self.tol, self.max_it, self.closing_work)
+        return ccp.Limits(self.tol, self.max_it, self.closing_work, self.fallback)
 
     def of(self, scene: Experiment) -> Settings:
         """The same, with what a scene and a solver have of their own where nothing is given; then ``options`` is an

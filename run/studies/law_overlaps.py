@@ -16,7 +16,7 @@ from pctt.ccp.cone import tangential
 from pctt.run.options import read_options
 from pctt.run.report import Progress
 from pctt.run.simulate import first_state
-from pctt.run.stepper import Solved, Stepper
+from pctt.run.stepper import Stepper
 
 LAWS = {"relaxation": (None, (1e-4, 1e-5, 1e-6)), "Coulomb": (ccp.Coulomb(max_it=20), (1e-4, 1e-5))}
 
@@ -26,7 +26,7 @@ class Compared(Stepper):
 
     every = 1
 
-    def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> Solved:
+    def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> ccp.Result:
         if self.world.step % self.every == 0:
             for law, (coulomb, tolerances) in LAWS.items():
                 start = guess

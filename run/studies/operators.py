@@ -101,7 +101,7 @@ def apgd_iteration(problem: ccp.ConeProblem) -> float:
     seconds = []
     for count in (20, 220):
         start = time.perf_counter()
-        ccp.solve(problem, None, "apgd", ccp.Limits(1e-16, count, np.inf))
+        ccp.solve(problem, None, "apgd", ccp.Limits(1e-16, count, np.inf, fallback=False))
         seconds.append(time.perf_counter() - start)
     return (seconds[1] - seconds[0]) / 200
 

@@ -15,9 +15,10 @@ from pctt.ccp.auto import Auto
 DONE = "natural residual and closing work below the tolerance"
 
 
-def solve(type, tol=1e-8, max_it=-1, options=None, comm=SELF, **more):
+def solve(type, tol=1e-8, max_it=-1, options=None, comm=SELF, coulomb=None, fallback=True):
     known, graph = heap(bodies=8)
-    return ccp.solve(from_graph(known, graph, comm), None, type, Limits(tol, max_it), options, **more)
+    limits = Limits(tol, max_it, fallback=fallback)
+    return ccp.solve(from_graph(known, graph, comm), None, type, limits, options, coulomb=coulomb)
 
 
 def test_auto_takes_apgd_where_it_is_quick():

@@ -174,7 +174,7 @@ def test_every_iteration_descends(method, monkeypatch):
         return goes_on(self, x, gradient)
 
     monkeypatch.setattr(Progress, "goes_on", watched)
-    ccp.solve(problem, project(100 * np.abs(known.r), known.mu), method, Limits(1e-12, 40), fallback=False)
+    ccp.solve(problem, project(100 * np.abs(known.r), known.mu), method, Limits(1e-12, 40, fallback=False))
     assert len(values) == 41
     assert np.all(np.diff(values) < 0)
 
@@ -187,7 +187,7 @@ def test_the_point_handed_back_is_the_best_that_was_looked_at(method):
     known, graph = heap(1, hub=True)
     problem = from_graph(known, graph)
     options = ccp.SOLVERS[method].options(check=3)
-    result = ccp.solve(problem, type=method, limits=Limits(1e-14, 60), options=options, fallback=False)
+    result = ccp.solve(problem, type=method, limits=Limits(1e-14, 60, fallback=False), options=options)
     assert not result.converged
     # looks in single precision differ by its rounding
     assert result.residual == pytest.approx(min(result.history), rel=1e-4 if method == "apgd" else 1e-15)
@@ -199,7 +199,7 @@ def test_an_accuracy_that_cannot_be_reached_ends_with_a_reason(method):
     known, graph = heap(bodies=60, contacts=10)
     problem = from_graph(known, graph)
     options = ccp.SOLVERS[method].options(patience=150)
-    result = ccp.solve(problem, None, method, Limits(1e-30), options, fallback=False)
+    result = ccp.solve(problem, None, method, Limits(1e-30, fallback=False), options)
     if not result.converged:  # a residual of exactly zero is no stagnation
         assert "no progress" in result.reason
     assert result.iterations < ccp.SOLVERS[method].iterations
@@ -257,8 +257,8 @@ def test_a_good_start_saves_iterations(method):
 def test_a_solution_given_by_n_and_by_g_is_the_same(double):
     known, graph = heap(7)
     for method in METHODS:
-        limits = Limits(1e-12, 20)
-        one, two = (ccp.solve(p, type=method, limits=limits, fallback=False) for p in (from_graph(known, graph), from_matrix(known)))
+        limits = Limits(1e-12, 20, fallback=False)
+        one, two = (ccp.solve(p, type=method, limits=limits) for p in (from_graph(known, graph), from_matrix(known)))
         assert np.allclose(one.impulse, two.impulse, atol=1e-11)
 
 
@@ -283,14 +283,14 @@ def problems_of(comm):
 @EVERY
 def test_iterates_do_not_depend_on_the_ranks(method, double):
     """Also where a rank has no contact. After 15 iterations rounding has not grown yet."""
-    comm, limits = MPI.COMM_WORLD, Limits(1e-13, 15)
+    comm, limits = MPI.COMM_WORLD, Limits(1e-13, 15, fallback=False)
     alone = problems_of(SELF)
     for name, problem in problems_of(comm).items():
-        result = ccp.solve(problem, type=method, limits=limits, fallback=False)
+        result = ccp.solve(problem, type=method, limits=limits)
         said = (result.converged, result.reason, result.iterations, result.history)
         assert comm.allgather(said) == [said] * comm.size
         impulse = np.concatenate(comm.allgather(result.impulse))
-        expected = ccp.solve(alone["few" if name == "few" else "even"], type=method, limits=limits, fallback=False)
+        expected = ccp.solve(alone["few" if name == "few" else "even"], type=method, limits=limits)
         assert abs(result.iterations - expected.iterations) <= (name == "few")
         assert np.allclose(impulse, expected.impulse, rtol=0, atol=1e-9)
         problem.destroy()

@@ -63,6 +63,6 @@ def test_the_default_limit_is_that_of_the_registry(name, monkeypatch):
 
     solver = ccp.SOLVERS[name]
     monkeypatch.setitem(ccp.SOLVERS, name, type(solver)(**{**vars(solver), "function": function}))
-    for limits in (None, Limits(), Limits(max_it=0), Limits(max_it=7)):
-        ccp.solve(from_graph(known, graph), type=name, limits=limits, fallback=False)
-    assert seen == [solver.iterations, solver.iterations, 0, 7]
+    for limits in (Limits(fallback=False), Limits(max_it=0, fallback=False), Limits(max_it=7, fallback=False)):
+        ccp.solve(from_graph(known, graph), type=name, limits=limits)
+    assert seen == [solver.iterations, 0, 7]

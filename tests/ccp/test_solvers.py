@@ -255,7 +255,7 @@ def test_first_order_methods_started_at_the_solution_stay_there(solver):
 def test_giving_up_is_said_and_leaves_an_impulse_in_the_cones(solver, max_it):
     known, graph = heap()
     problem = from_graph(known, graph)
-    result = ccp.solve(problem, type=solver, limits=Limits(1e-8, max_it), fallback=False)
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-8, max_it, fallback=False))
     assert not result.converged
     newton = ccp.SOLVERS[solver].needs == NEWTON
     assert str(max_it if newton else result.iterations) in result.reason
@@ -277,7 +277,7 @@ def test_more_steps_bring_it_nearer(solver):
     errors = []
     steps = {"pdip": (5, 15, 25), "conic": (3, 6, 9), "auto": (10, 40, 200)}.get(solver, (10, 100, 1000))
     for max_it in steps:
-        impulse = ccp.solve(problem, type=solver, limits=Limits(1e-14, max_it), fallback=False).impulse
+        impulse = ccp.solve(problem, type=solver, limits=Limits(1e-14, max_it, fallback=False)).impulse
         errors.append(np.linalg.norm(problem.product(impulse) + problem.r - known.y))
     assert errors[0] > 2 * errors[1] > 4 * errors[2]
 
