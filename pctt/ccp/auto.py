@@ -50,13 +50,14 @@ def solve(
         return first
     inner, start = replace(limits, max_it=min(60, limits.max_it)), options.start * first.residual
     if not coulomb:
-        second = conic.solve(problem, first.impulse, inner, conic.Conic(start=min(30.0, start)), newton)
+        second = conic.solve(problem, first.impulse, inner, conic.Conic(start=min(conic.Conic().start, start)), newton)
         second.solver, second.newton_its = "conic", second.iterations
         second.reason = f"apgd: {first.reason}; conic: {second.reason}"
         return second.after(first)
     inner = replace(inner, tol=max(limits.tol, options.basin), closing_work=np.inf)
     second = conic.solve(problem, guess, inner, conic.Conic(), newton, coulomb)
     second.newton_its = second.iterations
-    last = apgd.solve(problem, second.impulse, limits, apgd.APGD(), coulomb)
+    begin = second.impulse if second.iterations else first.impulse
+    last = apgd.solve(problem, begin, limits, apgd.APGD(), coulomb)
     last.solver, last.reason = "apgd", f"apgd: {first.reason}; conic: {second.reason}; apgd: {last.reason}"
     return last.after(first, second)

@@ -16,7 +16,6 @@ from pctt.ccp.result import Result
 
 PRODUCT, MATRIX, NEWTON = "products with N", "rows of N", "Newton systems"
 EITHER = "products with N, or Newton systems"
-LAW_TOL = 1e-4
 
 
 @dataclass(frozen=True)
@@ -59,10 +58,10 @@ SOLVERS = {
                "Nesterov, Todd 1997; Acary et al. 2023", has_law=True),
         Solver("auto", auto.solve, auto.Auto, EITHER, 20_000,
                "`apgd` for as many iterations as half of `conic` costs, then `conic`", "`pctt/ccp/auto.py`",
-               has_law=True, law_tol=LAW_TOL),
+               has_law=True, law_tol=1e-4),
         Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
                "accelerated projected gradient descent with restart", "Mazhar et al. 2015",
-               has_law=True, law_tol=LAW_TOL),
+               has_law=True, law_tol=1e-4),
         Solver("barzilai_borwein", barzilai_borwein.adaptive, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,
                "projected Barzilai-Borwein steps with an adaptive nonmonotone line search", "Dai, Fletcher 2005"),
         Solver("spectral", barzilai_borwein.spectral, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,

@@ -48,7 +48,7 @@ class Limits:
         return f"natural residual{'' if math.isinf(self.closing_work) else ' and closing work'} below the tolerance"
 
     def to(self, tol: float) -> Limits:
-        """The same for another tolerance of the same residual."""
+        """For another tolerance of the same residual."""
         return dataclasses.replace(self, tol=tol, closing_work=self.closing_work / self.tol * tol)
 
 

@@ -13,7 +13,7 @@ from pctt import ccp
 from pctt.ccp import Limits
 from pctt.ccp.cone import margin, project
 from pctt.ccp.first_order import apgd, barzilai_borwein, gauss_seidel
-from pctt.ccp.first_order.faces import Face, GradientProjection
+from pctt.ccp.first_order.faces import Face
 from pctt.ccp.first_order.scaled import Progress, ScaledProblem
 
 METHODS = [name for name, solver in ccp.SOLVERS.items() if not solver.newton]
@@ -52,12 +52,6 @@ def test_the_scaled_problem_is_the_same_problem():
     assert scaled.residuals(Limits(), scaled.start(g), y)[0] == pytest.approx(expected)
 
 
-def test_an_impulse_in_the_cones_starts_as_it_is():
-    known, graph = heap()
-    scaled = ScaledProblem(from_graph(known, graph))
-    assert np.allclose(scaled.impulse(scaled.start(known.g)), known.g, atol=1e-14)
-
-
 # -- faces --------------------------------------------------------------------------------------------------
 
 
@@ -89,26 +83,6 @@ def test_the_reach_in_a_face_ends_at_its_boundary():
     assert 0 < reach < np.inf
     assert margin(x + reach * (1 - 1e-9) * p, mu).min() >= -1e-12
     assert margin(x + reach * (1 + 1e-6) * p, mu).min() < -1e-12 or (x + reach * (1 + 1e-6) * p)[:, 0].min() < 0
-
-
-def test_a_gradient_projection_raises_a_bound_that_is_too_small_and_descends():
-    known, graph = heap()
-    scaled = ScaledProblem(from_graph(known, graph))
-    projection = GradientProjection(scaled)
-    projection.lipschitz = 0.05
-    x = scaled.start(np.zeros((40, 3)))
-    y = scaled.gradient(x)
-    values = []
-    products = 0
-    for _ in range(30):
-        values.append(scaled.dots((x, 0.5 * (y + scaled.b)))[0])
-        x, y, count = projection.step(x, y)
-        products += count
-    assert products > 30
-    assert 1.0 < projection.lipschitz < 2 * np.linalg.eigvalsh(known.N).max()
-    assert np.all(np.diff(values) <= 1e-14 * abs(values[-1]))
-    assert np.allclose(y, scaled.gradient(x))
-    assert margin(x, scaled.mu).min() >= -1e-13
 
 
 def test_the_line_search_takes_the_whole_step_where_it_may():
@@ -242,28 +216,7 @@ def test_apgd_begins_in_single_precision_and_ends_in_double(size, monkeypatch):
     assert y == pytest.approx(problem.product(known.g), rel=1e-6, abs=1e-8)
 
 
-@EVERY
-def test_a_good_start_saves_iterations(method):
-    known, graph = heap(4, bodies=60)
-    problem = from_graph(known, graph)
-    cold = ccp.solve(problem, type=method, limits=Limits(1e-5))
-    near = known.g * (1 + 1e-4 * np.random.default_rng(0).normal(size=(40, 3)))
-    warm = ccp.solve(problem, near, method, Limits(1e-5))
-    assert cold.converged
-    assert warm.converged
-    assert warm.iterations < cold.iterations
-
-
-def test_a_solution_given_by_n_and_by_g_is_the_same(double):
-    known, graph = heap(7)
-    for method in METHODS:
-        limits = Limits(1e-12, 20, fallback=False)
-        one, two = (ccp.solve(p, type=method, limits=limits) for p in (from_graph(known, graph), from_matrix(known)))
-        assert np.allclose(one.impulse, two.impulse, atol=1e-11)
-
-
 # -- several ranks ------------------------------------------------------------------------------------------
-
 
 
 def problems_of(comm):
