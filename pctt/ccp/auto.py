@@ -43,7 +43,7 @@ def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Auto, newton: Newton, coulomb: bool = False
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
-    few = min(limits.max_it, options.iterations(problem.size, limits.tol, coulomb))
+    few = min(limits.max_it, problem.comm.bcast(options.iterations(problem.size, limits.tol, coulomb)))
     first = apgd.solve(problem, guess, replace(limits, max_it=few), apgd.APGD(), coulomb)
     first.solver = "apgd"
     if first.final or few == limits.max_it:

@@ -15,6 +15,7 @@ from pctt.ccp.cone import margin, project
 from pctt.ccp.first_order import apgd, barzilai_borwein, gauss_seidel
 from pctt.ccp.first_order.faces import Face
 from pctt.ccp.first_order.scaled import Progress, ScaledProblem
+from pctt.contact_map import Ghosts
 
 METHODS = [name for name, solver in ccp.SOLVERS.items() if not solver.newton]
 EVERY = pytest.mark.parametrize("method", METHODS)
@@ -98,16 +99,16 @@ def test_the_line_search_takes_the_whole_step_where_it_may():
 # -- colours and sweeps -------------------------------------------------------------------------------------
 
 
-def neighbourhood(known) -> gauss_seidel.Neighbours:
+def colours(known) -> np.ndarray:
     blocks = sp.csr_matrix(known.N).tobsr((3, 3))
-    return gauss_seidel.Neighbours(SELF, blocks.indptr, blocks.indices.copy())
+    ghosts = Ghosts(SELF, len(known.mu), blocks.indices)
+    return gauss_seidel.colours(ghosts, blocks.indptr, ghosts.body)[: len(known.mu)]
 
 
 @pytest.mark.parametrize("hub", [False, True])
 def test_neighbours_have_different_colours(hub):
     known, _ = heap(contacts=80, bodies=30, hub=hub)
-    graph = neighbourhood(known)
-    colour = gauss_seidel.colours(graph)[:80]
+    colour = colours(known)
     coupled = np.abs(known.N).reshape(80, 3, 80, 3).max(axis=(1, 3)) > 0
     same = colour[:, None] == colour[None, :]
     assert np.array_equal(coupled & same, np.eye(80, dtype=bool))
@@ -122,7 +123,7 @@ def test_neighbours_have_different_colours(hub):
 def test_a_sweep_is_gauss_seidel_contact_by_contact():
     known, graph = heap(2, mu=np.arange(40) % 4 * 0.3)
     scaled = ScaledProblem(from_graph(known, graph))
-    colour = gauss_seidel.colours(neighbourhood(known))[:40]
+    colour = colours(known)
     sweep = gauss_seidel.Sweep(scaled, 1.3)
     x = scaled.start(np.abs(known.r))
     swept = sweep(x)

@@ -67,90 +67,64 @@ class Sweep:
     """One pass over the colours."""
 
     def __init__(self, problem: ScaledProblem, relaxation: float):
-        comm, rows = problem.problem.comm, rows_in_blocks(problem.problem.N)
-        self._neighbours = neighbours = Neighbours(comm, rows.indptr, rows.indices)
-        shrink = neighbours.fetch(problem.shrink)
-        left, right = np.repeat(shrink[: neighbours.own], np.diff(rows.indptr), axis=0), shrink[neighbours.columns]
-        A = sp.bsr_matrix(
-            (left[:, :, None] * rows.data * right[:, None, :], neighbours.columns, rows.indptr),
-            shape=(rows.shape[0], 3 * len(shrink)),
-        )
-        colour, steps = colours(neighbours)[: neighbours.own], relaxation * problem.block_steps()
+        comm, N = problem.problem.comm, rows_in_blocks(problem.problem.N)
+        self._ghosts = ghosts = Ghosts(comm, len(N.indptr) - 1, N.indices)
+        left, right = np.repeat(problem.shrink, np.diff(N.indptr), axis=0), spread(ghosts, problem.shrink)
+        blocks = left[:, :, None] * N.data * right[ghosts.body][:, None, :]
+        A = sp.bsr_matrix((blocks, ghosts.body, N.indptr), shape=(N.shape[0], right.size)).tocsr()
+        colour = colours(ghosts, N.indptr, ghosts.body)[: ghosts.own]
+        steps = relaxation * problem.block_steps()
         self._colours = []
         for k in range(comm.allreduce(int(colour.max(initial=-1)), op=MPI.MAX) + 1):
             own = np.flatnonzero(colour == k)
-            self._colours.append((own, _picked(A, own), steps[own], problem.b[own], problem.mu[own]))
+            rows = A[(3 * own[:, None] + np.arange(3)).ravel()].tobsr((3, 3))
+            self._colours.append((own, rows, steps[own], problem.b[own], problem.mu[own]))
 
     def __call__(self, x: Array) -> Array:
         """The point after the sweep, from x (nc, 3)."""
-        x = self._neighbours.fetch(x)
+        x = spread(self._ghosts, x)
         for own, rows, steps, b, mu in self._colours:
             y = (rows @ x.ravel()).reshape(-1, 3) + b
             x[own] = cone.project(x[own] - steps * y, mu)
-            self._neighbours.update(x)
-        return x[: self._neighbours.own]
-
-    def destroy(self) -> None:
-        self._neighbours.destroy()
-
-
-def _picked(A: sp.bsr_matrix, rows: np.ndarray) -> sp.bsr_matrix:
-    """Some block rows of A (scipy's own indexing would turn them into another format)."""
-    count = np.diff(A.indptr)[rows]
-    indptr = np.concatenate([[0], np.cumsum(count)])
-    pick = np.arange(indptr[-1]) + np.repeat(A.indptr[rows] - indptr[:-1], count)
-    return sp.bsr_matrix((A.data[pick], A.indices[pick], indptr), shape=(3 * len(rows), A.shape[1]))
-
-
-class Neighbours:
-    """This rank's contacts and the contacts of other ranks (ghosts) that share a body with them.
-
-    ``indptr``, ``columns``: block rows of N, columns local: below ``own`` this rank's contacts, then the ghosts.
-    """
-
-    def __init__(self, comm: MPI.Comm, indptr: np.ndarray, columns: np.ndarray):
-        self.comm, self.indptr, self.own = comm, indptr, len(indptr) - 1
-        self._ghosts = Ghosts(comm, self.own, columns)
-        self.columns = self._ghosts.body
-
-    def fetch(self, own: np.ndarray) -> np.ndarray:
-        """Numbers (n, k) of own contacts and ghosts, from those of own contacts; collective."""
-        values = np.zeros((self._ghosts.nobody + 1, *own.shape[1:]))
-        values[: self.own] = own
-        self._ghosts.update(values)
-        return values
-
-    def update(self, values: np.ndarray) -> None:
-        """Renew those of the ghosts; collective."""
-        self._ghosts.update(values)
+            self._ghosts.update(x)
+        return x[: self._ghosts.own]
 
     def destroy(self) -> None:
         self._ghosts.destroy()
 
 
-def colours(graph: Neighbours) -> np.ndarray:
-    """Colour of each own contact and ghost, of contacts that share a body different ones; collective.
+def spread(ghosts: Ghosts, own: np.ndarray) -> np.ndarray:
+    """Numbers of own contacts, then of the contacts of other ranks that share a body with them, then of none;
+    collective."""
+    values = np.zeros((ghosts.nobody + 1, *own.shape[1:]))
+    values[: ghosts.own] = own
+    ghosts.update(values)
+    return values
+
+
+def colours(ghosts: Ghosts, indptr: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Colour of each contact of `spread`, of contacts that share a body different ones; ``indptr`` and ``columns`` (its
+    rows) are the pattern of N. Collective.
 
     Jones and Plassmann, "A parallel graph coloring heuristic", SIAM J. Sci. Comput. 14 (1993): a contact takes the
     smallest colour that its neighbours of higher priority have left, and all contacts that wait for nobody choose at
     once. Priorities are a hash of the global index, so the colours do not depend on the number of ranks. PETSc has the
     method as MatColoring, which petsc4py does not offer.
     """
-    first = offsets(graph.comm, graph.own)[graph.comm.rank]
-    priority = _hash(graph.fetch(first + np.arange(graph.own)))
-    row = np.repeat(np.arange(graph.own), np.diff(graph.indptr))
-    waits = priority[graph.columns] > priority[row]  # edges to neighbours that choose before
-    row, before = row[waits], graph.columns[waits]
-    colour = graph.fetch(np.full(graph.own, -1)).astype(int)
-    while graph.comm.allreduce(int((colour[: graph.own] < 0).sum())):
-        ready = colour[: graph.own] < 0
+    comm, own = ghosts.comm, ghosts.own
+    priority = _hash(spread(ghosts, offsets(comm, own)[comm.rank] + np.arange(own)))
+    row = np.repeat(np.arange(own), np.diff(indptr))
+    waits = priority[columns] > priority[row]  # edges to neighbours that choose before
+    row, before = row[waits], columns[waits]
+    colour = spread(ghosts, np.full(own, -1)).astype(int)
+    while comm.allreduce(int((colour[:own] < 0).sum())):
+        ready = colour[:own] < 0
         ready[row[colour[before] < 0]] = False
         edge = ready[row]
         taken = np.zeros((int(ready.sum()), int(colour.max(initial=-1)) + 2), bool)
         taken[(np.cumsum(ready) - 1)[row[edge]], colour[before[edge]]] = True
-        own = colour[: graph.own].copy()
-        own[ready] = np.argmin(taken, axis=1)
-        colour = graph.fetch(own).astype(int)
+        colour[:own][ready] = np.argmin(taken, axis=1)
+        colour = spread(ghosts, colour[:own]).astype(int)
         left = ~edge & (colour[row] < 0)
         row, before = row[left], before[left]
     return colour
