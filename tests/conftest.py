@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 
 import numpy as np
@@ -20,6 +21,11 @@ def pytest_xdist_auto_num_workers() -> int:
 @pytest.fixture
 def double(monkeypatch):
     """APGD in double precision from the first iteration: rounding alone is left between two ways to compute it."""
-    from pctt.ccp.first_order import apgd  # not before tests begin: it starts PETSc
+    from pctt import ccp  # not before tests begin: it starts PETSc
+    from pctt.ccp.first_order.apgd import APGD
 
-    monkeypatch.setattr(apgd, "STEERING", apgd.Steering(single=np.inf))
+    @dataclasses.dataclass(frozen=True)
+    class Double(APGD):
+        single: float = np.inf
+
+    monkeypatch.setitem(ccp.SOLVERS, "apgd", dataclasses.replace(ccp.SOLVERS["apgd"], options=Double))

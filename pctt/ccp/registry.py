@@ -9,15 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pctt.ccp import auto
-from pctt.ccp.first_order import apgd, barzilai_borwein, spectral
-from pctt.ccp.first_order.compared import gauss_seidel, gpminres, jacobi, kucera
-from pctt.ccp.first_order.progress import FirstOrder
+from pctt.ccp.first_order import apgd, barzilai_borwein, faces, gauss_seidel, jacobi
+from pctt.ccp.first_order.scaled import FirstOrder
 from pctt.ccp.interior import conic, pdip
 from pctt.ccp.result import Result
 
 PRODUCT, MATRIX, NEWTON = "products with N", "rows of N", "Newton systems"
 EITHER = "products with N, or Newton systems"
-LAW_TOL = 1e-4
 
 
 @dataclass(frozen=True)
@@ -59,20 +57,20 @@ SOLVERS = {
                "symmetric cone interior point method, Nesterov-Todd scaling, Mehrotra's corrector",
                "Nesterov, Todd 1997; Acary et al. 2023", has_law=True),
         Solver("auto", auto.solve, auto.Auto, EITHER, 20_000,
-               "`apgd` as long as it is expected to be the faster, else `conic`", "`pctt/ccp/auto.py`",
-               has_law=True, law_tol=LAW_TOL),
+               "`apgd` for as many iterations as half of `conic` costs, then `conic`", "`pctt/ccp/auto.py`",
+               has_law=True, law_tol=1e-4),
         Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
                "accelerated projected gradient descent with restart", "Mazhar et al. 2015",
-               has_law=True, law_tol=LAW_TOL),
-        Solver("barzilai_borwein", barzilai_borwein.solve, FirstOrder, PRODUCT, 20_000,
+               has_law=True, law_tol=1e-4),
+        Solver("barzilai_borwein", barzilai_borwein.adaptive, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,
                "projected Barzilai-Borwein steps with an adaptive nonmonotone line search", "Dai, Fletcher 2005"),
-        Solver("spectral", spectral.solve, FirstOrder, PRODUCT, 20_000,
+        Solver("spectral", barzilai_borwein.spectral, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,
                "preconditioned spectral projected gradient with fallback (P-SPG-FB)",
                "Heyn et al. 2013; Birgin, Martinez, Raydan 2000"),
-        Solver("kucera", kucera.solve, FirstOrder, PRODUCT, 20_000,
+        Solver("kucera", faces.kucera, FirstOrder, PRODUCT, 20_000,
                "conjugate gradients in the faces of the cones, gradient projection between them",
                "Kucera 2007, 2008"),
-        Solver("gpminres", gpminres.solve, FirstOrder, PRODUCT, 20_000,
+        Solver("gpminres", faces.gpminres, FirstOrder, PRODUCT, 20_000,
                "gradient projection alternating with MINRES in a face", "Heyn et al. 2013"),
         Solver("gauss_seidel", gauss_seidel.solve, gauss_seidel.GaussSeidel, MATRIX, 20_000,
                "projected block Gauss-Seidel over the colours of the contact graph",

@@ -15,12 +15,10 @@ from pctt.options import FRACTION, option
 
 RELAXATION, COULOMB, FIXED_POINT = "relaxation", "Coulomb", "Coulomb by cone problems"
 
-ENOUGH = 1000.0  #: a natural residual of the tolerance over this counts as solved, whatever the closing work is
-
 
 @dataclass(frozen=True)
 class Limits:
-    """When a solver stops; options of every solver: ``-ccp_tol``, ``-ccp_max_it``, ``-ccp_closing_work``."""
+    """When a solver stops; options of every solver: ``-ccp_tol``, ``-ccp_max_it`` and so on."""
 
     tol: float = option(1e-4, "natural residual at which a cone problem counts as solved", check=FRACTION)
     max_it: int = option(
@@ -33,15 +31,16 @@ class Limits:
         "closing and opening work at which a cone problem counts as solved; inf: any",
         check=("a positive number, or inf", lambda x: x > 0),
     )
+    fallback: bool = option(True, "where the solver does not converge, another one goes on from its impulses")
 
     def residual(self, natural: float, problem: ConeProblem, g: Array, y: Array) -> float:
         """What ``tol`` is for: the natural residual of impulses g (nc, 3) with y = N g + r, or their closing or opening
-        work in units in which its limit is ``tol``, whichever is larger. It is at most ENOUGH times the natural
+        work in units in which its limit is ``tol``, whichever is larger. It is at most a thousand times the natural
         residual: where bodies are squeezed no accuracy may bring the closing work below its limit."""
         if math.isinf(self.closing_work):
             return natural
         work = self.tol / self.closing_work * problem.wrong_work(g, y)
-        return min(max(natural, work), ENOUGH * natural)
+        return min(max(natural, work), 1000.0 * natural)
 
     @property
     def met(self) -> str:
@@ -49,7 +48,7 @@ class Limits:
         return f"natural residual{'' if math.isinf(self.closing_work) else ' and closing work'} below the tolerance"
 
     def to(self, tol: float) -> Limits:
-        """The same for another tolerance of the same residual."""
+        """For another tolerance of the same residual."""
         return dataclasses.replace(self, tol=tol, closing_work=self.closing_work / self.tol * tol)
 
 
@@ -61,7 +60,7 @@ class Status(Enum):
     STALLED = "stalled"  #: no progress, or steps too short
     UNBOUNDED = "unbounded"  #: the problem has no solution
     BREAKDOWN = "breakdown"  #: something is no number
-    GIVEN_UP = "given up"  #: its caller expects another method to be faster
+    GIVEN_UP = "given up"  #: the method does not apply
 
 
 @dataclass
@@ -72,18 +71,18 @@ class Result:
     ----------
     impulse : (nc, 3) impulses of this rank's contacts (N s)
     status : CONVERGED where the residual of `Limits` fell below the tolerance, else why not
-    reason : why the iteration ended, in words
+    reason : what ran and why it ended, in words
     residual : the solver's own last value: the natural residual if the closing work has no limit
-    iterations : Newton steps, or steps of a first-order method
+    iterations : Newton steps, or steps of first-order methods, of all methods tried
     ksp_its : Krylov iterations in all Newton steps
     fallbacks : Newton systems that the user's KSP did not solve
-    history : residual per iteration
+    history : residual per iteration of ``solver``; of Coulomb's law by cone problems, one per cone problem
     cone_problems : how many were solved for it: more than one for Coulomb's law
-    solver : name of the method that found it, where that was chosen; "" otherwise
+    solver : name of the method that found the impulses
+    newton_its : the Newton steps among the iterations
     law : RELAXATION, COULOMB or FIXED_POINT: the law of the impulses and of the residuals
-    momentum : (6 owned,) G' g, the change of the mass-scaled velocities of this rank's bodies, as `ccp.solve` fills in
-
-    With FIXED_POINT ``history`` has one residual per cone problem.
+    momentum : (6m,) G' g, or g where the problem is given by N
+    asked : what the asked method made of it, where another one had to follow; else None
     """
 
     impulse: Array
@@ -96,8 +95,10 @@ class Result:
     history: list[float] = field(default_factory=list)
     cone_problems: int = 1
     solver: str = ""
+    newton_its: int = 0
     law: str = RELAXATION
     momentum: Array = field(default_factory=lambda: np.zeros(0))
+    asked: Result | None = None
 
     @property
     def converged(self) -> bool:
@@ -107,3 +108,9 @@ class Result:
     def final(self) -> bool:
         """Whether no other solver would do better."""
         return self.status in (Status.CONVERGED, Status.UNBOUNDED)
+
+    def after(self, *earlier: Result) -> Result:
+        """This result, with what the results before it have cost."""
+        for count in ("iterations", "ksp_its", "fallbacks", "newton_its"):
+            setattr(self, count, sum(getattr(result, count) for result in (self, *earlier)))
+        return self

@@ -11,10 +11,6 @@ import numpy as np
 from pctt.ccp.cone import Array, dot
 from pctt.ccp.problem import ConeProblem
 
-AMPLIFICATION = 1e3  # change of velocity per speed of the contacts that no step is believed to need
-ELSEWHERE = 1e-3  # how much speeds of contacts count that have no part in it
-ROUNDING = 1e-15  # of d'Nd, in units of d' diag(N) d
-
 
 def why_unbounded(problem: ConeProblem, g: Array) -> str:
     """The reason, in words, if the direction d = g / ||g|| of impulses g (nc, 3) in the cones shows that the problem is
@@ -22,7 +18,7 @@ def why_unbounded(problem: ConeProblem, g: Array) -> str:
 
     A solution has velocities y = G v + r in the dual cones, so that d.y >= 0 and ||v|| >= -r.d / ||G'd||. In an
     unbounded problem impulses grow along a d with G'd = 0 and r.d < 0, and this bound is infinite. The problem counts
-    as unbounded if the bound is more than AMPLIFICATION times ||r|| / sqrt(d' diag(N) d), the size that the data
+    as unbounded if the bound is more than a thousand times ||r|| / sqrt(d' diag(N) d), the size that the data
     suggest; a contact counts in ||r|| by its share in d. Self-stress, G'd = 0 with r.d >= 0, does not count, however
     large. With compliance no problem is unbounded, as d'Nd includes it.
 
@@ -32,13 +28,13 @@ def why_unbounded(problem: ConeProblem, g: Array) -> str:
     r = problem.r.copy()
     r[problem.mu == 0, 1:] = 0.0  # sliding that no impulse answers
     sizes, speeds = np.sqrt(dot(g, g)), dot(r, r)
-    weight = np.maximum(sizes / max(problem.max(sizes.max(initial=0.0)), 1e-300), ELSEWHERE**2)
+    share = np.maximum(sizes / max(problem.max(sizes.max(initial=0.0)), 1e-300), 1e-6)
     alone = np.einsum("ni,nij,nj->", g, problem.diagonal_blocks, g)
-    parts = (np.vdot(r, g), weight @ speeds, np.vdot(problem.product(g), g), sizes @ sizes, alone)
+    parts = (np.vdot(r, g), share @ speeds, np.vdot(problem.product(g), g), sizes @ sizes, alone)
     along, closing, bent, length, alone = problem.sum(np.array(parts))
     size, speed = np.sqrt(length), np.sqrt(closing)
-    bound = (along / (AMPLIFICATION * size * speed)) ** 2 if along < 0 < size * speed else 0.0
-    if not bound > max(bent / alone if alone > 0 else 0.0, ROUNDING):
+    bound = (along / (1e3 * size * speed)) ** 2 if along < 0 < size * speed else 0.0
+    if not bound > max(bent / alone if alone > 0 else 0.0, 1e-15):  # rounding of d'Nd
         return ""
     if problem.contact_map is not None and not bound > _left_over(problem, g / size):
         return ""

@@ -176,7 +176,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
         "compliance": problem.softness,
         **dataclasses.asdict(accuracy),
         "cone_problems": result.cone_problems,
-        "newton_its": result.iterations if by_newton else 0,
+        "newton_its": result.newton_its,
         "iterations": result.iterations,
         "ksp_its": result.ksp_its,
         "newton_systems": systems,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import resource
 import sys
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -20,22 +20,6 @@ from dem.world import World
 from pctt import ccp, log
 from pctt.run.dump import Dump
 from pctt.run.settings import Settings
-
-
-class Solved(NamedTuple):
-    """A step's cone problem, solved."""
-
-    result: ccp.Result  #: with which the step goes on
-    asked: ccp.Result  #: what the solver of the options made of it
-    solver: str  #: the method that ``result`` is of
-    newton_its: int  #: Newton steps made
-
-    def after(self, first: Solved) -> Solved:
-        """With what solving the step's first problem took, which lacked a contact."""
-        self.result.iterations += first.result.iterations
-        self.result.ksp_its += first.result.ksp_its
-        self.result.fallbacks += first.result.fallbacks
-        return self._replace(newton_its=self.newton_its + first.newton_its)
 
 
 class Stepper:
@@ -89,23 +73,22 @@ class Stepper:
     def _step(self) -> dict[str, Any]:
         problem, guess = self._assemble(self._search(), self.memory)
         with log.phase("solve"):
-            solved = self.solve(problem, guess)
+            result = self.solve(problem, guess)
         self._corrections = 0
-        while again := self._overrun(solved.result) or self._turned(solved.result):
+        while again := self._overrun(result) or self._turned(result):
             problem, guess = self._assemble(*again)
             with log.phase("solve"):
-                solved = self.solve(problem, guess).after(solved)
-        result = solved.result
+                result = self.solve(problem, guess).after(result)
         with log.phase("solve"):
             accuracy = ccp.measure(problem, result.impulse)
         with log.phase("output"):
-            files = self.dump.step(self.system, problem, guess, result, solved.asked) if self.dump else {}
+            files = self.dump.step(self.system, problem, guess, result, result.asked or result) if self.dump else {}
         with log.phase("advance"):
             self.impulse, self.history = result.impulse, result.history
             advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt)
             self.memory.remember(self.system.key, self.impulse, self.system.frame)
         self._release()
-        return self._figures(problem.size, solved, accuracy, files)
+        return self._figures(problem.size, result, accuracy, files)
 
     def _search(self) -> Contacts:
         """The contacts of the step."""
@@ -114,10 +97,10 @@ class Stepper:
             return find_contacts(self.world, self.settings.delta, self.settings.dt)
 
     def _figures(
-        self, contacts: int, solved: Solved, accuracy: ccp.Accuracy, files: dict[str, Any]
+        self, contacts: int, result: ccp.Result, accuracy: ccp.Accuracy, files: dict[str, Any]
     ) -> dict[str, Any]:
         """The line of a step in steps.jsonl."""
-        newton, result = self.newton, solved.result
+        newton = self.newton
         pc_report = newton.pc_report if newton is not None else []
         compare = newton.compare if newton is not None else None
         phases = ("search", "assembly", "solve", *(["compare"] if compare else []), "advance")
@@ -125,7 +108,7 @@ class Stepper:
             "step": self.world.step,
             "time": self.world.time,
             "contacts": contacts,
-            "newton_its": solved.newton_its,
+            "newton_its": result.newton_its,
             "iterations": result.iterations,
             "ksp_its": result.ksp_its,
             "cone_problems": result.cone_problems,
@@ -134,7 +117,7 @@ class Stepper:
             "status": result.status.value,
             "reason": result.reason,
             "fallbacks": result.fallbacks,
-            "solver": solved.solver,
+            "solver": result.solver,
             "law": result.law,
             "asked_solver": self.settings.solver,
             "tolerance": self.settings.tol,
@@ -193,21 +176,13 @@ class Stepper:
         memory.remember(self.system.key, found.impulse, self.system.frame)
         return memory
 
-    def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> Solved:
-        """Solve as asked; where that does not converge, go on with APGD from there and keep the better."""
-        settings, coulomb = self.settings, self.settings.coulomb or None
-        wanted, limits = settings.solver, settings.limits
-        asked = ccp.solve(problem, guess, wanted, limits, settings.options, self.newton, coulomb)
-        used = asked.solver or wanted
-        newton_its = asked.iterations if ccp.SOLVERS[used].newton else 0
-        if asked.final or used == "apgd":
-            return Solved(asked, asked, used, newton_its)
-        limits = dataclasses.replace(limits, max_it=-1)
-        second = ccp.solve(problem, asked.impulse, "apgd", limits, coulomb=coulomb)
-        if second.residual < asked.residual:
-            second.ksp_its, second.fallbacks = asked.ksp_its, asked.fallbacks
-            return Solved(second, asked, "apgd", newton_its)
-        return Solved(asked, asked, used, newton_its)
+    def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> ccp.Result:
+        """Solve a problem of the step as the settings say."""
+        settings = self.settings
+        coulomb = settings.coulomb or None
+        return ccp.solve(
+            problem, guess, settings.solver, settings.limits, settings.options, self.newton, coulomb
+        )
 
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0) -> ccp.ConeProblem:

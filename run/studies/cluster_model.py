@@ -90,7 +90,7 @@ def solved(problem: ccp.ConeProblem, solver: str) -> dict[str, Any]:
         Counter(ccp.ConeProblem, "sum", "min", "max") as reductions,
         Counter(ScaledProblem, "sums") as first_order,
     ):
-        result = ccp.solve(problem, None, solver, ccp.Limits(TOL, closing_work=np.inf), newton=krylov)
+        result = ccp.solve(problem, None, solver, ccp.Limits(TOL, closing_work=np.inf, fallback=False), newton=krylov)
     seconds, of_petsc = time.perf_counter() - start, _petsc_reductions() - before
     if krylov is not None:
         krylov.destroy()

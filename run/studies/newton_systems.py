@@ -26,7 +26,7 @@ from pctt.pc import TensorTrain
 from pctt.pc.sparse_train import SparseTrain
 from pctt.run.options import read_options
 from pctt.run.settings import Settings
-from pctt.run.stepper import Solved, Stepper
+from pctt.run.stepper import Stepper
 from pctt.simulation import Simulation
 
 
@@ -87,17 +87,18 @@ class ReplayingStepper(Stepper):
         super().__init__(settings, world, memory, Recorder(world.comm))
         self.look, self.newton_steps = look, newton_steps
 
-    def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> Solved:
+    def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> ccp.Result:
         assert isinstance(self.newton, Recorder)
         limits, options = self.settings.limits, self.settings.options
-        few = limits if self.newton_steps is None else replace(limits, max_it=self.newton_steps)
-        result = ccp.solve(problem, guess, "pdip", few, options, self.newton)
+        if self.newton_steps is not None:
+            limits = replace(limits, max_it=self.newton_steps, fallback=False)
+        result = ccp.solve(problem, guess, "pdip", limits, options, self.newton)
         replay = Replay(problem, self.newton.systems)
         self.look(replay)
         replay.destroy()
         if self.newton_steps is not None:
-            result = ccp.solve(problem, guess, "apgd", limits)
-        return Solved(result, result, "pdip" if self.newton_steps is None else "apgd", result.iterations)
+            result = ccp.solve(problem, guess, "apgd", self.settings.limits)
+        return result
 
 
 def replay_steps(

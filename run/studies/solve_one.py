@@ -47,14 +47,14 @@ class Watch:
 def own(problem: ccp.ConeProblem, name: str, tol: float, seconds: float, coulomb: bool) -> dict[str, Any]:
     """A solver of the registry from a cold start."""
     newton = ccp.newton_for(problem.comm, name) if ccp.SOLVERS[name].newton else None
-    limits = ccp.Limits(tol, 10_000_000 if not newton else -1, math.inf)
+    limits = ccp.Limits(tol, 10_000_000 if not newton else -1, math.inf, fallback=False)
     law = ccp.Coulomb() if coulomb else None
     impulse = None
     with Counter(type(problem.operator), "add_delassus") as products:
         watch = Watch(problem, newton, products, seconds)
         try:
             result = ccp.solve(problem, None, name, limits, None, newton, law)
-            impulse, reason, solver = result.impulse, result.reason, result.solver or name
+            impulse, reason, solver = result.impulse, result.reason, result.solver
         except OutOfTimeError:
             reason, solver = f"{seconds:g} s", name
         spent = time.perf_counter() - watch.start

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +9,10 @@ import pytest
 from mpi4py import MPI
 from problems import SELF, from_graph, heap, matrix
 from several_ranks import alone
-from test_accuracy import column
 
 from pctt import ccp
-from pctt.ccp import Coulomb, Limits, Status, auto, coulomb, fclib
-from pctt.ccp.first_order.momentum import Momentum
+from pctt.ccp import Coulomb, Limits, Status, fclib
+from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.interior import conic, lorentz, slip
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "fclib"
@@ -26,13 +24,13 @@ def solve(problem, solver="apgd", tol=1e-8, guess=None, **options):
 
 
 def by_cone_problems(problem, tol=1e-8, guess=None, **options):
-    """The second rung alone, with APGD inside."""
+    """A sequence of cone problems, solved by APGD."""
     guess = np.zeros_like(problem.r) if guess is None else guess
 
-    def convex(problem, guess, tol):
-        return ccp.solve(problem, guess, "apgd", Limits(tol))
+    def convex(guess, limits):
+        return ccp.solve(problem, guess, "apgd", limits)
 
-    return coulomb.solve(problem, guess, Limits(tol), Coulomb(**options), convex)
+    return fixed_point(convex, problem, guess, Limits(tol), Coulomb(**options))
 
 
 def newton_steps(problem, tol=1e-8, guess=None):
@@ -108,118 +106,12 @@ def test_one_run_finds_it_at_high_friction(mu):
         assert result.iterations < 2500
 
 
-def test_near_a_solution_the_bound_of_momentum_changes_seldom():
-    """Far from it every window begins without a bound."""
-
-    def beta(friction, residuals, iterations=0):
-        momentum = Momentum(friction)
-        momentum.look(0, residuals[:1])
-        momentum.look(iterations, residuals)
-        for _ in range(1000):
-            momentum.advance(uphill=False)
-        return momentum.beta
-
-    assert beta(0.5, [1e-3]) > 0.99
-    for stalled in (0, 500):
-        assert beta(0.5, [2e-5, 1e-3, 1e-3], stalled) == pytest.approx(0.97)
-    assert beta(0.5, [2e-5, 2e-5], 1000) == pytest.approx(0.94)
-    assert beta(0.5, [2e-6, 2e-6], 1000) == pytest.approx(0.97)  # nearer, not at all
-    assert beta(1.5, [2e-5]) == pytest.approx(0.95)
-    assert beta(None, [2e-5]) > 0.99  # without the law there is none
-
-
 def test_the_newton_steps_of_conic_end_fast():
     """The derivative of the opening is that: the last five steps take three digits off the residual."""
     result = newton_steps(sliding_heap(0.3, seed=1), tol=1e-9)
     assert result.converged, result.reason
     assert result.iterations < 20
     assert result.history[-1] < 1e-3 * result.history[-6]
-
-
-def test_the_last_rung_is_the_relaxation(monkeypatch):
-    """Where nothing finds Coulomb's law the best is handed back, and named."""
-    problem = sliding_heap(0.3)
-
-    def convex(problem, guess, tol):
-        impulse = ccp.solve(problem, guess, "apgd", Limits(tol)).impulse
-        return ccp.Result(impulse, Status.CONVERGED, "as it happens", 1.0, 7)
-
-    def failing(problem, guess, tol):
-        return ccp.Result(np.full_like(guess, 1e-3), Status.STALLED, "as it happens", 1.0, 7)
-
-    not_met = Status.STALLED, "not met", 0.9, 5
-    monkeypatch.setattr(coulomb, "solve", lambda problem, guess, *rest: ccp.Result(guess, *not_met))
-    guess = np.zeros_like(problem.r)
-    result = coulomb.ladder(problem, guess, Limits(1e-8), Coulomb(), convex, [failing])
-    assert not result.converged
-    assert result.law == "relaxation"
-    assert result.reason.startswith("relaxation, as Coulomb's law was not met")
-    assert result.iterations == 7 + 5 + 7
-    assert result.residual == pytest.approx(ccp.measure(problem, result.impulse).coulomb_residual, rel=1e-6)
-
-
-@pytest.mark.parametrize(("tol", "tried"), [(1e-7, False), (1e-9, True)])
-def test_no_cone_problems_from_a_point_near_the_law(monkeypatch, tol, tried):
-    """They would lead away from it."""
-    problem, calls = sliding_heap(0.3), []
-    found = solve(problem, tol=5e-7)
-    assert 1e-8 < found.residual < 1e-6
-
-    def by_cone_problems(problem, guess, *rest):
-        calls.append(guess)
-        return ccp.Result(guess, Status.CONVERGED, "as it happens", 0.5 * tol, 7)
-
-    def stalling(problem, guess, tol):
-        return dataclasses.replace(found, status=Status.STALLED)
-
-    monkeypatch.setattr(coulomb, "solve", by_cone_problems)
-    result = coulomb.ladder(problem, np.zeros_like(problem.r), Limits(tol), Coulomb(), stalling, [stalling])
-    assert bool(calls) == result.converged == tried
-    assert np.array_equal(result.impulse, found.impulse)
-
-
-def test_each_way_begins_where_the_one_before_has_ended():
-    problem = sliding_heap(0.3)
-    starts = []
-
-    def way(problem, guess, tol):
-        starts.append(guess[0, 0])
-        status = Status.CONVERGED if len(starts) == 3 else Status.STALLED
-        return ccp.Result(guess + 1.0, status, "as it happens", 1e-3, 7)
-
-    result = coulomb.ladder(problem, np.zeros_like(problem.r), Limits(1e-8), Coulomb(), way, 4 * [way])
-    assert starts == [0.0, 1.0, 2.0]
-    assert (result.converged, result.law, result.iterations) == (True, "Coulomb", 21)
-
-
-def test_where_the_path_of_conic_ends_early_apgd_goes_on(monkeypatch):
-    """`apgd` begins, is given up, `conic` follows its path from the first guess, and `apgd` goes on from its end."""
-    problem, starts = sliding_heap(0.3), {"apgd": [], "conic": []}
-    guess = 0.5 * solve(problem, tol=1e-3).impulse
-
-    def noted(name, module):
-        original = module.solve
-
-        def noting(problem, guess, *rest):
-            result = original(problem, guess, *rest)
-            starts[name].append((guess, result))
-            return result
-
-        monkeypatch.setattr(module, "solve", noting)
-
-    noted("apgd", auto.apgd)
-    noted("conic", auto.conic)
-    monkeypatch.setattr(auto, "STEERING", dataclasses.replace(auto.STEERING, law=1e-6, law_contacts=1e12))
-    result = solve(problem, "conic", 1e-8, guess=guess)
-    assert (result.converged, result.law, result.solver) == (True, "Coulomb", "apgd")
-    (first, given_up), (second, _) = starts["apgd"]
-    (path, ended), = starts["conic"]
-    assert given_up.status is Status.GIVEN_UP
-    assert np.array_equal(path, guess)
-    assert np.array_equal(first, guess)
-    assert 1e-8 < ended.residual <= auto.STEERING.basin
-    assert np.array_equal(second, ended.impulse)
-    assert ccp.measure(problem, result.impulse).coulomb_residual < 1e-7
 
 
 def test_conic_begins_near_a_good_guess(monkeypatch):
@@ -251,22 +143,9 @@ def test_contacts_that_do_not_slide_have_no_direction():
         np.testing.assert_allclose(slip.sliding_directions(z), [[0, 0, 0], [0, 0.6, -0.8]])
 
 
-def test_a_problem_without_solution_stays_one(monkeypatch):
-    """However small a residual an earlier rung has left."""
-    problem = sliding_heap(0.3)
-    none = ccp.Result(np.ones_like(problem.r), Status.UNBOUNDED, "no solution", 0.9, 5)
-    monkeypatch.setattr(coulomb, "solve", lambda *arguments: none)
-
-    def stalling(problem, guess, tol):
-        return ccp.Result(guess, Status.STALLED, "as it happens", 1e-3, 7)
-
-    result = coulomb.ladder(problem, np.zeros_like(problem.r), Limits(1e-8), Coulomb(), stalling, [stalling])
-    assert (result.status, result.reason, result.iterations) == (Status.UNBOUNDED, "no solution", 12)
-
-
 def test_acceleration_and_a_warm_start_save_cone_problems():
     problem = sliding_heap(0.8)
-    plain, fast = (by_cone_problems(problem, tol=1e-4, memory=memory) for memory in (0, 5))
+    plain, fast = (by_cone_problems(problem, tol=1e-4, depth=depth) for depth in (0, 5))
     assert fast.converged
     assert fast.cone_problems < plain.cone_problems
     again = by_cone_problems(problem, tol=1e-4, guess=fast.impulse)
@@ -282,13 +161,6 @@ def test_giving_up_is_said():
     assert result.reason == f"Coulomb's law not met: residual {min(result.history):.1e} at best in 3 cone problems"
     assert np.array_equal(problem.r, r)  # put back
     assert ccp.measure(problem, result.impulse).coulomb_residual == pytest.approx(min(result.history), rel=1e-3)
-
-
-def test_its_own_tolerance_goes_before():
-    result = solve(sliding_heap(0.3), tol=1e-9)
-    assert result.residual <= 1e-9
-    loose = ccp.solve(sliding_heap(0.3), type="apgd", limits=Limits(1e-9), coulomb=Coulomb(tol=1e-3))
-    assert 1e-9 < loose.residual <= 1e-3
 
 
 def test_without_friction_or_sliding_it_is_the_cone_problem():
@@ -327,12 +199,12 @@ def test_what_was_learnt_is_forgotten_when_the_residual_grows(growth, forgets):
     problem = ccp.ConeProblem(SELF, r.copy(), np.array([mu]), N=matrix(SELF, np.eye(3)))
     openings, answers = [], [1 + error for error in (0.1, 0.02, 0.02 * growth, 0.0)]
 
-    def convex(shifted, guess, tol):
-        openings.append(shifted.r[0, 0] - r[0, 0])
+    def convex(guess, limits):
+        openings.append(problem.r[0, 0] - r[0, 0])
         g = answers[len(openings) - 1] * np.array([[1.0, -mu, 0.0]])
         return ccp.Result(g, Status.CONVERGED, "", 0.0, 1, 0, 0, [0.0])
 
-    result = coulomb.solve(problem, np.zeros((1, 3)), Limits(1e-6), Coulomb(), convex)
+    result = fixed_point(convex, problem, np.zeros((1, 3)), Limits(1e-6), Coulomb())
     assert result.converged
     assert result.history[2] == pytest.approx(growth * result.history[1], rel=0.1)
     sliding = 3.0 - mu * answers[2]
@@ -354,12 +226,3 @@ def test_the_answer_does_not_depend_on_the_ranks():
     expected = alone(lambda comm: figures_of(comm, "apgd"))
     for solver in ("apgd", "conic"):
         np.testing.assert_allclose(figures_of(MPI.COMM_WORLD, solver), expected, rtol=1e-5)
-
-
-def test_where_the_closing_work_alone_is_too_large_no_cone_problems_follow():
-    """After 60 iterations the natural residual of a column that comes to rest is small enough."""
-    limits = Limits(1e-2, 60)
-    result = ccp.solve(column(30, stopped=0)[0], type="apgd", limits=limits, coulomb=Coulomb())
-    assert not result.converged
-    assert result.residual > limits.tol
-    assert (result.law, result.cone_problems) == ("Coulomb", 1)

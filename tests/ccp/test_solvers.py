@@ -11,7 +11,6 @@ from problems import SELF, Graph, Known, from_graph, from_matrix, heap, known_op
 
 from pctt import ccp
 from pctt.ccp import Limits
-from pctt.ccp.first_order import apgd
 from pctt.ccp.registry import NEWTON
 
 EVERY = pytest.mark.parametrize("solver", ccp.SOLVERS)
@@ -59,22 +58,6 @@ def test_reaches_the_known_optimum(solver, name, way):
     problem = from_graph(known, graph) if way == "by its map" else from_matrix(known)
     tol = tolerance(solver)
     check(known, problem, ccp.solve(problem, type=solver, limits=Limits(tol)), tol)
-
-
-@pytest.mark.parametrize("seed", range(100, 106))
-def test_both_solvers_find_the_same_motion(seed):
-    """With sizes, friction and mass ratio drawn at random; the impulses themselves need not be unique."""
-    rng = np.random.default_rng(seed)
-    contacts = int(rng.integers(2, 60))
-    mu = rng.uniform(0, 1.0, contacts) * (rng.random(contacts) < 0.8)
-    bodies = 1 + int(contacts * rng.uniform(0.4, 1.5))
-    known, graph = heap(seed, contacts, bodies, mu, mass_ratio=rng.uniform(1, 20))
-    problem = from_graph(known, graph)
-    found = [ccp.solve(problem, type=solver, limits=Limits(TOL)) for solver in ("pdip", "apgd")]
-    for result in found:
-        check(known, problem, result)
-    one, two = (problem.product(result.impulse) for result in found)
-    assert np.linalg.norm(one - two) <= 1e3 * TOL * np.linalg.norm(known.r)
 
 
 @pytest.mark.parametrize("constraint", ["perspective", "quadratic"])
@@ -187,12 +170,6 @@ def test_bodies_of_very_different_mass(solver, seed, database):
     check(known, problem, ccp.solve(problem, type=solver, limits=Limits(tol)), tol)
 
 
-def test_bodies_of_very_different_mass_with_default_options():
-    for seed in range(0, 100, 10):
-        known, graph = heap(seed, mass_ratio=1e4)
-        assert ccp.solve(from_graph(known, graph)).converged
-
-
 def in_units(known: Known, a: float, b: float) -> Known:
     """min 1/2 g'(aN)g + (br)'g has the solution b/a g and the velocities b y."""
     return Known(a * known.N, b * known.r, known.mu, b / a * known.g, b * known.y)
@@ -210,22 +187,6 @@ def test_units_that_are_powers_of_two_change_nothing_but_the_units(solver, a, b)
     rounding = 1e-6 if solver in ("conic", "auto") else 0.0  # auto may go over to conic
     assert scaled.history == pytest.approx(plain.history, rel=rounding, abs=0.0)
     assert np.allclose(scaled.impulse, b / a * plain.impulse, rtol=rounding, atol=rounding * b / a)
-
-
-@EVERY
-@pytest.mark.parametrize(("a", "b"), [(1e-9, 1.0), (1e-5, 1e7), (1e6, 1e-3)])
-def test_other_units_need_the_same_steps(solver, a, b):
-    """Also with contacts without friction."""
-    known, _ = heap(2, mu=np.arange(40) % 5 * 0.2)
-    scaled = in_units(known, a, b)
-    tol = tolerance(solver, 1e-6)
-    plain = ccp.solve(from_matrix(known), type=solver, limits=Limits(tol))
-    result = ccp.solve(from_matrix(scaled), type=solver, limits=Limits(tol))
-    check(scaled, from_matrix(scaled), result, tol)
-    if ccp.SOLVERS[solver].needs == NEWTON:
-        assert abs(result.iterations - plain.iterations) <= 3
-    else:  # rounding grows along the path of a nonmonotone method
-        assert abs(result.iterations - plain.iterations) <= 10 + plain.iterations / 2
 
 
 @EVERY
@@ -255,7 +216,7 @@ def test_first_order_methods_started_at_the_solution_stay_there(solver):
 def test_giving_up_is_said_and_leaves_an_impulse_in_the_cones(solver, max_it):
     known, graph = heap()
     problem = from_graph(known, graph)
-    result = ccp.solve(problem, type=solver, limits=Limits(1e-8, max_it))
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-8, max_it, fallback=False))
     assert not result.converged
     newton = ccp.SOLVERS[solver].needs == NEWTON
     assert str(max_it if newton else result.iterations) in result.reason
@@ -277,18 +238,9 @@ def test_more_steps_bring_it_nearer(solver):
     errors = []
     steps = {"pdip": (5, 15, 25), "conic": (3, 6, 9), "auto": (10, 40, 200)}.get(solver, (10, 100, 1000))
     for max_it in steps:
-        impulse = ccp.solve(problem, type=solver, limits=Limits(1e-14, max_it)).impulse
+        impulse = ccp.solve(problem, type=solver, limits=Limits(1e-14, max_it, fallback=False)).impulse
         errors.append(np.linalg.norm(problem.product(impulse) + problem.r - known.y))
     assert errors[0] > 2 * errors[1] > 4 * errors[2]
-
-
-def test_pdip_counts_what_it_did():
-    known, graph = heap()
-    result = ccp.solve(from_graph(known, graph), limits=Limits(1e-6))
-    assert len(result.history) == result.iterations + 1
-    assert result.history[-1] == result.residual
-    assert result.ksp_its >= result.iterations
-    assert result.fallbacks == 0
 
 
 @pytest.mark.parametrize(
@@ -313,30 +265,6 @@ def test_systems_that_the_asked_for_method_cannot_solve_are_solved_and_counted(o
     assert 0 < result.fallbacks <= 2 * result.iterations  # a Newton step solves one system or two
     assert abs(result.iterations - expected.iterations) <= 3
     assert expected.fallbacks == 0
-
-
-def test_pdip_takes_the_users_krylov_method(database):
-    known, graph = heap()
-    problem = from_graph(known, graph)
-    database["ksp_type"] = "gmres"
-    database["pc_type"] = "cholesky"
-    result = ccp.solve(problem, limits=Limits(1e-6))
-    check(known, problem, result, 1e-6)
-    assert result.ksp_its <= 2 * result.iterations  # with an exact factorisation
-    assert result.fallbacks == 0
-
-
-def test_options_of_a_solver_are_used():
-    """Careful centring takes more Newton steps, looking seldom more iterations than needed, in each precision."""
-    known, graph = heap()
-    problem = from_graph(known, graph)
-    slow = ccp.solve(problem, limits=Limits(1e-6), options=ccp.SOLVERS["pdip"].options(centering=0.8))
-    assert slow.iterations > 1.5 * ccp.solve(problem, limits=Limits(1e-6)).iterations
-    every = ccp.solve(problem, type="apgd", limits=Limits(1e-6), options=apgd.APGD(check=1))
-    seldom = ccp.solve(problem, type="apgd", limits=Limits(1e-6), options=apgd.APGD(check=500))
-    assert every.converged
-    assert every.iterations <= seldom.iterations <= 1010 + every.iterations
-    assert len(seldom.history) < len(every.history)
 
 
 # -- several ranks ------------------------------------------------------------------------------------------

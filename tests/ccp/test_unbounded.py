@@ -172,14 +172,3 @@ def test_one_squeezed_sphere_among_many_contacts_on_several_ranks():
     nothing = problem.natural_residual(np.full_like(problem.r, np.nan if comm.rank == 0 else 1.0), problem.r)
     assert words == ["unbounded", "unbounded"]
     assert nothing == np.inf
-
-
-@pytest.mark.parametrize("wrong", [np.nan, np.inf])
-def test_the_residual_of_impulses_that_are_no_numbers_is_infinite(wrong):
-    known, graph = heap()
-    problem = from_graph(known, graph)
-    g, y = known.g.copy(), known.y.copy()
-    g[3, 1] = wrong
-    with np.errstate(invalid="ignore"):
-        assert problem.natural_residual(g, y) == np.inf
-        assert problem.natural_residual(known.g, np.where(np.arange(40)[:, None] == 2, wrong, y)) == np.inf

@@ -79,7 +79,7 @@ BAD_OPTIONS = {
     "-ccp_conic_start 0.1": ["another -ccp_type than pdip"],
     "-ccp_newton body -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],
     "-ksp_rtol 1e-3 -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],
-    "-ccp_coulomb_tol 1e-3": ["-ccp_coulomb"],
+    "-ccp_coulomb_max_it 3": ["-ccp_coulomb"],
     # misspelt options of PETSc
     "-pc_typ ilu": ["did you mean -pc_type?"],
     "-ksp_tpye cg -ccp_type conic": ["did you mean -ksp_type?"],

@@ -48,7 +48,7 @@ def test_a_problem_that_is_not_solved_says_so(program, tmp_path):
     path = FOLDER / "Spheres-i099-356-679.hdf5"
     if not path.exists():
         pytest.skip(f"no {path}")
-    done = program("-problem", path, "-ccp_max_it", 3, "-ccp_tol", 1e-9)
+    done = program("-problem", path, "-ccp_max_it", 3, "-ccp_tol", 1e-9, "-ccp_fallback", 0)
     summary = json.loads((tmp_path / "results" / "summary.json").read_text())
     assert summary["converged"] is False
     assert summary["newton_its"] == 3

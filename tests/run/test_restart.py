@@ -51,7 +51,7 @@ def test_on_another_number_of_ranks_the_way_is_the_same_but_for_rounding(settled
     monkeypatch.chdir(tmp_path)
     comm = MPI.COMM_WORLD
     one, two = (comm.Split(0 if comm.rank < count else MPI.UNDEFINED) for count in (1, 2))
-    options = (*SMALL, "-ccp_type", "apgd", "-ccp_max_it", "20", "-quiet")
+    options = (*SMALL, "-ccp_type", "apgd", "-ccp_max_it", "20", "-ccp_fallback", "0", "-quiet")
 
     def run(ranks, *more):
         if ranks != MPI.COMM_NULL:

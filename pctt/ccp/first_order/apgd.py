@@ -6,98 +6,93 @@ the gradient at the extrapolated point follows from those at the last two iterat
 line search is a Rayleigh quotient. The extrapolated point is computed twice, where it is used: reading the last two
 iterates takes less time than storing and reading the point.
 
-For Coulomb's law the opening mu |y_t| of the present gradient is added to it in every iteration, and momentum gets a
-bound (`Momentum`). Then Coulomb's law is the fixed point of the projected step, and one run finds it.
+For Coulomb's law the De Saxce term mu |y_t| of the present gradient is added to it in every iteration. Then the law is
+the fixed point of the projected step, and one run finds it. But that step is no gradient step: the term is not the
+derivative of any function of the impulses. Linearised, the step is an unsymmetric map with complex eigenvalues a + ib,
+and where 1 - beta < |b| / sqrt(a) momentum beta turns them into growing oscillations. So momentum has a bound, and
+begins anew where steps have grown.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pctt.ccp.cone import Array, accelerated_curvature, accelerated_step
-from pctt.ccp.first_order.momentum import Momentum
-from pctt.ccp.first_order.progress import FirstOrder, GiveUp, Progress
-from pctt.ccp.first_order.scaled import ScaledProblem
+from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
-
-
-@dataclass(frozen=True)
-class Steering:
-    """How the estimate L of the curvature follows the curvature along the steps; its inverse is the length of a
-    step."""
-
-    margin: float = 1.3  #: L of a repeated step, over the curvature found: the next step need not be repeated too
-    decay: float = 0.99  #: factor on L after each step, so that steps grow again where the curvature allows it
-    rounding: float = 1e-12  #: part of L by which the curvature may exceed it
-    least: float = 1e-3  #: the first L at least; A has a diagonal of about one
-    #: natural residual above which single precision is enough, times the root of the number of contacts: rounding hides
-    #: the curvature along a step, but the errors of many contacts cancel
-    single: float = 3e-4
-
-
-STEERING = Steering()
+from pctt.options import number
 
 
 @dataclass(frozen=True)
 class APGD(FirstOrder):
-    """Options ``-ccp_apgd_*``."""
+    """Options ``-ccp_apgd_*``. L is the estimate of the curvature along a step; its inverse is the step's length."""
+
+    margin: float = number(1.3, "L of a repeated step, over the curvature found: the next need not be repeated too")
+    decay: float = number(0.99, "factor on L after each step, so that steps grow again where the curvature allows it")
+    damping: float = number(0.05, "Coulomb's law: 1 - the greatest momentum; docs/notebook_ccp.md has trials")
+    near: float = number(0.03, "the same below a residual of 1e-4, where slow chains of force are left")
+    growth: float = number(6.0, "Coulomb's law: of a squared step over the least one, where momentum begins anew")
+    single: float = number(
+        3e-4,
+        "natural residual above which single precision is enough, times the root of the number of contacts: rounding "
+        "hides the curvature along a step, but the errors of many contacts cancel",
+    )
 
 
-def solve(
-    problem: ConeProblem,
-    guess: Array,
-    limits: Limits,
-    options: APGD,
-    give_up: GiveUp | None = None,
-    coulomb: bool = False,
-) -> Result:
+def solve(problem: ConeProblem, guess: Array, limits: Limits, options: APGD, coulomb: bool = False) -> Result:
     """Impulses from a first guess (nc, 3): of the cone problem, or of Coulomb's law.
 
     If the bodies are known, the first iterations have single precision. The last ones, and the residual of the result,
     always have double precision.
     """
-    momentum = Momentum(problem.max(problem.mu.max(initial=0.0)) if coulomb else None)
     progress = None
     if problem.contact_map is not None:
-        enough = STEERING.single / np.sqrt(max(problem.size, 1))
-        rough = limits.to(max(limits.tol, enough))
-        progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, options, give_up)
-        rough_impulse = _descend(progress, momentum, guess)
+        rough = limits.to(max(limits.tol, options.single / np.sqrt(max(problem.size, 1))))
+        impatient = replace(options, patience=min(options.patience, 300))  # double precision takes over
+        progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, impatient)
+        rough_impulse = _descend(progress, guess, options)
         if progress.iterations:  # else rounding would spoil a guess that is good already
             guess = rough_impulse
-    progress = Progress(ScaledProblem(problem, coulomb), limits, options, give_up, progress)
-    _descend(progress, momentum, guess)
+    progress = Progress(ScaledProblem(problem, coulomb), limits, options, progress)
+    _descend(progress, guess, options)
     return progress.result()
 
 
-def _descend(progress: Progress, momentum: Momentum, guess: Array) -> Array:
+def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
     """The best impulses that accelerated projected steps find from a first guess."""
-    scaled = progress.problem
-    momentum.restart()
+    scaled, coulomb = progress.problem, progress.problem.coulomb
     x = scaled.start(guess)
     y = scaled.gradient(x)
     last_x, last_y, new_x, new_y = x.copy(), y.copy(), np.empty_like(x), np.empty_like(y)
     lipschitz = _first_lipschitz(scaled)
+    theta, beta, least = 1.0, 0.0, np.inf  # momentum is beta; the least of |L step|^2 since it has begun
     while progress.goes_on(x, y):
-        momentum.look(progress.iterations, progress.history)
-        beta, mu = momentum.beta, scaled.mu
         while True:  # a step from z = x + beta (x - last_x), where the gradient is y_z = y + beta (y - last_y)
-            length, uphill = accelerated_step(x, last_x, y, last_y, beta, 1 / lipschitz, mu, scaled.opening, new_x)
+            length, uphill = accelerated_step(
+                x, last_x, y, last_y, beta, 1 / lipschitz, scaled.mu, float(coulomb), new_x
+            )
             scaled.gradient(new_x, out=new_y)
             progress.iterations += 1
             curvature = accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta)
             curvature, length, uphill = scaled.sums(curvature, length, uphill)
-            allowed = lipschitz * length * (1 + STEERING.rounding)
+            allowed = lipschitz * length * (1 + 1e-12)
             if not (length > 0 and curvature > allowed):  # also ends on a number that is none
                 break
-            lipschitz = STEERING.margin * curvature / length
-        momentum.advance(uphill > 0)
+            lipschitz = options.margin * curvature / length
+        step = lipschitz**2 * length
+        if uphill > 0 or (coulomb and step > options.growth * least):
+            theta, beta, least = 1.0, 0.0, np.inf
+        else:
+            last_theta, theta = theta, theta * (np.sqrt(theta**2 + 4) - theta) / 2
+            beta, least = last_theta * (1 - last_theta) / (last_theta**2 + theta), min(least, step)
+            if coulomb:
+                beta = min(beta, 1 - (options.near if progress.best < 1e-4 else options.damping))
         last_x, x, new_x = x, new_x, last_x
         last_y, y, new_y = y, new_y, last_y
-        lipschitz *= STEERING.decay
+        lipschitz *= options.decay
     return progress.impulse
 
 
@@ -105,4 +100,4 @@ def _first_lipschitz(problem: ScaledProblem) -> float:
     ones = np.ones_like(problem.b)
     Ax = problem.product(ones)
     length, size = problem.dots((Ax, Ax), (ones, ones))
-    return max(float(np.sqrt(length / max(size, 1.0))), STEERING.least)
+    return max(float(np.sqrt(length / max(size, 1.0))), 1e-3)  # A has a diagonal of about one

@@ -1,10 +1,7 @@
-"""Projected Barzilai-Borwein method with adaptive nonmonotone line search.
+"""Projected Barzilai-Borwein steps, with two line searches: `barzilai_borwein` and `spectral`.
 
-Dai and Fletcher, "Projected Barzilai-Borwein methods for large-scale box-constrained quadratic programming", Numer.
-Math. 100 (2005); here on cones, as the method needs nothing but the projection. Steps alternate between the two
-Barzilai-Borwein lengths. A step is shortened, to the exact minimiser on its segment, only where the objective would
-rise above a reference value: the worst of the values since the best one, taken over when `Steering.memory` steps have
-brought no new best. One product with N per iteration.
+Both methods alternate between the two Barzilai-Borwein lengths of a projected step, with one product with N per
+iteration. They differ in when a step is shortened, as the objective need not fall in every one of them.
 """
 
 from __future__ import annotations
@@ -15,33 +12,84 @@ from dataclasses import dataclass
 import numpy as np
 
 from pctt.ccp.cone import Array
-from pctt.ccp.first_order.progress import FirstOrder, Progress
-from pctt.ccp.first_order.scaled import ScaledProblem
+from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
+from pctt.options import number
 
 # from slope and curvature, of the change slope t + curvature t^2 / 2 of the objective: the part t of the step to take
 LineSearch = Callable[[float, float], float]
 
 
 @dataclass(frozen=True)
-class Steering:
-    """Numbers that steer the method."""
+class BarzilaiBorwein(FirstOrder):
+    """Options ``-ccp_barzilai_borwein_*`` and ``-ccp_spectral_*``."""
 
-    memory: int = 10  #: steps without a new best objective after which the reference value falls; Dai and Fletcher's L
-    flat: float = 1e-14  #: curvature over squared length of a step below which rounding decides its sign
-
-
-STEERING = Steering()
+    window: int = number(10, "objectives that the line search compares with; Dai and Fletcher's L, Birgin's M")
 
 
-def solve(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder) -> Result:
-    """Impulses from a first guess (nc, 3)."""
-    return descend(problem, guess, limits, options, adaptive_search())
+def adaptive(problem: ConeProblem, guess: Array, limits: Limits, options: BarzilaiBorwein) -> Result:
+    """Impulses from a first guess (nc, 3), by the adaptive nonmonotone line search.
+
+    Dai and Fletcher, "Projected Barzilai-Borwein methods for large-scale box-constrained quadratic programming", Numer.
+    Math. 100 (2005); here on cones, as the method needs nothing but the projection. A step is shortened, to the exact
+    minimiser on its segment, only where the objective would rise above a reference value: the worst of the values since
+    the best one, taken over when ``window`` steps have brought no new best.
+    """
+    reference, best, worst, since = np.inf, 0.0, 0.0, 0  # objectives, less that of the present point
+
+    def line_search(slope: float, curvature: float) -> float:
+        nonlocal reference, best, worst, since
+        part = 1.0
+        if curvature > 0 and slope + 0.5 * curvature > reference:
+            part = min(1.0, -slope / curvature)
+        change = part * slope + 0.5 * part**2 * curvature
+        reference, best, worst = reference - change, best - change, worst - change
+        if best > 0:
+            best, worst, since = 0.0, 0.0, 0
+        else:
+            worst, since = max(worst, 0.0), since + 1
+            if since == options.window:
+                reference, worst, since = worst, 0.0, 0
+        return part
+
+    return _descend(problem, guess, limits, options, line_search)
 
 
-def descend(
-    problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder, line_search: LineSearch
+def spectral(problem: ConeProblem, guess: Array, limits: Limits, options: BarzilaiBorwein) -> Result:
+    """Impulses from a first guess (nc, 3), by preconditioned spectral projected gradient with fallback (P-SPG-FB).
+
+    Heyn, Anitescu, Tasora, Negrut, "Using Krylov subspace and spectral methods for solving complementarity problems in
+    many-body contact dynamics simulation", Int. J. Numer. Meth. Engng 95 (2013), after Birgin, Martinez, Raydan,
+    "Nonmonotone spectral projected gradient methods on convex sets", SIAM J. Optim. 10 (2000). The preconditioner is
+    the diagonal of N (`ScaledProblem`), taken so that the projection stays exact in its metric. Steps are accepted by
+    the nonmonotone test of Grippo, Lampariello and Lucidi: sufficient descent below the largest of the last ``window``
+    objectives. The fallback is that the result is the best point seen (`Progress`).
+    """
+    rises = np.zeros(1)  # objectives of the last points, less that of the present one
+
+    def line_search(slope: float, curvature: float) -> float:
+        nonlocal rises
+        part, change = sufficient(slope, curvature, rises.max())
+        rises = np.append(rises - change, 0.0)[-options.window :]
+        return part
+
+    return _descend(problem, guess, limits, options, line_search)
+
+
+def sufficient(slope: float, curvature: float, rise: float) -> tuple[float, float]:
+    """The part of a step to take, and the change of the objective, with the constants of Birgin, Martinez and Raydan.
+
+    ``rise``: how far above the present objective the next one may be."""
+    part, change = 1.0, slope + 0.5 * curvature
+    while change > rise + 1e-4 * part * slope and slope < 0:
+        part *= min(max(-slope / (curvature * part), 0.1), 0.9)
+        change = part * slope + 0.5 * part**2 * curvature
+    return part, change
+
+
+def _descend(
+    problem: ConeProblem, guess: Array, limits: Limits, options: BarzilaiBorwein, line_search: LineSearch
 ) -> Result:
     """Impulses by projected steps of these lengths with any line search."""
     scaled = ScaledProblem(problem)
@@ -62,27 +110,6 @@ def descend(
         x = np.add(x, d, out=d)
         y += Ad
         step = 1.0
-        if curvature > STEERING.flat * length:
+        if curvature > 1e-14 * length:  # else rounding decides its sign
             step = float(length / curvature if progress.iterations % 2 else curvature / stretch)
     return progress.result()
-
-
-def adaptive_search() -> LineSearch:
-    reference, best, worst, since = np.inf, 0.0, 0.0, 0  # objectives, less that of the present point
-
-    def search(slope: float, curvature: float) -> float:
-        nonlocal reference, best, worst, since
-        part = 1.0
-        if curvature > 0 and slope + 0.5 * curvature > reference:
-            part = min(1.0, -slope / curvature)
-        change = part * slope + 0.5 * part**2 * curvature
-        reference, best, worst = reference - change, best - change, worst - change
-        if best > 0:
-            best, worst, since = 0.0, 0.0, 0
-        else:
-            worst, since = max(worst, 0.0), since + 1
-            if since == STEERING.memory:
-                reference, worst, since = worst, 0.0, 0
-        return part
-
-    return search

@@ -1,17 +1,18 @@
-"""The cone problem in unknowns of equal size, and the arithmetic on them that first-order methods share."""
+"""What all first-order methods share: the cone problem in unknowns of equal size, and the course of a method on it."""
 
 from __future__ import annotations
 
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from pctt.ccp import cone
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.result import Limits
+from pctt.ccp.result import Limits, Result, Status
+from pctt.ccp.unbounded import why_unbounded
+from pctt.options import AT_LEAST_ONE, number, option
 
 
 class ScaledProblem:
@@ -22,23 +23,23 @@ class ScaledProblem:
     diagonal preconditioning by a metric in which the projection is still exact.
 
     With ``coulomb`` it is Coulomb's law, in the same variables: x is a solution if the projected step from x along the
-    gradient *with its opening* (mu |y_t|, 0, 0) leads back to x. The natural residual measures how far it leads away.
+    gradient *with its De Saxce term* (mu |y_t|, 0, 0) leads back to x.
 
     In single ``precision`` products with a contact map move half of the bytes.
     """
 
     def __init__(self, problem: ConeProblem, coulomb: bool = False, precision: type[np.floating] = np.float64):
-        self.problem, self.opening, self.precision = problem, float(coulomb), precision
+        self.problem, self.coulomb, self.precision = problem, coulomb, precision
         blocks = problem.diagonal_blocks
         size = np.empty_like(problem.r)
         size[:, 0] = blocks[:, 0, 0]
         size[:, 1] = size[:, 2] = 0.5 * (blocks[:, 1, 1] + blocks[:, 2, 2])
         self._scale = np.sqrt(np.where(size > 0, size, problem.mean_diagonal))
-        self._shrink = 1.0 / self._scale
+        self.shrink = 1.0 / self._scale  #: (nc, 3) diagonal of S^-1
         self.mu = self._rounded(problem.mu * self._scale[:, 1] / self._scale[:, 0])
-        self.b = self._rounded(problem.r * self._shrink)
-        self._compliance = self._rounded(problem.compliance * self._shrink**2)
-        self._operator = problem.operator.scaled(self._shrink, precision)
+        self.b = self._rounded(problem.r * self.shrink)
+        self._compliance = self._rounded(problem.compliance * self.shrink**2)
+        self._operator = problem.operator.scaled(self.shrink, precision)
 
     def _rounded(self, x: Array) -> Array:
         return x.astype(self.precision, copy=False)
@@ -48,22 +49,20 @@ class ScaledProblem:
         return self.project(self._rounded(guess * self._scale))
 
     def impulse(self, x: Array) -> Array:
-        return x * self._shrink
+        return x * self.shrink
 
-    def product(self, x: Array, out: Array | None = None) -> Array:
+    def product(self, x: Array) -> Array:
         """A x (nc, 3)."""
-        out = np.multiply(self._compliance, x, out=out)
+        out: Array = self._compliance * x
         self._operator.add_delassus(x, out)
         return out
 
     def gradient(self, x: Array, out: Array | None = None) -> Array:
         """A x + b (nc, 3)."""
-        if self.problem.softness:
-            out = self.product(x, out)
-            out += self.b
-            return out
         out = np.empty_like(x) if out is None else out
         out[:] = self.b
+        if self.problem.softness:
+            out += self._compliance * x
         self._operator.add_delassus(x, out)
         return out
 
@@ -85,29 +84,16 @@ class ScaledProblem:
         self.problem.comm.Allreduce(MPI.IN_PLACE, out)
         return out
 
-    def matrix(self) -> PETSc.Mat:
-        """A as a Mat of its own."""
-        A = self.problem.N.duplicate(copy=True)
-        shrink = A.createVecLeft()
-        shrink.array[:] = self._shrink.ravel()
-        A.diagonalScale(shrink, shrink)
-        shrink.destroy()
-        return A
-
-    @cached_property
-    def blocks(self) -> Array:
-        """The 3 x 3 diagonal blocks of A (nc, 3, 3)."""
-        return self.problem.diagonal_blocks * (self._shrink[:, :, None] * self._shrink[:, None, :])
-
     def block_steps(self) -> Array:
-        """1 over the largest eigenvalue of each contact's block of A, per unknown (nc, 3)."""
-        largest = np.linalg.eigvalsh(self.blocks)[:, -1]
+        """1 over the largest eigenvalue of each contact's diagonal block of A, per unknown (nc, 3)."""
+        blocks = self.problem.diagonal_blocks * (self.shrink[:, :, None] * self.shrink[:, None, :])
+        largest = np.linalg.eigvalsh(blocks)[:, -1]
         return np.repeat(1.0 / np.where(largest > 0, largest, 1.0), 3).reshape(-1, 3)
 
     def residuals(self, limits: Limits, x: Array, gradient: Array) -> tuple[float, float]:
         """The natural residual of the impulse of x, in its own units, and the residual that the tolerance is for."""
         g, y = self.impulse(x), gradient * self._scale
-        natural = self.problem.natural_residual(g, y, bool(self.opening))
+        natural = self.problem.natural_residual(g, y, self.coulomb)
         return natural, limits.residual(natural, self.problem, g, y)
 
     def largest_curvature(self, steps: int = 10) -> float:
@@ -122,3 +108,90 @@ class ScaledProblem:
             curvature = self.dots((x, Ax))[0] / norm
             x = Ax
         return max(curvature, 1.0)  # the mean of diag A is 1
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """Options of every first-order method."""
+
+    check: int = option(10, "iterations between two looks at the natural residual", check=AT_LEAST_ONE)
+    patience: int = number(5000, "iterations without progress before it has stalled: there are plateaus of thousands")
+
+
+class Progress:
+    """Counts the iterations of a method (products with N), keeps its best point, and says when to stop.
+
+    The objective of these methods need not fall in every step, and the natural residual falls steadily in none of them.
+    So the result is the best of all points that were looked at.
+    """
+
+    def __init__(self, problem: ScaledProblem, limits: Limits, options: FirstOrder, before: Progress | None = None):
+        """``before`` is the progress in lower precision, whose iterations and history go on."""
+        self.problem, self.limits, self.check, self.patience = problem, limits, options.check, options.patience
+        self.iterations: int = before.iterations if before else 0
+        self.history: list[float] = before.history if before else []
+        self.status, self.reason = Status.STALLED, ""
+        self.best, self._point = np.inf, np.zeros((0, 3))  # residual and x
+        self._looks = self._next_look = 0
+        self._suspicious, self._unbounded = limits.tol, ""
+        self._gain = (np.inf, self.iterations)  # residual and iteration of the last progress
+
+    def goes_on(self, x: Array, gradient: Array | None = None) -> bool:
+        """Whether to iterate further from x. Every ``check`` iterations this computes the residual.
+
+        ``gradient`` is A x + b if the method has it."""
+        if self.iterations < min(self._next_look, self.limits.max_it):
+            return True
+        self._next_look = self.iterations + self.check
+        residual = self._residual(x, gradient)
+        self.history.append(residual)
+        if residual < self.best or self._looks == 0:
+            self.best, self._point = residual, x.copy()
+        self._looks += 1
+        self.status, self.reason = self._why_stop(residual)
+        return not self.reason
+
+    @property
+    def impulse(self) -> Array:
+        """Of the best point (nc, 3)."""
+        return self.problem.impulse(self._point)
+
+    def result(self) -> Result:
+        status = Status.CONVERGED if self.best <= self.limits.tol else self.status
+        return Result(self.impulse, status, self.reason, self.best, self.iterations, history=self.history)
+
+    def _residual(self, x: Array, gradient: Array | None) -> float:
+        """The residual that the tolerance is for; nan where x or its gradient is no number."""
+        if gradient is not None:
+            residual = self._judge(x, gradient)
+            # inf where x = 0, or x is no number; methods that update the gradient collect rounding: look twice
+            if self.limits.tol < residual < np.inf:
+                return residual
+        gradient = self.problem.gradient(x)
+        finite = np.isfinite(self.problem.dots((x, gradient))[0])
+        return self._judge(x, gradient) if finite else np.nan
+
+    def _judge(self, x: Array, gradient: Array) -> float:
+        """The residual that the tolerance is for. Where only the closing work is too large, the problem may have no
+        solution: this is found out whenever the natural residual has fallen to a tenth."""
+        natural, residual = self.problem.residuals(self.limits, x, gradient)
+        if natural <= self._suspicious and residual > self.limits.tol:
+            self._suspicious = 0.1 * natural
+            self._unbounded = why_unbounded(self.problem.problem, self.problem.impulse(x))
+        return residual
+
+    def _why_stop(self, residual: float) -> tuple[Status, str]:
+        """The reason is empty as long as there is none."""
+        if residual <= self.limits.tol:
+            return Status.CONVERGED, self.limits.met
+        if self._unbounded:
+            return Status.UNBOUNDED, self._unbounded
+        if np.isnan(residual):
+            return Status.BREAKDOWN, f"not a number after {self.iterations} iterations"
+        if self.iterations >= self.limits.max_it:
+            return Status.ITERATION_LIMIT, f"{self.iterations} iterations"
+        if residual < 0.99 * self._gain[0]:  # rounding alone is no progress
+            self._gain = (residual, self.iterations)
+        if self.iterations - self._gain[1] >= self.patience:
+            return Status.STALLED, f"no progress in the last {self.patience} of {self.iterations} iterations"
+        return Status.STALLED, ""

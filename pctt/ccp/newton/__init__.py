@@ -49,12 +49,10 @@ class Newton:
     Attributes
     ----------
     ksp_its, fallbacks : of the present problem: Krylov iterations, systems not solved by the user's KSP
-    memory : what a method keeps here for the next problem (`auto`); None at first
     """
 
     def __init__(self, comm: MPI.Comm, form: str = "contact", compare: Comparison | None = None):
         self.comm, self.form, self.compare = comm, form, compare
-        self.memory: object = None
         self.system: NewtonForm | None = None
         self._present = form
         self._structure: tuple | None = None

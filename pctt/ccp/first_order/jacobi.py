@@ -12,8 +12,7 @@ search on the direction to the block minimisers is Bertsekas, Nonlinear Programm
 from __future__ import annotations
 
 from pctt.ccp.cone import Array
-from pctt.ccp.first_order.progress import FirstOrder, Progress
-from pctt.ccp.first_order.scaled import ScaledProblem
+from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 
