@@ -87,7 +87,7 @@ BAD_FILES = {
     "x = 1\n": "no class derived",
     GOOD + GOOD.replace("One", "Two"): "must define one scene, has One, Two",
     GOOD.replace("    height: float = 1.0", "    height: float"): "option height of One has no default",
-    GOOD.replace("height: float = 1.0", "height: list = None"): "option height of One: the type must be one of",
+    GOOD.replace("height: float = 1.0", "height: list = None"): "option height of One: the type must be",
     GOOD.replace("@dataclass(frozen=True)", ""): "must be marked @dataclass",
     GOOD.replace("def build", "def bild"): "no method build",
 }
