@@ -9,13 +9,13 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from problems import SELF, from_graph, from_matrix, heap
 
+from dem.contact_map import find_halo
 from pctt import ccp
 from pctt.ccp import Limits
 from pctt.ccp.cone import margin, project
 from pctt.ccp.first_order import apgd, barzilai_borwein, gauss_seidel
 from pctt.ccp.first_order.faces import Face
 from pctt.ccp.first_order.scaled import Progress, ScaledProblem
-from dem.contact_map import find_halo
 
 METHODS = [name for name, solver in ccp.SOLVERS.items() if not solver.newton]
 EVERY = pytest.mark.parametrize("method", METHODS)

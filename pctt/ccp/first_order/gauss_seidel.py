@@ -22,10 +22,9 @@ from mpi4py import MPI
 
 from dem.contact_map import Halo, find_halo
 from dem.exchange import offsets
-from pctt.ccp.delassus import HUB
 from pctt.ccp import cone
 from pctt.ccp.cone import Array
-from pctt.ccp.delassus import rows_in_blocks
+from pctt.ccp.delassus import HUB, rows_in_blocks
 from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
