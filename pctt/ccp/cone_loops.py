@@ -60,8 +60,8 @@ def projected_move(x: Array, y: Array, step: float, mu: Array) -> Array:
 def accelerated_step(
     x: Array, last_x: Array, y: Array, last_y: Array, beta: float, step: float, mu: Array, de_saxce: float, out: Array
 ) -> tuple[float, float]:
-    """P(z - step y_z) for z = x + beta (x - last_x) and its gradient y_z = y + beta (y - last_y), to which De Saxce's term
-    (mu |y_t|, 0, 0) is added once (``de_saxce`` 1: Coulomb's law) or not (0).
+    """P(z - step y_z) for z = x + beta (x - last_x) and its gradient y_z = y + beta (y - last_y), to which the term
+    (mu |y_t|, 0, 0) of De Saxce is added once (``de_saxce`` 1: Coulomb's law) or not (0).
 
     Returned are, for this rank, |out - z|^2 and y_z'(out - x); z and y_z themselves are nowhere stored."""
     part, way = x.dtype.type(beta), x.dtype.type(step)

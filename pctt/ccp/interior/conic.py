@@ -68,7 +68,7 @@ class Conic:
     forcing_of_impulses: float = number(0.003, "the same in the form `contact`, where no step mends it; 0.3: it stalls")
     boundary: float = number(0.99, "part of the way to the cone's boundary that a step may go")
     boundary_with_law: float = number(0.9, "the same; with 0.99 it stalls at 1e-4")
-    least: float = number(0.01, "part of the complementarity to aim at in any case: so all contacts shrink together")
+    least: float = number(0.06, "part of the complementarity to aim at at least; with 0.01 some end at 1e-9")
     short: float = number(0.8, "the direction of a shorter step is corrected; without, 1.15 times the iterations")
     proximal: float = number(1e-9, "compliance within a step [mean diag N], bounds (B + C)^-1; 1e-8 to 1e-12 do too")
     patience: int = number(8, "iterations without progress before it gives up; of Coulomb's law some take 6")
@@ -255,10 +255,8 @@ class Scaled(NamedTuple):
     def reach(self, d: Direction) -> float:
         """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""
         problem, at = self.cones.problem, self.at
-        if self.u is None:
-            of_z = step_inside(at.z, d.dz)
-        else:
-            of_z = step_to_zero(without_de_saxce(at.z)[:, 0], d.dy[:, 0])
+        normal = without_de_saxce(at.z)[:, 0]
+        of_z = step_inside(at.z, d.dz) if self.u is None else step_to_zero(normal, d.dy[:, 0])
         longest = problem.min(min(step_inside(at.s, d.ds), of_z))
         return longest if np.isfinite(problem.sum(float(d.ds.sum() + d.dz.sum()))) else 0.0
 
