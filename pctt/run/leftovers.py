@@ -13,7 +13,7 @@ from pctt.options import OptionError
 
 #: First words of the options of PETSc's solvers; all others are read when PETSc starts or ends.
 OF_SOLVERS = (
-    "ksp_", "pc_", "mat_", "vec_", "sub_", "mg_", "fieldsplit_", "compare_", "fallback_",
+    "ksp_", "pc_", "mat_", "vec_", "sub_", "mg_", "fieldsplit_", "kkt_", "compare_", "fallback_",
 )  # fmt: skip
 
 #: The options of Newton systems that are typed most, for what others are taken to be misspelt.

@@ -32,21 +32,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cone import (
-    TINY,
-    Array,
-    NesterovTodd,
-    central_pair,
-    determinant,
-    dot,
-    jordan_divide,
-    jordan_product,
-    step_inside,
-    step_to_zero,
-    tangential,
-    times,
-    towards_interval,
-)
+from pctt.ccp import cone
+from pctt.ccp.cone import Array, NesterovTodd, dot, times
 from pctt.ccp.cone_loops import scaling
 from pctt.ccp.interior import useful_part
 from pctt.ccp.newton import Newton
@@ -83,13 +70,20 @@ def solve(
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
     cones = Cones(problem, options, coulomb)
-    at, course = cones.start(guess), Course(problem, limits, options.patience)
     forcing = options.forcing_with_law if coulomb else options.forcing
     forcing = forcing if newton.mends else options.forcing_of_impulses
+    at, history, waited, least, last_gap = cones.start(guess), list[float](), 0, np.inf, np.inf
     while True:
         # residuals
-        found = cones.residuals(at)
-        if course.ends(found, problem.dot(at.s, at.z)):
+        found, gap = cones.residuals(at), problem.dot(at.s, at.z)
+        history.append(limits.residual(found.natural, problem, found.g, found.y))
+        unbounded = bool(why_unbounded(problem, found.g))
+        if unbounded or history[-1] == min(history):
+            best = found.g
+        waited = 0 if found.natural <= 0.9 * least or gap <= 0.5 * last_gap else waited + 1
+        least, last_gap = min(found.natural, least), gap
+        done = history[-1] <= limits.tol or unbounded
+        if done or len(history) > limits.max_it or waited > options.patience:
             break
         # scaling
         scaled = cones.scaled(at, found, forcing)
@@ -98,8 +92,7 @@ def solve(
         with phase("ConicPredictor"):
             affine = scaled.direction(newton, np.zeros_like(at.z))
         # centring: the further the affine step may go, the less (Mehrotra)
-        share = max((1.0 - min(1.0, scaled.reach(affine))) ** 3, options.least)
-        target = share * problem.dot(at.s, at.z) / problem.size
+        target = max((1.0 - min(1.0, scaled.reach(affine))) ** 3, options.least) * gap / problem.size
         with phase("ConicCorrector"):
             # combined step, with the second-order term of the affine one
             w = scaled.centred(affine, target)
@@ -113,7 +106,13 @@ def solve(
         # update
         if step > 0:
             at = cones.moved(at, direction, step)
-    return course.result(newton)
+    iterations = len(history) - 1
+    status, words = Status.STALLED, f"stalled after {iterations} iterations"
+    if history[-1] <= limits.tol:
+        status, words = Status.CONVERGED, limits.met
+    elif iterations == limits.max_it:
+        status, words = Status.ITERATION_LIMIT, f"{iterations} iterations"
+    return Result(best, status, words, min(history), iterations, newton.ksp_its, newton.fallbacks, history)
 
 
 class Point(NamedTuple):
@@ -171,7 +170,7 @@ class Cones:
         diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2
         tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
         amount = self.options.start * problem.dot(problem.r, problem.r) / problem.size / problem.mean_diagonal
-        s, z = central_pair(guess * scale - tau[:, None] * y / scale, tau, amount)
+        s, z = cone.central_pair(guess * scale - tau[:, None] * y / scale, tau, amount)
         return Point(s, z, problem.momentum(s / scale))
 
     def residuals(self, at: Point) -> Residuals:
@@ -256,8 +255,8 @@ class Scaled(NamedTuple):
         """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""
         problem, at = self.cones.problem, self.at
         normal = without_de_saxce(at.z)[:, 0]
-        of_z = step_inside(at.z, d.dz) if self.u is None else step_to_zero(normal, d.dy[:, 0])
-        longest = problem.min(min(step_inside(at.s, d.ds), of_z))
+        of_z = cone.step_inside(at.z, d.dz) if self.u is None else cone.step_to_zero(normal, d.dy[:, 0])
+        longest = problem.min(min(cone.step_inside(at.s, d.ds), of_z))
         return longest if np.isfinite(problem.sum(float(d.ds.sum() + d.dz.sum()))) else 0.0
 
     def step(self, d: Direction) -> float:
@@ -266,9 +265,9 @@ class Scaled(NamedTuple):
 
     def centred(self, d: Direction, target: float) -> Array:
         """The w of a direction that aims at s o z = target e, with the second-order term of the last direction."""
-        aim = -jordan_product(self.W.divide(d.ds), self.W.times(d.dz))
+        aim = -cone.jordan_product(self.W.divide(d.ds), self.W.times(d.dz))
         aim[:, 0] += target
-        return jordan_divide(self.W.times(self.at.z), aim)
+        return cone.jordan_divide(self.W.times(self.at.z), aim)
 
     def towards_path(self, d: Direction, reach: float, target: float) -> Array:
         """What to add to w so that the eigenvalues of s o z, ``reach`` along the direction, come near the target: a
@@ -276,54 +275,21 @@ class Scaled(NamedTuple):
 
         Source: Gondzio (1996), multiple centrality corrections; here with the eigenvalues of second-order cones."""
         centre = self.W.times(self.at.z)
-        after = jordan_product(centre + reach * self.W.divide(d.ds), centre + reach * self.W.times(d.dz))
-        return jordan_divide(centre, towards_interval(after, 0.1 * target, 10.0 * target))
-
-
-class Course:
-    """The course of the iterations so far, and the tests that end them. ``history``: the residual of every iterate."""
-
-    def __init__(self, problem: ConeProblem, limits: Limits, patience: int):
-        self.problem, self.limits, self.patience = problem, limits, patience
-        self.history: list[float] = []
-        self._waited, self._least, self._last_gap = 0, np.inf, np.inf
-
-    def ends(self, found: Residuals, gap: float) -> bool:
-        """Note an iterate with the complementarity ``gap``; whether it is the last."""
-        residual = self.limits.residual(found.natural, self.problem, found.g, found.y)
-        unbounded = bool(why_unbounded(self.problem, found.g))
-        if unbounded or residual <= min(self.history, default=residual):
-            self.best = found.g
-        progress = found.natural <= 0.9 * self._least or gap <= 0.5 * self._last_gap
-        self._waited, self._last_gap = (0 if progress else self._waited + 1), gap
-        self._least = min(found.natural, self._least)
-        self.history.append(residual)
-        out_of_time = len(self.history) > self.limits.max_it or self._waited > self.patience
-        return residual <= self.limits.tol or unbounded or out_of_time
-
-    def result(self, newton: Newton) -> Result:
-        """The best iterate, and why it was the last."""
-        iterations = len(self.history) - 1
-        status, words = Status.STALLED, f"stalled after {iterations} iterations"
-        if self.history[-1] <= self.limits.tol:
-            status, words = Status.CONVERGED, self.limits.met
-        elif iterations == self.limits.max_it:
-            status, words = Status.ITERATION_LIMIT, f"{iterations} iterations"
-        least = min(self.history)
-        return Result(self.best, status, words, least, iterations, newton.ksp_its, newton.fallbacks, self.history)
+        after = cone.jordan_product(centre + reach * self.W.divide(d.ds), centre + reach * self.W.times(d.dz))
+        return cone.jordan_divide(centre, cone.towards_interval(after, 0.1 * target, 10.0 * target))
 
 
 def with_de_saxce(y: Array) -> Array:
     """(y_n + |y_t|, y_t) of scaled velocities y (nc, 3): inside the cones if y_n > 0."""
     z = y.copy()
-    z[:, 0] += tangential(y)
+    z[:, 0] += cone.tangential(y)
     return z
 
 
 def without_de_saxce(z: Array) -> Array:
     """The y (nc, 3) that z is of, `with_de_saxce`."""
     y = z.copy()
-    y[:, 0] = determinant(z) / (z[:, 0] + tangential(z))
+    y[:, 0] = cone.determinant(z) / (z[:, 0] + cone.tangential(z))
     return y
 
 
@@ -331,7 +297,7 @@ def sliding_directions(z: Array) -> Array:
     """The directions (nc, 3) in which contacts with scaled velocities z slide; zero without sliding."""
     u = z.copy()
     u[:, 0] = 0.0
-    return u / np.maximum(tangential(z), TINY)[:, None]
+    return u / np.maximum(cone.tangential(z), cone.TINY)[:, None]
 
 
 def with_de_saxce_terms(Y: Array, share: Array, u: Array, compliance: Array) -> tuple[Array, Array, Array]:
