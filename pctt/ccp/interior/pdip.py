@@ -52,7 +52,7 @@ class PDIP:
     rtol: float = number(3e-4, "relative residual of a linear solve; with 1 it takes twice the Newton steps")
     forcing: float = number(0.03, "the same at most [velocity that the natural residual shows]; `_accuracy`")
     short: float = number(0.5, "the direction of a shorter step is corrected; without, 1.7 times the Newton steps")
-    late: float = number(1e-3, "natural residual below which S has a proximal term after a short step; `_proximal`")
+    late: float = number(1e-3, "natural residual below which S has a proximal term; `_next_damping`")
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     g, lam = _start(problem, guess, cone, options)
     history: list[float] = []
     earlier: deque[Array] = deque(maxlen=3)
-    step = 1.0
+    step, damping = 1.0, 0.0
     for iteration in range(limits.max_it + 1):
         y = _velocity(problem, g)
         natural = problem.natural_residual(g, y)
@@ -125,7 +125,8 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
         aim = options.centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, aim, earlier)
-        newton.update(_barrier_blocks(at, _proximal(at, natural, step, options)))
+        damping = _next_damping(damping, step, natural, options)
+        newton.update(_barrier_blocks(at, damping * natural * problem.mean_diagonal))
         step, dg, dlam = _corrected(at, natural, options)
         if not step > 1e-10:
             status, reason = Status.STALLED, "steps became too short"
@@ -164,13 +165,17 @@ def _accuracy(at: Linearised, q: Array, natural: float, options: PDIP) -> float:
     return min(options.rtol * at.problem.norm(q), options.forcing * shown)
 
 
-def _proximal(at: Linearised, natural: float, step: float, options: PDIP) -> float:
-    """The rho of a term rho I in S, after a step of length ``step``.
+def _next_damping(damping: float, step: float, natural: float, options: PDIP) -> float:
+    """The factor of the proximal term natural residual * mean diag N * I in S, after a step of length ``step``.
 
     Forces that hold each other move no body, and only the barrier bounds them: directions along them are long, leave
     the cones at once, and cut the rest of the step short. The term shortens them. It leaves a velocity of rho dg, which
     is less than the natural residual shows. Early, impulses may have to grow by orders of magnitude: there is none."""
-    return natural * at.problem.mean_diagonal if step < options.short and natural < options.late else 0.0
+    if natural > options.late:
+        return 0.0
+    if step < 0.3:
+        return min(max(1.0, 4.0 * damping), 4.0)
+    return damping / 4.0 if step > 0.7 else damping
 
 
 def _corrected(at: Linearised, natural: float, options: PDIP) -> tuple[float, Array, Array]:
