@@ -180,7 +180,7 @@ def _next_damping(damping: float, step: float, natural: float, options: PDIP) ->
 
 def _corrected(at: Linearised, natural: float, options: PDIP) -> tuple[float, Array, Array]:
     """The step to take, and the direction dg, dlam: Newton's, corrected once where the cones' curvature cuts it short
-    and that makes it longer."""
+    and that makes it much longer."""
     q = _right_side(at, at.barrier)
     tol = _accuracy(at, q, natural, options)
     dg, dlam = _direction(at, q, at.barrier, tol)
@@ -191,7 +191,7 @@ def _corrected(at: Linearised, natural: float, options: PDIP) -> tuple[float, Ar
     aim = at.barrier + missed
     other_dg, other_dlam = _direction(at, _right_side(at, aim) - curved, aim, tol)
     other = _step_length(at, other_dg, other_dlam, options)
-    return (other, other_dg, other_dlam) if other > step else (step, dg, dlam)
+    return (other, other_dg, other_dlam) if other > 1.2 * step else (step, dg, dlam)
 
 
 def _right_side(at: Linearised, aim: Array | float) -> Array:
