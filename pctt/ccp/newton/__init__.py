@@ -61,6 +61,7 @@ class Newton:
 
     def begin(self, problem: ConeProblem) -> None:
         """Take the next problem; its structure is kept where contacts and bodies are those of the last."""
+        self.problem = problem
         instead = self.form == "body" and problem.contact_map is None
         structure = problem.structure()
         same = self.system is not None and instead == self._instead and len(structure) == len(self._structure)
@@ -172,8 +173,7 @@ class Newton:
     def _least_energy(self, xs: Array, products: Array, b: Array) -> Array:
         """The coefficients of the combination of vectors xs (k, rows) with the least energy; zeros if the energies are
         no numbers."""
-        assert self.system is not None
-        sums = self.system.problem.sum(np.column_stack([xs @ products.T, xs @ b]))
+        sums = self.problem.sum(np.column_stack([xs @ products.T, xs @ b]))
         if not np.isfinite(sums).all():
             return np.zeros(len(xs))
         energies, works = sums[:, :-1], sums[:, -1]
