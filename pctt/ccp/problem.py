@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
 from dem.exchange import refuse
-from pctt.ccp.cone import Array, add_opening, dot, projected_move
+from pctt.ccp.cone import Array, add_de_saxce, dot, projected_move
 from pctt.ccp.delassus import BlockMap, GivenMatrix, delassus, without_hubs
 
 Given = Union[BlockRows, CompactRows, ContactMap]
@@ -98,11 +98,11 @@ class ConeProblem:
 
     def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
         """||g - P(g - y / mean diag N)|| / ||g||, velocities y = N g + r: the stop test of every solver. For Coulomb's
-        law y gets its opening.
+        law y gets De Saxce's term.
 
         inf if that is undefined: for g = 0, unless it solves the problem, and if g or y has a nan or inf."""
         if coulomb:
-            y = add_opening(y.copy(), self.mu)
+            y = add_de_saxce(y.copy(), self.mu)
         move = projected_move(g, y, 1.0 / self.mean_diagonal, self.mu)
         distance, norm = np.sqrt(self.sum(np.array([np.vdot(move, move), np.vdot(g, g)])))
         if distance == 0:

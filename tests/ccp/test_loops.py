@@ -10,7 +10,7 @@ import pytest
 
 from pctt.ccp import cone
 from pctt.ccp.accuracy import _nearest_in_cone
-from pctt.ccp.interior import lorentz
+from pctt.ccp.cone_loops import scaling
 
 COUNTS = [0, 1, 7, 256, 1000]  # also of whole strips, and not
 
@@ -35,21 +35,11 @@ def times(blocks, x):
     return np.einsum("nij,nj->ni", blocks, x)
 
 
-def scaling(root, eta):
-    """W (nc, 3, 3)."""
-    return eta[:, None, None] * (2 * root[:, :, None] * root[:, None, :] - np.diag([1.0, -1.0, -1.0]))
-
-
-def barrier_blocks(direction, eta, spread, scale, compliance, proximal):
-    u, v = direction.T
-    one, zero = np.ones_like(u), np.zeros_like(u)
-    axes = np.moveaxis(np.array([[one, u, v], [one, -u, -v], [zero, v, -u]]), 2, 0)
-    axes /= np.linalg.norm(axes, axis=2)[:, :, None]
-    values = 1 / np.stack([eta * spread, eta / spread, eta], axis=1) ** 2
-    inverse_square = np.einsum("nki,nk,nkj->nij", axes, values, axes)  # W^-2
-    sides = scale[:, :, None] * scale[:, None, :]
-    whole = np.linalg.inv(inverse_square + compliance[:, None, None] * np.eye(3))
-    return (inverse_square + proximal * np.eye(3)) * sides, whole / sides, whole @ inverse_square
+def inside(rng, count):
+    """Points inside the cones of friction 1, some next to the boundary."""
+    x = rng.normal(size=(count, 3))
+    x[:, 0] = np.hypot(x[:, 1], x[:, 2]) * (1 + 10.0 ** rng.uniform(-6, 1, count)) + 1e-3
+    return x
 
 
 class Sample:
@@ -61,9 +51,6 @@ class Sample:
         x, dx, y, dy, z, dz = rng.normal(size=(6, count, 3))
         x[::7] = 0.0
         x[3::7, 1:] = 0.0
-        a, sizes = rng.uniform(0.1, 2.0, (3, count)), rng.uniform(0.1, 2.0, (count, 3))
-        angle = rng.uniform(0, 2 * np.pi, count)
-        direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         blocks = rng.normal(size=(count, 3, 3))
         self.cases = {
             "project": (cone.project, _nearest_in_cone, (x, mu)),
@@ -71,24 +58,12 @@ class Sample:
             "step": (stepped, accelerated_step, (x, dx, y, dy, 0.7, 0.3, mu, 1.0)),
             "curvature": (cone.accelerated_curvature, accelerated_curvature, (x, dx, z, y, dy, dz, 0.7)),
             "times": (cone.times, times, (blocks, x)),
-            "scale": (lorentz.scale, lambda root, eta, x: times(scaling(root, eta), x), (x, a[0], y)),
-            "unscale": (lorentz.unscale, unscale, (hyperbolic(x), a[0], y)),
-            "barrier": (lorentz.barrier_blocks, barrier_blocks, (direction, a[0], 1 + a[1], sizes, a[2], 0.1)),
         }  # fmt: skip
 
 
 def stepped(x, last_x, y, last_y, beta, step, mu, opening):
     out = np.zeros_like(x)
     return *cone.accelerated_step(x, last_x, y, last_y, beta, step, mu, opening, out), out
-
-
-def unscale(root, eta, x):
-    return times(np.linalg.inv(scaling(root, eta)), x)
-
-
-def hyperbolic(x):
-    """Points with x_0^2 - |x_1:|^2 = 1, for which the scaling has a simple inverse."""
-    return np.column_stack([np.sqrt(1 + x[:, 1] ** 2 + x[:, 2] ** 2), x[:, 1:]])
 
 
 NAMES = list(Sample(0).cases)
@@ -117,7 +92,7 @@ def test_a_loop_in_single_precision_stays_in_it(name, count):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(other).max(initial=1.0))
 
 
-@pytest.mark.parametrize("name", NAMES[:-1])
+@pytest.mark.parametrize("name", NAMES)
 def test_a_number_that_is_none_stays_none(name):
     """A NaN at any place of any argument, wherever the formula has one."""
     loop, formula, arguments = Sample(6).cases[name]
@@ -127,6 +102,41 @@ def test_a_number_that_is_none_stays_none(name):
             broken[k].flat[place] = np.nan
             for one, other in zip(parts(loop(*broken)), parts(formula(*broken))):
                 assert np.isnan(one[np.isnan(other)]).all(), (k, place)
+
+
+@pytest.mark.parametrize("tangential", [1e-9, 0.3])
+@pytest.mark.parametrize("normal", [1e-9, 1e-3, 0.3, 10.0])
+def test_the_scaling_is_that_of_nesterov_and_todd(normal, tangential):
+    """W z = W^-1 s, and the blocks are those of the formulas, for a compliance that is another along the normal."""
+    rng = np.random.default_rng(0)
+    s, z = inside(rng, 200), inside(rng, 200)
+    s[:5, 1:] = z[:5, 1:] = 0.0
+    compliance = np.tile([normal, tangential, tangential], (200, 1))
+    root, eta, square, X, share = scaling(s, z, compliance)
+    W = cone.NesterovTodd(root, eta)
+    np.testing.assert_allclose(W.times(z), W.divide(s), rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(W.divide(W.times(s)), s, rtol=1e-7, atol=1e-9)
+    dense = np.stack([W.divide(W.divide(np.tile(e, (200, 1)))) for e in np.eye(3)], axis=2)
+    big = np.abs(square).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(square / big, dense / big, atol=1e-10)
+    whole = square + compliance[:, :, None] * np.eye(3)
+    for found, expected in ((X @ whole, np.eye(3)), (whole @ share, square)):
+        size = np.abs(whole).max(axis=(1, 2), keepdims=True) * np.maximum(1, np.abs(X).max(axis=(1, 2), keepdims=True))
+        assert (np.abs(found - expected) <= 1e-12 * size).all()
+
+
+def test_pairs_on_the_central_path():
+    rng = np.random.default_rng(0)
+    x, tau = rng.normal(size=(100, 3)), rng.uniform(0.1, 2.0, 100)
+    x[:3], x[3:6, 1:] = 0.0, 0.0
+    s, z = cone.central_pair(x, tau, 1e-6)
+    np.testing.assert_allclose(s - tau[:, None] * z, x, atol=1e-14)
+    np.testing.assert_allclose(cone.jordan_product(s, z), np.tile([1e-6, 0, 0], (100, 1)), atol=1e-14)
+    inner = inside(rng, 100)
+    np.testing.assert_allclose(cone.jordan_product(inner, cone.jordan_divide(inner, x)), x, rtol=1e-6, atol=1e-8)
+    moved = x + cone.towards_interval(x, 0.1, 1.0)
+    values = moved[:, 0] + np.hypot(moved[:, 1], moved[:, 2]) * [[1.0], [-1.0]]
+    assert (values >= 0.1 - 1e-12).all()
 
 
 def test_a_loop_takes_arrays_of_other_layouts():

@@ -13,8 +13,13 @@ spoils v = G' g alone, and the next step mends that. With W the scaling of the p
 Late in an iteration W^2 is large along an impulse that slides, and the product W^2 z, which equals s, drowns in
 rounding. So the change of each contact without the others, ds = W w - s, is formed from s instead.
 
-For Coulomb's law z belongs to the De Saxce velocity, (y_n / mu + |y_t|, y_t); `slip` has the additional terms. A step
-is straight in y, so that z takes the opening as it is, and not by its derivative.
+For Coulomb's law z belongs to the De Saxce velocity, (y_n / mu + |y_t|, y_t), and the step takes the derivative of its
+term along: with u = y_t / |y_t|,
+
+    dz = T (G dv + C dg) + r_z,    T = 1 + e_n u',
+
+which makes the Newton systems unsymmetric. (Terms that lag behind converge by a fifth per cone problem, each solved
+exactly.) A step is straight in y, so that z takes the term as it is, and not by its derivative.
 
 Source: Nesterov and Todd (1997), Mehrotra (1992); Acary, Armand, Nguyen and Shpakovych, "Second-order cone
 programming for frictional contact mechanics using interior point algorithm", Optim. Methods Softw. (2023), for their
@@ -27,56 +32,33 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cone import Array, step_to_zero, times
-from pctt.ccp.interior import lorentz
-from pctt.ccp.interior.guess import no_larger_than_useful
-from pctt.ccp.interior.lorentz import NesterovTodd
-from pctt.ccp.interior.slip import Slip, closed, opened, sliding_directions
+from pctt.ccp import cone
+from pctt.ccp.cone import Array, NesterovTodd, dot, times
+from pctt.ccp.cone_loops import scaling
+from pctt.ccp.interior import useful_part
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.log import phase
-from pctt.options import FRACTION, POSITIVE, option
+from pctt.options import number
 
 
 @dataclass(frozen=True)
 class Conic:
-    """Options ``-ccp_conic_*``."""
+    """The numbers of the method; docs/notebook_ccp.md has what was measured. Those ``with_law`` are for Coulomb's law,
+    with which a contact next to the boundary has no room to turn."""
 
-    start: float = option(30.0, "complementarity of the start, in units of mean(r^2) / mean diag N", check=POSITIVE)
-    forcing: float = option(0.3, "residual of a linear solve, as a part of the natural residual", check=POSITIVE)
-    boundary: float = option(0.99, "part of the way to the cone's boundary that a step may go", check=FRACTION)
-
-
-@dataclass(frozen=True)
-class Steering:
-    """Numbers that steer the method, without unit but where one is given; docs/notebook_ccp.md has the measurements."""
-
-    #: compliance within a step [mean diag N]; it bounds (B + C)^-1, and the answer does not have it
-    proximal: float = 1e-9
-    #: factor on the forcing where impulses are the unknowns: there a residual changes velocities that should be zero
-    closer: float = 0.01
-    sharper: float = 0.1  #: factor on the forcing for Coulomb's law
-    centering: float = 0.02  #: part of the complementarity to aim at, per deviation from the central path
-    least: float = 0.01  #: part of the complementarity to aim at in any case
-    near: tuple[float, float] = (0.1, 10.0)  #: what counts as near the central path [complementarity aimed at]
-    short: float = 0.8  #: the direction of a shorter step is corrected
-    corrections: int = 3  #: of a direction at most
-    further: float = 0.3  #: a correction of a short step aims at a step that is longer by this
-    longer: float = 1.02  #: a corrected short step is kept if it is so many times as long
-    less: float = 0.7  #: a corrected long step is kept if it leaves this part of the complementarity
-    #: natural residual below which long steps are corrected too, after a step with progress; before, a correction may
-    #: enlarge impulses that next to nothing bounds
-    late: float = 1e-2
-    patience: int = 3  #: iterations without progress before the Newton systems are sharpened
-    patience_with_law: int = 8  #: the same for Coulomb's law, before the method gives up
-    #: for Coulomb's law, part of the way to the boundary at most: next to it a contact has no room to turn
-    boundary_with_law: float = 0.9
-    near_start: float = 3e4  #: for Coulomb's law, ``-ccp_conic_start`` at most, per residual of the guess or tolerance
-
-
-STEERING = Steering()
+    start: float = number(30.0, "complementarity of the start [mean(r^2) / mean diag N]; below 1 steps are short")
+    forcing: float = number(0.3, "residual of a linear solve [velocity that the natural residual shows]; 1: 2x steps")
+    forcing_with_law: float = number(0.03, "the same; with 0.3 it stalls at 1e-4")
+    forcing_of_impulses: float = number(0.003, "the same in the form `contact`, where no step mends it; 0.3: it stalls")
+    boundary: float = number(0.99, "part of the way to the cone's boundary that a step may go")
+    boundary_with_law: float = number(0.9, "the same; with 0.99 it stalls at 1e-4")
+    least: float = number(0.06, "part of the complementarity to aim at at least; with 0.01 some end at 1e-9")
+    short: float = number(0.8, "the direction of a shorter step is corrected; without, 1.15 times the iterations")
+    proximal: float = number(1e-9, "compliance within a step [mean diag N], bounds (B + C)^-1; 1e-8 to 1e-12 do too")
+    patience: int = number(8, "iterations without progress before it gives up; of Coulomb's law some take 6")
 
 
 def solve(
@@ -87,23 +69,50 @@ def solve(
     if coulomb and not newton.takes_any:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
-    cones = Cones.of(problem, coulomb)
-    start = options.start
-    if coulomb:  # from a point near the law, the end of another path
-        off = max(problem.natural_residual(guess, cones.velocity(guess), coulomb), limits.tol)
-        start = min(start, STEERING.near_start * off)
-    at = _start(cones, guess, start)
-    course = Course(cones, limits)
-    while not course.ends(at, newton):
-        scaled = Scaled.of(cones, at, newton, options, course)
+    cones = Cones(problem, options, coulomb)
+    forcing = options.forcing_with_law if coulomb else options.forcing
+    forcing = forcing if newton.mends else options.forcing_of_impulses
+    at, history, waited, least, last_gap = cones.start(guess), list[float](), 0, np.inf, np.inf
+    while True:
+        # residuals
+        found, gap = cones.residuals(at), problem.dot(at.s, at.z)
+        history.append(limits.residual(found.natural, problem, found.g, found.y))
+        unbounded = bool(why_unbounded(problem, found.g))
+        if unbounded or history[-1] == min(history):
+            best = found.g
+        waited = 0 if found.natural <= 0.9 * least or gap <= 0.5 * last_gap else waited + 1
+        least, last_gap = min(found.natural, least), gap
+        done = history[-1] <= limits.tol or unbounded
+        if done or len(history) > limits.max_it or waited > options.patience:
+            break
+        # scaling
+        scaled = cones.scaled(at, found, forcing)
+        newton.update(scaled.B, scaled.H, symmetric=not coulomb)
+        # affine step
         with phase("ConicPredictor"):
-            predictor = scaled.direction(np.zeros_like(at.z))
-            target = scaled.target(predictor)
+            affine = scaled.direction(newton, np.zeros_like(at.z))
+        # centring: the further the affine step may go, the less (Mehrotra)
+        target = max((1.0 - min(1.0, scaled.reach(affine))) ** 3, options.least) * gap / problem.size
         with phase("ConicCorrector"):
-            direction, step = _corrected(scaled, predictor, target, course)
+            # combined step, with the second-order term of the affine one
+            w = scaled.centred(affine, target)
+            direction = scaled.direction(newton, w, affine.x)
+            # length: of a step that the cones cut short, towards the central path if that is longer
+            step = scaled.step(direction)
+            if step < options.short:
+                w += scaled.towards_path(direction, min(1.0, step + 0.3), target)
+                other = scaled.direction(newton, w, direction.x)
+                step, direction = max((step, direction), (scaled.step(other), other), key=lambda pair: pair[0])
+        # update
         if step > 0:
             at = cones.moved(at, direction, step)
-    return course.result(newton)
+    iterations = len(history) - 1
+    status, words = Status.STALLED, f"stalled after {iterations} iterations"
+    if history[-1] <= limits.tol:
+        status, words = Status.CONVERGED, limits.met
+    elif iterations == limits.max_it:
+        status, words = Status.ITERATION_LIMIT, f"{iterations} iterations"
+    return Result(best, status, words, min(history), iterations, newton.ksp_its, newton.fallbacks, history)
 
 
 class Point(NamedTuple):
@@ -114,9 +123,20 @@ class Point(NamedTuple):
     v: Array
 
 
+class Residuals(NamedTuple):
+    """Of an iterate: its impulses and their velocities y = N g + r (nc, 3), the natural residual, v - G' g, and in the
+    scaled variables y - z with the y of v, z without De Saxce's term."""
+
+    g: Array
+    y: Array
+    natural: float
+    r_v: Array
+    r_y: Array
+
+
 class Direction(NamedTuple):
     """A change of a `Point`, and the Newton system's solution ``x`` that it was made from. ``dy`` is dz without the
-    change of the opening."""
+    change of De Saxce's term."""
 
     ds: Array
     dz: Array
@@ -125,260 +145,169 @@ class Direction(NamedTuple):
     x: Array
 
 
-@dataclass(frozen=True)
 class Cones:
     """The problem in the scaled variables s = scale g, z = y / scale.
 
     scale : (nc, 3) mu, 1, 1 per contact; 1, 1, 1 without friction
-    frictionless : (nc,) contacts whose tangential part, which the problem does not have, is held at zero
-    coulomb : whether velocities have the opening of Coulomb's law
+    live : (nc, 3) 1; 0 for tangential parts without friction, which the problem does not have
+    compliance : (nc, 3) the diagonal of C within a step
     """
 
-    problem: ConeProblem
-    scale: Array
-    frictionless: Array
-    coulomb: bool
+    def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool):
+        self.problem, self.options, self.coulomb = problem, options, coulomb
+        self.scale, self.live = np.ones_like(problem.r), np.ones_like(problem.r)
+        self.scale[:, 0] = np.where(problem.mu > 0, problem.mu, 1.0)
+        self.live[problem.mu == 0, 1:] = 0.0
+        self.proximal = options.proximal * problem.mean_diagonal
+        self.compliance = problem.compliance / self.scale**2 + self.proximal
+        self.boundary = options.boundary_with_law if coulomb else options.boundary
 
-    @classmethod
-    def of(cls, problem: ConeProblem, coulomb: bool) -> Cones:
-        scale, frictionless = np.ones((problem.mu.size, 3)), problem.mu == 0
-        scale[:, 0] = np.where(frictionless, 1.0, problem.mu)
-        return cls(problem, scale, frictionless, coulomb)
+    def start(self, guess: Array) -> Point:
+        """A pair on the central path near the guess: s - tau z = s_0 - tau z_0."""
+        problem, scale = self.problem, self.scale
+        guess = useful_part(problem, guess) * self.live
+        y = (problem.product(guess) + problem.r) * self.live
+        diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2
+        tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
+        amount = self.options.start * problem.dot(problem.r, problem.r) / problem.size / problem.mean_diagonal
+        s, z = cone.central_pair(guess * scale - tau[:, None] * y / scale, tau, amount)
+        return Point(s, z, problem.momentum(s / scale))
 
-    def velocity(self, g: Array) -> Array:
-        """y = N g + r but for the sliding of contacts without friction, which no impulse answers."""
-        y = self.problem.product(g) + self.problem.r
-        y[self.frictionless, 1:] = 0.0
-        return y
-
-    def residuals(self, at: Point) -> tuple[Array, Array]:
-        """r_v = v - G' g, and r_y = y / scale - z with y from v and z without its opening."""
+    def residuals(self, at: Point) -> Residuals:
         problem, g = self.problem, at.s / self.scale
-        y = problem.velocity_of(at.v) + problem.compliance * g + problem.r
-        y[self.frictionless, 1:] = 0.0
-        z = closed(at.z) if self.coulomb else at.z
-        return at.v - problem.momentum(g), y / self.scale - z
+        momentum = problem.momentum(g)
+        rest = problem.compliance * g + problem.r
+        y = (problem.velocity_of(momentum) + rest) * self.live
+        r_y = (problem.velocity_of(at.v) + rest) * self.live / self.scale
+        r_y -= without_de_saxce(at.z) if self.coulomb else at.z
+        return Residuals(g, y, problem.natural_residual(g, y, self.coulomb), at.v - momentum, r_y)
+
+    def scaled(self, at: Point, found: Residuals, forcing: float) -> Scaled:
+        """The linear equations of an iterate."""
+        with phase("CCPBarrier"):
+            root, eta, B, X, share = scaling(at.s, at.z, self.compliance)
+            B[:, [0, 1, 2], [0, 1, 2]] += self.proximal
+            H, u = X, None
+            if self.coulomb:
+                u = sliding_directions(at.z)
+                X, H, share = with_de_saxce_terms(X, share, u, self.compliance)
+            free, d = self.live[:, 1] == 0, self.problem.mean_diagonal
+            B *= self.scale[:, :, None] * self.scale[:, None, :]
+            B[free, 1, 1] = B[free, 2, 2] = 1e12 * np.maximum(B[free, 0, 0], d)
+            sides = self.live / self.scale
+            H = H * (sides[:, :, None] * sides[:, None, :])
+        # the velocities that the natural residual stands for
+        shown = found.natural * self.problem.norm(found.g) * d
+        return Scaled(self, at, found, NesterovTodd(root, eta), B, X, H, share, u, forcing * shown)
 
     def moved(self, at: Point, d: Direction, step: float) -> Point:
-        """The point after a step; for Coulomb's law with the openings of its velocities."""
-        z = opened(closed(at.z) + step * d.dy) if self.coulomb else at.z + step * d.dz
+        """The point after a step; for Coulomb's law with De Saxce's terms of its velocities."""
+        z = with_de_saxce(without_de_saxce(at.z) + step * d.dy) if self.coulomb else at.z + step * d.dz
         return Point(at.s + step * d.ds, z, at.v + step * d.dv)
 
-    def reach(self, at: Point, d: Direction) -> float:
-        """The longest step that keeps both in the cones of this rank."""
-        of_z = step_to_zero(closed(at.z)[:, 0], d.dy[:, 0]) if self.coulomb else lorentz.step_to_boundary(at.z, d.dz)
-        return min(lorentz.step_to_boundary(at.s, d.ds), of_z)
 
-
-class Course:
-    """The course of the iterations so far, and the test that ends them.
-
-    history : residual of every iterate
-    natural : natural residual of the last one
-    waited : iterations without progress
-    """
-
-    def __init__(self, cones: Cones, limits: Limits):
-        self._cones, self._limits = cones, limits
-        self._patience = STEERING.patience_with_law if cones.coulomb else STEERING.patience
-        self.history: list[float] = []
-        self.natural, self.waited, self._least, self._last_gap = np.inf, 0, np.inf, np.inf
-
-    @property
-    def residual(self) -> float:
-        return self.history[-1]
-
-    def ends(self, at: Point, newton: Newton) -> bool:
-        """Note an iterate; whether it is the last. Without progress the Newton systems are sharpened, once."""
-        problem, g = self._cones.problem, at.s / self._cones.scale
-        gap = problem.dot(at.s, at.z)
-        y = self._cones.velocity(g)
-        natural = problem.natural_residual(g, y, self._cones.coulomb)
-        residual = self._limits.residual(natural, problem, g, y)
-        unbounded = bool(why_unbounded(problem, g))
-        if unbounded or residual <= min(self.history, default=residual):
-            self._best = g
-        progress = natural <= 0.9 * self._least or gap <= 0.5 * self._last_gap
-        self.waited, self._last_gap = (0 if progress else self.waited + 1), gap
-        self.natural, self._least = natural, min(natural, self._least)
-        self.history.append(residual)
-        if residual <= self._limits.tol or len(self.history) > self._limits.max_it or unbounded:
-            return True
-        if self.waited > self._patience:
-            if self._cones.coulomb or not newton.sharpen():
-                return True
-            self.waited = 0
-        return False
-
-    def result(self, newton: Newton) -> Result:
-        """The best iterate, and why it was the last."""
-        iterations = len(self.history) - 1
-        status, words = Status.STALLED, f"stalled after {iterations} iterations"
-        if self.residual <= self._limits.tol:
-            status, words = Status.CONVERGED, self._limits.met
-        elif iterations == self._limits.max_it:
-            status, words = Status.ITERATION_LIMIT, f"{iterations} iterations"
-        least = min(self.history)
-        return Result(self._best, status, words, least, iterations, newton.ksp_its, newton.fallbacks, self.history)
-
-
-@dataclass(frozen=True)
-class Scaled:
+class Scaled(NamedTuple):
     """An iteration's linear equations, which all its directions share.
 
-    at, r_v, r_y, r_z : the iterate and its residuals; r_z is r_y with the change of the opening
+    at, found : the iterate and its residuals
     W : scaling of the pair
-    inverse, barrier_share : (nc, 3, 3) (B + C)^-1 and, in the scaled variables, (B + C)^-1 B
-    slip : what Coulomb's law adds
-    tol : residual to which Newton systems are solved
-    boundary : part of the way to the boundary that a step may go
+    B, H : blocks (nc, 3, 3) of the Newton system: W^-2, and X T = (B + C)^-1 without Coulomb's law
+    X, share : in the scaled variables (W^-2 + T C)^-1, and that times W^-2
+    u : (nc, 3) directions in which contacts slide, for T; None without Coulomb's law: T = 1
+    tol : residual to which Newton systems are solved [m/s]
     """
 
     cones: Cones
-    newton: Newton
     at: Point
-    r_v: Array
-    r_y: Array
-    r_z: Array
+    found: Residuals
     W: NesterovTodd
-    inverse: Array
-    barrier_share: Array
-    slip: Slip | None
+    B: Array
+    X: Array
+    H: Array
+    share: Array
+    u: Array | None
     tol: float
-    boundary: float
 
-    @classmethod
-    def of(cls, cones: Cones, at: Point, newton: Newton, options: Conic, course: Course) -> Scaled:
-        """Scaling and residuals of an iterate; the Newton systems get its matrix."""
-        problem = cones.problem
-        r_v, r_y = cones.residuals(at)
-        r_z = r_y
-        W = NesterovTodd.of(at.s, at.z)
-        B, inverse, barrier_share = _barrier_blocks(cones, W)
-        slip = None
-        if cones.coulomb:
-            compliance = problem.compliance[:, 1:2] + STEERING.proximal * problem.mean_diagonal
-            slip = Slip.of(inverse, sliding_directions(at.z), cones.scale, compliance)
-            r_z = slip.change(r_y)
-        newton.update(B, inverse if slip is None else inverse + slip.blocks, symmetric=slip is None)
-        # a residual of v = G' g makes y wrong by G times that
-        tol = options.forcing * course.natural * problem.norm(at.s / cones.scale) * np.sqrt(problem.mean_diagonal)
-        tol *= 1.0 if newton.primary == "momenta" else STEERING.closer
-        tol *= STEERING.sharper if cones.coulomb else 1.0
-        boundary = min(options.boundary, STEERING.boundary_with_law) if cones.coulomb else options.boundary
-        return cls(cones, newton, at, r_v, r_y, r_z, W, inverse, barrier_share, slip, tol, boundary)
-
-    def direction(self, w: Array, *earlier: Array) -> Direction:
+    def direction(self, newton: Newton, w: Array, *earlier: Array) -> Direction:
         """The direction of the right-hand side w; ``earlier``: solutions of the Newton system to begin from."""
-        problem, newton, scale = self.cones.problem, self.newton, self.cones.scale
-        c = self.W.divide(w) - self.at.z
-        uncoupled = times(self.barrier_share, self.W.times(w) - self.at.s)
-        uncoupled /= scale
-        uncoupled -= times(self.inverse, self.r_z * scale)
-        if self.slip is not None:
-            self.slip.reduce(uncoupled)
-        dg, x = newton.solve((c - self.r_z) * scale, self.tol, self.r_v, earlier, uncoupled)
-        dv = newton.momentum(x, dg, self.r_v)
-        ds = dg * scale
-        if newton.primary == "momenta":  # r_y vanishes, r_v takes the error of the linear solve
-            dy = (problem.velocity_of(dv) + problem.compliance * dg) / scale + self.r_y
+        cones, scale, live = self.cones, self.cones.scale, self.cones.live
+        c, r_z = self.W.divide(w) - self.at.z, self._turned(self.found.r_y)
+        uncoupled = times(self.share, self.W.times(w) - self.at.s) - times(self.X, r_z)
+        q = (c - r_z) * scale
+        dg, x = newton.solve(q, self.tol, self.found.r_v, earlier, uncoupled * live / scale)
+        dv, ds = newton.momenta(x, dg, self.found.r_v), live * scale * dg
+        if newton.mends:  # r_y vanishes, r_v takes the error of the linear solve
+            problem = cones.problem
+            dy = (problem.velocity_of(dv) + problem.compliance * dg) / scale + self.found.r_y
         else:  # r_v vanishes, r_y takes it
             dy = c - self.W.divide(self.W.divide(ds))
-        dy[self.cones.frictionless, 1:] = ds[self.cones.frictionless, 1:] = 0.0
-        return Direction(ds, dy if self.slip is None else self.slip.change(dy), dy, dv, x)
+        return Direction(ds, self._turned(live * dy), live * dy, dv, x)
+
+    def _turned(self, dy: Array) -> Array:
+        """T dy (nc, 3), the change of z to first order."""
+        if self.u is None:
+            return dy
+        dz = dy.copy()
+        dz[:, 0] += dot(self.u, dy)
+        return dz
 
     def reach(self, d: Direction) -> float:
         """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""
-        problem = self.cones.problem
-        longest = problem.min(self.cones.reach(self.at, d))
+        problem, at = self.cones.problem, self.at
+        normal = without_de_saxce(at.z)[:, 0]
+        of_z = cone.step_inside(at.z, d.dz) if self.u is None else cone.step_to_zero(normal, d.dy[:, 0])
+        longest = problem.min(min(cone.step_inside(at.s, d.ds), of_z))
         return longest if np.isfinite(problem.sum(float(d.ds.sum() + d.dz.sum()))) else 0.0
 
     def step(self, d: Direction) -> float:
         """The step to take, at most 1 and not up to the boundary."""
-        return min(1.0, self.boundary * self.reach(d))
-
-    def left(self, d: Direction, step: float) -> float:
-        """Complementarity after a step."""
-        return self.cones.problem.dot(self.at.s + step * d.ds, self.at.z + step * d.dz)
-
-    def target(self, predictor: Direction) -> float:
-        """The complementarity of a contact to aim at: the further the predictor may go, the less (Mehrotra)."""
-        problem = self.cones.problem
-        part = max((1.0 - min(1.0, self.reach(predictor))) ** 3, _centering(problem, self.at), STEERING.least)
-        return part * problem.dot(self.at.s, self.at.z) / problem.size
+        return min(1.0, self.cones.boundary * self.reach(d))
 
     def centred(self, d: Direction, target: float) -> Array:
         """The w of a direction that aims at s o z = target e, with the second-order term of the last direction."""
-        aim = -lorentz.product(self.W.divide(d.ds), self.W.times(d.dz))
+        aim = -cone.jordan_product(self.W.divide(d.ds), self.W.times(d.dz))
         aim[:, 0] += target
-        return lorentz.divide(self.W.times(self.at.z), aim)
+        return cone.jordan_divide(self.W.times(self.at.z), aim)
 
     def towards_path(self, d: Direction, reach: float, target: float) -> Array:
-        """What to add to w so that the eigenvalues of s o z, ``reach`` along the direction, come near the target.
+        """What to add to w so that the eigenvalues of s o z, ``reach`` along the direction, come near the target: a
+        tenth to ten times that.
 
         Source: Gondzio (1996), multiple centrality corrections; here with the eigenvalues of second-order cones."""
         centre = self.W.times(self.at.z)
-        after = lorentz.product(centre + reach * self.W.divide(d.ds), centre + reach * self.W.times(d.dz))
-        low, high = STEERING.near
-        return lorentz.divide(centre, lorentz.towards_interval(after, low * target, high * target))
+        after = cone.jordan_product(centre + reach * self.W.divide(d.ds), centre + reach * self.W.times(d.dz))
+        return cone.jordan_divide(centre, cone.towards_interval(after, 0.1 * target, 10.0 * target))
 
 
-def _corrected(scaled: Scaled, predictor: Direction, target: float, course: Course) -> tuple[Direction, float]:
-    """Mehrotra's corrector and the length of its step; then further corrections, as long as they pay: of a direction
-    that the cones cut short, and late of a long one, where another solve costs next to nothing."""
-    w = scaled.centred(predictor, target)
-    direction = scaled.direction(w, predictor.x)
-    step = scaled.step(direction)
-    for _ in range(STEERING.corrections):
-        short = step < STEERING.short
-        if short:
-            w = w + scaled.towards_path(direction, min(1.0, step + STEERING.further), target)
-        elif scaled.newton.factored and course.waited == 0 and course.residual < STEERING.late:
-            w = scaled.centred(direction, target)
-        else:
-            break
-        other = scaled.direction(w, direction.x)
-        longer = scaled.step(other)
-        if short and longer < STEERING.longer * step:
-            break
-        if not short and scaled.left(other, longer) > STEERING.less * scaled.left(direction, step):
-            break
-        direction, step = other, longer
-    return direction, step
+def with_de_saxce(y: Array) -> Array:
+    """(y_n + |y_t|, y_t) of scaled velocities y (nc, 3): inside the cones if y_n > 0."""
+    z = y.copy()
+    z[:, 0] += cone.tangential(y)
+    return z
 
 
-def _start(cones: Cones, guess: Array, start: float) -> Point:
-    """A pair on the central path near the guess: s - tau z = s_0 - tau z_0; ``start`` as ``-ccp_conic_start``."""
-    problem, scale = cones.problem, cones.scale
-    guess = no_larger_than_useful(problem, guess)
-    s, z = guess * scale, cones.velocity(guess) / scale
-    s[cones.frictionless, 1:] = 0.0
-    diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2
-    tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
-    closing = problem.dot(problem.r, problem.r) / problem.size
-    amount = start * closing / problem.mean_diagonal
-    s, z = lorentz.central_pair(s - tau[:, None] * z, tau, amount)
-    return Point(s, z, problem.momentum(s / scale))
+def without_de_saxce(z: Array) -> Array:
+    """The y (nc, 3) that z is of, `with_de_saxce`."""
+    y = z.copy()
+    y[:, 0] = cone.determinant(z) / (z[:, 0] + cone.tangential(z))
+    return y
 
 
-def _barrier_blocks(cones: Cones, W: NesterovTodd) -> tuple[Array, Array, Array]:
-    """B, (B + C)^-1 and, in the scaled variables, (B + C)^-1 B (nc, 3, 3)."""
-    with phase("CCPBarrier"):
-        problem, free = cones.problem, cones.frictionless
-        proximal = STEERING.proximal * problem.mean_diagonal
-        compliance = problem.compliance[:, 1] + proximal  # the same along all axes of the scaled variables
-        B, inverse, barrier_share = W.barrier_blocks(cones.scale, compliance, proximal)
-        if free.any():
-            B[free, 1, 1] = B[free, 2, 2] = 1e12 * np.maximum(B[free, 0, 0], problem.mean_diagonal)
-            for blocks in (inverse, barrier_share):
-                blocks[free, 1:] = blocks[free, :, 1:] = 0.0
-        return B, inverse, barrier_share
+def sliding_directions(z: Array) -> Array:
+    """The directions (nc, 3) in which contacts with scaled velocities z slide; zero without sliding."""
+    u = z.copy()
+    u[:, 0] = 0.0
+    return u / np.maximum(cone.tangential(z), cone.TINY)[:, None]
 
 
-def _centering(problem: ConeProblem, at: Point) -> float:
-    """The least part of the complementarity to aim at: more, the further the pair is off the central path. On it s o
-    z has no tangential part; off it the sliding directions of impulse and velocity differ by an angle that falls like
-    the root of the complementarity only."""
-    turned = lorentz.product(at.s, at.z)
-    off = problem.norm(turned[:, 1:]) / max(problem.norm(turned[:, 0]), 1e-300)
-    return min(STEERING.centering * off, 0.5)
+def with_de_saxce_terms(Y: Array, share: Array, u: Array, compliance: Array) -> tuple[Array, Array, Array]:
+    """X = (W^-2 + T C)^-1, X T and X W^-2 (nc, 3, 3) for T = 1 + e_n u', of Y = (W^-2 + C)^-1 and Y W^-2.
+
+    With e the diagonal of C and p = Y e_n, X = (1 - p (e u)' / d) Y and X T = Y + p (u - Y (e u))' / d, where
+    d = 1 + (e u)'p."""
+    p, eu = Y[:, :, 0], compliance * u
+    d = 1.0 + dot(eu, p)[:, None]
+    of_Y = times(Y, eu)  # it is symmetric
+    of_share = times(share.transpose(0, 2, 1), eu)
+    p = p[:, :, None] / d[:, :, None]
+    return Y - p * of_Y[:, None], Y + p * (u - of_Y)[:, None], share - p * of_share[:, None]

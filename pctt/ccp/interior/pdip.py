@@ -9,11 +9,10 @@ with the multipliers eliminated:
     S dg = -(N g + r + grad f / (-t f)),    S = N + lambda hess f + lambda/(-f) grad f grad f'.
 
 Where the paper's form creeps (134 Newton steps at 17,911 contacts, natural residual 6e-5), this one differs
-in five points, each measured in ``docs/notebook_ccp.md``: the constraint is the cone's perspective form
-(``barrier.py``); steps end at 0.9 of the way to the boundary and inside a neighbourhood of the central
-path, rather than at 0.99 and where the multiplier residual falls; a direction that the cones' curvature cuts
-short is corrected, and short steps near the solution give S a proximal term rho I; and the natural residual alone
-decides when to stop.
+in five points, each measured in ``docs/notebook_ccp.md``: the constraint is the cone's perspective form; steps end at
+0.9 of the way to the boundary and inside a neighbourhood of the central path, rather than at 0.99 and where the
+multiplier residual falls; a direction that the cones' curvature cuts short is corrected, and after short steps near the
+solution S has a proximal term; and the natural residual alone decides when to stop.
 """
 
 from __future__ import annotations
@@ -25,18 +24,19 @@ from typing import NamedTuple
 import numpy as np
 
 from pctt.ccp.cone import Array, dot, step_to_boundary, step_to_zero, times
-from pctt.ccp.interior.barrier import CONSTRAINTS, Perspective, Quadratic
-from pctt.ccp.interior.guess import no_larger_than_useful
+from pctt.ccp.interior import useful_part
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 from pctt.log import phase
-from pctt.options import FRACTION, POSITIVE, option
+from pctt.options import FRACTION, number, option
+
+CONSTRAINTS = ("perspective", "quadratic")
 
 
 @dataclass(frozen=True)
 class PDIP:
-    """Options ``-ccp_pdip_*``."""
+    """Options ``-ccp_pdip_*`` and the other numbers of the method; docs/notebook_ccp.md has what was measured."""
 
     constraint: str = option(
         "perspective", "form of the cone constraint; quadratic is the paper's", choices=CONSTRAINTS
@@ -47,44 +47,70 @@ class PDIP:
     boundary: float = option(
         0.9, "part of the way to the cone's boundary that a step may go (the paper: 0.99)", check=FRACTION
     )
-    neighbourhood: float = option(
-        1e-4, "smallest complementarity of a contact, as a part of the mean", check=FRACTION
-    )
-    start: float = option(
-        10.0, "normal impulse of new contacts, in units of rms(r) / mean diag N", check=POSITIVE
-    )
+    neighbourhood: float = number(1e-4, "least complementarity of a contact, as a part of the mean; below, steps stick")
+    start: float = number(10.0, "normal impulse of new contacts [rms(r) / mean diag N]: 1 N s in a settled packing")
+    rtol: float = number(3e-4, "relative residual of a linear solve; with 1 it takes twice the Newton steps")
+    forcing: float = number(0.03, "the same at most [velocity that the natural residual shows]; `_accuracy`")
+    short: float = number(0.5, "the direction of a shorter step is corrected; without, 1.7 times the Newton steps")
+    late: float = number(1e-3, "natural residual below which S has a proximal term; `_next_damping`")
 
 
 @dataclass(frozen=True)
-class Steering:
-    """Numbers that steer the method, without unit; docs/notebook_ccp.md has what was measured."""
+class Cone:
+    """The friction cones as constraints f(g) <= 0, whose first and second derivatives exist inside.
 
-    rtol: float = 3e-4  #: relative residual of the linear solves, if ``-ksp_rtol`` gives no other
-    forcing: float = 0.03  #: residual of a linear solve at most, as a part of what the natural residual shows
-    stuck: float = 0.1  #: after a shorter step the next one only centres
-    #: natural residual below which S has a proximal term; before, impulses may have to grow by orders of magnitude
-    late: float = 1e-3
-    cut: float = 0.3  #: after a shorter step the proximal term grows
-    whole: float = 0.7  #: after a longer step it falls
-    factor: float = 4.0  #: by which it grows or falls
-    damping: tuple[float, float] = (1.0, 4.0)  #: its bounds where it grows [natural residual times mean diag N]
-    short: float = 0.5  #: the direction of a shorter step is corrected
-    further: float = 0.3  #: the correction aims at a step that is longer by this
-    bent: float = 100.0  #: no correction helps if terms of second order enlarge the right-hand side by this factor
-    longer: float = 1.2  #: a corrected step is taken if it is so many times as long
-    earlier: int = 3  #: a linear solve begins from the best combination of so many earlier solutions
+    quadratic : the paper's f = 1/2 (|g_t|^2 - mu^2 g_n^2), g_n > 0. Its gradient vanishes at the apex, so that the
+        multipliers of contacts that open diverge.
+    perspective : the same divided by g_n, convex and of degree one. Its gradient stays away from zero.
 
+    A contact without friction has no interior: its constraint is -g_n <= 0.
+    """
 
-STEERING = Steering()
+    constraint: str
+    mu: Array
+
+    @property
+    def frictionless(self) -> np.ndarray:
+        return self.mu == 0
+
+    def value(self, g: Array) -> Array:
+        """f (nc,)."""
+        f = 0.5 * (g[:, 1] ** 2 + g[:, 2] ** 2 - (self.mu * g[:, 0]) ** 2)
+        if self.constraint == "perspective":
+            f /= g[:, 0]
+        return np.where(self.frictionless, -g[:, 0], f)
+
+    def gradient(self, g: Array) -> Array:
+        """(nc, 3)."""
+        df = g.copy()
+        df[:, 0] *= -(self.mu**2)
+        if self.constraint == "perspective":
+            df[:, 1:] /= g[:, :1]
+            df[:, 0] = -0.5 * (df[:, 1] ** 2 + df[:, 2] ** 2 + self.mu**2)
+        df[self.frictionless] = [-1.0, 0.0, 0.0]
+        return df
+
+    def hessian(self, g: Array) -> Array:
+        """(nc, 3, 3)."""
+        H = np.zeros((len(g), 3, 3))
+        H[:, 1, 1] = H[:, 2, 2] = 1.0
+        H[:, 0, 0] = -(self.mu**2)
+        if self.constraint == "perspective":
+            slope = g[:, 1:] / g[:, :1]
+            H[:, 0, 0] = (slope**2).sum(1)
+            H[:, 0, 1:] = H[:, 1:, 0] = -slope
+            H /= g[:, :1, None]
+        H[self.frictionless] = 0.0
+        return H
 
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, newton: Newton) -> Result:
     """Impulses; ``guess`` (nc, 3) gives the normal impulses of persistent contacts, 0 elsewhere."""
-    cone = CONSTRAINTS[options.constraint](problem.mu)
+    cone = Cone(options.constraint, problem.mu)
     newton.begin(problem)
     g, lam = _start(problem, guess, cone, options)
     history: list[float] = []
-    earlier: deque[Array] = deque(maxlen=STEERING.earlier)
+    earlier: deque[Array] = deque(maxlen=3)
     step, damping = 1.0, 0.0
     for iteration in range(limits.max_it + 1):
         y = _velocity(problem, g)
@@ -97,11 +123,10 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
             status, reason = Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
             break
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
-        centering = options.centering if step > STEERING.stuck else 1.0
-        aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
+        aim = options.centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, aim, earlier)
-        damping = _next_damping(damping, step, natural)
-        newton.update(_barrier_blocks(at, damping * min(natural, STEERING.late) * problem.mean_diagonal))
+        damping = _next_damping(damping, step, natural, options)
+        newton.update(_barrier_blocks(at, damping * natural * problem.mean_diagonal))
         step, dg, dlam = _corrected(at, natural, options)
         if not step > 1e-10:
             status, reason = Status.STALLED, "steps became too short"
@@ -120,7 +145,7 @@ class Linearised(NamedTuple):
 
     problem: ConeProblem
     newton: Newton
-    cone: Perspective | Quadratic
+    cone: Cone
     g: Array
     lam: Array
     y: Array
@@ -131,47 +156,42 @@ class Linearised(NamedTuple):
     earlier: deque[Array]
 
 
-def _accuracy(at: Linearised, q: Array, residual: float) -> float:
-    """How accurately to solve a Newton system with the right-hand side q (momenta, sqrt J).
+def _accuracy(at: Linearised, q: Array, natural: float, options: PDIP) -> float:
+    """How accurately to solve a Newton system with the right-hand side q [m/s].
 
     The residual of a solve is a velocity. It must be only a part of the velocities that the natural residual stands
     for: otherwise complementarity would fall without them, and near the boundary no step makes up for that."""
-    problem = at.problem
-    shown = residual * problem.norm(at.g) * problem.mean_diagonal
-    left = min(STEERING.rtol * problem.norm(q), STEERING.forcing * shown)
-    return left / float(np.sqrt(problem.mean_diagonal))
+    shown = natural * at.problem.norm(at.g) * at.problem.mean_diagonal
+    return min(options.rtol * at.problem.norm(q), options.forcing * shown)
 
 
-def _next_damping(damping: float, step: float, residual: float) -> float:
-    """The factor of the proximal term after a step of length ``step``, as a part of the natural residual.
+def _next_damping(damping: float, step: float, natural: float, options: PDIP) -> float:
+    """The factor of the proximal term natural residual * mean diag N * I in S, after a step of length ``step``.
 
     Forces that hold each other move no body, and only the barrier bounds them: directions along them are long, leave
-    the cones at once, and cut the rest of the step short. The proximal term shortens them. It leaves a velocity of rho
-    dg, which is less than the natural residual shows."""
-    if residual > STEERING.late:
+    the cones at once, and cut the rest of the step short. The term shortens them. It leaves a velocity of rho dg, which
+    is less than the natural residual shows. Early, impulses may have to grow by orders of magnitude: there is none."""
+    if natural > options.late:
         return 0.0
-    if step < STEERING.cut:
-        return float(np.clip(STEERING.factor * damping, *STEERING.damping))
-    return damping / STEERING.factor if step > STEERING.whole else damping
+    if step < 0.3:
+        return min(max(1.0, 4.0 * damping), 4.0)
+    return damping / 4.0 if step > 0.7 else damping
 
 
-def _corrected(at: Linearised, residual: float, options: PDIP) -> tuple[float, Array, Array]:
+def _corrected(at: Linearised, natural: float, options: PDIP) -> tuple[float, Array, Array]:
     """The step to take, and the direction dg, dlam: Newton's, corrected once where the cones' curvature cuts it short
-    and that pays."""
+    and that makes it much longer."""
     q = _right_side(at, at.barrier)
-    tol = _accuracy(at, q, residual)
+    tol = _accuracy(at, q, natural, options)
     dg, dlam = _direction(at, q, at.barrier, tol)
     step = _step_length(at, dg, dlam, options)
-    if not step < STEERING.short:
+    if not step < options.short:
         return step, dg, dlam
-    curved, missed = _bend(at, dg, dlam, min(1.0, step + STEERING.further))
-    bent = _right_side(at, at.barrier + missed) - curved
-    if at.problem.norm(bent) < STEERING.bent * at.problem.norm(q):
-        other_dg, other_dlam = _direction(at, bent, at.barrier + missed, tol)
-        other = _step_length(at, other_dg, other_dlam, options)
-        if other > STEERING.longer * step:
-            return other, other_dg, other_dlam
-    return step, dg, dlam
+    curved, missed = _bend(at, dg, dlam, min(1.0, step + 0.3))
+    aim = at.barrier + missed
+    other_dg, other_dlam = _direction(at, _right_side(at, aim) - curved, aim, tol)
+    other = _step_length(at, other_dg, other_dlam, options)
+    return (other, other_dg, other_dlam) if other > 1.2 * step else (step, dg, dlam)
 
 
 def _right_side(at: Linearised, aim: Array | float) -> Array:
@@ -183,7 +203,7 @@ def _direction(at: Linearised, q: Array, aim: Array | float, tol: float) -> tupl
     """dg and dlam for the right-hand side q and the complementarity ``aim``."""
     dg, x = at.newton.solve(q, tol, earlier=at.earlier)
     at.earlier.append(x)
-    dg[at.problem.mu == 0, 1:] = 0.0
+    dg[at.cone.frictionless, 1:] = 0.0
     return dg, -(at.lam + aim / at.f + at.lam / at.f * dot(at.df, dg))
 
 
@@ -203,13 +223,11 @@ def _velocity(problem: ConeProblem, g: Array) -> Array:
     return y
 
 
-def _start(
-    problem: ConeProblem, guess: Array, cone: Perspective | Quadratic, options: PDIP
-) -> tuple[Array, Array]:
+def _start(problem: ConeProblem, guess: Array, cone: Cone, options: PDIP) -> tuple[Array, Array]:
     """Impulses on the cones' axes and multipliers of equal complementarity."""
     closing = problem.norm(_velocity(problem, np.zeros_like(problem.r))) / np.sqrt(problem.size)
     new = options.start * closing / problem.mean_diagonal
-    known = no_larger_than_useful(problem, guess)[:, 0]
+    known = useful_part(problem, guess)[:, 0]
     g = np.zeros_like(problem.r)
     g[:, 0] = np.where(known > 0, np.maximum(known, 0.1 * new), new)
     speed = problem.norm(_velocity(problem, g)) / np.sqrt(problem.size)
@@ -224,10 +242,8 @@ def _barrier_blocks(at: Linearised, proximal: float) -> Array:
         blocks = at.lam[:, None, None] * at.hessian
         blocks += (at.lam / -at.f)[:, None, None] * at.df[:, :, None] * at.df[:, None, :]
         blocks[:, [0, 1, 2], [0, 1, 2]] += proximal
-        frictionless = at.problem.mu == 0
-        if frictionless.any():  # hold the tangential impulses at zero
-            stiff = 1e12 * np.maximum(blocks[frictionless, 0, 0], 1)
-            blocks[frictionless, 1, 1] = blocks[frictionless, 2, 2] = stiff
+        free = at.cone.frictionless  # hold their tangential impulses at zero
+        blocks[free, 1, 1] = blocks[free, 2, 2] = 1e12 * np.maximum(blocks[free, 0, 0], 1)
         return blocks
 
 

@@ -1,4 +1,5 @@
-"""The Newton system of the bodies, K = I + G' (B + C)^-1 G (6M x 6M, block size 6), in mass-scaled velocities.
+"""The Newton system of the bodies, K = I + G' (B + C)^-1 G (6M x 6M, block size 6), in mass-scaled velocities: the
+Schur complement of the bodies.
 
     K dv = G' (B + C)^-1 q - r_v,    dg = (B + C)^-1 (q - G dv).
 
@@ -16,13 +17,13 @@ from pctt.body_matrix import BodyOperator, inverse_blocks
 from pctt.ccp.cone import Array, times
 from pctt.ccp.problem import ConeProblem
 
-LEAST = 0.1  # of the mass: entries of a block between bodies that a factor is better off without
+LEAST = 0.1  # drop tolerance of a factor: entries of a block between bodies [mass] that it is better off without
 
 
 class BodyForm:
     """The `NewtonForm` of the module."""
 
-    definite = True
+    mends = True
 
     def __init__(self, problem: ConeProblem):
         assert problem.contact_map is not None
@@ -45,7 +46,7 @@ class BodyForm:
         self.operator.update(inverse, symmetric)
 
     def entries(self) -> PETSc.Mat:
-        """K as a matrix that preconditioners can read; collective."""
+        """K as a matrix that preconditioners can read, with the places of the bodies; collective."""
         entries = self.operator.entries()
         if self.problem.point is not None and not self._placed:
             entries.mat.setAttr("coordinates", entries.places(self.problem.point))
@@ -56,6 +57,10 @@ class BodyForm:
         """What is worth factorising of K, in scalar rows."""
         return self.operator.entries().stiff_part(LEAST, self.symmetric)
 
+    @property
+    def speed(self) -> float:
+        return float(self.problem.mean_diagonal**0.5)
+
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         push = self.problem.momentum(times(self._inverse, q) if uncoupled is None else uncoupled)
         return push if r_v is None else push - r_v
@@ -64,6 +69,9 @@ class BodyForm:
         if uncoupled is None:
             return times(self._inverse, q - self.problem.velocity_of(x))
         return uncoupled - times(self._inverse, self.problem.velocity_of(x))
+
+    def momenta(self, x: Array, dg: Array, r_v: Array) -> Array:
+        return x
 
     def destroy(self) -> None:
         self.operator.destroy()

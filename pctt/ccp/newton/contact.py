@@ -19,9 +19,11 @@ from pctt.shell import symmetric_shell
 
 
 class ContactForm:
-    """The `NewtonForm` S dg = q + G r_v, dv = G' dg - r_v."""
+    """The `NewtonForm` of the module: S dg = q + G r_v, dv = G' dg - r_v."""
 
-    symmetric = definite = True
+    symmetric = True
+    mends = False
+    speed = 1.0
 
     def __init__(self, problem: ConeProblem):
         self.problem = problem
@@ -32,11 +34,10 @@ class ContactForm:
         self.problem, self._loaded = problem, False
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
-        """Put the barrier blocks (nc, 3, 3) in."""
         self._blocks, self._made = self.problem.diagonal_blocks + barrier, False
         self._local = np.empty((len(barrier), 6))
         pack(barrier + self.problem.compliance_blocks, self._local)
-        self._describe(self.matrix)
+        set_diagonal_blocks(self.matrix, self._blocks)
         self.matrix.stateIncrease()
 
     def _product(self, g: Array, out: Array) -> None:
@@ -46,7 +47,8 @@ class ContactForm:
         self.problem.operator.add_delassus(g, out)
 
     def entries(self) -> PETSc.Mat:
-        """S without the columns of hubs, as a matrix (BAIJ) that preconditioners can read; collective."""
+        """S without the columns of hubs (BAIJ), with the places and names of the contacts that preconditioners may have
+        as attributes; collective."""
         if self._entries is None:
             self._entries = self.problem.N.duplicate(copy=True)
             self._entries.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -55,22 +57,21 @@ class ContactForm:
         self._loaded = True
         if not self._made:
             put_diagonal_blocks(self._entries, self._blocks)
-            self._describe(self._entries)
+            set_diagonal_blocks(self._entries, self._blocks)
+            for name, value in (("coordinates", self.problem.point), ("key", self.problem.key)):
+                if value is not None:
+                    self._entries.setAttr(name, value)
             self._made = True
         return self._entries
-
-    def _describe(self, mat: PETSc.Mat) -> None:
-        """What preconditioners may ask for: diagonal blocks, places and names of the contacts."""
-        set_diagonal_blocks(mat, self._blocks)
-        for name, value in (("coordinates", self.problem.point), ("key", self.problem.key)):
-            if value is not None:
-                mat.setAttr(name, value)
 
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
 
     def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
         return x.reshape(-1, 3).copy()
+
+    def momenta(self, x: Array, dg: Array, r_v: Array) -> Array:
+        return self.problem.momentum(dg) - r_v
 
     def destroy(self) -> None:
         self.matrix.destroy()
