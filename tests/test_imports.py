@@ -55,11 +55,8 @@ BELOW = {
     "dem": {},
     "pctt.tt": {},
     "pctt.contact_map": {"pctt.blocks", "pctt.compiled", "pctt.exchange", "pctt.petsc"},
-    "pctt.body_matrix": {"pctt.block_diagonal", "pctt.blocks", "pctt.contact_map", "pctt.exchange", "pctt.shell"},
-    "pctt.mat": {
-        "pctt.context", "pctt.disk", "pctt.exchange", "pctt.morton", "pctt.options", "pctt.petsc", "pctt.shell",
-        "pctt.tt",
-    },
+    "pctt.body_matrix": {"pctt.block_diagonal", "pctt.blocks", "pctt.contact_map", "pctt.exchange"},
+    "pctt.mat": {"pctt.disk", "pctt.exchange", "pctt.morton", "pctt.options", "pctt.petsc", "pctt.tt"},
     "pctt.look": {"dem", "pctt.disk", "pctt.figures_json", "pctt.petsc"},
 }
 

@@ -10,14 +10,13 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.context import Context
 from pctt.exchange import on_first, refuse
 from pctt.mat.entries import Combination, Entries, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.options import MAX_RANK, Options
 from pctt.mat.order import Places, digits_of, whole_numbers
 from pctt.mat.product import TrainProduct
-from pctt.petsc import on_axpy, on_getinfo, own_errors, warn
+from pctt.petsc import Context, on_axpy, on_getinfo, own_errors, warn
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.entries import EntryMatrix
 from pctt.tt.train import Array, Train

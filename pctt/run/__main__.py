@@ -28,12 +28,11 @@ except ImportError as error:
     sys.exit(str(error))
 
 from dem.together import SceneError
-from pctt.ksp_options import entered
+from pctt.ksp_options import entered, keep_from_petsc, refuse_stray
 from pctt.options import OptionError
 from pctt.run.hdf5 import FileError
 from pctt.run.help import help_text
 from pctt.run.interrupt import InterruptError, heed
-from pctt.run.leftovers import keep_from_petsc, refuse_stray
 from pctt.run.options import read_options
 from pctt.run.problem import solve_file
 from pctt.run.settings import DEMO_SOLVERS

@@ -18,13 +18,11 @@ from dem.together import together
 from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
-from pctt.ccp.newton.users_solver import LADDER
-from pctt.ksp_options import entered, to_enter
+from pctt.ksp_options import OF_SOLVERS, entered, refuse_misspelt, to_enter, unused
 from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, made, read, refuse_unknown
 from pctt.petsc import own_errors
 from pctt.run.dump import dump_steps
 from pctt.run.hdf5 import refuse_serial
-from pctt.run.leftovers import OF_SOLVERS, refuse_misspelt
 from pctt.run.place import refusal
 from pctt.run.settings import DEMO, Options, Run, Settings, find_scene, obeys_coulomb
 
@@ -49,7 +47,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     solver = ccp.SOLVERS[run.ccp_type]
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in option_groups(scene_class) for d in describe(group, start)]
-    refuse_unknown(database, known, prefixes=OF_SOLVERS)
+    refuse_unknown(unused(database), known, prefixes=OF_SOLVERS)  # PETSc has asked for its own when it started
     for name in known:
         PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
     limits = read(ccp.Limits, database, "ccp_")
@@ -124,7 +122,6 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, coulomb: bool)
     newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
     of_others = tuple(other.prefix for other in ccp.SOLVERS.values() if other is not solver)
     compared = tuple(map(prefix, labelled(run.compared())))
-    ladder = tuple(f"fallback_{name}_" for name in LADDER)
     own = {field.name for field in dataclasses.fields(Run)}
 
     def strangers(start: str, known: tuple[str, ...]) -> set[str]:
@@ -145,7 +142,6 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, coulomb: bool)
         (not solver.newton, {"compare", "ccp_newton"}, OF_SOLVERS, no_newton),
         (not run.compare, {"compare_every"}, (), "allowed with -compare only"),
         (True, strangers("compare_", compared) - {"compare_every"}, (), not_compared),
-        (True, strangers("fallback_", ladder), (), f"no such fallback; there are {', '.join(LADDER)}"),
         (True, set(), of_others, f"belongs to another -ccp_type than {run.ccp_type}"),
         (not coulomb, set(), ("ccp_coulomb_",), "allowed with -ccp_coulomb only"),
     ]

@@ -11,7 +11,7 @@ from pctt import ccp, figures_json, log
 from pctt.ccp import fclib
 from pctt.ccp.cone import Array
 from pctt.ccp.fclib import FileFormatError, Stored
-from pctt.run import leftovers
+from pctt.ksp_options import remark
 from pctt.run.hdf5 import FileError, write_text
 from pctt.run.place import Place
 from pctt.run.report import Progress, compare_table
@@ -37,7 +37,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         progress.say("\n" + compare_table(compare.summary()))
     if not summary["converged"]:
         progress.say(f"NOT CONVERGED: {summary['reason']}")
-    if left := leftovers.remark():
+    if left := remark():
         progress.say(left)
     with Place(Path(options.run.output), comm, overwrite=options.run.overwrite) as place:
         place.make()

@@ -8,7 +8,8 @@ from mpi4py import MPI
 
 from pctt import ccp
 from pctt.compiled import tell_first_compilation
-from pctt.run import interrupt, leftovers, report
+from pctt.ksp_options import remark
+from pctt.run import interrupt, report
 from pctt.run.dump import dump_steps, refuse_absent
 from pctt.run.settings import DEMO, Options
 from pctt.run.settling import Settling, built, settled_state
@@ -62,7 +63,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
             progress.say(f"Newton systems: {what}")
     if compare.names and sim.last:
         progress.say("\n" + report.compare_table(compare.summary()))
-    if left := leftovers.remark():
+    if left := remark():
         progress.say(left)
     if sim.last:
         folder = sim.output.place.folder

@@ -10,8 +10,8 @@ import pytest
 from mpi4py import MPI
 from program import SMALL, arrays
 
+from pctt.ksp_options import refuse_stray
 from pctt.options import OptionError
-from pctt.run.leftovers import refuse_stray
 from pctt.run.options import read_options
 
 # options, and what the line must name beside the first of them: value and what is allowed
@@ -90,7 +90,6 @@ BAD_OPTIONS = {
     "-compare_every 3": ["-compare"],
     "-compare_ilu_pc_factor_levels 1": ["-compare lists none"],
     "-compare_icc_pc_factor_levels 1 -compare ilu,none": ["-compare lists ilu,none"],
-    "-fallback_ilu_ksp_rtol 1e-3": ["cg, cholesky"],
     "-ccp_apgd_x 1": ["did you mean"],
     "-ccp_conic_start 0.1": ["another -ccp_type than pdip"],
     "-ccp_newton body -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],

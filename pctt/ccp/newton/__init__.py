@@ -20,13 +20,11 @@ from petsc4py import PETSc
 
 from pctt.ccp.cone import TINY, Array
 from pctt.ccp.newton.body import BodyForm
-from pctt.ccp.newton.body_ladder import BodyLadder
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.contact import ContactForm
 from pctt.ccp.newton.form import NewtonForm
 from pctt.ccp.newton.kkt import KKTForm
-from pctt.ccp.newton.krylov import LinearSolver
-from pctt.ccp.newton.users_solver import UsersSolver
+from pctt.ccp.newton.linear import LinearSolver
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase
 
@@ -43,8 +41,8 @@ DEFAULTS = {
 class Newton:
     """The Newton systems of one cone problem after another.
 
-    form : of FORMS. The body form has its own ladder of preconditioners unless the options name a KSP or PC; a problem
-        that knows no bodies (given by N) is solved in the form `kkt` instead.
+    form : of FORMS. The body form changes from block Jacobi to factors by itself unless the options name a KSP or PC;
+        a problem that knows no bodies (given by N) is solved in the form `kkt` instead.
 
     Attributes
     ----------
@@ -97,10 +95,9 @@ class Newton:
         """What solves the systems of the present form."""
         form = self._present
         if form not in self._linear:
-            own_ladder = form == "body" and self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
-            prefix = "" if form == self.form else f"{form}_"
-            users = UsersSolver(self.comm, DEFAULTS[form], self.compare if form == self.form else None, prefix)
-            self._linear[form] = BodyLadder(self.comm) if own_ladder else users
+            own = form == "body" and self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
+            compare, prefix = (self.compare, "") if form == self.form else (None, f"{form}_")
+            self._linear[form] = LinearSolver(self.comm, DEFAULTS[form], compare, prefix, own)
         return self._linear[form]
 
     @property

@@ -11,11 +11,10 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks
+from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.contact_map.block_loops import local_product, pack
-from pctt.shell import symmetric_shell
 
 
 class ContactForm:
@@ -36,8 +35,7 @@ class ContactForm:
         self._blocks, self._made = self.problem.diagonal_blocks + barrier, False
         self._local = np.empty((len(barrier), 6))
         pack(barrier + self.problem.compliance_blocks, self._local)
-        self._describe(self.matrix)
-        self.matrix.stateIncrease()
+        set_diagonal_blocks(self.matrix, self._blocks)
 
     def _product(self, g: Array, out: Array) -> None:
         g, out = g.reshape(-1, 3), out.reshape(-1, 3)
@@ -60,8 +58,7 @@ class ContactForm:
         return self._entries
 
     def _describe(self, mat: PETSc.Mat) -> None:
-        """What preconditioners may ask for: diagonal blocks, places and names of the contacts."""
-        set_diagonal_blocks(mat, self._blocks)
+        """What preconditioners may ask for: places and names of the contacts."""
         for name, value in (("coordinates", self.problem.point), ("key", self.problem.key)):
             if value is not None:
                 mat.setAttr(name, value)

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from petsc4py import PETSc
 
-from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks
+from pctt.block_diagonal import put_diagonal_blocks
 from pctt.blocks import square_block_matrix
 from pctt.ccp.cone import TINY, Array
 from pctt.ccp.delassus import rows_in_blocks
@@ -65,7 +65,6 @@ class KKTForm:
         blocks[:, 3:, :3] = scale * V[:, :, 1:].transpose(0, 2, 1)
         blocks[:, [3, 4], [3, 4]] = -(scale**2) / np.maximum(k[:, 1:], TINY**0.5)
         put_diagonal_blocks(self.matrix, blocks)
-        set_diagonal_blocks(self.matrix, blocks)
 
     def entries(self) -> PETSc.Mat:
         return self.matrix
