@@ -20,7 +20,7 @@ class Settings:
     """Numbers of `LinearSolver`."""
 
     easy: float = number(8.0, "iterations with block Jacobi / bodies^0.4, after which the next matrix gets a factor: "
-                              "one costs as much as 10 to 18, and the next matrix takes up to twice as many")  # fmt: skip
+                              "one costs as much as 10 to 18, and the next matrix takes up to twice that")  # fmt: skip
     limit: float = number(3.0, "iterations with block Jacobi at most, in units of easy")
     alone: int = number(20_000, "the same where the memory has no room for a factor")
     factor_bytes: float = number(170.0, "memory of a factor / rows^(4/3), the growth of nested dissection in space: "
