@@ -14,7 +14,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from pctt.blocks import block_csr_matrix
+from pctt.blocks import block_csr_matrix, new_matrix
 
 Array = NDArray[np.float64]
 
@@ -81,6 +81,13 @@ def block_diagonal(P: PETSc.Mat, blocks: Array | None = None) -> PETSc.Mat:
     first, last = (row // P.getBlockSize() for row in P.getOwnershipRange())
     rows = P.getLocalSize()[0]
     return block_csr_matrix(P.comm, rows, rows, np.arange(last - first + 1), np.arange(first, last), blocks)
+
+
+def fresh_copy(P: PETSc.Mat) -> PETSc.Mat:
+    """A copy of a sequential BAIJ matrix for SOR, which does not work with the copy that ``MatDuplicate`` makes."""
+    copy = new_matrix(P.comm, P.getSizes(), P.getBlockSize(), P.getRowIJ(compressed=True), P.getType())
+    P.copy(copy, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+    return copy
 
 
 def inverse_diagonal_blocks(P: PETSc.Mat) -> Array:

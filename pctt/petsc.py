@@ -47,8 +47,9 @@ _raised: list[BaseException] | None = None  # errors that contexts raised since 
 def own_errors() -> Iterator[None]:
     """Within the block, an error that our Python raises while PETSc calls it comes out as it was raised.
 
-    petsc4py 3.18 does this by itself. Newer releases make our error the cause of a PETSc error, or lose it. They also
-    crash if the garbage collector meets a dead python PC before the error is out. So the collector is off in the block.
+    petsc4py 3.18 does this by itself. Newer releases make our error the cause of a PETSc error, or lose it. If the
+    garbage collector meets a dead python PC before the error is out, they print it amid others (3.25) or crash. So the
+    collector is off in the block.
     """
     global _raised
     before, _raised = _raised, []
@@ -109,7 +110,6 @@ def _remembering(method: Callable[..., Any]) -> Callable[..., Any]:
             return method(*arguments)
         except BaseException as error:
             remember(error)
-            gc.collect()  # now, because PETSc cannot destroy a dead context while the error passes through it
             raise
 
     return called

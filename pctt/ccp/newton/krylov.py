@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.block_diagonal import block_diagonal, shell_of
+from pctt.block_diagonal import block_diagonal, fresh_copy, shell_of
 from pctt.ksp_options import entered, to_enter
 from pctt.pc.base import PythonPC
 from pctt.pc.mat import residual_norm
@@ -81,7 +81,9 @@ class Krylov:
         within = {value for name, value in options.getAll().items() if _OF_PARTS.fullmatch(name)}
         self._remembers = bool(_REMEMBERING & within)
         shifted = any(name.endswith("pc_factor_shift_type") for name in options.getAll())
-        self._scalar = self._pc_name not in _IN_BLOCKS or shifted or self._remembers
+        # block Gauss-Seidel over several ranks crashes in PETSc 3.18
+        in_blocks = self._pc_name in _IN_BLOCKS or (self.kind == "sor" and self.comm.size == 1)
+        self._scalar = not in_blocks or shifted or self._remembers
         if self.method in _RIGHT_SIDED:
             self.ksp.setPCSide(PETSc.PC.Side.RIGHT)
         self.ksp.setFromOptions()
@@ -175,6 +177,8 @@ class Krylov:
             definite = self.kind not in _FACTORS
             rows.setOption(PETSc.Mat.Option.SPD if definite else PETSc.Mat.Option.SYMMETRIC, True)
             return rows
+        if self.kind == "sor" and P.getType() == "seqbaij":
+            return fresh_copy(P)
         return block_diagonal(P) if self.kind == "pbjacobi" else None
 
     @property
