@@ -19,8 +19,8 @@ from pctt.options import number
 class Settings:
     """Numbers of `LinearSolver`."""
 
-    easy: float = number(8.0, "iterations with block Jacobi / bodies^0.4, after which the next matrix gets a factor: "
-                              "one costs as much as 10 to 18, and the next matrix takes up to twice that")  # fmt: skip
+    easy: float = number(8.0, "iterations with block Jacobi / bodies^0.4 and rank, after which the next matrix gets a "
+                              "factor. It costs as much as 10 to 18 on one rank, and no less on more")  # fmt: skip
     limit: float = number(3.0, "iterations with block Jacobi at most, in units of easy")
     alone: int = number(20_000, "the same where the memory has no room for a factor")
     factor_bytes: float = number(170.0, "memory of a factor / rows^(4/3), the growth of nested dissection in space: "
@@ -67,7 +67,8 @@ class LinearSolver:
         """The system has new values."""
         self.system, self._symmetric, self._factored = system, system.symmetric, False
         bodies = system.matrix.getSize()[0] / 6.0
-        self._easy = self.comm.bcast(int(self.settings.easy * bodies**0.4))  # a last bit may differ between processors
+        easy = int(self.settings.easy * bodies**0.4 * self.comm.size)
+        self._easy = self.comm.bcast(easy)  # a last bit may differ between processors
         self._hard = self.takes_any and self._worst > self._easy
 
     def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
