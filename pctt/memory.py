@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-KIB = 1024.0
+GROUPS = Path("/sys/fs/cgroup")
 
 
 def available(comm: MPI.Comm) -> float:
@@ -22,20 +22,26 @@ def available(comm: MPI.Comm) -> float:
 
 
 def _of_node() -> float:
-    """The memory that Linux can give without swapping, within the limit of this process's control group [bytes]."""
+    """The memory that Linux can give without swapping, within the limits of this process's control groups [bytes]."""
     try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return float("inf")
-    free = [KIB * float(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
-    return min(free + _of_group(), default=float("inf"))
-
-
-def _of_group() -> list[float]:
-    """A list with the memory that a container can still take [bytes]; empty if the container has no limit."""
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
-        return [] if limit == "max" else [float(limit) - float(used)]
+        words = Path("/proc/meminfo").read_text().split()
+        free = [1024.0 * float(words[words.index("MemAvailable:") + 1])]
     except (OSError, ValueError):
-        return []
+        free = []
+    return min(free + _of_groups(), default=float("inf"))
+
+
+def _of_groups() -> list[float]:
+    """What each limited control group of this process can still take [bytes]; they may be nested, as Slurm's are."""
+    try:
+        (own,) = [line for line in Path("/proc/self/cgroup").read_text().split() if line.startswith("0::")]
+    except (OSError, ValueError):
+        own = "0::/"
+    left, group = [], GROUPS / own[4:]
+    for folder in {GROUPS, group, *(parent for parent in group.parents if GROUPS in parent.parents)}:
+        try:
+            limit, used = ((folder / name).read_text().strip() for name in ("memory.max", "memory.current"))
+            left += [] if limit == "max" else [float(limit) - float(used)]
+        except (OSError, ValueError):  # the root has none
+            continue
+    return left

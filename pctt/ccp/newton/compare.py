@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -25,41 +25,17 @@ NAMED: dict[str, dict[str, str]] = {
 }
 
 
-@dataclass
-class Record:
-    """What one preconditioner did over the systems of a run, and its solves since they were last taken.
-
-    ``excess_max`` : the greatest true residual, as a multiple of what was asked for
-    """
-
-    systems: int = 0
-    converged: int = 0
-    ksp_its_mean: float = 0.0
-    ksp_its_max: int = 0
-    setup_s: float = 0.0
-    solve_s: float = 0.0
-    true_residual_max: float = 0.0
-    excess_max: float = 0.0
-    solves: list[Solve] = field(default_factory=list)
-
-    def add(self, solve: Solve) -> None:
-        self.systems += 1
-        self.converged += solve.converged
-        self.ksp_its_mean += (solve.iterations - self.ksp_its_mean) / self.systems
-        self.ksp_its_max = max(self.ksp_its_max, solve.iterations)
-        self.setup_s += solve.setup_s
-        self.solve_s += solve.solve_s
-        self.true_residual_max = max(self.true_residual_max, float(solve.true_residual))
-        self.excess_max = max(self.excess_max, float(solve.true_residual) / solve.asked)
-        self.solves.append(solve)
-
-
 class Comparison:
     """Solves every ``every``-th Newton system by each of ``entries`` (``-compare``, ``-compare_every``), of the form
     TYPE or LABEL:TYPE (`labelled`).
 
     A type is a PETSc PC type or one of NAMED. Its KSP has the prefix ``compare_<label>_`` for further options.
     Raises OptionError for a type that PETSc does not know.
+
+    Attributes
+    ----------
+    names : the labels
+    solves : by label, of all systems so far
     """
 
     def __init__(self, comm: MPI.Comm, entries: Sequence[str], every: int = 1):
@@ -67,9 +43,9 @@ class Comparison:
         for kind in self.kinds.values():
             _check_kind(kind, comm)
         self.comm, self.names, self.every = comm, list(self.kinds), every
-        self.records = {name: Record() for name in self.names}
+        self.solves: dict[str, list[Solve]] = {name: [] for name in self.names}
         self._krylov: dict[str, Krylov] = {}
-        self._seen = 0
+        self._seen = self._taken = 0
         self._entries_s = 0.0
 
     def due(self) -> bool:
@@ -89,7 +65,7 @@ class Comparison:
             self._make_entries(A, P)
             for name in self.names:
                 done = self._solver(name).solve(A, b, x, rtol, P)
-                self.records[name].add(done)
+                self.solves[name].append(done)
                 better = chosen is None or done.converged or done.true_residual < chosen.true_residual
                 if better and not (chosen and chosen.converged):
                     chosen, kept = done, x.array.copy()
@@ -106,13 +82,25 @@ class Comparison:
             self._entries_s += time.perf_counter() - start
 
     def summary(self) -> dict[str, dict[str, Any]]:
-        """Figures of `Record` by label. ``what``: what the preconditioner really was, where its type does not say it.
-        ``entries_s``: seconds that the matrix's entries took, of a preconditioner that reads them; they are made once
-        for all, and in no one's ``setup_s``. ``pc_report``: lines, of the project's own."""
+        """Figures over the systems by label. ``what``: what the preconditioner really was, where its type does not say
+        it. ``excess_max``: the greatest true residual, as a multiple of what was asked for. ``entries_s``: seconds that
+        the matrix's entries took, of a preconditioner that reads them; they are made once for all, and in no one's
+        ``setup_s``. ``pc_report``: lines, of the project's own."""
         figures: dict[str, dict[str, Any]] = {}
-        for name, record in self.records.items():
-            sums = {key: value for key, value in vars(record).items() if key != "solves"}
-            figures[name] = {"type": self.kinds[name], "what": "", **sums}
+        for name, solves in self.solves.items():
+            its = [solve.iterations for solve in solves]
+            figures[name] = {
+                "type": self.kinds[name],
+                "what": "",
+                "systems": len(solves),
+                "converged": sum(solve.converged for solve in solves),
+                "ksp_its_mean": float(np.mean(its or [0])),
+                "ksp_its_max": max(its, default=0),
+                "setup_s": sum(solve.setup_s for solve in solves),
+                "solve_s": sum(solve.solve_s for solve in solves),
+                "true_residual_max": max((float(solve.true_residual) for solve in solves), default=0.0),
+                "excess_max": max((float(solve.true_residual) / solve.asked for solve in solves), default=0.0),
+            }
         for name, krylov in self._krylov.items():
             figures[name]["what"] = krylov.what()
             figures[name]["entries_s"] = self._entries_s if krylov.needs_entries else 0.0
@@ -122,11 +110,12 @@ class Comparison:
 
     def take_solves(self) -> dict[str, list[list[Any]]]:
         """By label: converged, iterations, seconds and true residual of each solve since this was last asked."""
-        taken = {}
-        for name, record in self.records.items():
-            solves, record.solves = record.solves, []
-            taken[name] = [[s.converged, s.iterations, s.setup_s + s.solve_s, s.true_residual] for s in solves]
-        return taken
+        fresh = {name: solves[self._taken :] for name, solves in self.solves.items()}
+        self._taken = max(map(len, self.solves.values()), default=0)
+        return {
+            name: [[s.converged, s.iterations, s.setup_s + s.solve_s, s.true_residual] for s in solves]
+            for name, solves in fresh.items()
+        }
 
     def _solver(self, name: str) -> Krylov:
         if name not in self._krylov:
