@@ -32,16 +32,17 @@ def _of_node() -> float:
 
 
 def _of_groups() -> list[float]:
-    """What each limited control group of this process can still take [bytes]; they may be nested, as Slurm's are."""
     try:
-        (own,) = [line for line in Path("/proc/self/cgroup").read_text().split() if line.startswith("0::")]
+        groups = [line for line in Path("/proc/self/cgroup").read_text().split() if line.startswith("0::/")]
+        return limits(GROUPS, groups[0][4:]) if groups else []
     except (OSError, ValueError):
-        own = "0::/"
-    left, group = [], GROUPS / own[4:]
-    for folder in {GROUPS, group, *(parent for parent in group.parents if GROUPS in parent.parents)}:
-        try:
-            limit, used = ((folder / name).read_text().strip() for name in ("memory.max", "memory.current"))
-            left += [] if limit == "max" else [float(limit) - float(used)]
-        except (OSError, ValueError):  # the root has none
-            continue
-    return left
+        return []
+
+
+def limits(top: Path, group: str) -> list[float]:
+    """What each limited control group can still take [bytes], from this one up to the top. They may be nested, as
+    Slurm's are."""
+    folders = [folder for folder in (top / group, *(top / group).parents) if folder == top or top in folder.parents]
+    limited = [folder for folder in folders if (folder / "memory.max").is_file()]  # the root has no such file
+    texts = [((folder / "memory.max").read_text(), (folder / "memory.current").read_text()) for folder in limited]
+    return [float(most) - float(used) for most, used in texts if most.strip() != "max"]
