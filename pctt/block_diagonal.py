@@ -1,30 +1,67 @@
-"""The present diagonal blocks of a Mat.
+"""Diagonal blocks of Mats, and symmetric Mats that are given by a function and their diagonal blocks.
 
 PETSc inverts the diagonal blocks of a BAIJ matrix once and keeps these inverses even if the matrix gets other values
 (seen in 3.22 and 3.25, not in 3.18; in 3.25 also for AIJ). So ``MatInvertBlockDiagonal``, ``-pc_type pbjacobi`` and SOR
-on BAIJ always use the first inverses. A new Mat has no such memory.
+use the first inverses for ever. A new Mat has no such memory.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from pctt.blocks import block_csr_matrix, new_matrix
 
-#: Types of preconditioners that use the inverses of the diagonal blocks of a Mat.
-BY_DIAGONAL_BLOCKS = frozenset({"pbjacobi", "sor"})
+Array = NDArray[np.float64]
 
 
-def set_diagonal_blocks(P: PETSc.Mat, blocks: np.ndarray) -> None:
-    """Attach the diagonal blocks (n, bs, bs) of this rank's block rows to P, which saves a copy of P.
+class Shell:
+    """The context of a symmetric Mat of type python; it knows the diagonal blocks (n, bs, bs) of this rank's rows."""
 
-    Call this again whenever P changes.
-    """
-    P.setAttr("diagonal_blocks", blocks)
+    def __init__(self, product: Callable[[Array, Array], None]):
+        self.product = product
+        self.blocks: Array | None = None
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.product(x.array_r, y.array_w)
+
+    multTranspose = mult  # noqa: N815 - as PETSc names it
+
+    def getDiagonal(self, mat: PETSc.Mat, diagonal: PETSc.Vec) -> None:
+        assert self.blocks is not None
+        diagonal.array_w[:] = np.diagonal(self.blocks, axis1=1, axis2=2).ravel()
 
 
-def put_diagonal_blocks(mat: PETSc.Mat, blocks: np.ndarray) -> None:
+def symmetric_shell(comm: MPI.Comm, rows: int, block: int, product: Callable[[Array, Array], None]) -> PETSc.Mat:
+    """A Mat with ``rows`` local rows in blocks of size ``block``. Its product is ``product(x, out)``, which is
+    collective and gets local flat arrays."""
+    mat = PETSc.Mat().createPython(((rows, PETSc.DETERMINE), (rows, PETSc.DETERMINE)), Shell(product), comm=comm)
+    mat.setBlockSize(block)
+    mat.setUp()
+    mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    return mat
+
+
+def shell_of(mat: PETSc.Mat) -> Shell | None:
+    """The context of a Mat of `symmetric_shell`; None for other Mats."""
+    context = mat.getPythonContext() if mat.getType() == PETSc.Mat.Type.PYTHON else None
+    return context if isinstance(context, Shell) else None
+
+
+def set_diagonal_blocks(mat: PETSc.Mat, blocks: Array, symmetric: bool = True) -> None:
+    """Tell a Mat of `symmetric_shell` that it has changed, and its diagonal blocks (n, bs, bs) on this rank."""
+    shell = shell_of(mat)
+    assert shell is not None
+    shell.blocks = blocks
+    mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+    mat.stateIncrease()
+
+
+def put_diagonal_blocks(mat: PETSc.Mat, blocks: Array) -> None:
     """Write the diagonal blocks (n, bs, bs) of this rank's block rows into a Mat; collective."""
     size = mat.getBlockSize()
     first, last = mat.getOwnershipRange()
@@ -34,12 +71,11 @@ def put_diagonal_blocks(mat: PETSc.Mat, blocks: np.ndarray) -> None:
     mat.assemble()
 
 
-def block_diagonal(P: PETSc.Mat, blocks: np.ndarray | None = None) -> PETSc.Mat:
-    """A new Mat with the diagonal blocks of P; ``pbjacobi`` needs nothing else. The caller destroys the Mat.
-
-    If neither the argument ``blocks`` nor an attribute of P gives the blocks, the new Mat is a copy of P.
-    """
-    blocks = P.getAttr("diagonal_blocks") if blocks is None else blocks
+def block_diagonal(P: PETSc.Mat, blocks: Array | None = None) -> PETSc.Mat:
+    """A new Mat with the diagonal blocks of P, or these ``blocks``; ``pbjacobi`` needs nothing else. For an assembled P
+    it is a copy. The caller destroys the Mat."""
+    shell = shell_of(P)
+    blocks = shell.blocks if blocks is None and shell else blocks
     if blocks is None:
         return P.duplicate(copy=True)
     first, last = (row // P.getBlockSize() for row in P.getOwnershipRange())
@@ -47,39 +83,25 @@ def block_diagonal(P: PETSc.Mat, blocks: np.ndarray | None = None) -> PETSc.Mat:
     return block_csr_matrix(P.comm, rows, rows, np.arange(last - first + 1), np.arange(first, last), blocks)
 
 
-def without_memory(P: PETSc.Mat, kind: str) -> PETSc.Mat | None:
-    """A new Mat for a preconditioner of this type, because PETSc may remember old diagonal blocks of P.
-
-    None if the preconditioner can use P itself. The caller destroys the Mat.
-    """
-    if kind == "pbjacobi":
-        return block_diagonal(P)
-    return _copy(P) if kind == "sor" and P.getType() == "seqbaij" else None
-
-
-def _copy(P: PETSc.Mat) -> PETSc.Mat:
-    """A copy of a sequential BAIJ matrix; SOR does not work with the copy that ``MatDuplicate`` makes."""
+def fresh_copy(P: PETSc.Mat) -> PETSc.Mat:
+    """A copy of a sequential BAIJ matrix for SOR, which does not work with the copy that ``MatDuplicate`` makes."""
     copy = new_matrix(P.comm, P.getSizes(), P.getBlockSize(), P.getRowIJ(compressed=True), P.getType())
     P.copy(copy, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
     return copy
 
 
-def inverse_diagonal_blocks(P: PETSc.Mat) -> np.ndarray:
-    """Inverses (n, bs, bs) of the diagonal blocks of this rank's block rows.
+def inverse_diagonal_blocks(P: PETSc.Mat) -> Array:
+    """Inverses (n, bs, bs) of the diagonal blocks of this rank's block rows of an assembled Mat.
 
     Raises numpy.linalg.LinAlgError on the ranks that have a singular block.
     """
-    blocks = P.getAttr("diagonal_blocks")
-    if blocks is not None:
-        inverse = np.linalg.inv(blocks)
-    else:
-        here = P.getDiagonalBlock().duplicate(copy=True)
-        try:
-            inverse = np.array(here.invertBlockDiagonal())
-        except PETSc.Error:  # a zero pivot
-            raise np.linalg.LinAlgError("a diagonal block is singular") from None
-        finally:
-            here.destroy()
+    here = P.getDiagonalBlock().duplicate(copy=True)
+    try:
+        inverse = np.array(here.invertBlockDiagonal())
+    except PETSc.Error:  # a zero pivot
+        raise np.linalg.LinAlgError("a diagonal block is singular") from None
+    finally:
+        here.destroy()
     if not np.isfinite(inverse).all():
         raise np.linalg.LinAlgError("a diagonal block is singular")
     return inverse

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-KIB = 1024.0
+GROUPS = Path("/sys/fs/cgroup")
 
 
 def available(comm: MPI.Comm) -> float:
@@ -22,20 +22,27 @@ def available(comm: MPI.Comm) -> float:
 
 
 def _of_node() -> float:
-    """The memory that Linux can give without swapping, within the limit of this process's control group [bytes]."""
+    """The memory that Linux can give without swapping, within the limits of this process's control groups [bytes]."""
     try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return float("inf")
-    free = [KIB * float(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
-    return min(free + _of_group(), default=float("inf"))
+        words = Path("/proc/meminfo").read_text().split()
+        free = [1024.0 * float(words[words.index("MemAvailable:") + 1])]
+    except (OSError, ValueError):
+        free = []
+    return min(free + _of_groups(), default=float("inf"))
 
 
-def _of_group() -> list[float]:
-    """A list with the memory that a container can still take [bytes]; empty if the container has no limit."""
-    group = Path("/sys/fs/cgroup")
+def _of_groups() -> list[float]:
     try:
-        limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
-        return [] if limit == "max" else [float(limit) - float(used)]
+        groups = [line for line in Path("/proc/self/cgroup").read_text().split() if line.startswith("0::/")]
+        return limits(GROUPS, groups[0][4:]) if groups else []
     except (OSError, ValueError):
         return []
+
+
+def limits(top: Path, group: str) -> list[float]:
+    """What each limited control group can still take [bytes], from this one up to the top. They may be nested, as
+    Slurm's are."""
+    folders = [folder for folder in (top / group, *(top / group).parents) if folder == top or top in folder.parents]
+    limited = [folder for folder in folders if (folder / "memory.max").is_file()]  # the root has no such file
+    texts = [((folder / "memory.max").read_text(), (folder / "memory.current").read_text()) for folder in limited]
+    return [float(most) - float(used) for most, used in texts if most.strip() != "max"]

@@ -26,14 +26,13 @@ def option(
     help: str,
     *,
     unit: str = "",
-    choices: Iterable[str] | None = None,
+    choices: Iterable[str] = (),
     check: tuple[str, Callable[[Any], bool]] | None = None,
     name: str = "",
 ) -> Any:
     """A dataclass field that is an option. ``check`` is a pair: the allowed values in words, and a test of a value.
     ``name`` is that of the option, if it is not the prefix of the group and the name of the field."""
-    metadata = {"help": help, "unit": unit, "choices": tuple(choices) if choices else None, "check": check}
-    metadata["name"] = name
+    metadata = {"help": help, "unit": unit, "choices": tuple(choices), "check": check, "name": name}
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -42,12 +41,10 @@ def number(default: Any, why: str) -> Any:
     return dataclasses.field(default=default, metadata={"help": why, "python_only": True})
 
 
-def _of_the_database(group: type) -> list[dataclasses.Field]:
-    return [f for f in dataclasses.fields(group) if not f.metadata.get("python_only")]
-
-
-def _name(prefix: str, f: dataclasses.Field) -> str:
-    return f.metadata.get("name") or prefix + f.name
+def _named(group: type, prefix: str) -> dict[str, dataclasses.Field]:
+    """The fields of the database by the names of their options."""
+    fields = [f for f in dataclasses.fields(group) if not f.metadata.get("python_only")]
+    return {f.metadata.get("name") or prefix + f.name: f for f in fields}
 
 
 POSITIVE = ("a positive number", lambda x: math.isfinite(x) and x > 0)
@@ -63,9 +60,9 @@ class Description:
 
     name: str
     default: Any
-    unit: str
-    help: str
-    choices: tuple[str, ...] | None
+    unit: str = ""
+    help: str = ""
+    choices: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         default = str(self.default).lower() if isinstance(self.default, bool) else self.default
@@ -76,16 +73,11 @@ class Description:
 
 
 def describe(group: type, prefix: str = "") -> list[Description]:
-    """The options of a group, in the order of its fields."""
+    """The options of a group, in the order of its fields, which may be plain ones of a user's scene."""
+    shown = ("unit", "help", "choices")
     return [
-        Description(
-            _name(prefix, f),
-            f.default,
-            f.metadata.get("unit", ""),
-            f.metadata.get("help", ""),  # fields of a user's scene may be plain
-            f.metadata.get("choices"),
-        )
-        for f in _of_the_database(group)
+        Description(name, f.default, **{key: f.metadata[key] for key in shown if key in f.metadata})
+        for name, f in _named(group, prefix).items()
     ]
 
 
@@ -94,24 +86,16 @@ def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "
 
     ``database`` maps names without the dash to strings, as ``PETSc.Options().getAll()`` does.
     """
-    types = typing.get_type_hints(group)
-    values = {
-        f.name: _value(_name(prefix, f), database[_name(prefix, f)], types[f.name], f.metadata)
-        for f in _of_the_database(group)
-        if _name(prefix, f) in database
-    }
+    types, values = typing.get_type_hints(group), {}
+    for name, f in _named(group, prefix).items():
+        if name in database:
+            text, kind = database[name] or "", _kind(types[f.name])  # None stands for an option without a value
+            try:
+                values[f.name] = _truth(text) if kind is bool else kind(text)
+            except ValueError:
+                raise OptionError(f"-{name} {text}: allowed is {_allowed(kind, f.metadata)}") from None
+            _refuse(f"-{name} {text}", values[f.name], kind, f.metadata)
     return group(**values)
-
-
-def _value(name: str, text: str | None, kind: Any, metadata: Mapping[str, Any]) -> Any:
-    text = text or ""  # the database has None for an option without a value
-    kind = _kind(kind)
-    try:
-        value = _truth(text) if kind is bool else kind(text)
-    except ValueError:
-        raise OptionError(f"-{name} {text}: allowed is {_allowed(kind, metadata)}") from None
-    _refuse(f"-{name} {text}", value, kind, metadata)
-    return value
 
 
 def made(group: type[Group], values: Mapping[str, Any]) -> Group:
@@ -128,11 +112,10 @@ def refuse_bad(group: Any) -> None:
     kinds = typing.get_type_hints(type(group))
     for f in dataclasses.fields(group):
         value, kind = getattr(group, f.name), _kind(kinds[f.name])
-        if value is f.default or kind not in _TYPES:
-            continue
-        if not isinstance(value, _TYPES[kind]):
-            raise OptionError(f"{f.name} {value!r}: allowed is {_allowed(kind, f.metadata)}")
-        _refuse(f"{f.name} {value}", value, kind, f.metadata)
+        if value is not f.default and kind in _TYPES:
+            if not isinstance(value, _TYPES[kind]):
+                raise OptionError(f"{f.name} {value!r}: allowed is {_allowed(kind, f.metadata)}")
+            _refuse(f"{f.name} {value}", value, kind, f.metadata)
 
 
 #: What an option of each type may be in Python.
@@ -156,19 +139,17 @@ def _refuse(given: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> N
     choices, check = metadata.get("choices"), metadata.get("check")
     if choices and value not in choices:
         raise OptionError(f"{given}: allowed is {_allowed(kind, metadata)}{nearest(value, choices)}")
-    if kind is float and not math.isfinite(value) and not check:
-        raise OptionError(f"{given}: allowed is a finite number")
-    if check and not check[1](value):
-        raise OptionError(f"{given}: allowed is {check[0]}")
+    allowed, test = check or ("a finite number", lambda x: kind is not float or math.isfinite(x))
+    if not test(value):
+        raise OptionError(f"{given}: allowed is {allowed}")
 
 
 def _truth(text: str) -> bool:
-    truths = {"": True, "1": True, "true": True, "yes": True, "on": True}
-    truths |= {"0": False, "false": False, "no": False, "off": False}
-    try:
-        return truths[text.lower()]
-    except KeyError:
-        raise ValueError(text) from None
+    if text.lower() in ("", "1", "true", "yes", "on"):
+        return True
+    if text.lower() in ("0", "false", "no", "off"):
+        return False
+    raise ValueError(text)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -177,16 +158,13 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
-# first words of the names of options of PETSc, of its solvers and of its command line
+# first words of the names of options that PETSc reads anew in a run or at its end; those that it reads when it starts
+# are known to `pctt.ksp_options.unused`
 _PETSC = (
-    "ksp_", "pc_", "mat_", "vec_", "sub_", "mg_", "fieldsplit_", "prefix_", "log_", "options_", "info",
-    "malloc", "memory_", "viewer_", "citations", "help", "version", "on_error", "error_output_", "debug",
-    "start_in_debugger", "stop_for_debugger", "fp_trap", "check_pointer", "object_", "objects_", "petsc_",
-    "sf_", "is_", "dm_", "tao_", "snes_", "ts_", "mpi_", "use_gpu", "device_", "cuda_", "hip_", "kokkos_",
-    "not_shared_tmp", "shared_tmp", "tmp", "nox", "saws", "x_", "skip_petscrc", "get_", "threads",
-    "blas_", "checkstack", "history", "draw_", "display", "matmatmult", "matptap", "matproduct", "st_",
-    "eps_", "svd_", "python",
-)
+    "ksp_", "pc_", "mat_", "vec_", "sub_", "mg_", "fieldsplit_", "is_", "sf_", "dm_", "prefix_", "log_", "options_",
+    "info", "malloc", "memory_", "viewer_", "draw_", "citations", "help", "version", "on_error", "start_in_debugger",
+    "nox", "get_total_flops", "tmp", "shared_tmp", "not_shared_tmp",
+)  # fmt: skip
 
 
 def refuse_unknown(names: Iterable[str], known: Iterable[str], prefixes: Iterable[str] = ()) -> None:
@@ -195,9 +173,8 @@ def refuse_unknown(names: Iterable[str], known: Iterable[str], prefixes: Iterabl
     Names that begin with PETSc's first words, or with one of ``prefixes``, pass.
     """
     known = set(known)
-    through = (*_PETSC, *prefixes)
     for name in names:
-        if name not in known and not name.startswith(through):
+        if name not in known and not name.startswith((*_PETSC, *prefixes)):
             raise no_such_option(name, known)
 
 

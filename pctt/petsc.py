@@ -1,12 +1,15 @@
-"""Differences between builds and releases of PETSc: the scalars, the way in which errors return to Python, and
-functions that petsc4py has no name for in every release."""
+"""What petsc4py leaves to us: the scalars of a build, the life and the errors of python contexts, warnings on all
+ranks, and functions that it has no name for in every release from 3.18 on."""
 
 from __future__ import annotations
 
+import atexit
 import ctypes
+import functools
 import gc
 import sys
 import warnings
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -30,6 +33,13 @@ def require_real_double(scalar: type = PETSc.ScalarType) -> None:
 
 require_real_double()  # here, as every package that uses PETSc imports this module
 
+# -- contexts: the Python objects that PETSc calls for the project's PCs and Mats of type python ---------------------
+
+#: The methods that PETSc calls by name.
+CALLED = (
+    "setFromOptions", "setUp", "apply", "applyTranspose", "mult", "multTranspose", "getDiagonal", "view",
+    "scale", "shift", "zeroEntries", "diagonalScale", "norm", "duplicate", "copy",
+)  # fmt: skip
 _raised: list[BaseException] | None = None  # errors that contexts raised since the innermost `own_errors` began
 
 
@@ -37,8 +47,9 @@ _raised: list[BaseException] | None = None  # errors that contexts raised since 
 def own_errors() -> Iterator[None]:
     """Within the block, an error that our Python raises while PETSc calls it comes out as it was raised.
 
-    petsc4py does this up to 3.18. Newer releases make our error the cause of a PETSc error, or lose it. They also crash
-    if the garbage collector meets a dead python PC before the error is out. So the collector is off in the block.
+    petsc4py 3.18 does this by itself. Newer releases make our error the cause of a PETSc error, or lose it. If the
+    garbage collector meets a dead python PC before the error is out, they print it amid others (3.25) or crash. So the
+    collector is off in the block.
     """
     global _raised
     before, _raised = _raised, []
@@ -47,7 +58,9 @@ def own_errors() -> Iterator[None]:
     try:
         yield
     except PETSc.Error as error:
-        first = origin(error)
+        first: BaseException = error
+        while isinstance(first, PETSc.Error) and first.__cause__ is not None:
+            first = first.__cause__
         raise _raised[0] if isinstance(first, PETSc.Error) and _raised else first from None
     finally:
         _raised = before
@@ -61,11 +74,70 @@ def remember(error: BaseException) -> None:
         _raised.append(error)
 
 
-def origin(error: BaseException) -> BaseException:
-    """The first error of a chain: the Python error that caused a PETSc error, or ``error`` itself."""
-    while isinstance(error, PETSc.Error) and error.__cause__ is not None:
-        error = error.__cause__
-    return error
+class Context:
+    """The base class of contexts. It remembers the errors that methods of `CALLED` raise for `own_errors`, and leaves
+    its PC or Mat before Python ends: PETSc would call it after that, and crash."""
+
+    without: str  #: the type that the PC or Mat gets when the context leaves it
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        for name in CALLED:
+            if name in cls.__dict__:
+                setattr(cls, name, _remembering(cls.__dict__[name]))
+
+    def create(self, owner: PETSc.Object) -> None:
+        """PETSc calls this when its PC or Mat gets the context."""
+        owner.decRef()  # our reference must not keep the owner alive; `destroy` gives it back
+        self._owner: PETSc.Object | None = owner
+        _living.add(self)
+        # PETSc frees its copy of the world communicator with the last object on a rank. At the end it would make a new
+        # one on such ranks, which waits for all ranks for ever. An empty Vec keeps it.
+        if not _kept and owner.comm.size == PETSc.COMM_WORLD.size:
+            _kept.append(PETSc.Vec().create(comm=owner.comm))
+
+    def destroy(self, owner: PETSc.Object) -> None:
+        """PETSc calls this at the end of the PC or Mat."""
+        if self._owner is not None:
+            self._owner.incRef()
+            self._owner = None
+
+
+def _remembering(method: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(method)
+    def called(*arguments: Any) -> Any:
+        try:
+            return method(*arguments)
+        except BaseException as error:
+            remember(error)
+            raise
+
+    return called
+
+
+_living: weakref.WeakSet[Context] = weakref.WeakSet()
+_kept: list[PETSc.Vec] = []
+
+
+@atexit.register
+def _leave_all() -> None:
+    """Remove the contexts from owners that still exist, for example in the traceback of an error. Then PETSc destroys
+    the objects that petsc4py has released."""
+    for context in list(_living):
+        if context._owner is not None:
+            context._owner.setType(context.without)
+    gc.collect()
+    PETSc.garbage_cleanup()
+
+
+# -- options and warnings --------------------------------------------------------------------------------------------
+
+
+def is_used(name: str) -> bool:
+    """Whether anybody has asked PETSc's database for this option (``PetscOptionsUsed``; petsc4py 3.18 lacks it)."""
+    flag = ctypes.c_int(0)  # at least as wide as PetscBool in any version
+    _library.PetscOptionsUsed(None, name.encode(), ctypes.byref(flag))
+    return flag.value != 0
 
 
 def given_options(group: type, prefix: str) -> dict[str, str]:
@@ -108,12 +180,11 @@ def _levels_of_ours() -> int:
 _library = ctypes.CDLL(PETSc.__file__)
 _INT = ctypes.c_int64 if np.dtype(PETSc.IntType).itemsize == 8 else ctypes.c_int32
 _SET_COORDINATES = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, _INT, _INT, ctypes.POINTER(ctypes.c_double))
-_FAILED = {False: 0, True: -1}  # PC_NOERROR, PC_SETUP_ERROR
 
 
 def set_failed(pc: PETSc.PC, failed: bool) -> None:
     """``PCSetFailedReason``: a KSP with this PC ends with KSP_DIVERGED_PC_FAILED, or not any more."""
-    _library.PCSetFailedReason(ctypes.c_void_p(pc.handle), ctypes.c_int(_FAILED[failed]))
+    _library.PCSetFailedReason(ctypes.c_void_p(pc.handle), ctypes.c_int(-1 if failed else 0))  # PC_SETUP_ERROR
 
 
 def on_coordinates(pc: PETSc.PC, take: Callable[[np.ndarray], None] | None) -> Any:

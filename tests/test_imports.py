@@ -55,9 +55,9 @@ BELOW = {
     "dem": {},
     "pctt.tt": {},
     "dem.contact_map": {"dem.arrays", "dem.compiled", "dem.exchange"},
-    "pctt.body_matrix": {"pctt.block_diagonal", "pctt.blocks", "dem.contact_map", "dem.exchange", "pctt.shell"},
+    "pctt.body_matrix": {"pctt.block_diagonal", "pctt.blocks", "dem.contact_map", "dem.exchange"},
     "pctt.mat": {
-        "pctt.context", "pctt.disk", "dem.exchange", "dem.morton", "pctt.options", "pctt.petsc", "pctt.shell",
+        "pctt.disk", "dem.exchange", "dem.morton", "pctt.options", "pctt.petsc",
         "pctt.tt",
     },
     "pctt.look": {"dem", "pctt.disk", "pctt.folder", "pctt.options", "pctt.petsc"},

@@ -58,15 +58,10 @@ def test_without_options_all_defaults_hold():
 @pytest.mark.parametrize(
     ("name", "text", "expected"),
     [
-        ("count", "0", 0),
         ("count", "12", 12),
-        ("every", "1", 1),
         ("number", "-7", -7),
         ("dt", "1e-3", 0.001),
-        ("dt", "2", 2.0),
         ("gap", "0", 0.0),
-        ("part", ".25", 0.25),
-        ("angle", "-3.5", -3.5),
         ("maybe", "0.5", 0.5),
         ("steps", "4", 4),
         ("shape", "box", "box"),
@@ -87,29 +82,21 @@ def test_values_are_converted(name, text, expected):
     [
         ("count", "-1", "a whole number >= 0"),
         ("count", "1.5", "a whole number >= 0"),
-        ("count", "many", "a whole number >= 0"),
         ("count", "1e3", "a whole number >= 0"),
         ("every", "0", "a whole number >= 1"),
-        ("number", "1.0", "a whole number"),
         ("number", "", "a whole number"),
         ("dt", "0", "a positive number"),
-        ("dt", "-1", "a positive number"),
         ("dt", "nan", "a positive number"),
         ("dt", "inf", "a positive number"),
-        ("dt", "0,1", "a positive number"),
         ("gap", "-1e-9", "a number >= 0"),
         ("gap", "nan", "a number >= 0"),
-        ("part", "0", "a number between 0 and 1, both excluded"),
         ("part", "1", "a number between 0 and 1, both excluded"),
         ("part", "nan", "a number between 0 and 1, both excluded"),
-        ("angle", "nan", "a finite number"),
         ("angle", "-inf", "a finite number"),
         ("angle", "steep", "a number"),
         ("maybe", "-2", "a positive number"),
-        ("maybe", "soon", "a positive number"),
         ("steps", "2.5", "a whole number"),
         ("on", "maybe", "true or false"),
-        ("shape", "", "one of sphere, box, tetrahedron"),
         ("shape", "Box", "one of sphere, box, tetrahedron"),
     ],
 )
@@ -117,22 +104,9 @@ def test_errors_name_option_value_and_what_is_allowed(name, text, allowed):
     assert error(name, text).startswith(f"-x_{name} {text}: allowed is {allowed}")
 
 
-def test_an_option_without_its_value_is_an_error_too():
-    assert error("dt", None) == "-x_dt : allowed is a positive number"
-
-
 def test_a_misspelt_choice_gets_the_nearest():
     assert error("shape", "tetrahedon").endswith("; did you mean tetrahedron?")
     assert "did you mean" not in error("shape", "cylinder")
-
-
-def test_the_first_bad_option_is_raised_and_no_group_made():
-    with pytest.raises(OptionError, match="-dt x"):
-        read(Group, {"count": "1", "dt": "x"})
-
-
-def test_an_option_error_is_a_value_error():
-    assert issubclass(OptionError, ValueError)
 
 
 # -- unknown names ------------------------------------------------------------------------------------------
@@ -141,8 +115,7 @@ KNOWN = ["scene", "scene_n", "steps", "dt", "restart", "output", "compare", "com
 
 
 @pytest.mark.parametrize(
-    ("name", "nearest"),
-    [("sceen", "scene"), ("step", "steps"), ("restrat", "restart"), ("ccp_toll", "ccp_tol"), ("outptu", "output")],
+    ("name", "nearest"), [("sceen", "scene"), ("step", "steps"), ("ccp_toll", "ccp_tol")]
 )
 def test_a_misspelt_name_gets_the_nearest(name, nearest):
     with pytest.raises(OptionError, match=f"^-{name}: no such option; did you mean -{nearest}\\?$"):
@@ -154,30 +127,10 @@ def test_a_name_like_none_of_ours_gets_a_pointer_to_the_help():
         refuse_unknown(["qqq"], KNOWN)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "ksp_type",
-        "ksp_monitor",
-        "pc_type",
-        "pc_factor_shift_type",
-        "pc_tt_max_rank",
-        "mat_mumps_icntl_14",
-        "sub_pc_type",
-        "mg_levels_ksp_type",
-        "log_view",
-        "options_left",
-        "options_file",
-        "help",
-        "malloc_debug",
-        "on_error_abort",
-        "start_in_debugger",
-        "info",
-        "citations",
-        "vec_type",
-        "viewer_binary_skip_info",
-    ],
-)
+@pytest.mark.parametrize("name", [
+    "ksp_type", "pc_tt_max_rank", "mat_mumps_icntl_14", "sub_pc_type", "log_view", "options_file", "help",
+    "malloc_debug", "on_error_abort", "start_in_debugger", "citations", "viewer_binary_skip_info",
+])  # fmt: skip
 def test_petscs_own_names_pass(name):
     assert refuse_unknown([name], KNOWN) is None
 

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from petsc4py import PETSc
 
+from pctt.memory import limits
 from pctt.petsc import own_errors, remember, require_real_double
-
-
-def test_real_double_precision_will_do():
-    assert require_real_double() is None
 
 
 @pytest.mark.parametrize("scalar", [np.complex128, np.float32])
@@ -32,6 +29,15 @@ def test_an_error_of_petsc_itself_stays():
     remember(KeyError("of another time"))
     with pytest.raises(PETSc.Error), own_errors():
         raise PETSc.Error(77)
+
+
+def test_the_limits_of_nested_control_groups_hold(tmp_path):
+    for folder, most, used in (("", "max", "7"), ("slurm", "1000", "100"), ("slurm/job", "max", "50")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "memory.max").write_text(most + "\n")
+        (tmp_path / folder / "memory.current").write_text(used + "\n")
+    assert limits(tmp_path, "slurm/job") == [900.0]
+    assert limits(tmp_path, "") == []
 
 
 PROGRAM = """

@@ -13,12 +13,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.exchange import on_first, refuse
-from pctt.context import Context
 from pctt.mat.entries import Entries, Entry, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.order import Places, digits_of, whole_numbers
 from pctt.options import AT_LEAST_ONE, FRACTION, OptionError, describe, option, read, refuse_bad
-from pctt.petsc import given_options, on_axpy, on_getinfo, own_errors, warn
+from pctt.petsc import Context, given_options, on_axpy, on_getinfo, own_errors, warn
 from pctt.tt.cross import EntryMatrix, compress_cross
 from pctt.tt.train import Train
 from pctt.tt.work import Work

@@ -2,9 +2,8 @@
 
     -pc_type python -pc_python_type pctt.pc.TensorTrain -pc_tt_rank 10
 
-A subclass names its group of options (a dataclass, see ``pctt.options``) and their prefix. The base class turns the
-calls of PETSc into ``build`` (a matrix with a new structure), ``update`` (new values in the same structure) and
-``multiply``.
+It turns the calls of PETSc into ``build`` (a matrix with a new structure), ``update`` (new values in the same
+structure) and ``multiply``.
 """
 
 from __future__ import annotations
@@ -13,13 +12,16 @@ from typing import Any
 
 from petsc4py import PETSc
 
-from pctt.context import Context
 from pctt.options import describe, read
-from pctt.petsc import given_options
+from pctt.petsc import Context, given_options
+
+#: The attributes that a user's Mat may have, see docs/preconditioners.md.
+ATTRIBUTES = ("coordinates", "grid", "key")
 
 
 class PythonPC(Context):
-    """Base class. Subclasses set ``options_class`` and ``options_prefix``, and define build, update and multiply.
+    """Base class. Subclasses name their group of options (a dataclass, see ``pctt.options``) and its prefix, and define
+    update and multiply.
 
     Matrices of other types than AIJ and BAIJ are converted. For a matrix without rows no method of a subclass is
     called.
@@ -37,6 +39,11 @@ class PythonPC(Context):
         self.P: PETSc.Mat | None = None  # the matrix, in AIJ or BAIJ; None if it has no rows
         self._converted: PETSc.Mat | None = None
 
+    @property
+    def name(self) -> str:
+        """The name for ``-pc_python_type``."""
+        return f"pctt.pc.{type(self).__name__}"
+
     def setFromOptions(self, pc: PETSc.PC) -> None:
         """Read the options with the prefix of the PC; OptionError for a bad value or a misspelt name.
 
@@ -44,8 +51,7 @@ class PythonPC(Context):
         """
         self.prefix = pc.getOptionsPrefix() or ""
         prefix = self.prefix + self.options_prefix
-        given = given_options(self.options_class, prefix)
-        before, self.options = self.options, read(self.options_class, given, prefix)
+        before, self.options = self.options, read(self.options_class, given_options(self.options_class, prefix), prefix)
         if self.options != before:
             self._structure = None
         if PETSc.Options().hasName("help"):
@@ -57,14 +63,14 @@ class PythonPC(Context):
         rows, columns = P.getSize()
         if rows != columns:
             raise ValueError(f"{self.name}: the matrix has {rows} rows and {columns} columns; allowed is a square one")
-        handle = P.handle
+        structure: tuple = (P.handle, rows)
         if rows == 0:
-            self.P, self._structure = None, (handle, 0)
+            self.P, self._structure = None, structure
             return
         if not self.takes(P):
             P = self._as_sparse(P)
+            structure += (P.getInfo()["nz_used"],)
         self.P = P
-        structure = (handle, rows, 0 if self.takes(P) else P.getInfo()["nz_used"])
         if structure != self._structure:
             self.build(pc, P)
             self._structure = structure
@@ -74,40 +80,37 @@ class PythonPC(Context):
         """Whether P is used as it is, whatever its type."""
         return False
 
-    @property
-    def name(self) -> str:
-        """The name for ``-pc_python_type``."""
-        return f"pctt.pc.{type(self).__name__}"
-
     def _as_sparse(self, P: PETSc.Mat) -> PETSc.Mat:
         """P, or a copy of P in AIJ if P has another type."""
-        if P.getType().startswith(("seqaij", "mpiaij", "seqbaij", "mpibaij")):
+        kind = P.getType()
+        if kind.startswith(("seqaij", "mpiaij", "seqbaij", "mpibaij")):
             return P
-        if not P.getType().startswith(("seqsbaij", "mpisbaij", "seqdense", "mpidense")):
-            raise ValueError(
-                f"{self.name}: a Mat of type {P.getType()} has no entries to read; allowed are aij, baij, sbaij, dense"
-            )
+        if not kind.startswith(("seqsbaij", "mpisbaij", "seqdense", "mpidense")):
+            allowed = "allowed are aij, baij, sbaij, dense"
+            raise ValueError(f"{self.name}: a Mat of type {kind} has no entries to read; {allowed}")
         sparse = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
         if sparse.getBlockSize() != P.getBlockSize():
             sparse.setBlockSize(P.getBlockSize())
         for attribute in ATTRIBUTES:
             if P.getAttr(attribute) is not None:
                 sparse.setAttr(attribute, P.getAttr(attribute))
-        if self._converted is not None:
-            self._converted.destroy()
+        self._drop_converted()
         self._converted = sparse
         return sparse
+
+    def _drop_converted(self) -> None:
+        if self._converted is not None:
+            self._converted.destroy()
+            self._converted = None
 
     def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Set up everything that depends only on the structure of P."""
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Set up everything that depends on the values of P."""
-        raise NotImplementedError
 
     def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x."""
-        raise NotImplementedError
 
     def multiply_transpose(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M' x; unless a subclass says something else, M is symmetric."""
@@ -139,9 +142,7 @@ class PythonPC(Context):
         """PETSc calls this at the end of the PC."""
         self.release()
         self.P = None
-        if self._converted is not None:
-            self._converted.destroy()
-            self._converted = None
+        self._drop_converted()
         super().destroy(pc)
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer | None = None) -> None:
@@ -157,7 +158,3 @@ class PythonPC(Context):
     def what(self) -> str:
         """What the preconditioner really was over its solves, in a few words, where its name does not say it."""
         return ""
-
-
-#: The attributes that a user's Mat may have, see docs/preconditioners.md.
-ATTRIBUTES = ("coordinates", "grid", "key")

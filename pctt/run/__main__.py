@@ -29,11 +29,10 @@ except ImportError as error:
 
 from dem.together import SceneError
 from pctt.disk import FileError
-from pctt.ksp_options import entered
+from pctt.ksp_options import entered, keep_from_petsc, refuse_stray
 from pctt.options import OptionError
 from pctt.run.help import help_text
 from pctt.run.interrupt import InterruptError, heed
-from pctt.run.leftovers import keep_from_petsc, refuse_stray
 from pctt.run.options import read_options
 from pctt.run.settings import DEMO_SOLVERS
 from pctt.run.simulate import simulate, solve_file

@@ -20,10 +20,9 @@ from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
 from pctt.disk import refuse_serial
 from pctt.folder import refusal
-from pctt.ksp_options import entered, to_enter
+from pctt.ksp_options import OF_SOLVERS, entered, refuse_misspelt, to_enter, unused
 from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read, refuse_unknown
 from pctt.petsc import own_errors
-from pctt.run.leftovers import OF_SOLVERS, refuse_misspelt
 from pctt.run.settings import DEMO, Asked, Options, Run, Settings, find_scene
 
 #: Options of simulations, beside those of the scene; those that settled states depend on, and -quiet.
@@ -42,7 +41,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     solver = ccp.SOLVERS[asked.solver]
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in option_groups(scene_class) for d in describe(group, start)]
-    refuse_unknown(database, known, prefixes=OF_SOLVERS)
+    refuse_unknown(unused(database), known, prefixes=OF_SOLVERS)  # PETSc has asked for its own when it started
     for name in known:
         PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
     # a file of -problem is solved as a plain cone problem by default

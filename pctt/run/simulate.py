@@ -15,7 +15,8 @@ from pctt.ccp.cone import Array
 from pctt.ccp.fclib import FileFormatError, Stored
 from pctt.disk import FileError, on_first, write_text
 from pctt.folder import Place, dumps
-from pctt.run import interrupt, leftovers, report
+from pctt.ksp_options import remark
+from pctt.run import interrupt, report
 from pctt.run.settings import DEMO, Options
 from pctt.run.state import built, settled_state
 from pctt.simulation import Simulation
@@ -75,7 +76,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
             progress.say(f"Newton systems: {what}")
         if compare.names:
             progress.say("\n" + report.compare_table(compare.summary()))
-    if left := leftovers.remark():
+    if left := remark():
         progress.say(left)
     if sim.last:
         folder = output.place.folder
@@ -133,7 +134,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         progress.say("\n" + report.compare_table(compare.summary()))
     if not summary["converged"]:
         progress.say(f"NOT CONVERGED: {summary['reason']}")
-    if left := leftovers.remark():
+    if left := remark():
         progress.say(left)
     place = Place(Path(options.run.output), comm, overwrite=options.run.overwrite)
     try:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from problems import SELF, Graph, Known, from_graph, from_matrix, heap, known_optimum, matrix
 
-from dem.contact_map import BlockRows
 from pctt import ccp, memory
+from pctt.blocks import BlockRows
 from pctt.ccp import ConeProblem, Limits, newton_for
-from pctt.ccp.newton.body_ladder import BodyLadder
+from pctt.ccp.newton.krylov import Krylov
 
 FORMS = pytest.mark.parametrize("form", ccp.FORMS)
 
@@ -77,24 +77,24 @@ def test_a_packing_to_high_accuracy(form, tol):
     assert result.iterations <= 17 + 4 * (form == "contact")  # 21 with what contacts do alone in a rounded form
 
 
-def test_its_systems_climb_from_block_jacobi_to_factors():
-    G, r, mu = packing(8)
+@pytest.mark.parametrize("room", [True, False])
+def test_its_systems_change_from_block_jacobi_to_factors_if_the_memory_has_room(room, monkeypatch):
+    used = []
+
+    def noted(krylov, *arguments, **keywords):
+        used.append((krylov.ksp.getType(), krylov.ksp.pc.getType()))
+        return once(krylov, *arguments, **keywords)
+
+    once = Krylov.solve
+    monkeypatch.setattr(Krylov, "solve", noted)
+    if not room:
+        monkeypatch.setattr(memory, "available", lambda comm: 1e6)
+    G, r, mu = packing(8 if room else 5)
     newton = newton_for(SELF, "conic")
     assert ccp.solve(ConeProblem(SELF, r, mu, G=G), None, "conic", Limits(1e-6), newton=newton).converged
-    assert isinstance(newton.linear, BodyLadder)
-    assert list(newton.linear.used) == ["pbjacobi", "cholesky"]  # in the order of their first use
-    for rung in newton.linear.used:
-        ksp = newton.linear._solver(rung).ksp
-        assert (ksp.getType(), ksp.pc.getType()) == ("cg", rung)
-    newton.destroy()
-
-
-def test_without_memory_for_factors_block_jacobi_goes_on_alone(monkeypatch):
-    G, r, mu = packing(5)
-    monkeypatch.setattr(memory, "available", lambda comm: 1e6)
-    newton = newton_for(SELF, "conic")
-    assert ccp.solve(ConeProblem(SELF, r, mu, G=G), None, "conic", Limits(1e-6), newton=newton).converged
-    assert list(newton.linear.used) == ["pbjacobi"]
+    assert newton.fallbacks == 0
+    jacobi, factor = ("cg", "pbjacobi"), ("gmres", "cholesky")
+    assert list(dict.fromkeys(used)) == ([jacobi, factor] if room else [jacobi])  # in the order of their first use
     newton.destroy()
 
 

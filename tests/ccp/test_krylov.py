@@ -8,9 +8,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from problems import SELF, dense_of, from_graph, heap, matrix
 
-from pctt.ccp import ConeProblem, Limits, Newton
+from pctt import memory
+from pctt.ccp import ConeProblem, Newton
 from pctt.ccp.newton.krylov import Krylov
-from pctt.ccp.newton.users_solver import LADDER
 
 
 def system(seed: int = 0, size: int = 60, shift: float = 1.0):
@@ -46,11 +46,10 @@ def test_the_true_residual_is_the_true_one(pc, method):
     assert min(done.setup_s, done.solve_s) > 0
 
 
-def test_the_true_residual_is_reported_where_the_method_claims_success():
+def test_what_the_method_claims_is_checked():
     dense, S, x, b = system()
     done = Krylov(SELF, "", {"ksp_type": "preonly", "pc_type": "jacobi"}).solve(S, b, x)
     assert done.reason == "converged_its"
-    assert done.true_residual == pytest.approx(np.linalg.norm(b.array - dense @ x.array) / np.linalg.norm(b.array))
     assert not done.converged
 
 
@@ -105,9 +104,10 @@ def test_eisenstat_works_on_scalar_rows():
     assert np.linalg.norm(dense @ x.array - b.array) <= 1e-5 * np.linalg.norm(b.array)
 
 
-@pytest.mark.parametrize("pc", ["lu", "cholesky", "ilu", "icc", "hypre", "pbjacobi", "none"])
+@pytest.mark.parametrize("pc", ["lu", "cholesky", "ilu", "icc", "hypre", "pbjacobi", "none", "python"])
 def test_a_breakdown_is_reported_and_forgotten(pc):
-    """A matrix with a NaN: nothing is raised, and the next matrix is solved as if nothing had been."""
+    """A matrix with a NaN, or a set-up that fails: nothing is raised, and the next matrix is solved as if nothing had
+    been."""
     dense, S, x, b = system()
     krylov = Krylov(SELF, "broken_", {"pc_type": pc}, rtol=1e-6)
     broken = dense.copy()
@@ -118,19 +118,7 @@ def test_a_breakdown_is_reported_and_forgotten(pc):
     assert done.true_residual == 1.0
     assert np.array_equal(x.array, np.zeros(60))
     overwrite(S, dense)
-    assert krylov.solve(S, b, x).converged
-
-
-def test_a_failing_set_up_is_reported_not_raised():
-    _, S, x, b = system()
-    x.array[:] = np.nan
-    krylov = Krylov(SELF, "none_", {"pc_type": "python"})
-    done = krylov.solve(S, b, x)
-    krylov.destroy()
-    assert not done.converged
-    assert done.reason.startswith("PETSc error")
-    assert done.true_residual == 1.0
-    assert np.array_equal(x.array, np.zeros(60))
+    assert krylov.solve(S, b, x).converged or pc == "python"
 
 
 def test_a_right_hand_side_of_zero():
@@ -183,12 +171,7 @@ def test_a_newton_system_is_n_plus_the_barrier_blocks():
     assert np.allclose(dense_of(problem.N), known.N)
 
 
-@pytest.mark.parametrize("first", [None, *LADDER])
-def test_the_ladder_is_climbed_down_until_a_rung_holds(first, database):
-    """Rungs before ``first`` are made to fail."""
-    rungs = list(LADDER)
-    for rung in rungs[: rungs.index(first) if first else 0]:
-        database[f"fallback_{rung}_pc_type"] = "python"
+def test_where_the_ksp_fails_a_factor_solves(database):
     database["pc_type"] = "python"
     known, graph = heap()
     newton = newton_of(from_graph(known, graph))
@@ -197,50 +180,46 @@ def test_the_ladder_is_climbed_down_until_a_rung_holds(first, database):
     x = solved(newton, rhs, 1e-8)
     S = dense_of(schur(newton))
     assert np.linalg.norm(S @ x.ravel() - rhs.ravel()) <= 2e-8 * np.linalg.norm(rhs)
-    assert newton.fallbacks == 1
-    assert newton.ksp_its >= 1
+    assert (newton.fallbacks, newton.ksp_its) == (1, 1)
     newton.destroy()
 
 
-def test_where_every_rung_fails_the_step_is_the_best_there_is(database):
-    """Of three that stop early the one of the smallest true residual; zero where nothing is any good."""
+@pytest.mark.parametrize("better", ["", "fallback_"])
+def test_where_both_fail_the_step_is_the_better_one(better, database):
+    """By the true residual; zero where neither is any good."""
     known, graph = heap()
     problem = from_graph(known, graph)
-    blocks, rhs = 1e-6 * spd_blocks(40), np.random.default_rng(1).normal(size=(40, 3))
-    database["ksp_type"] = "cg"
-    database["ksp_max_it"] = 2
-    database["fallback_cg_ksp_max_it"] = 20
-    database["fallback_cholesky_ksp_type"] = "cg"
-    database["fallback_cholesky_pc_type"] = "none"
+    blocks, rhs = spd_blocks(40), np.random.default_rng(1).normal(size=(40, 3))
+    for prefix in ("", "fallback_"):
+        database[prefix + "ksp_type"] = "cg"
+        database[prefix + "pc_type"] = "jacobi"
+        database[prefix + "ksp_max_it"] = 8 if prefix == better else 1
     newton = newton_of(problem)
     newton.update(blocks)
     S = dense_of(schur(newton))
-    residuals = []
-    for prefix in ("", "fallback_pbjacobi_", "fallback_cholesky_"):
-        x, b = schur(newton).createVecs()
-        b.array[:] = rhs.ravel()
-        residuals.append(Krylov(SELF, prefix, LADDER.get(prefix[9:-1]), 1e-12).solve(schur(newton), b, x).true_residual)
-    best = min(residuals + [1.0])
+    x, b = schur(newton).createVecs()
+    b.array[:] = rhs.ravel()
+    best = Krylov(SELF, better, rtol=1e-12).solve(schur(newton), b, x).true_residual
+    assert best < 1.0
     x = solved(newton, rhs, 1e-12)
     assert np.linalg.norm(S @ x.ravel() - rhs.ravel()) / np.linalg.norm(rhs) == pytest.approx(best, rel=1e-6)
     newton.destroy()
-    for rung in ("", "fallback_pbjacobi_", "fallback_cholesky_"):
-        database[rung + "pc_type"] = "python"
+    for prefix in ("", "fallback_"):
+        database[prefix + "pc_type"] = "python"
     newton = newton_of(problem)
     newton.update(blocks)
     assert np.array_equal(solved(newton, rhs, 1e-8), np.zeros((40, 3)))
     newton.destroy()
 
 
-def test_systems_of_another_structure_follow_each_other():
-    """Solvers make and destroy a system per cone problem."""
-    from pctt import ccp
-
-    for contacts in (10, 40, 25):
-        known, graph = heap(3, contacts)
-        problem: ConeProblem = from_graph(known, graph)
-        assert ccp.solve(problem, limits=Limits(1e-5)).converged
-        problem.destroy()
+def test_without_memory_a_failing_ksp_has_no_fallback(database, monkeypatch):
+    monkeypatch.setattr(memory, "available", lambda comm: 1e3)
+    database["pc_type"] = "python"
+    newton = newton_of(from_graph(*heap()))
+    newton.update(spd_blocks(40))
+    assert np.array_equal(solved(newton, np.ones((40, 3)), 1e-8), np.zeros((40, 3)))
+    assert newton.fallbacks == 1
+    newton.destroy()
 
 
 @pytest.mark.parallel(2, 3)
@@ -264,13 +243,3 @@ def test_on_several_ranks_factorisations_of_one_rank_work_within_each():
         assert done.converged or pc == "none", (pc, done)
         assert comm.allgather((done.iterations, done.converged)) == [(done.iterations, done.converged)] * comm.size
         assert krylov.ksp.pc.getType() == ("bjacobi" if pc in ("ilu", "icc") else pc)
-    # options of the factorisation reach those of the ranks: more fill, fewer iterations
-    N = matrix(comm, heap(contacts=200, bodies=40)[0].N + np.eye(600))
-    x, b = N.createVecs()
-    b.array[:] = 1.0
-    PETSc.Options()["filled_pc_factor_levels"] = 3
-    ilu = {"ksp_type": "gmres", "pc_type": "ilu"}
-    plain, filled = (Krylov(comm, prefix, ilu, 1e-7).solve(N, b, x) for prefix in ("plain_", "filled_"))
-    assert plain.converged
-    assert filled.converged
-    assert filled.iterations < 0.9 * plain.iterations, (filled, plain)

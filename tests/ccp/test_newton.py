@@ -25,7 +25,7 @@ def definite(rng: np.random.Generator, count: int) -> np.ndarray:
 @pytest.mark.parametrize("many", [20, 1000])
 def test_the_forms_agree_with_dense_algebra(many, monkeypatch):
     """Also where a body has more contacts than N is filled with."""
-    monkeypatch.setattr(blocks, "HUB", many)
+    monkeypatch.setattr(delassus, "HUB", many)
     comm = MPI.COMM_WORLD
     contacts, bodies = 120, 30
     rng = np.random.default_rng(0)

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from systems import contacts, dense, spd
 
-from pctt.block_diagonal import block_diagonal, inverse_diagonal_blocks, set_diagonal_blocks
+from pctt.block_diagonal import block_diagonal, inverse_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.blocks import block_csr_matrix
 from pctt.body_matrix import BodyMatrix
 from pctt.ccp.newton.krylov import Krylov
@@ -77,16 +77,16 @@ def test_new_values_make_the_preconditioner_that_a_new_matrix_gets(way, kind):
 
 @pytest.mark.parametrize("kind", ["baij", "aij"])
 def test_the_blocks_are_the_present_ones(kind):
-    for said in (False, True):
-        mat = full(kind, spd(BLOCK * COUNT, 0))
-        for seed in (1, 2):
-            A = spd(BLOCK * COUNT, seed)
-            overwrite(mat, A)
-            blocks = np.array([A[i : i + BLOCK, i : i + BLOCK] for i in range(0, len(A), BLOCK)])
-            if said:
-                set_diagonal_blocks(mat, blocks)
-            assert np.allclose(inverse_diagonal_blocks(mat), np.linalg.inv(blocks))
-            copy = block_diagonal(mat)
+    mat = full(kind, spd(BLOCK * COUNT, 0))
+    shell = symmetric_shell(MPI.COMM_SELF, BLOCK * COUNT, BLOCK, lambda x, out: None)
+    for seed in (1, 2):
+        A = spd(BLOCK * COUNT, seed)
+        overwrite(mat, A)
+        blocks = np.array([A[i : i + BLOCK, i : i + BLOCK] for i in range(0, len(A), BLOCK)])
+        set_diagonal_blocks(shell, blocks)
+        assert np.allclose(inverse_diagonal_blocks(mat), np.linalg.inv(blocks))
+        for P in (mat, shell):
+            copy = block_diagonal(P)
             assert np.allclose(copy.invertBlockDiagonal(), np.linalg.inv(blocks))
             copy.destroy()
 

@@ -137,7 +137,7 @@ TRAIN = ("-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")
     [
         ((), "BiCGStab (right), pbjacobi", None),
         (("-ksp_type", "cg", "-pc_type", "ilu"), "CG, ilu", None),
-        (("-ccp_type", "conic"), "CG, pbjacobi or cholesky by expected cost", None),
+        (("-ccp_type", "conic"), "CG, pbjacobi until it takes long, then cholesky", None),
         (TRAIN, "BiCGStab (right), pctt.pc.TensorTrain", "pctt.pc.TensorTrain was rank 1: block Jacobi"),
         (("-ccp_type", "apgd"), None, None),
     ],

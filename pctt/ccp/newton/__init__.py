@@ -20,12 +20,10 @@ from petsc4py import PETSc
 
 from pctt.ccp.cone import TINY, Array
 from pctt.ccp.newton.body import BodyForm
-from pctt.ccp.newton.body_ladder import BodyLadder
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.contact import ContactForm
 from pctt.ccp.newton.form import NewtonForm
-from pctt.ccp.newton.krylov import LinearSolver
-from pctt.ccp.newton.users_solver import UsersSolver
+from pctt.ccp.newton.linear import LinearSolver
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase
 
@@ -53,7 +51,6 @@ class Newton:
 
     def __init__(self, comm: MPI.Comm, form: str = "contact", compare: Comparison | None = None):
         self.comm, self.form, self.compare = comm, form, compare
-        self.memory: object = None  # of `auto`
         self.system: NewtonForm | None = None
         self._structure: tuple = ()
         self._instead = False  # of the bodies' form, which the present problem has not
@@ -82,12 +79,10 @@ class Newton:
     def linear(self) -> LinearSolver:
         """What solves the systems of the present form."""
         if self._linear is None:
-            own = self.form == "body" and self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
-            if own and not self._instead:
-                self._linear = BodyLadder(self.comm)
-            else:
-                defaults = GIVEN if self._instead else DEFAULTS[self.form]
-                self._linear = UsersSolver(self.comm, defaults, self.compare, "")
+            own = self.form == "body" and not self._instead and self.compare is None
+            own = own and not _ASKED & PETSc.Options().getAll().keys()
+            defaults = GIVEN if self._instead else DEFAULTS[self.form]
+            self._linear = LinearSolver(self.comm, defaults, self.compare, own=own)
         return self._linear
 
     @property

@@ -48,13 +48,14 @@ class BodyForm:
     def entries(self) -> PETSc.Mat:
         """K as a matrix that preconditioners can read, with the places of the bodies; collective."""
         entries = self.operator.entries()
+        mat = entries.mat
         if self.problem.point is not None and not self._placed:
-            entries.mat.setAttr("coordinates", entries.places(self.problem.point))
+            mat.setAttr("coordinates", entries.places(self.problem.point))
             self._placed = True
-        return entries.mat
+        return mat
 
     def stiff_part(self) -> PETSc.Mat:
-        """What is worth factorising of K, in scalar rows."""
+        """What is worth factorising of K, in scalar rows: a new Mat, which the caller destroys."""
         return self.operator.entries().stiff_part(LEAST, self.symmetric)
 
     @property

@@ -5,16 +5,16 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt import log
-from pctt.ccp.newton.krylov import Krylov, KrylovFamily, Solve, Source
+from pctt.block_diagonal import shell_of
+from pctt.ccp.newton.krylov import Krylov, Solve, Source
 from pctt.options import OptionError
-from pctt.shell import is_shell
 
 # names beside PETSc's own PC types: options that make them
 NAMED: dict[str, dict[str, str]] = {
@@ -25,69 +25,27 @@ NAMED: dict[str, dict[str, str]] = {
 }
 
 
-LABEL = re.compile(r"[A-Za-z0-9_-]+")
-
-
-@dataclass
-class Record:
-    """What one preconditioner did over the systems of a run: sums, and the solves since they were last taken."""
-
-    systems: int = 0
-    converged: int = 0
-    iterations: int = 0
-    most_iterations: int = 0
-    setup_s: float = 0.0
-    solve_s: float = 0.0
-    true_residual_max: float = 0.0
-    excess_max: float = 0.0
-    solves: list[Solve] = field(default_factory=list)
-
-    def add(self, solve: Solve) -> None:
-        self.systems += 1
-        self.converged += solve.converged
-        self.iterations += solve.iterations
-        self.most_iterations = max(self.most_iterations, solve.iterations)
-        self.setup_s += solve.setup_s
-        self.solve_s += solve.solve_s
-        self.true_residual_max = max(self.true_residual_max, float(solve.true_residual))
-        self.excess_max = max(self.excess_max, float(solve.true_residual) / solve.asked)
-        self.solves.append(solve)
-
-    def take_solves(self) -> list[list[Any]]:
-        """Converged, iterations, seconds and true residual of each solve since this was last asked."""
-        solves, self.solves = self.solves, []
-        return [[s.converged, s.iterations, s.setup_s + s.solve_s, s.true_residual] for s in solves]
-
-    def summary(self) -> dict[str, Any]:
-        """Figures over the systems; ``excess_max``: the greatest true residual, as a multiple of what was asked for."""
-        return {
-            "systems": self.systems,
-            "converged": self.converged,
-            "ksp_its_mean": self.iterations / max(self.systems, 1),
-            "ksp_its_max": self.most_iterations,
-            "setup_s": self.setup_s,
-            "solve_s": self.solve_s,
-            "true_residual_max": self.true_residual_max,
-            "excess_max": self.excess_max,
-        }
-
-
-class Comparison(KrylovFamily):
+class Comparison:
     """Solves every ``every``-th Newton system by each of ``entries`` (``-compare``, ``-compare_every``), of the form
     TYPE or LABEL:TYPE (`labelled`).
 
     A type is a PETSc PC type or one of NAMED. Its KSP has the prefix ``compare_<label>_`` for further options.
     Raises OptionError for a type that PETSc does not know.
+
+    Attributes
+    ----------
+    names : the labels
+    solves : by label, of all systems so far
     """
 
     def __init__(self, comm: MPI.Comm, entries: Sequence[str], every: int = 1):
         self.kinds = labelled(entries)
         for kind in self.kinds.values():
             _check_kind(kind, comm)
-        super().__init__(comm)
-        self.names, self.every = list(self.kinds), every
-        self.records = {name: Record() for name in self.names}
-        self._seen = 0
+        self.comm, self.names, self.every = comm, list(self.kinds), every
+        self.solves: dict[str, list[Solve]] = {name: [] for name in self.names}
+        self._krylov: dict[str, Krylov] = {}
+        self._seen = self._taken = 0
         self._entries_s = 0.0
 
     def due(self) -> bool:
@@ -101,38 +59,48 @@ class Comparison(KrylovFamily):
         The seconds of the others count in the phase `compare`, not in `solve`: a run without comparison does not spend
         them.
         """
-        chosen: Solve | None = None
+        start, chosen = time.perf_counter(), None
         with log.phase("CCPCompare"):
             A.mult(b, x)  # no one's seconds: the first product on a machine compiles its loops
             self._make_entries(A, P)
             for name in self.names:
                 done = self._solver(name).solve(A, b, x, rtol, P)
-                self.records[name].add(done)
+                self.solves[name].append(done)
                 better = chosen is None or done.converged or done.true_residual < chosen.true_residual
                 if better and not (chosen and chosen.converged):
                     chosen, kept = done, x.array.copy()
         assert chosen is not None
-        spent = log.take_seconds(("CCPCompare",))["CCPCompare"]
-        log.move_seconds(spent - chosen.setup_s - chosen.solve_s, "solve", "compare")
+        log.move_seconds(time.perf_counter() - start - chosen.setup_s - chosen.solve_s, "solve", "compare")
         x.array[:] = kept
         return chosen
 
     def _make_entries(self, A: PETSc.Mat, P: Source) -> None:
-        """Where S is a function, its entries, once for all that read them: no one's set-up."""
-        if not is_shell(A) or isinstance(P, PETSc.Mat) or P is None:
-            return
-        if any(self._solver(name).needs_entries for name in self.names):
+        """Where A is a function, its entries, once for all that read them: no one's set-up."""
+        if callable(P) and shell_of(A) and any(self._solver(name).needs_entries for name in self.names):
             start = time.perf_counter()
             P()
             self._entries_s += time.perf_counter() - start
 
     def summary(self) -> dict[str, dict[str, Any]]:
-        """Figures by label. ``what``: what the preconditioner really was, where its type does not say it.
-        ``entries_s``: seconds that the matrix's entries took, of a preconditioner that reads them; they are made once
-        for all, and in no one's ``setup_s``. ``pc_report``: lines, of the project's own."""
-        figures: dict[str, dict[str, Any]] = {
-            name: {"type": self.kinds[name], "what": "", **record.summary()} for name, record in self.records.items()
-        }
+        """Figures over the systems by label. ``what``: what the preconditioner really was, where its type does not say
+        it. ``excess_max``: the greatest true residual, as a multiple of what was asked for. ``entries_s``: seconds that
+        the matrix's entries took, of a preconditioner that reads them; they are made once for all, and in no one's
+        ``setup_s``. ``pc_report``: lines, of the project's own."""
+        figures: dict[str, dict[str, Any]] = {}
+        for name, solves in self.solves.items():
+            its = [solve.iterations for solve in solves]
+            figures[name] = {
+                "type": self.kinds[name],
+                "what": "",
+                "systems": len(solves),
+                "converged": sum(solve.converged for solve in solves),
+                "ksp_its_mean": float(np.mean(its or [0])),
+                "ksp_its_max": max(its, default=0),
+                "setup_s": sum(solve.setup_s for solve in solves),
+                "solve_s": sum(solve.solve_s for solve in solves),
+                "true_residual_max": max((float(solve.true_residual) for solve in solves), default=0.0),
+                "excess_max": max((float(solve.true_residual) / solve.asked for solve in solves), default=0.0),
+            }
         for name, krylov in self._krylov.items():
             figures[name]["what"] = krylov.what()
             figures[name]["entries_s"] = self._entries_s if krylov.needs_entries else 0.0
@@ -141,14 +109,29 @@ class Comparison(KrylovFamily):
         return figures
 
     def take_solves(self) -> dict[str, list[list[Any]]]:
-        """The solves by label, as of `Record.take_solves`."""
-        return {name: record.take_solves() for name, record in self.records.items()}
+        """By label: converged, iterations, seconds and true residual of each solve since this was last asked."""
+        fresh = {name: solves[self._taken :] for name, solves in self.solves.items()}
+        self._taken = max(map(len, self.solves.values()), default=0)
+        return {
+            name: [[s.converged, s.iterations, s.setup_s + s.solve_s, s.true_residual] for s in solves]
+            for name, solves in fresh.items()
+        }
 
     def _solver(self, name: str) -> Krylov:
         if name not in self._krylov:
             kind = self.kinds[name]
             self._krylov[name] = Krylov(self.comm, prefix(name), NAMED.get(kind, {"pc_type": kind}))
         return self._krylov[name]
+
+    def forget(self) -> None:
+        """The next matrix has another structure."""
+        for krylov in self._krylov.values():
+            krylov.forget()
+
+    def destroy(self) -> None:
+        for krylov in self._krylov.values():
+            krylov.destroy()
+        self._krylov.clear()
 
 
 def prefix(label: str) -> str:
@@ -163,7 +146,7 @@ def labelled(entries: Sequence[str]) -> dict[str, str]:
     for entry in entries:
         before, colon, kind = entry.rpartition(":")
         label = before if colon else kind
-        if colon and not LABEL.fullmatch(label):
+        if colon and not re.fullmatch(r"[A-Za-z0-9_-]+", label):
             allowed = "TYPE or LABEL:TYPE with a label of letters, digits, _ and -"
             raise OptionError(f"-compare {entry}: allowed is {allowed}")
         if label in kinds:
@@ -182,10 +165,8 @@ def _check_kind(name: str, comm: MPI.Comm) -> None:
     try:
         pc.setType(NAMED.get(name, {"pc_type": name})["pc_type"])
     except PETSc.Error:
-        known = [*NAMED, "none", "jacobi", "pbjacobi", "bjacobi", "sor", "ilu", "icc", "gamg", "hypre"]
-        raise OptionError(
-            f"-compare {name}: PETSc has no such preconditioner here; allowed are its PC types, such as "
-            + ", ".join(known)
-        ) from None
+        known = ", ".join([*NAMED, "none", "jacobi", "pbjacobi", "bjacobi", "sor", "ilu", "icc", "gamg", "hypre"])
+        allowed = f"PETSc has no such preconditioner here; allowed are its PC types, such as {known}"
+        raise OptionError(f"-compare {name}: {allowed}") from None
     finally:
         pc.destroy()

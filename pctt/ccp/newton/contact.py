@@ -12,10 +12,9 @@ import numpy as np
 from petsc4py import PETSc
 
 from dem.contact_map.loops import local_product, pack
-from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks
+from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
-from pctt.shell import symmetric_shell
 
 
 class ContactForm:
@@ -38,7 +37,6 @@ class ContactForm:
         self._local = np.empty((len(barrier), 6))
         pack(barrier + self.problem.compliance_blocks, self._local)
         set_diagonal_blocks(self.matrix, self._blocks)
-        self.matrix.stateIncrease()
 
     def _product(self, g: Array, out: Array) -> None:
         g, out = g.reshape(-1, 3), out.reshape(-1, 3)
@@ -57,7 +55,6 @@ class ContactForm:
         self._loaded = True
         if not self._made:
             put_diagonal_blocks(self._entries, self._blocks)
-            set_diagonal_blocks(self._entries, self._blocks)
             for name, value in (("coordinates", self.problem.point), ("key", self.problem.key)):
                 if value is not None:
                     self._entries.setAttr(name, value)

@@ -13,28 +13,29 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.block_diagonal import BY_DIAGONAL_BLOCKS, without_memory
-from pctt.ccp.newton.form import NewtonForm
-from pctt.ksp_options import entered, prefer_mumps, to_enter
+from pctt.block_diagonal import block_diagonal, fresh_copy, shell_of
+from pctt.ksp_options import entered, to_enter
 from pctt.pc.base import PythonPC
 from pctt.pc.mat import residual_norm
 from pctt.petsc import own_errors
-from pctt.shell import is_shell
 
 # the Mat from which a preconditioner is made, or a function that makes it, for those that read entries
 Source = Union[PETSc.Mat, Callable[[], PETSc.Mat], None]
 # right preconditioning makes the residual that the method sees the true one
 _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
-# what wants scalar rows; others switch when PETSc says so
-_SCALAR_FORMAT = {"gamg", "hypre", "cholesky", "lu", "eisenstat"}
 _BY_PRODUCTS = {"none", "jacobi", "pbjacobi"}  # these need no entries beside the diagonal blocks
+_IN_BLOCKS = {*_BY_PRODUCTS, "ilu", "icc", "python"}  # others get scalar rows, as PETSc has no block code for all
+_FACTORS = {"cholesky", "lu"}
 WITHIN = "within each rank"
 _WITHIN_RANKS = {"bjacobi", "sor", "eisenstat"}  # of several ranks each works on its own rows
 _NAMES = {"bcgs": "BiCGStab", "cg": "CG", "gmres": "GMRES", "fgmres": "FGMRES", "minres": "MINRES"}
-WAIT_FOR_OTHERS = 10.0  # seconds that a rank that has failed waits for the others
 # preconditioners of parts of the matrix; ours have inner ones too, but of other matrices
 _OF_PARTS = re.compile(r"(sub|mg|fieldsplit|composite|telescope)_.*pc_type")
-_NOT_SUPPORTED = 56  # PETSC_ERR_SUP: this method has no code for block formats
+_REMEMBERING = {"pbjacobi", "sor"}  # the inverse diagonal blocks of the first matrix, see `pctt.block_diagonal`
+_REASONS = {
+    value: name.lower() for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)
+}
+WAIT_FOR_OTHERS = 60.0  # seconds that a rank waits for the others if it has failed in a collective call
 
 
 @dataclass(frozen=True)
@@ -76,16 +77,15 @@ class Krylov:
 
     def _configure(self, options: PETSc.Options, rtol: float) -> None:
         self.method, self.kind = options.getString("ksp_type"), options.getString("pc_type")
-        self._pc_name = options.getString("sub_pc_type", self.kind) if self.kind == "bjacobi" else self.kind
+        self._pc_name = options.getString("sub_pc_type", "ilu") if self.kind == "bjacobi" else self.kind
         within = {value for name, value in options.getAll().items() if _OF_PARTS.fullmatch(name)}
-        self._remembers_within = bool(BY_DIAGONAL_BLOCKS & within)
-        # block Gauss-Seidel over several ranks crashes in PETSc 3.18, parts of a matrix of blocks have none
-        self.scalar = (
-            self.kind in _SCALAR_FORMAT or (self.kind == "sor" and self.comm.size > 1) or self._remembers_within
-        )
+        self._remembers = bool(_REMEMBERING & within)
+        shifted = any(name.endswith("pc_factor_shift_type") for name in options.getAll())
+        # block Gauss-Seidel over several ranks crashes in PETSc 3.18
+        in_blocks = self._pc_name in _IN_BLOCKS or (self.kind == "sor" and self.comm.size == 1)
+        self._scalar = not in_blocks or shifted or self._remembers
         if self.method in _RIGHT_SIDED:
             self.ksp.setPCSide(PETSc.PC.Side.RIGHT)
-        prefer_mumps(self.ksp.pc, self.kind)
         self.ksp.setFromOptions()
         # PETSc lets preonly have no options, but its preconditioner may be an iteration that wants the tolerance
         self._rtol_is_given = options.hasName("ksp_rtol")
@@ -115,12 +115,9 @@ class Krylov:
         with entered(self._options):
             error = on_all_ranks(self.comm, lambda: self._set_up(A, P, keep))
             setup = _now(self.comm)
-            error = error or on_all_ranks(self.comm, lambda: self._iterate(b, x))
+            error = error or on_all_ranks(self.comm, lambda: self._iterate(b, x), WAIT_FOR_OTHERS)
         if error:
             self.forget()
-            if error == _NOT_SUPPORTED and not self.scalar:
-                self.scalar = True
-                return self.solve(A, b, x, rtol, P)
             x.zeroEntries()
             return Solve(False, f"PETSc error {error}", 0, 0.0, 0.0, 1.0, self.rtol)
         reason, iterations = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
@@ -139,6 +136,7 @@ class Krylov:
             form = self._form(self._source(A, P))
             self.ksp.setOperators(form if self.kind == "eisenstat" else A, form)
         self.ksp.setUp()
+        self.ksp.setUpOnBlocks()
 
     def _iterate(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         x.zeroEntries()
@@ -148,7 +146,7 @@ class Krylov:
 
     def _source(self, A: PETSc.Mat, P: Source) -> PETSc.Mat:
         """The Mat that the preconditioner is made from."""
-        if P is None or (is_shell(A) and not self.needs_entries):
+        if P is None or (shell_of(A) and not self.needs_entries):
             return A
         return P if isinstance(P, PETSc.Mat) else P()
 
@@ -166,20 +164,22 @@ class Krylov:
         return self._formed if self._formed is not None else P
 
     def _formed_anew(self, P: PETSc.Mat, old: PETSc.Mat | None) -> PETSc.Mat | None:
-        to_scalar = self._remembers_within or (self.scalar and P.getType() not in ("seqaij", "mpiaij"))
-        if self._remembers_within:  # and the preconditioner keeps parts of the matrix
-            self.ksp.reset()
-        elif to_scalar and old is not None:
+        to_scalar = self._remembers or (self._scalar and P.getType() not in ("seqaij", "mpiaij"))
+        if to_scalar and old is not None and self.kind in _FACTORS:
             return P.convert(PETSc.Mat.Type.AIJ, old)  # in place: a factorisation knows its structure
+        if self._remembers:  # parts of the matrix
+            self.ksp.reset()
         if old is not None:
             old.destroy()
         if to_scalar:
             rows = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
             # a factorisation that takes the matrix for definite fails where rounding has made it just indefinite
-            definite = self.kind not in ("cholesky", "lu")
+            definite = self.kind not in _FACTORS
             rows.setOption(PETSc.Mat.Option.SPD if definite else PETSc.Mat.Option.SYMMETRIC, True)
             return rows
-        return without_memory(P, self.kind)
+        if self.kind == "sor" and P.getType() == "seqbaij":
+            return fresh_copy(P)
+        return block_diagonal(P) if self.kind == "pbjacobi" else None
 
     @property
     def own(self) -> PythonPC | None:
@@ -218,74 +218,6 @@ class Krylov:
         self.ksp.destroy()
 
 
-class KrylovFamily:
-    """Krylov methods by name, each made when it is first needed."""
-
-    def __init__(self, comm: MPI.Comm):
-        self.comm = comm
-        self._krylov: dict[str, Krylov] = {}
-
-    def forget(self) -> None:
-        """The next matrix has another structure."""
-        for krylov in self._krylov.values():
-            krylov.forget()
-
-    def destroy(self) -> None:
-        for krylov in self._krylov.values():
-            krylov.destroy()
-        self._krylov.clear()
-
-
-class LinearSolver(KrylovFamily):
-    """Solves the systems of a `NewtonForm`. Subclasses define new_matrix, solve and factored.
-
-    Attributes
-    ----------
-    iterations, fallbacks : of the present problem: Krylov iterations, systems not solved in the first way
-    takes_any : whether matrices need not be symmetric
-    """
-
-    takes_any = False
-
-    def __init__(self, comm: MPI.Comm):
-        super().__init__(comm)
-        self.begin()
-
-    def begin(self) -> None:
-        """Another problem."""
-        self.iterations = self.fallbacks = 0
-
-    def new_matrix(self, system: NewtonForm) -> None:
-        """The system has new values."""
-        raise NotImplementedError
-
-    def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
-        """x = A^-1 b to a relative residual of rtol; whether that was reached."""
-        raise NotImplementedError
-
-    @property
-    def factored(self) -> bool:
-        """Whether the present matrix has been factorised, and another solve costs little."""
-        raise NotImplementedError
-
-    def report(self) -> list[str]:
-        """Lines about the preconditioner, if it is one of this package."""
-        return []
-
-    def words(self) -> str:
-        """Krylov method and preconditioner."""
-        raise NotImplementedError
-
-    def what(self) -> str:
-        """What a preconditioner of this package really was; empty for others."""
-        return ""
-
-
-_REASONS = {
-    value: name.lower() for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)
-}
-
-
 def _true_residual(S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:
     """||b - S x|| / ||b||; an x that is no number is replaced by zero, and leaves 1."""
     norm, reference = residual_norm(S, b, x), b.norm()
@@ -301,11 +233,12 @@ def _now(comm: MPI.Comm) -> float:
     return time.perf_counter()
 
 
-def on_all_ranks(comm: MPI.Comm, work: Callable[[], None]) -> int:
+def on_all_ranks(comm: MPI.Comm, work: Callable[[], None], patience: float = np.inf) -> int:
     """Do some work on all ranks. Returns 0, or on all ranks PETSc's error code if the work failed on one or more.
 
-    A rank that fails alone cannot call the others back from a collective call of PETSc. If they do not arrive within
-    WAIT_FOR_OTHERS, it prints a message and ends the run."""
+    A rank that fails alone waits for the others, which may still factorise blocks of their own. It cannot call them
+    back from a collective call of PETSc. Where the work is nothing but such calls, it ends the run after ``patience``
+    seconds, with a message."""
     code = np.zeros(1, int)
     words = ""
     try:
@@ -317,7 +250,7 @@ def on_all_ranks(comm: MPI.Comm, work: Callable[[], None]) -> int:
         return int(code[0])
     worst = np.empty(1, int)
     meeting = comm.Iallreduce(code, worst, op=MPI.MAX)
-    deadline = time.monotonic() + WAIT_FOR_OTHERS
+    deadline = time.monotonic() + patience
     while code[0] and not meeting.Test():
         if time.monotonic() > deadline:
             sys.stderr.write(f"pctt: rank {comm.rank} failed alone: {words}\n")

@@ -1,0 +1,181 @@
+"""The Newton matrix in the velocities of the bodies, K = I + G' H G: a 6 x 6 block per body and per pair in contact.
+
+G is the mass-scaled contact map (3Nc x 6M), H = (B + C)^-1 block diagonal with a 3 x 3 block per contact. Products of K
+are those of the map. Preconditioners that need entries get a matrix, and factorisations the part of it that is worth
+factorising: late in an interior point iteration a third of the contacts have opened, and a factor of the rest costs
+half and is as good a preconditioner.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from dem.contact_map import BlockRows, ContactMap
+from dem.exchange import exchange, offsets
+from pctt.block_diagonal import set_diagonal_blocks, symmetric_shell
+from pctt.blocks import Array, new_matrix
+
+ROUNDING = 1e-14  # part of the trace that is added to blocks which rounding may have made singular
+
+
+def inverse_blocks(blocks: Array) -> Array:
+    """The inverses of positive definite blocks (nc, 3, 3), also of those that rounding has made singular."""
+    floor = ROUNDING * np.trace(blocks, axis1=1, axis2=2)
+    return np.linalg.inv(blocks + floor[:, None, None] * np.eye(3))
+
+
+class BodyOperator:
+    """K for a sequence of contact maps with the same structure.
+
+    Attributes
+    ----------
+    mat : K as a shell of block size 6
+    """
+
+    def __init__(self, contact_map: ContactMap):
+        self._matrix: BodyMatrix | None = None
+        self.load(contact_map)
+        self.mat = symmetric_shell(contact_map.comm, 6 * contact_map.columns, 6, self._product)
+
+    def load(self, contact_map: ContactMap) -> None:
+        """Take another map of the same structure."""
+        self.contact_map, self._loaded = contact_map, False
+
+    def update(self, inverse: Array, symmetric: bool = True) -> None:
+        """Take the blocks H (nc, 3, 3) of K, which may be unsymmetric."""
+        self._inverse, self._made = inverse, False
+        self._weight = self.contact_map.weights(inverse, symmetric)
+        set_diagonal_blocks(self.mat, self.contact_map.body_blocks(self._weight), symmetric)
+
+    def _product(self, v: Array, out: Array) -> None:
+        self.contact_map.through(self._weight, v, out)
+
+    def entries(self) -> BodyMatrix:
+        """The entries of K with its present values; collective."""
+        if self._matrix is None:
+            self._matrix = BodyMatrix(self.contact_map.comm, self.contact_map.block_rows)
+        elif not self._loaded:
+            self._matrix.load(self.contact_map.block_rows)
+        if not self._made:
+            self._matrix.update(self._inverse)
+        self._loaded = self._made = True
+        return self._matrix
+
+    def destroy(self) -> None:
+        self.mat.destroy()
+        if self._matrix is not None:
+            self._matrix.destroy()
+
+
+class BodyMatrix:
+    """The blocks of K in this rank's block rows, and Mats made from them.
+
+    Each rank multiplies the rows of its own contacts. It sends the blocks of bodies that other ranks own to these
+    ranks, by a pattern that is computed once. The blocks are always added in the same order.
+    """
+
+    def __init__(self, comm: MPI.Comm, G: BlockRows):
+        self.comm = comm
+        self._whole: PETSc.Mat | None = None
+        # 64 bits, because each pair of bodies gets a number
+        self.bodies, column = np.unique(np.asarray(G.indices, np.int64), return_inverse=True)
+        self._column = column.ravel()
+        self.load(G)
+        self._index(G)
+
+    def load(self, G: BlockRows) -> None:
+        """Take a G of the same structure."""
+        self.G = G
+        if len(self.bodies):
+            self._rows = sp.bsr_matrix((G.blocks, self._column, G.indptr), shape=(3 * G.rows, 6 * len(self.bodies)))
+            self._columns = self._rows.T.tobsr()
+
+    def _product(self, inverse: Array) -> sp.bsr_matrix:
+        """G' H G of the contacts and bodies of this rank, for the blocks H (nc, 3, 3)."""
+        count = len(inverse)
+        if len(self.bodies) == 0:
+            return sp.bsr_matrix((0, 0), blocksize=(6, 6))
+        weight = sp.bsr_matrix((inverse, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
+        return self._columns @ (weight @ self._rows)
+
+    def _index(self, G: BlockRows) -> None:
+        """Find the owners of the blocks to which this rank's contacts contribute, and the pattern of the own rows."""
+        starts = offsets(self.comm, G.columns)
+        self._first, own = int(starts[self.comm.rank]), G.columns
+        local = self._product(np.tile(np.eye(3), (G.rows, 1, 1)))
+        row = np.repeat(self.bodies, np.diff(local.indptr))
+        column = self.bodies[local.indices]
+        self._owner = np.searchsorted(starts, row, side="right") - 1
+        self._away = self._owner != self.comm.rank
+        home, diagonal = ~self._away, self._first + np.arange(own)
+        away = {"row": row[self._away], "column": column[self._away]}
+        received = exchange(self.comm, away, self._owner[self._away])
+        self._total = max(int(starts[-1]), 1)
+        pairs = ((row[home], column[home]), (received["row"], received["column"]), (diagonal, diagonal))
+        names = [r * self._total + c for r, c in pairs]
+        every = np.unique(np.concatenate(names))
+        self._own_places, self._received_places, self._diagonal = (np.searchsorted(every, n) for n in names)
+        self._row, self._indices = np.divmod(every, self._total)
+        self._sizes = ((6 * own, PETSc.DETERMINE), (6 * own, PETSc.DETERMINE))
+
+    def update(self, inverse: Array) -> None:
+        """Compute K for the blocks H (nc, 3, 3)."""
+        blocks = self._product(inverse).data.reshape(-1, 6, 6)
+        self._values = np.zeros((len(self._indices), 6, 6))
+        self._values[self._own_places] = blocks[~self._away] if self._away.any() else blocks
+        if self.comm.size > 1:
+            received = exchange(self.comm, {"blocks": blocks[self._away]}, self._owner[self._away])
+            np.add.at(self._values, self._received_places, received["blocks"])
+        self._values[self._diagonal] += np.eye(6)
+        self._current = False
+
+    def _indptr(self, rows: np.ndarray) -> np.ndarray:
+        """Where each of this rank's block rows begins in the sorted ``rows`` of blocks."""
+        return np.searchsorted(rows, self._first + np.arange(len(self._diagonal) + 1))
+
+    @property
+    def mat(self) -> PETSc.Mat:
+        """K as a BAIJ Mat of block size 6, with the present values; collective."""
+        pattern = [x.astype(PETSc.IntType) for x in (self._indptr(self._row), self._indices)]
+        if self._whole is None:
+            self._whole = new_matrix(self.comm, self._sizes, 6, tuple(pattern))
+            self._whole.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        if not self._current:
+            if len(self._indices):
+                self._whole.setValuesBlockedCSR(*pattern, self._values.ravel())
+            self._whole.assemble()
+            self._current = True
+        return self._whole
+
+    def stiff_part(self, least: float, symmetric: bool = True) -> PETSc.Mat:
+        """A new AIJ Mat: K without the blocks between two bodies whose entries are all below ``least`` (in units of the
+        mass). AIJ, because Cholesky has no code for blocks."""
+        kept = np.abs(self._values).max(axis=(1, 2), initial=0.0) >= least
+        kept[self._diagonal] = True
+        indptr, shape = self._indptr(self._row[kept]), (self._sizes[0][0], 6 * self._total)
+        rows = sp.bsr_matrix((self._values[kept], self._indices[kept], indptr), shape=shape).tocsr()
+        csr = (rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType), rows.data)
+        mat = new_matrix(self.comm, self._sizes, 6, csr, PETSc.Mat.Type.AIJ)
+        mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+        return mat
+
+    def places(self, points: Array) -> Array:
+        """Places (n, 3) of this rank's bodies: the means of their contact points. ``points`` (nc, 3); collective."""
+        sums = PETSc.Vec().createMPI(self._sizes[0], bsize=6, comm=self.comm)  # of points, and their number
+        if len(points):
+            contact = np.repeat(np.arange(len(points)), np.diff(self.G.indptr))
+            index = 6 * np.asarray(self.G.indices)[:, None] + np.arange(4)
+            values = np.column_stack([points[contact], np.ones(len(contact))])
+            sums.setValues(index.astype(PETSc.IntType).ravel(), values.ravel(), PETSc.InsertMode.ADD_VALUES)
+        sums.assemble()
+        found = sums.array_r.reshape(-1, 6)
+        places = found[:, :3] / np.maximum(found[:, 3:4], 1)
+        sums.destroy()
+        return places
+
+    def destroy(self) -> None:
+        if self._whole is not None:
+            self._whole.destroy()

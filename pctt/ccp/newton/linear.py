@@ -1,0 +1,176 @@
+"""The linear solver of Newton systems: a KSP, and where that fails a factor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from pctt import memory
+from pctt.ccp.newton.body import BodyForm
+from pctt.ccp.newton.compare import Comparison
+from pctt.ccp.newton.form import NewtonForm
+from pctt.ccp.newton.krylov import Krylov, Solve, Source
+from pctt.options import number
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Numbers of `LinearSolver`."""
+
+    easy: float = number(8.0, "iterations with block Jacobi / bodies^0.4 and rank, after which the next matrix gets a "
+                              "factor. It costs as much as 10 to 18 on one rank, and no less on more")  # fmt: skip
+    limit: float = number(3.0, "iterations with block Jacobi at most, in units of easy")
+    alone: int = number(20_000, "the same where the memory has no room for a factor")
+    factor_bytes: float = number(170.0, "memory of a factor / rows^(4/3), the growth of nested dissection in space: "
+                                        "2.2e9 bytes at 35,900 bodies, a fifth more than measured")  # fmt: skip
+    spare: float = number(0.9, "part of the available memory that a factor may take")
+
+
+class LinearSolver:
+    """Solves the systems of a `NewtonForm` by a KSP, to at most twice the asked true residual. Where it fails, a factor
+    of the matrix takes over, if the memory has room for one.
+
+    own : whether the KSP is the project's own choice, conjugate gradients with block Jacobi. Systems get harder from
+        one iteration of an interior point method to the next; so once they take many iterations, the rest of the
+        problem is left to factors. The choice rests on iteration counts, so that a repeated run repeats it.
+    compare : its preconditioners are tried in place of the KSP
+
+    Attributes
+    ----------
+    iterations, fallbacks : of the present problem: Krylov iterations, systems that were not solved as planned
+    takes_any : whether matrices need not be symmetric
+    """
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        defaults: dict[str, str],
+        compare: Comparison | None = None,
+        prefix: str = "",
+        own: bool = False,
+        settings: Settings | None = None,
+    ):
+        self.comm, self.defaults, self.compare, self.prefix = comm, defaults, compare, prefix
+        self.takes_any, self.settings = own, settings or Settings()
+        self._krylov: dict[tuple[str, bool], Krylov] = {}
+        self._symmetric = True
+        self.begin()
+
+    def begin(self) -> None:
+        """Another problem."""
+        self.iterations = self.fallbacks = 0
+        self._worst, self._hard, self._factored = 0, False, False
+
+    def new_matrix(self, system: NewtonForm) -> None:
+        """The system has new values."""
+        self.system, self._symmetric, self._factored = system, system.symmetric, False
+        bodies = system.matrix.getSize()[0] / 6.0
+        easy = int(self.settings.easy * bodies**0.4 * self.comm.size)
+        self._easy = self.comm.bcast(easy)  # a last bit may differ between processors
+        self._hard = self.takes_any and self._worst > self._easy
+
+    def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
+        """x = A^-1 b to a relative residual of rtol; whether that was reached. Otherwise x is the best that was found,
+        or zero if nothing leaves less than 1."""
+        first = None if self._hard else self._by_ksp(b, x, rtol)
+        if first and first.converged:
+            return True
+        self._hard, before = self.takes_any, x.array.copy()
+        last = self._by_factor(b, x, rtol)
+        self.fallbacks += not (self.takes_any and last and last.converged)
+        if first and (last is None or first.true_residual < last.true_residual):
+            last, x.array[:] = first, before
+        if last is None or last.true_residual >= 1.0:
+            x.zeroEntries()
+        return last is not None and last.converged
+
+    def _by_ksp(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
+        if self.compare is not None and self.compare.due():
+            done = self.compare.run(self.system.matrix, b, x, rtol, self.system.entries)
+            self.iterations += done.iterations
+        else:
+            done = self._run(self._solver(""), b, x, rtol, self.system.entries)
+        self._worst = max(self._worst, done.iterations)
+        return done
+
+    def _by_factor(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve | None:
+        """Without room for a factor block Jacobi goes on, if it was our choice; else None."""
+        solver = self._solver("factor")
+        if self._factored:
+            return self._run(solver, b, x, rtol, keep=True)
+        solver.forget()  # first, as its memory counts as taken
+        if not self._has_room():
+            return self._run(self._solver("alone"), b, x, rtol) if self.takes_any else None
+        if isinstance(self.system, BodyForm):
+            part = self.system.stiff_part()
+            done = self._run(solver, b, x, rtol, part)
+            part.destroy()  # the KSP keeps it
+        else:
+            done = self._run(solver, b, x, rtol, self.system.entries)
+        self._factored = done.converged
+        return done
+
+    def _run(
+        self, solver: Krylov, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: Source = None, keep: bool = False
+    ) -> Solve:
+        done = solver.solve(self.system.matrix, b, x, rtol, P, keep)
+        self.iterations += done.iterations
+        return done
+
+    def _has_room(self) -> bool:
+        """Whether the memory has room for a factor; collective."""
+        needed = self.settings.factor_bytes * self.system.matrix.getSize()[0] ** (4.0 / 3.0) / self.comm.size
+        return self.comm.bcast(needed < self.settings.spare * memory.available(self.comm))
+
+    def _solver(self, name: str) -> Krylov:
+        """A Krylov method by its name, "" for the KSP, made when it is first needed. Unsymmetric systems, which are
+        those of Coulomb's law, have others."""
+        symmetric = self._symmetric
+        if (name, symmetric) not in self._krylov:
+            if name == "factor":
+                options = {"ksp_type": "gmres", "ksp_gmres_restart": "60", "ksp_max_it": "60"}
+                options["pc_type"] = "cholesky" if symmetric else "lu"
+                cholmod = self.comm.size == 1 and PETSc.Sys.hasExternalPackage("suitesparse")
+                if cholmod and symmetric and isinstance(self.system, BodyForm):
+                    # 1.3 times faster than MUMPS, its solves twice; for unsymmetric matrices UMFPACK is half as fast
+                    options["pc_factor_mat_solver_type"] = "cholmod"
+            else:
+                options = {**self.defaults, **({} if symmetric else {"ksp_type": "bcgs"})}
+                if self.takes_any:
+                    most = self.settings.alone if name == "alone" else int(self.settings.limit * self._easy)
+                    options["ksp_max_it"] = str(most)
+            prefix = "fallback_" if name == "factor" else self.prefix
+            self._krylov[name, symmetric] = Krylov(self.comm, prefix, options)
+        return self._krylov[name, symmetric]
+
+    @property
+    def factored(self) -> bool:
+        """Whether the present matrix has been factorised, and another solve costs little."""
+        users = self._krylov.get(("", True))
+        return self._factored or (users is not None and users.ksp.pc.getType() in ("cholesky", "lu"))
+
+    def report(self) -> list[str]:
+        """Lines about the preconditioner, if it is one of this package."""
+        return [line for solver in self._krylov.values() for line in solver.report()]
+
+    def words(self) -> str:
+        """Krylov method and preconditioner."""
+        return "CG, pbjacobi until it takes long, then cholesky" if self.takes_any else self._solver("").words()
+
+    def what(self) -> str:
+        """What a preconditioner of this package really was; empty for others."""
+        owns = [solver.own for solver in self._krylov.values()]
+        return "; ".join(f"{own.name} was {own.what()}" for own in owns if own and own.what())
+
+    def forget(self) -> None:
+        """The next matrix has another structure."""
+        self._factored = False
+        for solver in self._krylov.values():
+            solver.forget()
+
+    def destroy(self) -> None:
+        for solver in self._krylov.values():
+            solver.destroy()
+        self._krylov.clear()
