@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from problems import SELF, Graph, Known, from_graph, from_matrix, heap, known_optimum, matrix
 
+from dem.contact_map import BlockRows
 from pctt import ccp, memory
-from pctt.blocks import BlockRows
 from pctt.ccp import ConeProblem, Limits, newton_for
 from pctt.ccp.newton.krylov import Krylov
 

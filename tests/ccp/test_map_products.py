@@ -95,7 +95,7 @@ def check(comm: MPI.Comm, rows: CompactRows | BlockRows, G: np.ndarray, here: sl
         close = {"rtol": 1e-12, "atol": 1e-12 * np.abs(K).max()}
         np.testing.assert_allclose(out.array.reshape(-1, 6), (K @ v.ravel()).reshape(-1, 6)[own], **close)
         diagonal = K.reshape(bodies, 6, bodies, 6)[range(bodies), :, range(bodies)][own]
-        np.testing.assert_allclose(body.mat.getAttr("diagonal_blocks"), diagonal, **close)
+        np.testing.assert_allclose(body.mat.getPythonContext().blocks, diagonal, **close)
         body.entries().mat.mult(x, out)
         np.testing.assert_allclose(out.array.reshape(-1, 6), (K @ v.ravel()).reshape(-1, 6)[own], **close)
     for thing in (body, product, x, out):

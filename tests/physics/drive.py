@@ -61,7 +61,7 @@ def steps(
     number of `iterations`."""
     limits = ccp.Limits(SOLVERS[solver] if tol is None else tol)
     if iterations is not None:
-        limits = ccp.Limits(1e-300, iterations)
+        limits = ccp.Limits(1e-300, iterations, fallback=False)
     for _ in range(count):
         rebalance(world)
         contacts = find_contacts(world, delta, dt)
