@@ -249,6 +249,23 @@ def mean_velocity(motion: Prescribed, time: float, dt: float, position: Floats, 
     return np.concatenate([(end - start) / dt, vector(f"angular velocity of {type(motion).__name__}", turning)])
 
 
+def top_speed(motion: Motion, position: Floats, reach: float) -> float:
+    """The greatest speed [m/s] that a motion or its servo gives to points within the `reach` [m] of the centre of a
+    body which is at `position` (3,) at time zero; 0 of motions that are not of this module."""
+    if isinstance(motion, Rotation):
+        of_center = np.linalg.norm(np.cross(motion.velocity, position - np.array(motion.center)))
+        return float(of_center + np.linalg.norm(motion.velocity) * reach)
+    if isinstance(motion, Oscillation):
+        return abs(2.0 * np.pi * motion.amplitude / motion.period)
+    if isinstance(motion, Glide):
+        return float(np.linalg.norm(motion.velocity))
+    if isinstance(motion, Path):
+        ways = np.linalg.norm(np.diff(np.array(motion.positions), axis=0), axis=1)
+        return float((ways / np.diff(motion.times)).max(initial=0.0))
+    speed = abs(getattr(motion, "speed", None) or 0.0)
+    return speed * reach if isinstance(motion, Hinged) else speed
+
+
 def changed(motion: Motion, time: float, **values: Any) -> Motion:
     """The motion with other parameters from `time` [s] on. An oscillation of another period stays in its phase, unless
     a phase is given. ValueError for a parameter that the motion does not have, or a bad value."""

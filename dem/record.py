@@ -76,13 +76,13 @@ def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:
 def energy_balance(step: Step) -> dict[str, float]:
     """Energies at the end of the step and where their change came from [J].
 
-        change of kinetic + potential = work of motions - friction loss - impact loss + time stepping
+        change of kinetic + potential + spring = work of motions - friction loss - impact loss + time stepping
 
     With g the impulses and w the mean of the velocities before and after (of prescribed motions: that of the step), the
-    impulses do the work g' D' w. Its tangential part is the friction loss. Its normal part is lost in impacts, or
-    pushes overlaps apart where it is a gain. The work of motions is that of prescribed bodies on the others, and that
-    of the drives of guided and hinged bodies. The rest is the error of the semi-implicit step, of the order of dt:
-    -dt/2 m g (v_new - v_old) per body.
+    impulses do the work g' D' w. Its tangential part is the friction loss. Its normal part goes to the springs of
+    contacts, and the rest is lost in impacts, or pushes overlaps of rigid contacts apart where it is a gain. The work
+    of motions is that of prescribed bodies on the others, and that of the drives of guided and hinged bodies. The rest
+    is the error of the semi-implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
     """
     world, near, comm = step.world, step.contacts.near, step.world.comm
     before = near.bodies.take(slice(0, near.grains)), near.bodies.take(slice(near.grains + near.ghosts, None))
@@ -98,18 +98,32 @@ def energy_balance(step: Step) -> dict[str, float]:
     was = sums(*(energy(table, world.gravity) for table in before))
     now = sums(*(energy(table, world.gravity) for table in after))
     normal, tangential = ((sums(*map(np.vdot, load, mean))) for load in step.generalised_impulses)
+    springs = comm.allreduce(spring_energies(step))
     received = np.vdot((step.generalised_impulses[0][1] + step.generalised_impulses[1][1])[~moves], mean[1][~moves])
     work = np.vdot(step.system.drive_impulse, mean[1]) - received
     whole = comm.allreduce(np.array([*was, *now, normal, tangential]))
-    change = whole[2] + whole[3] - whole[0] - whole[1]
+    change, held = whole[2] + whole[3] - whole[0] - whole[1], springs[1] - springs[0]
     return {
         "kinetic_energy [J]": whole[2],
         "potential_energy [J]": whole[3],
+        "spring_energy [J]": springs[1],
         "work_of_motions [J]": work,
         "friction_loss [J]": 0.0 - whole[5],  # nothing is zero, not -0
-        "impact_loss [J]": 0.0 - whole[4],
+        "impact_loss [J]": 0.0 - whole[4] - held,
         "time_stepping [J]": change - work - whole[4] - whole[5],
     }
+
+
+def spring_energies(step: Step) -> Floats:
+    """What the contacts of this rank hold as springs at the start and at the end of a step (2,) [J].
+
+    k/2 d^2 of an overlap d. At the end it is what the impulse tells, d = dt C g + (1 - share) d_start; a contact
+    without impulse holds nothing, as the damping of `dem.stiffness` takes what is left of it."""
+    system, gap, g = step.system, step.contacts.gap, step.impulse[:, 0]
+    k = np.where(np.isinf(system.stiffness), 0.0, system.stiffness)
+    begun = np.maximum(-gap, 0.0)
+    end = system.dt * (system.compliance * g + system.b[:, 0]) - gap
+    return np.array([0.5 * k @ begun**2, 0.5 * k @ np.where(g > 0.0, end, 0.0) ** 2])
 
 
 def contact_statistics(step: Step) -> dict[str, float]:

@@ -42,12 +42,18 @@ class LargeBody:
 class Scene:
     """Collects grains, large bodies, materials and gravity; checks each as it comes (ValueError)."""
 
-    def __init__(self, friction: float, gravity: Sequence[float] = (0.0, 0.0, -9.81)) -> None:
-        """`friction`: coefficient of all pairs of materials not set otherwise; `gravity`: (3,) [m/s^2]."""
+    def __init__(
+        self, friction: float, gravity: Sequence[float] = (0.0, 0.0, -9.81), stiffness: float | None = None
+    ) -> None:
+        """`friction`: coefficient, and `stiffness` [N/m] of the contacts of all pairs of materials not set otherwise;
+        `gravity`: (3,) [m/s^2]. A stiffness of inf is that of rigid contacts; None: `dem.stiffness.recommended`.
+        """
         self.gravity = checks.vector("gravity", gravity)
         self.large_bodies: list[LargeBody] = []
         self._friction = float(checks.not_negative("friction", friction))
+        self.stiffness = None if stiffness is None else _stiffness(stiffness)  #: [N/m]; None: not stated
         self._pairs: dict[tuple[int, int], float] = {}
+        self._stiff_pairs: dict[tuple[int, int], float] = {}
         self._materials: dict[str, int] = {}
         self._grains: list[Bodies] = []
 
@@ -161,6 +167,11 @@ class Scene:
         pair = sorted((self._material(material), self._material(other)))
         self._pairs[pair[0], pair[1]] = float(checks.not_negative("friction", friction))
 
+    def set_stiffness(self, stiffness: float, material: str, other: str) -> None:
+        """Stiffness of the contacts of two materials (which may be the same one) [N/m]; inf: rigid."""
+        pair = sorted((self._material(material), self._material(other)))
+        self._stiff_pairs[pair[0], pair[1]] = _stiffness(stiffness)
+
     @property
     def materials(self) -> tuple[str, ...]:
         """The names of the materials, in the order of their numbers."""
@@ -168,9 +179,16 @@ class Scene:
 
     def friction_table(self) -> Floats:
         """Friction coefficients (materials, materials), symmetric."""
-        table = np.full((len(self._materials), len(self._materials)), self._friction)
-        for (i, j), friction in self._pairs.items():
-            table[i, j] = table[j, i] = friction
+        return self._table(self._friction, self._pairs)
+
+    def stiffness_table(self, usual: float) -> Floats:
+        """Stiffnesses of contacts (materials, materials), symmetric [N/m]; the `usual` one of pairs not set."""
+        return self._table(usual, self._stiff_pairs)
+
+    def _table(self, usual: float, pairs: dict[tuple[int, int], float]) -> Floats:
+        table = np.full((len(self._materials), len(self._materials)), usual)
+        for (i, j), value in pairs.items():
+            table[i, j] = table[j, i] = value
         return table
 
     def grains(self) -> Bodies:
@@ -226,6 +244,12 @@ class Scene:
         )
         self._grains.append(table)
         return table.id
+
+
+def _stiffness(value: float) -> float:
+    if not float(value) > 0.0:
+        raise ValueError(f"stiffness must be a positive number or inf, got {value}")
+    return float(value)
 
 
 def _refuse_speed(name: str, motion: Motion, speed: Floats) -> None:

@@ -8,7 +8,7 @@ from dataclasses import fields
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies
+from dem import bodies, stiffness
 from dem.arrays import Ints
 from dem.bodies import Bodies
 from dem.contact import find_contacts
@@ -69,8 +69,8 @@ def even_slice(count: int, comm: MPI.Comm) -> slice:
 
 
 def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
-    friction, names = scene.friction_table(), scene.materials
-    return World(comm, tuple(scene.large_bodies), scene.gravity, friction, names, grains, scene.large())
+    tables = scene.friction_table(), stiffness.table(scene)
+    return World(comm, tuple(scene.large_bodies), scene.gravity, *tables, scene.materials, grains, scene.large())
 
 
 def _refuse_overlap(world: World, overlap: float) -> None:

@@ -19,7 +19,7 @@ from dem.bodies import SPHERE, Bodies
 from dem.contact import Contacts, contact_order, find_contacts
 from dem.contact_map.loops import relative_velocities
 from dem.motion import Dynamic, checked_pose
-from dem.system import ContactSystem, contact_arms, contact_frames
+from dem.system import ContactSystem, contact_arms, contact_frames, gap_velocities
 from dem.together import meet, together
 from dem.world import World
 
@@ -118,7 +118,7 @@ def find_turned(
     end = find_contacts(advanced(world, velocity, dt), 0.0)
     end = end.take(end.gap < -depth)
     start, approach = _at_start(end, dt)
-    overlap = -(np.maximum(start.gap, -recovery_speed * dt) + approach)
+    overlap = -(dt * gap_velocities(world, start, dt, recovery_speed)[2] + approach)
     a, b, known = _rows_in(contacts, end)
     missed = known & (overlap > depth)
     if not world.comm.allreduce(bool(missed.any()), MPI.LOR):

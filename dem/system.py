@@ -26,6 +26,7 @@ from dem.contact_map import CompactRows, ContactMap, Halo
 from dem.contact_map.loops import scale
 from dem.contact_map.map import packed
 from dem.free_motion import drive_impulses, free_directions, free_velocities
+from dem.stiffness import compliance
 from dem.world import World
 
 
@@ -36,7 +37,9 @@ class ContactSystem:
         dt (float): step [s]
         key (nc,), mu (nc,), point (nc, 3): contact key, friction coefficient, contact point [m]
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
-        b (nc, 3): (max(gap / dt, -recovery_speed), 0, 0) [m/s]
+        stiffness (nc,): of the contacts; inf: rigid [N/m]
+        compliance (nc,): C, what a normal impulse leaves of the overlap, over dt; 0: rigid [1/kg]
+        b (nc, 3): (gap / dt, 0, 0) [m/s], see `gap_velocities`
         r (nc, 3): b + D' v_free [m/s]
         near: the bodies about this rank
         contact_map: G, with the halo of the bodies; the rows of its tables are those of `near`
@@ -45,7 +48,7 @@ class ContactSystem:
     """
 
     def __init__(self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf) -> None:
-        """`recovery_speed` [m/s] bounds the speed at which overlaps are pushed apart."""
+        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart."""
         positive("time step", dt)
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
@@ -70,7 +73,7 @@ class ContactSystem:
         self.free_velocity = free[:owned]
         self.drive_impulse = drive_impulses(world, dt)
         self.b = np.zeros((len(contacts), 3))
-        self.b[:, 0] = np.maximum(contacts.gap / dt, -recovery_speed)
+        self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
         self.r = self.b + self.contact_map.relative_velocities(free)
 
     def velocity(self, impulse: Floats) -> Floats:
@@ -91,6 +94,19 @@ class ContactSystem:
         self.contact_map.comm.Allreduce(MPI.IN_PLACE, large)
         self.contact_map.halo.add(sums)
         return sums[: near.grains], large
+
+
+def gap_velocities(
+    world: World, contacts: Contacts, dt: float, recovery_speed: float
+) -> tuple[Floats, Floats, Floats]:
+    """Stiffness (nc,), compliance (nc,) and the part of r (nc,) that closes gaps or pushes overlaps apart: gap / dt, of
+    stiff contacts that overlap the share of `dem.stiffness`, of rigid ones at most the recovery speed."""
+    table, a, b = contacts.near.bodies, contacts.a, contacts.b
+    stiffness = world.stiffness[table.material[a], table.material[b]]
+    C, share = compliance(stiffness, 1.0 / (1.0 / table.mass[a] + 1.0 / table.mass[b]), dt)
+    speed = contacts.gap / dt
+    deepest = np.where(np.isinf(stiffness), -recovery_speed, -np.inf)
+    return stiffness, C, np.maximum(np.where(speed < 0.0, share * speed, speed), deepest)
 
 
 def inverse_root_masses(world: World) -> Floats:

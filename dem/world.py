@@ -35,6 +35,7 @@ class World:
     large_bodies: tuple[LargeBody, ...]
     gravity: Floats  #: (3,) [m/s^2]
     friction: Floats  #: (materials, materials)
+    stiffness: Floats  #: of contacts (materials, materials); inf: rigid [N/m]
     materials: tuple[str, ...]  #: their names; the column `material` of a table of bodies is an index into them
     grains: Bodies  #: the slab of this rank; replace it by `set_grains` only
     large: Bodies  #: one row per large body

@@ -89,16 +89,19 @@ class Simulation:
         self.settings = together(
             comm, "settings", lambda: made(Settings, given).of(self.experiment), own=(OptionError,)
         )
+        self._compare = compare or ccp.Comparison(comm, [])
         scene = state.built(self.experiment, comm)
         if restart == "settled":
             restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
+        stated = self.settings.stiffness is not None or scene.stiffness is not None
+        if not stated and (self.settings.solver == "pdip" or self._compare.names):  # the paper's model
+            self.settings = dataclasses.replace(self.settings, stiffness=math.inf)
         self._origin = state.origin(self.experiment, scene, self.settings.dt)
         if restart:
             self.world, self.memory = state.load(Path(restart), scene, self._origin, comm)
         else:
             self.world, self.memory = state.world_at_start(self.experiment, scene, comm), ImpulseMemory(comm)
         self.restart = str(restart)  #: the file from which it goes on
-        self._compare = compare or ccp.Comparison(comm, [])
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
         self.last: Step | None = None

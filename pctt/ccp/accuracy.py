@@ -21,7 +21,6 @@ class Accuracy:
     Attributes
     ----------
     natural_residual : ||g - P(g - s y)|| / ||g||, s = 1 / mean(diag N)
-    rigid_residual : the same of the problem without its compliance
     coulomb_residual : the same with y_n + mu |y_t| for y_n: zero where impulses obey Coulomb's law (``coulomb.py``)
     objective : 1/2 g'Ng + r'g (J)
     cone_violation : largest distance |g_t| - mu g_n outside the friction cone (N s)
@@ -36,7 +35,6 @@ class Accuracy:
     """
 
     natural_residual: float
-    rigid_residual: float
     coulomb_residual: float
     objective: float
     cone_violation: float
@@ -62,7 +60,6 @@ def measure(problem: ConeProblem, g: Array) -> Accuracy:
     energy = problem.dot(g, 0.5 * (y - problem.r))
     return Accuracy(
         natural_residual=natural,
-        rigid_residual=_residual(problem, g, y - problem.compliance * g) if problem.softness else natural,
         coulomb_residual=_residual(problem, g, with_opening),
         objective=problem.dot(g, 0.5 * (y + problem.r)),
         cone_violation=max(0.0, problem.max((tangential - problem.mu * g[:, 0]).max(initial=0.0))),

@@ -36,6 +36,9 @@ from pctt.disk import make_hdf5, whole
 __all__ = ["FileFormatError", "Info", "Solution", "Stored", "load", "read", "write_global", "write_local"]
 
 
+SINGLE = ("mu", "compliance")  # of the vectors with one number per contact
+
+
 class FileFormatError(ValueError):
     """A file that is no cone problem; raised on all ranks alike."""
 
@@ -89,10 +92,9 @@ def read(path: str | Path, comm: MPI.Comm) -> ConeProblem:
     return load(path, comm).problem
 
 
-def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> Stored:
+def load(path: str | Path, comm: MPI.Comm) -> Stored:
     """The cone problem as ``read`` gives it, with the solution and the first guess of the file if it has
-    impulses there: all published files have the groups, many with nothing but zeros in them. ``compliance`` takes
-    the place of the file's."""
+    impulses there: all published files have the groups, many with nothing but zeros in them."""
     parts: list[dict[str, Any]] = []
     error = None
     if comm.rank == 0:
@@ -100,8 +102,9 @@ def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> S
             matrix, vectors, words = _contents(Path(path))
             count = len(vectors["mu"])
             for name, x in {"matrix": matrix.shape[0], **vectors}.items():
-                size = x if name == "matrix" else 3 * count if x is None or name == "mu" else np.size(x)
-                if size != 3 * count:
+                numbers = count if name in SINGLE else 3 * count
+                size = x if name == "matrix" else numbers if x is None else np.size(x)
+                if size != numbers:
                     raise FileFormatError(f"{count} friction coefficients, but its {name} has {size} rows or numbers")
             parts = [_part(matrix, vectors, rank, comm.size) | words for rank in range(comm.size)]
         except Exception as reason:  # of any kind, as bad data surprise h5py, numpy and scipy; other ranks wait
@@ -110,13 +113,14 @@ def load(path: str | Path, comm: MPI.Comm, compliance: float | None = None) -> S
     if error:
         raise FileFormatError(error)
     part = comm.scatter(parts)
-    rows, e, N = part["matrix"], part["compliance"] if compliance is None else compliance, None
+    rows, N = part["matrix"], None
+    C = 0.0 if part["compliance"] is None else part["compliance"]
     try:
         if rows.blocksize == (3, 6):
             operator: dict[str, Any] = {"G": BlockRows(rows.indptr, rows.indices, rows.data, part["columns"])}
         else:
             operator = {"N": (N := square_block_matrix(comm, rows))}
-        problem = ConeProblem(comm, part["r"], part["mu"], **operator, point=part["point"], compliance=e)
+        problem = ConeProblem(comm, part["r"], part["mu"], **operator, point=part["point"], compliance=C)
     except ValueError as reason:  # on all ranks alike
         raise FileFormatError(f"{path}: no FCLIB problem: {reason}") from None
     finally:
@@ -153,10 +157,10 @@ def _contents(path: Path) -> tuple[sp.bsr_matrix, dict[str, Any], dict[str, Any]
             "solution": _impulses(file, "solution/r"),
             "guess": _impulses(file, "guesses/1/r"),
             "point": file["pctt/point"][()] if "pctt/point" in file else None,
+            "compliance": file["pctt/compliance"][()] if "pctt/compliance" in file else None,
         }
-        compliance = float(file["pctt/compliance"][()]) if "pctt/compliance" in file else 0.0
         title = _text(group["info/title"][()]) if "info/title" in group else ""
-        return matrix, vectors, {"form": f"FCLIB {form}", "title": title, "note": note, "compliance": compliance}
+        return matrix, vectors, {"form": f"FCLIB {form}", "title": title, "note": note}
 
 
 def _part(A: sp.bsr_matrix, vectors: Mapping[str, Any], rank: int, ranks: int) -> dict[str, Any]:
@@ -171,7 +175,7 @@ def _part(A: sp.bsr_matrix, vectors: Mapping[str, Any], rank: int, ranks: int) -
         "columns": columns * (rank + 1) // ranks - columns * rank // ranks,
     }
     for name, x in vectors.items():
-        part[name] = None if x is None else x[mine] if name == "mu" else np.reshape(x, (-1, 3))[mine]
+        part[name] = None if x is None else x[mine] if name in SINGLE else np.reshape(x, (-1, 3))[mine]
     return part
 
 
@@ -297,7 +301,7 @@ def write_local(
     W = _gathered(problem.comm, rows_in_blocks(N).tocsr())
     N.destroy()
     vectors = {"q": problem.r, "mu": problem.mu}
-    extra = {"point": problem.point, "compliance": problem.softness}
+    extra = {"point": problem.point, "compliance": problem.compliance[:, 0] if problem.yields else None}
     _write(path, problem.comm, "local", {"W": W}, vectors, info, {"solution": solution, "guesses/1": guess}, extra)
 
 
@@ -313,13 +317,13 @@ def write_global(
     solution: Solution | None = None,
     guess: Solution | None = None,
     point: Array | None = None,
-    compliance: float = 0.0,
+    compliance: Array | None = None,
 ) -> None:
     """Write M v = H r + f, u = H'v + w with all rows distributed over the ranks; collective.
 
     M (n, N) this rank's rows of the masses and inertia tensors, Ht (3 nc, N) its rows of H', f (n,) momenta without
     contacts (N s), w (nc, 3) velocities of the contacts at v = 0 (m/s), mu (nc,); ``point`` (nc, 3) contact points
-    (m), and ``compliance``, that of a `ConeProblem`, are kept outside the groups of FCLIB. Raises OSError on all
+    (m), and ``compliance`` (nc,), that of a `ConeProblem`, are kept outside the groups of FCLIB. Raises OSError on all
     ranks if the file cannot be written.
     """
     matrices = {"M": _gathered(comm, M.tocsr()), "H": _gathered(comm, Ht.tocsr()).T}
@@ -346,10 +350,7 @@ def _write(
         data |= {f"{name}/{letter}": _gathered_rows(comm, x).ravel() for letter, x in parts.items() if x is not None}
     if states["guesses/1"] is not None:
         data["guesses/number_of_guesses"] = _integers([1])
-    if extra["point"] is not None:
-        data["pctt/point"] = _gathered_rows(comm, extra["point"])
-    if extra["compliance"]:
-        data["pctt/compliance"] = np.array(extra["compliance"])
+    data |= {f"pctt/{name}": _gathered_rows(comm, x) for name, x in extra.items() if x is not None}
     data |= {f"{top}/info/{name}": _string(text) for name, text in vars(info or Info()).items()}
     data[f"{top}/spacedim"] = _integers([3])
     failure = None

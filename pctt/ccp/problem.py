@@ -21,8 +21,7 @@ class ConeProblem:
     """One step's cone problem, its contacts distributed over the ranks of ``comm``.
 
     N = G G' + C is given by the mass-scaled contact map G = D' M^-1/2 (3Nc x 6M), or directly (``N``). The compliance
-    C is e mean(diag G G') times the identity in the variables (mu g_n, g_t) in which all cones are the same: contacts
-    that yield a little. Without friction the normal direction gets what tangents get.
+    C is diagonal and acts on normal impulses alone: contacts that yield a little, see `dem.stiffness`.
 
     Attributes
     ----------
@@ -32,8 +31,8 @@ class ConeProblem:
     contact_map : the operator if it is G, and the bodies are known; or None
     point : (nc, 3) contact points (m) or None; orders the unknowns of hierarchical preconditioners
     key : (nc,) persistent names of the contacts or None
-    compliance : (nc, 3) the diagonal of C
-    softness : e, the same on all ranks; 0 for rigid contacts
+    compliance : (nc, 3) the diagonal of C, (C_n, 0, 0) per contact (1/kg); given as a number or (nc,)
+    yields : whether C is not zero, the same on all ranks
     size : contacts on all ranks, Nc
     """
 
@@ -47,14 +46,12 @@ class ConeProblem:
         N: PETSc.Mat | None = None,
         point: Array | None = None,
         key: np.ndarray | None = None,
-        compliance: float = 0.0,
+        compliance: Array | float = 0.0,
     ):
         if (G is None) == (N is None):
             raise ValueError("a cone problem is given by either the map G or the matrix N")
-        if not 0.0 <= compliance < np.inf:
-            raise ValueError(f"compliance {compliance}: allowed is a number >= 0")
         self.comm, self.point, self.key = comm, point, key
-        refuse(comm, _wrong(r, mu, G, N, point, key))
+        refuse(comm, _wrong(r, mu, G, N, point, key, compliance))
         self.r = np.ascontiguousarray(r, dtype=float).reshape(-1, 3)
         self.mu = np.ascontiguousarray(mu, dtype=float)
         bad = ~np.isfinite(self.r).all(1) | ~(np.isfinite(self.mu) & (self.mu >= 0))
@@ -67,11 +64,9 @@ class ConeProblem:
         if wrong := self.sum((~np.isfinite(self._rigid_blocks).all(axis=(1, 2))).sum()):
             self.destroy()
             raise ValueError(f"G has a NaN or an infinite number in {wrong} contacts")
-        self.softness = float(compliance)
-        along_normal = np.where(self.mu > 0, self.mu**2, 1.0)
-        ones = np.ones_like(along_normal)
-        self.compliance = np.stack([along_normal, ones, ones], axis=1)
-        self.compliance *= compliance * self.mean_diagonal if compliance else 0.0
+        self.compliance = np.zeros_like(self.r)
+        self.compliance[:, 0] = compliance
+        self.yields = bool(self.max(bool(self.compliance.any())))
 
     def __repr__(self) -> str:
         given = "N" if self.contact_map is None else "G"
@@ -83,7 +78,7 @@ class ConeProblem:
         """N g for impulses g (nc, 3): velocities of the contacts (nc, 3)."""
         y = np.zeros_like(self.r)
         self.operator.add_delassus(g, y)
-        if self.softness:
+        if self.yields:
             y += self.compliance * g
         return y
 
@@ -122,7 +117,7 @@ class ConeProblem:
     def N(self) -> PETSc.Mat:
         """N as a Mat of block size 3 (BAIJ), without the columns of hubs; built at its first use and kept."""
         N = self.rigid_matrix()
-        if self.softness:
+        if self.yields:
             diagonal = N.createVecLeft()
             diagonal.array[:] = self.compliance.ravel()
             N.setDiagonal(diagonal, PETSc.InsertMode.ADD_VALUES)
@@ -148,7 +143,7 @@ class ConeProblem:
     @cached_property
     def diagonal_blocks(self) -> Array:
         """The 3 x 3 diagonal blocks of N (nc, 3, 3), hubs and the compliance included."""
-        return self._rigid_blocks + self.compliance_blocks if self.softness else self._rigid_blocks
+        return self._rigid_blocks + self.compliance_blocks if self.yields else self._rigid_blocks
 
     @cached_property
     def compliance_blocks(self) -> Array:
@@ -221,8 +216,9 @@ def _map(comm: MPI.Comm, G: Given) -> ContactMap:
 
 
 def _wrong(
-    r: Array, mu: Array, G: Given | None, N: PETSc.Mat | None, point: Array | None, key: np.ndarray | None
-) -> str:
+    r: Array, mu: Array, G: Given | None, N: PETSc.Mat | None, point: Array | None, key: np.ndarray | None,
+    compliance: Array | float,
+) -> str:  # fmt: skip
     """What is wrong with the shapes of a problem's data on this rank; empty if nothing is."""
     try:
         shape, friction = np.asarray(r, dtype=float).shape, np.asarray(mu, dtype=float).shape
@@ -242,4 +238,8 @@ def _wrong(
     for name, given, width in (("point", point, (3,)), ("key", key, ())):
         if given is not None and np.shape(given) != (nc, *width):
             return f"{name} has the shape {np.shape(given)}; allowed is {(nc, *width)}"
+    if np.shape(compliance) not in ((), (nc,)):
+        return f"compliance has the shape {np.shape(compliance)}; allowed is {(nc,)}, or a number"
+    if not (np.isfinite(compliance).all() and (np.asarray(compliance) >= 0.0).all()):
+        return "compliance: allowed are numbers >= 0"
     return ""

@@ -31,7 +31,10 @@ UNITS = {
     "Pa": "stresses", "kg": "masses", "degrees": "angles",
 }
 # columns of the energy balance (dem.record.energy_balance)
-BALANCE = ("kinetic_energy", "potential_energy", "work_of_motions", "friction_loss", "impact_loss", "time_stepping")
+BALANCE = (
+    "kinetic_energy", "potential_energy", "spring_energy", "work_of_motions", "friction_loss", "impact_loss",
+    "time_stepping",
+)  # fmt: skip
 
 
 def figures(folder: Folder) -> dict[str, Figure]:
@@ -166,13 +169,13 @@ def _with_unit(axes: Axes, name: str, unit: str) -> None:
 def energy(columns: Mapping[str, np.ndarray]) -> Figure:
     """Energies, and the sums of the work and of the losses, over time. The lower axes show the drift: the change of
 
-        kinetic + potential + losses - work
+        kinetic + potential + spring + losses - work
 
     since the beginning of the first step. The drift is the error of the time stepping. Potential energy counts from the
     first record."""
     time = columns["time [s]"]
-    kinetic, potential, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
-    total = kinetic + potential - potential[0] + np.cumsum(friction + impact - work)
+    kinetic, potential, spring, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
+    total = kinetic + spring + potential - potential[0] + np.cumsum(friction + impact - work)
     figure = Figure(figsize=(9.5, 6.4))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     above.plot(time, kinetic, label="kinetic energy")
@@ -180,7 +183,7 @@ def energy(columns: Mapping[str, np.ndarray]) -> Figure:
     above.plot(time, np.cumsum(work), "--", label="work of moving bodies, sum")
     above.plot(time, np.cumsum(friction), "-.", label="friction loss, sum")
     above.plot(time, np.cumsum(impact), ":", label="impact loss, sum")
-    above.plot(time, total, color="black", linewidth=1.8, label="kinetic + potential + losses - work")
+    above.plot(time, total, color="black", linewidth=1.8, label="kinetic + potential + spring + losses - work")
     below.plot(time, total - (total[0] - stepping[0]), color="black", label="drift of the sum above")
     for axes, name in ((above, "energy"), (below, "drift")):
         _with_unit(axes, name, "J")

@@ -102,7 +102,7 @@ class Dump:
             solution=state(result.impulse) if result.converged else None,
             guess=state(guess) if problem.norm(guess) > 0 else None,
             point=system.point,
-            compliance=problem.softness,
+            compliance=problem.compliance[:, 0] if problem.yields else None,
         )  # fmt: skip
 
     def _info(self, problem: ccp.ConeProblem, result: ccp.Result, asked: ccp.Result) -> fclib.Info:

@@ -27,10 +27,10 @@ from pctt.run.settings import DEMO, Asked, Options, Run, Settings, find_scene
 
 #: Options of simulations, beside those of the scene; those that settled states depend on, and -quiet.
 OF_STEPS = {
-    "scene", "steps", "dt", "delta", "recovery_speed", "restart", "settle", "output_every", "checkpoint_every",
-    "dump_problem",
+    "scene", "steps", "dt", "delta", "stiffness", "recovery_speed", "restart", "settle", "output_every",
+    "checkpoint_every", "dump_problem",
 }  # fmt: skip
-OF_SETTLING = {"settle", "scene", "dt", "delta", "recovery_speed", "quiet"}
+OF_SETTLING = {"settle", "scene", "dt", "delta", "stiffness", "recovery_speed", "quiet"}
 
 
 def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:

@@ -53,11 +53,6 @@ class Settings(ccp.Limits):
     newton: str = option(
         "auto", "unknowns of the Newton systems; auto: contact for pdip, body for conic", choices=("auto", *ccp.FORMS)
     )
-    compliance: Optional[float] = option(
-        None,
-        "compliance of the contacts, as a part of mean diag N; none: 0, rigid, or that of the file of -problem",
-        check=NOT_NEGATIVE,
-    )
     coulomb: Any = option(
         None,
         "true: Coulomb's law; false: its relaxation by the cone problem, whose sliding contacts open; none: Coulomb's "
@@ -68,8 +63,14 @@ class Settings(ccp.Limits):
         None, "gap below which a pair of bodies is a contact; none: the scene's own", unit="m", check=NOT_NEGATIVE,
         name="delta",
     )  # fmt: skip
+    stiffness: Optional[float] = option(
+        None,
+        "stiffness of all contacts; inf: rigid; none: what the scene states, else rigid with pdip and in comparisons, "
+        "and with other solvers what overlaps of 0.3 % of a radius need",
+        unit="N/m", check=("a positive number, or inf", lambda x: x > 0), name="stiffness",
+    )  # fmt: skip
     recovery_speed: float = option(
-        1.0, "greatest speed at which bodies that overlap are pushed apart", unit="m/s", check=NOT_NEGATIVE,
+        1.0, "greatest speed at which rigid bodies that overlap are pushed apart", unit="m/s", check=NOT_NEGATIVE,
         name="recovery_speed",
     )  # fmt: skip
     options: Any = number(None, "options of the solver, an instance of its class or a dict of its fields")

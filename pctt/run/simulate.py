@@ -115,7 +115,7 @@ def _how_to_go_on(options: Options, state: Path, steps: int) -> str:
 def solve_file(options: Options, comm: MPI.Comm) -> None:
     """Solve, print the figures, and write them to summary.json in the output folder."""
     try:
-        stored = fclib.load(options.run.problem, comm, options.settings.compliance)
+        stored = fclib.load(options.run.problem, comm)
     except FileFormatError as error:
         raise FileError(str(error)) from None
     compare = ccp.Comparison(comm, options.run.compared(), options.run.compare_every)
@@ -174,7 +174,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
         "ranks": comm.size,
         "solver": used,
         "law": "Coulomb" if settings.coulomb else "cone problem",
-        "compliance": problem.softness,
+        "mean_compliance": problem.sum(problem.compliance[:, 0].sum()) / max(problem.size, 1),
         **dataclasses.asdict(accuracy),
         "cone_problems": result.cone_problems,
         "newton_its": result.newton_its,

@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from dem import stiffness
 from dem.arrays import Floats
 from dem.bodies import Bodies
 from dem.experiment import Experiment
@@ -171,25 +172,27 @@ def cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pctt"
 
 
-def settled_path(experiment: Experiment, settings: Settings, made_with: dict[str, Any]) -> Path:
+def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_with: dict[str, Any]) -> Path:
     """The file of a scene's settled state. Its name has the scene and a digest of all that influences the state.
     OptionError if the scene never settles."""
-    scene = json.loads(made_with["scene"])
+    about = json.loads(made_with["scene"])
     if not experiment.settling_time:
-        raise OptionError(f"-scene {scene['scene']}: has no settling_time and so no settled state")
+        raise OptionError(f"-scene {about['scene']}: has no settling_time and so no settled state")
     how: dict[str, Any] = {
         "dt": settings.dt,
         "delta": [experiment.settle_delta, settings.delta],
         "recovery_speed": settings.recovery_speed,
         "tol": settings.settle_tol,
     }
+    if settings.stiffness != np.inf:
+        how["stiffness"] = settings.stiffness or stiffness.table(scene).tolist()
     if experiment.digest:
         how["file"] = experiment.digest  # a file that was changed may build another scene
     if surfaces := json.loads(made_with["surfaces"]):
         how["surfaces"] = surfaces
     digest = hashlib.sha256((made_with["scene"] + json.dumps(how, sort_keys=True)).encode()).hexdigest()[:12]
-    size = f"_n{scene['n']}" if "n" in scene else ""
-    return cache() / f"{scene['scene']}{size}_{digest}.h5"
+    size = f"_n{about['n']}" if "n" in about else ""
+    return cache() / f"{about['scene']}{size}_{digest}.h5"
 
 
 def unfinished(path: Path) -> Path:
@@ -209,7 +212,7 @@ def settled_state(
     ``anew``. An interrupted or killed settling is continued."""
     say = say if comm.rank == 0 else lambda text: None
     made_with = origin(experiment, scene, settings.dt)
-    path = settled_path(experiment, settings, made_with)
+    path = settled_path(experiment, settings, scene, made_with)
     if not anew and comm.bcast(path.exists()):
         return path
     on_first(comm, path.parent, lambda: path.parent.mkdir(parents=True, exist_ok=True))
@@ -254,7 +257,7 @@ def _settle(
         world, memory = world_at_start(experiment, scene, comm), ImpulseMemory(comm)
     loose = Settings(
         dt=settings.dt, delta=experiment.settle_delta, solver="apgd", tol=tol, coulomb=False,
-        recovery_speed=settings.recovery_speed,
+        stiffness=settings.stiffness, recovery_speed=settings.recovery_speed,
     ).of(experiment)  # fmt: skip
     with Stepper(loose, world, memory) as stepper:
         while world.step < end:

@@ -44,6 +44,8 @@ class Stepper:
         self.settings, self.world, self.memory, self.newton, self.dump = settings, world, memory, newton, dump
         self._problem: ccp.ConeProblem | None = None
         self._corrections = 0  # of the present step
+        if settings.stiffness is not None:
+            world.stiffness = np.full_like(world.stiffness, settings.stiffness)
 
     def __enter__(self) -> Stepper:
         return self
@@ -135,7 +137,7 @@ class Stepper:
             self._release()
             self.contacts = contacts
             self.system = ContactSystem(self.world, contacts, settings.dt, settings.recovery_speed)
-            self._problem = cone_problem(self.system, self.world.comm, settings.compliance or 0.0)
+            self._problem = cone_problem(self.system, self.world.comm)
             guess, _ = memory.recall(self.system.key, self.system.frame)
         return self._problem, guess
 
@@ -185,10 +187,10 @@ class Stepper:
         )
 
 
-def cone_problem(system: ContactSystem, comm: MPI.Comm, compliance: float = 0.0) -> ccp.ConeProblem:
+def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
     G, point, key = system.contact_map, system.point, system.key
-    return ccp.ConeProblem(comm, system.r, system.mu, G=G, point=point, key=key, compliance=compliance)
+    return ccp.ConeProblem(comm, system.r, system.mu, G=G, point=point, key=key, compliance=system.compliance)
 
 
 def _peak_memory(comm: MPI.Comm) -> int:

@@ -57,7 +57,7 @@ VARIANTS = {
 }
 
 
-def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
+def step_problem(n: int, variant: str, stiffness: float) -> ccp.ConeProblem:
     """The cone problem of the first step after the settled state of a mixer."""
     sim = Simulation(Mixer(n=n), restart="settled", comm=COMM)
     world, settings, grains = sim.world, sim.settings, sim.world.grains
@@ -65,6 +65,7 @@ def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
         rng = np.random.default_rng(0)
         grains.position[:, 2] *= 1.01
         grains.velocity[:, :3] += 0.5 * rng.normal(size=(len(grains), 3)) - np.array([0, 0, 0.5])
+    world.stiffness[:] = stiffness
     contacts = find_contacts(world, settings.delta, settings.dt)
     if variant == "friction":
         contacts.friction[:] = 0.8
@@ -75,7 +76,7 @@ def step_problem(n: int, variant: str, compliance: float) -> ccp.ConeProblem:
         grains.inertia[top] *= HEAVIER
         contacts = find_contacts(world, settings.delta, settings.dt)
     system = ContactSystem(world, contacts, settings.dt, settings.recovery_speed)
-    return cone_problem(system, COMM, compliance)
+    return cone_problem(system, COMM)
 
 
 def run(path: Path, method: str, tol: float, seconds: float) -> dict[str, Any]:
@@ -171,14 +172,14 @@ def solvers(parser: argparse.ArgumentParser, words: argparse.Namespace) -> None:
                 parser.error(f"{kind} {name}: allowed is {', '.join(allowed)}")
     about = say_machine()
     record_rows: list[dict[str, Any]] = []
-    compliances = [float(word) for word in words.compliance.split(",")]
-    cases = [(n, v, e) for n in words.n for e in compliances for v in variants if v == "settled" or e == compliances[0]]
-    for n, variant, compliance in cases:
+    stiffnesses = [float(word) for word in words.stiffness.split(",")]
+    cases = [(n, v, k) for n in words.n for k in stiffnesses for v in variants if v == "settled" or k == stiffnesses[0]]
+    for n, variant, stiffness in cases:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "problem.npz"
-            problem = step_problem(n, variant, compliance)
+            problem = step_problem(n, variant, stiffness)
             solve_one.write(path, problem)
-            title = f"mixer n = {n}, {problem.size} contacts, {VARIANTS[variant]}, compliance {compliance:g}"
+            title = f"mixer n = {n}, {problem.size} contacts, {VARIANTS[variant]}, stiffness {stiffness:g} N/m"
             heads = " ".join(f"{tol:9.0e}" for tol in TOLERANCES)
             print(f"\n{title}; limit {words.seconds:g} s\n{'seconds to':18} {heads} products   Krylov       MB")
             table = {}
@@ -186,11 +187,11 @@ def solvers(parser: argparse.ArgumentParser, words: argparse.Namespace) -> None:
                 if method in PEERS and n > words.peers_up_to:
                     continue
                 rows = table[method] = (peer_rows if method in PEERS else own_rows)(path, method, words.seconds)
-                case = {"n": n, "variant": variant, "compliance": compliance, "contacts": problem.size}
+                case = {"n": n, "variant": variant, "stiffness": stiffness, "contacts": problem.size}
                 record_rows += [case | {"method": method} | row for row in rows]
                 show(method, rows)
         record("compare_solvers", about, record_rows)
-        plot(f"compare_solvers_n{n}_{variant}_{compliance:g}", title, table)
+        plot(f"compare_solvers_n{n}_{variant}_{stiffness:g}", title, table)
 
 
 # -- laws of friction ---------------------------------------------------------------------------------------
@@ -277,7 +278,7 @@ def main() -> None:
     of_solvers.add_argument("n", type=int, nargs="*", default=[4, 8, 16], help="sizes of the mixer")
     of_solvers.add_argument("--seconds", type=float, default=60.0, help="limit of a run")
     of_solvers.add_argument("--variants", default=",".join(VARIANTS), help="with commas between")
-    of_solvers.add_argument("--compliance", default="0,1e-5", help="the later ones for `settled` only")
+    of_solvers.add_argument("--stiffness", default="inf,1e8", help="N/m; the later ones for `settled` only")
     of_solvers.add_argument("--methods", default="", help="instead of all, with commas between")
     of_solvers.add_argument("--peers-up-to", type=int, default=8, help="largest n that peers get")
     given = words.parse_args()

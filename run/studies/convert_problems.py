@@ -3,8 +3,7 @@ convert_problems FILE [FILE ...] -to DIR. DIR/NAME.h5 holds what FILE NAME.* doe
 
 A local problem of Siconos stays local and a global one global. W is made symmetric, and so is M, whose entries have six
 digits; where only one triangle is stored, it is mirrored. A file of PETSc has the Mat N of rigid contacts and the Vecs
-r and mu, and where there is compliance a Vec of length 1 with it; releases of pctt before FCLIB was their only format
-wrote such files.
+r and mu; releases of pctt before FCLIB was their only format wrote such files.
 """
 
 from __future__ import annotations
@@ -90,25 +89,25 @@ def _from_petsc(path: Path, made: Path) -> str:
         r, mu = (_vector(viewer) for _ in range(2))
         integers = 4 + len(indptr) - 1 + len(indices) + 2 * 2
         rigid = np.dtype(PETSc.IntType).itemsize * integers + 8 * (len(values) + len(r) + len(mu))
-        compliance = _vector(viewer) if path.stat().st_size > rigid else np.zeros(1)
+        more = path.stat().st_size > rigid
     except PETSc.Error as error:  # its last line states the reason, the lines above it functions of PETSc
         raise FileFormatError(str(error).splitlines()[-1].rpartition("] ")[2]) from None
     finally:
         if viewer is not None:
             viewer.destroy()
-    if len(compliance) != 1:
-        raise FileFormatError(f"a vector of length {len(compliance)} follows mu; allowed is its compliance, a number")
+    if more:
+        raise FileFormatError("a vector follows mu: a compliance in all directions, which cone problems no longer have")
     W = sp.csr_matrix((values, indices, indptr), shape=N.getSize())
-    return _write_local(path, made, W, r, mu, float(compliance[0]))
+    return _write_local(path, made, W, r, mu)
 
 
-def _write_local(path: Path, made: Path, W: sp.csr_matrix, q: Array, mu: Array, compliance: float = 0.0) -> str:
+def _write_local(path: Path, made: Path, W: sp.csr_matrix, q: Array, mu: Array) -> str:
     """Write W (3 nc, 3 nc), made symmetric, q (3 nc,) and mu (nc,); what was done to W."""
     if W.shape[0] != 3 * len(mu) or len(q) != 3 * len(mu):
         raise FileFormatError(f"{len(mu)} friction coefficients, but a matrix {W.shape} and a vector {q.shape}")
     blocks, note = symmetric_blocks(W)
     N = square_block_matrix(MPI.COMM_SELF, blocks)
-    with ConeProblem(MPI.COMM_SELF, q.reshape(-1, 3), mu, N=N, compliance=compliance) as problem:
+    with ConeProblem(MPI.COMM_SELF, q.reshape(-1, 3), mu, N=N) as problem:
         fclib.write_local(made, problem, _info(path, note))
     N.destroy()
     return note

@@ -104,7 +104,7 @@ def _clarabel(problem: ccp.ConeProblem, tol: float, seconds: float) -> Found:
         P, q, A, b = S @ _delassus(problem) @ S / mean, r, -sp.identity(len(r)), np.zeros(len(r))
     else:
         rows = _contact_rows(problem)
-        if problem.softness:
+        if problem.yields:
             rows = sp.hstack([rows, sp.diags(np.sqrt(problem.compliance.ravel()))])
         P, q, A, b = sp.identity(rows.shape[1]), np.zeros(rows.shape[1]), -S @ rows / np.sqrt(mean), r
     settings = clarabel.DefaultSettings()

@@ -74,7 +74,7 @@ def peer(problem: ccp.ConeProblem, name: str, tol: float, seconds: float) -> dic
 def write(path: Path, problem: ccp.ConeProblem) -> None:
     """A problem of frames and arms on one rank, for `read`."""
     G = vars(problem.contact_map.given)
-    np.savez(path, r=problem.r, mu=problem.mu, point=problem.point, compliance=problem.softness, **G)
+    np.savez(path, r=problem.r, mu=problem.mu, point=problem.point, compliance=problem.compliance[:, 0], **G)
 
 
 def read(path: str) -> ccp.ConeProblem:
@@ -83,7 +83,7 @@ def read(path: str) -> ccp.ConeProblem:
         return fclib.read(path, MPI.COMM_SELF)
     with np.load(path) as file:
         G = ccp.CompactRows(*(file[name] for name in ("frame", "arm", "body", "root")), int(file["columns"]))
-        rest = {"point": file["point"], "compliance": float(file["compliance"])}
+        rest = {"point": file["point"], "compliance": file["compliance"]}
         return ccp.ConeProblem(MPI.COMM_SELF, file["r"], file["mu"], G=G, **rest)
 
 

@@ -58,7 +58,8 @@ def steps(
     coulomb: ccp.Coulomb | None = None,
 ) -> Iterator[Step]:
     """Make steps one by one; each must be solved to `tol`, by default that of SOLVERS, or is left after a
-    number of `iterations`."""
+    number of `iterations`. Contacts are rigid."""
+    world.stiffness[:] = np.inf
     limits = ccp.Limits(SOLVERS[solver] if tol is None else tol)
     if iterations is not None:
         limits = ccp.Limits(1e-300, iterations, fallback=False)

@@ -61,7 +61,7 @@ class ScaledProblem:
         """A x + b (nc, 3)."""
         out = np.empty_like(x) if out is None else out
         out[:] = self.b
-        if self.problem.softness:
+        if self.problem.yields:
             out += self._compliance * x
         self._operator.add_delassus(x, out)
         return out

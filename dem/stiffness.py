@@ -1,0 +1,92 @@
+"""The stiffness of contacts: what a scene needs, what a material has, and what a time step makes of it.
+
+Bodies in contact push each other apart with the force k d + c d', where d is their overlap, k the stiffness and c a
+damping that takes nearly all speed of an impact. The step is implicit in it. With the normal velocity v_n and the
+impulse g = dt (k d + c d') at its end, d = -(gap + dt v_n) and d' = -v_n,
+
+    v_n + (k dt gap + g) / (k dt^2 + c dt) = 0:
+
+a compliance C = 1 / (k dt^2 + c dt) on the diagonal of the Delassus matrix, and a share of gap / dt. So dt has no
+limit, the overlap of bodies at rest does not depend on it, and no step adds energy: an implicit spring gives back what
+it holds at most. Rigid contacts are k = inf.
+
+Source: Negrut, Serban, Tasora, "Posing multibody dynamics with friction and contact as a differential complementarity
+problem", J. Comput. Nonlinear Dynam. 13 (2017), for the compliance; Schwager, Poeschel, "Coefficient of restitution
+and linear-dashpot model revisited", Granular Matter 9 (2007), for impacts with springs that do not pull.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dem import bodies, checks
+from dem.arrays import ArrayLike, Floats
+from dem.motion import Dynamic, top_speed
+from dem.scene import LargeBody, Scene
+from dem.shapes import Plane, placed
+
+OVERLAP = 0.003  #: the greatest overlap that `recommended` allows, as a part of a grain's radius
+DAMPING = 2.0  #: c as a part of 2 sqrt(k m): an impact leaves 5 % of the speed (Schwager, Poeschel); 1: 14 %
+
+
+def table(scene: Scene) -> Floats:
+    """The stiffnesses of contacts by pair of materials (materials, materials), symmetric [N/m]."""
+    return scene.stiffness_table(recommended(scene) if scene.stiffness is None else scene.stiffness)
+
+
+def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
+    """The stiffness [N/m] with which no grain of a scene overlaps by more than this part of its radius, whether under
+    the weight of the bed above it or stopped by the fastest tool or grain, to two digits; inf if there is neither.
+
+    The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width. A grain
+    of mass m that a tool of speed v meets is stopped by k d = v sqrt(k m). Grains that fall from high are not reckoned
+    with.
+    """
+    grains = scene.grains()
+    allowed = overlap * bodies.bounding_radius(grains)
+    load = _load(scene)
+    speed = max([_speed(body) for body in scene.large_bodies], default=0.0)
+    speed = max(speed, float(np.linalg.norm(grains.velocity[:, :3], axis=1).max()))
+    stiffness = float(np.maximum(load / allowed, grains.mass * (speed / allowed) ** 2).max())
+    return float(f"{stiffness:.1e}") if stiffness > 0.0 else np.inf  # the same on processors that round in other ways
+
+
+def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:
+    """The stiffness E R [N/m] of the contact of two equal spheres of Young's modulus E [Pa] and radius R [m].
+
+    Source: the linear law of Yade (Smilauer et al., documentation of `Ip2_FrictMat_FrictMat_FrictPhys`), for equal
+    spheres; for others take the harmonic mean of E R of both."""
+    return float(checks.positive("Young's modulus", modulus)) * float(checks.positive("radius", radius))
+
+
+def compliance(stiffness: Floats, mass: Floats, dt: float) -> tuple[Floats, Floats]:
+    """C (nc,) [1/kg] and the share (nc,) of gap / dt of overlapping contacts, for their stiffness (nc,) [N/m] and the
+    reduced masses (nc,) of their bodies [kg]; 0 and 1 of rigid ones."""
+    rigid = np.isinf(stiffness)
+    k = np.where(rigid, 1.0, stiffness)
+    damping = 2.0 * DAMPING * np.sqrt(k * mass)
+    C = 1.0 / (k * dt**2 + damping * dt)
+    return np.where(rigid, 0.0, C), np.where(rigid, 1.0, k * dt**2 * C)
+
+
+def _load(scene: Scene) -> Floats:
+    """The weight (grains,) that the whole bed would lay on each grain [N]."""
+    grains, gravity = scene.grains(), float(np.linalg.norm(scene.gravity))
+    if gravity == 0.0:
+        return np.zeros(len(grains))
+    down = np.asarray(scene.gravity) / gravity
+    across = grains.position - np.outer(grains.position @ down, down)
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(across.T, bias=True)), 0.0))[1:]  # in the plane across
+    radius = bodies.bounding_radius(grains)
+    width = np.sqrt(12.0) * spread + 2.0 * radius.mean()  # of a rectangle of that spread, with the grains at its edges
+    others = sum(body.mass for body in scene.large_bodies if isinstance(body.motion, Dynamic))
+    pressure = gravity * (grains.mass.sum() + others) / width.prod()
+    return np.maximum(pressure * (2.0 * radius) ** 2, gravity * grains.mass)
+
+
+def _speed(body: LargeBody) -> float:
+    """The greatest speed of a point of a large body [m/s]; a plane has no end, and counts by the body's centre."""
+    parts = [placed(shape) for shape in body.shapes if not isinstance(shape, Plane)]
+    reach = max((float(np.linalg.norm(center) + np.linalg.norm(size)) for _, center, _, size in parts), default=0.0)
+    start = float(np.linalg.norm(body.velocity[:3]) + np.linalg.norm(body.velocity[3:]) * reach)
+    return max(start, top_speed(body.motion, body.position, reach))
