@@ -117,13 +117,12 @@ def energy_balance(step: Step) -> dict[str, float]:
 def spring_energies(step: Step) -> Floats:
     """What the contacts of this rank hold as springs at the start and at the end of a step (2,) [J].
 
-    k/2 d^2 of an overlap d. At the end it is what the impulse tells, d = dt C g + (1 - share) d_start; a contact
-    without impulse holds nothing, as the damping of `dem.stiffness` takes what is left of it."""
-    system, gap, g = step.system, step.contacts.gap, step.impulse[:, 0]
+    k/2 d^2 of an overlap d, which changes in the step by dt times the normal velocity at its end. Collective."""
+    system, gap = step.system, step.contacts.gap
     k = np.where(np.isinf(system.stiffness), 0.0, system.stiffness)
-    begun = np.maximum(-gap, 0.0)
-    end = system.dt * (system.compliance * g + system.b[:, 0]) - gap
-    return np.array([0.5 * k @ begun**2, 0.5 * k @ np.where(g > 0.0, end, 0.0) ** 2])
+    after = system.contact_map.velocities(system.contact_map.momenta(step.impulse)) + system.r - system.b
+    overlaps = np.maximum(-gap, 0.0), np.maximum(-gap - system.dt * after[:, 0], 0.0)
+    return np.array([0.5 * k @ overlap**2 for overlap in overlaps])
 
 
 def contact_statistics(step: Step) -> dict[str, float]:

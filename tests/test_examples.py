@@ -66,7 +66,7 @@ def test_the_commands_in_the_heads_name_the_files_and_known_options():
 
 
 def test_a_sliding_box_and_a_rolling_sphere_have_the_textbooks_accelerations():
-    scene, records = run("incline", 10, ccp_tol="1e-8", ccp_coulomb="true")
+    scene, records = run("incline", 10, ccp_tol="1e-8", ccp_coulomb="true", stiffness="inf")
     found = scene.analyse(records)
     assert found["sphere_acceleration [m/s^2]"] == pytest.approx(5 / 7 * 9.81 * np.sin(np.radians(25)), rel=1e-7)
     assert abs(found["box_error [m/s^2]"]) < 1e-6
@@ -114,8 +114,8 @@ def test_the_accelerations_of_the_sweep_are_those_of_theory():
     """The relaxation lifts the box off the slope in the first step, which it then loses."""
     rows = importlib.import_module("sweep").main()
     assert len(rows) == 8
-    for friction, law, value, theory in rows:
-        assert value == pytest.approx(theory, abs=1e-6 if law == "Coulomb" or friction in (0.0, 0.6) else 0.01)
+    for friction, law, value, theory in rows:  # of contacts that settle into their springs
+        assert value == pytest.approx(theory, abs=1e-3 if law == "Coulomb" or friction in (0.0, 0.6) else 0.01)
 
 
 def test_the_notebook_runs_and_shows_what_its_file_has(tmp_path, monkeypatch):

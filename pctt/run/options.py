@@ -30,7 +30,7 @@ OF_STEPS = {
     "scene", "steps", "dt", "delta", "stiffness", "recovery_speed", "restart", "settle", "output_every",
     "checkpoint_every", "dump_problem",
 }  # fmt: skip
-OF_SETTLING = {"settle", "scene", "dt", "delta", "stiffness", "recovery_speed", "quiet"}
+OF_SETTLING = {"settle", "scene", "quiet"}
 
 
 def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:

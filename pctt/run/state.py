@@ -114,8 +114,8 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
     """The world and the impulses of a checkpoint of the scene; collective.
 
     If the number of ranks is that of the writing run, the world is the same to the last bit. Raises FileError if the
-    file is no checkpoint or damaged, and OptionError if it is of another scene, option or time step; warns of another
-    text of the scene file or surface of a body.
+    file is no checkpoint or damaged, and OptionError if it is of another scene or option; warns of another text of the
+    scene file or surface of a body. Where the time step is another, impulses are scaled to it.
     """
     columns = [field.name for field in dataclasses.fields(Bodies)]
 
@@ -140,8 +140,8 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
         restore_motions(world, motions)
     except (KeyError, TypeError, ValueError) as error:  # another text of the scene file may build other bodies
         raise OptionError(f"-restart {path}: {error}") from None
-    memory = ImpulseMemory(comm)
-    memory.restore(*impulses)
+    memory, (key, impulse) = ImpulseMemory(comm), impulses
+    memory.restore(key, impulse if old["dt"] in (None, made_with["dt"]) else impulse * (made_with["dt"] / old["dt"]))
     return world, memory
 
 
@@ -155,7 +155,6 @@ def _refuse_other_origin(
     absent = "(no such option)"
     names = [name for name in {**new_scene, **old_scene} if name != "scene"]
     pairs += [(f"-scene_{name}", old_scene.get(name, absent), new_scene.get(name, absent)) for name in names]
-    pairs += [("-dt", old["dt"], new["dt"])]
     for option, was, now in pairs:
         if was is not None and was != now:
             raise OptionError(f"{option} {now}: {path} was made with {option} {was}; allowed is the same")
@@ -173,19 +172,19 @@ def cache() -> Path:
 
 
 def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_with: dict[str, Any]) -> Path:
-    """The file of a scene's settled state. Its name has the scene and a digest of all that influences the state.
+    """The file of a scene's settled state, which the numerics of a run do not influence but for ``settle_tol``. Its name
+    has the scene and a digest of all that influences it.
     OptionError if the scene never settles."""
     about = json.loads(made_with["scene"])
     if not experiment.settling_time:
         raise OptionError(f"-scene {about['scene']}: has no settling_time and so no settled state")
     how: dict[str, Any] = {
-        "dt": settings.dt,
-        "delta": [experiment.settle_delta, settings.delta],
-        "recovery_speed": settings.recovery_speed,
+        "dt": experiment.dt,
+        "delta": [experiment.settle_delta, experiment.delta],
+        "recovery_speed": Settings.recovery_speed,
+        "stiffness": stiffness.table(scene).tolist(),
         "tol": settings.settle_tol,
     }
-    if settings.stiffness != np.inf:
-        how["stiffness"] = settings.stiffness or stiffness.table(scene).tolist()
     if experiment.digest:
         how["file"] = experiment.digest  # a file that was changed may build another scene
     if surfaces := json.loads(made_with["surfaces"]):
@@ -200,9 +199,9 @@ def unfinished(path: Path) -> Path:
     return path.with_suffix(".unfinished.h5")
 
 
-def settling_steps(experiment: Experiment, settings: Settings) -> int:
+def settling_steps(experiment: Experiment) -> int:
     """The steps of a settling from time zero."""
-    return math.ceil(experiment.settling_time / settings.dt * (1 - 1e-12))
+    return math.ceil(experiment.settling_time / experiment.dt * (1 - 1e-12))
 
 
 def settled_state(
@@ -211,7 +210,7 @@ def settled_state(
     """The cached settled state of ``scene``, which the experiment has `built`. It is made if it is missing, or with
     ``anew``. An interrupted or killed settling is continued."""
     say = say if comm.rank == 0 else lambda text: None
-    made_with = origin(experiment, scene, settings.dt)
+    made_with = origin(experiment, scene, experiment.dt)
     path = settled_path(experiment, settings, scene, made_with)
     if not anew and comm.bcast(path.exists()):
         return path
@@ -247,7 +246,7 @@ def _settle(
 
     The last tenth has the contact distance of the scene and ten times the accuracy: otherwise overlaps remain, and the
     first accurate step of a run would push them apart."""
-    end, tol, begun = settling_steps(experiment, settings), settings.settle_tol, time.perf_counter()
+    end, tol, begun = settling_steps(experiment), settings.settle_tol, time.perf_counter()
     tenth = max(1, end // 10)
     say(f"settling {scene_name(experiment)}, {end} steps with APGD to {tol:g}:")
     if comm.bcast(unfinished(path).exists()):
@@ -255,14 +254,11 @@ def _settle(
         say(f"  goes on after step {world.step}, from {unfinished(path)}")
     else:
         world, memory = world_at_start(experiment, scene, comm), ImpulseMemory(comm)
-    loose = Settings(
-        dt=settings.dt, delta=experiment.settle_delta, solver="apgd", tol=tol, coulomb=False,
-        stiffness=settings.stiffness, recovery_speed=settings.recovery_speed,
-    ).of(experiment)  # fmt: skip
+    loose = Settings(delta=experiment.settle_delta, solver="apgd", tol=tol, coulomb=False).of(experiment)
     with Stepper(loose, world, memory) as stepper:
         while world.step < end:
             if world.step + 1 >= end - end // 10:
-                stepper.settings = dataclasses.replace(loose, delta=settings.delta, tol=0.1 * tol)
+                stepper.settings = dataclasses.replace(loose, delta=experiment.delta, tol=0.1 * tol)
             line = stepper.step()
             interrupted = interrupt.asked(comm)
             if world.step % tenth == 0 or world.step == end or interrupted:

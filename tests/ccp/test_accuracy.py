@@ -154,4 +154,4 @@ def test_the_measure_agrees_with_the_stop_test_of_the_solvers():
 
 def test_a_problem_without_contacts():
     figures = ccp.measure(problem([], np.zeros((0, 3)), []), np.zeros((0, 3)))
-    assert figures == ccp.Accuracy(*[0.0] * 11)
+    assert figures == ccp.Accuracy(*[0.0] * 10)

@@ -27,7 +27,8 @@ DT = 0.01
 
 
 def made(world, solve=crude_impulse, dt=DT, delta=0.02):
-    """A step of the world with the impulses that `solve` finds."""
+    """A step of the world, its contacts rigid, with the impulses that `solve` finds."""
+    world.stiffness[:] = np.inf
     contacts = find_contacts(world, delta)
     system = ContactSystem(world, contacts, dt, recovery_speed=0.5)
     impulse = solve(system)

@@ -74,7 +74,7 @@ def test_a_servo_keeps_its_speed_as_far_as_its_torque_goes():
 @pytest.mark.parametrize(("force", "speed"), [(2000.0, 0.2), (800.0, 0.0)])
 def test_a_press_with_a_servo_rises_if_it_is_strong_enough(force, speed):
     """It weighs 981 N and stands on the floor: with 2 kN it rises at its speed, with 800 N the floor bears the rest."""
-    scene = Scene(0.5)
+    scene = Scene(0.5, stiffness=np.inf)
     scene.add_body("floor", [Plane((0, 0, 1))])
     press = Guided((0, 0, 1), force=force, speed=0.2)
     scene.add_body("tool", [Box((0.1, 0.1, 0.1))], press, mass=100.0, position=(0, 0, 0.1))

@@ -4,25 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
 import pctt
+from dem.motion import Glide, Rotation
 from dem.scene import Scene
-from dem.shapes import Plane
+from dem.shapes import Box, Plane
+from dem.stiffness import compliance, of_youngs_modulus, recommended, table
 
 R, DENSITY, G = 0.1, 2500.0, 9.81
 MASS = DENSITY * 4 / 3 * np.pi * R**3
 EXACT = {"tol": 1e-10, "closing_work": np.inf, "delta": 0.01}
+SOLVERS = pytest.mark.parametrize("solver", ["apgd", "pdip", "conic"])
 
 
-def column(stiffness: float, count: int = 5) -> Scene:
-    """Spheres on top of each other on a floor."""
+def column(stiffness: float | None, count: int = 5, squeezed: float = 0.0) -> Scene:
+    """Spheres on top of each other on a floor, each squeezed by so much [m] into the next."""
     scene = Scene(friction=0.3, stiffness=stiffness)
     scene.add_body("floor", [Plane((0, 0, 1))])
-    scene.add_spheres([[0, 0, R + 2 * R * k] for k in range(count)], R, DENSITY)
+    scene.add_spheres([[0, 0, (2 * R - squeezed) * (k + 0.5)] for k in range(count)], R, DENSITY)
     return scene
 
 
-@pytest.mark.parametrize("solver", ["apgd", "pdip", "conic"])
+@SOLVERS
 @pytest.mark.parametrize("coulomb", [False, True])
 def test_a_column_rests_on_the_overlaps_that_its_weight_makes(solver, coulomb):
     stiffness = 1e6
@@ -33,6 +37,7 @@ def test_a_column_rests_on_the_overlaps_that_its_weight_makes(solver, coulomb):
         expected = MASS * G * np.arange(5, 0, -1) / stiffness
         np.testing.assert_allclose(overlap, expected, rtol=1e-4)
         np.testing.assert_allclose(sim.body("floor").force, [0, 0, -5 * MASS * G], atol=1e-3 * MASS * G)
+        assert sim.figures["spring_energy [J]"] == pytest.approx(0.5 * stiffness * (expected**2).sum(), rel=1e-3)
 
 
 @pytest.mark.parametrize("dt", [0.002, 0.005, 0.02])
@@ -42,3 +47,112 @@ def test_the_overlaps_do_not_depend_on_the_step(dt):
         sim.run(until=1.5)
         top = sim.positions[-1, 2]
     assert 9 * R - top == pytest.approx(15 * MASS * G / stiffness, rel=1e-4)
+
+
+def heads_on(stiffness: float, dt: float, steps: int) -> tuple[np.ndarray, float]:
+    """Velocities along x of two spheres after they have met at 2 m/s, and the energy lost by then."""
+    scene = Scene(friction=0.0, gravity=(0, 0, 0), stiffness=stiffness)
+    for side in (-1, 1):
+        scene.add_spheres([[side * 1.05 * R, 0, 0]], R, DENSITY, velocity=(-side * 1.0, 0, 0))
+    with pctt.Simulation(scene, dt=dt, solver="apgd", **EXACT) as sim:
+        lost = 0.0
+        for _ in range(steps):
+            lost += sim.step()["impact_loss [J]"]
+        return sim.velocities[:, 0], lost
+
+
+@pytest.mark.parametrize("dt", [1e-5, 1e-4, 1e-3, 1e-2])
+def test_an_impact_takes_nearly_all_speed_whatever_the_step(dt):
+    """5 % are left where the step resolves the impact (Schwager, Poeschel 2007), and none where it is longer."""
+    velocity, lost = heads_on(1e7, dt, max(30, int(0.02 / dt)))
+    assert velocity.sum() == pytest.approx(0.0, abs=1e-9)
+    assert -1e-9 <= velocity[1] <= 0.055
+    if dt == 1e-5:
+        assert velocity[1] == pytest.approx(0.048, abs=0.003)
+    assert lost == pytest.approx(MASS - MASS * velocity[1] ** 2, rel=0.02)
+
+
+def test_the_limit_of_great_stiffness_is_the_rigid_contact():
+    velocities = [heads_on(k, 0.01, 3)[0] for k in (1e7, 1e9, 1e11, np.inf)]
+    off = [np.abs(velocity - velocities[-1]).max() for velocity in velocities[:-1]]
+    assert off[0] > off[1] > off[2]
+    assert off[2] < 1e-4
+
+
+@pytest.mark.parametrize("dt", [1e-3, 1e-2])
+def test_what_was_squeezed_gives_back_at_most_what_it_holds(dt):
+    """The energy of motion, weight and springs never rises."""
+    stiffness, squeezed = 1e6, 0.0009
+    scene = column(stiffness, squeezed=squeezed)
+    held = 0.5 * stiffness * squeezed**2 * 5
+    with pctt.Simulation(scene, dt=dt, solver="apgd", **EXACT) as sim:
+        start, whole = MASS * G * sim.positions[:, 2].sum(), []
+        for _ in range(int(0.3 / dt)):
+            row = sim.step()
+            whole.append([row[f"{name} [J]"] for name in ("kinetic_energy", "potential_energy", "spring_energy")])
+    total = np.sum(whole, axis=1) - start
+    assert (total < 1.001 * held).all()
+    assert (np.diff(total) < 1e-3 * held).all()
+
+
+@pytest.mark.parametrize("steps", [500, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_a_block_on_an_incline_does_not_creep(steps):
+    """Sticking contacts have no velocity: the springs are in the normals alone."""
+    angle = np.radians(15.0)
+    scene = Scene(friction=0.5, gravity=(G * np.sin(angle), 0, -G * np.cos(angle)), stiffness=1e6)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_boxes([[0, 0, 0.05]], (0.2, 0.15, 0.05), DENSITY)
+    with pctt.Simulation(scene, dt=0.01, solver="apgd", coulomb=True, **{**EXACT, "tol": 1e-8}) as sim:
+        sim.run(steps=100)
+        before = sim.positions[0]
+        sim.run(steps=steps)
+        moved = np.abs(sim.positions[0] - before).max()
+    assert moved < 1e-8 * steps
+
+
+def test_the_recommended_stiffness_holds_the_bed_and_the_tool():
+    scene = column(None, count=20)
+    stiffness = recommended(scene)
+    assert table(scene).tolist() == [[stiffness]]
+    assert stiffness == pytest.approx(20 * MASS * G / (0.003 * R), rel=0.05)
+    with pctt.Simulation(scene, dt=0.01, solver="apgd", **EXACT) as sim:
+        sim.run(steps=100)
+        assert sim.figures["worst_overlap [m]"] <= 0.0031 * R
+    for motion, speed in ((Glide((0, 3.0, 0)), 3.0), (Rotation((0, 0, 2.0)), 2.0 * np.sqrt(3.0))):
+        scene = Scene(friction=0.3, gravity=(0, 0, 0))
+        scene.add_body("tool", [Box((1.0, 1.0, 1.0))], motion)
+        scene.add_spheres([[0, 0, 2]], R, DENSITY)
+        assert recommended(scene) == pytest.approx(MASS * (speed / (0.003 * R)) ** 2, rel=0.05)
+    idle = Scene(friction=0.3, gravity=(0, 0, 0))
+    idle.add_spheres([[0, 0, 0]], R, DENSITY)
+    assert recommended(idle) == np.inf
+
+
+def test_pairs_of_materials_and_moduli():
+    scene = Scene(friction=0.3, stiffness=2e6)
+    scene.add_spheres([[0, 0, 0], [1, 0, 0]], R, DENSITY, material="glass")
+    scene.add_spheres([[2, 0, 0]], R, DENSITY, material="steel")
+    scene.set_stiffness(np.inf, "steel", "steel")
+    scene.set_stiffness(of_youngs_modulus(7e7, R), "steel", "glass")
+    np.testing.assert_array_equal(table(scene), [[2e6, 7e6], [7e6, np.inf]])
+    C, share = compliance(np.array([np.inf, 1e6]), np.array([1.0, 1.0]), 0.01)
+    assert (C[0], share[0]) == (0.0, 1.0)
+    assert C[1] == pytest.approx(1 / (1e6 * 1e-4 + 4 * 1e3 * 0.01))
+    for bad in (0.0, -1.0, np.nan):
+        with pytest.raises(ValueError, match="stiffness must be a positive number or inf"):
+            scene.set_stiffness(bad, "glass", "glass")
+
+
+@pytest.mark.parallel(2, 3)
+def test_a_pile_is_the_same_on_several_ranks(ranks):
+    """With springs between grains of different ranks."""
+    scene = Scene(friction=0.3, stiffness=1e6)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    place = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    scene.add_spheres(2 * R * (place + [0.0, 0.0, 0.5]), R, DENSITY)
+    found = []
+    for comm in (MPI.COMM_WORLD, MPI.COMM_SELF):
+        with pctt.Simulation(scene, dt=0.01, solver="apgd", comm=comm, **EXACT) as sim:
+            sim.run(steps=20)
+            found.append(sim.positions)
+    np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-9)

@@ -314,11 +314,10 @@ def test_a_file_that_is_no_checkpoint_is_refused(damage, program, results, settl
     [
         ("-scene_friction", "0.5", "0.25"),
         ("-scene_seed", "7", "1"),
-        ("-dt", "0.02", "0.025"),
         ("-scene", "shear", "mixer"),
     ],
 )
-def test_a_checkpoint_of_another_scene_or_time_step_is_refused(option, value, stored, program, results, settled):
+def test_a_checkpoint_of_another_scene_is_refused(option, value, stored, program, results, settled):
     own = () if option == "-scene" else SMALL
     said = refused(program, results, *own, option, value, "-restart", settled, "-overwrite")
     assert said == f"pctt.run: {option} {value}: {settled} was made with {option} {stored}; allowed is the same"

@@ -30,7 +30,7 @@ def _elsewhere(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("solver", ["pdip", "apgd"])
 def test_one_body_falls_and_lands(solver):
-    scene = Scene(0.3)
+    scene = Scene(0.3, stiffness=np.inf)
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_spheres([0, 0, 0.2], 0.1, 1000.0)
     sim = simulation_of(scene, solver=solver, tol=1e-8)
@@ -49,7 +49,7 @@ def test_one_body_falls_and_lands(solver):
 @pytest.mark.parametrize("solver", ["pdip", "apgd"])
 def test_what_a_struck_grain_strikes_is_seen(solver):
     """A tool that goes 5 cm a step pushes two spheres in contact; the third, 3 cm ahead, was far from all motion."""
-    scene = Scene(0.0, gravity=(0, 0, 0))
+    scene = Scene(0.0, gravity=(0, 0, 0), stiffness=np.inf)
     scene.add_body("tool", [Box((0.02, 0.3, 0.3))], Glide((2.0, 0, 0)))
     scene.add_spheres([[0.12, 0, 0], [0.32, 0, 0], [0.55, 0, 0]], 0.1, 1000.0)
     sim = simulation_of(scene, solver=solver, tol=1e-8)
