@@ -172,9 +172,8 @@ def cache() -> Path:
 
 
 def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_with: dict[str, Any]) -> Path:
-    """The file of a scene's settled state, which the numerics of a run do not influence but for ``settle_tol``. Its name
-    has the scene and a digest of all that influences it.
-    OptionError if the scene never settles."""
+    """The file of a scene's settled state. Its name has the scene and a digest of all that influences the state: of a
+    run's settings that is ``settle_tol``. OptionError if the scene never settles."""
     about = json.loads(made_with["scene"])
     if not experiment.settling_time:
         raise OptionError(f"-scene {about['scene']}: has no settling_time and so no settled state")
