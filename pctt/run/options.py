@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,10 @@ from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
 from pctt.disk import refuse_serial
-from pctt.folder import refusal
 from pctt.ksp_options import OF_SOLVERS, entered, refuse_misspelt, to_enter, unused
 from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read, refuse_unknown
 from pctt.petsc import own_errors
+from pctt.run.output import refusal, refuse_unwritable
 from pctt.run.settings import DEMO, Asked, Options, Run, Settings, find_scene
 
 #: Options of simulations, beside those of the scene; those that settled states depend on, and -quiet.
@@ -161,20 +160,3 @@ def _refuse_places(run: Run, comm: MPI.Comm) -> None:
     restart = run.restart if not run.problem else ""
     if refused := comm.bcast(refusal(Path(run.output), restart, run.overwrite)):
         raise OptionError(refused)
-
-
-def refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
-    """Make a folder; OptionError for the option ``name`` if files cannot be written there; collective."""
-    error = None
-    if comm.rank == 0:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                pass
-        except OSError as problem:
-            error = problem.strerror
-    error = comm.bcast(error)
-    if error:
-        raise OptionError(
-            f"{name} {folder}: cannot write there ({error}); allowed is a folder that can be written"
-        )

@@ -14,9 +14,10 @@ from pctt.ccp import fclib
 from pctt.ccp.cone import Array
 from pctt.ccp.fclib import FileFormatError, Stored
 from pctt.disk import FileError, on_first, write_text
-from pctt.folder import Place, dumps
+from pctt.folder import dumps
 from pctt.ksp_options import remark
 from pctt.run import interrupt, report
+from pctt.run.output import Place
 from pctt.run.settings import DEMO, Options
 from pctt.run.state import built, settled_state
 from pctt.simulation import Simulation

@@ -13,9 +13,9 @@ from program import arrays, recorded_steps, steps_of, table
 from dem.together import SceneError
 from pctt.ccp import BlockRows, ConeProblem, fclib
 from pctt.disk import FileError
-from pctt.folder import Place
 from pctt.options import OptionError
 from pctt.run.options import read_options
+from pctt.run.output import Place
 from pctt.run.simulate import simulate, solve_file
 
 SELF = MPI.COMM_SELF
