@@ -76,7 +76,7 @@ BAD_OPTIONS = {
     "-compare_ilu_pc_factor_levels 1": ["-compare lists none"],
     "-compare_icc_pc_factor_levels 1 -compare ilu,none": ["-compare lists ilu,none"],
     "-ccp_apgd_x 1": ["did you mean"],
-    "-ccp_apgd_check 5": ["another -ccp_type than pdip"],
+    "-ccp_gauss_seidel_relaxation 1.2": ["another -ccp_type than pdip"],
     "-ccp_newton body -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],
     "-ksp_rtol 1e-3 -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],
     "-ccp_coulomb_max_it 3": ["-ccp_coulomb"],
