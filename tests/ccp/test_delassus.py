@@ -45,17 +45,6 @@ def test_a_matrix_of_any_type(kind):
     assert np.allclose(given.velocities(known.r).ravel(), known.N @ known.r.ravel())
 
 
-def test_a_problem_given_by_its_matrix_does_the_same():
-    known, graph = heap()
-    by_graph = from_graph(known, graph)
-    by_matrix = ConeProblem(SELF, known.r, known.mu, N=matrix(SELF, known.N))
-    there, here = by_graph.product(known.r), by_matrix.product(known.r)
-    assert np.allclose(here, there, rtol=0, atol=1e-12 * np.abs(known.N).max())
-    assert np.allclose(by_graph.diagonal_blocks, by_matrix.diagonal_blocks)
-    assert by_graph.mean_diagonal == pytest.approx(by_matrix.mean_diagonal)
-    assert np.allclose(dense(by_graph.N), dense(by_matrix.N))
-
-
 def test_columns_may_come_in_any_order():
     """Block CSR from a sparse product has its columns unsorted; PETSc takes them sorted only."""
     rng = np.random.default_rng(0)

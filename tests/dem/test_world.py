@@ -30,13 +30,6 @@ def test_a_state_of_another_scene_is_refused():
         restored_world(heap(1, side=3, large=False), SELF, local, replicated)
 
 
-def test_unknown_large_body():
-    world = new_world(heap(1, side=3), SELF)
-    assert world.large_row("blade") == 1
-    with pytest.raises(KeyError, match="no large body 'lid'; there are: walls, blade, ball, slab"):
-        world.large_row("lid")
-
-
 def contacts_of(comm, delta, dt):
     world = new_world(heap(2, side=6, capsules=True), comm)
     for _ in range(2):

@@ -123,16 +123,6 @@ def test_a_damaged_file_is_named(name, damage, tmp_path):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("program", "library"), [("render", "vtkmodules"), ("export", "vtkmodules")])
-def test_a_folder_without_the_bodies_is_refused(program, library, show, tmp_path):
-    pytest.importorskip(library, reason=f"{library} is not installed (extra `pictures`)")
-    made = handmade.write(tmp_path / "made", handmade.FLOOR)
-    (made / "frames" / "bodies.h5").unlink()
-    done = show(program, folder=made, status=2)
-    assert "bodies.h5: damaged, or no such file" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
 @pytest.mark.parametrize(
     ("program", "missing"), [("plot", "matplotlib"), ("render", "vtkmodules"), ("export", "vtkmodules")]
 )

@@ -142,18 +142,6 @@ def test_rows_of_the_same_name_never_share_a_slot():
     assert not follow(slots, springs(points, keys), yes)
 
 
-def test_no_rows_at_all():
-    points, keys = np.empty((0, 3)), np.empty(0, np.int64)
-    empty = PETSc.Mat().createAIJ((0, 0), nnz=0, comm=PETSc.COMM_SELF)
-    empty.assemble()
-    empty.setAttr("coordinates", points)
-    empty.setAttr("key", keys)
-    slots = slots_of(empty)
-    assert slots.capacity == 0
-    assert follow(slots, empty, yes)
-    assert not follow(slots, springs(*cloud(10)), yes)
-
-
 @pytest.mark.parametrize("scaling", ["block", "none"])
 @pytest.mark.parametrize("block", [1, 3])
 def test_empty_slots_leave_the_preconditioner_as_it_is(block, scaling):

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -60,12 +56,3 @@ def test_impulses_come_back_whatever_the_order_of_contacts_and_bodies(study, sta
     np.testing.assert_allclose(study.mapped(step.body, step.frame, theirs[order]), impulse)
     with pytest.raises(study.DriverError, match="4 here and 3 in Chrono; 1 are only here, 0 only there"):
         study.mapped(step.body, step.frame, theirs[1:])
-
-
-def test_without_a_driver_it_says_how_to_get_one():
-    command = [sys.executable, "run/studies/compare_chrono.py", "1"]
-    environment = {**os.environ, "PCTT_CHRONO": "/nowhere/driver", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr.startswith("Chrono's driver /nowhere/driver is not built. Install cmake")
-    assert len(done.stderr.splitlines()) == 1

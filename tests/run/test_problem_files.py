@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from program import SETTLED, SMALL, steps_of
+from program import ROOT, SETTLED, SMALL, steps_of
 
 TOL = ("-ccp_tol", 1e-8)
 HARD = (*SETTLED, "-ccp_max_it", 2)  # no step is solved in two Newton steps
@@ -130,6 +130,26 @@ def test_hard_problems_of_another_run_are_replaced_and_of_this_one_kept(program,
     assert hard() == [first, first + 1, first + 2]
     program(*HARD, "-steps", 1, "-overwrite")
     assert hard() == [first]
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("solver", ["pdip", "apgd"])
+def test_the_optimum_of_a_published_problem_is_found(solver, ranks, program, tmp_path):
+    """On which two unrelated algorithms agree (docs/ccp.md; tests/ccp/test_fclib.py has more of them)."""
+    path = ROOT.parent / "shared" / "fclib" / "Spheres-i099-356-679.hdf5"
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    program("-problem", path, "-ccp_type", solver, "-ccp_tol", 1e-7)
+    found = summary(tmp_path / "results")
+    assert (found["converged"], found["contacts"], found["ranks"]) == (True, 356, ranks)
+    assert found["objective"] == pytest.approx(-2.084946581043e2, rel=1e-6)
+    assert found["velocity_norm"] == pytest.approx(1.0829370, rel=3e-5)
+    assert found["newton_systems"] == ("BiCGStab (right), pbjacobi" if solver == "pdip" else "")
+    assert sorted(p.name for p in (tmp_path / "results").iterdir()) == ["summary.json"]
+    if solver == "pdip":
+        done = program("-problem", path, "-ccp_max_it", 3, "-ccp_fallback", 0, "-output", "few")
+        assert "NOT CONVERGED" in done.stdout
+        assert (summary(tmp_path / "few")["converged"], summary(tmp_path / "few")["newton_its"]) == (False, 3)
 
 
 @pytest.mark.parallel(1, 2)

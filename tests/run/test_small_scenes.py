@@ -11,7 +11,6 @@ from dem.motion import Dynamic, Glide, Guided
 from dem.scene import Scene
 from dem.scenes import Mixer
 from dem.shapes import Box, Plane
-from dem.start import new_world
 from dem.together import SceneError
 from pctt.options import OptionError
 from pctt.run.state import world_at_start
@@ -85,13 +84,6 @@ def test_a_contact_that_does_not_close_needs_no_impulse():
     scene.add_spheres([[0, 0, 0], [0.21, 0, 0]], 0.1, 1000.0)
     line = simulation_of(scene).step()
     assert (line["contacts"], line["newton_its"], line["natural_residual"]) == (1, 0, 0.0)
-
-
-def test_an_overlapping_start_names_the_bodies_and_the_depth():
-    scene = Scene(0.3)
-    scene.add_spheres([[0, 0, 0], [1, 0, 0], [1.15, 0, 0]], 0.1, 1000.0)
-    with pytest.raises(ValueError, match=r"grain 1 and grain 2 overlap by 0\.05 m"):
-        new_world(scene, MPI.COMM_SELF)
 
 
 def test_a_body_that_is_lost_ends_the_run():
