@@ -324,10 +324,9 @@ class Simulation:
     # -- pictures --------------------------------------------------------------------------------------------
 
     def __repr__(self) -> str:
-        settings, bodies = self.settings, f"{self.world.body_count} bodies on {self.comm.size} ranks"
-        method = f"{settings.solver} to {settings.tol:g}, {settings.law}"
-        name = scene_name(self.experiment)
-        return f"<Simulation of {name}: {bodies}, step {self.steps}, time {self.time:g} s, {method}>"
+        bodies = f"{self.world.body_count} bodies on {self.comm.size} ranks"
+        now = f"step {self.steps}, time {self.time:g} s"
+        return f"<Simulation of {scene_name(self.experiment)}: {bodies}, {now}, {self.settings.words}>"
 
     def _repr_html_(self) -> str:
         """The figures of the last step as a table, for notebooks."""

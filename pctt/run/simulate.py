@@ -53,8 +53,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     assert newton is not None
     assert output is not None
     end = sim.steps + options.run.steps
-    method = f"{settings.solver} to {settings.tol:g}, {settings.law}"
-    progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {method}")
+    progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {settings.words}")
     if ccp.SOLVERS[settings.solver].needs != ccp.NEWTON and settings.tol > ccp.Limits().tol:
         progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE}")
     if ccp.SOLVERS[settings.solver].newton:
