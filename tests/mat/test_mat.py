@@ -95,6 +95,8 @@ def test_arithmetic_is_that_of_matrices(grid):
     A, B, one = kernel.dense, other.dense, np.eye(len(kernel.dense))
     mat, second = from_entries(kernel, grid, EPS), from_entries(other, grid, EPS)
     is_matrix(mat, A)
+    assert mat.isSymmetricKnown() == (True, False)
+    assert "ranks" in mat.getPythonContext().compressed.words()
     mat.scale(-0.5)
     is_matrix(mat, -0.5 * A)
     mat.shift(7.0)
