@@ -73,11 +73,7 @@ def end_of_trajectory(comm):
     system = ContactSystem(world, find_contacts(world, 0.02), 0.005)
     impulse = crude_impulse(system)
     force = {name: force_on(world, system, name, impulse) for name in ("walls", "blade", "slab")}
-    # The blocks of D' give the same velocities.
-    load = comm.allreduce(dense_map(system).T @ impulse.ravel()).reshape(-1, 6)
-    mine = load[world.slabs[comm.rank] :][: len(world.grains)]
     change = (system.velocity(impulse) - system.free_velocity)[: len(world.grains)]
-    np.testing.assert_allclose(change[:, :3], mine[:, :3] / world.grains.mass[:, None], atol=1e-10)
     response = comm.allreduce(float(np.sum(change[:, :3] ** 2 * world.grains.mass[:, None])))
     grains = grains_by_id(world)
     columns = {name: getattr(grains, name) for name in ("position", "quaternion", "velocity")}
