@@ -18,7 +18,7 @@ from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
 from pctt.disk import refuse_serial
-from pctt.ksp_options import OF_SOLVERS, entered, refuse_misspelt, to_enter, unused
+from pctt.ksp_options import OF_SOLVERS, entered, keep_from_petsc, refuse_misspelt, to_enter, unused
 from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read, refuse_unknown
 from pctt.petsc import own_errors
 from pctt.run.output import refusal, refuse_unwritable
@@ -41,8 +41,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in option_groups(scene_class) for d in describe(group, start)]
     refuse_unknown(unused(database), known, prefixes=OF_SOLVERS)  # PETSc has asked for its own when it started
-    for name in known:
-        PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
+    keep_from_petsc(known)
     # a file of -problem is solved as a plain cone problem by default
     coulomb = bool(asked.coulomb) if run.problem else asked.obeys_coulomb
     _refuse_without_effect(database, run, asked, coulomb)
