@@ -87,24 +87,6 @@ def check_mechanics(line: dict, tmp_path: Path) -> None:
 
 
 @pytest.mark.parallel(1, 2)
-def test_a_guided_body_moves_along_its_guide_alone(program, tmp_path):
-    """The press of the shear box goes up and down and does not turn: its moments of inertia are infinite."""
-    program("-scene", "shear", "-scene_n", 1, "-steps", 2, *TOL, "-dump_problem", "problems")
-    line = steps_of(tmp_path / "results")[1]
-    path = line["dumped"][0]
-    with h5py.File(tmp_path / path) as file:
-        group, solution = file["fclib_global"], file["solution"]
-        v, f = solution["v"][:], group["vectors/f"][:]
-        assert np.isfinite(group["M/x"][:]).all()
-        assert np.allclose(product(group["M"], v), product(group["H"], solution["r"][:]) + f, atol=1e-9)
-        row = group["H/i"][:][group["H/x"][:] != 0]
-    press = range(len(v) - 6, len(v))
-    assert set(row) & set(press) == {press[2]}
-    program("-problem", path, *TOL, "-output", "again")
-    assert summary(tmp_path / "again")["objective"] == pytest.approx(line["objective"], rel=1e-6)
-
-
-@pytest.mark.parallel(1, 2)
 def test_hard_problems_are_kept_and_the_steps_say_so(program, settled, tmp_path):
     done = program(*HARD, "-steps", 6)
     steps = steps_of(tmp_path / "results")
