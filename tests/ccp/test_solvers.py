@@ -14,7 +14,6 @@ from pctt.ccp import Limits
 from pctt.ccp.registry import NEWTON
 
 EVERY = pytest.mark.parametrize("solver", ccp.SOLVERS)
-FIRST_ORDER = pytest.mark.parametrize("solver", [n for n, s in ccp.SOLVERS.items() if not s.newton])
 PROBLEMS = {
     "singular N": {},
     "regular N": {"bodies": 60},
@@ -197,15 +196,6 @@ def test_a_start_near_the_solution_leads_to_the_same(solver):
     check(known, problem, ccp.solve(problem, known.g, solver, Limits(tol)), tol)
     rough = known.g * np.random.default_rng(0).uniform(0, 2, (40, 1))
     check(known, problem, ccp.solve(problem, rough, solver, Limits(tol)), tol)
-
-
-@FIRST_ORDER
-def test_first_order_methods_started_at_the_solution_stay_there(solver):
-    known, graph = heap()
-    result = ccp.solve(from_graph(known, graph), known.g, solver, Limits(1e-10))
-    assert result.converged
-    assert result.iterations == 0
-    assert np.allclose(result.impulse, known.g, atol=1e-13)
 
 
 # -- ends without a solution --------------------------------------------------------------------------------

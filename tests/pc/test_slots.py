@@ -69,14 +69,6 @@ def test_every_row_has_a_slot_of_its_own_and_the_spare_ones_are_spread():
     assert in_box.max() <= BOX
 
 
-def test_without_keys_there_are_no_spare_slots_and_nothing_is_followed():
-    points, _ = cloud(100)
-    slots = slots_of(springs(points, None))
-    assert sorted(slots.place) == list(range(100))
-    assert slots.capacity == 100
-    assert not follow(slots, springs(points, None), yes)
-
-
 def test_rows_that_stay_keep_their_slots_whatever_comes_and_goes():
     points, keys = cloud(1000)
     slots = slots_of(springs(points, keys))

@@ -10,7 +10,7 @@ from dem.bodies import Bodies
 from dem.motion import Dynamic, Glide, Guided
 from dem.scene import Scene
 from dem.scenes import Mixer
-from dem.shapes import Box, Plane
+from dem.shapes import Box
 from dem.together import SceneError
 from pctt.options import OptionError
 from pctt.run.state import world_at_start
@@ -25,24 +25,6 @@ def simulation_of(scene, **settings):
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.mark.parametrize("solver", ["pdip", "apgd"])
-def test_one_body_falls_and_lands(solver):
-    scene = Scene(0.3)
-    scene.add_body("floor", [Plane((0, 0, 1))])
-    scene.add_spheres([0, 0, 0.2], 0.1, 1000.0)
-    sim = simulation_of(scene, solver=solver, tol=1e-8)
-    lines = [sim.step() for _ in range(12)]
-    assert [line["contacts"] for line in lines[:3]] == [0, 0, 0]
-    assert lines[-1]["contacts"] == 1
-    for line in lines:
-        assert line["converged"]
-        assert line["natural_residual"] <= 1e-8
-        assert np.isfinite(line["objective"])
-    np.testing.assert_allclose(sim.world.grains.position[0], [0, 0, 0.1], atol=1e-8)
-    weight = sim.world.grains.mass[0] * 9.81
-    np.testing.assert_allclose(sim.last.impulse, [[weight * sim.settings.dt, 0, 0]], rtol=1e-7)
 
 
 @pytest.mark.parametrize("solver", ["pdip", "apgd"])
