@@ -75,9 +75,3 @@ def inverse_root_inertia(bodies: Bodies) -> Floats:
     """Symmetric square roots (n, 3, 3) of the inverse inertia tensors in the world frame."""
     turn = quaternion.matrix(bodies.quaternion)
     return (turn / np.sqrt(bodies.inertia)[:, None, :]) @ turn.transpose(0, 2, 1)
-
-
-def inverse_inertia(bodies: Bodies) -> Floats:
-    """Inverse inertia tensors (n, 3, 3) in the world frame [1/(kg m^2)]."""
-    root = inverse_root_inertia(bodies)
-    return root @ root

@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from dem import exchange
 from pctt.options import OptionError
 
 Found = TypeVar("Found")
@@ -130,17 +131,7 @@ class Lock:
 def on_first(comm: MPI.Comm, path: Path, call: Callable[[], Found]) -> Found:
     """What the call, which writes ``path``, returns on the first rank; collective. FileError on all ranks if it raises
     one, or an OSError."""
-    found, failure = None, ""
-    if comm.rank == 0:
-        try:
-            with told(path):
-                found = call()
-        except FileError as error:
-            failure = str(error)
-    found, failure = comm.bcast((found, failure))
-    if failure:
-        raise FileError(failure)
-    return found  # type: ignore[return-value]
+    return exchange.on_first(comm, told(path)(call))
 
 
 def make_hdf5(path: Path, numbers: int, items: int) -> None:

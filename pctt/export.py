@@ -21,9 +21,9 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from pctt.disk import make_hdf5
-from pctt.folder import RUN_FILES, Folder, FolderError, Frame
-from pctt.look.program import chosen, made_folder, parser, run, whole
+from pctt.disk import FileError, make_hdf5, told, whole, write_text
+from pctt.folder import RUN_FILES, Folder, Frame
+from pctt.look.program import chosen, made_folder, parser, run
 
 SERIES = ("bodies", "contacts", "large")
 
@@ -76,13 +76,13 @@ def main(comm: MPI.Comm) -> None:
 def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
     """Write one HDF5 file with the data of these steps to which state.h5 links.
 
-    FolderError if a file cannot be read or written, or belongs to the run.
+    FileError if a file cannot be read or written, or belongs to the run.
     """
     frames = folder.bodies_path.parent.resolve()
     if path.resolve().parent == frames or path.resolve() in [(folder.path / name).resolve() for name in RUN_FILES]:
-        raise FolderError(f"-single {path}: is a file of the run; allowed is another name")
+        raise FileError(f"-single {path}: is a file of the run; allowed is another name")
     parts = {"bodies": folder.bodies_path, **{f"steps/{step:06d}": folder.frame_path(step) for step in steps}}
-    with whole(path) as temporary:
+    with told(path), whole(path) as temporary:
         make_hdf5(temporary, sum(source.stat().st_size for source in parts.values()), items=0)
         with h5py.File(temporary, "r+") as file:
             source = folder.path / "state.h5"
@@ -95,7 +95,7 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
                     with h5py.File(source, "r") as part:
                         file.copy(part["/"], name)
             except (OSError, RuntimeError) as error:
-                raise FolderError(f"{source}: cannot be copied ({error})") from None
+                raise FileError(f"{source}: cannot be copied ({error})") from None
 
 
 def series(name: str, scene: Any, frame: Frame) -> Any:
@@ -170,7 +170,7 @@ def large(scene: Any, frame: Frame) -> Any:
 
 
 def write_vtp(path: Path, data: Any, time: float) -> None:
-    """Write polygonal data with its time, whole or not at all; FolderError if it cannot be written."""
+    """Write polygonal data with its time, whole or not at all; FileError if it cannot be written."""
     from vtkmodules.vtkCommonMisc import vtkErrorCode
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
@@ -182,7 +182,7 @@ def write_vtp(path: Path, data: Any, time: float) -> None:
     writer.SetHeaderTypeToUInt64()
     writer.SetDataModeToAppended()
     writer.EncodeAppendedDataOff()
-    with whole(path) as temporary:
+    with told(path), whole(path) as temporary:
         writer.SetFileName(str(temporary))
         if writer.Write() != 1 or writer.GetErrorCode():
             raise OSError(vtkErrorCode.GetStringFromErrorCode(writer.GetErrorCode()))
@@ -192,12 +192,11 @@ def write_pvd(path: Path, files: dict[str, float]) -> None:
     """Write a list of files with their times [s]."""
     lines = [f'    <DataSet timestep="{time!r}" file="{name}"/>' for name, time in files.items()]
     head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n  <Collection>'
-    with whole(path) as temporary:
-        temporary.write_text("\n".join([head, *lines, "  </Collection>", "</VTKFile>", ""]))
+    write_text(path, "\n".join([head, *lines, "  </Collection>", "</VTKFile>", ""]))
 
 
 def write_vtkhdf(path: Path, name: str, scene: Any, steps: list[int]) -> None:
-    """Write all steps of a series into one file; FolderError if it cannot be written."""
+    """Write all steps of a series into one file; FileError if it cannot be written."""
     from vtkmodules.util.vtkAlgorithm import VTKPythonAlgorithmBase
     from vtkmodules.vtkCommonCore import vtkVersion
     from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline as Pipeline
@@ -223,7 +222,7 @@ def write_vtkhdf(path: Path, name: str, scene: Any, steps: list[int]) -> None:
     source = Source(nInputPorts=0, outputType="vtkPolyData")
     writer = vtkHDFWriter(write_all_time_steps=True, chunk_size=1000)
     writer.SetInputConnection(source.GetOutputPort())
-    with whole(path) as temporary:
+    with told(path), whole(path) as temporary:
         # VTK's writer tells no errors, and does not return if it cannot open the file, so the room is tried before
         frames = [scene.folder.frame_path(step).stat().st_size for step in steps]
         make_hdf5(temporary, 2 * sum(frames), items=200)

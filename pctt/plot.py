@@ -7,8 +7,9 @@ from functools import partial
 
 from mpi4py import MPI
 
-from pctt.folder import Folder, FolderError
-from pctt.look.program import made_folder, parser, run, whole
+from pctt.disk import FileError, told, whole
+from pctt.folder import Folder
+from pctt.look.program import made_folder, parser, run
 
 
 def main(comm: MPI.Comm) -> None:
@@ -28,10 +29,11 @@ def main(comm: MPI.Comm) -> None:
     with mpl.rc_context(figures.STYLE):  # type: ignore[arg-type]
         made = figures.figures(folder)
         if not made:
-            raise FolderError(f"{folder.path}: nothing to plot: no steps, no records, no comparison")
+            raise FileError(f"{folder.path}: nothing to plot: no steps, no records, no comparison")
         for name, figure in made.items():
-            with whole(target / f"{name}.{given.format}") as path:
-                figure.savefig(path, format=given.format)
+            path = target / f"{name}.{given.format}"
+            with told(path), whole(path) as temporary:
+                figure.savefig(temporary, format=given.format)
     print(f"{len(made)} figures: {target}/" + ", ".join(f"{name}.{given.format}" for name in made))
 
 

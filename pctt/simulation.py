@@ -35,13 +35,13 @@ from dem.step import Step
 from dem.together import meet, together
 from dem.world import set_motion
 from pctt import ccp, log
-from pctt.disk import refuse_serial
-from pctt.folder import Contacts, FolderError, Frame, Place, Snapshot, Writer, described_bodies
+from pctt.disk import FileError, refuse_serial
+from pctt.folder import Contacts, Frame, Snapshot
 from pctt.options import OptionError, made, refuse_bad
 from pctt.render import Picture, picture
 from pctt.run import state
 from pctt.run.dump import Dump
-from pctt.run.options import refuse_unwritable
+from pctt.run.output import Place, Writer, described_bodies, refuse_unwritable
 from pctt.run.settings import Run, Settings, scene_name
 from pctt.run.stepper import Stepper
 
@@ -59,7 +59,7 @@ class Simulation:
     last : the last step, a `dem.step.Step` with this rank's contacts and impulses; None before the first
     figures : of the last step, as in steps.jsonl and records.csv: ``iterations``, ``natural_residual``, ``converged``,
         ``seconds``, ``phases``, ``kinetic_energy [J]``, ``worst_overlap [m]`` and so on; empty before the first
-    output : the files of `write`, a `pctt.folder.Writer`; None before
+    output : the files of `write`, a `pctt.run.output.Writer`; None before
     """
 
     def __init__(
@@ -327,10 +327,9 @@ class Simulation:
     # -- pictures --------------------------------------------------------------------------------------------
 
     def __repr__(self) -> str:
-        settings, bodies = self.settings, f"{self.world.body_count} bodies on {self.comm.size} ranks"
-        method = f"{settings.solver} to {settings.tol:g}, {settings.law}"
-        name = scene_name(self.experiment)
-        return f"<Simulation of {name}: {bodies}, step {self.steps}, time {self.time:g} s, {method}>"
+        bodies = f"{self.world.body_count} bodies on {self.comm.size} ranks"
+        now = f"step {self.steps}, time {self.time:g} s"
+        return f"<Simulation of {scene_name(self.experiment)}: {bodies}, {now}, {self.settings.words}>"
 
     def _repr_html_(self) -> str:
         """The figures of the last step as a table, for notebooks."""
@@ -348,7 +347,7 @@ class Simulation:
         def draw() -> Picture | None:
             return picture(snapshot, color, view) if self.comm.rank == 0 else None
 
-        return self.comm.bcast(together(self.comm, "render", draw, own=(ImportError, OptionError, FolderError)))
+        return self.comm.bcast(together(self.comm, "render", draw, own=(ImportError, OptionError, FileError)))
 
     def _snapshot(self) -> Snapshot:
         """All bodies and contacts on every rank, for those that draw."""

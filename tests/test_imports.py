@@ -60,6 +60,7 @@ BELOW = {
         "pctt.disk", "dem.exchange", "dem.morton", "pctt.options", "pctt.petsc",
         "pctt.tt",
     },
+    "pctt.folder": {"dem", "pctt.disk"},
     "pctt.look": {"dem", "pctt.disk", "pctt.folder", "pctt.options", "pctt.petsc"},
 }
 
@@ -83,6 +84,7 @@ def test_a_part_knows_only_of_those_below_it(graph, part):
 @pytest.mark.parametrize(("part", "above"), [
     ("pctt.pc", ("dem", "pctt.ccp", "pctt.run", "pctt.look")),
     ("pctt.ccp", ("dem", "pctt.run", "pctt.look")),
+    ("pctt.run", ("pctt.look", "pctt.plot", "pctt.render", "pctt.export")),
 ])  # fmt: skip
 def test_a_part_does_not_know_of_those_above_it(graph, part, above):
     for name in graph:

@@ -144,26 +144,6 @@ def test_known_names_and_those_of_further_prefixes_pass():
 # -- descriptions -------------------------------------------------------------------------------------------
 
 
-def test_every_option_is_described_with_default_unit_and_meaning():
-    lines = {line.name: str(line) for line in describe(Group, "x_")}
-    assert list(lines) == ["x_" + field.name for field in dataclasses.fields(Group)]
-    assert lines == {
-        "x_count": "  -x_count <3>: bodies along a side",
-        "x_every": "  -x_every <1>: steps between two records",
-        "x_number": "  -x_number <-1>: any whole number",
-        "x_dt": "  -x_dt <0.025 s>: time step",
-        "x_gap": "  -x_gap <0.0 m>: gap",
-        "x_part": "  -x_part <0.5>: part",
-        "x_angle": "  -x_angle <1.0 rad>: any finite number",
-        "x_maybe": "  -x_maybe <none s>: none: the scene's own",
-        "x_steps": "  -x_steps <none>: none: all",
-        "x_on": "  -x_on <false>: whether",
-        "x_off": "  -x_off <true>: whether not",
-        "x_shape": "  -x_shape <sphere>: form of a body (one of: sphere, box, tetrahedron)",
-        "x_path": "  -x_path <none>: file to read",
-    }
-
-
 def test_described_defaults_pass_their_own_checks():
     """Of the groups of the project: what -help shows as a default can be given as a value."""
     from pctt import ccp

@@ -5,16 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
-from pctt import disk
-from pctt.folder import FolderError
+from pctt.disk import FileError, told
 from pctt.options import AT_LEAST_ONE, POSITIVE, option
 
 LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")
@@ -76,11 +74,11 @@ def checked(kind: Callable[[str], Any], check: tuple[str, Callable[[Any], bool]]
 
 
 def chosen(steps: list[int], given: argparse.Namespace) -> list[int]:
-    """The steps that -first, -last and -every choose; FolderError if there is none."""
+    """The steps that -first, -last and -every choose; FileError if there is none."""
     picked = [step for step in steps if given.first <= step <= given.last][:: given.every]
     if not picked:
         there = f"there are {steps[0]} to {steps[-1]}"
-        raise FolderError(f"{given.folder}: no recorded step from -first to -last; {there}")
+        raise FileError(f"{given.folder}: no recorded step from -first to -last; {there}")
     return picked
 
 
@@ -93,7 +91,7 @@ def run(main: Callable[[MPI.Comm], None], program: str) -> int:
     comm = MPI.COMM_WORLD
     try:
         main(comm)
-    except FolderError as error:
+    except FileError as error:
         print(f"pctt.{program}: {error}", file=sys.stderr, flush=True)
         if comm.size > 1:  # the error may be on this rank only
             comm.Abort(2)
@@ -114,22 +112,7 @@ def run(main: Callable[[MPI.Comm], None], program: str) -> int:
 
 
 def made_folder(path: Path) -> Path:
-    """Make the folder if it does not exist, and return it; FolderError if this is not possible."""
-    try:
+    """Make the folder if it does not exist, and return it; FileError if this is not possible."""
+    with told(path):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FolderError(f"{path}: cannot write there ({error.strerror})") from None
     return path
-
-
-@contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """A temporary name for a file, which is renamed to ``path`` when the block ends.
-
-    FolderError if the file cannot be written.
-    """
-    try:
-        with disk.whole(path) as temporary:
-            yield temporary
-    except OSError as error:
-        raise FolderError(f"{path}: cannot write ({error.strerror or error})") from None

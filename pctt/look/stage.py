@@ -32,7 +32,8 @@ from vtkmodules.vtkRenderingOpenGL2 import vtkOpenGLSphereMapper
 
 from dem import quaternion
 from dem.bodies import BOX, CAPSULE, SPHERE
-from pctt.folder import Folder, FolderError, Frame
+from pctt.disk import FileError
+from pctt.folder import Folder, Frame
 from pctt.look import surfaces
 from pctt.look.program import View
 
@@ -146,11 +147,11 @@ class Stage:
 
 
 def _window(view: View) -> vtkRenderWindow:
-    """A window without a display; FolderError if VTK would end the process because it lacks a driver."""
+    """A window without a display; FileError if VTK would end the process because it lacks a driver."""
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # without a display VTK warns that it tries X, then EGL
     window = vtkRenderWindow()
     if window.GetClassName() == "vtkOSOpenGLRenderWindow" and not find_library("OSMesa"):
-        raise FolderError(
+        raise FileError(
             "vtk found no display, no EGL driver and no OSMesa; on Debian: apt-get install libosmesa6, "
             "or libegl1 libgl1-mesa-dri"
         )

@@ -17,7 +17,8 @@ from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSp
 
 from dem import quaternion
 from dem.bodies import BOX, CAPSULE, SPHERE
-from pctt.folder import Folder, FolderError, Frame
+from pctt.disk import FileError
+from pctt.folder import Folder, Frame
 
 MARGIN = 0.06  # how far walls go beyond the scene, in diagonals of the scene
 HOLLOW = 0.2  # a hollow body is empty up to this part of the way from its middle to its bounds
@@ -162,7 +163,7 @@ def extent(folder: Folder) -> np.ndarray:
     shape, size = folder.shape[: folder.grains, None], folder.size[: folder.grains]
     unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE}
     if unknown:
-        raise FolderError(f"{folder.path}: no surface is known for grains of shape {unknown.pop()}")
+        raise FileError(f"{folder.path}: no surface is known for grains of shape {unknown.pop()}")
     round_ones = size[:, :1] + [0, 0, 1] * size[:, 1:2]  # a sphere is a capsule of length zero
     return 2 * np.where(shape == BOX, size, round_ones)
 

@@ -29,7 +29,8 @@ from pctt import ccp
 from pctt.ccp import fclib
 from pctt.ccp.cone import Array
 from pctt.disk import FileError
-from pctt.folder import HARD, Place
+from pctt.folder import HARD
+from pctt.run.output import Place
 from pctt.run.settings import Settings, scene_name
 
 

@@ -11,10 +11,10 @@ from pctt.run.options import option_groups
 from pctt.run.settings import DEMO, find_scene
 
 NEWTON_HELP = """\
-  The KSP without prefix, e.g. -ksp_type bcgs -ksp_rtol 1e-3 -ksp_max_it 1000 -ksp_pc_side right -pc_type pbjacobi
-  (the defaults; rtol is 10 ccp_tol where that is smaller), -ksp_monitor, -ksp_view, -log_view. A compared
-  preconditioner NAME has the prefix -compare_NAME_, e.g. -compare_ilu_pc_factor_levels 1. On several ranks ilu and
-  icc work within each rank."""
+  The KSP without prefix, e.g. -ksp_type bcgs -ksp_max_it 1000 -ksp_pc_side right -pc_type pbjacobi (the defaults of
+  pdip), -ksp_rtol 1e-3 (in place of a tolerance that follows the accuracy of the step), -ksp_monitor, -ksp_view,
+  -log_view. A compared preconditioner NAME has the prefix -compare_NAME_, e.g. -compare_ilu_pc_factor_levels 1. On
+  several ranks ilu and icc work within each rank."""
 TOPICS = {"run": "the run itself", "scene": "the scene of -scene", "ccp": "cone problems and their solvers",
           "pc": "preconditioners of this package", "ksp": "Newton systems"}  # fmt: skip
 
@@ -28,8 +28,8 @@ def help_text(database: Mapping[str, str], topic: str = "") -> str:
     lines += ["Of one topic: " + ", ".join(f"-help {name} ({text})" for name, text in TOPICS.items()), ""]
     for part, title, text in _help_sections(database):
         if topic in ("", part):
-            lines += [title, text, ""]
-    return "\n".join(lines[:-1] if not topic else lines[4:-1])
+            lines += [title, text, ""] if text else [title]
+    return "\n".join(lines[4:] if topic else lines).rstrip()
 
 
 def _help_sections(database: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:

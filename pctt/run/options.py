@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,10 @@ from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
 from pctt.disk import refuse_serial
-from pctt.folder import refusal
-from pctt.ksp_options import OF_SOLVERS, entered, refuse_misspelt, to_enter, unused
+from pctt.ksp_options import OF_SOLVERS, entered, keep_from_petsc, refuse_misspelt, to_enter, unused
 from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read, refuse_unknown
 from pctt.petsc import own_errors
+from pctt.run.output import refusal, refuse_unwritable
 from pctt.run.settings import DEMO, Asked, Options, Run, Settings, find_scene
 
 #: Options of simulations, beside those of the scene; those that settled states depend on, and -quiet.
@@ -42,8 +41,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in option_groups(scene_class) for d in describe(group, start)]
     refuse_unknown(unused(database), known, prefixes=OF_SOLVERS)  # PETSc has asked for its own when it started
-    for name in known:
-        PETSc.Options().hasName(name)  # PETSc warns of options that nobody asked for
+    keep_from_petsc(known)
     # a file of -problem is solved as a plain cone problem by default
     coulomb = bool(asked.coulomb) if run.problem else asked.obeys_coulomb
     _refuse_without_effect(database, run, asked, coulomb)
@@ -161,20 +159,3 @@ def _refuse_places(run: Run, comm: MPI.Comm) -> None:
     restart = run.restart if not run.problem else ""
     if refused := comm.bcast(refusal(Path(run.output), restart, run.overwrite)):
         raise OptionError(refused)
-
-
-def refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
-    """Make a folder; OptionError for the option ``name`` if files cannot be written there; collective."""
-    error = None
-    if comm.rank == 0:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                pass
-        except OSError as problem:
-            error = problem.strerror
-    error = comm.bcast(error)
-    if error:
-        raise OptionError(
-            f"{name} {folder}: cannot write there ({error}); allowed is a folder that can be written"
-        )

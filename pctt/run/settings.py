@@ -82,9 +82,10 @@ class Settings(ccp.Limits):
         return ccp.Limits(**{field.name: getattr(self, field.name) for field in dataclasses.fields(ccp.Limits)})
 
     @property
-    def law(self) -> str:
-        """Which law of contact steps obey, in words."""
-        return "Coulomb's law" if self.coulomb else "relaxation of Coulomb's law"
+    def words(self) -> str:
+        """How steps are solved: the method, its tolerance and the law of contact."""
+        law = "Coulomb's law" if self.coulomb else "relaxation of Coulomb's law"
+        return f"{self.solver} to {self.tol:g}, {law}"
 
     def of(self, scene: Experiment) -> Settings:
         """The same, with what a scene and a solver have of their own where nothing is given; then ``options`` is an

@@ -14,9 +14,10 @@ from pctt.ccp import fclib
 from pctt.ccp.cone import Array
 from pctt.ccp.fclib import FileFormatError, Stored
 from pctt.disk import FileError, on_first, write_text
-from pctt.folder import Place, dumps
+from pctt.folder import dumps
 from pctt.ksp_options import remark
 from pctt.run import interrupt, report
+from pctt.run.output import Place
 from pctt.run.settings import DEMO, Options
 from pctt.run.state import built, settled_state
 from pctt.simulation import Simulation
@@ -52,8 +53,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     assert newton is not None
     assert output is not None
     end = sim.steps + options.run.steps
-    method = f"{settings.solver} to {settings.tol:g}, {settings.law}"
-    progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {method}")
+    progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {settings.words}")
     if ccp.SOLVERS[settings.solver].needs != ccp.NEWTON and settings.tol > ccp.Limits().tol:
         progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE}")
     if ccp.SOLVERS[settings.solver].newton:

@@ -33,6 +33,8 @@ HIGH = 300  # with a larger product of the ranks of S and X, the residual is est
 class Inverse:
     """A train of the inverse of S, symmetric up to rounding.
 
+    Attributes
+    ----------
     applied : X, or Z with X = I + Z if ``identity``
     residual : ||I - S X||_F / ||I||_F, with ``identity`` ||I - S X||_F / ||S - I||_F
     sweeps : number of sweeps there and back over the cores

@@ -21,7 +21,6 @@ from pctt.ccp.fclib import FileFormatError, Stored
 
 STUDIES = Path(__file__).resolve().parents[2] / "run" / "studies"
 sys.path.insert(0, str(STUDIES))
-import siconos_text
 from convert_problems import convert
 
 sys.path.remove(str(STUDIES))
@@ -132,14 +131,6 @@ def test_a_global_problem_is_converted(tmp_path, storage, masses):
         np.testing.assert_allclose(problem.product(known.g), product, atol=accuracy * max(10, np.abs(product).max()))
 
 
-@pytest.mark.parametrize("block", [4, 9, 45])
-def test_blocks_of_any_size_in_a_matrix_that_is_not_square(block):
-    A = np.random.default_rng(0).normal(size=(17, 45))
-    A[:4, :9] = A[8:, 20:] = 0.0
-    found = siconos_text.matrix(siconos_text.Words(matrix(A, "blocks", block).encode()), "A")
-    assert np.array_equal(found.toarray(), A)
-
-
 def test_the_two_forms_of_few_contacts_are_told_apart(tmp_path):
     """M and W of one contact are both 3 x 3; numbers may be written as whole ones."""
     W = np.diag([2.0, 3.0, 5.0])
@@ -153,23 +144,6 @@ def test_the_two_forms_of_few_contacts_are_told_apart(tmp_path):
     assert stored.form == "FCLIB global"
     np.testing.assert_allclose(dense_of(stored.problem.N), np.diag([1 / 2, 1 / 3, 1 / 5]), rtol=1e-15)
     np.testing.assert_allclose(stored.problem.r, [[1.0, 2.0, 2.0]], rtol=1e-15)
-
-
-def test_a_triangle_of_W_is_mirrored_and_a_rough_W_made_symmetric(tmp_path):
-    known, _ = heap(0, 12, 8)
-    stored = converted(tmp_path / "one.dat", local(known, "triplets", np.tril(known.N)))
-    assert "W is stored as one triangle" in stored.note
-    np.testing.assert_allclose(dense_of(stored.problem.N), known.N, atol=1e-13)
-    W = known.N + 1e-3 * np.random.default_rng(0).normal(size=known.N.shape)
-    stored = converted(tmp_path / "rough.dat", local(known, "dense", W))
-    assert stored.note == ""
-    np.testing.assert_allclose(dense_of(stored.problem.N), 0.5 * (W + W.T), atol=1e-13)
-
-
-def test_without_contacts(tmp_path):
-    text = "3\n0\n" + matrix(np.eye(6), "triplets") + matrix(np.zeros((6, 0)), "columns") + numbers(np.ones(6))
-    problem = converted(tmp_path / "nothing.dat", text).problem
-    assert problem.size == 0
 
 
 SMALL = heap(0, 4, 3)[0]
@@ -187,27 +161,13 @@ def word(text: str, index: int, other: str) -> str:
 BROKEN = {
     "nothing": ("", r"line 1: it ends too early, after 0 of 1 words of the dimension"),
     "a poem": ("Mary had\na little lamb", r"line 1: 'Mary' in the dimension; allowed is a whole number"),
-    "in the plane": (word(TEXT["dense"], 0, "2"), r"line 1: dimension 2 \(contacts in the plane\); allowed is 3"),
-    "rolling": (word(TEXT["dense"], 0, "5"), r"line 1: dimension 5 \(rolling friction\); allowed is 3"),
-    "contacts below zero": (word(TEXT["dense"], 1, "-4"), r"line 2: -4 for the number of contacts"),
     "more contacts": (word(TEXT["dense"], 1, "5"), r"line 8: a matrix \(12, 12\) alone, for 5 contacts; allowed"),
-    "an unknown storage": (word(TEXT["dense"], 2, "7"), r"line 3: storage 7 of W or M; allowed are 0 \(dense\), 1"),
-    "other rows": (word(TEXT["dense"], 5, "11"), r"line 3: W or M has the size \(12, 12\), then \(11, 12\)"),
     "letters in W": (word(TEXT["dense"], 20, "1.0x"), r"line 7: '1\.0x' in W or M; allowed is a finite number"),
-    "NaN in W": (word(TEXT["dense"], 20, "nan"), r"line 7: 'nan' in W or M"),
-    "negative friction": (word(TEXT["dense"], -1, "-0.1"), r"1 contacts with a .* negative"),
     "cut": (TEXT["dense"][:-60], r"line 9: it ends too early, after [123] of 4 words of mu"),
-    "words after the end": (TEXT["dense"] + "0.5 0.5", r"line 10: '0\.5' and 1 words more after the friction"),
     "blocks out of turn": (word(TEXT["blocks"], 39, "3"), r"line \d+: block 3 of W or M; allowed is block 0 here"),
-    "a block outside": (word(TEXT["blocks"], 24, "4"), r"do not fit together"),
-    "indices of another length": (word(TEXT["blocks"], 16, "6"), r"indices of lengths 6 and"),
-    "an unknown kind": (word(TEXT["triplets"], 5, "3"), r"line 6: kind 3 of W or M; allowed are 1 \(triplets\) and 2"),
     "columns called triplets": (word(TEXT["columns"], 5, "1"), r"line 7: the head that CSparse prints of W"),
-    "a triplet outside": (word(TEXT["triplets"], -19, "12"), r"entries outside its rows and columns"),
-    "more columns": (TEXT["columns"].replace("12-by-12", "12-by-11"), r"columns in W or M|has the size|words of W"),
     "a global problem without q": (GLOBAL[:-700], r"it ends too early"),
     "a light body": (word(GLOBAL, 7, "-1"), r"mass matrix is not positive"),
-    "a coupled one way": (word(word(GLOBAL, 8, "0.5"), 13, "0.4"), r"mass matrix is not symmetric"),
 }  # fmt: skip
 
 

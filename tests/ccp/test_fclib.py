@@ -101,22 +101,6 @@ def test_a_global_problem_is_read(tmp_path, kind, block_mass):
     assert np.array_equal(problem.mu, known.mu)
 
 
-def test_a_mass_matrix_that_couples_bodies_gives_the_matrix(tmp_path):
-    """As of finite elements: N = H' M^-1 H, with the map of no body."""
-    path, known, _ = write_global(tmp_path / "global.hdf5")
-    with h5py.File(path, "a") as file:
-        H = _dense_triplets(file["fclib_global/H"])
-        n = len(H)
-        M = 3.0 * np.eye(n) + np.eye(n, k=1) + np.eye(n, k=-1)
-        del file["fclib_global/M"]
-        write_matrix(file["fclib_global"].create_group("M"), M, "csr")
-        f, w = file["fclib_global/vectors/f"][:], file["fclib_global/vectors/w"][:]
-    problem = fclib.read(path, SELF)
-    assert problem.contact_map is None
-    assert np.allclose(dense(problem), H.T @ np.linalg.solve(M, H), atol=1e-12)
-    assert np.allclose(problem.r.ravel(), w + H.T @ np.linalg.solve(M, f), atol=1e-12)
-
-
 def replace_mass(path: Path, change) -> np.ndarray:
     """Write another M into a global problem, in triplets; what it was."""
     with h5py.File(path, "a") as file:
@@ -268,23 +252,6 @@ def test_what_is_no_hdf5_file_is_refused(tmp_path):
     for path in (absent, text, cut, tmp_path):
         with pytest.raises(FileFormatError, match=str(path.name)):
             fclib.read(path, SELF)
-
-
-@pytest.mark.parallel(4)
-@pytest.mark.parametrize("contacts", [12, 3])
-def test_every_rank_gets_its_part_and_the_same_error(contacts, tmp_path):
-    """Four ranks: with more contacts than ranks, and with fewer."""
-    comm = MPI.COMM_WORLD
-    known, _ = heap(0, contacts, 8)
-    if comm.rank == 0:
-        write_local(tmp_path / "local.hdf5", known)
-    comm.Barrier()
-    problem = fclib.read(tmp_path / "local.hdf5", comm)
-    assert sum(comm.allgather(len(problem.mu))) == problem.size == contacts
-    result = ccp.solve(problem, limits=Limits(1e-6))
-    assert ccp.measure(problem, result.impulse).objective == pytest.approx(known.objective, rel=1e-5)
-    with pytest.raises(FileFormatError):
-        fclib.read(tmp_path / "absent.hdf5", comm)
 
 
 # -- writing -----------------------------------------------------------------------------------------------
@@ -439,6 +406,8 @@ def test_files_written_and_read_by_several_ranks(tmp_path, monkeypatch):
     fclib.write_global("global.h5", comm, M, D, f, known.r[mine], known.mu[mine], point=known.g[mine])
     with pytest.raises(OSError, match="nowhere"):
         fclib.write_local("nowhere/local.h5", problem)
+    with pytest.raises(FileFormatError, match="absent"):
+        fclib.read("absent.h5", comm)
 
     for name in ("local.h5", "global.h5"):
         stored = fclib.load(name, comm)

@@ -53,14 +53,6 @@ def test_what_the_method_claims_is_checked():
     assert not done.converged
 
 
-def test_iterations_are_capped_and_the_failure_said(database):
-    _, S, x, b = system()
-    database["ksp_max_it"] = 3
-    done = Krylov(SELF, "", rtol=1e-10).solve(S, b, x)
-    assert (done.converged, done.reason, done.iterations) == (False, "diverged_max_it", 3)
-    assert 1e-10 < done.true_residual < 10
-
-
 def test_defaults_and_the_users_options(database):
     ksp = Krylov(SELF).ksp
     assert (ksp.getType(), ksp.pc.getType(), ksp.getPCSide()) == ("bcgs", "pbjacobi", PETSc.PC.Side.RIGHT)
@@ -70,31 +62,6 @@ def test_defaults_and_the_users_options(database):
     database["one_ksp_rtol"] = 1e-9
     ksp = Krylov(SELF, "one_", {"pc_type": "jacobi", "ksp_type": "cg"}, rtol=1e-2).ksp
     assert (ksp.getType(), ksp.pc.getType(), ksp.getTolerances()[0]) == ("cg", "sor", 1e-9)
-
-
-def test_a_prefixed_ksp_takes_the_ksp_options_of_the_one_without(database):
-    database["ksp_type"] = "gmres"
-    database["ksp_rtol"] = 1e-9
-    database["ksp_max_it"] = 7
-    database["pc_type"] = "ilu"
-    ksp = Krylov(SELF, "two_", {"pc_type": "jacobi"}, rtol=1e-2).ksp
-    assert (ksp.getType(), ksp.pc.getType()) == ("gmres", "jacobi")
-    assert ksp.getTolerances()[0] == 1e-9
-    assert ksp.getTolerances()[3] == 7
-    database["three_ksp_rtol"] = 1e-5  # unless told otherwise
-    assert Krylov(SELF, "three_", {"pc_type": "jacobi"}).ksp.getTolerances()[0] == 1e-5
-
-
-@pytest.mark.parametrize("pc", ["pbjacobi", "ilu", "icc", "cholesky", "lu", "gamg"])
-def test_new_values_are_used(pc):
-    """Also by what works on a copy in another format."""
-    _, S, x, b = system(0, shift=100.0)
-    krylov = Krylov(SELF, "again_", {"pc_type": pc}, rtol=1e-6)
-    assert krylov.solve(S, b, x).converged
-    dense = system(1, shift=100.0)[0]
-    overwrite(S, dense)
-    assert krylov.solve(S, b, x).converged
-    assert np.linalg.norm(dense @ x.array - b.array) <= 2e-6 * np.linalg.norm(b.array)
 
 
 def test_eisenstat_works_on_scalar_rows():

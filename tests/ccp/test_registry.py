@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from problems import from_graph, heap
 
 from pctt import ccp
 from pctt.ccp import Limits
-from pctt.options import describe, read
+from pctt.options import describe
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "ccp.md"
 
@@ -31,17 +30,6 @@ def table():
 
 def test_the_documentation_has_the_table_of_the_registry():
     assert table() in DOCS.read_text(), f"the new table:\n{table()}"
-
-
-@pytest.mark.parametrize("name", ccp.SOLVERS)
-def test_an_entry_is_complete(name):
-    solver = ccp.SOLVERS[name]
-    assert solver.name == name
-    assert re.fullmatch("[a-z_]+", name)
-    assert solver.help
-    assert solver.source
-    assert solver.iterations > 0
-    assert read(solver.options, {}, solver.prefix) == solver.options()
 
 
 @pytest.mark.parametrize("name", ccp.SOLVERS)

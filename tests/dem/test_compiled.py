@@ -7,10 +7,8 @@ import pytest
 from cases import random_quaternions
 
 from dem import quaternion
-from dem import system as contact_system
 from dem.contact import broad
 from dem.contact.narrow import Spheres, sphere_sphere, spheres_within
-from dem.contact_map import loops
 from dem.free_motion import free_spin
 
 
@@ -52,36 +50,6 @@ def test_contacts_of_spheres():
     np.testing.assert_array_equal(pair, near)
     for column, expected in zip(touch, whole.take(near)):
         np.testing.assert_allclose(column, expected, atol=1e-14)
-
-
-def random_rows(count=50, bodies=12):
-    """Frames, arms and rows of contacts."""
-    rng = np.random.default_rng(4)
-    normal = rng.normal(size=(count, 3))
-    frame = contact_system.contact_frames(normal / np.linalg.norm(normal, axis=1, keepdims=True))
-    row = np.array([rng.choice(bodies, 2, replace=False) for _ in range(count)])
-    return rng, frame, rng.normal(size=(count, 6)), row
-
-
-def test_velocities_and_impulses_of_contacts():
-    rng, frame, arm, row = random_rows()
-    v, g = rng.normal(size=(12, 6)), rng.normal(size=(50, 3))
-    one, two = (v[row[:, k], :3] + np.cross(v[row[:, k], 3:], arm[:, 3 * k : 3 * k + 3]) for k in (0, 1))
-    frame, row = frame.reshape(-1, 9), row.astype(np.uint32)
-    relative = loops.relative_velocities(frame, arm, row, v)
-    np.testing.assert_allclose(relative, np.einsum("cij,cj->ci", frame.reshape(-1, 3, 3), two - one), atol=1e-14)
-    load = np.zeros((12, 6))
-    loops.add_momenta(frame, arm, row, g, load)
-    np.testing.assert_allclose(np.vdot(load, v), np.vdot(g, relative), rtol=1e-12)  # the transposed map
-
-
-def test_orientations():
-    rng = np.random.default_rng(6)
-    turn, spin = random_quaternions(rng, 30), 20.0 * rng.normal(size=(30, 3))
-    spin[:3] = 0.0
-    spin[3:6] *= 1e-12
-    expected = quaternion.multiply(quaternion.exponential(0.02 * spin), turn)
-    np.testing.assert_allclose(quaternion.integrate(turn, spin, 0.02), expected, atol=1e-15)
 
 
 @pytest.mark.parametrize("turn", [1e-9, 0.01, 0.3])

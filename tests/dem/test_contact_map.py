@@ -105,12 +105,3 @@ def test_a_product_sends_one_message_to_each_rank_that_shares_a_ghost():
     assert comm.sent == len(holders)
     G.momenta(np.zeros_like(system.r))
     assert comm.sent == len(holders) + len(owners)
-
-
-def test_without_contacts():
-    scene = Scene(friction=0.3)
-    scene.add_spheres([[0, 0, 5]], 0.1, 1000.0)
-    world = new_world(scene, MPI.COMM_SELF)
-    given = ContactSystem(world, find_contacts(world, 0.01), 0.01).contact_map.given
-    shapes = [array.shape for array in (given.frame, given.arm, given.body, given.root)]
-    assert shapes == [(0, 9), (0, 6), (0, 2), (1, 6)]

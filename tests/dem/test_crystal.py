@@ -25,8 +25,3 @@ def test_spheres_touch_and_do_not_overlap(lattice, neighbours):
     assert np.allclose(np.abs(centres[:, :2]).max(axis=0), wall - crystal.radius)
     assert np.isclose(centres[:, 2].min(), crystal.radius)
     crystal.build()
-
-
-def test_an_unknown_lattice_is_refused():
-    with pytest.raises(ValueError, match="lattice bcc: allowed is one of fcc, cubic"):
-        from_file(SCENE)(lattice="bcc")

@@ -7,13 +7,6 @@ from mpi4py import MPI
 from dem.exchange import exchange
 
 
-def test_on_one_rank_rows_stay_in_order():
-    columns = {"a": np.arange(3), "b": np.ones((3, 2, 2))}
-    out = exchange(MPI.COMM_SELF, columns, np.zeros(3, np.int64))
-    np.testing.assert_array_equal(out["a"], [0, 1, 2])
-    assert out["b"].shape == (3, 2, 2)
-
-
 @pytest.mark.parallel(1, 2, 3, 4)
 def test_rows_arrive_in_the_order_of_ranks():
     comm = MPI.COMM_WORLD

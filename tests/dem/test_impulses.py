@@ -15,19 +15,6 @@ def frames(count):
     return contact_frames(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
-def test_known_impulses_come_back_and_unknown_ones_are_zero():
-    memory = ImpulseMemory(MPI.COMM_SELF)
-    impulse, frame = RNG.normal(size=(4, 3)), frames(4)
-    empty, found = memory.recall(np.array([7, 1]), frame[:2])
-    assert not found.any()
-    assert not empty.any()
-    memory.remember(np.array([8, 3, 2**62, 5]), impulse, frame)
-    recalled, found = memory.recall(np.array([5, 4, 2**62, 8, 9]), frame[[3, 0, 2, 0, 0]])
-    np.testing.assert_array_equal(found, [True, False, True, True, False])
-    np.testing.assert_allclose(recalled[found], impulse[[3, 2, 0]], atol=1e-15)
-    assert not recalled[~found].any()
-
-
 def test_the_last_step_replaces_the_one_before():
     memory = ImpulseMemory(MPI.COMM_SELF)
     frame = frames(1)

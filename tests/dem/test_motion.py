@@ -31,19 +31,6 @@ def test_mean_velocity_takes_the_body_exactly_to_the_next_pose(motion):
     np.testing.assert_allclose(quaternion.integrate(turn[None], velocity[None, 3:], dt)[0], end_turn, atol=1e-14)
 
 
-def test_rotation_is_a_circle_about_its_axis():
-    motion = Rotation((0.0, 0.0, np.pi / 2), (1.0, 0.0, 0.0))
-    position, turn = motion.pose(1.0, np.array([2.0, 0.0, 5.0]), np.array([1.0, 0, 0, 0]))
-    np.testing.assert_allclose(position, [1.0, 1.0, 5.0], atol=1e-15)
-    np.testing.assert_allclose(quaternion.rotate(turn, np.array([1.0, 0, 0])), [0, 1.0, 0], atol=1e-15)
-
-
-def test_oscillation_is_periodic_with_its_amplitude():
-    motion = Oscillation((0.0, 2.0, 0.0), 0.3, 4.0)
-    np.testing.assert_allclose(motion.pose(1.0, PLACE, TURN)[0] - PLACE, [0, 0.3, 0], atol=1e-15)
-    np.testing.assert_allclose(motion.pose(4.0, PLACE, TURN)[0], PLACE, atol=1e-15)
-
-
 def test_rotation_and_oscillation_rest_before_and_after():
     upright = np.array([1.0, 0.0, 0.0, 0.0])
     turning = Rotation((0, 0, np.pi), start=1.0, end=1.5)

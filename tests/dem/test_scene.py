@@ -9,7 +9,7 @@ from mpi4py import MPI
 from dem.bodies import bounding_radius
 from dem.motion import Dynamic, Glide, Guided, Hinged, Oscillation, Path, Rotation
 from dem.scene import Scene
-from dem.shapes import Box, Capsule, Plane, Sphere
+from dem.shapes import Box, Plane, Sphere
 from dem.start import new_world
 
 SELF = MPI.COMM_SELF
@@ -33,17 +33,12 @@ def body(*arguments, **options):
         (balls([[0, 0, np.nan]], 0.1, 1000.0), "positions: NaN or infinite"),
         (balls([[0, 0]], 0.1, 1000.0), r"positions must have shape \(3,\) or \(1, 3\)"),
         (balls([UP], [-0.1], 1000.0), "radius must be positive, got -0.1"),
-        (balls([UP], np.nan, 1000.0), "radius: NaN"),
         (balls([UP], [0.1, 0.2], 1000.0), r"radius must have shape \(\) or \(1,\), got \(2,\)"),
         (balls([UP], 0.1, -1.0), "density must be positive"),
-        (balls([UP], 0.1, np.inf), "density: NaN or infinite"),
-        (balls(velocity=(0, np.nan, 0)), "velocity: NaN"),
         (balls(velocity=[UP, UP]), r"velocity must have shape \(3,\) or \(1, 3\)"),
         (lambda scene: scene.add_boxes([UP], (0.1, 0.0, 0.1), 1000.0), "half extents must be positive"),
         (lambda scene: scene.add_boxes([UP], (1, 1, 1), 1.0, quaternions=(0, 0, 0, 0)), "zero quaternion"),
-        (lambda scene: scene.add_capsules([UP], 0.1, 0.0, 1000.0), "half length must be positive, got 0"),
         (lambda scene: scene.set_friction(-0.1, "a", "b"), "friction must not be negative"),
-        (lambda scene: Scene(friction=-0.1), "friction must not be negative"),
         (lambda scene: Scene(friction=0.1, gravity=(0, 0, np.nan)), "gravity: NaN"),
         (body("floor", FLOOR), "distinct names, got 'floor'"),
         (body("empty", []), "has no shape"),
@@ -52,19 +47,15 @@ def body(*arguments, **options):
         (body("press", FLOOR, Dynamic(), density=100.0), "half space has no finite mass"),
         (body("press", FLOOR, velocity=(0, 0, 1)), "prescribed: it takes no initial velocity"),
         (body("press", [Sphere(1.0)], Guided(UP), density=1.0, velocity=(0.1, 0, 0)), "be along the guide"),
-        (body("press", [Sphere(1.0)], Guided(UP), density=1.0, angular_velocity=(0, 0, 1)), "be along the guide"),
         (body("press", [Sphere(1.0)], Guided(UP)), "density or both mass"),
         (body("wheel", [Sphere(1.0, (0.1, 0, 0))], Hinged(UP), density=1.0), "its centre of mass must be on the axis"),
         (body("wheel", [Sphere(1.0)], Hinged(UP), density=1.0, velocity=(0, 0, 1)), "be about the hinge"),
         (lambda scene: Plane((0, 0, 0)), "Plane.normal is the zero vector"),
         (lambda scene: Box((1, -1, 1)), "Box.half_extents must be positive"),
         (lambda scene: Sphere(0.0), "Sphere.radius must be positive"),
-        (lambda scene: Capsule(0.1, 0.0), "Capsule.half_length must be positive"),
         (lambda scene: Guided((0, 0, 0)), "Guided.direction is the zero vector"),
-        (lambda scene: Guided(UP, force=np.nan), "Guided.force: NaN"),
         (lambda scene: Guided(UP, speed=1.0), "Guided.force of a servo"),
         (lambda scene: Hinged(UP, torque=-1.0, speed=1.0), "Hinged.torque of a servo"),
-        (lambda scene: Hinged(UP, torque=1.0, speed=np.nan), "Hinged.speed: NaN"),
         (lambda scene: Glide(UP, start=2.0, end=1.0), "Glide cannot begin at 2 s and end at 1 s"),
         (lambda scene: Rotation((0, 0, np.nan)), "Rotation.velocity: NaN"),
         (lambda scene: Oscillation(UP, 0.1, 0.0), "Oscillation.period must be positive"),

@@ -5,7 +5,6 @@ import pytest
 from cases import heap, step
 from mpi4py import MPI
 
-from dem import quaternion
 from dem.contact import find_contacts
 from dem.motion import Glide, Rotation
 from dem.scene import Scene
@@ -21,37 +20,6 @@ def fly(world, dt, steps):
     for _ in range(steps):
         contacts = find_contacts(world, 0.0)
         advance(world, ContactSystem(world, contacts, dt).velocity(np.zeros((len(contacts), 3))), dt)
-
-
-def test_free_fall_is_the_semi_implicit_sum():
-    scene = Scene(friction=0.3)
-    scene.add_spheres([[0, 0, 0]], 0.1, 1000.0, velocity=(1.0, 0, 5.0))
-    world = new_world(scene, SELF)
-    dt, k = 0.025, 40
-    fly(world, dt, k)
-    assert world.step == k
-    np.testing.assert_allclose(world.time, k * dt)
-    np.testing.assert_allclose(world.grains.velocity[0, :3], [1, 0, 5 - 9.81 * k * dt], atol=1e-13)
-    np.testing.assert_allclose(
-        world.grains.position[0], [k * dt, 0, 5 * k * dt - 9.81 * dt**2 * k * (k + 1) / 2], atol=1e-12
-    )
-
-
-def test_a_free_box_tumbles_with_a_drift_of_angular_momentum_of_first_order():
-    scene = Scene(friction=0.3, gravity=(0, 0, 0))
-    scene.add_boxes([[0, 0, 0]], (0.1, 0.2, 0.3), 1000.0, angular_velocity=(0.5, 3.0, 0.2))
-
-    def drift(dt):
-        world = new_world(scene, SELF)
-        fly(world, dt, round(1.0 / dt))
-        turn = quaternion.matrix(world.grains.quaternion[0])
-        spin = turn @ np.diag(world.grains.inertia[0]) @ turn.T @ world.grains.velocity[0, 3:]
-        start = world.grains.inertia[0] * [0.5, 3.0, 0.2]
-        return np.linalg.norm(spin - start) / np.linalg.norm(start)
-
-    coarse, fine = drift(4e-3), drift(2e-3)
-    assert coarse < 0.03
-    assert 1.8 < coarse / fine < 2.2  # of first order
 
 
 def test_prescribed_bodies_follow_their_motion_exactly_at_any_step():

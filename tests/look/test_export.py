@@ -12,7 +12,8 @@ import pytest
 from mpi4py import MPI
 
 from pctt import export
-from pctt.folder import Folder, FolderError
+from pctt.disk import FileError
+from pctt.folder import Folder
 from pctt.look import program
 
 pytest.importorskip("vtkmodules", reason="vtk is not installed (extra `pictures`)")
@@ -120,7 +121,7 @@ def test_a_series_that_cannot_be_written_is_an_error(folder, tmp_path):
     scene, before = Scene(run, [run.frame(4)]), resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-        with pytest.raises(FolderError, match="cannot write"):
+        with pytest.raises(FileError, match="cannot write"):
             export.write_vtkhdf(tmp_path / "bodies.vtkhdf", "bodies", scene, run.steps)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)

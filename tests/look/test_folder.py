@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 import subprocess
 import sys
 
@@ -14,8 +13,8 @@ import pytest
 from several_ranks import environment, mpiexec
 
 from dem.scenes import Mixer
-from pctt.folder import Folder, FolderError
-from pctt.look.program import whole
+from pctt.disk import FileError
+from pctt.folder import Folder
 
 
 def test_a_run_tells_the_shapes_of_its_bodies(folder):
@@ -118,39 +117,10 @@ def test_a_damaged_file_is_named(name, damage, tmp_path):
         folder.require_frames()
         folder.frame(1)
 
-    with pytest.raises(FolderError, match=name) as error:
+    with pytest.raises(FileError, match=name) as error:
         read()
     assert str(made) in str(error.value)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("kind", [FolderError, None], ids=["cannot be written", "can be written"])
-def test_a_file_is_written_whole_or_not_at_all(kind, tmp_path):
-    path = tmp_path / "figure.png"
-    path.write_text("before")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        if kind:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-            with pytest.raises(FolderError, match=r"figure.png: cannot write \(File too large\)"), whole(path) as new:
-                new.write_bytes(bytes(1000))
-        else:
-            with whole(path) as new:
-                new.write_bytes(bytes(1000))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert path.read_bytes() == (b"before" if kind else bytes(1000))
-    assert [p.name for p in tmp_path.iterdir()] == ["figure.png"]
-
-
-@pytest.mark.parametrize(("program", "library"), [("render", "vtkmodules"), ("export", "vtkmodules")])
-def test_a_folder_without_the_bodies_is_refused(program, library, show, tmp_path):
-    pytest.importorskip(library, reason=f"{library} is not installed (extra `pictures`)")
-    made = handmade.write(tmp_path / "made", handmade.FLOOR)
-    (made / "frames" / "bodies.h5").unlink()
-    done = show(program, folder=made, status=2)
-    assert "lacks the shapes" in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -208,7 +178,7 @@ def test_records_are_columns_of_numbers(tmp_path):
     np.testing.assert_array_equal(columns["force_blade_x [N]"], [3, np.nan])
     np.testing.assert_array_equal(columns["late [N]"], [np.nan, np.nan])
     (tmp_path / "made" / "analysis.csv").write_text("step,force\n1,many\n")
-    with pytest.raises(FolderError, match="analysis.csv"):
+    with pytest.raises(FileError, match="analysis.csv"):
         read.analysis()
 
 
@@ -221,5 +191,5 @@ def test_figures_of_steps_that_were_no_numbers_are_infinite(tmp_path):
         {"step": 1, "natural_residual": float("inf")}, {"step": 2, "natural_residual": 1e-5}
     ]  # the third is half a line
     table.write_text("words\n")
-    with pytest.raises(FolderError, match="steps.jsonl"):
+    with pytest.raises(FileError, match="steps.jsonl"):
         read.lines()

@@ -47,28 +47,6 @@ def solve(mat: PETSc.Mat, **options: object) -> tuple[PETSc.KSP, float]:
     return ksp, left(ksp, x, b)
 
 
-@pytest.mark.parallel(1, 3)
-@pytest.mark.parametrize("skew", [0.0, 0.01])
-def test_products_are_those_of_the_entries(skew):
-    def entries(i, j):
-        return kernel(i, j) + skew * np.sin(0.1 * i) * np.cos(0.07 * j)
-
-    mat = from_entries(entries, GRID, 1e-10)
-    A, v = dense(entries), np.random.default_rng(0).standard_normal(108)
-    x, y = mat.createVecs()
-    own = slice(*x.getOwnershipRange())
-    x.array[:] = v[own]
-    mat.mult(x, y)
-    np.testing.assert_allclose(y.array, (A @ v)[own], atol=1e-7)
-    mat.multTranspose(x, y)
-    np.testing.assert_allclose(y.array, (A.T @ v)[own], atol=1e-7)
-    np.testing.assert_allclose(mat.getDiagonal().array, np.diag(A)[own])
-    words = mat.getPythonContext().compressed.words()
-    assert "ranks" in words
-    assert "bytes" in words
-    assert mat.isSymmetricKnown() == (True, skew == 0)
-
-
 @pytest.mark.parallel(1, 2, 3)
 @pytest.mark.parametrize("way", ["grid", "coordinates", "natural", "dense", "train"])
 def test_matrices_given_by_entries_are_preconditioned(way):

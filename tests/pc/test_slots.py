@@ -69,14 +69,6 @@ def test_every_row_has_a_slot_of_its_own_and_the_spare_ones_are_spread():
     assert in_box.max() <= BOX
 
 
-def test_without_keys_there_are_no_spare_slots_and_nothing_is_followed():
-    points, _ = cloud(100)
-    slots = slots_of(springs(points, None))
-    assert sorted(slots.place) == list(range(100))
-    assert slots.capacity == 100
-    assert not follow(slots, springs(points, None), yes)
-
-
 def test_rows_that_stay_keep_their_slots_whatever_comes_and_goes():
     points, keys = cloud(1000)
     slots = slots_of(springs(points, keys))
@@ -140,18 +132,6 @@ def test_rows_of_the_same_name_never_share_a_slot():
     slots = slots_of(springs(points, keys))
     keys[7] = keys[8]
     assert not follow(slots, springs(points, keys), yes)
-
-
-def test_no_rows_at_all():
-    points, keys = np.empty((0, 3)), np.empty(0, np.int64)
-    empty = PETSc.Mat().createAIJ((0, 0), nnz=0, comm=PETSc.COMM_SELF)
-    empty.assemble()
-    empty.setAttr("coordinates", points)
-    empty.setAttr("key", keys)
-    slots = slots_of(empty)
-    assert slots.capacity == 0
-    assert follow(slots, empty, yes)
-    assert not follow(slots, springs(*cloud(10)), yes)
 
 
 @pytest.mark.parametrize("scaling", ["block", "none"])

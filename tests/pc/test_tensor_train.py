@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
-from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,24 +13,12 @@ from train_solver import context, operator, solve, solver
 
 from pctt import memory
 from pctt.pc import sparse_train
-from pctt.pc.train_options import Account
-
-DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 def set_up(ksp: PETSc.KSP) -> None:
     """For new values of the same matrix."""
     ksp.setOperators(ksp.getOperators()[0])
     ksp.setUp()
-
-
-def test_full_ranks_give_the_inverse():
-    mat = poisson(8)
-    ksp = solver(mat, rank=64, eps=1e-12)
-    ksp.setUp()
-    assert context(ksp).rank == 64
-    assert context(ksp).made.compression.error < 1e-6
-    assert np.linalg.norm(operator(ksp) @ dense(mat) - np.eye(64)) / 8 < 0.05
 
 
 @pytest.mark.parallel(1, 2)
@@ -175,36 +159,6 @@ def test_it_says_what_it_was():
         for _ in range(2):
             solve(ksp)
         assert re.fullmatch(words, context(ksp).what())
-
-
-BLOCKS = "rank 1: block Jacobi"
-
-
-@pytest.mark.parametrize(
-    ("used", "words"),
-    [
-        ({}, ""),
-        ({BLOCKS: 3}, "rank 1: block Jacobi"),
-        ({BLOCKS: 9, 3: 1}, "rank 1: block Jacobi, 1 of 10 systems rank 3"),
-        ({8: 2, 3: 1, BLOCKS: 9}, "rank 1: block Jacobi, 3 of 12 systems rank 3 to 8"),
-    ],
-)
-def test_what_many_solves_used(used, words):
-    assert Account(used=Counter(used)).what() == words
-
-
-def test_misspelt_options_are_refused():
-    with pytest.raises((ValueError, PETSc.Error)):
-        solver(poisson(4), max_rnk=1)
-
-
-def test_the_example_of_the_documentation_runs():
-    text = (DOCS / "preconditioners.md").read_text()
-    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "pctt.pc.TensorTrain" in done.stdout
-    assert "inverse I + Z ranks" in done.stdout
 
 
 @pytest.mark.parallel(1, 2, 3, 4)

@@ -18,6 +18,32 @@ SMALL = ("-scene_n", "1", "-scene_margin", "0.7")  # narrower boxes jam, and pdi
 SETTLED = (*SMALL, "-restart", "settled")
 
 
+#: A scene file: spheres fall one upon the other.
+DROP = """
+from dataclasses import dataclass
+from dem.experiment import Experiment, option
+from dem.scene import Scene
+from dem.shapes import Plane
+
+@dataclass(frozen=True)
+class Drop(Experiment):
+    height: float = option(0.2, "m", "of the lowest centre")
+
+    def build(self):
+        scene = Scene(friction=0.3)
+        scene.add_body("floor", [Plane(normal=(0, 0, 1))])
+        places = [[0.05 * k, 0, self.height + 0.3 * k] for k in range(3)]
+        scene.add_spheres(places, radius=0.1, density=2500.0)
+        return scene
+
+    def record(self, step):
+        return {}
+
+    def analyse(self, records):
+        return {"twice": 2 * records["time [s]"]}
+"""
+
+
 def database(words: list[str]) -> dict[str, str | None]:
     """The options in the words of a command line, as PETSc takes them."""
 

@@ -21,47 +21,29 @@ BAD_OPTIONS = {
     "-ccp_pdip_bounadry 1": ["did you mean -ccp_pdip_boundary?"],
     "-nonsense": ["no such option"],
     "-steps abc": ["abc", "whole number"],
-    "-steps 1.5": ["1.5", "whole number"],
     "-steps -1": ["-1", ">= 0"],
     "-steps": ["whole number"],
-    "-dt -1": ["-1", "positive"],
-    "-dt 0": ["0", "positive"],
     "-dt nan": ["nan", "positive"],
-    "-dt inf": ["inf", "positive"],
-    "-delta -0.1": ["-0.1", ">= 0"],
     "-recovery_speed nan": ["nan", ">= 0"],
-    "-output_every -1": ["-1", ">= 0"],
     "-checkpoint_every 0": ["0", ">= 1"],
     "-settle maybe": ["maybe", "true or false"],
     "-scene nosuch": ["nosuch", "mixer"],
     "-scene_n 0": ["0", "at least 1"],
-    "-scene_n two": ["two", "whole number"],
     "-scene_radius nan": ["nan", "finite number"],
-    "-scene_radius -0.1": ["-0.1", "positive"],
-    "-scene_friction -1": ["-1", "not be negative"],
     "-scene_seed -1": ["-1", "not be negative"],
     "-scene_perturbation 0.03": ["0.03", "0.025"],  # the spheres could overlap
-    "-ccp_type nosuch": ["nosuch", "pdip", "apgd"],
     "-ccp_type pdpi": ["pdpi", "did you mean pdip?"],
-    "-ccp_tol 0": ["0", "between 0 and 1"],
     "-ccp_tol 1e4": ["1e4", "between 0 and 1"],  # a typing error for 1e-4: any impulses would be a solution
-    "-ccp_tol 1e-4x": ["1e-4x", "between 0 and 1"],
-    "-ccp_max_it -2": ["-2", ">= -1"],
     "-ccp_pdip_centering 2": ["2", "between 0 and 1"],
     "-compare nosuch": ["nosuch", "ilu", "pbjacobi"],
-    "-compare a:nosuch": ["nosuch", "ilu"],
-    "-compare a:ilu,a:icc": ["a is there twice"],
-    "-compare a.b:ilu": ["a.b:ilu", "letters, digits"],
     "-compare ten:tt,tent:tt,tt,x:ilu,x_pc:ilu": ["-compare_x_pc_... would be an option of x too"],
     "-compare_ten_pc_tt_rank 3 -compare auto:tt": ["not compared", "-compare lists auto:tt"],
     "-compare ilu -ccp_type apgd": ["apgd", "pdip"],
-    "-compare_every 0": ["0", ">= 1"],
     "-ksp_type nosuch": ["nosuch"],
     "-pc_type nosuch": ["nosuch"],
     "-ksp_rtol abc": ["abc"],
     "-ksp_rtol 1e3": ["1e3", "below 1"],  # a typing error for 1e-3
     "-ksp_rtol -1": ["-1", ">= 0"],
-    "-ksp_rtol nan": ["nan", ">= 0"],
     "-pc_python_type nosuch.Thing -pc_type python": ["nosuch.Thing"],
     "-restart missing.h5": ["missing.h5", "no such file"],
     "-restart .": ["no such file"],
@@ -76,7 +58,7 @@ BAD_OPTIONS = {
     "-compare_ilu_pc_factor_levels 1": ["-compare lists none"],
     "-compare_icc_pc_factor_levels 1 -compare ilu,none": ["-compare lists ilu,none"],
     "-ccp_apgd_x 1": ["did you mean"],
-    "-ccp_apgd_check 5": ["another -ccp_type than pdip"],
+    "-ccp_gauss_seidel_relaxation 1.2": ["another -ccp_type than pdip"],
     "-ccp_newton body -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],
     "-ksp_rtol 1e-3 -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],
     "-ccp_coulomb_max_it 3": ["-ccp_coulomb"],
@@ -88,21 +70,13 @@ BAD_OPTIONS = {
 #: These go through the program, the others through its function that reads the options.
 FROM_OUTSIDE = (
     "-stepss 3",
-    "-steps abc",
     "-steps -1",
     "-steps",
-    "-dt nan",
-    "-scene nosuch",
     "-scene_n 0",
     "-scene_radius nan",
-    "-compare nosuch",
     "-ksp_type nosuch",
     "-pc_type nosuch",
-    "-ksp_rtol abc",
     "-pc_python_type nosuch.Thing -pc_type python",
-    "-restart missing.h5",
-    "-problem missing.hdf5",
-    "-pc_typ ilu",
 )
 
 
@@ -251,20 +225,9 @@ def no_hdf5(path, checkpoint):
     path.write_text("these are no data\n" * 100)
 
 
-def empty(path, checkpoint):
-    path.touch()
-
-
 def truncated(path, checkpoint):
     whole = checkpoint.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-
-
-def scrambled(path, checkpoint):
-    """The middle of the file, where the tables of HDF5 are, overwritten."""
-    whole = bytearray(checkpoint.read_bytes())
-    whole[512:4096] = bytes(3584)
-    path.write_bytes(bytes(whole))
 
 
 def other_hdf5(path, checkpoint):
@@ -294,8 +257,8 @@ def without(name):
 
 
 DAMAGES = {
-    "no HDF5": no_hdf5, "empty": empty, "truncated": truncated, "scrambled": scrambled, "other HDF5": other_hdf5,
-    "FCLIB": fclib, **{name: without(name) for name in ("grains", "grains/velocity", "scene")},
+    "no HDF5": no_hdf5, "truncated": truncated, "other HDF5": other_hdf5, "FCLIB": fclib,
+    **{name: without(name) for name in ("grains/velocity", "scene")},
 }  # fmt: skip
 
 

@@ -65,33 +65,6 @@ def test_all_see_the_same_systems_and_the_table_agrees_with_the_summary(program,
     assert summary["compare"]["pbjacobi"]["converged"] == count
 
 
-@pytest.mark.parametrize("every", [2, 7])
-def test_only_every_kth_system_is_compared_on(every, program, settled, tmp_path):
-    whole, _ = compared(program, tmp_path, "-compare", "pbjacobi")
-    expected = math.ceil(whole["compare"]["pbjacobi"]["systems"] / every)
-    summary, table = compared(program, tmp_path, "-compare", "pbjacobi,sor", "-compare_every", every)
-    for name in ("pbjacobi", "sor"):
-        assert summary["compare"][name]["systems"] == expected
-        assert int(table[name][0]) == expected
-
-
-@pytest.mark.parallel(2)
-def test_on_two_ranks_ilu_is_said_to_work_within_each(program, settled, tmp_path):
-    summary, table = compared(program, tmp_path, "-compare", "none,ilu,pbjacobi")
-    assert list(summary["compare"]) == ["none", "ilu", "pbjacobi"]
-    assert [row[-1] for row in table.values()] == ["", "within each rank", ""]
-    (systems,) = {record["systems"] for record in summary["compare"].values()}
-    assert systems >= summary["newton_its"]
-
-
-def test_a_failing_preconditioner_stays_in_the_table(program, settled, tmp_path):
-    summary, table = compared(program, tmp_path, "-compare", "none,pbjacobi", "-compare_none_ksp_max_it", 2)
-    assert summary["compare"]["none"]["converged"] < summary["compare"]["none"]["systems"]
-    assert summary["compare"]["none"]["ksp_its_max"] <= 2
-    assert int(table["none"][1]) == summary["compare"]["none"]["converged"]
-    assert summary["natural_residual"] <= 1e-4
-
-
 @pytest.mark.slow
 @pytest.mark.mpi
 def test_without_options_the_program_is_the_demo(program, tmp_path):
@@ -119,15 +92,6 @@ def test_fallbacks_of_a_train_reach_the_summary(program, settled, tmp_path):
     program(*SETTLED, "-steps", 1, *train, "-output", "train")
     (step,) = steps_of(tmp_path / "train")
     assert step["pc_report"][0].startswith("tensor train")
-
-
-def test_two_trains_stand_in_one_table(program, settled, tmp_path):
-    options = ("-compare", "auto:tt,ten:tt", "-compare_ten_pc_tt_rank", "10", "-ksp_rtol", "1e-3", "-ksp_max_it", "300")
-    summary, table = compared(program, tmp_path, *options)
-    assert list(table) == ["auto:tt", "ten:tt"]
-    assert table["auto:tt"][-1].startswith("rank 1: block Jacobi")
-    assert table["ten:tt"][-1] == summary["compare"]["ten"]["what"] != table["auto:tt"][-1]
-    assert table["ten:tt"][-1].startswith("rank ")
 
 
 TRAIN = ("-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")

@@ -10,11 +10,9 @@ import subprocess
 import numpy as np
 import pytest
 from mpi4py import MPI
-from petsc4py import PETSc
 from program import SMALL, arrays, command, environment, recorded_steps, steps_of
 
 from pctt import disk
-from pctt.ccp import ConeProblem, fclib
 from pctt.disk import FileError, append
 from pctt.run.options import read_options
 from pctt.run.simulate import simulate
@@ -128,18 +126,6 @@ def test_the_room_of_a_file_is_taken_until_it_is_written(tmp_path, monkeypatch):
     assert taken[0] >= data.nbytes
     np.testing.assert_array_equal(arrays(path)["data"], data)
     assert path.stat().st_size < 1.01 * data.nbytes  # what was taken beyond need is given back
-
-
-def test_a_problem_that_cannot_be_written_leaves_the_old_file(tmp_path):
-    path = tmp_path / "problem"
-    path.write_text("what was there")
-    csr = (np.arange(601, dtype=np.int32), np.arange(600, dtype=np.int32), np.ones(600))
-    unit = PETSc.Mat().createAIJ((600, 600), bsize=3, csr=csr, comm=PETSc.COMM_SELF)
-    problem = ConeProblem(MPI.COMM_SELF, np.ones((200, 3)), np.ones(200), N=unit)
-    with Limit(2_000), pytest.raises(OSError, match="cannot write"):
-        fclib.write_local(path, problem)
-    assert [p.name for p in tmp_path.iterdir()] == ["problem"]
-    assert path.read_text() == "what was there"
 
 
 @pytest.fixture

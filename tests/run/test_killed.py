@@ -88,14 +88,7 @@ def check_files(folder):
     return step
 
 
-@pytest.mark.parametrize(
-    ("ranks", "kills"),
-    [
-        (1, 2),
-        pytest.param(1, 12, marks=pytest.mark.slow),
-        pytest.param(2, 3, marks=[pytest.mark.mpi, pytest.mark.slow]),
-    ],
-)
+@pytest.mark.parametrize(("ranks", "kills"), [(1, 2), pytest.param(2, 3, marks=[pytest.mark.mpi, pytest.mark.slow])])
 def test_a_killed_run_goes_on_as_if_nothing_had_happened(ranks, kills, program, settled, cache, tmp_path):
     options = (*SMALL, *OPTIONS)
     program(*SETTLED, *OPTIONS, "-steps", STEPS, "-output", "whole", ranks=ranks)

@@ -8,37 +8,17 @@ import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import arrays, recorded_steps, steps_of, table
+from program import DROP, arrays, recorded_steps, steps_of, table
 
 from dem.together import SceneError
 from pctt.ccp import BlockRows, ConeProblem, fclib
 from pctt.disk import FileError
-from pctt.folder import Place
 from pctt.options import OptionError
 from pctt.run.options import read_options
+from pctt.run.output import Place
 from pctt.run.simulate import simulate, solve_file
 
 SELF = MPI.COMM_SELF
-DROP = """
-from dataclasses import dataclass
-from dem.experiment import Experiment
-from dem.scene import Scene
-from dem.shapes import Plane
-
-@dataclass(frozen=True)
-class Drop(Experiment):
-    def build(self):
-        scene = Scene(friction=0.3)
-        scene.add_body("floor", [Plane(normal=(0, 0, 1))])
-        scene.add_spheres([[0.05 * k, 0, 0.2 + 0.3 * k] for k in range(3)], radius=0.1, density=2500.0)
-        return scene
-
-    def record(self, step):
-        return {}
-
-    def analyse(self, records):
-        return {"twice": 2 * records["time [s]"]}
-"""
 FAILING = DROP.replace("return {}", "raise ValueError('no record')")
 UNBUILDABLE = DROP.replace("return scene", "raise ValueError('no scene')")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from program import SETTLED, SMALL, steps_of
+from program import ROOT, SETTLED, SMALL, steps_of
 
 TOL = ("-ccp_tol", 1e-8)
 HARD = (*SETTLED, "-ccp_max_it", 2)  # no step is solved in two Newton steps
@@ -87,24 +87,6 @@ def check_mechanics(line: dict, tmp_path: Path) -> None:
 
 
 @pytest.mark.parallel(1, 2)
-def test_a_guided_body_moves_along_its_guide_alone(program, tmp_path):
-    """The press of the shear box goes up and down and does not turn: its moments of inertia are infinite."""
-    program("-scene", "shear", "-scene_n", 1, "-steps", 2, *TOL, "-dump_problem", "problems")
-    line = steps_of(tmp_path / "results")[1]
-    path = line["dumped"][0]
-    with h5py.File(tmp_path / path) as file:
-        group, solution = file["fclib_global"], file["solution"]
-        v, f = solution["v"][:], group["vectors/f"][:]
-        assert np.isfinite(group["M/x"][:]).all()
-        assert np.allclose(product(group["M"], v), product(group["H"], solution["r"][:]) + f, atol=1e-9)
-        row = group["H/i"][:][group["H/x"][:] != 0]
-    press = range(len(v) - 6, len(v))
-    assert set(row) & set(press) == {press[2]}
-    program("-problem", path, *TOL, "-output", "again")
-    assert summary(tmp_path / "again")["objective"] == pytest.approx(line["objective"], rel=1e-6)
-
-
-@pytest.mark.parallel(1, 2)
 def test_hard_problems_are_kept_and_the_steps_say_so(program, settled, tmp_path):
     done = program(*HARD, "-steps", 6)
     steps = steps_of(tmp_path / "results")
@@ -130,6 +112,26 @@ def test_hard_problems_of_another_run_are_replaced_and_of_this_one_kept(program,
     assert hard() == [first, first + 1, first + 2]
     program(*HARD, "-steps", 1, "-overwrite")
     assert hard() == [first]
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("solver", ["pdip", "apgd"])
+def test_the_optimum_of_a_published_problem_is_found(solver, ranks, program, tmp_path):
+    """On which two unrelated algorithms agree (docs/ccp.md; tests/ccp/test_fclib.py has more of them)."""
+    path = ROOT.parent / "shared" / "fclib" / "Spheres-i099-356-679.hdf5"
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    program("-problem", path, "-ccp_type", solver, "-ccp_tol", 1e-7)
+    found = summary(tmp_path / "results")
+    assert (found["converged"], found["contacts"], found["ranks"]) == (True, 356, ranks)
+    assert found["objective"] == pytest.approx(-2.084946581043e2, rel=1e-6)
+    assert found["velocity_norm"] == pytest.approx(1.0829370, rel=3e-5)
+    assert found["newton_systems"] == ("BiCGStab (right), pbjacobi" if solver == "pdip" else "")
+    assert sorted(p.name for p in (tmp_path / "results").iterdir()) == ["summary.json"]
+    if solver == "pdip":
+        done = program("-problem", path, "-ccp_max_it", 3, "-ccp_fallback", 0, "-output", "few")
+        assert "NOT CONVERGED" in done.stdout
+        assert (summary(tmp_path / "few")["converged"], summary(tmp_path / "few")["newton_its"]) == (False, 3)
 
 
 @pytest.mark.parallel(1, 2)

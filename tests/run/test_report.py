@@ -20,20 +20,6 @@ def test_the_time_left_goes_on_as_before(spent, done, steps, words):
     assert report.remaining(spent, done, steps) == words
 
 
-def test_the_seconds_of_a_comparison_have_a_column():
-    line = {
-        "step": 3, "time": 0.1, "contacts": 7, "iterations": 2, "ksp_its": 5, "natural_residual": 1e-5, "seconds": 4.0,
-        "phases": {"search": 0.1, "assembly": 0.2, "solve": 0.3, "output": 0.4}, "converged": True, "fallbacks": 0,
-        "cone_problems": 1, "solver": "pdip", "asked_solver": "pdip",
-    }
-    compared = {**line, "phases": {**line["phases"], "compare": 3.0}}
-    for shown, more in ((line, {}), (compared, {"compare": "3.00"})):
-        heads, row = report.columns(bool(more)), report.step_line(shown)
-        ends = [heads.index(name) + len(name) for name in ("solve", *more, "output")]
-        assert [row[:end].split()[-1] for end in ends] == ["0.30", *more.values(), "0.40"]
-    assert "compare" not in report.columns(False)
-
-
 def test_a_large_overlap_is_a_warning():
     small = {"overlap [m]": 4e-4, "step": 7, "smallest_radius [m]": 0.1}
     assert report.overlap_line(small) == "worst overlap 0.0004 m, 0.4% of the smallest radius, at step 7"

@@ -10,8 +10,7 @@ from dem.bodies import Bodies
 from dem.motion import Dynamic, Glide, Guided
 from dem.scene import Scene
 from dem.scenes import Mixer
-from dem.shapes import Box, Plane
-from dem.start import new_world
+from dem.shapes import Box
 from dem.together import SceneError
 from pctt.options import OptionError
 from pctt.run.state import world_at_start
@@ -26,24 +25,6 @@ def simulation_of(scene, **settings):
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.mark.parametrize("solver", ["pdip", "apgd"])
-def test_one_body_falls_and_lands(solver):
-    scene = Scene(0.3, stiffness=np.inf)
-    scene.add_body("floor", [Plane((0, 0, 1))])
-    scene.add_spheres([0, 0, 0.2], 0.1, 1000.0)
-    sim = simulation_of(scene, solver=solver, tol=1e-8)
-    lines = [sim.step() for _ in range(12)]
-    assert [line["contacts"] for line in lines[:3]] == [0, 0, 0]
-    assert lines[-1]["contacts"] == 1
-    for line in lines:
-        assert line["converged"]
-        assert line["natural_residual"] <= 1e-8
-        assert np.isfinite(line["objective"])
-    np.testing.assert_allclose(sim.world.grains.position[0], [0, 0, 0.1], atol=1e-8)
-    weight = sim.world.grains.mass[0] * 9.81
-    np.testing.assert_allclose(sim.last.impulse, [[weight * sim.settings.dt, 0, 0]], rtol=1e-7)
 
 
 @pytest.mark.parametrize("solver", ["pdip", "apgd"])
@@ -85,13 +66,6 @@ def test_a_contact_that_does_not_close_needs_no_impulse():
     scene.add_spheres([[0, 0, 0], [0.21, 0, 0]], 0.1, 1000.0)
     line = simulation_of(scene).step()
     assert (line["contacts"], line["newton_its"], line["natural_residual"]) == (1, 0, 0.0)
-
-
-def test_an_overlapping_start_names_the_bodies_and_the_depth():
-    scene = Scene(0.3)
-    scene.add_spheres([[0, 0, 0], [1, 0, 0], [1.15, 0, 0]], 0.1, 1000.0)
-    with pytest.raises(ValueError, match=r"grain 1 and grain 2 overlap by 0\.05 m"):
-        new_world(scene, MPI.COMM_SELF)
 
 
 def test_a_body_that_is_lost_ends_the_run():

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import ROOT, database, table
+from program import ROOT
 
 from dem.experiment import from_file
 from dem.together import SceneError
@@ -16,8 +16,6 @@ from pctt.run.options import read_options
 from pctt.run.settings import find_scene
 from pctt.run.simulate import simulate
 from pctt.simulation import Simulation
-
-LOOSE = ("-ccp_type", "apgd", "-ccp_tol", "1e-3")
 
 
 @pytest.fixture
@@ -47,25 +45,6 @@ def test_grains_flow_out_of_the_hopper_and_none_is_lost(hopper):
     assert door[:30].min() < 0  # grains lay on it
     records = {name: np.array([row[name] for row in rows]) for name in rows[0] if "phases" not in name}
     assert scene.analyse(records)["mean_discharge_rate [1/s]"] == pytest.approx(out[-1] / 0.89)
-
-
-@pytest.mark.parallel(2)
-def test_the_program_runs_the_file_on_any_number_of_ranks(hopper, program, tmp_path, monkeypatch):
-    options = ("-scene", "hopper.py", "-scene_n", "4", "-scene_settling_time", "0.12", "-ccp_type", "apgd")
-    options += ("-ccp_tol", "1e-7", "-restart", "settled", "-steps", "4")
-    done = program(*options, "-output", "both", cache=tmp_path / "cache")
-    assert "mean_discharge_rate [1/s]" in done.stdout
-    if MPI.COMM_WORLD.rank > 0:
-        return
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    simulate(read_options(database([*options, "-quiet", "-output", "alone"]), MPI.COMM_SELF), MPI.COMM_SELF)
-    first, rows = (table(tmp_path / name / "records.csv") for name in ("alone", "both"))
-    assert list(first) == list(rows)
-    assert list(first["step"]) == [13, 14, 15, 16]
-    for name in ("contacts", "kinetic_energy [J]", "potential_energy [J]", "force_door_z [N]", "grains_out"):
-        scale = np.abs(first[name]).max() + 1e-300
-        np.testing.assert_allclose(rows[name], first[name], atol=1e-3 * scale, err_msg=name)
-    assert len(list((tmp_path / "cache" / "pctt").glob("hopper_n4_*.h5"))) == 1
 
 
 GOOD = """

@@ -67,13 +67,6 @@ def test_ranks_grow_until_the_residual_is_small_enough(n: int, dimensions: int, 
     assert found.residual <= tt.residual(S, best)  # as many numbers, the same rank in all bonds
 
 
-def test_more_rank_leaves_less() -> None:
-    S = exact(laplacian_and_one(16, 2), (2,) * 8)
-    left = [tt.invert(S, rank, sweeps=12, eps=1e-9).residual for rank in (4, 8, 16, 32)]
-    assert all(later < 0.5 * earlier for earlier, later in zip(left, left[1:]))
-    assert left[-1] < 1e-5
-
-
 def test_warm_start_of_a_near_matrix() -> None:
     rng = np.random.default_rng(0)
     dense = positive(rng, 64, 3).dense()

@@ -12,7 +12,7 @@ from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
-from pctt.options import AT_LEAST_ONE, number, option
+from pctt.options import number
 
 
 class ScaledProblem:
@@ -114,7 +114,7 @@ class ScaledProblem:
 class FirstOrder:
     """Options of every first-order method."""
 
-    check: int = option(10, "iterations between two looks at the natural residual", check=AT_LEAST_ONE)
+    check: int = number(10, "iterations between two looks at the natural residual, each of the cost of a product")
     patience: int = number(5000, "iterations without progress before it has stalled: there are plateaus of thousands")
 
 

@@ -1,0 +1,298 @@
+"""Writing the folder of a run, whose layout `pctt.folder` has: the place of the files, and what each step adds.
+
+A line is added to steps.jsonl with one write; every other file is written under a temporary name and renamed. So a
+killed run leaves whole files, and what is written per step does not grow with the number of steps.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import bodies
+from dem.exchange import exchange
+from dem.experiment import Experiment
+from dem.shapes import described
+from dem.step import Step
+from dem.together import together
+from dem.world import World
+from pctt import disk
+from pctt.disk import FileError, Lock, on_first, texts, write_rows, write_text
+from pctt.folder import DERIVED, FILES, HARD, Folder, dumps, write_table
+from pctt.options import OptionError
+
+
+def refusal(folder: Path, restart: str, overwrite: bool) -> str:
+    """Why a run with these values of -restart and -overwrite may not write to the folder; empty if it may."""
+    there = _held(folder)
+    if not there or overwrite or _goes_on(folder, restart):
+        return ""
+    goes_on = f", or -restart {folder / 'checkpoint.h5'} to go on with it" * ("checkpoint.h5" in there)
+    allowed = f"another folder, -overwrite to replace that run{goes_on}"
+    return f"-output {folder}: holds a run ({', '.join(there)}); allowed is {allowed}"
+
+
+def refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
+    """Make a folder; OptionError for the option ``name`` if files cannot be written there; collective."""
+
+    def write() -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+
+    try:
+        on_first(comm, folder, write)
+    except FileError as error:
+        raise OptionError(f"{name} {error}; allowed is a folder that can be written") from None
+
+
+def _held(folder: Path) -> list[str]:
+    """What is there of a run; nothing if a run may write to the folder."""
+    return [name for name in FILES if (folder / name).is_file() or any((folder / name).glob("*.h5"))]
+
+
+def _goes_on(folder: Path, restart: str) -> bool:
+    """Whether the file of ``-restart`` is the folder's own, so that a run goes on with what is there."""
+    return bool(restart) and Path(restart).resolve() == (folder / "checkpoint.h5").resolve()
+
+
+class Place:
+    """The place where a run writes, ``now``. It is the run's ``folder``, unless that holds another run. Then it is a
+    hidden folder in it until ``take`` replaces the other run, which stays untouched up to then.
+
+    A run that ``goes_on`` from the folder's own checkpoint adds to the files of the earlier one. No other run has the
+    folder until ``leave``.
+    """
+
+    def __init__(self, folder: Path, comm: MPI.Comm, restart: str = "", overwrite: bool = False):
+        """``restart`` and ``overwrite`` are the values of the options; collective. FileError on all ranks if another
+        run is writing to the folder, or has written there since the options were read."""
+        self.folder, self._comm, self._lock = folder, comm, Lock(folder)
+
+        def begin() -> tuple[bool, Path]:
+            folder.mkdir(parents=True, exist_ok=True)
+            if not self._lock.take():
+                raise FileError(f"-output {folder}: another run is writing there; allowed is another folder")
+            if refused := refusal(folder, restart, overwrite):
+                self.leave()
+                raise FileError(refused)
+            shutil.rmtree(folder / ".new", ignore_errors=True)  # of a run that ended before its first step stood
+            goes_on = _goes_on(folder, restart)
+            return goes_on, folder / ".new" if _held(folder) and not goes_on else folder
+
+        self.goes_on, self.now = on_first(comm, folder, begin)
+
+    def leave(self) -> None:
+        """Let other runs have the folder."""
+        self._lock.release()
+
+    def make(self, name: str = ".") -> None:
+        """Make the folder, or one within it; collective."""
+        on_first(self._comm, self.folder, lambda: (self.now / name).mkdir(parents=True, exist_ok=True))
+
+    def take(self) -> None:
+        """Put what was written in the place of the earlier run; collective."""
+        now, self.now = self.now, self.folder
+
+        def replace() -> None:
+            (now / ".old").mkdir()
+            for name in FILES:  # renames come first: a kill between two of them would leave parts of both runs
+                for source, target in ((self.folder / name, now / ".old" / name), (now / name, self.folder / name)):
+                    if source.exists():
+                        os.replace(source, target)
+            shutil.rmtree(now)
+
+        if now != self.folder:
+            on_first(self._comm, self.folder, replace)
+
+
+class Writer:
+    """Writes the steps of a run to a place: of each by `record` and then `add`, and at the end by `complete`.
+
+    A frame is recorded every ``every`` steps (0: never), and ``save(path)`` writes a checkpoint every
+    ``checkpoint_every``. A run that goes on from the folder's own checkpoint adds to the files of the earlier run; any
+    other run replaces them. Either removes nothing before its first step is written. Methods are collective.
+    """
+
+    def __init__(
+        self, place: Place, world: World, about: dict[str, Any], save: Callable[[Path], None],
+        compare: Callable[[], dict[str, Any]], every: int, checkpoint_every: int,
+    ):  # fmt: skip
+        """``about``: what settings.json says; ``compare()``: the summary of the compared preconditioners."""
+        self.place, self._world, self._save, self._compare, self.comm = place, world, save, compare, world.comm
+        self._every, self._checkpoint_every = every, checkpoint_every
+        self._start = self._recorded = self._saved = world.step
+        self._kept_steps = world.step if place.goes_on else 0
+        self._first_frame: int | None = None
+        self._begun = self._stands = self._stale = False
+        self.analysis: dict[str, float] | None = None  #: the scene's numbers of all steps so far
+        smallest = float(bodies.least_half_thickness(world.grains).min(initial=np.inf))
+        radius = self.comm.allreduce(smallest, MPI.MIN)
+        self._about = {**about, "bodies": world.body_count, "ranks": self.comm.size, "smallest_radius [m]": radius}
+        on_first(self.comm, self._lines, lambda: sum(1 for _ in self._kept()))  # which can be gone on with
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.place.now / "checkpoint.h5"
+
+    @property
+    def folder(self) -> Folder:
+        """What is written so far; on rank 0."""
+        return Folder(self.place.now)
+
+    @property
+    def _lines(self) -> Path:
+        return self.place.now / "steps.jsonl"
+
+    def _kept(self) -> Iterator[str]:
+        """The lines of the steps that stay of an earlier run; FileError if one is damaged."""
+        for line in disk.lines(self._lines):
+            try:
+                step = json.loads(line)["step"]
+            except (LookupError, TypeError, ValueError) as error:
+                raise FileError(f"{self._lines}: cannot be continued ({error})") from None
+            if step <= self._kept_steps:
+                yield line
+
+    def record(self, step: Step, row: Mapping[str, float]) -> None:
+        """Write the frame of a step, with the row of its records, if that is due."""
+        if self._every and step.world.step % self._every == 0:
+            self._record(step, row)
+
+    def add(self, line: Mapping[str, Any], row: Mapping[str, float]) -> None:
+        """Write the figures of a step with the row of its records, and the checkpoint if that is due."""
+        self.place.make()
+        on_first(self.comm, self._lines, lambda: self._add(dumps({**line, "record": row})))
+        # after the figures: a run that goes on from the checkpoint must find the step
+        if (self._world.step - self._start) % self._checkpoint_every == 0:
+            self._checkpoint()
+        if not self._stands:
+            self.place.take()
+            on_first(self.comm, self.place.folder, lambda: self._remove_later(Path(line["hard_problem"]).name))
+            self._stands = True
+        self.analysis, self._stale = None, True
+
+    def _add(self, line: str) -> None:
+        """The first line replaces the file, with the lines that stay; every other one is a single write."""
+        if self._begun:
+            disk.append(self._lines, line)
+            return
+        write_text(self.place.now / "settings.json", dumps(self._about, indent=1) + "\n")
+        with disk.whole(self._lines) as temporary, open(temporary, "w") as file:
+            file.writelines(f"{text}\n" for text in chain(self._kept(), [line]))
+        self._begun = True
+
+    def complete(self, step: Step, row: Mapping[str, float]) -> None:
+        """Write the frame and the checkpoint of the last step, if they are not there, and what follows from all."""
+        if self._every and self._recorded < self._world.step:
+            self._record(step, row)
+        if self._saved < self._world.step:
+            self._checkpoint()
+        if self._stale:
+            self._derive()
+
+    def analyse(self, scene: Experiment) -> dict[str, float]:
+        """The numbers that the scene finds in the records, which also go to summary.json; SceneError if it fails."""
+        what = f"analyse of the scene {type(scene).__name__}"
+        self.analysis = self.comm.bcast(together(self.comm, what, lambda: self._analyse(scene), own=(FileError,)))
+        self._derive()
+        return self.analysis
+
+    def _analyse(self, scene: Experiment) -> dict[str, float]:
+        if self.comm.rank > 0:
+            return {}
+        records = self.folder.records()
+        found = scene.analyse(records)
+        figures = {name: float(value) for name, value in found.items() if np.ndim(value) == 0}
+        series = {name: np.asarray(value) for name, value in found.items() if name not in figures}
+        if series:
+            leading = {name: records[name] for name in list(records)[:2]}
+            write_table(self.place.now / "analysis.csv", {**leading, **series})
+        return figures
+
+    def _derive(self) -> None:
+        more = {"analysis": self.analysis or {}, "compare": self._compare()}
+        on_first(self.comm, self.place.now, lambda: self.folder.derive(**more))
+        self._stale = False
+
+    def leave(self) -> None:
+        """Let other runs have the folder. A run that an error ends writes what follows from its files."""
+        if self.comm.rank == 0 and self._stands and self._stale:
+            with suppress(FileError):  # which has said so already
+                self.folder.derive(compare=self._compare())
+        self.place.leave()
+
+    def _checkpoint(self) -> None:
+        self._save(self.checkpoint)
+        self._saved = self._world.step
+
+    def _record(self, step: Step, row: Mapping[str, float]) -> None:
+        """Write the state at the end of a step, the contacts and impulses that led to it, and the row of its records
+        as attributes of the group `record`.
+
+        Bodies are in the order of their ids (grains, then large bodies).
+        """
+        world, contacts, frames = step.world, step.contacts, self.place.now / "frames"
+        if self._first_frame is None:
+            self.place.make("frames")
+            rows = _by_id(world, ("shape", "size", "mass", "material"))
+            large = np.bytes_(json.dumps(described_bodies(world)))
+            shared = {"materials": texts(world.materials), "large": large}
+            write_rows(frames / "bodies.h5", self.comm, rows, shared, {})
+            self._first_frame = world.step
+        near = contacts.near.bodies
+        rows = {
+            **_by_id(world, ("position", "quaternion", "velocity")),
+            "contact/key": contacts.key,
+            "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
+            "contact/point": contacts.point,
+            "contact/frame": step.system.frame,
+            "contact/gap": contacts.gap,
+            "contact/impulse": step.impulse,
+        }
+        about = {"/": {"step": world.step, "time": world.time}, "record": row, "contact": {"dt": step.system.dt}}
+        write_rows(frames / f"{world.step:06d}.h5", self.comm, rows, {}, about)
+        self._recorded = world.step
+
+    def _remove_later(self, hard: str) -> None:
+        """Remove what followed from an earlier run's steps, and its later steps, but not those of this run's first
+        step, such as the file ``hard``."""
+        folder, kept = self.folder, self._kept_steps
+        for name in DERIVED:  # first of all: no link is without its file
+            (folder.path / name).unlink(missing_ok=True)
+        for step in folder.steps:
+            if step > kept and step != self._first_frame:
+                folder.frame_path(step).unlink()
+        for path in (folder.path / HARD).glob("step??????_*its.h5"):
+            if int(path.name[4:10]) > kept and path.name != hard:
+                path.unlink()
+
+
+def described_bodies(world: World) -> list[dict[str, Any]]:
+    """The names and shapes of the large bodies, as JSON has them."""
+    large = [
+        {"name": body.name, "shapes": [described(shape) for shape in body.shapes]}
+        for body in world.large_bodies
+    ]
+    return json.loads(json.dumps(large, default=list))  # arrays as lists
+
+
+def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Columns of the table of all bodies, in the order of their ids, spread over the ranks; collective."""
+    grains, comm = world.grains, world.comm
+    columns = {"id": grains.id, **{name: getattr(grains, name) for name in names}}
+    starts = np.arange(comm.size + 1) * int(world.slabs[-1]) // comm.size
+    rows = exchange(comm, columns, np.searchsorted(starts, grains.id, side="right") - 1)
+    order, last = np.argsort(rows["id"]), comm.rank == comm.size - 1
+    large = {name: getattr(world.large, name) for name in names}
+    return {name: np.concatenate([rows[name][order], large[name] if last else large[name][:0]]) for name in names}
