@@ -26,6 +26,7 @@ from dem.scene import LargeBody, Scene
 from dem.shapes import Plane, placed
 
 OVERLAP = 0.003  #: the greatest overlap that `recommended` allows, as a part of a grain's radius
+CHAINS = 4.0  #: the strongest forces between grains over those that a like share of the weight makes
 DAMPING = 2.0  #: c as a part of 2 sqrt(k m): an impact leaves 5 % of the speed (Schwager, Poeschel); 1: 14 %
 
 
@@ -34,21 +35,27 @@ def table(scene: Scene) -> Floats:
     return scene.stiffness_table(recommended(scene) if scene.stiffness is None else scene.stiffness)
 
 
-def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
+def recommended(scene: Scene, overlap: float = OVERLAP, without: str = "") -> float:
     """The stiffness [N/m] with which no grain of a scene overlaps by more than this part of its radius, whether under
-    the weight of the bed above it or stopped by the fastest tool or grain, to two digits; inf if there is neither.
+    the weight of the bed above it or stopped by the fastest tool or grain, to two digits; inf if there is neither. The
+    large body ``without`` goes away from the grains.
 
-    The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width. A grain
-    of mass m that a tool of speed v meets is stopped by k d = v sqrt(k m). Grains that fall from high are not reckoned
-    with.
+    The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width, and
+    four times as much where a chain of force goes (Radjai, Jean, Moreau, Roux, Phys. Rev. Lett. 77 (1996): a share of
+    exp(-1.4 f) bears more than f times the mean). A grain of mass m that a tool of speed v meets is stopped by
+    k d = v sqrt(k m). Grains that fall from high are not reckoned with.
     """
     grains = scene.grains()
     allowed = overlap * bodies.bounding_radius(grains)
-    load = _load(scene)
-    speed = max([_speed(body) for body in scene.large_bodies], default=0.0)
-    speed = max(speed, float(np.linalg.norm(grains.velocity[:, :3], axis=1).max()))
-    stiffness = float(np.maximum(load / allowed, grains.mass * (speed / allowed) ** 2).max())
+    stiffness = float(np.maximum(_load(scene) / allowed, grains.mass * (_speed(scene, without) / allowed) ** 2).max())
     return float(f"{stiffness:.1e}") if stiffness > 0.0 else np.inf  # the same on processors that round in other ways
+
+
+def expected_overlap(scene: Scene, stiffness: float) -> float:
+    """The greatest overlap, as a part of a radius, that `recommended` would expect of a stiffness [N/m]."""
+    grains = scene.grains()
+    stopped = _speed(scene) * np.sqrt(grains.mass / stiffness)
+    return float((np.maximum(_load(scene) / stiffness, stopped) / bodies.bounding_radius(grains)).max())
 
 
 def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:
@@ -81,10 +88,16 @@ def _load(scene: Scene) -> Floats:
     width = np.sqrt(12.0) * spread + 2.0 * radius.mean()  # of a rectangle of that spread, with the grains at its edges
     others = sum(body.mass for body in scene.large_bodies if isinstance(body.motion, Dynamic))
     pressure = gravity * (grains.mass.sum() + others) / width.prod()
-    return np.maximum(pressure * (2.0 * radius) ** 2, gravity * grains.mass)
+    return np.maximum(CHAINS * pressure * (2.0 * radius) ** 2, gravity * grains.mass)
 
 
-def _speed(body: LargeBody) -> float:
+def _speed(scene: Scene, without: str = "") -> float:
+    """The greatest speed of a tool or a grain at time zero [m/s]."""
+    tools = [_top_speed(body) for body in scene.large_bodies if body.name != without]
+    return max([*tools, float(np.linalg.norm(scene.grains().velocity[:, :3], axis=1).max())])
+
+
+def _top_speed(body: LargeBody) -> float:
     """The greatest speed of a point of a large body [m/s]; a plane has no end, and counts by the body's centre."""
     parts = [placed(shape) for shape in body.shapes if not isinstance(shape, Plane)]
     reach = max((float(np.linalg.norm(center) + np.linalg.norm(size)) for _, center, _, size in parts), default=0.0)

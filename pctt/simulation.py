@@ -32,6 +32,7 @@ from dem.impulses import ImpulseMemory
 from dem.motion import Motion
 from dem.scene import LargeBody, Scene
 from dem.step import Step
+from dem.stiffness import expected_overlap
 from dem.together import meet, together
 from dem.world import set_motion
 from pctt import ccp, log
@@ -55,6 +56,7 @@ class Simulation:
     settings : the `Settings`, with what the scene and the solver have of their own filled in
     experiment : the scene as an `Experiment`
     world : the bodies of this rank and the time, a `dem.world.World`
+    expected_overlap : the greatest to expect of the contacts' stiffness, as a part of a radius; 0 of rigid contacts
     memory, stepper : the impulses of the last step, and what makes the next, a `pctt.run.stepper.Stepper`
     last : the last step, a `dem.step.Step` with this rank's contacts and impulses; None before the first
     figures : of the last step, as in steps.jsonl and records.csv: ``iterations``, ``natural_residual``, ``converged``,
@@ -104,6 +106,7 @@ class Simulation:
         self.restart = str(restart)  #: the file from which it goes on
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
+        self.expected_overlap = expected_overlap(scene, float(self.world.stiffness.min()))
         self.last: Step | None = None
         self.figures: dict[str, Any] = {}
         self.output: Writer | None = None

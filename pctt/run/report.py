@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 
 from pctt.ccp.result import FIXED_POINT, RELAXATION
@@ -39,6 +40,15 @@ def columns(compared: bool) -> str:
         "  step    time s  contacts   iters  Krylov  residual"
         f"  seconds: total  search  assembly   solve{compare}  output"
     )
+
+
+def stiffness_line(stiffness: np.ndarray, overlap: float) -> str:
+    """The stiffnesses [N/m] of contacts, and the part of a radius that bodies may overlap by."""
+    if np.isinf(stiffness).all():
+        return "rigid contacts"
+    least, most = (f"{value:.2g}" for value in (stiffness.min(), stiffness.max()))
+    words = f"contacts of {least} N/m" if least == most else f"contacts of {least} to {most} N/m"
+    return f"{words}: weight and tools make overlaps of up to {100 * overlap:.2g} % of a radius"
 
 
 def step_line(line: Mapping[str, Any]) -> str:

@@ -54,6 +54,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     assert output is not None
     end = sim.steps + options.run.steps
     progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {settings.words}")
+    progress.say(report.stiffness_line(sim.world.stiffness, sim.expected_overlap))
     if ccp.SOLVERS[settings.solver].needs != ccp.NEWTON and settings.tol > ccp.Limits().tol:
         progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE}")
     if ccp.SOLVERS[settings.solver].newton:
