@@ -45,6 +45,8 @@ class World:
 
     changed: set[str] = field(init=False, default_factory=set)  #: large bodies with another motion than the scene gave
 
+    lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
+
     #: By time and dt [s] the mean velocities of prescribed motions, by row; of the last question alone.
     _followed: dict[tuple[float, float], dict[int, Floats]] = field(init=False, repr=False, default_factory=dict)
 
@@ -60,7 +62,7 @@ class World:
 
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
-        self.grains = grains
+        self.grains, self.lists = grains, None
         counts, spheres = zip(*self.comm.allgather((len(grains), bool((grains.shape == bodies.SPHERE).all()))))
         self.slabs = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.only_spheres = all(spheres)

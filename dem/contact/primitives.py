@@ -27,11 +27,9 @@ from dem.contact.narrow import (
     joined,
     manifold,
     reversed_touch,
-    sphere_box,
     sphere_capsule,
-    sphere_plane,
-    spheres_within,
 )
+from dem.contact.spheres import touch_spheres
 from dem.mesh import Mesh, Surface
 from dem.neighbourhood import Neighbourhood
 from dem.shapes import Shape, placed
@@ -66,14 +64,6 @@ class Primitives(NamedTuple):
 
     def mesh(self, row: int) -> PlacedMesh:
         return PlacedMesh(self.surfaces[row], self.center[row], quaternion.matrix(self.quaternion[row]))
-
-    def keys(self, i: Ints, j: Ints, feature: Ints) -> Ints:
-        """Numbers (m,) of the features of pairs of rows i, j (m,), distinct and the same at all times."""
-        first, second = self.number[i], self.number[j]
-        if self.surfaces:
-            further, feature = np.divmod(feature, FEATURES)
-            first, second = first + further * (self.kind[i] == MESH), second + further * (self.kind[i] != MESH)
-        return (first * self.numbers + second) * FEATURES + feature
 
 
 def primitives(near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int) -> Primitives:
@@ -122,11 +112,16 @@ def _numbers_of(shape: Shape) -> int:
 
 
 def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
-    """All contacts of gap at most `delta` (m,) [m] of the pairs of rows i, j (m,); normals point from i to j.
+    """All contacts of gap at most `delta` (m,) [m] of the pairs of rows i, j (m,); normals point from i to j. Those of
+    spheres come first, in the order of the pairs.
 
     Two half spaces have none, nor have meshes with boxes or meshes: `dem.scene` refuses those.
     """
-    found = [Manifold(i[:0], j[:0], Touch(table.center[:0], table.center[:0], delta[:0]))]
+    pair, point, normal, gap, others = touch_spheres(
+        table.kind, table.center, table.quaternion, table.size, i, j, delta
+    )
+    found = [Manifold(pair, np.zeros_like(pair), Touch(point, normal, gap))]
+    i, j, delta = i[others], j[others], delta[others]
     code = 8 * table.kind[i] + table.kind[j]
     for one, two in (divmod(int(kinds), 8) for kinds in np.flatnonzero(np.bincount(code))):
         rows = np.flatnonzero(code == 8 * one + two)
@@ -137,15 +132,13 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
             touch = reversed_touch(touch)
         else:
             continue
-        found.append(Manifold(rows[pair], feature, touch))
-    return joined(found)
+        found.append(Manifold(others[rows[pair]], feature, touch))
+    return joined(found) if len(found) > 1 else found[0]
 
 
 def _touching(table: Primitives, one: int, two: int, i: Ints, j: Ints, delta: Floats) -> Manifold:
     """The contacts of pairs of rows i, j (m,) of the kinds `one` and `two`; with meshes mesh by mesh."""
     contacts, first = _TOUCH[one, two], _SHAPE[one]
-    if one == two == SPHERE:
-        return contacts(table, i, j, delta)  # without copies of the many spheres
     if two != MESH:
         return contacts(first(table, i), _SHAPE[two](table, j), delta)
     found = []
@@ -156,23 +149,11 @@ def _touching(table: Primitives, one: int, two: int, i: Ints, j: Ints, delta: Fl
     return joined(found)
 
 
-def _spheres(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
-    pair, *touch = spheres_within(table.center, table.size, i, j, delta)
-    return Manifold(pair, np.zeros_like(pair), Touch(*touch))
-
-
-def _in_one_point(touch: Callable[[Any, Any], Touch]) -> Callable[..., Manifold]:
-    return lambda first, second, delta: manifold(delta, [touch(first, second)])
-
-
 _SHAPE: dict[int, Callable[..., Any]] = {
     SPHERE: Primitives.sphere, BOX: Primitives.box, CAPSULE: Primitives.capsule, PLANE: Primitives.plane
 }  # fmt: skip
 _TOUCH: dict[tuple[int, int], Callable[..., Manifold]] = {
-    (SPHERE, SPHERE): _spheres,
-    (SPHERE, BOX): _in_one_point(sphere_box),
-    (SPHERE, CAPSULE): _in_one_point(sphere_capsule),
-    (SPHERE, PLANE): sphere_plane,
+    (SPHERE, CAPSULE): lambda ball, capsule, delta: manifold(delta, [sphere_capsule(ball, capsule)]),
     (CAPSULE, CAPSULE): capsule_capsule,
     (CAPSULE, BOX): capsule_box,
     (CAPSULE, PLANE): capsule_plane,
