@@ -18,9 +18,8 @@ from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.bodies import SPHERE, Bodies
 from dem.contact import Contacts, contact_order, find_contacts
 from dem.contact_map.loops import relative_velocities
-from dem.motion import Dynamic, checked_pose
 from dem.system import ContactSystem, contact_arms, contact_frames
-from dem.together import meet, together
+from dem.together import meet
 from dem.world import World
 
 
@@ -87,13 +86,8 @@ def advanced(world: World, velocity: Floats, dt: float) -> World:
 def follow_motions(world: World) -> None:
     """Put the bodies of prescribed motion where they are to be now; collective. SceneError if a motion fails."""
 
-    def follow() -> None:
-        for row, body in enumerate(world.large_bodies):
-            if not isinstance(body.motion, Dynamic):
-                pose = checked_pose(body.motion, world.time, body.position, body.quaternion)
-                world.large.position[row], world.large.quaternion[row] = pose
-
-    together(world.comm, "motion of a large body", follow)
+    for row, pose in world.poses(world.time).items():
+        world.large.position[row], world.large.quaternion[row] = pose
 
 
 def _move(table: Bodies, velocity: Floats, dt: float) -> None:
@@ -140,11 +134,10 @@ def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
 
 def _at_start(end: Contacts, dt: float) -> tuple[Contacts, Floats]:
     """The contacts of the end of a step as contacts of its start, and by how much (nc,) their gaps grow in it [m]."""
-    velocity, row = end.near.bodies.velocity, np.stack([end.a, end.b], axis=1)
+    velocity, row = end.near.bodies.velocity, np.stack([end.a, end.b], axis=1).astype(np.uint32)
     point = end.point - 0.5 * dt * velocity[row, :3].sum(axis=1)
     arm = contact_arms(point, end.near.bodies.position - dt * velocity[:, :3], row)
-    frame = contact_frames(end.normal).reshape(-1, 9)
-    growth = dt * relative_velocities(frame, arm, row.astype(np.uint32), velocity)[:, 0]
+    growth = dt * relative_velocities(contact_frames(end.normal).reshape(-1, 9), arm, row, velocity)[:, 0]
     return replace(end, point=point, gap=end.gap - growth), growth
 
 

@@ -25,7 +25,8 @@ def meeting(
     bodies are delta/2 or the way of their surfaces, if the bodies move and turn by any of the `shifts` (k, large, 6)
     [m, rad]."""
     last = world.comm.rank == world.comm.size - 1
-    foreign = ~last & bodies.is_dynamic(world.large)[table.row[near.grains + near.ghosts :] - near.grains - near.ghosts]
+    first = near.grains + near.ghosts
+    foreign = bodies.is_dynamic(world.large)[table.row[first:] - first] & (not last)
     found = [_of_grains(near, lists, lists.own, ~foreign, table, delta, shifts)]
     if last:
         if bodies.is_dynamic(world.large).any():

@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from dem import bodies
 from dem.arrays import Bools, Floats, Ints
-from dem.bodies import MESH, SPHERE, Bodies
+from dem.bodies import CAPSULE, MESH, SPHERE
 from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.candidates import meeting
@@ -67,7 +67,7 @@ def find_contacts(
     if shifts is None:
         shifts = (dt * large_free_velocity(world, dt) if dt else np.zeros_like(world.large.velocity))[None]
     free = free_velocity(world.grains, world.gravity, dt) if dt else world.grains.velocity
-    way = _way(world.grains, free, dt)
+    way = ways(world.grains.shape, world.grains.size, free, dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
     lists = grain_lists(world, margin, way)
     near = refreshed(lists.near, lists.halo, world, margin)
@@ -129,14 +129,14 @@ def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: floa
     The search may be repeated for the contacts that it finds: margins only grow.
     """
     seen = contacts.near.margin[: contacts.near.grains]
-    ways = _way(world.grains, velocity[: len(seen)], dt)
+    way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
     shift = dt * world.large_velocity(velocity)
     # reduced, though all ranks have the same data: processors of other kinds may round otherwise
     beyond = world.comm.allreduce(_go_beyond(world, shift, contacts.shifts, delta), MPI.LOR)
-    if not (world.comm.allreduce(bool((ways > seen).any()), MPI.LOR) or beyond):
+    if not (world.comm.allreduce(bool((way > seen).any()), MPI.LOR) or beyond):
         return None
     shifts = np.concatenate([contacts.shifts, shift[None]]) if beyond else contacts.shifts
-    wider = find_contacts(world, delta, dt, np.maximum(seen, ways), shifts)
+    wider = find_contacts(world, delta, dt, np.maximum(seen, way), shifts)
     new = len(wider) > len(contacts) or not np.isin(wider.key, contacts.key, assume_unique=True).all()
     return wider if world.comm.allreduce(new, MPI.LOR) else None
 
@@ -145,6 +145,8 @@ def _go_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
     """Whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as in one
     of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
     free = bodies.is_dynamic(world.large)
+    if not free.any():
+        return False
     size = extents([body.shapes for body in world.large_bodies])[free]
 
     def way(shift: Floats) -> Floats:
@@ -153,14 +155,21 @@ def _go_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
     return bool(((way(shift) > delta / 2) & (way(shift - seen) > 0.01 * delta).all(axis=0)).any())
 
 
-def _way(grains: Bodies, velocity: Floats, dt: float) -> Floats:
+@loop
+def ways(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
     """About how far (n,) a point of each grain goes in dt [s], at most two of its radii [m]. For spheres it is the
     centre's way, as turning does not move their surface. NaN where the velocity is not finite."""
-    radius = bodies.bounding_radius(grains)
-    turn = np.where(grains.shape == SPHERE, 0.0, radius) * length(velocity[:, 3:])
-    way = np.minimum(dt * (length(velocity[:, :3]) + turn), 2.0 * radius)
-    finite = np.isfinite(velocity)
-    return way if finite.all() else np.where(finite.all(axis=1), way, np.nan)
+    out = np.empty(len(shape))
+    for n in range(len(shape)):
+        v = velocity[n]
+        way, spin = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2), np.sqrt(v[3] ** 2 + v[4] ** 2 + v[5] ** 2)
+        radius = np.sqrt(size[n, 0] ** 2 + size[n, 1] ** 2 + size[n, 2] ** 2)
+        if shape[n] == CAPSULE:
+            radius = size[n, 0] + size[n, 1]
+        if shape[n] != SPHERE:
+            way += radius * spin
+        out[n] = min(dt * way, 2.0 * radius) if np.isfinite(way + spin) else np.nan
+    return out
 
 
 def _gives_no_way(world: World, contacts: Contacts) -> Bools:
