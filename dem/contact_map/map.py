@@ -230,8 +230,8 @@ class ContactMap:
     def contact_blocks(self) -> Floats:
         """The diagonal blocks of G G' (nc, 3, 3)."""
         out = np.empty((self.rows, 3, 3), self.precision)
-        mass = np.zeros((self.halo.rows, 12), self.precision)
-        mass[: self.columns] = packed(root_blocks(self._mass))
+        mass = np.zeros((self.halo.rows, self._mass.shape[1]), self.precision)
+        mass[: self.columns] = self._mass
         self.halo.update(mass)
         loops.contact_blocks(*self._arrays, mass, out)
         return out
