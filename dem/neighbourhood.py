@@ -6,6 +6,7 @@ A contact belongs to the rank of the lower global body index: ghosts only travel
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -63,14 +64,14 @@ def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> 
     grains of `near`; collective."""
     count = near.grains + near.ghosts
 
-    def now(own: Floats, large: Floats) -> Floats:
+    def now(own: Floats, large: Floats | float) -> Floats:
         column = np.empty((len(near.bodies), *own.shape[1:]))
         column[: near.grains], column[count:] = own, large
         halo.update(column)
         return column
 
     names = ("position", "quaternion", "velocity")
-    columns = {name: now(getattr(world.grains, name), getattr(world.large, name)) for name in names}
+    columns: dict[str, Any] = {name: now(getattr(world.grains, name), getattr(world.large, name)) for name in names}
     return replace(near, bodies=replace(near.bodies, **columns), margin=now(margin, 0.0)[:count])
 
 

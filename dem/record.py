@@ -58,8 +58,10 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
-    place = step.world.grains.position
-    return step.total(((place < np.asarray(low)) | (place > np.asarray(high))).any(axis=1))
+    place, lost = step.world.grains.position, np.zeros(len(step.world.grains), bool)
+    for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high))):
+        lost |= (place[:, axis] < least) | (place[:, axis] > most)
+    return step.total(lost)
 
 
 def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:

@@ -19,7 +19,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
-from dem.arrays import Floats, Ints
+from dem.arrays import Floats
 from dem.checks import positive
 from dem.compiled import loop
 from dem.contact import Contacts
@@ -130,7 +130,7 @@ def _frames(normal: Floats) -> Floats:
 
 
 @loop
-def contact_arms(point: Floats, position: Floats, row: Ints) -> Floats:
+def contact_arms(point: Floats, position: Floats, row: np.ndarray) -> Floats:
     """Vectors (nc, 6) from the centres of the two bodies of each contact to its point (nc, 3); `row` (nc, 2) are the
     bodies' rows in a table of positions (rows, 3)."""
     out = np.empty((len(row), 6))
@@ -145,7 +145,8 @@ def contact_arms(point: Floats, position: Floats, row: Ints) -> Floats:
 def _rows_of(a, b, body, moves, owned):
     """Of contacts of bodies in the rows a and b (nc,): the rows (nc, 2), the indices `body` (nc, 2) of those that move,
     else -1, and which rows that this rank does not own they touch and move."""
-    row, moved, touched = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int64), np.zeros(len(moves), np.bool_)
+    row, moved = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int64)
+    touched = np.zeros(len(moves), np.bool_)
     for c in range(len(a)):
         row[c, 0], row[c, 1] = a[c], b[c]
         for k, n in enumerate((a[c], b[c])):

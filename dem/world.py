@@ -47,7 +47,7 @@ class World:
 
     lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
 
-    #: By time the poses of the two last times, and by time and dt the mean velocities, of prescribed motions by row [s].
+    #: Of prescribed motions, by row: the poses at the two last times, and by time and dt [s] the mean velocities.
     _poses: dict[float, dict[int, Pose]] = field(init=False, repr=False, default_factory=dict)
     _followed: dict[tuple[float, float], dict[int, Floats]] = field(init=False, repr=False, default_factory=dict)
 
@@ -117,7 +117,7 @@ class World:
             start, end = self.poses(self.time), self.poses(self.time + dt)
 
             def follow() -> dict[int, Floats]:
-                motions = {row: self.large_bodies[row].motion for row in start}
+                motions: list[Any] = [body.motion for body in self.large_bodies]
                 return {row: velocity_between(motions[row], start[row], end[row], dt) for row in start}
 
             self._followed = {asked: together(self.comm, "motion of a large body", follow)}

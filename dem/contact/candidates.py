@@ -27,30 +27,31 @@ def meeting(
     last = world.comm.rank == world.comm.size - 1
     first = near.grains + near.ghosts
     foreign = bodies.is_dynamic(world.large)[table.row[first:] - first] & (not last)
-    found = [_of_grains(near, lists, lists.own, ~foreign, table, delta, shifts)]
+    found = [_of_grains(near, lists.own, ~foreign, table, delta, shifts)]
     if last:
         if bodies.is_dynamic(world.large).any():
             found.append(_of_large(world, near, table, delta, shifts))
     else:
-        found.append(_of_grains(near, lists, lists.away, foreign, table, delta, shifts))
+        found.append(_of_grains(near, lists.away, foreign, table, delta, shifts))
     i, j, reach = (np.concatenate(columns) for columns in zip(*found)) if len(found) > 1 else found[0]
     return i, j, reach
 
 
 def _of_grains(
-    near: Neighbourhood, lists: Lists, rows: Rows, wanted: Bools, table: Primitives, delta: float, shifts: Floats
+    near: Neighbourhood, rows: Rows, wanted: Bools, table: Primitives, delta: float, shifts: Floats
 ) -> Pairs:
     """Pairs of local grains with those in their rows, and with the `wanted` (parts,) parts of large bodies."""
     first = near.grains + near.ghosts
     part = first + np.flatnonzero(wanted)
     turn = quaternion.matrix(table.quaternion[part]).reshape(-1, 9)
-    parts = part, table.row[part] - first, turn, near.bodies.position[first:], shifts, 0.5 * delta
-    grains = rows.start, rows.other, lists.radius, near.margin, table.number
-    shapes = table.kind, table.center, table.size, table.radius
+    turning, way = shifts[:, :, 3:].any(axis=(0, 2)), length(shifts[:, :, :3]).max(axis=0)
+    large = near.bodies.position[first:], shifts, turning, np.maximum(0.5 * delta, np.where(turning, 0.0, way))
+    parts = part, table.row[part] - first, turn
+    shapes = table.number, table.kind, table.center, table.size, table.radius
     done, found, room = 0, 0, len(rows.other) + near.grains + len(part)
     i, j, reach = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)
     while True:
-        done, found = fill(*grains, *parts, *shapes, done, found, i, j, reach)
+        done, found = fill(rows.start, rows.other, near.margin, *parts, *large, *shapes, done, found, i, j, reach)
         if done == near.grains:
             return i[:found], j[:found], reach[:found]
         i, j, reach = (np.concatenate([column, np.empty_like(column)]) for column in (i, j, reach))
@@ -58,15 +59,15 @@ def _of_grains(
 
 @loop
 def fill(
-    start, other, radius, margin, number, part, body, turn, pivot, shifts, least, kind, center, size, extent, done,
+    start, other, margin, part, body, turn, pivot, shifts, turning, least, number, kind, center, size, radius, done,
     found, i, j, reach,
 ):  # fmt: skip
     """Add to the first pairs those of the rows that are not done, as long as there is room; new numbers of rows done
     and pairs found.
 
-    The grains have the pairs `start`, `other`, and a `radius`, `margin` and `number` each. The parts are rows `part`
-    (p,) with frames `turn` (p, 9), of the bodies `body` (p,), which have a `pivot` (bodies, 3), move and turn by the
-    `shifts` (k, bodies, 6), and have the `least` margin.
+    The grains have the pairs `start`, `other`, and a `margin` each. The parts are rows `part` (p,) with frames `turn`
+    (p, 9), of the bodies `body` (p,). These have a `pivot` (bodies, 3), move and turn by the `shifts` (k, bodies, 6),
+    and have the margins `least` (bodies,) but for those `turning` (bodies,), whose surfaces go further.
     """
     for n in range(done, len(start) - 1):
         if found + start[n + 1] - start[n] + len(part) > len(i):
@@ -83,21 +84,23 @@ def fill(
         last, limit = -1, 0.0
         for k in range(len(part)):
             if body[k] != last:
-                last, way = body[k], 0.0
-                u, v, w = x - pivot[last, 0], y - pivot[last, 1], z - pivot[last, 2]
-                for s in range(len(shifts)):
-                    p, q, r = shifts[s, last, 3], shifts[s, last, 4], shifts[s, last, 5]
-                    a = shifts[s, last, 0] + q * w - r * v
-                    b = shifts[s, last, 1] + r * u - p * w
-                    c = shifts[s, last, 2] + p * v - q * u
-                    way = max(way, np.sqrt(a * a + b * b + c * c) + wide * np.sqrt(p * p + q * q + r * r))
-                limit = own + max(least, way)
+                last = body[k]
+                way = least[last]
+                if turning[last]:
+                    u, v, w = x - pivot[last, 0], y - pivot[last, 1], z - pivot[last, 2]
+                    for s in range(len(shifts)):
+                        p, q, r = shifts[s, last, 3], shifts[s, last, 4], shifts[s, last, 5]
+                        a = shifts[s, last, 0] + q * w - r * v
+                        b = shifts[s, last, 1] + r * u - p * w
+                        c = shifts[s, last, 2] + p * v - q * u
+                        way = max(way, np.sqrt(a * a + b * b + c * c) + wide * np.sqrt(p * p + q * q + r * r))
+                limit = own + way
             m, far = part[k], wide * (1.0 + 1e-9) + limit  # where rounding matters, the narrow phase is to decide
             u, v, w = x - center[m, 0], y - center[m, 1], z - center[m, 2]
             if kind[m] == PLANE:
                 apart = u * size[m, 0] + v * size[m, 1] + w * size[m, 2]
             else:
-                square, enough = u * u + v * v + w * w, extent[m] + far
+                square, enough = u * u + v * v + w * w, radius[m] + far
                 if square > enough * enough:
                     continue
                 if kind[m] == BOX or kind[m] == MESH:  # of meshes the box about them
@@ -107,7 +110,7 @@ def fill(
                     a, b, c = max(a, 0.0), max(b, 0.0), max(c, 0.0)
                     apart = np.sqrt(a * a + b * b + c * c)
                 else:
-                    apart = np.sqrt(square) - extent[m]
+                    apart = np.sqrt(square) - radius[m]
             if apart <= far:
                 i[found], j[found], reach[found] = n, m, limit
                 found += 1

@@ -8,6 +8,7 @@ whether the margins meet now: it finds the same with the lists of an earlier ste
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -16,8 +17,9 @@ from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.compiled import loop
 from dem.contact.broad import close_pairs
+from dem.contact.primitives import Primitives, primitives
 from dem.contact_map import Halo
-from dem.neighbourhood import Neighbourhood, neighbourhood, refreshed
+from dem.neighbourhood import Neighbourhood, neighbourhood
 from dem.world import World
 
 #: The slack of a grain at rest, as a part of its radius: it costs a sixth more pairs.
@@ -41,11 +43,11 @@ class Lists:
 
     near: Neighbourhood  #: then; its margins have the slack
     halo: Halo  #: between the grains of `near`
-    radius: Floats  #: (grains + ghosts,) of the spheres that enclose the grains [m]
+    table: Primitives  #: of the bodies of `near`, not yet where they are
     margin: Floats  #: (grains,) without slack [m]
     own: Rows  #: pairs of local grains
     away: Rows  #: pairs of a local grain and a ghost
-    constant: tuple[np.ndarray, ...]  #: the columns of the world's tables that no step changes
+    constant: list[Any]  #: the columns of the world's tables, and the shapes, that no step changes
 
     def hold(self, world: World, margin: Floats) -> bool:
         """Whether the lists of this rank have all pairs of these margins (grains,)."""
@@ -66,18 +68,18 @@ def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:
     size = bodies.bounding_radius(world.grains)
     near = neighbourhood(world, margin + np.minimum(AT_REST * size + STEPS * way, size))
     grains, count = near.grains, near.grains + near.ghosts
-    radius, table = bodies.bounding_radius(near.bodies)[:count], near.bodies
-    pairs = close_pairs(table.position[:count], radius + near.margin)
+    table = primitives(near, [body.shapes for body in world.large_bodies], int(world.slabs[-1]))
+    pairs = close_pairs(table.center[:count], table.radius[:count] + near.margin)
     index = near.index[grains:count]
     owner = np.searchsorted(world.slabs, index, side="right") - 1
-    halo = Halo(world.comm, grains, len(table), np.arange(grains, count), owner, index - world.slabs[owner])
-    own, away = (Rows(*in_rows(pairs, table.id, grains, *between)) for between in ((0, grains), (grains, count)))
-    return Lists(near, halo, radius, margin, own, away, _constant(world))
+    halo = Halo(world.comm, grains, len(near.bodies), np.arange(grains, count), owner, index - world.slabs[owner])
+    own, away = (Rows(*in_rows(pairs, table.number, grains, *between)) for between in ((0, grains), (grains, count)))
+    return Lists(near, halo, table, margin, own, away, _constant(world))
 
 
-def _constant(world: World) -> tuple[np.ndarray, ...]:
-    names = ("id", "mass", "inertia", "material", "shape", "size")
-    return tuple(getattr(table, name) for table in (world.grains, world.large) for name in names)
+def _constant(world: World) -> list[Any]:
+    names, tables = ("id", "mass", "inertia", "material", "shape", "size"), (world.grains, world.large)
+    return [*(getattr(table, name) for table in tables for name in names), *(b.shapes for b in world.large_bodies)]
 
 
 @loop

@@ -49,6 +49,20 @@ class Primitives(NamedTuple):
     surfaces: dict[int, Surface]  #: of the meshes, by row
     numbers: int  #: more than any of `number`, and those that meshes take after theirs
 
+    def now(self, near: Neighbourhood) -> Primitives:
+        """The same where the bodies are; parts come from the frames of their bodies."""
+        table, parts = near.bodies, slice(near.grains + near.ghosts, None)
+        row = self.row[parts]
+        turn, plane = table.quaternion[row], (self.kind[parts] == PLANE)[:, None]
+        of_parts = (
+            table.position[row] + quaternion.rotate(turn, self.center[parts]),
+            quaternion.multiply(turn, self.quaternion[parts]),
+            np.where(plane, quaternion.rotate(turn, self.size[parts]), self.size[parts]),
+        )
+        columns = (table.position, table.quaternion, table.size)
+        center, turn, size = (np.concatenate([c[: parts.start], part]) for c, part in zip(columns, of_parts))
+        return self._replace(center=center, quaternion=turn, size=size)
+
     def sphere(self, rows: Ints) -> Spheres:
         return Spheres(self.center[rows], self.size[rows, 0])
 
@@ -67,23 +81,20 @@ class Primitives(NamedTuple):
 
 
 def primitives(near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int) -> Primitives:
-    """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies; `grains` is the number of
-    grains on all ranks."""
+    """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies, for `Primitives.now`; the
+    parts are in the frames of their bodies. `grains` is the number of grains on all ranks."""
     table, count = near.bodies, near.grains + near.ghosts
     row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
     members = [shape for body in shapes for shape in body]
     kinds, centers, turns, sizes = zip(*(placed(shape) for shape in members)) if members else [()] * 4
-    body_turn, kind = table.quaternion[row], np.array(kinds, np.int64)
     center, turn, size = (np.reshape(c, (len(row), k)) for c, k in ((centers, 3), (turns, 4), (sizes, 3)))
-    center = table.position[row] + quaternion.rotate(body_turn, center)
-    size = np.where((kind == PLANE)[:, None], quaternion.rotate(body_turn, size), size)
     spans = [_numbers_of(shape) for shape in members]
     columns = {
         "number": (table.id, grains + np.cumsum([0, *spans])[:-1]),
         "row": (np.arange(count), row),
-        "kind": (table.shape, kind),
+        "kind": (table.shape, np.array(kinds, np.int64)),
         "center": (table.position, center),
-        "quaternion": (table.quaternion, quaternion.multiply(body_turn, turn)),
+        "quaternion": (table.quaternion, turn),
         "size": (table.size, size),
     }
     both = {name: np.concatenate([of_grains[:count], of_parts]) for name, (of_grains, of_parts) in columns.items()}

@@ -14,7 +14,7 @@ from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.candidates import meeting
 from dem.contact.lists import grain_lists
-from dem.contact.primitives import FEATURES, extents, primitives, touches
+from dem.contact.primitives import FEATURES, extents, touches
 from dem.free_motion import free_directions, free_velocity, large_free_velocity
 from dem.motion import Hinged
 from dem.neighbourhood import Neighbourhood, refreshed
@@ -71,7 +71,7 @@ def find_contacts(
     margin = np.maximum(np.maximum(delta / 2, way), margin)
     lists = grain_lists(world, margin, way)
     near = refreshed(lists.near, lists.halo, world, margin)
-    table = primitives(near, [body.shapes for body in world.large_bodies], int(world.slabs[-1]))
+    table = lists.table.now(near)
     i, j, reach = meeting(world, near, lists, table, delta, shifts)
     pair, feature, touch = touches(table, i, j, reach)
     key, a, b, body, friction, weight = named(
