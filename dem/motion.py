@@ -250,7 +250,10 @@ def mean_velocity(motion: Prescribed, time: float, dt: float, position: Floats, 
 def velocity_between(motion: Prescribed, start: Pose, end: Pose, dt: float) -> Floats:
     """Velocity (6,) that takes a body from one of its poses to another in dt [s]."""
     given = getattr(motion, "angular_velocity", None)
-    turning = quaternion.rotation_vector(start[1], end[1]) / dt if given is None else given()
+    if given is not None:
+        turning = given()
+    else:
+        turning = quaternion.rotation_vector(start[1], end[1]) / dt if (start[1] != end[1]).any() else np.zeros(3)
     turning = vector(f"angular velocity of {type(motion).__name__}", turning)
     return np.concatenate([(end[0] - start[0]) / dt, turning])
 

@@ -117,8 +117,9 @@ def energy_balance(step: Step) -> dict[str, float]:
 
     was = sums(*(energy(table, world.gravity) for table in before))
     now = sums(*(energy(table, world.gravity) for table in after))
-    normal, tangential = ((sums(*map(np.vdot, load, mean))) for load in step.generalised_impulses)
-    received = np.vdot((step.generalised_impulses[0][1] + step.generalised_impulses[1][1])[~moves], mean[1][~moves])
+    slip = step.system.contact_velocities(*mean)
+    normal, tangential = (np.vdot(step.impulse[:, part], slip[:, part]) for part in (slice(0, 1), slice(1, 3)))
+    received = np.vdot(step.impulse_on_large[~moves], mean[1][~moves])
     work = np.vdot(step.system.drive_impulse, mean[1]) - received
     whole = comm.allreduce(np.array([*was, *now, normal, tangential]))
     change = whole[2] + whole[3] - whole[0] - whole[1]

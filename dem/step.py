@@ -37,9 +37,7 @@ class Step:
 
     def force_on(self, name: str) -> Floats:
         """Contact force and torque (6,) [N, N m] on a large body, about its reference point, averaged over the step."""
-        row = self.world.large_row(name)
-        normal, tangential = self.generalised_impulses
-        return (normal[1][row] + tangential[1][row]) / self.system.dt
+        return self.impulse_on_large[self.world.large_row(name)] / self.system.dt
 
     def position(self, name: str) -> Floats:
         """Position (3,) of a large body [m]."""
@@ -56,10 +54,9 @@ class Step:
         return float(self.world.comm.allreduce(float(np.sum(values))))
 
     @cached_property
-    def generalised_impulses(self) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-        """Generalised impulses on grains and large bodies by the normal and by the tangential impulses."""
-        normal = self.impulse * [1.0, 0.0, 0.0]
-        return self.system.generalised_impulse(normal), self.system.generalised_impulse(self.impulse - normal)
+    def impulse_on_large(self) -> Floats:
+        """Impulses and angular impulses (large, 6) of the contacts on the large bodies; the same on all ranks."""
+        return self.system.impulse_on_large(self.impulse)
 
 
 def advance(world: World, velocity: Floats, dt: float) -> None:

@@ -81,14 +81,22 @@ class ContactSystem:
         scale(self.contact_map.given.root, momentum.reshape(change.shape), change)
         return self.free_velocity + change
 
-    def generalised_impulse(self, impulse: Floats) -> tuple[Floats, Floats]:
-        """D g of the local grains (grains, 6), and of the large bodies (large, 6), the same on all ranks, from
-        the impulses (nc, 3) of all ranks [N s, N m s]; collective."""
-        near, sums = self.near, self.contact_map.sums_of_impulses(impulse)
-        large = sums[near.grains + near.ghosts :].copy()
+    def impulse_on_large(self, impulse: Floats) -> Floats:
+        """Impulses and angular impulses D g (large, 6) on the large bodies, the same on all ranks, from the impulses
+        (nc, 3) of all ranks [N s, N m s]; collective."""
+        first = self.near.grains + self.near.ghosts
+        rows = np.flatnonzero(self.contact_map.body[:, 1] >= first)  # body b has the higher id
+        large = self.contact_map.sums_of_impulses(impulse, rows)[first:].copy()
         self.contact_map.comm.Allreduce(MPI.IN_PLACE, large)
-        self.contact_map.halo.add(sums)
-        return sums[: near.grains], large
+        return large
+
+    def contact_velocities(self, velocity: Floats, large: Floats) -> Floats:
+        """D' v (nc, 3) for velocities of the local grains (grains, 6) and of the large bodies (large, 6); collective."""
+        table = np.zeros((len(self.near.bodies), 6))
+        table[: self.near.grains] = velocity
+        self.contact_map.halo.update(table)
+        table[self.near.grains + self.near.ghosts :] = large
+        return self.contact_map.relative_velocities(table)
 
 
 def inverse_root_masses(world: World) -> Floats:

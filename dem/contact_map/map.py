@@ -183,10 +183,11 @@ class ContactMap:
         """D' v (nc, 3) for the velocities (rows, 6) of all rows of a table of the halo, without a message."""
         return loops.relative_velocities(*self._arrays, v)
 
-    def sums_of_impulses(self, g: Floats) -> Floats:
-        """D g (rows, 6) of this rank's contacts, by rows of a table of the halo, without a message."""
+    def sums_of_impulses(self, g: Floats, contacts: Ints) -> Floats:
+        """D g (rows, 6) of these of this rank's contacts, by rows of a table of the halo, without a message."""
         sums = np.zeros((self.halo.rows, 6))
-        loops.add_momenta(*self._arrays, self._floats(shaped("impulses", g, self.rows, 3)), sums)
+        g = self._floats(shaped("impulses", g, self.rows, 3))
+        loops.add_momenta(*(array[contacts] for array in (*self._arrays, g)), sums)
         return sums
 
     def _enter(self, scale: Floats, v: Floats) -> None:

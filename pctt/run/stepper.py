@@ -160,7 +160,7 @@ class Stepper:
         """The contacts, with those that overlap at the end of the step because bodies turn, and the impulses so far.
         None if there are none, or after so many corrections."""
         settings, depth, most = self.settings, 0.1 * self.settings.delta, 3  # overlap that is corrected, and how often
-        if self._corrections == most:
+        if self._corrections == most or self.world.only_spheres:
             return None
         with log.phase("search"):
             velocity = self.system.velocity_with(found.momentum)
