@@ -187,7 +187,8 @@ class ContactMap:
         """D g (rows, 6) of these of this rank's contacts, by rows of a table of the halo, without a message."""
         sums = np.zeros((self.halo.rows, 6))
         g = self._floats(shaped("impulses", g, self.rows, 3))
-        loops.add_momenta(*(array[contacts] for array in (*self._arrays, g)), sums)
+        frame, arm, body = (array[contacts] for array in self._arrays)
+        loops.add_momenta(frame, arm, body, g[contacts], sums)
         return sums
 
     def _enter(self, scale: Floats, v: Floats) -> None:
