@@ -18,6 +18,7 @@ from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.bodies import SPHERE, Bodies
 from dem.contact import Contacts, contact_order, find_contacts
 from dem.contact_map.loops import relative_velocities
+from dem.keys import places
 from dem.system import ContactSystem, contact_arms, contact_frames
 from dem.together import meet
 from dem.world import World
@@ -115,7 +116,7 @@ def find_turned(
     if not world.comm.allreduce(bool(missed.any()), MPI.LOR):
         return None
     found = replace(start, a=a, b=b, near=contacts.near).take(missed)
-    return _joined(world, contacts.take(~np.isin(contacts.key, found.key)), found)
+    return _joined(world, contacts.take(places(found.key, contacts.key) < 0), found)
 
 
 def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:

@@ -91,7 +91,8 @@ class ContactSystem:
         return large
 
     def contact_velocities(self, velocity: Floats, large: Floats) -> Floats:
-        """D' v (nc, 3) for velocities of the local grains (grains, 6) and of the large bodies (large, 6); collective."""
+        """D' v (nc, 3) for the velocities of the local grains (grains, 6) and of the large bodies (large, 6);
+        collective."""
         table = np.zeros((len(self.near.bodies), 6))
         table[: self.near.grains] = velocity
         self.contact_map.halo.update(table)

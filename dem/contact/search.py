@@ -16,6 +16,7 @@ from dem.contact.candidates import meeting
 from dem.contact.lists import grain_lists
 from dem.contact.primitives import FEATURES, extents, touches
 from dem.free_motion import free_directions, free_velocity, large_free_velocity
+from dem.keys import places
 from dem.motion import Hinged
 from dem.neighbourhood import Neighbourhood, refreshed
 from dem.quaternion import cross, length
@@ -137,7 +138,7 @@ def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: floa
         return None
     shifts = np.concatenate([contacts.shifts, shift[None]]) if beyond else contacts.shifts
     wider = find_contacts(world, delta, dt, np.maximum(seen, way), shifts)
-    new = len(wider) > len(contacts) or not np.isin(wider.key, contacts.key, assume_unique=True).all()
+    new = bool((places(contacts.key, wider.key) < 0).any())
     return wider if world.comm.allreduce(new, MPI.LOR) else None
 
 

@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from dem.contact import Contacts, find_contacts, find_overrun
 from dem.impulses import ImpulseMemory
+from dem.keys import places
 from dem.partition import rebalance
 from dem.step import advance, find_turned
 from dem.system import ContactSystem
@@ -149,7 +150,7 @@ class Stepper:
         if wider is None:
             return None
         with log.phase("assembly"):
-            unseen = wider.take(~np.isin(wider.key, self.contacts.key))
+            unseen = wider.take(places(self.contacts.key, wider.key) < 0)
             beyond = ContactSystem(world, unseen, settings.dt, settings.recovery_speed)
             opening = (beyond.contact_map.velocities(found.momentum) + beyond.r)[:, 0]
             # solved for if the overlap would be deeper than a hundredth of delta

@@ -24,7 +24,7 @@ DT = 0.005
 
 def among_walls():
     """All shapes of grains among walls, with a fast blade, an oscillating ball and a free slab."""
-    return heap(3, side=5, capsules=True)
+    return heap(3, side=4, capsules=True)
 
 
 def among_surfaces():
@@ -80,14 +80,15 @@ def test_a_search_with_kept_lists_finds_what_a_fresh_one_finds(make):
     comm, scene = MPI.COMM_WORLD, make()
     world = new_world(scene, comm)
     made, lists = 0, None
-    for n in range(60):
+    for n in range(36):
         rebalance(world, 1.2)
-        if n == 30:  # a restart
+        if n == 20:  # a restart
             world = restored_world(scene, comm, *world.state())
         contacts = find_contacts(world, 0.01, DT)
         made += world.lists is not lists
         lists = world.lists
-        assert_same(contacts, find_contacts(forgetful(world), 0.01, DT), comm.size)
+        if n % 2:
+            assert_same(contacts, find_contacts(forgetful(world), 0.01, DT), comm.size)
         if n % 10 == 3:  # as of a step in which a grain goes further than was seen
             margin = np.where(world.grains.id % 5 == 0, 0.05, 0.0)
             wider = find_contacts(world, 0.01, DT, margin)
@@ -96,8 +97,8 @@ def test_a_search_with_kept_lists_finds_what_a_fresh_one_finds(make):
             lists = world.lists
         system = ContactSystem(world, contacts, DT, recovery_speed=0.5)
         advance(world, system.velocity(crude_impulse(system)), DT)
-    assert comm.allreduce(len(contacts)) > 100
-    assert 5 < made < 40  # else nothing was shown
+    assert comm.allreduce(len(contacts)) > 50
+    assert 4 < made < 25  # else nothing was shown
 
 
 def test_other_grains_and_places_need_new_lists():
