@@ -132,9 +132,10 @@ def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: floa
     seen = contacts.near.margin[: contacts.near.grains]
     way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
     shift = dt * world.large_velocity(velocity)
-    # reduced, though all ranks have the same data: processors of other kinds may round otherwise
-    beyond = world.comm.allreduce(_go_beyond(world, shift, contacts.shifts, delta), MPI.LOR)
-    if not (world.comm.allreduce(bool((way > seen).any()), MPI.LOR) or beyond):
+    # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
+    gone = bool((way > seen).any()), _go_beyond(world, shift, contacts.shifts, delta)
+    further, beyond = map(any, zip(*world.comm.allgather(gone)))
+    if not (further or beyond):
         return None
     shifts = np.concatenate([contacts.shifts, shift[None]]) if beyond else contacts.shifts
     wider = find_contacts(world, delta, dt, np.maximum(seen, way), shifts)
