@@ -80,8 +80,12 @@ def find_contacts(
         *(table.numbers, near.grains, i, j, pair, feature),
     )
     contacts = Contacts(key, a, b, body, *touch, friction, near, shifts)
-    if (np.diff(pair) <= 0).any():  # other shapes come behind the spheres, and touch in several points
-        contacts = contacts.take(contact_order(world, near, a, b, key))
+    back = np.flatnonzero(np.diff(pair) <= 0)  # other shapes come behind the spheres, and touch in several points
+    if len(back):
+        left = slice(int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min())), None)
+        order = contact_order(world, near, a[left], b[left], key[left])
+        for column in contacts.columns().values():
+            column[left] = column[left].take(order, axis=0)
     world.grains.weight = weight
     rigid = _gives_no_way(world, contacts)
     return contacts.take(~rigid) if rigid.any() else contacts
