@@ -77,7 +77,7 @@ def find_contacts(
     pair, feature, touch = touches(table, i, j, reach)
     key, a, b, body, friction, weight = named(
         *(table.number, table.row, table.kind, near.index, near.bodies.material, world.friction),
-        *(table.numbers, near.grains, i, j, pair, feature),
+        *(table.numbers, FEATURES, near.grains, i, j, pair, feature),
     )
     contacts = Contacts(key, a, b, body, *touch, friction, near, shifts)
     back = np.flatnonzero(np.diff(pair) <= 0)  # other shapes come behind the spheres, and touch in several points
@@ -92,7 +92,7 @@ def find_contacts(
 
 
 @loop
-def named(number, row, kind, index, material, friction, numbers, grains, i, j, pair, feature):
+def named(number, row, kind, index, material, friction, numbers, features, grains, i, j, pair, feature):
     """Of contacts of the pairs of rows i, j (m,) of `Primitives`, with their number `pair` (nc,) and `feature` (nc,):
     key, rows a and b of the bodies, `index` of the bodies (nc, 2), friction; and how many each of the `grains` owns.
 
@@ -101,12 +101,12 @@ def named(number, row, kind, index, material, friction, numbers, grains, i, j, p
     body, mu, owned = np.empty((len(pair), 2), np.int64), np.empty(len(pair)), np.zeros(grains)
     for c in range(len(pair)):
         p, q = i[pair[c]], j[pair[c]]
-        one, two, further = number[p], number[q], feature[c] // FEATURES
+        one, two, further = number[p], number[q], feature[c] // features
         if kind[p] == MESH:
             one += further
         else:
             two += further
-        key[c] = (one * numbers + two) * FEATURES + feature[c] % FEATURES
+        key[c] = (one * numbers + two) * features + feature[c] % features
         a[c], b[c] = row[p], row[q]
         body[c, 0], body[c, 1] = index[a[c]], index[b[c]]
         mu[c] = friction[material[a[c]], material[b[c]]]
