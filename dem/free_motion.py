@@ -9,7 +9,7 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Floats
 from dem.bodies import SPHERE, Bodies
-from dem.compiled import unfused
+from dem.compiled import loop, unfused
 from dem.motion import Driven, Dynamic, Guided
 from dem.neighbourhood import Neighbourhood
 from dem.scene import LargeBody
@@ -21,17 +21,26 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
 
     Rows of bodies with prescribed motion come back as they are.
     """
-    velocity = table.velocity.copy()
-    dynamic = bodies.is_dynamic(table)
-    velocity[:, :3] += np.outer(dynamic, dt * gravity)
+    velocity = falling(table.velocity, table.mass, dt * gravity)
     # The torque vanishes where all moments are equal, as for spheres.
-    rows = np.flatnonzero(dynamic & (table.shape != SPHERE))
+    rows = np.flatnonzero(bodies.is_dynamic(table) & (table.shape != SPHERE))
     if not len(rows):
         return velocity
     a, b, c = table.inertia[rows].T
     rows = rows[np.isfinite(a + b + c) & ((a != b) | (b != c))]  # guided bodies do not turn
     velocity[rows, 3:] = free_spin(table.quaternion[rows], velocity[rows, 3:], table.inertia[rows], dt)
     return velocity
+
+
+@loop
+def falling(velocity: Floats, mass: Floats, change: Floats) -> Floats:
+    """The velocities (n, 6), with a change (3,) of the linear ones of bodies whose mass (n,) is finite."""
+    out = velocity.copy()
+    for n in range(len(mass)):
+        if np.isfinite(mass[n]):
+            for k in range(3):
+                out[n, k] += change[k]
+    return out
 
 
 @unfused
@@ -132,8 +141,9 @@ def _each(a, b):
 
 def free_velocities(world: World, near: Neighbourhood, dt: float) -> Floats:
     """Velocities (rows, 6) of all bodies of `near` over a step of dt [s] without contacts."""
-    grains = near.bodies.take(slice(0, near.grains + near.ghosts))
-    return np.concatenate([free_velocity(grains, world.gravity, dt), large_free_velocity(world, dt)])
+    free = free_velocity(near.bodies, world.gravity, dt)
+    free[near.grains + near.ghosts :] = large_free_velocity(world, dt)
+    return free
 
 
 def large_free_velocity(world: World, dt: float) -> Floats:

@@ -6,7 +6,9 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Bools, Floats, Ints
+from dem.compiled import loop
 from dem.exchange import exchange
+from dem.keys import places
 
 
 class ImpulseMemory:
@@ -24,25 +26,21 @@ class ImpulseMemory:
 
     def remember(self, key: Ints, impulse: Floats, frame: Floats) -> None:
         """Replace the memory by impulses (nc, 3) of contacts with keys (nc,) and frames (nc, 3, 3)."""
-        tangential = np.einsum("ci,cij->cj", impulse[:, 1:], frame[:, 1:])
-        self.restore(key, np.concatenate([impulse[:, :1], tangential], axis=1))
+        self.restore(key, in_world(impulse, frame))
 
     def recall(self, key: Ints, frame: Floats) -> tuple[Floats, Bools]:
         """Impulses (nc, 3) in the given frames (nc, 3, 3), zero where unknown, and the mask (nc,) of those
         known.
 
         Collective."""
-        place, found = _places(self._key, key)
-        stored = np.zeros((len(key), 4))
-        stored[found] = self._impulse.take(place[found], axis=0)
+        place, stored = places(self._key, key), self._impulse
         if self._comm.size > 1:
-            missing, left = np.flatnonzero(~found), np.ones(len(self._key), dtype=bool)
-            left[place[found]] = False
+            missing, left = np.flatnonzero(place < 0), np.ones(len(self._key), dtype=bool)
+            left[place[place >= 0]] = False
             row, impulse = self._elsewhere(key[missing], self._key[left], self._impulse[left])
-            stored[missing[row]], found[missing[row]] = impulse, True
-        # of the tangential vectors only the part that is tangential in these frames
-        tangential = np.einsum("cij,cj->ci", frame[:, 1:], stored[:, 1:])
-        return np.concatenate([stored[:, :1], tangential], axis=1), found
+            place[missing[row]] = len(stored) + np.arange(len(row))
+            stored = np.concatenate([stored, impulse])
+        return in_frames(stored, place, frame), place >= 0
 
     def _elsewhere(self, asked: Ints, key: Ints, impulse: Floats) -> tuple[Ints, Floats]:
         """Which of the keys `asked` (m,) other ranks offer in their `key` (n,), and their impulses; collective."""
@@ -57,11 +55,9 @@ class ImpulseMemory:
         # Fibonacci hashing: the low bits of keys are mostly zero and must not choose the rank.
         mixed = (both.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)
         met = exchange(comm, rows, (mixed % np.uint64(comm.size)).astype(np.int64))
-        offered = np.flatnonzero(met["row"] < 0)
-        offered = offered[np.argsort(met["key"][offered])]
-        wanted = np.flatnonzero(met["row"] >= 0)
-        place, known = _places(met["key"][offered], met["key"][wanted])
-        wanted, offered = wanted[known], offered[place[known]]
+        offered, wanted = np.flatnonzero(met["row"] < 0), np.flatnonzero(met["row"] >= 0)
+        place = places(met["key"][offered], met["key"][wanted])
+        wanted, offered = wanted[place >= 0], offered[place[place >= 0]]
         answer = exchange(comm, {"row": met["row"][wanted], "impulse": met["impulse"][offered]}, met["rank"][wanted])
         return answer["row"], answer["impulse"]
 
@@ -71,13 +67,30 @@ class ImpulseMemory:
 
     def restore(self, key: Ints, stored: Floats) -> None:
         """Replace the memory by rows of `state`, distributed in any way."""
-        order = np.argsort(key)
-        self._key, self._impulse = key[order], stored.take(order, axis=0)
+        self._key, self._impulse = key, stored
 
 
-def _places(sorted_keys: Ints, keys: Ints) -> tuple[Ints, Bools]:
-    """Where the keys (n,) are among sorted ones, and whether they are there."""
-    place = np.searchsorted(sorted_keys, keys)
-    known = place < len(sorted_keys)
-    known[known] = sorted_keys[place[known]] == keys[known]
-    return place, known
+@loop
+def in_world(impulse: Floats, frame: Floats) -> Floats:
+    """Impulses (nc, 3) in frames (nc, 3, 3) as rows (nc, 4): the normal one, and the tangential one in the world."""
+    out = np.empty((len(impulse), 4))
+    for c in range(len(impulse)):
+        out[c, 0] = impulse[c, 0]
+        for k in range(3):
+            out[c, 1 + k] = impulse[c, 1] * frame[c, 1, k] + impulse[c, 2] * frame[c, 2, k]
+    return out
+
+
+@loop
+def in_frames(stored: Floats, place: Ints, frame: Floats) -> Floats:
+    """The rows `place` (nc,) of `in_world` as impulses (nc, 3) in the given frames (nc, 3, 3), of which they may not be
+    quite tangential; zero for the row -1."""
+    out = np.zeros((len(place), 3))
+    for c in range(len(place)):
+        n = place[c]
+        if n >= 0:
+            out[c, 0] = stored[n, 0]
+            for k in range(3):
+                out[c, 1] += stored[n, 1 + k] * frame[c, 1, k]
+                out[c, 2] += stored[n, 1 + k] * frame[c, 2, k]
+    return out

@@ -230,9 +230,10 @@ class Path:
 #: Motions that do not answer to forces.
 Prescribed = Union[Fixed, Rotation, Oscillation, Glide, Path]
 Motion = Union[Dynamic, Prescribed]
+Pose = tuple[Floats, Floats]  #: position (3,) [m] and quaternion (4,)
 
 
-def checked_pose(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
+def checked_pose(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> Pose:
     """The pose of a motion, also of one that is not of this module, as arrays of its own, the quaternion of unit norm.
     ValueError if it is no pose."""
     place, turn = motion.pose(time, position.copy(), orientation.copy())
@@ -242,11 +243,19 @@ def checked_pose(motion: Prescribed, time: float, position: Floats, orientation:
 
 def mean_velocity(motion: Prescribed, time: float, dt: float, position: Floats, orientation: Floats) -> Floats:
     """Velocity (6,) from `time` to `time + dt` of a body with the given pose at time zero."""
-    start, before = checked_pose(motion, time, position, orientation)
-    end, after = checked_pose(motion, time + dt, position, orientation)
+    pose = position, orientation
+    return velocity_between(motion, checked_pose(motion, time, *pose), checked_pose(motion, time + dt, *pose), dt)
+
+
+def velocity_between(motion: Prescribed, start: Pose, end: Pose, dt: float) -> Floats:
+    """Velocity (6,) that takes a body from one of its poses to another in dt [s]."""
     given = getattr(motion, "angular_velocity", None)
-    turning = quaternion.rotation_vector(before, after) / dt if given is None else given()
-    return np.concatenate([(end - start) / dt, vector(f"angular velocity of {type(motion).__name__}", turning)])
+    if given is not None:
+        turning = given()
+    else:
+        turning = quaternion.rotation_vector(start[1], end[1]) / dt if (start[1] != end[1]).any() else np.zeros(3)
+    turning = vector(f"angular velocity of {type(motion).__name__}", turning)
+    return np.concatenate([(end[0] - start[0]) / dt, turning])
 
 
 def top_speed(motion: Motion, position: Floats, reach: float) -> float:

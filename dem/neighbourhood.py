@@ -5,13 +5,15 @@ A contact belongs to the rank of the lower global body index: ghosts only travel
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
+from dem.contact_map.halo import Halo
 from dem.exchange import exchange
 from dem.world import World
 
@@ -55,6 +57,22 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
         grains=len(grains),
         ghosts=len(index),
     )
+
+
+def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> Neighbourhood:
+    """The same bodies as they are now, with these margins (grains,) [m] of the local ones; the halo is that of the
+    grains of `near`; collective."""
+    count = near.grains + near.ghosts
+
+    def now(own: Floats, large: Floats | float) -> Floats:
+        column = np.empty((len(near.bodies), *own.shape[1:]))
+        column[: near.grains], column[count:] = own, large
+        halo.update(column)
+        return column
+
+    names = ("position", "quaternion", "velocity")
+    columns: dict[str, Any] = {name: now(getattr(world.grains, name), getattr(world.large, name)) for name in names}
+    return replace(near, bodies=replace(near.bodies, **columns), margin=now(margin, 0.0)[:count])
 
 
 def _chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:

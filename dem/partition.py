@@ -58,7 +58,8 @@ def redistribute(world: World) -> None:
 def imbalance(world: World) -> float:
     """Greatest load of a rank over the mean load, in contacts plus grains; collective."""
     load = float(world.grains.weight.sum() + len(world.grains))
-    return world.comm.allreduce(load, MPI.MAX) * world.comm.size / world.comm.allreduce(load)
+    loads = world.comm.allgather(load)
+    return max(loads) * len(loads) / sum(loads)
 
 
 def rebalance(world: World, tolerance: float = 1.1) -> bool:

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, quaternion
+from dem import bodies
 from dem.arrays import ArrayLike, Floats
 from dem.bodies import COMPOUND, Bodies
+from dem.compiled import loop
 from dem.experiment import Experiment
 from dem.step import Step
 from dem.together import SceneError, together
@@ -57,20 +58,39 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
-    place = step.world.grains.position
-    return step.total(((place < np.asarray(low)) | (place > np.asarray(high))).any(axis=1))
+    place, lost = step.world.grains.position, np.zeros(len(step.world.grains), bool)
+    for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high))):
+        lost |= (place[:, axis] < least) | (place[:, axis] > most)
+    return step.total(lost)
 
 
 def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:
     """Kinetic and potential energy [J] of the bodies of a table that forces can move; the potential energy is zero at
     the origin."""
-    dynamic = bodies.is_dynamic(table)
-    table = table if dynamic.all() else table.take(dynamic)
-    spin = quaternion.rotate(quaternion.conjugate(table.quaternion), table.velocity[:, 3:])
-    turns = np.isfinite(table.inertia)  # guided bodies do not
-    rotational = np.where(turns, table.inertia, 0.0) * spin**2
-    kinetic = 0.5 * (table.mass * (table.velocity[:, :3] ** 2).sum(axis=1)).sum() + 0.5 * rotational.sum()
-    return float(kinetic), float(-(table.mass * (table.position @ gravity)).sum())
+    kinetic, moment = energies(table.position, table.quaternion, table.velocity, table.mass, table.inertia)
+    return kinetic, float(-(moment @ gravity))
+
+
+@loop
+def energies(position: Floats, turn: Floats, velocity: Floats, mass: Floats, inertia: Floats) -> tuple[float, Floats]:
+    """The kinetic energy [J] of n bodies with principal moments (n, 3), and the sum of mass times position (3,)
+    [kg m]. An infinite mass or moment does not move."""
+    kinetic, moment = 0.0, np.zeros(3)
+    for n in range(len(mass)):
+        if np.isfinite(mass[n]):
+            for k in range(3):
+                kinetic += 0.5 * mass[n] * velocity[n, k] ** 2
+                moment[k] += mass[n] * position[n, k]
+            w, x, y, z = turn[n, 0], -turn[n, 1], -turn[n, 2], -turn[n, 3]
+            a, b, c = velocity[n, 3], velocity[n, 4], velocity[n, 5]
+            p, q, r = y * c - z * b, z * a - x * c, x * b - y * a  # to the frame of the body
+            spin = (
+                a + 2.0 * (w * p + y * r - z * q), b + 2.0 * (w * q + z * p - x * r), c + 2.0 * (w * r + x * q - y * p)
+            )  # fmt: skip
+            for k in range(3):
+                if np.isfinite(inertia[n, k]):
+                    kinetic += 0.5 * inertia[n, k] * spin[k] ** 2
+    return kinetic, moment
 
 
 def energy_balance(step: Step) -> dict[str, float]:
@@ -97,9 +117,10 @@ def energy_balance(step: Step) -> dict[str, float]:
 
     was = sums(*(energy(table, world.gravity) for table in before))
     now = sums(*(energy(table, world.gravity) for table in after))
-    normal, tangential = ((sums(*map(np.vdot, load, mean))) for load in step.generalised_impulses)
+    slip = step.system.contact_velocities(*mean)
+    normal, tangential = (np.vdot(step.impulse[:, part], slip[:, part]) for part in (slice(0, 1), slice(1, 3)))
+    received = np.vdot(step.impulse_on_large[~moves], mean[1][~moves])
     springs = comm.allreduce(spring_energies(step))
-    received = np.vdot((step.generalised_impulses[0][1] + step.generalised_impulses[1][1])[~moves], mean[1][~moves])
     work = np.vdot(step.system.drive_impulse, mean[1]) - received
     whole = comm.allreduce(np.array([*was, *now, normal, tangential]))
     change, held = whole[2] + whole[3] - whole[0] - whole[1], springs[1] - springs[0]
@@ -120,7 +141,7 @@ def spring_energies(step: Step) -> Floats:
     k/2 d^2 of an overlap d, which changes in the step by dt times the normal velocity at its end. Collective."""
     system, gap = step.system, step.contacts.gap
     k = np.where(np.isinf(system.stiffness), 0.0, system.stiffness)
-    after = system.contact_map.velocities(system.contact_map.momenta(step.impulse)) + system.r - system.b
+    after = system.contact_velocities(step.world.grains.velocity, step.world.large.velocity)
     overlaps = np.maximum(-gap, 0.0), np.maximum(-gap - system.dt * after[:, 0], 0.0)
     return np.array([0.5 * k @ overlap**2 for overlap in overlaps])
 
@@ -134,17 +155,31 @@ def contact_statistics(step: Step) -> dict[str, float]:
     number of active contacts per grain.
     """
     comm, contacts = step.world.comm, step.contacts
-    normal, tangential = step.impulse[:, 0], np.hypot(step.impulse[:, 1], step.impulse[:, 2])
-    count, weight = comm.allreduce(np.array([len(contacts), normal.sum()]))
-    active = normal > 0.01 * weight / max(count, 1.0)
-    sliding = active & (tangential >= 0.99 * contacts.friction * normal)
-    shape = contacts.near.bodies.shape
-    ends = sum((shape[rows] != COMPOUND).astype(int) for rows in (contacts.a, contacts.b))  # grains of a contact
-    sums = comm.allreduce(np.array([active.sum(), sliding.sum(), ends[active].sum()]))
+    count, weight = comm.allreduce(np.array([len(contacts), step.impulse[:, 0].sum()]))
+    grain = contacts.near.bodies.shape != COMPOUND
+    least = 0.01 * weight / max(count, 1.0)
+    *sums, worst = counted(step.impulse, contacts.friction, contacts.gap, contacts.a, contacts.b, grain, least)
+    sums = comm.allreduce(np.array(sums))
     return {
         "contacts": count,
         "active_contacts": sums[0],
         "coordination_number": sums[2] / step.world.slabs[-1],
         "sliding_fraction": sums[1] / max(sums[0], 1),
-        "worst_overlap [m]": comm.allreduce(float((0.0 - contacts.gap).max(initial=0.0)), MPI.MAX),
+        "worst_overlap [m]": comm.allreduce(worst, MPI.MAX),
     }
+
+
+@loop
+def counted(impulse, friction, gap, a, b, grain, least):
+    """Of contacts of bodies in the rows a, b (nc,), those active whose normal impulse exceeds the `least`: their
+    number, how many of them slide, how many ends of them are at grains; and the greatest overlap of all, 0 if none."""
+    active, sliding, ends, worst = 0, 0, 0, 0.0
+    for c in range(len(gap)):
+        normal, bears = impulse[c, 0], 0.99 * friction[c] * impulse[c, 0]
+        worst = max(worst, -gap[c])
+        if normal > least:
+            active += 1
+            ends += int(grain[a[c]]) + int(grain[b[c]])
+            if np.sqrt(impulse[c, 1] ** 2 + impulse[c, 2] ** 2) >= bears:
+                sliding += 1
+    return active, sliding, ends, worst

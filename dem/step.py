@@ -18,9 +18,9 @@ from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.bodies import SPHERE, Bodies
 from dem.contact import Contacts, contact_order, find_contacts
 from dem.contact_map.loops import relative_velocities
-from dem.motion import Dynamic, checked_pose
+from dem.keys import places
 from dem.system import ContactSystem, contact_arms, contact_frames, gap_velocities
-from dem.together import meet, together
+from dem.together import meet
 from dem.world import World
 
 
@@ -38,9 +38,7 @@ class Step:
 
     def force_on(self, name: str) -> Floats:
         """Contact force and torque (6,) [N, N m] on a large body, about its reference point, averaged over the step."""
-        row = self.world.large_row(name)
-        normal, tangential = self.generalised_impulses
-        return (normal[1][row] + tangential[1][row]) / self.system.dt
+        return self.impulse_on_large[self.world.large_row(name)] / self.system.dt
 
     def position(self, name: str) -> Floats:
         """Position (3,) of a large body [m]."""
@@ -57,10 +55,9 @@ class Step:
         return float(self.world.comm.allreduce(float(np.sum(values))))
 
     @cached_property
-    def generalised_impulses(self) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-        """Generalised impulses on grains and large bodies by the normal and by the tangential impulses."""
-        normal = self.impulse * [1.0, 0.0, 0.0]
-        return self.system.generalised_impulse(normal), self.system.generalised_impulse(self.impulse - normal)
+    def impulse_on_large(self) -> Floats:
+        """Impulses and angular impulses (large, 6) of the contacts on the large bodies; the same on all ranks."""
+        return self.system.impulse_on_large(self.impulse)
 
 
 def advance(world: World, velocity: Floats, dt: float) -> None:
@@ -87,13 +84,8 @@ def advanced(world: World, velocity: Floats, dt: float) -> World:
 def follow_motions(world: World) -> None:
     """Put the bodies of prescribed motion where they are to be now; collective. SceneError if a motion fails."""
 
-    def follow() -> None:
-        for row, body in enumerate(world.large_bodies):
-            if not isinstance(body.motion, Dynamic):
-                pose = checked_pose(body.motion, world.time, body.position, body.quaternion)
-                world.large.position[row], world.large.quaternion[row] = pose
-
-    together(world.comm, "motion of a large body", follow)
+    for row, pose in world.poses(world.time).items():
+        world.large.position[row], world.large.quaternion[row] = pose
 
 
 def _move(table: Bodies, velocity: Floats, dt: float) -> None:
@@ -124,7 +116,7 @@ def find_turned(
     if not world.comm.allreduce(bool(missed.any()), MPI.LOR):
         return None
     found = replace(start, a=a, b=b, near=contacts.near).take(missed)
-    return _joined(world, contacts.take(~np.isin(contacts.key, found.key)), found)
+    return _joined(world, contacts.take(places(found.key, contacts.key) < 0), found)
 
 
 def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
@@ -140,11 +132,10 @@ def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
 
 def _at_start(end: Contacts, dt: float) -> tuple[Contacts, Floats]:
     """The contacts of the end of a step as contacts of its start, and by how much (nc,) their gaps grow in it [m]."""
-    velocity, row = end.near.bodies.velocity, np.stack([end.a, end.b], axis=1)
+    velocity, row = end.near.bodies.velocity, np.stack([end.a, end.b], axis=1).astype(np.uint32)
     point = end.point - 0.5 * dt * velocity[row, :3].sum(axis=1)
     arm = contact_arms(point, end.near.bodies.position - dt * velocity[:, :3], row)
-    frame = contact_frames(end.normal).reshape(-1, 9)
-    growth = dt * relative_velocities(frame, arm, row.astype(np.uint32), velocity)[:, 0]
+    growth = dt * relative_velocities(contact_frames(end.normal).reshape(-1, 9), arm, row, velocity)[:, 0]
     return replace(end, point=point, gap=end.gap - growth), growth
 
 

@@ -19,8 +19,9 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
-from dem.arrays import Floats, Ints
+from dem.arrays import Floats
 from dem.checks import positive
+from dem.compiled import loop
 from dem.contact import Contacts
 from dem.contact_map import CompactRows, ContactMap, Halo
 from dem.contact_map.loops import scale
@@ -56,19 +57,16 @@ class ContactSystem:
         self.dt, self.near = dt, near
         self.key, self.mu, self.point = contacts.key, contacts.friction, contacts.point
         self.frame = contact_frames(contacts.normal)
-        row, moves = np.stack([contacts.a, contacts.b], axis=1), bodies.is_dynamic(near.bodies)
-        arm = contact_arms(self.point, near.bodies.position, row)
-        body, root = np.where(moves[row], contacts.body, -1), inverse_root_masses(world)
-        rows = CompactRows(self.frame.reshape(-1, 9), arm, body, root, owned)
+        moves = bodies.is_dynamic(near.bodies)
         # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
-        touched = np.zeros(len(moves), bool)
-        touched[row] = True
-        touched[:owned] = False
-        ghosts = np.flatnonzero(touched & moves)
+        row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
+        arm = contact_arms(self.point, near.bodies.position, row)
+        rows = CompactRows(self.frame.reshape(-1, 9), arm, body, inverse_root_masses(world), owned)
+        ghosts = np.flatnonzero(touched)
         index = near.index[ghosts]
         owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
         halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
-        self.contact_map = ContactMap(world.comm, rows, halo, row.astype(np.uint32))
+        self.contact_map = ContactMap(world.comm, rows, halo, row)
         free = free_velocities(world, near, dt)
         self.free_velocity = free[:owned]
         self.drive_impulse = drive_impulses(world, dt)
@@ -86,14 +84,23 @@ class ContactSystem:
         scale(self.contact_map.given.root, momentum.reshape(change.shape), change)
         return self.free_velocity + change
 
-    def generalised_impulse(self, impulse: Floats) -> tuple[Floats, Floats]:
-        """D g of the local grains (grains, 6), and of the large bodies (large, 6), the same on all ranks, from
-        the impulses (nc, 3) of all ranks [N s, N m s]; collective."""
-        near, sums = self.near, self.contact_map.sums_of_impulses(impulse)
-        large = sums[near.grains + near.ghosts :].copy()
+    def impulse_on_large(self, impulse: Floats) -> Floats:
+        """Impulses and angular impulses D g (large, 6) on the large bodies, the same on all ranks, from the impulses
+        (nc, 3) of all ranks [N s, N m s]; collective."""
+        first = self.near.grains + self.near.ghosts
+        rows = np.flatnonzero(self.contact_map.body[:, 1] >= first)  # body b has the higher id
+        large = self.contact_map.sums_of_impulses(impulse, rows)[first:].copy()
         self.contact_map.comm.Allreduce(MPI.IN_PLACE, large)
-        self.contact_map.halo.add(sums)
-        return sums[: near.grains], large
+        return large
+
+    def contact_velocities(self, velocity: Floats, large: Floats) -> Floats:
+        """D' v (nc, 3) for the velocities of the local grains (grains, 6) and of the large bodies (large, 6);
+        collective."""
+        table = np.zeros((len(self.near.bodies), 6))
+        table[: self.near.grains] = velocity
+        self.contact_map.halo.update(table)
+        table[self.near.grains + self.near.ghosts :] = large
+        return self.contact_map.relative_velocities(table)
 
 
 def gap_velocities(
@@ -113,9 +120,11 @@ def inverse_root_masses(world: World) -> Floats:
     """M^-1/2 of the bodies whose rows this rank owns, as `CompactRows.root` has it: (owned, 6) where that is all on all
     ranks, else (owned, 12)."""
     last = world.comm.rank == world.comm.size - 1
-    owned = bodies.concatenate([world.grains, world.large]) if last else world.grains
+    tables = [world.grains, world.large] if last else [world.grains]
     if world.only_spheres and not bodies.is_dynamic(world.large).any():
-        return 1.0 / np.sqrt(np.column_stack([owned.mass, owned.mass, owned.mass, owned.inertia]))
+        columns = [np.concatenate([table.mass[:, None]] * 3 + [table.inertia], axis=1) for table in tables]
+        return 1.0 / np.sqrt(np.concatenate(columns))
+    owned = bodies.concatenate(tables)
     translation = np.eye(3) / np.sqrt(owned.mass)[:, None, None]
     guides = free_directions(world.large_bodies) if last else np.zeros((0, 3, 3))
     translation[len(world.grains) :] = translation[len(world.grains) :] @ guides
@@ -128,15 +137,45 @@ def contact_frames(normal: Floats) -> Floats:
     Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
     but where the sign of its z component changes.
     """
-    x, y, z = normal.T
-    sign = np.copysign(1.0, z)
-    p = -1.0 / (sign + z)
-    q = x * y * p
-    rows = [x, y, z, 1.0 + sign * x * x * p, sign * q, -sign * x, q, sign + y * y * p, -y]
-    return np.stack(rows, axis=1).reshape(-1, 3, 3)
+    return _frames(normal).reshape(-1, 3, 3)
 
 
-def contact_arms(point: Floats, position: Floats, row: Ints) -> Floats:
+@loop
+def _frames(normal: Floats) -> Floats:
+    out = np.empty((len(normal), 9))
+    for c in range(len(normal)):
+        x, y, z = normal[c, 0], normal[c, 1], normal[c, 2]
+        sign = np.copysign(1.0, z)
+        p = -1.0 / (sign + z)
+        q = x * y * p
+        out[c, 0], out[c, 1], out[c, 2] = x, y, z
+        out[c, 3], out[c, 4], out[c, 5] = 1.0 + sign * x * x * p, sign * q, -sign * x
+        out[c, 6], out[c, 7], out[c, 8] = q, sign + y * y * p, -y
+    return out
+
+
+@loop
+def contact_arms(point: Floats, position: Floats, row: np.ndarray) -> Floats:
     """Vectors (nc, 6) from the centres of the two bodies of each contact to its point (nc, 3); `row` (nc, 2) are the
     bodies' rows in a table of positions (rows, 3)."""
-    return (point[:, None] - position[row]).reshape(-1, 6)
+    out = np.empty((len(row), 6))
+    for c in range(len(row)):
+        for k in range(3):
+            out[c, k] = point[c, k] - position[row[c, 0], k]
+            out[c, 3 + k] = point[c, k] - position[row[c, 1], k]
+    return out
+
+
+@loop
+def _rows_of(a, b, body, moves, owned):
+    """Of contacts of bodies in the rows a and b (nc,): the rows (nc, 2), the indices `body` (nc, 2) of those that move,
+    else -1, and which rows that this rank does not own they touch and move."""
+    row, moved = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int64)
+    touched = np.zeros(len(moves), np.bool_)
+    for c in range(len(a)):
+        row[c, 0], row[c, 1] = a[c], b[c]
+        for k, n in enumerate((a[c], b[c])):
+            moved[c, k] = body[c, k] if moves[n] else -1
+            if n >= owned and moves[n]:
+                touched[n] = True
+    return row, moved, touched

@@ -17,7 +17,7 @@ from dem import bodies, quaternion
 from dem import motion as motions
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
-from dem.motion import Driven, Dynamic, Motion, Prescribed, changed, checked_pose, mean_velocity
+from dem.motion import Driven, Dynamic, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
 from dem.scene import LargeBody
 from dem.together import together
 
@@ -46,7 +46,10 @@ class World:
 
     changed: set[str] = field(init=False, default_factory=set)  #: large bodies with another motion than the scene gave
 
-    #: By time and dt [s] the mean velocities of prescribed motions, by row; of the last question alone.
+    lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
+
+    #: Of prescribed motions, by row: the poses at the two last times, and by time and dt [s] the mean velocities.
+    _poses: dict[float, dict[int, Pose]] = field(init=False, repr=False, default_factory=dict)
     _followed: dict[tuple[float, float], dict[int, Floats]] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -61,7 +64,7 @@ class World:
 
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
-        self.grains = grains
+        self.grains, self.lists = grains, None
         counts, spheres = zip(*self.comm.allgather((len(grains), bool((grains.shape == bodies.SPHERE).all()))))
         self.slabs = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.only_spheres = all(spheres)
@@ -88,7 +91,7 @@ class World:
         row = self.large_row(body.name)
         self.large_bodies = (*self.large_bodies[:row], body, *self.large_bodies[row + 1 :])
         self.changed.add(body.name)
-        self._followed.clear()
+        self._poses, self._followed = {}, {}
 
     def large_velocity(self, velocity: Floats) -> Floats:
         """Those (large, 6) of the large bodies, on all ranks, of the velocities (owned, 6) of the bodies whose rows
@@ -99,21 +102,34 @@ class World:
         self.comm.Bcast(large, root=self.comm.size - 1)
         return large
 
+    def poses(self, time: float) -> dict[int, Pose]:
+        """Places (3,) and quaternions (4,) of the large bodies of prescribed motion at `time` [s], by row; collective.
+        SceneError if a motion fails."""
+        if time not in self._poses:  # the end of a step is the start of the next
+            found = together(self.comm, "motion of a large body", lambda: self._each(time))
+            self._poses = {**dict([*self._poses.items()][-1:]), time: found}
+        return self._poses[time]
+
     def prescribed_velocity(self, dt: float) -> Floats:
         """Velocities (large bodies, 6) over the next step of `dt` [s]; dynamic bodies keep theirs; collective.
         SceneError if a motion fails."""
         asked = (self.time, dt)
         if asked not in self._followed:  # a step asks several times
-            self._followed = {asked: together(self.comm, "motion of a large body", lambda: self._follow(dt))}
+            start, end = self.poses(self.time), self.poses(self.time + dt)
+
+            def follow() -> dict[int, Floats]:
+                motions: list[Any] = [body.motion for body in self.large_bodies]
+                return {row: velocity_between(motions[row], start[row], end[row], dt) for row in start}
+
+            self._followed = {asked: together(self.comm, "motion of a large body", follow)}
         velocity = self.large.velocity.copy()
         for row, mean in self._followed[asked].items():
             velocity[row] = mean
         return velocity
 
-    def _follow(self, dt: float) -> dict[int, Floats]:
-        """The mean velocities (6,) of the bodies of prescribed motion over the next step, by row."""
+    def _each(self, time: float) -> dict[int, Pose]:
         return {
-            row: mean_velocity(body.motion, self.time, dt, body.position, body.quaternion)
+            row: checked_pose(body.motion, time, body.position, body.quaternion)
             for row, body in enumerate(self.large_bodies)
             if not isinstance(body.motion, Dynamic)
         }
@@ -137,7 +153,7 @@ def set_motion(world: World, name: str, motion: Motion | None = None, **values: 
     world.replace_large(dataclasses.replace(body, motion=motion, position=pose[0], quaternion=pose[1]))
 
 
-def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
+def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> Pose:
     """The pose at time zero of a body that the motion brings to this pose at `time`. ValueError if there is none."""
     shift, turn = checked_pose(motion, time, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     back = quaternion.conjugate(turn)

@@ -14,7 +14,7 @@ def close_pairs(position: Floats, radius: Floats) -> Ints:
     position (n, 3), radius (n,). Spheres are sorted into classes of radii within a factor of two, with one
     grid each, so that a few large ones do not widen the search among many small ones.
     """
-    level = np.frexp(radius)[1]
+    level = np.frexp(radius / radius.min(initial=np.inf))[1]  # alike ones are in one class
     classes = [np.flatnonzero(level == size) for size in np.unique(level)]
     pairs = [np.zeros((0, 2), np.int64)]
     for k, rows in enumerate(classes):

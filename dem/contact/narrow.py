@@ -1,7 +1,7 @@
-"""Narrow phase of spheres, capsules and half spaces, and what that of boxes and of meshes shares with it.
+"""Narrow phase of capsules and half spaces, and what that of boxes and of meshes shares with it.
 
 Each function takes m pairs of a first and a second shape, and returns a `Touch` if they touch in one point, else a
-`Manifold`. Boxes on boxes are in `box_box`, surfaces of triangles in `meshes`.
+`Manifold`. Spheres are in `spheres`, boxes on boxes in `box_box`, surfaces of triangles in `meshes`.
 
 Capsules touch at the ends of what lies side by side, and at the closest point between them; docs/mechanics.md says why.
 """
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
-from dem.compiled import loop
+from dem.contact.spheres import spheres_boxes, spheres_spheres
 from dem.quaternion import across, cross, length
 
 #: Corners (8, 3) of the box with half extents one; the row number is the feature of a contact.
@@ -113,40 +113,9 @@ def reversed_touch(touch: Touch) -> Touch:
     return touch._replace(normal=-touch.normal)
 
 
-@loop
-def spheres_within(
-    center: Floats, size: Floats, i: Ints, j: Ints, delta: Floats
-) -> tuple[Ints, Floats, Floats, Floats]:
-    """Of the pairs of rows i, j (m,) of spheres of centres (n, 3) and sizes (n, k), whose first column has the radii,
-    those of which the gap is at most `delta` (m,): their numbers, points, normals and gaps. Concentric ones are parted
-    along z."""
-    pair = np.empty(len(i), np.int64)
-    point, normal, gap = np.empty((len(i), 3)), np.empty((len(i), 3)), np.empty(len(i))
-    found = 0
-    for k in range(len(i)):
-        p, q = center[i[k]], center[j[k]]
-        radius = size[i[k], 0]
-        x, y, z = q[0] - p[0], q[1] - p[1], q[2] - p[2]
-        distance = np.sqrt(x * x + y * y + z * z)
-        apart = distance - radius - size[j[k], 0]
-        if apart <= delta[k]:
-            if distance > 0.0:
-                x, y, z = x / distance, y / distance, z / distance
-            else:
-                z = 1.0
-            middle = radius + 0.5 * apart
-            pair[found], gap[found] = k, apart
-            normal[found, 0], normal[found, 1], normal[found, 2] = x, y, z
-            point[found, 0], point[found, 1], point[found, 2] = p[0] + middle * x, p[1] + middle * y, p[2] + middle * z
-            found += 1
-    return pair[:found], point[:found], normal[:found], gap[:found]
-
-
 def sphere_sphere(first: Spheres, second: Spheres) -> Touch:
-    """As `spheres_within`, of all pairs."""
-    rows = np.arange(len(first.center))
-    center, radius = (np.concatenate(both) for both in zip(first, second))
-    return Touch(*spheres_within(center, radius[:, None], rows, len(rows) + rows, np.full(len(rows), np.inf))[1:])
+    """Concentric spheres are parted along z."""
+    return Touch(*spheres_spheres(*first, *second))
 
 
 def sphere_capsule(ball: Spheres, capsule: Capsules) -> Touch:
@@ -181,33 +150,14 @@ def balls_plane(center: Floats, radius: Floats, plane: Planes, delta: Floats) ->
     return Manifold(pair, feature, Touch(center[pair, feature] + ahead[:, None] * normal, normal, gap))
 
 
-def sphere_plane(ball: Spheres, plane: Planes, delta: Floats) -> Manifold:
-    return balls_plane(ball.center[:, None], ball.radius, plane, delta)
-
-
 def box_plane(box: Boxes, plane: Planes, delta: Floats) -> Manifold:
     """The corners."""
     return balls_plane(box.corners(), np.zeros(len(box.center)), plane, delta)
 
 
 def sphere_box(ball: Spheres, box: Boxes) -> Touch:
-    """The nearest point of the box lies on a face, an edge or a corner. A centre inside the box is pushed out through
-    the nearest face."""
-    (center, radius), turn, half = ball, box.turn, box.half
-    local = ((center - box.center)[:, None, :] @ turn)[:, 0]
-    beyond = local - np.clip(local, -half, half)
-    distance = length(beyond)
-    outward = beyond / np.where(distance > 0.0, distance, 1.0)[:, None]
-    # At the surface `beyond` is zero or rounding noise: the direction of the nearest face is right there too.
-    inside = np.flatnonzero(distance <= 1e-12 * half.max(axis=1))
-    depth = half[inside] - np.abs(local[inside])
-    axis = depth.argmin(axis=1)
-    distance[inside] = -depth[np.arange(len(inside)), axis]
-    outward[inside] = 0.0
-    outward[inside, axis] = np.copysign(1.0, local[inside, axis])
-    gap = distance - radius
-    normal = -(turn @ outward[:, :, None])[:, :, 0]
-    return Touch(center + (radius + 0.5 * gap)[:, None] * normal, normal, gap)
+    """A centre inside the box is pushed out through the nearest face."""
+    return Touch(*spheres_boxes(*ball, box.center, box.turn.reshape(-1, 9), box.half))
 
 
 def end_ball(capsule: Capsules, side: float) -> Spheres:

@@ -27,11 +27,9 @@ from dem.contact.narrow import (
     joined,
     manifold,
     reversed_touch,
-    sphere_box,
     sphere_capsule,
-    sphere_plane,
-    spheres_within,
 )
+from dem.contact.spheres import touch_spheres
 from dem.mesh import Mesh, Surface
 from dem.neighbourhood import Neighbourhood
 from dem.shapes import Shape, placed
@@ -51,6 +49,20 @@ class Primitives(NamedTuple):
     surfaces: dict[int, Surface]  #: of the meshes, by row
     numbers: int  #: more than any of `number`, and those that meshes take after theirs
 
+    def now(self, near: Neighbourhood) -> Primitives:
+        """The same where the bodies are; parts come from the frames of their bodies."""
+        table, parts = near.bodies, slice(near.grains + near.ghosts, None)
+        row = self.row[parts]
+        turn, plane = table.quaternion[row], (self.kind[parts] == PLANE)[:, None]
+        of_parts = (
+            table.position[row] + quaternion.rotate(turn, self.center[parts]),
+            quaternion.multiply(turn, self.quaternion[parts]),
+            np.where(plane, quaternion.rotate(turn, self.size[parts]), self.size[parts]),
+        )
+        columns = (table.position, table.quaternion, table.size)
+        center, turn, size = (np.concatenate([c[: parts.start], part]) for c, part in zip(columns, of_parts))
+        return self._replace(center=center, quaternion=turn, size=size)
+
     def sphere(self, rows: Ints) -> Spheres:
         return Spheres(self.center[rows], self.size[rows, 0])
 
@@ -67,33 +79,22 @@ class Primitives(NamedTuple):
     def mesh(self, row: int) -> PlacedMesh:
         return PlacedMesh(self.surfaces[row], self.center[row], quaternion.matrix(self.quaternion[row]))
 
-    def keys(self, i: Ints, j: Ints, feature: Ints) -> Ints:
-        """Numbers (m,) of the features of pairs of rows i, j (m,), distinct and the same at all times."""
-        first, second = self.number[i], self.number[j]
-        if self.surfaces:
-            further, feature = np.divmod(feature, FEATURES)
-            first, second = first + further * (self.kind[i] == MESH), second + further * (self.kind[i] != MESH)
-        return (first * self.numbers + second) * FEATURES + feature
-
 
 def primitives(near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int) -> Primitives:
-    """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies; `grains` is the number of
-    grains on all ranks."""
+    """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies, for `Primitives.now`; the
+    parts are in the frames of their bodies. `grains` is the number of grains on all ranks."""
     table, count = near.bodies, near.grains + near.ghosts
     row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
     members = [shape for body in shapes for shape in body]
     kinds, centers, turns, sizes = zip(*(placed(shape) for shape in members)) if members else [()] * 4
-    body_turn, kind = table.quaternion[row], np.array(kinds, np.int64)
     center, turn, size = (np.reshape(c, (len(row), k)) for c, k in ((centers, 3), (turns, 4), (sizes, 3)))
-    center = table.position[row] + quaternion.rotate(body_turn, center)
-    size = np.where((kind == PLANE)[:, None], quaternion.rotate(body_turn, size), size)
     spans = [_numbers_of(shape) for shape in members]
     columns = {
         "number": (table.id, grains + np.cumsum([0, *spans])[:-1]),
         "row": (np.arange(count), row),
-        "kind": (table.shape, kind),
+        "kind": (table.shape, np.array(kinds, np.int64)),
         "center": (table.position, center),
-        "quaternion": (table.quaternion, quaternion.multiply(body_turn, turn)),
+        "quaternion": (table.quaternion, turn),
         "size": (table.size, size),
     }
     both = {name: np.concatenate([of_grains[:count], of_parts]) for name, (of_grains, of_parts) in columns.items()}
@@ -122,11 +123,16 @@ def _numbers_of(shape: Shape) -> int:
 
 
 def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
-    """All contacts of gap at most `delta` (m,) [m] of the pairs of rows i, j (m,); normals point from i to j.
+    """All contacts of gap at most `delta` (m,) [m] of the pairs of rows i, j (m,); normals point from i to j. Those of
+    spheres come first, in the order of the pairs.
 
     Two half spaces have none, nor have meshes with boxes or meshes: `dem.scene` refuses those.
     """
-    found = [Manifold(i[:0], j[:0], Touch(table.center[:0], table.center[:0], delta[:0]))]
+    pair, point, normal, gap, others = touch_spheres(
+        table.kind, table.center, table.quaternion, table.size, i, j, delta
+    )
+    found = [Manifold(pair, np.zeros_like(pair), Touch(point, normal, gap))]
+    i, j, delta = i[others], j[others], delta[others]
     code = 8 * table.kind[i] + table.kind[j]
     for one, two in (divmod(int(kinds), 8) for kinds in np.flatnonzero(np.bincount(code))):
         rows = np.flatnonzero(code == 8 * one + two)
@@ -137,15 +143,13 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
             touch = reversed_touch(touch)
         else:
             continue
-        found.append(Manifold(rows[pair], feature, touch))
-    return joined(found)
+        found.append(Manifold(others[rows[pair]], feature, touch))
+    return joined(found) if len(found) > 1 else found[0]
 
 
 def _touching(table: Primitives, one: int, two: int, i: Ints, j: Ints, delta: Floats) -> Manifold:
     """The contacts of pairs of rows i, j (m,) of the kinds `one` and `two`; with meshes mesh by mesh."""
     contacts, first = _TOUCH[one, two], _SHAPE[one]
-    if one == two == SPHERE:
-        return contacts(table, i, j, delta)  # without copies of the many spheres
     if two != MESH:
         return contacts(first(table, i), _SHAPE[two](table, j), delta)
     found = []
@@ -156,23 +160,11 @@ def _touching(table: Primitives, one: int, two: int, i: Ints, j: Ints, delta: Fl
     return joined(found)
 
 
-def _spheres(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
-    pair, *touch = spheres_within(table.center, table.size, i, j, delta)
-    return Manifold(pair, np.zeros_like(pair), Touch(*touch))
-
-
-def _in_one_point(touch: Callable[[Any, Any], Touch]) -> Callable[..., Manifold]:
-    return lambda first, second, delta: manifold(delta, [touch(first, second)])
-
-
 _SHAPE: dict[int, Callable[..., Any]] = {
     SPHERE: Primitives.sphere, BOX: Primitives.box, CAPSULE: Primitives.capsule, PLANE: Primitives.plane
 }  # fmt: skip
 _TOUCH: dict[tuple[int, int], Callable[..., Manifold]] = {
-    (SPHERE, SPHERE): _spheres,
-    (SPHERE, BOX): _in_one_point(sphere_box),
-    (SPHERE, CAPSULE): _in_one_point(sphere_capsule),
-    (SPHERE, PLANE): sphere_plane,
+    (SPHERE, CAPSULE): lambda ball, capsule, delta: manifold(delta, [sphere_capsule(ball, capsule)]),
     (CAPSULE, CAPSULE): capsule_capsule,
     (CAPSULE, BOX): capsule_box,
     (CAPSULE, PLANE): capsule_plane,

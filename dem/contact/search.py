@@ -7,16 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, quaternion
-from dem.arrays import Floats, Ints
-from dem.bodies import BOX, SPHERE, Bodies
+from dem import bodies
+from dem.arrays import Bools, Floats, Ints
+from dem.bodies import CAPSULE, MESH, SPHERE
 from dem.checks import not_negative
-from dem.contact.broad import close_pairs
-from dem.contact.narrow import Touch
-from dem.contact.primitives import MESH, PLANE, Primitives, extents, primitives, touches
+from dem.compiled import loop
+from dem.contact.candidates import meeting
+from dem.contact.lists import grain_lists
+from dem.contact.primitives import FEATURES, extents, touches
 from dem.free_motion import free_directions, free_velocity, large_free_velocity
+from dem.keys import places
 from dem.motion import Hinged
-from dem.neighbourhood import Neighbourhood, neighbourhood
+from dem.neighbourhood import Neighbourhood, refreshed
 from dem.quaternion import cross, length
 from dem.world import World
 
@@ -63,43 +65,55 @@ def find_contacts(
     `world.grains.weight`.
     """
     not_negative("contact distance delta", delta)
-    shapes, total = [body.shapes for body in world.large_bodies], int(world.slabs[-1])
     if shifts is None:
         shifts = (dt * large_free_velocity(world, dt) if dt else np.zeros_like(world.large.velocity))[None]
     free = free_velocity(world.grains, world.gravity, dt) if dt else world.grains.velocity
-    way = _way(world.grains, free, dt)
+    way = ways(world.grains.shape, world.grains.size, free, dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
-    near = neighbourhood(world, margin)
-    table = primitives(near, shapes, total)
-    found = [_grain_pairs(near, table), _grains_on_parts(near, table, delta, shifts)]
-    if world.comm.rank == world.comm.size - 1:
-        found.append(_large_pairs(world, near, table, delta, shifts))
-    pairs, reach = (np.concatenate(columns) for columns in zip(*found))
-    swap = table.number[pairs[:, 0]] > table.number[pairs[:, 1]]
-    i, j = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
-
+    lists = grain_lists(world, margin, way)
+    near = refreshed(lists.near, lists.halo, world, margin)
+    table = lists.table.now(near)
+    i, j, reach = meeting(world, near, lists, table, delta, shifts)
     pair, feature, touch = touches(table, i, j, reach)
-    i, j = i[pair], j[pair]
-    key = table.keys(i, j, feature)
-    a, b = table.row[i], table.row[j]
-    order = contact_order(world, near, a, b, key)
-    order = order[_gives_way(world, near, a, b, touch)[order]]
-    a, b = a[order], b[order]
-    owner = np.minimum(a, b)
-    world.grains.weight = np.bincount(owner, minlength=near.grains)[: near.grains].astype(np.float64)
-    material = near.bodies.material
-    return Contacts(
-        key=key[order],
-        a=a,
-        b=b,
-        body=np.stack([near.index[a], near.index[b]], axis=1),
-        point=touch.point.take(order, axis=0),  # faster than an index
-        normal=touch.normal.take(order, axis=0),
-        gap=touch.gap[order],
-        friction=world.friction[material[a], material[b]],
-        near=near,
-        shifts=shifts,
+    key, a, b, body, friction, weight = named(
+        *(table.number, table.row, table.kind, near.index, near.bodies.material, world.friction),
+        *(table.numbers, FEATURES, near.grains, i, j, pair, feature),
     )
+    contacts = Contacts(key, a, b, body, *touch, friction, near, shifts)
+    back = np.flatnonzero(np.diff(pair) <= 0)  # other shapes come behind the spheres, and touch in several points
+    if len(back):
+        left = slice(int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min())), None)
+        order = contact_order(world, near, a[left], b[left], key[left])
+        for column in contacts.columns().values():
+            column[left] = column[left].take(order, axis=0)
+    world.grains.weight = weight
+    rigid = _gives_no_way(world, contacts)
+    return contacts.take(~rigid) if rigid.any() else contacts
+
+
+@loop
+def named(number, row, kind, index, material, friction, numbers, features, grains, i, j, pair, feature):
+    """Of contacts of the pairs of rows i, j (m,) of `Primitives`, with their number `pair` (nc,) and `feature` (nc,):
+    key, rows a and b of the bodies, `index` of the bodies (nc, 2), friction; and how many each of the `grains` owns.
+
+    Keys are distinct, and the same at all times: a mesh takes further numbers for its features."""
+    key, a, b = np.empty(len(pair), np.int64), np.empty(len(pair), np.int64), np.empty(len(pair), np.int64)
+    body, mu, owned = np.empty((len(pair), 2), np.int64), np.empty(len(pair)), np.zeros(grains)
+    for c in range(len(pair)):
+        p, q = i[pair[c]], j[pair[c]]
+        one, two, further = number[p], number[q], feature[c] // features
+        if kind[p] == MESH:
+            one += further
+        else:
+            two += further
+        key[c] = (one * numbers + two) * features + feature[c] % features
+        a[c], b[c] = row[p], row[q]
+        body[c, 0], body[c, 1] = index[a[c]], index[b[c]]
+        mu[c] = friction[material[a[c]], material[b[c]]]
+        owner = min(a[c], b[c])  # the local grains are the first rows, and ghosts come from higher ranks only
+        if owner < grains:
+            owned[owner] += 1.0
+    return key, a, b, body, mu, owned
 
 
 def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints) -> Ints:
@@ -120,15 +134,16 @@ def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: floa
     The search may be repeated for the contacts that it finds: margins only grow.
     """
     seen = contacts.near.margin[: contacts.near.grains]
-    ways = _way(world.grains, velocity[: len(seen)], dt)
+    way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
     shift = dt * world.large_velocity(velocity)
-    # reduced, though all ranks have the same data: processors of other kinds may round otherwise
-    beyond = world.comm.allreduce(_go_beyond(world, shift, contacts.shifts, delta), MPI.LOR)
-    if not (world.comm.allreduce(bool((ways > seen).any()), MPI.LOR) or beyond):
+    # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
+    gone = bool((way > seen).any()), _go_beyond(world, shift, contacts.shifts, delta)
+    further, beyond = map(any, zip(*world.comm.allgather(gone)))
+    if not (further or beyond):
         return None
     shifts = np.concatenate([contacts.shifts, shift[None]]) if beyond else contacts.shifts
-    wider = find_contacts(world, delta, dt, np.maximum(seen, ways), shifts)
-    new = len(wider) > len(contacts) or not np.isin(wider.key, contacts.key, assume_unique=True).all()
+    wider = find_contacts(world, delta, dt, np.maximum(seen, way), shifts)
+    new = bool((places(contacts.key, wider.key) < 0).any())
     return wider if world.comm.allreduce(new, MPI.LOR) else None
 
 
@@ -136,6 +151,8 @@ def _go_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
     """Whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as in one
     of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
     free = bodies.is_dynamic(world.large)
+    if not free.any():
+        return False
     size = extents([body.shapes for body in world.large_bodies])[free]
 
     def way(shift: Floats) -> Floats:
@@ -144,107 +161,42 @@ def _go_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
     return bool(((way(shift) > delta / 2) & (way(shift - seen) > 0.01 * delta).all(axis=0)).any())
 
 
-def _way(grains: Bodies, velocity: Floats, dt: float) -> Floats:
+@loop
+def ways(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
     """About how far (n,) a point of each grain goes in dt [s], at most two of its radii [m]. For spheres it is the
     centre's way, as turning does not move their surface. NaN where the velocity is not finite."""
-    radius = bodies.bounding_radius(grains)
-    turn = np.where(grains.shape == SPHERE, 0.0, radius) * length(velocity[:, 3:])
-    way = np.minimum(dt * (length(velocity[:, :3]) + turn), 2.0 * radius)
-    finite = np.isfinite(velocity)
-    return way if finite.all() else np.where(finite.all(axis=1), way, np.nan)
+    out = np.empty(len(shape))
+    for n in range(len(shape)):
+        v = velocity[n]
+        way, spin = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2), np.sqrt(v[3] ** 2 + v[4] ** 2 + v[5] ** 2)
+        radius = np.sqrt(size[n, 0] ** 2 + size[n, 1] ** 2 + size[n, 2] ** 2)
+        if shape[n] == CAPSULE:
+            radius = size[n, 0] + size[n, 1]
+        if shape[n] != SPHERE:
+            way += radius * spin
+        out[n] = min(dt * way, 2.0 * radius) if np.isfinite(way + spin) else np.nan
+    return out
 
 
-def _grain_pairs(near: Neighbourhood, table: Primitives) -> tuple[Ints, Floats]:
-    """Rows (m, 2) of local grains, and of a local grain and a ghost, whose margins may meet, and the gaps (m,) within
-    which they do."""
-    count = near.grains + near.ghosts
-    pairs = close_pairs(table.center[:count], table.radius[:count] + near.margin)
-    if near.ghosts:
-        pairs = pairs[pairs[:, 0] < near.grains]
-    return pairs, near.margin[pairs[:, 0]] + near.margin[pairs[:, 1]]
-
-
-def _grains_on_parts(
-    near: Neighbourhood, table: Primitives, delta: float, shifts: Floats
-) -> tuple[Ints, Floats]:
-    """Rows (m, 2) of a local grain and a part of a large body whose margins may meet, and the gaps (m,) within which
-    they do. The bodies move and turn by `shifts` (k, large bodies, 6)."""
-    count, first = near.grains, near.grains + near.ghosts
-    center, radius = table.center[:count], table.radius[:count]
-    found = [(np.zeros((0, 2), np.int64), np.zeros(0))]
-    for body in np.unique(table.row[first:]):
-        margin = _part_margin(shifts[:, [body - first]], near.bodies.position[[body]], center, radius, delta)
-        reach = near.margin[:count] + margin
-        for part in first + np.flatnonzero(table.row[first:] == body):
-            # where the rounding matters, the narrow phase is to decide
-            rows = np.flatnonzero(_distance_at_least(table, part, center) - (1.0 + 1e-9) * radius <= reach)
-            found.append((np.stack([rows, np.full(len(rows), part)], axis=1), reach[rows]))
-    pairs, gaps = zip(*found)
-    return np.concatenate(pairs), np.concatenate(gaps)
-
-
-def _distance_at_least(table: Primitives, part: int, points: Floats) -> Floats:
-    """A lower bound of the distances (m,) of points (m, 3) from the surface of a part [m]; of planes and boxes the
-    distance itself, as far as it is positive; of meshes that of the box about them."""
-    place, size = table.center[part], table.size[part]
-    if table.kind[part] == PLANE:
-        return points @ size - place @ size
-    offset = points - place
-    if table.kind[part] in (BOX, MESH):
-        return length(np.maximum(np.abs(offset @ quaternion.matrix(table.quaternion[part])) - size, 0.0))
-    return length(offset) - table.radius[part]
-
-
-def _large_pairs(
-    world: World, near: Neighbourhood, table: Primitives, delta: float, shifts: Floats
-) -> tuple[Ints, Floats]:
-    """Rows (m, 2) of the parts of two large bodies, of which one at least is free to move, and the gaps (m,) within
-    which their margins meet."""
-    first = near.grains + near.ghosts
-    free = bodies.is_dynamic(world.large)
-    body = table.row[first:] - first
-    i, j = np.triu_indices(len(body), 1)
-    touch = (body[i] != body[j]) & (free[body[i]] | free[body[j]])
-    i, j = first + i[touch], first + j[touch]
-    # Two half spaces never touch: the first is to be the one that has a centre.
-    i, j = np.where(table.kind[i] == PLANE, j, i), np.where(table.kind[i] == PLANE, i, j)
-    at = table.center[i], table.radius[i]
-    rows = [table.row[part] for part in (i, j)]
-    margins = [_part_margin(shifts[:, row - first], near.bodies.position[row], *at, delta) for row in rows]
-    return np.stack([i, j], axis=1), margins[0] + margins[1]
-
-
-def _part_margin(shifts: Floats, pivot: Floats, center: Floats, radius: Floats, delta: float) -> Floats:
-    """Margins (m,) of the parts of large bodies at the surfaces of primitives of centres (m, 3) and radii (m,) [m]. The
-    bodies move and turn, about the pivots (m, 3), by any of the `shifts` (k, m, 6).
-
-    Of one body, with (k, 1, 6) and (1, 3), a single margin (1,) if that is the same everywhere.
-    """
-    move, turn = shifts[..., :3], shifts[..., 3:]
-    way = length(move)
-    if turn.any():
-        way = length(move + cross(turn, center - pivot)) + radius * length(turn)
-    return np.maximum(delta / 2, way.max(axis=0))
-
-
-def _gives_way(world: World, near: Neighbourhood, a: Ints, b: Ints, touch: Touch) -> np.ndarray:
-    """Which contacts (nc,) of bodies in the rows a, b (nc,) a force can open. It cannot open those whose normal is
-    across the guide of a guided body, nor those that do not turn a hinged one, if the other body is held too.
+def _gives_no_way(world: World, contacts: Contacts) -> Bools:
+    """Which contacts (nc,) no force can open: those whose normal is across the guide of a guided body, or that do not
+    turn a hinged one, if the other body is held too.
 
     Their normal impulse changes no velocity, and would allow any friction.
     """
+    near = contacts.near
     first = near.grains + near.ghosts
-    gives = np.ones(len(a), dtype=bool)
-    rows = np.flatnonzero((a >= first) & (b >= first))
-    if len(rows):
+    rigid = np.minimum(contacts.a, contacts.b) >= first
+    if rigid.any():
+        these = contacts.take(rigid)
         motions = [body.motion for body in world.large_bodies]
         free = free_directions(world.large_bodies) * bodies.is_dynamic(world.large)[:, None, None]
         axis = np.array([m.axis if isinstance(m, Hinged) else np.zeros(3) for m in motions])
-        normal, opens = touch.normal[rows], np.zeros(len(rows))
-        for body in (a[rows], b[rows]):
-            arm = touch.point[rows] - near.bodies.position[body]
+        normal, opens = these.normal, np.zeros(len(these))
+        for body in (these.a, these.b):
+            arm = these.point - near.bodies.position[body]
             lever = cross(axis[body - first], arm / np.maximum(length(arm), 1e-300)[:, None])
             opens += np.einsum("ci,cij,cj->c", normal, free[body - first], normal)
             opens += np.einsum("ci,ci->c", lever, normal) ** 2
-        gives[rows] = opens > 1e-8
-    return gives
+        rigid[rigid] = opens <= 1e-8
+    return rigid

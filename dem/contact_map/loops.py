@@ -133,29 +133,38 @@ def add_body_blocks(frame, arm, body, weight, blocks):
 
 @loop
 def contact_blocks(frame, arm, body, mass, out):
-    """out (nc, 3, 3) = diagonal blocks of D' M^-1 D; ``mass`` (bodies, 12) is M^-1 in the format of
+    """out (nc, 3, 3) = diagonal blocks of D' M^-1 D; ``mass`` (bodies, 6 or 12) is M^-1 in the format of
     `CompactRows.root`."""
-    J = np.empty((3, 6))
+    W = np.empty(6)  # from an impulse at the contact point to its velocity, the upper triangle
     for c in range(len(frame)):
-        for i in range(3):
-            for j in range(3):
-                out[c, i, j] = 0.0
+        W[:] = 0.0
         for side in range(2):
             n = body[c, side]
-            r0, r1, r2 = arm[c, 3 * side], arm[c, 3 * side + 1], arm[c, 3 * side + 2]
-            for i in range(3):
-                f0, f1, f2 = frame[c, 3 * i], frame[c, 3 * i + 1], frame[c, 3 * i + 2]
-                J[i, 0], J[i, 1], J[i, 2] = f0, f1, f2
-                J[i, 3], J[i, 4], J[i, 5] = r1 * f2 - r2 * f1, r2 * f0 - r0 * f2, r0 * f1 - r1 * f0
-            for part in range(2):
-                p, q = 6 * part, 3 * part
-                for j in range(3):
-                    x, y, z = J[j, q], J[j, q + 1], J[j, q + 2]
-                    v0 = mass[n, p] * x + mass[n, p + 1] * y + mass[n, p + 2] * z
-                    v1 = mass[n, p + 1] * x + mass[n, p + 3] * y + mass[n, p + 4] * z
-                    v2 = mass[n, p + 2] * x + mass[n, p + 4] * y + mass[n, p + 5] * z
-                    for i in range(3):
-                        out[c, i, j] += J[i, q] * v0 + J[i, q + 1] * v1 + J[i, q + 2] * v2
+            x, y, z = arm[c, 3 * side], arm[c, 3 * side + 1], arm[c, 3 * side + 2]
+            if mass.shape[1] == 6:
+                p, q, r = mass[n, 3], mass[n, 4], mass[n, 5]
+                W[0] += mass[n, 0] + q * z * z + r * y * y
+                W[1] -= r * x * y
+                W[2] -= q * x * z
+                W[3] += mass[n, 1] + p * z * z + r * x * x
+                W[4] -= p * y * z
+                W[5] += mass[n, 2] + p * y * y + q * x * x
+            else:  # the rows of [r]x I^-1 and then times [r]x'
+                p, q, r, s, t, u = mass[n, 6], mass[n, 7], mass[n, 8], mass[n, 9], mass[n, 10], mass[n, 11]
+                a0, a1, a2 = y * r - z * q, y * t - z * s, y * u - z * t
+                b0, b1, b2 = z * p - x * r, z * q - x * t, z * r - x * u
+                c0, c1 = x * q - y * p, x * s - y * q
+                W[0] += mass[n, 0] + y * a2 - z * a1
+                W[1] += mass[n, 1] + z * a0 - x * a2
+                W[2] += mass[n, 2] + x * a1 - y * a0
+                W[3] += mass[n, 3] + z * b0 - x * b2
+                W[4] += mass[n, 4] + x * b1 - y * b0
+                W[5] += mass[n, 5] + x * c1 - y * c0
+        for i in range(3):
+            x, y, z = frame[c, 3 * i], frame[c, 3 * i + 1], frame[c, 3 * i + 2]
+            u, v, w = W[0] * x + W[1] * y + W[2] * z, W[1] * x + W[3] * y + W[4] * z, W[2] * x + W[4] * y + W[5] * z
+            for j in range(3):
+                out[c, i, j] = u * frame[c, 3 * j] + v * frame[c, 3 * j + 1] + w * frame[c, 3 * j + 2]
 
 
 @loop

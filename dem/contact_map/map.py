@@ -183,10 +183,12 @@ class ContactMap:
         """D' v (nc, 3) for the velocities (rows, 6) of all rows of a table of the halo, without a message."""
         return loops.relative_velocities(*self._arrays, v)
 
-    def sums_of_impulses(self, g: Floats) -> Floats:
-        """D g (rows, 6) of this rank's contacts, by rows of a table of the halo, without a message."""
+    def sums_of_impulses(self, g: Floats, contacts: Ints) -> Floats:
+        """D g (rows, 6) of these of this rank's contacts, by rows of a table of the halo, without a message."""
         sums = np.zeros((self.halo.rows, 6))
-        loops.add_momenta(*self._arrays, self._floats(shaped("impulses", g, self.rows, 3)), sums)
+        g = self._floats(shaped("impulses", g, self.rows, 3))
+        frame, arm, body = (array[contacts] for array in self._arrays)
+        loops.add_momenta(frame, arm, body, g[contacts], sums)
         return sums
 
     def _enter(self, scale: Floats, v: Floats) -> None:
@@ -230,8 +232,8 @@ class ContactMap:
     def contact_blocks(self) -> Floats:
         """The diagonal blocks of G G' (nc, 3, 3)."""
         out = np.empty((self.rows, 3, 3), self.precision)
-        mass = np.zeros((self.halo.rows, 12), self.precision)
-        mass[: self.columns] = packed(root_blocks(self._mass))
+        mass = np.zeros((self.halo.rows, self._mass.shape[1]), self.precision)
+        mass[: self.columns] = self._mass
         self.halo.update(mass)
         loops.contact_blocks(*self._arrays, mass, out)
         return out

@@ -54,14 +54,13 @@ class ConeProblem:
         refuse(comm, _wrong(r, mu, G, N, point, key, compliance))
         self.r = np.ascontiguousarray(r, dtype=float).reshape(-1, 3)
         self.mu = np.ascontiguousarray(mu, dtype=float)
-        bad = ~np.isfinite(self.r).all(1) | ~(np.isfinite(self.mu) & (self.mu >= 0))
-        if count := self.sum(bad.sum()):
+        if count := self.sum(_not_finite(self.r) + np.sum(~((self.mu >= 0) & (self.mu < np.inf)))):
             raise ValueError(f"{count} contacts with a NaN, infinite or negative coefficient")
         self.size = self.sum(len(self.mu))
         self.contact_map = None if G is None else _map(comm, G)
         self.operator: ContactMap | GivenMatrix = self.contact_map or GivenMatrix(comm, N)
         # the diagonal blocks have squares of all numbers of G
-        if wrong := self.sum((~np.isfinite(self._rigid_blocks).all(axis=(1, 2))).sum()):
+        if wrong := self.sum(_not_finite(self._rigid_blocks)):
             self.destroy()
             raise ValueError(f"G has a NaN or an infinite number in {wrong} contacts")
         self.compliance = np.zeros_like(self.r)
@@ -162,7 +161,7 @@ class ConeProblem:
     @cached_property
     def mean_diagonal(self) -> float:
         """Mean of the diagonal of N without compliance (1/kg); 1 for a problem without contacts."""
-        trace = self.sum(np.trace(self._rigid_blocks, axis1=1, axis2=2).sum())
+        trace = self.sum(np.einsum("cii->", self._rigid_blocks))
         return trace / (3 * self.size) if trace > 0 else 1.0
 
     # -- reductions over all contacts -----------------------------------------------------------------------
@@ -204,6 +203,12 @@ class ConeProblem:
         self.operator.destroy()
         if "N" in self.__dict__:
             self.__dict__.pop("N").destroy()
+
+
+def _not_finite(array: Array) -> int:
+    """How many rows of an array have a NaN or an infinite number."""
+    finite = np.isfinite(array)
+    return 0 if finite.all() else int((~finite.reshape(len(array), -1).all(axis=1)).sum())
 
 
 def _map(comm: MPI.Comm, G: Given) -> ContactMap:

@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from dem.contact import Contacts, find_contacts, find_overrun
 from dem.impulses import ImpulseMemory
+from dem.keys import places
 from dem.partition import rebalance
 from dem.step import advance, find_turned
 from dem.system import ContactSystem
@@ -151,7 +152,7 @@ class Stepper:
         if wider is None:
             return None
         with log.phase("assembly"):
-            unseen = wider.take(~np.isin(wider.key, self.contacts.key))
+            unseen = wider.take(places(self.contacts.key, wider.key) < 0)
             beyond = ContactSystem(world, unseen, settings.dt, settings.recovery_speed)
             opening = (beyond.contact_map.velocities(found.momentum) + beyond.r)[:, 0]
             # solved for if the overlap would be deeper than a hundredth of delta
@@ -162,7 +163,7 @@ class Stepper:
         """The contacts, with those that overlap at the end of the step because bodies turn, and the impulses so far.
         None if there are none, or after so many corrections."""
         settings, depth, most = self.settings, 0.1 * self.settings.delta, 3  # overlap that is corrected, and how often
-        if self._corrections == most:
+        if self._corrections == most or self.world.only_spheres:
             return None
         with log.phase("search"):
             velocity = self.system.velocity_with(found.momentum)

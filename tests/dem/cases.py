@@ -19,7 +19,7 @@ from dem.world import World
 
 def force_on(world: World, system: ContactSystem, name: str, impulse: np.ndarray) -> np.ndarray:
     """Contact force and torque (6,) [N, N m] on a large body, from the impulses (nc, 3) of all ranks; collective."""
-    return system.generalised_impulse(impulse)[1][world.large_row(name)] / system.dt
+    return system.impulse_on_large(impulse)[world.large_row(name)] / system.dt
 
 
 def random_quaternions(rng: np.random.Generator, count: int) -> Floats:

@@ -7,8 +7,10 @@ import pytest
 from cases import random_quaternions
 
 from dem import quaternion
+from dem.bodies import SPHERE
 from dem.contact import broad
-from dem.contact.narrow import Spheres, sphere_sphere, spheres_within
+from dem.contact.narrow import Spheres, sphere_sphere
+from dem.contact.spheres import touch_spheres
 from dem.free_motion import free_spin
 
 
@@ -46,7 +48,9 @@ def test_contacts_of_spheres():
     whole = sphere_sphere(Spheres(center[i], size[i, 0]), Spheres(center[j], size[j, 0]))
     near = np.flatnonzero(whole.gap <= delta)
     assert 20 < len(near) < len(i)
-    pair, *touch = spheres_within(center, size, i, j, delta)
+    kind, turn = np.full(60, SPHERE), np.tile([1.0, 0, 0, 0], (60, 1))
+    pair, *touch, others = touch_spheres(kind, center, turn, size, i, j, delta)
+    assert len(others) == 0
     np.testing.assert_array_equal(pair, near)
     for column, expected in zip(touch, whole.take(near)):
         np.testing.assert_allclose(column, expected, atol=1e-14)

@@ -6,19 +6,21 @@ import numpy as np
 import pytest
 
 from dem import quaternion
+from dem.bodies import PLANE, SPHERE
 from dem.contact.narrow import (
     CORNERS,
     Boxes,
     Capsules,
     Planes,
     Spheres,
+    Touch,
     box_plane,
     closest_on_lines,
     sphere_box,
     sphere_capsule,
-    sphere_plane,
     sphere_sphere,
 )
+from dem.contact.spheres import touch_spheres
 
 RNG = np.random.default_rng(2)
 UNIT = np.eye(3)[None]
@@ -42,8 +44,14 @@ def test_spheres():
 def test_sphere_above_and_below_a_tilted_plane():
     outward, origin = np.array([0.6, 0.0, 0.8]), np.array([1.0, 2.0, 3.0])
     center = origin + np.outer([1.5, -4.0], outward) + np.array([0.8, 5.0, -0.6])
-    plane = Planes(np.array([outward] * 2), np.array([origin] * 2))
-    touch = sphere_plane(Spheres(center, np.array([1.0, 1.0])), plane, np.ones(2)).touch
+    places, turn = np.array([*center, origin]), np.tile([1.0, 0, 0, 0], (3, 1))
+    size, kind = np.array([[1.0, 0, 0], [1.0, 0, 0], outward]), np.array([SPHERE, SPHERE, PLANE])
+    rows = np.array([[0, 2], [1, 2], [2, 0]])
+    pair, *found, others = touch_spheres(kind, places, turn, size, *rows.T, np.ones(3))
+    np.testing.assert_array_equal(pair, [0, 1, 2])
+    assert len(others) == 0
+    np.testing.assert_allclose(found[1][2], -found[1][0])  # the half space first: the other way
+    touch = Touch(*found).take(slice(2))
     np.testing.assert_allclose(touch.gap, [0.5, -5.0])
     np.testing.assert_allclose(touch.normal, -np.tile(outward, (2, 1)))
     check_consistency(touch, center, np.ones(2))

@@ -1,0 +1,143 @@
+"""Pairs whose margins meet: grains and grains, grains and the parts of large bodies, these with each other."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dem import bodies, quaternion
+from dem.arrays import Bools, Floats, Ints
+from dem.bodies import BOX, MESH, PLANE
+from dem.compiled import loop
+from dem.contact.lists import Lists, Rows
+from dem.contact.primitives import Primitives
+from dem.neighbourhood import Neighbourhood
+from dem.quaternion import cross, length
+from dem.world import World
+
+#: Rows i, j (m,) of `Primitives`, of which i has the lower number, and the gaps (m,) within which their margins meet.
+Pairs = tuple[Ints, Ints, Floats]
+
+
+def meeting(
+    world: World, near: Neighbourhood, lists: Lists, table: Primitives, delta: float, shifts: Floats
+) -> Pairs:
+    """All pairs of this rank whose margins meet, or by rounding do not, in the order of `Contacts`. Those of large
+    bodies are delta/2 or the way of their surfaces, if the bodies move and turn by any of the `shifts` (k, large, 6)
+    [m, rad]."""
+    last = world.comm.rank == world.comm.size - 1
+    first = near.grains + near.ghosts
+    foreign = bodies.is_dynamic(world.large)[table.row[first:] - first] & (not last)
+    found = [_of_grains(near, lists.own, ~foreign, table, delta, shifts)]
+    if last:
+        if bodies.is_dynamic(world.large).any():
+            found.append(_of_large(world, near, table, delta, shifts))
+    else:
+        found.append(_of_grains(near, lists.away, foreign, table, delta, shifts))
+    i, j, reach = (np.concatenate(columns) for columns in zip(*found)) if len(found) > 1 else found[0]
+    return i, j, reach
+
+
+def _of_grains(
+    near: Neighbourhood, rows: Rows, wanted: Bools, table: Primitives, delta: float, shifts: Floats
+) -> Pairs:
+    """Pairs of local grains with those in their rows, and with the `wanted` (parts,) parts of large bodies."""
+    first = near.grains + near.ghosts
+    part = first + np.flatnonzero(wanted)
+    turn = quaternion.matrix(table.quaternion[part]).reshape(-1, 9)
+    turning, way = shifts[:, :, 3:].any(axis=(0, 2)), length(shifts[:, :, :3]).max(axis=0)
+    large = near.bodies.position[first:], shifts, turning, np.maximum(0.5 * delta, np.where(turning, 0.0, way))
+    parts = part, table.row[part] - first, turn
+    shapes = table.number, table.kind, table.center, table.size, table.radius
+    done, found, room = 0, 0, len(rows.other) + near.grains + len(part)
+    i, j, reach = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)
+    while True:
+        done, found = fill(rows.start, rows.other, near.margin, *parts, *large, *shapes, done, found, i, j, reach)
+        if done == near.grains:
+            return i[:found], j[:found], reach[:found]
+        i, j, reach = (np.concatenate([column, np.empty_like(column)]) for column in (i, j, reach))
+
+
+@loop
+def fill(
+    start, other, margin, part, body, turn, pivot, shifts, turning, least, number, kind, center, size, radius, done,
+    found, i, j, reach,
+):  # fmt: skip
+    """Add to the first pairs those of the rows that are not done, as long as there is room; new numbers of rows done
+    and pairs found.
+
+    The grains have the pairs `start`, `other`, and a `margin` each. The parts are rows `part` (p,) with frames `turn`
+    (p, 9), of the bodies `body` (p,). These have a `pivot` (bodies, 3), move and turn by the `shifts` (k, bodies, 6),
+    and have the margins `least` (bodies,) but for those `turning` (bodies,), whose surfaces go further.
+    """
+    for n in range(done, len(start) - 1):
+        if found + start[n + 1] - start[n] + len(part) > len(i):
+            return n, found
+        x, y, z, own, wide = center[n, 0], center[n, 1], center[n, 2], margin[n], radius[n]
+        for k in range(start[n], start[n + 1]):
+            m = other[k]
+            u, v, w = center[m, 0] - x, center[m, 1] - y, center[m, 2] - z
+            most = ((wide + own) + (radius[m] + margin[m])) * (1.0 + 1e-12)
+            if u * u + v * v + w * w <= most * most:
+                ahead = number[n] < number[m]
+                i[found], j[found], reach[found] = n if ahead else m, m if ahead else n, own + margin[m]
+                found += 1
+        last, limit = -1, 0.0
+        for k in range(len(part)):
+            if body[k] != last:
+                last = body[k]
+                way = least[last]
+                if turning[last]:
+                    u, v, w = x - pivot[last, 0], y - pivot[last, 1], z - pivot[last, 2]
+                    for s in range(len(shifts)):
+                        p, q, r = shifts[s, last, 3], shifts[s, last, 4], shifts[s, last, 5]
+                        a = shifts[s, last, 0] + q * w - r * v
+                        b = shifts[s, last, 1] + r * u - p * w
+                        c = shifts[s, last, 2] + p * v - q * u
+                        way = max(way, np.sqrt(a * a + b * b + c * c) + wide * np.sqrt(p * p + q * q + r * r))
+                limit = own + way
+            m, far = part[k], wide * (1.0 + 1e-9) + limit  # where rounding matters, the narrow phase is to decide
+            u, v, w = x - center[m, 0], y - center[m, 1], z - center[m, 2]
+            if kind[m] == PLANE:
+                apart = u * size[m, 0] + v * size[m, 1] + w * size[m, 2]
+            else:
+                square, enough = u * u + v * v + w * w, radius[m] + far
+                if square > enough * enough:
+                    continue
+                if kind[m] == BOX or kind[m] == MESH:  # of meshes the box about them
+                    a = abs(u * turn[k, 0] + v * turn[k, 3] + w * turn[k, 6]) - size[m, 0]
+                    b = abs(u * turn[k, 1] + v * turn[k, 4] + w * turn[k, 7]) - size[m, 1]
+                    c = abs(u * turn[k, 2] + v * turn[k, 5] + w * turn[k, 8]) - size[m, 2]
+                    a, b, c = max(a, 0.0), max(b, 0.0), max(c, 0.0)
+                    apart = np.sqrt(a * a + b * b + c * c)
+                else:
+                    apart = np.sqrt(square) - radius[m]
+            if apart <= far:
+                i[found], j[found], reach[found] = n, m, limit
+                found += 1
+    return len(start) - 1, found
+
+
+def _of_large(world: World, near: Neighbourhood, table: Primitives, delta: float, shifts: Floats) -> Pairs:
+    """Pairs of the parts of two large bodies, of which one at least is free to move."""
+    first = near.grains + near.ghosts
+    free = bodies.is_dynamic(world.large)
+    body = table.row[first:] - first
+    i, j = np.triu_indices(len(body), 1)
+    touch = (body[i] != body[j]) & (free[body[i]] | free[body[j]])
+    i, j = first + i[touch], first + j[touch]
+    # Two half spaces never touch: what has a centre tells how far the surfaces go
+    plane = table.kind[i] == PLANE
+    at = np.where(plane, j, i)
+    margins = [
+        _part_margin(shifts[:, row - first], near.bodies.position[row], table.center[at], table.radius[at], delta)
+        for row in (table.row[i], table.row[j])
+    ]
+    return i, j, margins[0] + margins[1]
+
+
+def _part_margin(shifts: Floats, pivot: Floats, center: Floats, radius: Floats, delta: float) -> Floats:
+    """Margins (m,) of the parts of large bodies at the surfaces of primitives of centres (m, 3) and radii (m,) [m]. The
+    bodies move and turn, about the pivots (m, 3), by any of the `shifts` (k, m, 6)."""
+    move, turn = shifts[..., :3], shifts[..., 3:]
+    way = length(move + cross(turn, center - pivot)) + radius * length(turn)
+    return np.maximum(delta / 2, way.max(axis=0))

@@ -1,0 +1,117 @@
+"""Pairs of grains that are close in this step or may be so in one of the next.
+
+Each grain has some slack beyond its margin, and a pair is in the lists if margins with slack meet. So the lists hold
+until a grain has moved, and its margin has grown, by more than its slack together. A search asks of each pair in them
+whether the margins meet now: it finds the same with the lists of an earlier step as with new ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import bodies
+from dem.arrays import Floats, Ints
+from dem.compiled import loop
+from dem.contact.broad import close_pairs
+from dem.contact.primitives import Primitives, primitives
+from dem.contact_map import Halo
+from dem.neighbourhood import Neighbourhood, neighbourhood
+from dem.world import World
+
+#: The slack of a grain at rest, as a part of its radius: it costs a sixth more pairs.
+AT_REST = 0.1
+
+#: For how many steps of its present speed a grain has slack; a radius is enough, as more makes the lists long.
+STEPS = 4.0
+
+
+@dataclass(frozen=True)
+class Rows:
+    """For each local grain the other grains of its pairs, which follow it in the table of bodies."""
+
+    start: Ints  #: (grains + 1,)
+    other: Ints  #: (start[-1],) rows, in the order of the contacts
+
+
+@dataclass(frozen=True)
+class Lists:
+    """The lists of this rank, and what they were made for."""
+
+    near: Neighbourhood  #: then; its margins have the slack
+    halo: Halo  #: between the grains of `near`
+    table: Primitives  #: of the bodies of `near`, not yet where they are
+    margin: Floats  #: (grains,) without slack [m]
+    own: Rows  #: pairs of local grains
+    away: Rows  #: pairs of a local grain and a ghost
+    constant: list[Any]  #: the columns of the world's tables, and the shapes, that no step changes
+
+    def hold(self, world: World, margin: Floats) -> bool:
+        """Whether the lists of this rank have all pairs of these margins (grains,)."""
+        same = all(then is now for then, now in zip(self.constant, _constant(world)))
+        return same and stays(self.near.bodies.position, self.near.margin, self.margin, world.grains.position, margin)
+
+
+def grain_lists(world: World, margin: Floats, way: Floats) -> Lists:
+    """Those of the last search if they hold for the margins (grains,) [m], else new ones for grains that go the `way`
+    (grains,) [m] in a step; collective."""
+    last = world.lists
+    if world.comm.allreduce(last is None or not last.hold(world, margin), MPI.LOR):
+        world.lists = last = _new_lists(world, margin, way)
+    return last
+
+
+def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:
+    size = bodies.bounding_radius(world.grains)
+    near = neighbourhood(world, margin + np.minimum(AT_REST * size + STEPS * way, size))
+    grains, count = near.grains, near.grains + near.ghosts
+    table = primitives(near, [body.shapes for body in world.large_bodies], int(world.slabs[-1]))
+    pairs = close_pairs(table.center[:count], table.radius[:count] + near.margin)
+    index = near.index[grains:count]
+    owner = np.searchsorted(world.slabs, index, side="right") - 1
+    halo = Halo(world.comm, grains, len(near.bodies), np.arange(grains, count), owner, index - world.slabs[owner])
+    own, away = (Rows(*in_rows(pairs, table.number, grains, *between)) for between in ((0, grains), (grains, count)))
+    return Lists(near, halo, table, margin, own, away, _constant(world))
+
+
+def _constant(world: World) -> list[Any]:
+    names, tables = ("id", "mass", "inertia", "material", "shape", "size"), (world.grains, world.large)
+    return [*(getattr(table, name) for table in tables for name in names), *(b.shapes for b in world.large_bodies)]
+
+
+@loop
+def stays(then: Floats, most: Floats, margin: Floats, now: Floats, wanted: Floats) -> bool:
+    """Whether no grain of margin (n,) has moved from the place `then` (n or more, 3) to the place `now` (n, 3) and
+    wants another margin (n,), by more than leads to the margin `most` (n or more,)."""
+    for n in range(len(now)):
+        x, y, z = now[n, 0] - then[n, 0], now[n, 1] - then[n, 1], now[n, 2] - then[n, 2]
+        gone = np.sqrt(x * x + y * y + z * z) + wanted[n] - margin[n]
+        if not gone <= (1.0 - 1e-9) * (most[n] - margin[n]):  # also for NaN
+            return False
+    return True
+
+
+@loop
+def in_rows(pairs: Ints, id: Ints, rows: int, low: int, high: int) -> tuple[Ints, Ints]:
+    """The pairs (m, 2) of a row below `rows` and of one from `low` to `high` as `Rows`: in the order of the first row,
+    then of the lower id of the two, then of the higher."""
+    start = np.zeros(rows + 1, np.int64)
+    for k in range(len(pairs)):
+        if pairs[k, 0] < rows and low <= pairs[k, 1] < high:
+            start[pairs[k, 0] + 1] += 1
+    for n in range(rows):
+        start[n + 1] += start[n]
+    other, end = np.empty(start[rows], np.int64), start[:rows].copy()
+    for k in range(len(pairs)):
+        i, j = pairs[k, 0], pairs[k, 1]
+        if i < rows and low <= j < high:
+            to = end[i]  # ids that are lower than that of i come first, and all ascend: so do the ids themselves
+            while to > start[i] and id[other[to - 1]] > id[j]:
+                other[to] = other[to - 1]
+                to -= 1
+            other[to] = j
+            end[i] += 1
+    return start, other
