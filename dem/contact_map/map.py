@@ -147,17 +147,40 @@ class ContactMap:
 
     def momenta(self, g: Floats) -> Floats:
         """G' g (columns, 6)."""
-        self._collect(g)
+        self._collect(g, self._m)
         self.log_flops(self._flops)
         return self._left()
 
     def add_delassus(self, g: Floats, y: Floats) -> None:
         """y += G G' g; y (nc, 3) is C-contiguous."""
         y = shaped("velocities of contacts", y, self.rows, 3)
-        self._collect(g)
+        self._collect(g, self._m)
         self._enter(self._mass, self._m)
         self._add_velocities(y)
         self.log_flops(2 * self._flops)
+
+    # What an iteration x is to the bodies: its image, the momenta D x, from which velocities G G' x and energies x'GG'x
+    # follow. Sequences of x are linear combined on the bodies, which are fewer than contacts.
+
+    def image(self) -> Floats:
+        """Memory for an image: momenta (halo.rows, 6)."""
+        return np.zeros((self.halo.rows, 6), self.precision)
+
+    def find_image(self, x: Floats, image: Floats) -> None:
+        """image = D x for impulses x (nc, 3)."""
+        self._collect(x, image)
+        self.log_flops(self._flops)
+
+    def add_extrapolated(self, image: Floats, last: Floats, beta: float, y: Floats) -> None:
+        """y += G G' z (nc, 3) for the z whose image is image + beta (image - last)."""
+        loops.scale_extrapolated(self._mass, image, last, beta, self._w)
+        self.halo.begin_update(self._w)
+        self._add_velocities(y)
+        self.log_flops(self._flops + 12 * self.columns)
+
+    def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
+        """d'GG'd of this rank's bodies, for the step d that leads from this z to the x with the image ``new``."""
+        return loops.energy_of_step(self._mass, new, image, last, beta)
 
     def weights(self, H: Floats, symmetric: bool = True) -> Floats:
         """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""
@@ -203,15 +226,15 @@ class ContactMap:
         self.halo.end_update(self._w)
         self._add(loops.add_velocities, self._away, y, self._w)
 
-    def _collect(self, g: Floats) -> None:
-        """Collect the momenta that the impulses give to the bodies, not yet scaled by masses."""
+    def _collect(self, g: Floats, m: Floats) -> None:
+        """m = the momenta that the impulses give to the bodies, not yet scaled by masses."""
         g = self._floats(shaped("impulses", g, self.rows, 3))
-        self._m[:] = 0.0
-        self._add(loops.add_momenta, self._away, g, self._m)
-        self.halo.begin_add(self._m)
-        self._add(loops.add_momenta, self._half, g, self._m)
-        self._add(loops.add_momenta, self._rest, g, self._m)
-        self.halo.end_add(self._m)
+        m[:] = 0.0
+        self._add(loops.add_momenta, self._away, g, m)
+        self.halo.begin_add(m)
+        self._add(loops.add_momenta, self._half, g, m)
+        self._add(loops.add_momenta, self._rest, g, m)
+        self.halo.end_add(m)
 
     def _add(self, loop: Callable[..., None], part: tuple[Any, ...], each: Floats, *others: Floats) -> None:
         """Run a loop over a part of the contacts, with an array (nc, ...) that has a row for each contact."""

@@ -62,6 +62,20 @@ class GivenMatrix:
         """y += N g; y (nc, 3)."""
         y += self._size * self.velocities(self._size * g)
 
+    def image(self) -> Array:
+        """Memory for the image (nc, 6) of impulses: x and N x."""
+        return np.zeros((self.rows, 6), np.asarray(self._size).dtype)
+
+    def find_image(self, x: Array, image: Array) -> None:
+        image[:, :3], image[:, 3:] = x, self._size * self.velocities(self._size * x)
+
+    def add_extrapolated(self, image: Array, last: Array, beta: float, y: Array) -> None:
+        y += (image + beta * (image - last))[:, 3:]
+
+    def energy_of_step(self, new: Array, image: Array, last: Array, beta: float) -> float:
+        d = new - (image + beta * (image - last))
+        return float(np.vdot(d[:, :3], d[:, 3:]))
+
     def contact_blocks(self) -> Array:
         """The diagonal blocks of N (nc, 3, 3)."""
         row = np.repeat(np.arange(self.rows), np.diff(self._local.indptr))
@@ -123,6 +137,20 @@ class BlockMap(ContactMap):
     def add_delassus(self, g: Array, y: Array) -> None:
         """y += G G' g; y (nc, 3)."""
         y += self.velocities(self.momenta(g))
+
+    def image(self) -> Array:
+        """Memory for an image: G'x (columns, 6)."""
+        return np.zeros((self.columns, 6), self.precision)
+
+    def find_image(self, x: Array, image: Array) -> None:
+        image[:] = self.momenta(x)
+
+    def add_extrapolated(self, image: Array, last: Array, beta: float, y: Array) -> None:
+        y += self.velocities(image + image.dtype.type(beta) * (image - last))
+
+    def energy_of_step(self, new: Array, image: Array, last: Array, beta: float) -> float:
+        d = new - (image + image.dtype.type(beta) * (image - last))
+        return float(np.vdot(d, d))
 
     def weights(self, H: Array, symmetric: bool = True) -> Array:
         """Blocks H (nc, 3, 3) in the format of `through`."""

@@ -15,11 +15,12 @@ begins anew where steps have grown.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pctt.ccp.cone import Array, accelerated_curvature, accelerated_step
+from pctt.ccp.cone import Array
 from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
@@ -45,8 +46,8 @@ class APGD(FirstOrder):
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: APGD, coulomb: bool = False) -> Result:
     """Impulses from a first guess (nc, 3): of the cone problem, or of Coulomb's law.
 
-    If the bodies are known, the first iterations have single precision. The last ones, and the residual of the result,
-    always have double precision.
+    If the bodies are known, the first iterations have single precision, and the last ones double precision where it
+    makes a difference. The residual of the result has double precision.
     """
     progress = None
     if problem.contact_map is not None:
@@ -54,6 +55,8 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: APGD, cou
         impatient = replace(options, patience=min(options.patience, 300))  # double precision takes over
         progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, impatient)
         rough_impulse = _descend(progress, guess, options)
+        if progress.best <= limits.tol:
+            return progress.result()
         if progress.iterations:  # else rounding would spoil a guess that is good already
             guess = rough_impulse
     progress = Progress(ScaledProblem(problem, coulomb), limits, options, progress)
@@ -64,20 +67,15 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: APGD, cou
 def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
     """The best impulses that accelerated projected steps find from a first guess."""
     scaled, coulomb = progress.problem, progress.problem.coulomb
-    x = scaled.start(guess)
-    y = scaled.gradient(x)
-    last_x, last_y, new_x, new_y = x.copy(), y.copy(), np.empty_like(x), np.empty_like(y)
+    now = scaled.iterate(scaled.start(guess))
+    last, new, y = scaled.iterate(now.x.copy()), scaled.iterate(now.x.copy()), np.empty_like(now.x)
     lipschitz = _first_lipschitz(scaled)
-    theta, beta, least = 1.0, 0.0, np.inf  # momentum is beta; the least of |L step|^2 since it has begun
-    while progress.goes_on(x, y):
-        while True:  # a step from z = x + beta (x - last_x), where the gradient is y_z = y + beta (y - last_y)
-            length, uphill = accelerated_step(
-                x, last_x, y, last_y, beta, 1 / lipschitz, scaled.mu, float(coulomb), new_x
-            )
-            scaled.gradient(new_x, out=new_y)
+    theta, beta, step, least = 1.0, 0.0, 0.0, np.inf  # momentum is beta; |L step|^2, and the least since it has begun
+    while not progress.is_due(math.sqrt(step)) or progress.goes_on(now.x, scaled.gradient_at(now)):
+        scaled.rigid_gradient(now, last, beta, out=y)  # at z = x + beta (x - last_x)
+        while True:
+            curvature, length, uphill = scaled.step(now, last, beta, y, 1 / lipschitz, new)
             progress.iterations += 1
-            curvature = accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta)
-            curvature, length, uphill = scaled.sums(curvature, length, uphill)
             allowed = lipschitz * length * (1 + 1e-12)
             if not (length > 0 and curvature > allowed):  # also ends on a number that is none
                 break
@@ -90,8 +88,7 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
             beta, least = last_theta * (1 - last_theta) / (last_theta**2 + theta), min(least, step)
             if coulomb:
                 beta = min(beta, 1 - (options.near if progress.best < 1e-4 else options.damping))
-        last_x, x, new_x = x, new_x, last_x
-        last_y, y, new_y = y, new_y, last_y
+        last, now, new = now, new, last
         lipschitz *= options.decay
     return progress.impulse
 
