@@ -16,6 +16,9 @@ from pctt.ccp.unbounded import why_unbounded
 from pctt.options import AT_LEAST_ONE, number, option
 
 
+RATIO = 0.4  # of the natural residual to |L step| / |x|: .3 to .5 from the second step on, in all scenes and both laws
+
+
 class Iterate(NamedTuple):
     """A point x (nc, 3), and its image: what it does to the bodies (`ContactMap.image`)."""
 
@@ -97,7 +100,10 @@ class ScaledProblem:
 
     def gradient_at(self, now: Iterate) -> Array:
         """A x + b (nc, 3)."""
-        return self.rigid_gradient(now, now, 0.0, np.empty_like(self.b)) + self._compliance * now.x
+        y = self.rigid_gradient(now, now, 0.0, np.empty_like(self.b))
+        if self.problem.softness:
+            y += self._compliance * now.x
+        return y
 
     def step(
         self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate
@@ -182,10 +188,12 @@ class Progress:
         self._gain = (np.inf, self.iterations)  # residual and iteration of the last progress
 
     def is_due(self, size: float) -> bool:
-        """Whether `goes_on` will look: after ``check`` iterations, or where the residual would be below the tolerance
-        if it had changed since the last look as the ``size`` of steps has."""
+        """Whether `goes_on` will look: after ``check`` iterations, or a few after the last look where the residual would
+        be about the tolerance if it had changed as the ``size`` of steps has: |L step|, 0 before the first.
+
+        Before there was a step it is taken for RATIO times |L step| / |x|."""
         residual, size_then = self._last_look
-        if residual * size <= self.limits.tol * size_then:
+        if residual * size <= 1.25 * self.limits.tol * size_then and self._next_look <= self.iterations + self.check - 3:
             self._next_look = self.iterations
         self._size = size
         return self.iterations >= min(self._next_look, self.limits.max_it)
@@ -202,7 +210,8 @@ class Progress:
         if residual < self.best or self._looks == 0:
             self.best, self._point = residual, x.copy()
         self._looks += 1
-        self._last_look = residual, self._size
+        norm = np.sqrt(self.problem.dots((x, x))[0])
+        self._last_look = (residual, self._size) if self._size > 0 else (RATIO, float(norm))
         self.status, self.reason = self._why_stop(residual)
         return not self.reason
 
