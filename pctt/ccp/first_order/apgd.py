@@ -34,6 +34,7 @@ class APGD(FirstOrder):
     check: int = option(25, "most iterations between two looks at the natural residual", check=AT_LEAST_ONE)
     margin: float = number(1.3, "L of a repeated step, over the curvature found: the next need not be repeated too")
     decay: float = number(0.99, "factor on L after each step, so that steps grow again where the curvature allows it")
+    theta: float = number(0.2, "where momentum begins: below 1, as steps are short for most directions of descent")
     damping: float = number(0.05, "Coulomb's law: 1 - the greatest momentum; docs/notebook_ccp.md has trials")
     near: float = number(0.03, "the same below a residual of 1e-4, where slow chains of force are left")
     growth: float = number(6.0, "Coulomb's law: of a squared step over the least one, where momentum begins anew")
@@ -71,7 +72,7 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
     now = scaled.iterate(scaled.start(guess))
     last, new, y = scaled.iterate(now.x.copy()), scaled.iterate(now.x.copy()), np.empty_like(now.x)
     lipschitz = _first_lipschitz(scaled)
-    theta, beta, step, least = 1.0, 0.0, 0.0, np.inf  # momentum is beta; |L step|^2, and the least since it has begun
+    theta, beta, step, least = options.theta, 0.0, 0.0, np.inf  # momentum is beta; |L step|^2, its least since beta = 0
     while not progress.is_due(math.sqrt(step)) or progress.goes_on(now.x, scaled.gradient_at(now)):
         scaled.rigid_gradient(now, last, beta, out=y)  # at z = x + beta (x - last_x)
         while True:
@@ -83,7 +84,7 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
             lipschitz = options.margin * curvature / length
         step = lipschitz**2 * length
         if uphill > 0 or (coulomb and step > options.growth * least):
-            theta, beta, least = 1.0, 0.0, np.inf
+            theta, beta, least = options.theta, 0.0, np.inf
         else:
             last_theta, theta = theta, theta * (np.sqrt(theta**2 + 4) - theta) / 2
             beta, least = last_theta * (1 - last_theta) / (last_theta**2 + theta), min(least, step)
