@@ -15,7 +15,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, ContactMap, Halo, find_halo, loops
-from dem.contact_map.map import checked, shaped
+from dem.contact_map.map import Some, checked, shaped
 from dem.exchange import exchange, offsets
 from pctt.blocks import Array, square_block_matrix
 
@@ -35,8 +35,11 @@ def rows_in_blocks(N: PETSc.Mat) -> sp.bsr_matrix:
 
 class GivenMatrix:
     """N itself, of a problem that knows no bodies, with the members of `ContactMap` that it can have: impulses take the
-    place of momenta, and N g that of the velocities of contacts. A copy in 3 x 3 blocks (BAIJ) of a Mat of type AIJ,
-    BAIJ, SBAIJ or dense. ValueError on all ranks if it has a NaN or an infinite number."""
+    place of momenta, and N g that of the velocities of contacts; an image has both, of all contacts. A copy in 3 x 3
+    blocks (BAIJ) of a Mat of type AIJ, BAIJ, SBAIJ or dense. ValueError on all ranks if it has a NaN or an infinite
+    number."""
+
+    everything: Some = (np.zeros(0, np.uint32), np.zeros(0, np.uint32))
 
     def __init__(self, comm: MPI.Comm, N: PETSc.Mat):
         rows = rows_in_blocks(N)
@@ -66,11 +69,14 @@ class GivenMatrix:
         """Memory for the image (nc, 6) of impulses: x and N x."""
         return np.zeros((self.rows, 6), np.asarray(self._size).dtype)
 
-    def find_image(self, x: Array, image: Array) -> None:
+    def among(self, chosen: np.ndarray) -> Some:
+        return self.everything
+
+    def find_image(self, x: Array, image: Array, some: Some) -> None:
         image[:, :3], image[:, 3:] = x, self._size * self.velocities(self._size * x)
 
-    def add_extrapolated(self, image: Array, last: Array, beta: float, y: Array) -> None:
-        y += (image + beta * (image - last))[:, 3:]
+    def find_velocities(self, image: Array, last: Array, beta: float, before: Array, y: Array, some: Some) -> None:
+        y[:] = before + (image + beta * (image - last))[:, 3:]
 
     def energy_of_step(self, new: Array, image: Array, last: Array, beta: float) -> float:
         d = new - (image + beta * (image - last))
@@ -114,6 +120,7 @@ class BlockMap(ContactMap):
         rows = checked(comm, rows) if halo is None else rows
         self.comm, self.given, self.block_rows, self.precision = comm, rows, rows, precision  # type: ignore[assignment]
         self.rows, self.columns = rows.rows, rows.columns
+        self.everything = GivenMatrix.everything
         self._found = halo or find_halo(comm, rows.columns, rows.indices)
         self.halo, body = self._found
         self._blocks = (np.ascontiguousarray(rows.blocks, precision), rows.indptr, body)
@@ -142,11 +149,15 @@ class BlockMap(ContactMap):
         """Memory for an image: G'x (columns, 6)."""
         return np.zeros((self.columns, 6), self.precision)
 
-    def find_image(self, x: Array, image: Array) -> None:
+    def among(self, chosen: np.ndarray) -> Some:
+        """Every contact: products by blocks have no choice."""
+        return self.everything
+
+    def find_image(self, x: Array, image: Array, some: Some) -> None:
         image[:] = self.momenta(x)
 
-    def add_extrapolated(self, image: Array, last: Array, beta: float, y: Array) -> None:
-        y += self.velocities(image + image.dtype.type(beta) * (image - last))
+    def find_velocities(self, image: Array, last: Array, beta: float, before: Array, y: Array, some: Some) -> None:
+        y[:] = before + self.velocities(image + image.dtype.type(beta) * (image - last))
 
     def energy_of_step(self, new: Array, image: Array, last: Array, beta: float) -> float:
         d = new - (image + image.dtype.type(beta) * (image - last))

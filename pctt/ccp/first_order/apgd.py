@@ -73,8 +73,12 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
     last, new, y = scaled.iterate(now.x.copy()), scaled.iterate(now.x.copy()), np.empty_like(now.x)
     lipschitz = _first_lipschitz(scaled)
     theta, beta, step, least = options.theta, 0.0, 0.0, np.inf  # momentum is beta; |L step|^2, its least since beta = 0
-    while not progress.is_due(math.sqrt(step)) or progress.goes_on(now.x, scaled.gradient_at(now)):
-        scaled.rigid_gradient(now, last, beta, out=y)  # at z = x + beta (x - last_x)
+    while True:
+        if progress.is_due(math.sqrt(step)):
+            if not progress.goes_on(now.x, scaled.look(now, y)):
+                return progress.impulse
+            scaled.fall_asleep(now, last, y, new)
+        scaled.rigid_gradient(now, last, beta, y)  # at z = x + beta (x - last_x)
         while True:
             curvature, length, uphill = scaled.step(now, last, beta, y, 1 / lipschitz, new)
             progress.iterations += 1
@@ -92,7 +96,6 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
                 beta = min(beta, 1 - (options.near if progress.best < 1e-4 else options.damping))
         last, now, new = now, new, last
         lipschitz *= options.decay
-    return progress.impulse
 
 
 def _first_lipschitz(problem: ScaledProblem) -> float:
