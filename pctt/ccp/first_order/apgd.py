@@ -1,10 +1,13 @@
 """Accelerated projected gradient descent (APGD) with restart.
 
 Mazhar, Heyn, Negrut, Tasora, "Using Nesterov's method to accelerate multibody dynamics with friction and contact", ACM
-Trans. Graph. 34 (2015); restart by the gradient test of O'Donoghue and Candes (2015). N is applied once per iteration:
-the gradient at the extrapolated point follows from those at the last two iterates, and for a quadratic objective the
-line search is a Rayleigh quotient. The extrapolated point is computed twice, where it is used: reading the last two
-iterates takes less time than storing and reading the point.
+Trans. Graph. 34 (2015); restart by the gradient test of O'Donoghue and Candes (2015). For a quadratic objective the line
+search is a Rayleigh quotient.
+
+N is applied once per iteration, in two halves. The first gives the velocities of the contacts at the extrapolated point
+from the images of the last two iterates, their momenta on the bodies. The second gives the image of the new point, and
+with it the curvature along the step, so a step that is repeated costs half. In single precision a contact moves 96 bytes
+in the first half, 64 in the step, 84 in the second: 244, and 64 while it sleeps.
 
 For Coulomb's law the De Saxce term mu |y_t| of the present gradient is added to it in every iteration. Then the law is
 the fixed point of the projected step, and one run finds it. But that step is no gradient step: the term is not the
