@@ -104,14 +104,12 @@ class ScaledProblem:
         self.rigid_gradient(now, now, 0.0, y)
         return y + self._compliance * now.x if self.problem.softness else y
 
-    def fall_asleep(self, now: Iterate, last: Iterate, y: Array, new: Iterate) -> None:
+    def fall_asleep(self, now: Iterate, last: Iterate, y: Array, length: float) -> None:
         """Let contacts sleep that will stay open until the next look, as far as one can see: they have no impulse, and
-        open faster than the next step changes velocities by (root mean square), five times. A contact too many costs
-        iterations, but no accuracy. ``y`` is what `look` has left, and in ``new`` is a point to be lost."""
-        step = cone.accelerated_step(now.x, now.x, y, self._soft, 0.0, 1.0, self.mu, float(self.coulomb), new.x)
-        size = np.sqrt(self.sums(step[1])[0] / max(self.problem.size, 1))
-        needed = (now.x[:, 0] > 0) | (last.x[:, 0] > 0)
-        self._awake = self._operator.among(needed | ~(y[:, 0] - self.mu * cone.tangential(y) > 5 * size))
+        open five times faster than steps change velocities, which is the root mean square of their ``length`` |L step|.
+        A contact too many costs iterations, but no accuracy. ``y`` (nc, 3) is the rigid gradient of all contacts."""
+        faster = y[:, 0] - self.mu * cone.tangential(y) > 5 * length / np.sqrt(max(self.problem.size, 1))
+        self._awake = self._operator.among((now.x[:, 0] > 0) | (last.x[:, 0] > 0) | ~faster)
 
     def step(
         self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate
