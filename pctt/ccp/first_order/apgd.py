@@ -35,6 +35,7 @@ class APGD(FirstOrder):
     """Options ``-ccp_apgd_*``. L is the estimate of the curvature along a step; its inverse is the step's length."""
 
     check: int = option(25, "most iterations between two looks at the natural residual", check=AT_LEAST_ONE)
+    lipschitz: float = number(2.0, "the first L: A has a diagonal of about one, and on packings L is 2 to 3")
     margin: float = number(1.3, "L of a repeated step, over the curvature found: the next need not be repeated too")
     decay: float = number(0.99, "factor on L after each step, so that steps grow again where the curvature allows it")
     theta: float = number(0.2, "where momentum begins: below 1, as steps are short for most directions of descent")
@@ -73,8 +74,8 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
     """The best impulses that accelerated projected steps find from a first guess."""
     scaled, coulomb = progress.problem, progress.problem.coulomb
     now = scaled.iterate(scaled.start(guess))
-    last, new, y = scaled.iterate(now.x.copy()), scaled.iterate(now.x.copy()), np.empty_like(now.x)
-    lipschitz, awake = _first_lipschitz(scaled), True
+    last, new, y = now.copy(), now.copy(), np.empty_like(now.x)
+    lipschitz, awake = options.lipschitz, True
     theta, beta, step, least = options.theta, 0.0, 0.0, np.inf  # momentum is beta; |L step|^2, its least since beta = 0
     while True:
         if progress.is_due(math.sqrt(step)):
@@ -102,10 +103,3 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
                 beta = min(beta, 1 - (options.near if progress.best < 1e-4 else options.damping))
         last, now, new = now, new, last
         lipschitz *= options.decay
-
-
-def _first_lipschitz(problem: ScaledProblem) -> float:
-    ones = np.ones_like(problem.b)
-    Ax = problem.product(ones)
-    length, size = problem.dots((Ax, Ax), (ones, ones))
-    return max(float(np.sqrt(length / max(size, 1.0))), 1e-3)  # A has a diagonal of about one

@@ -24,6 +24,9 @@ class Iterate(NamedTuple):
     x: Array
     image: Array
 
+    def copy(self) -> Iterate:
+        return Iterate(self.x.copy(), self.image.copy())
+
 
 class ScaledProblem:
     """min 1/2 x'Ax + b'x over friction cones, where the diagonal of A is about one.
