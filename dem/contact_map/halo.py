@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 from mpi4py import MPI
 
@@ -17,7 +19,7 @@ class Halo:
     """Which rows of a table of bodies are ghosts, and who owns them.
 
     Values of bodies are arrays (rows, ...) of any type. The first ``own`` rows are the bodies of this rank. Messages
-    go only to ranks that share a ghost, one per rank and call; they need no other memory than their buffers.
+    go only to ranks that share a ghost, one per rank and call.
 
     Attributes
     ----------
@@ -34,7 +36,8 @@ class Halo:
         asked = exchange(comm, {"row": place, "rank": np.full(len(place), comm.rank)}, owner)
         self._shared = asked["row"]  # own rows that are ghosts elsewhere, by rank
         self._owners, self._holders = _pieces(owner), _pieces(asked["rank"])
-        self._open: list[MPI.Request] = []
+        self._messages: dict[tuple, Messages] = {}
+        self._open: Messages | None = None
 
     def update(self, values: np.ndarray) -> None:
         """Copy the values of the owners to the ghosts."""
@@ -48,34 +51,62 @@ class Halo:
 
     def begin_update(self, values: np.ndarray) -> None:
         """Owners may change their values after this, and read those of ghosts after `end_update`."""
-        self._arriving = np.empty((len(self.ghosts), *values.shape[1:]), values.dtype)
-        self._send(values, self._shared, self._holders, self._owners)
+        self._send(values, self._shared, self.ghosts, self._holders, self._owners)
 
     def end_update(self, values: np.ndarray) -> None:
-        if self._wait():
-            values[self.ghosts] = self._arriving
+        for rows, arrived in self._wait():
+            values[rows] = arrived
 
     def begin_add(self, values: np.ndarray) -> None:
         """Owners may still change their own values until `end_add`."""
-        self._arriving = np.empty((len(self._shared), *values.shape[1:]), values.dtype)
-        self._send(values, self.ghosts, self._owners, self._holders)
+        self._send(values, self.ghosts, self._shared, self._owners, self._holders)
 
     def end_add(self, values: np.ndarray) -> None:
-        if self._wait():
-            for _, piece in self._holders:  # in the order of the ranks, so that sums repeat themselves
-                values[self._shared[piece]] += self._arriving[piece]
+        for rows, arrived in self._wait():  # in the order of the ranks, so that sums repeat themselves
+            values[rows] += arrived
 
-    def _send(self, values: np.ndarray, rows: Ints, to: Pieces, by: Pieces) -> None:
-        if to or by:
-            leaving = values[rows]
-            self._open = [self.comm.Irecv(self._arriving[piece], rank, TAG) for rank, piece in by]
-            self._open += [self.comm.Isend(leaving[piece], rank, TAG) for rank, piece in to]
+    def _send(self, values: np.ndarray, rows: Ints, changed: Ints, to: Pieces, by: Pieces) -> None:
+        """Begin to send ``rows`` of the values to some ranks; the rows ``changed`` are those of what others send."""
+        if not (to or by):
+            return
+        kind = (rows is self.ghosts, values.shape[1:], values.dtype)
+        if kind not in self._messages:
+            self._messages[kind] = Messages(self.comm, kind, rows, changed, to, by)
+        self._open = self._messages[kind]
+        self._open.start(values)
 
-    def _wait(self) -> bool:
-        """Whether there were messages, which are now here."""
-        requests, self._open = self._open, []
-        MPI.Request.Waitall(requests)
-        return bool(requests)
+    def _wait(self) -> list[tuple[Ints, np.ndarray]]:
+        """Rows and what has arrived for them, of each rank."""
+        messages, self._open = self._open, None
+        return messages.wait() if messages else []
+
+
+class Messages:
+    """The messages of a halo for tables of one width and type, with their memory: begun again and again."""
+
+    def __init__(self, comm: MPI.Comm, kind: tuple, rows: Ints, changed: Ints, to: Pieces, by: Pieces):
+        _, shape, dtype = kind
+        self._rows, self._leaving = rows, np.empty((len(rows), *shape), dtype)
+        arriving = np.empty((len(changed), *shape), dtype)
+        self._parts = [(changed[piece], arriving[piece]) for _, piece in by]
+        requests = [comm.Recv_init(arriving[piece], rank, TAG) for rank, piece in by]
+        requests += [comm.Send_init(self._leaving[piece], rank, TAG) for rank, piece in to]
+        self._requests = requests
+        weakref.finalize(self, _free, requests)
+
+    def start(self, values: np.ndarray) -> None:
+        values.take(self._rows, axis=0, out=self._leaving, mode="clip")  # other modes take a copy
+        MPI.Prequest.Startall(self._requests)
+
+    def wait(self) -> list[tuple[Ints, np.ndarray]]:
+        MPI.Request.Waitall(self._requests)
+        return self._parts
+
+
+def _free(requests: list[MPI.Prequest]) -> None:
+    for request in requests:
+        if not MPI.Is_finalized():
+            request.Free()
 
 
 def _pieces(rank: Ints) -> Pieces:

@@ -44,26 +44,38 @@ def push(c, arm, body, f0, f1, f2, m):
 
 
 @loop
-def add_velocities(frame, arm, body, y, w):
-    """y += D' w (nc, 3)."""
-    for c in range(len(body)):
+def set_velocities(which, frame, arm, body, before, y, w):
+    """y = before + D' w (nc, 3) in the contacts ``which`` (n,), uint32; y may be ``before``. The others keep theirs."""
+    for k in range(len(which)):
+        c = which[k]
         u0, u1, u2 = velocity_at(c, arm, body, w)
-        y[c, 0] += frame[c, 0] * u0 + frame[c, 1] * u1 + frame[c, 2] * u2
-        y[c, 1] += frame[c, 3] * u0 + frame[c, 4] * u1 + frame[c, 5] * u2
-        y[c, 2] += frame[c, 6] * u0 + frame[c, 7] * u1 + frame[c, 8] * u2
+        y[c, 0] = before[c, 0] + (frame[c, 0] * u0 + frame[c, 1] * u1 + frame[c, 2] * u2)
+        y[c, 1] = before[c, 1] + (frame[c, 3] * u0 + frame[c, 4] * u1 + frame[c, 5] * u2)
+        y[c, 2] = before[c, 2] + (frame[c, 6] * u0 + frame[c, 7] * u1 + frame[c, 8] * u2)
 
 
 def relative_velocities(frame, arm, body, w) -> Floats:
     """D' w (nc, 3)."""
     y = np.zeros((len(body), 3))
-    add_velocities(frame, arm, body, y, w)
+    set_velocities(every(body), frame, arm, body, y, y, w)
     return y
 
 
-@loop
-def add_momenta(frame, arm, body, g, m):
+def add_momenta(frame, arm, body, g, m) -> None:
     """m += D g for impulses g (nc, 3)."""
-    for c in range(len(body)):
+    add_momenta_of(every(body), frame, arm, body, g, m)
+
+
+def every(body) -> np.ndarray:
+    """The indices of all contacts."""
+    return np.arange(len(body), dtype=np.uint32)
+
+
+@loop
+def add_momenta_of(which, frame, arm, body, g, m):
+    """m += D g for impulses g (nc, 3) of the contacts ``which`` (n,), uint32."""
+    for k in range(len(which)):
+        c = which[k]
         g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
         f0 = frame[c, 0] * g0 + frame[c, 3] * g1 + frame[c, 6] * g2
         f1 = frame[c, 1] * g0 + frame[c, 4] * g1 + frame[c, 7] * g2
@@ -167,21 +179,63 @@ def contact_blocks(frame, arm, body, mass, out):
                 out[c, i, j] = u * frame[c, 3 * j] + v * frame[c, 3 * j + 1] + w * frame[c, 3 * j + 2]
 
 
+@inlined
+def scaled_row(root, i, x0, x1, x2, x3, x4, x5):
+    """R_i x of the body i. R is block diagonal in the format of `CompactRows.root`."""
+    if root.shape[1] == 6:
+        return root[i, 0] * x0, root[i, 1] * x1, root[i, 2] * x2, root[i, 3] * x3, root[i, 4] * x4, root[i, 5] * x5
+    return (
+        root[i, 0] * x0 + root[i, 1] * x1 + root[i, 2] * x2,
+        root[i, 1] * x0 + root[i, 3] * x1 + root[i, 4] * x2,
+        root[i, 2] * x0 + root[i, 4] * x1 + root[i, 5] * x2,
+        root[i, 6] * x3 + root[i, 7] * x4 + root[i, 8] * x5,
+        root[i, 7] * x3 + root[i, 9] * x4 + root[i, 10] * x5,
+        root[i, 8] * x3 + root[i, 10] * x4 + root[i, 11] * x5,
+    )
+
+
 @loop
 def scale(root, v, out):
-    """out = R v for v and out (bodies, 6); out may have more rows. R is block diagonal in the format of
+    """out = R v for v and out (bodies, 6); out may have more rows."""
+    for i in range(len(root)):
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(
+            root, i, v[i, 0], v[i, 1], v[i, 2], v[i, 3], v[i, 4], v[i, 5]
+        )
+
+
+@inlined
+def extrapolated(m, last_m, beta, i, k):
+    return m[i, k] + beta * (m[i, k] - last_m[i, k])
+
+
+@loop
+def scale_extrapolated(mass, m, last_m, beta, out):
+    """out = M^-1 (m + beta (m - last_m)) for the bodies of ``mass``, which is M^-1 in the format of
     `CompactRows.root`."""
-    if root.shape[1] == 6:
-        for i in range(len(root)):
-            for k in range(6):
-                out[i, k] = root[i, k] * v[i, k]
-    else:
-        for i in range(len(root)):
-            for p in range(0, 6, 3):
-                x, y, z, q = v[i, p], v[i, p + 1], v[i, p + 2], 2 * p
-                out[i, p] = root[i, q] * x + root[i, q + 1] * y + root[i, q + 2] * z
-                out[i, p + 1] = root[i, q + 1] * x + root[i, q + 3] * y + root[i, q + 4] * z
-                out[i, p + 2] = root[i, q + 2] * x + root[i, q + 4] * y + root[i, q + 5] * z
+    way = m.dtype.type(beta)
+    for i in range(len(mass)):
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(
+            mass, i, extrapolated(m, last_m, way, i, 0), extrapolated(m, last_m, way, i, 1),
+            extrapolated(m, last_m, way, i, 2), extrapolated(m, last_m, way, i, 3),
+            extrapolated(m, last_m, way, i, 4), extrapolated(m, last_m, way, i, 5),
+        )  # fmt: skip
+
+
+@loop
+def energy_of_step(mass, new_m, m, last_m, beta):
+    """d' M^-1 d of d = new_m - (m + beta (m - last_m)), summed in double precision over the bodies of ``mass``."""
+    way = m.dtype.type(beta)
+    energy = 0.0
+    for i in range(len(mass)):
+        d0 = new_m[i, 0] - extrapolated(m, last_m, way, i, 0)
+        d1 = new_m[i, 1] - extrapolated(m, last_m, way, i, 1)
+        d2 = new_m[i, 2] - extrapolated(m, last_m, way, i, 2)
+        d3 = new_m[i, 3] - extrapolated(m, last_m, way, i, 3)
+        d4 = new_m[i, 4] - extrapolated(m, last_m, way, i, 4)
+        d5 = new_m[i, 5] - extrapolated(m, last_m, way, i, 5)
+        v0, v1, v2, v3, v4, v5 = scaled_row(mass, i, d0, d1, d2, d3, d4, d5)
+        energy += d0 * v0 + d1 * v1 + d2 * v2 + d3 * v3 + d4 * v4 + d5 * v5
+    return energy
 
 
 @loop

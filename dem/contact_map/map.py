@@ -23,6 +23,8 @@ from dem.exchange import refuse
 #: The entries (xx, xy, xz, yy, yz, zz) of a symmetric matrix among the nine, and the numbers (3, 3) of all among these.
 UPPER, SYMMETRIC = [0, 1, 2, 4, 5, 8], [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
 
+Some = tuple[np.ndarray, np.ndarray]  # a choice of contacts, see `ContactMap.among`
+
 
 @dataclass(frozen=True)
 class CompactRows:
@@ -133,6 +135,8 @@ class ContactMap:
         ends = [0, first_away // 2, first_away, self.rows]
         pieces = (slice(*pair) for pair in zip(ends, ends[1:]))
         self._half, self._rest, self._away = ((here, *(x[here] for x in self._arrays)) for here in pieces)
+        self._first_away = first_away
+        self.everything = self.among(np.ones(self.rows, bool))  #: all contacts
         self._flops = 45 * self.rows + 6 * self.columns
 
     # -- products -------------------------------------------------------------------------------------------
@@ -141,23 +145,53 @@ class ContactMap:
         """G v (nc, 3)."""
         y = np.zeros((self.rows, 3), self.precision)
         self._enter(self._root, shaped("velocities of bodies", v, self.columns, 6))
-        self._add_velocities(y)
+        self._set_velocities(y, y, self.everything)
         self.log_flops(self._flops)
         return y
 
     def momenta(self, g: Floats) -> Floats:
         """G' g (columns, 6)."""
-        self._collect(g)
+        self._collect(g, self._m, self.everything)
         self.log_flops(self._flops)
         return self._left()
 
     def add_delassus(self, g: Floats, y: Floats) -> None:
         """y += G G' g; y (nc, 3) is C-contiguous."""
         y = shaped("velocities of contacts", y, self.rows, 3)
-        self._collect(g)
+        self._collect(g, self._m, self.everything)
         self._enter(self._mass, self._m)
-        self._add_velocities(y)
+        self._set_velocities(y, y, self.everything)
         self.log_flops(2 * self._flops)
+
+    # What an iterate x is to the bodies: its image, the momenta D x, from which velocities G G'x and energies x'G G'x
+    # follow. It is found, and used, for ``some`` contacts: a choice of `among`, or `everything`.
+
+    def among(self, chosen: np.ndarray) -> Some:
+        """The indices of the contacts of a mask (nc,): of those that wait for no other rank, and of the others."""
+        index = np.flatnonzero(chosen).astype(np.uint32)
+        return index[: (end := np.searchsorted(index, self._first_away))], index[end:]
+
+    def image(self) -> Floats:
+        """Memory for an image: momenta (halo.rows, 6)."""
+        return np.zeros((self.halo.rows, 6), self.precision)
+
+    def find_image(self, x: Floats, image: Floats, some: Some) -> None:
+        """image = D x for impulses x (nc, 3), which are zero elsewhere."""
+        self._collect(x, image, some)
+        self.log_flops(self._flops)
+
+    def find_velocities(
+        self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats, some: Some
+    ) -> None:
+        """y = before + G G' z (nc, 3) for the z whose image is image + beta (image - last). Elsewhere y stays."""
+        loops.scale_extrapolated(self._mass, image, last, beta, self._w)
+        self.halo.begin_update(self._w)
+        self._set_velocities(before, y, some)
+        self.log_flops(self._flops + 12 * self.columns)
+
+    def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
+        """d'GG'd of this rank's bodies, for the step d that leads from this z to the x with the image ``new``."""
+        return loops.energy_of_step(self._mass, new, image, last, beta)
 
     def weights(self, H: Floats, symmetric: bool = True) -> Floats:
         """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""
@@ -199,21 +233,24 @@ class ContactMap:
         loops.scale(scale, v, self._w)
         self.halo.begin_update(self._w)
 
-    def _add_velocities(self, y: Floats) -> None:
-        self._add(loops.add_velocities, self._half, y, self._w)
-        self._add(loops.add_velocities, self._rest, y, self._w)
+    def _set_velocities(self, before: Floats, y: Floats, some: Some) -> None:
+        """y = before + D' w (nc, 3) in some contacts, with the velocities w that are on their way."""
+        own, away = some
+        loops.set_velocities(own, *self._arrays, before, y, self._w)
         self.halo.end_update(self._w)
-        self._add(loops.add_velocities, self._away, y, self._w)
+        if len(away):
+            loops.set_velocities(away, *self._arrays, before, y, self._w)
 
-    def _collect(self, g: Floats) -> None:
-        """Collect the momenta that the impulses give to the bodies, not yet scaled by masses."""
+    def _collect(self, g: Floats, m: Floats, some: Some) -> None:
+        """m = the momenta that the impulses of some contacts give to the bodies, not yet scaled by masses."""
         g = self._floats(shaped("impulses", g, self.rows, 3))
-        self._m[:] = 0.0
-        self._add(loops.add_momenta, self._away, g, self._m)
-        self.halo.begin_add(self._m)
-        self._add(loops.add_momenta, self._half, g, self._m)
-        self._add(loops.add_momenta, self._rest, g, self._m)
-        self.halo.end_add(self._m)
+        own, away = some
+        m[:] = 0.0
+        if len(away):
+            loops.add_momenta_of(away, *self._arrays, g, m)
+        self.halo.begin_add(m)
+        loops.add_momenta_of(own, *self._arrays, g, m)
+        self.halo.end_add(m)
 
     def _add(self, loop: Callable[..., None], part: tuple[Any, ...], each: Floats, *others: Floats) -> None:
         """Run a loop over a part of the contacts, with an array (nc, ...) that has a row for each contact."""

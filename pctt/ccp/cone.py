@@ -16,7 +16,6 @@ import numpy as np
 from pctt.ccp.cone_loops import (
     TINY,
     Array,
-    accelerated_curvature,
     accelerated_step,
     determinant,
     project_to,
@@ -30,7 +29,6 @@ from pctt.ccp.cone_loops import (
 __all__ = [
     "TINY",
     "Array",
-    "accelerated_curvature",
     "accelerated_step",
     "determinant",
     "projected_move",

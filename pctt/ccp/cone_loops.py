@@ -58,33 +58,54 @@ def projected_move(x: Array, y: Array, step: float, mu: Array) -> Array:
 
 @unfused
 def accelerated_step(
-    x: Array, last_x: Array, y: Array, last_y: Array, beta: float, step: float, mu: Array, de_saxce: float, out: Array
-) -> tuple[float, float]:
-    """P(z - step y_z) for z = x + beta (x - last_x) and its gradient y_z = y + beta (y - last_y), to which the term
-    (mu |y_t|, 0, 0) of De Saxce is added once (``de_saxce`` 1: Coulomb's law) or not (0).
+    x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, de_saxce: float,
+    out: Array,
+) -> tuple[float, float, float]:  # fmt: skip
+    """P(z - step y_z) for z = x + beta (x - last_x) and its gradient y_z = y + C z, to which the term (mu |y_t|, 0, 0)
+    of De Saxce is added once (``de_saxce`` 1: Coulomb's law) or not (0). ``compliance`` has the diagonal of C (nc, 3),
+    or no row for C = 0.
 
-    Returned are, for this rank, |out - z|^2 and y_z'(out - x); z and y_z themselves are nowhere stored."""
-    part, way = x.dtype.type(beta), x.dtype.type(step)
-    x, last_x, y, last_y, to = x.ravel(), last_x.ravel(), y.ravel(), last_y.ravel(), out.reshape(out.size)
+    Returned are, for this rank, d'Cd and |d|^2 of d = out - z, and y_z'(out - x); z and y_z are nowhere stored. A
+    contact moves 64 bytes in single precision, 52 without compliance."""
+    part, way, soft = x.dtype.type(beta), x.dtype.type(step), len(compliance) > 0
+    x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)
     z, y_z = np.empty(3 * STRIP, x.dtype), np.empty(3 * STRIP, x.dtype)
     squares, products = np.zeros(3 * STRIP, x.dtype), np.zeros(3 * STRIP, x.dtype)
+    work = np.zeros(3 * STRIP, x.dtype)
     for first in range(0, len(mu), STRIP):
         friction = mu[first : first + STRIP]
         a, b = 3 * first, 3 * (first + len(friction))
         _extrapolate(x[a:b], last_x[a:b], part, z)
-        _extrapolate(y[a:b], last_y[a:b], part, y_z)
+        if soft:
+            _add_compliance(y[a:b], compliance[a:b], z, y_z)
+        else:
+            y_z[: b - a] = y[a:b]
         if de_saxce:
             _add_de_saxce(y_z, friction)
         _step(z, y_z, way, friction, to[a:b])
         _add_squares(to[a:b], z, squares)
         _add_products(to[a:b], x[a:b], y_z, products)
-    return squares.sum(), products.sum()
+        if soft:
+            _add_work(to[a:b], z, compliance[a:b], work)
+    return work.sum(), squares.sum(), products.sum()
 
 
 @unfused
 def _extrapolate(x, last_x, beta, out):
     for k in range(len(x)):
         out[k] = x[k] + beta * (x[k] - last_x[k])
+
+
+@unfused
+def _add_compliance(y, compliance, z, out):
+    for k in range(len(y)):
+        out[k] = y[k] + compliance[k] * z[k]
+
+
+@unfused
+def _add_work(x, y, compliance, sums):
+    for k in range(len(x)):
+        sums[k] += compliance[k] * (x[k] - y[k]) ** 2
 
 
 @unfused
@@ -112,35 +133,6 @@ def _add_squares(x, y, sums):
 def _add_products(x, y, z, sums):
     for k in range(len(x)):
         sums[k] += (x[k] - y[k]) * z[k]
-
-
-@unfused
-def accelerated_curvature(
-    new_x: Array, x: Array, last_x: Array, new_y: Array, y: Array, last_y: Array, beta: float
-) -> float:
-    """d'Ad of the step d = new_x - z, from the same z and y_z and the gradient new_y at new_x; on this rank."""
-    part = x.dtype.type(beta)
-    new_x, x, last_x, new_y, y, last_y = (
-        new_x.ravel(), x.ravel(), last_x.ravel(), new_y.ravel(), y.ravel(), last_y.ravel(),
-    )  # fmt: skip
-    d, products = np.empty(3 * STRIP, x.dtype), np.zeros(3 * STRIP, x.dtype)
-    for i in range(0, len(x), 3 * STRIP):
-        j = min(i + 3 * STRIP, len(x))
-        _extrapolated_move(new_x[i:j], x[i:j], last_x[i:j], part, d)
-        _add_extrapolated_work(new_y[i:j], y[i:j], last_y[i:j], part, d, products)
-    return products.sum()
-
-
-@unfused
-def _extrapolated_move(new, x, last_x, beta, out):
-    for k in range(len(x)):
-        out[k] = new[k] - (x[k] + beta * (x[k] - last_x[k]))
-
-
-@unfused
-def _add_extrapolated_work(new, x, last_x, beta, d, sums):
-    for k in range(len(x)):
-        sums[k] += d[k] * (new[k] - (x[k] + beta * (x[k] - last_x[k])))
 
 
 @loop

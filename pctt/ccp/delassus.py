@@ -15,7 +15,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, ContactMap, Halo, find_halo, loops
-from dem.contact_map.map import checked, shaped
+from dem.contact_map.map import Some, checked, shaped
 from dem.exchange import exchange, offsets
 from pctt.blocks import Array, square_block_matrix
 
@@ -35,8 +35,11 @@ def rows_in_blocks(N: PETSc.Mat) -> sp.bsr_matrix:
 
 class GivenMatrix:
     """N itself, of a problem that knows no bodies, with the members of `ContactMap` that it can have: impulses take the
-    place of momenta, and N g that of the velocities of contacts. A copy in 3 x 3 blocks (BAIJ) of a Mat of type AIJ,
-    BAIJ, SBAIJ or dense. ValueError on all ranks if it has a NaN or an infinite number."""
+    place of momenta, and N g that of the velocities of contacts; an image has both, of all contacts. A copy in 3 x 3
+    blocks (BAIJ) of a Mat of type AIJ, BAIJ, SBAIJ or dense. ValueError on all ranks if it has a NaN or an infinite
+    number."""
+
+    everything: Some = (np.zeros(0, np.uint32), np.zeros(0, np.uint32))
 
     def __init__(self, comm: MPI.Comm, N: PETSc.Mat):
         rows = rows_in_blocks(N)
@@ -61,6 +64,23 @@ class GivenMatrix:
     def add_delassus(self, g: Array, y: Array) -> None:
         """y += N g; y (nc, 3)."""
         y += self._size * self.velocities(self._size * g)
+
+    def image(self) -> Array:
+        """Memory for the image (nc, 6) of impulses: x and N x."""
+        return np.zeros((self.rows, 6), np.asarray(self._size).dtype)
+
+    def among(self, chosen: np.ndarray) -> Some:
+        return self.everything
+
+    def find_image(self, x: Array, image: Array, some: Some) -> None:
+        image[:, :3], image[:, 3:] = x, self._size * self.velocities(self._size * x)
+
+    def find_velocities(self, image: Array, last: Array, beta: float, before: Array, y: Array, some: Some) -> None:
+        y[:] = before + (image + beta * (image - last))[:, 3:]
+
+    def energy_of_step(self, new: Array, image: Array, last: Array, beta: float) -> float:
+        d = new - (image + beta * (image - last))
+        return float(np.vdot(d[:, :3], d[:, 3:]))
 
     def contact_blocks(self) -> Array:
         """The diagonal blocks of N (nc, 3, 3)."""
@@ -100,6 +120,7 @@ class BlockMap(ContactMap):
         rows = checked(comm, rows) if halo is None else rows
         self.comm, self.given, self.block_rows, self.precision = comm, rows, rows, precision  # type: ignore[assignment]
         self.rows, self.columns = rows.rows, rows.columns
+        self.everything = GivenMatrix.everything
         self._found = halo or find_halo(comm, rows.columns, rows.indices)
         self.halo, body = self._found
         self._blocks = (np.ascontiguousarray(rows.blocks, precision), rows.indptr, body)
@@ -123,6 +144,24 @@ class BlockMap(ContactMap):
     def add_delassus(self, g: Array, y: Array) -> None:
         """y += G G' g; y (nc, 3)."""
         y += self.velocities(self.momenta(g))
+
+    def image(self) -> Array:
+        """Memory for an image: G'x (columns, 6)."""
+        return np.zeros((self.columns, 6), self.precision)
+
+    def among(self, chosen: np.ndarray) -> Some:
+        """Every contact: products by blocks have no choice."""
+        return self.everything
+
+    def find_image(self, x: Array, image: Array, some: Some) -> None:
+        image[:] = self.momenta(x)
+
+    def find_velocities(self, image: Array, last: Array, beta: float, before: Array, y: Array, some: Some) -> None:
+        y[:] = before + self.velocities(image + image.dtype.type(beta) * (image - last))
+
+    def energy_of_step(self, new: Array, image: Array, last: Array, beta: float) -> float:
+        d = new - (image + image.dtype.type(beta) * (image - last))
+        return float(np.vdot(d, d))
 
     def weights(self, H: Array, symmetric: bool = True) -> Array:
         """Blocks H (nc, 3, 3) in the format of `through`."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pctt.ccp.cone import Array, dot
+from pctt.ccp.cone import Array, dot, times
 from pctt.ccp.problem import ConeProblem
 
 
@@ -29,7 +29,7 @@ def why_unbounded(problem: ConeProblem, g: Array) -> str:
     r[problem.mu == 0, 1:] = 0.0  # sliding that no impulse answers
     sizes, speeds = np.sqrt(dot(g, g)), dot(r, r)
     share = np.maximum(sizes / max(problem.max(sizes.max(initial=0.0)), 1e-300), 1e-6)
-    alone = np.einsum("ni,nij,nj->", g, problem.diagonal_blocks, g)
+    alone = np.vdot(g, times(problem.diagonal_blocks, g))
     parts = (np.vdot(r, g), share @ speeds, np.vdot(problem.product(g), g), sizes @ sizes, alone)
     along, closing, bent, length, alone = problem.sum(np.array(parts))
     size, speed = np.sqrt(length), np.sqrt(closing)

@@ -86,7 +86,7 @@ def solved(problem: ccp.ConeProblem, solver: str) -> dict[str, Any]:
     ccp.solve(problem, None, solver, ccp.Limits(0.1), newton=krylov)  # loads compiled loops
     before, start = _petsc_reductions(), time.perf_counter()
     with (
-        Counter(type(problem.contact_map), "add_delassus", "through") as products,
+        Counter(type(problem.contact_map), "add_delassus", "find_image", "through") as products,
         Counter(ccp.ConeProblem, "sum", "min", "max") as reductions,
         Counter(ScaledProblem, "sums") as first_order,
     ):

@@ -50,7 +50,7 @@ def own(problem: ccp.ConeProblem, name: str, tol: float, seconds: float, coulomb
     limits = ccp.Limits(tol, 10_000_000 if not newton else -1, math.inf, fallback=False)
     law = ccp.Coulomb() if coulomb else None
     impulse = None
-    with Counter(type(problem.operator), "add_delassus") as products:
+    with Counter(type(problem.operator), "add_delassus", "find_image") as products:
         watch = Watch(problem, newton, products, seconds)
         try:
             result = ccp.solve(problem, None, name, limits, None, newton, law)

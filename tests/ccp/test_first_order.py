@@ -28,9 +28,10 @@ def objective(problem: ccp.ConeProblem, g: np.ndarray) -> float:
 # -- scaled problem -----------------------------------------------------------------------------------------
 
 
-def test_the_scaled_problem_is_the_same_problem():
+@pytest.mark.parametrize("given", ["blocks", "matrix"])
+def test_the_scaled_problem_is_the_same_problem(given):
     known, graph = heap(mass_ratio=100.0)
-    problem = from_graph(known, graph)
+    problem = from_matrix(known) if given == "matrix" else from_graph(known, graph)
     scaled = ScaledProblem(problem)
     rng = np.random.default_rng(0)
     x = rng.normal(size=(40, 3))
@@ -50,7 +51,17 @@ def test_the_scaled_problem_is_the_same_problem():
     y = scaled.gradient(scaled.start(g))
     start = scaled.impulse(scaled.start(g))
     expected = problem.natural_residual(start, problem.product(start) + problem.r)
-    assert scaled.residuals(Limits(), scaled.start(g), y)[0] == pytest.approx(expected)
+    assert problem.natural_residual(start, scaled.velocities(y)) == pytest.approx(expected)
+    now, last, new = (scaled.iterate(scaled.project(z)) for z in rng.normal(size=(3, 40, 3)))
+    y = np.empty_like(now.x)
+    assert np.allclose(scaled.look(now, y), scaled.gradient(now.x))
+    z = now.x + 0.7 * (now.x - last.x)
+    scaled.rigid_gradient(now, last, 0.7, y)
+    curvature, length, uphill = scaled.step(now, last, 0.7, y, 0.3, new)
+    assert np.allclose(new.x, project(z - 0.3 * scaled.gradient(z), scaled.mu))
+    assert curvature == pytest.approx(np.vdot(new.x - z, scaled.product(new.x - z)))
+    assert length == pytest.approx(np.vdot(new.x - z, new.x - z))
+    assert uphill == pytest.approx(np.vdot(scaled.gradient(z), new.x - now.x))
 
 
 # -- faces --------------------------------------------------------------------------------------------------

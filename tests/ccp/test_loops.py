@@ -19,16 +19,14 @@ def projected_move(x, y, step, mu):
     return _nearest_in_cone(x - step * y, mu) - x
 
 
-def accelerated_step(x, last_x, y, last_y, beta, step, mu, opening):
+def accelerated_step(x, last_x, y, compliance, beta, step, mu, opening):
     """What the loop returns, and what it leaves in its last argument."""
-    z, y_z = x + beta * (x - last_x), y + beta * (y - last_y)
+    z = x + beta * (x - last_x)
+    y_z = y + compliance * z if len(compliance) else y.copy()
     y_z[:, 0] += opening * mu * np.hypot(y_z[:, 1], y_z[:, 2])
     out = _nearest_in_cone(z - step * y_z, mu)
-    return np.vdot(out - z, out - z), np.vdot(y_z, out - x), out
-
-
-def accelerated_curvature(new_x, x, last_x, new_y, y, last_y, beta):
-    return np.vdot(new_x - x - beta * (x - last_x), new_y - y - beta * (y - last_y))
+    work = np.vdot(out - z, compliance * (out - z)) if len(compliance) else 0.0
+    return work, np.vdot(out - z, out - z), np.vdot(y_z, out - x), out
 
 
 def times(blocks, x):
@@ -48,22 +46,22 @@ class Sample:
     def __init__(self, count: int, seed: int = 0):
         rng = np.random.default_rng(seed)
         mu = rng.uniform(0.05, 2.0, count) * (np.arange(count) % 5 > 0)
-        x, dx, y, dy, z, dz = rng.normal(size=(6, count, 3))
+        x, dx, y, dy = rng.normal(size=(4, count, 3))
         x[::7] = 0.0
         x[3::7, 1:] = 0.0
         blocks = rng.normal(size=(count, 3, 3))
         self.cases = {
             "project": (cone.project, _nearest_in_cone, (x, mu)),
             "move": (cone.projected_move, projected_move, (x, y, 0.3, mu)),
-            "step": (stepped, accelerated_step, (x, dx, y, dy, 0.7, 0.3, mu, 1.0)),
-            "curvature": (cone.accelerated_curvature, accelerated_curvature, (x, dx, z, y, dy, dz, 0.7)),
+            "step": (stepped, accelerated_step, (x, dx, y, np.abs(dy), 0.7, 0.3, mu, 1.0)),
+            "rigid step": (stepped, accelerated_step, (x, dx, y, dy[:0], 0.7, 0.3, mu, 0.0)),
             "times": (cone.times, times, (blocks, x)),
         }  # fmt: skip
 
 
-def stepped(x, last_x, y, last_y, beta, step, mu, opening):
+def stepped(x, last_x, y, compliance, beta, step, mu, opening):
     out = np.zeros_like(x)
-    return *cone.accelerated_step(x, last_x, y, last_y, beta, step, mu, opening, out), out
+    return *cone.accelerated_step(x, last_x, y, compliance, beta, step, mu, opening, out), out
 
 
 NAMES = list(Sample(0).cases)

@@ -84,6 +84,20 @@ def check(comm: MPI.Comm, rows: CompactRows | BlockRows, G: np.ndarray, here: sl
     close = {"rtol": 1e-4, "atol": 1e-5 * np.abs(expected).max(initial=0.0)}
     np.testing.assert_allclose(y, expected.reshape(-1, 3)[here], **close)
 
+    # the step from z = x + .6 (x - last) to new, by images alone
+    x, last, new = rng.standard_normal((3, contacts, 3))
+    images = []
+    for point in (x, last, new):
+        images.append(product.image())
+        product.find_image(point[here], images[-1], product.everything)
+    z = x + 0.6 * (x - last)
+    y = np.empty_like(g[here])
+    product.find_velocities(*images[:2], 0.6, g[here], y, product.everything)
+    close = {"rtol": 1e-12, "atol": 1e-11}
+    np.testing.assert_allclose(y - g[here], (G @ G.T @ z.ravel()).reshape(-1, 3)[here], **close)
+    energy = comm.allreduce(product.energy_of_step(images[2], *images[:2], 0.6))
+    np.testing.assert_allclose(energy, np.square((new - z).ravel() @ G).sum(), rtol=1e-12, atol=1e-11)
+
     body = BodyOperator(product)
     x, out = body.mat.createVecs()
     x.array[:] = v[own].ravel()

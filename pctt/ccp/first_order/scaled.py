@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -13,6 +14,18 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.options import number
+
+RATIO = 0.4  # of the natural residual to |L step| / |x|: .3 to .5 from the second step on, in all scenes and both laws
+
+
+class Iterate(NamedTuple):
+    """A point x (nc, 3), and its image: what it does to the bodies (`ContactMap.image`)."""
+
+    x: Array
+    image: Array
+
+    def copy(self) -> Iterate:
+        return Iterate(self.x.copy(), self.image.copy())
 
 
 class ScaledProblem:
@@ -39,7 +52,9 @@ class ScaledProblem:
         self.mu = self._rounded(problem.mu * self._scale[:, 1] / self._scale[:, 0])
         self.b = self._rounded(problem.r * self.shrink)
         self._compliance = self._rounded(problem.compliance * self.shrink**2)
+        self._soft = self._compliance[: None if problem.yields else 0]
         self._operator = problem.operator.scaled(self.shrink, precision)
+        self._awake = self._operator.everything
 
     def _rounded(self, x: Array) -> Array:
         return x.astype(self.precision, copy=False)
@@ -49,7 +64,9 @@ class ScaledProblem:
         return self.project(self._rounded(guess * self._scale))
 
     def impulse(self, x: Array) -> Array:
-        return x * self.shrink
+        """The impulses (nc, 3) of x, in the cones in double precision too."""
+        g = x * self.shrink
+        return g if self.precision is np.float64 else cone.project(g, self.problem.mu, out=g)
 
     def product(self, x: Array) -> Array:
         """A x (nc, 3)."""
@@ -66,6 +83,49 @@ class ScaledProblem:
         self._operator.add_delassus(x, out)
         return out
 
+    # -- accelerated steps --------------------------------------------------------------------------------------
+
+    def iterate(self, x: Array) -> Iterate:
+        """The iterate at x (nc, 3), which is kept."""
+        found = Iterate(x, self._operator.image())
+        self.find_image(found)
+        return found
+
+    def find_image(self, iterate: Iterate) -> None:
+        """The image that belongs to the point."""
+        self._operator.find_image(*iterate, self._awake)
+
+    def rigid_gradient(self, now: Iterate, last: Iterate, beta: float, out: Array) -> Array:
+        """(A - C) z + b (nc, 3) at z = x + beta (x - last_x), into ``out``, from images alone: half a product. Contacts
+        that sleep keep what ``out`` has."""
+        self._operator.find_velocities(now.image, last.image, beta, self.b, out, self._awake)
+        return out
+
+    def look(self, now: Iterate, y: Array) -> Array:
+        """A x + b (nc, 3) of all contacts, which wake up, and ``y`` its rigid part."""
+        self._awake = self._operator.everything
+        self.rigid_gradient(now, now, 0.0, y)
+        return y + self._compliance * now.x if self.problem.yields else y
+
+    def fall_asleep(self, now: Iterate, last: Iterate, y: Array, length: float) -> None:
+        """Let contacts sleep that will stay open until the next look, as far as one can see: they have no impulse, and
+        open five times faster than steps change velocities, which is the root mean square of their ``length`` |L step|.
+        A contact too many costs iterations, but no accuracy. ``y`` (nc, 3) is the rigid gradient of all contacts."""
+        faster = y[:, 0] - self.mu * cone.tangential(y) > 5 * length / np.sqrt(max(self.problem.size, 1))
+        self._awake = self._operator.among((now.x[:, 0] > 0) | (last.x[:, 0] > 0) | ~faster)
+
+    def step(
+        self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate
+    ) -> list[float]:
+        """The projected step of this length from z, where the rigid gradient is y, into ``new``; of the step d from z
+        d'Ad and |d|^2, and y_z'(x_new - x), with y_z the gradient at z with the De Saxce term of Coulomb's law."""
+        work, square, uphill = cone.accelerated_step(
+            now.x, last.x, y, self._soft, beta, length, self.mu, float(self.coulomb), new.x
+        )
+        self.find_image(new)
+        work += self._operator.energy_of_step(new.image, now.image, last.image, beta)
+        return self.sums(work, square, uphill).tolist()
+
     def project(self, x: Array) -> Array:
         """x moved to the nearest point of the cones, in place."""
         return cone.project(x, self.mu, out=x)
@@ -81,7 +141,8 @@ class ScaledProblem:
     def sums(self, *parts: float) -> Array:
         """Sums of numbers over the ranks, in one reduction; of a buffer, which takes a tenth of the time of objects."""
         out = np.array(parts, dtype=float)
-        self.problem.comm.Allreduce(MPI.IN_PLACE, out)
+        if self.problem.comm.size > 1:
+            self.problem.comm.Allreduce(MPI.IN_PLACE, out)
         return out
 
     def block_steps(self) -> Array:
@@ -90,11 +151,9 @@ class ScaledProblem:
         largest = np.linalg.eigvalsh(blocks)[:, -1]
         return np.repeat(1.0 / np.where(largest > 0, largest, 1.0), 3).reshape(-1, 3)
 
-    def residuals(self, limits: Limits, x: Array, gradient: Array) -> tuple[float, float]:
-        """The natural residual of the impulse of x, in its own units, and the residual that the tolerance is for."""
-        g, y = self.impulse(x), gradient * self._scale
-        natural = self.problem.natural_residual(g, y, self.coulomb)
-        return natural, limits.residual(natural, self.problem, g, y)
+    def velocities(self, gradient: Array) -> Array:
+        """The velocities N g + r (nc, 3) that belong to a gradient."""
+        return gradient * self._scale
 
     def largest_curvature(self, steps: int = 10) -> float:
         """Estimate from below of the largest eigenvalue of A: ``steps`` power iterations from b."""
@@ -133,8 +192,21 @@ class Progress:
         self.status, self.reason = Status.STALLED, ""
         self.best, self._point = np.inf, np.zeros((0, 3))  # residual and x
         self._looks = self._next_look = 0
+        self._size, self._last_look = 0.0, (1.0, 0.0)  # of the last step; the residual and the size at the last look
         self._suspicious, self._unbounded = limits.tol, ""
         self._gain = (np.inf, self.iterations)  # residual and iteration of the last progress
+
+    def is_due(self, size: float) -> bool:
+        """Whether `goes_on` will look: after ``check`` iterations, or a few after the last look where the residual
+        would be about the tolerance if it had changed as the ``size`` of steps has: |L step|, 0 before the first.
+
+        Before there was a step it is taken for RATIO times |L step| / |x|."""
+        residual, size_then = self._last_look
+        few = self._next_look - self.check + 3
+        if self.iterations >= few and residual * size <= 1.25 * self.limits.tol * size_then:
+            self._next_look = self.iterations
+        self._size = size
+        return self.iterations >= min(self._next_look, self.limits.max_it)
 
     def goes_on(self, x: Array, gradient: Array | None = None) -> bool:
         """Whether to iterate further from x. Every ``check`` iterations this computes the residual.
@@ -148,6 +220,8 @@ class Progress:
         if residual < self.best or self._looks == 0:
             self.best, self._point = residual, x.copy()
         self._looks += 1
+        norm = np.sqrt(self.problem.dots((x, x))[0])
+        self._last_look = (residual, self._size) if self._size > 0 else (RATIO, float(norm))
         self.status, self.reason = self._why_stop(residual)
         return not self.reason
 
@@ -162,22 +236,24 @@ class Progress:
 
     def _residual(self, x: Array, gradient: Array | None) -> float:
         """The residual that the tolerance is for; nan where x or its gradient is no number."""
+        g, problem = self.problem.impulse(x), self.problem.problem
         if gradient is not None:
-            residual = self._judge(x, gradient)
+            residual = self._judge(g, self.problem.velocities(gradient))
             # inf where x = 0, or x is no number; methods that update the gradient collect rounding: look twice
             if self.limits.tol < residual < np.inf:
                 return residual
-        gradient = self.problem.gradient(x)
-        finite = np.isfinite(self.problem.dots((x, gradient))[0])
-        return self._judge(x, gradient) if finite else np.nan
+        y = problem.product(g) + problem.r  # in double precision
+        return self._judge(g, y) if np.isfinite(problem.dot(g, y)) else np.nan
 
-    def _judge(self, x: Array, gradient: Array) -> float:
-        """The residual that the tolerance is for. Where only the closing work is too large, the problem may have no
-        solution: this is found out whenever the natural residual has fallen to a tenth."""
-        natural, residual = self.problem.residuals(self.limits, x, gradient)
+    def _judge(self, g: Array, y: Array) -> float:
+        """The residual that the tolerance is for, of impulses g and velocities y. Where only the closing work is too
+        large, the problem may have no solution: this is found out whenever the natural residual has fallen to a
+        tenth."""
+        natural = self.problem.problem.natural_residual(g, y, self.problem.coulomb)
+        residual = self.limits.residual(natural, self.problem.problem, g, y)
         if natural <= self._suspicious and residual > self.limits.tol:
             self._suspicious = 0.1 * natural
-            self._unbounded = why_unbounded(self.problem.problem, self.problem.impulse(x))
+            self._unbounded = why_unbounded(self.problem.problem, g)
         return residual
 
     def _why_stop(self, residual: float) -> tuple[Status, str]:
