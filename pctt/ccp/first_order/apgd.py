@@ -27,14 +27,14 @@ from pctt.ccp.cone import Array
 from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
-from pctt.options import AT_LEAST_ONE, number, option
+from pctt.options import number
 
 
 @dataclass(frozen=True)
 class APGD(FirstOrder):
     """Options ``-ccp_apgd_*``. L is the estimate of the curvature along a step; its inverse is the step's length."""
 
-    check: int = option(25, "most iterations between two looks at the natural residual", check=AT_LEAST_ONE)
+    check: int = number(25, "most iterations between two looks at the natural residual")
     lipschitz: float = number(2.0, "the first L: A has a diagonal of about one, and on packings L is 2 to 3")
     margin: float = number(1.3, "L of a repeated step, over the curvature found: the next need not be repeated too")
     decay: float = number(0.99, "factor on L after each step, so that steps grow again where the curvature allows it")
