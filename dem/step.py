@@ -60,14 +60,16 @@ class Step:
         return self.system.impulse_on_large(self.impulse)
 
 
-def advance(world: World, velocity: Floats, dt: float) -> None:
+def advance(world: World, velocity: Floats, dt: float, moving: Floats | None = None) -> None:
     """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by dt [s]; collective.
 
-    x <- x + dt v, q <- exp(dt w) q. Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
+    x <- x + dt v, q <- exp(dt w) q, with the velocities `moving` (owned, 6) in place of these if they are given.
+    Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
     """
-    large_velocity = world.large_velocity(velocity)
-    _move(world.grains, velocity[: len(world.grains)], dt)
-    _move(world.large, large_velocity, dt)
+    moving = velocity if moving is None else moving
+    large_velocity, large_moving = world.large_velocity(velocity), world.large_velocity(moving)
+    _move(world.grains, velocity[: len(world.grains)], moving[: len(world.grains)], dt)
+    _move(world.large, large_velocity, large_moving, dt)
     world.time += dt
     world.step += 1
     follow_motions(world)
@@ -88,10 +90,10 @@ def follow_motions(world: World) -> None:
         world.large.position[row], world.large.quaternion[row] = pose
 
 
-def _move(table: Bodies, velocity: Floats, dt: float) -> None:
+def _move(table: Bodies, velocity: Floats, moving: Floats, dt: float) -> None:
     table.velocity = velocity.copy()
-    table.position = table.position + dt * velocity[:, :3]
-    table.quaternion = quaternion.integrate(table.quaternion, velocity[:, 3:], dt)
+    table.position = table.position + dt * moving[:, :3]
+    table.quaternion = quaternion.integrate(table.quaternion, moving[:, 3:], dt)
 
 
 def find_turned(

@@ -19,7 +19,8 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
-from dem.arrays import Floats
+from dem.arrays import Bools, Floats
+from dem.bodies import COMPOUND
 from dem.checks import positive
 from dem.compiled import loop
 from dem.contact import Contacts
@@ -101,6 +102,17 @@ class ContactSystem:
         self.contact_map.halo.update(table)
         table[self.near.grains + self.near.ghosts :] = large
         return self.contact_map.relative_velocities(table)
+
+
+def touching(contacts: Contacts, system: ContactSystem) -> Bools:
+    """Mask (nc,) of the contacts of a system that touch at the start of its step, to a hundredth of a radius. Bodies
+    that slide along each other are apart by (dt v_t)^2 / (2 R) after a step that has kept them in contact."""
+    table = contacts.near.bodies
+    radius = np.where(table.shape == COMPOUND, np.inf, bodies.bounding_radius(table))
+    radius = np.minimum(radius[contacts.a], radius[contacts.b])
+    slip = system.contact_map.relative_velocities(table.velocity)[:, 1:]
+    near: Bools = contacts.gap <= (system.dt * slip) ** 2 @ np.ones(2) / (2.0 * radius) + 0.01 * radius
+    return near
 
 
 def gap_velocities(

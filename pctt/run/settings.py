@@ -69,6 +69,10 @@ class Settings(ccp.Limits):
         "and with other solvers what overlaps of 0.3 % of a radius need",
         unit="N/m", check=("a positive number, or inf", lambda x: x > 0), name="stiffness",
     )  # fmt: skip
+    projection: bool = option(
+        False, "forces of touching contacts alone, then positions without overlaps: forces depend less on dt",
+        name="projection",
+    )  # fmt: skip
     recovery_speed: float = option(
         1.0, "greatest speed at which rigid bodies that overlap are pushed apart", unit="m/s", check=NOT_NEGATIVE,
         name="recovery_speed",

@@ -15,11 +15,13 @@ from dem.impulses import ImpulseMemory
 from dem.keys import places
 from dem.partition import rebalance
 from dem.step import advance, find_turned
-from dem.system import ContactSystem
+from dem.system import ContactSystem, touching
 from dem.together import SceneError
 from dem.world import World
 from pctt import ccp, log
+from pctt.ccp.cone import Array
 from pctt.run.dump import Dump
+from pctt.run.projection import projected
 from pctt.run.settings import Settings
 
 
@@ -33,6 +35,7 @@ class Stepper:
     system: ContactSystem
     impulse: np.ndarray
     history: list[float]  #: natural residual by iteration
+    projection_its: int  #: iterations of the last projection of positions
 
     def __init__(
         self,
@@ -74,24 +77,44 @@ class Stepper:
             raise SceneError(f"step {self.world.step + 1}: {error}") from None
 
     def _step(self) -> dict[str, Any]:
-        problem, guess = self._assemble(self._search(), self.memory)
-        with log.phase("solve"):
-            result = self.solve(problem, guess)
         self._corrections = 0
-        while again := self._overrun(result) or self._turned(result):
-            problem, guess = self._assemble(*again)
-            with log.phase("solve"):
-                result = self.solve(problem, guess).after(result)
+        contacts = self._search()
+        if self.settings.projection:
+            problem, guess, result, moving = self._step_with_projection(contacts)
+        else:
+            problem, guess, result, moving = self._step_to_gaps(contacts)
         with log.phase("solve"):
             accuracy = ccp.measure(problem, result.impulse)
         with log.phase("output"):
             files = self.dump.step(self.system, problem, guess, result, result.asked or result) if self.dump else {}
         with log.phase("advance"):
             self.impulse, self.history = result.impulse, result.history
-            advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt)
+            advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt, moving)
             self.memory.remember(self.system.key, self.impulse, self.system.frame)
         self._release()
         return self._figures(problem.size, result, accuracy, files)
+
+    def _step_to_gaps(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
+        """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
+        problem, guess = self._assemble(contacts, self.memory)
+        result = self.solve(problem, guess)
+        while again := self._unseen(self.contacts, self.system, result.momentum):
+            problem, guess = self._assemble(again, self._remembered(result))
+            result = self.solve(problem, guess).after(result)
+        return problem, guess, result, None
+
+    def _step_with_projection(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
+        """Forces of contacts that touch at the start, then positions without overlaps; see `pctt.run.projection`."""
+        every = self._system(contacts)
+        problem, guess = self._assemble(contacts.take(touching(contacts, every)), self.memory)
+        result = self.solve(problem, guess)
+        while True:
+            with log.phase("project"):
+                shift, self.projection_its = projected(every, self.system, result)
+            again = self._unseen(contacts, every, result.momentum + shift)
+            if again is None:
+                return problem, guess, result, self.system.velocity_with(result.momentum + shift)
+            contacts, every = again, self._system(again)
 
     def _search(self) -> Contacts:
         """The contacts of the step."""
@@ -106,7 +129,8 @@ class Stepper:
         newton = self.newton
         pc_report = newton.pc_report if newton is not None else []
         compare = newton.compare if newton is not None else None
-        phases = ("search", "assembly", "solve", *(["compare"] if compare else []), "advance")
+        more = (["compare"] if compare else []) + (["project"] if self.settings.projection else [])
+        phases = ("search", "assembly", "solve", *more, "advance")
         return {
             "step": self.world.step,
             "time": self.world.time,
@@ -115,6 +139,7 @@ class Stepper:
             "iterations": result.iterations,
             "ksp_its": result.ksp_its,
             "cone_problems": result.cone_problems,
+            **({"projection_its": self.projection_its} if self.settings.projection else {}),
             **dataclasses.asdict(accuracy),
             "converged": result.converged,
             "status": result.status.value,
@@ -131,47 +156,48 @@ class Stepper:
             "phases": log.take_seconds(phases),
         }
 
-    def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, np.ndarray]:
-        """The problem of these contacts, which takes the place of the last, and the impulses remembered."""
-        settings = self.settings
+    def _system(self, contacts: Contacts) -> ContactSystem:
         with log.phase("assembly"):
-            self._release()
-            self.contacts = contacts
-            self.system = ContactSystem(self.world, contacts, settings.dt, settings.recovery_speed)
+            return ContactSystem(self.world, contacts, self.settings.dt, self.settings.recovery_speed)
+
+    def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, Array]:
+        """The problem of these contacts, which takes the place of the last, and the impulses remembered."""
+        self._release()
+        self.contacts, self.system = contacts, self._system(contacts)
+        with log.phase("assembly"):
             self._problem = cone_problem(self.system, self.world.comm)
             guess, _ = memory.recall(self.system.key, self.system.frame)
         return self._problem, guess
 
-    def _overrun(self, found: ccp.Result) -> tuple[Contacts, ImpulseMemory] | None:
-        """The contacts together with those that the search did not foresee, because an impulse of this step sends a
-        grain further than its margin, and the impulses so far. None if no such grain meets anything."""
-        world, settings = self.world, self.settings
+    def _unseen(self, contacts: Contacts, system: ContactSystem, momentum: Array) -> Contacts | None:
+        """The contacts, with those that these momenta show to be missed; None if there are none."""
         with log.phase("search"):
-            velocity = self.system.velocity_with(found.momentum)
-            wider = find_overrun(world, self.contacts, velocity, settings.delta, settings.dt)
+            velocity = system.velocity_with(momentum)
+            return self._overrun(contacts, velocity, momentum) or self._turned(contacts, velocity)
+
+    def _overrun(self, contacts: Contacts, velocity: Array, momentum: Array) -> Contacts | None:
+        """The contacts together with those that the search did not foresee, because an impulse of this step sends a
+        grain further than its margin. None if no such grain meets anything."""
+        world, settings = self.world, self.settings
+        wider = find_overrun(world, contacts, velocity, settings.delta, settings.dt)
         if wider is None:
             return None
-        with log.phase("assembly"):
-            unseen = wider.take(places(self.contacts.key, wider.key) < 0)
-            beyond = ContactSystem(world, unseen, settings.dt, settings.recovery_speed)
-            opening = (beyond.contact_map.velocities(found.momentum) + beyond.r)[:, 0]
-            # solved for if the overlap would be deeper than a hundredth of delta
-            closes = bool((settings.dt * opening < -0.01 * settings.delta).any())
-        return (wider, self._remembered(found)) if world.comm.allreduce(closes, MPI.LOR) else None
+        unseen = wider.take(places(contacts.key, wider.key) < 0)
+        beyond = ContactSystem(world, unseen, settings.dt, settings.recovery_speed)
+        opening = (beyond.contact_map.velocities(momentum) + beyond.r)[:, 0]
+        # solved for if the overlap would be deeper than a hundredth of delta
+        closes = bool((settings.dt * opening < -0.01 * settings.delta).any())
+        return wider if world.comm.allreduce(closes, MPI.LOR) else None
 
-    def _turned(self, found: ccp.Result) -> tuple[Contacts, ImpulseMemory] | None:
-        """The contacts, with those that overlap at the end of the step because bodies turn, and the impulses so far.
-        None if there are none, or after so many corrections."""
+    def _turned(self, contacts: Contacts, velocity: Array) -> Contacts | None:
+        """The contacts, with those that overlap at the end of the step because bodies turn. None if there are none, or
+        after so many corrections."""
         settings, depth, most = self.settings, 0.1 * self.settings.delta, 3  # overlap that is corrected, and how often
         if self._corrections == most or self.world.only_spheres:
             return None
-        with log.phase("search"):
-            velocity = self.system.velocity_with(found.momentum)
-            turned = find_turned(self.world, self.contacts, velocity, settings.dt, depth, settings.recovery_speed)
-        if turned is None:
-            return None
-        self._corrections += 1
-        return turned, self._remembered(found)
+        turned = find_turned(self.world, contacts, velocity, settings.dt, depth, settings.recovery_speed)
+        self._corrections += turned is not None
+        return turned
 
     def _remembered(self, found: ccp.Result) -> ImpulseMemory:
         """A memory of these impulses of the present contacts."""
@@ -179,13 +205,14 @@ class Stepper:
         memory.remember(self.system.key, found.impulse, self.system.frame)
         return memory
 
-    def solve(self, problem: ccp.ConeProblem, guess: np.ndarray) -> ccp.Result:
+    def solve(self, problem: ccp.ConeProblem, guess: Array) -> ccp.Result:
         """Solve a problem of the step as the settings say."""
         settings = self.settings
         coulomb = settings.coulomb or None
-        return ccp.solve(
-            problem, guess, settings.solver, settings.limits, settings.options, self.newton, coulomb
-        )
+        with log.phase("solve"):
+            return ccp.solve(
+                problem, guess, settings.solver, settings.limits, settings.options, self.newton, coulomb
+            )
 
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
