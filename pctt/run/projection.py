@@ -30,10 +30,9 @@ def projected(every: ContactSystem, touching: ContactSystem, found: ccp.Result) 
 
     every: the contacts that must not overlap; touching: those with forces, whose problem was solved by ``found``.
     """
-    row = places(touching.key, every.key)
-    spring = np.where(row >= 0, (touching.compliance * found.impulse[:, 0]).take(np.maximum(row, 0), mode="clip"), 0.0)
     r = np.zeros_like(every.r)
-    r[:, 0] = (every.contact_map.velocities(found.momentum) + every.r)[:, 0] + spring
+    r[:, 0] = (every.contact_map.velocities(found.momentum) + every.r)[:, 0]
+    r[places(every.key, touching.key), 0] += touching.compliance * found.impulse[:, 0]  # what their springs hold
     G, free = every.contact_map, np.zeros(len(r))
     problem = ccp.ConeProblem(G.comm, r, free, G=G, point=every.point, key=every.key, compliance=every.compliance)
     result = ccp.solve(problem, None, "apgd", LIMITS)
