@@ -43,17 +43,22 @@ class Scene:
     """Collects grains, large bodies, materials and gravity; checks each as it comes (ValueError)."""
 
     def __init__(
-        self, friction: float, gravity: Sequence[float] = (0.0, 0.0, -9.81), stiffness: float | None = None
+        self,
+        friction: float,
+        gravity: Sequence[float] = (0.0, 0.0, -9.81),
+        stiffness: float | None = None,
+        restitution: float = 0.0,
     ) -> None:
-        """`friction`: coefficient, and `stiffness` [N/m] of the contacts of all pairs of materials not set otherwise;
-        `gravity`: (3,) [m/s^2]. A stiffness of inf is that of rigid contacts; None: `dem.stiffness.recommended`.
+        """`friction`: coefficient, `stiffness` [N/m] and coefficient of `restitution` of the contacts of all pairs of
+        materials not set otherwise; `gravity`: (3,) [m/s^2]. A stiffness of inf is that of rigid contacts; None:
+        `dem.stiffness.recommended`.
         """
         self.gravity = checks.vector("gravity", gravity)
         self.large_bodies: list[LargeBody] = []
         self._friction = float(checks.not_negative("friction", friction))
         self.stiffness = None if stiffness is None else _stiffness(stiffness)  #: [N/m]; None: not stated
-        self._pairs: dict[tuple[int, int], float] = {}
-        self._stiff_pairs: dict[tuple[int, int], float] = {}
+        self._restitution = _restitution(restitution)
+        self._pairs: dict[str, dict[tuple[int, int], float]] = {"friction": {}, "stiffness": {}, "restitution": {}}
         self._materials: dict[str, int] = {}
         self._grains: list[Bodies] = []
 
@@ -164,13 +169,19 @@ class Scene:
 
     def set_friction(self, friction: float, material: str, other: str) -> None:
         """Friction coefficient between two materials (which may be the same one)."""
-        pair = sorted((self._material(material), self._material(other)))
-        self._pairs[pair[0], pair[1]] = float(checks.not_negative("friction", friction))
+        self._set_pair("friction", float(checks.not_negative("friction", friction)), material, other)
 
     def set_stiffness(self, stiffness: float, material: str, other: str) -> None:
         """Stiffness of the contacts of two materials (which may be the same one) [N/m]; inf: rigid."""
-        pair = sorted((self._material(material), self._material(other)))
-        self._stiff_pairs[pair[0], pair[1]] = _stiffness(stiffness)
+        self._set_pair("stiffness", _stiffness(stiffness), material, other)
+
+    def set_restitution(self, restitution: float, material: str, other: str) -> None:
+        """Coefficient of restitution of impacts between two materials (which may be the same one), from 0 to 1."""
+        self._set_pair("restitution", _restitution(restitution), material, other)
+
+    def _set_pair(self, name: str, value: float, material: str, other: str) -> None:
+        one, two = sorted((self._material(material), self._material(other)))
+        self._pairs[name][one, two] = value
 
     @property
     def materials(self) -> tuple[str, ...]:
@@ -179,15 +190,19 @@ class Scene:
 
     def friction_table(self) -> Floats:
         """Friction coefficients (materials, materials), symmetric."""
-        return self._table(self._friction, self._pairs)
+        return self._table("friction", self._friction)
 
     def stiffness_table(self, usual: float) -> Floats:
         """Stiffnesses of contacts (materials, materials), symmetric [N/m]; the `usual` one of pairs not set."""
-        return self._table(usual, self._stiff_pairs)
+        return self._table("stiffness", usual)
 
-    def _table(self, usual: float, pairs: dict[tuple[int, int], float]) -> Floats:
+    def restitution_table(self) -> Floats:
+        """Coefficients of restitution (materials, materials), symmetric."""
+        return self._table("restitution", self._restitution)
+
+    def _table(self, name: str, usual: float) -> Floats:
         table = np.full((len(self._materials), len(self._materials)), usual)
-        for (i, j), value in pairs.items():
+        for (i, j), value in self._pairs[name].items():
             table[i, j] = table[j, i] = value
         return table
 
@@ -244,6 +259,11 @@ class Scene:
         )
         self._grains.append(table)
         return table.id
+
+
+def _restitution(value: float) -> float:
+    checks.between(0.0, 1.0)("restitution", value)
+    return float(value)
 
 
 def _stiffness(value: float) -> float:

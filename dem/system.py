@@ -49,8 +49,11 @@ class ContactSystem:
         drive_impulse (large, 6): impulses and angular impulses of the drives of large bodies, the same on all ranks
     """
 
-    def __init__(self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf) -> None:
-        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart."""
+    def __init__(
+        self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf, impacts: bool = True
+    ) -> None:
+        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `impacts`:
+        whether contacts that begin bounce."""
         positive("time step", dt)
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
@@ -73,7 +76,22 @@ class ContactSystem:
         self.drive_impulse = drive_impulses(world, dt)
         self.b = np.zeros((len(contacts), 3))
         self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
-        self.r = self.b + self.contact_map.relative_velocities(free)
+        freely = self.contact_map.relative_velocities(free)
+        if impacts and world.restitution.any():
+            self._bounce(world, contacts, freely[:, 0])
+        self.r = self.b + freely
+
+    def _bounce(self, world: World, contacts: Contacts, freely: Floats) -> None:
+        """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton).
+
+        They begin if without impulses they close in the step, `freely` (nc,) [m/s], and come faster than a fall of one
+        step: a body at rest does not bounce."""
+        table, a, b = contacts.near.bodies, contacts.a, contacts.b
+        e = world.restitution[table.material[a], table.material[b]]
+        came = self.contact_map.relative_velocities(table.velocity)[:, 0]
+        begin = (e > 0.0) & (came < -self.dt * np.linalg.norm(world.gravity)) & (contacts.gap + self.dt * freely < 0.0)
+        self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
+        self.compliance = np.where(begin, 0.0, self.compliance)
 
     def velocity(self, impulse: Floats) -> Floats:
         """Velocities (owned, 6) after the step, v_free + M^-1 D g, for impulses (nc, 3); collective."""

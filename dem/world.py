@@ -36,6 +36,7 @@ class World:
     gravity: Floats  #: (3,) [m/s^2]
     friction: Floats  #: (materials, materials)
     stiffness: Floats  #: of contacts (materials, materials); inf: rigid [N/m]
+    restitution: Floats  #: coefficients of impacts (materials, materials)
     materials: tuple[str, ...]  #: their names; the column `material` of a table of bodies is an index into them
     grains: Bodies  #: the slab of this rank; replace it by `set_grains` only
     large: Bodies  #: one row per large body

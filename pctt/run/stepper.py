@@ -105,7 +105,7 @@ class Stepper:
 
     def _step_with_projection(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
         """Forces of contacts that touch at the start, then positions without overlaps; see `pctt.run.projection`."""
-        every = self._system(contacts)
+        every = self._system(contacts, impacts=False)
         problem, guess = self._assemble(contacts.take(touching(contacts, every)), self.memory)
         result = self.solve(problem, guess)
         while True:
@@ -114,7 +114,7 @@ class Stepper:
             again = self._unseen(contacts, every, result.momentum + shift)
             if again is None:
                 return problem, guess, result, self.system.velocity_with(result.momentum + shift)
-            contacts, every = again, self._system(again)
+            contacts, every = again, self._system(again, impacts=False)
 
     def _search(self) -> Contacts:
         """The contacts of the step."""
@@ -156,9 +156,9 @@ class Stepper:
             "phases": log.take_seconds(phases),
         }
 
-    def _system(self, contacts: Contacts) -> ContactSystem:
+    def _system(self, contacts: Contacts, impacts: bool = True) -> ContactSystem:
         with log.phase("assembly"):
-            return ContactSystem(self.world, contacts, self.settings.dt, self.settings.recovery_speed)
+            return ContactSystem(self.world, contacts, self.settings.dt, self.settings.recovery_speed, impacts)
 
     def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, Array]:
         """The problem of these contacts, which takes the place of the last, and the impulses remembered."""

@@ -1,0 +1,77 @@
+"""Impacts with restitution have the closed forms of Newton's law."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import pctt
+from dem.scene import Scene
+from dem.shapes import Plane
+
+R, DENSITY, G = 0.1, 2500.0, 9.81
+EXACT = {"tol": 1e-10, "closing_work": np.inf}
+STIFF = pytest.mark.parametrize("stiffness", [1e7, np.inf])
+
+
+@STIFF
+@pytest.mark.parametrize("projection", [False, True])
+@pytest.mark.parametrize("solver", ["apgd", "pdip", "conic"])
+def test_two_spheres_of_other_masses_part_as_newton_says(stiffness, projection, solver):
+    """Head on, m1 and 8 m1: momentum is kept and the relative speed is e times that before."""
+    e, mass = 0.6, np.array([1.0, 8.0])
+    scene = Scene(friction=0.0, gravity=(0, 0, 0), stiffness=stiffness, restitution=e)
+    scene.add_spheres([[-0.101, 0, 0]], R, DENSITY, velocity=(2.0, 0.3, 0))
+    scene.add_spheres([[0.201, 0, 0]], 2 * R, DENSITY, velocity=(-1.0, 0, 0))
+    with pctt.Simulation(scene, dt=0.005, solver=solver, projection=projection, **EXACT) as sim:
+        lost = sum(sim.step()["impact_loss [J]"] for _ in range(4))
+        found = sim.velocities
+    centre = (2.0 - 8.0) / 9.0
+    apart = e * 3.0
+    np.testing.assert_allclose(found[:, 0], [centre - apart * 8 / 9, centre + apart / 9], rtol=1e-5)
+    np.testing.assert_allclose(found[:, 1], [0.3, 0.0], atol=1e-9)
+    reduced = 8.0 / 9.0 * mass[0] * DENSITY * 4 / 3 * np.pi * R**3
+    if not projection:
+        assert lost == pytest.approx(0.5 * reduced * 9.0 * (1 - e**2), rel=1e-5)
+
+
+@STIFF
+@pytest.mark.parametrize(("dt", "rel"), [(0.01, 0.12), (0.001, 0.012)])
+def test_a_ball_bounces_to_e2_of_its_height_and_comes_to_rest(stiffness, dt, rel):
+    e, fall = 0.7, 1.0
+    scene = Scene(friction=0.3, stiffness=stiffness)
+    scene.add_body("floor", [Plane((0, 0, 1))], material="steel")
+    scene.add_spheres([[0, 0, R + fall]], R, DENSITY, material="rubber")
+    scene.set_restitution(e, "steel", "rubber")
+    with pctt.Simulation(scene, dt=dt, solver="apgd", delta=0.01, **EXACT) as sim:
+        time, height = [], []
+
+        def note(sim):
+            time.append(sim.time)
+            height.append(sim.positions[0, 2] - R)
+
+        sim.run(until=3.2, call=note)
+        speed = sim.velocities[0, 2]
+    height, time = np.array(height), np.array(time)
+    first = np.sqrt(2 * fall / G)
+    between = (time > first) & (time < first * (1 + 2 * e))
+    assert height[between].max() == pytest.approx(e**2 * fall, rel=rel)
+    rest = first * (1 + e) / (1 - e)  # of endlessly many bounces
+    assert rest < 3.0
+    assert abs(speed) < 1e-9
+    assert np.abs(height[time > 3.1]).max() < 1e-4
+
+
+def test_bodies_at_rest_do_not_bounce():
+    scene = Scene(friction=0.3, restitution=0.9, stiffness=1e7)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_spheres([[0, 0, R * (2 * k + 1)] for k in range(3)], R, DENSITY)
+    with pctt.Simulation(scene, dt=0.005, solver="apgd", **EXACT) as sim:
+        sim.run(steps=200)
+        assert sim.kinetic_energy < 1e-12
+
+
+@pytest.mark.parametrize("bad", [-0.1, 1.5])
+def test_a_coefficient_is_between_0_and_1(bad):
+    with pytest.raises(ValueError, match="restitution must be from 0 to 1"):
+        Scene(friction=0.3, restitution=bad)
