@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -15,12 +16,19 @@ from pctt.ccp.newton.krylov import Krylov, Solve, Source
 from pctt.options import number
 
 
+FRONTS = {
+    "ksp_type": "cg", "ksp_norm_type": "unpreconditioned",
+    "pc_type": "python", "pc_python_type": "pctt.ccp.newton.fronts.FrontPC",
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Settings:
     """Numbers of `LinearSolver`."""
 
     easy: float = number(8.0, "iterations with block Jacobi / bodies^0.4 and rank, after which the next matrix gets a "
                               "factor. It costs as much as 10 to 18 on one rank, and no less on more")  # fmt: skip
+    single: int = number(6, "iterations with factors of single precision, after which the next ones are of double")
     limit: float = number(3.0, "iterations with block Jacobi at most, in units of easy")
     alone: int = number(20_000, "the same where the memory has no room for a factor")
     factor_bytes: float = number(170.0, "memory of a factor / rows^(4/3), the growth of nested dissection in space: "
@@ -61,7 +69,7 @@ class LinearSolver:
     def begin(self) -> None:
         """Another problem."""
         self.iterations = self.fallbacks = 0
-        self._worst, self._hard, self._factored = 0, False, False
+        self._worst, self._hard, self._factored, self._double = 0, False, False, False
 
     def new_matrix(self, system: NewtonForm) -> None:
         """The system has new values."""
@@ -103,13 +111,30 @@ class LinearSolver:
         solver.forget()  # first, as its memory counts as taken
         if not self._has_room():
             return self._run(self._solver("alone"), b, x, rtol) if self.takes_any else None
-        if isinstance(self.system, BodyForm):
+        if solver.kind == "python":
+            done = self._by_fronts(solver, b, x, rtol)
+        elif isinstance(self.system, BodyForm):
             part = self.system.stiff_part()
             done = self._run(solver, b, x, rtol, part)
             part.destroy()  # the KSP keeps it
         else:
             done = self._run(solver, b, x, rtol, self.system.entries)
         self._factored = done.converged
+        return done
+
+    def _by_fronts(self, solver: Krylov, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
+        """In single precision, until that has taken many iterations."""
+        system, pc = self.system, solver.ksp.pc.getPythonContext()
+        assert isinstance(system, BodyForm)
+        done = None
+        if not self._double:
+            pc.make = lambda: system.fronts(np.float32)
+            done = self._run(solver, b, x, rtol, system.matrix)
+            self._double = done.iterations > self.settings.single
+        if done is None or not done.converged:
+            solver.forget()
+            pc.make = lambda: system.fronts(np.float64)
+            done = self._run(solver, b, x, rtol, system.matrix)
         return done
 
     def _run(
@@ -132,10 +157,8 @@ class LinearSolver:
             if name == "factor":
                 options = {"ksp_type": "gmres", "ksp_gmres_restart": "60", "ksp_max_it": "60"}
                 options["pc_type"] = "cholesky" if symmetric else "lu"
-                cholmod = self.comm.size == 1 and PETSc.Sys.hasExternalPackage("suitesparse")
-                if cholmod and symmetric and isinstance(self.system, BodyForm):
-                    # 1.3 times faster than MUMPS, its solves twice; for unsymmetric matrices UMFPACK is half as fast
-                    options["pc_factor_mat_solver_type"] = "cholmod"
+                if self.comm.size == 1 and symmetric and isinstance(self.system, BodyForm):
+                    options |= FRONTS
             else:
                 options = {**self.defaults, **({} if symmetric else {"ksp_type": "bcgs"})}
                 if self.takes_any:
