@@ -19,6 +19,7 @@ from pctt.ccp.cone_loops import (
     accelerated_curvature,
     accelerated_step,
     determinant,
+    nesterov_todd,
     project_to,
     projected_move,
     step_inside,
@@ -108,12 +109,11 @@ class NesterovTodd(NamedTuple):
 
     def times(self, x: Array) -> Array:
         """W x (nc, 3)."""
-        return (2.0 * dot(self.root, x)[:, None] * self.root - J * x) * self.eta[:, None]
+        return nesterov_todd(self.root, self.eta, x, False)
 
     def divide(self, x: Array) -> Array:
         """W^-1 x (nc, 3)."""
-        root = J * self.root
-        return (2.0 * dot(root, x)[:, None] * root - J * x) / self.eta[:, None]
+        return nesterov_todd(self.root, self.eta, x, True)
 
 
 def towards_interval(x: Array, low: float, high: float) -> Array:

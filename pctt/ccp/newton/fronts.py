@@ -90,9 +90,8 @@ def _factorised(first: np.ndarray, starts: np.ndarray, rows: np.ndarray, blocks:
     ``starts`` on; ``first`` says where each front begins, and the number of bodies."""
     fronts: list[Front] = []
     trsm, syrk = blas.get_blas_funcs(("trsm", "syrk"), dtype=blocks.dtype)
-    front_of = np.repeat(np.arange(len(first) - 1), np.diff(first))
     updates: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in first[1:]]
-    place = np.zeros(first[-1], np.int64)
+    place = np.zeros(len(starts), np.int64)
     for k, (begin, end) in enumerate(zip(first, first[1:])):
         touched = [rows[starts[begin] : starts[end]], *(bodies for bodies, _ in updates[k])]
         bodies = np.unique(np.concatenate(touched))
@@ -108,7 +107,7 @@ def _factorised(first: np.ndarray, starts: np.ndarray, rows: np.ndarray, blocks:
         if rest:
             below = trsm(1.0, diagonal, below, side=1, lower=1, trans_a=1, overwrite_b=1)
             update = syrk(-1.0, below, beta=1.0, c=update, lower=1, overwrite_c=1)
-            updates[front_of[bodies[0]]].append((bodies, update))
+            updates[np.searchsorted(first, bodies[0], "right") - 1].append((bodies, update))
         entries = (6 * bodies[:, None] + np.arange(6)).ravel()
         fronts.append(Front(slice(6 * begin, 6 * end), entries, diagonal, below))
     return fronts
@@ -167,12 +166,13 @@ def add_update(values, bodies, end, place, diagonal, below, update):
 
 
 def dissected(points: Array, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The bodies (n,) in the order of nested dissection, and where each front begins in it, with n at the end; ``row``
-    and ``column``: the pairs of bodies, each once."""
+    """The bodies (n,) in the order of nested dissection, those without neighbours first, and where each front begins in
+    it, with n at the end; ``row`` and ``column``: the pairs of bodies, each once."""
     count = len(points)
     name, group = np.zeros((2, count), np.int64)  # of a front: a digit for each level, 0 and 1 the halves, 2 between
-    active = np.bincount(row, minlength=count) + np.bincount(column, minlength=count) <= HUB
-    name[~active] = 1 << 61
+    neighbours = np.bincount(row, minlength=count) + np.bincount(column, minlength=count)
+    active = (neighbours > 0) & (neighbours <= HUB)
+    name[neighbours > HUB], name[neighbours == 0] = 1 << 61, -1
     for level in range(LEVELS):
         _, part, sizes = np.unique(group[active], return_inverse=True, return_counts=True)
         active[active] = sizes[part] > LEAF

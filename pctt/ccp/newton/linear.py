@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.linalg import lapack
 
 from pctt import memory
+from pctt.ccp.cone import Array
 from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.form import NewtonForm
@@ -16,6 +18,7 @@ from pctt.ccp.newton.krylov import Krylov, Solve, Source
 from pctt.options import number
 
 
+REFINEMENTS = 10
 FRONTS = {
     "ksp_type": "cg", "ksp_norm_type": "unpreconditioned",
     "pc_type": "python", "pc_python_type": "pctt.ccp.newton.fronts.FrontPC",
@@ -28,12 +31,32 @@ class Settings:
 
     easy: float = number(8.0, "iterations with block Jacobi / bodies^0.4 and rank, after which the next matrix gets a "
                               "factor. It costs as much as 10 to 18 on one rank, and no less on more")  # fmt: skip
-    single: int = number(6, "iterations with factors of single precision, after which the next ones are of double")
+    single: int = number(12, "iterations with factors of single precision, after which the next ones are of double")
     limit: float = number(3.0, "iterations with block Jacobi at most, in units of easy")
     alone: int = number(20_000, "the same where the memory has no room for a factor")
     factor_bytes: float = number(170.0, "memory of a factor / rows^(4/3), the growth of nested dissection in space: "
                                         "2.2e9 bytes at 35,900 bodies, a fifth more than measured")  # fmt: skip
     spare: float = number(0.9, "part of the available memory that a factor may take")
+
+
+class Dense:
+    """Factors by LAPACK of a matrix that one rank holds: a KSP takes longer to begin than they take to solve."""
+
+    def __init__(self, matrix: Array, symmetric: bool):
+        names = ("potrf", "potrs") if symmetric else ("getrf", "getrs")
+        factorise, self._solve = lapack.get_lapack_funcs(names, dtype=float)
+        self.matrix, self._side = matrix, {"lower": 1} if symmetric else {}
+        *self._factors, self.failed = factorise(matrix, **self._side)
+
+    def solve(self, b: Array, rtol: float) -> Array | None:
+        """x with A x = b to a relative residual of rtol, refined where it must be; None if that does not help."""
+        x, left, wanted = np.zeros_like(b), b, rtol * np.linalg.norm(b)
+        for _ in range(0 if self.failed else REFINEMENTS):
+            x += self._solve(*self._factors, left, **self._side)[0]
+            left = b - self.matrix @ x
+            if np.linalg.norm(left) <= wanted:
+                return x
+        return None
 
 
 class LinearSolver:
@@ -48,7 +71,7 @@ class LinearSolver:
     Attributes
     ----------
     iterations, fallbacks : of the present problem: Krylov iterations, systems that were not solved as planned
-    takes_any : whether matrices need not be symmetric
+    direct : whether the present problem's systems are solved by `Dense`
     """
 
     def __init__(
@@ -61,33 +84,38 @@ class LinearSolver:
         settings: Settings | None = None,
     ):
         self.comm, self.defaults, self.compare, self.prefix = comm, defaults, compare, prefix
-        self.takes_any, self.settings = own, settings or Settings()
+        self.own, self.settings = own, settings or Settings()
         self._krylov: dict[tuple[str, bool], Krylov] = {}
         self._symmetric = True
         self.begin()
 
-    def begin(self) -> None:
-        """Another problem."""
+    def begin(self, direct: bool = False) -> None:
+        """Another problem; ``direct``: its systems are few rows of one rank, and are solved by `Dense` factors."""
+        self.direct = direct
         self.iterations = self.fallbacks = 0
         self._worst, self._hard, self._factored, self._double = 0, False, False, False
 
     def new_matrix(self, system: NewtonForm) -> None:
         """The system has new values."""
         self.system, self._symmetric, self._factored = system, system.symmetric, False
+        self._dense = Dense(system.dense(), system.symmetric) if self.direct else None
         bodies = system.matrix.getSize()[0] / 6.0
         easy = int(self.settings.easy * bodies**0.4 * self.comm.size)
         self._easy = self.comm.bcast(easy)  # a last bit may differ between processors
-        self._hard = self.takes_any and self._worst > self._easy
+        self._hard = self.own and self._worst > self._easy
 
     def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
         """x = A^-1 b to a relative residual of rtol; whether that was reached. Otherwise x is the best that was found,
         or zero if nothing leaves less than 1."""
+        if self._dense and (found := self._dense.solve(b.array_r, rtol)) is not None:
+            x.array[:] = found
+            return True
         first = None if self._hard else self._by_ksp(b, x, rtol)
         if first and first.converged:
             return True
-        self._hard, before = self.takes_any, x.array.copy()
+        self._hard, before = self.own, x.array.copy()
         last = self._by_factor(b, x, rtol)
-        self.fallbacks += not (self.takes_any and last and last.converged)
+        self.fallbacks += not (self.own and last and last.converged)
         if first and (last is None or first.true_residual < last.true_residual):
             last, x.array[:] = first, before
         if last is None or last.true_residual >= 1.0:
@@ -110,7 +138,7 @@ class LinearSolver:
             return self._run(solver, b, x, rtol, keep=True)
         solver.forget()  # first, as its memory counts as taken
         if not self._has_room():
-            return self._run(self._solver("alone"), b, x, rtol) if self.takes_any else None
+            return self._run(self._solver("alone"), b, x, rtol) if self.own else None
         if solver.kind == "python":
             done = self._by_fronts(solver, b, x, rtol)
         elif isinstance(self.system, BodyForm):
@@ -161,7 +189,7 @@ class LinearSolver:
                     options |= FRONTS
             else:
                 options = {**self.defaults, **({} if symmetric else {"ksp_type": "bcgs"})}
-                if self.takes_any:
+                if self.own:
                     most = self.settings.alone if name == "alone" else int(self.settings.limit * self._easy)
                     options["ksp_max_it"] = str(most)
             prefix = "fallback_" if name == "factor" else self.prefix
@@ -180,7 +208,7 @@ class LinearSolver:
 
     def words(self) -> str:
         """Krylov method and preconditioner."""
-        return "CG, pbjacobi until it takes long, then cholesky" if self.takes_any else self._solver("").words()
+        return "CG, pbjacobi until it takes long, then cholesky" if self.own else self._solver("").words()
 
     def what(self) -> str:
         """What a preconditioner of this package really was; empty for others."""
