@@ -33,16 +33,16 @@ DEFAULTS = {
     "contact": {"ksp_type": "bcgs", "pc_type": "pbjacobi"},
     "body": {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "pc_type": "pbjacobi"},
 }
-# of a problem that is given by N: few contacts, and a solve as accurate as that of the bodies would be
-FEW = 400  # rows of a problem that is solved by dense factors: those take .3 ms for 250, 1 ms for 450
+FEW = 400  # rows of a problem on one rank up to which `Dense` factors pay: they take .2 ms for 250, 1 ms for 450
+# of a problem that is given by N: a solve as accurate as that of the bodies would be
 GIVEN = {"ksp_type": "gmres", "pc_type": "cholesky"}
 
 
 class Newton:
     """The Newton systems of one cone problem after another.
 
-    form : of FORMS. The body form has its own solver unless the options name a KSP or PC; a problem that knows no
-        bodies (given by N) is solved in the form `contact` instead, by a factor.
+    form : of FORMS. The body form has its own solver unless the options name a KSP or PC; a problem of few contacts, or
+        one that knows no bodies (given by N), is solved in the form `contact` instead, by a factor.
 
     Attributes
     ----------

@@ -15,6 +15,7 @@ from petsc4py import PETSc
 from dem.contact_map.loops import local_product, pack
 from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.ccp.cone import Array
+from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.problem import ConeProblem
 
 
@@ -87,9 +88,9 @@ class ContactForm:
 
 def _dense(problem: ConeProblem) -> Array:
     """N of a problem on one rank, without compliance."""
-    if problem.contact_map is None:
+    if isinstance(problem.operator, GivenMatrix):
         indptr, indices, values = problem.operator.mat.getValuesCSR()
         return sp.csr_matrix((values, indices, indptr), shape=(problem.r.size,) * 2).toarray()
-    G = problem.contact_map.block_rows
+    G = problem.operator.block_rows
     rows = sp.bsr_matrix((G.blocks, G.indices, G.indptr), shape=(problem.r.size, 6 * G.columns))
     return (rows @ rows.T).toarray()

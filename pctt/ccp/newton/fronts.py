@@ -23,8 +23,8 @@ from scipy.linalg import blas, lapack
 from scipy.sparse import csgraph
 
 from dem.compiled import inlined, loop
-from pctt.body_matrix import Part
 from pctt.blocks import Array
+from pctt.body_matrix import Part
 from pctt.petsc import Context
 
 LEAF = 16  # bodies of a part that is not cut further; 40 take as long
@@ -97,7 +97,8 @@ def _factorised(first: np.ndarray, starts: np.ndarray, rows: np.ndarray, blocks:
         bodies = np.unique(np.concatenate(touched))
         bodies = bodies[np.searchsorted(bodies, end) :]
         own, rest = 6 * (end - begin), 6 * len(bodies)
-        diagonal, below, update = (np.zeros(shape, blocks.dtype, "F") for shape in ((own, own), (rest, own), (rest, rest)))
+        shapes = (own, own), (rest, own), (rest, rest)
+        diagonal, below, update = (np.zeros(shape, blocks.dtype, "F") for shape in shapes)
         place[begin:end], place[bodies] = np.arange(end - begin), np.arange(len(bodies))
         add_columns(starts, rows, blocks, begin, end, place, diagonal, below)
         for others, values in updates[k]:
@@ -207,9 +208,9 @@ def cover(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
     """A mask (count,) of the fewest bodies that have one of every pair (low, high); no body is both. Those are as many
     as the pairs of a maximum matching: of each pair the high one if an alternating path from an unmatched low one
     leads there, else the low one."""
-    lows, l = np.unique(low, return_inverse=True)
-    highs, h = np.unique(high, return_inverse=True)
-    graph = sp.csr_matrix((np.ones(len(l)), (l, h)), shape=(len(lows), len(highs)))
+    lows, i = np.unique(low, return_inverse=True)
+    highs, j = np.unique(high, return_inverse=True)
+    graph = sp.csr_matrix((np.ones(len(i)), (i, j)), shape=(len(lows), len(highs)))
     mate = csgraph.maximum_bipartite_matching(graph, perm_type="column")
     mate_of_high = np.full(len(highs), -1)
     mate_of_high[mate[mate >= 0]] = np.flatnonzero(mate >= 0)
@@ -217,7 +218,7 @@ def cover(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
     reached_low = new.copy()
     while new.any():
         ahead = np.zeros(len(highs), bool)
-        ahead[h[new[l]]] = True
+        ahead[j[new[i]]] = True
         ahead &= ~reached_high
         reached_high |= ahead
         new = np.zeros(len(lows), bool)

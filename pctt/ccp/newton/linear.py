@@ -13,12 +13,13 @@ from pctt import memory
 from pctt.ccp.cone import Array
 from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.compare import Comparison
+from pctt.ccp.newton.contact import ContactForm
 from pctt.ccp.newton.form import NewtonForm
+from pctt.ccp.newton.fronts import FrontPC
 from pctt.ccp.newton.krylov import Krylov, Solve, Source
 from pctt.options import number
 
-
-REFINEMENTS = 10
+# factors of the part of K on one rank that is worth it
 FRONTS = {
     "ksp_type": "cg", "ksp_norm_type": "unpreconditioned",
     "pc_type": "python", "pc_python_type": "pctt.ccp.newton.fronts.FrontPC",
@@ -48,15 +49,16 @@ class Dense:
         self.matrix, self._side = matrix, {"lower": 1} if symmetric else {}
         *self._factors, self.failed = factorise(matrix, **self._side)
 
-    def solve(self, b: Array, rtol: float) -> Array | None:
-        """x with A x = b to a relative residual of rtol, refined where it must be; None if that does not help."""
+    def solve(self, b: Array, rtol: float) -> tuple[Array, int]:
+        """x with A x = b to a relative residual of rtol, refined where it must be, and the solves that this took; 0 if
+        it was not reached."""
         x, left, wanted = np.zeros_like(b), b, rtol * np.linalg.norm(b)
-        for _ in range(0 if self.failed else REFINEMENTS):
+        for count in range(1, 1 if self.failed else 11):
             x += self._solve(*self._factors, left, **self._side)[0]
             left = b - self.matrix @ x
             if np.linalg.norm(left) <= wanted:
-                return x
-        return None
+                return x, count
+        return x, 0
 
 
 class LinearSolver:
@@ -90,15 +92,18 @@ class LinearSolver:
         self.begin()
 
     def begin(self, direct: bool = False) -> None:
-        """Another problem; ``direct``: its systems are few rows of one rank, and are solved by `Dense` factors."""
+        """Another problem; ``direct``: its systems, of the contacts, have few rows and get `Dense` factors."""
         self.direct = direct
+        self._dense: Dense | None = None
         self.iterations = self.fallbacks = 0
         self._worst, self._hard, self._factored, self._double = 0, False, False, False
 
     def new_matrix(self, system: NewtonForm) -> None:
         """The system has new values."""
         self.system, self._symmetric, self._factored = system, system.symmetric, False
-        self._dense = Dense(system.dense(), system.symmetric) if self.direct else None
+        if self.direct:
+            assert isinstance(system, ContactForm)
+            self._dense = Dense(system.dense(), system.symmetric)
         bodies = system.matrix.getSize()[0] / 6.0
         easy = int(self.settings.easy * bodies**0.4 * self.comm.size)
         self._easy = self.comm.bcast(easy)  # a last bit may differ between processors
@@ -107,9 +112,11 @@ class LinearSolver:
     def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
         """x = A^-1 b to a relative residual of rtol; whether that was reached. Otherwise x is the best that was found,
         or zero if nothing leaves less than 1."""
-        if self._dense and (found := self._dense.solve(b.array_r, rtol)) is not None:
-            x.array[:] = found
-            return True
+        if self._dense:
+            x.array[:], count = self._dense.solve(b.array_r, rtol)
+            self.iterations += count
+            if count:
+                return True
         first = None if self._hard else self._by_ksp(b, x, rtol)
         if first and first.converged:
             return True
@@ -139,8 +146,9 @@ class LinearSolver:
         solver.forget()  # first, as its memory counts as taken
         if not self._has_room():
             return self._run(self._solver("alone"), b, x, rtol) if self.own else None
-        if solver.kind == "python":
-            done = self._by_fronts(solver, b, x, rtol)
+        context = solver.ksp.pc.getPythonContext() if solver.kind == "python" else None
+        if isinstance(context, FrontPC):
+            done = self._by_fronts(solver, context, b, x, rtol)
         elif isinstance(self.system, BodyForm):
             part = self.system.stiff_part()
             done = self._run(solver, b, x, rtol, part)
@@ -150,20 +158,19 @@ class LinearSolver:
         self._factored = done.converged
         return done
 
-    def _by_fronts(self, solver: Krylov, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
-        """In single precision, until that has taken many iterations."""
-        system, pc = self.system, solver.ksp.pc.getPythonContext()
+    def _by_fronts(self, solver: Krylov, pc: FrontPC, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
+        """By factors of single precision, until they take many iterations."""
+        system = self.system
         assert isinstance(system, BodyForm)
-        done = None
         if not self._double:
             pc.make = lambda: system.fronts(np.float32)
             done = self._run(solver, b, x, rtol, system.matrix)
             self._double = done.iterations > self.settings.single
-        if done is None or not done.converged:
+            if done.converged:
+                return done
             solver.forget()
-            pc.make = lambda: system.fronts(np.float64)
-            done = self._run(solver, b, x, rtol, system.matrix)
-        return done
+        pc.make = lambda: system.fronts(np.float64)
+        return self._run(solver, b, x, rtol, system.matrix)
 
     def _run(
         self, solver: Krylov, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: Source = None, keep: bool = False
