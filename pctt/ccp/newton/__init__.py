@@ -60,7 +60,7 @@ class Newton:
     def begin(self, problem: ConeProblem) -> None:
         """Take the next problem; its structure is kept where contacts and bodies are those of the last."""
         self.problem = problem
-        few = self.form == "body" and self._own and problem.comm.size == 1 and problem.r.size <= FEW
+        few = self.has_few(problem)
         instead = self.form == "body" and (few or problem.contact_map is None)
         structure = problem.structure()
         same = self.system is not None and instead == self._instead and len(structure) == len(self._structure)
@@ -76,6 +76,10 @@ class Newton:
             self.forget()
             self.system = FORMS["contact" if instead else self.form](problem)
             self._x, self._b = self.system.matrix.createVecs()
+
+    def has_few(self, problem: ConeProblem) -> bool:
+        """Whether the systems of this problem get `Dense` factors."""
+        return self.form == "body" and self._own and problem.comm.size == 1 and problem.r.size <= FEW
 
     @property
     def linear(self) -> LinearSolver:

@@ -2,8 +2,8 @@
 
 The bodies are ordered by nested dissection: a cut in two halves by place, and between the halves the fewest bodies that
 touch all pairs across the cut; and so on. The bodies of a separator, or of a part that is not cut further, make a
-*front*: a dense matrix of their columns and of the rows that these touch, which LAPACK factorises. So nearly all work is
-that of dense matrices, and single precision is twice as fast and takes half of the memory. As a preconditioner it is
+*front*: a dense matrix of their columns and of the rows that these touch, which LAPACK factorises. So nearly all work
+is that of dense matrices, and single precision is twice as fast and takes half of the memory. As a preconditioner it is
 enough for all but the last systems of an interior point method, if the matrix is scaled first so that its diagonal
 blocks are the identity.
 
