@@ -103,7 +103,7 @@ def test_its_systems_change_from_block_jacobi_to_factors_if_the_memory_has_room(
     once = Krylov.solve
     monkeypatch.setattr(Krylov, "solve", noted)
     if not room:
-        monkeypatch.setattr(memory, "available", lambda comm: 1e6)
+        monkeypatch.setattr(memory, "available", lambda comm: 1e5)
     G, r, mu = packing(8 if room else 5)
     newton = newton_for(SELF, "conic")
     assert ccp.solve(ConeProblem(SELF, r, mu, G=G), None, "conic", Limits(1e-6), newton=newton).converged

@@ -35,8 +35,8 @@ class Settings:
     single: int = number(12, "iterations with factors of single precision, after which the next ones are of double")
     limit: float = number(3.0, "iterations with block Jacobi at most, in units of easy")
     alone: int = number(20_000, "the same where the memory has no room for a factor")
-    factor_bytes: float = number(170.0, "memory of a factor / rows^(4/3), the growth of nested dissection in space: "
-                                        "2.2e9 bytes at 35,900 bodies, a fifth more than measured")  # fmt: skip
+    factor_bytes: float = number(210.0, "memory of a factor in double precision / rows^(4/3), the growth of nested "
+                                        "dissection in space: 2.7e9 bytes at 35,939 bodies by fronts")  # fmt: skip
     spare: float = number(0.9, "part of the available memory that a factor may take")
 
 
@@ -141,12 +141,16 @@ class LinearSolver:
     def _by_factor(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve | None:
         """Without room for a factor block Jacobi goes on, if it was our choice; else None."""
         solver = self._solver("factor")
-        if self._factored:
-            return self._run(solver, b, x, rtol, keep=True)
-        solver.forget()  # first, as its memory counts as taken
-        if not self._has_room():
-            return self._run(self._solver("alone"), b, x, rtol) if self.own else None
         context = solver.ksp.pc.getPythonContext() if solver.kind == "python" else None
+        single = isinstance(context, FrontPC) and not self._double
+        if self._factored:
+            done = self._run(solver, b, x, rtol, keep=True)
+            if done.converged or not single:
+                return done
+            self._double = True
+        solver.forget()  # first, as its memory counts as taken
+        if not self._has_room(0.5 if single else 1.0):
+            return self._run(self._solver("alone"), b, x, rtol) if self.own else None
         if isinstance(context, FrontPC):
             done = self._by_fronts(solver, context, b, x, rtol)
         elif isinstance(self.system, BodyForm):
@@ -165,8 +169,8 @@ class LinearSolver:
         if not self._double:
             pc.make = lambda: system.fronts(np.float32)
             done = self._run(solver, b, x, rtol, system.matrix)
-            self._double = done.iterations > self.settings.single
-            if done.converged:
+            self._double = done.iterations > self.settings.single and self._has_room()
+            if done.converged or not self._double:
                 return done
             solver.forget()
         pc.make = lambda: system.fronts(np.float64)
@@ -179,9 +183,9 @@ class LinearSolver:
         self.iterations += done.iterations
         return done
 
-    def _has_room(self) -> bool:
-        """Whether the memory has room for a factor; collective."""
-        needed = self.settings.factor_bytes * self.system.matrix.getSize()[0] ** (4.0 / 3.0) / self.comm.size
+    def _has_room(self, part: float = 1.0) -> bool:
+        """Whether the memory has room for a factor of double precision, or for this part of it; collective."""
+        needed = part * self.settings.factor_bytes * self.system.matrix.getSize()[0] ** (4.0 / 3.0) / self.comm.size
         return self.comm.bcast(needed < self.settings.spare * memory.available(self.comm))
 
     def _solver(self, name: str) -> Krylov:
