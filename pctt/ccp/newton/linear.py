@@ -33,7 +33,7 @@ class Settings:
     easy: float = number(8.0, "iterations with block Jacobi / bodies^0.4 and rank, after which the next matrix gets a "
                               "factor. It costs as much as 10 to 18 on one rank, and no less on more")  # fmt: skip
     single: float = number(0.015, "iterations with factors of single precision, in units of easy, after which the "
-                                  "next are of double: those cost 10 iterations more at n = 8, 30 at n = 16")  # fmt: skip
+                                  "next are of double, which cost 10 iterations more (n = 8), 30 (n = 16)")  # fmt: skip
     limit: float = number(3.0, "iterations with block Jacobi at most, in units of easy")
     alone: int = number(20_000, "the same where the memory has no room for a factor")
     factor_bytes: float = number(210.0, "memory of a factor in double precision / rows^(4/3), the growth of nested "
