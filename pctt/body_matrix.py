@@ -8,6 +8,8 @@ half and is as good a preconditioner.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
@@ -68,6 +70,14 @@ class BodyOperator:
         self.mat.destroy()
         if self._matrix is not None:
             self._matrix.destroy()
+
+
+class Part(NamedTuple):
+    """Rows of a matrix in block CSR format, every diagonal block among the ``blocks`` (nnz, 6, 6); global columns."""
+
+    indptr: np.ndarray
+    indices: np.ndarray
+    blocks: Array
 
 
 class BodyMatrix:
@@ -150,13 +160,17 @@ class BodyMatrix:
             self._current = True
         return self._whole
 
-    def stiff_part(self, least: float, symmetric: bool = True) -> PETSc.Mat:
-        """A new AIJ Mat: K without the blocks between two bodies whose entries are all below ``least`` (in units of the
-        mass). AIJ, because Cholesky has no code for blocks."""
+    def stiff_part(self, least: float) -> Part:
+        """This rank's rows of K without the blocks between two bodies whose entries are all below ``least`` (in units
+        of the mass)."""
         kept = np.abs(self._values).max(axis=(1, 2), initial=0.0) >= least
         kept[self._diagonal] = True
-        indptr, shape = self._indptr(self._row[kept]), (self._sizes[0][0], 6 * self._total)
-        rows = sp.bsr_matrix((self._values[kept], self._indices[kept], indptr), shape=shape).tocsr()
+        return Part(self._indptr(self._row[kept]), self._indices[kept], self._values[kept])
+
+    def stiff_mat(self, least: float, symmetric: bool = True) -> PETSc.Mat:
+        """The same of all ranks as a new AIJ Mat, because external packages have no code for blocks."""
+        indptr, indices, blocks = self.stiff_part(least)
+        rows = sp.bsr_matrix((blocks, indices, indptr), shape=(self._sizes[0][0], 6 * self._total)).tocsr()
         csr = (rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType), rows.data)
         mat = new_matrix(self.comm, self._sizes, 6, csr, PETSc.Mat.Type.AIJ)
         mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)

@@ -29,13 +29,15 @@ class Auto:
     """Settings of `auto`."""
 
     patience: float = number(25.0, "APGD's iterations per digit of the tolerance and cube root of the contacts")
+    few: float = number(12.0, "the same of problems that get dense factors: all of `conic` costs 7 to 30 there")
     law: float = number(2.0, "factor on it for Coulomb's law, as its Newton systems are unsymmetric: 2 to 3 measured")
     start: float = number(3e4, "complementarity of the conic method's start, at most, by APGD's residual")
     basin: float = number(3e-4, "Coulomb residual at which the conic method's path is near enough for APGD")
 
-    def iterations(self, contacts: int, tol: float, coulomb: bool) -> int:
-        """Those of APGD. Small problems have fixed costs."""
-        per_digit = self.patience * np.cbrt(max(contacts, 400)) * (self.law if coulomb else 1.0)
+    def iterations(self, contacts: int, tol: float, coulomb: bool, few: bool = False) -> int:
+        """Those of APGD. Small problems have fixed costs, except where they are ``few`` enough for dense factors."""
+        per_digit = self.few * np.cbrt(contacts) if few else self.patience * np.cbrt(max(contacts, 400))
+        per_digit *= self.law if coulomb else 1.0
         return int(-np.log10(tol) * per_digit)
 
 
@@ -43,7 +45,8 @@ def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Auto, newton: Newton, coulomb: bool = False
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
-    few = min(limits.max_it, problem.comm.bcast(options.iterations(problem.size, limits.tol, coulomb)))
+    most = options.iterations(problem.size, limits.tol, coulomb, newton.has_few(problem))
+    few = min(limits.max_it, problem.comm.bcast(most))
     first = apgd.solve(problem, guess, replace(limits, max_it=few), apgd.APGD(), coulomb)
     first.solver = "apgd"
     if first.final or few == limits.max_it:

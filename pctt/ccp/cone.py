@@ -18,6 +18,7 @@ from pctt.ccp.cone_loops import (
     Array,
     accelerated_step,
     determinant,
+    nesterov_todd,
     project_to,
     projected_move,
     step_inside,
@@ -106,12 +107,11 @@ class NesterovTodd(NamedTuple):
 
     def times(self, x: Array) -> Array:
         """W x (nc, 3)."""
-        return (2.0 * dot(self.root, x)[:, None] * self.root - J * x) * self.eta[:, None]
+        return nesterov_todd(self.root, self.eta, x, False)
 
     def divide(self, x: Array) -> Array:
         """W^-1 x (nc, 3)."""
-        root = J * self.root
-        return (2.0 * dot(root, x)[:, None] * root - J * x) / self.eta[:, None]
+        return nesterov_todd(self.root, self.eta, x, True)
 
 
 def towards_interval(x: Array, low: float, high: float) -> Array:

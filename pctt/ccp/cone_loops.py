@@ -267,6 +267,21 @@ def scaling(s: Array, z: Array, compliance: Array) -> tuple[Array, Array, Array,
     return root, size, square, X, share
 
 
+@loop
+def nesterov_todd(root: Array, size: Array, x: Array, inverse: bool) -> Array:
+    """W x (nc, 3) for the W of `scaling`, or W^-1 x."""
+    out = np.empty(x.shape)
+    for c in range(len(x)):
+        first, u, v, eta = root[c, 0], root[c, 1], root[c, 2], size[c]
+        if inverse:
+            u, v, eta = -u, -v, 1.0 / eta
+        along = 2.0 * (first * x[c, 0] + u * x[c, 1] + v * x[c, 2])
+        out[c, 0] = (along * first - x[c, 0]) * eta
+        out[c, 1] = (along * u + x[c, 1]) * eta
+        out[c, 2] = (along * v + x[c, 2]) * eta
+    return out
+
+
 @inlined
 def _determinant(x_0, x_1, x_2):
     small, large = abs(x_1), abs(x_2)

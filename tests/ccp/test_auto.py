@@ -22,16 +22,16 @@ def solve(type, tol=1e-8, max_it=-1, options=None, comm=SELF, coulomb=None, fall
 
 
 def test_auto_takes_apgd_where_it_is_quick():
-    result = solve("auto", 1e-4)
+    result = solve("auto", 1e-3)
     assert (result.converged, result.solver, result.newton_its, result.ksp_its) == (True, "apgd", 0, 0)
-    assert result.iterations == solve("apgd", 1e-4).iterations
+    assert result.iterations == solve("apgd", 1e-3).iterations
 
 
 @pytest.mark.parametrize("coulomb", [None, ccp.Coulomb()])
 def test_auto_goes_over_to_conic_where_apgd_takes_long(coulomb):
     """For Coulomb's law to the end of its path, from where APGD goes on. All iterations are counted."""
-    result = solve("auto", options=Auto(patience=1.0), coulomb=coulomb)
-    few = Auto(patience=1.0).iterations(40, 1e-8, coulomb is not None)
+    result = solve("auto", options=Auto(few=1.0), coulomb=coulomb)
+    few = Auto(few=1.0).iterations(40, 1e-8, coulomb is not None, few=True)
     words = [f"apgd: {few} iterations", "conic: ", "apgd: "][: 3 if coulomb else 2]
     assert result.converged, result.reason
     assert [part.startswith(word) for part, word in zip(result.reason.split("; "), words)] == [True] * len(words)
@@ -45,6 +45,7 @@ def test_the_iterations_of_apgd_grow_with_size_and_accuracy():
     of = Auto().iterations
     assert of(40, 1e-4, False) < of(40, 1e-8, False) < of(9000, 1e-8, False) < of(9000, 1e-8, True)
     assert of(10, 1e-6, False) == of(300, 1e-6, False)  # small problems have fixed costs
+    assert of(10, 1e-6, False, few=True) < of(100, 1e-6, False, few=True) < of(100, 1e-6, False)
 
 
 @pytest.mark.parametrize("type", ccp.SOLVERS)

@@ -11,8 +11,15 @@ from pctt import ccp
 from pctt.ccp import delassus
 from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.contact import ContactForm
+from pctt.ccp.newton.linear import Dense
 
 FORMS = pytest.mark.parametrize("form", ccp.FORMS)
+
+
+@pytest.fixture(autouse=True)
+def few(request, monkeypatch):
+    """Rows of the problems that get dense factors: none, unless a test says more."""
+    monkeypatch.setattr(ccp.newton, "FEW", getattr(request, "param", 0))
 
 
 def definite(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -176,3 +183,35 @@ def test_a_tolerance_of_the_user_is_kept_where_earlier_solutions_leave_less_than
     left = problem.product(dg) + (1.01 * barrier @ dg[:, :, None])[:, :, 0] - q
     assert np.linalg.norm(left) < 1e-8 * np.linalg.norm(q)
     newton.destroy()
+
+
+@pytest.mark.parametrize("few", [400], indirect=True)
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_few_contacts_get_dense_factors(symmetric):
+    """Of the form of the contacts, whether bodies are known or not; options for the KSP are obeyed instead."""
+    known, graph = heap(3)
+    rng = np.random.default_rng(0)
+    barrier, q = definite(rng, 40), rng.standard_normal((40, 3))
+    if not symmetric:
+        barrier[:, 0] *= 1.5
+    S = known.N.copy()
+    for c in range(40):
+        S[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] += barrier[c]
+    newton = ccp.Newton(SELF, "body")
+    for problem in (from_graph(known, graph), from_matrix(known)):
+        newton.begin(problem)
+        newton.update(barrier, symmetric=symmetric)
+        dg, _ = newton.solve(q, 1e-12)
+        assert np.linalg.norm(S @ dg.ravel() - q.ravel()) <= 2e-12
+        assert newton.takes_any
+        assert (newton.ksp_its <= 2, newton.fallbacks) == (True, 0)
+    newton.destroy()
+
+
+def test_dense_factors_say_where_they_fail():
+    assert Dense(-np.eye(3), True).solve(np.ones(3), 1e-9)[1] == 0
+    assert Dense(np.ones((3, 3)), False).solve(np.arange(3.0), 1e-9)[1] == 0
+    wrong = np.diag([1.0, 2.0, 3.0]) + np.triu(np.full((3, 3), 0.1), 1)  # its factor is that of the lower triangle
+    x, count = Dense(wrong, True).solve(np.ones(3), 1e-12)
+    assert count > 1
+    np.testing.assert_allclose(wrong @ x, 1.0, atol=1e-11)

@@ -186,11 +186,12 @@ class Cones:
         """The linear equations of an iterate."""
         with phase("CCPBarrier"):
             root, eta, B, X, share = scaling(at.s, at.z, self.compliance)
-            B[:, [0, 1, 2], [0, 1, 2]] += self.proximal
             H, u = X, None
             if self.coulomb:
                 u = sliding_directions(at.z)
+                B[:, 0] -= times(B.transpose(0, 2, 1), u)
                 X, H, share = with_de_saxce_terms(X, share, u, self.compliance)
+            B[:, [0, 1, 2], [0, 1, 2]] += self.proximal
             free, d = self.live[:, 1] == 0, self.problem.mean_diagonal
             B *= self.scale[:, :, None] * self.scale[:, None, :]
             B[free, 1, 1] = B[free, 2, 2] = 1e12 * np.maximum(B[free, 0, 0], d)
@@ -211,7 +212,7 @@ class Scaled(NamedTuple):
 
     at, found : the iterate and its residuals
     W : scaling of the pair
-    B, H : blocks (nc, 3, 3) of the Newton system: W^-2, and X T = (B + C)^-1 without Coulomb's law
+    B, H : blocks (nc, 3, 3) of the Newton system: T^-1 W^-2, and X T = (B + C)^-1
     X, share : in the scaled variables (W^-2 + T C)^-1, and that times W^-2
     u : (nc, 3) directions in which contacts slide, for T; None without Coulomb's law: T = 1
     tol : residual to which Newton systems are solved [m/s]
@@ -233,14 +234,14 @@ class Scaled(NamedTuple):
         cones, scale, live = self.cones, self.cones.scale, self.cones.live
         c, r_z = self.W.divide(w) - self.at.z, self._turned(self.found.r_y)
         uncoupled = times(self.share, self.W.times(w) - self.at.s) - times(self.X, r_z)
-        q = (c - r_z) * scale
+        q = self._straight(c - r_z) * scale
         dg, x = newton.solve(q, self.tol, self.found.r_v, earlier, uncoupled * live / scale)
         dv, ds = newton.momenta(x, dg, self.found.r_v), live * scale * dg
         if newton.mends:  # r_y vanishes, r_v takes the error of the linear solve
             problem = cones.problem
             dy = (problem.velocity_of(dv) + problem.compliance * dg) / scale + self.found.r_y
         else:  # r_v vanishes, r_y takes it
-            dy = c - self.W.divide(self.W.divide(ds))
+            dy = self._straight(c - self.W.divide(self.W.divide(ds)))
         return Direction(ds, self._turned(live * dy), live * dy, dv, x)
 
     def _turned(self, dy: Array) -> Array:
@@ -249,6 +250,12 @@ class Scaled(NamedTuple):
             return dy
         dz = dy.copy()
         dz[:, 0] += dot(self.u, dy)
+        return dz
+
+    def _straight(self, dz: Array) -> Array:
+        """T^-1 dz (nc, 3), in place."""
+        if self.u is not None:
+            dz[:, 0] -= dot(self.u, dz)
         return dz
 
     def reach(self, d: Direction) -> float:

@@ -33,15 +33,16 @@ DEFAULTS = {
     "contact": {"ksp_type": "bcgs", "pc_type": "pbjacobi"},
     "body": {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "pc_type": "pbjacobi"},
 }
-# of a problem that is given by N: few contacts, and a solve as accurate as that of the bodies would be
+FEW = 400  # rows of a problem on one rank up to which `Dense` factors pay: they take .2 ms for 250, 1 ms for 450
+# of a problem that is given by N: a solve as accurate as that of the bodies would be
 GIVEN = {"ksp_type": "gmres", "pc_type": "cholesky"}
 
 
 class Newton:
     """The Newton systems of one cone problem after another.
 
-    form : of FORMS. The body form has its own solver unless the options name a KSP or PC; a problem that knows no
-        bodies (given by N) is solved in the form `contact` instead, by a factor.
+    form : of FORMS. The body form has its own solver unless the options name a KSP or PC; a problem of few contacts, or
+        one that knows no bodies (given by N), is solved in the form `contact` instead, by a factor.
 
     Attributes
     ----------
@@ -59,14 +60,15 @@ class Newton:
     def begin(self, problem: ConeProblem) -> None:
         """Take the next problem; its structure is kept where contacts and bodies are those of the last."""
         self.problem = problem
-        instead = self.form == "body" and problem.contact_map is None
+        few = self.has_few(problem)
+        instead = self.form == "body" and (few or problem.contact_map is None)
         structure = problem.structure()
         same = self.system is not None and instead == self._instead and len(structure) == len(self._structure)
         same = same and all(map(np.array_equal, structure, self._structure))
         if instead != self._instead:
             self.destroy()
         self._instead, self._structure = instead, structure
-        self.linear.begin()
+        self.linear.begin(few)
         if problem.comm.allreduce(same, op=MPI.LAND):
             assert self.system is not None
             self.system.load(problem)
@@ -75,15 +77,23 @@ class Newton:
             self.system = FORMS["contact" if instead else self.form](problem)
             self._x, self._b = self.system.matrix.createVecs()
 
+    def has_few(self, problem: ConeProblem) -> bool:
+        """Whether the systems of this problem get `Dense` factors."""
+        return self.form == "body" and self._own and problem.comm.size == 1 and problem.r.size <= FEW
+
     @property
     def linear(self) -> LinearSolver:
         """What solves the systems of the present form."""
         if self._linear is None:
-            own = self.form == "body" and not self._instead and self.compare is None
-            own = own and not _ASKED & PETSc.Options().getAll().keys()
+            own = self.form == "body" and not self._instead and self._own
             defaults = GIVEN if self._instead else DEFAULTS[self.form]
             self._linear = LinearSolver(self.comm, defaults, self.compare, own=own)
         return self._linear
+
+    @property
+    def _own(self) -> bool:
+        """Whether the linear solver is the project's own choice."""
+        return self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
 
     @property
     def ksp_its(self) -> int:
@@ -109,7 +119,7 @@ class Newton:
     @property
     def takes_any(self) -> bool:
         """Whether the present systems may be unsymmetric."""
-        return self.linear.takes_any
+        return self.linear.own or self.linear.direct
 
     @property
     def mends(self) -> bool:
@@ -140,7 +150,7 @@ class Newton:
         with phase("CCPKrylov"):
             assert self.system is not None
             b = self.system.right_hand_side(q, r_v, uncoupled)
-            x, product = self._start(b, earlier)
+            x, product = self._start(b, () if self.linear.direct else earlier)
             self._b.array[:] = b - product
             norm = self._b.norm()
             wanted = tol / self.system.speed

@@ -11,10 +11,12 @@ For Coulomb's law (B + C)^-1 is not symmetric, and K is not either.
 
 from __future__ import annotations
 
+import numpy as np
 from petsc4py import PETSc
 
 from pctt.body_matrix import BodyOperator, inverse_blocks
 from pctt.ccp.cone import Array, times
+from pctt.ccp.newton.fronts import Fronts, places_in
 from pctt.ccp.problem import ConeProblem
 
 LEAST = 0.1  # drop tolerance of a factor: entries of a block between bodies [mass] that it is better off without
@@ -30,6 +32,7 @@ class BodyForm:
         self.problem = problem
         self.operator = BodyOperator(problem.contact_map)
         self.matrix = self.operator.mat
+        self._places: Array | None = None
         self._placed = False
         self.symmetric = True
 
@@ -37,7 +40,7 @@ class BodyForm:
         assert problem.contact_map is not None
         self.problem = problem
         self.operator.load(problem.contact_map)
-        self._placed = False
+        self._places, self._placed = None, False
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
         if inverse is None:
@@ -49,14 +52,25 @@ class BodyForm:
         """K as a matrix that preconditioners can read, with the places of the bodies; collective."""
         entries = self.operator.entries()
         mat = entries.mat
-        if self.problem.point is not None and not self._placed:
-            mat.setAttr("coordinates", entries.places(self.problem.point))
+        if not self._placed and self.places() is not None:
+            mat.setAttr("coordinates", self.places())
             self._placed = True
         return mat
 
+    def places(self) -> Array | None:
+        """Places (n, 3) of this rank's bodies, if the problem has those of its contacts; collective."""
+        if self._places is None and self.problem.point is not None:
+            self._places = self.operator.entries().places(self.problem.point)
+        return self._places
+
     def stiff_part(self) -> PETSc.Mat:
         """What is worth factorising of K, in scalar rows: a new Mat, which the caller destroys."""
-        return self.operator.entries().stiff_part(LEAST, self.symmetric)
+        return self.operator.entries().stiff_mat(LEAST, self.symmetric)
+
+    def fronts(self, precision: type[np.floating]) -> Fronts:
+        """The factors of this part, which is symmetric and on one rank."""
+        part, points = self.operator.entries().stiff_part(LEAST), self.places()
+        return Fronts(part, places_in(part) if points is None else points, precision)
 
     @property
     def speed(self) -> float:

@@ -9,31 +9,33 @@ full diagonal blocks.
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
 from petsc4py import PETSc
 
 from dem.contact_map.loops import local_product, pack
 from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.ccp.cone import Array
+from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.problem import ConeProblem
 
 
 class ContactForm:
     """The `NewtonForm` of the module: S dg = q + G r_v, dv = G' dg - r_v."""
 
-    symmetric = True
     mends = False
     speed = 1.0
 
     def __init__(self, problem: ConeProblem):
-        self.problem = problem
+        self.problem, self.symmetric = problem, True
         self._entries: PETSc.Mat | None = None
+        self._N: Array | None = None
         self.matrix = symmetric_shell(problem.comm, problem.r.size, 3, self._product)
 
     def load(self, problem: ConeProblem) -> None:
-        self.problem, self._loaded = problem, False
+        self.problem, self._loaded, self._N = problem, False, None
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
-        self._blocks, self._made = self.problem.diagonal_blocks + barrier, False
+        self._blocks, self._made, self.symmetric = self.problem.diagonal_blocks + barrier, False, symmetric
         self._local = np.empty((len(barrier), 6))
         pack(barrier + self.problem.compliance_blocks, self._local)
         set_diagonal_blocks(self.matrix, self._blocks)
@@ -61,6 +63,14 @@ class ContactForm:
             self._made = True
         return self._entries
 
+    def dense(self) -> Array:
+        """S of a problem on one rank (3Nc, 3Nc)."""
+        if self._N is None:
+            self._N = _dense(self.problem)
+        matrix, here = self._N.copy(), np.arange(len(self._blocks))
+        matrix.reshape(len(here), 3, len(here), 3)[here, :, here] = self._blocks
+        return matrix
+
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
 
@@ -74,3 +84,13 @@ class ContactForm:
         self.matrix.destroy()
         if self._entries is not None:
             self._entries.destroy()
+
+
+def _dense(problem: ConeProblem) -> Array:
+    """N of a problem on one rank, without compliance."""
+    if isinstance(problem.operator, GivenMatrix):
+        indptr, indices, values = problem.operator.mat.getValuesCSR()
+        return sp.csr_matrix((values, indices, indptr), shape=(problem.r.size,) * 2).toarray()
+    G = problem.operator.block_rows
+    rows = sp.bsr_matrix((G.blocks, G.indices, G.indptr), shape=(problem.r.size, 6 * G.columns))
+    return (rows @ rows.T).toarray()

@@ -4,15 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.linalg import lapack
 
 from pctt import memory
+from pctt.ccp.cone import Array
 from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.compare import Comparison
+from pctt.ccp.newton.contact import ContactForm
 from pctt.ccp.newton.form import NewtonForm
+from pctt.ccp.newton.fronts import FrontPC
 from pctt.ccp.newton.krylov import Krylov, Solve, Source
 from pctt.options import number
+
+# factors of the part of K on one rank that is worth it
+FRONTS = {
+    "ksp_type": "cg", "ksp_norm_type": "unpreconditioned",
+    "pc_type": "python", "pc_python_type": "pctt.ccp.newton.fronts.FrontPC",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -21,11 +32,34 @@ class Settings:
 
     easy: float = number(8.0, "iterations with block Jacobi / bodies^0.4 and rank, after which the next matrix gets a "
                               "factor. It costs as much as 10 to 18 on one rank, and no less on more")  # fmt: skip
+    single: float = number(0.015, "iterations with factors of single precision, in units of easy, after which the "
+                                  "next are of double, which cost 10 iterations more (n = 8), 30 (n = 16)")  # fmt: skip
     limit: float = number(3.0, "iterations with block Jacobi at most, in units of easy")
     alone: int = number(20_000, "the same where the memory has no room for a factor")
-    factor_bytes: float = number(170.0, "memory of a factor / rows^(4/3), the growth of nested dissection in space: "
-                                        "2.2e9 bytes at 35,900 bodies, a fifth more than measured")  # fmt: skip
+    factor_bytes: float = number(210.0, "memory of a factor in double precision / rows^(4/3), the growth of nested "
+                                        "dissection in space: 2.7e9 bytes at 35,939 bodies by fronts")  # fmt: skip
     spare: float = number(0.9, "part of the available memory that a factor may take")
+
+
+class Dense:
+    """Factors by LAPACK of a matrix that one rank holds: a KSP takes longer to begin than they take to solve."""
+
+    def __init__(self, matrix: Array, symmetric: bool):
+        names = ("potrf", "potrs") if symmetric else ("getrf", "getrs")
+        factorise, self._solve = lapack.get_lapack_funcs(names, dtype=float)
+        self.matrix, self._side = matrix, {"lower": 1} if symmetric else {}
+        *self._factors, self.failed = factorise(matrix, **self._side)
+
+    def solve(self, b: Array, rtol: float) -> tuple[Array, int]:
+        """x with A x = b to a relative residual of rtol, refined where it must be, and the solves that this took; 0 if
+        it was not reached."""
+        x, left, wanted = np.zeros_like(b), b, rtol * np.linalg.norm(b)
+        for count in range(1, 1 if self.failed else 11):
+            x += self._solve(*self._factors, left, **self._side)[0]
+            left = b - self.matrix @ x
+            if np.linalg.norm(left) <= wanted:
+                return x, count
+        return x, 0
 
 
 class LinearSolver:
@@ -40,7 +74,7 @@ class LinearSolver:
     Attributes
     ----------
     iterations, fallbacks : of the present problem: Krylov iterations, systems that were not solved as planned
-    takes_any : whether matrices need not be symmetric
+    direct : whether the present problem's systems are solved by `Dense`
     """
 
     def __init__(
@@ -53,33 +87,43 @@ class LinearSolver:
         settings: Settings | None = None,
     ):
         self.comm, self.defaults, self.compare, self.prefix = comm, defaults, compare, prefix
-        self.takes_any, self.settings = own, settings or Settings()
+        self.own, self.settings = own, settings or Settings()
         self._krylov: dict[tuple[str, bool], Krylov] = {}
         self._symmetric = True
         self.begin()
 
-    def begin(self) -> None:
-        """Another problem."""
+    def begin(self, direct: bool = False) -> None:
+        """Another problem; ``direct``: its systems, of the contacts, have few rows and get `Dense` factors."""
+        self.direct = direct
+        self._dense: Dense | None = None
         self.iterations = self.fallbacks = 0
-        self._worst, self._hard, self._factored = 0, False, False
+        self._worst, self._hard, self._factored, self._double = 0, False, False, False
 
     def new_matrix(self, system: NewtonForm) -> None:
         """The system has new values."""
         self.system, self._symmetric, self._factored = system, system.symmetric, False
+        if self.direct:
+            assert isinstance(system, ContactForm)
+            self._dense = Dense(system.dense(), system.symmetric)
         bodies = system.matrix.getSize()[0] / 6.0
         easy = int(self.settings.easy * bodies**0.4 * self.comm.size)
         self._easy = self.comm.bcast(easy)  # a last bit may differ between processors
-        self._hard = self.takes_any and self._worst > self._easy
+        self._hard = self.own and self._worst > self._easy
 
     def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
         """x = A^-1 b to a relative residual of rtol; whether that was reached. Otherwise x is the best that was found,
         or zero if nothing leaves less than 1."""
+        if self._dense:
+            x.array[:], count = self._dense.solve(b.array_r, rtol)
+            self.iterations += count
+            if count:
+                return True
         first = None if self._hard else self._by_ksp(b, x, rtol)
         if first and first.converged:
             return True
-        self._hard, before = self.takes_any, x.array.copy()
+        self._hard, before = self.own, x.array.copy()
         last = self._by_factor(b, x, rtol)
-        self.fallbacks += not (self.takes_any and last and last.converged)
+        self.fallbacks += not (self.own and last and last.converged)
         if first and (last is None or first.true_residual < last.true_residual):
             last, x.array[:] = first, before
         if last is None or last.true_residual >= 1.0:
@@ -98,12 +142,19 @@ class LinearSolver:
     def _by_factor(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve | None:
         """Without room for a factor block Jacobi goes on, if it was our choice; else None."""
         solver = self._solver("factor")
+        context = solver.ksp.pc.getPythonContext() if solver.kind == "python" else None
+        single = isinstance(context, FrontPC) and not self._double
         if self._factored:
-            return self._run(solver, b, x, rtol, keep=True)
+            done = self._run(solver, b, x, rtol, keep=True)
+            if done.converged or not single:
+                return done
+            self._double = True
         solver.forget()  # first, as its memory counts as taken
-        if not self._has_room():
-            return self._run(self._solver("alone"), b, x, rtol) if self.takes_any else None
-        if isinstance(self.system, BodyForm):
+        if not self._has_room(0.5 if single else 1.0):
+            return self._run(self._solver("alone"), b, x, rtol) if self.own else None
+        if isinstance(context, FrontPC):
+            done = self._by_fronts(solver, context, b, x, rtol)
+        elif isinstance(self.system, BodyForm):
             part = self.system.stiff_part()
             done = self._run(solver, b, x, rtol, part)
             part.destroy()  # the KSP keeps it
@@ -112,6 +163,20 @@ class LinearSolver:
         self._factored = done.converged
         return done
 
+    def _by_fronts(self, solver: Krylov, pc: FrontPC, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
+        """By factors of single precision, until they take many iterations."""
+        system = self.system
+        assert isinstance(system, BodyForm)
+        if not self._double:
+            pc.make = lambda: system.fronts(np.float32)
+            done = self._run(solver, b, x, rtol, system.matrix)
+            self._double = done.iterations > self.settings.single * self._easy and self._has_room()
+            if done.converged or not self._double:
+                return done
+            solver.forget()
+        pc.make = lambda: system.fronts(np.float64)
+        return self._run(solver, b, x, rtol, system.matrix)
+
     def _run(
         self, solver: Krylov, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: Source = None, keep: bool = False
     ) -> Solve:
@@ -119,9 +184,9 @@ class LinearSolver:
         self.iterations += done.iterations
         return done
 
-    def _has_room(self) -> bool:
-        """Whether the memory has room for a factor; collective."""
-        needed = self.settings.factor_bytes * self.system.matrix.getSize()[0] ** (4.0 / 3.0) / self.comm.size
+    def _has_room(self, part: float = 1.0) -> bool:
+        """Whether the memory has room for a factor of double precision, or for this part of it; collective."""
+        needed = part * self.settings.factor_bytes * self.system.matrix.getSize()[0] ** (4.0 / 3.0) / self.comm.size
         return self.comm.bcast(needed < self.settings.spare * memory.available(self.comm))
 
     def _solver(self, name: str) -> Krylov:
@@ -132,13 +197,11 @@ class LinearSolver:
             if name == "factor":
                 options = {"ksp_type": "gmres", "ksp_gmres_restart": "60", "ksp_max_it": "60"}
                 options["pc_type"] = "cholesky" if symmetric else "lu"
-                cholmod = self.comm.size == 1 and PETSc.Sys.hasExternalPackage("suitesparse")
-                if cholmod and symmetric and isinstance(self.system, BodyForm):
-                    # 1.3 times faster than MUMPS, its solves twice; for unsymmetric matrices UMFPACK is half as fast
-                    options["pc_factor_mat_solver_type"] = "cholmod"
+                if self.comm.size == 1 and symmetric and isinstance(self.system, BodyForm):
+                    options |= FRONTS
             else:
                 options = {**self.defaults, **({} if symmetric else {"ksp_type": "bcgs"})}
-                if self.takes_any:
+                if self.own:
                     most = self.settings.alone if name == "alone" else int(self.settings.limit * self._easy)
                     options["ksp_max_it"] = str(most)
             prefix = "fallback_" if name == "factor" else self.prefix
@@ -157,7 +220,7 @@ class LinearSolver:
 
     def words(self) -> str:
         """Krylov method and preconditioner."""
-        return "CG, pbjacobi until it takes long, then cholesky" if self.takes_any else self._solver("").words()
+        return "CG, pbjacobi until it takes long, then cholesky" if self.own else self._solver("").words()
 
     def what(self) -> str:
         """What a preconditioner of this package really was; empty for others."""

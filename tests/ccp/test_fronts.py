@@ -1,0 +1,96 @@
+"""Cholesky factors by fronts against dense algebra, and the order of nested dissection."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+
+from pctt.body_matrix import Part
+from pctt.ccp.newton import fronts
+from pctt.ccp.newton.fronts import Fronts, cover, dissected, places_in
+
+
+def stiff(count: int = 300, hub: bool = False, seed: int = 0) -> tuple[Part, np.ndarray]:
+    """K = I + G'HG of bodies at random places with springs between neighbours, of stiffness 1 to 1e4; bodies far from
+    all others; with a hub that a third of the bodies touch."""
+    rng = np.random.default_rng(seed)
+    points = rng.random((count, 3))
+    points[-5:] += 10.0 * np.arange(1, 6)[:, None]
+    pairs = cKDTree(points).query_pairs(1.2 * count ** (-1 / 3), output_type="ndarray")
+    if hub:
+        touching = rng.choice(np.arange(1, count), count // 3, replace=False)
+        pairs = np.unique(np.concatenate([pairs, np.stack([0 * touching, np.sort(touching)], 1)]), axis=0)
+    G = np.zeros((len(pairs), 3, count, 6))
+    for side in (0, 1):
+        G[np.arange(len(pairs)), :, pairs[:, side]] = rng.standard_normal((len(pairs), 3, 6))
+    G *= 10 ** rng.uniform(0, 2, (len(pairs), 1, 1, 1))
+    G = G.reshape(3 * len(pairs), 6 * count)
+    K = sp.csr_matrix(np.eye(6 * count) + G.T @ G).tobsr((6, 6))
+    K.sort_indices()
+    return Part(K.indptr, K.indices, K.data), points
+
+
+def dense(part: Part) -> np.ndarray:
+    return sp.bsr_matrix((part.blocks, part.indices, part.indptr)).toarray()
+
+
+@pytest.mark.parametrize(("precision", "accuracy"), [(np.float32, 3e-2), (np.float64, 1e-10)])
+@pytest.mark.parametrize("hub", [False, True])
+@pytest.mark.parametrize("known", [False, True])
+def test_the_factors_solve(precision, accuracy, hub, known):
+    """Also where places are not known, with a body that touches hundreds, and with bodies that touch none."""
+    part, points = stiff(hub=hub)
+    factors = Fronts(part, points if known else places_in(part), precision)
+    assert len(factors.fronts) > 10
+    x = np.random.default_rng(1).standard_normal(len(dense(part)))
+    found = factors.solve(dense(part) @ x)
+    assert np.linalg.norm(found - x) <= accuracy * np.linalg.norm(x)
+
+
+def test_a_matrix_that_rounding_has_made_indefinite_gets_a_larger_diagonal():
+    part, points = stiff()
+    blocks = part.blocks.copy()
+    row = np.repeat(np.arange(len(points)), np.diff(part.indptr))
+    blocks[row == part.indices] *= 1 - 1e-4
+    factors = Fronts(part._replace(blocks=blocks), points)
+    assert np.isfinite(factors.solve(np.ones(6 * len(points)))).all()
+
+
+def test_nothing_to_factorise():
+    empty = Part(np.zeros(1, int), np.zeros(0, int), np.zeros((0, 6, 6)))
+    assert Fronts(empty, np.zeros((0, 3))).solve(np.zeros(0)).shape == (0,)
+    alone = Part(np.arange(3), np.arange(2), np.tile(2 * np.eye(6), (2, 1, 1)))
+    np.testing.assert_allclose(Fronts(alone, np.zeros((2, 3))).solve(np.ones(12)), 0.5, rtol=1e-6)
+
+
+def test_separators_separate():
+    """What is in two halves of a cut touches only through fronts that come later: in a grid the first front touches no
+    more than its neighbourhood, and the last front is as large as a cross-section at most."""
+    side = 9
+    points = np.stack(np.meshgrid(*[np.arange(float(side))] * 3, indexing="ij"), -1).reshape(-1, 3)
+    pairs = cKDTree(points).query_pairs(1.1, output_type="ndarray")
+    order, first = dissected(points, *pairs.T)
+    assert np.array_equal(np.sort(order), np.arange(side**3))
+    sizes = np.diff(first)
+    assert first[0] == 0
+    assert first[-1] == side**3
+    assert sizes[-1] <= side**2
+    front = np.empty(side**3, int)
+    front[order] = np.repeat(np.arange(len(sizes)), sizes)
+    leaves = sizes[front[pairs]].max(axis=1) <= fronts.LEAF
+    assert np.count_nonzero(front[pairs[:, 0]] == front[pairs[:, 1]]) > 0
+    assert leaves.any()
+
+
+def test_a_cover_is_the_smallest():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        low, high = rng.integers(0, 6, 9), rng.integers(6, 12, 9)
+        mask = cover(low, high, 12)
+        assert (mask[low] | mask[high]).all()
+        subsets = (np.arange(1 << 12)[:, None] >> np.arange(12)) & 1
+        covers = (subsets[:, low] | subsets[:, high]).all(axis=1)
+        assert mask.sum() == subsets[covers].sum(axis=1).min()
+    assert not cover(np.zeros(0, int), np.zeros(0, int), 4).any()
