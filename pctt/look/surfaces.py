@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
-from vtkmodules.vtkCommonCore import mutable, vtkPoints
+from vtkmodules.vtkCommonCore import mutable, vtkPoints, vtkVersion
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData, vtkStaticCellLocator
 from vtkmodules.vtkCommonTransforms import vtkTransform
 from vtkmodules.vtkFiltersCore import vtkAppendPolyData, vtkTriangleFilter
@@ -19,6 +19,9 @@ from dem import quaternion
 from dem.bodies import BOX, CAPSULE, SPHERE
 from pctt.disk import FileError
 from pctt.folder import Folder, Frame
+
+if tuple(map(int, vtkVersion.GetVTKVersion().split(".")[:2])) < (9, 4):  # as Debian 12 has it
+    raise ModuleNotFoundError(f"vtk {vtkVersion.GetVTKVersion()} is older than 9.4", name="vtkmodules")
 
 MARGIN = 0.06  # how far walls go beyond the scene, in diagonals of the scene
 HOLLOW = 0.2  # a hollow body is empty up to this part of the way from its middle to its bounds

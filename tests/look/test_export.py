@@ -16,7 +16,7 @@ from pctt.disk import FileError
 from pctt.folder import Folder
 from pctt.look import program
 
-pytest.importorskip("vtkmodules", reason="vtk is not installed (extra `pictures`)")
+pytest.importorskip("pctt.look.surfaces", reason="vtk 9.4 is not installed (extra `pictures`)")
 
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOXML import vtkXMLPolyDataReader

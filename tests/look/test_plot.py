@@ -64,7 +64,8 @@ def test_the_energy_figure_is_a_balance():
     time, work, friction, impact = np.arange(1.0, 6.0), np.arange(5.0) ** 2, np.arange(5.0), np.full(5, 0.5)
     kinetic = np.array([3.0, 1, 4, 1, 5])
     total = 1e6 + np.cumsum(work - friction - impact + 1)
-    values = (kinetic, total - kinetic, work, friction, impact, np.ones(5))
+    spring = np.linspace(0.0, 2.0, 5)
+    values = (kinetic, total - kinetic - spring, spring, work, friction, impact, np.ones(5))
     columns = {"step": time, "time [s]": time} | {f"{k} [J]": v for k, v in zip(figures.BALANCE, values)}
     made = figures.records(columns)
     assert set(made) == {"energy"}
@@ -72,10 +73,11 @@ def test_the_energy_figure_is_a_balance():
     drawn = {line.get_label(): line.get_ydata() for line in above.lines}
     assert len(drawn) == 6
     np.testing.assert_allclose(drawn["kinetic energy"], kinetic)
-    np.testing.assert_allclose(drawn["potential energy, change"], (total - kinetic) - (total - kinetic)[0])
+    potential = total - kinetic - spring
+    np.testing.assert_allclose(drawn["potential energy, change"], potential - potential[0])
     np.testing.assert_allclose(drawn["work of moving bodies, sum"], [0, 1, 5, 14, 30])
     np.testing.assert_allclose(drawn["friction loss, sum"], [0, 1, 3, 6, 10])
-    np.testing.assert_allclose(np.diff(drawn["kinetic + potential + losses - work"]), 1, atol=1e-9)
+    np.testing.assert_allclose(np.diff(drawn["kinetic + potential + spring + losses - work"]), 1, atol=1e-9)
     np.testing.assert_allclose(below.lines[-1].get_ydata(), time, atol=1e-9)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from pctt import render as program
 
-pytest.importorskip("vtkmodules.vtkCommonCore", reason="vtk is not installed (extra `pictures`)")
+pytest.importorskip("pctt.look.surfaces", reason="vtk 9.4 is not installed (extra `pictures`)")
 image = pytest.importorskip("PIL.Image", reason="pillow is not installed (extra `pictures`)")
 
 SIZE = ("-size", "320x240")

@@ -11,7 +11,7 @@ from dem.mesh import Mesh
 from dem.shapes import Box, Plane, described
 from pctt.folder import Folder
 
-pytest.importorskip("vtkmodules.vtkCommonCore", reason="vtk is not installed (extra `pictures`)")
+pytest.importorskip("pctt.look.surfaces", reason="vtk 9.4 is not installed (extra `pictures`)")
 
 from pctt import export  # noqa: E402
 from pctt.look import surfaces  # noqa: E402

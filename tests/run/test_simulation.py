@@ -477,7 +477,7 @@ def test_a_notebook_shows_the_last_step_as_a_table():
 
 
 def test_a_picture_of_the_present_state(tmp_path):
-    pytest.importorskip("vtkmodules", reason="vtk is not installed (extra `pictures`)")
+    pytest.importorskip("pctt.look.surfaces", reason="vtk 9.4 is not installed (extra `pictures`)")
     sim = pctt.Simulation(Stirred(), comm=SELF)
     sim.render(width=320, height=240)
     sim.run(steps=2)
