@@ -372,7 +372,7 @@ def limit_of(rows: list[dict[str, Any]]) -> tuple[float, float] | None:
     estimates = [(stiffest["torque"], stiffest["torque_error"])]
     own = [each for each in rows if each["code"] == "pctt" and each.get("dt", 1.0) <= 0.005 and "stiffness" not in each]
     for projection in (False, True):
-        kind = [each for each in own if each["projection"] == projection]
+        kind = [each for each in own if each.get("projection", False) == projection]
         if not kind:
             continue
         fine = min(kind, key=lambda each: (each["dt"], each["tol"]))
@@ -463,8 +463,10 @@ def main() -> None:
             settings_of(setting)
     except ValueError as error:
         parser.error(f"--ours {error}")
-    if words.seconds <= FORGETS or words.starts < 1:
-        parser.error(f"--seconds {words.seconds:g} --starts {words.starts}: allowed are more than {FORGETS} and 1 or more")
+    if words.seconds <= FORGETS + SAMPLES:
+        parser.error(f"--seconds {words.seconds:g}: allowed is more than {FORGETS + SAMPLES}")
+    if words.starts < 1:
+        parser.error(f"--starts {words.starts}: allowed are 1 and more")
     if not shutil.which("liggghts"):
         parser.exit(1, "there is no program liggghts on the path; on Debian: apt-get install liggghts\n")
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
