@@ -16,9 +16,9 @@ every start, so that the courses part. Both codes take the same starts. For each
 - the peak of memory in RAM.
 
 The limit of small steps and stiff contacts, from which errors of the torque are reckoned, is the mean of three that
-know nothing of each other, weighted by their standard errors: LIGGGHTS with its stiffest contacts, our smallest
-steps without projection, prolonged by a line to dt = 0 where there are two of the same tolerance, and our smallest with
-projection. Writes results/compare_liggghts.json and .png.
+know nothing of each other: LIGGGHTS with its stiffest contacts, our smallest steps without projection, prolonged by a
+line to dt = 0 where there are two of the same tolerance, and our smallest with projection. Its standard error is what
+the three show, or what their starts do, if that is more. Writes results/compare_liggghts.json and .png.
 """
 
 from __future__ import annotations
@@ -365,9 +365,8 @@ def row(start: Start, seconds: float, courses: list[Course]) -> dict[str, Any]:
     }
 
 
-def limit_of(rows: list[dict[str, Any]]) -> tuple[float, float] | None:
-    """The torque for small steps and stiff contacts and its standard error, as the top of the file says; None if there
-    is no estimate with an error."""
+def limit_of(rows: list[dict[str, Any]]) -> tuple[float, float]:
+    """The torque for small steps and stiff contacts and its standard error, as the top of the file says."""
     stiffest = max((each for each in rows if each["code"] == "LIGGGHTS"), key=lambda each: each["stiffness"])
     estimates = [(stiffest["torque"], stiffest["torque_error"])]
     own = [each for each in rows if each["code"] == "pctt" and each.get("dt", 1.0) <= 0.005 and "stiffness" not in each]
@@ -381,11 +380,11 @@ def limit_of(rows: list[dict[str, Any]]) -> tuple[float, float] | None:
         if coarse and not projection:
             value, error = 2 * value - coarse[0]["torque"], math.hypot(2 * error, coarse[0]["torque_error"])
         estimates.append((value, error))
-    weights = [error**-2 for _, error in estimates if error > 0]
-    if len(weights) < len(estimates):
-        return None
-    print("limits: " + ", ".join(f"{value:.1f} +- {error:.1f}" for value, error in estimates))
-    return sum(w * value for w, (value, _) in zip(weights, estimates)) / sum(weights), sum(weights) ** -0.5
+    values, errors = zip(*estimates)
+    print("limits: " + ", ".join(f"{value:.2f} +- {error:.2f}" for value, error in estimates))
+    of_starts = math.hypot(*errors) / len(errors)
+    value, of_estimates = spread(list(values))
+    return value, of_starts if len(values) == 1 else max(of_starts, of_estimates)
 
 
 def show(row: dict[str, Any]) -> None:
@@ -411,10 +410,9 @@ def compare(n: int, words: argparse.Namespace) -> list[dict[str, Any]]:
         courses = [in_new_process(n, seed, words.seconds, settings_of(setting)) for seed in range(words.starts)]
         rows.append(about | row(starts[0], words.seconds, courses))
         show(rows[-1])
-    case = {"n": n, "seconds": words.seconds, "starts": words.starts}
-    if limit := limit_of(rows):
-        case |= {"limit": limit[0], "limit_error": limit[1]}
-        print(f"limit {limit[0]:.2f} +- {limit[1]:.2f} kN m")
+    limit, error = limit_of(rows)
+    print(f"limit {limit:.2f} +- {error:.2f} kN m")
+    case = {"n": n, "seconds": words.seconds, "starts": words.starts, "limit": limit, "limit_error": error}
     return [case | row for row in rows]
 
 
@@ -479,8 +477,7 @@ def main() -> None:
             record("compare_liggghts", about, [row for rows in sizes for row in rows])
     except LiggghtsError as error:
         parser.exit(1, f"{error}\n")
-    if all("limit" in rows[0] for rows in sizes):
-        draw(sizes)
+    draw(sizes)
 
 
 if __name__ == "__main__":
