@@ -431,18 +431,24 @@ def draw(sizes: list[list[dict[str, Any]]]) -> None:
                 bars = [100 * row["torque_error"] / limit for row in chosen]
                 axes.errorbar([row["cpu"] for row in chosen], off, bars, fmt=marker, capsize=2, label=label)
                 for row, error in zip(chosen, off):
-                    axes.annotate(_short(row), (row["cpu"], error), (4, 4), textcoords="offset points", fontsize=6)
+                    place = (4, 4) if row.get("projection") else (4, -9)
+                    axes.annotate(_short(row), (row["cpu"], error), place, textcoords="offset points", fontsize=6)
             axes.axhspan(-blur, blur, color="0.9", zorder=0, label="standard error of the limit")
             axes.axhline(0.0, color="0.6", linewidth=0.8)
+            costs = [row["cpu"] for row in rows]
             axes.set(xscale="log", xlabel="CPU s per simulated s", ylabel="torque off its limit, %")
+            axes.set(xlim=(0.8 * min(costs), 2 * max(costs)))
+            axes.set_xticks([cost for cost in (0.5, 1, 2, 5, 10, 20, 50) if cost < 2 * max(costs)], minor=False)
+            axes.xaxis.set_major_formatter("{x:g}")
             axes.set_title(f"mixer n = {rows[0]['n']}, limit {limit:.1f} kN m")
             axes.legend(fontsize=7)
 
 
 def _short(row: dict[str, Any]) -> str:
-    stiff = f"k {row['stiffness']:.0e} " if "stiffness" in row else ""
-    step = f"{1e3 * row['dt']:g} ms {row['tol']:g}" if "tol" in row else ""
-    return f"{stiff}{step} ({row['overlap']:.1f} %)"
+    """The step and the tolerance of ours, or the stiffness, and the worst overlap."""
+    step = f"{1e3 * row['dt']:g} ms {row['tol']:g} " if "tol" in row else ""
+    stiff = f"k {row['stiffness']:.0e} ".replace("e+0", "e") if "stiffness" in row else ""
+    return f"{step}{stiff}({row['overlap']:.1f} %)"
 
 
 def main() -> None:
