@@ -31,6 +31,7 @@ import re
 import resource
 import shutil
 import statistics
+import string
 import subprocess
 import tempfile
 import time
@@ -68,6 +69,7 @@ OURS = (
     "dt=.0025,tol=3e-4,closing_work=inf,projection=0",
     "dt=.0025,tol=3e-4,closing_work=inf,projection=1",
 )
+LETTERS = string.ascii_lowercase + string.ascii_uppercase  # of the rows, in the figure
 FIELDS = {"dt": float, "tol": float, "closing_work": float, "stiffness": float, "projection": lambda text: text == "1"}
 
 
@@ -387,10 +389,10 @@ def limit_of(rows: list[dict[str, Any]]) -> tuple[float, float]:
     return value, of_starts if len(values) == 1 else max(of_starts, of_estimates)
 
 
-def show(row: dict[str, Any]) -> None:
+def show(row: dict[str, Any], letter: str) -> None:
     print(
-        f"{row['name']:66} {row['cpu']:7.2f} {row['overlap']:7.2f} {row['torque']:8.2f} +- {row['torque_error']:5.2f} "
-        f"{row['floor']:6.3f} {row['memory']:6.0f} {row['unsolved']:4d}",
+        f"{letter} {row['name']:66} {row['cpu']:7.2f} {row['overlap']:7.2f} {row['torque']:8.2f} +- "
+        f"{row['torque_error']:5.2f} {row['floor']:6.3f} {row['memory']:6.0f} {row['unsolved']:4d}",
         flush=True,
     )
 
@@ -398,18 +400,18 @@ def show(row: dict[str, Any]) -> None:
 def compare(n: int, words: argparse.Namespace) -> list[dict[str, Any]]:
     starts = [start_of(n, seed) for seed in range(words.starts)]
     print(f"mixer n = {n}, {len(starts[0].position)} spheres, {words.starts} starts of {words.seconds:g} s")
-    print(f"{'':66} {'CPU s/s':>7} {'overlap':>7} {'torque kN m':>17} {'floor':>6} {'MiB':>6} unsolved")
+    print(f"{'':68} {'CPU s/s':>7} {'overlap':>7} {'torque kN m':>17} {'floor':>6} {'MiB':>6} unsolved")
     rows: list[dict[str, Any]] = []
     for stiffness in words.stiffness:
         about = {"code": "LIGGGHTS", "name": f"LIGGGHTS k = {stiffness:g} N/m", "stiffness": stiffness}
         courses = [theirs(start, stiffness, words.seconds) for start in starts]
         rows.append(about | row(starts[0], words.seconds, courses))
-        show(rows[-1])
+        show(rows[-1], LETTERS[len(rows) - 1])
     for setting in words.ours:
         about = {"code": "pctt", "name": f"pctt {setting}"} | settings_of(setting)
         courses = [in_new_process(n, seed, words.seconds, settings_of(setting)) for seed in range(words.starts)]
         rows.append(about | row(starts[0], words.seconds, courses))
-        show(rows[-1])
+        show(rows[-1], LETTERS[len(rows) - 1])
     limit, error = limit_of(rows)
     print(f"limit {limit:.2f} +- {error:.2f} kN m")
     case = {"n": n, "seconds": words.seconds, "starts": words.starts, "limit": limit, "limit_error": error}
@@ -417,7 +419,7 @@ def compare(n: int, words: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def draw(sizes: list[list[dict[str, Any]]]) -> None:
-    """Error of the torque over CPU seconds, a panel for each size."""
+    """Error of the torque over CPU seconds, a panel for each size, with the letters of the rows."""
     with figure("compare_liggghts", len(sizes)) as panels:
         for axes, rows in zip(panels, sizes):
             limit, blur = rows[0]["limit"], 100 * rows[0]["limit_error"] / rows[0]["limit"]
@@ -431,24 +433,18 @@ def draw(sizes: list[list[dict[str, Any]]]) -> None:
                 bars = [100 * row["torque_error"] / limit for row in chosen]
                 axes.errorbar([row["cpu"] for row in chosen], off, bars, fmt=marker, capsize=2, label=label)
                 for row, error in zip(chosen, off):
-                    place = (4, 4) if row.get("projection") else (4, -9)
-                    axes.annotate(_short(row), (row["cpu"], error), place, textcoords="offset points", fontsize=6)
+                    place = (5, 3) if row.get("projection") else (5, -9)
+                    axes.annotate(LETTERS[rows.index(row)], (row["cpu"], error), place, textcoords="offset points")
             axes.axhspan(-blur, blur, color="0.9", zorder=0, label="standard error of the limit")
             axes.axhline(0.0, color="0.6", linewidth=0.8)
-            costs = [row["cpu"] for row in rows]
             axes.set(xscale="log", xlabel="CPU s per simulated s", ylabel="torque off its limit, %")
-            axes.set(xlim=(0.8 * min(costs), 2 * max(costs)))
-            axes.set_xticks([cost for cost in (0.5, 1, 2, 5, 10, 20, 50) if cost < 2 * max(costs)], minor=False)
+            least, most = min(row["cpu"] for row in rows), max(row["cpu"] for row in rows)
+            axes.set_xticks([cost for cost in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if least <= cost <= most])
+            axes.set_xlim(0.8 * least, 1.3 * most)
             axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter("")
             axes.set_title(f"mixer n = {rows[0]['n']}, limit {limit:.1f} kN m")
             axes.legend(fontsize=7)
-
-
-def _short(row: dict[str, Any]) -> str:
-    """The step and the tolerance of ours, or the stiffness, and the worst overlap."""
-    step = f"{1e3 * row['dt']:g} ms {row['tol']:g} " if "tol" in row else ""
-    stiff = f"k {row['stiffness']:.0e} ".replace("e+0", "e") if "stiffness" in row else ""
-    return f"{step}{stiff}({row['overlap']:.1f} %)"
 
 
 def main() -> None:
