@@ -1,0 +1,486 @@
+"""The stirred mixer by LIGGGHTS and by `pctt.Simulation`, from the same settled beds on the same core:
+
+    run/study compare_liggghts [N ...] [--seconds S] [--starts M] [--stiffness K,K] [--ours SETTINGS ...]
+
+LIGGGHTS is not part of this project: apt-get install liggghts. It has linear springs and dashpots, kt = 2/7 kn,
+restitution .3, and steps of a tenth of the contact time, as its users choose them. SETTINGS of ours are fields of
+`pctt.Settings`, dt=.01,tol=1e-3,projection=1, or `default`; the solver is `apgd`.
+
+A start is the settled state of the mixer with every sphere moved by up to a hundredth of a millimetre, another way in
+every start, so that the courses part. Both codes take the same starts. For each of them the table has
+
+- CPU seconds per simulated second on one core, without start-up: median of the starts;
+- the worst overlap, of samples 25 ms apart, by one formula for both;
+- the torque on the paddle and the force on the floor over the weight, means of the time after the first .1 s, in which
+  both codes forget how the bed was settled, with the standard error that the starts show;
+- the peak of memory in RAM.
+
+The limit of small steps and stiff contacts, from which errors of the torque are reckoned, is the mean of three that
+know nothing of each other: LIGGGHTS with its stiffest contacts, our smallest steps without projection, prolonged by a
+line to dt = 0 where there are two of the same tolerance, and our smallest with projection. Its standard error is what
+the three show, or what their starts do, if that is more. Writes results/compare_liggghts.json and .png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import multiprocessing
+import os
+import re
+import resource
+import shutil
+import statistics
+import string
+import subprocess
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mpi4py import MPI
+from scipy.spatial import cKDTree
+from shared import figure, record, say_machine
+
+from dem.scenes import Mixer
+from pctt.simulation import Simulation
+
+FORGETS = 0.1  # [s] from the start, not part of means and overlaps
+SAMPLES = 0.025  # [s] between two samples of positions
+MOVED = 1e-5  # [m]
+RESTITUTION = 0.3
+CONTACT_STEPS = 10  # time steps of LIGGGHTS in a contact
+OURS = (
+    "default",
+    "dt=.025,tol=3e-4,closing_work=inf,projection=0",
+    "dt=.025,tol=3e-4,closing_work=inf,projection=1",
+    "dt=.025,tol=3e-4,closing_work=inf,projection=1,stiffness=1e8",
+    "dt=.01,tol=5e-4,closing_work=inf,projection=0",
+    "dt=.01,tol=5e-4,closing_work=inf,projection=1",
+    "dt=.01,tol=5e-4,closing_work=inf,projection=1,stiffness=1e8",
+    "dt=.01,tol=1e-3,closing_work=inf,projection=0",
+    "dt=.01,tol=1e-3,closing_work=inf,projection=1",
+    "dt=.005,tol=1e-3,closing_work=inf,projection=0",
+    "dt=.005,tol=1e-3,closing_work=inf,projection=1",
+    "dt=.005,tol=3e-4,closing_work=inf,projection=0",
+    "dt=.0025,tol=3e-4,closing_work=inf,projection=0",
+    "dt=.0025,tol=3e-4,closing_work=inf,projection=1",
+)
+LETTERS = string.ascii_lowercase + string.ascii_uppercase  # of the rows, in the figure
+FIELDS = {"dt": float, "tol": float, "closing_work": float, "stiffness": float, "projection": lambda text: text == "1"}
+
+
+class LiggghtsError(Exception):
+    """LIGGGHTS is not installed, or has failed."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """The bed and the paddle at time zero of a comparison."""
+
+    mixer: Mixer
+    position: np.ndarray  #: (spheres, 3) [m]
+    velocity: np.ndarray  #: (spheres, 6) [m/s, rad/s]
+    angle: float  #: of the paddle about the vertical [rad]
+    middle: float  #: height of its centre [m]
+
+    @property
+    def half(self) -> np.ndarray:
+        """Half extents (3,) of the paddle [m]."""
+        mixer = self.mixer
+        return 0.5 * mixer.width * np.array([mixer.paddle_length, mixer.paddle_thickness, mixer.paddle_height])
+
+    @property
+    def mass(self) -> float:
+        """Of a sphere [kg]."""
+        return 4 / 3 * math.pi * self.mixer.radius**3 * self.mixer.density
+
+    @property
+    def weight(self) -> float:
+        """Of all spheres [N]."""
+        return len(self.position) * self.mass * self.mixer.gravity
+
+    def in_paddle(self, points: np.ndarray, seconds: float, back: bool = True) -> np.ndarray:
+        """Points (n, 3) in the frame of the paddle, so many seconds after the start; else from there to the world's."""
+        angle = self.angle + self.mixer.angular_velocity * seconds
+        cos, sin = math.cos(angle), math.sin(angle)
+        turn, center = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), np.array([0, 0, self.middle])
+        return (points - center) @ turn if back else points @ turn.T + center
+
+
+class Course(NamedTuple):
+    """What a run of one of the codes shows."""
+
+    time: np.ndarray  #: (n,) since the start [s]
+    torque: np.ndarray  #: (n,) that turns the paddle [N m]
+    floor: np.ndarray  #: (n,) force of the spheres on the floor [N]
+    samples: list[tuple[float, np.ndarray]]  #: time since the start [s] and positions (spheres, 3) [m]
+    cpu: float  #: [s]
+    memory: float  #: [MiB]
+    unsolved: int  #: time steps
+
+
+def opened(n: int, seed: int, **settings: Any) -> Simulation:
+    """The settled mixer with spheres moved by up to MOVED."""
+    sim = Simulation(Mixer(n=n), restart="settled", comm=MPI.COMM_SELF, solver="apgd", **settings)
+    grains = sim.world.grains
+    moved = MOVED * np.random.default_rng(seed).uniform(-1.0, 1.0, grains.position.shape)
+    grains.position += moved[grains.id]
+    return sim
+
+
+def start_of(n: int, seed: int) -> Start:
+    with opened(n, seed) as sim:
+        mixer, paddle = Mixer(n=n), sim.body("mixer")
+        angle = 2 * math.atan2(paddle.orientation[3], paddle.orientation[0])
+        return Start(mixer, sim.positions, sim.velocities, angle, paddle.position[2])
+
+
+def overlap(start: Start, position: np.ndarray, seconds: float) -> float:
+    """The greatest of spheres (n, 3) with each other, the walls, the floor and the paddle, as a part of a radius."""
+    radius, wall = start.mixer.radius, start.mixer.width / 2
+    pairs = cKDTree(position).query_pairs(2 * radius, output_type="ndarray")
+    apart = np.linalg.norm(position[pairs[:, 0]] - position[pairs[:, 1]], axis=1)
+    beyond = np.abs(start.in_paddle(position, seconds)) - start.half
+    from_paddle = np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
+    gaps = [apart - 2 * radius, position[:, 2] - radius, from_paddle - radius]
+    gaps += [wall - np.abs(position[:, axis]) - radius for axis in (0, 1)]
+    return -min(float(gap.min(initial=0.0)) for gap in gaps) / radius
+
+
+def peak_memory(process: int | str) -> float:
+    """The most that a process had in RAM [MiB]; 0 if it has ended. Those that `resource` tells have that of its parent,
+    too."""
+    try:
+        found = re.search(r"VmHWM:\s+(\d+)", Path(f"/proc/{process}/status").read_text())
+    except OSError:
+        found = None
+    return int(found[1]) / 1024 if found else 0.0
+
+
+# -- this project -----------------------------------------------------------------------------------------------
+
+
+def ours(n: int, seed: int, seconds: float, settings: dict[str, Any]) -> Course:
+    """Steps of a simulation; a step of another one first, which loads compiled loops."""
+    with opened(n, seed, **settings) as first:
+        first.step()
+    with opened(n, seed, **settings) as sim:
+        begun, dt, spent, unsolved = sim.time, sim.settings.dt, 0.0, 0
+        box, every, rows, samples = len(sim.positions), max(1, round(SAMPLES / dt)), [], []
+        for step in range(1, round(seconds / dt) + 1):
+            before = time.process_time()
+            unsolved += not sim.step()["converged"]
+            spent += time.process_time() - before
+            contacts = sim.contacts
+            floor = (contacts.bodies[:, 1] == box) & (contacts.normal[:, 2] < -0.99)
+            rows.append((sim.time - begun, -sim.body("mixer").torque[2], -contacts.force[floor, 2].sum()))
+            if step % every == 0:
+                samples.append((sim.time - begun, sim.positions))
+    return Course(*np.array(rows).T, samples, spent, peak_memory("self"), unsolved)
+
+
+def in_new_process(*arguments: Any) -> Course:
+    """`ours` where nothing else takes memory."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(ours, *arguments).result()
+
+
+# -- LIGGGHTS ---------------------------------------------------------------------------------------------------
+
+
+def contact_law(stiffness: float, mass: float) -> dict[str, float]:
+    """Damping along the normal and across [kg/s] of a contact of two spheres, and the time step [s]."""
+    decay = -math.log(RESTITUTION)
+    share = decay / math.hypot(math.pi, decay)  # of the critical damping
+    normal = 2 * share * math.sqrt(stiffness * mass / 2)
+    lasts = math.pi / math.sqrt(2 * stiffness / mass * (1 - share**2))
+    return {"normal": normal, "tangential": 0.5 * normal * math.sqrt(2 / 7), "dt": lasts / CONTACT_STEPS}
+
+
+def stl(name: str, triangles: np.ndarray) -> str:
+    """Triangles (n, 3, 3) as an STL file; LIGGGHTS computes the normals itself."""
+    lines = [f"solid {name}"]
+    for triangle in triangles:
+        corners = [f"vertex {x:.12g} {y:.12g} {z:.12g}" for x, y, z in triangle]
+        lines += ["facet normal 0 0 0", "outer loop", *corners, "endloop", "endfacet"]
+    return "\n".join([*lines, f"endsolid {name}", ""])
+
+
+def meshes(start: Start) -> dict[str, str]:
+    """The files of the floor and the paddle."""
+    corner = start.half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    paddle = start.in_paddle(corner, 0.0, back=False)[[[(a, b, c), (a, c, d)] for a, b, c, d in sides]]
+    end = start.mixer.width / 2 + 2 * start.mixer.radius
+    floor = np.array([[-end, -end, 0], [end, -end, 0], [end, end, 0], [-end, end, 0]])[[(0, 1, 2), (0, 2, 3)]]
+    return {"paddle.stl": stl("paddle", paddle.reshape(-1, 3, 3)), "floor.stl": stl("floor", floor)}
+
+
+def atoms(start: Start) -> str:
+    """The data file with the spheres."""
+    mixer, numbers = start.mixer, np.arange(1, len(start.position) + 1)
+    side, top = mixer.width / 2 + 3 * mixer.radius, start.position[:, 2].max() + mixer.width
+    lines = ["mixer", "", f"{len(numbers)} atoms", "1 atom types"]
+    lines += [f"{-side} {side} {axis}lo {axis}hi" for axis in "xy"] + [f"{-3 * mixer.radius} {top} zlo zhi"]
+    form = " ".join(["%.15g"] * 3)
+    places = [f"{n} 1 {2 * mixer.radius} {mixer.density} {form % tuple(x)}" for n, x in zip(numbers, start.position)]
+    speeds = [f"{n} {form % tuple(v[:3])} {form % tuple(v[3:])}" for n, v in zip(numbers, start.velocity)]
+    return "\n".join([*lines, "", "Atoms", "", *places, "", "Velocities", "", *speeds, ""])
+
+
+def script(start: Start, stiffness: float, steps: int) -> str:
+    """The input of LIGGGHTS."""
+    mixer, law = start.mixer, contact_law(stiffness, start.mass)
+    dt, wall = law["dt"], start.mixer.width / 2
+    properties = {"kn": stiffness, "kt": stiffness * 2 / 7, "gamman_abs": law["normal"]}
+    properties |= {"gammat_abs": law["tangential"], "coefficientFriction": mixer.friction}
+    values = [f"fix {name} all property/global {name} peratomtypepair 1 {x:.12g}" for name, x in properties.items()]
+    model = "model hooke/stiffness tangential history"
+    planes = [
+        f"fix wall_{axis}{side} all wall/gran {model} primitive type 1 {axis}plane {place} absolute_damping on"
+        for axis in "xy"
+        for side, place in enumerate((-wall, wall))
+    ]
+    lines = f"""
+        atom_style granular
+        atom_modify map array
+        boundary f f f
+        newton off
+        communicate single vel yes
+        units si
+        read_data atoms.data
+        neighbor {0.1 * mixer.radius} bin
+        neigh_modify delay 0
+        {{properties}}
+        pair_style gran {model} absolute_damping on
+        pair_coeff * *
+        timestep {dt:.12g}
+        fix move all nve/sphere
+        fix weight all gravity {mixer.gravity} vector 0.0 0.0 -1.0
+        {{planes}}
+        fix floor all mesh/surface/stress file floor.stl type 1 reference_point 0 0 0
+        fix paddle all mesh/surface/stress file paddle.stl type 1 reference_point 0 0 {start.middle}
+        fix tools all wall/gran {model} mesh n_meshes 2 meshes floor paddle absolute_damping on
+        fix turn all move/mesh mesh paddle rotate origin 0 0 {start.middle} axis 0 0 1 period {{period:.12g}}
+        variable torque equal f_paddle[6]
+        variable force equal f_floor[3]
+        thermo_style custom step v_torque v_force
+        thermo {max(1, round(1e-3 / dt))}
+        thermo_modify lost warn norm no
+        dump positions all custom {max(1, round(SAMPLES / dt))} sample_*.bin id x y z
+        run {steps}
+    """
+    text = lines.replace("\n        ", "\n").format(
+        properties="\n".join(values), planes="\n".join(planes), period=2 * math.pi / mixer.angular_velocity
+    )
+    return text.lstrip()
+
+
+def sampled(path: Path, spheres: int) -> np.ndarray:
+    """Positions (spheres, 3) in the order of their numbers, from a binary dump of one rank, which ends with the rows
+    number, x, y, z."""
+    table = np.frombuffer(path.read_bytes()[-32 * spheres :], dtype=float).reshape(spheres, 4)
+    return table[np.argsort(table[:, 0]), 1:]
+
+
+class Spent(NamedTuple):
+    """Of a run of LIGGGHTS."""
+
+    said: str
+    cpu: float
+    memory: float
+
+
+def liggghts_run(folder: Path) -> Spent:
+    """Run the input in the folder; LiggghtsError if that fails."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    memory = 0.0
+    with (folder / "said").open("w+") as said:
+        command = ["liggghts", "-in", "script", "-log", "none"]
+        process = subprocess.Popen(command, cwd=folder, stdout=said, stderr=subprocess.STDOUT)
+        while process.poll() is None:
+            memory = max(memory, peak_memory(process.pid))
+            time.sleep(0.02)
+        said.seek(0)
+        text = said.read()
+    if process.returncode:
+        raise LiggghtsError(f"LIGGGHTS failed with code {process.returncode}:\n{text[-1500:]}")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return Spent(text, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, memory)
+
+
+def theirs(start: Start, stiffness: float, seconds: float) -> Course:
+    """A run of LIGGGHTS, whose CPU seconds are those beyond a run of no steps."""
+    dt = contact_law(stiffness, start.mass)["dt"]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file, text in {**meshes(start), "atoms.data": atoms(start)}.items():
+            (folder / file).write_text(text)
+        (folder / "script").write_text(script(start, stiffness, 0))
+        nothing = liggghts_run(folder)
+        (folder / "script").write_text(script(start, stiffness, round(seconds / dt)))
+        spent = liggghts_run(folder)
+        rows = re.findall(r"^ +(\d+) +(\S+) +(\S+) *$", spent.said, re.MULTILINE)
+        step, torque, force = np.array(rows, dtype=float)[1:].T
+        files = sorted((int(path.stem.split("_")[1]), path) for path in folder.glob("sample_*.bin"))
+        samples = [(number * dt, sampled(path, len(start.position))) for number, path in files if number]
+    return Course(step * dt, -torque, -force, samples, spent.cpu - nothing.cpu, spent.memory, 0)
+
+
+# -- the table ----------------------------------------------------------------------------------------------------
+
+
+def settings_of(words: str) -> dict[str, Any]:
+    """Of `dt=.01,projection=1`; ValueError for a name or value that there is not."""
+    if words == "default":
+        return {}
+    pairs = [word.partition("=")[::2] for word in words.split(",")]
+    if bad := [name for name, _ in pairs if name not in FIELDS]:
+        raise ValueError(f"{bad[0]}: allowed are {', '.join(FIELDS)}")
+    return {name: FIELDS[name](value) for name, value in pairs}
+
+
+def spread(values: list[float]) -> tuple[float, float]:
+    """Mean, and its standard error; NaN of one value."""
+    error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+    return statistics.fmean(values), error
+
+
+def row(start: Start, seconds: float, courses: list[Course]) -> dict[str, Any]:
+    """Of the starts of one setting."""
+    late = [course.time > FORGETS for course in courses]
+    torque, error = spread([float(course.torque[part].mean()) / 1e3 for course, part in zip(courses, late)])
+    floor = [float(course.floor[part].mean()) / start.weight for course, part in zip(courses, late)]
+    found = [overlap(start, x, t) for course in courses for t, x in course.samples if t > FORGETS]
+    return {
+        "cpu": statistics.median(course.cpu for course in courses) / seconds,
+        "torque": torque,
+        "torque_error": error,
+        "overlap": 100 * max(found),
+        "floor": statistics.fmean(floor),
+        "memory": max(course.memory for course in courses),
+        "unsolved": sum(course.unsolved for course in courses),
+    }
+
+
+def limit_of(rows: list[dict[str, Any]]) -> tuple[float, float]:
+    """The torque for small steps and stiff contacts and its standard error, as the top of the file says."""
+    stiffest = max((each for each in rows if each["code"] == "LIGGGHTS"), key=lambda each: each["stiffness"])
+    estimates = [(stiffest["torque"], stiffest["torque_error"])]
+    own = [each for each in rows if each["code"] == "pctt" and each.get("dt", 1.0) <= 0.005 and "stiffness" not in each]
+    for projection in (False, True):
+        kind = [each for each in own if each.get("projection", False) == projection]
+        if not kind:
+            continue
+        fine = min(kind, key=lambda each: (each["dt"], each["tol"]))
+        value, error = fine["torque"], fine["torque_error"]
+        coarse = [each for each in kind if each["tol"] == fine["tol"] and each["dt"] == 2 * fine["dt"]]
+        if coarse and not projection:
+            value, error = 2 * value - coarse[0]["torque"], math.hypot(2 * error, coarse[0]["torque_error"])
+        estimates.append((value, error))
+    values, errors = zip(*estimates)
+    print("limits: " + ", ".join(f"{value:.2f} +- {error:.2f}" for value, error in estimates))
+    of_starts = math.hypot(*errors) / len(errors)
+    value, of_estimates = spread(list(values))
+    return value, of_starts if len(values) == 1 else max(of_starts, of_estimates)
+
+
+def show(row: dict[str, Any], letter: str) -> None:
+    print(
+        f"{letter} {row['name']:66} {row['cpu']:7.2f} {row['overlap']:7.2f} {row['torque']:8.2f} +- "
+        f"{row['torque_error']:5.2f} {row['floor']:6.3f} {row['memory']:6.0f} {row['unsolved']:4d}",
+        flush=True,
+    )
+
+
+def compare(n: int, words: argparse.Namespace) -> list[dict[str, Any]]:
+    starts = [start_of(n, seed) for seed in range(words.starts)]
+    print(f"mixer n = {n}, {len(starts[0].position)} spheres, {words.starts} starts of {words.seconds:g} s")
+    print(f"{'':68} {'CPU s/s':>7} {'overlap':>7} {'torque kN m':>17} {'floor':>6} {'MiB':>6} unsolved")
+    rows: list[dict[str, Any]] = []
+    for stiffness in words.stiffness:
+        about = {"code": "LIGGGHTS", "name": f"LIGGGHTS k = {stiffness:g} N/m", "stiffness": stiffness}
+        courses = [theirs(start, stiffness, words.seconds) for start in starts]
+        rows.append(about | row(starts[0], words.seconds, courses))
+        show(rows[-1], LETTERS[len(rows) - 1])
+    for setting in words.ours:
+        about = {"code": "pctt", "name": f"pctt {setting}"} | settings_of(setting)
+        courses = [in_new_process(n, seed, words.seconds, settings_of(setting)) for seed in range(words.starts)]
+        rows.append(about | row(starts[0], words.seconds, courses))
+        show(rows[-1], LETTERS[len(rows) - 1])
+    limit, error = limit_of(rows)
+    print(f"limit {limit:.2f} +- {error:.2f} kN m")
+    case = {"n": n, "seconds": words.seconds, "starts": words.starts, "limit": limit, "limit_error": error}
+    return [case | row for row in rows]
+
+
+def draw(sizes: list[list[dict[str, Any]]]) -> None:
+    """Error of the torque over CPU seconds, a panel for each size, with the letters of the rows."""
+    with figure("compare_liggghts", len(sizes)) as panels:
+        for axes, rows in zip(panels, sizes):
+            limit, blur = rows[0]["limit"], 100 * rows[0]["limit_error"] / rows[0]["limit"]
+            for label, marker, chosen in (
+                ("LIGGGHTS", "s", [row for row in rows if row["code"] == "LIGGGHTS"]),
+                ("pctt, default", "*", [row for row in rows if row["name"] == "pctt default"]),
+                ("pctt", "o", [row for row in rows if row.get("projection") is False]),
+                ("pctt, projection", "^", [row for row in rows if row.get("projection")]),
+            ):
+                off = [100 * (row["torque"] / limit - 1) for row in chosen]
+                bars = [100 * row["torque_error"] / limit for row in chosen]
+                axes.errorbar([row["cpu"] for row in chosen], off, bars, fmt=marker, capsize=2, label=label)
+                for row, error in zip(chosen, off):
+                    place = (5, 3) if row.get("projection") else (5, -9)
+                    axes.annotate(LETTERS[rows.index(row)], (row["cpu"], error), place, textcoords="offset points")
+            axes.axhspan(-blur, blur, color="0.9", zorder=0, label="standard error of the limit")
+            axes.axhline(0.0, color="0.6", linewidth=0.8)
+            axes.set(xscale="log", xlabel="CPU s per simulated s", ylabel="torque off its limit, %")
+            least, most = min(row["cpu"] for row in rows), max(row["cpu"] for row in rows)
+            axes.set_xticks([cost for cost in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if least <= cost <= most])
+            axes.set_xlim(0.8 * least, 1.3 * most)
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter("")
+            axes.set_title(f"mixer n = {rows[0]['n']}, limit {limit:.1f} kN m")
+            axes.legend(fontsize=7)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="run/study compare_liggghts", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("n", type=int, nargs="*", default=[4, 8], help="sizes of the mixer")
+    parser.add_argument("--seconds", type=float, default=0.5, help="simulated")
+    parser.add_argument("--starts", type=int, default=3)
+    parser.add_argument("--stiffness", default="1e7,1e8", help="of LIGGGHTS [N/m]")
+    parser.add_argument("--ours", nargs="+", default=OURS, help="settings, see above")
+    words = parser.parse_args()
+    words.stiffness = [float(each) for each in words.stiffness.split(",")]
+    try:
+        for setting in words.ours:
+            settings_of(setting)
+    except ValueError as error:
+        parser.error(f"--ours {error}")
+    if words.seconds <= FORGETS + SAMPLES:
+        parser.error(f"--seconds {words.seconds:g}: allowed is more than {FORGETS + SAMPLES}")
+    if words.starts < 1:
+        parser.error(f"--starts {words.starts}: allowed are 1 and more")
+    if not shutil.which("liggghts"):
+        parser.exit(1, "there is no program liggghts on the path; on Debian: apt-get install liggghts\n")
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    os.environ["OMP_NUM_THREADS"] = "1"
+    about = say_machine()
+    try:
+        sizes = []
+        for n in words.n:
+            sizes.append(compare(n, words))
+            record("compare_liggghts", about, [row for rows in sizes for row in rows])
+    except LiggghtsError as error:
+        parser.exit(1, f"{error}\n")
+    draw(sizes)
+
+
+if __name__ == "__main__":
+    main()
