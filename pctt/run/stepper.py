@@ -98,7 +98,7 @@ class Stepper:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
         problem, guess = self._assemble(contacts, self.memory)
         result = self.solve(problem, guess)
-        while again := self._unseen(self.contacts, self.system, result.momentum):
+        while (again := self._unseen(self.contacts, self.system, result.momentum)) is not None:
             problem, guess = self._assemble(again, self._remembered(result))
             result = self.solve(problem, guess).after(result)
         return problem, guess, result, None
@@ -173,7 +173,8 @@ class Stepper:
         """The contacts, with those that these momenta show to be missed; None if there are none."""
         with log.phase("search"):
             velocity = system.velocity_with(momentum)
-            return self._overrun(contacts, velocity, momentum) or self._turned(contacts, velocity)
+            wider = self._overrun(contacts, velocity, momentum)
+            return self._turned(contacts, velocity) if wider is None else wider
 
     def _overrun(self, contacts: Contacts, velocity: Array, momentum: Array) -> Contacts | None:
         """The contacts together with those that the search did not foresee, because an impulse of this step sends a
