@@ -124,6 +124,12 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) ->
     """OptionError for options of the KSP that PETSc refuses or does not know. PETSc itself would complain only at the
     first Newton system, or never."""
     given = {name: value for name, value in database.items() if name.startswith(("ksp_", "pc_"))}
+    try:
+        rtol = float(given.get("ksp_rtol") or 0.0)
+    except ValueError:
+        rtol = 0.0  # PETSc says what is no number
+    if not 0.0 <= rtol < 1.0:  # releases of PETSc differ in what numbers they refuse
+        raise OptionError(f"-ksp_rtol {database['ksp_rtol']}: allowed is a number >= 0 and below 1")
     known = PETSc.Options().getAll()
     absent = {name: value for name, value in given.items() if name not in known}
     ksp = PETSc.KSP().create(comm)
@@ -131,8 +137,6 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) ->
         with entered({**to_enter("", DEFAULTS[form], comm.size), **absent}), own_errors():
             ksp.setFromOptions()
             refuse_misspelt(given)
-            if not 0.0 <= ksp.getTolerances()[0] < 1.0:  # newer releases of PETSc refuse it in other words
-                raise OptionError(f"-ksp_rtol {database['ksp_rtol']}: allowed is a number >= 0 and below 1")
     except OptionError:  # also from a preconditioner of ours
         raise
     except Exception as error:  # PETSc's own, and whatever importing a -pc_python_type raises
