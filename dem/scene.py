@@ -57,6 +57,8 @@ class Scene:
         self.large_bodies: list[LargeBody] = []
         self._friction = float(checks.not_negative("friction", friction))
         self.stiffness = None if stiffness is None else _stiffness(stiffness)  #: [N/m]; None: not stated
+        #: Names of large bodies that go away from the grains: their speed asks for no stiffness.
+        self.leaving: set[str] = set()
         self._restitution = _restitution(restitution)
         self._pairs: dict[str, dict[tuple[int, int], float]] = {"friction": {}, "stiffness": {}, "restitution": {}}
         self._materials: dict[str, int] = {}
@@ -195,6 +197,11 @@ class Scene:
     def stiffness_table(self, usual: float) -> Floats:
         """Stiffnesses of contacts (materials, materials), symmetric [N/m]; the `usual` one of pairs not set."""
         return self._table("stiffness", usual)
+
+    @property
+    def states_stiffness(self) -> bool:
+        """Whether the stiffness of all or some contacts was stated."""
+        return self.stiffness is not None or bool(self._pairs["stiffness"])
 
     def restitution_table(self) -> Floats:
         """Coefficients of restitution (materials, materials), symmetric."""

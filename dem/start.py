@@ -69,7 +69,8 @@ def even_slice(count: int, comm: MPI.Comm) -> slice:
 
 
 def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
-    tables = scene.friction_table(), stiffness.table(scene), scene.restitution_table()
+    stiff = comm.bcast(stiffness.table(scene))  # of one processor
+    tables = scene.friction_table(), stiff, scene.restitution_table()
     return World(comm, tuple(scene.large_bodies), scene.gravity, *tables, scene.materials, grains, scene.large())
 
 

@@ -21,9 +21,10 @@ import numpy as np
 
 from dem import bodies, checks
 from dem.arrays import ArrayLike, Floats
-from dem.motion import Dynamic, top_speed
+from dem.contact.primitives import extents
+from dem.motion import Dynamic, Hinged, top_speed
 from dem.scene import LargeBody, Scene
-from dem.shapes import Plane, placed
+from dem.shapes import Plane
 
 OVERLAP = 0.003  #: the greatest overlap that `recommended` allows, as a part of a grain's radius
 CHAINS = 4.0  #: the strongest forces between grains over those that a like share of the weight makes
@@ -35,10 +36,9 @@ def table(scene: Scene) -> Floats:
     return scene.stiffness_table(recommended(scene) if scene.stiffness is None else scene.stiffness)
 
 
-def recommended(scene: Scene, overlap: float = OVERLAP, without: str = "") -> float:
+def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
     """The stiffness [N/m] with which no grain of a scene overlaps by more than this part of its radius, whether under
-    the weight of the bed above it or stopped by the fastest tool or grain, to two digits; inf if there is neither. The
-    large body ``without`` goes away from the grains.
+    the weight of the bed above it or stopped by the fastest tool or grain, to two digits; inf if there is neither.
 
     The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width, and
     four times as much where a chain of force goes (Radjai, Jean, Moreau, Roux, Phys. Rev. Lett. 77 (1996): a share of
@@ -47,7 +47,7 @@ def recommended(scene: Scene, overlap: float = OVERLAP, without: str = "") -> fl
     """
     grains = scene.grains()
     allowed = overlap * bodies.bounding_radius(grains)
-    stiffness = float(np.maximum(_load(scene) / allowed, grains.mass * (_speed(scene, without) / allowed) ** 2).max())
+    stiffness = float(np.maximum(_load(scene) / allowed, grains.mass * (_speed(scene) / allowed) ** 2).max())
     return float(f"{stiffness:.1e}") if stiffness > 0.0 else np.inf  # the same on processors that round in other ways
 
 
@@ -86,20 +86,21 @@ def _load(scene: Scene) -> Floats:
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(across.T, bias=True)), 0.0))[1:]  # in the plane across
     radius = bodies.bounding_radius(grains)
     width = np.sqrt(12.0) * spread + 2.0 * radius.mean()  # of a rectangle of that spread, with the grains at its edges
-    others = sum(body.mass for body in scene.large_bodies if isinstance(body.motion, Dynamic))
+    free = [body for body in scene.large_bodies if isinstance(body.motion, Dynamic)]
+    others = sum(body.mass for body in free if not isinstance(body.motion, Hinged))  # which a bearing bears
     pressure = gravity * (grains.mass.sum() + others) / width.prod()
     return np.maximum(CHAINS * pressure * (2.0 * radius) ** 2, gravity * grains.mass)
 
 
-def _speed(scene: Scene, without: str = "") -> float:
-    """The greatest speed of a tool or a grain at time zero [m/s]."""
-    tools = [_top_speed(body) for body in scene.large_bodies if body.name != without]
+def _speed(scene: Scene) -> float:
+    """The greatest speed of a tool, or of a grain at time zero [m/s]."""
+    tools = [_top_speed(body) for body in scene.large_bodies if body.name not in scene.leaving]
     return max([*tools, float(np.linalg.norm(scene.grains().velocity[:, :3], axis=1).max())])
 
 
 def _top_speed(body: LargeBody) -> float:
     """The greatest speed of a point of a large body [m/s]; a plane has no end, and counts by the body's centre."""
-    parts = [placed(shape) for shape in body.shapes if not isinstance(shape, Plane)]
-    reach = max((float(np.linalg.norm(center) + np.linalg.norm(size)) for _, center, _, size in parts), default=0.0)
+    parts = tuple(shape for shape in body.shapes if not isinstance(shape, Plane))
+    reach = float(extents([parts])[0]) if parts else 0.0
     start = float(np.linalg.norm(body.velocity[:3]) + np.linalg.norm(body.velocity[3:]) * reach)
     return max(start, top_speed(body.motion, body.position, reach))

@@ -95,7 +95,7 @@ class Simulation:
         scene = state.built(self.experiment, comm)
         if restart == "settled":
             restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
-        stated = self.settings.stiffness is not None or scene.stiffness is not None
+        stated = self.settings.stiffness is not None or scene.states_stiffness
         if not stated and (self.settings.solver == "pdip" or self._compare.names):  # the paper's model
             self.settings = dataclasses.replace(self.settings, stiffness=math.inf)
         self._origin = state.origin(self.experiment, scene, self.settings.dt)
@@ -298,6 +298,7 @@ class Simulation:
                 refuse_unwritable(name, Path(path), self.comm)
         place = Place(Path(folder), self.comm, self.restart, overwrite)
         about = {"scene": json.loads(self._origin["scene"]), "settings": dataclasses.asdict(self.settings)}
+        about["stiffness"] = self.world.stiffness.tolist()
         self.output = Writer(place, self.world, about, self._save, self._compare.summary, every, checkpoint_every)
         self.stepper.dump = Dump(self.settings, self.experiment, self.world, place, hard, str(problems))
 

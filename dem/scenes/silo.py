@@ -17,7 +17,6 @@ from dem.scene import Scene
 from dem.scenes.lattice import SmallSpheres, rest_after_fall
 from dem.shapes import Plane
 from dem.step import Step
-from dem.stiffness import recommended
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class Silo(SmallSpheres):
         disc = Mesh.revolved([(0.0, 0.0), (hole, 0.0)], self.sides)
         scene.add_body("gate", [disc], away)
         scene.add_body("floor", [Plane((0, 0, 1))], position=(0.0, 0.0, self.floor))
-        scene.stiffness = recommended(scene, without="gate")
+        scene.leaving.add("gate")
         return scene
 
     def record(self, step: Step) -> dict[str, float]:

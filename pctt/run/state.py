@@ -210,7 +210,7 @@ def settled_state(
     ``anew``. An interrupted or killed settling is continued."""
     say = say if comm.rank == 0 else lambda text: None
     made_with = origin(experiment, scene, experiment.dt)
-    path = settled_path(experiment, settings, scene, made_with)
+    path = comm.bcast(settled_path(experiment, settings, scene, made_with))  # processors may round in other ways
     if not anew and comm.bcast(path.exists()):
         return path
     on_first(comm, path.parent, lambda: path.parent.mkdir(parents=True, exist_ok=True))

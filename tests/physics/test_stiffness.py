@@ -124,6 +124,8 @@ def test_the_recommended_stiffness_holds_the_bed_and_the_tool():
         scene.add_body("tool", [Box((1.0, 1.0, 1.0))], motion)
         scene.add_spheres([[0, 0, 2]], R, DENSITY)
         assert recommended(scene) == pytest.approx(MASS * (speed / (0.003 * R)) ** 2, rel=0.05)
+    scene.leaving.add("tool")
+    assert recommended(scene) == np.inf
     idle = Scene(friction=0.3, gravity=(0, 0, 0))
     idle.add_spheres([[0, 0, 0]], R, DENSITY)
     assert recommended(idle) == np.inf
@@ -136,6 +138,8 @@ def test_pairs_of_materials_and_moduli():
     scene.set_stiffness(np.inf, "steel", "steel")
     scene.set_stiffness(of_youngs_modulus(7e7, R), "steel", "glass")
     np.testing.assert_array_equal(table(scene), [[2e6, 7e6], [7e6, np.inf]])
+    assert scene.states_stiffness
+    assert not Scene(friction=0.3).states_stiffness
     C, share = compliance(np.array([np.inf, 1e6]), np.array([1.0, 1.0]), 0.01)
     assert (C[0], share[0]) == (0.0, 1.0)
     assert C[1] == pytest.approx(1 / (1e6 * 1e-4 + 4 * 1e3 * 0.01))
