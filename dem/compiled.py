@@ -72,7 +72,7 @@ def tell_first_compilation(say: Callable[[str], None]) -> None:
         def on_start(self, event: Any) -> None:
             if not self.told:
                 self.told = True
-                say("compiling loops for this processor: some seconds, once")
+                say("compiling loops for this processor: up to half a minute, once")
 
         def on_end(self, event: Any) -> None:
             pass
