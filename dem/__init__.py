@@ -6,13 +6,13 @@ The loop of a simulation, on any number of ranks::
     while world.time < end:
         contacts = find_contacts(world, delta, dt)
         system = ContactSystem(world, contacts, dt, recovery_speed)
-        impulse = solve(system)
+        impulse = ...  # (nc, 3) of the contacts, by a solver of yours or by `pctt.ccp.solve`
         advance(world, system.velocity(impulse), dt)
         rebalance(world)
 
 Import from the modules: `dem.scene`, `dem.shapes`, `dem.motion` describe what there is; `dem.start`, `dem.world`,
 `dem.bodies`, `dem.partition` and `dem.neighbourhood` hold it on the ranks; `dem.contact`, `dem.system` with
 `dem.contact_map`, `dem.step` and `dem.impulses` are the time step; `dem.experiment` is what the program needs of a
-scene, and `dem.scenes` has ready-made ones; `dem.record` and `dem.analysis` say what steps and runs show.
-All quantities are in SI units.
+scene, and `dem.scenes` has ready-made ones; `dem.record`, `dem.measures` and `dem.analysis` say what steps and runs
+show. All quantities are in SI units.
 """

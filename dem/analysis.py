@@ -7,7 +7,7 @@ from math import ceil
 
 import numpy as np
 
-from dem.arrays import Floats
+from dem.arrays import Bools, Floats
 
 
 def low_pass(time: Floats, values: Floats, cutoff: float) -> Floats:
@@ -36,6 +36,11 @@ def filtered(records: Mapping[str, Floats], names: list[str], cutoff: float) -> 
         stem, bracket, unit = name.partition(" [")
         out[f"{stem}_filtered{bracket}{unit}"] = low_pass(records["time [s]"], records[name], cutoff)
     return out
+
+
+def calm(records: Mapping[str, Floats]) -> Bools:
+    """Mask (n,) of the steps without a jump of energy (`dem.record.energy_balance`): means are of these."""
+    return records["energy_jump [J]"] == 0.0
 
 
 def friction_angle(shear: Floats, normal: Floats) -> float:

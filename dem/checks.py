@@ -26,6 +26,12 @@ def positive(name: str, values: ArrayLike) -> Floats:
     return array
 
 
+def positive_or_inf(name: str, value: float) -> None:
+    """ValueError unless a number is above zero; inf is."""
+    if not value > 0.0:
+        raise ValueError(f"{name} must be positive, or inf, got {value:g}")
+
+
 def not_negative(name: str, values: ArrayLike) -> Floats:
     """`values` as a float array; ValueError unless all are finite and not below zero."""
     array = finite(name, values)
@@ -86,3 +92,12 @@ def check_fields(instance: Any, **checks: Callable[[str, Any], Floats]) -> None:
     for name, check in checks.items():
         value = check(f"{type(instance).__name__}.{name}", getattr(instance, name)).tolist()
         object.__setattr__(instance, name, tuple(value) if isinstance(value, list) else value)
+
+
+def period(values: Any) -> Floats | None:
+    """Lengths (3,) [m] of a periodic cell, inf where None stands; None if there is none. ValueError for bad ones."""
+    if values is None or all(value is None for value in values):
+        return None
+    if len(values) != 3:
+        raise ValueError(f"period must have three entries, for x, y and z, got {values}")
+    return np.array([np.inf if value is None else float(positive("period", value)) for value in values])

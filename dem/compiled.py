@@ -6,7 +6,9 @@ disk. Arrays are C-contiguous; of other types or layouts a loop would be compile
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cached_property, update_wrapper
 from typing import Any, TypeVar, cast
 
@@ -33,33 +35,48 @@ class Loop:
             if isinstance(names.get(name), Loop):
                 names[name] = names[name].compiled
         try:
-            return numba.njit(cache=True, **self._options)(self._function)
+            compiled = numba.njit(cache=True, **self._options)(self._function)
         except RuntimeError:  # no folder to keep the machine code in
             return numba.njit(**self._options)(self._function)
+        if compiled is not self._function:  # as NUMBA_DISABLE_JIT leaves it
+            _mend_cache(compiled._cache)
+        return compiled
+
+
+def _mend_cache(cache: Any) -> None:
+    """Let numba's cache of a loop make damaged files anew, with a warning, and do without files that it cannot write:
+    numba itself would end the program."""
+    load, save = cache.load_overload, cache.save_overload
+
+    def load_overload(*arguments: Any) -> Any:
+        try:
+            return load(*arguments)
+        except Exception as error:  # of any kind, as the files are pickles
+            warnings.warn(f"machine code in {cache.cache_path} is damaged ({error}), and made anew", stacklevel=2)
+            with suppress(OSError):
+                cache.flush()
+            return None
+
+    def save_overload(*arguments: Any) -> None:
+        with suppress(OSError):
+            save(*arguments)
+
+    cache.load_overload, cache.save_overload = load_overload, save_overload
 
 
 def loop(function: Function) -> Function:
-    """A function that numba compiles.
+    """A function that numba compiles, to operations that each round as IEEE 754 says.
 
-    Products and sums may be fused, and a division by zero gives inf or nan as in numpy. (What else numba calls fast
-    assumes that there are no NaNs.) numba compiles again only when the file of ``function`` itself changes. So a loop
-    must not call a loop of another file. In its own file it calls functions that are `inlined`, or both are
-    `unfused`."""
-    return cast(Function, Loop(function, {"fastmath": {"contract"}}))
+    So its bits are the same on all processors and after each compilation. Were products and sums fused, they would
+    not be: which product is fused with a sum depends on the order in which numba visits the variables, and that changes
+    from process to process. (What numba calls fast also assumes that there are no NaNs.) numba compiles again only when
+    the file of ``function`` itself changes: a loop must not call a loop of another file."""
+    return cast(Function, Loop(function, {}))
 
 
 def inlined(function: Function) -> Function:
     """A function that is compiled as a part of each loop that calls it."""
-    return cast(Function, Loop(function, {"fastmath": {"contract"}, "inline": "always"}))
-
-
-def unfused(function: Function) -> Function:
-    """A `loop` in which products and sums are not fused.
-
-    If a loop calls another, the machine code on disk differs from that of the process that compiled both: there the
-    compiler has seen the called loop once more. Fused differently, the first run on a machine would not have the bits
-    of the later ones."""
-    return cast(Function, Loop(function, {}))
+    return cast(Function, Loop(function, {"inline": "always"}))
 
 
 def tell_first_compilation(say: Callable[[str], None]) -> None:

@@ -54,8 +54,17 @@ def offsets(comm: MPI.Comm, count: int) -> Ints:
     return np.cumsum(ends)
 
 
+def on_any(comm: MPI.Comm, *here: bool) -> list[bool]:
+    """Of each of some facts, whether it holds on any rank; collective, without a message per rank."""
+    held = np.array(here, dtype=np.int64)
+    comm.Allreduce(MPI.IN_PLACE, held, MPI.MAX)
+    return held.astype(bool).tolist()
+
+
 def refuse(comm: MPI.Comm, wrong: str) -> None:
     """ValueError on all ranks if any rank has words for what is wrong with the user's data. Collective."""
+    if not on_any(comm, bool(wrong))[0]:
+        return
     for rank, words in enumerate(comm.allgather(wrong)):
         if words:
             raise ValueError(words + (f" (on rank {rank})" if comm.size > 1 else ""))

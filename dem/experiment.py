@@ -38,12 +38,12 @@ class Experiment:
     A scene defines `build`, and may define the rest. The attributes may be properties that depend on the options.
     """
 
-    #: Recommended time step [s].
-    dt: ClassVar[Any] = 0.01
-    #: Recommended contact distance: pairs with smaller gaps are contacts [m].
-    delta: ClassVar[Any] = 0.02
-    #: Contact distance while settling: falling bodies come closer within a step than bodies at rest [m].
-    settle_delta: ClassVar[Any] = 0.1
+    #: Recommended time step [s]; None: `dem.time_step.recommended`.
+    dt: ClassVar[Any] = None
+    #: Recommended contact distance: pairs with smaller gaps are contacts [m]; None: a fifth of the smallest radius.
+    delta: ClassVar[Any] = None
+    #: Contact distance while settling, as falling bodies come closer within a step [m]; None: the smallest radius.
+    settle_delta: ClassVar[Any] = None
     #: Time after which the start may be taken as settled [s]. A motion that is to begin then has it as its `start`.
     settling_time: ClassVar[Any] = 0.0
     #: Lower and upper corner of the box that no centre of a grain should leave [m]; None: there is none.
@@ -52,14 +52,14 @@ class Experiment:
     digest: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
-        """ValueError for numbers that are not finite or fail the test of their option. The message starts with the name
-        of the option. Extend this to check more."""
+        """ValueError for numbers that fail the test of their option, or are not finite where it has none. The message
+        starts with the name of the option. Extend this to check more."""
         for field in dataclasses.fields(self):
             value, test = getattr(self, field.name), field.metadata.get("test")
-            if isinstance(value, float):
-                checks.finite(field.name, value)
             if test is not None:
                 test(field.name, value)
+            elif isinstance(value, float):
+                checks.finite(field.name, value)
 
     def refuse(self, name: str, why: str) -> None:
         """ValueError with the name of an option, its value and its unit before the reason."""

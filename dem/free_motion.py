@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats
 from dem.bodies import SPHERE, Bodies
-from dem.compiled import loop, unfused
-from dem.motion import Driven, Dynamic, Guided
-from dem.neighbourhood import Neighbourhood
-from dem.scene import LargeBody
-from dem.world import World
+from dem.compiled import loop
 
 
 def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
@@ -21,7 +15,9 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
 
     Rows of bodies with prescribed motion come back as they are.
     """
-    velocity = falling(table.velocity, table.mass, dt * gravity)
+    with np.errstate(over="ignore"):  # `dem.neighbourhood` refuses bodies that are lost
+        change = dt * gravity
+    velocity = falling(table.velocity, table.mass, change)
     # The torque vanishes where all moments are equal, as for spheres.
     rows = np.flatnonzero(bodies.is_dynamic(table) & (table.shape != SPHERE))
     if not len(rows):
@@ -43,7 +39,7 @@ def falling(velocity: Floats, mass: Floats, change: Floats) -> Floats:
     return out
 
 
-@unfused
+@loop
 def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
     """Angular velocities (n, 3) [rad/s] after dt [s] without torque, from `spin` (n, 3), of bodies with orientations
     `turn` (n, 4) at the start of the step and principal moments (n, 3). All vectors are in the world frame.
@@ -88,14 +84,14 @@ def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
 _ZERO = (0.0, 0.0, 0.0)
 
 
-@unfused
+@loop
 def _slope(along, axis, rotation, sine, versed, middle, half):
     """How the angular momentum in the middle of the step changes with the spin about an axis."""
     turned = _turned(axis, rotation, 0.5, 1.0 / 6.0)
     return _sum(_turned(along, rotation, sine, versed), -half, _cross(middle, turned))
 
 
-@unfused
+@loop
 def _turned(v, r, sine, versed):
     """v + sine r x v + versed r x (r x v): the vector v, turned by the rotation vector r with its `_shares`, or by the
     quaternion (w, r) with 2 w and 2; with -sine the other way."""
@@ -103,7 +99,7 @@ def _turned(v, r, sine, versed):
     return _sum(_sum(v, sine, once), versed, _cross(r, once))
 
 
-@unfused
+@loop
 def _shares(rotation):
     """sin(a) / a and (1 - cos(a)) / a^2 of the angle a of a rotation vector."""
     square = _dot(rotation, rotation)
@@ -111,7 +107,7 @@ def _shares(rotation):
     return (np.sin(angle) / angle, (1.0 - np.cos(angle)) / square) if angle > 1e-8 else (1.0, 0.5)
 
 
-@unfused
+@loop
 def _solve(a, b, c, right):
     """The solution of a matrix with columns a, b, c, by Cramer's rule."""
     across = _cross(b, c)
@@ -119,60 +115,21 @@ def _solve(a, b, c, right):
     return over * _dot(right, across), over * _dot(a, _cross(right, c)), over * _dot(a, _cross(b, right))
 
 
-@unfused
+@loop
 def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@unfused
+@loop
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@unfused
+@loop
 def _sum(a, share, b):
     return a[0] + share * b[0], a[1] + share * b[1], a[2] + share * b[2]
 
 
-@unfused
+@loop
 def _each(a, b):
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
-
-
-def free_velocities(world: World, near: Neighbourhood, dt: float) -> Floats:
-    """Velocities (rows, 6) of all bodies of `near` over a step of dt [s] without contacts."""
-    free = free_velocity(near.bodies, world.gravity, dt)
-    free[near.grains + near.ghosts :] = large_free_velocity(world, dt)
-    return free
-
-
-def large_free_velocity(world: World, dt: float) -> Floats:
-    """Velocities (large bodies, 6) over a step of dt [s] without contacts: guided bodies along their guides with the
-    forces of their drives, hinged ones with their torques, prescribed ones on their paths."""
-    table = world.large
-    free, drive = free_velocity(table, world.gravity, dt), drive_impulses(world, dt)
-    free[:, :3] += drive[:, :3] / table.mass[:, None]
-    free[:, 3:] += drive[:, 3:] / table.inertia[:, 2:]  # the z axis of a hinged body is that of its hinge
-    free[:, :3] = (free_directions(world.large_bodies) @ free[:, :3, None])[:, :, 0]
-    prescribed = ~bodies.is_dynamic(table)
-    free[prescribed] = world.prescribed_velocity(dt)[prescribed]
-    return free
-
-
-def drive_impulses(world: World, dt: float) -> Floats:
-    """Impulses and angular impulses (large bodies, 6) of drives over a step of dt [s], zero where there is none."""
-    impulse = np.zeros_like(world.large.velocity)
-    free = free_velocity(world.large, world.gravity, dt)
-    for row, body in enumerate(world.large_bodies):
-        motion = body.motion
-        if isinstance(motion, Driven):
-            part, inertia = (slice(0, 3), body.mass) if isinstance(motion, Guided) else (slice(3, 6), body.inertia[2])
-            lack = inertia / dt * ((motion.speed or 0.0) - float(free[row, part] @ motion.line))
-            impulse[row, part] = dt * motion.mean_drive(world.time, dt, lack)
-    return impulse
-
-
-def free_directions(members: Sequence[LargeBody]) -> Floats:
-    """Projectors (large, 3, 3) on the directions that are open to the velocities of large bodies."""
-    open_to = [body.motion.free_directions() if isinstance(body.motion, Dynamic) else np.eye(3) for body in members]
-    return np.array(open_to).reshape(len(members), 3, 3)

@@ -5,42 +5,47 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from dem.arrays import Bools, Floats, Ints
+from dem.arrays import Bools, Floats, Ints, places
 from dem.compiled import loop
 from dem.exchange import exchange
-from dem.keys import places
 
 
 class ImpulseMemory:
     """Impulses of the contacts of one step, by key.
 
     The normal impulse is kept as a number and the tangential one as a vector in the world, because the
-    contact frames of the next step are others. Rows stay on the rank that stored them: most contacts are on the same
-    rank a step later. What a rank does not find, and what it was not asked for, meets on ranks that a hash of the key
-    tells.
+    contact frames of the next step are others. Rows stay on the rank that stored them: contacts are on the same rank a
+    step later, unless grains were given to other ranks. Then what a rank does not find, and what it was not asked for,
+    meets on ranks that a hash of the key tells.
     """
 
-    def __init__(self, comm: MPI.Comm) -> None:
-        self._comm = comm
-        self.restore(np.zeros(0, np.int64), np.zeros((0, 4)))
+    def __init__(self, comm: MPI.Comm, parts: int = 1) -> None:
+        """`parts`: how often a contact has three numbers, see `dem.pairs.Pairs.parts`."""
+        self._comm, self._parts = comm, parts
+        self.restore(np.zeros(0, np.int64), np.zeros((0, 4 * parts)))
 
     def remember(self, key: Ints, impulse: Floats, frame: Floats) -> None:
-        """Replace the memory by impulses (nc, 3) of contacts with keys (nc,) and frames (nc, 3, 3)."""
-        self.restore(key, in_world(impulse, frame))
+        """Replace the memory by impulses (parts nc, 3) of contacts with keys (nc,) and frames (nc, 3, 3)."""
+        each = impulse.reshape(self._parts, len(key), 3)
+        rows = [in_world(part, frame) for part in each]
+        self.restore(key, rows[0] if self._parts == 1 else np.concatenate(rows, axis=1))
 
-    def recall(self, key: Ints, frame: Floats) -> tuple[Floats, Bools]:
-        """Impulses (nc, 3) in the given frames (nc, 3, 3), zero where unknown, and the mask (nc,) of those
-        known.
+    def recall(self, key: Ints, frame: Floats, elsewhere: bool = True) -> tuple[Floats, Bools]:
+        """Impulses (parts nc, 3) in the given frames (nc, 3, 3), zero where unknown, and the mask (nc,) of those
+        known. `elsewhere`: whether other ranks may have stored them, as grains have changed their rank since; the same
+        on all ranks.
 
         Collective."""
         place, stored = places(self._key, key), self._impulse
-        if self._comm.size > 1:
+        if elsewhere and self._comm.size > 1:
             missing, left = np.flatnonzero(place < 0), np.ones(len(self._key), dtype=bool)
             left[place[place >= 0]] = False
             row, impulse = self._elsewhere(key[missing], self._key[left], self._impulse[left])
             place[missing[row]] = len(stored) + np.arange(len(row))
             stored = np.concatenate([stored, impulse])
-        return in_frames(stored, place, frame), place >= 0
+        each = np.split(stored, self._parts, axis=1)
+        found = [in_frames(np.ascontiguousarray(part), place, frame) for part in each]
+        return found[0] if self._parts == 1 else np.concatenate(found), place >= 0
 
     def _elsewhere(self, asked: Ints, key: Ints, impulse: Floats) -> tuple[Ints, Floats]:
         """Which of the keys `asked` (m,) other ranks offer in their `key` (n,), and their impulses; collective."""
@@ -50,7 +55,7 @@ class ImpulseMemory:
             "key": both,
             "row": np.concatenate([np.arange(many), np.full(len(key), -1)]),  # -1: this one is offered
             "rank": np.full(len(both), comm.rank),
-            "impulse": np.concatenate([np.zeros((many, 4)), impulse]),
+            "impulse": np.concatenate([np.zeros((many, 4 * self._parts)), impulse]),
         }
         # Fibonacci hashing: the low bits of keys are mostly zero and must not choose the rank.
         mixed = (both.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)
@@ -62,7 +67,7 @@ class ImpulseMemory:
         return answer["row"], answer["impulse"]
 
     def state(self) -> tuple[Ints, Floats]:
-        """Keys (n,) and impulses (n, 4) (normal, tangential vector) that this rank stores, for `restore`."""
+        """Keys (n,) and impulses (n, 4 parts) (normal, tangential vector) that this rank stores, for `restore`."""
         return self._key, self._impulse
 
     def restore(self, key: Ints, stored: Floats) -> None:

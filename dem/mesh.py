@@ -17,6 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.checks import between, check_fields, finite, not_negative, positive, rows, unit_quaternion, vector
+from dem.compiled import loop
 from dem.quaternion import cross, length
 
 
@@ -63,6 +64,8 @@ class Surface:
         area = length(across)
         flat = area <= 1e-10 * longest**2
         self.normal = np.where(flat[:, None], 0.0, across / np.where(flat, 1.0, area)[:, None])
+        self._center = self.corner.mean(axis=1)
+        self._radius = length(self.corner - self._center[:, None]).max(axis=1)
         ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
         self.edge, side = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
         self.side = side.reshape(-1, 3)
@@ -112,33 +115,22 @@ class Surface:
             row, entry = spread(cells.start, at[hit])
             found.append((at_level[hit[row]], cells.triangle[entry]))
         row, triangle = (np.concatenate(parts) for parts in zip(*found))
-        height = np.einsum("ij,ij->i", points[row] - self.corner[triangle, 0], self.normal[triangle])
-        close = np.abs(height) <= reach[row] * (1.0 + 1e-9)
+        close = self._within(points[row], triangle, reach[row] * (1.0 + 1e-9))
         return row[close], triangle[close]
+
+    def _within(self, points: Floats, triangle: Ints, reach: Floats) -> Ints:
+        """Which of triangles (m,) may be within reach (m,) [m] of points (m, 3), by the spheres about them and then by
+        their planes."""
+        away = points - self._center[triangle]
+        close = np.flatnonzero(np.einsum("ij,ij->i", away, away) <= (reach + self._radius[triangle]) ** 2)
+        height = np.einsum("ij,ij->i", away[close], self.normal[triangle[close]])
+        return close[np.abs(height) <= reach[close]]
 
     def closest(self, points: Floats, triangle: Ints) -> Closest:
         """The points of triangles (m,) that are closest to points (m, 3): over the face, or else of the three edges."""
-        corner, normal = self.corner[triangle], self.normal[triangle]
-        side = np.roll(corner, -1, axis=1) - corner
-        offset = points[:, None] - corner
-        inward = np.einsum("mi,mki->mk", normal, cross(side, offset))
-        face = (inward > 0.0).all(axis=1)
-        square = np.einsum("mki,mki->mk", side, side)
-        along = np.einsum("mki,mki->mk", side, offset)
-        along = np.clip(along / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
-        foot = corner + along[:, :, None] * side
-        distance = length(points[:, None] - foot)
-        every, k = np.arange(len(points)), distance.argmin(axis=1)
-        height = np.einsum("mi,mi->m", normal, offset[:, 0])
-        share = along[every, k]
-        end = np.where(share == 0.0, k, (k + 1) % 3)
         edges, vertices = len(self.triangle), len(self.triangle) + len(self.edge)
-        at_end = (share == 0.0) | (share == 1.0)
-        rim = np.where(at_end, vertices + self.triangle[triangle, end], edges + self.side[triangle, k])
         return Closest(
-            np.where(face[:, None], points - height[:, None] * normal, foot[every, k]),
-            np.where(face, triangle, rim),
-            np.where(face, np.abs(height), distance[every, k]),
+            *_closest(points, triangle, self.corner, self.normal, edges + self.side, vertices + self.triangle)
         )
 
     def _table(self, level: int) -> Cells:
@@ -151,14 +143,13 @@ class Surface:
         low = np.full(3, -0.5 * width)
         place = np.zeros((len(self.triangle), 3), np.int64)
         triangle = np.arange(len(self.triangle))
-        while width > 0.5 * reach and len(triangle) < 30_000:
+        while width > 0.5 * reach and len(triangle) < max(30_000, 4 * len(self.triangle)):
             width *= 0.5
             place = (2 * place[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T).reshape(-1, 3)
             triangle = np.repeat(triangle, 8)
             far = 0.5 * np.sqrt(3.0) * width + reach * (1.0 + 1e-9)
             middle = low + (place + 0.5) * width
-            height = np.einsum("ij,ij->i", middle - self.corner[triangle, 0], self.normal[triangle])
-            close = np.flatnonzero(np.abs(height) <= far)
+            close = self._within(middle, triangle, np.full(len(triangle), far))
             close = close[self.closest(middle[close], triangle[close]).distance <= far]
             place, triangle = place[close], triangle[close]
         codes = place @ _CODE
@@ -167,6 +158,36 @@ class Surface:
         cells = Cells(low, width, code, np.append(start, len(order)), triangle[order])
         self._cells[level] = cells
         return cells
+
+
+@loop
+def _closest(points, triangle, corner, normal, edge, vertex):
+    """`Closest` of points (m, 3) and triangles (m,) with the features `edge` and `vertex` (triangles, 3), each from one
+    corner to the next."""
+    point, feature, distance = np.empty((len(points), 3)), np.empty(len(points), np.int64), np.empty(len(points))
+    for n in range(len(points)):
+        t, face, best = triangle[n], True, 0.0
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        for k in range(3):
+            end = (k + 1) % 3
+            a, b, c = corner[t, k, 0], corner[t, k, 1], corner[t, k, 2]
+            p, q, r = corner[t, end, 0] - a, corner[t, end, 1] - b, corner[t, end, 2] - c
+            u, v, w = x - a, y - b, z - c
+            across = normal[t, 0] * (q * w - r * v) + normal[t, 1] * (r * u - p * w) + normal[t, 2] * (p * v - q * u)
+            face &= across > 0.0
+            square = p * p + q * q + r * r
+            along = min(max((p * u + q * v + r * w) / (square if square > 0.0 else 1.0), 0.0), 1.0)
+            a, b, c = a + along * p, b + along * q, c + along * r
+            apart = np.sqrt((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2)
+            if k == 0 or apart < best:
+                best, point[n, 0], point[n, 1], point[n, 2], distance[n] = apart, a, b, c, apart
+                feature[n] = edge[t, k] if 0.0 < along < 1.0 else vertex[t, k if along == 0.0 else end]
+        if face:
+            u, v, w = x - corner[t, 0, 0], y - corner[t, 0, 1], z - corner[t, 0, 2]
+            height = normal[t, 0] * u + normal[t, 1] * v + normal[t, 2] * w
+            point[n, 0], point[n, 1] = x - height * normal[t, 0], y - height * normal[t, 1]
+            point[n, 2], feature[n], distance[n] = z - height * normal[t, 2], t, abs(height)
+    return point, feature, distance
 
 
 #: One number for the integer coordinates of a cube: more than any side of a neighbourhood has.

@@ -1,10 +1,10 @@
-"""Motions of large bodies: free, guided along a line, hinged, fixed, rotating, oscillating, gliding or along a path.
+"""Motions of large bodies: free, guided along a line, hinged, held in part, fixed, rotating, oscillating, gliding or
+along a path.
 
 A prescribed motion is a pose as a function of time. Over a time step the body has the *mean* velocity
 (x(t+dt) - x(t)) / dt, and the angular velocity that turns it from the one orientation to the other in dt the shortest
 way (so less than half a turn), so that the contacts see the velocity that takes it exactly to its next pose. Any
-object with the method `pose` of `Fixed` is one. If it has a method `angular_velocity()` too, a vector (3,) [rad/s], the
-contacts see that one instead, at all times.
+object with the method `pose` of `Fixed` is one.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ import numpy as np
 from dem import quaternion
 from dem.arrays import Floats
 from dem.checks import check_fields, finite, positive, rows, unit_quaternions, unit_vector, vector
+
+DROOP = 1e-3  #: of its speed that a servo loses at most under a load that it can bear
 
 
 class Timed:
@@ -45,9 +47,23 @@ class Dynamic:
         """Projector (3, 3) on the directions in which forces can move the centre of mass."""
         return np.eye(3)
 
+    def free_turns(self) -> Floats:
+        """Projector (3, 3) on the axes about which torques can turn the body."""
+        return np.eye(3)
+
+    def held(self, time: float, dt: float) -> Floats:
+        """The mean velocity (6,) from `time` to `time + dt` [s] of what neither forces nor torques can change."""
+        return np.zeros(6)
+
 
 class Driven(Dynamic, Timed):
-    """Moved by forces along one line of the world only, or by torques about one only, with a drive that acts on it."""
+    """Moved by forces along one line of the world only, or by torques about one only, with a drive that acts on it.
+
+    A servo is implicit in the step: with f the force of `mean_drive`, which brings the body to its speed if nothing
+    touches it, and v_free what that gives, it acts with f + c (v_free - v) at the end of the step. c is such that all
+    its strength is used where the body is as far from its speed as it was before the step, or by DROOP of the speed.
+    Where a load grows at once to more than it can bear, it pushes with more in that one step.
+    """
 
     speed: float | None
     _line: ClassVar[str]  #: the name of the field with the line
@@ -72,15 +88,22 @@ class Driven(Dynamic, Timed):
         most = getattr(self, self._strength) * (self.gone(time + dt) - self.gone(time)) / dt
         return (most if self.speed is None else min(max(lack, -most), most)) * self.line
 
+    def grip(self, time: float, dt: float, mass: float, speed: float, lack: float) -> float:
+        """c dt of a servo [kg or kg m^2], for the mass or moment, and the `speed` before the step; else 0."""
+        if self.speed is None:
+            return 0.0
+        most = getattr(self, self._strength) * (self.gone(time + dt) - self.gone(time)) / dt
+        slip = max(DROOP * abs(self.speed), abs(self.speed - speed), 1e-6 * dt * most / mass)
+        return dt * max(most - abs(lack), 0.0) / slip if most > 0.0 else 0.0
+
 
 @dataclass(frozen=True)
 class Guided(Driven):
     """Moved by forces along one direction of the world only, without turning: a piston, a press.
 
     The guide takes all other forces and all torques. A drive may push along it with a constant force, beside gravity,
-    from one time to another. With a `speed` the drive is a servo: it pushes, either way, with the force that would
-    bring the body to that speed at the end of the step if nothing touched it, but with `force` at most. A load L makes
-    the body slower by dt L / mass.
+    from one time to another. With a `speed` the drive is a servo: it pushes, either way, with the force that keeps
+    the body at that speed, to a thousandth, but with `force` at most. Against a larger load it gives way.
     """
 
     direction: Sequence[float]  #: (3,), normalised
@@ -93,6 +116,10 @@ class Guided(Driven):
     def free_directions(self) -> Floats:
         """Projector (3, 3) on the direction of the guide."""
         return np.outer(self.direction, self.direction)
+
+    def free_turns(self) -> Floats:
+        """Projector (3, 3) on nothing."""
+        return np.zeros((3, 3))
 
 
 @dataclass(frozen=True)
@@ -113,6 +140,53 @@ class Hinged(Driven):
     def free_directions(self) -> Floats:
         """Projector (3, 3) on nothing: the axis stays where it is."""
         return np.zeros((3, 3))
+
+    def free_turns(self) -> Floats:
+        """Projector (3, 3) on the axis."""
+        return np.outer(self.axis, self.axis)
+
+
+@dataclass(frozen=True)
+class Held(Dynamic, Timed):
+    """Some components of the velocity of the centre of mass and of the angular velocity are held, in the axes of the
+    world, and forces move the body in the others: a wheel that turns at a given speed and is free to rise and sink.
+
+    None stands for a free component, a number for one that is held: at this value from `start` to `end`, and at zero
+    before and after. Of the turns all, none or one may be free; of one the others are held at zero. What holds the body
+    bears all other forces and torques.
+    """
+
+    velocity: Sequence[float | None] = (None, None, None)  #: (3,) [m/s]
+    angular_velocity: Sequence[float | None] = (None, None, None)  #: (3,) [rad/s]
+    start: float = 0.0  #: [s]
+    end: float = np.inf  #: [s]
+
+    def __post_init__(self) -> None:
+        self._check_times()
+        for name in ("velocity", "angular_velocity"):
+            given = tuple(getattr(self, name))
+            numbers = vector(f"Held.{name}", [0.0 if value is None else value for value in given])
+            values = tuple(None if value is None else float(x) for value, x in zip(given, numbers))
+            object.__setattr__(self, name, values)
+        held = [value for value in self.angular_velocity if value is not None]
+        if len(held) == 1 or (len(held) == 2 and any(held)):
+            raise ValueError(
+                f"Held.angular_velocity {self.angular_velocity}: allowed are three numbers, three times None, or None "
+                "for one axis and zero for the others"
+            )
+
+    def free_directions(self) -> Floats:
+        """Projector (3, 3) on the axes along which the velocity is free."""
+        return np.diag([float(value is None) for value in self.velocity])
+
+    def free_turns(self) -> Floats:
+        """Projector (3, 3) on the axes about which the angular velocity is free."""
+        return np.diag([float(value is None) for value in self.angular_velocity])
+
+    def held(self, time: float, dt: float) -> Floats:
+        """The velocity (6,) that is held, its mean from `time` to `time + dt` [s]; zero where it is free."""
+        values = np.array([value or 0.0 for value in (*self.velocity, *self.angular_velocity)])
+        return (self.gone(time + dt) - self.gone(time)) / dt * values
 
 
 @dataclass(frozen=True)
@@ -244,18 +318,36 @@ def checked_pose(motion: Prescribed, time: float, position: Floats, orientation:
 def mean_velocity(motion: Prescribed, time: float, dt: float, position: Floats, orientation: Floats) -> Floats:
     """Velocity (6,) from `time` to `time + dt` of a body with the given pose at time zero."""
     pose = position, orientation
-    return velocity_between(motion, checked_pose(motion, time, *pose), checked_pose(motion, time + dt, *pose), dt)
+    return velocity_between(checked_pose(motion, time, *pose), checked_pose(motion, time + dt, *pose), dt)
 
 
-def velocity_between(motion: Prescribed, start: Pose, end: Pose, dt: float) -> Floats:
+def velocity_between(start: Pose, end: Pose, dt: float) -> Floats:
     """Velocity (6,) that takes a body from one of its poses to another in dt [s]."""
-    given = getattr(motion, "angular_velocity", None)
-    if given is not None:
-        turning = given()
-    else:
-        turning = quaternion.rotation_vector(start[1], end[1]) / dt if (start[1] != end[1]).any() else np.zeros(3)
-    turning = vector(f"angular velocity of {type(motion).__name__}", turning)
+    turning = quaternion.rotation_vector(start[1], end[1]) / dt if (start[1] != end[1]).any() else np.zeros(3)
     return np.concatenate([(end[0] - start[0]) / dt, turning])
+
+
+#: What classes of motions might define, and what the program asks of those of a kind.
+KNOWN = {"pose", "position", "orientation", "velocity", "angular_velocity", "force", "torque", "free_directions"}
+KNOWN |= {"free_turns", "mean_drive", "held"}
+OF_FORCES, OF_DRIVES = {"free_directions", "free_turns", "held"}, {"mean_drive"}
+
+
+def refuse_ignored(motion: Motion) -> None:
+    """ValueError for a motion of a class that is not of this module, and that defines a method or a property which
+    nothing asks for: neither the program of such a motion, nor its own methods."""
+    own: dict[str, Any] = {}
+    for kind in reversed(type(motion).__mro__):
+        if kind is not object and kind.__module__ != __name__:
+            own |= vars(kind)
+    asked = OF_FORCES.copy() if isinstance(motion, Dynamic) else {"pose"}
+    asked |= OF_DRIVES if isinstance(motion, Driven) else set()
+    codes = [getattr(value, "fget", value) for value in own.values()]
+    asked |= {name for code in codes for name in getattr(getattr(code, "__code__", None), "co_names", ())}
+    methods = {name for name, value in own.items() if callable(value) or isinstance(value, property)}
+    for name in sorted(KNOWN & methods - asked):
+        called, allowed = type(motion).__name__, ", ".join(sorted(asked & KNOWN))
+        raise ValueError(f"the motion {called} defines {name}, which nothing asks for; allowed: {allowed}")
 
 
 def top_speed(motion: Motion, position: Floats, reach: float) -> float:
@@ -271,6 +363,9 @@ def top_speed(motion: Motion, position: Floats, reach: float) -> float:
     if isinstance(motion, Path):
         ways = np.linalg.norm(np.diff(np.array(motion.positions), axis=0), axis=1)
         return float((ways / np.diff(motion.times)).max(initial=0.0))
+    if isinstance(motion, Held):
+        along, about = np.array([value or 0.0 for value in (*motion.velocity, *motion.angular_velocity)]).reshape(2, 3)
+        return float(np.linalg.norm(along) + np.linalg.norm(about) * reach)
     speed = abs(getattr(motion, "speed", None) or 0.0)
     return speed * reach if isinstance(motion, Hinged) else speed
 

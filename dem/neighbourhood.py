@@ -6,6 +6,7 @@ A contact belongs to the rank of the lower global body index: ghosts only travel
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
     """
     comm, grains = world.comm, world.grains
     radius = bodies.bounding_radius(grains) + margin
-    own = _chunk_boxes(grains.position, radius, 8)  # enough to tell a piece of the curve from its bounding box
+    own = chunk_boxes(grains.position, radius, 8)  # enough to tell a piece of the curve from its bounding box
     boxes = np.empty((comm.size, *own.shape))
     comm.Allgather(own, boxes)
     if np.isnan(boxes).any():
@@ -47,7 +48,12 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
         )
     mine, large = world.slabs[comm.rank] + np.arange(len(grains)), world.slabs[-1] + np.arange(len(world.large))
     columns = dict(grains.columns(), margin=margin, index=mine)
-    row, rank = _touched(grains.position, radius, boxes[: comm.rank])
+    row, rank = touched(grains.position, radius, boxes[: comm.rank])
+    if world.period is not None:
+        ways = image_ways(world.period)
+        more = [touched(grains.position + way, radius, boxes[: comm.rank]) for way in ways]
+        both = np.concatenate([np.stack([rank, row]), *(np.stack(pair[::-1]) for pair in more)], axis=1)
+        rank, row = np.unique(both, axis=1)
     ghosts = exchange(comm, {name: column[row] for name, column in columns.items()}, rank)
     index, ghost_margin = ghosts.pop("index"), ghosts.pop("margin")
     return Neighbourhood(
@@ -75,7 +81,14 @@ def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> 
     return replace(near, bodies=replace(near.bodies, **columns), margin=now(margin, 0.0)[:count])
 
 
-def _chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:
+def image_ways(period: Floats) -> Floats:
+    """By what (k, 3) images are moved, for the periods (3,) [m], inf: none."""
+    each = [(-1.0, 0.0, 1.0) if np.isfinite(length) else (0.0,) for length in period]
+    whole = np.array([steps for steps in product(*each) if any(steps)])
+    return whole * np.where(np.isfinite(period), period, 0.0)
+
+
+def chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:
     """Bounding boxes (count, 2, 3) of equal pieces of a slab; empty ones reach from +inf to -inf."""
     boxes = np.empty((count, 2, 3))
     boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
@@ -89,7 +102,7 @@ def _chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:
     return boxes
 
 
-def _touched(position: Floats, radius: Floats, boxes: Floats) -> tuple[Ints, Ints]:
+def touched(position: Floats, radius: Floats, boxes: Floats) -> tuple[Ints, Ints]:
     """Pairs (row, rank) of the balls that touch a box of a rank; boxes (ranks, k, 2, 3)."""
     rows, ranks = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     if len(position) and len(boxes):

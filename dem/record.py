@@ -5,6 +5,7 @@ All functions are collective, and their results are the same on all ranks and, t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,10 +13,12 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
-from dem.arrays import ArrayLike, Floats
+from dem.arrays import ArrayLike, Bools, Floats
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
 from dem.experiment import Experiment
+from dem.motion import Held
+from dem.period import wrapped
 from dem.step import Step
 from dem.together import SceneError, together
 
@@ -58,10 +61,17 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
-    place, lost = step.world.grains.position, np.zeros(len(step.world.grains), bool)
+    place, lost = wrapped(step.world.grains.position, step.world.period), np.zeros(len(step.world.grains), bool)
     for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high))):
         lost |= (place[:, axis] < least) | (place[:, axis] > most)
     return step.total(lost)
+
+
+#: A step has a jump of energy where the kinetic energy rises by more than its sources give, by this part of all that is
+#: there, or to so many times what there was.
+CREATED, SUDDEN = 0.1, 10.0
+SLOW = 0.1  #: a body is at rest below this part of the speed that a step of free fall gives
+CREEP = 1e-6  #: or below this part of its radius in a step
 
 
 def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:
@@ -96,20 +106,29 @@ def energies(position: Floats, turn: Floats, velocity: Floats, mass: Floats, ine
 def energy_balance(step: Step) -> dict[str, float]:
     """Energies at the end of the step and where their change came from [J].
 
-        change of kinetic + potential + spring = work of motions - friction loss - impact loss + time stepping
+        change of kinetic + potential + spring = work of motions and of cohesion - friction loss - impact loss
+                                                 + time stepping
 
     With g the impulses and w the mean of the velocities before and after (of prescribed motions: that of the step), the
     impulses do the work g' D' w. Its tangential part is the friction loss. Its normal part goes to the springs of
     contacts, and the rest is lost in impacts, or pushes overlaps of rigid contacts apart where it is a gain. The work
-    of motions is that of prescribed bodies on the others, and that of the drives of guided and hinged bodies. The rest
-    is the error of the semi-implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
+    of motions is that of prescribed bodies on the others, of the drives of guided and hinged bodies, of what holds
+    bodies in part, of belts, loads and springs. The rest is the error of the semi-implicit step, of the order of dt:
+    -dt/2 m g (v_new - v_old) per body.
+
+    Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be. Where
+    spheres slide these differ by (dt v_t)^2 / 2R. With stiff contacts and large dt that is as much as the overlaps, and
+    what springs lose by it between two steps is in no term: the spring energy of a step less that before the next.
+
+    The jump is the rise of the kinetic energy in a step in which it rises by more than the work of motions, gravity
+    and springs allows, or to more than ten times what there was, although gravity and drives do not give that; else 0.
+    Springs may give that too where no moving tool of prescribed motion can have loaded them. What there was includes
+    what bodies at rest have (SLOW), and what those have that go with the tool they touch.
     """
-    world, near, comm = step.world, step.contacts.near, step.world.comm
-    before = near.bodies.take(slice(0, near.grains)), near.bodies.take(slice(near.grains + near.ghosts, None))
+    world, near, comm, system = step.world, step.contacts.near, step.world.comm, step.system
+    first, moves = near.grains + near.ghosts, bodies.is_dynamic(world.large)
+    before = near.bodies.take(slice(0, near.grains)), near.bodies.take(slice(first, None))
     after = world.grains, world.large
-    moves = bodies.is_dynamic(world.large)
-    mean = [0.5 * (old.velocity + new.velocity) for old, new in zip(before, after)]
-    mean[1][~moves] = world.large.velocity[~moves]
 
     def sums(grains: Any, large: Any) -> Floats:
         """Local sums; what all ranks know of the large bodies counts once."""
@@ -117,33 +136,97 @@ def energy_balance(step: Step) -> dict[str, float]:
 
     was = sums(*(energy(table, world.gravity) for table in before))
     now = sums(*(energy(table, world.gravity) for table in after))
-    slip = step.system.contact_velocities(*mean)
-    normal, tangential = (np.vdot(step.impulse[:, part], slip[:, part]) for part in (slice(0, 1), slice(1, 3)))
-    received = np.vdot(step.impulse_on_large[~moves], mean[1][~moves])
-    springs = comm.allreduce(spring_energies(step))
-    work = np.vdot(step.system.drive_impulse, mean[1]) - received
-    whole = comm.allreduce(np.array([*was, *now, normal, tangential]))
-    change, held = whole[2] + whole[3] - whole[0] - whole[1], springs[1] - springs[0]
+    velocity = near.bodies.velocity.copy()
+    velocity[first:][~moves] = world.large.velocity[~moves]
+    mean = 0.5 * (velocity[first:] + world.large.velocity)
+    speeds = [table.velocity for table in after]
+    normal, tangential, opening = system.works(step.in_cone, velocity, speeds[0], speeds[1], step.moment)
+    springs = spring_energies(system.stiffness, step.contacts.gap, opening, system.dt)
+    received = np.vdot(step.impulse_on_large[~moves], mean[~moves])
+    loads = 0.0
+    if system.applied is not None:
+        loads = comm.allreduce(0.5 * np.vdot(system.applied.grains, before[0].velocity + world.grains.velocity))
+    belts = 0.0
+    if system.surface is not None:
+        belts = comm.allreduce(-np.vdot(step.impulse[:, 1:], system.surface))
+    holding = _holding_work(step, near.bodies.velocity[first:], mean)
+    driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + loads + belts + holding
+    work = driving - received
+    still = sums(*(_still(table, world.gravity, system.dt) for table in after))
+    cohesion = 0.0
+    if system.attraction is not None:
+        cohesion = system.works(step.impulse, velocity, *speeds)[0] - normal
+    whole = np.array([*was, *now, normal, tangential, *springs, still, _carried(step, ~moves), cohesion])
+    comm.Allreduce(MPI.IN_PLACE, whole)
+    change, held = whole[2] + whole[3] - whole[0] - whole[1], whole[7] - whole[6]
+    rise, fallen, released = whole[2] - whole[0], whole[1] - whole[3], max(-held, 0.0)
+    there = whole[0] + whole[8] + whole[9]
+    pulled = 2.0 * max(whole[10], 0.0)  # with the velocity of the end, for bodies that were at rest
+    created = rise - fallen - work - released - pulled > CREATED * (there + whole[6] + abs(work))
+    driven = max(fallen, 0.0) + max(driving, 0.0) + pulled + released * (whole[9] == 0.0)
+    jumps = rise > 0.0 and (created or whole[2] - driven > SUDDEN * there + CREATED * driven)
     return {
         "kinetic_energy [J]": whole[2],
         "potential_energy [J]": whole[3],
-        "spring_energy [J]": springs[1],
+        "spring_energy_before [J]": whole[6],
+        "spring_energy [J]": whole[7],
         "work_of_motions [J]": work,
-        "friction_loss [J]": 0.0 - whole[5],  # nothing is zero, not -0
+        "friction_loss [J]": belts - whole[5],  # nothing is zero, not -0
         "impact_loss [J]": 0.0 - whole[4] - held,
-        "time_stepping [J]": change - work - whole[4] - whole[5],
+        **({} if system.attraction is None else {"work_of_cohesion [J]": whole[10]}),
+        "time_stepping [J]": change - work - whole[4] - whole[5] - whole[10] + belts,
+        "energy_jump [J]": comm.bcast(rise if jumps else 0.0),  # what follows from it must not differ between ranks
     }
 
 
-def spring_energies(step: Step) -> Floats:
-    """What the contacts of this rank hold as springs at the start and at the end of a step (2,) [J].
+def _still(table: Bodies, gravity: Floats, dt: float) -> float:
+    """The kinetic energy [J] that bodies at rest may have by the errors of a solver: a part SLOW of what gravity gives
+    in a step, or a way of CREEP radii."""
+    radius = bodies.bounding_radius(table)
+    creep = CREEP * np.where(np.isfinite(radius), radius, 0.0) / dt
+    speed = np.maximum(SLOW * dt * math.hypot(*gravity), creep)
+    moves = bodies.is_dynamic(table)
+    return 0.5 * float(table.mass[moves] @ speed[moves] ** 2)
 
-    k/2 d^2 of an overlap d, which changes in the step by dt times the normal velocity at its end. Collective."""
-    system, gap = step.system, step.contacts.gap
-    k = np.where(np.isinf(system.stiffness), 0.0, system.stiffness)
-    after = system.contact_velocities(step.world.grains.velocity, step.world.large.velocity)
-    overlaps = np.maximum(-gap, 0.0), np.maximum(-gap - system.dt * after[:, 0], 0.0)
-    return np.array([0.5 * k @ overlap**2 for overlap in overlaps])
+
+def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
+    """The work [J] of what holds components of the velocities of `Held` bodies; velocities (large, 6) before the step,
+    and means of those before and after."""
+    work, world, system = 0.0, step.world, step.system
+    for row, body in enumerate(world.large_bodies):
+        if isinstance(body.motion, Held):
+            push = -step.impulse_on_large[row] - system.drive_impulse(world.large.velocity)[row]
+            push[:3] += body.mass * (world.large.velocity[row, :3] - before[row, :3] - system.dt * world.gravity)
+            held = np.eye(3) - body.motion.free_directions(), np.eye(3) - body.motion.free_turns()
+            work += float(mean[row, :3] @ held[0] @ push[:3] + mean[row, 3:] @ held[1] @ push[3:])
+    return work
+
+
+def _carried(step: Step, prescribed: Bools) -> float:
+    """The kinetic energy [J] that bodies have which go with the `prescribed` (large,) motions that they touch, on this
+    rank."""
+    velocity = np.where(prescribed[:, None], step.world.large.velocity, 0.0)
+    if not velocity.any():
+        return 0.0
+    near = step.contacts.near
+    table = np.zeros((len(near.bodies), 6))
+    table[near.grains + near.ghosts :] = velocity
+    speed = step.system.contact_map.relative_velocities(table)
+    mass = near.bodies.mass
+    lighter = np.minimum(mass[step.contacts.a], mass[step.contacts.b])
+    return float(0.5 * lighter @ np.einsum("ci,ci->c", speed, speed))
+
+
+@loop
+def spring_energies(stiffness: Floats, gap: Floats, opening: Floats, dt: float) -> tuple[float, float]:
+    """What contacts hold as springs at the start and at the end of a step [J]: k/2 d^2 of an overlap d, which changes
+    in the step by dt times the normal velocity at its end, `opening` (nc,). Rigid ones hold nothing."""
+    start, end = 0.0, 0.0
+    for c in range(len(gap)):
+        k = 0.0 if np.isinf(stiffness[c]) else stiffness[c]
+        start += 0.5 * k * max(-gap[c], 0.0) ** 2
+        end += 0.5 * k * max(-gap[c] - dt * opening[c], 0.0) ** 2
+    return start, end
 
 
 def contact_statistics(step: Step) -> dict[str, float]:
@@ -154,18 +237,18 @@ def contact_statistics(step: Step) -> dict[str, float]:
     slides if its tangential impulse is 99 % of what friction can bear, or more. The coordination number is the mean
     number of active contacts per grain.
     """
-    comm, contacts = step.world.comm, step.contacts
-    count, weight = comm.allreduce(np.array([len(contacts), step.impulse[:, 0].sum()]))
+    comm, contacts, impulse = step.world.comm, step.contacts, step.in_cone
+    count, weight = comm.allreduce(np.array([len(contacts), impulse[:, 0].sum()]))
     grain = contacts.near.bodies.shape != COMPOUND
     least = 0.01 * weight / max(count, 1.0)
-    *sums, worst = counted(step.impulse, contacts.friction, contacts.gap, contacts.a, contacts.b, grain, least)
+    *sums, worst = counted(impulse, contacts.friction, contacts.gap, contacts.a, contacts.b, grain, least)
     sums = comm.allreduce(np.array(sums))
     return {
         "contacts": count,
         "active_contacts": sums[0],
         "coordination_number": sums[2] / step.world.slabs[-1],
         "sliding_fraction": sums[1] / max(sums[0], 1),
-        "worst_overlap [m]": comm.allreduce(worst, MPI.MAX),
+        "worst_overlap [m]": comm.allreduce(max(worst, contacts.held_overlap), MPI.MAX),
     }
 
 
@@ -177,9 +260,8 @@ def counted(impulse, friction, gap, a, b, grain, least):
     for c in range(len(gap)):
         normal, bears = impulse[c, 0], 0.99 * friction[c] * impulse[c, 0]
         worst = max(worst, -gap[c])
-        if normal > least:
-            active += 1
-            ends += int(grain[a[c]]) + int(grain[b[c]])
-            if np.sqrt(impulse[c, 1] ** 2 + impulse[c, 2] ** 2) >= bears:
-                sliding += 1
+        bearing, slides = normal > least, np.sqrt(impulse[c, 1] ** 2 + impulse[c, 2] ** 2) >= bears
+        active += bearing
+        sliding += bearing & slides
+        ends += bearing * (int(grain[a[c]]) + int(grain[b[c]]))
     return active, sliding, ends, worst

@@ -1,6 +1,6 @@
 """Description of a scene: its bodies, materials and gravity at time zero.
 
-A scene is the same on every rank and knows nothing of ranks; `dem.start.new_world` distributes it.
+A scene is the same on every rank and knows nothing of ranks; `dem.start.new_world` distributes it::
 
     scene = Scene(friction=0.3)
     scene.add_body("floor", [Plane(normal=(0, 0, 1))])
@@ -10,18 +10,32 @@ A scene is the same on every rank and knows nothing of ranks; `dem.start.new_wor
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Union
 
 import numpy as np
 
 from dem import bodies, checks, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints
-from dem.bodies import BOX, CAPSULE, COMPOUND, SPHERE, Bodies
+from dem.bodies import BOX, CAPSULE, COMPOUND, PLANE, SPHERE, Bodies
+from dem.loads import Law, Load, On
 from dem.mesh import Mesh
-from dem.motion import Driven, Dynamic, Fixed, Guided, Hinged, Motion
+from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
+from dem.pairs import Pairs, checked, tables
 from dem.quaternion import across, length
 from dem.shapes import Box, Shape
+from dem.springs import End, Spring
+
+#: A velocity (3,), or a function of points (n, 3) [m] and outward normals (n, 3) that returns (3,) or (n, 3) [m/s].
+SurfaceVelocity = Union[Sequence[float], Callable[[Floats, Floats], ArrayLike]]
+
+
+def checked_surface(name: str, velocity: SurfaceVelocity | None) -> SurfaceVelocity | None:
+    """The surface velocity of the body of this name; ValueError for what is none."""
+    if velocity is None or callable(velocity):
+        return velocity
+    return tuple(checks.vector(f"surface velocity of {name!r}", velocity).tolist())
 
 
 @dataclass(frozen=True)
@@ -37,6 +51,7 @@ class LargeBody:
     velocity: Floats  #: (6,) at time zero, of dynamic bodies
     mass: float  #: infinite unless the motion is dynamic [kg]
     inertia: Floats  #: (3,) principal moments in the body frame; infinite if the body cannot turn [kg m^2]
+    surface: SurfaceVelocity | None = None  #: of its surface along itself, in the body frame [m/s]
 
 
 class Scene:
@@ -48,21 +63,36 @@ class Scene:
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         stiffness: float | None = None,
         restitution: float = 0.0,
+        *,
+        cohesion: float = 0.0,
+        cohesion_range: float = 0.0,
+        rolling: float = 0.0,
+        spinning: float = 0.0,
+        period: Sequence[float | None] | None = None,
     ) -> None:
-        """`friction`: coefficient, `stiffness` [N/m] and coefficient of `restitution` of the contacts of all pairs of
-        materials not set otherwise; `gravity`: (3,) [m/s^2]. A stiffness of inf is that of rigid contacts; None:
-        `dem.stiffness.recommended`.
+        """`gravity`: (3,) [m/s^2]. The others are coefficients of the contacts of all pairs of materials, but of those
+        of `set_pair`: `friction`, `stiffness` [N/m] (inf: rigid; None: `dem.stiffness.recommended`), `restitution`, the
+        attractive force `cohesion` [N] up to a gap of `cohesion_range` [m], and the greatest moments against `rolling`
+        and `spinning`, over the normal force [m]. See `dem.pairs` and docs/contact_laws.md.
+        `period`: (3,) lengths of the cell, from zero on, that repeats itself along x, y, z [m], None: not along that
+        axis; see docs/periodic.md.
         """
+        self.period = checks.period(period)
         self.gravity = checks.vector("gravity", gravity)
         self.large_bodies: list[LargeBody] = []
-        self._friction = float(checks.not_negative("friction", friction))
-        self.stiffness = None if stiffness is None else _stiffness(stiffness)  #: [N/m]; None: not stated
         #: Names of large bodies that go away from the grains: their speed asks for no stiffness.
         self.leaving: set[str] = set()
-        self._restitution = _restitution(restitution)
-        self._pairs: dict[str, dict[tuple[int, int], float]] = {"friction": {}, "stiffness": {}, "restitution": {}}
+        self._usual = checked(
+            {
+                "friction": friction, "stiffness": stiffness, "restitution": restitution, "cohesion": cohesion,
+                "cohesion_range": cohesion_range, "rolling": rolling, "spinning": spinning,
+            }
+        )  # fmt: skip
+        self._pairs: dict[tuple[int, int], dict[str, float]] = {}
         self._materials: dict[str, int] = {}
-        self._grains: list[Bodies] = []
+        self.parts: list[Bodies] = []  #: the grains, as they were added
+        self.loads: dict[str, Load] = {}  #: by name
+        self.springs: dict[str, Spring] = {}  #: by name
 
     def add_spheres(
         self,
@@ -134,6 +164,7 @@ class Scene:
         inertia: Sequence[float] | None = None,
         velocity: Sequence[float] = (0.0, 0.0, 0.0),
         angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
+        surface_velocity: SurfaceVelocity | None = None,
     ) -> None:
         """Add a large body made of `shapes`, which are placed in its body frame.
 
@@ -150,80 +181,143 @@ class Scene:
         place = checks.vector(f"position of {name!r}", position)
         turn = checks.unit_quaternion(f"quaternion of {name!r}", quaternion)
         speed = _velocities(velocity, angular_velocity, 1)[0]
+        refuse_ignored(motion)
         _refuse_speed(name, motion, speed)
         body = LargeBody(name, tuple(shapes), motion, -1, place, turn, speed, np.inf, np.full(3, np.inf))
         if not isinstance(motion, Dynamic):
             pass
         elif density is not None and mass is None and inertia is None:
             body = _centered(body, float(checks.positive(f"density of {name!r}", density)))
-        elif density is None and mass is not None and (inertia is not None or isinstance(motion, Guided)):
+        elif density is None and mass is not None and (inertia is not None or not motion.free_turns().any()):
             body = replace(body, mass=float(checks.positive(f"mass of {name!r}", mass)))
             if inertia is not None:
                 moments = checks.positive(f"inertia of {name!r}", inertia)
                 body = replace(body, inertia=checks.vector(f"inertia of {name!r}", moments))
         else:
             raise ValueError(f"dynamic body {name!r} needs either its density or both mass and inertia")
-        if isinstance(motion, Guided):
-            body = replace(body, inertia=np.full(3, np.inf))
         if isinstance(motion, Hinged):
-            body = _on_hinge(body, motion.line, body.position - place)
+            _refuse_beside_hinge(body, motion.line, body.position - place)
+        if isinstance(motion, Dynamic):
+            body = _turning(body, motion)
+        body = replace(body, surface=checked_surface(name, surface_velocity))
         self.large_bodies.append(replace(body, material=self._material(material)))
 
-    def set_friction(self, friction: float, material: str, other: str) -> None:
-        """Friction coefficient between two materials (which may be the same one)."""
-        self._set_pair("friction", float(checks.not_negative("friction", friction)), material, other)
+    def add_load(
+        self,
+        name: str,
+        on: On = None,
+        *,
+        force: ArrayLike | Law = (0.0, 0.0, 0.0),
+        torque: ArrayLike | Law = (0.0, 0.0, 0.0),
+        start: float = 0.0,
+        end: float = np.inf,
+    ) -> None:
+        """Put a force [N] at the centre of mass and a torque [N m] on each of some bodies: a large body or the grains
+        of a material by its name, grains by their ids, or all grains. Each is (3,), for ids also (ids, 3), or a
+        function of the time [s] and the table of the bodies, see `dem.loads.Load`. They act from `start` to `end` [s].
+        """
+        if not name or name in self.loads or name in (body.name for body in self.large_bodies):
+            raise ValueError(f"loads need names that no other load and no large body has, got {name!r}")
+        self.loads[name] = Load(on, force, torque, start, end)
 
-    def set_stiffness(self, stiffness: float, material: str, other: str) -> None:
-        """Stiffness of the contacts of two materials (which may be the same one) [N/m]; inf: rigid."""
-        self._set_pair("stiffness", _stiffness(stiffness), material, other)
+    def add_spring(
+        self,
+        name: str,
+        one: End,
+        other: End = None,
+        *,
+        stiffness: float,
+        damping: float = 0.0,
+        length: float | None = None,
+        anchor: Sequence[float] = (0.0, 0.0, 0.0),
+        other_anchor: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Join two bodies, or a body and the world (None), by a spring with a damper, see `dem.springs`.
 
-    def set_restitution(self, restitution: float, material: str, other: str) -> None:
-        """Coefficient of restitution of impacts between two materials (which may be the same one), from 0 to 1."""
-        self._set_pair("restitution", _restitution(restitution), material, other)
+        A body is a large body by its name or a grain by its id. The anchors (3,) are in the frames of the bodies, that
+        of the world is a place [m]. stiffness [N/m], damping [N s/m], rest `length` [m]: None is the distance at time
+        zero; with zero the spring acts in all directions.
+        """
+        if not name or name in self.springs:
+            raise ValueError(f"springs need distinct names, got {name!r}")
+        spring = Spring((one, other), (anchor, other_anchor), stiffness, damping, 0.0 if length is None else length)
+        poses = [self._pose(name, end) for end in spring.ends]
+        places = [place + quaternion.rotate(turn, np.array(at)) for (place, turn), at in zip(poses, spring.anchors)]
+        rest = float(np.linalg.norm(places[1] - places[0])) if length is None else length
+        self.springs[name] = replace(spring, length=rest)
 
-    def _set_pair(self, name: str, value: float, material: str, other: str) -> None:
+    def _pose(self, name: str, end: End) -> tuple[Floats, Floats]:
+        """Position (3,) and quaternion (4,) of the end of a spring at time zero; ValueError if there is none."""
+        if end is None:
+            return np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+        if isinstance(end, str):
+            tables = [self.large()]
+            rows = np.flatnonzero([body.name == end for body in self.large_bodies])
+        else:
+            tables = self.parts
+            rows = np.array([end]) if 0 <= end < sum(map(len, tables)) else np.zeros(0, np.int64)
+        if not len(rows):
+            raise ValueError(f"spring {name!r}: there is no body or grain {end!r} yet")
+        table = bodies.concatenate(tables).take(rows)
+        return table.position[0], table.quaternion[0]
+
+    def set_pair(
+        self,
+        material: str,
+        other: str,
+        *,
+        friction: float | None = None,
+        stiffness: float | None = None,
+        restitution: float | None = None,
+        cohesion: float | None = None,
+        cohesion_range: float | None = None,
+        rolling: float | None = None,
+        spinning: float | None = None,
+    ) -> None:
+        """Coefficients of the contacts of two materials (which may be the same one), with the units of `Scene`; those
+        not given stay as they are. ValueError for a bad one."""
+        given = {
+            "friction": friction, "stiffness": stiffness, "restitution": restitution, "cohesion": cohesion,
+            "cohesion_range": cohesion_range, "rolling": rolling, "spinning": spinning,
+        }  # fmt: skip
         one, two = sorted((self._material(material), self._material(other)))
-        self._pairs[name][one, two] = value
+        self._pairs.setdefault((one, two), {}).update(checked(given))
 
     @property
     def materials(self) -> tuple[str, ...]:
         """The names of the materials, in the order of their numbers."""
         return tuple(self._materials)
 
-    def friction_table(self) -> Floats:
-        """Friction coefficients (materials, materials), symmetric."""
-        return self._table("friction", self._friction)
+    def pairs(self, stiffness: float) -> Pairs:
+        """The coefficients of all pairs of materials, with this `stiffness` [N/m] where none is stated. ValueError for
+        those that contradict each other."""
+        return tables(len(self._materials), {"stiffness": stiffness, **self._usual}, self._pairs)
 
-    def stiffness_table(self, usual: float) -> Floats:
-        """Stiffnesses of contacts (materials, materials), symmetric [N/m]; the `usual` one of pairs not set."""
-        return self._table("stiffness", usual)
+    @property
+    def reach(self) -> float:
+        """The greatest gap at which bodies attract each other [m]."""
+        found = self.pairs(np.inf)
+        return float(found.cohesion_range[found.cohesion > 0.0].max(initial=0.0))
 
     @property
     def states_stiffness(self) -> bool:
         """Whether the stiffness of all or some contacts was stated."""
-        return self.stiffness is not None or bool(self._pairs["stiffness"])
-
-    def restitution_table(self) -> Floats:
-        """Coefficients of restitution (materials, materials), symmetric."""
-        return self._table("restitution", self._restitution)
-
-    def _table(self, name: str, usual: float) -> Floats:
-        table = np.full((len(self._materials), len(self._materials)), usual)
-        for (i, j), value in self._pairs[name].items():
-            table[i, j] = table[j, i] = value
-        return table
+        return any("stiffness" in given for given in (self._usual, *self._pairs.values()))
 
     def grains(self) -> Bodies:
         """All grains, in the order of their ids. ValueError if there is none, or if a mesh might meet boxes or other
         meshes, which it cannot touch."""
-        if sum(len(part) for part in self._grains) == 0:
+        if sum(len(part) for part in self.parts) == 0:
             raise ValueError("empty scene: there is no grain")
-        _refuse_beside_meshes(self.large_bodies, any((part.shape == BOX).any() for part in self._grains))
-        return bodies.concatenate(self._grains)
+        _refuse_beside_meshes(self.large_bodies, any((part.shape == BOX).any() for part in self.parts))
+        grains = bodies.concatenate(self.parts)
+        if self.period is not None:
+            _refuse_in_cell(self, self.period, float(bodies.bounding_radius(grains).max()))
+        return grains
 
     def large(self) -> Bodies:
         """The table of the large bodies at time zero, in the order in which they were added."""
-        count, first = len(self.large_bodies), sum(len(part) for part in self._grains)
+        count, first = len(self.large_bodies), sum(len(part) for part in self.parts)
         return Bodies(
             id=np.arange(first, first + count),
             **{
@@ -246,7 +340,7 @@ class Scene:
     ) -> Ints:  # fmt: skip
         """Add grains of one kind, of which `lengths` has the columns of `size` by name; their ids."""
         centers = np.atleast_2d(checks.finite("positions", positions))
-        count, first = len(centers), sum(len(part) for part in self._grains)
+        count, first = len(centers), sum(len(part) for part in self.parts)
         size = np.zeros((count, 3))
         for k, (name, values) in enumerate(lengths.items()):
             column, row = (slice(None), (3,)) if kind == BOX else (k, ())
@@ -264,30 +358,26 @@ class Scene:
             size=size,
             weight=np.zeros(count),
         )
-        self._grains.append(table)
+        self.parts.append(table)
         return table.id
-
-
-def _restitution(value: float) -> float:
-    checks.between(0.0, 1.0)("restitution", value)
-    return float(value)
-
-
-def _stiffness(value: float) -> float:
-    if not float(value) > 0.0:
-        raise ValueError(f"stiffness must be a positive number or inf, got {value}")
-    return float(value)
 
 
 def _refuse_speed(name: str, motion: Motion, speed: Floats) -> None:
     """ValueError for an initial velocity (6,) that the motion does not allow."""
     if not isinstance(motion, Dynamic) and speed.any():
         raise ValueError(f"the motion of {name!r} is prescribed: it takes no initial velocity")
+    if isinstance(motion, Held) and (kept := speed - _freely(motion, speed)).any():
+        raise ValueError(f"{name!r} is held: its initial velocity must be free, got {kept} of what is not")
     if isinstance(motion, Driven):
         allowed, other = (speed[:3], speed[3:]) if isinstance(motion, Guided) else (speed[3:], speed[:3])
         if other.any() or length(np.cross(motion.line, allowed)) > 1e-12 * length(allowed):
             kind, along = ("guided", "along the guide") if isinstance(motion, Guided) else ("hinged", "about the hinge")
             raise ValueError(f"{name!r} is {kind}: its initial velocity must be {along}")
+
+
+def _freely(motion: Dynamic, speed: Floats) -> Floats:
+    """The part of a velocity (6,) that forces and torques can change."""
+    return np.concatenate([motion.free_directions() @ speed[:3], motion.free_turns() @ speed[3:]])
 
 
 def _reframed(body: LargeBody, center: Floats, inner: Floats) -> LargeBody:
@@ -307,11 +397,21 @@ def _centered(body: LargeBody, density: float) -> LargeBody:
     return replace(_reframed(body, center, quaternion.from_matrix(axes)), mass=mass, inertia=moments)
 
 
-def _on_hinge(body: LargeBody, axis: Floats, arm: Floats) -> LargeBody:
-    """The same body in a frame whose z axis is the axis (3,) of its hinge, with a moment about that alone. ValueError
-    if its centre of mass, at `arm` (3,) from a point of the axis, is not on it."""
+def _refuse_beside_hinge(body: LargeBody, axis: Floats, arm: Floats) -> None:
+    """ValueError if the centre of mass of a body, at `arm` (3,) from a point of its hinge, is not on the axis (3,)."""
     if length(np.cross(axis, arm)) > 1e-6 * max(length(arm), np.sqrt(body.inertia.max() / body.mass)):
         raise ValueError(f"{body.name!r} is hinged: its centre of mass must be on the axis through its position")
+
+
+def _turning(body: LargeBody, motion: Dynamic) -> LargeBody:
+    """The same body with moments about those axes alone about which torques turn it. If there is only one, it is the z
+    axis of its frame."""
+    turns = motion.free_turns()
+    if not turns.any():
+        return replace(body, inertia=np.full(3, np.inf))
+    if np.trace(turns) > 1.5:
+        return body
+    axis = motion.line if isinstance(motion, Hinged) else np.diag(turns)
     back = quaternion.conjugate(body.quaternion)
     moment = float(body.inertia @ quaternion.rotate(back, axis) ** 2)
     x = across(axis[None])[0]
@@ -339,3 +439,41 @@ def _refuse_beside_meshes(members: Sequence[LargeBody], box_grains: bool) -> Non
 
 def _velocities(linear: ArrayLike, angular: ArrayLike, count: int) -> Floats:
     return np.hstack([checks.rows("velocity", linear, count, 3), checks.rows("angular velocity", angular, count, 3)])
+
+
+def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
+    """ValueError for what a scene with these periods (3,) [m] and grains of at most this radius [m] cannot have."""
+    axes = np.flatnonzero(np.isfinite(period))
+    for k in axes:
+        if period[k] <= 4.0 * radius:
+            raise ValueError(
+                f"period of {period[k]:g} m along {'xyz'[k]} is too short: a grain could meet another one on both its "
+                f"sides, or its own image; allowed is more than two greatest diameters, {4.0 * radius:g} m"
+            )
+    if scene.springs:
+        raise ValueError(f"spring {next(iter(scene.springs))!r}: springs have no images, so periods allow none")
+    for body in scene.large_bodies:
+        for shape in body.shapes:
+            kind, center, turn, size = shapes.placed(shape)
+            if kind == PLANE:
+                normal = quaternion.rotate(body.quaternion, size)
+                across_them = [k for k in axes if abs(normal[k]) > 1e-9]
+                if across_them:
+                    raise ValueError(
+                        f"large body {body.name!r} has a plane across the periodic direction {'xyz'[across_them[0]]}; "
+                        "allowed are planes along it"
+                    )
+                continue
+            if not isinstance(body.motion, Fixed):
+                raise ValueError(
+                    f"large body {body.name!r} moves: with periods only bodies of planes may; other shapes are Fixed"
+                )
+            middle = body.position + quaternion.rotate(body.quaternion, center)
+            wide = float(bodies.enclosing_radius(np.array([kind]), size[None])[0])
+            for k in axes:
+                if not 0.0 <= middle[k] <= period[k] or 2.0 * (wide + radius) >= period[k]:
+                    raise ValueError(
+                        f"large body {body.name!r}: a {type(shape).__name__.lower()} must have its centre in the cell "
+                        f"along {'xyz'[k]}, and a sphere about it and a grain must be shorter than the period of "
+                        f"{period[k]:g} m"
+                    )

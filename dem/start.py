@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import fields
 
@@ -12,10 +13,12 @@ from dem import bodies, stiffness
 from dem.arrays import Ints
 from dem.bodies import Bodies
 from dem.contact import find_contacts
+from dem.exchange import exchange, refuse
 from dem.partition import redistribute
+from dem.period import put_back, wrapped
 from dem.scene import Scene
 from dem.step import follow_motions
-from dem.world import World
+from dem.world import World, refuse_load
 
 
 def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
@@ -25,8 +28,10 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     grains overlap each other or a large body by more than `overlap` radii; SceneError if a motion fails.
     """
     grains = scene.grains()
+    grains.position = wrapped(grains.position, scene.period)
     world = _world(scene, comm, grains.take(even_slice(len(grains), comm)))
     follow_motions(world)
+    put_back(world)
     redistribute(world)
     _refuse_overlap(world, overlap)
     return world
@@ -38,12 +43,19 @@ def restored_world(
     """The world whose `World.state` was taken, for the same scene; collective.
 
     `local`: the rows `restart_rows` of every local array. If the number of ranks is that of the state, the restored
-    world is the same to the last bit; otherwise the grains are distributed anew. ValueError if the scene has other
-    bodies than the state.
+    world is the same to the last bit; otherwise the grains are distributed anew. ValueError on all ranks if the scene
+    has other bodies than the state, or if this is none that a run can have.
     """
+    large = {field.name: np.array(replicated[f"large_{field.name}"]) for field in fields(Bodies)}
+    other = [
+        name
+        for name, like in scene.large().columns().items()
+        for column in (large[name], local[name])
+        if (column.shape[1:], column.dtype.kind) != (like.shape[1:], like.dtype.kind)
+    ]
+    refuse(comm, f"arrays of other shapes or types: {', '.join(other)}" if other else "")
     world = _world(scene, comm, Bodies(**{name: np.array(column) for name, column in local.items()}))
     count = len(scene.grains())
-    large = {field.name: np.array(replicated[f"large_{field.name}"]) for field in fields(Bodies)}
     if world.slabs[-1] != count or len(large["id"]) != len(world.large):
         raise ValueError(
             f"the state has {world.slabs[-1]} grains and {len(large['id'])} large bodies, "
@@ -51,9 +63,37 @@ def restored_world(
         )
     world.large = Bodies(**large)
     world.time, world.step = float(replicated["time"]), int(replicated["step"])
+    expected = np.array(replicated["expected"]) if "expected" in replicated else None
+    world.expected = expected if expected is not None and expected.shape == (len(world.springs), 2, 6) else None
+    _refuse_impossible(world, count)
     if len(replicated["slabs"]) != comm.size + 1:
         redistribute(world)
     return world
+
+
+def _refuse_impossible(world: World, count: int) -> None:
+    """ValueError on all ranks for a state of `count` grains that `dem.scene` would refuse to start with; collective."""
+    wrong = [] if np.isfinite(world.time) and world.time >= 0.0 <= world.step else ["time or step"]
+    for table, what in ((world.grains, "grain"), (world.large, "large body")):
+        grains = what == "grain"
+        heavy = np.concatenate([table.mass, table.inertia.ravel()])
+        kinds = np.isin(table.shape, (bodies.SPHERE, bodies.BOX, bodies.CAPSULE) if grains else (bodies.COMPOUND,))
+        right = {
+            "position": np.isfinite(table.position),
+            "velocity": np.isfinite(table.velocity),
+            "quaternion": np.abs(np.linalg.norm(table.quaternion, axis=1) - 1.0) < 1e-6,
+            "mass or inertia": (heavy > 0.0) & (np.isfinite(heavy) if grains else True),
+            "material": (table.material >= 0) & (table.material < len(world.materials)),
+            "shape": kinds,
+            "size": np.isfinite(table.size) & (table.size >= 0.0) & (table.size[:, :1] > 0.0 if grains else True),
+        }
+        wrong += [f"{name} of a {what}" for name, good in right.items() if not good.all()]
+    starts = np.arange(world.comm.size + 1) * count // world.comm.size
+    owner = np.clip(np.searchsorted(starts, world.grains.id, side="right") - 1, 0, world.comm.size - 1)
+    ids = np.sort(exchange(world.comm, {"id": world.grains.id}, owner)["id"])
+    if not np.array_equal(ids, np.arange(starts[world.comm.rank], starts[world.comm.rank + 1])):
+        wrong.append("id of a grain")
+    refuse(world.comm, f"a state that no run can have: {', '.join(wrong)}" if wrong else "")
 
 
 def restart_rows(slabs: Ints, comm: MPI.Comm) -> slice:
@@ -69,9 +109,12 @@ def even_slice(count: int, comm: MPI.Comm) -> slice:
 
 
 def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
-    stiff = comm.bcast(stiffness.table(scene))  # of one processor
-    tables = scene.friction_table(), stiff, scene.restitution_table()
-    return World(comm, tuple(scene.large_bodies), scene.gravity, *tables, scene.materials, grains, scene.large())
+    pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
+    world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
+    world.loads, world.springs, world.period = dict(scene.loads), dict(scene.springs), scene.period
+    for name, load in world.loads.items():
+        refuse_load(world, name, load)
+    return world
 
 
 def _refuse_overlap(world: World, overlap: float) -> None:
@@ -89,8 +132,22 @@ def _refuse_overlap(world: World, overlap: float) -> None:
         worst = (float(relative[c]), float(-contacts.gap[c]), a, b)
     relative_depth, depth, a, b = world.comm.allreduce(worst, MPI.MAX)
     if relative_depth > overlap:
-        names = [
-            f"grain {i}" if i < world.slabs[-1] else f"body {world.large_bodies[i - world.slabs[-1]].name!r}"
-            for i in (a, b)
-        ]
-        raise ValueError(f"overlapping start: {names[0]} and {names[1]} overlap by {depth:g} m")
+        raise ValueError(f"overlapping start: {world.name_of(a)} and {world.name_of(b)} overlap by {depth:g} m")
+
+
+def step_remark(world: World, dt: float) -> str:
+    """What to say of a dt [s] that is too large for the grains as they are now, and a better one; empty if it is not;
+    collective.
+
+    A grain should not fall by more than its diameter from rest, dt <= sqrt(d / g), nor go further than two radii.
+    """
+    grains = world.grains
+    radius = bodies.bounding_radius(grains)
+    speed = np.sqrt((grains.velocity[:, :3] ** 2).sum(axis=1))
+    least = world.comm.allreduce(float(radius.min(initial=np.inf)), MPI.MIN)
+    passing = world.comm.allreduce(float((radius / np.maximum(speed, 1e-300)).min(initial=np.inf)), MPI.MIN)
+    fall = np.sqrt(2.0 * least / max(math.hypot(*world.gravity), 1e-300))
+    if dt <= min(fall, 2.0 * passing):
+        return ""
+    why = "a grain falls further than its diameter" if dt > fall else "a grain goes further than two of its radii"
+    return f"dt {dt:g} s is too large: {why} in a step; take at most {0.95 * min(0.1 * fall, passing):.2g} s"

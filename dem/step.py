@@ -1,7 +1,7 @@
 """The semi-implicit step: new velocities come from the contact problem, and positions follow them.
 
-Where bodies turn so fast that the contacts found at the start of a step do not keep them apart, `find_turned` finds
-the others.
+Where impulses send bodies so far, or bodies turn so fast, that the contacts found at the start of a step do not keep
+them apart, `find_overrun` and `find_turned` find the others.
 """
 
 from __future__ import annotations
@@ -14,11 +14,14 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies, quaternion
-from dem.arrays import ArrayLike, Bools, Floats, Ints
+from dem.applied import applied_impulses
+from dem.arrays import ArrayLike, Bools, Floats, Ints, places
 from dem.bodies import SPHERE, Bodies
-from dem.contact import Contacts, contact_order, find_contacts
+from dem.cohesion import along_normal
+from dem.contact import Contacts, contact_order, find_contacts, goes_beyond, ways
 from dem.contact_map.loops import relative_velocities
-from dem.keys import places
+from dem.measures import Sample
+from dem.period import wrapped
 from dem.system import ContactSystem, contact_arms, contact_frames, gap_velocities
 from dem.together import meet
 from dem.world import World
@@ -34,11 +37,20 @@ class Step:
     world: World  #: at the end of the step
     contacts: Contacts
     system: ContactSystem
-    impulse: Floats  #: (nc, 3) of the local contacts: normal, t1, t2 [N s]
+    impulse: Floats  #: (nc, 3) of the local contacts: normal, t1, t2; with their attraction [N s]
+    moment: Floats | None = None  #: (nc, 3) about normal, t1, t2, over `Resistance.length`; None without [N s]
 
     def force_on(self, name: str) -> Floats:
         """Contact force and torque (6,) [N, N m] on a large body, about its reference point, averaged over the step."""
         return self.impulse_on_large[self.world.large_row(name)] / self.system.dt
+
+    def spring_force(self, name: str) -> Floats:
+        """Force (3,) of a spring on its second end, averaged over the step [N]; the first has the opposite one."""
+        names = list(self.world.springs)
+        if name not in names or self.system.applied is None:
+            raise KeyError(f"no spring {name!r}; there are: {', '.join(names) or 'none'}")
+        force: Floats = self.system.applied.springs[names.index(name)] / self.system.dt
+        return force
 
     def position(self, name: str) -> Floats:
         """Position (3,) of a large body [m]."""
@@ -54,10 +66,51 @@ class Step:
         meet(self.world.comm, "Step.total")
         return float(self.world.comm.allreduce(float(np.sum(values))))
 
+    @property
+    def in_cone(self) -> Floats:
+        """The impulses (nc, 3) without the attraction of contacts, which are in the friction cones [N s]."""
+        attraction = self.system.attraction
+        return self.impulse if attraction is None else self.impulse + along_normal(attraction)
+
+    @property
+    def moments(self) -> Floats | None:
+        """Moments (nc, 3) on the second bodies, beside those of the forces, in the world, of contacts that resist
+        rolling or spinning, averaged over the step [N m]."""
+        if self.moment is None or self.system.resistance is None:
+            return None
+        size = self.moment * self.system.resistance.length[:, None] / self.system.dt
+        return np.einsum("ci,cij->cj", size, self.system.frame)
+
+    @cached_property
+    def sample(self) -> Sample:
+        """This rank's grains and contacts for the functions of `dem.measures`; not collective."""
+        contacts, grains, near = self.contacts, self.world.grains, self.contacts.near.bodies
+        pair = np.stack([contacts.a, contacts.b], axis=1)
+        point, center = contacts.point, near.position[pair]
+        if contacts.moved is not None:
+            center[:, 1] += contacts.moved
+            point = wrapped(point, self.world.period)
+            center += (point - contacts.point)[:, None]
+        names = ("id", "velocity", "mass", "shape", "size", "material")
+        return Sample(
+            comm=self.world.comm,
+            count=int(self.world.slabs[-1]),
+            **{name: getattr(grains, name) for name in names},
+            materials=self.world.materials,
+            bodies=near.id[pair],
+            position=wrapped(grains.position, self.world.period),
+            center=center,
+            point=point,
+            normal=contacts.normal,
+            gap=contacts.gap,
+            force=np.einsum("ci,cij->cj", self.impulse, self.system.frame) / self.system.dt,
+            moment=self.moments,
+        )
+
     @cached_property
     def impulse_on_large(self) -> Floats:
         """Impulses and angular impulses (large, 6) of the contacts on the large bodies; the same on all ranks."""
-        return self.system.impulse_on_large(self.impulse)
+        return self.system.impulse_on_large(self.impulse, self.moment)
 
 
 def advance(world: World, velocity: Floats, dt: float, moving: Floats | None = None) -> None:
@@ -70,6 +123,8 @@ def advance(world: World, velocity: Floats, dt: float, moving: Floats | None = N
     large_velocity, large_moving = world.large_velocity(velocity), world.large_velocity(moving)
     _move(world.grains, velocity[: len(world.grains)], moving[: len(world.grains)], dt)
     _move(world.large, large_velocity, large_moving, dt)
+    if world.springs:
+        world.expected = applied_impulses(world, dt).expected
     world.time += dt
     world.step += 1
     follow_motions(world)
@@ -94,6 +149,46 @@ def _move(table: Bodies, velocity: Floats, moving: Floats, dt: float) -> None:
     table.velocity = velocity.copy()
     table.position = table.position + dt * moving[:, :3]
     table.quaternion = quaternion.integrate(table.quaternion, moving[:, 3:], dt)
+
+
+def find_overrun(
+    world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float, depth: float, recovery_speed: float
+) -> Contacts | None:
+    """The contacts of wider margins, if with these velocities (owned, 6) bodies go further in dt [s] than their margins
+    in the search for `contacts`, and overlap by more than `depth` [m] with others that it has not seen. None if none
+    do; collective.
+
+    The search may be repeated for the contacts that it finds: margins only grow.
+    """
+    seen = contacts.near.margin[: contacts.near.grains]
+    way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
+    large = world.large_velocity(velocity)
+    # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
+    gone = bool((way > seen).any()), goes_beyond(world, dt * large, contacts.shifts, delta)
+    further, beyond = map(any, zip(*world.comm.allgather(gone)))
+    if not (further or beyond):
+        return None
+    shifts = np.concatenate([contacts.shifts, dt * large[None]]) if beyond else contacts.shifts
+    margin = np.maximum(seen, way)
+    unseen = find_contacts(world, delta, dt, margin, shifts, besides=contacts)
+    table = np.zeros((len(unseen.near.bodies), 6))
+    table[: len(seen)] = velocity[: len(seen)]
+    world.lists.halo.update(table)
+    table[unseen.near.grains + unseen.near.ghosts :] = large
+    opening = _opening(unseen, unseen.near.bodies.position, table)
+    overlap = -dt * (gap_velocities(world, unseen, dt, recovery_speed)[2] + opening)
+    if not world.comm.allreduce(bool((overlap > depth).any()), MPI.LOR):
+        return None
+    return find_contacts(world, delta, dt, margin, shifts)
+
+
+def _opening(contacts: Contacts, position: Floats, velocity: Floats) -> Floats:
+    """Normal velocities (nc,) of contacts of bodies with these positions and velocities (rows, 3 and 6)."""
+    row = np.stack([contacts.a, contacts.b], axis=1).astype(np.uint32)
+    arm = contact_arms(contacts.point, position, row)
+    if contacts.moved is not None:
+        arm[:, 3:] -= contacts.moved
+    return relative_velocities(contact_frames(contacts.normal).reshape(-1, 9), arm, row, velocity)[:, 0]
 
 
 def find_turned(
@@ -134,11 +229,10 @@ def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
 
 def _at_start(end: Contacts, dt: float) -> tuple[Contacts, Floats]:
     """The contacts of the end of a step as contacts of its start, and by how much (nc,) their gaps grow in it [m]."""
-    velocity, row = end.near.bodies.velocity, np.stack([end.a, end.b], axis=1).astype(np.uint32)
-    point = end.point - 0.5 * dt * velocity[row, :3].sum(axis=1)
-    arm = contact_arms(point, end.near.bodies.position - dt * velocity[:, :3], row)
-    growth = dt * relative_velocities(contact_frames(end.normal).reshape(-1, 9), arm, row, velocity)[:, 0]
-    return replace(end, point=point, gap=end.gap - growth), growth
+    velocity = end.near.bodies.velocity
+    start = replace(end, point=end.point - 0.5 * dt * (velocity[end.a, :3] + velocity[end.b, :3]))
+    growth = dt * _opening(start, end.near.bodies.position - dt * velocity[:, :3], velocity)
+    return replace(start, gap=end.gap - growth), growth
 
 
 def _rows_in(contacts: Contacts, end: Contacts) -> tuple[Ints, Ints, Bools]:
@@ -149,6 +243,13 @@ def _rows_in(contacts: Contacts, end: Contacts) -> tuple[Ints, Ints, Bools]:
     row = order[np.minimum(place, len(index) - 1)]
     known: Bools = (index[row] == end.body).all(axis=1)
     return row[:, 0], row[:, 1], known
+
+
+def carried(world: World, contacts: Contacts, wider: Contacts) -> Contacts:
+    """The contacts of a wider search, where they are among these as these: `find_turned` has linearised some anew."""
+    a, b, known = _rows_in(wider, contacts)
+    kept = replace(contacts, a=a, b=b, near=wider.near, shifts=wider.shifts).take(known)
+    return _joined(world, wider.take(places(kept.key, wider.key) < 0), kept)
 
 
 def _joined(world: World, one: Contacts, other: Contacts) -> Contacts:

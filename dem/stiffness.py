@@ -17,23 +17,26 @@ and linear-dashpot model revisited", Granular Matter 9 (2007), for impacts with 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from dem import bodies, checks
-from dem.arrays import ArrayLike, Floats
-from dem.contact.primitives import extents
-from dem.motion import Dynamic, Hinged, top_speed
-from dem.scene import LargeBody, Scene
-from dem.shapes import Plane
+from dem.arrays import ArrayLike, Floats, Ints
+from dem.compiled import loop
+from dem.motion import Dynamic
+from dem.pairs import Pairs
+from dem.scene import Scene
+from dem.time_step import fastest
 
 OVERLAP = 0.003  #: the greatest overlap that `recommended` allows, as a part of a grain's radius
 CHAINS = 4.0  #: the strongest forces between grains over those that a like share of the weight makes
 DAMPING = 2.0  #: c as a part of 2 sqrt(k m): an impact leaves 5 % of the speed (Schwager, Poeschel); 1: 14 %
 
 
-def table(scene: Scene) -> Floats:
-    """The stiffnesses of contacts by pair of materials (materials, materials), symmetric [N/m]."""
-    return scene.stiffness_table(recommended(scene) if scene.stiffness is None else scene.stiffness)
+def pairs(scene: Scene) -> Pairs:
+    """The coefficients of contacts by pair of materials, with the recommended stiffness where none is stated."""
+    return scene.pairs(recommended(scene))
 
 
 def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
@@ -43,18 +46,21 @@ def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
     The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width, and
     four times as much where a chain of force goes (Radjai, Jean, Moreau, Roux, Phys. Rev. Lett. 77 (1996): a share of
     exp(-1.4 f) bears more than f times the mean). A grain of mass m that a tool of speed v meets is stopped by
-    k d = v sqrt(k m). Grains that fall from high are not reckoned with.
+    k d = v sqrt(k m). Cohesion c presses grains together by c / k. Grains that fall from high are not reckoned with.
     """
     grains = scene.grains()
     allowed = overlap * bodies.bounding_radius(grains)
-    stiffness = float(np.maximum(_load(scene) / allowed, grains.mass * (_speed(scene) / allowed) ** 2).max())
+    with np.errstate(over="ignore"):  # inf: rigid
+        stiffness = float(np.maximum(_load(scene) / allowed, grains.mass * (fastest(scene) / allowed) ** 2).max())
     return float(f"{stiffness:.1e}") if stiffness > 0.0 else np.inf  # the same on processors that round in other ways
 
 
 def expected_overlap(scene: Scene, stiffness: float) -> float:
     """The greatest overlap, as a part of a radius, that `recommended` would expect of a stiffness [N/m]."""
     grains = scene.grains()
-    stopped = _speed(scene) * np.sqrt(grains.mass / stiffness)
+    if np.isinf(stiffness):
+        return 0.0
+    stopped = fastest(scene) * np.sqrt(grains.mass / stiffness)
     return float((np.maximum(_load(scene) / stiffness, stopped) / bodies.bounding_radius(grains)).max())
 
 
@@ -66,41 +72,48 @@ def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:
     return float(checks.positive("Young's modulus", modulus)) * float(checks.positive("radius", radius))
 
 
-def compliance(stiffness: Floats, mass: Floats, dt: float) -> tuple[Floats, Floats]:
-    """C (nc,) [1/kg] and the share (nc,) of gap / dt of overlapping contacts, for their stiffness (nc,) [N/m] and the
-    reduced masses (nc,) of their bodies [kg]; 0 and 1 of rigid ones."""
-    rigid = np.isinf(stiffness)
-    k = np.where(rigid, 1.0, stiffness)
-    damping = 2.0 * DAMPING * np.sqrt(k * mass)
-    C = 1.0 / (k * dt**2 + damping * dt)
-    return np.where(rigid, 0.0, C), np.where(rigid, 1.0, k * dt**2 * C)
+@loop
+def gap_velocities(
+    stiffness: Floats, material: Ints, mass: Floats, a: Ints, b: Ints, gap: Floats, dt: float, recovery_speed: float
+) -> tuple[Floats, Floats, Floats]:
+    """Stiffness (nc,), compliance (nc,) and the part of r (nc,) that closes gaps or pushes overlaps apart: gap / dt, of
+    stiff contacts that overlap the share of `compliance`, of rigid ones at most the recovery speed.
+
+    `stiffness` (materials, materials); `material` and `mass` of the bodies, which have the rows a, b (nc,)."""
+    k, C, speed = np.empty(len(gap)), np.empty(len(gap)), np.empty(len(gap))
+    for c in range(len(gap)):
+        k[c] = stiffness[material[a[c]], material[b[c]]]
+        C[c], share = compliance(k[c], 1.0 / (1.0 / mass[a[c]] + 1.0 / mass[b[c]]), dt)
+        speed[c] = gap[c] / dt
+        if speed[c] < 0.0:
+            speed[c] *= share
+        if np.isinf(k[c]) and speed[c] < -recovery_speed:
+            speed[c] = -recovery_speed
+    return k, C, speed
+
+
+@loop
+def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float]:
+    """C [1/kg] and the share of gap / dt of an overlapping contact, for its stiffness [N/m] and the reduced mass of its
+    bodies [kg]; 0 and 1 of a rigid one."""
+    if np.isinf(stiffness):
+        return 0.0, 1.0
+    C = 1.0 / (stiffness * dt**2 + 2.0 * DAMPING * np.sqrt(stiffness * mass) * dt)
+    return C, stiffness * dt**2 * C
 
 
 def _load(scene: Scene) -> Floats:
-    """The weight (grains,) that the whole bed would lay on each grain [N]."""
-    grains, gravity = scene.grains(), float(np.linalg.norm(scene.gravity))
+    """The weight (grains,) that the whole bed would lay on each grain, and the strongest cohesion [N]."""
+    grains, gravity = scene.grains(), math.hypot(*scene.gravity)
+    pull = scene.pairs(np.inf).cohesion.max()
     if gravity == 0.0:
-        return np.zeros(len(grains))
+        return np.full(len(grains), pull)
     down = np.asarray(scene.gravity) / gravity
     across = grains.position - np.outer(grains.position @ down, down)
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(across.T, bias=True)), 0.0))[1:]  # in the plane across
     radius = bodies.bounding_radius(grains)
     width = np.sqrt(12.0) * spread + 2.0 * radius.mean()  # of a rectangle of that spread, with the grains at its edges
-    free = [body for body in scene.large_bodies if isinstance(body.motion, Dynamic)]
-    others = sum(body.mass for body in free if not isinstance(body.motion, Hinged))  # which a bearing bears
+    free = [(body.mass, body.motion) for body in scene.large_bodies if isinstance(body.motion, Dynamic)]
+    others = sum(mass * float(down @ motion.free_directions() @ down) for mass, motion in free)  # the rest is borne
     pressure = gravity * (grains.mass.sum() + others) / width.prod()
-    return np.maximum(CHAINS * pressure * (2.0 * radius) ** 2, gravity * grains.mass)
-
-
-def _speed(scene: Scene) -> float:
-    """The greatest speed of a tool, or of a grain at time zero [m/s]."""
-    tools = [_top_speed(body) for body in scene.large_bodies if body.name not in scene.leaving]
-    return max([*tools, float(np.linalg.norm(scene.grains().velocity[:, :3], axis=1).max())])
-
-
-def _top_speed(body: LargeBody) -> float:
-    """The greatest speed of a point of a large body [m/s]; a plane has no end, and counts by the body's centre."""
-    parts = tuple(shape for shape in body.shapes if not isinstance(shape, Plane))
-    reach = float(extents([parts])[0]) if parts else 0.0
-    start = float(np.linalg.norm(body.velocity[:3]) + np.linalg.norm(body.velocity[3:]) * reach)
-    return max(start, top_speed(body.motion, body.position, reach))
+    return np.maximum(CHAINS * pressure * (2.0 * radius) ** 2, gravity * grains.mass) + pull

@@ -15,20 +15,25 @@ Source: Anitescu and Hart (2004), Tasora and Anitescu (2011): the cone complemen
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies
+from dem import bodies, stiffness
+from dem.applied import Drives, applied_impulses, drives_of, free_directions, free_velocities
 from dem.arrays import Bools, Floats
-from dem.bodies import COMPOUND
+from dem.bodies import COMPOUND, Bodies
 from dem.checks import positive
+from dem.cohesion import along_normal, attraction
 from dem.compiled import loop
 from dem.contact import Contacts
 from dem.contact_map import CompactRows, ContactMap, Halo
 from dem.contact_map.loops import scale
 from dem.contact_map.map import packed
-from dem.free_motion import drive_impulses, free_directions, free_velocities
-from dem.stiffness import compliance
+from dem.rolling import resistance
+from dem.surface import surface_velocities
 from dem.world import World
 
 
@@ -41,12 +46,16 @@ class ContactSystem:
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
         stiffness (nc,): of the contacts; inf: rigid [N/m]
         compliance (nc,): C, what a normal impulse leaves of the overlap, over dt; 0: rigid [1/kg]
-        b (nc, 3): (gap / dt, 0, 0) [m/s], see `gap_velocities`
+        surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.surface`; None if there is none
+        b (nc, 3): (gap / dt, surface) [m/s], see `gap_velocities`
         r (nc, 3): b + D' v_free [m/s]
         near: the bodies about this rank
         contact_map: G, with the halo of the bodies; the rows of its tables are those of `near`
-        free_velocity (owned, 6): velocities without contacts
-        drive_impulse (large, 6): impulses and angular impulses of the drives of large bodies, the same on all ranks
+        free_velocity (owned, 6): velocities without contacts, but with their attraction
+        resistance: the rows of `dem.rolling`, or None
+        attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.cohesion`
+        drives: of the large bodies, the same on all ranks
+        applied: what loads and springs give, a `dem.applied.Applied`; None if there are none
     """
 
     def __init__(
@@ -65,19 +74,37 @@ class ContactSystem:
         # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
         row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
         arm = contact_arms(self.point, near.bodies.position, row)
-        rows = CompactRows(self.frame.reshape(-1, 9), arm, body, inverse_root_masses(world), owned)
+        if contacts.moved is not None:
+            arm[:, 3:] -= contacts.moved
+        self.drives = drives_of(world, dt)
+        root = inverse_root_masses(world, self.drives)
+        rows = CompactRows(self.frame.reshape(-1, 9), arm, body, root, owned)
         ghosts = np.flatnonzero(touched)
         index = near.index[ghosts]
         owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
         halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
         self.contact_map = ContactMap(world.comm, rows, halo, row)
         free = free_velocities(world, near, dt)
+        self.applied = applied_impulses(world, dt) if world.loaded else None
+        if world.loaded:
+            halo.update(free)
         self.free_velocity = free[:owned]
-        self.drive_impulse = drive_impulses(world, dt)
+        self._free_large = free[near.grains + near.ghosts :]
         self.b = np.zeros((len(contacts), 3))
         self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
+        self.surface = surface_velocities(world, contacts, self.frame)
+        if self.surface is not None:
+            self.b[:, 1:] = self.surface
         freely = self.contact_map.relative_velocities(free)
-        if impacts and world.restitution.any():
+        self.attraction = attraction(world, contacts, dt)
+        if self.attraction is not None:
+            momentum = self.contact_map.momenta(along_normal(-self.attraction))
+            self.free_velocity = self.velocity_with(momentum)
+            freely += self.contact_map.velocities(momentum)
+        self.resistance = resistance(world, contacts, self.contact_map, self.frame, free)
+        if self.attraction is not None and self.resistance is not None:
+            self.resistance.velocity[:] += self.resistance.map.velocities(momentum)[len(contacts) :]
+        if impacts and world.pairs.restitution.any():
             self._bounce(world, contacts, freely[:, 0])
         self.r = self.b + freely
 
@@ -87,11 +114,15 @@ class ContactSystem:
         They begin if without impulses they close in the step, `freely` (nc,) [m/s], and come faster than a fall of one
         step: a body at rest does not bounce."""
         table, a, b = contacts.near.bodies, contacts.a, contacts.b
-        e = world.restitution[table.material[a], table.material[b]]
+        e = world.pairs.restitution[table.material[a], table.material[b]]
         came = self.contact_map.relative_velocities(table.velocity)[:, 0]
-        begin = (e > 0.0) & (came < -self.dt * np.linalg.norm(world.gravity)) & (contacts.gap + self.dt * freely < 0.0)
+        begin = (e > 0.0) & (came < -self.dt * math.hypot(*world.gravity)) & (contacts.gap + self.dt * freely < 0.0)
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance = np.where(begin, 0.0, self.compliance)
+
+    def net(self, impulse: Floats) -> Floats:
+        """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
+        return impulse if self.attraction is None else impulse - along_normal(self.attraction)
 
     def velocity(self, impulse: Floats) -> Floats:
         """Velocities (owned, 6) after the step, v_free + M^-1 D g, for impulses (nc, 3); collective."""
@@ -103,54 +134,68 @@ class ContactSystem:
         scale(self.contact_map.given.root, momentum.reshape(change.shape), change)
         return self.free_velocity + change
 
-    def impulse_on_large(self, impulse: Floats) -> Floats:
+    def impulse_on_large(self, impulse: Floats, moment: Floats | None = None) -> Floats:
         """Impulses and angular impulses D g (large, 6) on the large bodies, the same on all ranks, from the impulses
-        (nc, 3) of all ranks [N s, N m s]; collective."""
+        and the moments of `dem.rolling` (nc, 3) of all ranks [N s, N m s]; collective."""
         first = self.near.grains + self.near.ghosts
         rows = np.flatnonzero(self.contact_map.body[:, 1] >= first)  # body b has the higher id
-        large = self.contact_map.sums_of_impulses(impulse, rows)[first:].copy()
+        sums = self.contact_map.sums_of_impulses(impulse, rows)
+        if moment is not None and self.resistance is not None:
+            self.resistance.map.sums_of_moments(moment, rows, sums)
+        large = sums[first:].copy()
         self.contact_map.comm.Allreduce(MPI.IN_PLACE, large)
         return large
 
-    def contact_velocities(self, velocity: Floats, large: Floats) -> Floats:
-        """D' v (nc, 3) for the velocities of the local grains (grains, 6) and of the large bodies (large, 6);
-        collective."""
-        table = np.zeros((len(self.near.bodies), 6))
-        table[: self.near.grains] = velocity
-        self.contact_map.halo.update(table)
-        table[self.near.grains + self.near.ghosts :] = large
-        return self.contact_map.relative_velocities(table)
+    def drive_impulse(self, large: Floats) -> Floats:
+        """Impulses and angular impulses (large, 6) of the drives and loads of large bodies that have the velocities
+        `large` (large, 6) after the step."""
+        line, slip = self.drives.line, self._free_large - large
+        return self.drives.impulse + (self.drives.grip * np.einsum("bi,bi->b", line, slip))[:, None] * line
+
+    def works(
+        self, impulse: Floats, before: Floats, grains: Floats, large: Floats, moment: Floats | None = None
+    ) -> tuple[float, float, Floats]:
+        """The work of this rank's normal impulses, and of its tangential ones and moments (nc, 3), on the mean of two
+        velocities [J], and the normal velocities (nc,) of the second ones: `before` (rows, 6) are of all rows of
+        `near`, the second of the local grains (grains, 6) and of the large bodies (large, 6); collective."""
+        after = np.zeros_like(before)
+        after[: self.near.grains] = grains
+        self.contact_map.halo.update(after)
+        after[self.near.grains + self.near.ghosts :] = large
+        normal, tangential, opening = self.contact_map.works(impulse, before, after)
+        if moment is not None and self.resistance is not None:
+            turning = self.resistance.map.turning
+            tangential += 0.5 * float(np.vdot(moment, turning(before) + turning(after)))
+        return normal, tangential, opening
 
 
 def touching(contacts: Contacts, system: ContactSystem) -> Bools:
     """Mask (nc,) of the contacts of a system that touch at the start of its step, to a hundredth of a radius. Bodies
-    that slide along each other are apart by (dt v_t)^2 / (2 R) after a step that has kept them in contact."""
+    that slide along each other are apart by (dt v_t)^2 / (2 R) after a step that has kept them in contact. So do those
+    that attract each other: their force is in both problems of a step."""
     table = contacts.near.bodies
     radius = np.where(table.shape == COMPOUND, np.inf, bodies.bounding_radius(table))
     radius = np.minimum(radius[contacts.a], radius[contacts.b])
     slip = system.contact_map.relative_velocities(table.velocity)[:, 1:]
     near: Bools = contacts.gap <= (system.dt * slip) ** 2 @ np.ones(2) / (2.0 * radius) + 0.01 * radius
-    return near
+    return near if system.attraction is None else near | (system.attraction > 0.0)
 
 
 def gap_velocities(
     world: World, contacts: Contacts, dt: float, recovery_speed: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Stiffness (nc,), compliance (nc,) and the part of r (nc,) that closes gaps or pushes overlaps apart: gap / dt, of
-    stiff contacts that overlap the share of `dem.stiffness`, of rigid ones at most the recovery speed."""
-    table, a, b = contacts.near.bodies, contacts.a, contacts.b
-    stiffness = world.stiffness[table.material[a], table.material[b]]
-    C, share = compliance(stiffness, 1.0 / (1.0 / table.mass[a] + 1.0 / table.mass[b]), dt)
-    speed = contacts.gap / dt
-    deepest = np.where(np.isinf(stiffness), -recovery_speed, -np.inf)
-    return stiffness, C, np.maximum(np.where(speed < 0.0, share * speed, speed), deepest)
+    """`dem.stiffness.gap_velocities` of these contacts."""
+    table, rows = contacts.near.bodies, (contacts.a, contacts.b)
+    return stiffness.gap_velocities(
+        world.pairs.stiffness, table.material, table.mass, *rows, contacts.gap, dt, float(recovery_speed)
+    )
 
 
-def inverse_root_masses(world: World) -> Floats:
+def inverse_root_masses(world: World, drives: Drives) -> Floats:
     """M^-1/2 of the bodies whose rows this rank owns, as `CompactRows.root` has it: (owned, 6) where that is all on all
     ranks, else (owned, 12)."""
     last = world.comm.rank == world.comm.size - 1
-    tables = [world.grains, world.large] if last else [world.grains]
+    tables = [world.grains, gripped(world.large, drives)] if last else [world.grains]
     if world.only_spheres and not bodies.is_dynamic(world.large).any():
         columns = [np.concatenate([table.mass[:, None]] * 3 + [table.inertia], axis=1) for table in tables]
         return 1.0 / np.sqrt(np.concatenate(columns))
@@ -159,6 +204,16 @@ def inverse_root_masses(world: World) -> Floats:
     guides = free_directions(world.large_bodies) if last else np.zeros((0, 3, 3))
     translation[len(world.grains) :] = translation[len(world.grains) :] @ guides
     return packed(np.stack([translation, bodies.inverse_root_inertia(owned)], axis=1))
+
+
+def gripped(large: Bodies, drives: Drives) -> Bodies:
+    """The large bodies with what servos add to their masses and to their moments about hinges."""
+    if not drives.grip.any():
+        return large
+    mass, inertia = large.mass.copy(), large.inertia.copy()
+    mass += drives.grip * drives.line[:, :3].any(axis=1)
+    inertia[:, 2] += drives.grip * drives.line[:, 3:].any(axis=1)  # the z axis of a hinged body is that of its hinge
+    return replace(large, mass=mass, inertia=inertia)
 
 
 def contact_frames(normal: Floats) -> Floats:

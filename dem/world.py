@@ -13,12 +13,15 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, quaternion
+from dem import bodies, loads, quaternion, springs
 from dem import motion as motions
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
-from dem.motion import Driven, Dynamic, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
-from dem.scene import LargeBody
+from dem.loads import Load, On
+from dem.motion import Dynamic, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
+from dem.pairs import Pairs
+from dem.scene import LargeBody, SurfaceVelocity, checked_surface
+from dem.springs import Spring
 from dem.together import together
 
 
@@ -34,12 +37,13 @@ class World:
     comm: MPI.Comm
     large_bodies: tuple[LargeBody, ...]
     gravity: Floats  #: (3,) [m/s^2]
-    friction: Floats  #: (materials, materials)
-    stiffness: Floats  #: of contacts (materials, materials); inf: rigid [N/m]
-    restitution: Floats  #: coefficients of impacts (materials, materials)
+    pairs: Pairs  #: coefficients of contacts by pair of materials
     materials: tuple[str, ...]  #: their names; the column `material` of a table of bodies is an index into them
     grains: Bodies  #: the slab of this rank; replace it by `set_grains` only
     large: Bodies  #: one row per large body
+    loads: dict[str, Load] = field(default_factory=dict)  #: by name; change them by `set_load` only
+    springs: dict[str, Spring] = field(default_factory=dict)  #: by name; change them by `set_spring` only
+    period: Floats | None = None  #: (3,) lengths of the cell that repeats itself, inf: none; None: along no axis [m]
     time: float = 0.0  #: [s]
     step: int = 0  #: number of steps done
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
@@ -47,11 +51,21 @@ class World:
 
     changed: set[str] = field(init=False, default_factory=set)  #: large bodies with another motion than the scene gave
 
+    loads_set: set[str] = field(init=False, default_factory=set)  #: loads with other numbers than the scene gave
+
+    springs_set: set[str] = field(init=False, default_factory=set)  #: springs with other numbers than the scene gave
+
     lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
 
     #: Of prescribed motions, by row: the poses at the two last times, and by time and dt [s] the mean velocities.
     _poses: dict[float, dict[int, Pose]] = field(init=False, repr=False, default_factory=dict)
     _followed: dict[tuple[float, float], dict[int, Floats]] = field(init=False, repr=False, default_factory=dict)
+
+    #: Velocities (springs, 2, 6) that the ends of springs were to have after the last step without contacts and drives.
+    expected: Floats | None = field(init=False, default=None)
+
+    #: By time and dt [s]: what loads and springs give in that step, a `dem.applied.Applied`.
+    applied: dict[tuple[float, float], Any] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.set_grains(self.grains)
@@ -61,14 +75,21 @@ class World:
         ones."""
         replicated = {f"large_{name}": column for name, column in self.large.columns().items()}
         replicated.update(slabs=self.slabs, time=np.array(self.time), step=np.array(self.step))
+        if self.expected is not None:
+            replicated["expected"] = self.expected
         return self.grains.columns(), replicated
 
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
-        self.grains, self.lists = grains, None
+        self.grains, self.lists, self.applied = grains, None, {}
         counts, spheres = zip(*self.comm.allgather((len(grains), bool((grains.shape == bodies.SPHERE).all()))))
         self.slabs = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.only_spheres = all(spheres)
+
+    @property
+    def loaded(self) -> bool:
+        """Whether there are loads or springs."""
+        return bool(self.loads or self.springs)
 
     @property
     def body_count(self) -> int:
@@ -86,6 +107,11 @@ class World:
         if name not in names:
             raise KeyError(f"no large body {name!r}; there are: {', '.join(names) or 'none'}")
         return names.index(name)
+
+    def name_of(self, id: int) -> str:
+        """What messages call the body of this id."""
+        first = int(self.slabs[-1])
+        return f"grain {id}" if id < first else f"body {self.large_bodies[id - first].name!r}"
 
     def replace_large(self, body: LargeBody) -> None:
         """Put this large body in the place of that of its name; the same on all ranks."""
@@ -119,8 +145,7 @@ class World:
             start, end = self.poses(self.time), self.poses(self.time + dt)
 
             def follow() -> dict[int, Floats]:
-                motions: list[Any] = [body.motion for body in self.large_bodies]
-                return {row: velocity_between(motions[row], start[row], end[row], dt) for row in start}
+                return {row: velocity_between(start[row], end[row], dt) for row in start}
 
             self._followed = {asked: together(self.comm, "motion of a large body", follow)}
         velocity = self.large.velocity.copy()
@@ -144,14 +169,62 @@ def set_motion(world: World, name: str, motion: Motion | None = None, **values: 
     body = world.large_bodies[row]
     motion = changed(body.motion, world.time, **values) if motion is None else motion
     pose = body.position, body.quaternion
+    motions.refuse_ignored(motion)
     if isinstance(body.motion, Dynamic) or isinstance(motion, Dynamic):
-        line, now = (each.line if isinstance(each, Driven) else np.zeros(3) for each in (motion, body.motion))
-        if type(motion) is not type(body.motion) or not np.allclose(line, now, atol=1e-12):
+        if type(motion) is not type(body.motion) or not np.allclose(_ways(motion), _ways(body.motion), atol=1e-12):
             kind = f"{type(body.motion).__name__} with another drive" if isinstance(body.motion, Dynamic) else "a path"
             raise ValueError(f"body {name!r} cannot change its motion to {motion!r}: allowed is {kind}")
     else:
         pose = _leading_to(motion, world.time, world.large.position[row], world.large.quaternion[row])
     world.replace_large(dataclasses.replace(body, motion=motion, position=pose[0], quaternion=pose[1]))
+
+
+def set_surface(world: World, name: str, velocity: SurfaceVelocity | None) -> None:
+    """Let the surface of a large body move along itself at another velocity (3,) in the body frame [m/s]. ValueError
+    for a function, which a checkpoint could not keep."""
+    if callable(velocity):
+        raise ValueError(f"surface velocity of {name!r} can be set to a vector within a run; a function is the scene's")
+    body = world.large_bodies[world.large_row(name)]
+    world.replace_large(dataclasses.replace(body, surface=checked_surface(name, velocity)))
+
+
+def _ways(motion: Any) -> Floats:
+    """Projectors (2, 3, 3) on what forces and torques can move."""
+    return np.array([motion.free_directions(), motion.free_turns()])
+
+
+def set_load(world: World, name: str, on: On = None, **values: Any) -> None:
+    """Give a load other numbers: `force`, `torque`, `start` or `end`; a name that no load has begins one `on` some
+    bodies, all grains if nothing is given. ValueError for what it cannot be."""
+    load = world.loads[name].changed(**values) if name in world.loads else Load(on).changed(**values)
+    refuse_load(world, name, load)
+    world.loads[name] = load
+    world.loads_set.add(name)
+    world.applied = {}
+
+
+def refuse_load(world: World, name: str, load: Load) -> None:
+    """ValueError for a load on bodies that are not there, or that no force moves; not collective."""
+    if isinstance(load.on, str):
+        bodies_of_name = [body for body in world.large_bodies if body.name == load.on]
+        if bodies_of_name and not isinstance(bodies_of_name[0].motion, Dynamic):
+            raise ValueError(f"load {name!r}: the motion of the body {load.on!r} is prescribed, so no force moves it")
+        if bool(bodies_of_name) == (load.on in world.materials):
+            kind = "both a body and a material" if bodies_of_name else "neither a body nor a material"
+            raise ValueError(f"load {name!r}: {load.on!r} is {kind}")
+    elif load.ids is not None and len(wrong := load.ids[(load.ids < 0) | (load.ids >= world.slabs[-1])]):
+        raise ValueError(f"load {name!r}: there is no grain {wrong[0]}")
+
+
+def set_spring(world: World, name: str, **values: Any) -> None:
+    """Give a spring another `stiffness`, `damping` or rest `length`. ValueError for what it cannot have."""
+    if name not in world.springs:
+        raise ValueError(f"no spring {name!r}; there are: {', '.join(world.springs) or 'none'}")
+    if other := sorted(set(values) - {"stiffness", "damping", "length"}):
+        raise ValueError(f"spring {name!r}: {other[0]} cannot be set; allowed are stiffness, damping and length")
+    world.springs[name] = dataclasses.replace(world.springs[name], **values)
+    world.springs_set.add(name)
+    world.applied = {}
 
 
 def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> Pose:
@@ -174,6 +247,7 @@ def changed_motions(world: World) -> str:
             "values": {field.name: getattr(body.motion, field.name) for field in dataclasses.fields(body.motion)},
             "position": body.position,
             "quaternion": body.quaternion,
+            **({} if callable(body.surface) else {"surface": body.surface}),
         }
         for body in world.large_bodies
         if body.name in world.changed
@@ -190,5 +264,21 @@ def restore_motions(world: World, text: str) -> None:
         if kind is None:
             raise ValueError(f"body {name!r}: neither the scene nor dem.motion has the motion {entry['motion']}")
         place, turn = np.array(entry["position"]), np.array(entry["quaternion"])
-        moved = dataclasses.replace(body, motion=kind(**entry["values"]), position=place, quaternion=turn)
-        world.replace_large(moved)
+        surface = entry.get("surface", body.surface)
+        motion = kind(**entry["values"])
+        world.replace_large(dataclasses.replace(body, motion=motion, position=place, quaternion=turn, surface=surface))
+
+
+def restore_loads(world: World, text: str) -> None:
+    """Give a world, made from its scene, the loads of `dem.loads.as_text`. ValueError if that fails."""
+    for name, load in loads.from_text(text, world.loads).items():
+        refuse_load(world, name, load)
+        world.loads[name] = load
+        world.loads_set.add(name)
+
+
+def restore_springs(world: World, text: str) -> None:
+    """Give a world, made from its scene, the springs of `dem.springs.as_text`."""
+    for name, spring in springs.from_text(text).items():
+        world.springs[name] = spring
+        world.springs_set.add(name)

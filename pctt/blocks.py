@@ -1,7 +1,14 @@
-"""PETSc Mats of small dense blocks, distributed by rows, from arrays."""
+"""PETSc Mats of small dense blocks, distributed by rows: from arrays, or symmetric ones by a function and their
+diagonal blocks; and the diagonal blocks of Mats.
+
+PETSc inverts the diagonal blocks of a BAIJ matrix once and keeps these inverses even if the matrix gets other values
+(seen in 3.22 and 3.25, not in 3.18; in 3.25 also for AIJ). So ``MatInvertBlockDiagonal``, ``-pc_type pbjacobi`` and SOR
+use the first inverses for ever. A new Mat has no such memory.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -45,3 +52,94 @@ def new_matrix(
     mat.setType(kind)
     mat.setPreallocationCSR(csr)
     return mat
+
+
+# -- diagonal blocks -----------------------------------------------------------------------------------------
+
+
+class Shell:
+    """The context of a symmetric Mat of type python; it knows the diagonal blocks (n, bs, bs) of this rank's rows."""
+
+    def __init__(self, product: Callable[[Array, Array], None]):
+        self.product = product
+        self.blocks: Array | None = None
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.product(x.array_r, y.array_w)
+
+    multTranspose = mult  # noqa: N815 - as PETSc names it
+
+    def getDiagonal(self, mat: PETSc.Mat, diagonal: PETSc.Vec) -> None:
+        assert self.blocks is not None
+        diagonal.array_w[:] = np.diagonal(self.blocks, axis1=1, axis2=2).ravel()
+
+
+def symmetric_shell(comm: MPI.Comm, rows: int, block: int, product: Callable[[Array, Array], None]) -> PETSc.Mat:
+    """A Mat with ``rows`` local rows in blocks of size ``block``. Its product is ``product(x, out)``, which is
+    collective and gets local flat arrays."""
+    mat = PETSc.Mat().createPython(((rows, PETSc.DETERMINE), (rows, PETSc.DETERMINE)), Shell(product), comm=comm)
+    mat.setBlockSize(block)
+    mat.setUp()
+    mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    return mat
+
+
+def shell_of(mat: PETSc.Mat) -> Shell | None:
+    """The context of a Mat of `symmetric_shell`; None for other Mats."""
+    context = mat.getPythonContext() if mat.getType() == PETSc.Mat.Type.PYTHON else None
+    return context if isinstance(context, Shell) else None
+
+
+def set_diagonal_blocks(mat: PETSc.Mat, blocks: Array, symmetric: bool = True) -> None:
+    """Tell a Mat of `symmetric_shell` that it has changed, and its diagonal blocks (n, bs, bs) on this rank."""
+    shell = shell_of(mat)
+    assert shell is not None
+    shell.blocks = blocks
+    mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+    mat.stateIncrease()
+
+
+def put_diagonal_blocks(mat: PETSc.Mat, blocks: Array) -> None:
+    """Write the diagonal blocks (n, bs, bs) of this rank's block rows into a Mat; collective."""
+    size = mat.getBlockSize()
+    first, last = mat.getOwnershipRange()
+    rows = np.arange(first // size, last // size, dtype=PETSc.IntType)[:, None]
+    if len(blocks):  # petsc4py divides by their number
+        mat.setValuesBlockedRCV(rows, rows, blocks.reshape(-1, size**2))
+    mat.assemble()
+
+
+def block_diagonal(P: PETSc.Mat, blocks: Array | None = None) -> PETSc.Mat:
+    """A new Mat with the diagonal blocks of P, or these ``blocks``; ``pbjacobi`` needs nothing else. For an assembled P
+    it is a copy. The caller destroys the Mat."""
+    shell = shell_of(P)
+    blocks = shell.blocks if blocks is None and shell else blocks
+    if blocks is None:
+        return P.duplicate(copy=True)
+    first, last = (row // P.getBlockSize() for row in P.getOwnershipRange())
+    rows = P.getLocalSize()[0]
+    return block_csr_matrix(P.comm, rows, rows, np.arange(last - first + 1), np.arange(first, last), blocks)
+
+
+def fresh_copy(P: PETSc.Mat) -> PETSc.Mat:
+    """A copy of a sequential BAIJ matrix for SOR, which does not work with the copy that ``MatDuplicate`` makes."""
+    copy = new_matrix(P.comm, P.getSizes(), P.getBlockSize(), P.getRowIJ(compressed=True), P.getType())
+    P.copy(copy, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+    return copy
+
+
+def inverse_diagonal_blocks(P: PETSc.Mat) -> Array:
+    """Inverses (n, bs, bs) of the diagonal blocks of this rank's block rows of an assembled Mat.
+
+    Raises numpy.linalg.LinAlgError on the ranks that have a singular block.
+    """
+    here = P.getDiagonalBlock().duplicate(copy=True)
+    try:
+        inverse = np.array(here.invertBlockDiagonal())
+    except PETSc.Error:  # a zero pivot
+        raise np.linalg.LinAlgError("a diagonal block is singular") from None
+    finally:
+        here.destroy()
+    if not np.isfinite(inverse).all():
+        raise np.linalg.LinAlgError("a diagonal block is singular")
+    return inverse

@@ -17,8 +17,7 @@ from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, ContactMap
 from dem.exchange import exchange, offsets
-from pctt.block_diagonal import set_diagonal_blocks, symmetric_shell
-from pctt.blocks import Array, new_matrix
+from pctt.blocks import Array, new_matrix, set_diagonal_blocks, symmetric_shell
 
 ROUNDING = 1e-14  # part of the trace that is added to blocks which rounding may have made singular
 

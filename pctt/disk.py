@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import io
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +25,9 @@ Found = TypeVar("Found")
 #: Bytes for HDF5 beside the numbers: per file, and per data set or attribute. HDF5 was seen to use a quarter of them.
 PER_FILE, PER_ITEM = 16384, 2048
 
+#: What file systems and sandboxes answer that cannot reserve room. EBADF: glibc has tried to read the file instead.
+CANNOT_RESERVE = (errno.EINVAL, errno.EOPNOTSUPP, errno.EBADF, errno.ENOSYS, errno.EPERM)
+
 #: The last bytes of a file of `written` are this word and its checksum. HDF5 does not see them.
 SEAL = b"pctt sum"
 
@@ -41,9 +45,12 @@ def temporary_name(path: Path) -> Path:
 def whole(path: Path) -> Iterator[Path]:
     """A temporary name for a file. When the block ends, the file is flushed to the disk and replaces ``path``.
 
-    If the block or the disk raises an error, the old file stays as it was, and the temporary file is removed.
+    If the block or the disk raises an error, the old file stays as it was, and the temporary file is removed. OSError
+    if ``path`` is a device, a pipe or a folder: no file may take its place.
     """
     temporary = temporary_name(path)
+    if path.exists() and not path.is_file():
+        raise OSError("it is no regular file")
     try:
         yield temporary
         _replace(path)
@@ -54,8 +61,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 def _replace(path: Path) -> None:
     temporary = temporary_name(path)
-    with open(temporary, "rb") as file:
-        os.fsync(file.fileno())
+    flush(temporary)
     os.replace(temporary, path)
 
 
@@ -75,24 +81,30 @@ def write_text(path: Path, text: str) -> None:
 
 
 def append(path: Path, line: str) -> None:
-    """Add a line to a text file. If the disk has no room, OSError is raised and no part of the line stays."""
+    """Add a line to a text file. If the disk has no room, OSError is raised and no part of the line stays. A killed
+    program leaves the line; a machine that stops may lose those since the last `flush`."""
     with open(path, "ab", buffering=0) as file:
         length, rest = file.seek(0, os.SEEK_END), f"{line}\n".encode()
         try:
             while rest:
                 rest = rest[file.write(rest) :]
-            os.fsync(file.fileno())
         except OSError:
             file.truncate(length)
             raise
 
 
+def flush(path: Path) -> None:
+    """Wait until what was written to a file is on the disk."""
+    with open(path, "rb") as file:
+        os.fsync(file.fileno())
+
+
 def lines(path: Path) -> Iterator[str]:
-    """The whole lines of a text file to which `append` writes; none if the file does not exist.
+    """The whole lines of a text file to which `append` writes; none if there is no such file, as a device is none.
 
     A last line without its end is left out: a program is writing it, or was writing it when the machine stopped.
     """
-    if path.exists():
+    if path.is_file():
         with open(path) as file:
             for line in file:
                 if line.endswith("\n"):
@@ -143,8 +155,48 @@ def make_hdf5(path: Path, numbers: int, items: int) -> None:
     """
     size = numbers + PER_FILE + items * PER_ITEM
     _take_room(path, size)  # before HDF5 writes its first bytes
-    h5py.File(path, "w").close()  # this gives the room back
+    with hdf5(path, "w"):  # this gives the room back
+        pass
     _take_room(path, size)
+
+
+class _Bytes(io.FileIO):
+    """A file whose ``error``, the first one, is kept from HDF5: with one that cannot be written this is lost."""
+
+    error: OSError | None = None
+
+    def _tried(self, call: Callable[..., Found], *arguments: Any, instead: Found) -> Found:
+        try:
+            return call(*arguments)
+        except OSError as error:
+            self.error = self.error or error
+            return instead
+
+    def write(self, data: Any) -> int:
+        left = memoryview(data)
+        while left and not self.error:
+            left = left[self._tried(super().write, left, instead=0) or 0 :]
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        return self._tried(super().truncate, size, instead=size or 0)
+
+    def readinto(self, data: Any) -> int:
+        return self._tried(super().readinto, data, instead=0) or 0
+
+
+@contextmanager
+def hdf5(path: Path, mode: str = "r+") -> Iterator[h5py.File]:
+    """An HDF5 file that this rank alone writes; "r+": one of `make_hdf5`, "w": a new one. OSError if it cannot be
+    written, where HDF5 itself would end the program with a segmentation fault."""
+    with _Bytes(path, "w+" if mode == "w" else mode) as data:
+        try:
+            with h5py.File(data, mode) as file:
+                yield file
+        except (OSError, RuntimeError) as error:  # h5py raises both
+            raise data.error or error from None
+        if data.error:
+            raise data.error
 
 
 def _take_room(path: Path, size: int) -> None:
@@ -154,7 +206,7 @@ def _take_room(path: Path, size: int) -> None:
         try:
             os.posix_fallocate(file.fileno(), 0, size)
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP, errno.EBADF):  # the file system cannot reserve
+            if error.errno not in CANNOT_RESERVE:
                 raise
 
 
@@ -204,24 +256,25 @@ def write_rows(
     own = comm.allreduce(sum(array.nbytes for array in rows.values()))
     same = [np.asarray(value) for values in (shared, *attributes.values()) for value in values.values()]
     numbers, items = own + sum(array.nbytes for array in same), len(rows) + len(same)
-    parallel = {"driver": "mpio", "comm": comm} if comm.size > 1 else {}
+
+    def alone() -> None:
+        with hdf5(temporary) as file:
+            _fill(file, comm, rows, shared, attributes)
+
     try:
         _together(what, comm, lambda: make_hdf5(temporary, numbers, items) if first else None)
-        file = _together(what, comm, lambda: h5py.File(temporary, "r+", **parallel))
-        failure = None
-        try:
-            _fill(file, comm, rows, shared, attributes)
-            file.close()
-        except (OSError, RuntimeError) as error:  # h5py raises both
-            failure = error
-            if comm.size > 1:  # the other ranks may be within a call that waits for this one
+        if comm.size == 1:
+            _together(what, comm, alone)
+        else:
+            file = _together(what, comm, lambda: h5py.File(temporary, "r+", driver="mpio", comm=comm))
+            try:
+                _fill(file, comm, rows, shared, attributes)
+                file.close()
+            except (OSError, RuntimeError) as error:  # h5py raises both
+                # the other ranks may be within a call that waits for this one
                 sys.stderr.write(f"pctt.run: {what} ({error})\n")
                 sys.stderr.flush()
                 comm.Abort(2)
-            with suppress(OSError, RuntimeError):
-                file.close()
-        if failure:
-            raise FileError(f"{what} ({failure})")
         size = comm.bcast(os.path.getsize(temporary) if first else 0)
         seal = SEAL + checksum(temporary, size, comm).to_bytes(8, "little")
         _together(what, comm, lambda: _finish(path, seal) if first else None)
@@ -287,7 +340,7 @@ def _together(what: str, comm: MPI.Comm, call: Callable[[], Found]) -> Found:
         found = call()
     except (KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
         failure = getattr(error, "strerror", None) or str(error)
-    failures = [text for text in comm.allgather(failure) if text is not None]
-    if failures:
+    if exchange.on_any(comm, failure is not None)[0]:
+        failures = [text for text in comm.allgather(failure) if text is not None]
         raise FileError(f"{what} ({failures[0]})")
     return found

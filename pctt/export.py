@@ -21,9 +21,9 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from pctt.disk import FileError, make_hdf5, told, whole, write_text
+from pctt.disk import FileError, hdf5, make_hdf5, told, whole, write_text
 from pctt.folder import RUN_FILES, Folder, Frame
-from pctt.look.program import chosen, made_folder, parser, run
+from pctt.look.program import chosen, made_folder, parser, run, told_steps
 
 SERIES = ("bodies", "contacts", "large")
 
@@ -43,7 +43,7 @@ def main(comm: MPI.Comm) -> None:
     if given.single:
         if comm.rank == 0:
             write_single(given.single, folder, steps)
-            print(f"{len(steps)} steps: {given.single}")
+            print(f"{told_steps(folder, steps)}: {given.single}")
         return
     target = made_folder(given.output or folder.path / "paraview")
 
@@ -69,7 +69,7 @@ def main(comm: MPI.Comm) -> None:
             else:
                 write_vtkhdf(target / f"{name}.vtkhdf", name, scene, steps)
         kind = "pvd" if given.format == "vtp" else "vtkhdf"
-        print(f"{len(steps)} steps: {target}/" + ", ".join(f"{name}.{kind}" for name in SERIES))
+        print(f"{told_steps(folder, steps)}: {target}/" + ", ".join(f"{name}.{kind}" for name in SERIES))
     comm.Barrier()  # all files exist when any rank returns
 
 
@@ -84,7 +84,7 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
     parts = {"bodies": folder.bodies_path, **{f"steps/{step:06d}": folder.frame_path(step) for step in steps}}
     with told(path), whole(path) as temporary:
         make_hdf5(temporary, sum(source.stat().st_size for source in parts.values()), items=0)
-        with h5py.File(temporary, "r+") as file:
+        with hdf5(temporary) as file:
             source = folder.path / "state.h5"
             try:
                 if not source.exists():  # of a run that goes on, or was killed

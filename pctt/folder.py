@@ -44,7 +44,8 @@ CONTENTS = (
     "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, by body id; "
     "record: attributes as in records.csv; "
     "contact: bodies a and b, point m, frame rows (normal from a to b, t1, t2), gap m, "
-    "impulse on b N s; attribute dt s. bodies: shape, size m, mass kg, material by body id; "
+    "impulse on b N s, and moment on b in the world N m where contacts resist rolling or spinning; attribute dt s. "
+    "bodies: shape, size m, mass kg, material by body id; "
     "materials: the names of the materials, of which material is the index; "
     "large: names and shapes of the large bodies, the last of the ids, in their frames"
 )
@@ -88,8 +89,13 @@ def totals(steps: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "last_step": steps[-1]["step"],
         "time": steps[-1]["time"],
         "contacts": [min(contacts), max(contacts)],
-        **{name: sum(line[name] for line in steps) for name in ("newton_its", "ksp_its", "fallbacks", "seconds")},
+        **{
+            name: sum(line[name] for line in steps)
+            for name in ("iterations", "newton_its", "ksp_its", "fallbacks", "seconds")
+        },
         "not_converged": sum(not line["converged"] for line in steps),
+        "squeezed": sum(line["status"] == "squeezed" for line in steps),  # of those
+        "energy_jumps": sum(line.get("energy_jump", 0.0) > 0.0 for line in steps),
         **{
             name: max(line[name] for line in steps)
             for name in ("natural_residual", "coulomb_residual", "peak_memory")
@@ -111,6 +117,7 @@ class Contacts:
     gap: np.ndarray  #: (nc,) at the start of the step, negative if the bodies overlap [m]
     impulse: np.ndarray  #: (nc, 3) on b, in the contact frame [N s]
     dt: float  #: length of the step in which the impulses acted [s]
+    moment: np.ndarray | None = None  #: (nc, 3) on b in the world, where contacts resist rolling or spinning [N m]
 
     @classmethod
     def none(cls) -> Contacts:
@@ -182,6 +189,15 @@ class Folder:
         """The file of a recorded step."""
         return self._frames / f"{step:06d}.h5"
 
+    @property
+    def lost(self) -> list[int]:
+        """The recorded steps to which state.h5 leads without an end."""
+        try:
+            with h5py.File(self.path / "state.h5", "r") as file:
+                return sorted({int(name) for name in file["steps"]} - {*self.steps})
+        except (KeyError, OSError, ValueError):  # it is made again from what is there
+            return []
+
     def require_frames(self) -> None:
         """Read the shapes of the bodies; FileError if these, or recorded steps, are missing."""
         if not self.steps:
@@ -208,7 +224,8 @@ class Folder:
         def take(file: h5py.File, sealed: bool) -> Frame:
             contact = file["contact"]
             rows = [contact[name][()] for name in ("body", "point", "frame", "gap", "impulse")]
-            contacts = Contacts(*rows, float(contact.attrs["dt"]))  # type: ignore[call-arg]
+            moment = contact["moment"][()] if "moment" in contact else None
+            contacts = Contacts(*rows, float(contact.attrs["dt"]), moment)  # type: ignore[call-arg]
             table = {name: file[name][()] for name in ("position", "quaternion", "velocity")}
             return Frame(step, float(file.attrs["time"]), **table, contacts=contacts)
 
@@ -279,7 +296,7 @@ class Folder:
         path = self.path / "state.h5"
         with told(path), disk.whole(path) as temporary:
             disk.make_hdf5(temporary, numbers=4096 + 128 * len(self.steps), items=0)
-            with h5py.File(temporary, "r+") as file:
+            with disk.hdf5(temporary) as file:
                 file.attrs["scene"] = json.dumps(self._json("settings.json").get("scene", {}))
                 file.attrs["large_bodies"] = [body["name"] for body in self.large]
                 file.attrs["contents"], file.attrs["links"] = CONTENTS, LINKS

@@ -60,6 +60,8 @@ def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> dict[str, 
     kind, solver = everything.get(prefix + "pc_type"), prefix + "pc_factor_mat_solver_type"
     if kind in ("cholesky", "lu") and solver not in everything and PETSc.Sys.hasExternalPackage("mumps"):
         options[solver] = "mumps"
+        room = prefix + "mat_mumps_icntl_14"  # % beyond its estimate, which pivots of nearly singular matrices exceed
+        options |= {} if room in everything else {room: "100"}
     if ranks > 1 and kind in ("ilu", "icc"):
         options |= {prefix + "pc_type": "bjacobi", prefix + "sub_pc_type": kind}
         factor = {name: value for name, value in everything.items() if name.startswith(prefix + "pc_factor_")}

@@ -10,6 +10,7 @@ import dataclasses
 import difflib
 import math
 import numbers
+import sys
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
@@ -139,7 +140,8 @@ def _refuse(given: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> N
     choices, check = metadata.get("choices"), metadata.get("check")
     if choices and value not in choices:
         raise OptionError(f"{given}: allowed is {_allowed(kind, metadata)}{nearest(value, choices)}")
-    allowed, test = check or ("a finite number", lambda x: kind is not float or math.isfinite(x))
+    most = math.inf if metadata.get("test") else sys.float_info.max  # the test of a scene may allow inf
+    allowed, test = check or ("a finite number", lambda x: kind is not float or -most <= x <= most)
     if not test(value):
         raise OptionError(f"{given}: allowed is {allowed}")
 

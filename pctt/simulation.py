@@ -16,7 +16,7 @@ import dataclasses
 import html
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,27 +24,35 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from dem import measures
 from dem import record as recording
-from dem.arrays import Floats
+from dem.arrays import ArrayLike, Floats
 from dem.bodies import Bodies
 from dem.experiment import Experiment, Given
 from dem.impulses import ImpulseMemory
+from dem.loads import Load, On
+from dem.measures import Sample
+from dem.mesh import Mesh
 from dem.motion import Motion
-from dem.scene import LargeBody, Scene
+from dem.period import wrapped
+from dem.scene import LargeBody, Scene, SurfaceVelocity
+from dem.springs import Spring
+from dem.start import step_remark
 from dem.step import Step
 from dem.stiffness import expected_overlap
 from dem.together import meet, together
-from dem.world import set_motion
+from dem.world import set_load, set_motion, set_spring, set_surface
 from pctt import ccp, log
 from pctt.disk import FileError, refuse_serial
 from pctt.folder import Contacts, Frame, Snapshot
 from pctt.options import OptionError, made, refuse_bad
+from pctt.petsc import warn
 from pctt.render import Picture, picture
-from pctt.run import state
+from pctt.run import report, state
 from pctt.run.dump import Dump
 from pctt.run.output import Place, Writer, described_bodies, refuse_unwritable
 from pctt.run.settings import Run, Settings, scene_name
-from pctt.run.stepper import Stepper
+from pctt.run.stepper import NoSolutionError, Stepper
 
 
 class Simulation:
@@ -88,11 +96,13 @@ class Simulation:
         self.comm = comm
         self.experiment = scene if isinstance(scene, Experiment) else Given(scene)
         given = {**(vars(settings) if settings else {}), **changes}
-        self.settings = together(
-            comm, "settings", lambda: made(Settings, given).of(self.experiment), own=(OptionError,)
-        )
         self._compare = compare or ccp.Comparison(comm, [])
+        compared = bool(self._compare.names)
+        self.settings = together(
+            comm, "settings", lambda: made(Settings, given).of(self.experiment, compared), own=(OptionError,)
+        )
         scene = state.built(self.experiment, comm)
+        self.settings = self.settings.fitted(scene)
         if restart == "settled":
             restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
         stated = self.settings.stiffness is not None or scene.states_stiffness
@@ -102,11 +112,14 @@ class Simulation:
         if restart:
             self.world, self.memory = state.load(Path(restart), scene, self._origin, comm)
         else:
-            self.world, self.memory = state.world_at_start(self.experiment, scene, comm), ImpulseMemory(comm)
+            self.world = state.world_at_start(self.experiment, scene, comm)
+            self.memory = ImpulseMemory(comm, self.world.pairs.parts)
+        if large := step_remark(self.world, self.settings.dt):
+            warn(comm, large)
         self.restart = str(restart)  #: the file from which it goes on
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
-        self.expected_overlap = expected_overlap(scene, float(self.world.stiffness.min()))
+        self.expected_overlap = expected_overlap(scene, float(self.world.pairs.stiffness.min()))
         self.last: Step | None = None
         self.figures: dict[str, Any] = {}
         self.output: Writer | None = None
@@ -127,15 +140,22 @@ class Simulation:
     # -- steps -----------------------------------------------------------------------------------------------
 
     def step(self) -> dict[str, Any]:
-        """Make a step of dt; its `figures`. SceneError if a body is lost, or if code of the scene fails."""
+        """Make a step of dt; its `figures`. Warns of a jump of energy. SceneError if a body is lost, if code of the
+        scene fails, or if the contacts have no solution: the state is then that before the step."""
         if self._closed:
             raise ValueError("this simulation is closed")
         stepper, output, self.last = self.stepper, self.output, None  # frees the arrays of the last step
-        figures = stepper.step()
-        self.last = Step(self.world, stepper.contacts, stepper.system, stepper.impulse)
+        try:
+            figures = stepper.step()
+        except NoSolutionError:
+            if output:
+                output.keep()
+            raise
+        self.last = Step(self.world, stepper.contacts, stepper.system, stepper.impulse, stepper.moment)
         with log.phase("output"):
             self._row = recording.row(self.last, self.experiment)
             figures["worst_overlap"] = self._row["worst_overlap [m]"]
+            figures["energy_jump"] = self._row["energy_jump [J]"]
             if output:
                 output.record(self.last, self._row)
         # a step's checkpoint is written after its figures, so its seconds count in the next step
@@ -145,6 +165,8 @@ class Simulation:
             with log.phase("output"):
                 output.add(figures, self._row)
         self.figures = self._row | figures
+        if figures["energy_jump"]:
+            warn(self.comm, report.jump_words(self.figures))
         return self.figures
 
     def run(
@@ -193,8 +215,9 @@ class Simulation:
 
     @property
     def positions(self) -> Floats:
-        """Centres (n, 3) of all grains on every rank, in the order in which the scene added them [m]."""
-        return self._of_grains("position")
+        """Centres (n, 3) of all grains on every rank, in the order in which the scene added them, within the cell of a
+        periodic scene [m]."""
+        return wrapped(self._of_grains("position"), self.world.period)
 
     @property
     def orientations(self) -> Floats:
@@ -240,13 +263,20 @@ class Simulation:
             "contacts",
             key=own.key,
             bodies=np.stack([id[own.a], id[own.b]], axis=1),
-            point=own.point,
+            point=wrapped(own.point, self.world.period),
             frame=step.system.frame,
             gap=own.gap,
             impulse=step.impulse,
+            **({} if step.moments is None else {"moment": step.moments}),
         )
         order = np.argsort(found.pop("key"))
         return Contacts(**{name: column[order] for name, column in found.items()}, dt=step.system.dt)
+
+    @property
+    def sample(self) -> Sample:
+        """The grains and contacts of this rank after the last step, for the functions of `dem.measures`. ValueError
+        before the first step. Not collective."""
+        return self._last.sample
 
     def body(self, name: str) -> Body:
         """A large body; ValueError if there is none of that name. Not collective."""
@@ -254,6 +284,37 @@ class Simulation:
             return Body(self, self.world.large_row(name))
         except KeyError as error:
             raise ValueError(error.args[0]) from None
+
+    @property
+    def loads(self) -> dict[str, Load]:
+        """The loads by name; `set_load` changes them. Not collective."""
+        return dict(self.world.loads)
+
+    def set_load(self, name: str, on: On = None, **values: ArrayLike) -> None:
+        """Give a load other numbers, ``force=(0, 0, -5.0)`` [N], ``torque`` [N m], ``start`` or ``end`` [s]; or begin
+        one ``on`` a body, a material or ids of grains; nothing: all grains. The first rank's values count, and
+        checkpoints keep them. ValueError for what it cannot be (`dem.world.set_load`)."""
+        meet(self.comm, f"load {name}")
+        on, values = self.comm.bcast((on, values))
+        change = partial(set_load, self.world, name, on, **values)
+        together(self.comm, f"load {name}", change, own=(ValueError, TypeError))
+
+    @property
+    def springs(self) -> dict[str, Spring]:
+        """The springs by name; `set_spring` changes them. Not collective."""
+        return dict(self.world.springs)
+
+    def set_spring(self, name: str, **values: float) -> None:
+        """Give a spring another ``stiffness`` [N/m], ``damping`` [N s/m] or rest ``length`` [m]. The first rank's
+        values count, and checkpoints keep them. ValueError for what it cannot have."""
+        meet(self.comm, f"spring {name}")
+        change = partial(set_spring, self.world, name, **self.comm.bcast(values))
+        together(self.comm, f"spring {name}", change, own=(ValueError, TypeError))
+
+    def spring_force(self, name: str) -> Floats:
+        """Force (3,) of a spring on its second end, its mean over the last step [N]. ValueError before the first step,
+        KeyError if there is none of that name. Not collective."""
+        return self._last.spring_force(name)
 
     @property
     def _last(self) -> Step:
@@ -298,7 +359,7 @@ class Simulation:
                 refuse_unwritable(name, Path(path), self.comm)
         place = Place(Path(folder), self.comm, self.restart, overwrite)
         about = {"scene": json.loads(self._origin["scene"]), "settings": dataclasses.asdict(self.settings)}
-        about["stiffness"] = self.world.stiffness.tolist()
+        about["stiffness"] = self.world.pairs.stiffness.tolist()
         self.output = Writer(place, self.world, about, self._save, self._compare.summary, every, checkpoint_every)
         self.stepper.dump = Dump(self.settings, self.experiment, self.world, place, hard, str(problems))
 
@@ -359,6 +420,8 @@ class Simulation:
         names = ("position", "quaternion", "velocity", "shape", "size", "material")
         table = {name: np.concatenate([self._of_grains(name), getattr(large, name)]) for name in names}
         position, turn, velocity = (table.pop(name) for name in names[:3])
+        grains = len(position) - len(large)
+        position[:grains] = wrapped(position[:grains], world.period)
         contacts = self.contacts if self.last else Contacts.none()
         frame = Frame(self.steps, self.time, position, turn, velocity, contacts)
         return Snapshot(frame, **table, materials=world.materials, large=described_bodies(world))
@@ -403,6 +466,50 @@ class Body:
     def torque(self) -> Floats:
         """Torque of the contact forces (3,) about the position, their mean over the last step [N m]."""
         return self._sim._last.force_on(self.name)[3:]
+
+    @property
+    def applied_force(self) -> Floats:
+        """Force (3,) that acts on it from now on at its centre of mass [N], beside gravity and the loads of the scene.
+        Set it on all ranks; checkpoints keep it. ValueError for a body whose motion is prescribed."""
+        return self._applied("force")
+
+    @applied_force.setter
+    def applied_force(self, force: ArrayLike) -> None:
+        self._sim.set_load(self.name, self.name, force=force)
+
+    @property
+    def applied_torque(self) -> Floats:
+        """As `applied_force` a torque (3,) [N m]."""
+        return self._applied("torque")
+
+    @applied_torque.setter
+    def applied_torque(self, torque: ArrayLike) -> None:
+        self._sim.set_load(self.name, self.name, torque=torque)
+
+    @property
+    def surface_velocity(self) -> SurfaceVelocity | None:
+        """Velocity (3,) of its surface along itself in the body frame, that of a belt [m/s]; None: it has none. Set it
+        on all ranks; the first rank's value counts, and checkpoints keep it."""
+        return self._large.surface
+
+    @surface_velocity.setter
+    def surface_velocity(self, velocity: Sequence[float] | None) -> None:
+        sim, what = self._sim, f"surface velocity of the body {self.name}"
+        meet(sim.comm, what)
+        change = partial(set_surface, sim.world, self.name, sim.comm.bcast(velocity))
+        together(sim.comm, what, change, own=(ValueError, TypeError))
+
+    def _applied(self, name: str) -> Floats:
+        load = self._sim.world.loads.get(self.name)
+        return np.zeros(3) if load is None else np.array(getattr(load, name))
+
+    def triangle_forces(self) -> Floats:
+        """Forces (triangles, 3) on the triangles of a body that is one mesh, of the last step, each contact's on the
+        nearest [N]; collective. ValueError for another body."""
+        sample, mesh = self._sim.sample, self._large.shapes[0]
+        if len(self._large.shapes) > 1 or not isinstance(mesh, Mesh):
+            raise ValueError(f"triangle_forces: the body {self.name!r} is not one mesh")
+        return measures.triangle_forces(sample, sample.count + self._row, mesh, self.position, self.orientation)
 
     @property
     def motion(self) -> BodyMotion:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import notebook as notebooks
 import numpy as np
+import pictures
 import pytest
 from mpi4py import MPI
 
@@ -21,7 +22,6 @@ from pctt.simulation import Simulation
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
 PAGE = (ROOT / "docs" / "examples.md").read_text()
-STUDIES = str(ROOT / "run" / "studies")
 PICTURE_BYTES = 150_000
 
 
@@ -29,7 +29,6 @@ PICTURE_BYTES = 150_000
 def imports(monkeypatch):
     """The examples import each other, as files of one folder do."""
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    monkeypatch.syspath_prepend(STUDIES)
 
 
 def run(name: str, steps: int, **options: str) -> tuple[object, dict[str, np.ndarray]]:
@@ -42,8 +41,6 @@ def run(name: str, steps: int, **options: str) -> tuple[object, dict[str, np.nda
 
 
 def test_the_page_shows_every_example_and_its_picture():
-    import pictures
-
     listed = {path.stem for path in EXAMPLES.glob("*.py")} - {"integral_problems", "comparison"}
     assert set(re.findall(r"\]\(examples/(\w+)\.py\)", PAGE)) == listed
     assert sorted(re.findall(r"\]\(examples/(\w+)\.png\)", PAGE)) == pictures.pictured()
@@ -52,8 +49,6 @@ def test_the_page_shows_every_example_and_its_picture():
 
 
 def test_the_commands_in_the_heads_name_the_files_and_known_options():
-    import pictures
-
     for name in pictures.STEPS:
         *_, simulate, draw = pictures.commands(EXAMPLES / f"{name}.py")
         words = dict(zip(simulate[2:], simulate[3:]))
@@ -66,7 +61,7 @@ def test_the_commands_in_the_heads_name_the_files_and_known_options():
 
 
 def test_a_sliding_box_and_a_rolling_sphere_have_the_textbooks_accelerations():
-    scene, records = run("incline", 10, ccp_tol="1e-8", ccp_coulomb="true", stiffness="inf")
+    scene, records = run("incline", 10, ccp_tol="1e-8", ccp_type="apgd", stiffness="inf")
     found = scene.analyse(records)
     assert found["sphere_acceleration [m/s^2]"] == pytest.approx(5 / 7 * 9.81 * np.sin(np.radians(25)), rel=1e-7)
     assert abs(found["box_error [m/s^2]"]) < 1e-6
@@ -97,6 +92,27 @@ def test_the_plough_feels_the_bed():
     scene, records = run("blade", 20, scene_settling_time="0", scene_speed="1.0")
     assert records["draft [N]"].max() > 0
     assert scene.analyse(records)["mean_draft [N]"] > 0
+
+
+def test_both_sizes_fall_in_the_shaken_box():
+    _, records = run("vibrated", 20, scene_n="3")
+    assert (np.diff(records["large_z [m]"]) < 0).any()
+    large, small = records["large_z [m]"], records["small_z [m]"]
+    np.testing.assert_allclose(records["segregation"], (large - small) / (large + small))
+
+
+def test_the_belt_carries_the_capsules():
+    _, records = run("conveyor", 100, scene_layers="1")
+    assert records["arrived"][-1] > 0
+    assert records["lost"][-1] == 0
+    assert records["power [W]"].sum() > 0
+
+
+def test_the_wheel_drives_itself_with_its_load():
+    _, records = run("wheel", 200, scene_settling_time="0.1", scene_length="16")
+    assert records["slip"][-1] < 0.6
+    assert records["pull [W]"][-1] > 0
+    assert records["height [m]"][-1] < records["height [m]"][0]
 
 
 def test_the_bucket_is_a_scene_with_a_tool_from_a_file(tmp_path, monkeypatch):
@@ -168,8 +184,11 @@ def test_pictures_of_solutions(name, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["fredholm", "gaussian_process", "lippmann_schwinger", "yukawa"])
 def test_comparisons_on_small_grids(name, capsys):
-    problem = getattr(importlib.import_module("integral_problems"), name)
-    importlib.import_module("comparison").compare(problem(8), eps=1e-6)
+    problem = getattr(importlib.import_module("integral_problems"), name)(8)
+    v = np.random.default_rng(0).standard_normal(problem.size)
+    A = problem.entries(*np.indices((problem.size, problem.size)).reshape(2, -1)).reshape(problem.size, -1)
+    np.testing.assert_allclose(problem.product()(v), A @ v)  # products by FFT are those of the entries
+    importlib.import_module("comparison").compare(problem, eps=1e-6)
     said = capsys.readouterr().out
     assert "CG + train, FFT products" in said
     assert "dense Cholesky" in said

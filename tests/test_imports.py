@@ -55,12 +55,13 @@ BELOW = {
     "dem": {},
     "pctt.tt": {},
     "dem.contact_map": {"dem.arrays", "dem.compiled", "dem.exchange"},
-    "pctt.body_matrix": {"pctt.block_diagonal", "pctt.blocks", "dem.contact_map", "dem.exchange"},
+    "pctt.body_matrix": {"pctt.blocks", "dem.contact_map", "dem.exchange"},
     "pctt.mat": {
         "pctt.disk", "dem.exchange", "dem.morton", "pctt.options", "pctt.petsc",
         "pctt.tt",
     },
     "pctt.folder": {"dem", "pctt.disk"},
+    "pctt.analysis": {"dem", "pctt.disk", "pctt.folder"},
     "pctt.look": {"dem", "pctt.disk", "pctt.folder", "pctt.options", "pctt.petsc"},
 }
 

@@ -147,9 +147,9 @@ def test_known_names_and_those_of_further_prefixes_pass():
 def test_described_defaults_pass_their_own_checks():
     """Of the groups of the project: what -help shows as a default can be given as a value."""
     from pctt import ccp
-    from pctt.run.settings import Asked, Run
+    from pctt.run.settings import Run, Settings
 
-    groups = [(Run, ""), (Asked, "ccp_"), *((s.options, f"ccp_{n}_") for n, s in ccp.SOLVERS.items())]
+    groups = [(Run, ""), (Settings, "ccp_"), *((s.options, f"ccp_{n}_") for n, s in ccp.SOLVERS.items())]
     described = [describe(group, prefix) for group, prefix in groups]
     assert sum(map(len, described)) > 20
     for (group, prefix), lines in zip(groups, described):

@@ -46,6 +46,24 @@ def test_the_scene_of_the_readme_is_one(in_folder):
     assert [body.name for body in scene.large_bodies] == ["floor"]
 
 
+def test_the_measures_of_their_page_are_those_of_a_lattice(in_folder, capsys):
+    (text,) = blocks("docs/measuring.md")
+    exec(text, {})
+    said = [float(re.findall(r"[\d.]+", line)[0]) for line in capsys.readouterr().out.splitlines()]
+    weight = np.pi / 6 * 2500 * 9.81 * 0.25  # mean of what is above
+    assert said[:4] == pytest.approx([weight, np.pi / 6, (4 * 2 + 1 * 1) / 5, 1.0], rel=0.01)
+    assert said[4] == pytest.approx(weight, rel=0.1)  # the kernel takes a part out of the box
+    assert (in_folder / "fields.vtkhdf").exists()
+
+
+def test_the_loads_of_their_page_give_what_it_says(in_folder, capsys):
+    (text,) = blocks("docs/loads.md")
+    exec(text, {})
+    said = [float(word) for word in re.findall(r"-?\d+\.\d+", capsys.readouterr().out)]
+    pull = 0.3 * 2.0 * 9.81
+    assert said == pytest.approx([0.3 * 9.81 - 1.0, -pull, pull, 0.2], rel=0.01)
+
+
 def test_the_simulation_of_its_page_runs(in_folder, capsys):
     (text,) = blocks("docs/python.md")
     before = PETSc.Options().getAll()
@@ -95,3 +113,11 @@ def test_a_problem_is_copied_as_on_the_page_of_files(in_folder):
     exec("\n".join(lines), {"comm": MPI.COMM_SELF})
     copy = fclib.load(in_folder / "copy.hdf5", MPI.COMM_SELF)
     assert (copy.title, copy.problem.size) == ("a title", 3)
+
+
+def test_the_reference_has_all_public_names_of_the_cone_problem():
+    text = (ROOT / "docs" / "reference.md").read_text()
+    public = [name for name in ccp.__all__ if not name.isupper()]
+    assert [name for name in public if f"pctt.ccp.{name}\n" not in text] == []
+    named = re.findall(r"auto(?:class|function):: pctt\.ccp\.(\w+)\n", text)
+    assert [name for name in named if not hasattr(ccp, name)] == []

@@ -13,11 +13,14 @@ from pctt.pc import TensorTrain
 Entries = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def solver(mat: PETSc.Mat, ksp_type: str = "cg", rtol: float = 1e-8, **options: object) -> PETSc.KSP:
+def solver(
+    mat: PETSc.Mat, ksp_type: str = "cg", rtol: float = 1e-8, prefix: str = "", **options: object
+) -> PETSc.KSP:
     """A KSP with the train as preconditioner, by these options -pc_tt_*."""
     for name, value in options.items():
-        PETSc.Options()[f"pc_tt_{name}"] = str(value)
+        PETSc.Options()[f"{prefix}pc_tt_{name}"] = str(value)
     ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOptionsPrefix(prefix)
     ksp.setOperators(mat)
     ksp.setType(ksp_type)
     ksp.setTolerances(rtol=rtol, max_it=2000)

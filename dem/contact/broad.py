@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dem.arrays import Floats, Ints
-from dem.compiled import unfused
+from dem.compiled import loop
 
 
 def close_pairs(position: Floats, radius: Floats) -> Ints:
@@ -24,7 +24,7 @@ def close_pairs(position: Floats, radius: Floats) -> Ints:
     return np.concatenate(pairs)
 
 
-@unfused
+@loop
 def pairs_in_cells(center: Floats, radius: Floats, first: Ints, second: Ints, alike: bool) -> Ints:
     """Pairs (m, 2), the lower row first, of a sphere of the rows `first` and one of the rows `second` that touch, to
     rounding.
@@ -70,7 +70,7 @@ def pairs_in_cells(center: Floats, radius: Floats, first: Ints, second: Ints, al
         pairs = np.concatenate((pairs, np.empty((max(len(pairs), len(second)), 2), np.int64)))
 
 
-@unfused
+@loop
 def _pairs_of_rows(center, radius, rows, done, alike, largest, per, side, start, place, member, pairs, found):
     """Add to the first pairs those of the rows that are not done, as long as there is room; new numbers of rows done
     and pairs found. A loop that makes the room itself takes twice the time."""

@@ -19,39 +19,61 @@ Pairs = tuple[Ints, Ints, Floats]
 
 
 def meeting(
-    world: World, near: Neighbourhood, lists: Lists, table: Primitives, delta: float, shifts: Floats
+    world: World, near: Neighbourhood, lists: Lists, table: Primitives, delta: float, shifts: Floats, grown: Bools
 ) -> Pairs:
-    """All pairs of this rank whose margins meet, or by rounding do not, in the order of `Contacts`. Those of large
-    bodies are delta/2 or the way of their surfaces, if the bodies move and turn by any of the `shifts` (k, large, 6)
-    [m, rad]."""
+    """All pairs of this rank whose margins meet, or by rounding do not, in the order of `Contacts`; of pairs with
+    grains those of which one has `grown` (grains + ghosts,). Margins of large bodies are delta/2 or the way of their
+    surfaces, if the bodies move and turn by any of the `shifts` (k, large, 6) [m, rad]."""
     last = world.comm.rank == world.comm.size - 1
     first = near.grains + near.ghosts
     foreign = bodies.is_dynamic(world.large)[table.row[first:] - first] & (not last)
-    found = [_of_grains(near, lists.own, ~foreign, table, delta, shifts)]
+    found = [_of_grains(near, lists.own, ~foreign, table, delta, shifts, grown)]
     if last:
         if bodies.is_dynamic(world.large).any():
             found.append(_of_large(world, near, table, delta, shifts))
     else:
-        found.append(_of_grains(near, lists.away, foreign, table, delta, shifts))
+        found.append(_of_grains(near, lists.away, foreign, table, delta, shifts, grown))
+    if lists.images is not None:
+        if last:
+            found.append(_of_grains(near, lists.away, np.zeros_like(foreign), table, delta, shifts, grown))
+        found.append(_of_images(near, lists.images.own(near.grains) & grown[near.grains :], table, delta, shifts))
     i, j, reach = (np.concatenate(columns) for columns in zip(*found)) if len(found) > 1 else found[0]
     return i, j, reach
 
 
+def _of_images(near: Neighbourhood, wanted: Bools, table: Primitives, delta: float, shifts: Floats) -> Pairs:
+    """Pairs of the `wanted` (ghosts,) images of local grains with the parts of large bodies that are no half spaces."""
+    first, image = near.grains + near.ghosts, near.grains + np.flatnonzero(wanted)
+    count = len(image)
+    bodies_of = np.concatenate([image, np.arange(first, len(near.bodies))])
+    alone = Neighbourhood(near.bodies.take(bodies_of), near.margin[image], near.index[bodies_of], count, 0)
+    rows = np.concatenate([image, np.arange(first, len(table.kind))])
+    names = ("number", "kind", "center", "quaternion", "size", "radius")
+    columns = {name: getattr(table, name)[rows] for name in names}
+    row = np.concatenate([np.arange(count), table.row[first:] - first + count])
+    none = Rows(np.zeros(count + 1, np.int64), np.zeros(0, np.int64))
+    solid = table.kind[first:] != PLANE
+    found = _of_grains(alone, none, solid, table._replace(row=row, **columns), delta, shifts, np.ones(count, bool))
+    return rows[found[0]], rows[found[1]], found[2]
+
+
 def _of_grains(
-    near: Neighbourhood, rows: Rows, wanted: Bools, table: Primitives, delta: float, shifts: Floats
+    near: Neighbourhood, rows: Rows, wanted: Bools, table: Primitives, delta: float, shifts: Floats, grown: Bools
 ) -> Pairs:
-    """Pairs of local grains with those in their rows, and with the `wanted` (parts,) parts of large bodies."""
+    """Pairs of local grains with those in their rows, and with the `wanted` (parts,) parts of large bodies, of which a
+    grain has `grown` (grains + ghosts,)."""
     first = near.grains + near.ghosts
     part = first + np.flatnonzero(wanted)
     turn = quaternion.matrix(table.quaternion[part]).reshape(-1, 9)
     turning, way = shifts[:, :, 3:].any(axis=(0, 2)), length(shifts[:, :, :3]).max(axis=0)
+    grains = rows.start, rows.other, near.margin, grown
     large = near.bodies.position[first:], shifts, turning, np.maximum(0.5 * delta, np.where(turning, 0.0, way))
     parts = part, table.row[part] - first, turn
     shapes = table.number, table.kind, table.center, table.size, table.radius
     done, found, room = 0, 0, len(rows.other) + near.grains + len(part)
     i, j, reach = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)
     while True:
-        done, found = fill(rows.start, rows.other, near.margin, *parts, *large, *shapes, done, found, i, j, reach)
+        done, found = fill(*grains, *parts, *large, *shapes, done, found, i, j, reach)
         if done == near.grains:
             return i[:found], j[:found], reach[:found]
         i, j, reach = (np.concatenate([column, np.empty_like(column)]) for column in (i, j, reach))
@@ -59,15 +81,16 @@ def _of_grains(
 
 @loop
 def fill(
-    start, other, margin, part, body, turn, pivot, shifts, turning, least, number, kind, center, size, radius, done,
-    found, i, j, reach,
+    start, other, margin, grown, part, body, turn, pivot, shifts, turning, least, number, kind, center, size, radius,
+    done, found, i, j, reach,
 ):  # fmt: skip
     """Add to the first pairs those of the rows that are not done, as long as there is room; new numbers of rows done
     and pairs found.
 
-    The grains have the pairs `start`, `other`, and a `margin` each. The parts are rows `part` (p,) with frames `turn`
-    (p, 9), of the bodies `body` (p,). These have a `pivot` (bodies, 3), move and turn by the `shifts` (k, bodies, 6),
-    and have the margins `least` (bodies,) but for those `turning` (bodies,), whose surfaces go further.
+    The grains have the pairs `start`, `other`, of which those count where a grain has `grown`, and a `margin` each. The
+    parts are rows `part` (p,) with frames `turn` (p, 9), of the bodies `body` (p,). These have a `pivot` (bodies, 3),
+    move and turn by the `shifts` (k, bodies, 6), and have the margins `least` (bodies,) but for those `turning`
+    (bodies,), whose surfaces go further.
     """
     for n in range(done, len(start) - 1):
         if found + start[n + 1] - start[n] + len(part) > len(i):
@@ -75,6 +98,8 @@ def fill(
         x, y, z, own, wide = center[n, 0], center[n, 1], center[n, 2], margin[n], radius[n]
         for k in range(start[n], start[n + 1]):
             m = other[k]
+            if not (grown[n] or grown[m]):
+                continue
             u, v, w = center[m, 0] - x, center[m, 1] - y, center[m, 2] - z
             most = ((wide + own) + (radius[m] + margin[m])) * (1.0 + 1e-12)
             if u * u + v * v + w * w <= most * most:
@@ -82,7 +107,7 @@ def fill(
                 i[found], j[found], reach[found] = n if ahead else m, m if ahead else n, own + margin[m]
                 found += 1
         last, limit = -1, 0.0
-        for k in range(len(part)):
+        for k in range(len(part) if grown[n] else 0):
             if body[k] != last:
                 last = body[k]
                 way = least[last]

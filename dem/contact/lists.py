@@ -20,6 +20,7 @@ from dem.contact.broad import close_pairs
 from dem.contact.primitives import Primitives, primitives
 from dem.contact_map import Halo
 from dem.neighbourhood import Neighbourhood, neighbourhood
+from dem.period import Images, between, images
 from dem.world import World
 
 #: The slack of a grain at rest, as a part of its radius: it costs a sixth more pairs.
@@ -46,7 +47,8 @@ class Lists:
     table: Primitives  #: of the bodies of `near`, not yet where they are
     margin: Floats  #: (grains,) without slack [m]
     own: Rows  #: pairs of local grains
-    away: Rows  #: pairs of a local grain and a ghost
+    away: Rows  #: pairs of a local grain and a ghost or an image
+    images: Images | None  #: of grains and ghosts, in a periodic world
     constant: list[Any]  #: the columns of the world's tables, and the shapes, that no step changes
 
     def hold(self, world: World, margin: Floats) -> bool:
@@ -68,13 +70,18 @@ def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:
     size = bodies.bounding_radius(world.grains)
     near = neighbourhood(world, margin + np.minimum(AT_REST * size + STEPS * way, size))
     grains, count = near.grains, near.grains + near.ghosts
-    table = primitives(near, [body.shapes for body in world.large_bodies], int(world.slabs[-1]))
-    pairs = close_pairs(table.center[:count], table.radius[:count] + near.margin)
+    periodic = None if world.period is None else images(world, near)
+    wide = near if periodic is None else periodic.among(near)
+    seen = wide.grains + wide.ghosts
+    table = primitives(wide, [body.shapes for body in world.large_bodies], int(world.slabs[-1]))
+    pairs = close_pairs(table.center[:seen], table.radius[:seen] + wide.margin)
+    if periodic is not None:
+        pairs = between(pairs, wide)
     index = near.index[grains:count]
     owner = np.searchsorted(world.slabs, index, side="right") - 1
     halo = Halo(world.comm, grains, len(near.bodies), np.arange(grains, count), owner, index - world.slabs[owner])
-    own, away = (Rows(*in_rows(pairs, table.number, grains, *between)) for between in ((0, grains), (grains, count)))
-    return Lists(near, halo, table, margin, own, away, _constant(world))
+    own, away = (Rows(*in_rows(pairs, table.number, grains, *ends)) for ends in ((0, grains), (grains, seen)))
+    return Lists(near, halo, table, margin, own, away, periodic, _constant(world))
 
 
 def _constant(world: World) -> list[Any]:

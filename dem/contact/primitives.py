@@ -34,6 +34,9 @@ from dem.mesh import Mesh, Surface
 from dem.neighbourhood import Neighbourhood
 from dem.shapes import Shape, placed
 
+#: What `Primitives.numbers` can be: a contact is known by two of them and a feature, in 63 bits.
+MOST_NUMBERS = int((2**63 // FEATURES) ** 0.5) - 1
+
 
 class Primitives(NamedTuple):
     """Spheres, boxes, capsules, half spaces and meshes in the world frame; first all grains, then parts of large
@@ -97,12 +100,18 @@ def primitives(near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int
         "quaternion": (table.quaternion, turn),
         "size": (table.size, size),
     }
+    numbers = grains + sum(spans)
+    if numbers > MOST_NUMBERS:
+        raise ValueError(
+            f"{grains} grains and {numbers - grains} numbers of parts of large bodies: their contacts have no names of "
+            f"64 bits; allowed are {MOST_NUMBERS} together"
+        )
     both = {name: np.concatenate([of_grains[:count], of_parts]) for name, (of_grains, of_parts) in columns.items()}
     return Primitives(
         **both,
         radius=enclosing_radius(both["kind"], both["size"]),
         surfaces={count + n: shape.surface for n, shape in enumerate(members) if isinstance(shape, Mesh)},
-        numbers=grains + sum(spans),
+        numbers=numbers,
     )
 
 

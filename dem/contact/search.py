@@ -5,20 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mpi4py import MPI
 
 from dem import bodies
-from dem.arrays import Bools, Floats, Ints
+from dem.applied import free_directions, free_turns, grains_free_velocity, large_free_velocity
+from dem.arrays import Bools, Floats, Ints, places
 from dem.bodies import CAPSULE, MESH, SPHERE
 from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.candidates import meeting
 from dem.contact.lists import grain_lists
 from dem.contact.primitives import FEATURES, extents, touches
-from dem.free_motion import free_directions, free_velocity, large_free_velocity
-from dem.keys import places
-from dem.motion import Hinged
 from dem.neighbourhood import Neighbourhood, refreshed
+from dem.period import Images, refuse_short
 from dem.quaternion import cross, length
 from dem.world import World
 
@@ -39,13 +37,21 @@ class Contacts:
     friction: Floats  #: (nc,) coefficient
     near: Neighbourhood  #: the bodies of the rows `a` and `b`
     shifts: Floats  #: (k, large, 6) the ways and turns of the large bodies that the search reckoned with [m, rad]
+    moved: Floats | None = None  #: (nc, 3) from body b to its image that touches body a; None without periods [m]
+    held_overlap: float = 0.0  #: the deepest overlap of bodies that no force can part, left out of the contacts [m]
 
     def __len__(self) -> int:
         return len(self.key)
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays with a row per contact by name, without copies."""
-        return {name: value for name, value in vars(self).items() if name not in ("near", "shifts")}
+        left = {"near", "shifts", "held_overlap"} | ({"moved"} if self.moved is None else set())
+        return {name: value for name, value in vars(self).items() if name not in left}
+
+    def way(self, position: Floats) -> Floats:
+        """From the centre of body a to that of body b, or of its image (nc, 3), at these positions (rows, 3) [m]."""
+        way = position[self.b] - position[self.a]
+        return way if self.moved is None else way + self.moved
 
     def take(self, rows: np.ndarray) -> Contacts:
         """The contacts of the given rows (index array or mask)."""
@@ -53,8 +59,9 @@ class Contacts:
 
 
 def find_contacts(
-    world: World, delta: float, dt: float = 0.0, margin: Floats | float = 0.0, shifts: Floats | None = None
-) -> Contacts:
+    world: World, delta: float, dt: float = 0.0, margin: Floats | float = 0.0, shifts: Floats | None = None,
+    besides: Contacts | None = None,
+) -> Contacts:  # fmt: skip
     """All contacts that this rank owns of the pairs whose margins meet; collective.
 
     The margin of a body is delta/2 [m], or the way that it goes in dt [s] without contact forces if that is longer. So
@@ -63,32 +70,68 @@ def find_contacts(
     [m, rad] further ways and turns of the large bodies that their margins are to cover. A contact belongs to the rank
     that owns the body of lower global index. The numbers of contacts that the grains own are left in
     `world.grains.weight`.
+
+    With `besides`, contacts that a search with margins not greater has found, only those are found that are not among
+    them, and the weights stay.
     """
     not_negative("contact distance delta", delta)
     if shifts is None:
         shifts = (dt * large_free_velocity(world, dt) if dt else np.zeros_like(world.large.velocity))[None]
-    free = free_velocity(world.grains, world.gravity, dt) if dt else world.grains.velocity
+    free = grains_free_velocity(world, dt) if dt else world.grains.velocity
     way = ways(world.grains.shape, world.grains.size, free, dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
+    refuse_short(world, margin)
     lists = grain_lists(world, margin, way)
-    near = refreshed(lists.near, lists.halo, world, margin)
+    base = near = refreshed(lists.near, lists.halo, world, margin)
+    grown = _grown(base, shifts, besides)
+    if lists.images is not None:
+        near, grown = lists.images.among(base), grown[lists.images.rows]
     table = lists.table.now(near)
-    i, j, reach = meeting(world, near, lists, table, delta, shifts)
+    i, j, reach = meeting(world, near, lists, table, delta, shifts, grown)
     pair, feature, touch = touches(table, i, j, reach)
     key, a, b, body, friction, weight = named(
-        *(table.number, table.row, table.kind, near.index, near.bodies.material, world.friction),
+        *(table.number, table.row, table.kind, near.index, near.bodies.material, world.pairs.friction),
         *(table.numbers, FEATURES, near.grains, i, j, pair, feature),
     )
     contacts = Contacts(key, a, b, body, *touch, friction, near, shifts)
+    if lists.images is not None:
+        contacts, weight = _without_images(world, contacts, base, lists.images)
     back = np.flatnonzero(np.diff(pair) <= 0)  # other shapes come behind the spheres, and touch in several points
-    if len(back):
+    if len(back) and lists.images is None:
         left = slice(int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min())), None)
         order = contact_order(world, near, a[left], b[left], key[left])
         for column in contacts.columns().values():
             column[left] = column[left].take(order, axis=0)
-    world.grains.weight = weight
+    if besides is None:
+        world.grains.weight = weight
+    else:
+        contacts = contacts.take(places(besides.key, contacts.key) < 0)
     rigid = _gives_no_way(world, contacts)
-    return contacts.take(~rigid) if rigid.any() else contacts
+    if not rigid.any():
+        return contacts
+    return replace(contacts.take(~rigid), held_overlap=-float(contacts.gap[rigid].min(initial=0.0)))
+
+
+def _without_images(
+    world: World, contacts: Contacts, near: Neighbourhood, images: Images
+) -> tuple[Contacts, Floats]:
+    """The contacts of a table with images as contacts of the bodies of `near`, at the place of body a and in order, and
+    how many each of the local grains owns (grains,)."""
+    (a, way), (b, moved) = images.place(contacts.a), images.place(contacts.b)
+    found = replace(contacts, a=a, b=b, near=near, point=contacts.point - way, moved=moved - way)
+    owned = np.minimum(a, b)
+    weight = np.bincount(owned[owned < near.grains], minlength=near.grains).astype(float)
+    return found.take(contact_order(world, near, a, b, contacts.key)), weight
+
+
+def _grown(near: Neighbourhood, shifts: Floats, besides: Contacts | None) -> Bools:
+    """Which grains and ghosts (n,) may have contacts that are not among the known ones: those of greater margin than
+    then, ghosts that may be others than then, and all if large bodies go further."""
+    grown = np.ones(near.grains + near.ghosts, bool)
+    if besides is not None and len(shifts) == len(besides.shifts):
+        many = len(grown) if near.index is besides.near.index else near.grains
+        grown[:many] = near.margin[:many] > besides.near.margin[:many]
+    return grown
 
 
 @loop
@@ -127,27 +170,7 @@ def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints
     return np.lexsort((key, owner, foreign[a] | foreign[b]))
 
 
-def find_overrun(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Contacts | None:
-    """The contacts of wider margins, if with these velocities (owned, 6) bodies go further in dt [s] than their margins
-    in the search for `contacts`; None if that brings no new ones: then no grain meets anything unseen; collective.
-
-    The search may be repeated for the contacts that it finds: margins only grow.
-    """
-    seen = contacts.near.margin[: contacts.near.grains]
-    way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
-    shift = dt * world.large_velocity(velocity)
-    # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
-    gone = bool((way > seen).any()), _go_beyond(world, shift, contacts.shifts, delta)
-    further, beyond = map(any, zip(*world.comm.allgather(gone)))
-    if not (further or beyond):
-        return None
-    shifts = np.concatenate([contacts.shifts, shift[None]]) if beyond else contacts.shifts
-    wider = find_contacts(world, delta, dt, np.maximum(seen, way), shifts)
-    new = bool((places(contacts.key, wider.key) < 0).any())
-    return wider if world.comm.allreduce(new, MPI.LOR) else None
-
-
-def _go_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
+def goes_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
     """Whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as in one
     of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
     free = bodies.is_dynamic(world.large)
@@ -179,8 +202,8 @@ def ways(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
 
 
 def _gives_no_way(world: World, contacts: Contacts) -> Bools:
-    """Which contacts (nc,) no force can open: those whose normal is across the guide of a guided body, or that do not
-    turn a hinged one, if the other body is held too.
+    """Which contacts (nc,) no force can open: those whose normal is across the free directions of a body and that do
+    not turn it about a free axis, if the other body is held too.
 
     Their normal impulse changes no velocity, and would allow any friction.
     """
@@ -189,14 +212,13 @@ def _gives_no_way(world: World, contacts: Contacts) -> Bools:
     rigid = np.minimum(contacts.a, contacts.b) >= first
     if rigid.any():
         these = contacts.take(rigid)
-        motions = [body.motion for body in world.large_bodies]
-        free = free_directions(world.large_bodies) * bodies.is_dynamic(world.large)[:, None, None]
-        axis = np.array([m.axis if isinstance(m, Hinged) else np.zeros(3) for m in motions])
+        moves = bodies.is_dynamic(world.large)[:, None, None]
+        free, turns = free_directions(world.large_bodies) * moves, free_turns(world.large_bodies) * moves
         normal, opens = these.normal, np.zeros(len(these))
         for body in (these.a, these.b):
             arm = these.point - near.bodies.position[body]
-            lever = cross(axis[body - first], arm / np.maximum(length(arm), 1e-300)[:, None])
+            lever = cross(arm / np.maximum(length(arm), 1e-300)[:, None], normal)
             opens += np.einsum("ci,cij,cj->c", normal, free[body - first], normal)
-            opens += np.einsum("ci,ci->c", lever, normal) ** 2
+            opens += np.einsum("ci,cij,cj->c", lever, turns[body - first], lever)
         rigid[rigid] = opens <= 1e-8
     return rigid

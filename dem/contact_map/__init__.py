@@ -3,5 +3,6 @@ the halo of bodies of other ranks that they need."""
 
 from dem.contact_map.halo import Halo, find_halo
 from dem.contact_map.map import BlockRows, CompactRows, ContactMap, root_blocks
+from dem.contact_map.turning import TurningMap
 
-__all__ = ["BlockRows", "CompactRows", "ContactMap", "Halo", "find_halo", "root_blocks"]
+__all__ = ["BlockRows", "CompactRows", "ContactMap", "Halo", "TurningMap", "find_halo", "root_blocks"]

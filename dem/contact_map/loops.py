@@ -61,6 +61,21 @@ def relative_velocities(frame, arm, body, w) -> Floats:
     return y
 
 
+@loop
+def works(frame, arm, body, g, w, new_w):
+    """g' D' (w + new_w) / 2 of normal and of tangential impulses g (nc, 3), and the normal part (nc,) of D' new_w."""
+    normal, tangential, velocity = 0.0, 0.0, np.empty(len(body))
+    for c in range(len(body)):
+        u0, u1, u2 = velocity_at(c, arm, body, w)
+        v0, v1, v2 = velocity_at(c, arm, body, new_w)
+        velocity[c] = frame[c, 0] * v0 + frame[c, 1] * v1 + frame[c, 2] * v2
+        u0, u1, u2 = 0.5 * (u0 + v0), 0.5 * (u1 + v1), 0.5 * (u2 + v2)
+        normal += g[c, 0] * (frame[c, 0] * u0 + frame[c, 1] * u1 + frame[c, 2] * u2)
+        tangential += g[c, 1] * (frame[c, 3] * u0 + frame[c, 4] * u1 + frame[c, 5] * u2)
+        tangential += g[c, 2] * (frame[c, 6] * u0 + frame[c, 7] * u1 + frame[c, 8] * u2)
+    return normal, tangential, velocity
+
+
 def add_momenta(frame, arm, body, g, m) -> None:
     """m += D g for impulses g (nc, 3)."""
     add_momenta_of(every(body), frame, arm, body, g, m)
@@ -254,24 +269,62 @@ def local_product(weight, g, y):
         y[c, 0], y[c, 1], y[c, 2] = weighted(weight, c, g[c, 0], g[c, 1], g[c, 2])
 
 
+@inlined
+def block_velocity_at(c, blocks, start, body, w):
+    """G w at the contact c, in registers: sums in memory take 1.5 times as long."""
+    y0 = y1 = y2 = blocks.dtype.type(0)
+    for k in range(start[c], start[c + 1]):
+        i = body[k]
+        for n in range(6):
+            y0 += blocks[k, 0, n] * w[i, n]
+            y1 += blocks[k, 1, n] * w[i, n]
+            y2 += blocks[k, 2, n] * w[i, n]
+    return y0, y1, y2
+
+
+@inlined
+def block_push(c, blocks, start, body, g0, g1, g2, m):
+    """m += G' g for the impulse of the contact c. All six sums are read before one is written, so that the compiler
+    makes vectors of them."""
+    for k in range(start[c], start[c + 1]):
+        i = body[k]
+        m0 = blocks[k, 0, 0] * g0 + blocks[k, 1, 0] * g1 + blocks[k, 2, 0] * g2
+        m1 = blocks[k, 0, 1] * g0 + blocks[k, 1, 1] * g1 + blocks[k, 2, 1] * g2
+        m2 = blocks[k, 0, 2] * g0 + blocks[k, 1, 2] * g1 + blocks[k, 2, 2] * g2
+        m3 = blocks[k, 0, 3] * g0 + blocks[k, 1, 3] * g1 + blocks[k, 2, 3] * g2
+        m4 = blocks[k, 0, 4] * g0 + blocks[k, 1, 4] * g1 + blocks[k, 2, 4] * g2
+        m5 = blocks[k, 0, 5] * g0 + blocks[k, 1, 5] * g1 + blocks[k, 2, 5] * g2
+        m[i, 0] += m0
+        m[i, 1] += m1
+        m[i, 2] += m2
+        m[i, 3] += m3
+        m[i, 4] += m4
+        m[i, 5] += m5
+
+
 @loop
 def block_velocities(blocks, start, body, w, y):
     """y += G w (nc, 3) for blocks (nb, 3, 6): contact c has those from start[c] to start[c + 1], of bodies (nb,)."""
     for c in range(len(y)):
-        for k in range(start[c], start[c + 1]):
-            i = body[k]
-            for n in range(6):
-                y[c, 0] += blocks[k, 0, n] * w[i, n]
-                y[c, 1] += blocks[k, 1, n] * w[i, n]
-                y[c, 2] += blocks[k, 2, n] * w[i, n]
+        y0, y1, y2 = block_velocity_at(c, blocks, start, body, w)
+        y[c, 0] += y0
+        y[c, 1] += y1
+        y[c, 2] += y2
 
 
 @loop
 def block_momenta(blocks, start, body, g, m):
     """m += G' g for the blocks of `block_velocities` and impulses g (nc, 3)."""
     for c in range(len(g)):
-        g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
-        for k in range(start[c], start[c + 1]):
-            i = body[k]
-            for n in range(6):
-                m[i, n] += blocks[k, 0, n] * g0 + blocks[k, 1, n] * g1 + blocks[k, 2, n] * g2
+        block_push(c, blocks, start, body, g[c, 0], g[c, 1], g[c, 2], m)
+
+
+@loop
+def block_through(blocks, start, body, weight, w, m):
+    """m += G' H G w for blocks H (nc, 3, 3), here ``weight``; one pass over the blocks of `block_velocities`."""
+    for c in range(len(weight)):
+        y0, y1, y2 = block_velocity_at(c, blocks, start, body, w)
+        g0 = weight[c, 0, 0] * y0 + weight[c, 0, 1] * y1 + weight[c, 0, 2] * y2
+        g1 = weight[c, 1, 0] * y0 + weight[c, 1, 1] * y1 + weight[c, 1, 2] * y2
+        g2 = weight[c, 2, 0] * y0 + weight[c, 2, 1] * y1 + weight[c, 2, 2] * y2
+        block_push(c, blocks, start, body, g0, g1, g2, m)

@@ -217,6 +217,11 @@ class ContactMap:
         """D' v (nc, 3) for the velocities (rows, 6) of all rows of a table of the halo, without a message."""
         return loops.relative_velocities(*self._arrays, v)
 
+    def works(self, g: Floats, v: Floats, new_v: Floats) -> tuple[float, float, Floats]:
+        """The work of normal and of tangential impulses g (nc, 3) on the mean of two velocities (rows, 6) of all rows
+        of a table of the halo, and the normal velocities (nc,) of the second, without a message."""
+        return loops.works(*self._arrays, g, v, new_v)
+
     def sums_of_impulses(self, g: Floats, contacts: Ints) -> Floats:
         """D g (rows, 6) of these of this rank's contacts, by rows of a table of the halo, without a message."""
         sums = np.zeros((self.halo.rows, 6))
@@ -304,14 +309,21 @@ class ContactMap:
     @cached_property
     def block_rows(self) -> BlockRows:
         """The rows as 3 x 6 blocks; collective at its first use."""
+        return self.rows_of_blocks(self.frame_blocks())
+
+    def frame_blocks(self) -> Floats:
+        """The blocks (nc, 2, 3, 6) of both bodies without their masses, and without the sign of the first."""
+        frame, arms = self.given.frame.reshape(-1, 1, 3, 3), self.given.arm.reshape(-1, 2, 1, 3)
+        return np.concatenate(np.broadcast_arrays(frame, np.cross(arms, frame)), axis=3)
+
+    def rows_of_blocks(self, blocks: Floats) -> BlockRows:
+        """The rows that such blocks (nc, 2, 3, 6) make; collective."""
         given = self.given
         root = np.zeros((self.halo.rows, given.root.shape[1]))
         root[: self.columns] = given.root
         self.halo.update(root)
         order = np.argsort(given.body, axis=1)
-        frame, arms = given.frame.reshape(-1, 1, 3, 3), given.arm.reshape(-1, 2, 1, 3)
-        blocks = np.concatenate(np.broadcast_arrays(frame, np.cross(arms, frame)), axis=3)
-        blocks *= np.array([-1.0, 1.0])[:, None, None]
+        blocks = blocks * np.array([-1.0, 1.0])[:, None, None]
         body, local = (np.take_along_axis(rows, order, axis=1) for rows in (given.body, self.body))
         moves = body >= 0
         blocks = np.take_along_axis(blocks, order[:, :, None, None], axis=1)[moves]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import pi
 
 import numpy as np
 
@@ -71,11 +70,6 @@ class Blade(ToAndFro):
         return -self.length / 2 + self.end_gap * self.width + self.thickness / 2
 
     @property
-    def delta(self) -> float:
-        """Contact distance [m]: not less than the way of the blade in a step, that no sphere is run over."""
-        return max(0.02, self.dt * pi * self.travel / self.period)
-
-    @property
     def domain(self) -> Corners:
         """The inside of the box [m]."""
         return (-self.length / 2, -self.width / 2, 0.0), (self.length / 2, self.width / 2, self.height)
@@ -111,7 +105,7 @@ class Blade(ToAndFro):
         names += [f"force_blade_{axis} [N]" for axis in "xyz"] + [f"torque_blade_{axis} [N m]" for axis in "xyz"]
         out: dict[str, float | Floats] = {"blade_position [m]": records["blade_position [m]"]}
         out |= analysis.filtered(records, names, self.cutoff)
-        force = records["draft_force [N]"][self.steady(records["time [s]"])]
+        force = records["draft_force [N]"][self.steady(records)]
         if len(force):
             out["steady_draft_force [N]"] = float(force.mean())
             out["median_draft_force [N]"] = float(np.median(force))

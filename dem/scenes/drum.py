@@ -8,6 +8,7 @@ from math import atan2, ceil, degrees, pi, sin, sqrt
 
 import numpy as np
 
+from dem.analysis import calm
 from dem.arrays import Corners, Floats
 from dem.checks import between, not_negative, positive
 from dem.experiment import option
@@ -86,8 +87,8 @@ class Drum(SmallSpheres):
         """The scene, with the large bodies "drum" and "ends"."""
         radii = self.radius * np.random.default_rng(self.seed).uniform(1.0 - self.spread, 1.0, self.spheres)
         scene = self.spheres_alone(radii, "spheres")
-        scene.set_friction(self.wall_friction, "spheres", "side")
-        scene.set_friction(self.end_friction, "spheres", "ends")
+        scene.set_pair("spheres", "side", friction=self.wall_friction)
+        scene.set_pair("spheres", "ends", friction=self.end_friction)
         half, wide = self.width / 2, self.container_radius
         turning = Rotation((0.0, self.speed, 0.0), start=self.settling_time)
         along_y = (sqrt(0.5), -sqrt(0.5), 0.0, 0.0)  # where the z axis is turned to
@@ -106,7 +107,7 @@ class Drum(SmallSpheres):
     def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
         """Mean and standard deviation of the angle after the drum has turned by 90 degrees."""
         time, angle = records["time [s]"], records["bed_angle [degrees]"]
-        steady = time > self.settling_time + 0.5 * pi / self.speed
+        steady = (time > self.settling_time + 0.5 * pi / self.speed) & calm(records)
         if not steady.any():
             return {}
         return {

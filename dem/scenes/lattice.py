@@ -3,12 +3,14 @@ fro, and lengths in scenes of small spheres."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import ceil, cos, pi, sqrt
 from typing import Any, ClassVar
 
 import numpy as np
 
+from dem.analysis import calm
 from dem.arrays import Bools, Floats
 from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
@@ -88,10 +90,11 @@ class ToAndFro(LargeSpheres):
         """The motion: displacement travel / 2 (1 - cos(2 pi t / period))."""
         return Oscillation((1, 0, 0), self.travel / 2, self.period, phase=-pi / 2, start=self.settling_time)
 
-    def steady(self, time: Floats) -> Bools:
-        """Mask (n,) of the times of the first way at which the speed is above 1/sqrt(2) of the greatest."""
-        phase = (time - self.settling_time) / self.period
-        return (phase >= 1 / 8) & (phase <= 3 / 8)
+    def steady(self, records: Mapping[str, Floats]) -> Bools:
+        """Mask (n,) of the steps of the first way in which the speed is above 1/sqrt(2) of the greatest, without those
+        that have a jump of energy."""
+        phase = (records["time [s]"] - self.settling_time) / self.period
+        return (phase >= 1 / 8) & (phase <= 3 / 8) & calm(records)
 
 
 @dataclass(frozen=True)
@@ -106,23 +109,12 @@ class SmallSpheres(Spheres):
     )
     sides: int = option(32, "", "flat sides of the container", between(12))
 
-    dt: ClassVar[float] = 0.005
     packing: ClassVar[float] = 0.58  #: share of the volume that settled spheres take
 
     @property
     def pitch(self) -> float:
         """Spacing of the lattice on which the spheres start [m]."""
         return 2.2 * self.radius
-
-    @property
-    def delta(self) -> float:
-        """Contact distance [m]."""
-        return 0.2 * self.radius
-
-    @property
-    def settle_delta(self) -> float:
-        """Contact distance while settling [m]."""
-        return self.radius
 
     @property
     def container_radius(self) -> float:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf, pi, sqrt
-from typing import ClassVar
+from math import inf, isinf, pi, sqrt
 
 import numpy as np
 
+from dem import analysis
 from dem.arrays import Corners, Floats
-from dem.checks import not_negative, positive
+from dem.checks import not_negative, positive, positive_or_inf
 from dem.experiment import option
-from dem.motion import Rotation
+from dem.motion import Hinged, Rotation
 from dem.scene import Scene
 from dem.scenes.lattice import LargeSpheres, perturbed
 from dem.shapes import Box
@@ -32,8 +32,10 @@ class Mixer(LargeSpheres):
     paddle_thickness: float = option(1 / 20, "box widths", "thickness of the paddle", positive)
     clearance: float = option(0.05, "m", "gap between the floor and the paddle", not_negative)
     angular_velocity: float = option(pi / 3, "rad/s", "angular velocity of the paddle about the vertical")
-
-    dt: ClassVar[float] = 0.025
+    torque: float = option(
+        inf, "N m", "greatest torque of a drive that turns the paddle at that speed; inf: it is prescribed",
+        positive_or_inf,
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,10 +79,15 @@ class Mixer(LargeSpheres):
         scene = self.spheres_alone(self.radius)
         scene.add_body("box", self.walls())
         half = self.width / 2 * np.array([self.paddle_length, self.paddle_thickness, self.paddle_height])
-        turning, middle = Rotation((0, 0, self.angular_velocity)), (0, 0, self.clearance + half[2])
-        scene.add_body("mixer", [Box(tuple(half))], turning, position=middle)
+        paddle, middle = [Box(tuple(half))], (0, 0, self.clearance + half[2])
+        if isinf(self.torque):
+            scene.add_body("mixer", paddle, Rotation((0, 0, self.angular_velocity)), position=middle)
+        else:
+            drive = Hinged((0, 0, 1), self.torque, speed=self.angular_velocity)
+            scene.add_body("mixer", paddle, drive, position=middle, density=self.density)
         return scene
 
     def analyse(self, records: Mapping[str, Floats]) -> Mapping[str, float | Floats]:
-        """The mean of the torque that turns the mixer."""
-        return {"mean_torque [N m]": float(-np.mean(records["torque_mixer_z [N m]"]))}
+        """The mean of the torque that turns the mixer, without steps that have a jump of energy."""
+        torque = records["torque_mixer_z [N m]"][analysis.calm(records)]
+        return {"mean_torque [N m]": -float(torque.mean())} if len(torque) else {}

@@ -82,7 +82,7 @@ class Shear(ToAndFro):
     def build(self) -> Scene:
         """The scene, with the large bodies "lower", "upper" and "press"."""
         scene = self.spheres_alone(self.radius, "spheres")
-        scene.set_friction(self.wall_friction, "spheres", "walls")
+        scene.set_pair("spheres", "walls", friction=self.wall_friction)
         thickness = self.press_thickness * self.width
         lower = [Plane((0, 0, 1)), *self._side_walls(-2 * self.radius, self.split_height)]
         scene.add_body("lower", lower, self.to_and_fro(), material="walls")
@@ -125,7 +125,7 @@ class Shear(ToAndFro):
         shear, normal = (np.asarray(out[f"{name}_stress_filtered [Pa]"]) for name in ("shear", "normal"))
         out["volume_strain"] = height / height[0] - 1.0
         stroke = (time > self.settling_time) & (time <= self.settling_time + self.period / 2)
-        steady = self.steady(time)
+        steady = self.steady(records)
         if stroke.any():
             peak = np.flatnonzero(stroke)[np.argmax(shear[stroke])]
             out["peak_shear_stress [Pa]"] = float(shear[peak])

@@ -34,8 +34,8 @@ class MixingDrum(Experiment):
     def build(self) -> Scene:
         """The scene, with the large bodies "side" and "ends"; the ends have no friction, as of a long drum."""
         scene = Scene(self.friction)
-        scene.set_friction(0.0, "left", "ends")
-        scene.set_friction(0.0, "right", "ends")
+        scene.set_pair("left", "ends", friction=0.0)
+        scene.set_pair("right", "ends", friction=0.0)
         pitch, room = 2.2 * self.grain, self.radius - 1.5 * self.grain
         across = np.arange(-int(room / pitch), int(room / pitch) + 1) * pitch
         count = int((self.length - 2.2 * self.grain) / pitch) + 1

@@ -1,6 +1,6 @@
 """A box slides and a sphere rolls down a slope, as fast as the textbook says::
 
-    python -m pctt.run -scene docs/examples/incline.py -ccp_type apgd -ccp_coulomb -ccp_tol 1e-8 -steps 100 \
+    python -m pctt.run -scene docs/examples/incline.py -ccp_type apgd -ccp_tol 1e-8 -steps 100 \
         -output_every 10 -output incline
     python -m pctt.render incline -color speed -azimuth -90 -elevation 15 -size 640x480
 """

@@ -17,28 +17,33 @@ from dem.contact_map import BlockRows, CompactRows
 from dem.exchange import refuse
 from pctt.ccp.accuracy import Accuracy, measure
 from pctt.ccp.cone import Array
-from pctt.ccp.coulomb import Coulomb, fixed_point
+from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.newton import FORMS, Newton
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.registry import NEWTON, SOLVERS
-from pctt.ccp.result import COULOMB, RELAXATION, Limits, Result, Status
+from pctt.ccp.registry import FOR_ROLLING, NEWTON, SOLVERS
+from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Limits, Result, Status
+from pctt.ccp.rolling import RollingProblem
 from pctt.ccp.unbounded import why_unbounded
 from pctt.log import phase
 
 __all__ = [
+    "COULOMB",
     "FORMS",
+    "FOR_ROLLING",
+    "LAWS",
     "NEWTON",
+    "RELAXATION",
     "SOLVERS",
     "Accuracy",
     "BlockRows",
     "CompactRows",
     "Comparison",
     "ConeProblem",
-    "Coulomb",
     "Limits",
     "Newton",
     "Result",
+    "RollingProblem",
     "Status",
     "measure",
     "newton_for",
@@ -53,9 +58,9 @@ def solve(
     limits: Limits | None = None,
     options: Any = None,
     newton: Newton | None = None,
-    coulomb: Coulomb | None = None,
+    law: str = RELAXATION,
 ) -> Result:
-    """Solve a cone problem by a method of SOLVERS; with ``coulomb`` find impulses of Coulomb's law.
+    """Solve a cone problem by a method of SOLVERS; with the ``law`` COULOMB find impulses of Coulomb's law.
 
     Where the method does not solve it, one other goes on from its impulses, with its own limit of iterations: `apgd`,
     or `conic` after `apgd`. If that does not solve it either, the result is the one with the smaller residual, and its
@@ -64,22 +69,29 @@ def solve(
     Coulomb's law is found by the method itself if it can (`Solver.has_law`), else by a sequence of cone problems
     (`pctt.ccp.coulomb`).
 
+    A `RollingProblem`, whose impulses are (2 nc, 3), is for `apgd` and `auto` alone, and no other one follows.
+
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
     the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
     from one problem to the next. A problem without a solution has the status UNBOUNDED.
     """
     if type not in SOLVERS:
         raise ValueError(f"the solver {type!r}: allowed are {', '.join(SOLVERS)}")
+    if law not in LAWS:
+        raise ValueError(f"the law {law!r}: allowed are {', '.join(LAWS)}")
+    rolls = isinstance(problem, RollingProblem)
+    if rolls and not SOLVERS[type].has_rolling:
+        raise ValueError(f"the solver {type!r}: with rolling or spinning resistance allowed are {FOR_ROLLING}")
     limits = limits or Limits()
     if not limits.tol > 0.0:
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
-    result = _by(type, problem, _start(problem, guess), limits, options, newton, coulomb)
+    result = _by(type, problem, _start(problem, guess), limits, options, newton, law)
     other = "conic" if result.solver == "apgd" else "apgd"
     hopeless = result.final or (result.status is Status.BREAKDOWN and other == "conic")  # products are no numbers
-    if limits.fallback and not hopeless:
+    if limits.fallback and not hopeless and not rolls:
         asked = result
         limits = dataclasses.replace(limits, max_it=-1)
-        second = _by(other, problem, asked.impulse, limits, None, newton, coulomb)
+        second = _by(other, problem, asked.impulse, limits, None, newton, law)
         result = second if second.final or second.residual < asked.residual else dataclasses.replace(asked)
         result.after(asked if result is second else second)
         result.asked, result.reason = asked, f"{type}: {asked.reason}; {other}: {second.reason}"
@@ -88,15 +100,13 @@ def solve(
 
 
 def _by(
-    name: str, problem: ConeProblem, guess: Array, limits: Limits, options: Any, newton: Newton | None,
-    coulomb: Coulomb | None,
-) -> Result:  # fmt: skip
+    name: str, problem: ConeProblem, guess: Array, limits: Limits, options: Any, newton: Newton | None, law: str
+) -> Result:
     """What one method makes of the problem. Impulses that are no numbers become zero."""
-    method, nothing = SOLVERS[name], np.zeros_like(problem.r)
-    law = RELAXATION if coulomb is None else COULOMB
+    method, nothing, coulomb = SOLVERS[name], np.zeros_like(problem.r), law == COULOMB
     if problem.size == 0:
         return Result(nothing, Status.CONVERGED, "no contacts", 0.0, 0, solver=name, law=law)
-    cold = problem.natural_residual(nothing, problem.r, coulomb is not None)
+    cold = problem.natural_residual(nothing, problem.r, coulomb)
     if cold == 0:
         return Result(nothing, Status.CONVERGED, "no contact closes", 0.0, 0, solver=name, law=law)
     limits = dataclasses.replace(limits, max_it=method.iterations) if limits.max_it < 0 else limits
@@ -108,13 +118,13 @@ def _by(
 
     try:
         with phase("CCPSolve"):
-            if coulomb is None:
+            if not coulomb:
                 result = convex(guess, limits)
             elif method.has_law:
                 result = method.function(problem, guess, limits, *given, coulomb=True)
                 result.law = COULOMB
             else:
-                result = fixed_point(convex, problem, guess, limits, coulomb)
+                result = fixed_point(convex, problem, guess, limits)
     finally:
         if own is not None:
             own.destroy()
@@ -126,6 +136,8 @@ def _by(
         result.impulse, result.status, result.residual = nothing, Status.BREAKDOWN, cold
     elif unbounded := why_unbounded(problem, result.impulse):
         result.status, result.reason = Status.UNBOUNDED, unbounded
+    elif result.converged and (squeezed := limits.squeezed(problem, result.impulse, coulomb)):
+        result.status, result.reason = Status.SQUEEZED, squeezed
     return result
 
 

@@ -6,7 +6,10 @@ root of the number of contacts, within a quarter of what was measured on settled
 that is easy costs nothing more.
 
 For Coulomb's law the conic method stalls often, but the path that it follows leads to the neighbourhood of a solution.
-So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path.
+So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path. Problems
+so small that they get dense factors are the exception: there it goes on to the end.
+
+Where contacts resist rolling or spinning, it is APGD alone: the conic method has no such cones.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from pctt.ccp.interior import conic
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
+from pctt.ccp.rolling import RollingProblem
 from pctt.options import number
 
 
@@ -30,7 +34,7 @@ class Auto:
 
     patience: float = number(25.0, "APGD's iterations per digit of the tolerance and cube root of the contacts")
     few: float = number(12.0, "the same of problems that get dense factors: all of `conic` costs 7 to 30 there")
-    law: float = number(2.0, "factor on it for Coulomb's law, as its Newton systems are unsymmetric: 2 to 3 measured")
+    law: float = number(5.0, "factor on it for Coulomb's law: more systems, and unsymmetric; docs/notebook_ccp.md")
     start: float = number(3e4, "complementarity of the conic method's start, at most, by APGD's residual")
     basin: float = number(3e-4, "Coulomb residual at which the conic method's path is near enough for APGD")
 
@@ -45,7 +49,12 @@ def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Auto, newton: Newton, coulomb: bool = False
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
-    most = options.iterations(problem.size, limits.tol, coulomb, newton.has_few(problem))
+    if isinstance(problem, RollingProblem):
+        first = apgd.solve(problem, guess, limits, apgd.APGD(), coulomb)
+        first.solver = "apgd"
+        return first
+    dense = newton.has_few(problem)
+    most = options.iterations(problem.size, limits.tol, coulomb, dense)
     few = min(limits.max_it, problem.comm.bcast(most))
     first = apgd.solve(problem, guess, replace(limits, max_it=few), apgd.APGD(), coulomb)
     first.solver = "apgd"
@@ -57,9 +66,13 @@ def solve(
         second.solver, second.newton_its = "conic", second.iterations
         second.reason = f"apgd: {first.reason}; conic: {second.reason}"
         return second.after(first)
-    inner = replace(inner, tol=max(limits.tol, options.basin), closing_work=np.inf)
+    if not dense:
+        inner = replace(inner, tol=max(limits.tol, options.basin), closing_work=np.inf)
     second = conic.solve(problem, guess, inner, conic.Conic(), newton, coulomb)
-    second.newton_its = second.iterations
+    second.solver, second.newton_its = "conic", second.iterations
+    if dense and second.final:
+        second.reason = f"apgd: {first.reason}; conic: {second.reason}"
+        return second.after(first)
     begin = second.impulse if second.iterations else first.impulse
     last = apgd.solve(problem, begin, limits, apgd.APGD(), coulomb)
     last.solver, last.reason = "apgd", f"apgd: {first.reason}; conic: {second.reason}; apgd: {last.reason}"

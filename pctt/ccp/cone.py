@@ -50,13 +50,6 @@ def project(x: Array, mu: Array, out: Array | None = None) -> Array:
     return project_to(x, mu, np.empty(x.shape, x.dtype) if out is None else out)
 
 
-def add_de_saxce(y: Array, mu: Array) -> Array:
-    """y, in place, with De Saxce's term mu |y_t| more in the normal direction: with these velocities a cone problem is
-    Coulomb's law."""
-    y[:, 0] += mu * tangential(y)
-    return y
-
-
 def margin(x: Array, mu: Array) -> Array:
     """mu g_n - |(g_1, g_2)|, positive inside the cone (nc,)."""
     return mu * x[:, 0] - tangential(x)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dem.compiled import inlined, loop, unfused
+from dem.compiled import inlined, loop
 
 Array = NDArray[np.float64]
 TINY = float(np.finfo(float).tiny)
@@ -44,6 +44,31 @@ def project_to(x: Array, mu: Array, out: Array) -> Array:
 
 
 @loop
+def project_scaled(x: Array, size: Array, mu: Array) -> Array:
+    """`project` of the points x size (nc, 3), in double precision."""
+    out = np.empty(x.shape)
+    flat, size, to = x.ravel(), size.ravel(), out.ravel()
+    for c in range(len(mu)):
+        i = 3 * c
+        n, t_1, t_2 = flat[i] * size[i], flat[i + 1] * size[i + 1], flat[i + 2] * size[i + 2]
+        to[i], to[i + 1], to[i + 2] = _nearest(n, t_1, t_2, mu[c])
+    return out
+
+
+@loop
+def not_idle(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDArray[np.bool_]:
+    """Mask (nc,) of the contacts but those without an impulse at x and last_x that open so fast that y_n - mu |y_t|
+    exceeds the ``least``."""
+    out, enough = np.empty(len(mu), np.bool_), x.dtype.type(least)
+    x, last_x, y = x.ravel(), last_x.ravel(), y.ravel()
+    for c in range(len(mu)):
+        i = 3 * c
+        opening = y[i] - mu[c] * np.sqrt(y[i + 1] * y[i + 1] + y[i + 2] * y[i + 2])
+        out[c] = (x[i] > ZERO) | (last_x[i] > ZERO) | (not opening > enough)
+    return out
+
+
+@loop
 def projected_move(x: Array, y: Array, step: float, mu: Array) -> Array:
     """P(x - step y) - x."""
     out = np.empty(x.shape, x.dtype)
@@ -56,7 +81,34 @@ def projected_move(x: Array, y: Array, step: float, mu: Array) -> Array:
     return out
 
 
-@unfused
+@loop
+def squared_moves(x: Array, y: Array, step: float, mu: Array, de_saxce: float) -> Array:
+    """|P(x - step y) - x|^2 (nc,), where y gets the term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1."""
+    out = np.empty(len(mu))
+    x, y = x.ravel(), y.ravel()
+    for c in range(len(mu)):
+        i = 3 * c
+        m, u, v = mu[c], y[i + 1], y[i + 2]
+        w = y[i] + de_saxce * m * np.sqrt(u * u + v * v)
+        n, t_1, t_2 = _nearest(x[i] - step * w, x[i + 1] - step * u, x[i + 2] - step * v, m)
+        out[c] = (n - x[i]) ** 2 + (t_1 - x[i + 1]) ** 2 + (t_2 - x[i + 2]) ** 2
+    return out
+
+
+@loop
+def wrong_works(g: Array, y: Array, r: Array) -> tuple[float, float, float]:
+    """Closing work, opening work and 1/2 g.(y - r), summed over the contacts. Comparisons let a NaN through."""
+    closing, opening, energy = 0.0, 0.0, 0.0
+    for c in range(len(g)):
+        n, u, v = g[c, 0], g[c, 1], g[c, 2]
+        along = n * y[c, 0] + u * y[c, 1] + v * y[c, 2]
+        closing += n * (0.0 if y[c, 0] > 0.0 else -y[c, 0])
+        opening += 0.0 if along < 0.0 else along
+        energy += 0.5 * (along - (n * r[c, 0] + u * r[c, 1] + v * r[c, 2]))
+    return closing, opening, energy
+
+
+@loop
 def accelerated_step(
     x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, de_saxce: float,
     out: Array,
@@ -75,47 +127,47 @@ def accelerated_step(
     for first in range(0, len(mu), STRIP):
         friction = mu[first : first + STRIP]
         a, b = 3 * first, 3 * (first + len(friction))
-        _extrapolate(x[a:b], last_x[a:b], part, z)
+        extrapolate(x[a:b], last_x[a:b], part, z)
         if soft:
-            _add_compliance(y[a:b], compliance[a:b], z, y_z)
+            add_compliance(y[a:b], compliance[a:b], z, y_z)
         else:
             y_z[: b - a] = y[a:b]
         if de_saxce:
             _add_de_saxce(y_z, friction)
         _step(z, y_z, way, friction, to[a:b])
-        _add_squares(to[a:b], z, squares)
-        _add_products(to[a:b], x[a:b], y_z, products)
+        add_squares(to[a:b], z, squares)
+        add_products(to[a:b], x[a:b], y_z, products)
         if soft:
-            _add_work(to[a:b], z, compliance[a:b], work)
+            add_work(to[a:b], z, compliance[a:b], work)
     return work.sum(), squares.sum(), products.sum()
 
 
-@unfused
-def _extrapolate(x, last_x, beta, out):
+@loop
+def extrapolate(x, last_x, beta, out):
     for k in range(len(x)):
         out[k] = x[k] + beta * (x[k] - last_x[k])
 
 
-@unfused
-def _add_compliance(y, compliance, z, out):
+@loop
+def add_compliance(y, compliance, z, out):
     for k in range(len(y)):
         out[k] = y[k] + compliance[k] * z[k]
 
 
-@unfused
-def _add_work(x, y, compliance, sums):
+@loop
+def add_work(x, y, compliance, sums):
     for k in range(len(x)):
         sums[k] += compliance[k] * (x[k] - y[k]) ** 2
 
 
-@unfused
+@loop
 def _add_de_saxce(y, mu):
     for c in range(len(mu)):
         i = 3 * c
         y[i] += mu[c] * np.sqrt(y[i + 1] * y[i + 1] + y[i + 2] * y[i + 2])
 
 
-@unfused
+@loop
 def _step(x, y, step, mu, out):
     for c in range(len(mu)):
         i = 3 * c
@@ -123,14 +175,14 @@ def _step(x, y, step, mu, out):
         out[i], out[i + 1], out[i + 2] = _nearest(n, t_1, t_2, mu[c])
 
 
-@unfused
-def _add_squares(x, y, sums):
+@loop
+def add_squares(x, y, sums):
     for k in range(len(x)):
         sums[k] += (x[k] - y[k]) ** 2
 
 
-@unfused
-def _add_products(x, y, z, sums):
+@loop
+def add_products(x, y, z, sums):
     for k in range(len(x)):
         sums[k] += (x[k] - y[k]) * z[k]
 

@@ -20,14 +20,14 @@ import numpy as np
 from pctt.ccp.cone import Array, tangential
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import FIXED_POINT, Limits, Result, Status
-from pctt.options import AT_LEAST_ONE, number, option
+from pctt.options import number
 
 
 @dataclass(frozen=True)
 class Coulomb:
-    """Coulomb's law is asked for. Options ``-ccp_coulomb_*`` are for methods that solve cone problems only."""
+    """Settings of `fixed_point`."""
 
-    max_it: int = option(200, "cone problems before the iteration gives up", check=AT_LEAST_ONE)
+    max_it: int = number(200, "cone problems before the iteration gives up")
     depth: int = number(5, "earlier points of Anderson's acceleration; docs/notebook_ccp.md compares 0 to 10")
     inner: float = number(
         0.3,
@@ -38,8 +38,9 @@ class Coulomb:
 
 
 def fixed_point(
-    convex: Callable[[Array, Limits], Result], problem: ConeProblem, guess: Array, limits: Limits, options: Coulomb
-) -> Result:
+    convex: Callable[[Array, Limits], Result], problem: ConeProblem, guess: Array, limits: Limits,
+    options: Coulomb = Coulomb(),
+) -> Result:  # fmt: skip
     """Impulses that obey Coulomb's law; ``convex(guess, limits)`` solves the cone problem.
 
     The result's residual and history are those of Coulomb's law, one value per cone problem; its iterations are those

@@ -127,12 +127,16 @@ class BlockMap(ContactMap):
 
     def velocities(self, v: Array) -> Array:
         """G v (nc, 3)."""
-        w = np.zeros((self.halo.rows, 6), self.precision)
+        y = np.zeros((self.rows, 3), self.precision)
+        loops.block_velocities(*self._blocks, self._with_ghosts(v), y)
+        return y
+
+    def _with_ghosts(self, v: Array) -> Array:
+        """Velocities (halo.rows, 6) of this rank's bodies and of those that it only touches."""
+        w = np.empty((self.halo.rows, 6), self.precision)
         w[: self.columns] = shaped("velocities of bodies", v, self.columns, 6)
         self.halo.update(w)
-        y = np.zeros((self.rows, 3), self.precision)
-        loops.block_velocities(*self._blocks, w, y)
-        return y
+        return w
 
     def momenta(self, g: Array) -> Array:
         """G' g (columns, 6)."""
@@ -165,12 +169,14 @@ class BlockMap(ContactMap):
 
     def weights(self, H: Array, symmetric: bool = True) -> Array:
         """Blocks H (nc, 3, 3) in the format of `through`."""
-        return H
+        return np.ascontiguousarray(H, self.precision)
 
     def through(self, weight: Array, v: Array, out: Array) -> None:
         """out = v + G' H G v (columns, 6)."""
-        impulses = np.einsum("cij,cj->ci", weight, self.velocities(v))
-        np.add(v.reshape(-1, 6), self.momenta(impulses), out=out.reshape(-1, 6))
+        m = np.zeros((self.halo.rows, 6), self.precision)
+        loops.block_through(*self._blocks, weight, self._with_ghosts(v), m)
+        self.halo.add(m)
+        np.add(v.reshape(-1, 6), m[: self.columns], out=out.reshape(-1, 6))
 
     def contact_blocks(self) -> Array:
         """The diagonal blocks of G G' (nc, 3, 3)."""

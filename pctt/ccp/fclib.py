@@ -17,6 +17,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from pctt.blocks import square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.delassus import HUB, rows_in_blocks
 from pctt.ccp.problem import ConeProblem
-from pctt.disk import make_hdf5, whole
+from pctt.disk import hdf5, make_hdf5, whole
 
 __all__ = ["FileFormatError", "Info", "Solution", "Stored", "load", "read", "write_global", "write_local"]
 
@@ -132,30 +133,32 @@ def load(path: str | Path, comm: MPI.Comm) -> Stored:
 def _contents(path: Path) -> tuple[sp.bsr_matrix, dict[str, Any], dict[str, Any]]:
     """G (3 nc, 6 bodies) in 3 x 6 blocks or N (3 nc, 3 nc) in 3 x 3 blocks, the vectors, and what the file says."""
     if path.is_file() and not h5py.is_hdf5(path):
-        raise FileFormatError(
-            "it is not HDF5; run/study convert_problems makes FCLIB files of Siconos' text and of PETSc's binary files"
-        )
+        raise FileFormatError("it is not HDF5; run/study convert_problems makes FCLIB files of Siconos' text files")
     with h5py.File(path, "r") as file:
         form = next((form for form in ("local", "global") if f"fclib_{form}" in file), None)
         if form is None:
             raise FileFormatError("it has neither fclib_local nor fclib_global")
         group = file[f"fclib_{form}"]
-        if int(np.ravel(group["spacedim"][()])[0]) != 3:
-            raise FileFormatError("its space dimension is not 3")
+        dimension = int(np.ravel(group["spacedim"][()])[0])
+        if dimension not in (2, 3):
+            raise FileFormatError(f"its space dimension is {dimension}; allowed are 2 and 3")
         for name in ("V", "R") if form == "local" else ("G",):
             if name in group:
                 raise FileFormatError(f"it has bilateral constraints ({name}), which a cone problem has not")
+        mu = group["vectors/mu"][:]
+        spatial = partial(in_space, dimension=dimension, contacts=len(mu))
         if form == "local":
-            matrix, note = symmetric_blocks(_matrix(group["W"]))
-            r = group["vectors/q"][:]
+            matrix, note = symmetric_blocks(spatial(spatial(_matrix(group["W"])).T).T)
+            r = spatial(group["vectors/q"][:])
         else:
-            f, w = group["vectors/f"][:], group["vectors/w"][:]
-            matrix, r, note = without_velocities(_matrix(group["M"]), _matrix(group["H"]), f, w)
+            f, w, H = group["vectors/f"][:], spatial(group["vectors/w"][:]), spatial(_matrix(group["H"]).T).T
+            matrix, r, note = without_velocities(_matrix(group["M"]), H.tocsr(), f, w)
+        solution, guess = (_impulses(file, f"{name}/r") for name in ("solution", "guesses/1"))
         vectors = {
             "r": r,
-            "mu": group["vectors/mu"][:],
-            "solution": _impulses(file, "solution/r"),
-            "guess": _impulses(file, "guesses/1/r"),
+            "mu": mu,
+            "solution": None if solution is None else spatial(solution),
+            "guess": None if guess is None else spatial(guess),
             "point": file["pctt/point"][()] if "pctt/point" in file else None,
             "compliance": file["pctt/compliance"][()] if "pctt/compliance" in file else None,
         }
@@ -208,6 +211,18 @@ def _text(stored: Any) -> str:
 
 
 # -- problems of other programs -----------------------------------------------------------------------------
+
+
+def in_space(x: Any, dimension: int, contacts: int) -> Any:
+    """The rows (3 nc, ...) in space of those of contacts in the plane, (2 nc, ...): normal and one tangent. No impulse
+    along the second tangent moves anything. With dimension 3, x itself. ValueError for another number of rows."""
+    if dimension == 3:
+        return x
+    rows = (3 * np.arange(contacts)[:, None] + np.arange(2)).ravel()
+    lift = sp.csr_matrix((np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=(3 * contacts, len(rows)))
+    if x.shape[0] != len(rows):
+        raise ValueError(f"{x.shape[0]} rows for {contacts} contacts in the plane")
+    return lift @ x
 
 
 def without_velocities(M: sp.csr_matrix, H: sp.csr_matrix, f: Array, w: Array) -> tuple[sp.bsr_matrix, Array, str]:
@@ -360,7 +375,7 @@ def _write(
                 data |= {f"{top}/{name}/{part}": values for part, values in _triplets(A).items()}
             with whole(Path(path)) as temporary:
                 make_hdf5(temporary, sum(values.nbytes for values in data.values()), len(data) + 10)  # and the groups
-                with h5py.File(temporary, "r+") as file:
+                with hdf5(temporary) as file:
                     for name, values in data.items():
                         file[name] = values
         except (OSError, ValueError, RuntimeError) as error:  # h5py raises all three

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
 from dem.exchange import refuse
-from pctt.ccp.cone import Array, add_de_saxce, dot, projected_move
+from pctt.ccp.cone_loops import Array, squared_moves, wrong_works
 from pctt.ccp.delassus import BlockMap, GivenMatrix, delassus, without_hubs
 
 Given = Union[BlockRows, CompactRows, ContactMap]
@@ -36,6 +36,8 @@ class ConeProblem:
     size : contacts on all ranks, Nc
     """
 
+    rows_of_contact = 1  # of three numbers each; `pctt.ccp.rolling` has two
+
     def __init__(
         self,
         comm: MPI.Comm,
@@ -56,7 +58,7 @@ class ConeProblem:
         self.mu = np.ascontiguousarray(mu, dtype=float)
         if count := self.sum(_not_finite(self.r) + np.sum(~((self.mu >= 0) & (self.mu < np.inf)))):
             raise ValueError(f"{count} contacts with a NaN, infinite or negative coefficient")
-        self.size = self.sum(len(self.mu))
+        self.size = self.sum(len(self.mu) // self.rows_of_contact)
         self.contact_map = None if G is None else _map(comm, G)
         self.operator: ContactMap | GivenMatrix = self.contact_map or GivenMatrix(comm, N)
         # the diagonal blocks have squares of all numbers of G
@@ -95,10 +97,8 @@ class ConeProblem:
         law y gets De Saxce's term.
 
         inf if that is undefined: for g = 0, unless it solves the problem, and if g or y has a nan or inf."""
-        if coulomb:
-            y = add_de_saxce(y.copy(), self.mu)
-        move = projected_move(g, y, 1.0 / self.mean_diagonal, self.mu)
-        distance, norm = np.sqrt(self.sum(np.array([np.vdot(move, move), np.vdot(g, g)])))
+        square = squared_moves(g, y, 1.0 / self.mean_diagonal, self.mu, float(coulomb)).sum()
+        distance, norm = np.sqrt(self.sum(np.array([square, np.vdot(g, g)])))
         if distance == 0:
             return 0.0
         residual = float(distance / norm) if norm > 0 else np.inf
@@ -107,10 +107,13 @@ class ConeProblem:
     def wrong_work(self, g: Array, y: Array) -> float:
         """The larger of the closing and the opening work, over 1/2 g'Ng: the sums of g_n max(-y_n, 0) and of
         max(g.y, 0) over the contacts; velocities y = N g + r. 0 without impulses, inf if it is no number."""
-        closing, opening = g[:, 0] @ np.maximum(-y[:, 0], 0.0), np.maximum(dot(g, y), 0.0).sum()
-        closing, opening, energy = self.sum(np.array([closing, opening, 0.5 * np.vdot(g, y - self.r)]))
+        closing, opening, energy = self.sum(np.array(self.works(g, y)))
         work = 0.0 if energy <= 0 else float(np.maximum(closing, opening) / energy)
         return work if work == work else np.inf
+
+    def works(self, g: Array, y: Array) -> tuple[float, float, float]:
+        """Closing work, opening work and 1/2 g'Ng of this rank."""
+        return wrong_works(g, y, self.r)
 
     @cached_property
     def N(self) -> PETSc.Mat:
@@ -142,7 +145,11 @@ class ConeProblem:
     @cached_property
     def diagonal_blocks(self) -> Array:
         """The 3 x 3 diagonal blocks of N (nc, 3, 3), hubs and the compliance included."""
-        return self._rigid_blocks + self.compliance_blocks if self.yields else self._rigid_blocks
+        if not self.yields:
+            return self._rigid_blocks
+        blocks = self._rigid_blocks.copy()
+        blocks[:, 0, 0] += self.compliance[:, 0]
+        return blocks
 
     @cached_property
     def compliance_blocks(self) -> Array:
@@ -159,10 +166,16 @@ class ConeProblem:
         return (key, *self.operator.structure(), np.array([self.size]))
 
     @cached_property
+    def all_yield(self) -> bool:
+        """Whether all contacts have compliance; the same on all ranks."""
+        normal = self.compliance[: len(self.compliance) // self.rows_of_contact, 0]
+        return self.yields and self.min(normal.min(initial=np.inf)) > 0.0
+
+    @cached_property
     def mean_diagonal(self) -> float:
         """Mean of the diagonal of N without compliance (1/kg); 1 for a problem without contacts."""
-        trace = self.sum(np.einsum("cii->", self._rigid_blocks))
-        return trace / (3 * self.size) if trace > 0 else 1.0
+        trace, rows = self.sum(np.array([np.einsum("cii->", self._rigid_blocks), self.r.size]))
+        return float(trace / rows) if trace > 0 else 1.0
 
     # -- reductions over all contacts -----------------------------------------------------------------------
 
@@ -173,7 +186,7 @@ class ConeProblem:
     def min(self, x: float) -> float:
         return self._reduced(x, MPI.MIN)
 
-    def max(self, x: float) -> float:
+    def max(self, x):
         return self._reduced(x, MPI.MAX)
 
     def _reduced(self, x, op: MPI.Op):
@@ -207,8 +220,9 @@ class ConeProblem:
 
 def _not_finite(array: Array) -> int:
     """How many rows of an array have a NaN or an infinite number."""
-    finite = np.isfinite(array)
-    return 0 if finite.all() else int((~finite.reshape(len(array), -1).all(axis=1)).sum())
+    if np.isfinite(array.sum()):  # so are all its numbers
+        return 0
+    return int((~np.isfinite(array).reshape(len(array), -1).all(axis=1)).sum())
 
 
 def _map(comm: MPI.Comm, G: Given) -> ContactMap:

@@ -6,8 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from pctt.ccp import auto
 from pctt.ccp.first_order import apgd, barzilai_borwein, faces, gauss_seidel, jacobi
 from pctt.ccp.first_order.scaled import FirstOrder
@@ -24,8 +22,8 @@ class Solver:
     Newton systems.
 
     ``needs`` is PRODUCT, MATRIX, NEWTON or EITHER; ``iterations`` the default limit (``-ccp_max_it``). A method that
-    ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself. At tolerances of ``law_tol``
-    and above that costs about as much as the relaxation.
+    ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself; one that ``has_rolling``
+    takes a `pctt.ccp.rolling.RollingProblem`.
     """
 
     name: str
@@ -36,7 +34,7 @@ class Solver:
     help: str
     source: str
     has_law: bool = False
-    law_tol: float = np.inf
+    has_rolling: bool = False
 
     @property
     def newton(self) -> bool:
@@ -58,10 +56,10 @@ SOLVERS = {
                "Nesterov, Todd 1997; Acary et al. 2023", has_law=True),
         Solver("auto", auto.solve, auto.Auto, EITHER, 20_000,
                "`apgd` for as many iterations as half of `conic` costs, then `conic`", "`pctt/ccp/auto.py`",
-               has_law=True, law_tol=1e-4),
+               has_law=True, has_rolling=True),
         Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
-               "accelerated projected gradient descent with restart", "Mazhar et al. 2015",
-               has_law=True, law_tol=1e-4),
+               "accelerated projected gradient descent with restart", "Mazhar et al. 2015", has_law=True,
+               has_rolling=True),
         Solver("barzilai_borwein", barzilai_borwein.adaptive, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,
                "projected Barzilai-Borwein steps with an adaptive nonmonotone line search", "Dai, Fletcher 2005"),
         Solver("spectral", barzilai_borwein.spectral, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,
@@ -79,3 +77,6 @@ SOLVERS = {
                "projected block Jacobi, relaxed by an exact line search", "Tasora, Anitescu 2011"),
     )
 }  # fmt: skip
+
+#: The methods for contacts that resist rolling, as messages name them.
+FOR_ROLLING = " and ".join(name for name, method in SOLVERS.items() if method.has_rolling)

@@ -13,7 +13,10 @@ from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.options import FRACTION, option
 
-RELAXATION, COULOMB, FIXED_POINT = "relaxation", "Coulomb", "Coulomb by cone problems"
+#: The laws of contact, and how a law is named that a sequence of cone problems has found.
+RELAXATION, COULOMB, FIXED_POINT = "relaxation", "coulomb", "coulomb by cone problems"
+LAWS = (COULOMB, RELAXATION)
+ENOUGH = 1000.0  # accuracy of the natural residual, over the tolerance, at which a wrong closing work is no lack of it
 
 
 @dataclass(frozen=True)
@@ -35,12 +38,27 @@ class Limits:
 
     def residual(self, natural: float, problem: ConeProblem, g: Array, y: Array) -> float:
         """What ``tol`` is for: the natural residual of impulses g (nc, 3) with y = N g + r, or their closing or opening
-        work in units in which its limit is ``tol``, whichever is larger. It is at most a thousand times the natural
-        residual: where bodies are squeezed no accuracy may bring the closing work below its limit."""
+        work in units in which its limit is ``tol``, whichever is larger. It is at most ENOUGH times the natural
+        residual: where bodies are squeezed no accuracy may bring the closing work below its limit. What passes so is
+        `squeezed`."""
         if math.isinf(self.closing_work):
             return natural
         work = self.tol / self.closing_work * problem.wrong_work(g, y)
-        return min(max(natural, work), 1000.0 * natural)
+        return min(max(natural, work), ENOUGH * natural)
+
+    def squeezed(self, problem: ConeProblem, g: Array, coulomb: bool) -> str:
+        """The reason, in words, if impulses g (nc, 3) meet the limits although their closing or opening work is above
+        its own; else "". One product with N."""
+        if math.isinf(self.closing_work):
+            return ""
+        y = problem.product(g) + problem.r
+        work, natural = problem.wrong_work(g, y), problem.natural_residual(g, y, coulomb)
+        if work <= self.closing_work or ENOUGH * natural > self.tol:
+            return ""
+        return (
+            f"squeezed: closing or opening work {work:.2g}, above {self.closing_work:g}, at a natural residual of "
+            f"{natural:.1e}, {ENOUGH:g} times below the tolerance"
+        )
 
     @property
     def met(self) -> str:
@@ -56,6 +74,7 @@ class Status(Enum):
     """How a solver ended; code looks at this, people at the ``reason`` beside it."""
 
     CONVERGED = "converged"
+    SQUEEZED = "squeezed"  #: the natural residual is far below the tolerance, the closing work is not
     ITERATION_LIMIT = "iteration limit"
     STALLED = "stalled"  #: no progress, or steps too short
     UNBOUNDED = "unbounded"  #: the problem has no solution
@@ -70,7 +89,9 @@ class Result:
     Attributes
     ----------
     impulse : (nc, 3) impulses of this rank's contacts (N s)
-    status : CONVERGED where the residual of `Limits` fell below the tolerance, else why not
+    status : CONVERGED where the residual and the closing work of `Limits` are below theirs, else why not. SQUEEZED:
+        bodies are pressed so hard, or have masses so far apart, that the closing work says nothing, or that forces on
+        light bodies are wrong. No other method would do better
     reason : what ran and why it ended, in words
     residual : the solver's own last value: the natural residual if the closing work has no limit
     iterations : Newton steps, or steps of first-order methods, of all methods tried
@@ -107,7 +128,7 @@ class Result:
     @property
     def final(self) -> bool:
         """Whether no other solver would do better."""
-        return self.status in (Status.CONVERGED, Status.UNBOUNDED)
+        return self.status in (Status.CONVERGED, Status.SQUEEZED, Status.UNBOUNDED)
 
     def after(self, *earlier: Result) -> Result:
         """This result, with what the results before it have cost."""

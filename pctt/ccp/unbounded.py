@@ -8,33 +8,38 @@ from __future__ import annotations
 
 import numpy as np
 
-from pctt.ccp.cone import Array, dot, times
+from pctt.ccp.cone import Array, dot
 from pctt.ccp.problem import ConeProblem
 
 
 def why_unbounded(problem: ConeProblem, g: Array) -> str:
     """The reason, in words, if the direction d = g / ||g|| of impulses g (nc, 3) in the cones shows that the problem is
-    unbounded; else "". One product with N.
+    unbounded; else "". At most one product with N.
 
     A solution has velocities y = G v + r in the dual cones, so that d.y >= 0 and ||v|| >= -r.d / ||G'd||. In an
     unbounded problem impulses grow along a d with G'd = 0 and r.d < 0, and this bound is infinite. The problem counts
     as unbounded if the bound is more than a thousand times ||r|| / sqrt(d' diag(N) d), the size that the data
-    suggest; a contact counts in ||r|| by its share in d. Self-stress, G'd = 0 with r.d >= 0, does not count, however
-    large. With compliance no problem is unbounded, as d'Nd includes it.
+    suggest; a contact counts in ||r|| by its share in d, and in diag(N) by the mean of its block, as what no impulse
+    moves along the normal may move along the tangents. Self-stress, G'd = 0 with r.d >= 0, does not count, however
+    large. If all contacts yield no problem is unbounded.
 
     A heavy body, too, has a small part in G'd: a press on a light grain. So where G is known, the impulses of d must
     cancel on every body in units of its own mass, see `_left_over`.
     """
+    if problem.all_yield:
+        return ""
     r = problem.r.copy()
     r[problem.mu == 0, 1:] = 0.0  # sliding that no impulse answers
     sizes, speeds = np.sqrt(dot(g, g)), dot(r, r)
     share = np.maximum(sizes / max(problem.max(sizes.max(initial=0.0)), 1e-300), 1e-6)
-    alone = np.vdot(g, times(problem.diagonal_blocks, g))
-    parts = (np.vdot(r, g), share @ speeds, np.vdot(problem.product(g), g), sizes @ sizes, alone)
-    along, closing, bent, length, alone = problem.sum(np.array(parts))
+    alone = np.einsum("cii,c->", problem.diagonal_blocks, dot(g, g)) / 3.0
+    parts = (np.vdot(r, g), share @ speeds, problem.compliance[:, 0] @ g[:, 0] ** 2, sizes @ sizes, alone)
+    along, closing, yielding, length, alone = problem.sum(np.array(parts))
     size, speed = np.sqrt(length), np.sqrt(closing)
     bound = (along / (1e3 * size * speed)) ** 2 if along < 0 < size * speed else 0.0
-    if not bound > max(bent / alone if alone > 0 else 0.0, 1e-15):  # rounding of d'Nd
+    if not bound > max(yielding / alone if alone > 0 else 0.0, 1e-15):  # a part of d'Nd, and its rounding
+        return ""
+    if alone > 0 and not bound > problem.dot(problem.product(g), g) / alone:
         return ""
     if problem.contact_map is not None and not bound > _left_over(problem, g / size):
         return ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import traceback
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from typing import Any
 from mpi4py import MPI
 
 from pctt.disk import FileError, told
+from pctt.folder import Folder
 from pctt.options import AT_LEAST_ONE, POSITIVE, option
 
 LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")
@@ -53,8 +55,9 @@ def parser(program: str, text: str, folder: str = "", steps: bool = True) -> arg
     line.add_argument("-output", type=Path, metavar="DIR", help=f"folder to write to; without: {folder}/ in the folder")
     if steps:
         line.add_argument("-first", type=int, default=0, metavar="STEP", help="first step")
-        line.add_argument("-last", type=int, default=sys.maxsize, metavar="STEP", help="last step")
-        line.add_argument("-every", type=checked(int, AT_LEAST_ONE), default=1, metavar="K", help="one step of K")
+        line.add_argument("-last", type=int, default=math.inf, metavar="STEP", help="last step")
+        every = "one of K recorded steps"
+        line.add_argument("-every", type=checked(int, AT_LEAST_ONE), default=1, metavar="K", help=every)
     return line
 
 
@@ -80,6 +83,12 @@ def chosen(steps: list[int], given: argparse.Namespace) -> list[int]:
         there = f"there are {steps[0]} to {steps[-1]}"
         raise FileError(f"{given.folder}: no recorded step from -first to -last; {there}")
     return picked
+
+
+def told_steps(folder: Folder, steps: list[int]) -> str:
+    """How many of the recorded steps these are, and a remark if frames of the run are missing."""
+    lost = ", ".join(str(step) for step in folder.lost)
+    return f"{len(steps)} of {len(folder.steps)} recorded steps{f' (missing: {lost})' if lost else ''}"
 
 
 def run(main: Callable[[MPI.Comm], None], program: str) -> int:

@@ -21,7 +21,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.morton import Frame, morton_codes
-from pctt.block_diagonal import inverse_diagonal_blocks
+from pctt.blocks import inverse_diagonal_blocks
 from pctt.mat.grid_train import TrainProduct
 from pctt.mat.order import Places, chosen_order
 from pctt.tt.quantise import GridDigits, group_modes

@@ -13,7 +13,7 @@ import time
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.block_diagonal import block_diagonal
+from pctt.blocks import block_diagonal
 from pctt.mat.entries import diagonal_blocks, has_entries
 from pctt.mat.order import Places, places_of
 from pctt.pc.base import PythonPC
@@ -221,7 +221,7 @@ class TensorTrain(PythonPC):
             f"trees made anew {a.resets}",
             f"rows ordered by {self.places.source}",
         ]
-        lines += [] if self.made.symmetric else [NOT_SYMMETRIC]
+        lines += [] if self.P is None or self.made.symmetric else [NOT_SYMMETRIC]
         return lines + [f"fell back: {why} ({count} times)" for why, count in a.fallbacks.items()]
 
     def what(self) -> str:
@@ -236,6 +236,8 @@ class TensorTrain(PythonPC):
     def _line(self) -> str:
         if self.failed:
             return f"none: {self.account.last}"
+        if self.P is None:
+            return "made for no system yet"
         if self.rank == 1:
             note = f", because {self.made.note}" if self.made.note else ""
             return f"rank 1 (block Jacobi{note}), set up in {self._made_in:.2e} s"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import sys
 import traceback
@@ -27,7 +28,7 @@ try:
 except ImportError as error:
     sys.exit(str(error))
 
-from dem.together import SceneError
+from dem.together import SceneError, unlike
 from pctt.disk import FileError
 from pctt.ksp_options import entered, keep_from_petsc, refuse_stray
 from pctt.options import OptionError
@@ -43,11 +44,11 @@ def main(comm: MPI.Comm) -> None:
     if HELP & set(sys.argv):
         text = help_text(database, _topic(sys.argv))
         if comm.rank == 0:
-            print(text)
+            answer(text)
         return
     if VERSION & set(sys.argv):
         if comm.rank == 0:
-            print(versions())
+            answer(versions())
         return
     refuse_stray(sys.argv[1:])
     options = read_options(database, comm)
@@ -56,6 +57,15 @@ def main(comm: MPI.Comm) -> None:
     else:
         with entered(DEMO_SOLVERS if options.demo else {}):
             simulate(options, comm)
+
+
+def answer(text: str) -> None:
+    """Print what was asked for; FileError if there is no room for it."""
+    try:
+        print(text, flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes the rest at its end
+        raise FileError(f"the answer cannot be written ({error.strerror})") from None
 
 
 def _topic(words: list[str]) -> str:
@@ -80,9 +90,11 @@ STATUS: dict[type[Exception], int] = {OptionError: 2, FileError: 2, SceneError: 
 def run() -> int:
     """Exit status: 0; 1 if a scene fails; 2 for a bad option or file; 130, the status of Ctrl-C in shells, if a signal
     has ended the run. One message says what went wrong. Other errors abort all ranks."""
-    comm = MPI.COMM_WORLD
+    comm = MPI.COMM_WORLD.Dup()  # a message of a user's scene meets none of ours
     heed(comm)
     try:
+        if other := unlike(comm, repr((sys.argv[1:], sorted(PETSc.Options().getAll().items())))):
+            raise OptionError(f"rank {other} has other options than rank 0; allowed are the same options on all ranks")
         main(comm)
     except tuple(STATUS) as error:
         status = next(status for kind, status in STATUS.items() if isinstance(error, kind))

@@ -30,13 +30,17 @@ from pctt.ccp import fclib
 from pctt.ccp.cone import Array
 from pctt.disk import FileError
 from pctt.folder import HARD
+from pctt.options import OptionError
+from pctt.petsc import warn
 from pctt.run.output import Place
 from pctt.run.settings import Settings, scene_name
 
 
 class Dump:
     """Writes the cone problems of a simulation's steps: the ``hard`` first that its solver does not solve, and to
-    ``folder``, if there is one, all."""
+    ``folder``, if there is one, all. The first rank gathers and writes them."""
+
+    most = 500_000  #: contacts of a hard problem that is written unasked: 684 bytes each on the first rank
 
     def __init__(
         self, settings: Settings, experiment: Experiment, world: World, place: Place,
@@ -44,6 +48,8 @@ class Dump:
     ):  # fmt: skip
         self._settings, self._experiment, self._world, self._place = settings, experiment, world, place
         self._hard_left, self._folder = hard, folder
+        if folder and world.pairs.resists:
+            raise OptionError("-dump_problem: files have no rolling and spinning; allowed are scenes without them")
 
     def step(
         self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result, asked: ccp.Result
@@ -53,6 +59,8 @@ class Dump:
         ``asked`` is the result of the solver that the user chose, ``result`` the one that the step uses. Returns the
         entries for the step's figures. FileError if a file cannot be written.
         """
+        if system.resistance is not None:  # FCLIB's files have a format of their own for these
+            return {"dumped": [], "hard_problem": ""}
         number = self._world.step + 1
         hard = not asked.converged and self._hard_left > 0
         files: dict[str, Any] = {"dumped": [], "hard_problem": ""}
@@ -67,7 +75,11 @@ class Dump:
             path = Path(self._folder) / f"step{number:06d}_{problem.size}contacts.h5"
             write(path)
             files["dumped"] = [str(path)]
-        if problem.size and hard:
+        if hard and problem.size > self.most:
+            self._hard_left = 0
+            words = f"step {number} is not solved, and its {problem.size} contacts are more than are written unasked"
+            warn(self._world.comm, f"{words}; allowed are {self.most}, or -dump_problem")
+        elif problem.size and hard:
             self._hard_left -= 1
             name = f"step{number:06d}_{problem.size}contacts_{asked.iterations}its.h5"
             self._place.make(HARD)
@@ -115,7 +127,7 @@ class Dump:
             f"{settings.solver} with -ccp_tol {settings.tol:g}: {asked.reason}, {asked.iterations} iterations, "
             f"natural residual {asked.residual:.3g}. {stored}",
             "Solution and guess are those of Coulomb's law (mu |u_t| is added to the normal velocity)."
-            if settings.coulomb
+            if settings.law == ccp.COULOMB
             else "Solution and guess are those of the convex cone problem, min 1/2 r'Wr + q'r over the friction cones "
             "(no mu |u_t| in the normal velocity). W is positive semidefinite; r need not be unique, u is.",
         )

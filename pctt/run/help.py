@@ -35,7 +35,7 @@ def help_text(database: Mapping[str, str], topic: str = "") -> str:
 def _help_sections(database: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
     """Topic, title and text of each section of the help."""
     scene = database.get("scene", "mixer")
-    titles = ["Run", f"Scene {scene}", "Cone problem", "Coulomb's law by cone problems, with -ccp_coulomb"]
+    titles = ["Run", f"Scene {scene}", "Cone problem"]
     titles += [f"-ccp_type {name}: {solver.help}" for name, solver in ccp.SOLVERS.items()]
     for title, (group, prefix) in zip(titles, option_groups(find_scene(scene))):
         topic = prefix.partition("_")[0] or "run"  # the first word of the options

@@ -12,8 +12,9 @@ from types import FrameType
 
 from mpi4py import MPI
 
-#: Ctrl-C; what mpiexec and batch systems send before they kill; what mpiexec passes on without killing.
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+#: Ctrl-C; what mpiexec and batch systems send before they kill; what mpiexec passes on without killing; a terminal that
+#: goes away; the limit of processor time.
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP, signal.SIGXCPU)
 
 _noted: list[int] = []
 
@@ -33,7 +34,8 @@ def heed(comm: MPI.Comm) -> None:
         _noted.append(number)
 
     for number in SIGNALS:
-        signal.signal(number, note)
+        ignored = number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN  # under nohup
+        signal.signal(number, signal.SIG_IGN if ignored else note)
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it without a word; PETSc would print a page
 
 

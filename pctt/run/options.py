@@ -22,7 +22,7 @@ from pctt.ksp_options import OF_SOLVERS, entered, keep_from_petsc, refuse_misspe
 from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read, refuse_unknown
 from pctt.petsc import own_errors
 from pctt.run.output import refusal, refuse_unwritable
-from pctt.run.settings import DEMO, Asked, Options, Run, Settings, find_scene
+from pctt.run.settings import DEMO, Options, Run, Settings, find_scene
 
 #: Options of simulations, beside those of the scene; those that settled states depend on, and -quiet.
 OF_STEPS = {
@@ -36,25 +36,24 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     """The options of the database; raises OptionError, the same on every rank, before any work."""
     demo = not database
     database = DEMO if demo else database
-    run, asked = read(Run, database), read(Asked, database, "ccp_")
+    run, asked = read(Run, database), read(Settings, database, "ccp_")
+    if run.compare and "ccp_type" not in database:
+        asked = dataclasses.replace(asked, solver="pdip")  # the paper's
     solver = ccp.SOLVERS[asked.solver]
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in option_groups(scene_class) for d in describe(group, start)]
     refuse_unknown(unused(database), known, prefixes=OF_SOLVERS)  # PETSc has asked for its own when it started
     keep_from_petsc(known)
-    # a file of -problem is solved as a plain cone problem by default
-    coulomb = bool(asked.coulomb) if run.problem else asked.obeys_coulomb
-    _refuse_without_effect(database, run, asked, coulomb)
+    _refuse_without_effect(database, run, asked)
     what = f"options of the scene {scene_class.__name__}"
     scene = together(comm, what, lambda: _read_scene(run.scene, scene_class, database), own=(OptionError,))
-    law = coulomb and read(ccp.Coulomb, database, "ccp_coulomb_")
-    given = {**vars(asked), "options": read(solver.options, database, solver.prefix), "coulomb": law}
+    asked = dataclasses.replace(asked, options=read(solver.options, database, solver.prefix))
     compare = ccp.Comparison(comm, run.compared())  # refuses unknown names
     if solver.newton and not run.settle:
         form = ccp.newton_for(comm, asked.solver, asked.newton, compare).form
         _refuse_for_petsc(database, form, comm)
     _refuse_places(run, comm)
-    return Options(run, scene, Settings(**given).of(scene), demo)
+    return Options(run, scene, asked.of(scene, relaxed=bool(run.problem or run.compare)), demo)
 
 
 def _read_scene(name: str, scene_class: type[Experiment], database: Mapping[str, str]) -> Experiment:
@@ -76,6 +75,8 @@ def _refuse_bad_numerics(name: str, scene: Experiment) -> None:
     properties and options too."""
     for attribute in ("dt", "delta", "settle_delta", "settling_time"):
         value, (allowed, test) = getattr(scene, attribute), POSITIVE if attribute == "dt" else NOT_NEGATIVE
+        if value is None and attribute != "settling_time":
+            continue  # from the scene's sizes and speeds
         if not (isinstance(value, (int, float, np.number)) and test(value)):
             raise OptionError(f"-scene {name}: its {attribute} is {value!r}; allowed is {allowed}")
     try:
@@ -91,10 +92,10 @@ def _refuse_bad_numerics(name: str, scene: Experiment) -> None:
 def option_groups(scene: type[Experiment]) -> list[tuple[type, str]]:
     """The classes whose fields are options, with their prefixes."""
     solvers = [(solver.options, solver.prefix) for solver in ccp.SOLVERS.values()]
-    return [(Run, ""), (scene, "scene_"), (Asked, "ccp_"), (ccp.Coulomb, "ccp_coulomb_"), *solvers]
+    return [(Run, ""), (scene, "scene_"), (Settings, "ccp_"), *solvers]
 
 
-def _refuse_without_effect(database: Mapping[str, str], run: Run, asked: Asked, coulomb: bool) -> None:
+def _refuse_without_effect(database: Mapping[str, str], run: Run, asked: Settings) -> None:
     """OptionError for the first option that means nothing beside the others."""
     solver = ccp.SOLVERS[asked.solver]
     newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
@@ -108,11 +109,10 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, asked: Asked, 
     no_newton = f"-ccp_type {asked.solver} solves no Newton systems; allowed is {newton}"
     rules: list[tuple[Any, set[str], tuple[str, ...], str]] = [  # if, which options by name or by beginning, why not
         (run.problem, OF_STEPS, ("scene_",), f"-problem {run.problem} makes no steps; allowed is one of the two"),
-        (run.settle, own - OF_SETTLING, ("ccp_", *OF_SOLVERS), settles),
+        (run.settle, own - OF_SETTLING | {"law"}, ("ccp_", *OF_SOLVERS), settles),
         (not solver.newton, {"compare", "ccp_newton"}, OF_SOLVERS, no_newton),
         (True, strangers, (), f"its preconditioner is not compared; -compare lists {run.compare or 'none'}"),
         (True, set(), of_others, f"belongs to another -ccp_type than {asked.solver}"),
-        (not coulomb, set(), ("ccp_coulomb_",), "allowed with -ccp_coulomb only"),
     ]
     for applies, names, starts, reason in rules:
         for name, value in database.items():

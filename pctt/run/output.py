@@ -22,6 +22,7 @@ from mpi4py import MPI
 from dem import bodies
 from dem.exchange import exchange
 from dem.experiment import Experiment
+from dem.period import wrapped
 from dem.shapes import described
 from dem.step import Step
 from dem.together import together
@@ -30,6 +31,7 @@ from pctt import disk
 from pctt.disk import FileError, Lock, on_first, texts, write_rows, write_text
 from pctt.folder import DERIVED, FILES, HARD, Folder, dumps, write_table
 from pctt.options import OptionError
+from pctt.petsc import warn
 
 
 def refusal(folder: Path, restart: str, overwrite: bool) -> str:
@@ -139,7 +141,9 @@ class Writer:
         smallest = float(bodies.least_half_thickness(world.grains).min(initial=np.inf))
         radius = self.comm.allreduce(smallest, MPI.MIN)
         self._about = {**about, "bodies": world.body_count, "ranks": self.comm.size, "smallest_radius [m]": radius}
-        on_first(self.comm, self._lines, lambda: sum(1 for _ in self._kept()))  # which can be gone on with
+        kept = on_first(self.comm, self._lines, lambda: {step for step, _ in self._kept()})  # which can be gone on with
+        if place.goes_on and len(kept) <= self._start - min(kept, default=self._start):
+            warn(self.comm, f"{self._lines}: has no figures of some of the steps up to {self._start}")
 
     @property
     def checkpoint(self) -> Path:
@@ -154,15 +158,16 @@ class Writer:
     def _lines(self) -> Path:
         return self.place.now / "steps.jsonl"
 
-    def _kept(self) -> Iterator[str]:
-        """The lines of the steps that stay of an earlier run; FileError if one is damaged."""
-        for line in disk.lines(self._lines):
+    def _kept(self) -> Iterator[tuple[int, str]]:
+        """The steps that stay of an earlier run, and their lines; FileError if a line is damaged."""
+        for number, line in enumerate(disk.lines(self._lines), 1):
             try:
-                step = json.loads(line)["step"]
+                step = int(json.loads(line)["step"])
             except (LookupError, TypeError, ValueError) as error:
-                raise FileError(f"{self._lines}: cannot be continued ({error})") from None
+                words = f"line {number} is no step ({error}); delete it, and the run goes on with the others"
+                raise FileError(f"{self._lines}: cannot be continued: {words}") from None
             if step <= self._kept_steps:
-                yield line
+                yield step, line
 
     def record(self, step: Step, row: Mapping[str, float]) -> None:
         """Write the frame of a step, with the row of its records, if that is due."""
@@ -189,15 +194,19 @@ class Writer:
             return
         write_text(self.place.now / "settings.json", dumps(self._about, indent=1) + "\n")
         with disk.whole(self._lines) as temporary, open(temporary, "w") as file:
-            file.writelines(f"{text}\n" for text in chain(self._kept(), [line]))
+            file.writelines(f"{text}\n" for text in chain((text for _, text in self._kept()), [line]))
         self._begun = True
+
+    def keep(self) -> None:
+        """Write the checkpoint of the present state, if it is not there."""
+        if self._saved < self._world.step:
+            self._checkpoint()
 
     def complete(self, step: Step, row: Mapping[str, float]) -> None:
         """Write the frame and the checkpoint of the last step, if they are not there, and what follows from all."""
         if self._every and self._recorded < self._world.step:
             self._record(step, row)
-        if self._saved < self._world.step:
-            self._checkpoint()
+        self.keep()
         if self._stale:
             self._derive()
 
@@ -233,6 +242,8 @@ class Writer:
         self.place.leave()
 
     def _checkpoint(self) -> None:
+        """The lines of steps.jsonl come to the disk first: a run goes on from the checkpoint with them."""
+        on_first(self.comm, self._lines, lambda: disk.flush(self._lines))
         self._save(self.checkpoint)
         self._saved = self._world.step
 
@@ -255,11 +266,13 @@ class Writer:
             **_by_id(world, ("position", "quaternion", "velocity")),
             "contact/key": contacts.key,
             "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
-            "contact/point": contacts.point,
+            "contact/point": wrapped(contacts.point, world.period),
             "contact/frame": step.system.frame,
             "contact/gap": contacts.gap,
             "contact/impulse": step.impulse,
         }
+        if (moments := step.moments) is not None:
+            rows["contact/moment"] = moments
         about = {"/": {"step": world.step, "time": world.time}, "record": row, "contact": {"dt": step.system.dt}}
         write_rows(frames / f"{world.step:06d}.h5", self.comm, rows, {}, about)
         self._recorded = world.step
@@ -291,6 +304,8 @@ def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Columns of the table of all bodies, in the order of their ids, spread over the ranks; collective."""
     grains, comm = world.grains, world.comm
     columns = {"id": grains.id, **{name: getattr(grains, name) for name in names}}
+    if "position" in columns:
+        columns["position"] = wrapped(columns["position"], world.period)
     starts = np.arange(comm.size + 1) * int(world.slabs[-1]) // comm.size
     rows = exchange(comm, columns, np.searchsorted(starts, grains.id, side="right") - 1)
     order, last = np.argsort(rows["id"]), comm.rank == comm.size - 1

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dem.keys import places
+from dem.arrays import places
 from dem.system import ContactSystem
 from pctt import ccp
 from pctt.ccp.cone import Array
@@ -32,7 +32,8 @@ def projected(every: ContactSystem, touching: ContactSystem, found: ccp.Result) 
     """
     r = np.zeros_like(every.r)
     r[:, 0] = (every.contact_map.velocities(found.momentum) + every.r)[:, 0]
-    r[places(every.key, touching.key), 0] += touching.compliance * found.impulse[:, 0]  # what their springs hold
+    held = found.impulse[: len(touching.key), 0]  # by springs; moments come behind
+    r[places(every.key, touching.key), 0] += touching.compliance * held
     G, free = every.contact_map, np.zeros(len(r))
     problem = ccp.ConeProblem(G.comm, r, free, G=G, point=every.point, key=every.key, compliance=every.compliance)
     result = ccp.solve(problem, None, "apgd", LIMITS)

@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from pctt.ccp.result import FIXED_POINT, RELAXATION
+from pctt.ccp.result import FIXED_POINT, RELAXATION, Status
 from pctt.folder import totals
 
 #: What is worth a warning: Coulomb residuals of the relaxation above the first, closing work above the second part of
 #: the impulses' energy, overlaps above the third of the radius of the smallest grain.
-LARGE_OPENING, LARGE_CLOSING_WORK, LARGE_OVERLAP = 1e-3, 0.05, 0.05
+LARGE_OPENING, LARGE_CLOSING_WORK, LARGE_OVERLAP = 1e-3, 0.3, 0.05
 
-#: What a first-order method is warned of at a tolerance above the default.
-LOOSE = (
-    "above 1e-4 first-order methods leave overlaps of millimetres; as these are pushed apart, a packing may not come "
-    "to rest"
-)
+#: Tolerances above it are warned of, and why.
+LOOSE, LOOSE_BECAUSE = 1e-3, "forces of dense beds are too small by 5 to 20 % at such tolerances"
+
+#: What helps against jumps of energy; a smaller tolerance does not.
+JUMP_ADVICE = "What helps: a smaller -dt, a -stiffness, or a tool of bounded force or torque (docs/mechanics.md)"
 
 
 def residual(line: Mapping[str, Any]) -> float:
@@ -57,7 +57,7 @@ def step_line(line: Mapping[str, Any]) -> str:
     names = ("search", "assembly", "solve", "output")
     search, assembly, solve, output = (phases.get(name, 0.0) for name in names)
     compare = f" {phases['compare']:7.2f}" if "compare" in phases else ""
-    remark = "" if line["converged"] else f"  NOT CONVERGED: {line['reason']}"
+    remark = "" if line["converged"] else f"  {_shortfall(line)}"
     if line["fallbacks"]:
         remark += f"  ({line['fallbacks']} Newton systems by a fallback)"
     if line.get("law") == FIXED_POINT:
@@ -73,6 +73,24 @@ def step_line(line: Mapping[str, Any]) -> str:
     )
 
 
+def _shortfall(line: Mapping[str, Any]) -> str:
+    """Why a step is not converged, with the residuals of both laws where Coulomb's is asked for."""
+    if line["status"] == Status.SQUEEZED.value:
+        return f"SQUEEZED: {line['reason']}"
+    if line["law"] == RELAXATION:
+        return f"NOT CONVERGED: {line['reason']}"
+    residuals = f"Coulomb residual {line['coulomb_residual']:.1e}, natural residual {line['natural_residual']:.1e}"
+    return f"NOT CONVERGED: {residuals}: {line['reason']}"
+
+
+def jump_words(line: Mapping[str, Any]) -> str:
+    """What is said at once of a step with a jump of energy."""
+    return (
+        f"step {line['step']}: the kinetic energy rises by {line['energy_jump']:.3g} J to"
+        f" {line['kinetic_energy [J]']:.3g} J, tenfold or out of nothing. {JUMP_ADVICE}"
+    )
+
+
 class Progress:
     """Prints the messages of a run on the first rank, and on a terminal a passing line about the present step."""
 
@@ -80,12 +98,23 @@ class Progress:
         self._active = comm.rank == 0 and not quiet
         # under mpiexec standard output looks like a terminal even if it goes to a file
         started = any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK"))
+        self._active = self._active and sys.stdout is not None  # closed by the shell
         self._live = self._active and not started and sys.stdout.isatty()
         self._begun, self._first = time.perf_counter(), -1
 
     def say(self, text: str = "") -> None:
+        self._print("\r\033[K" * self._live + text + "\n")
+
+    def _print(self, text: str) -> None:
+        """Without room for what a run says, it goes on in silence: its files have all that it finds."""
         if self._active:
-            print("\r\033[K" * self._live + text, flush=True)
+            try:
+                sys.stdout.write(text)
+                sys.stdout.flush()
+            except OSError as error:
+                self._active = self._live = False
+                sys.stderr.write(f"pctt.run: says no more, as it cannot write there ({error.strerror})\n")
+                sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - else what is left fails at the end
 
     def doing(self, done: int, now: float, end: int) -> None:
         """After so many steps, at a time ``now`` [s] of the simulation, the next one begins, unless it is the end."""
@@ -95,7 +124,7 @@ class Progress:
             spent, made = time.perf_counter() - self._begun, done - self._first
             left = f", {remaining(spent, made, end - self._first)}" if made else ""
             line = f"step {done + 1}, time {now:.3f} s ({made + 1} of {end - self._first}){left} ..."
-            print(f"\r\033[K{line[: shutil.get_terminal_size().columns - 1]}", end="", flush=True)
+            self._print(f"\r\033[K{line[: shutil.get_terminal_size().columns - 1]}")
 
 
 def remaining(spent: float, done: int, steps: int) -> str:
@@ -137,15 +166,16 @@ def phase_table(steps: Sequence[Mapping[str, Any]]) -> str:
     ]
     failed, (least, most) = run["not_converged"], run["contacts"]
     figures = (
-        f"{run['steps']} steps, {least} to {most} contacts, {run['newton_its']} Newton steps, {run['ksp_its']} Krylov"
-        f" iterations, worst residual {max(map(residual, steps)):.1e}, "
+        f"{run['steps']} steps, {least} to {most} contacts, {run['iterations']} iterations ({run['newton_its']} Newton"
+        f" steps), {run['ksp_its']} Krylov iterations, worst residual {max(map(residual, steps)):.1e}, "
         + (f"{failed} NOT CONVERGED" if failed else "all converged")
+        + (f" ({run['squeezed']} of them squeezed)" if run["squeezed"] else "")
     )
     return "\n".join([head, "-" * len(head), *rows, figures])
 
 
 def law_line(steps: Sequence[Mapping[str, Any]], tol: float) -> str:
-    """A line about the law that the steps obey, and its residual, with a warning if the relaxation is far from
+    """A line about the law that the steps obey, and its residual, and what it means if the relaxation is far from
     Coulomb's law."""
     laws = Counter(line["law"] for line in steps)
     counted = ", ".join(f"{name} in {count} steps" for name, count in laws.most_common())
@@ -153,7 +183,17 @@ def law_line(steps: Sequence[Mapping[str, Any]], tol: float) -> str:
     said = f"law of contact: {counted}; Coulomb residual at most {worst:.1e}"
     if RELAXATION not in laws or worst <= max(LARGE_OPENING, 10 * tol):
         return said
-    return f"WARNING: {said}: sliding contacts open by dt mu |v_t|; -ccp_coulomb keeps them closed (docs/ccp.md)"
+    return f"{said}: sliding contacts open by dt mu |v_t|; -law coulomb keeps them closed (docs/ccp.md)"
+
+
+def jumps_line(steps: Sequence[Mapping[str, Any]]) -> str:
+    """A warning of jumps of energy; empty without."""
+    jumps = [line for line in steps if line.get("energy_jump", 0.0) > 0.0]
+    if not jumps:
+        return ""
+    worst = max(jumps, key=lambda line: line["energy_jump"])
+    said = f"WARNING: {len(jumps)} jumps of energy, the largest of {worst['energy_jump']:.3g} J in step {worst['step']}"
+    return f"{said}; means are without these steps. {JUMP_ADVICE}"
 
 
 def forces_line(steps: Sequence[Mapping[str, Any]], limit: float) -> str:
@@ -174,7 +214,7 @@ def overlap_line(worst: Mapping[str, float]) -> str:
     line = f"worst overlap {overlap:.2g} m, {overlap / radius:.1%} of the smallest radius, at step {worst['step']}"
     if overlap <= LARGE_OVERLAP * radius:
         return line
-    return f"WARNING: {line}; try a smaller -ccp_tol, then a smaller -dt"
+    return f"WARNING: {line}; try a smaller -dt, then a smaller -ccp_tol"
 
 
 def figure_table(figures: Mapping[str, float]) -> str:

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Optional
 
+import numpy as np
+
+from dem import time_step
 from dem.experiment import SCENE_FILE, Experiment, Given, SceneFileError, from_file
+from dem.scene import Scene
 from dem.scenes import SCENES
 from pctt import ccp
 from pctt.options import (
     AT_LEAST_ONE,
     COUNT,
+    FRACTION,
     NOT_NEGATIVE,
     POSITIVE,
     OptionError,
@@ -33,8 +39,11 @@ DEMO_SOLVERS = {
 DEMO = {
     "scene": "mixer",
     "scene_n": "4",
+    "ccp_type": "pdip",
     "restart": "settled",
     "steps": "5",
+    "dt": "0.025",
+    "ccp_tol": "1e-4",
     "compare": "auto:tt,ten:tt,pbjacobi,ilu,none",
     "compare_every": "6",
     "output": "results/demo",
@@ -46,22 +55,31 @@ DEMO = {
 @dataclasses.dataclass(frozen=True)
 class Settings(ccp.Limits):
     """How a simulation makes its steps; options of the program, but for ``options`` and ``settle_tol``. The limits of
-    the solver, ``tol``, ``max_it`` and ``closing_work``, are those of `pctt.ccp.Limits`. ``coulomb`` may also be a
-    `pctt.ccp.Coulomb`."""
+    the solver, ``tol``, ``max_it`` and ``closing_work``, are those of `pctt.ccp.Limits`."""
 
-    solver: str = option("auto", "solver of the cone problems", choices=ccp.SOLVERS, name="ccp_type")
+    solver: str = option(
+        "auto", "solver of the cone problems; -compare alone takes pdip", choices=ccp.SOLVERS, name="ccp_type"
+    )
     newton: str = option(
         "auto", "unknowns of the Newton systems; auto: contact for pdip, body for conic", choices=("auto", *ccp.FORMS)
     )
-    coulomb: Any = option(
-        None,
-        "true: Coulomb's law; false: its relaxation by the cone problem, whose sliding contacts open; none: Coulomb's "
-        "law where that costs about the same, in scenes with apgd or auto at -ccp_tol 1e-4 and above (docs/ccp.md)",
+    law: str = option(
+        "",
+        "Coulomb's law, or its relaxation by the cone problem, where what slides opens (docs/ccp.md); none: coulomb, "
+        "but relaxation with pdip, -compare and -problem",
+        choices=ccp.LAWS, name="law",
+    )  # fmt: skip
+    tol: float = option(3e-4, "natural residual at which a cone problem counts as solved", check=FRACTION)
+    closing_work: float = option(
+        0.3, "closing and opening work at which a cone problem counts as solved; inf: any",
+        check=("a positive number, or inf", lambda x: x > 0),
+    )  # fmt: skip
+    dt: float = option(
+        None, "time step; none: the scene's own, or what its sizes and speeds need", unit="s", check=POSITIVE, name="dt"
     )
-    dt: float = option(None, "time step; none: the scene's own", unit="s", check=POSITIVE, name="dt")
     delta: float = option(
-        None, "gap below which a pair of bodies is a contact; none: the scene's own", unit="m", check=NOT_NEGATIVE,
-        name="delta",
+        None, "gap below which a pair of bodies is a contact; none: the scene's own, or 0.2 radii", unit="m",
+        check=NOT_NEGATIVE, name="delta",
     )  # fmt: skip
     stiffness: Optional[float] = option(
         None,
@@ -88,42 +106,36 @@ class Settings(ccp.Limits):
     @property
     def words(self) -> str:
         """How steps are solved: the method, its tolerance and the law of contact."""
-        law = "Coulomb's law" if self.coulomb else "relaxation of Coulomb's law"
+        law = "Coulomb's law" if self.law == ccp.COULOMB else "relaxation of Coulomb's law"
         return f"{self.solver} to {self.tol:g}, {law}"
 
-    def of(self, scene: Experiment) -> Settings:
+    def of(self, scene: Experiment, relaxed: bool = False) -> Settings:
         """The same, with what a scene and a solver have of their own where nothing is given; then ``options`` is an
-        instance, and ``coulomb`` one or False. OptionError for a bad value."""
-        coulomb = self.coulomb
-        if not isinstance(coulomb, (bool, ccp.Coulomb, type(None))):
-            raise OptionError(f"coulomb {coulomb!r}: allowed is true, false or a Coulomb")
+        instance. The law is the relaxation with `pdip`, and where the run is ``relaxed`` by its kind, as comparisons
+        are. OptionError for a bad value."""
         refuse_bad(self)
-        if not isinstance(coulomb, ccp.Coulomb):
-            coulomb = self.obeys_coulomb and ccp.Coulomb()
+        law = self.law or (ccp.RELAXATION if relaxed or self.solver == "pdip" else ccp.COULOMB)
         kind, options = ccp.SOLVERS[self.solver].options, self.options
         if options is None or isinstance(options, Mapping):
             options = made(kind, options or {})
         if not isinstance(options, kind):
             raise OptionError(f"options {options!r}: allowed for {self.solver} is a dict or a {kind.__name__}")
         refuse_bad(options)
-        refuse_bad(coulomb or ccp.Coulomb())
         dt, delta = (scene.dt if self.dt is None else self.dt, scene.delta if self.delta is None else self.delta)
-        whole = dataclasses.replace(self, dt=dt, delta=delta, options=options, coulomb=coulomb)
+        whole = dataclasses.replace(self, dt=dt, delta=delta, options=options, law=law)
         refuse_bad(whole)
         return whole
 
-    @property
-    def obeys_coulomb(self) -> bool:
-        """Whether steps obey Coulomb's law: as asked, or where that costs about the same."""
-        return self.tol >= ccp.SOLVERS[self.solver].law_tol if self.coulomb is None else bool(self.coulomb)
-
-
-@dataclasses.dataclass(frozen=True)
-class Asked(Settings):
-    """The settings of the program, whose solver is the paper's where none is asked for."""
-
-    solver: str = dataclasses.field(default="pdip", metadata=Settings.__dataclass_fields__["solver"].metadata)
-    coulomb: Optional[bool] = Settings.__dataclass_fields__["coulomb"]  # type: ignore[assignment]
+    def fitted(self, scene: Scene) -> Settings:
+        """The same, with the time step and the contact distance that a built scene needs where none is given."""
+        dt = time_step.recommended(scene) if self.dt is None else self.dt
+        delta = time_step.contact_distance(scene) if self.delta is None else self.delta
+        if not ccp.SOLVERS[self.solver].has_rolling and scene.pairs(np.inf).resists:
+            why = f"rolling or spinning resistance; allowed are {ccp.FOR_ROLLING}"
+            raise OptionError(f"-ccp_type {self.solver}: the scene has {why}")
+        if delta < scene.reach:
+            raise OptionError(f"-delta {delta:g} m: cohesion acts up to {scene.reach:g} m; allowed is at least that")
+        return dataclasses.replace(self, dt=dt, delta=delta)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,17 +144,21 @@ class Run:
 
     scene: str = option("mixer", f"what to simulate: {', '.join(SCENES)}, or a file FILE.py with a scene of your own")
     steps: int = option(5, "time steps to make", check=COUNT)
+    seconds: Optional[float] = option(None, "time to simulate, in place of -steps", unit="s", check=POSITIVE)
     restart: str = option(
         "",
         "file to start from: checkpoint.h5 of a run; settled: the scene's settled state, made at first use",
     )
     settle: bool = option(False, "make the scene's settled state with APGD, keep it in the cache, and stop")
-    output: str = option("results", "folder for state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
+    output: str = option(
+        "results", "folder for state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5",
+        check=("the name of a folder", bool),
+    )  # fmt: skip
     overwrite: bool = option(
         False, "let the run replace another one in the folder of -output, once its first step is written"
     )
-    output_every: int = option(1, "steps between two records in state.h5; 0: none", check=COUNT)
-    checkpoint_every: int = option(1, "steps between two checkpoints", check=AT_LEAST_ONE)
+    output_every: int = option(10, "steps between two records in state.h5, and the last one; 0: none", check=COUNT)
+    checkpoint_every: int = option(10, "steps between two checkpoints, and one at the end", check=AT_LEAST_ONE)
     problem: str = option("", "FCLIB file with a cone problem to solve instead of a scene")
     dump_problem: str = option("", "folder for the steps' cone problems as FCLIB files")
     compare: str = option(
@@ -152,6 +168,10 @@ class Run:
     )
     compare_every: int = option(1, "compare on every k-th Newton system", check=AT_LEAST_ONE)
     quiet: bool = option(False, "print nothing but errors")
+
+    def steps_of(self, dt: float) -> int:
+        """How many time steps of dt [s] to make."""
+        return self.steps if self.seconds is None else math.ceil(self.seconds / dt * (1 - 1e-12))
 
     def compared(self) -> list[str]:
         """The entries of ``compare``."""

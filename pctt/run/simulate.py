@@ -52,14 +52,15 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     newton, settings, output = sim.stepper.newton, sim.settings, sim.output
     assert newton is not None
     assert output is not None
-    end = sim.steps + options.run.steps
+    steps = options.run.steps_of(settings.dt)
+    end = sim.steps + steps
     progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {settings.words}")
-    progress.say(report.stiffness_line(sim.world.stiffness, sim.expected_overlap))
-    if ccp.SOLVERS[settings.solver].needs != ccp.NEWTON and settings.tol > ccp.Limits().tol:
-        progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE}")
+    progress.say(report.stiffness_line(sim.world.pairs.stiffness, sim.expected_overlap))
+    if settings.tol > report.LOOSE:
+        progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE_BECAUSE}")
     if ccp.SOLVERS[settings.solver].newton:
         progress.say(f"Newton systems: {newton.words()}")
-    if options.run.steps:
+    if steps:
         progress.say(report.columns(newton.compare is not None))
 
     def say(sim: Simulation) -> None:
@@ -67,12 +68,12 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         progress.doing(sim.steps, sim.time, end)
 
     progress.doing(sim.steps, sim.time, end)
-    sim.run(steps=options.run.steps, call=say, stop=lambda sim: interrupt.asked(sim.comm))
+    sim.run(steps=steps, call=say, stop=lambda sim: interrupt.asked(sim.comm))
     if sim.steps < end:
         words = _how_to_go_on(options, output.checkpoint, end - sim.steps)
         raise interrupt.InterruptError(f"interrupted after step {sim.steps}; the same command with {words}")
     if sim.last:
-        _say_end(options, sim, progress)
+        _say_end(sim, steps, progress)
         if what := newton.what():
             progress.say(f"Newton systems: {what}")
         if compare.names:
@@ -84,15 +85,17 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         progress.say(f"\nresults: {folder}/state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
 
 
-def _say_end(options: Options, sim: Simulation, progress: report.Progress) -> None:
-    """What the steps have taken and shown."""
+def _say_end(sim: Simulation, steps: int, progress: report.Progress) -> None:
+    """What the last ``steps`` have taken and shown."""
     figures, output = sim.analyse(), sim.output
     if sim.comm.rank > 0:
         return
     assert output is not None
-    lines = [line for line in output.folder.lines() if line["step"] > sim.steps - options.run.steps]
+    lines = [line for line in output.folder.lines() if line["step"] > sim.steps - steps]
     progress.say("\n" + report.phase_table(lines))
     progress.say(report.law_line(lines, sim.settings.tol))
+    if jumps := report.jumps_line(lines):
+        progress.say(jumps)
     progress.say(report.forces_line(lines, sim.settings.closing_work))
     if figures:
         progress.say(report.figure_table(figures))
@@ -155,7 +158,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
     try:
         with log.phase("solve"):
             result = ccp.solve(
-                problem, guess, settings.solver, settings.limits, settings.options, newton, settings.coulomb or None
+                problem, guess, settings.solver, settings.limits, settings.options, newton, settings.law
             )
         used = result.solver or settings.solver
         by_newton = ccp.SOLVERS[used].newton
@@ -174,7 +177,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
         "contacts": problem.size,
         "ranks": comm.size,
         "solver": used,
-        "law": "Coulomb" if settings.coulomb else "cone problem",
+        "law": settings.law,
         "mean_compliance": problem.sum(problem.compliance[:, 0].sum()) / max(problem.size, 1),
         **dataclasses.asdict(accuracy),
         "cone_problems": result.cone_problems,

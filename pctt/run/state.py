@@ -17,17 +17,20 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from dem import stiffness
+from dem import loads, springs, stiffness, time_step
 from dem.arrays import Floats
 from dem.bodies import Bodies
+from dem.exchange import refuse
 from dem.experiment import Experiment
 from dem.impulses import ImpulseMemory
 from dem.mesh import Mesh
 from dem.quaternion import cross
 from dem.scene import LargeBody, Scene
+from dem.shapes import placed
 from dem.start import even_slice, new_world, restart_rows, restored_world
-from dem.together import together
-from dem.world import World, changed_motions, restore_motions
+from dem.together import SceneError, together, unlike
+from dem.world import World, changed_motions, restore_loads, restore_motions, restore_springs
+from pctt import ccp
 from pctt.disk import FileError, Lock, on_first, read, texts, write_rows
 from pctt.options import OptionError
 from pctt.petsc import warn
@@ -35,13 +38,14 @@ from pctt.run import interrupt
 from pctt.run.settings import Settings, scene_name
 from pctt.run.stepper import Stepper
 
+CHANGES = {"motions": restore_motions, "loads": restore_loads, "springs": restore_springs}  #: made within a run
 FORMAT, FIRST_FORMAT = "pctt checkpoint 2", "pctt checkpoint 1"  #: the first one had no checksums
 
 Say = Callable[[str], object]  #: told on the first rank
 
 
 def built(scene: Experiment, comm: MPI.Comm) -> Scene:
-    """What the scene builds; SceneError on all ranks if that fails on any."""
+    """What the scene builds; SceneError on all ranks if that fails on any, or if the ranks build different things."""
 
     def build() -> Scene:
         built = scene.build()
@@ -49,7 +53,29 @@ def built(scene: Experiment, comm: MPI.Comm) -> Scene:
             raise TypeError(f"build must return a dem.scene.Scene, not {type(built).__name__}")
         return built
 
-    return together(comm, f"build of the scene {type(scene).__name__}", build)
+    what = f"build of the scene {type(scene).__name__}"
+    found = together(comm, what, build)
+    words, numbers = together(comm, what, lambda: _facts(found))
+    if other := unlike(comm, words, numbers):
+        allowed = "allowed is the same scene on all ranks (random numbers need a seed, and no rank a part of its own)"
+        raise SceneError(f"{what}: rank {other} has built other bodies or materials than rank 0; {allowed}")
+    return found
+
+
+def _facts(scene: Scene) -> tuple[str, list[Floats]]:
+    """What a scene is made of, in words and numbers, for `unlike`."""
+    large = scene.large_bodies
+    motions = [(body.name, type(body.motion).__name__) for body in large]
+    words = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
+    numbers = [column for table in (*scene.parts, scene.large()) for column in table.columns().values()]
+    numbers += [np.asarray(value) for body in large for shape in body.shapes for value in placed(shape)]
+    of_motions = [np.asarray(value) for body in large for value in getattr(body.motion, "__dict__", {}).values()]
+    of_motions += [np.asarray(body.surface) for body in large]
+    of_motions += [np.asarray(value) for spring in scene.springs.values() for value in vars(spring).values()]
+    of_motions += [np.asarray(value) for load in scene.loads.values() for value in vars(load).values()]
+    numbers += [value for value in of_motions if value.dtype.kind in "fiub"]
+    numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values()]
+    return repr(words), numbers
 
 
 def world_at_start(experiment: Experiment, scene: Scene, comm: MPI.Comm) -> World:
@@ -106,6 +132,11 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
     shared["world/materials"] = texts(world.materials)
     if motions := changed_motions(world):
         shared["world/motions"] = texts([motions])
+    if world.loads_set:
+        shared["world/loads"] = texts([loads.as_text({name: world.loads[name] for name in sorted(world.loads_set)})])
+    if world.springs_set:
+        changed = {name: world.springs[name] for name in sorted(world.springs_set)}
+        shared["world/springs"] = texts([springs.as_text(changed)])
     rows |= {"contacts/key": key, "contacts/impulse": impulse}
     write_rows(path, world.comm, rows, shared, {"/": {"format": FORMAT, **made_with}})
 
@@ -120,29 +151,36 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
     columns = [field.name for field in dataclasses.fields(Bodies)]
 
     def take(file: h5py.File, sealed: bool) -> tuple[Any, ...]:
-        if (file.attrs.get("format"), sealed) not in ((FORMAT, True), (FIRST_FORMAT, False)):
-            raise ValueError(f"it is not marked '{FORMAT}', or has no checksum")
+        _refuse_unmarked(file, sealed)
         replicated = {n: file[f"world/{n}"][()] for n in (*(f"large_{n}" for n in columns), "slabs", "time", "step")}
-        motions = file["world/motions"].asstr()[0] if "world/motions" in file else "{}"
+        if "world/expected" in file:  # of springs
+            replicated["expected"] = file["world/expected"][()]
+        changes = [file[f"world/{n}"].asstr()[0] if f"world/{n}" in file else "{}" for n in CHANGES]
         rows, contacts = restart_rows(replicated["slabs"], comm), even_slice(len(file["contacts/key"]), comm)
         local = {name: file[f"grains/{name}"][rows] for name in columns}
         old = {name: file.attrs.get(name) for name in made_with}
         impulses = file["contacts/key"][contacts], file["contacts/impulse"][contacts]
-        return old, json.loads(file.attrs["scene"]), replicated, motions, local, impulses
+        return old, json.loads(file.attrs["scene"]), replicated, changes, local, impulses
 
-    try:
-        old, scene_of, replicated, motions, local, impulses = read(path, comm, take)
-    except FileError as error:
-        raise FileError(f"{error}{'; delete it to have it made again' * (path.parent == cache())}") from None
+    old, scene_of, replicated, changes, local, impulses = read(path, comm, take)
     _refuse_other_origin(path, old, scene_of, made_with, comm)
     try:
         world = restored_world(scene, comm, local, replicated)
-        restore_motions(world, motions)
+        for restore, text in zip(CHANGES.values(), changes):
+            restore(world, text)
+        memory, (key, impulse) = ImpulseMemory(comm, world.pairs.parts), impulses
+        right = np.isfinite(impulse).all() and impulse.shape == (len(key), 4 * world.pairs.parts)
+        right = right and len(np.unique(key)) == len(key)
+        refuse(comm, "" if right else "impulses of contacts that are no numbers, or two of one contact")
     except (KeyError, TypeError, ValueError) as error:  # another text of the scene file may build other bodies
         raise OptionError(f"-restart {path}: {error}") from None
-    memory, (key, impulse) = ImpulseMemory(comm), impulses
     memory.restore(key, impulse if old["dt"] in (None, made_with["dt"]) else impulse * (made_with["dt"] / old["dt"]))
     return world, memory
+
+
+def _refuse_unmarked(file: h5py.File, sealed: bool) -> None:
+    if (file.attrs.get("format"), sealed) not in ((FORMAT, True), (FIRST_FORMAT, False)):
+        raise ValueError(f"it is not marked '{FORMAT}', or has no checksum")
 
 
 def _refuse_other_origin(
@@ -178,10 +216,10 @@ def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_
     if not experiment.settling_time:
         raise OptionError(f"-scene {about['scene']}: has no settling_time and so no settled state")
     how: dict[str, Any] = {
-        "dt": experiment.dt,
-        "delta": [experiment.settle_delta, experiment.delta],
+        "dt": time_step.for_settling(scene),
+        "delta": settling_distances(experiment, scene),
         "recovery_speed": Settings.recovery_speed,
-        "stiffness": stiffness.table(scene).tolist(),
+        "stiffness": stiffness.pairs(scene).stiffness.tolist(),
         "tol": settings.settle_tol,
     }
     if experiment.digest:
@@ -198,21 +236,33 @@ def unfinished(path: Path) -> Path:
     return path.with_suffix(".unfinished.h5")
 
 
-def settling_steps(experiment: Experiment) -> int:
+def settling_steps(experiment: Experiment, scene: Scene) -> int:
     """The steps of a settling from time zero."""
-    return math.ceil(experiment.settling_time / experiment.dt * (1 - 1e-12))
+    return math.ceil(experiment.settling_time / time_step.for_settling(scene) * (1 - 1e-12))
+
+
+def settling_distances(experiment: Experiment, scene: Scene) -> tuple[float, float]:
+    """The contact distances of falling grains and of those at rest [m]."""
+    falling = time_step.smallest(scene) if experiment.settle_delta is None else experiment.settle_delta
+    at_rest = time_step.contact_distance(scene) if experiment.delta is None else experiment.delta
+    return max(falling, at_rest), at_rest
 
 
 def settled_state(
     experiment: Experiment, settings: Settings, scene: Scene, comm: MPI.Comm, say: Say, anew: bool = False
 ) -> Path:
-    """The cached settled state of ``scene``, which the experiment has `built`. It is made if it is missing, or with
-    ``anew``. An interrupted or killed settling is continued."""
+    """The cached settled state of ``scene``, which the experiment has `built`. It is made if it is missing or damaged,
+    or with ``anew``. An interrupted or killed settling is continued."""
     say = say if comm.rank == 0 else lambda text: None
-    made_with = origin(experiment, scene, experiment.dt)
+    made_with = origin(experiment, scene, time_step.for_settling(scene))
     path = comm.bcast(settled_path(experiment, settings, scene, made_with))  # processors may round in other ways
     if not anew and comm.bcast(path.exists()):
-        return path
+        try:
+            read(path, comm, _refuse_unmarked)
+            return path
+        except FileError as error:
+            say(f"{error}; it is made anew")
+            anew = True
     on_first(comm, path.parent, lambda: path.parent.mkdir(parents=True, exist_ok=True))
     with _alone(path, comm, say):
         if anew or not comm.bcast(path.exists()):
@@ -245,19 +295,23 @@ def _settle(
 
     The last tenth has the contact distance of the scene and ten times the accuracy: otherwise overlaps remain, and the
     first accurate step of a run would push them apart."""
-    end, tol, begun = settling_steps(experiment), settings.settle_tol, time.perf_counter()
+    end, tol, begun = settling_steps(experiment, scene), settings.settle_tol, time.perf_counter()
     tenth = max(1, end // 10)
     say(f"settling {scene_name(experiment)}, {end} steps with APGD to {tol:g}:")
+    world = world_at_start(experiment, scene, comm)
+    memory = ImpulseMemory(comm, world.pairs.parts)
     if comm.bcast(unfinished(path).exists()):
-        world, memory = load(unfinished(path), scene, made_with, comm)
-        say(f"  goes on after step {world.step}, from {unfinished(path)}")
-    else:
-        world, memory = world_at_start(experiment, scene, comm), ImpulseMemory(comm)
-    loose = Settings(delta=experiment.settle_delta, solver="apgd", tol=tol, coulomb=False).of(experiment)
+        try:
+            world, memory = load(unfinished(path), scene, made_with, comm)
+            say(f"  goes on after step {world.step}, from {unfinished(path)}")
+        except FileError as error:
+            say(f"  {error}; settled from the beginning")
+    dt, (falling, at_rest) = time_step.for_settling(scene), settling_distances(experiment, scene)
+    loose = Settings(dt=dt, delta=falling, solver="apgd", tol=tol, law=ccp.RELAXATION).of(experiment)
     with Stepper(loose, world, memory) as stepper:
         while world.step < end:
             if world.step + 1 >= end - end // 10:
-                stepper.settings = dataclasses.replace(loose, delta=experiment.delta, tol=0.1 * tol)
+                stepper.settings = dataclasses.replace(loose, delta=at_rest, tol=0.1 * tol)
             line = stepper.step()
             interrupted = interrupt.asked(comm)
             if world.step % tenth == 0 or world.step == end or interrupted:

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem.contact import Contacts, find_contacts, find_overrun
+from dem.arrays import Ints
+from dem.contact import Contacts, find_contacts
+from dem.fast import refuse_passages
 from dem.impulses import ImpulseMemory
-from dem.keys import places
 from dem.partition import rebalance
-from dem.step import advance, find_turned
+from dem.period import put_back
+from dem.step import advance, carried, find_overrun, find_turned
 from dem.system import ContactSystem, touching
 from dem.together import SceneError
 from dem.world import World
@@ -23,6 +25,10 @@ from pctt.ccp.cone import Array
 from pctt.run.dump import Dump
 from pctt.run.projection import projected
 from pctt.run.settings import Settings
+
+
+class NoSolutionError(SceneError):
+    """The contacts of a step have no solution; the bodies are where they were before it."""
 
 
 class Stepper:
@@ -34,6 +40,7 @@ class Stepper:
     contacts: Contacts
     system: ContactSystem
     impulse: np.ndarray
+    moment: np.ndarray | None  #: where contacts resist rolling or spinning
     history: list[float]  #: natural residual by iteration
     projection_its: int  #: iterations of the last projection of positions
 
@@ -48,8 +55,9 @@ class Stepper:
         self.settings, self.world, self.memory, self.newton, self.dump = settings, world, memory, newton, dump
         self._problem: ccp.ConeProblem | None = None
         self._corrections = 0  # of the present step
+        self._slabs: Ints | None = None  # those of the last step, or of a solution that is remembered within this one
         if settings.stiffness is not None:
-            world.stiffness = np.full_like(world.stiffness, settings.stiffness)
+            world.pairs.stiffness[:] = settings.stiffness
 
     def __enter__(self) -> Stepper:
         return self
@@ -69,8 +77,8 @@ class Stepper:
             self._problem = None
 
     def step(self) -> dict[str, Any]:
-        """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no
-        number)."""
+        """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no number), or if
+        the contacts have no solution: any impulses would be invented, and those of the solver throw bodies away."""
         try:
             return self._step()
         except FloatingPointError as error:  # raised on all ranks alike
@@ -87,10 +95,18 @@ class Stepper:
             accuracy = ccp.measure(problem, result.impulse)
         with log.phase("output"):
             files = self.dump.step(self.system, problem, guess, result, result.asked or result) if self.dump else {}
+        if result.status is ccp.Status.UNBOUNDED:
+            raise NoSolutionError(
+                f"step {self.world.step + 1}: {result.reason}: rigid bodies are squeezed, and no impulses stop it; the "
+                "run ends with the state before. What helps: a -stiffness, a smaller -dt, or tools of bounded force"
+            )
         with log.phase("advance"):
-            self.impulse, self.history = result.impulse, result.history
+            forces, moments = np.split(result.impulse, [len(self.contacts)])
+            self.impulse, self.history = self.system.net(forces), result.history
+            self.moment = None if self.system.resistance is None else moments
             advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt, moving)
-            self.memory.remember(self.system.key, self.impulse, self.system.frame)
+            self.memory.remember(self.system.key, result.impulse, self.system.frame)
+            self._slabs = self.world.slabs
         self._release()
         return self._figures(problem.size, result, accuracy, files)
 
@@ -119,6 +135,7 @@ class Stepper:
     def _search(self) -> Contacts:
         """The contacts of the step."""
         with log.phase("search"):
+            put_back(self.world)
             rebalance(self.world)
             return find_contacts(self.world, self.settings.delta, self.settings.dt)
 
@@ -166,29 +183,21 @@ class Stepper:
         self.contacts, self.system = contacts, self._system(contacts)
         with log.phase("assembly"):
             self._problem = cone_problem(self.system, self.world.comm)
-            guess, _ = memory.recall(self.system.key, self.system.frame)
+            guess, _ = memory.recall(self.system.key, self.system.frame, self._slabs is not self.world.slabs)
         return self._problem, guess
 
     def _unseen(self, contacts: Contacts, system: ContactSystem, momentum: Array) -> Contacts | None:
         """The contacts, with those that these momenta show to be missed; None if there are none."""
         with log.phase("search"):
-            velocity = system.velocity_with(momentum)
-            wider = self._overrun(contacts, velocity, momentum)
-            return self._turned(contacts, velocity) if wider is None else wider
-
-    def _overrun(self, contacts: Contacts, velocity: Array, momentum: Array) -> Contacts | None:
-        """The contacts together with those that the search did not foresee, because an impulse of this step sends a
-        grain further than its margin. None if no such grain meets anything."""
-        world, settings = self.world, self.settings
-        wider = find_overrun(world, contacts, velocity, settings.delta, settings.dt)
-        if wider is None:
-            return None
-        unseen = wider.take(places(contacts.key, wider.key) < 0)
-        beyond = ContactSystem(world, unseen, settings.dt, settings.recovery_speed)
-        opening = (beyond.contact_map.velocities(momentum) + beyond.r)[:, 0]
-        # solved for if the overlap would be deeper than a hundredth of delta
-        closes = bool((settings.dt * opening < -0.01 * settings.delta).any())
-        return wider if world.comm.allreduce(closes, MPI.LOR) else None
+            velocity, delta, dt = system.velocity_with(momentum), self.settings.delta, self.settings.dt
+            deep = 0.01 * delta  # the overlap that is solved for
+            wider = find_overrun(self.world, contacts, velocity, delta, dt, deep, self.settings.recovery_speed)
+            if wider is not None:
+                return carried(self.world, contacts, wider) if self._corrections else wider
+            turned = self._turned(contacts, velocity)
+            if turned is None:
+                refuse_passages(self.world, contacts, velocity, delta, dt)
+            return turned
 
     def _turned(self, contacts: Contacts, velocity: Array) -> Contacts | None:
         """The contacts, with those that overlap at the end of the step because bodies turn. None if there are none, or
@@ -202,23 +211,27 @@ class Stepper:
 
     def _remembered(self, found: ccp.Result) -> ImpulseMemory:
         """A memory of these impulses of the present contacts."""
-        memory = ImpulseMemory(self.world.comm)
+        memory = ImpulseMemory(self.world.comm, self.world.pairs.parts)
         memory.remember(self.system.key, found.impulse, self.system.frame)
+        self._slabs = self.world.slabs
         return memory
 
     def solve(self, problem: ccp.ConeProblem, guess: Array) -> ccp.Result:
         """Solve a problem of the step as the settings say."""
         settings = self.settings
-        coulomb = settings.coulomb or None
         with log.phase("solve"):
             return ccp.solve(
-                problem, guess, settings.solver, settings.limits, settings.options, self.newton, coulomb
+                problem, guess, settings.solver, settings.limits, settings.options, self.newton, settings.law
             )
 
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
     G, point, key = system.contact_map, system.point, system.key
+    if (resists := system.resistance) is not None:
+        r, more = np.concatenate([system.r, resists.velocity]), (resists.rolling, resists.spinning)
+        soft = system.compliance
+        return ccp.RollingProblem(comm, r, system.mu, *more, G=resists.map, point=point, key=key, compliance=soft)
     return ccp.ConeProblem(comm, system.r, system.mu, G=G, point=point, key=key, compliance=system.compliance)
 
 

@@ -1,7 +1,7 @@
-"""What a time step would take on a cluster: run/study cluster_model [N] [-ranks 1,2,4,8,16] [-latency S] [-bandwidth
-B], default the settled mixer of n = 8. Contacts, bodies, ghosts, messages and bytes per product and reductions
-per iteration are counted on so many ranks of this machine, more than it has cores; seconds are a model of them.
-docs/cluster.md explains. Writes results/cluster_model_nN.json."""
+"""What an iteration of APGD would take on a cluster: run/study cluster_model [N] [-ranks 1,2,4,8,16] [-latency S]
+[-bandwidth B], default the settled mixer of n = 8. Contacts, bodies, ghosts, messages and bytes per product and
+reductions per iteration are counted on so many ranks of this machine, more than it has cores; seconds are a model of
+them. docs/cluster.md explains. Writes results/cluster_model_nN.json."""
 
 from __future__ import annotations
 
@@ -32,6 +32,9 @@ TOL = 1e-6
 SOLVERS = ("apgd", "conic")
 BODY = 6 * 8  # bytes of a body's velocity or momentum
 SIZES = {8: (4_915, 18_500), 16: (35_939, 144_700), 32: (274_627, 1_150_000)}  # bodies, contacts of settled mixers
+MODEL = (1, 4, 16, 64, 256, 1024, 4096)  # ranks
+SHARE = 100_000  # contacts of a rank where the problem grows with the ranks
+MESSAGES_PER_DOUBLING = 2.5  # beyond the ranks counted here; partitions alone, on 64 to 1,024 ranks, had 12 to 23
 SOLVED = 4  # ranks up to which the step is solved: more wait for each other on few cores, and do the same
 SMALL, LARGE = 8, 2**20  # bytes of the messages that latency and bandwidth are measured with
 
@@ -43,7 +46,7 @@ def count(n: int) -> dict[str, Any]:
     comm = MPI.COMM_WORLD
     for name, value in {"ksp_type": "cg", "pc_type": "pbjacobi"}.items():  # factors are another story
         PETSc.Options().setValue(name, value)
-    sim = Simulation(Mixer(n=n), restart="settled")
+    sim = Simulation(Mixer(n=n), restart="settled", dt=0.025)
     world, settings = sim.world, sim.settings
     contacts = find_contacts(world, settings.delta, settings.dt)
     if rebalance(world):
@@ -54,6 +57,7 @@ def count(n: int) -> dict[str, Any]:
         for solver in SOLVERS if comm.size <= SOLVED else ():
             row |= {f"{solver} {name}": value for name, value in solved(problem, solver).items()}
         row["product_s"] = seconds_of_product(problem)
+        row["iteration_s"] = seconds_of_iteration(problem)
     return row
 
 
@@ -84,19 +88,18 @@ def solved(problem: ccp.ConeProblem, solver: str) -> dict[str, Any]:
     """Iterations, products and reductions of a cold start, rank 0's."""
     krylov = ccp.newton_for(problem.comm, solver) if ccp.SOLVERS[solver].newton else None
     ccp.solve(problem, None, solver, ccp.Limits(0.1), newton=krylov)  # loads compiled loops
-    before, start = _petsc_reductions(), time.perf_counter()
+    before = _petsc_reductions()
     with (
         Counter(type(problem.contact_map), "add_delassus", "find_image", "through") as products,
         Counter(ccp.ConeProblem, "sum", "min", "max") as reductions,
         Counter(ScaledProblem, "sums") as first_order,
     ):
         result = ccp.solve(problem, None, solver, ccp.Limits(TOL, closing_work=np.inf, fallback=False), newton=krylov)
-    seconds, of_petsc = time.perf_counter() - start, _petsc_reductions() - before
+    of_petsc = _petsc_reductions() - before
     if krylov is not None:
         krylov.destroy()
     count = reductions.calls + first_order.calls + of_petsc
-    return {"its": result.iterations, "products": products.calls, "reductions": count, "seconds": seconds,
-            "converged": result.converged}  # fmt: skip
+    return {"its": result.iterations, "products": products.calls, "reductions": count, "converged": result.converged}
 
 
 def _petsc_reductions() -> float:
@@ -107,6 +110,16 @@ def seconds_of_product(problem: ccp.ConeProblem) -> float:
     """Of y += N g, median."""
     g, y = np.ones_like(problem.r), np.zeros_like(problem.r)
     return median_seconds(lambda: problem.contact_map.add_delassus(g, y), 50)
+
+
+def seconds_of_iteration(problem: ccp.ConeProblem) -> float:
+    """CPU seconds of an iteration of APGD on this rank; the best of five solves, each of 200 iterations."""
+    limits, spent = ccp.Limits(1e-14, 200, np.inf, fallback=False), []
+    for _ in range(5):
+        start = time.process_time()
+        result = ccp.solve(problem, None, "apgd", limits)
+        spent.append((time.process_time() - start) / result.iterations)
+    return min(spent)
 
 
 def ping_pong() -> tuple[float, float]:
@@ -130,24 +143,27 @@ def ping_pong() -> tuple[float, float]:
 # -- the model ----------------------------------------------------------------------------------------------
 
 
-def modelled(rows: list[dict[str, Any]], ranks: int, bodies: int, contacts: int, latency: float, bandwidth: float,
-             solver: str) -> float:  # fmt: skip
-    """Seconds of a solve on so many ranks: what one rank takes, in parts, and what travels.
+def modelled(rows: list[dict[str, Any]], fixed: float, ranks: int, bodies: int, contacts: int, latency: float,
+             bandwidth: float) -> tuple[float, float]:  # fmt: skip
+    """Seconds of an iteration of APGD on so many ranks, and those of them that are work on contacts.
 
-    The work of a rank is its share of that of one rank times the worst load; every product exchanges velocities and
-    momenta of ghosts, whose number grows as the surface of a rank's share; every reduction is a tree of messages.
+    fixed: seconds of an iteration on hardly any contacts. The rest of the work of one rank is divided by the ranks, and
+    multiplied by the worst load; every product exchanges velocities and momenta of ghosts, whose number grows as the
+    surface of a rank's share; every reduction is a tree of messages.
     """
     one, most = rows[0], rows[-1]
-    reductions = [row[f"{solver} reductions"] for row in rows if f"{solver} reductions" in row][-1]
-    work = one[f"{solver} seconds"] * contacts / one["contacts"]["most"] / ranks
+    work = (one["iteration_s"] - fixed) * contacts / one["contacts"]["most"] / ranks
     if ranks == 1:
-        return work
-    load = max(row["contacts"]["most"] / row["contacts"]["mean"] for row in rows)
+        return fixed + work, work
+    its = one["apgd its"]
+    reductions = [row["apgd reductions"] for row in rows if "apgd reductions" in row][-1] / its
+    work *= max(row["contacts"]["most"] / row["contacts"]["mean"] for row in rows)
+    counted = [row["messages"]["most"] for row in rows if row["ranks"] >= ranks]
+    beyond = most["messages"]["most"] + MESSAGES_PER_DOUBLING * np.log2(ranks / most["ranks"])
     surface = most["bytes"]["most"] / (most["bodies"]["mean"]) ** (2 / 3)
-    messages = min(most["messages"]["most"], 2 * (ranks - 1))
-    product = messages * latency + surface * (bodies / ranks) ** (2 / 3) / bandwidth
+    product = (counted[0] if counted else beyond) * latency + surface * (bodies / ranks) ** (2 / 3) / bandwidth
     reduction = 2 * np.ceil(np.log2(ranks)) * latency
-    return work * load + one[f"{solver} products"] * product + reductions * reduction
+    return fixed + work + one["apgd products"] / its * product + reductions * reduction, work
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -191,17 +207,23 @@ def main() -> None:
         milliseconds = 1e3 * rows[-1]["product_s"]
         print(f"{count_} ranks: product {milliseconds:.2f} ms, load {rows[-1]['imbalance']:.3f}", flush=True)
     print("\n" + table(rows))
-    about["model"] = models = {}
+    about["fixed_s"] = fixed = start(2, "--count", "1")["iteration_s"]
+    slope = (rows[0]["iteration_s"] - fixed) / rows[0]["contacts"]["most"]
+    print(f"\nan iteration takes {1e6 * fixed:.0f} us, and {1e9 * slope:.0f} ns per contact of the rank; modelled:")
+    ways = (words.latency, words.bandwidth)
     for n, (bodies, contacts) in SIZES.items():
-        print(f"\nmixer n = {n}, {bodies:,} bodies, to {TOL:g}, modelled: seconds (efficiency)")
-        for solver in SOLVERS:
-            given = bodies, contacts, words.latency, words.bandwidth, solver
-            seconds = {r: modelled(rows, r, *given) for r in 2 ** np.arange(13)}
-            models[f"{n} {solver}"] = {int(r): s for r, s in seconds.items()}
-            good = [int(r) for r, s in seconds.items() if seconds[1] / (r * s) >= 0.5]
-            cells = ", ".join(f"{r}: {s:.2g} ({seconds[1] / (r * s):.2f})" for r, s in seconds.items())
-            print(f"{solver:6} {cells}; half of the ranks' time is work up to {max(good)} ranks")
+        times = {r: modelled(rows, fixed, r, bodies, contacts, *ways) for r in MODEL}
+        say(f"mixer n = {n}, {contacts:,} contacts", times)
+    per_contact = SIZES[32][0] / SIZES[32][1]
+    grown = {r: modelled(rows, fixed, r, int(r * SHARE * per_contact), r * SHARE, *ways) for r in MODEL}
+    say(f"{SHARE:,} contacts per rank", grown)
     record(f"cluster_model_n{words.n}", about, rows)
+
+
+def say(name: str, iteration: dict[int, tuple[float, float]]) -> None:
+    """Print the microseconds of an iteration for each number of ranks, and the part of them that is work."""
+    cells = ", ".join(f"{ranks}: {1e6 * whole:,.0f} ({work / whole:.2f})" for ranks, (whole, work) in iteration.items())
+    print(f"{name}: {cells}")
 
 
 def start(ranks: int, *words: str) -> Any:

@@ -1,9 +1,8 @@
-"""FCLIB files of cone problems in Siconos' text files and PETSc's binary files (docs/files.md): run/study
-convert_problems FILE [FILE ...] -to DIR. DIR/NAME.h5 holds what FILE NAME.* does. A file there is not replaced.
+"""FCLIB files of cone problems in Siconos' text files (docs/files.md): run/study convert_problems FILE [FILE ...] -to
+DIR. DIR/NAME.h5 holds what FILE NAME.* does. A file there is not replaced.
 
-A local problem of Siconos stays local and a global one global. W is made symmetric, and so is M, whose entries have six
-digits; where only one triangle is stored, it is mirrored. A file of PETSc has the Mat N of rigid contacts and the Vecs
-r and mu; releases of pctt before FCLIB was their only format wrote such files.
+A local problem stays local and a global one global. W is made symmetric, and so is M, whose entries have six digits;
+where only one triangle is stored, it is mirrored.
 """
 
 from __future__ import annotations
@@ -14,11 +13,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
 import scipy.sparse as sp
 import siconos_text
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from pctt.blocks import square_block_matrix
 from pctt.ccp import ConeProblem, fclib
@@ -28,8 +25,6 @@ from pctt.ccp.fclib import FileFormatError, symmetric_blocks, symmetric_masses
 #: Of masses in Siconos' files, as `symmetric_masses` takes it: %g and %e print six and seven digits.
 ROUNDING = 1e-5
 
-# the first number of a file that begins with a Mat, MAT_FILE_CLASSID of petscmat.h, with 32- and 64-bit indices
-PETSC_BEGINNINGS = tuple((1211216).to_bytes(size, "big") for size in (4, 8))
 HDF5_BEGINNING = b"\x89HDF\r\n\x1a\n"
 
 
@@ -46,18 +41,17 @@ def convert(path: Path, folder: Path) -> tuple[Path, str]:
         beginning = file.read(8)
     if beginning == HDF5_BEGINNING:
         raise FileFormatError(f"{path}: it is HDF5; pctt.run -problem reads FCLIB files as they are")
-    form, write = ("PETSc binary", _from_petsc) if beginning.startswith(PETSC_BEGINNINGS) else ("Siconos", _from_text)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
         made = Path(temporary) / target.name
         try:
-            note = write(path, made)
+            note = _from_text(path, made)
             fclib.read(made, MPI.COMM_SELF).destroy()
         except OSError:
             raise
         except Exception as error:  # of any kind: bad data surprise numpy and scipy
             reason = str(error).replace(f"{made}: no FCLIB problem: ", "")
-            raise FileFormatError(f"{path}: no {form} problem: {reason}") from None
+            raise FileFormatError(f"{path}: no Siconos problem: {reason}") from None
         os.replace(made, target)
     return target, note
 
@@ -77,30 +71,6 @@ def _from_text(path: Path, made: Path) -> str:
     return note
 
 
-def _from_petsc(path: Path, made: Path) -> str:
-    """Write the problem of a binary file of PETSc; what was done to its matrix."""
-    viewer = None
-    try:
-        viewer = PETSc.Viewer().createBinary(str(path), "r", comm=PETSc.COMM_SELF)
-        N = PETSc.Mat().create(PETSc.COMM_SELF)
-        N.setType(PETSc.Mat.Type.AIJ)
-        N.load(viewer)
-        indptr, indices, values = N.getValuesCSR()
-        r, mu = (_vector(viewer) for _ in range(2))
-        integers = 4 + len(indptr) - 1 + len(indices) + 2 * 2
-        rigid = np.dtype(PETSc.IntType).itemsize * integers + 8 * (len(values) + len(r) + len(mu))
-        more = path.stat().st_size > rigid
-    except PETSc.Error as error:  # its last line states the reason, the lines above it functions of PETSc
-        raise FileFormatError(str(error).splitlines()[-1].rpartition("] ")[2]) from None
-    finally:
-        if viewer is not None:
-            viewer.destroy()
-    if more:
-        raise FileFormatError("a vector follows mu: a compliance in all directions, which cone problems no longer have")
-    W = sp.csr_matrix((values, indices, indptr), shape=N.getSize())
-    return _write_local(path, made, W, r, mu)
-
-
 def _write_local(path: Path, made: Path, W: sp.csr_matrix, q: Array, mu: Array) -> str:
     """Write W (3 nc, 3 nc), made symmetric, q (3 nc,) and mu (nc,); what was done to W."""
     if W.shape[0] != 3 * len(mu) or len(q) != 3 * len(mu):
@@ -113,12 +83,6 @@ def _write_local(path: Path, made: Path, W: sp.csr_matrix, q: Array, mu: Array) 
     return note
 
 
-def _vector(viewer: PETSc.Viewer) -> Array:
-    vector = PETSc.Vec().create(PETSc.COMM_SELF)
-    vector.setType(PETSc.Vec.Type.SEQ)
-    return np.array(vector.load(viewer).array)
-
-
 def _info(path: Path, note: str) -> fclib.Info:
     return fclib.Info(path.name, f"Converted from {path.name}. {note}".strip())
 
@@ -127,7 +91,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="run/study convert_problems", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("files", nargs="+", metavar="FILE", help="text file of Siconos, or binary file of PETSc")
+    parser.add_argument("files", nargs="+", metavar="FILE", help="text file of Siconos")
     parser.add_argument("-to", required=True, metavar="DIR", help="folder for the FCLIB files, made if need be")
     words = parser.parse_args()
     here = Path(os.environ.get("CALLED_FROM", "."))

@@ -13,7 +13,7 @@ import statistics
 
 from shared import record, results, say_machine
 
-STEPS, RANKS = 3, (1, 2)
+STEPS, RANKS = 40, (1, 2)
 PHASES = ("search", "assembly", "solve", "advance", "output")
 NAMES = "none,ilu,ilu-shifted,pbjacobi,sor,icc-shifted,gamg,hypre,cholesky,tt"
 
@@ -21,22 +21,22 @@ NAMES = "none,ilu,ilu-shifted,pbjacobi,sor,icc-shifted,gamg,hypre,cholesky,tt"
 def steps(sizes: list[int]) -> None:
     """Seconds per phase of settled mixer steps, for each size and number of ranks."""
     about = say_machine()
-    print(f"medians of {STEPS} steps, pdip to 1e-4, BiCGStab with block Jacobi; seconds")
+    print(f"medians of {STEPS} steps by default settings; seconds")
     heads = " ".join(f"{phase:>9}" for phase in PHASES)
-    print(f"{'n':>3} {'ranks':>5} {'contacts':>9} {'Newton':>7} {'Krylov':>7} {heads} {'total':>9} {'spread':>15}")
+    print(f"{'n':>3} {'ranks':>5} {'contacts':>9} {'iterations':>10} {heads} {'total':>9} {'spread':>15}")
     rows: list[dict] = []
     for n in sizes:
         for ranks in RANKS:
             _, lines = results(ranks, "-scene_n", n, "-restart", "settled", "-steps", STEPS)
             row: dict = {"n": n, "ranks": ranks}
-            for name in ("contacts", "newton_its", "ksp_its", "seconds"):
+            for name in ("contacts", "iterations", "seconds"):
                 row[name] = statistics.median(line[name] for line in lines)
             row |= {phase: statistics.median(line["phases"].get(phase, 0.0) for line in lines) for phase in PHASES}
             least, most = (pick(line["seconds"] for line in lines) for pick in (min, max))
             rows.append(row | {"spread": [least, most]})
-            cells = " ".join(f"{row[phase]:9.3f}" for phase in PHASES)
-            counts = f"{row['contacts']:9.0f} {row['newton_its']:7.0f} {row['ksp_its']:7.0f}"
-            print(f"{n:3d} {ranks:5d} {counts} {cells} {row['seconds']:9.2f} {least:7.2f}-{most:.2f}", flush=True)
+            cells = " ".join(f"{row[phase]:9.4f}" for phase in PHASES)
+            counts = f"{row['contacts']:9.0f} {row['iterations']:10.0f}"
+            print(f"{n:3d} {ranks:5d} {counts} {cells} {row['seconds']:9.4f} {least:7.3f}-{most:.3f}", flush=True)
         print(f"    n = {n}: 1 rank / 2 ranks = {rows[-2]['seconds'] / rows[-1]['seconds']:.2f}")
     record("measure_steps", about, rows)
 
@@ -45,7 +45,7 @@ def preconditioners(n: int, every: int, names: str, options: list[str]) -> None:
     """All preconditioners on the same Newton systems of a settled mixer step, every EVERY-th of them."""
     about = say_machine()
     run = ["-scene_n", n, "-restart", "settled", "-steps", 1, "-compare", names, "-compare_every", every]
-    run += ["-ccp_closing_work", "inf"]
+    run += ["-dt", 0.025, "-ccp_tol", 1e-4, "-ccp_closing_work", "inf"]
     summary, (step,) = results(1, *run, *options)
     print(
         f"mixer n = {n}: {step['contacts']} contacts, {step['newton_its']} Newton steps to natural residual "

@@ -1,7 +1,7 @@
 """Solvers of other projects on our cone problems, where they are installed.
 
 `siconos soclcp` is Siconos' Gauss-Seidel for the second-order cone complementarity problem: the same convex problem
-as ours. `siconos nsgs` and `siconos admm` solve Coulomb's law itself, as `-ccp_coulomb` does: compare them with
+as ours. `siconos nsgs` and `siconos admm` solve Coulomb's law itself, as `-law coulomb` does: compare them with
 that, by the Coulomb residual. `clarabel` is an interior point method for any conic program; it gets the dual of
 ours,
 

@@ -1,8 +1,11 @@
-"""All problems in folders of FCLIB files (docs/files.md) by all solvers: run/study profile_problems DIR [DIR ...]
-[SOLVER ...] [options]; --help lists the options. Seconds to 1e-4, 1e-6 and 1e-8 of the convex problem and of Coulomb's
-law, performance profiles, failures counted. Peers (Siconos, Clarabel) are in it where they are installed: apt-get
-install python3-siconos, .venv/bin/pip install -e '.[peers]'. Writes results/profile.json, results/profile.md and
-results/profile.png. Siconos' text (.dat) and PETSc's binary files (.petsc) are converted first, in a temporary folder.
+"""All problems in folders of FCLIB files (docs/files.md), or steps of settled mixers, by all solvers:
+
+    run/study profile_problems [DIR ...] [SOLVER ...] [--mixer N,N] [options]        --help lists the options
+
+Seconds to 1e-4, 1e-6 and 1e-8 of the convex problem and of Coulomb's law, performance profiles, failures counted. Peers
+(Siconos, Clarabel) are in it where they are installed: apt-get install python3-siconos, .venv/bin/pip install -e
+'.[peers]'. Writes results/profile.json, results/profile.md and results/profile.png. Siconos' text files (.dat) are
+converted first, in a temporary folder.
 
 A solver works on a problem in a process of its own, cold and on one core, to one tolerance after the other. A
 tolerance counts as reached where `pctt.ccp.measure`, which shares no code with any solver, finds the natural
@@ -17,23 +20,27 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import solve_one
 from convert_problems import convert
 from mpi4py import MPI
 from peers import PEERS
 from shared import figure, record, say_machine
 
+from dem.contact import find_contacts
+from dem.scenes import Mixer
+from dem.system import ContactSystem
 from pctt import ccp
 from pctt.ccp import fclib
 from pctt.ccp.fclib import FileFormatError
+from pctt.run.stepper import cone_problem
+from pctt.simulation import Simulation
 
-CONVERTED = (".dat", ".petsc")
-SUFFIXES = (*CONVERTED, ".hdf5", ".h5")
+SUFFIXES = (".dat", ".hdf5", ".h5")
 TOLERANCES = (1e-4, 1e-6, 1e-8)
 ROUNDING = 1.01  # of a residual that another formula finds
 AGAIN, TIMES = 2.0, 5  # seconds up to which a solve is repeated, and how often at most
@@ -42,6 +49,14 @@ LAWS = {"convex": "the convex problem", "coulomb": "Coulomb's law"}
 OWN = {"convex": list(ccp.SOLVERS), "coulomb": ["conic", "pdip", "auto", "apgd"]}
 TABLEAU = ("blue", "orange", "green", "red", "purple", "brown", "pink", "gray", "olive", "cyan")
 WITHIN = (1.0, 2.0, 10.0)  # times the fastest, columns of the table
+COMM = MPI.COMM_SELF
+HEAVIER = 1000.0
+VARIANTS = {
+    "settled": "a step of the settled packing",
+    "friction": "the same with a friction coefficient of 0.8",
+    "heavy": "the same with the uppermost grain 1000 times heavier",
+    "loose": "the packing stretched by 1 % in height, grains at random velocities of 0.5 m/s and falling",
+}
 
 Rows = list[dict[str, Any]]
 
@@ -79,22 +94,99 @@ def fastest(path: str, law: str, solver: str, tol: float, seconds: float) -> dic
     return min(runs, key=lambda run: run["seconds"])
 
 
+class OutOfTimeError(Exception):
+    """The solver has had its seconds."""
+
+
+def within(look: Callable[..., float], end: float) -> Callable[..., float]:
+    """A function that ends a solver which looks at its residual after this moment."""
+
+    def checked(*arguments: Any, **named: Any) -> float:
+        if time.perf_counter() > end:
+            raise OutOfTimeError
+        return look(*arguments, **named)
+
+    return checked
+
+
 def once(path: str, law: str, solver: str, tol: float, seconds: float) -> dict[str, Any]:
-    with solve_one.read(path) as problem:
+    """From a cold start. Of a solve that is out of time the best that it looked at is not known."""
+    with read(path) as problem:
+        impulse, reason = None, f"{seconds:g} s"
+        start = time.perf_counter()
         if solver in PEERS:
-            found = solve_one.peer(problem, solver, tol, seconds)
-            if found["seconds"] > seconds:
-                found["reason"] = f"{seconds:g} s"
+            impulse, reason = PEERS[solver].solve(problem, tol, seconds)
         else:
-            found = solve_one.own(problem, solver, tol, seconds, law == "coulomb")
-            del found["course"]
-        impulse = found.pop("impulse")
-        residual, objective = np.inf, None  # of a solve that is out of time the best that it looked at is not known
+            newton = ccp.newton_for(COMM, solver) if ccp.SOLVERS[solver].newton else None
+            limits = ccp.Limits(tol, -1 if newton else 10_000_000, np.inf, fallback=False)
+            problem.natural_residual = within(problem.natural_residual, start + seconds)  # type: ignore[method-assign]
+            try:
+                of = ccp.COULOMB if law == "coulomb" else ccp.RELAXATION
+                result = ccp.solve(problem, None, solver, limits, None, newton, of)
+                impulse, reason = result.impulse, result.reason
+            except OutOfTimeError:
+                pass
+            del problem.natural_residual
+        spent = time.perf_counter() - start
+        found = {"seconds": spent, "reason": reason, "residual": np.inf, "objective": None}
         if impulse is not None and np.isfinite(impulse).all():
             accuracy = ccp.measure(problem, impulse)
             residual = accuracy.coulomb_residual if law == "coulomb" else accuracy.natural_residual
-            objective = accuracy.objective
-        return {**found, "residual": float(residual), "objective": objective}
+            found |= {"residual": float(residual), "objective": accuracy.objective}
+        return found
+
+
+# -- problems -----------------------------------------------------------------------------------------------
+
+
+def read(path: str | Path) -> ccp.ConeProblem:
+    """The problem in a file of `write`, or in an FCLIB file."""
+    if not str(path).endswith(".npz"):
+        return fclib.read(path, COMM)
+    with np.load(path) as file:
+        G = ccp.CompactRows(*(file[name] for name in ("frame", "arm", "body", "root")), int(file["columns"]))
+        rest = {"point": file["point"], "compliance": file["compliance"]}
+        return ccp.ConeProblem(COMM, file["r"], file["mu"], G=G, **rest)
+
+
+def write(path: Path, problem: ccp.ConeProblem) -> None:
+    """A problem of frames and arms, for `read`: in an FCLIB file it would lose them."""
+    G = vars(problem.contact_map.given)
+    np.savez(path, r=problem.r, mu=problem.mu, point=problem.point, compliance=problem.compliance[:, 0], **G)
+
+
+def mixers(sizes: list[int], variants: list[str], stiffness: float, folder: Path) -> list[tuple[str, Path, int]]:
+    """Steps of settled mixers, written into the folder: as `problems` has them."""
+    found = []
+    for n in sizes:
+        for variant in variants:
+            path = folder / f"mixer_{n}_{variant}.npz"
+            with step_problem(n, variant, stiffness) as problem:
+                write(path, problem)
+                found.append((path.stem, path, problem.size))
+    return found
+
+
+def step_problem(n: int, variant: str, stiffness: float) -> ccp.ConeProblem:
+    """The cone problem of the first step after the settled state of a mixer."""
+    sim = Simulation(Mixer(n=n), restart="settled", dt=0.025, comm=COMM)
+    world, settings, grains = sim.world, sim.settings, sim.world.grains
+    if variant == "loose":
+        rng = np.random.default_rng(0)
+        grains.position[:, 2] *= 1.01
+        grains.velocity[:, :3] += 0.5 * rng.normal(size=(len(grains), 3)) - np.array([0, 0, 0.5])
+    world.pairs.stiffness[:] = stiffness
+    contacts = find_contacts(world, settings.delta, settings.dt)
+    if variant == "friction":
+        contacts.friction[:] = 0.8
+    if variant == "heavy":
+        touched = np.unique(contacts.body)
+        top = touched[np.argmax(grains.position[touched[touched < len(grains)], 2])]
+        grains.mass[top] *= HEAVIER
+        grains.inertia[top] *= HEAVIER
+        contacts = find_contacts(world, settings.delta, settings.dt)
+    system = ContactSystem(world, contacts, settings.dt, settings.recovery_speed)
+    return cone_problem(system, COMM)
 
 
 # -- all of them --------------------------------------------------------------------------------------------
@@ -123,8 +215,8 @@ def problems(folders: list[Path], converted: Path) -> tuple[list[tuple[str, Path
     found, refused = [], []
     for k, path in enumerate(sorted(p for folder in folders for p in folder.iterdir() if p.suffix in SUFFIXES)):
         try:
-            as_fclib = convert(path, converted / str(k))[0] if path.suffix in CONVERTED else path
-            with fclib.read(as_fclib, MPI.COMM_SELF) as problem:
+            as_fclib = convert(path, converted / str(k))[0] if path.suffix == ".dat" else path
+            with read(as_fclib) as problem:
                 found.append((path.name, as_fclib, problem.size))
         except FileFormatError as error:  # noqa: PERF203 - as many files as a folder has
             refused.append(str(error))
@@ -179,7 +271,7 @@ def _seconds(row: dict[str, Any]) -> str:
     """Of a solve; where it failed, the residual that it stopped at in brackets, if there is one."""
     if row["reached"]:
         return f"{row['seconds']:.2g}"
-    return f"({row['residual']:.1e})" if np.isfinite(row["residual"]) else "-"
+    return f"({row['residual']:.1e})" if row["residual"] <= 1.0 else "-"  # that of no impulses is 1
 
 
 def _failures(rows: Rows) -> list[str]:
@@ -209,39 +301,50 @@ def plot(rows: Rows) -> None:
             axes.legend(fontsize=7, loc="lower right")
 
 
-def read_words() -> tuple[list[Path], dict[str, list[str]], float]:
-    """Folders, solvers by law and seconds of the command line."""
+def read_words() -> tuple[argparse.Namespace, list[Path], dict[str, list[str]]]:
+    """Options, folders, and solvers by law of the command line."""
     everything = {
         law: OWN[law] + [name for name, peer in PEERS.items() if peer.installed and peer.coulomb == (law == "coulomb")]
         for law in LAWS
     }
-    parser = argparse.ArgumentParser(prog="run/study profile_problems", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="run/study profile_problems", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("words", nargs="*", metavar="DIR or SOLVER", help="folders of problems; solvers, none: all")
     parser.add_argument("--seconds", type=float, default=20.0, help="limit of a solve (20)")
     parser.add_argument("--laws", default=",".join(LAWS), help=f"of {', '.join(LAWS)}, with commas between (both)")
-    words = parser.parse_args()
+    parser.add_argument("--mixer", default="", help="sizes of settled mixers, with commas between")
+    about = "; ".join(f"{name}: {text}" for name, text in VARIANTS.items()).replace("%", "%%")
+    parser.add_argument("--variants", default="settled", help=f"of their steps, with commas between (settled); {about}")
+    parser.add_argument("--stiffness", type=float, default=np.inf, help="of their contacts [N/m] (inf)")
+    given = parser.parse_args()
     allowed = sorted({name for names in everything.values() for name in names})
-    paths = {word: Path(os.path.normpath(Path(os.environ.get("CALLED_FROM", ".")) / word)) for word in words.words}
+    paths = {word: Path(os.path.normpath(Path(os.environ.get("CALLED_FROM", ".")) / word)) for word in given.words}
     folders = [path for path in paths.values() if path.is_dir()]
     asked = [name for word, path in paths.items() if not path.is_dir() for name in word.split(",")]
-    for name in asked:
-        if name not in allowed:
-            parser.error(f"{name}: no folder, and no solver; allowed are {', '.join(allowed)}")
-    laws = words.laws.split(",")
-    for law in laws:
-        if law not in LAWS:
-            parser.error(f"--laws {law}: allowed are {', '.join(LAWS)}")
-    if not folders:
+    given.laws, given.variants = given.laws.split(","), given.variants.split(",")
+    given.mixer = [int(word) for word in given.mixer.split(",") if word]
+    for what, names, known in (
+        ("neither a folder nor a solver: ", asked, allowed),
+        ("--laws ", given.laws, LAWS),
+        ("--variants ", given.variants, VARIANTS),
+    ):
+        for name in names:
+            if name not in known:
+                parser.error(f"{what}{name}: allowed are {', '.join(known)}")
+    if not folders and not given.mixer:
         parser.error("no folder with problems given; allowed is run/study profile_problems DIR [DIR ...] [SOLVER ...]")
-    if not words.seconds > 0:
-        parser.error(f"--seconds {words.seconds:g}: allowed is a number > 0")
-    return folders, {law: [s for s in everything[law] if not asked or s in asked] for law in laws}, words.seconds
+    if not given.seconds > 0:
+        parser.error(f"--seconds {given.seconds:g}: allowed is a number > 0")
+    return given, folders, {law: [s for s in everything[law] if not asked or s in asked] for law in given.laws}
 
 
 def main() -> None:
-    folders, solvers, seconds = read_words()
-    with tempfile.TemporaryDirectory() as converted:
-        rows = solve_all(*problems(folders, Path(converted)), folders, solvers, seconds)
+    given, folders, solvers = read_words()
+    with tempfile.TemporaryDirectory() as made:
+        found, refused = problems(folders, Path(made))
+        found += mixers(given.mixer, given.variants, given.stiffness, Path(made))
+        rows = solve_all(found, refused, folders, solvers, given.seconds)
     show(rows)
 
 

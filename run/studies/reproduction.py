@@ -19,7 +19,7 @@ def measure(scene: str, n: int) -> list[dict[str, Any]]:
     number."""
     every = EVERY.get(n, 1)
     words = ["-scene", scene, "-scene_n", n, "-restart", "settled", "-steps", 1, "-ccp_type", "pdip"]
-    words += ["-ccp_closing_work", "inf"]
+    words += ["-dt", 0.025 if scene == "mixer" else 0.01, "-ccp_tol", 1e-4, "-ccp_closing_work", "inf"]
     summary, (step,) = results(1, *words, "-compare", ",".join(METHODS), "-compare_every", every)
     rows = []
     for name, done in summary["compare"].items():

@@ -27,21 +27,21 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
     "silo": {
         f"silo_{outlet:g}_{seed}": (
             *("silo", "-scene_n", 6, "-scene_filling", 0.7, "-scene_half_angle", 90, "-scene_outlet", outlet),
-            *("-scene_seed", seed, "-steps", steps),
+            *("-scene_seed", seed, "-dt", 0.005, "-seconds", seconds),
         )
-        for outlet, steps in zip(OUTLETS, (520, 350, 280))
+        for outlet, seconds in zip(OUTLETS, (2.6, 1.75, 1.4))
         for seed in SEEDS
     },
     "heap": {
         f"heap_{friction:g}_{seed}": (
             *("run/studies/validation/heap.py", "-scene_friction", friction, "-scene_seed", seed),
-            *("-steps", 900),
+            *("-seconds", 4.5),
         )
         for friction in reversed(FRICTIONS)  # the longest first
         for seed in SEEDS
     },
-    "drum": {"drum": ("drum", "-scene_n", 8, "-steps", 640)},
-    "column": {"column": ("run/studies/validation/column.py", "-steps", 240)},
+    "drum": {"drum": ("drum", "-scene_n", 8, "-seconds", 3.2)},
+    "column": {"column": ("run/studies/validation/column.py", "-seconds", 1.2)},
 }
 
 #: What reads the runs of each check: rows of the table, and what the figure shows.

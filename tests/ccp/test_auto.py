@@ -15,10 +15,10 @@ from pctt.ccp.auto import Auto
 DONE = "natural residual and closing work below the tolerance"
 
 
-def solve(type, tol=1e-8, max_it=-1, options=None, comm=SELF, coulomb=None, fallback=True):
-    known, graph = heap(bodies=8)
+def solve(type, tol=1e-8, max_it=-1, options=None, comm=SELF, law=ccp.RELAXATION, fallback=True, contacts=40):
+    known, graph = heap(contacts=contacts, bodies=contacts // 5)
     limits = Limits(tol, max_it, fallback=fallback)
-    return ccp.solve(from_graph(known, graph, comm), None, type, limits, options, coulomb=coulomb)
+    return ccp.solve(from_graph(known, graph, comm), None, type, limits, options, law=law)
 
 
 def test_auto_takes_apgd_where_it_is_quick():
@@ -27,15 +27,20 @@ def test_auto_takes_apgd_where_it_is_quick():
     assert result.iterations == solve("apgd", 1e-3).iterations
 
 
-@pytest.mark.parametrize("coulomb", [None, ccp.Coulomb()])
-def test_auto_goes_over_to_conic_where_apgd_takes_long(coulomb):
-    """For Coulomb's law to the end of its path, from where APGD goes on. All iterations are counted."""
-    result = solve("auto", options=Auto(few=1.0), coulomb=coulomb)
-    few = Auto(few=1.0).iterations(40, 1e-8, coulomb is not None, few=True)
-    words = [f"apgd: {few} iterations", "conic: ", "apgd: "][: 3 if coulomb else 2]
+@pytest.mark.parametrize(("contacts", "tol"), [(40, 1e-8), (200, 1e-5)])
+@pytest.mark.parametrize("law", ccp.LAWS)
+def test_auto_goes_over_to_conic_where_apgd_takes_long(law, contacts, tol):
+    """To the end; for Coulomb's law, where factors are not dense, to the end of its path, from where APGD goes on. All
+    iterations are counted."""
+    options, coulomb, dense = Auto(few=1.0, patience=0.3), law == ccp.COULOMB, contacts == 40
+    result = solve("auto", tol, options=options, law=law, contacts=contacts)
+    few = options.iterations(contacts, tol, coulomb, few=dense)
+    words = [f"apgd: {few} iterations", "conic: ", "apgd: "][: 3 if coulomb and not dense else 2]
     assert result.converged, result.reason
-    assert [part.startswith(word) for part, word in zip(result.reason.split("; "), words)] == [True] * len(words)
-    assert result.solver == ("apgd" if coulomb else "conic")
+    parts = result.reason.split("; ")
+    assert [part.startswith(word) for part, word in zip(parts, words)] == [True] * len(parts)
+    assert len(parts) == len(words)
+    assert result.solver == ("apgd" if len(words) == 3 else "conic")
     assert 0 < result.newton_its <= 60
     assert result.iterations >= few + result.newton_its
     assert result.ksp_its > 0
@@ -44,6 +49,7 @@ def test_auto_goes_over_to_conic_where_apgd_takes_long(coulomb):
 def test_the_iterations_of_apgd_grow_with_size_and_accuracy():
     of = Auto().iterations
     assert of(40, 1e-4, False) < of(40, 1e-8, False) < of(9000, 1e-8, False) < of(9000, 1e-8, True)
+    assert 8411 < of(9000, 1e-4, True) < 22_000 / 2  # a rigid bed of 80 layers: its hardest step, and half of `conic`
     assert of(10, 1e-6, False) == of(300, 1e-6, False)  # small problems have fixed costs
     assert of(10, 1e-6, False, few=True) < of(100, 1e-6, False, few=True) < of(100, 1e-6, False)
 

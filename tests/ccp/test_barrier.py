@@ -75,15 +75,6 @@ def test_perspective_is_convex_and_of_degree_one():
 
 
 @BOTH
-def test_without_friction_the_constraint_is_a_normal_impulse_that_pushes(name):
-    g = np.array([[2.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
-    cone = Cone(name, np.zeros(2))
-    assert np.array_equal(cone.value(g), [-2.0, -0.1])
-    assert np.array_equal(cone.gradient(g), [[-1, 0, 0], [-1, 0, 0]])
-    assert np.array_equal(cone.hessian(g), np.zeros((2, 3, 3)))
-
-
-@BOTH
 @pytest.mark.parametrize("towards_surface", [0.0, 1 - 1e-4])
 def test_barrier_blocks_are_symmetric_and_positive_definite_inside(name, towards_surface):
     g, mu = inside()

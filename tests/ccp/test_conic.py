@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 import pytest
-from problems import SELF, Graph, Known, from_graph, from_matrix, heap, known_optimum, matrix
+from problems import SELF, Known, from_graph, from_matrix, heap, known_optimum, random_graph
 
 from dem.contact_map import BlockRows
 from pctt import ccp, memory
@@ -120,15 +120,6 @@ def test_the_share_of_the_memory_is_a_part_of_what_the_machine_has():
         assert share <= os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def test_all_forms_give_the_same_velocities_with_and_without_compliance():
-    G, r, mu = packing(4)
-    for compliance in (0.0, 1e-4):
-        problem = ConeProblem(SELF, r, mu, G=G, compliance=compliance)
-        found = [problem.product(solve(problem, 1e-9, form).impulse) for form in ccp.FORMS]
-        for other in found[1:]:
-            np.testing.assert_allclose(other, found[0], atol=1e-7)
-
-
 @pytest.mark.parametrize("few", [0, 400], indirect=True)
 @pytest.mark.parametrize("tol", [1e-8, 1e-10])
 @pytest.mark.parametrize("case", CASES)
@@ -149,52 +140,6 @@ def test_little_compliance_on_a_rank_deficient_heap(form):
     check(problem, solve(problem, tol, form), tol)
 
 
-@pytest.mark.parametrize("factor", [1e3, 1e4])
-def test_one_body_much_heavier_than_the_others(factor):
-    _, graph = heap(bodies=20)
-    blocks = np.where((graph.indices == 7)[:, None, None], graph.blocks / np.sqrt(factor), graph.blocks)
-    heavy = Graph(graph.indptr, graph.indices, blocks, graph.bodies)
-    G = heavy.dense()
-    known = known_optimum(3, G @ G.T, np.full(40, 0.4))
-    check_known(known, from_graph(known, heavy), solve(from_graph(known, heavy), 1e-8), 1e-8)
-
-
-def test_contacts_that_share_no_body():
-    """Also by N alone, where the body form gives way to that of the contacts."""
-    known, graph = heap(contacts=60, bodies=60, one_body=1.0, mu=0.5)
-    for problem in (from_graph(known, graph), from_matrix(known)):
-        check_known(known, problem, solve(problem, 1e-8), 1e-8)
-    isolated = known_optimum(0, np.eye(60), np.full(20, 0.5))
-    check_known(isolated, from_matrix(isolated), solve(from_matrix(isolated), 1e-10), 1e-10)
-
-
-def test_no_contacts():
-    empty = ConeProblem(SELF, np.zeros((0, 3)), np.zeros(0), N=matrix(SELF, np.zeros((0, 0))))
-    assert solve(empty, 1e-8).reason == "no contacts"
-
-
-@FORMS
-def test_newton_systems_serve_one_problem_after_another(form):
-    """Matrices are kept where contacts and bodies are the same, and made anew where not; the answers are the same as
-    with systems of their own."""
-    newton = newton_for(SELF, "conic", form)
-    one, graph = heap(0, bodies=30)
-    G = graph.dense()
-    twin = known_optimum(9, G @ G.T, one.mu)
-    other, other_graph = heap(5, contacts=25, bodies=9)
-    systems = []
-    for known, its_graph in ((one, graph), (twin, graph), (other, other_graph), (one, graph)):
-        problem = from_graph(known, its_graph)
-        result = ccp.solve(problem, None, "conic", Limits(1e-8), newton=newton)
-        check_known(known, problem, result, 1e-8)
-        alone = solve(problem, 1e-8, form)
-        assert abs(alone.iterations - result.iterations) <= 1
-        systems.append(newton.system)
-    assert systems[0] is systems[1]
-    assert systems[1] is not systems[2] is not systems[3]
-    newton.destroy()
-
-
 # -- compliance ----------------------------------------------------------------------------------------------
 
 
@@ -209,3 +154,13 @@ def test_methods_agree_on_the_compliant_optimum(compliance):
         check(problem, result, tol)
         normal, best = result.impulse[:, 0], found["conic"].impulse[:, 0]
         assert np.linalg.norm(normal - best) <= 0.1 * np.linalg.norm(best)
+
+
+def test_a_rounded_singular_matrix_keeps_none_from_the_tolerance():
+    """Files have N in a few digits: then it is indefinite, and factors put off pivots, for which they need room."""
+    N = random_graph(0, 200, 60).dense()
+    rounded = np.vectorize(lambda value: float(f"{value:.5g}"))(N @ N.T)
+    known = known_optimum(0, 0.5 * (rounded + rounded.T), np.ones(200))
+    found = ccp.solve(from_matrix(known), None, "conic", Limits(1e-8))
+    assert found.converged
+    assert found.fallbacks == 0

@@ -16,10 +16,10 @@ from test_map_products import random_contacts
 from pctt import ccp
 
 frames_and_arms, blocks = random_contacts(0, 70, 30, wide=True)[0], random_graph(0, 70, 30).part(SELF)
-for rows, solver, law in ((frames_and_arms, "apgd", ccp.Coulomb(max_it=1)), (blocks, "conic", None)):
+for rows, solver, law in ((frames_and_arms, "apgd", "coulomb"), (blocks, "conic", "relaxation")):
     r = np.random.default_rng(1).normal(size=(70, 3))
     with ccp.ConeProblem(SELF, r, np.full(70, 0.5), G=rows) as problem:
-        result = ccp.solve(problem, None, solver, ccp.Limits(1e-9, 20, fallback=False), coulomb=law)
+        result = ccp.solve(problem, None, solver, ccp.Limits(1e-9, 20, fallback=False), law=law)
         print(hashlib.sha256(result.impulse.tobytes()).hexdigest())
 """
 

@@ -13,14 +13,14 @@ from pctt.ccp import ConeProblem, Newton
 from pctt.ccp.newton.krylov import Krylov
 
 
-def system(seed: int = 0, size: int = 60, shift: float = 1.0):
+def system(shift: float = 1.0, comm: MPI.Comm = SELF):
     """A symmetric positive definite matrix, its Mat, a right-hand side and room for the solution."""
-    rng = np.random.default_rng(seed)
-    A = rng.normal(size=(size, size)) * np.exp(rng.normal(size=size))
-    dense = A @ A.T + shift * np.eye(size)
-    S = matrix(SELF, dense)
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(60, 60)) * np.exp(rng.normal(size=60))
+    dense = A @ A.T + shift * np.eye(60)
+    S = matrix(comm, dense)
     x, b = S.createVecs()
-    b.array[:] = rng.normal(size=size)
+    b.array[:] = rng.normal(size=60)[slice(*b.getOwnershipRange())]
     return dense, S, x, b
 
 
@@ -31,26 +31,26 @@ def overwrite(S, dense: np.ndarray) -> None:
     S.assemble()
 
 
-@pytest.mark.parametrize("pc", ["none", "jacobi", "pbjacobi", "ilu", "icc", "sor", "gamg", "hypre", "cholesky"])
+@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parametrize("pc", ["none", "jacobi", "pbjacobi", "ilu", "icc", "sor", "gamg", "hypre", "cholesky", "lu"])
 @pytest.mark.parametrize("method", ["bcgs", "cg", "gmres"])
 def test_the_true_residual_is_the_true_one(pc, method):
-    """||b - S x|| / ||b|| from S, x and b themselves, and small where the solve says that it converged."""
-    dense, S, x, b = system()
-    krylov = Krylov(SELF, f"{pc}_{method}_", {"pc_type": pc, "ksp_type": method}, rtol=1e-7)
+    """||b - S x|| / ||b|| from S, x and b themselves, and small where the solve says that it converged. On several
+    ranks the factorisations of one rank work within each."""
+    comm = MPI.COMM_WORLD
+    dense, S, x, b = system(comm=comm)
+    krylov = Krylov(comm, f"{pc}_{method}_", {"pc_type": pc, "ksp_type": method}, rtol=1e-7)
     done = krylov.solve(S, b, x)
-    residual = np.linalg.norm(b.array - dense @ x.array) / np.linalg.norm(b.array)
+    solution, rhs = (np.concatenate(comm.allgather(v.array)) for v in (x, b))
+    residual = np.linalg.norm(rhs - dense @ solution) / np.linalg.norm(rhs)
     assert done.true_residual == pytest.approx(residual, rel=1e-3, abs=1e-12)
     assert done.converged == (done.true_residual <= 2e-7)
     if method == "bcgs" and pc != "none":
         assert done.converged
     assert min(done.setup_s, done.solve_s) > 0
-
-
-def test_what_the_method_claims_is_checked():
-    dense, S, x, b = system()
-    done = Krylov(SELF, "", {"ksp_type": "preonly", "pc_type": "jacobi"}).solve(S, b, x)
-    assert done.reason == "converged_its"
-    assert not done.converged
+    assert comm.allgather((done.iterations, done.converged)) == [(done.iterations, done.converged)] * comm.size
+    within = comm.size > 1 and pc in ("ilu", "icc")
+    assert krylov.ksp.pc.getType() == ("bjacobi" if within else pc)
 
 
 def test_defaults_and_the_users_options(database):
@@ -119,38 +119,6 @@ def schur(newton: Newton):
     return newton.system.matrix
 
 
-def test_a_newton_system_is_n_plus_the_barrier_blocks():
-    """Written anew at every update, not added up; N itself stays as it is."""
-    known, graph = heap()
-    problem = from_graph(known, graph)
-    newton = newton_of(problem)
-    rhs = np.random.default_rng(1).normal(size=(40, 3))
-    for seed in (0, 1):
-        blocks = spd_blocks(40, seed)
-        S = known.N.copy()
-        for c in range(40):
-            S[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] += blocks[c]
-        newton.update(blocks)
-        assert np.allclose(dense_of(schur(newton)), S)
-        assert np.allclose(solved(newton, rhs, 1e-10).ravel(), np.linalg.solve(S, rhs.ravel()), atol=1e-8)
-    assert newton.fallbacks == 0
-    newton.destroy()
-    assert np.allclose(dense_of(problem.N), known.N)
-
-
-def test_where_the_ksp_fails_a_factor_solves(database):
-    database["pc_type"] = "python"
-    known, graph = heap()
-    newton = newton_of(from_graph(known, graph))
-    blocks, rhs = spd_blocks(40), np.random.default_rng(1).normal(size=(40, 3))
-    newton.update(blocks)
-    x = solved(newton, rhs, 1e-8)
-    S = dense_of(schur(newton))
-    assert np.linalg.norm(S @ x.ravel() - rhs.ravel()) <= 2e-8 * np.linalg.norm(rhs)
-    assert (newton.fallbacks, newton.ksp_its) == (1, 1)
-    newton.destroy()
-
-
 @pytest.mark.parametrize("better", ["", "fallback_"])
 def test_where_both_fail_the_step_is_the_better_one(better, database):
     """By the true residual; zero where neither is any good."""
@@ -187,26 +155,3 @@ def test_without_memory_a_failing_ksp_has_no_fallback(database, monkeypatch):
     assert np.array_equal(solved(newton, np.ones((40, 3)), 1e-8), np.zeros((40, 3)))
     assert newton.fallbacks == 1
     newton.destroy()
-
-
-@pytest.mark.parallel(2, 3)
-def test_on_several_ranks_factorisations_of_one_rank_work_within_each():
-    comm = MPI.COMM_WORLD
-    rng = np.random.default_rng(0)
-    A = rng.normal(size=(90, 90))
-    dense = A @ A.T + np.eye(90)
-    S = matrix(comm, dense)
-    x, b = S.createVecs()
-    first, last = S.getOwnershipRange()
-    rhs = rng.normal(size=90)
-    b.array[:] = rhs[first:last]
-    for pc in ("ilu", "icc", "pbjacobi", "cholesky", "lu", "none", "gamg", "hypre"):
-        krylov = Krylov(comm, pc + "_", {"pc_type": pc}, 1e-7)
-        done = krylov.solve(S, b, x)
-        whole = np.concatenate(comm.allgather(x.array))
-        residual = np.linalg.norm(dense @ whole - rhs) / np.linalg.norm(rhs)
-        assert abs(done.true_residual - residual) <= 1e-3 * residual + 1e-14, (pc, done, residual)
-        assert done.converged == (residual <= 2e-7), (pc, done)
-        assert done.converged or pc == "none", (pc, done)
-        assert comm.allgather((done.iterations, done.converged)) == [(done.iterations, done.converged)] * comm.size
-        assert krylov.ksp.pc.getType() == ("bjacobi" if pc in ("ilu", "icc") else pc)

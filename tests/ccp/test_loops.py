@@ -9,14 +9,32 @@ import numpy as np
 import pytest
 
 from pctt.ccp import cone
-from pctt.ccp.accuracy import _nearest_in_cone
-from pctt.ccp.cone_loops import scaling
+from pctt.ccp.cone_loops import scaling, squared_moves, wrong_works
 
 COUNTS = [0, 1, 7, 256, 1000]  # also of whole strips, and not
 
 
+def nearest(x, mu):
+    """The projection on the cones: of the point on the surface's ray, in the half plane of axis and point."""
+    size = np.hypot(x[:, 1], x[:, 2])
+    along = np.maximum(x[:, 0] + mu * size, 0.0) / (1 + mu**2)
+    turn = np.divide(mu * along, size, out=np.zeros_like(along), where=size > 0)
+    surface = np.stack([along, turn * x[:, 1], turn * x[:, 2]], axis=1)
+    return np.where(((x[:, 0] >= 0) & (size <= mu * x[:, 0]))[:, None], x, surface)
+
+
 def projected_move(x, y, step, mu):
-    return _nearest_in_cone(x - step * y, mu) - x
+    return nearest(x - step * y, mu) - x
+
+
+def squares(x, y, step, mu, opening):
+    y = y + np.stack([opening * mu * np.hypot(y[:, 1], y[:, 2]), 0 * mu, 0 * mu], axis=1)
+    return (projected_move(x, y, step, mu) ** 2).sum(axis=1)
+
+
+def works(x, y, r):
+    along = (x * y).sum(axis=1)
+    return x[:, 0] @ np.maximum(-y[:, 0], 0.0), np.maximum(along, 0.0).sum(), 0.5 * np.vdot(x, y - r)
 
 
 def accelerated_step(x, last_x, y, compliance, beta, step, mu, opening):
@@ -24,7 +42,7 @@ def accelerated_step(x, last_x, y, compliance, beta, step, mu, opening):
     z = x + beta * (x - last_x)
     y_z = y + compliance * z if len(compliance) else y.copy()
     y_z[:, 0] += opening * mu * np.hypot(y_z[:, 1], y_z[:, 2])
-    out = _nearest_in_cone(z - step * y_z, mu)
+    out = nearest(z - step * y_z, mu)
     work = np.vdot(out - z, compliance * (out - z)) if len(compliance) else 0.0
     return work, np.vdot(out - z, out - z), np.vdot(y_z, out - x), out
 
@@ -51,11 +69,13 @@ class Sample:
         x[3::7, 1:] = 0.0
         blocks = rng.normal(size=(count, 3, 3))
         self.cases = {
-            "project": (cone.project, _nearest_in_cone, (x, mu)),
+            "project": (cone.project, nearest, (x, mu)),
             "move": (cone.projected_move, projected_move, (x, y, 0.3, mu)),
             "step": (stepped, accelerated_step, (x, dx, y, np.abs(dy), 0.7, 0.3, mu, 1.0)),
             "rigid step": (stepped, accelerated_step, (x, dx, y, dy[:0], 0.7, 0.3, mu, 0.0)),
             "times": (cone.times, times, (blocks, x)),
+            "squares": (squared_moves, squares, (x, y, 0.3, mu, 1.0)),
+            "works": (wrong_works, works, (x, y, dy)),
         }  # fmt: skip
 
 

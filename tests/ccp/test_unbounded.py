@@ -147,7 +147,7 @@ def test_a_problem_given_by_its_matrix_is_recognised_too():
 
 
 def test_coulombs_law_says_so_at_once():
-    result = ccp.solve(squeezed((1.0, 1.0), 0.0, 0.5), type="apgd", limits=Limits(1e-6), coulomb=ccp.Coulomb())
+    result = ccp.solve(squeezed((1.0, 1.0), 0.0, 0.5), type="apgd", limits=Limits(1e-6), law=ccp.COULOMB)
     assert not result.converged
     assert result.reason.startswith("unbounded: ")
     assert result.cone_problems < 20

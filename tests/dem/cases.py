@@ -81,8 +81,8 @@ def heap(
             velocity=(0.1, 0, -1.0),
             angular_velocity=(0.1, 0.2, 0.3),
         )
-    scene.set_friction(0.6, "wood", "steel")
-    scene.set_friction(0.1, "glass", "steel")
+    scene.set_pair("wood", "steel", friction=0.6)
+    scene.set_pair("glass", "steel", friction=0.1)
     return scene
 
 

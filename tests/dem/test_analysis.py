@@ -39,11 +39,14 @@ def test_few_records_are_filtered_too(count):
 
 def test_the_steady_draft_force_is_the_mean_while_the_blade_is_fast():
     scene = Blade(n=4)
-    time = np.arange(0.0, scene.settling_time + 5.0, scene.dt)
+    time = np.arange(0.0, scene.settling_time + 5.0, 0.01)
     fast = np.sin(2 * np.pi * (time - scene.settling_time) / scene.period) > np.sqrt(0.5) - 1e-6
     fast &= (time > scene.settling_time) & (time < scene.settling_time + 2.0)
     records = {f"force_blade_{a} [N]": 0 * time for a in "xyz"} | {f"torque_blade_{a} [N m]": 0 * time for a in "xyz"}
     records |= {"time [s]": time, "draft_force [N]": np.where(fast, 7.0, 100.0), "blade_position [m]": time}
+    jump = time == time[len(time) // 2 + 70]
+    records |= {"energy_jump [J]": np.where(jump, 1.0, 0.0)}
+    records["draft_force [N]"][jump] = 1e6  # means are without the step of a jump
     found = scene.analyse(records)
     assert found["steady_draft_force [N]"] == pytest.approx(7.0)
     assert found["draft_force_deviation [N]"] == pytest.approx(0.0, abs=1e-12)
@@ -54,9 +57,10 @@ def test_the_steady_draft_force_is_the_mean_while_the_blade_is_fast():
 
 def test_friction_angles_of_a_shear_test_with_known_stresses():
     scene = Shear(n=4)
-    time = scene.settling_time + np.arange(0.0, 4.0, scene.dt)
+    time = scene.settling_time + np.arange(0.0, 4.0, 0.01)
     ratio = 0.3 + 0.2 * np.exp(-(((time - scene.settling_time - 0.4) / 0.1) ** 2))  # a peak before the steady part
     records = {"time [s]": time, "normal_stress [Pa]": np.full(len(time), 5e4), "shear_stress [Pa]": 5e4 * ratio}
+    records |= {"energy_jump [J]": 0 * time}
     records |= {"shear_displacement [m]": 0 * time, "sample_height [m]": 1.0 + 0.01 * (time - time[0])}
     found = scene.analyse(records)
     assert found["steady_friction_angle [degrees]"] == pytest.approx(np.degrees(np.arctan(0.3)), abs=0.7)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
+
 import numpy as np
 import pytest
 from cases import random_quaternions
 
 from dem import quaternion
 from dem.bodies import SPHERE
+from dem.compiled import loop
 from dem.contact import broad
 from dem.contact.narrow import Spheres, sphere_sphere
 from dem.contact.spheres import touch_spheres
 from dem.free_motion import free_spin
+from dem.system import contact_frames
 
 
 def sorted_rows(pairs):
@@ -56,6 +60,18 @@ def test_contacts_of_spheres():
         np.testing.assert_allclose(column, expected, atol=1e-14)
 
 
+def test_operations_round_each_for_themselves():
+    """To the bits of numpy: a fused product would differ, and with it a run from the same run in another process."""
+    normal = np.random.default_rng(3).normal(size=(20000, 3))
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    x, y, z = normal.T
+    sign = np.copysign(1.0, z)
+    p = -1.0 / (sign + z)
+    q = x * y * p
+    expected = [x, y, z, 1.0 + sign * x * x * p, sign * q, -sign * x, q, sign + y * y * p, -y]
+    np.testing.assert_array_equal(contact_frames(normal).reshape(-1, 9), np.stack(expected, axis=1))
+
+
 @pytest.mark.parametrize("turn", [1e-9, 0.01, 0.3])
 def test_free_spins_keep_the_angular_momentum(turn):
     """Also of rods and plates and of bodies at rest; a body that is lost spoils no other."""
@@ -74,3 +90,32 @@ def test_free_spins_keep_the_angular_momentum(turn):
         return quaternion.rotate(middle, moments[3:] * quaternion.rotate(quaternion.conjugate(middle), w))
 
     np.testing.assert_allclose(momentum(after[3:], 1), momentum(spin[3:], -1), rtol=1e-5, atol=1e-5 * turn / dt)
+
+
+def test_damaged_machine_code_is_made_anew(tmp_path, monkeypatch):
+    (tmp_path / "twice.py").write_text(
+        "from dem.compiled import loop\n\n@loop\ndef twice(x: float) -> float:\n    return 2.0 * x\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "code"))
+    module = importlib.import_module("twice")
+    assert module.twice(1.5) == 3.0
+    files = [path for path in (tmp_path / "code").rglob("twice*") if path.is_file()]
+    assert {path.suffix for path in files} == {".nbi", ".nbc"}
+    for path in files:
+        whole = path.read_bytes()
+        path.write_bytes(whole[: len(whole) // 2])
+        with pytest.warns(UserWarning, match="is damaged .* and made anew"):
+            assert importlib.reload(module).twice(1.5) == 3.0
+        assert importlib.reload(module).twice(1.5) == 3.0
+
+
+def test_a_loop_runs_where_numba_may_not_compile(monkeypatch):
+    """As with NUMBA_DISABLE_JIT, for those who debug a loop; on one rank alone the others would wait for ever."""
+    monkeypatch.setattr("numba.core.config.DISABLE_JIT", 1)
+
+    @loop
+    def doubled(x):
+        return 2.0 * x
+
+    assert doubled(3.0) == 6.0

@@ -52,19 +52,6 @@ def test_only_the_motion_along_the_guide_answers_to_forces(direction):
     np.testing.assert_allclose(world.large.position[1], [0.1, 0.1, 0.25] + 0.01 * speed * unit, atol=1e-14)
 
 
-@pytest.mark.parametrize("direction", [(0, 0, 1), SLANT])
-def test_the_force_of_a_drive_acts_while_it_lasts(direction):
-    unit = np.array(direction) / np.linalg.norm(direction)
-    world = pressed(Guided(direction, force=50.0, start=0.005, end=0.015), mass=40.0)
-    weight = unit @ [0, 0, -9.81]
-    for force in (25.0, 25.0, 0.0):  # steps that begin at 0, .01 and .02 s: the mean over each
-        before = world.large.velocity[1] @ [*unit, 0, 0, 0]
-        system = system_of(world)
-        velocity = system.free_velocity[5] @ [*unit, 0, 0, 0]
-        assert velocity == pytest.approx(before + 0.01 * (weight + force / 40.0), abs=1e-12)
-        advance(world, system.free_velocity, 0.01)
-
-
 def test_what_holds_a_guided_body_across_its_guide_makes_no_contact():
     """A press between two walls that it fills exactly rubs on neither; it does touch a stop in its way."""
     scene = Scene(0.4)
@@ -79,3 +66,14 @@ def test_what_holds_a_guided_body_across_its_guide_makes_no_contact():
     step = ContactSystem(new_world(scene, SELF), contacts, 0.01)
     rows = dense_scaled_map(step, SELF)[::3]
     assert (rows**2).sum(axis=1).min() > 0  # no normal impulse without effect
+
+
+def test_a_guided_motion_with_an_angular_velocity_is_refused():
+    """It was ignored."""
+
+    class Turned(Guided):
+        def angular_velocity(self):
+            return (0.0, 0.0, 1.0)
+
+    with pytest.raises(ValueError, match="the motion Turned defines angular_velocity, which nothing asks for"):
+        pressed(Turned((0, 0, 1)), density=500.0)

@@ -308,7 +308,7 @@ def moved_on(world, steps, dt=0.01):
     for _ in range(steps):
         system = ContactSystem(world, find_contacts(world, 0.01, dt), dt)
         with cone_problem(system, SELF) as problem:
-            result = ccp.solve(problem, None, "apgd", ccp.Limits(1e-9), coulomb=ccp.Coulomb())
+            result = ccp.solve(problem, None, "apgd", ccp.Limits(1e-9), law=ccp.COULOMB)
         advance(world, system.velocity(result.impulse), dt)
         yield system, result.impulse
 
@@ -412,3 +412,21 @@ def test_on_several_ranks_meshes_have_the_contacts_that_they_have_on_one():
             np.testing.assert_allclose(one[name], many[name], atol=1e-8)
         touched += [np.count_nonzero(one["b"] == len(worlds[0].grains) + k) for k in range(3)]  # drum, wheel, ball
     assert (touched > 0).all()
+
+
+def test_of_a_fine_surface_few_triangles_are_near():
+    """A ball of twenty triangles' size finds those around it, and not all of 45,000."""
+    n = 151
+    x, y = np.meshgrid(np.linspace(-1.0, 1.0, n), np.linspace(-1.0, 1.0, n), indexing="ij")
+    i = np.arange(n * (n - 1)).reshape(n - 1, n)[:, :-1].ravel()
+    triangles = np.concatenate([np.stack([i, i + n, i + n + 1], axis=1), np.stack([i, i + n + 1, i + 1], axis=1)])
+    surface = Mesh(np.stack([x, y, 0.1 * x * y], axis=-1).reshape(-1, 3), triangles).surface
+    points = np.random.default_rng(0).uniform(-0.7, 0.7, (20, 3)) * [1.0, 1.0, 0.1]
+    reach = np.full(20, 0.13)
+    row, triangle = surface.near(points, reach)
+    within = surface.closest(points[row], triangle).distance <= reach[row]
+    assert len(row) < 1.3 * np.count_nonzero(within)
+    every = np.arange(len(triangles))
+    for k in range(3):
+        true = np.flatnonzero(surface.closest(np.tile(points[k], (len(every), 1)), every).distance <= 0.13)
+        assert set(true) == set(triangle[(row == k) & within])

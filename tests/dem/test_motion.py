@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dem import quaternion
-from dem.motion import Fixed, Glide, Oscillation, Path, Rotation, checked_pose, mean_velocity
+from dem.motion import Fixed, Glide, Guided, Oscillation, Path, Rotation, checked_pose, mean_velocity, refuse_ignored
 
 PLACE, TURN = np.array([1.0, 2.0, 3.0]), quaternion.normalized(np.array([1.0, 0.5, 0.0, 0.2]))
 MOTIONS = [Fixed(), Rotation((0.1, 0.0, 1.0), (2.0, 0.0, 0.0)), Oscillation((1.0, 2.0, 0.0), 0.3, 4.0, 0.7)]
@@ -46,19 +46,53 @@ def test_rotation_and_oscillation_rest_before_and_after():
     np.testing.assert_allclose(mean_velocity(turning, 0.9, 0.2, 0 * PLACE, TURN)[5], np.pi / 2, atol=1e-14)
 
 
+class Rocking:
+    def pose(self, time, position, orientation):
+        turn = quaternion.exponential(np.array([self.angle(time), 0, 0]))
+        return position, quaternion.multiply(turn, orientation)
+
+    def angle(self, time):
+        return 0.3 * np.sin(time)
+
+
 def test_a_motion_of_ones_own_is_a_pose_alone():
-    class Rocking:
-        def pose(self, time, position, orientation):
-            turn = quaternion.exponential(np.array([0.3 * np.sin(time), 0, 0]))
-            return position, quaternion.multiply(turn, orientation)
-
-    class Belt(Rocking):
-        def angular_velocity(self):
-            return np.array([0, 7.0, 0])
-
+    refuse_ignored(Rocking())
     turning = mean_velocity(Rocking(), 0.4, 1e-4, PLACE, TURN)[3:]
     np.testing.assert_allclose(turning, [0.3 * np.cos(0.4), 0, 0], atol=1e-4)
-    np.testing.assert_array_equal(mean_velocity(Belt(), 0.4, 0.1, PLACE, TURN), [0, 0, 0, 0, 7, 0])
+
+
+class Belt(Rocking):
+    def angular_velocity(self):
+        return np.array([0, 7.0, 0])
+
+
+class Shaken(Guided):
+    def pose(self, time, position, orientation):
+        return position, orientation
+
+
+class Pushed(Glide):
+    @property
+    def force(self):
+        return np.zeros(3)
+
+
+class Used(Glide):
+    def force(self, time):
+        return time
+
+    def pose(self, time, position, orientation):
+        return position + self.force(time), orientation
+
+
+def test_a_motion_that_defines_what_nothing_asks_for_is_refused():
+    """Such definitions were ignored in silence."""
+    refuse_ignored(Used((1, 0, 0)))
+    for motion in MOTIONS:
+        refuse_ignored(motion)
+    for motion, name in ((Belt(), "angular_velocity"), (Shaken((0, 0, 1)), "pose"), (Pushed((0, 0, 1)), "force")):
+        with pytest.raises(ValueError, match=f"the motion {type(motion).__name__} defines {name}, which nothing asks"):
+            refuse_ignored(motion)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ from dem.bodies import Bodies
 from dem.contact import find_contacts
 from dem.morton import Frame, morton_codes
 from dem.partition import imbalance, rebalance, splitters
+from dem.scene import Scene
+from dem.shapes import Plane
 from dem.start import new_world
 
 
@@ -36,7 +38,7 @@ def test_splitters_cut_the_weight_evenly():
     rng = np.random.default_rng(comm.rank)
     codes = rng.integers(0, 2**63 - 1, 1000 * (comm.rank + 1)) >> rng.integers(0, 60)
     weights = rng.integers(1, 10, len(codes)).astype(float)
-    cuts = splitters(comm, codes, weights)
+    cuts = splitters(comm, codes, weights, comm.size)
     assert comm.bcast(cuts.tolist()) == cuts.tolist()
     everything = comm.allgather((codes, weights))
     codes, weights = (np.concatenate(part) for part in zip(*everything))
@@ -78,3 +80,26 @@ def test_rebalancing_keeps_the_bodies_and_spreads_the_contacts():
     codes = np.concatenate(comm.allgather(morton_codes(world.grains.position, Frame.between(low, high))))
     if comm.size > 1:
         assert (np.diff(codes) >= 0).all()
+
+
+@pytest.mark.parallel(2, 3)
+def test_few_grains_are_not_spread_again_and_again():
+    """No cut divides a grain with its contacts."""
+    world = new_world(heap(1, side=3, boxes=False), MPI.COMM_WORLD)
+    again = 0
+    for _ in range(6):
+        find_contacts(world, 0.05)
+        again += rebalance(world)
+    assert again <= 1
+
+
+@pytest.mark.parallel(2, 3)
+def test_a_grain_that_is_far_away_leaves_the_others_spread():
+    comm = MPI.COMM_WORLD
+    scene = Scene(friction=0.3)
+    scene.add_body("floor", [Plane(normal=(0, 0, 1))])
+    grid = 0.2 * np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3) + 0.1
+    scene.add_spheres([*grid, [0.0, 1e8, 0.1]], 0.1, 1000.0)
+    counts = np.array(comm.allgather(len(new_world(scene, comm).grains)))
+    assert counts.sum() == 126
+    assert abs(counts - 126 / comm.size).max() <= 2

@@ -28,7 +28,7 @@ DT = 0.01
 
 def made(world, solve=crude_impulse, dt=DT, delta=0.02):
     """A step of the world, its contacts rigid, with the impulses that `solve` finds."""
-    world.stiffness[:] = np.inf
+    world.pairs.stiffness[:] = np.inf
     contacts = find_contacts(world, delta)
     system = ContactSystem(world, contacts, dt, recovery_speed=0.5)
     impulse = solve(system)

@@ -38,7 +38,7 @@ def body(*arguments, **options):
         (balls(velocity=[UP, UP]), r"velocity must have shape \(3,\) or \(1, 3\)"),
         (lambda scene: scene.add_boxes([UP], (0.1, 0.0, 0.1), 1000.0), "half extents must be positive"),
         (lambda scene: scene.add_boxes([UP], (1, 1, 1), 1.0, quaternions=(0, 0, 0, 0)), "zero quaternion"),
-        (lambda scene: scene.set_friction(-0.1, "a", "b"), "friction must not be negative"),
+        (lambda scene: scene.set_pair("a", "b", friction=-0.1), "friction must not be negative"),
         (lambda scene: Scene(friction=0.1, gravity=(0, 0, np.nan)), "gravity: NaN"),
         (body("floor", FLOOR), "distinct names, got 'floor'"),
         (body("empty", []), "has no shape"),
@@ -114,7 +114,7 @@ def test_ids_materials_mass_and_inertia():
     scene.add_body("floor", [Plane((0, 0, 1))], material="steel")
     first = scene.add_spheres([[0, 0, 1], [0, 0, 2]], [0.1, 0.2], 1000.0, material="glass")
     second = scene.add_boxes([[0, 0, 3]], (0.1, 0.2, 0.3), 500.0, material="steel")
-    scene.set_friction(0.7, "steel", "glass")
+    scene.set_pair("steel", "glass", friction=0.7)
     np.testing.assert_array_equal(first, [0, 1])
     np.testing.assert_array_equal(second, [2])
     grains, large = scene.grains(), scene.large()
@@ -122,6 +122,6 @@ def test_ids_materials_mass_and_inertia():
     np.testing.assert_allclose(grains.mass, [4188.79e-3, 33.51032, 24.0], rtol=1e-5)
     np.testing.assert_allclose(grains.inertia[1], [0.4 * 33.51032 * 0.04] * 3, rtol=1e-5)
     np.testing.assert_allclose(grains.inertia[2], [24 / 3 * 0.13, 24 / 3 * 0.10, 24 / 3 * 0.05])
-    table = scene.friction_table()
+    table = scene.pairs(1.0).friction
     assert table[grains.material[0], large.material[0]] == table[large.material[0], grains.material[0]] == 0.7
     assert table[grains.material[2], large.material[0]] == 0.3

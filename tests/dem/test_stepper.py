@@ -1,16 +1,18 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from cases import heap, step
 from mpi4py import MPI
 
 from dem.contact import find_contacts
-from dem.motion import Glide, Rotation
+from dem.motion import Glide
 from dem.scene import Scene
 from dem.shapes import Box
 from dem.start import new_world
-from dem.step import advance
+from dem.step import advance, carried
 from dem.system import ContactSystem
 
 SELF = MPI.COMM_SELF
@@ -20,21 +22,6 @@ def fly(world, dt, steps):
     for _ in range(steps):
         contacts = find_contacts(world, 0.0)
         advance(world, ContactSystem(world, contacts, dt).velocity(np.zeros((len(contacts), 3))), dt)
-
-
-def test_prescribed_bodies_follow_their_motion_exactly_at_any_step():
-    for dt, steps in ((0.025, 40), (0.25, 4)):
-        scene = Scene(friction=0.3)
-        scene.add_spheres([[0, 0, 5]], 0.1, 1000.0)
-        motion = Rotation((0.0, 0.2, 1.0), (0.5, 0.0, 0.0))
-        scene.add_body("blade", [Box((0.1, 0.1, 0.1))], motion, position=(2, 0, 0))
-        world = new_world(scene, SELF)
-        start = world.large.position[0].copy()
-        fly(world, dt, steps)
-        position, turn = motion.pose(1.0, start, np.array([1.0, 0, 0, 0]))
-        np.testing.assert_allclose(world.large.position[0], position, atol=1e-14)
-        np.testing.assert_allclose(world.large.quaternion[0], turn, atol=1e-14)
-        np.testing.assert_allclose(world.large.velocity[0, 3:], [0, 0.2, 1.0])
 
 
 def test_a_body_is_where_its_motion_puts_it_from_the_start_on():
@@ -60,3 +47,15 @@ def test_a_step_changes_no_array_of_the_step_before():
     assert np.abs(world.grains.position - kept["position"][1]).max() > 0
     for column, copy in kept.values():
         np.testing.assert_array_equal(column, copy)
+
+
+def test_a_wider_search_keeps_the_contacts_that_were_linearised_anew():
+    world = new_world(heap(), SELF, overlap=1.0)
+    found = find_contacts(world, 0.02, 0.001)
+    anew = replace(found, gap=found.gap - 1.0)  # such gaps come from no search
+    wider = find_contacts(world, 0.02, 0.001, np.full(len(world.grains), 0.05))
+    both = carried(world, anew, wider)
+    assert len(found) < len(wider)
+    np.testing.assert_array_equal(both.key[both.gap < -0.5], found.key)
+    np.testing.assert_array_equal(np.sort(both.key), np.sort(wider.key))
+    np.testing.assert_array_equal(both.near.index[both.a], both.body[:, 0])

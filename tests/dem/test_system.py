@@ -24,7 +24,7 @@ def world():
     world = new_world(heap(3, side=4), SELF)
     for _ in range(20):
         step(world)
-    world.stiffness[:] = np.inf
+    world.pairs.stiffness[:] = np.inf
     return world
 
 

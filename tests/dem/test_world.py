@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pytest
-from cases import contacts_by_key, crude_impulse, dense_map, force_on, grains_by_id, heap, step
+from cases import contacts_by_key, dense_map, force_on, heap, step
 from mpi4py import MPI
 from several_ranks import alone
 
@@ -15,7 +13,7 @@ from dem.contact import find_contacts
 from dem.partition import rebalance
 from dem.scene import Scene
 from dem.shapes import Plane
-from dem.start import new_world, restart_rows, restored_world
+from dem.start import new_world, restored_world
 from dem.step import advance
 from dem.system import ContactSystem
 
@@ -61,83 +59,6 @@ def test_the_contacts_are_the_same_on_any_number_of_ranks(delta, dt):
         np.testing.assert_array_equal(found[name], expected[name])
     for name in ("point", "normal", "gap"):
         np.testing.assert_allclose(found[name], expected[name], atol=1e-11)
-
-
-def end_of_trajectory(comm):
-    world = new_world(heap(2, side=5), comm)
-    for _ in range(25):
-        step(world)
-        rebalance(world, 1.02)
-        slab = comm.allgather(world.large.position.tolist())
-        assert all(other == slab[0] for other in slab)
-    system = ContactSystem(world, find_contacts(world, 0.02), 0.005)
-    impulse = crude_impulse(system)
-    force = {name: force_on(world, system, name, impulse) for name in ("walls", "blade", "slab")}
-    change = (system.velocity(impulse) - system.free_velocity)[: len(world.grains)]
-    response = comm.allreduce(float(np.sum(change[:, :3] ** 2 * world.grains.mass[:, None])))
-    grains = grains_by_id(world)
-    columns = {name: getattr(grains, name) for name in ("position", "quaternion", "velocity")}
-    return {"response": response, "large": world.large.position, "time": world.time, **columns, **force}
-
-
-@pytest.mark.parallel(2, 3, 4)
-def test_the_trajectory_is_the_same_on_any_number_of_ranks():
-    found, expected = end_of_trajectory(MPI.COMM_WORLD), alone(end_of_trajectory)
-    assert np.abs(expected["slab"]).max() > 0
-    for name, value in expected.items():
-        np.testing.assert_allclose(found[name], value, atol=1e-8 * max(1.0, np.abs(value).max()), err_msg=name)
-
-
-@pytest.mark.parallel(3, 4)
-def test_restart_is_bitwise_on_the_same_ranks_and_close_on_others():
-    """From the state of two ranks, on these two, on one, and on all."""
-    everyone, scene = MPI.COMM_WORLD, heap(3, side=4)
-
-    def first(count):
-        return everyone.Split(0 if everyone.rank < count else MPI.UNDEFINED)
-
-    def four_steps(world):
-        for _ in range(4):
-            step(world)
-
-    def state(world):
-        """Of all ranks, on the first; that of the grains in the rows of the ranks."""
-        local, replicated = world.state()
-        parts = world.comm.gather(local)
-        if world.comm.rank > 0:
-            return None
-        return {name: np.concatenate([part[name] for part in parts]) for name in local}, dict(replicated)
-
-    def go_on(comm):
-        if comm == MPI.COMM_NULL:
-            return None
-        grains, replicated = middle
-        rows = restart_rows(replicated["slabs"], comm)
-        world = restored_world(scene, comm, {name: column[rows] for name, column in grains.items()}, replicated)
-        assert (grains_by_id(world).id == np.arange(64)).all()
-        four_steps(world)
-        return state(world)
-
-    middle = direct = None
-    two = first(2)
-    if two != MPI.COMM_NULL:
-        world = new_world(scene, two)
-        four_steps(world)
-        middle = copy.deepcopy(state(world))
-        four_steps(world)
-        direct = state(world)
-    middle = everyone.bcast(middle)
-    for comm in (first(1), two, everyone):
-        again = go_on(comm)
-        if everyone.rank > 0:
-            continue
-        (grains, replicated), (expected, large) = again, direct
-        if comm == two:
-            for name, value in {**expected, **large}.items():
-                np.testing.assert_array_equal({**grains, **replicated}[name], value, err_msg=name)
-        one, other = np.argsort(expected["id"]), np.argsort(grains["id"])
-        for name in ("position", "velocity", "quaternion"):
-            np.testing.assert_allclose(grains[name][other], expected[name][one], atol=1e-9, err_msg=name)
 
 
 @pytest.mark.parallel(1, 3, 4)

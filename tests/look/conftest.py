@@ -16,6 +16,7 @@ from pctt.run.options import read_options
 from pctt.run.simulate import simulate
 
 OPTIONS = {"scene_n": "2", "ccp_type": "pdip", "dt": "0.1", "compare": "pbjacobi,none", "compare_every": "40"}
+OPTIONS |= {"output_every": "1"}
 
 
 def start(*words: object) -> subprocess.CompletedProcess[str]:

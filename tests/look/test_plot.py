@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
+import structure
 from matplotlib.image import imread
 
 from pctt.folder import Folder
@@ -94,13 +93,7 @@ def test_nothing_to_plot_is_an_error(show, tmp_path):
     assert "nothing to plot" in show("plot", folder=tmp_path, status=2).stderr
 
 
-@pytest.fixture
-def structure(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "run" / "studies"))
-    return importlib.import_module("structure")
-
-
-def test_the_pattern_is_that_of_the_delassus_matrix(folder, structure):
+def test_the_pattern_is_that_of_the_delassus_matrix(folder):
     """Against G G' with a random 3 x 6 block for every contact and body of finite mass."""
     read = Folder(folder)
     read.require_frames()
@@ -116,7 +109,7 @@ def test_the_pattern_is_that_of_the_delassus_matrix(folder, structure):
     np.testing.assert_array_equal(structure.coupling(read, frame).toarray() > 0, there)
 
 
-def test_figures_of_a_small_cluster(folder, structure, tmp_path, monkeypatch):
+def test_figures_of_a_small_cluster(folder, tmp_path, monkeypatch):
     read = Folder(folder)
     read.require_frames()
     frame = read.frame(4)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 
 import h5py
 import handmade
 import pytest
+
+from pctt.disk import FileError
+from pctt.export import write_single
+from pctt.folder import Folder
+from pctt.look.program import told_steps
 
 
 def held(path):
@@ -28,7 +34,7 @@ def held(path):
 
 def test_one_file_holds_what_the_links_lead_to(folder, show, tmp_path):
     done = show("export", "-single", tmp_path / "one.h5")
-    assert done.stdout == f"4 steps: {tmp_path}/one.h5\n"
+    assert done.stdout == f"4 of 4 recorded steps: {tmp_path}/one.h5\n"
     assert [path.name for path in tmp_path.iterdir()] == ["one.h5"]
     linked = held(folder / "state.h5")
     assert "frames" in linked.pop("@links")
@@ -68,3 +74,18 @@ def test_what_cannot_be_read_or_written_is_named(show, tmp_path):
     (made / "state.h5").unlink()  # as of a run that was killed: it is made again
     show("export", "-single", tmp_path / "one.h5", "-last", 1, folder=made)
     assert (tmp_path / "one.h5").exists()
+
+
+def test_missing_frames_are_told_and_what_is_no_file_is_left_alone(folder, tmp_path):
+    whole = tmp_path / "run"
+    shutil.copytree(folder, whole)
+    (whole / "frames" / "000003.h5").unlink()
+    run = Folder(whole)
+    run.require_frames()
+    assert told_steps(run, [2, 4]) == "2 of 3 recorded steps (missing: 3)"
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FileError, match="pipe: cannot write .it is no regular file"):
+        write_single(tmp_path / "pipe", run, [2, 4])
+    (whole / "steps.jsonl").unlink()
+    os.mkfifo(whole / "steps.jsonl")  # nobody writes to it: reading would wait for ever
+    assert Folder(whole).lines() == []

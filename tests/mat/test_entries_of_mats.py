@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import subprocess
 import sys
@@ -136,11 +135,6 @@ def test_an_order_needs_what_it_goes_by(order):
         solve(shell(), order=order)
 
 
-def test_entries_that_are_no_function_are_refused():
-    with pytest.raises(ValueError, match="attribute entries"):
-        solve(shell(entries=[[1.0]]))
-
-
 def test_an_indefinite_matrix_is_not_given_to_cg():
     """Its train is refused, in words, and the diagonal takes over."""
     mat = shell(lambda i, j: kernel(i, j) - 8.0 * (abs(i - j) == 1), grid=GRID)
@@ -191,18 +185,3 @@ def test_the_example_of_the_documentation_runs():
     assert done.returncode == 0, done.stderr
     assert "times less than dense" in done.stdout
     assert "cosine transform of a grid of 256 x 256" in done.stdout
-
-
-def test_the_examples_multiply_with_their_entries():
-    """Products by FFT are those of the entries, and a train solves each with few iterations."""
-    path = Path(__file__).resolve().parents[2] / "docs" / "examples" / "integral_problems.py"
-    spec = importlib.util.spec_from_file_location("examples_problems", path)
-    assert spec is not None
-    assert spec.loader is not None
-    problems = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # dataclasses look for their module
-    spec.loader.exec_module(problems)
-    for problem in (problems.fredholm(9), problems.lippmann_schwinger(5), problems.gaussian_process(8)):
-        i = np.arange(problem.size)
-        A = problem.entries(*(k.ravel() for k in np.meshgrid(i, i, indexing="ij"))).reshape(len(i), -1)
-        v = np.random.default_rng(0).standard_normal(len(i))
-        np.testing.assert_allclose(problem.product()(v), A @ v)

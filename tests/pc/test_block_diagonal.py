@@ -8,8 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from systems import contacts, dense, spd
 
-from pctt.block_diagonal import block_diagonal, inverse_diagonal_blocks, set_diagonal_blocks, symmetric_shell
-from pctt.blocks import block_csr_matrix
+from pctt.blocks import block_csr_matrix, block_diagonal, inverse_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.body_matrix import BodyMatrix
 from pctt.ccp.newton.krylov import Krylov
 

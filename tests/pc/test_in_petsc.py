@@ -7,11 +7,12 @@ import warnings
 import numpy as np
 import pytest
 import scipy.sparse as sp
+import train_solver
 from mpi4py import MPI
 from petsc4py import PETSc
 from systems import dense, poisson, spd
 
-SMALL = {"pc_tt_rank": "20"}
+SMALL = {"rank": 20}
 
 
 def stored(A: np.ndarray, kind: str = "aij", block: int = 1, pattern: np.ndarray | None = None) -> PETSc.Mat:
@@ -28,18 +29,10 @@ def stored(A: np.ndarray, kind: str = "aij", block: int = 1, pattern: np.ndarray
     return mat if kind == "aij" else mat.convert(kind, PETSc.Mat())
 
 
-def solver(mat: PETSc.Mat, method="cg", prefix="", **options: str) -> PETSc.KSP:
-    for option, value in options.items():
-        PETSc.Options()[prefix + option] = value
-    ksp = PETSc.KSP().create(mat.comm)
-    ksp.setOptionsPrefix(prefix)
-    ksp.setOperators(mat)
-    ksp.setType(method)
+def solver(mat: PETSc.Mat, method="cg", prefix="", **options: object) -> PETSc.KSP:
+    """With a train, to a true residual of 1e-9."""
+    ksp = train_solver.solver(mat, method, 1e-9, prefix, **options)
     ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-    ksp.setTolerances(rtol=1e-9, max_it=500)
-    ksp.pc.setType("python")
-    ksp.pc.setPythonType("pctt.pc.TensorTrain")
-    ksp.setFromOptions()
     return ksp
 
 
@@ -97,7 +90,7 @@ def test_options_for_all_levels_are_those_of_each():
 
 
 def test_new_options_are_those_of_the_next_set_up():
-    ksp = solver(poisson(8), pc_tt_rank="2")
+    ksp = solver(poisson(8), rank=2)
     assert left(ksp) < 1e-8
     PETSc.Options()["pc_tt_rank"] = "12"
     ksp.setFromOptions()
@@ -108,7 +101,8 @@ def test_new_options_are_those_of_the_next_set_up():
 
 def test_a_new_context_of_a_solver_in_use():
     """PETSc makes one whenever the type is in the database, and does not set it up."""
-    ksp = solver(poisson(8), pc_type="python", pc_python_type="pctt.pc.TensorTrain", **SMALL)
+    PETSc.Options().insertString("-pc_type python -pc_python_type pctt.pc.TensorTrain")
+    ksp = solver(poisson(8), **SMALL)
     assert left(ksp) < 1e-8
     ksp.setFromOptions()
     assert left(ksp) < 1e-8
@@ -126,7 +120,7 @@ def test_zeros_that_are_stored(block):
 
 def test_another_pattern_with_as_many_nonzeros():
     mat = stored(ring(40, 1))
-    ksp = solver(mat, pc_tt_reuse="steps", **SMALL)
+    ksp = solver(mat, reuse="steps", **SMALL)
     left(ksp)
     other = sp.csr_matrix(ring(40, 7))
     mat.setPreallocationCSR((other.indptr, other.indices, other.data))

@@ -5,11 +5,7 @@ from __future__ import annotations
 import contextlib
 
 import pytest
-from mpi4py import MPI
-from petsc4py import PETSc
-from systems import contact_matrix, contacts
 
-from pctt.ccp.newton.krylov import Krylov
 from pctt.ksp_options import entered, to_enter
 
 
@@ -23,25 +19,6 @@ def test_options_stand_within_the_block_only(database):
     with contextlib.suppress(KeyError), entered({"mine": "2"}):
         raise KeyError
     assert database.getAll() == before
-
-
-def test_a_krylov_method_leaves_the_database_as_it_was(database):
-    database["compare_x_ksp_max_it"] = "500"
-    before = database.getAll()
-    mat = contact_matrix(*contacts(40, 12))
-    x, b = mat.createVecs()
-    b.set(1.0)
-    train = {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain", "pc_tt_rank": "4"}
-    for prefix, defaults in (("", {}), ("compare_x_", {"pc_type": "ilu"}), ("compare_y_", train)):
-        krylov = Krylov(MPI.COMM_SELF, prefix, defaults)
-        assert database.getAll() == before
-        assert krylov.solve(mat, b, x).converged
-        assert database.getAll() == before
-        unrelated = PETSc.KSP().create(MPI.COMM_SELF)
-        unrelated.setFromOptions()
-        assert unrelated.getType() != "bcgs"
-        krylov.destroy()
-        assert database.getAll() == before
 
 
 def test_ilu_on_several_ranks_is_block_jacobi_with_ilu(database):

@@ -55,11 +55,11 @@ def steps(
     delta: float = 0.01,
     recovery_speed: float = np.inf,
     iterations: int | None = None,
-    coulomb: ccp.Coulomb | None = None,
+    law: str = ccp.RELAXATION,
 ) -> Iterator[Step]:
     """Make steps one by one; each must be solved to `tol`, by default that of SOLVERS, or is left after a
     number of `iterations`. Contacts are rigid."""
-    world.stiffness[:] = np.inf
+    world.pairs.stiffness[:] = np.inf
     limits = ccp.Limits(SOLVERS[solver] if tol is None else tol)
     if iterations is not None:
         limits = ccp.Limits(1e-300, iterations, fallback=False)
@@ -68,7 +68,7 @@ def steps(
         contacts = find_contacts(world, delta, dt)
         system = ContactSystem(world, contacts, dt, recovery_speed)
         problem = cone_problem(system, world.comm)
-        result = ccp.solve(problem, None, solver, limits, coulomb=coulomb)
+        result = ccp.solve(problem, None, solver, limits, law=law)
         problem.destroy()
         reached = f"{result.reason}, residual {result.residual:.1e}"
         assert result.converged or iterations, f"step {world.step + 1}: {reached}"

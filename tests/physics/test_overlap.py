@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drive import RADIUS, SOLVERS, G, steps
+from drive import RADIUS, SOLVERS, steps
 from mpi4py import MPI
 
 from dem.scene import Scene
-from dem.shapes import Plane
 from dem.start import new_world
 
 
@@ -32,18 +31,3 @@ def test_overlapping_spheres_part_at_the_recovery_speed_at_most(solver, depth, s
     assert gaps[0] == pytest.approx(-depth)
     needed = max(1, round(depth / dt / min(depth / dt, speed)))
     assert np.less(gaps[:needed], -1e-6).all()
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_sphere_sunk_into_the_floor_comes_up_at_the_recovery_speed_and_rests(solver):
-    depth, speed, dt = 0.03, 0.4, 0.01
-    scene = Scene(0.3)
-    scene.add_body("floor", [Plane((0, 0, 1))])
-    scene.add_spheres([0, 0, RADIUS - depth], RADIUS, 1000.0)
-    world = new_world(scene, MPI.COMM_SELF, overlap=0.5)
-    for _ in steps(world, 30, dt, solver, recovery_speed=speed):
-        rising = world.grains.velocity[0, 2]
-        assert rising <= speed + 1e-6
-        assert world.grains.position[0, 2] < RADIUS + speed**2 / (2 * G) + dt * speed
-    assert world.grains.position[0, 2] == pytest.approx(RADIUS, abs=1e-6)
-    np.testing.assert_allclose(world.grains.velocity[0], 0.0, atol=1e-6)

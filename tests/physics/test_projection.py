@@ -16,18 +16,6 @@ MASS = DENSITY * 4 / 3 * np.pi * R**3
 EXACT = {"tol": 1e-10, "closing_work": np.inf, "solver": "apgd", "projection": True}
 
 
-def test_a_column_rests_on_the_overlaps_that_its_weight_makes():
-    stiffness = 1e6
-    scene = Scene(friction=0.3, stiffness=stiffness)
-    scene.add_body("floor", [Plane((0, 0, 1))])
-    scene.add_spheres([[0, 0, 2 * R * (k + 0.5)] for k in range(5)], R, DENSITY)
-    with pctt.Simulation(scene, dt=0.01, **EXACT) as sim:
-        sim.run(steps=150)
-        overlap = 2 * R - np.diff(np.concatenate([[-R], sim.positions[:, 2]]))
-        np.testing.assert_allclose(overlap, MASS * G * np.arange(5, 0, -1) / stiffness, rtol=1e-4)
-        np.testing.assert_allclose(sim.body("floor").force, [0, 0, -5 * MASS * G], atol=1e-3 * MASS * G)
-
-
 @pytest.mark.parametrize("dt", [0.002, 0.02])
 def test_a_sphere_lands_without_overlap_and_without_bounce(dt):
     """In the step in which it arrives no force acts on it, yet it does not enter the floor."""

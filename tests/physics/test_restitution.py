@@ -41,7 +41,7 @@ def test_a_ball_bounces_to_e2_of_its_height_and_comes_to_rest(stiffness, dt, rel
     scene = Scene(friction=0.3, stiffness=stiffness)
     scene.add_body("floor", [Plane((0, 0, 1))], material="steel")
     scene.add_spheres([[0, 0, R + fall]], R, DENSITY, material="rubber")
-    scene.set_restitution(e, "steel", "rubber")
+    scene.set_pair("steel", "rubber", restitution=e)
     with pctt.Simulation(scene, dt=dt, solver="apgd", delta=0.01, **EXACT) as sim:
         time, height = [], []
 

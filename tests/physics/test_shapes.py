@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drive import SOLVERS, G, by_id, make_steps, steps
+from drive import SOLVERS, G, by_id, make_steps, on_incline, steps
 from mpi4py import MPI
 
 from dem import quaternion
@@ -14,14 +14,6 @@ from dem.shapes import Box, Plane
 from dem.start import new_world
 
 DT = 0.01
-LYING = tuple(quaternion.exponential(np.array([0.0, np.pi / 2, 0.0])))  #: the axis of a capsule along x
-
-
-def floor(friction, slope=0.0):
-    """A floor seen in its own axes: x down the slope."""
-    scene = Scene(friction, gravity=(G * np.sin(slope), 0.0, -G * np.cos(slope)))
-    scene.add_body("floor", [Plane((0, 0, 1))])
-    return scene
 
 
 def world_of(scene):
@@ -39,7 +31,7 @@ def test_three_boxes_on_top_of_each_other_stay_at_rest(twist):
     half, height = (0.2, 0.15, 0.05), 0.05 * np.array([1, 3, 5])
     start = np.stack([[0, 0.01, -0.02], [0, 0.02, 0.0], height], axis=1)
     turns = quaternion.exponential(twist * np.array([[0, 0, 0], [0, 0, 1.0], [0, 0, 2.0]]))
-    scene = floor(0.3)
+    scene = on_incline(0.0, 0.3)
     scene.add_boxes(start, half, 1000.0, quaternions=turns)
     world = world_of(scene)
     weight = world.grains.mass[0] * G * DT
@@ -61,10 +53,10 @@ def test_three_boxes_on_top_of_each_other_stay_at_rest(twist):
 def test_a_box_on_a_box_holds_below_the_friction_angle_and_slides_above(solver, share):
     friction = 0.3
     slope = np.arctan(share * friction)
-    scene = floor(1.0, slope)
+    scene = on_incline(slope, 1.0)
     scene.add_boxes([[0, 0, 0.05]], (0.5, 0.3, 0.05), 2000.0, material="base")
     scene.add_boxes([[-0.2, 0, 0.15]], (0.1, 0.1, 0.05), 1000.0, material="top")
-    scene.set_friction(friction, "base", "top")
+    scene.set_pair("base", "top", friction=friction)
     world = world_of(scene)
     count = 25
     step = make_steps(world, count, DT, solver)
@@ -84,7 +76,7 @@ def test_a_box_on_a_box_holds_below_the_friction_angle_and_slides_above(solver, 
 def test_a_capsule_rolls_down_an_incline_at_the_acceleration_of_its_inertia(solver):
     """a = g sin / (1 + I / (m r^2)) across the axis; the step is implicit in the velocity and exact in it."""
     slope, count, radius = 0.1, 40, 0.1
-    scene = floor(0.5, slope)
+    scene = on_incline(slope, 0.5)
     turn = quaternion.exponential(np.array([np.pi / 2, 0.0, 0.0]))
     scene.add_capsules([[0, 0, radius]], radius, 0.3, 1000.0, quaternions=turn)
     world = world_of(scene)

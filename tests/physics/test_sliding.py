@@ -57,17 +57,3 @@ def test_a_sliding_block_comes_to_rest_after_its_braking_distance(solver, flush)
         errors.append(distance - world.grains.position[0, 0])
         assert errors[-1] == pytest.approx(dt * start / 2, rel=0.02)
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.02)
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_friction_is_isotropic(solver):
-    """Sliding under any angle of the contact frame: the same path."""
-    start, dt = 1.0, 0.01
-    reached = []
-    for angle in (0.0, 0.4, 1.3, 2.9):
-        way = np.array([np.cos(angle), np.sin(angle), 0.0])
-        world = block(on_incline(0.0, MU), velocity=tuple(start * way))
-        make_steps(world, 20, dt, solver)
-        np.testing.assert_allclose(np.cross(world.grains.position[0] * [1, 1, 0], way), 0.0, atol=1e-7)
-        reached.append(world.grains.position[0] @ way)
-    np.testing.assert_allclose(reached, reached[0], atol=1e-7)

@@ -15,7 +15,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 #: A mixer with 27 spheres and room enough that the paddle jams none of them.
 SMALL = ("-scene_n", "1", "-scene_margin", "0.7")  # narrower boxes jam, and pdip leaves such steps to APGD
-SETTLED = (*SMALL, "-restart", "settled")
+EVERY = ("-output_every", "1", "-checkpoint_every", "1")
+SETTLED = (*SMALL, *EVERY, "-restart", "settled")
 
 
 #: A scene file: spheres fall one upon the other.

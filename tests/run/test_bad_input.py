@@ -34,7 +34,7 @@ BAD_OPTIONS = {
     "-scene_perturbation 0.03": ["0.03", "0.025"],  # the spheres could overlap
     "-ccp_type pdpi": ["pdpi", "did you mean pdip?"],
     "-ccp_tol 1e4": ["1e4", "between 0 and 1"],  # a typing error for 1e-4: any impulses would be a solution
-    "-ccp_pdip_centering 2": ["2", "between 0 and 1"],
+    "-ccp_pdip_centering 2 -ccp_type pdip": ["2", "between 0 and 1"],
     "-compare nosuch": ["nosuch", "ilu", "pbjacobi"],
     "-compare ten:tt,tent:tt,tt,x:ilu,x_pc:ilu": ["-compare_x_pc_... would be an option of x too"],
     "-compare_ten_pc_tt_rank 3 -compare auto:tt": ["not compared", "-compare lists auto:tt"],
@@ -48,6 +48,7 @@ BAD_OPTIONS = {
     "-restart missing.h5": ["missing.h5", "no such file"],
     "-restart .": ["no such file"],
     "-problem missing.hdf5": ["missing.hdf5", "no such file"],
+    "-output": ["the name of a folder"],
     "-dump_problem results/notes.txt": ["results/notes.txt", "folder that can be written"],
     # options that mean nothing beside others
     "-scene blade -problem p.h5": ["blade", "-problem p.h5 makes no steps"],
@@ -58,10 +59,12 @@ BAD_OPTIONS = {
     "-compare_ilu_pc_factor_levels 1": ["-compare lists none"],
     "-compare_icc_pc_factor_levels 1 -compare ilu,none": ["-compare lists ilu,none"],
     "-ccp_apgd_x 1": ["did you mean"],
-    "-ccp_gauss_seidel_relaxation 1.2": ["another -ccp_type than pdip"],
+    "-ccp_gauss_seidel_relaxation 1.2": ["another -ccp_type than auto"],
     "-ccp_newton body -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],
     "-ksp_rtol 1e-3 -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],
-    "-ccp_coulomb_max_it 3": ["-ccp_coulomb"],
+    "-law columb": ["columb", "did you mean coulomb?"],
+    "-law coulomb -settle": ["-settle makes its state with APGD"],
+    "-scene_torque 0": ["0", "must be positive"],
     # misspelt options of PETSc
     "-pc_typ ilu": ["did you mean -pc_type?"],
     "-ksp_tpye cg -ccp_type conic": ["did you mean -ksp_type?"],
@@ -158,7 +161,8 @@ def test_a_file_of_options_that_petsc_refuses_is_named(text, program, results, t
         ("dt = float('nan')", ["its dt is nan", "positive"]),
         ("dt = '0.01'", ["its dt is '0.01'", "positive"]),
         ("dt: float = 0.0", ["its dt is 0.0", "positive"]),
-        ("delta = None", ["its delta is None", ">= 0"]),
+        ("delta = 'wide'", ["its delta is 'wide'", ">= 0"]),
+        ("settling_time = None", ["its settling_time is None", ">= 0"]),
         ("settle_delta = -1", ["its settle_delta is -1", ">= 0"]),
         ("settling_time = -1.0", ["its settling_time is -1.0", ">= 0"]),
         ("domain = (0, 1, 2)", ["its domain is (0, 1, 2)", "upper corner"]),
@@ -304,7 +308,7 @@ def test_an_output_folder_under_a_regular_file_is_refused(program, results, tmp_
 
 
 @pytest.mark.parallel(1, 2)
-@pytest.mark.filterwarnings("ignore:overflow encountered")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_scene_that_flies_apart_ends_with_one_line(program):
     done = program(*SMALL, "-scene_gravity", 1e308, "-dt", 1e3, "-steps", 3, status=1)
     said = [line for line in done.stderr.splitlines() if line.startswith("pctt.run: ")]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import compare_chrono
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import ROOT
 
 from dem.contact import find_contacts
 from dem.motion import Glide
@@ -15,25 +15,17 @@ from dem.start import new_world
 
 
 @pytest.fixture
-def study(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "run" / "studies"))
-    import compare_chrono
-
-    return compare_chrono
-
-
-@pytest.fixture
-def state(study):
+def state():
     """Two spheres on a floor that touch each other; a box pushes one of them."""
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 0.1], [0.2, 0, 0.1]], 0.1, 1000.0, velocity=[[0.5, 0, 0], [0, 0.2, 0]])
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_body("pusher", [Box((0.1, 0.1, 0.1))], Glide((1, 0, 0)), position=(-0.2, 0, 0.1))
-    return study.State("pushed", new_world(scene, MPI.COMM_SELF, np.inf), 0.01, 0.001)
+    return compare_chrono.State("pushed", new_world(scene, MPI.COMM_SELF, np.inf), 0.01, 0.001)
 
 
-def test_the_scene_has_the_bodies_in_the_order_of_their_indices(study, state):
-    numbers = np.array(study.scene_text(state).split(), dtype=float)
+def test_the_scene_has_the_bodies_in_the_order_of_their_indices(state):
+    numbers = np.array(compare_chrono.scene_text(state).split(), dtype=float)
     assert numbers[:8].tolist() == [0, 0, -9.81, 0.01, 0.001, 0.3, 2, 2]
     spheres, boxes = numbers[8:32].reshape(2, 12), numbers[32:].reshape(2, 16)
     np.testing.assert_array_equal(spheres[:, :3], state.world.grains.position)
@@ -44,15 +36,15 @@ def test_the_scene_has_the_bodies_in_the_order_of_their_indices(study, state):
     np.testing.assert_allclose(pusher, [-0.2, 0, 0.1, 1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0.1, 0.1, 0.1], atol=1e-12)
 
 
-def test_impulses_come_back_whatever_the_order_of_contacts_and_bodies(study, state):
-    step = study.assembled(state, find_contacts(state.world, state.delta))
+def test_impulses_come_back_whatever_the_order_of_contacts_and_bodies(state):
+    step = compare_chrono.assembled(state, find_contacts(state.world, state.delta))
     rng = np.random.default_rng(0)
     count = len(step.body)
     assert count == 4
     impulse, order, turned = rng.normal(size=(count, 3)), rng.permutation(count), np.array([1, 0, 1, 0], dtype=bool)
-    theirs = np.zeros(count, dtype=study.CONTACT)
+    theirs = np.zeros(count, dtype=compare_chrono.CONTACT)
     theirs["body"] = np.where(turned[:, None], step.body[:, ::-1], step.body)
     theirs["impulse"] = np.einsum("ci,cij->cj", impulse, step.frame) * np.where(turned, -1.0, 1.0)[:, None]
-    np.testing.assert_allclose(study.mapped(step.body, step.frame, theirs[order]), impulse)
-    with pytest.raises(study.DriverError, match="4 here and 3 in Chrono; 1 are only here, 0 only there"):
-        study.mapped(step.body, step.frame, theirs[1:])
+    np.testing.assert_allclose(compare_chrono.mapped(step.body, step.frame, theirs[order]), impulse)
+    with pytest.raises(compare_chrono.DriverError, match="4 here and 3 in Chrono; 1 are only here, 0 only there"):
+        compare_chrono.mapped(step.body, step.frame, theirs[1:])

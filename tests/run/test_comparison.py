@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
 
 import pytest
 from program import SETTLED, steps_of
 
-FIELDS = {
-    "type": str,
-    "what": str,
-    "systems": int,
-    "converged": int,
-    "ksp_its_mean": float,
-    "ksp_its_max": int,
-    "setup_s": float,
-    "solve_s": float,
-    "true_residual_max": float,
-    "excess_max": float,
-    "entries_s": float,
-}
 # accurate Newton steps, so that every cone problem is solved by PDIP alone
 ACCURATE = ("-ksp_rtol", "1e-6", "-ksp_max_it", "2000", "-ccp_tol", "1e-4")
+
+PDIP = ("-ccp_type", "pdip")
+TRAIN = ("-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")
 
 
 def compared(program, folder, *options):
@@ -35,33 +24,23 @@ def compared(program, folder, *options):
 
 
 def test_all_see_the_same_systems_and_the_table_agrees_with_the_summary(program, settled, tmp_path):
+    """The records themselves are asked in ccp/test_compare.py."""
     summary, table = compared(program, tmp_path, "-compare", "none,ilu,pbjacobi")
     count = summary["compare"]["pbjacobi"]["systems"]
     assert count >= summary["newton_its"] > 20  # one system or more in a step
     solves = [line["compare"] for line in steps_of(tmp_path / "results")]
     assert list(summary["compare"]) == list(table) == ["none", "ilu", "pbjacobi"]
     for name, record in summary["compare"].items():
-        for field, kind in FIELDS.items():
-            assert type(record[field]) is kind, f"{field}: {record[field]!r}"
-        assert set(record) == set(FIELDS)
         assert record["systems"] == sum(len(step[name]) for step in solves) == count
         assert sum(converged for step in solves for converged, *_ in step[name]) == record["converged"]
-        assert 0 <= record["converged"] <= record["systems"]
-        assert 0 < record["ksp_its_mean"] <= record["ksp_its_max"] <= 2000
-        assert math.isfinite(record["true_residual_max"])
-        assert record["setup_s"] >= 0
-        assert record["solve_s"] > 0
         systems, converged, mean, most, _, _, worst, what = table[name]
         assert (record["type"], what) == (name, record["what"])
         assert (int(systems), int(converged), int(most)) == (count, record["converged"], record["ksp_its_max"])
         assert float(mean) == pytest.approx(record["ksp_its_mean"], abs=0.06)
         assert float(worst) == pytest.approx(record["excess_max"], rel=0.06)
-        if record["converged"] == record["systems"]:
-            assert record["true_residual_max"] <= 2e-6
     assert summary["phases"]["compare"] > 0
     for line in steps_of(tmp_path / "results"):
         assert sum(line["phases"].values()) == pytest.approx(line["seconds"])
-    assert summary["compare"]["pbjacobi"]["ksp_its_mean"] < summary["compare"]["none"]["ksp_its_mean"]
     assert summary["compare"]["pbjacobi"]["converged"] == count
 
 
@@ -75,6 +54,7 @@ def test_without_options_the_program_is_the_demo(program, tmp_path):
     assert kinds == {"auto": "tt", "ten": "tt", "pbjacobi": "pbjacobi", "ilu": "ilu", "none": "none"}
     assert summary["natural_residual"] <= 1e-4
     assert "NOT CONVERGED" not in done.stdout
+    assert not any(line.startswith("WARNING") for line in done.stdout.splitlines()[-8:])
     assert "\nNewton systems: BiCGStab (right), pctt.pc.TensorTrain\n" in done.stdout
     assert "\nNewton systems: pctt.pc.TensorTrain was rank " in done.stdout
     assert "options without effect" not in done.stdout
@@ -88,21 +68,17 @@ def test_fallbacks_of_a_train_reach_the_summary(program, settled, tmp_path):
     assert report[0].startswith("tensor train")
     assert f"set-ups {summary['newton_its']} " in report[1]
     assert all("pc_report" not in line for line in steps_of(tmp_path / "results"))
-    train = ("-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")
-    program(*SETTLED, "-steps", 1, *train, "-output", "train")
+    program(*SETTLED, *PDIP, "-steps", 1, *TRAIN, "-output", "train")
     (step,) = steps_of(tmp_path / "train")
     assert step["pc_report"][0].startswith("tensor train")
-
-
-TRAIN = ("-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")
 
 @pytest.mark.parametrize(
     ("options", "start", "end"),
     [
-        ((), "BiCGStab (right), pbjacobi", None),
-        (("-ksp_type", "cg", "-pc_type", "ilu"), "CG, ilu", None),
+        ((*PDIP,), "BiCGStab (right), pbjacobi", None),
+        ((*PDIP, "-ksp_type", "cg", "-pc_type", "ilu"), "CG, ilu", None),
         (("-ccp_type", "conic"), "CG, pbjacobi until it takes long, then cholesky", None),
-        (TRAIN, "BiCGStab (right), pctt.pc.TensorTrain", "pctt.pc.TensorTrain was rank 1: block Jacobi"),
+        ((*PDIP, *TRAIN), "BiCGStab (right), pctt.pc.TensorTrain", "pctt.pc.TensorTrain was rank 1: block Jacobi"),
         (("-ccp_type", "apgd"), None, None),
     ],
 )

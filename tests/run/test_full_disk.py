@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import shutil
@@ -10,7 +11,7 @@ import subprocess
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import SMALL, arrays, command, environment, recorded_steps, steps_of
+from program import EVERY, SMALL, arrays, command, environment, recorded_steps, steps_of
 
 from pctt import disk
 from pctt.disk import FileError, append
@@ -18,7 +19,8 @@ from pctt.run.options import read_options
 from pctt.run.simulate import simulate
 
 LOOSE = ("-ccp_type", "apgd", "-ccp_tol", "1e-3")
-SCENE = {"scene_n": "1", "scene_margin": "0.5", "output": "out", "ccp_type": "apgd", "ccp_tol": "1e-3", "quiet": "true"}
+SCENE = {"scene_n": "1", "scene_margin": "0.5", "dt": "0.025", "output": "out", "quiet": "true"}
+SCENE |= {"ccp_type": "apgd", "ccp_tol": "1e-3", "output_every": "1", "checkpoint_every": "1"}
 
 
 def check_whole(folder):
@@ -118,7 +120,7 @@ def test_the_room_of_a_file_is_taken_until_it_is_written(tmp_path, monkeypatch):
     fill = disk._fill
 
     def look(file, *contents):
-        taken.append(512 * os.stat(file.filename).st_blocks)
+        taken.append(512 * os.stat(disk.temporary_name(path)).st_blocks)
         fill(file, *contents)
 
     monkeypatch.setattr(disk, "_fill", look)
@@ -126,6 +128,20 @@ def test_the_room_of_a_file_is_taken_until_it_is_written(tmp_path, monkeypatch):
     assert taken[0] >= data.nbytes
     np.testing.assert_array_equal(arrays(path)["data"], data)
     assert path.stat().st_size < 1.01 * data.nbytes  # what was taken beyond need is given back
+
+
+@pytest.mark.parametrize("number", [errno.EBADF, errno.EOPNOTSUPP, errno.ENOSYS, errno.EPERM])
+def test_where_no_room_can_be_taken_files_are_written_and_a_full_disk_is_told(number, tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    data, path = np.arange(20_000.0), tmp_path / "rows.h5"
+    disk.write_rows(path, MPI.COMM_SELF, {"data": data}, {}, {})
+    for size in (500, 20_000, 100_000):
+        with Limit(size), pytest.raises(FileError, match=r"cannot write \(File too large\)"):
+            disk.write_rows(path, MPI.COMM_SELF, {"data": data, "more": data}, {}, {})
+    np.testing.assert_array_equal(arrays(path)["data"], data)
 
 
 @pytest.fixture
@@ -152,17 +168,18 @@ def small_disk(cache, tmp_path):
 
 @pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
 def test_a_disk_that_fills_up_ends_the_run(ranks, small_disk, program, tmp_path):
-    done = small_disk("size=200k", *SMALL, *LOOSE, "-steps", 40, "-output", "disk/out", ranks=ranks)
+    done = small_disk("size=200k", *SMALL, *EVERY, *LOOSE, "-steps", 40, "-output", "disk/out", ranks=ranks)
     check_one_line(done, "disk/out/", "cannot write (No space left on device)")
     step = check_whole(tmp_path / "left" / "out")
     assert 2 <= step < 40
-    program(*SMALL, *LOOSE, "-restart", "left/out/checkpoint.h5", "-steps", 1, "-output", "left/out", ranks=ranks)
+    again = ("-restart", "left/out/checkpoint.h5", "-steps", 1, "-output", "left/out")
+    program(*SMALL, *EVERY, *LOOSE, *again, ranks=ranks)
     assert check_whole(tmp_path / "left" / "out") == step + 1
 
 
 @pytest.mark.parametrize("option", ["-output", "-dump_problem"])
 def test_a_folder_on_a_disk_that_cannot_be_written_is_refused_before_any_work(option, small_disk, tmp_path):
-    done = small_disk("ro", *SMALL, *LOOSE, "-steps", 1, option, "disk/out")
+    done = small_disk("ro", *SMALL, *EVERY, *LOOSE, "-steps", 1, option, "disk/out")
     check_one_line(done, f"{option} disk/out", "Read-only file system", "allowed is a folder that can be written")
     assert done.stdout == ""
     assert not list((tmp_path / "left").iterdir())

@@ -7,19 +7,20 @@ import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from program import ROOT, SMALL
+from program import ROOT, SMALL, command, environment
 
 import pctt
 from dem.scenes import Mixer
 from pctt import ccp
 from pctt.pc import TensorTrain
-from pctt.run.settings import Asked, Run
+from pctt.run.settings import Run, Settings
 
-GROUPS = [(Run, ""), (Mixer, "scene_"), (Asked, "ccp_"), (ccp.Coulomb, "ccp_coulomb_")]
+GROUPS = [(Run, ""), (Mixer, "scene_"), (Settings, "ccp_")]
 GROUPS += [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
 GROUPS += [(TensorTrain.options_class, TensorTrain.options_prefix)]
 
@@ -90,3 +91,12 @@ def test_lengths_times_and_speeds_have_units():
     expected = {"dt": "s", "delta": "m", "recovery_speed": "m/s", "scene_radius": "m", "scene_density": "kg/m^3"}
     expected |= {"scene_angular_velocity": "rad/s", "scene_gravity": "m/s^2"}
     assert expected.items() <= units.items()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize("word", ["-version", "-help"])
+def test_an_answer_without_room_is_one_line(word, cache):
+    with open("/dev/full", "w") as full:
+        more = {"stdout": full, "stderr": subprocess.PIPE, "text": True, "timeout": 60}
+        done = subprocess.run(command(word), env=environment(cache), check=False, **more)
+    assert (done.returncode, done.stderr) == (2, "pctt.run: the answer cannot be written (No space left on device)\n")

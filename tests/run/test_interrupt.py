@@ -11,10 +11,13 @@ import time
 from pathlib import Path
 
 import pytest
-from program import SMALL, assert_same_bits, command, environment
+from mpi4py import MPI
+from program import EVERY, SMALL, assert_same_bits, command, environment
 from test_killed import python_of
 
-OPTIONS = (*SMALL, "-ccp_type", "apgd", "-ccp_tol", 1e-3)
+from pctt.run import interrupt
+
+OPTIONS = (*SMALL, *EVERY, "-ccp_type", "apgd", "-ccp_tol", 1e-3)
 RANKS = [1, pytest.param(2, marks=pytest.mark.mpi)]
 
 
@@ -90,6 +93,26 @@ def test_the_same_signal_again_ends_a_run_at_once(program, tmp_path, cache):
     assert status == -signal.SIGINT
     assert "will end after this step" in said
     assert "interrupted" not in said
+
+
+def test_a_terminal_that_goes_away_and_the_limit_of_processor_time_end_a_run_as_others_do(monkeypatch):
+    before = {number: signal.getsignal(number) for number in interrupt.SIGNALS}
+    monkeypatch.setattr(interrupt, "_noted", [])
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # these tests may run under nohup
+        interrupt.heed(MPI.COMM_SELF)
+        for number in (signal.SIGHUP, signal.SIGXCPU):
+            os.kill(os.getpid(), number)
+            assert signal.getsignal(number) is signal.SIG_DFL  # once more, and it ends at once
+        assert interrupt._noted == [signal.SIGHUP, signal.SIGXCPU]
+        assert interrupt.asked(MPI.COMM_SELF)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+        interrupt.heed(MPI.COMM_SELF)
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert interrupt._noted == [signal.SIGHUP, signal.SIGXCPU]
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @pytest.mark.parametrize("ranks", RANKS)

@@ -11,7 +11,18 @@ import time
 from pathlib import Path
 
 import pytest
-from program import SETTLED, SMALL, arrays, assert_same_bits, command, environment, recorded_steps, steps_of, table
+from program import (
+    EVERY,
+    SETTLED,
+    SMALL,
+    arrays,
+    assert_same_bits,
+    command,
+    environment,
+    recorded_steps,
+    steps_of,
+    table,
+)
 
 from pctt.folder import Folder
 
@@ -90,7 +101,7 @@ def check_files(folder):
 
 @pytest.mark.parametrize(("ranks", "kills"), [(1, 2), pytest.param(2, 3, marks=[pytest.mark.mpi, pytest.mark.slow])])
 def test_a_killed_run_goes_on_as_if_nothing_had_happened(ranks, kills, program, settled, cache, tmp_path):
-    options = (*SMALL, *OPTIONS)
+    options = (*SMALL, *EVERY, *OPTIONS)
     program(*SETTLED, *OPTIONS, "-steps", STEPS, "-output", "whole", ranks=ranks)
     start = int(arrays(settled)["world/step"])
     folder = tmp_path / "killed"

@@ -110,6 +110,14 @@ CASES = [
             "of the record of the scene One, rank 2 at the end of the record of the scene One",
         ),
     ),
+    (
+        scene().replace("Scene(0.3)", "Scene(0.3 + 0.1 * (MPI.COMM_WORLD.rank == 2))"),
+        (
+            "SceneError",
+            f"{BUILD}: rank 2 has built other bodies or materials than rank 0; allowed is the same scene on all ranks "
+            "(random numbers need a seed, and no rank a part of its own)",
+        ),
+    ),
     (UNEQUAL_NAMES, ("SceneError", f"{RECORD}: it must return the same names on all ranks, in the same order")),
 ]
 

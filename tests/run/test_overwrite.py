@@ -30,7 +30,8 @@ def run(tmp_path, monkeypatch):
 
     def run(text=DROP, **options):
         (tmp_path / "drop.py").write_text(text)
-        words = {"scene": "drop.py", "ccp_type": "apgd", "output": "out", "quiet": "true", **options}
+        words = {"scene": "drop.py", "ccp_type": "apgd", "output": "out", "output_every": "1", "quiet": "true"}
+        words |= options
         given = {name: value for name, value in words.items() if value is not None}
         simulate(read_options(given, SELF), SELF)
 
@@ -137,7 +138,7 @@ def test_a_run_that_goes_on_makes_anew_what_lies_behind_its_checkpoint(run, tmp_
 @pytest.mark.mpi
 def test_two_ranks_replace_a_run(run, program, tmp_path):
     run(steps="3")
-    words = ("-scene", "drop.py", "-ccp_type", "apgd", "-steps", 2, "-output", "out")
+    words = ("-scene", "drop.py", "-ccp_type", "apgd", "-steps", 2, "-output_every", 1, "-output", "out")
     done = program(*words, ranks=2, status=2)
     assert done.stderr.count("pctt.run: -output out: holds a run") == 1
     program(*words, "-overwrite", ranks=2)
@@ -165,3 +166,19 @@ def test_a_run_does_not_replace_one_that_came_while_it_began(run, tmp_path):
     with pytest.raises(FileError, match="-output out: holds a run"):
         simulate(late, SELF)
     assert contents(tmp_path / "out") == before
+
+
+def test_a_run_goes_on_beside_a_damaged_list_of_steps_with_a_remark(run, tmp_path):
+    run(steps="3")
+    path, on = tmp_path / "out" / "steps.jsonl", {"restart": "out/checkpoint.h5", "steps": "1"}
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text(lines[0] + lines[2])
+    with pytest.warns(UserWarning, match="has no figures of some of the steps up to 3"):
+        run(**on)
+    assert [line["step"] for line in steps_of(tmp_path / "out")] == [1, 3, 4]
+    path.unlink()
+    with pytest.warns(UserWarning, match="has no figures of some of the steps up to 4"):
+        run(**on)
+    path.write_text(path.read_text() + "garbage\n")
+    with pytest.raises(FileError, match="line 2 is no step .*; delete it, and the run goes on with the others"):
+        run(**on)

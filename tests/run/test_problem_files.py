@@ -9,10 +9,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from program import ROOT, SETTLED, SMALL, steps_of
+from program import SETTLED, SMALL, steps_of
+
+from pctt.run.dump import Dump
 
 TOL = ("-ccp_tol", 1e-8)
-HARD = (*SETTLED, "-ccp_max_it", 2)  # no step is solved in two Newton steps
+PDIP = (*SETTLED, "-ccp_type", "pdip")
+HARD = (*PDIP, "-ccp_max_it", 2)  # no step is solved in two Newton steps
 
 
 def summary(folder: Path) -> dict:
@@ -35,7 +38,7 @@ def first_step(settled: Path) -> int:
 
 @pytest.mark.parallel(1, 2)
 def test_the_problem_of_a_step_is_written_and_solved_again(program, settled, tmp_path):
-    program(*SETTLED, *TOL, "-steps", 3, "-dump_problem", "problems")
+    program(*PDIP, *TOL, "-dt", 0.025, "-steps", 3, "-dump_problem", "problems")
     steps = steps_of(tmp_path / "results")
     third = steps[2]
     names = {f"problems/step{line['step']:06d}_{line['contacts']}contacts" for line in steps}
@@ -98,6 +101,18 @@ def test_hard_problems_are_kept_and_the_steps_say_so(program, settled, tmp_path)
     solved = summary(tmp_path / "solved")
     assert solved["converged"]
     assert solved["contacts"] == steps[1]["contacts"]
+    few = program("-problem", kept[1], "-ccp_type", "pdip", "-ccp_max_it", 2, "-ccp_fallback", 0, "-output", "few")
+    assert "NOT CONVERGED" in few.stdout
+    assert (summary(tmp_path / "few")["converged"], summary(tmp_path / "few")["newton_its"]) == (False, 2)
+
+
+def test_a_hard_problem_of_very_many_contacts_is_not_written_unasked(program, settled, tmp_path, monkeypatch):
+    monkeypatch.setattr(Dump, "most", 10)
+    with pytest.warns(UserWarning, match="more than are written unasked; allowed are 10, or -dump_problem"):
+        program(*HARD, "-steps", 2, "-dump_problem", "all")
+    assert [line["hard_problem"] for line in steps_of(tmp_path / "results")] == ["", ""]
+    assert not (tmp_path / "results" / "hard").exists()
+    assert len(list((tmp_path / "all").iterdir())) == 2
 
 
 def test_hard_problems_of_another_run_are_replaced_and_of_this_one_kept(program, settled, tmp_path):
@@ -107,39 +122,8 @@ def test_hard_problems_of_another_run_are_replaced_and_of_this_one_kept(program,
     first = first_step(settled)
     program(*HARD, "-steps", 2)
     assert hard() == [first, first + 1]
-    again = [*SMALL, "-ccp_max_it", 2, "-restart", "results/checkpoint.h5", "-steps", 1]
+    again = [*SMALL, "-ccp_type", "pdip", "-ccp_max_it", 2, "-restart", "results/checkpoint.h5", "-steps", 1]
     program(*again)
     assert hard() == [first, first + 1, first + 2]
     program(*HARD, "-steps", 1, "-overwrite")
     assert hard() == [first]
-
-
-@pytest.mark.parallel(1, 2)
-@pytest.mark.parametrize("solver", ["pdip", "apgd"])
-def test_the_optimum_of_a_published_problem_is_found(solver, ranks, program, tmp_path):
-    """On which two unrelated algorithms agree (docs/ccp.md; tests/ccp/test_fclib.py has more of them)."""
-    path = ROOT.parent / "shared" / "fclib" / "Spheres-i099-356-679.hdf5"
-    if not path.exists():
-        pytest.skip(f"no {path}")
-    program("-problem", path, "-ccp_type", solver, "-ccp_tol", 1e-7)
-    found = summary(tmp_path / "results")
-    assert (found["converged"], found["contacts"], found["ranks"]) == (True, 356, ranks)
-    assert found["objective"] == pytest.approx(-2.084946581043e2, rel=1e-6)
-    assert found["velocity_norm"] == pytest.approx(1.0829370, rel=3e-5)
-    assert found["newton_systems"] == ("BiCGStab (right), pbjacobi" if solver == "pdip" else "")
-    assert sorted(p.name for p in (tmp_path / "results").iterdir()) == ["summary.json"]
-    if solver == "pdip":
-        done = program("-problem", path, "-ccp_max_it", 3, "-ccp_fallback", 0, "-output", "few")
-        assert "NOT CONVERGED" in done.stdout
-        assert (summary(tmp_path / "few")["converged"], summary(tmp_path / "few")["newton_its"]) == (False, 3)
-
-
-@pytest.mark.parallel(1, 2)
-def test_a_file_of_another_format_is_refused_with_the_name_of_the_converter(program, tmp_path):
-    (tmp_path / "two.dat").write_text("3 1 0 3 3 3 3  1 0 0  0 1 0  0 0 1  -1 2 0  0.3")
-    done = program("-problem", "two.dat", status=2)
-    assert done.stderr == (
-        "pctt.run: two.dat: no FCLIB problem: it is not HDF5; run/study convert_problems makes FCLIB files of Siconos' "
-        "text and of PETSc's binary files\n"
-    )
-    assert not list((tmp_path / "results").glob("*"))

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import sys
+from contextlib import suppress
+
 import pytest
+from mpi4py import MPI
 
 from pctt.run import report
 
@@ -30,9 +34,22 @@ def test_forces_that_may_be_far_off_are_a_warning():
     works = enumerate((1e-3, 2e-2, 4e-3))
     steps = [{"step": 3 + k, "closing_work": work, "opening_work": 0.5 * work} for k, work in works]
     assert report.forces_line(steps, 0.05) == "closing work 4.0e-03 (median), 2.0e-02 at most, in step 4"
-    far_off = [*steps, {"step": 9, "closing_work": 0.2, "opening_work": 0.1}]
-    opening = [*steps, {"step": 9, "closing_work": 0.0, "opening_work": 0.3}]
-    assert report.forces_line(opening, 0.05).startswith("WARNING: opening work 6.0e-03 (median), 3.0e-01 at most")
+    far_off = [*steps, {"step": 9, "closing_work": 0.5, "opening_work": 0.1}]
+    opening = [*steps, {"step": 9, "closing_work": 0.0, "opening_work": 0.4}]
+    assert report.forces_line(opening, 0.05).startswith("WARNING: opening work 6.0e-03 (median), 4.0e-01 at most")
     assert report.forces_line(far_off, float("inf")).startswith("WARNING: closing work")
-    assert "try -ccp_closing_work 0.05" in report.forces_line(far_off, float("inf"))
+    assert "try -ccp_closing_work 0.3" in report.forces_line(far_off, float("inf"))
     assert "try a smaller -ccp_tol" in report.forces_line(far_off, 0.05)
+
+
+def test_a_terminal_without_room_leaves_the_run_silent(monkeypatch, capsys):
+    progress = report.Progress(MPI.COMM_SELF)
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        progress.say("one")
+        progress.say("two")
+        with suppress(OSError):  # what could not be written is tried again
+            full.close()
+    assert capsys.readouterr().err.count("says no more, as it cannot write there") == 1
+    monkeypatch.setattr(sys, "stdout", None)  # closed by the shell
+    report.Progress(MPI.COMM_SELF).say("three")

@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import threading
 import time
+from dataclasses import dataclass
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import DROP, SETTLED, SMALL, arrays, assert_same_bits, database, recorded_steps, steps_of
+from program import DROP, EVERY, SETTLED, SMALL, arrays, assert_same_bits, database, recorded_steps, steps_of
 
 from dem.experiment import Experiment
+from dem.scene import Scene
 from dem.scenes import Mixer
+from dem.shapes import Plane
 from pctt.disk import FileError, Lock
 from pctt.folder import Folder
 from pctt.options import OptionError
 from pctt.run.options import read_options
 from pctt.run.settings import Settings
 from pctt.run.simulate import simulate
-from pctt.run.state import origin, settled_path
+from pctt.run.state import origin, settled_path, unfinished
 from pctt.simulation import Simulation
 
 
@@ -32,7 +37,7 @@ def test_on_as_many_ranks_the_way_is_the_same_bit_for_bit(solver, program, settl
     options = ("-ccp_type", solver)
     program(*SETTLED, *options, "-steps", 6, "-output", "whole")
     program(*SETTLED, *options, "-steps", 3, "-output", "parts")
-    again = (*SMALL, *options, "-restart", "parts/checkpoint.h5", "-output", "parts")
+    again = (*SMALL, *EVERY, *options, "-restart", "parts/checkpoint.h5", "-output", "parts")
     program(*again, "-steps", 3)
     for name in ("state.h5", "checkpoint.h5"):
         assert_same_bits(tmp_path / "whole" / name, tmp_path / "parts" / name)
@@ -51,7 +56,7 @@ def test_on_another_number_of_ranks_the_way_is_the_same_but_for_rounding(settled
     monkeypatch.chdir(tmp_path)
     comm = MPI.COMM_WORLD
     one, two = (comm.Split(0 if comm.rank < count else MPI.UNDEFINED) for count in (1, 2))
-    options = (*SMALL, "-ccp_type", "apgd", "-ccp_max_it", "20", "-ccp_fallback", "0", "-quiet")
+    options = (*SMALL, *EVERY, "-ccp_type", "apgd", "-ccp_max_it", "20", "-ccp_fallback", "0", "-quiet")
 
     def run(ranks, *more):
         if ranks != MPI.COMM_NULL:
@@ -176,8 +181,9 @@ def test_another_surface_of_a_tool_is_warned_of(drop, tmp_path):
 
 @pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("name", ["checkpoint.h5", "frames/000002.h5"])
-def test_a_flipped_bit_is_an_error_on_all_ranks(name, tmp_path, monkeypatch):
-    """Fifty of them, anywhere before the seal."""
+@pytest.mark.parametrize("flips", [50, pytest.param(2000, marks=pytest.mark.slow)])
+def test_a_flipped_bit_is_an_error_on_all_ranks(name, flips, tmp_path, monkeypatch):
+    """Anywhere before the seal."""
     monkeypatch.chdir(tmp_path)
     comm = MPI.COMM_WORLD
     with Simulation(Mixer(n=1, margin=0.7), solver="apgd") as sim:
@@ -197,7 +203,7 @@ def test_a_flipped_bit_is_an_error_on_all_ranks(name, tmp_path, monkeypatch):
         else:
             np.testing.assert_array_equal(Folder("out").frame(2).position[:27], position)
 
-    for _ in range(50):
+    for _ in range(flips):
         place, bit = int(rng.integers(len(whole) - 16)), int(rng.integers(8))
         if comm.rank == 0:
             path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
@@ -214,7 +220,7 @@ def test_a_flipped_bit_is_an_error_on_all_ranks(name, tmp_path, monkeypatch):
 def test_a_checkpoint_without_time_step_scene_file_and_checksums_is_taken(drop, tmp_path):
     """As earlier versions wrote them."""
     with h5py.File(tmp_path / "out" / "checkpoint.h5", "a") as file:
-        assert file.attrs["dt"] == Experiment.dt
+        assert file.attrs["dt"] > 0
         for name in ("dt", "scene_file", "surfaces"):
             del file.attrs[name]
         file.attrs["format"] = "pctt checkpoint 1"
@@ -231,3 +237,103 @@ def test_figures_that_are_no_numbers_are_gone_on_with(drop, tmp_path):
     assert [line["natural_residual"] is None for line in steps_of(tmp_path / "out")] == [True, False, False, False]
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["steps"], summary["natural_residual"]) == (4, None)
+
+
+IMPOSSIBLE = {
+    "grains/mass": (np.inf, "mass or inertia of a grain"),
+    "grains/size": (-1.0, "size of a grain"),
+    "grains/quaternion": (0.0, "quaternion of a grain"),
+    "grains/velocity": (np.nan, "velocity of a grain"),
+    "grains/id": (1, "id of a grain"),
+    "grains/material": (7, "material of a grain"),
+    "world/step": (-3, "time or step"),
+    "contacts/impulse": (np.nan, "impulses of contacts"),
+}
+
+
+@pytest.mark.parallel(1, 2)
+def test_a_state_that_no_run_can_have_is_refused(tmp_path, monkeypatch):
+    """As if somebody had edited the file."""
+    monkeypatch.chdir(tmp_path)
+    with Simulation(Mixer(n=1, margin=0.7), solver="apgd") as sim:
+        sim.run(until=0.6)
+        sim.save("whole.h5")
+    for name, (value, words) in IMPOSSIBLE.items():
+        if MPI.COMM_WORLD.rank == 0:
+            shutil.copy("whole.h5", "edited.h5")
+            with h5py.File("edited.h5", "a") as file:
+                file.attrs["format"] = "pctt checkpoint 1"
+                assert file[name].size
+                file[name][() if file[name].ndim == 0 else slice(2)] = value
+        MPI.COMM_WORLD.Barrier()
+        with pytest.raises(OptionError, match=words):
+            Simulation.load("edited.h5", Mixer(n=1, margin=0.7), solver="apgd")
+        MPI.COMM_WORLD.Barrier()
+
+
+@dataclass(frozen=True)
+class Settles(Experiment):
+    dt = 0.01
+    settling_time = 0.04
+
+    def build(self):
+        scene = Scene(friction=0.3)
+        scene.add_body("floor", [Plane(normal=(0, 0, 1))])
+        scene.add_spheres([[x, 0, 0.1] for x in range(4)], 0.1, 1000.0)
+        return scene
+
+
+@pytest.mark.parallel(1, 2)
+def test_damaged_files_of_a_settling_are_made_anew_with_a_remark(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    comm, said = MPI.COMM_WORLD, []
+
+    def settled():
+        said.clear()
+        with Simulation(Settles(), restart="settled", solver="apgd", say=said.append) as sim:
+            assert sim.steps == 4
+            return Path(sim.restart)
+
+    path = settled()
+    whole = path.read_bytes()
+    comm.Barrier()
+    settled()
+    assert said == []
+    if comm.rank == 0:
+        path.write_bytes(whole[:-100])
+    comm.Barrier()
+    settled()
+    assert comm.bcast("\n".join(said)).count("it is made anew") == 1
+    if comm.rank == 0:
+        os.replace(path, unfinished(path))
+        unfinished(path).write_bytes(whole[: len(whole) // 2])
+    comm.Barrier()
+    settled()
+    assert comm.bcast("\n".join(said)).count("settled from the beginning") == 1
+    assert not unfinished(path).exists()
+
+
+def test_a_settled_state_goes_on_with_another_time_step(program, settled, tmp_path):
+    for dt in ("0.01", "0.0025"):
+        program(*SETTLED, "-dt", dt, "-seconds", 0.05, "-output", dt)
+    coarse, fine = (steps_of(tmp_path / dt) for dt in ("0.01", "0.0025"))
+    assert (len(coarse), len(fine)) == (5, 20)
+    assert coarse[-1]["time"] == pytest.approx(fine[-1]["time"])
+    assert all(line["converged"] for line in (*coarse, *fine))
+
+
+def test_impulses_of_a_checkpoint_begin_another_time_step_scaled(tmp_path):
+    """A sphere at rest is held by the impulse m g dt."""
+    scene = Scene(0.5)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_spheres([0.0, 0.0, 0.1], 0.1, 1000.0)
+    with Simulation(scene, dt=0.01, tol=1e-9, comm=MPI.COMM_SELF) as sim:
+        sim.run(steps=30)
+        sim.save(tmp_path / "state.h5")
+    with Simulation.load(tmp_path / "state.h5", scene, dt=0.002, comm=MPI.COMM_SELF) as sim:
+        sim.save(tmp_path / "scaled.h5")
+        sim.step()
+        assert sim.velocities[0] == pytest.approx(0.0, abs=1e-6)
+    with h5py.File(tmp_path / "scaled.h5") as file:
+        impulse = file["contacts/impulse"][:]
+    assert np.linalg.norm(impulse, axis=1) == pytest.approx(4e3 / 3 * np.pi * 0.1**3 * 9.81 * 0.002, rel=1e-3)

@@ -259,7 +259,7 @@ def test_to_import_the_package_starts_no_petsc():
         ({"slover": "apgd"}, "slover: no such setting; .*; did you mean solver"),
         ({"solver": "apgd", "options": {"memroy": 1}}, "memroy: no such setting"),
         ({"solver": "pdip", "options": APGD()}, "options APGD.*allowed for pdip is a dict or a PDIP"),
-        ({"coulomb": "yes"}, "coulomb 'yes': allowed is true, false or a Coulomb"),
+        ({"law": "yes"}, "law yes: allowed is one of coulomb, relaxation"),
     ],
 )
 def test_a_bad_setting_is_named(settings, words):
@@ -271,7 +271,8 @@ def test_settings_are_given_one_by_one_or_together():
     given = pctt.Settings(tol=1e-6, solver="apgd")
     sim = pctt.Simulation(Mixer(n=1), given, dt=0.001, comm=SELF)
     assert (sim.settings.tol, sim.settings.solver, sim.settings.dt, sim.settings.delta) == (1e-6, "apgd", 0.001, 0.02)
-    assert not sim.settings.coulomb  # that is for 1e-4 and above
+    assert sim.settings.law == "coulomb"
+    assert pctt.Simulation(Mixer(n=1), solver="pdip", comm=SELF).settings.law == "relaxation"
     assert sim.settings.options == APGD()
     with pytest.raises(OptionError, match="allowed is a dem.scene.Scene"):
         pctt.Simulation(Mixer, comm=SELF)
@@ -396,11 +397,11 @@ def test_a_settled_state_is_made_at_first_use_with_a_word(tmp_path, monkeypatch,
         settling_time = 0.1
 
     sim = pctt.Simulation(Settled(), restart="settled", comm=SELF)
-    assert sim.steps == 10
-    assert "settling Settled, 10 steps with APGD to 0.001:" in capsys.readouterr().out
+    assert sim.steps == 15
+    assert "settling Settled, 15 steps with APGD to 0.001:" in capsys.readouterr().out
     (state,) = tmp_path.glob("pctt/Settled_*.h5")
     made = state.stat().st_mtime_ns
-    assert pctt.Simulation(Settled(), restart="settled", comm=SELF).time == pytest.approx(0.1)
+    assert pctt.Simulation(Settled(), restart="settled", comm=SELF).time == pytest.approx(0.1065)
     assert state.stat().st_mtime_ns == made
     assert capsys.readouterr().out == ""
 
@@ -473,7 +474,7 @@ def test_a_notebook_shows_the_last_step_as_a_table():
     shown = sim._repr_html_()
     assert "<th>kinetic_energy [J]</th>" in shown
     assert "<th>iterations</th>" in shown
-    assert repr(sim).startswith("<Simulation of Stirred: 14 bodies on 1 ranks, step 2, time 0.02 s, auto to 0.0001, ")
+    assert repr(sim).startswith("<Simulation of Stirred: 14 bodies on 1 ranks, step 2, time 0.02 s, auto to 0.0003, ")
 
 
 def test_a_picture_of_the_present_state(tmp_path):
@@ -490,3 +491,10 @@ def test_a_picture_of_the_present_state(tmp_path):
     for bad in ({"color": "taste"}, {"elevation": 90.0}, {"tilt": 1.0}):
         with pytest.raises(OptionError):
             sim.render(**bad)
+
+
+def test_a_time_step_that_is_too_large_is_warned_of():
+    scene = Scene(0.5)
+    scene.add_spheres([0.0, 0.0, 0.1], 0.1, 1000.0, velocity=(100.0, 0.0, 0.0))
+    with pytest.warns(UserWarning, match=r"dt 0.01 s is too large: a grain goes further .* at most 0.00095 s"):
+        pctt.Simulation(scene, dt=0.01, comm=MPI.COMM_SELF)

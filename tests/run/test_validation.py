@@ -3,28 +3,15 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-RUN = Path(__file__).resolve().parents[2] / "run" / "studies"
-
-
-@pytest.fixture
-def laws(monkeypatch):
-    monkeypatch.syspath_prepend(str(RUN))
-    from validation import laws, rows
-
-    yield laws
-    for name in [name for name in sys.modules if name.startswith(("validation", "validate", "measure"))]:
-        del sys.modules[name]
-    assert rows
+from validation import laws
 
 
-def test_flows_of_beverloo_give_his_constants(laws, tmp_path):
+def test_flows_of_beverloo_give_his_constants(tmp_path):
     """Of three beds for each outlet, each with a tenth more flow than the one before."""
     folders = {}
     for outlet in (4.5, 5.5, 6.5):
@@ -43,7 +30,7 @@ def test_flows_of_beverloo_give_his_constants(laws, tmp_path):
     assert all(row["agrees"] for row in found)
 
 
-def test_a_band_tells_how_far_off_a_figure_is(laws):
+def test_a_band_tells_how_far_off_a_figure_is():
     from validation.rows import band, row
 
     inside, below = (band("drum", "angle", 20.0, 30.0, angle, "", "degrees") for angle in (25.0, 18.0))
@@ -56,7 +43,7 @@ def test_a_band_tells_how_far_off_a_figure_is(laws):
     assert row("sliding", "lift", 0.0, 1e-9, "", "m", 1e-6)["agrees"] is True
 
 
-def test_angles_of_a_heap_are_means_with_an_error(laws, monkeypatch):
+def test_angles_of_a_heap_are_means_with_an_error(monkeypatch):
     """Two beds a degree apart: a scatter of sqrt(1/2), an error of the mean of 1/2, of a difference of sqrt(1/2)."""
     angles = {"a": 14.0, "b": 15.0, "c": 24.0, "d": 25.0, "e": 25.0, "f": 26.0}
     line = np.arange(11.0)
@@ -72,7 +59,7 @@ def test_angles_of_a_heap_are_means_with_an_error(laws, monkeypatch):
     assert shown["height"].shape == (3, 2, 11)
 
 
-def test_a_wedge_has_its_angle(laws, monkeypatch):
+def test_a_wedge_has_its_angle(monkeypatch):
     """Small spheres that fill the space below a slope of 25 degrees; a tenth of them still moves; others fell."""
     rng = np.random.default_rng(1)
     x, z = rng.uniform(0.0, 0.13, 40000), rng.uniform(0.0, 0.08, 40000)

@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 from pctt.ccp import cone
 from pctt.ccp.cone import Array
+from pctt.ccp.cone_loops import not_idle, project_scaled
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
@@ -61,12 +62,11 @@ class ScaledProblem:
 
     def start(self, guess: Array) -> Array:
         """The scaled point of a first guess of the impulses (nc, 3), in the cones."""
-        return self.project(self._rounded(guess * self._scale))
+        return cone.project(self._rounded(guess * self._scale), self.mu)
 
     def impulse(self, x: Array) -> Array:
         """The impulses (nc, 3) of x, in the cones in double precision too."""
-        g = x * self.shrink
-        return g if self.precision is np.float64 else cone.project(g, self.problem.mu, out=g)
+        return x * self.shrink if self.precision is np.float64 else project_scaled(x, self.shrink, self.problem.mu)
 
     def product(self, x: Array) -> Array:
         """A x (nc, 3)."""
@@ -111,8 +111,8 @@ class ScaledProblem:
         """Let contacts sleep that will stay open until the next look, as far as one can see: they have no impulse, and
         open five times faster than steps change velocities, which is the root mean square of their ``length`` |L step|.
         A contact too many costs iterations, but no accuracy. ``y`` (nc, 3) is the rigid gradient of all contacts."""
-        faster = y[:, 0] - self.mu * cone.tangential(y) > 5 * length / np.sqrt(max(self.problem.size, 1))
-        self._awake = self._operator.among((now.x[:, 0] > 0) | (last.x[:, 0] > 0) | ~faster)
+        faster = float(5 * length / np.sqrt(max(self.problem.size, 1)))
+        self._awake = self._operator.among(not_idle(now.x, last.x, y, self.mu, faster))
 
     def step(
         self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate
@@ -122,6 +122,12 @@ class ScaledProblem:
         work, square, uphill = cone.accelerated_step(
             now.x, last.x, y, self._soft, beta, length, self.mu, float(self.coulomb), new.x
         )
+        return self.image_of_step(now, last, beta, new, work, square, uphill)
+
+    def image_of_step(
+        self, now: Iterate, last: Iterate, beta: float, new: Iterate, work: float, square: float, uphill: float
+    ) -> list[float]:
+        """Find the image of ``new``, and complete the sums of the step that has led there."""
         self.find_image(new)
         work += self._operator.energy_of_step(new.image, now.image, last.image, beta)
         return self.sums(work, square, uphill).tolist()

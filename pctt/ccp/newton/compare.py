@@ -12,7 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt import log
-from pctt.block_diagonal import shell_of
+from pctt.blocks import shell_of
 from pctt.ccp.newton.krylov import Krylov, Solve, Source
 from pctt.options import OptionError
 

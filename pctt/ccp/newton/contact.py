@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 
 from dem.contact_map.loops import local_product, pack
-from pctt.block_diagonal import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
+from pctt.blocks import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.ccp.cone import Array
 from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.problem import ConeProblem

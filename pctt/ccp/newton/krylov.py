@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.block_diagonal import block_diagonal, fresh_copy, shell_of
+from pctt.blocks import block_diagonal, fresh_copy, shell_of
 from pctt.ksp_options import entered, to_enter
 from pctt.pc.base import PythonPC
 from pctt.pc.mat import residual_norm
@@ -31,7 +31,7 @@ _WITHIN_RANKS = {"bjacobi", "sor", "eisenstat"}  # of several ranks each works o
 _NAMES = {"bcgs": "BiCGStab", "cg": "CG", "gmres": "GMRES", "fgmres": "FGMRES", "minres": "MINRES"}
 # preconditioners of parts of the matrix; ours have inner ones too, but of other matrices
 _OF_PARTS = re.compile(r"(sub|mg|fieldsplit|composite|telescope)_.*pc_type")
-_REMEMBERING = {"pbjacobi", "sor"}  # the inverse diagonal blocks of the first matrix, see `pctt.block_diagonal`
+_REMEMBERING = {"pbjacobi", "sor"}  # the inverse diagonal blocks of the first matrix, see `pctt.blocks`
 _REASONS = {
     value: name.lower() for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)
 }

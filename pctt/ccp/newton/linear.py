@@ -208,12 +208,6 @@ class LinearSolver:
             self._krylov[name, symmetric] = Krylov(self.comm, prefix, options)
         return self._krylov[name, symmetric]
 
-    @property
-    def factored(self) -> bool:
-        """Whether the present matrix has been factorised, and another solve costs little."""
-        users = self._krylov.get(("", True))
-        return self._factored or (users is not None and users.ksp.pc.getType() in ("cholesky", "lu"))
-
     def report(self) -> list[str]:
         """Lines about the preconditioner, if it is one of this package."""
         return [line for solver in self._krylov.values() for line in solver.report()]

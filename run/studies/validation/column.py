@@ -32,7 +32,7 @@ class Column(Experiment):
     def build(self) -> Scene:
         """The scene, with the large bodies "wall" and "bottom"."""
         scene = Scene(self.friction)
-        scene.set_friction(self.wall_friction, "spheres", "wall")
+        scene.set_pair("spheres", "wall", friction=self.wall_friction)
         radius, pitch = 2 * self.width * RADIUS, 2.3 * RADIUS
         count = int(radius / pitch)
         across = np.arange(-count, count + 1) * pitch

@@ -21,6 +21,7 @@ class Heap(Experiment):
     """Spheres on a shelf between two frictionless walls; a lip holds the lowest layer."""
 
     friction: float = option(0.5, "", "friction coefficient between spheres, and of shelf and lip")
+    rolling: float = option(0.0, "", "resistance to rolling between spheres, over the radius of the greatest")
     columns: int = option(11, "", "spheres of the lattice along the shelf")
     rows: int = option(4, "", "across")
     layers: int = option(22, "", "above each other")
@@ -38,7 +39,8 @@ class Heap(Experiment):
     def build(self) -> Scene:
         """The scene; the shelf is x < 0, its edge x = 0."""
         scene = Scene(self.friction)
-        scene.set_friction(0.0, "spheres", "walls")
+        scene.set_pair("spheres", "walls", friction=0.0)
+        scene.set_pair("spheres", "spheres", rolling=self.rolling * RADIUS)
         x = -(np.arange(self.columns) + 0.6) * self.pitch
         y = (np.arange(self.rows) - (self.rows - 1) / 2) * self.pitch
         z = 1.5 * RADIUS + (np.arange(self.layers) + 0.6) * self.pitch

@@ -104,7 +104,7 @@ def profile(folder: Path) -> Profile:
 def drum(folder: Path) -> tuple[list[Row], dict]:
     """Angle of the flowing bed."""
     angle, columns = _analysis(folder)["dynamic_angle [degrees]"], Folder(folder).records()
-    found = [band("drum", "dynamic angle at Froude number .01, friction .5", 20.9, 32.8, angle, JOP, "degrees")]
+    found = [band("drum", "dynamic angle at Froude number 0.01, friction 0.5", 20.9, 32.8, angle, JOP, "degrees")]
     return found, {"time": columns["time [s]"], "angle": columns["bed_angle [degrees]"], "mean": angle}
 
 
@@ -119,12 +119,12 @@ def column(folder: Path, radius: float = 0.04, bins: int = 8) -> tuple[list[Row]
     normal, upwards, borne = np.zeros(bins), np.zeros(bins), 0.0
     for frame in frames:
         contact = frame.contacts
-        on = (contact.body == wall).any(axis=1)
+        on = (contact.bodies == wall).any(axis=1)
         part = np.clip(np.digitize(contact.point[on, 2], edges) - 1, 0, bins - 1)
-        on_grain = np.where(contact.body[on, 1] == wall, -1.0, 1.0) * contact.force[on, 2]
+        on_grain = np.where(contact.bodies[on, 1] == wall, -1.0, 1.0) * contact.force[on, 2]
         normal += np.bincount(part, contact.impulse[on, 0] / contact.dt, bins) / len(frames)
         upwards += np.bincount(part, on_grain, bins) / len(frames)
-        borne += np.abs(contact.force[(contact.body == bottom).any(axis=1), 2]).sum() / len(frames)
+        borne += np.abs(contact.force[(contact.bodies == bottom).any(axis=1), 2]).sum() / len(frames)
     weight = float(run.mass[:wall].sum()) * GRAVITY
     area, side = np.pi * radius**2, 2.0 * np.pi * radius * height / bins
     middle = 0.5 * (edges[1:] + edges[:-1])

@@ -1,0 +1,204 @@
+"""What acts on the bodies of a world in a step beside contacts: gravity, loads, springs, drives and guides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import bodies, springs
+from dem.arrays import Bools, Floats, Ints
+from dem.bodies import Bodies
+from dem.free_motion import free_velocity
+from dem.loads import Load
+from dem.motion import Driven, Dynamic, Guided
+from dem.neighbourhood import Neighbourhood
+from dem.scene import LargeBody
+from dem.springs import Ends
+from dem.together import SceneError, together
+from dem.world import World
+
+
+@dataclass(frozen=True)
+class Applied:
+    """Impulses and angular impulses of loads and springs over a step [N s, N m s]."""
+
+    grains: Floats  #: (grains, 6) of this rank
+    large: Floats  #: (large, 6), the same on all ranks; zero on bodies of prescribed motion
+    springs: Floats  #: (springs, 3) impulses on the second ends, the same on all ranks
+    expected: Floats | None = None  #: (springs, 2, 6) velocities of the ends after the step, see `dem.springs.impulses`
+
+
+def applied_impulses(world: World, dt: float) -> Applied:
+    """What loads and springs give in the next step of dt [s]; collective. SceneError if a law fails, or if dt is too
+    large for the springs."""
+    asked = (world.time, dt)
+    if asked not in world.applied:  # a step asks several times
+        grains, large = np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity)
+        for name, load in world.loads.items():
+            of_large = np.array([body.name == load.on for body in world.large_bodies], bool)
+            of_one = bool(of_large.any())
+            table, out = (world.large, large) if of_one else (world.grains, grains)
+            rows = of_large if of_one else _chosen(world, load)
+            call = partial(load.impulses, world.time, dt, table.take(rows))
+            found = together(world.comm, f"load {name!r}", call)
+            out[rows] += world.comm.bcast(found) if of_one else found  # processors may round in other ways
+        world.applied = {asked: _with_springs(world, grains, large, dt)}
+    return world.applied[asked]
+
+
+def _chosen(world: World, load: Load) -> Ints | Bools:
+    """The rows or the mask of this rank's grains that have a load."""
+    if isinstance(load.on, str):
+        return world.grains.material == world.materials.index(load.on)
+    return np.arange(len(world.grains)) if load.on is None else np.isin(world.grains.id, load.on)
+
+
+def _with_springs(world: World, grains: Floats, large: Floats, dt: float) -> Applied:
+    """The impulses of loads and those of springs; collective."""
+    if not world.springs:
+        return Applied(grains, large, np.zeros((0, 3)))
+    members = list(world.springs.values())
+    ends = [end for spring in members for end in spring.ends]
+    ids = np.unique([end for end in ends if isinstance(end, int)]).astype(np.int64)
+    many, first = len(ids) + len(world.large), len(ids)
+    rows = [_row_of(world, ids, end) for end in ends]
+    row = np.array(rows).reshape(-1, 2)
+    table = _ends(world, ids, grains, large, dt)
+    found = springs.impulses(members, row, table, world.expected, dt) if world.comm.rank == 0 else None
+    g, change, expected, highest = world.comm.bcast(found)  # processors may round in other ways
+    if dt * highest >= 2.0:
+        raise SceneError(
+            f"the springs {', '.join(world.springs)[:200]} have frequencies up to {highest:.3g} rad/s: -dt {dt:g} s is "
+            f"too large for them; take less than {2.0 / highest:.3g} s, and a tenth of that to resolve them"
+        )
+    here = np.flatnonzero(np.isin(world.grains.id, ids))
+    grains[here] += change[np.searchsorted(ids, world.grains.id[here])]
+    large[:] += np.where(bodies.is_dynamic(world.large)[:, None], change[first:many], 0.0)
+    return Applied(grains, large, g, expected)
+
+
+def _row_of(world: World, ids: Ints, end: springs.End) -> int:
+    """The row of the end of a spring among the grains `ids`, the large bodies and the world."""
+    if isinstance(end, int):
+        return int(np.searchsorted(ids, end))
+    return len(ids) + (len(world.large) if end is None else world.large_row(end))
+
+
+def _ends(world: World, ids: Ints, grains: Floats, large: Floats, dt: float) -> Ends:
+    """The grains of these ids, the large bodies and the world, with the impulses of loads; collective."""
+    here = np.flatnonzero(np.isin(world.grains.id, ids))
+    own = world.grains.take(here)
+    given = free_velocity(own, world.gravity, dt) + velocity_changes(own, grains[here])
+    root = bodies.inverse_root_inertia(own)
+    columns = own.position, own.quaternion, own.velocity, given, 1.0 / own.mass[:, None], (root @ root).reshape(-1, 9)
+    gathered = np.zeros((len(ids), 29))
+    gathered[np.searchsorted(ids, own.id)] = np.concatenate(columns, axis=1)
+    world.comm.Allreduce(MPI.IN_PLACE, gathered)  # each row is that of one rank
+    position, turn, velocity, free, light, moments = np.split(gathered, np.cumsum([3, 4, 6, 6, 1]), axis=1)
+    tools = world.large
+    pushed = free_velocity(tools, world.gravity, dt) + velocity_changes(tools, large)
+    root = bodies.inverse_root_inertia(tools)
+    translation = free_directions(world.large_bodies) / tools.mass[:, None, None]
+    inverse = np.zeros((len(ids) + len(tools) + 1, 6, 6))
+    inverse[:, :3, :3] = np.concatenate([light[:, :, None] * np.eye(3), translation, np.zeros((1, 3, 3))])
+    inverse[:, 3:, 3:] = np.concatenate([moments.reshape(-1, 3, 3), root @ root, np.zeros((1, 3, 3))])
+    return Ends(
+        np.concatenate([position, tools.position, np.zeros((1, 3))]),
+        np.concatenate([turn, tools.quaternion, [[1.0, 0.0, 0.0, 0.0]]]),
+        np.concatenate([velocity, tools.velocity, np.zeros((1, 6))]),
+        np.concatenate([free, _as_motions_allow(world, pushed, dt), np.zeros((1, 6))]),
+        inverse,
+    )
+
+
+def velocity_changes(table: Bodies, impulse: Floats) -> Floats:
+    """What impulses and angular impulses (n, 6) change of the velocities (n, 6) of bodies on which nothing else acts;
+    zero where a mass or moment is infinite."""
+    change = np.empty_like(impulse)
+    change[:, :3] = impulse[:, :3] / table.mass[:, None]
+    change[:, 3:] = impulse[:, 3:] / table.inertia  # of spheres
+    rows = np.flatnonzero(impulse[:, 3:].any(axis=1) & (table.shape != bodies.SPHERE))
+    root = bodies.inverse_root_inertia(table.take(rows))
+    change[rows, 3:] = (root @ (root @ impulse[rows, 3:, None]))[:, :, 0]
+    return change
+
+
+def free_velocities(world: World, near: Neighbourhood, dt: float) -> Floats:
+    """Velocities (rows, 6) of all bodies of `near` over a step of dt [s] without contacts; those of ghosts lack what
+    loads give."""
+    free = free_velocity(near.bodies, world.gravity, dt)
+    if world.loaded:
+        free[: near.grains] += velocity_changes(world.grains, applied_impulses(world, dt).grains)
+    free[near.grains + near.ghosts :] = large_free_velocity(world, dt)
+    return free
+
+
+def grains_free_velocity(world: World, dt: float) -> Floats:
+    """Velocities (grains, 6) of this rank's grains over a step of dt [s] without contacts; collective."""
+    free = free_velocity(world.grains, world.gravity, dt)
+    return free + velocity_changes(world.grains, applied_impulses(world, dt).grains) if world.loaded else free
+
+
+def large_free_velocity(world: World, dt: float) -> Floats:
+    """Velocities (large bodies, 6) over a step of dt [s] without contacts: guided bodies along their guides with the
+    forces of their drives, hinged ones with their torques, prescribed ones on their paths; collective."""
+    table = world.large
+    free = free_velocity(table, world.gravity, dt) + velocity_changes(table, drives_of(world, dt).impulse)
+    return _as_motions_allow(world, free, dt)
+
+
+def _as_motions_allow(world: World, velocity: Floats, dt: float) -> Floats:
+    """These velocities (large, 6), with what motions hold or prescribe over a step of dt [s]; collective."""
+    free = np.empty_like(velocity)
+    free[:, :3] = (free_directions(world.large_bodies) @ velocity[:, :3, None])[:, :, 0]
+    free[:, 3:] = (free_turns(world.large_bodies) @ velocity[:, 3:, None])[:, :, 0]
+    for row, body in enumerate(world.large_bodies):
+        if isinstance(body.motion, Dynamic):
+            free[row] += body.motion.held(world.time, dt)
+    prescribed = ~bodies.is_dynamic(world.large)
+    free[prescribed] = world.prescribed_velocity(dt)[prescribed]
+    return free
+
+
+@dataclass(frozen=True)
+class Drives:
+    """What drives, loads and springs do to the large bodies in a step."""
+
+    impulse: Floats  #: (large, 6) impulses and angular impulses, of servos if nothing touches their bodies
+    line: Floats  #: (large, 6) unit vectors of the lines of drives
+    grip: Floats  #: (large,) what servos add to the inertia along them [kg or kg m^2], see `dem.motion.Driven`
+
+
+def drives_of(world: World, dt: float) -> Drives:
+    """Of the next step of dt [s], the same on all ranks; collective."""
+    impulse = np.zeros_like(world.large.velocity)
+    line, grip = np.zeros_like(impulse), np.zeros(len(impulse))
+    free = free_velocity(world.large, world.gravity, dt)
+    if world.loaded:
+        impulse += applied_impulses(world, dt).large
+        free += velocity_changes(world.large, impulse)
+    for row, body in enumerate(world.large_bodies):
+        motion = body.motion
+        if isinstance(motion, Driven):
+            part, inertia = (slice(0, 3), body.mass) if isinstance(motion, Guided) else (slice(3, 6), body.inertia[2])
+            line[row, part] = motion.line
+            lack = inertia / dt * ((motion.speed or 0.0) - float(free[row] @ line[row]))
+            impulse[row, part] += dt * motion.mean_drive(world.time, dt, lack)
+            grip[row] = motion.grip(world.time, dt, inertia, float(world.large.velocity[row] @ line[row]), lack)
+    return Drives(impulse, line, grip)
+
+
+def free_directions(members: Sequence[LargeBody]) -> Floats:
+    """Projectors (large, 3, 3) on the directions that are open to the velocities of large bodies."""
+    open_to = [body.motion.free_directions() if isinstance(body.motion, Dynamic) else np.eye(3) for body in members]
+    return np.array(open_to).reshape(len(members), 3, 3)
+
+
+def free_turns(members: Sequence[LargeBody]) -> Floats:
+    """Projectors (large, 3, 3) on the axes about which torques can turn large bodies."""
+    open_to = [body.motion.free_turns() if isinstance(body.motion, Dynamic) else np.eye(3) for body in members]
+    return np.array(open_to).reshape(len(members), 3, 3)

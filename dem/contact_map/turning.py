@@ -1,0 +1,114 @@
+"""The contact map of contacts that resist rolling and spinning: beside the velocities at the contact points it has the
+velocities with which bodies turn against each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from mpi4py import MPI
+
+from dem.arrays import Floats, Ints
+from dem.compiled import loop
+from dem.contact_map import loops
+from dem.contact_map.halo import Halo
+from dem.contact_map.map import BlockRows, CompactRows, ContactMap, Some, root_blocks, shaped
+
+
+class TurningMap(ContactMap):
+    """A `ContactMap` with twice as many rows: arrays of contacts are (2 nc, 3), first normal and tangents of all
+    contacts, then, for impulses, moments about the normal and the two tangents, in units of force times a length.
+
+    turn : (nc, 9) the frames of the contacts times those lengths [m]: the turning velocities are turn (w_b - w_a)
+    """
+
+    def __init__(
+        self, comm: MPI.Comm, given: CompactRows, turn: Floats, halo: Halo, body: np.ndarray,
+        precision: type[np.floating] = np.float64,
+    ):  # fmt: skip
+        super().__init__(comm, given, halo, body, precision)
+        self._given_turn, self._turn = turn, self._floats(turn)
+        self.contacts, self.rows = given.rows, 2 * given.rows
+
+    def turning(self, v: Floats) -> Floats:
+        """The turning velocities (nc, 3) of the velocities (rows, 6) of all rows of a table of the halo, without a
+        message."""
+        y = np.zeros((self.contacts, 3))
+        set_turning(loops.every(self.body), self._turn, self.body, y, y, v)
+        return y
+
+    def sums_of_moments(self, g: Floats, contacts: Ints, sums: Floats) -> None:
+        """sums (rows, 6) += the moments g (nc, 3) of these contacts, by rows of a table of the halo; no message."""
+        add_moments_of(contacts.astype(np.uint32), self._turn, self.body, g, sums)
+
+    def _set_velocities(self, before: Floats, y: Floats, some: Some) -> None:
+        n = self.contacts
+        super()._set_velocities(before[:n], y[:n], some)
+        for which in some:
+            set_turning(which, self._turn, self.body, before[n:], y[n:], self._w)
+
+    def _collect(self, g: Floats, m: Floats, some: Some) -> None:
+        g, n = self._floats(shaped("impulses", g, self.rows, 3)), self.contacts
+        own, away = some
+        m[:] = 0.0
+        if len(away):
+            loops.add_momenta_of(away, *self._arrays, g[:n], m)
+            add_moments_of(away, self._turn, self.body, g[n:], m)
+        self.halo.begin_add(m)
+        loops.add_momenta_of(own, *self._arrays, g[:n], m)
+        add_moments_of(own, self._turn, self.body, g[n:], m)
+        self.halo.end_add(m)
+
+    def contact_blocks(self) -> Floats:
+        """The diagonal blocks of G G' (2 nc, 3, 3)."""
+        out = super().contact_blocks()
+        inverse = np.zeros((self.halo.rows, 9), self.precision)
+        inverse[: self.columns] = root_blocks(self._mass)[:, 1].reshape(-1, 9)
+        self.halo.update(inverse)
+        both = inverse[self.body[:, 0]] + inverse[self.body[:, 1]]
+        turn = self._turn.reshape(-1, 3, 3)
+        out[self.contacts :] = turn @ both.reshape(-1, 3, 3) @ turn.transpose(0, 2, 1)
+        return out
+
+    def scaled(self, size: Floats, precision: type[np.floating] = np.float64) -> TurningMap:
+        """The map with its rows multiplied by ``size`` (2 nc, 3)."""
+        rows = np.concatenate([self.given.frame, self._given_turn]).reshape(-1, 3, 3) * size[:, :, None]
+        frame, turn = rows.reshape(2, -1, 9)
+        other = TurningMap(self.comm, replace(self.given, frame=frame), turn, self.halo, self.body, precision)
+        other.log_flops = self.log_flops
+        return other
+
+    @cached_property
+    def block_rows(self) -> BlockRows:
+        """The rows as 3 x 6 blocks; collective at its first use."""
+        turning = np.zeros((self.contacts, 2, 3, 6))
+        turning[..., 3:] = self._given_turn.reshape(-1, 1, 3, 3)
+        one, two = self.rows_of_blocks(self.frame_blocks()), self.rows_of_blocks(turning)
+        indptr = np.concatenate([one.indptr, one.indptr[-1] + two.indptr[1:]])
+        both = np.concatenate([one.indices, two.indices]), np.concatenate([one.blocks, two.blocks])
+        return BlockRows(indptr, *both, self.columns)
+
+
+@loop
+def set_turning(which, turn, body, before, y, w):
+    """y = before + turn (w_b - w_a) in the contacts ``which`` (n,), uint32; y may be ``before``."""
+    for k in range(len(which)):
+        c = which[k]
+        a, b = body[c, 0], body[c, 1]
+        u0, u1, u2 = w[b, 3] - w[a, 3], w[b, 4] - w[a, 4], w[b, 5] - w[a, 5]
+        y[c, 0] = before[c, 0] + (turn[c, 0] * u0 + turn[c, 1] * u1 + turn[c, 2] * u2)
+        y[c, 1] = before[c, 1] + (turn[c, 3] * u0 + turn[c, 4] * u1 + turn[c, 5] * u2)
+        y[c, 2] = before[c, 2] + (turn[c, 6] * u0 + turn[c, 7] * u1 + turn[c, 8] * u2)
+
+
+@loop
+def add_moments_of(which, turn, body, g, m):
+    """m (bodies, 6) += the moments g (nc, 3) of the contacts ``which`` (n,), uint32."""
+    for k in range(len(which)):
+        c = which[k]
+        a, b = body[c, 0], body[c, 1]
+        for i in range(3):
+            moment = turn[c, i] * g[c, 0] + turn[c, 3 + i] * g[c, 1] + turn[c, 6 + i] * g[c, 2]
+            m[a, 3 + i] -= moment
+            m[b, 3 + i] += moment

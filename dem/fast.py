@@ -1,0 +1,111 @@
+"""Grains that go further in a step than the search for contacts looks: whether they meet anything on their way.
+
+The margin of a grain ends at two of its radii, as contacts that far away are taken for planes. A grain that goes
+further may do so through empty space alone. If it meets a body there, the step is refused: its normal and its arms are
+not those of the start of the step, and the grain may meet several bodies one after another.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import bodies
+from dem.arrays import Bools, Floats, places
+from dem.bodies import SPHERE
+from dem.contact import Contacts, find_contacts
+from dem.quaternion import cross, length
+from dem.system import contact_arms
+from dem.together import SceneError
+from dem.world import World
+
+FAR = 2.0  #: radii that a margin reaches at most
+MANY = 1e7  #: pairs that are tested at most when margins are wider than a packing
+
+
+def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> None:
+    """SceneError, on all ranks, if with these velocities (owned, 6) a grain goes further in dt [s] than two radii, and
+    may meet a body that is in no contact with it; collective.
+
+    For two spheres the test is exact. For other pairs it asks whether the grain crosses the plane through the closest
+    points of the two: convex bodies that do not turn cannot meet without. So it never misses one of these, but refuses
+    some that pass beside a body. The margins are doubled from one search to the next, so that in a dense packing the
+    first search tells.
+    """
+    grains = world.grains
+    speed = length(velocity[: len(grains), :3])
+    way, most = dt * speed, FAR * bodies.bounding_radius(grains)
+    fast = (way > most) & np.isfinite(way)
+    furthest, count = float((way / most)[fast].max(initial=0.0)), int(fast.sum())
+    if not (furthest := world.comm.allreduce(furthest, MPI.MAX)):
+        return
+    count = world.comm.allreduce(count)
+    weight, reach, seen = grains.weight, 1.0, contacts.near.margin[: len(grains)]
+    while reach < furthest:
+        reach *= 2.0
+        worst = (0.0, -1, -1)  # speed [m/s], and the ids of the grain and of what it meets
+        if reach > 32.0 and count * float(world.slabs[-1]) > MANY:  # every grain would see every other
+            row = int(np.argmax(np.where(fast, speed, 0.0))) if fast.any() else -1
+            worst = (float(speed[row]), int(grains.id[row]), -1) if row >= 0 else worst
+        else:
+            margin = np.where(fast, np.minimum(way, reach * most), 0.0)
+            wide = find_contacts(world, delta, dt, np.maximum(seen, margin), contacts.shifts)
+            grains.weight = weight
+            wide = wide.take(places(contacts.key, wide.key) < 0)
+            met = wide.take(_meet(world, wide, velocity, delta, dt))
+            table = _velocities(world, wide, velocity)
+            if len(met):
+                pair = np.stack([met.a, met.b], axis=1)
+                grain = pair < met.near.grains + met.near.ghosts
+                of = np.where(grain, length(table[pair, :3]), -1.0)
+                row = int(np.argmax(of.max(axis=1)))
+                first = int(np.argmax(of[row]))
+                id = met.near.bodies.id[pair[row]]
+                worst = (float(of[row, first]), int(id[first]), int(id[1 - first]))
+        worst = world.comm.allreduce(worst, MPI.MAX)
+        if worst[1] >= 0:
+            raise SceneError(_refusal(world, worst, dt, furthest))
+
+
+def _velocities(world: World, contacts: Contacts, velocity: Floats) -> Floats:
+    """Velocities (bodies of `near`, 6) of all bodies about this rank, from those (owned, 6); collective."""
+    near = contacts.near
+    table = np.zeros((len(near.bodies), 6))
+    table[: near.grains] = velocity[: near.grains]
+    world.lists.halo.update(table)
+    table[near.grains + near.ghosts :] = world.large_velocity(velocity)
+    return table
+
+
+def _meet(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Bools:
+    """Which of the contacts (nc,) close within dt, to a hundredth of delta, with the velocities (owned, 6) of the
+    bodies; collective."""
+    table = _velocities(world, contacts, velocity)
+    near, row = contacts.near, np.stack([contacts.a, contacts.b], axis=1)
+    arm = contact_arms(contacts.point, near.bodies.position, row.astype(np.uint32)).reshape(-1, 2, 3)
+    if contacts.moved is not None:
+        arm[:, 1] -= contacts.moved
+    spin = cross(table[row, 3:], arm)
+    shape = near.bodies.shape[row]
+    spin[shape == SPHERE] = 0.0  # their surfaces do not move
+    way = dt * (table[row, :3] + spin)
+    way = way[:, 1] - way[:, 0]
+    closes: Bools = contacts.gap + np.einsum("ci,ci->c", way, contacts.normal) < -0.01 * delta
+    balls = (shape == SPHERE).all(axis=1)
+    radii = near.bodies.size[row[balls], 0].sum(axis=1)
+    apart = contacts.way(near.bodies.position)[balls]
+    square = np.maximum(length(way[balls]) ** 2, 1e-300)
+    share = -np.einsum("ci,ci->c", apart, way[balls]) / square
+    nearest = apart + np.clip(share, 0.0, 1.0)[:, None] * way[balls]
+    closes[balls] = length(nearest) < radii - 0.01 * delta
+    return closes
+
+
+def _refusal(world: World, worst: tuple[float, int, int], dt: float, furthest: float) -> str:
+    """What to say of a speed, a grain and the body that it may meet (-1: not known), by their ids."""
+    speed, one, other = worst
+    met = world.name_of(other) if other >= 0 else "other bodies"
+    return (
+        f"step {world.step + 1}: {world.name_of(one)} moves at {speed:.4g} m/s, too far in a time step of {dt:g} s "
+        f"to see whether it passes through {met}; a dt of {0.95 * dt / furthest:.2g} s is safe at this speed"
+    )

@@ -1,0 +1,96 @@
+"""What contacts do to grains, and to the triangles of meshes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dem import quaternion
+from dem.arrays import Bools, Floats, Ints
+from dem.measures.sample import Sample, summed
+from dem.mesh import Mesh, Surface
+
+
+class Ends(NamedTuple):
+    """The ends of contacts at grains: number of the grain (m,), its centre, the contact point, the force on it (m, 3),
+    the contact's row (m,), and the moment on it beside that of the force (m, 3), or 0."""
+
+    grain: Ints
+    center: Floats
+    point: Floats
+    force: Floats
+    contact: Ints
+    couple: Floats | float
+
+
+def ends(sample: Sample) -> Ends:
+    """The ends of this rank's contacts at grains; not collective."""
+    row, side = np.nonzero(sample.bodies < sample.count)
+    sign = np.where(side == 1, 1.0, -1.0)[:, None]
+    couple = 0.0 if sample.moment is None else sign * sample.moment[row]
+    force = sign * sample.force[row]
+    return Ends(sample.bodies[row, side], sample.center[row, side], sample.point[row], force, row, couple)
+
+
+def bearing(sample: Sample) -> Bools:
+    """Mask (nc,) of this rank's contacts that bear force: their normal force exceeds 1 % of the mean, as solvers leave
+    small forces at others."""
+    normal = np.einsum("ck,ck->c", sample.force, sample.normal)
+    total, count = sample.comm.allreduce(np.array([normal.sum(), len(normal)]))
+    mask: Bools = normal > 0.01 * total / max(count, 1.0)
+    return mask
+
+
+class Grains(NamedTuple):
+    """What contacts do to each grain; the rows are all grains in the order of the scene."""
+
+    force: Floats  #: (count, 3) [N]
+    torque: Floats  #: (count, 3) about its centre [N m]
+    moment: Floats  #: (count, 3, 3) sum of force times branch; over a volume it is the stress of the grain [N m]
+    coordination: Ints  #: (count,) number of contacts that bear force
+
+
+def per_grain(sample: Sample) -> Grains:
+    """Contact force, torque, stress times volume, and coordination number of every grain."""
+    end = ends(sample)
+    arm = end.point - end.center
+    moment = -end.force[:, :, None] * arm[:, None, :]
+    torque = np.cross(arm, end.force) + end.couple
+    columns = [end.force, torque, moment.reshape(-1, 9), bearing(sample)[end.contact, None]]
+    table = np.zeros((sample.count, 16))
+    np.add.at(table, end.grain, np.concatenate(columns, axis=1))
+    table = summed(sample, table)
+    return Grains(table[:, :3], table[:, 3:6], table[:, 6:15].reshape(-1, 3, 3), np.rint(table[:, 15]).astype(np.int64))
+
+
+def triangle_forces(sample: Sample, body: int, mesh: Mesh, position: Floats, turn: Floats) -> Floats:
+    """Forces (triangles, 3) of grains on the triangles of a mesh, in the world frame [N].
+
+    The mesh is all of the large body of this number (`Sample.bodies`) at `position` (3,) [m] and orientation `turn`
+    (4,). A contact's force is that of the triangle nearest to its point: searches keep no triangles."""
+    first, second = (sample.bodies[:, side] == body for side in (0, 1))
+    force = sample.force * (second.astype(float) - first)[:, None]
+    rows = first | second
+    back, own = quaternion.conjugate(turn), np.array(mesh.quaternion)
+    point = quaternion.rotate(back, sample.point[rows] - position) - np.array(mesh.center)
+    point = quaternion.rotate(quaternion.conjugate(own), point) - mesh.surface.middle
+    out = np.zeros((len(mesh.surface.triangle), 3))
+    np.add.at(out, nearest(mesh.surface, point), force[rows])
+    return np.asarray(summed(sample, out))
+
+
+def nearest(surface: Surface, point: Floats) -> Ints:
+    """The triangle (m,) that is nearest to each point (m, 3) in the frame of the surface, the first of equals."""
+    out, left = np.zeros(len(point), np.int64), np.arange(len(point))
+    reach = 1e-3 * float(surface.half.max())
+    while len(left):
+        row, triangle = surface.near(point[left], np.full(len(left), reach))
+        away = surface.closest(point[left[row]], triangle).distance
+        close = away <= reach  # nearer triangles than these are all among them
+        row, triangle, away = row[close], triangle[close], away[close]
+        order = np.lexsort((triangle, away, row))
+        found, first = np.unique(row[order], return_index=True)
+        out[left[found]] = triangle[order[first]]
+        left, reach = np.delete(left, found), 2.0 * reach
+    return out

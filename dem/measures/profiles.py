@@ -1,0 +1,72 @@
+"""Profiles, mean positions and mixing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dem.arrays import ArrayLike, Bools, Floats
+from dem.measures.region import Block
+from dem.measures.sample import Sample, summed
+
+
+class Profile(NamedTuple):
+    """Sums and means over the grains with their centres in each of the bins along an axis."""
+
+    middle: Floats  #: (bins,) [m]
+    grains: Floats  #: (bins,) their number
+    mass: Floats  #: (bins,) [kg]
+    velocity: Floats  #: (bins, 3) mean, weighted by mass; 0 in empty bins [m/s]
+
+
+def profile(sample: Sample, axis: ArrayLike, edges: ArrayLike) -> Profile:
+    """What is where along a direction `axis` (3,), in bins between the ascending `edges` (bins + 1,) [m]."""
+    edge = np.asarray(edges, float)
+    place = np.searchsorted(edge, sample.position @ np.asarray(axis, float) / np.linalg.norm(axis), "right") - 1
+    rows = (place >= 0) & (place < len(edge) - 1)
+    columns = np.column_stack([np.ones(len(place)), sample.mass, sample.mass[:, None] * sample.velocity[:, :3]])
+    table = np.zeros((len(edge) - 1, 5))
+    np.add.at(table, place[rows], columns[rows])
+    table = summed(sample, table)
+    velocity = table[:, 2:] / np.where(table[:, 1] > 0.0, table[:, 1], 1.0)[:, None]
+    return Profile(0.5 * (edge[1:] + edge[:-1]), table[:, 0], table[:, 1], velocity)
+
+
+def mean_position(sample: Sample, mask: Bools) -> Floats:
+    """Mean (3,) of the centres of the grains of a mask (n,) [m]; NaN if there are none."""
+    total = summed(sample, np.append(sample.position[mask].sum(axis=0), mask.sum()))
+    return total[:3] / (total[3] or np.nan)
+
+
+class Mixing(NamedTuple):
+    """How well the grains of a mask are mixed with the others."""
+
+    lacey: float  #: 0: apart, 1: as by chance (Lacey 1954)
+    intensity: float  #: of segregation, variance over p (1 - p); 1: apart, 0: even (Danckwerts 1952)
+
+
+def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> Mixing:
+    """Mixing of the grains of a mask (n,) with the others, by centres in the cells of a grid.
+
+    With p the fraction of them among all, and s^2 the variance of the fractions in the cells, each with the weight of
+    its grains: Lacey's index is (p (1 - p) - s^2) / (p (1 - p) - p (1 - p) / m) for cells of m grains on average that
+    are not empty. NaN if there is one kind alone, or one grain per cell."""
+    shape, low = np.array(cells, np.int64), np.array(region.low, float)
+    rows = region.contains(sample.position)
+    place = ((sample.position[rows] - low) / ((np.array(region.high) - low) / shape)).astype(np.int64)
+    cell = np.ravel_multi_index(tuple(np.minimum(place, shape - 1).T), tuple(shape))
+    size = int(shape.prod())
+    found = np.stack([np.bincount(cell, minlength=size), np.bincount(cell, mask[rows], size)])
+    count, marked = summed(sample, found)
+    some = count > 0
+    count, fraction = count[some], marked[some] / count[some]
+    total = max(count.sum(), 1.0)
+    p = float(count @ fraction) / total
+    apart, variance = p * (1.0 - p), float(count @ (fraction - p) ** 2) / total
+    by_chance = apart * len(count) / total
+    if apart <= 0.0:
+        return Mixing(np.nan, np.nan)
+    lacey = (apart - variance) / (apart - by_chance) if by_chance < apart else np.nan
+    return Mixing(lacey, variance / apart)

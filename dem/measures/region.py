@@ -1,0 +1,94 @@
+"""Regions of space: boxes and cylinders."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Union
+
+import numpy as np
+
+from dem.arrays import Bools, Floats
+from dem.checks import positive
+
+
+@dataclass(frozen=True)
+class Block:
+    """A box along the axes from the corner `low` to `high` (3,) [m]."""
+
+    low: Sequence[float]
+    high: Sequence[float]
+
+    def __post_init__(self) -> None:
+        positive("size of a Block", np.subtract(self.high, self.low))
+
+    @property
+    def volume(self) -> float:
+        """[m^3]"""
+        return float(np.prod(np.subtract(self.high, self.low)))
+
+    def contains(self, point: Floats) -> Bools:
+        """Mask of points (n, 3) [m]."""
+        inside: Bools = ((point >= self.low) & (point < self.high)).all(axis=1)
+        return inside
+
+    def part(self, start: Floats, end: Floats) -> Floats:
+        """Which part (n,) of the lines from `start` to `end` (n, 3) is inside; exact."""
+        first, last = np.zeros(len(start)), np.ones(len(start))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for k in range(3):
+                cuts = (np.array([self.low[k], self.high[k]]) - start[:, k, None]) / (end - start)[:, k, None]
+                first, last = np.fmax(first, cuts.min(axis=1)), np.fmin(last, cuts.max(axis=1))
+        return np.maximum(last - first, 0.0)
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A cylinder about the line from `start` to `end` (3,) with this radius [m]."""
+
+    start: Sequence[float]
+    end: Sequence[float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        positive("radius of a Cylinder", self.radius)
+        positive("length of a Cylinder", self.length)
+
+    @property
+    def length(self) -> float:
+        """[m]"""
+        return float(np.linalg.norm(np.subtract(self.end, self.start)))
+
+    @property
+    def volume(self) -> float:
+        """[m^3]"""
+        return float(np.pi * self.radius**2 * self.length)
+
+    def _split(self, vector: Floats) -> tuple[Floats, Floats]:
+        """The parts of vectors (n, 3) along (n,) and across (n, 3) the axis."""
+        axis = np.subtract(self.end, self.start) / self.length
+        along = vector @ axis
+        return along, vector - along[:, None] * axis
+
+    def contains(self, point: Floats) -> Bools:
+        """Mask of points (n, 3) [m]."""
+        along, across = self._split(point - np.asarray(self.start))
+        inside: Bools = (along >= 0.0) & (along < self.length) & ((across**2).sum(axis=1) < self.radius**2)
+        return inside
+
+    def part(self, start: Floats, end: Floats) -> Floats:
+        """Which part (n,) of the lines from `start` to `end` (n, 3) is inside; exact."""
+        height, offset = self._split(start - np.asarray(self.start))
+        rise, way = self._split(end - start)
+        a, b = (way**2).sum(axis=1), (way * offset).sum(axis=1)
+        c = (offset**2).sum(axis=1) - self.radius**2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cuts = (np.array([0.0, self.length]) - height[:, None]) / rise[:, None]
+            first, last = np.fmax(0.0, cuts.min(axis=1)), np.fmin(1.0, cuts.max(axis=1))
+            root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+            first, last = np.fmax(first, (-b - root) / a), np.fmin(last, (-b + root) / a)
+        outside = ((a == 0.0) & (c > 0.0)) | (b * b < a * c)
+        return np.where(outside, 0.0, np.maximum(last - first, 0.0))
+
+
+Region = Union[Block, Cylinder]

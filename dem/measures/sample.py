@@ -1,0 +1,55 @@
+"""The grains and contacts that are measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dem.arrays import Bools, Floats, Ints
+from dem.shapes import solid
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The grains (n) and contacts (nc) of this rank: grains as they are now, contacts as of the step that led there."""
+
+    comm: MPI.Comm
+    count: int  #: grains on all ranks; larger numbers are large bodies
+    id: Ints  #: (n,) numbers in the order of the scene
+    position: Floats  #: (n, 3) [m]
+    velocity: Floats  #: (n, 6) [m/s, rad/s]
+    mass: Floats  #: (n,) [kg]
+    shape: Ints  #: (n,) kinds, as of `dem.bodies`
+    size: Floats  #: (n, 3) [m]
+    material: Ints  #: (n,) indices into `materials`
+    materials: tuple[str, ...]
+    bodies: Ints  #: (nc, 2) numbers of the two bodies of each contact
+    center: Floats  #: (nc, 2, 3) their centres at the start of the step [m]
+    point: Floats  #: (nc, 3) [m]
+    normal: Floats  #: (nc, 3) from the first to the second
+    gap: Floats  #: (nc,) [m]
+    force: Floats  #: (nc, 3) on the second, mean over the step [N]
+    moment: Floats | None = None  #: (nc, 3) on the second, of contacts that resist rolling or spinning [N m]
+
+    def of(self, material: str) -> Bools:
+        """Mask (n,) of the grains of a material; ValueError if there is none of that name."""
+        if material not in self.materials:
+            raise ValueError(f"material {material!r}: allowed is one of {', '.join(self.materials)}")
+        return self.material == self.materials.index(material)
+
+    @property
+    def volume(self) -> Floats:
+        """Volumes (n,) of the grains [m^3]."""
+        out = np.zeros(len(self.shape))
+        for kind in np.unique(self.shape):
+            rows = self.shape == kind
+            out[rows] = solid(int(kind), self.size[rows], np.ones(rows.sum()))[0]
+        return out
+
+
+def summed(sample: Sample, values: Any) -> Any:
+    """The sum over the ranks."""
+    return sample.comm.allreduce(values)

@@ -1,0 +1,47 @@
+"""Large spheres rise among small ones in a shaken box, the Brazil nut effect::
+
+    mpiexec -n 2 python -m pctt.run -scene docs/examples/vibrated.py -ccp_type apgd -steps 1500 -output vibrated
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dem import measures
+from dem.experiment import Experiment, option
+from dem.motion import Oscillation
+from dem.scene import Scene
+from dem.scenes.lattice import perturbed
+from dem.shapes import Plane
+
+
+@dataclass(frozen=True)
+class Vibrated(Experiment):
+    """Spheres of two sizes settle in a box, which then oscillates upwards and downwards."""
+
+    n: int = option(8, "", "spheres along each side of the box")
+    radius: float = option(0.02, "m", "radius of a large sphere; a small one has half of it")
+    amplitude: float = option(0.01, "m", "of the oscillation")
+    frequency: float = option(10.0, "Hz", "of the oscillation")
+    settling_time: float = option(0.8, "s", "when the oscillation begins")
+    dt = 0.002
+
+    def build(self) -> Scene:
+        """The scene, with the large body "can"."""
+        scene, pitch = Scene(0.3), 2.2 * self.radius
+        line, side = (np.arange(self.n) + 0.5) * pitch, self.n * pitch
+        places = perturbed(line, line, line, 0.05 * self.radius, 1)
+        large = np.random.default_rng(0).random(len(places)) < 0.2
+        scene.add_spheres(places[large], self.radius, 2500.0, material="large")
+        scene.add_spheres(places[~large], 0.5 * self.radius, 2500.0, material="small")
+        walls = [Plane(s * np.eye(3)[k], (0.5 - 0.5 * s) * side * np.eye(3)[k]) for k in (0, 1) for s in (-1, 1)]
+        shaking = Oscillation((0, 0, 1), self.amplitude, 1 / self.frequency, start=self.settling_time)
+        scene.add_body("can", [Plane((0, 0, 1)), *walls], shaking)
+        return scene
+
+    def record(self, step):
+        """Mean heights of both sizes, and their difference over their sum."""
+        large, small = (measures.mean_position(step.sample, step.sample.of(name))[2] for name in ("large", "small"))
+        return {"large_z [m]": large, "small_z [m]": small, "segregation": (large - small) / (large + small)}

@@ -1,0 +1,220 @@
+"""Cone problems with resistance to rolling and spinning.
+
+A contact has six numbers: normal and tangential impulses, a moment about the normal and one about the tangents, in
+units of force times a length of the contact (`dem.contact_map.TurningMap`). The cone is
+
+    |g_t| <= mu g_n,    |m_roll| <= rho g_n,    |m_spin| <= sigma g_n,
+
+and its dual has y_n >= mu |y_t| + rho |w_roll| + sigma |w_spin|, with the velocities w that do work on the moments.
+Coulomb's law is the complementarity of both, with this sum added to y_n (De Saxce's term): each of the three resists
+against its own velocity, and nothing opens that slides, rolls or spins. Without the sum, in the relaxation, it does.
+Source: Acary, Bourrier, "Coulomb friction with rolling resistance as a cone complementarity problem", Eur. J. Mech.
+A/Solids 85 (2021), for the cone of friction and rolling.
+
+Arrays of contacts are (2 nc, 3): (normal, tangents) of all contacts, then (spin, rolls).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from dem.compiled import inlined, loop
+from dem.contact_map import BlockRows, TurningMap
+from dem.exchange import refuse
+from pctt.ccp.cone_loops import (
+    ONE,
+    STRIP,
+    ZERO,
+    Array,
+    add_compliance,
+    add_products,
+    add_squares,
+    add_work,
+    extrapolate,
+)
+from pctt.ccp.problem import ConeProblem
+
+
+class RollingProblem(ConeProblem):
+    """A `ConeProblem` whose ``mu`` (2 nc,) has the coefficients of friction, then those of rolling over the lengths of
+    the contacts, as ``spinning`` (nc,) has them of spinning."""
+
+    rows_of_contact = 2
+
+    def __init__(
+        self, comm: MPI.Comm, r: Array, mu: Array, rolling: Array, spinning: Array, *, G: TurningMap | BlockRows,
+        point: Array | None = None, key: np.ndarray | None = None, compliance: Array | float = 0.0,
+    ):  # fmt: skip
+        """r (2 nc, 3); the others as of a `ConeProblem`, with a row for each contact."""
+        nc = len(mu)
+        fits = np.shape(rolling) == np.shape(spinning) == (nc,) and (np.asarray(spinning) >= 0.0).all()
+        refuse(comm, "" if fits else f"rolling or spinning: allowed are numbers >= 0, one for each of {nc} contacts")
+        twice = None if point is None else np.concatenate([point, point])
+        soft = np.concatenate([np.broadcast_to(compliance, nc), np.zeros(nc)])
+        super().__init__(comm, r, np.concatenate([mu, rolling]), G=G, point=twice, compliance=soft)
+        self.key, self.spinning = key, np.ascontiguousarray(spinning, dtype=float)
+
+    def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
+        moves = squared_moves(g, y, 1.0 / self.mean_diagonal, self.mu, self.spinning, float(coulomb))
+        distance, norm = np.sqrt(self.sum(np.array([moves, np.vdot(g, g)])))
+        if distance == 0:
+            return 0.0
+        residual = float(distance / norm) if norm > 0 else np.inf
+        return residual if residual == residual else np.inf
+
+    def works(self, g: Array, y: Array) -> tuple[float, float, float]:
+        return wrong_works(g, y, self.r)
+
+
+@inlined
+def nearest(n, tangential, roll, spin, mu, rho, sigma):
+    """The normal part of the nearest point of a cone, and the factors of the other three parts, whose sizes are given.
+
+    At the height h the parts beyond their discs are pulled back to them, and h is the root of h - n - sum of mu_k max(
+    size_k - mu_k h, 0): a least of eight lines that ascend, one for each choice of parts. So h is the greatest root of
+    these lines: with rolling alone, inside, friction, rolling and both, and zero is the fifth case. Selections, as a
+    processor could not predict branches."""
+    a, b, c = mu * tangential, rho * roll, sigma * spin
+    of_a, of_b, of_c = mu * mu, rho * rho, sigma * sigma
+    height = ZERO if n < ZERO else n
+    height = _larger(height, (n + a) / (ONE + of_a))
+    height = _larger(height, (n + b) / (ONE + of_b))
+    height = _larger(height, (n + c) / (ONE + of_c))
+    height = _larger(height, (n + a + b) / (ONE + of_a + of_b))
+    height = _larger(height, (n + a + c) / (ONE + of_a + of_c))
+    height = _larger(height, (n + b + c) / (ONE + of_b + of_c))
+    height = _larger(height, (n + a + b + c) / (ONE + of_a + of_b + of_c))
+    return height, _factor(mu * height, tangential), _factor(rho * height, roll), _factor(sigma * height, spin)
+
+
+@inlined
+def _larger(x, y):
+    return y if not y <= x else x  # a NaN stays
+
+
+@inlined
+def _factor(radius, size):
+    reach = radius if size < radius else size
+    return radius / (ONE if reach == ZERO else reach) if size > radius else ONE
+
+
+@inlined
+def size_of(x, y):
+    return np.sqrt(x * x + y * y)
+
+
+@loop
+def project_to(x: Array, mu: Array, sigma: Array, out: Array) -> Array:
+    """The nearest points (2 nc, 3) of the cones, into ``out``, which may be x."""
+    count = len(sigma)
+    for c in range(count):
+        d = count + c
+        tangential, roll, spin = size_of(x[c, 1], x[c, 2]), size_of(x[d, 1], x[d, 2]), abs(x[d, 0])
+        n, t, r, s = nearest(x[c, 0], tangential, roll, spin, mu[c], mu[d], sigma[c])
+        out[c, 0], out[c, 1], out[c, 2] = n, t * x[c, 1], t * x[c, 2]
+        out[d, 0], out[d, 1], out[d, 2] = s * x[d, 0], r * x[d, 1], r * x[d, 2]
+    return out
+
+
+@loop
+def not_idle(x: Array, last_x: Array, y: Array, mu: Array, sigma: Array, least: float) -> np.ndarray:
+    """`pctt.ccp.cone_loops.not_idle` for these cones."""
+    out = np.empty(len(sigma), np.bool_)
+    for c in range(len(sigma)):
+        opening = y[c, 0] - _resisted(y, c, mu, sigma)
+        out[c] = (x[c, 0] > ZERO) | (last_x[c, 0] > ZERO) | (not opening > least)
+    return out
+
+
+@inlined
+def _resisted(y, c, mu, sigma):
+    """mu |y_t| + rho |w_roll| + sigma |w_spin| of the contact c."""
+    d = len(sigma) + c
+    return mu[c] * size_of(y[c, 1], y[c, 2]) + mu[d] * size_of(y[d, 1], y[d, 2]) + sigma[c] * abs(y[d, 0])
+
+
+@loop
+def squared_moves(x: Array, y: Array, step: float, mu: Array, sigma: Array, de_saxce: float) -> float:
+    """The sum of |P(x - step y) - x|^2, where y_n gets De Saxce's term if ``de_saxce`` is 1."""
+    count, total, p = len(sigma), 0.0, np.empty(6)
+    for c in range(count):
+        d = count + c
+        p[0] = x[c, 0] - step * (y[c, 0] + de_saxce * _resisted(y, c, mu, sigma))
+        p[1], p[2] = x[c, 1] - step * y[c, 1], x[c, 2] - step * y[c, 2]
+        for k in range(3):
+            p[3 + k] = x[d, k] - step * y[d, k]
+        n, t, r, s = nearest(p[0], size_of(p[1], p[2]), size_of(p[4], p[5]), abs(p[3]), mu[c], mu[d], sigma[c])
+        total += (n - x[c, 0]) ** 2 + (t * p[1] - x[c, 1]) ** 2 + (t * p[2] - x[c, 2]) ** 2
+        total += (s * p[3] - x[d, 0]) ** 2 + (r * p[4] - x[d, 1]) ** 2 + (r * p[5] - x[d, 2]) ** 2
+    return total
+
+
+@loop
+def wrong_works(g: Array, y: Array, r: Array) -> tuple[float, float, float]:
+    """`pctt.ccp.cone_loops.wrong_works` of these contacts."""
+    closing, opening, energy, count = 0.0, 0.0, 0.0, len(g) // 2
+    for c in range(count):
+        along, free = 0.0, 0.0
+        for k in range(3):
+            for row in (c, count + c):
+                along += g[row, k] * y[row, k]
+                free += g[row, k] * r[row, k]
+        closing += g[c, 0] * (0.0 if y[c, 0] > 0.0 else -y[c, 0])
+        opening += 0.0 if along < 0.0 else along
+        energy += 0.5 * (along - free)
+    return closing, opening, energy
+
+
+@loop
+def accelerated_step(
+    x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, sigma: Array,
+    de_saxce: float, out: Array,
+) -> tuple[float, float, float]:  # fmt: skip
+    """`pctt.ccp.cone_loops.accelerated_step` for these cones, of which both halves of the rows go through strips."""
+    count, soft = len(sigma), len(compliance) > 0
+    part, way, saxce = x.dtype.type(beta), x.dtype.type(step), x.dtype.type(de_saxce)
+    x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)
+    z, y_z, turns = np.empty(3 * STRIP, x.dtype), np.empty(3 * STRIP, x.dtype), np.empty(3 * STRIP, x.dtype)
+    squares, products = np.zeros(3 * STRIP, x.dtype), np.zeros(3 * STRIP, x.dtype)
+    work = np.zeros(3 * STRIP, x.dtype)
+    for first in range(0, count, STRIP):
+        here = sigma[first : first + STRIP]
+        friction, rolling = mu[first : first + len(here)], mu[count + first : count + first + len(here)]
+        a, b = 3 * first, 3 * (first + len(here))
+        d, e = a + 3 * count, b + 3 * count
+        extrapolate(x[a:b], last_x[a:b], part, z)
+        extrapolate(x[d:e], last_x[d:e], part, turns)
+        if soft:
+            add_compliance(y[a:b], compliance[a:b], z, y_z)
+        else:
+            y_z[: b - a] = y[a:b]
+        _add_de_saxce(y_z, y[d:e], saxce, friction, rolling, here)
+        _step(z, y_z, turns, y[d:e], way, friction, rolling, here, to[a:b], to[d:e])
+        add_squares(to[a:b], z, squares)
+        add_squares(to[d:e], turns, squares)
+        add_products(to[a:b], x[a:b], y_z, products)
+        add_products(to[d:e], x[d:e], y[d:e], products)
+        if soft:
+            add_work(to[a:b], z, compliance[a:b], work)
+    return work.sum(), squares.sum(), products.sum()
+
+
+@loop
+def _add_de_saxce(y, turns, saxce, mu, rho, sigma):
+    for c in range(len(mu)):
+        i = 3 * c
+        resisted = mu[c] * size_of(y[i + 1], y[i + 2]) + rho[c] * size_of(turns[i + 1], turns[i + 2])
+        y[i] += saxce * (resisted + sigma[c] * abs(turns[i]))
+
+
+@loop
+def _step(x, y, turned, turning, step, mu, rho, sigma, out, moments):
+    for c in range(len(mu)):
+        i = 3 * c
+        p0, p1, p2 = x[i] - step * y[i], x[i + 1] - step * y[i + 1], x[i + 2] - step * y[i + 2]
+        p3, p4 = turned[i] - step * turning[i], turned[i + 1] - step * turning[i + 1]
+        p5 = turned[i + 2] - step * turning[i + 2]
+        n, t, r, s = nearest(p0, size_of(p1, p2), size_of(p4, p5), abs(p3), mu[c], rho[c], sigma[c])
+        out[i], out[i + 1], out[i + 2] = n, t * p1, t * p2
+        moments[i], moments[i + 1], moments[i + 2] = s * p3, r * p4, r * p5

@@ -1,0 +1,332 @@
+"""Trains on the Newton systems of settled mixer steps, as the paper measures them:
+
+    run/study trains ranks [N] [-caps 10,100] [-every K]   its tables 1 and 2: ranks, errors and seconds per PDIP solve
+    run/study trains reuse [N ...] [-steps K]              seconds of set-up without over those with reuse of trains
+    run/study trains scaling [N ...]                       seconds of set-up and application against the contacts
+
+The systems are those of `pdip` with block Jacobi, from a cold start and of rigid contacts, recorded and handed to every
+configuration; `apgd` makes the time steps. Writes results/trains_WHAT.json, and results/trains_scaling.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import petsc4py
+
+petsc4py.init([sys.argv[0]])
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from shared import exponent, figure, median_seconds, record, say_machine
+
+from dem.contact import find_contacts
+from dem.scenes import Mixer
+from dem.system import ContactSystem
+from pctt import ccp
+from pctt.ccp.newton.contact import ContactForm
+from pctt.ksp_options import entered
+from pctt.pc import TensorTrain
+from pctt.pc.sparse_train import SparseTrain
+from pctt.run.stepper import cone_problem
+from pctt.simulation import Simulation
+
+COMM = MPI.COMM_SELF
+TOL = 1e-4  # natural residual at which the Newton systems end
+EPS = (1e-2, 1e-3, 1e-4)
+# (eps, cap): average ranks of matrix and inverse, seconds of compression and inversion per PDIP solve
+PAPER = {
+    (1e-2, 10): (4.6, 4.4, 10), (1e-2, 100): (10.5, 6.7, 25), (1e-2, 1000): (10.5, 6.7, 25),
+    (1e-3, 10): (8.7, 8.5, 16), (1e-3, 100): (59.3, 45.2, 1244), (1e-3, 1000): (65.2, 46.4, 1317),
+    (1e-4, 10): (9.1, 9.0, 16), (1e-4, 100): (68.6, 58.1, 2740), (1e-4, 1000): (113.3, 91.2, 8157),
+}  # fmt: skip
+LEVELS = ("none", "newton", "trains")  # of reuse
+EARLY, REPEAT = 6, 3  # `scaling` takes the last two of so many Newton systems, so often
+
+# -- the systems ----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class System:
+    """One Newton system S x = b: barrier blocks (nc, 3, 3) of S, and b (3 nc,)."""
+
+    barrier: np.ndarray
+    b: np.ndarray
+
+
+class Recorder(ccp.Newton):
+    """Newton systems as pdip has them solved by block Jacobi, kept for later."""
+
+    def begin(self, problem: ccp.ConeProblem) -> None:
+        super().begin(problem)
+        self.systems: list[System] = []
+
+    def update(self, barrier: np.ndarray, *more: Any, **named: Any) -> None:
+        self._barrier = barrier.copy()
+        super().update(barrier, *more, **named)
+
+    def solve(self, q: np.ndarray, *more: Any, **named: Any) -> tuple[np.ndarray, np.ndarray]:
+        self.systems.append(System(self._barrier, q.ravel().copy()))
+        return super().solve(q, *more, **named)
+
+
+class Replay:
+    """The recorded systems of one cone problem."""
+
+    def __init__(self, problem: ccp.ConeProblem, systems: list[System]):
+        self.contacts, self.systems = problem.size, systems
+        self._of = ContactForm(problem)
+
+    def matrix(self, system: System) -> PETSc.Mat:
+        """S, the same Mat with new values."""
+        self._of.update(system.barrier)
+        return self._of.entries()
+
+    def destroy(self) -> None:
+        self._of.destroy()
+
+
+def replays(n: int, steps: int = 1, max_it: int = -1) -> Iterator[Replay]:
+    """The systems of each of some steps from the settled mixer; ``max_it``: of each, at most."""
+    sim = Simulation(Mixer(n=n), restart="settled", dt=0.025, comm=COMM, solver="apgd", stiffness=np.inf)
+    world, settings = sim.world, sim.settings
+    for _ in range(steps):
+        contacts = find_contacts(world, settings.delta, settings.dt)
+        newton = Recorder(COMM)
+        with cone_problem(ContactSystem(world, contacts, settings.dt, settings.recovery_speed), COMM) as problem:
+            ccp.solve(problem, None, "pdip", ccp.Limits(TOL, max_it, np.inf, fallback=False), newton=newton)
+            replay = Replay(problem, newton.systems)
+            yield replay
+            replay.destroy()
+        newton.destroy()
+        sim.step()
+
+
+# -- set-ups, watched -----------------------------------------------------------------------------------------
+
+
+class WatchedSparseTrain(SparseTrain):
+    """Whose phases are timed into ``rows[-1]``, the list of its `WatchedTrain`."""
+
+    rows: list[dict[str, Any]]
+
+    def _compress(self, warm: bool):
+        start = time.perf_counter()
+        found = super()._compress(warm)
+        self.rows[-1] |= {"compress_s": time.perf_counter() - start, "error": found.error}
+        self.rows[-1] |= {"matrix_rank": mean_rank(found.train.ranks)}
+        return found
+
+    def _invert(self, warm: bool):
+        start = time.perf_counter()
+        inverse = super()._invert(warm)
+        self.rows[-1] |= {"invert_s": time.perf_counter() - start, "residual": inverse.residual}
+        # what is stored of I + Z is Z, of one rank less
+        self.rows[-1] |= {"inverse_rank": mean_rank(inverse.applied.ranks) + inverse.identity}
+        return inverse
+
+    def _is_positive(self, P: PETSc.Mat) -> bool:
+        self.rows[-1] |= {"positive": super()._is_positive(P)}
+        return self.rows[-1]["positive"]
+
+
+class WatchedTrain(TensorTrain):
+    """A tensor train whose set-ups are timed phase by phase; a rank that failed is tried again at the next matrix.
+
+    Attributes
+    ----------
+    rows : a dict of figures per set-up; ``rank`` is 1 where no positive inverse came of it
+    """
+
+    sparse_train = WatchedSparseTrain
+
+    def create(self, pc: PETSc.PC) -> None:
+        super().create(pc)
+        self.rows: list[dict[str, Any]] = []
+
+    def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
+        assert isinstance(self.made, WatchedSparseTrain)
+        self.made.rows, self.made.failure = self.rows, ""
+        self.rows.append({})
+        super().update(pc, P)
+        self.rows[-1] |= {"setup_s": self._made_in, "rank": self.rank}
+
+
+def mean_rank(ranks: tuple[int, ...]) -> float:
+    """Of the inner bonds of a train."""
+    return float(np.mean(ranks[1:-1])) if len(ranks) > 2 else 1.0
+
+
+def train_pc(**options: Any) -> PETSc.PC:
+    """A train with these options -pc_tt_*, of a fixed rank if they have one."""
+    pc = PETSc.PC().create(COMM)
+    pc.setOptionsPrefix("watched_")
+    pc.setType("python")
+    pc.setPythonContext(WatchedTrain())
+    with entered({f"watched_pc_tt_{name}": str(value) for name, value in options.items()}):
+        pc.setFromOptions()
+    return pc
+
+
+def set_up(pc: PETSc.PC, matrix: PETSc.Mat) -> dict[str, Any]:
+    """Make the preconditioner; the figures of the set-up."""
+    pc.setOperators(matrix)
+    pc.setUp()
+    return pc.getPythonContext().rows[-1]
+
+
+# -- ranks ----------------------------------------------------------------------------------------------------
+
+
+def of_cap(replay: Replay, eps: float, cap: int, scaling: str, every: int) -> dict[str, Any]:
+    """Averages over the systems, and seconds per PDIP solve: means times all its Newton steps."""
+    pc = train_pc(eps=eps, rank=cap, scaling=scaling, reuse="steps")
+    done = [dict(set_up(pc, replay.matrix(system))) for system in replay.systems[::every]]
+    pc.destroy()
+    rows = [row for row in done if "inverse_rank" in row]
+    row: dict[str, Any] = {"scaling": scaling, "eps": eps, "cap": cap, "contacts": replay.contacts}
+    row |= {"newton_steps": len(replay.systems), "set_ups": len(done), "positive": sum(row["positive"] for row in rows)}
+    row |= {name: float(np.mean([row[name] for row in rows])) for name in ("matrix_rank", "inverse_rank", "error")}
+    row["residual"] = float(np.median([row["residual"] for row in rows]))
+    for name in ("compress_s", "invert_s"):
+        row[name] = len(replay.systems) * float(np.mean([row[name] for row in rows]))
+    return row
+
+
+def ranks(given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Average ranks of trains and of their inverses, with and without block scaling."""
+    steps = replays(given.n)
+    replay = next(steps)
+    print(f"mixer n = {given.n}: {replay.contacts} contacts, {len(replay.systems)} Newton steps, 1 rank")
+    print("means over the Newton steps (residual: median); seconds per PDIP solve; paper: ranks and seconds")
+    print(f"{'scaling':8} {'eps':>8} {'cap':>5} {'ranks S/X':>12} {'paper':>18} {'error':>10} {'residual':>10} "
+          f"{'positive':>10} {'compress s':>10} {'invert s':>10}")  # fmt: skip
+    rows: list[dict[str, Any]] = []
+    for scaling in ("block", "none"):
+        for cap in given.caps:
+            every = given.every if cap <= 10 else max(given.every, len(replay.systems) // 3)
+            for eps in EPS:
+                row = of_cap(replay, eps, cap, scaling, every)
+                rows.append(row)
+                paper = "{}/{} {} s".format(*PAPER[eps, cap]) if (eps, cap) in PAPER else "-"
+                print(f"{scaling:8} {eps:8.0e} {cap:5d} {row['matrix_rank']:6.1f}/{row['inverse_rank']:5.1f} "
+                      f"{paper:>18} {row['error']:10.3g} {row['residual']:10.3g} "
+                      f"{row['positive']:>7}/{row['set_ups']:2d} {row['compress_s']:10.2f} {row['invert_s']:10.2f}",
+                      flush=True)  # fmt: skip
+    steps.close()
+    return rows
+
+
+# -- reuse ----------------------------------------------------------------------------------------------------
+
+
+def reuse(given: argparse.Namespace) -> list[dict[str, Any]]:
+    """A row per time step: set-ups of every Newton system by every level of reuse."""
+    rows: list[dict[str, Any]] = []
+    names = [f"{what}, {level}" for level in LEVELS[1:] for what in ("first", "all")]
+    print("seconds of set-up without reuse / with reuse within a time step (newton) and from step to step (trains):")
+    print("of the first Newton system of a step, and of all")
+    print(f"{'n':>3} {'step':>6} {'contacts':>9} {'Newton':>7}" + "".join(f"{name:>15}" for name in names))
+    for n in given.n:
+        pcs = {level: train_pc(reuse=level, rank=10, eps=1e-2) for level in LEVELS}
+        for step, replay in enumerate(replays(n, given.steps), start=1):
+            seconds: dict[str, list[float]] = {level: [] for level in LEVELS}
+            for pc in pcs.values():
+                pc.reset()
+            for k, system in enumerate(replay.systems):
+                for turn in range(len(LEVELS)):
+                    level = LEVELS[(k + turn) % len(LEVELS)]  # each is the first, with a cold cache, as often
+                    seconds[level].append(set_up(pcs[level], replay.matrix(system))["setup_s"])
+            row: dict[str, Any] = {"n": n, "step": step, "contacts": replay.contacts, "newton": len(replay.systems)}
+            for level in LEVELS[1:]:
+                row[f"first, {level}"] = seconds["none"][0] / seconds[level][0]
+                row[f"all, {level}"] = sum(seconds["none"]) / sum(seconds[level])
+            rows.append(row | {"seconds": seconds})
+            if step > 1:  # the first step of a run has nothing to start from
+                cells = "".join(f"{row[name]:15.2f}" for name in names)
+                print(f"{n:3d} {step:6d} {row['contacts']:9d} {row['newton']:7d}{cells}", flush=True)
+        for pc in pcs.values():
+            pc.destroy()
+        later = [row for row in rows if row["n"] == n][1:]
+        medians = [np.median([row[name] for row in later]) for name in names]
+        print(f"{n:3d} {'median':>6} {'':17}" + "".join(f"{median:15.2f}" for median in medians))
+    return rows
+
+
+# -- scaling --------------------------------------------------------------------------------------------------
+
+
+def phases(replay: Replay) -> dict[str, float]:
+    """Seconds for a cold start with a matrix and a warm one with the next, medians; of an application, and of S x."""
+    runs: list[dict[str, float]] = []
+    for _ in range(REPEAT):
+        run: dict[str, float] = {}
+        for way in ("als", "cross"):
+            pc = train_pc(compress=way, rank=10, eps=1e-2, reuse="steps")
+            for state, system in zip(("cold", "warm"), replay.systems[-2:]):
+                done = set_up(pc, replay.matrix(system))
+                run[f"{way} {state}"] = done["compress_s"]
+                if way == "als":
+                    run |= {f"invert {state}": done["invert_s"], f"set-up {state}": done["setup_s"]}
+            pc.destroy()
+        runs.append(run)
+    row = {name: float(np.median([run[name] for run in runs])) for name in runs[0]}
+    matrix = replay.matrix(replay.systems[-1])
+    pc = train_pc(rank=10, eps=1e-2)
+    x, y = matrix.createVecs()
+    x.array[:] = np.random.default_rng(0).standard_normal(x.getLocalSize())
+    good = set_up(pc, matrix)["rank"] > 1  # else it is block Jacobi
+    row["apply"] = median_seconds(lambda: pc.apply(x, y)) if good else np.nan
+    row["product"] = median_seconds(lambda: matrix.mult(x, y))
+    pc.destroy()
+    return row
+
+
+def scaling(given: argparse.Namespace) -> list[dict[str, Any]]:
+    """A row per size, and the exponents of the seconds in the contacts."""
+    rows: list[dict[str, Any]] = []
+    print(f"rank 10, eps 1e-2, 1 rank; medians of {REPEAT} set-ups, 5 applications; seconds")
+    for n in given.n:
+        (row,) = ({"contacts": replay.contacts, **phases(replay)} for replay in replays(n, max_it=EARLY))
+        names = [name for name in row if name != "contacts"]
+        if not rows:
+            print(f"{'n':>3} {'contacts':>9}" + "".join(f"{name:>12}" for name in names))
+        print(f"{n:3d} {row['contacts']:9d}" + "".join(f"{row[name]:12.4f}" for name in names), flush=True)
+        rows.append({"n": n, **row})
+    contacts = [row["contacts"] for row in rows]
+    powers = {name: exponent(contacts, [row[name] for row in rows]) for name in names}
+    print(f"{'exponent':>13}" + "".join(f"{powers[name]:12.2f}" for name in names))
+    with figure("trains_scaling", 1) as panels:
+        for axes in panels:
+            for name in names:
+                axes.loglog(contacts, [row[name] for row in rows], "o-", label=f"{name}: Nc^{powers[name]:.2f}")
+            axes.set(xlabel="contacts Nc", ylabel="seconds")
+            axes.legend(fontsize="small")
+    return [*rows, {"exponents": powers}]
+
+
+def main() -> None:
+    words = argparse.ArgumentParser("run/study trains", description=__doc__,
+                                    formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
+    kinds = words.add_subparsers(dest="what", required=True)
+    of_ranks, of_reuse, of_scaling = (kinds.add_parser(name) for name in ("ranks", "reuse", "scaling"))
+    of_ranks.add_argument("n", type=int, nargs="?", default=8, help="size of the mixer (8; the paper's is 16)")
+    of_ranks.add_argument("-caps", default="10,100", type=lambda text: [int(word) for word in text.split(",")],
+                          help="caps of the ranks, with commas between (10,100)")  # fmt: skip
+    of_ranks.add_argument("-every", type=int, default=1, help="every K-th system (1; caps over 10: three in all)")
+    of_reuse.add_argument("n", type=int, nargs="*", default=[4, 8], help="sizes of the mixer (4 8)")
+    of_reuse.add_argument("-steps", type=int, default=31, help="time steps of each, the first not counted (31)")
+    of_scaling.add_argument("n", type=int, nargs="*", default=[2, 4, 8, 16], help="sizes of the mixer (2 4 8 16)")
+    given = words.parse_args()
+    about = say_machine()
+    record(f"trains_{given.what}", about, {"ranks": ranks, "reuse": reuse, "scaling": scaling}[given.what](given))
+
+
+if __name__ == "__main__":
+    main()

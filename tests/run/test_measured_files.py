@@ -1,0 +1,93 @@
+"""Measures of a simulation and of its files: the same figures, on the same grains."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import pctt
+from dem import measures
+from dem.measures import Block
+from dem.mesh import Mesh
+from dem.scene import Scene
+from dem.shapes import Plane
+from pctt import analysis
+from pctt.folder import Folder
+
+WIDE = Block((-1, -1, -1), (1, 1, 1))
+
+
+def lying():
+    """Spheres upon a square of two triangles that lies turned in its body."""
+    scene = Scene(0.5)
+    turn = (np.cos(0.3), 0, 0, np.sin(0.3))
+    square = Mesh([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], quaternion=turn)
+    scene.add_body("floor", [square], position=(0, 0, -0.1))
+    scene.add_body("ceiling", [Plane((0, 0, -1))], position=(0, 0, 5))
+    scene.add_spheres([[0.4, -0.1, 0], [0.5, -0.3, 0], [-0.3, 0.4, 0], [0.4, -0.1, 0.2]], 0.1, 1000.0)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    path = tmp_path_factory.mktemp("measures") / "run"
+    sim = pctt.Simulation(lying(), dt=0.002, solver="apgd", tol=1e-9, stiffness=np.inf, comm=MPI.COMM_SELF)
+    sim.write(path)
+    sim.run(steps=3)
+    sim.close()
+    return sim, Folder(path)
+
+
+def test_nothing_is_measured_before_the_first_step():
+    with pytest.raises(ValueError, match="no step was made"):
+        pctt.Simulation(lying(), comm=MPI.COMM_SELF).sample  # noqa: B018
+
+
+def test_the_samples_of_a_simulation_and_of_its_files_are_alike(results):
+    sim, folder = results
+    one, other = sim.sample, analysis.sample(folder, folder.steps[-1])
+    for a, b in zip(measures.per_grain(one), measures.per_grain(other)):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+    np.testing.assert_allclose(measures.stress(one, WIDE), measures.stress(other, WIDE), atol=1e-9)
+    fields = analysis.fields(folder, folder.steps[-1], WIDE, (4, 4, 4), 0.6)
+    np.testing.assert_allclose(fields.stress, measures.fields(one, WIDE, (4, 4, 4), 0.6).stress, atol=1e-9)
+
+
+def test_the_triangles_bear_the_weight_of_the_spheres(results):
+    sim, folder = results
+    force = sim.body("floor").triangle_forces()
+    weight = 9.81 * sim.local.mass[0]
+    np.testing.assert_allclose(force[:, 2], [-3 * weight, -weight], rtol=1e-5)
+    np.testing.assert_allclose(force.sum(axis=0), sim.body("floor").force, atol=1e-9)
+    np.testing.assert_allclose(analysis.triangle_forces(folder, folder.steps[-1], "floor"), force, atol=1e-9)
+    with pytest.raises(ValueError, match="body 'ceiling' is not one mesh"):
+        sim.body("ceiling").triangle_forces()
+    with pytest.raises(ValueError, match="body 'ceiling' is not one mesh"):
+        analysis.triangle_forces(folder, folder.steps[-1], "ceiling")
+    with pytest.raises(ValueError, match="no large body 'roof'; there are: floor, ceiling"):
+        analysis.triangle_forces(folder, folder.steps[-1], "roof")
+
+
+def test_fields_are_written_as_image_data(results, tmp_path):
+    found = measures.fields(results[0].sample, Block((-1, -1, -1), (1, 2, 3)), (2, 3, 4), 0.9)
+    analysis.write_fields(tmp_path / "fields.vtkhdf", found)
+    with h5py.File(tmp_path / "fields.vtkhdf") as file:
+        root = file["VTKHDF"]
+        assert root.attrs["WholeExtent"].tolist() == [0, 2, 0, 3, 0, 4]
+        np.testing.assert_array_equal(root["CellData/density"][3, 1, 0], found.density[0, 1, 3])
+        np.testing.assert_array_equal(root["CellData/stress"][2, 1, 0], found.stress[0, 1, 2].ravel())
+
+
+def test_vtk_reads_the_fields(results, tmp_path):
+    hdf = pytest.importorskip("vtkmodules.vtkIOHDF", reason="vtk is not installed (extra `pictures`)")
+    found = measures.fields(results[0].sample, WIDE, (2, 3, 4), 0.9)
+    analysis.write_fields(tmp_path / "fields.vtkhdf", found)
+    reader = hdf.vtkHDFReader()
+    reader.SetFileName(str(tmp_path / "fields.vtkhdf"))
+    reader.Update()
+    image = reader.GetOutput()
+    assert image.GetDimensions() == (3, 4, 5)
+    density = image.GetCellData().GetArray("density")
+    assert density.GetValue(1 + 2 * (2 + 3 * 1)) == pytest.approx(found.density[1, 2, 1])
