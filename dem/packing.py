@@ -14,9 +14,9 @@ from dem.neighbourhood import image_ways
 from dem.quaternion import length
 from dem.sources import Listed, Uniform
 
-SPARSE = 0.25  #: solid fraction up to which spheres are put at random places one after another
+SPARSE = 0.1  #: solid fraction up to which spheres are put at random places one after another
 SWELL = 1e-4  #: by how much radii are larger while overlaps are removed, so that none is left
-TRIES = 500  #: places for a sphere
+TRIES = 100  #: places for a sphere
 
 
 def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -> Floats:
@@ -38,7 +38,7 @@ def random_packing(
     """Centres (n, 3) and radii (n,) [m] of spheres without overlaps in the box from zero to the `lengths` (3,) [m],
     with at least this solid `fraction`, up to about 0.6.
 
-    Along `periodic` axes the box repeats itself; others have walls, which spheres do not cross. Spheres of a quarter of
+    Along `periodic` axes the box repeats itself; others have walls, which spheres do not cross. Spheres of a tenth of
     the volume are put at random places; then they grow from step to step, and what overlaps is pushed apart (Jodrey,
     Tory, Physical Review A 32 (1985); Lubachevsky, Stillinger, J. Stat. Phys. 60 (1990)). ValueError if `most` rounds
     of that leave overlaps, as the fraction is too high.
@@ -64,7 +64,7 @@ def random_packing(
         raise ValueError(f"no place for {np.count_nonzero(taken < 0)} of {len(radii)} spheres: the box is too small")
     position, left = place[np.arange(len(radii)), taken], most
     while part < 1.0:
-        part = min(1.02 * part, 1.0)
+        part = min(1.03 * part, 1.0)
         position, left = _apart(position, part * radii * (1.0 + SWELL), box, period, left)
     order = random.permutation(len(radii))
     return position[order], radii[order]
