@@ -72,7 +72,7 @@ def _fits(point, radius, first, following, center, radii, low, wide, cells, peri
     for x in range(a - 1, a + 2):
         for y in range(b - 1, b + 2):
             for z in range(c - 1, c + 2):
-                i, j, l = x, y, z
+                i, j, h = x, y, z
                 if np.isfinite(period[0]):
                     i = x % cells[0]
                 elif x < 0 or x >= cells[0]:
@@ -82,10 +82,10 @@ def _fits(point, radius, first, following, center, radii, low, wide, cells, peri
                 elif y < 0 or y >= cells[1]:
                     continue
                 if np.isfinite(period[2]):
-                    l = z % cells[2]
+                    h = z % cells[2]
                 elif z < 0 or z >= cells[2]:
                     continue
-                k = first[(i * cells[1] + j) * cells[2] + l]
+                k = first[(i * cells[1] + j) * cells[2] + h]
                 while k >= 0:
                     square, reach = 0.0, (radius + radii[k]) * (1.0 + 1e-12)
                     for s in range(3):

@@ -98,7 +98,7 @@ class Source(Timed):
         _refuse_region("source", self.region)
         if (self.mass_rate is None) == (self.number_rate is None):
             raise ValueError("a source has either a mass_rate [kg/s] or a number_rate [1/s]")
-        checks.positive("rate of a source", self.mass_rate if self.number_rate is None else self.number_rate)
+        checks.positive("rate of a source", [rate for rate in (self.mass_rate, self.number_rate) if rate is not None])
         checks.positive("density of a source", self.density)
         if not isinstance(self.radius, (Uniform, Listed)):
             object.__setattr__(self, "radius", Listed(tuple(np.atleast_1d(np.asarray(self.radius, float)).tolist())))

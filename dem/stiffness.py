@@ -49,7 +49,8 @@ def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
     The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width, and
     four times as much where a chain of force goes (Radjai, Jean, Moreau, Roux, Phys. Rev. Lett. 77 (1996): a share of
     exp(-1.4 f) bears more than f times the mean). A grain of mass m that a tool of speed v meets is stopped by
-    k d = v sqrt(k m). Sources may fill the scene up to their height (`_bed`). Cohesion c presses grains together by c / k. Grains that fall from high are not reckoned with.
+    k d = v sqrt(k m). Sources may fill the scene up to their height (`_bed`). Cohesion c presses grains together by
+    c / k. Grains that fall from high are not reckoned with.
     """
     grains = scene.expected()
     allowed = overlap * bodies.bounding_radius(grains)

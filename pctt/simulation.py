@@ -216,8 +216,8 @@ class Simulation:
 
     @property
     def ids(self) -> np.ndarray:
-        """Ids (n,) of the grains that there are, in ascending order, on every rank: the order of `positions` and others.
-        They count the grains in the order of the scene, then those of sources in the order in which they came."""
+        """Ids (n,) of the grains that there are, in ascending order, on every rank: the order of `positions` and
+        others. They count the grains in the order of the scene, then those of sources as they came."""
         return self._of_grains("id")
 
     def source(self, name: str) -> Tally:

@@ -29,7 +29,8 @@ class Feeder(Experiment):
     def build(self) -> Scene:
         """The scene, with the large bodies "belt" and "guides", the source "feed" and the outlet "end"."""
         scene, r = Scene(0.4), self.radius
-        scene.add_body("belt", [Box((0.5, 0.15, 0.02))], position=(0.5, 0.0, -0.02), surface_velocity=(self.speed, 0, 0))
+        along = (self.speed, 0.0, 0.0)
+        scene.add_body("belt", [Box((0.5, 0.15, 0.02))], position=(0.5, 0.0, -0.02), surface_velocity=along)
         sides = [Box((0.5, 0.01, 0.1), (0.5, y, 0.1)) for y in (-0.16, 0.16)]
         scene.add_body("guides", [*sides, Box((0.01, 0.17, 0.1), (-0.01, 0.0, 0.1))])
         region = Block((0.05, -0.1, 0.1), (0.2, 0.1, 0.25))

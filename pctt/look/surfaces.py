@@ -160,7 +160,8 @@ class Scene:
 
 
 def _bounds(places: Sequence[np.ndarray]) -> np.ndarray:
-    return np.array([np.concatenate(places).min(axis=0), np.concatenate(places).max(axis=0)])
+    found = np.concatenate(places) if sum(map(len, places)) else np.array([[-0.5] * 3, [0.5] * 3])  # no grain yet
+    return np.array([found.min(axis=0), found.max(axis=0)])
 
 
 def extent(path: Path, table: Table) -> np.ndarray:

@@ -33,7 +33,6 @@ from pctt.folder import DERIVED, FILES, HARD, Folder, dumps, write_table
 from pctt.options import OptionError
 from pctt.petsc import warn
 
-
 #: What no step changes, but in a world with sources or outlets, whose frames have it too, and the ids.
 TABLE = ("shape", "size", "mass", "material")
 
