@@ -146,7 +146,7 @@ def ends_of(colour: str, values: np.ndarray) -> tuple[float, float]:
         return 0.0, max(high, 1.0)
     if colour == "size":
         return (low, high) if low < 0.999 * high else (0.0, high or 1.0)
-    high = float(np.quantile(values, 0.99)) or 1.0
+    high = (float(np.quantile(values, 0.99)) if len(values) else 0.0) or 1.0
     step = 10 ** np.floor(np.log10(high))
     return 0.0, step * min(k for k in (1, 2, 4, 6, 8, 10) if k * step >= high)  # a quarter has few digits
 
