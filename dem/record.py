@@ -21,13 +21,14 @@ from dem.motion import Held
 from dem.period import wrapped
 from dem.step import Step
 from dem.together import SceneError, together
+from dem.world import World
 
 
 def row(step: Step, scene: Experiment) -> dict[str, float]:
     """All quantities of a step by name, with units in brackets. SceneError if the scene's `record` fails or returns
     something else than numbers by name."""
     out = {"step": step.world.step, "time [s]": step.world.time}
-    out |= energy_balance(step) | contact_statistics(step)
+    out |= energy_balance(step) | contact_statistics(step) | passages(step.world)
     if scene.domain is not None:
         out["grains_outside"] = outside(step, *scene.domain)
     for body in step.world.large_bodies:
@@ -57,6 +58,20 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
     if any(other != names[0] for other in names):
         raise SceneError(f"{what}: it must return the same names on all ranks, in the same order")
     return own
+
+
+def passages(world: World) -> dict[str, float]:
+    """What has passed each source and outlet up to now, how many steps a source had no room, and the energies that
+    came and went with grains before this step [J]; nothing of a scene without."""
+    out: dict[str, float] = {}
+    for name, tally in world.tallies.items():
+        out |= {f"count_{name}": tally.count, f"mass_{name} [kg]": tally.mass}
+        if name in world.sources:
+            out[f"refused_{name}"] = tally.refused
+    if out:
+        for kind, names in (("sources", world.sources), ("outlets", world.outlets)):
+            out[f"energy_of_{kind} [J]"] = sum(world.tallies[name].energy for name in names)
+    return out
 
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
@@ -246,7 +261,7 @@ def contact_statistics(step: Step) -> dict[str, float]:
     return {
         "contacts": count,
         "active_contacts": sums[0],
-        "coordination_number": sums[2] / step.world.slabs[-1],
+        "coordination_number": sums[2] / max(step.world.slabs[-1], 1),
         "sliding_fraction": sums[1] / max(sums[0], 1),
         "worst_overlap [m]": comm.allreduce(max(worst, contacts.held_overlap), MPI.MAX),
     }

@@ -91,13 +91,14 @@ class Step:
             center[:, 1] += contacts.moved
             point = wrapped(point, self.world.period)
             center += (point - contacts.point)[:, None]
+        number, first, count = near.id[pair], self.world.first_large, self.world.ids
         names = ("id", "velocity", "mass", "shape", "size", "material")
         return Sample(
             comm=self.world.comm,
-            count=int(self.world.slabs[-1]),
+            count=count,
             **{name: getattr(grains, name) for name in names},
             materials=self.world.materials,
-            bodies=near.id[pair],
+            bodies=np.where(number < first, number, number - first + count),
             position=wrapped(grains.position, self.world.period),
             center=center,
             point=point,

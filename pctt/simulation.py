@@ -16,7 +16,7 @@ import dataclasses
 import html
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from dem.mesh import Mesh
 from dem.motion import Motion
 from dem.period import wrapped
 from dem.scene import LargeBody, Scene, SurfaceVelocity
+from dem.sources import Tally
 from dem.springs import Spring
 from dem.start import step_remark
 from dem.step import Step
@@ -44,7 +45,7 @@ from dem.together import meet, together
 from dem.world import set_load, set_motion, set_spring, set_surface
 from pctt import ccp, log
 from pctt.disk import FileError, refuse_serial
-from pctt.folder import Contacts, Frame, Snapshot
+from pctt.folder import Contacts, Frame, Snapshot, Table
 from pctt.options import OptionError, made, refuse_bad
 from pctt.petsc import warn
 from pctt.render import Picture, picture
@@ -214,6 +215,27 @@ class Simulation:
         return self.world.step
 
     @property
+    def ids(self) -> np.ndarray:
+        """Ids (n,) of the grains that there are, in ascending order, on every rank: the order of `positions` and
+        others. They count the grains in the order of the scene, then those of sources as they came."""
+        return self._of_grains("id")
+
+    def source(self, name: str) -> Tally:
+        """What has come from a source: ``count``, ``mass`` [kg], and ``refused``, the steps in which it had no room.
+        ValueError if there is none of that name. Not collective."""
+        return self._passage("source", self.world.sources, name)
+
+    def outlet(self, name: str) -> Tally:
+        """What has left by an outlet: ``count`` and ``mass`` [kg]. ValueError if there is none of that name. Not
+        collective."""
+        return self._passage("outlet", self.world.outlets, name)
+
+    def _passage(self, what: str, there: Mapping[str, Any], name: str) -> Tally:
+        if name not in there:
+            raise ValueError(f"no {what} {name!r}; there are: {', '.join(there) or 'none'}")
+        return dataclasses.replace(self.world.tallies[name])
+
+    @property
     def positions(self) -> Floats:
         """Centres (n, 3) of all grains on every rank, in the order in which the scene added them, within the cell of a
         periodic scene [m]."""
@@ -262,7 +284,7 @@ class Simulation:
         found = self._gathered(
             "contacts",
             key=own.key,
-            bodies=np.stack([id[own.a], id[own.b]], axis=1),
+            bodies=np.searchsorted(np.append(self.ids, self.world.large.id), np.stack([id[own.a], id[own.b]], axis=1)),
             point=wrapped(own.point, self.world.period),
             frame=step.system.frame,
             gap=own.gap,
@@ -417,14 +439,14 @@ class Simulation:
     def _snapshot(self) -> Snapshot:
         """All bodies and contacts on every rank, for those that draw."""
         world, large = self.world, self.world.large
-        names = ("position", "quaternion", "velocity", "shape", "size", "material")
+        names = ("position", "quaternion", "velocity", "id", "shape", "size", "mass", "material")
         table = {name: np.concatenate([self._of_grains(name), getattr(large, name)]) for name in names}
         position, turn, velocity = (table.pop(name) for name in names[:3])
         grains = len(position) - len(large)
         position[:grains] = wrapped(position[:grains], world.period)
         contacts = self.contacts if self.last else Contacts.none()
-        frame = Frame(self.steps, self.time, position, turn, velocity, contacts)
-        return Snapshot(frame, **table, materials=world.materials, large=described_bodies(world))
+        frame = Frame(self.steps, self.time, position, turn, velocity, contacts, Table(**table, grains=grains))
+        return Snapshot(frame, materials=world.materials, large=described_bodies(world))
 
 
 class Body:

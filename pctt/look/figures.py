@@ -175,6 +175,7 @@ def energy(columns: Mapping[str, np.ndarray]) -> Figure:
     first record."""
     time = columns["time [s]"]
     kinetic, potential, spring, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
+    work = work + columns.get("energy_of_sources [J]", 0.0) - columns.get("energy_of_outlets [J]", 0.0)
     total = kinetic + spring + potential - potential[0] + np.cumsum(friction + impact - work)
     figure = Figure(figsize=(9.5, 6.4))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))

@@ -67,6 +67,7 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     large = scene.large_bodies
     motions = [(body.name, type(body.motion).__name__) for body in large]
     words = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
+    words += [repr(scene.sources), repr(scene.outlets)]
     numbers = [column for table in (*scene.parts, scene.large()) for column in table.columns().values()]
     numbers += [np.asarray(value) for body in large for shape in body.shapes for value in placed(shape)]
     of_motions = [np.asarray(value) for body in large for value in getattr(body.motion, "__dict__", {}).values()]
@@ -153,8 +154,8 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
     def take(file: h5py.File, sealed: bool) -> tuple[Any, ...]:
         _refuse_unmarked(file, sealed)
         replicated = {n: file[f"world/{n}"][()] for n in (*(f"large_{n}" for n in columns), "slabs", "time", "step")}
-        if "world/expected" in file:  # of springs
-            replicated["expected"] = file["world/expected"][()]
+        for name in {"expected", "tallies"} & set(file["world"]):  # of springs, of sources and outlets
+            replicated[name] = file[f"world/{name}"][()]
         changes = [file[f"world/{n}"].asstr()[0] if f"world/{n}" in file else "{}" for n in CHANGES]
         rows, contacts = restart_rows(replicated["slabs"], comm), even_slice(len(file["contacts/key"]), comm)
         local = {name: file[f"grains/{name}"][rows] for name in columns}
