@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, loads, quaternion, springs
+from dem import bodies, checks, loads, quaternion, springs
 from dem import motion as motions
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
@@ -23,6 +23,25 @@ from dem.pairs import Pairs
 from dem.scene import LargeBody, SurfaceVelocity, checked_surface
 from dem.springs import Spring
 from dem.together import together
+
+
+@dataclass(frozen=True)
+class Shear:
+    """A simple shear of a periodic cell (Lees and Edwards 1972): flow along x, with its gradient along y or z."""
+
+    rate: float  #: d v_x / d y or z [1/s]
+    axis: int  #: of the gradient: 1 or 2
+    length: float  #: the period along it [m]
+    shift: float = 0.0  #: by how much the images behind that period are moved along x so far [m]
+
+    @property
+    def speed(self) -> float:
+        """Velocity along x of the images behind the period, relative to their grains [m/s]."""
+        return self.rate * self.length
+
+    def after(self, dt: float) -> Shear:
+        """dt [s] later."""
+        return dataclasses.replace(self, shift=self.shift + dt * self.speed)
 
 
 @dataclass
@@ -44,6 +63,7 @@ class World:
     loads: dict[str, Load] = field(default_factory=dict)  #: by name; change them by `set_load` only
     springs: dict[str, Spring] = field(default_factory=dict)  #: by name; change them by `set_spring` only
     period: Floats | None = None  #: (3,) lengths of the cell that repeats itself, inf: none; None: along no axis [m]
+    shear: Shear | None = None  #: of the cell
     time: float = 0.0  #: [s]
     step: int = 0  #: number of steps done
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
@@ -77,6 +97,8 @@ class World:
         replicated.update(slabs=self.slabs, time=np.array(self.time), step=np.array(self.step))
         if self.expected is not None:
             replicated["expected"] = self.expected
+        if self.shear is not None:
+            replicated["shear"] = np.array([self.shear.rate, self.shear.shift])
         return self.grains.columns(), replicated
 
     def set_grains(self, grains: Bodies) -> None:
@@ -191,6 +213,13 @@ def set_surface(world: World, name: str, velocity: SurfaceVelocity | None) -> No
 def _ways(motion: Any) -> Floats:
     """Projectors (2, 3, 3) on what forces and torques can move."""
     return np.array([motion.free_directions(), motion.free_turns()])
+
+
+def set_shear_rate(world: World, rate: float) -> None:
+    """Shear the cell at another rate [1/s] from now on. ValueError if the scene has no `shear_rate`."""
+    if world.shear is None:
+        raise ValueError("shear rate: the cell of this scene is not sheared; give the Scene a shear_rate, or 0")
+    world.shear = dataclasses.replace(world.shear, rate=float(checks.finite("shear rate", rate)))
 
 
 def set_load(world: World, name: str, on: On = None, **values: Any) -> None:

@@ -74,6 +74,7 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     of_motions += [np.asarray(value) for spring in scene.springs.values() for value in vars(spring).values()]
     of_motions += [np.asarray(value) for load in scene.loads.values() for value in vars(load).values()]
     numbers += [value for value in of_motions if value.dtype.kind in "fiub"]
+    numbers += [np.array([-np.inf if scene.shear_rate is None else scene.shear_rate, scene.gradient])]
     numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values()]
     return repr(words), numbers
 
@@ -153,8 +154,9 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
     def take(file: h5py.File, sealed: bool) -> tuple[Any, ...]:
         _refuse_unmarked(file, sealed)
         replicated = {n: file[f"world/{n}"][()] for n in (*(f"large_{n}" for n in columns), "slabs", "time", "step")}
-        if "world/expected" in file:  # of springs
-            replicated["expected"] = file["world/expected"][()]
+        for name in ("expected", "shear"):  # of springs, of a sheared cell
+            if f"world/{name}" in file:
+                replicated[name] = file[f"world/{name}"][()]
         changes = [file[f"world/{n}"].asstr()[0] if f"world/{n}" in file else "{}" for n in CHANGES]
         rows, contacts = restart_rows(replicated["slabs"], comm), even_slice(len(file["contacts/key"]), comm)
         local = {name: file[f"grains/{name}"][rows] for name in columns}
