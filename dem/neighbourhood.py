@@ -84,7 +84,7 @@ def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> 
 def image_ways(period: Floats, shear: Shear | None = None) -> tuple[Floats, Floats]:
     """By what (k, 3) images are moved, for the periods (3,) [m], inf: none; and how many sheared boundaries (k,) lie
     between them and the cell. Behind one, images are shifted by up to half a period, so that one more may be near."""
-    each = [(-1.0, 0.0, 1.0) if np.isfinite(length) else (0.0,) for length in period]
+    each: list[tuple[float, ...]] = [(-1.0, 0.0, 1.0) if np.isfinite(length) else (0.0,) for length in period]
     if shear is not None:
         each[0] = (-2.0, -1.0, 0.0, 1.0, 2.0)
     whole = np.array([steps for steps in product(*each) if any(steps)])
