@@ -76,7 +76,9 @@ def passages(world: World) -> dict[str, float]:
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
-    place, lost = wrapped(step.world.grains.position, step.world.period), np.zeros(len(step.world.grains), bool)
+    world = step.world
+    place = wrapped(world.grains.position, world.period, world.shear)
+    lost = np.zeros(len(world.grains), bool)
     for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high))):
         lost |= (place[:, axis] < least) | (place[:, axis] > most)
     return step.total(lost)
@@ -128,7 +130,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     impulses do the work g' D' w. Its tangential part is the friction loss. Its normal part goes to the springs of
     contacts, and the rest is lost in impacts, or pushes overlaps of rigid contacts apart where it is a gain. The work
     of motions is that of prescribed bodies on the others, of the drives of guided and hinged bodies, of what holds
-    bodies in part, of belts, loads and springs. The rest is the error of the semi-implicit step, of the order of dt:
+    bodies in part, of belts, loads, springs and the shear of a
+    cell. The rest is the error of the semi-implicit step, of the order of dt:
     -dt/2 m g (v_new - v_old) per body.
 
     Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be. Where
@@ -164,6 +167,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     belts = 0.0
     if system.surface is not None:
         belts = comm.allreduce(-np.vdot(step.impulse[:, 1:], system.surface))
+    if system.drift is not None:
+        loads += comm.allreduce(-np.vdot(step.impulse, system.drift))
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
     driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + loads + belts + holding
     work = driving - received

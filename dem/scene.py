@@ -71,15 +71,24 @@ class Scene:
         rolling: float = 0.0,
         spinning: float = 0.0,
         period: Sequence[float | None] | None = None,
+        shear_rate: float | None = None,
+        shear_gradient: str = "y",
     ) -> None:
         """`gravity`: (3,) [m/s^2]. The others are coefficients of the contacts of all pairs of materials, but of those
         of `set_pair`: `friction`, `stiffness` [N/m] (inf: rigid; None: `dem.stiffness.recommended`), `restitution`, the
         attractive force `cohesion` [N] up to a gap of `cohesion_range` [m], and the greatest moments against `rolling`
         and `spinning`, over the normal force [m]. See `dem.pairs` and docs/contact_laws.md.
         `period`: (3,) lengths of the cell, from zero on, that repeats itself along x, y, z [m], None: not along that
-        axis; see docs/periodic.md.
+        axis. `shear_rate`: d v_x / dy of the cell, or d v_x / dz for the `shear_gradient` "z" [1/s]; None: it is at
+        rest. See docs/periodic.md.
         """
         self.period = checks.period(period)
+        self.shear_rate = None if shear_rate is None else float(checks.finite("shear_rate", shear_rate))
+        if shear_gradient not in ("y", "z"):
+            raise ValueError(f"shear_gradient must be 'y' or 'z', got {shear_gradient!r}")
+        self.gradient = "xyz".index(shear_gradient)
+        if shear_rate is not None and (self.period is None or np.isinf(self.period[[0, self.gradient]]).any()):
+            raise ValueError(f"shear_rate needs periods along x and {shear_gradient}")
         self.gravity = checks.vector("gravity", gravity)
         self.large_bodies: list[LargeBody] = []
         #: Names of large bodies that go away from the grains: their speed asks for no stiffness.
@@ -481,6 +490,11 @@ def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
                 f"period of {period[k]:g} m along {'xyz'[k]} is too short: a grain could meet another one on both its "
                 f"sides, or its own image; allowed is more than two greatest diameters, {4.0 * radius:g} m"
             )
+    if scene.shear_rate is not None and scene.large_bodies:
+        raise ValueError(f"large body {scene.large_bodies[0].name!r}: a sheared cell has grains alone")
+    if scene.shear_rate is not None and (scene.sources or scene.outlets):
+        name = next(iter({**scene.sources, **scene.outlets}))
+        raise ValueError(f"{name!r}: a sheared cell has no sources and outlets")
     if scene.springs:
         raise ValueError(f"spring {next(iter(scene.springs))!r}: springs have no images, so periods allow none")
     for body in scene.large_bodies:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, loads, quaternion, springs
+from dem import bodies, checks, loads, quaternion, springs
 from dem import motion as motions
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
@@ -24,6 +24,25 @@ from dem.scene import LargeBody, SurfaceVelocity, checked_surface
 from dem.sources import Outlet, Source, Tally, as_array
 from dem.springs import Spring
 from dem.together import together
+
+
+@dataclass(frozen=True)
+class Shear:
+    """A simple shear of a periodic cell (Lees and Edwards 1972): flow along x, with its gradient along y or z."""
+
+    rate: float  #: d v_x / d y or z [1/s]
+    axis: int  #: of the gradient: 1 or 2
+    length: float  #: the period along it [m]
+    shift: float = 0.0  #: by how much the images behind that period are moved along x so far [m]
+
+    @property
+    def speed(self) -> float:
+        """Velocity along x of the images behind the period, relative to their grains [m/s]."""
+        return self.rate * self.length
+
+    def after(self, dt: float) -> Shear:
+        """dt [s] later."""
+        return dataclasses.replace(self, shift=self.shift + dt * self.speed)
 
 
 @dataclass
@@ -50,6 +69,7 @@ class World:
     tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets, by name
     initial: int = 0  #: number of grains at time zero
     first_large: int = 0  #: id of the first large body
+    shear: Shear | None = None  #: of the cell
     time: float = 0.0  #: [s]
     step: int = 0  #: number of steps done
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
@@ -85,6 +105,8 @@ class World:
             replicated["expected"] = self.expected
         if self.tallies:
             replicated["tallies"] = as_array(self.tallies)
+        if self.shear is not None:
+            replicated["shear"] = np.array([self.shear.rate, self.shear.shift])
         return self.grains.columns(), replicated
 
     def set_grains(self, grains: Bodies) -> None:
@@ -204,6 +226,13 @@ def set_surface(world: World, name: str, velocity: SurfaceVelocity | None) -> No
 def _ways(motion: Any) -> Floats:
     """Projectors (2, 3, 3) on what forces and torques can move."""
     return np.array([motion.free_directions(), motion.free_turns()])
+
+
+def set_shear_rate(world: World, rate: float) -> None:
+    """Shear the cell at another rate [1/s] from now on. ValueError if the scene has no `shear_rate`."""
+    if world.shear is None:
+        raise ValueError("shear rate: the cell of this scene is not sheared; give the Scene a shear_rate, or 0")
+    world.shear = dataclasses.replace(world.shear, rate=float(checks.finite("shear rate", rate)))
 
 
 def set_load(world: World, name: str, on: On = None, **values: Any) -> None:

@@ -34,7 +34,7 @@ from dem.loads import Load, On
 from dem.measures import Sample
 from dem.mesh import Mesh
 from dem.motion import Motion
-from dem.period import wrapped
+from dem.period import velocity_in_cell, wrapped
 from dem.scene import LargeBody, Scene, SurfaceVelocity
 from dem.sources import Tally
 from dem.springs import Spring
@@ -42,7 +42,7 @@ from dem.start import step_remark
 from dem.step import Step
 from dem.stiffness import expected_overlap
 from dem.together import meet, together
-from dem.world import set_load, set_motion, set_spring, set_surface
+from dem.world import set_load, set_motion, set_shear_rate, set_spring, set_surface
 from pctt import ccp, log
 from pctt.disk import FileError, refuse_serial
 from pctt.folder import Contacts, Frame, Snapshot, Table
@@ -239,7 +239,7 @@ class Simulation:
     def positions(self) -> Floats:
         """Centres (n, 3) of all grains on every rank, in the order in which the scene added them, within the cell of a
         periodic scene [m]."""
-        return wrapped(self._of_grains("position"), self.world.period)
+        return wrapped(self._of_grains("position"), self.world.period, self.world.shear)
 
     @property
     def orientations(self) -> Floats:
@@ -249,7 +249,9 @@ class Simulation:
     @property
     def velocities(self) -> Floats:
         """Linear and angular velocities (n, 6) of all grains on every rank, in the order of the scene [m/s, rad/s]."""
-        return self._of_grains("velocity")
+        if self.world.shear is None:
+            return self._of_grains("velocity")
+        return velocity_in_cell(self._of_grains("position"), self._of_grains("velocity"), self.world.shear)
 
     @property
     def local(self) -> Bodies:
@@ -285,7 +287,7 @@ class Simulation:
             "contacts",
             key=own.key,
             bodies=np.searchsorted(np.append(self.ids, self.world.large.id), np.stack([id[own.a], id[own.b]], axis=1)),
-            point=wrapped(own.point, self.world.period),
+            point=wrapped(own.point, self.world.period, self.world.shear),
             frame=step.system.frame,
             gap=own.gap,
             impulse=step.impulse,
@@ -320,6 +322,13 @@ class Simulation:
         on, values = self.comm.bcast((on, values))
         change = partial(set_load, self.world, name, on, **values)
         together(self.comm, f"load {name}", change, own=(ValueError, TypeError))
+
+    def set_shear_rate(self, rate: float) -> None:
+        """Shear the cell at another rate [1/s]. The first rank's value counts, and checkpoints keep it. ValueError if
+        the scene has no ``shear_rate``."""
+        meet(self.comm, "shear rate")
+        change = partial(set_shear_rate, self.world, self.comm.bcast(rate))
+        together(self.comm, "shear rate", change, own=(ValueError, TypeError))
 
     @property
     def springs(self) -> dict[str, Spring]:
@@ -443,7 +452,8 @@ class Simulation:
         table = {name: np.concatenate([self._of_grains(name), getattr(large, name)]) for name in names}
         position, turn, velocity = (table.pop(name) for name in names[:3])
         grains = len(position) - len(large)
-        position[:grains] = wrapped(position[:grains], world.period)
+        velocity[:grains] = velocity_in_cell(position[:grains], velocity[:grains], world.shear)
+        position[:grains] = wrapped(position[:grains], world.period, world.shear)
         contacts = self.contacts if self.last else Contacts.none()
         frame = Frame(self.steps, self.time, position, turn, velocity, contacts, Table(**table, grains=grains))
         return Snapshot(frame, materials=world.materials, large=described_bodies(world))

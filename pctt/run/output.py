@@ -22,7 +22,7 @@ from mpi4py import MPI
 from dem import bodies
 from dem.exchange import exchange
 from dem.experiment import Experiment
-from dem.period import wrapped
+from dem.period import velocity_in_cell, wrapped
 from dem.shapes import described
 from dem.step import Step
 from dem.together import together
@@ -270,7 +270,7 @@ class Writer:
             **_by_id(world, ("position", "quaternion", "velocity", *(("id", *TABLE) if world.tallies else ()))),
             "contact/key": contacts.key,
             "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
-            "contact/point": wrapped(contacts.point, world.period),
+            "contact/point": wrapped(contacts.point, world.period, world.shear),
             "contact/frame": step.system.frame,
             "contact/gap": contacts.gap,
             "contact/impulse": step.impulse,
@@ -309,7 +309,9 @@ def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:
     grains, comm = world.grains, world.comm
     columns = {"id": grains.id, **{name: getattr(grains, name) for name in names}}
     if "position" in columns:
-        columns["position"] = wrapped(columns["position"], world.period)
+        if "velocity" in columns:
+            columns["velocity"] = velocity_in_cell(columns["position"], columns["velocity"], world.shear)
+        columns["position"] = wrapped(columns["position"], world.period, world.shear)
     starts = np.arange(comm.size + 1) * world.ids // comm.size
     rows = exchange(comm, columns, np.searchsorted(starts, grains.id, side="right") - 1)
     order, last = np.argsort(rows["id"]), comm.rank == comm.size - 1
