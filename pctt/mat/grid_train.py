@@ -48,14 +48,13 @@ class TrainProduct:
     counts : number of rows of each rank
     slots : (rows,) slot of each row of all ranks in the train; other slots get zeros
     size : number of slots
-    train : matrix train; `set_train` takes another one with the same modes
     flops : operations of this rank in a product
 
     Every rank gathers x and multiplies with its part of the rows of the train. If the slots of the ranks overlap, they
     also gather the product.
     """
 
-    def __init__(self, comm: MPI.Comm, counts: Array, slots: Array, size: int, train: Train) -> None:
+    def __init__(self, comm: MPI.Comm, counts: Array, slots: Array, size: int) -> None:
         self.comm, self.size = comm, size
         rows = len(slots)
         if comm.size > 1 and rows > 1_000_000:
@@ -80,10 +79,10 @@ class TrainProduct:
         self._slots = slice(None) if rows == size and _consecutive(slots) else slots
         here = slots[self._gather.mine] - (bounds[0] if self._apart else 0)
         self._here = slice(None) if self._apart and _consecutive(here) else here
-        self._dtype: DTypeLike = train.dtype
-        self.set_train(train)
+        self._dtype: DTypeLike = float
 
     def set_train(self, train: Train) -> None:
+        """Multiply with this matrix train of `size` rows and columns from now on."""
         self.train = train
         self._applies: dict[np.dtype, Apply] = {}
 
@@ -239,7 +238,9 @@ class GridTrain:
 
     def product(self, train: Train) -> TrainProduct:
         """The product with a train, with rows in the order of the Mat."""
-        return TrainProduct(self.comm, self.counts, self._places, self.digits.size, train)
+        product = TrainProduct(self.comm, self.counts, self._places, self.digits.size)
+        product.set_train(train)
+        return product
 
     @cached_property
     def _product(self) -> TrainProduct:

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.exchange import on_first, refuse
-from pctt.mat.entries import Entries, Entry, given, is_symmetric
+from pctt.mat.entries import Entries, Entry, diagonal, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.order import Places, digits_of, whole_numbers
 from pctt.options import AT_LEAST_ONE, FRACTION, OptionError, describe, option, read, refuse_bad
@@ -184,9 +184,8 @@ class TensorTrain(Context):
             y.array_w[:] = self.compressed.times(x.array_r, transposed=True)
             PETSc.Log.logFlops(self.compressed.flops)
 
-    def getDiagonal(self, mat: PETSc.Mat, diagonal: PETSc.Vec) -> None:
-        here = np.arange(*mat.getOwnershipRange())
-        diagonal.array_w[:] = Entries.of(mat).own(here, here)
+    def getDiagonal(self, mat: PETSc.Mat, vec: PETSc.Vec) -> None:
+        vec.array_w[:] = diagonal(mat)
 
     # -- arithmetic -----------------------------------------------------------------------------------------
 
