@@ -18,7 +18,7 @@ from dem.exchange import on_first
 from pctt.blocks import symmetric_shell
 from pctt.mat.entries import DENSE, Entries, diagonal, is_symmetric, multiplies
 from pctt.mat.grid_train import GridTrain, TrainProduct, WholeVectors
-from pctt.mat.order import Places, digits_of
+from pctt.mat.order import Layout, Places, layout_of
 from pctt.mat.tensor_train import compressed, compressed_entries
 from pctt.pc.mat import finds_negative, iterations_with_the_diagonal
 from pctt.pc.options import Account, Options
@@ -36,33 +36,29 @@ class DifferencesInverse:
     iterations : those of conjugate gradients on a part of the grid, to 1e-8
     """
 
-    def __init__(
-        self, comm: MPI.Comm, counts: Array, order: Array | None, transform: differences.FastTransform, iterations: int,
-    ) -> None:  # fmt: skip
-        self.gather, self.order = WholeVectors(comm, counts), order
+    def __init__(self, layout: Layout, transform: differences.FastTransform, iterations: int) -> None:
+        self.gather, self.order = WholeVectors(layout.comm, layout.counts), layout.rows
         self.transform, self.iterations = transform, iterations
 
     @classmethod
-    def of(cls, P: PETSc.Mat, order: str, name: str, places: Places | None = None) -> DifferencesInverse | None:
+    def of(cls, P: PETSc.Mat, layout: Layout) -> DifferencesInverse | None:
         """For a Mat with entries; None if they do not depend on differences, or are not symmetric and positive.
 
-        order, name, places : as in `digits_of`. Collective; EntriesError or ValueError on all ranks.
+        Collective; EntriesError on all ranks.
         """
         if P.getBlockSize() > 1:
             return None
-        comm, entries = P.comm.tompi4py(), Entries.of(P)
-        digits, rows, _ = digits_of(P, order, name, places)
-        even = differences.depend_on_differences(entries, digits.shape, rows, np.random.default_rng(0))
-        if even is None or not is_symmetric(entries, digits.rows):
+        entries, shape, comm = Entries.of(P), layout.digits.shape, layout.comm
+        even = differences.depend_on_differences(entries, shape, layout.rows, np.random.default_rng(0))
+        if even is None or not is_symmetric(entries, layout.digits.rows):
             return None
-        means = differences.means_of_differences(entries, digits.shape, rows, even)
+        means = differences.means_of_differences(entries, shape, layout.rows, even)
         # what other ranks find best may differ by rounding
-        found = comm.bcast(differences.best(means) if comm.rank == 0 else None)
+        found = on_first(comm, lambda: differences.best(means))
         if found is None:
             return None
         transform = differences.FastTransform(means, found[0])
-        counts = np.array(comm.allgather(P.getLocalSize()[0]))
-        return cls(comm, counts, rows, transform, found[1]) if comm.bcast(transform.positive) else None
+        return cls(layout, transform, found[1]) if comm.bcast(transform.positive) else None
 
     def __call__(self, x: Array) -> Array:
         """This rank's part of the product, from its part of x. Every rank transforms the whole vector."""
@@ -93,8 +89,10 @@ class EntriesTrain:
     single_pays = True
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str, places: Places) -> None:
-        self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
-        self._order = (options.order, f"-{prefix}pc_tt_order", places)
+        self.comm, self.options, self.account = comm, options, account
+        self._named = f"-{prefix}pc_tt_"  # how the names of the options begin
+        self._places = places
+        self._layout: Layout | None = None
         self.rank = options.max_rank or 100 if options.automatic else int(options.rank)
         self.transform: DifferencesInverse | None = None
         self.compressed: GridTrain | None = None
@@ -120,9 +118,10 @@ class EntriesTrain:
         if self.rank == 1 or self._distrusted:
             return False
         options, iterations = self.options, 50  # if there is no estimate
-        product = self._product_operations(P)
+        layout = self._layout = self._layout or layout_of(P, options.order, f"{self._named}order", self._places)
+        product = _product_operations(P, layout)
         if options.automatic and options.eps >= options.coarse:
-            self.transform = DifferencesInverse.of(P, *self._order)
+            self.transform = DifferencesInverse.of(P, layout)
         if self.transform is not None:  # an iteration with it takes 1.3 products
             limit = options.part * 1.3 * product * self.transform.iterations
         else:
@@ -133,14 +132,14 @@ class EntriesTrain:
         if options.automatic and limit < options.pays:
             if self.transform is None:
                 self.note = f"conjugate gradients take about {iterations} iterations, so a train does not pay"
-            return self._take_no_train(P, "")
-        self._refused = self._refused or self._make_train(P, options.setup_limit or limit)
+            return self._take_no_train(P, layout, "")
+        self._refused = self._refused or self._make_train(P, layout, options.setup_limit or limit)
         if self._refused:
-            return self._take_no_train(P, self._refused)
+            return self._take_no_train(P, layout, self._refused)
         self.transform = None
         return True
 
-    def _take_no_train(self, P: PETSc.Mat, why: str) -> bool:
+    def _take_no_train(self, P: PETSc.Mat, layout: Layout, why: str) -> bool:
         """Use the transform if there is one; False: there is none. ``why``: a train that was tried has failed."""
         self.compressed = self.inverse = None
         if self.transform is not None:
@@ -149,21 +148,10 @@ class EntriesTrain:
             self.account.fall_back(why)
             self.failure = why
             if not self.options.automatic:
-                self.transform = DifferencesInverse.of(P, *self._order)
+                self.transform = DifferencesInverse.of(P, layout)
         return self.transform is not None
 
-    def _product_operations(self, P: PETSc.Mat) -> float:
-        """Of a product with P, by FFT on a grid twice as wide if P does not show how it multiplies."""
-        known = compressed(P)
-        if known is not None:
-            return apply_operations(known.train)
-        if P.getType() in DENSE:
-            return 0.5 * float(P.getSize()[0]) ** 2
-        shape = digits_of(P, *self._order)[0].shape
-        wide = prod(2 * n for n in shape)
-        return wide * log2(wide)
-
-    def _make_train(self, P: PETSc.Mat, limit: float) -> str:
+    def _make_train(self, P: PETSc.Mat, layout: Layout, limit: float) -> str:
         """Make a train with at most this number of operations; the reason if there is no positive one.
 
         eps is lowered three times if the train of the matrix or of its inverse is not positive.
@@ -173,7 +161,7 @@ class EntriesTrain:
             for _ in range(4):
                 warm = self.compressed is not None and self.options.reuse != "none"
                 with PETSc.Log.Event("TTCompress"):
-                    A = self.compressed = self._compress(P, eps, self.compressed if warm else None, work)
+                    A = self.compressed = self._compress(P, layout, eps, self.compressed if warm else None, work)
                 self.symmetric = A.symmetric
                 if A.shift <= 0:
                     return "the mean of the diagonal is not positive"
@@ -191,11 +179,13 @@ class EntriesTrain:
         except TooMuchWorkError as stopped:
             return self._too_much(str(stopped), work)
 
-    def _compress(self, P: PETSc.Mat, eps: float, start: GridTrain | None, work: Work) -> GridTrain:
-        known, (order, name, places) = compressed(P), self._order
-        if known is not None and known.error <= eps and order in ("auto", known.order):
+    def _compress(
+        self, P: PETSc.Mat, layout: Layout, eps: float, start: GridTrain | None, work: Work
+    ) -> GridTrain:
+        known = compressed(P)
+        if known is not None and known.error <= eps and self.options.order in ("auto", known.layout.order):
             return known.rounded(0.5 * eps, self.rank)
-        return compressed_entries(P, eps, self.rank, order, name, start, places, work)
+        return compressed_entries(P, layout, eps, self.rank, start, work)
 
     def _invert(self, A: GridTrain, eps: float, work: Work) -> Inverse | None:
         """The inverse of A / c; None if its train turns out not to be positive."""
@@ -220,7 +210,7 @@ class EntriesTrain:
         return found
 
     def _too_much(self, where: str, work: Work) -> str:
-        limit = f"the limit of {work.limit:.1e} operations (-{self.prefix}pc_tt_setup_limit) ends {where}"
+        limit = f"the limit of {work.limit:.1e} operations ({self._named}setup_limit) ends {where}"
         if self.options.setup_limit:
             return f"{limit}: raise it, if the ranks do not grow"
         if where == CROSS:
@@ -230,11 +220,11 @@ class EntriesTrain:
     def _why_not_positive(self, A: GridTrain, X: Inverse | None) -> str:
         missed = f"the train of the matrix leaves {A.error:.1e} of it"
         if X is None:
-            return f"the train of the matrix is not positive, {missed}: lower -{self.prefix}pc_tt_eps"
+            return f"the train of the matrix is not positive, {missed}: lower {self._named}eps"
         if X.residual <= self.options.eps:
-            return f"the inverse is not positive, because {missed}: lower -{self.prefix}pc_tt_eps"
+            return f"the inverse is not positive, because {missed}: lower {self._named}eps"
         why = f"the inverse of rank {self.rank} is not positive, it leaves {X.residual:.1e} of the residual"
-        return f"{why}: " + (f"raise -{self.prefix}pc_tt_rank" if X.residual < 1 else "this is hopeless")
+        return f"{why}: " + (f"raise {self._named}rank" if X.residual < 1 else "this is hopeless")
 
     # -- application ----------------------------------------------------------------------------------------
 
@@ -274,3 +264,14 @@ class EntriesTrain:
         assert self.inverse is not None
         X = self.inverse.applied
         return f"{self.compressed.words()}; inverse I + Z ranks {X.ranks} residual {self.inverse.residual:.2g}"
+
+
+def _product_operations(P: PETSc.Mat, layout: Layout) -> float:
+    """Of a product with P, by FFT on a grid twice as wide if P does not show how it multiplies."""
+    known = compressed(P)
+    if known is not None:
+        return apply_operations(known.train)
+    if P.getType() in DENSE:
+        return 0.5 * float(P.getSize()[0]) ** 2
+    wide = prod(2 * n for n in layout.digits.shape)
+    return wide * log2(wide)

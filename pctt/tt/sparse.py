@@ -91,9 +91,9 @@ class SparseHierarchy:
         starts = _starts(self.keys // m**2)
         wide = np.int64 if len(self.keys) * b * b >= 2**31 else np.int32
         i, j = np.divmod(self.keys % m**2, m)
-        first = (i * b * self.modes[-1] + j * b).astype(wide)  # column of the first entry of each block
+        first: Array = i * b * self.modes[-1] + j * b  # column of the first entry of each block
         place = np.add.outer(np.arange(b, dtype=wide) * self.modes[-1], np.arange(b, dtype=wide))
-        self._leaf_columns = np.add.outer(first, place).ravel()
+        self._leaf_columns = np.add.outer(first.astype(wide), place).ravel()
         self._leaf_pointers = (np.append(starts, len(self.keys)) * b * b).astype(wide)
         return self.keys[starts] // m**2
 
@@ -328,7 +328,8 @@ def backward(matrix: SparseHierarchy, last: Array, core_of: Callable[[int, Array
 
     core_of : gives core k from the matrix contracted with the cores after it
     """
-    V, spreads = matrix.leaf_up(last), []
+    V = matrix.leaf_up(last)
+    spreads: list[Array] = []
     for k in range(len(matrix.modes) - 2, -1, -1):
         spreads.insert(0, matrix.spread(k, V))
         if k > 0:
