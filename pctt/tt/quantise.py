@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from math import prod
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from pctt.tt.train import Array, Train
 
@@ -180,17 +179,18 @@ class GridDigits:
         return row * self.block + inner, inside
 
 
-def pair_keys(rows: ArrayLike, columns: ArrayLike, modes: Sequence[int]) -> Array:
+def pair_keys(rows: Array | int, columns: Array | int, modes: Sequence[int]) -> Array:
     """One number for each pair of slots, with the digits i_k m_k + j_k of base m_k^2; the first is most significant.
 
-    >>> pair_keys([0, 5], 3, [2, 4])
+    >>> pair_keys(np.array([0, 5]), 3, [2, 4])
     array([ 3, 23])
     """
     if float(slots_of(modes)) ** 2 >= 2.0**63:
         raise ValueError(f"too many slots for one key of 64 bits: modes {list(modes)}")
     key = np.zeros(1, np.int64)
-    for m, i, j in zip(modes, np.unravel_index(rows, modes), np.unravel_index(columns, modes)):
-        key = key * (m * m) + i * m + j
+    i, j = (np.unravel_index(np.asarray(x), modes) for x in (rows, columns))
+    for m, row, column in zip(modes, i, j):
+        key = key * (m * m) + row * m + column
     return key
 
 

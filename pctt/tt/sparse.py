@@ -90,8 +90,8 @@ class SparseHierarchy:
         m, b = self.slot_modes[-1], self.block
         starts = _starts(self.keys // m**2)
         wide = np.int64 if len(self.keys) * b * b >= 2**31 else np.int32
-        i, j = np.divmod(self.keys % m**2, m)
-        first: Array = i * b * self.modes[-1] + j * b  # column of the first entry of each block
+        digit: Array = self.keys % m**2
+        first = (digit // m * self.modes[-1] + digit % m) * b  # column of the first entry of each block
         place = np.add.outer(np.arange(b, dtype=wide) * self.modes[-1], np.arange(b, dtype=wide))
         self._leaf_columns = np.add.outer(first.astype(wide), place).ravel()
         self._leaf_pointers = (np.append(starts, len(self.keys)) * b * b).astype(wide)
