@@ -15,7 +15,7 @@ from petsc4py import PETSc
 
 from pctt.blocks import block_diagonal, fresh_copy, shell_of
 from pctt.ksp_options import entered, to_enter
-from pctt.pc.base import PythonPC
+from pctt.pc import TensorTrain
 from pctt.pc.mat import residual_norm
 from pctt.petsc import own_errors
 
@@ -182,11 +182,11 @@ class Krylov:
         return block_diagonal(P) if self.kind == "pbjacobi" else None
 
     @property
-    def own(self) -> PythonPC | None:
+    def own(self) -> TensorTrain | None:
         """The preconditioner, if it is one of the project."""
         pc = self.ksp.pc
         context = pc.getPythonContext() if pc.getType() == PETSc.PC.Type.PYTHON else None
-        return context if isinstance(context, PythonPC) else None
+        return context if isinstance(context, TensorTrain) else None
 
     def report(self) -> list[str]:
         """What a preconditioner of the project tells of itself and its fallbacks, as in ``-ksp_view``."""
