@@ -9,8 +9,7 @@ from problems import SELF, dense_of, from_graph, from_matrix, heap, matrix, part
 
 from pctt import ccp
 from pctt.ccp import delassus
-from pctt.ccp.newton.body import BodyForm
-from pctt.ccp.newton.contact import ContactForm
+from pctt.ccp.newton.forms import BodyForm, ContactForm
 from pctt.ccp.newton.linear import Dense
 
 FORMS = pytest.mark.parametrize("form", ccp.FORMS)

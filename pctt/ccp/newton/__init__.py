@@ -5,8 +5,8 @@ momenta dv with
 
     (N + C + B) dg = q + G r_v,    dv = G' dg - r_v,
 
-N = G G' the Delassus matrix and C the compliance. ``-ccp_newton`` chooses the unknowns: ``contact`` (`contact.py`) or
-``body`` (`body.py`). A `Newton` object lives as long as the simulation: Krylov methods and preconditioners stay from
+N = G G' the Delassus matrix and C the compliance. ``-ccp_newton`` chooses the unknowns: ``contact`` or ``body``
+(`forms.py`). A `Newton` object lives as long as the simulation: Krylov methods and preconditioners stay from
 one cone problem to the next, and matrices too where the contacts are the same.
 """
 
@@ -19,10 +19,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.ccp.cone import TINY, Array
-from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.compare import Comparison
-from pctt.ccp.newton.contact import ContactForm
-from pctt.ccp.newton.form import NewtonForm
+from pctt.ccp.newton.forms import BodyForm, ContactForm, NewtonForm
 from pctt.ccp.newton.linear import LinearSolver
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase

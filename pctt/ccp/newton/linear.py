@@ -11,10 +11,8 @@ from scipy.linalg import lapack
 
 from pctt import memory
 from pctt.ccp.cone import Array
-from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.compare import Comparison
-from pctt.ccp.newton.contact import ContactForm
-from pctt.ccp.newton.form import NewtonForm
+from pctt.ccp.newton.forms import BodyForm, ContactForm, NewtonForm
 from pctt.ccp.newton.fronts import FrontPC
 from pctt.ccp.newton.krylov import Krylov, Solve, Source
 from pctt.options import number
