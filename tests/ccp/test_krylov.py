@@ -153,5 +153,5 @@ def test_without_memory_a_failing_ksp_has_no_fallback(database, monkeypatch):
     newton = newton_of(from_graph(*heap()))
     newton.update(spd_blocks(40))
     assert np.array_equal(solved(newton, np.ones((40, 3)), 1e-8), np.zeros((40, 3)))
-    assert newton.fallbacks == 1
+    assert newton.linear.fallbacks == 1
     newton.destroy()

@@ -66,12 +66,13 @@ def solve(
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step."""
     newton.begin(problem)
-    if coulomb and not newton.takes_any:
+    linear = newton.linear
+    if coulomb and not linear.takes_any:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
     cones = Cones(problem, options, coulomb)
     forcing = options.forcing_with_law if coulomb else options.forcing
-    forcing = forcing if newton.mends else options.forcing_of_impulses
+    forcing = forcing if newton.system.mends else options.forcing_of_impulses
     at, history, waited, least, last_gap = cones.start(guess), list[float](), 0, np.inf, np.inf
     while True:
         # residuals
@@ -112,7 +113,7 @@ def solve(
         status, words = Status.CONVERGED, limits.met
     elif iterations == limits.max_it:
         status, words = Status.ITERATION_LIMIT, f"{iterations} iterations"
-    return Result(best, status, words, min(history), iterations, newton.ksp_its, newton.fallbacks, history)
+    return Result(best, status, words, min(history), iterations, linear.iterations, linear.fallbacks, history)
 
 
 class Point(NamedTuple):
@@ -236,8 +237,8 @@ class Scaled(NamedTuple):
         uncoupled = times(self.share, self.W.times(w) - self.at.s) - times(self.X, r_z)
         q = self._straight(c - r_z) * scale
         dg, x = newton.solve(q, self.tol, self.found.r_v, earlier, uncoupled * live / scale)
-        dv, ds = newton.momenta(x, dg, self.found.r_v), live * scale * dg
-        if newton.mends:  # r_y vanishes, r_v takes the error of the linear solve
+        dv, ds = newton.system.momenta(x, dg, self.found.r_v), live * scale * dg
+        if newton.system.mends:  # r_y vanishes, r_v takes the error of the linear solve
             problem = cones.problem
             dy = (problem.velocity_of(dv) + problem.compliance * dg) / scale + self.found.r_y
         else:  # r_v vanishes, r_y takes it

@@ -108,6 +108,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     """Impulses; ``guess`` (nc, 3) gives the normal impulses of persistent contacts, 0 elsewhere."""
     cone = Cone(options.constraint, problem.mu)
     newton.begin(problem)
+    linear = newton.linear
     g, lam = _start(problem, guess, cone, options)
     history: list[float] = []
     earlier: deque[Array] = deque(maxlen=3)
@@ -151,7 +152,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         # update
         g = g + step * dg
         lam = lam + step * dlam
-    return Result(g, status, reason, history[-1], iteration, newton.ksp_its, newton.fallbacks, history)
+    return Result(g, status, reason, history[-1], iteration, linear.iterations, linear.fallbacks, history)
 
 
 class Linearised(NamedTuple):

@@ -1,8 +1,19 @@
-"""The two forms of the Newton systems, and what `Newton` expects of a form: `ContactForm` and `BodyForm`."""
+"""The two forms of the Newton systems, `ContactForm` and `BodyForm`: the system in certain unknowns x, for one set of
+barrier blocks after another. Both have
+
+    problem : the cone problem
+    matrix : the system's matrix, a function; it is positive definite where it is symmetric
+    symmetric : whether the present matrix is
+    mends : whether the residual of a solve is one of momenta, dv = G' dg - r_v, which the next step of a method with
+        momenta of its own mends; or it is one of velocities, (B + C) dg + G dv = q, where it opens what should touch
+    speed : what a residual of 1 changes the velocities of contacts by, about
+
+and the functions of `ContactForm` but for `dense`.
+"""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Union
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,51 +26,6 @@ from pctt.ccp.cone import Array, times
 from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.newton.fronts import Fronts, places_in
 from pctt.ccp.problem import ConeProblem
-
-LEAST = 0.1  # drop tolerance of a factor: entries of a block between bodies [mass] that it is better off without
-
-
-class NewtonForm(Protocol):
-    """The Newton system in certain unknowns x, for one set of barrier blocks after another.
-
-    Attributes
-    ----------
-    problem : the cone problem
-    matrix : the system's matrix, a function; it is positive definite where it is symmetric
-    symmetric : whether the present matrix is
-    mends : whether the residual of a solve is one of momenta, dv = G' dg - r_v, which the next step of a method with
-        momenta of its own mends; or it is one of velocities, (B + C) dg + G dv = q, where it opens what should touch
-    """
-
-    problem: ConeProblem
-    matrix: PETSc.Mat
-    symmetric: bool
-    mends: bool
-
-    def load(self, problem: ConeProblem) -> None:
-        """Take another problem with the same contacts between the same bodies."""
-
-    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
-        """Make the matrix for the barrier blocks B (nc, 3, 3), or from ``inverse`` = (B + C)^-1 if the caller has it
-        more accurately. ``symmetric`` says whether the blocks are."""
-
-    def entries(self) -> PETSc.Mat:
-        """The matrix, or its sparse part, as one that preconditioners can read; collective."""
-
-    @property
-    def speed(self) -> float:
-        """What a residual of 1 changes the velocities of contacts by, about."""
-
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
-        """The right-hand side for the unknowns. ``uncoupled`` is (B + C)^-1 q, if the caller has it more accurately."""
-
-    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
-        """dg (nc, 3) of a solution."""
-
-    def momenta(self, x: Array, dg: Array, r_v: Array) -> Array:
-        """dv (6m,) of a solution."""
-
-    def destroy(self) -> None: ...
 
 
 class ContactForm:
@@ -83,9 +49,12 @@ class ContactForm:
         self.matrix = symmetric_shell(problem.comm, problem.r.size, 3, self._product)
 
     def load(self, problem: ConeProblem) -> None:
+        """Take another problem with the same contacts between the same bodies."""
         self.problem, self._loaded, self._N = problem, False, None
 
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
+        """Make the matrix for the barrier blocks B (nc, 3, 3), or from ``inverse`` = (B + C)^-1 if the caller has it
+        more accurately. ``symmetric`` says whether the blocks are."""
         self._blocks, self._made, self.symmetric = self.problem.diagonal_blocks + barrier, False, symmetric
         self._local = np.empty((len(barrier), 6))
         pack(barrier + self.problem.compliance_blocks, self._local)
@@ -123,12 +92,15 @@ class ContactForm:
         return matrix
 
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
+        """Of the system for x. ``uncoupled`` is (B + C)^-1 q, if the caller has it more accurately."""
         return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
 
     def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
+        """dg (nc, 3) of a solution."""
         return x.reshape(-1, 3).copy()
 
     def momenta(self, x: Array, dg: Array, r_v: Array) -> Array:
+        """dv (6m,) of a solution with the impulses dg."""
         return self.problem.momentum(dg) - r_v
 
     def destroy(self) -> None:
@@ -197,13 +169,14 @@ class BodyForm:
             self._places = self.operator.entries().places(self.problem.point)
         return self._places
 
-    def stiff_part(self) -> PETSc.Mat:
-        """What is worth factorising of K, in scalar rows: a new Mat, which the caller destroys."""
-        return self.operator.entries().stiff_mat(LEAST, self.symmetric)
+    def stiff_part(self, least: float) -> PETSc.Mat:
+        """K without blocks below ``least`` (`BodyMatrix.stiff_part`), in scalar rows: a new Mat, which the caller
+        destroys."""
+        return self.operator.entries().stiff_mat(least, self.symmetric)
 
-    def fronts(self, precision: type[np.floating]) -> Fronts:
+    def fronts(self, least: float, precision: type[np.floating]) -> Fronts:
         """The factors of this part, which is symmetric and on one rank."""
-        part, points = self.operator.entries().stiff_part(LEAST), self.places()
+        part, points = self.operator.entries().stiff_part(least), self.places()
         return Fronts(part, places_in(part) if points is None else points, precision)
 
     @property
@@ -224,3 +197,6 @@ class BodyForm:
 
     def destroy(self) -> None:
         self.operator.destroy()
+
+
+NewtonForm = Union[ContactForm, BodyForm]
