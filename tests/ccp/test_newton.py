@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from problems import SELF, dense_of, from_graph, from_matrix, heap, matrix, part
+from scipy.linalg import block_diag
 
 from pctt import ccp
 from pctt.ccp import delassus
@@ -57,9 +58,7 @@ def test_the_forms_agree_with_dense_algebra(many, monkeypatch):
     q, e = rng.standard_normal((contacts, 3)), 1e-2
     N = dense @ dense.T
     N += e * np.diag(np.tile([1.0, 0.0, 0.0], contacts))
-    S = N.copy()
-    for c in range(contacts):
-        S[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] += barrier[c]
+    S = N + block_diag(*barrier)
     momenta = rng.standard_normal(6 * bodies)
     mine = slice(6 * own[comm.rank], 6 * own[comm.rank + 1])
     exact = np.linalg.solve(S, q.ravel() + dense @ momenta)
@@ -125,9 +124,7 @@ def test_one_object_serves_one_problem_after_another(form):
     known, graph = heap(3)
     rng = np.random.default_rng(0)
     barrier, q = definite(rng, 40), rng.standard_normal((40, 3))
-    S = known.N.copy()
-    for c in range(40):
-        S[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] += barrier[c]
+    S = known.N + block_diag(*barrier)
     found, matrices = [], []
     for problem in (*(from_graph(known, graph) for _ in range(2)), from_matrix(known), from_graph(known, graph)):
         newton.begin(problem)
@@ -200,9 +197,7 @@ def test_few_contacts_get_dense_factors(symmetric):
     barrier, q = definite(rng, 40), rng.standard_normal((40, 3))
     if not symmetric:
         barrier[:, 0] *= 1.5
-    S = known.N.copy()
-    for c in range(40):
-        S[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] += barrier[c]
+    S = known.N + block_diag(*barrier)
     newton = ccp.Newton(SELF, "body")
     for problem in (from_graph(known, graph), from_matrix(known)):
         newton.begin(problem)

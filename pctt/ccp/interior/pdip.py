@@ -52,6 +52,10 @@ class PDIP:
     rtol: float = number(3e-4, "relative residual of a linear solve; with 1 it takes twice the Newton steps")
     forcing: float = number(0.03, "the same at most [velocity that the natural residual shows]; `solve`")
     short: float = number(0.5, "the direction of a shorter step is corrected; without, 1.7 times the Newton steps")
+    reach: float = number(0.3, "how much further than the short step the corrected one is to reach")
+    longer: float = number(1.2, "times longer that the corrected step must be; else Newton's direction is better")
+    back: float = number(0.8, "factor on a step that leaves the neighbourhood, so a fifth too short at most")
+    least: float = number(1e-10, "shorter steps change the impulses by less than the tightest tolerance asks")
     late: float = number(1e-3, "natural residual below which S has a proximal term; `_next_damping`")
 
 
@@ -139,12 +143,12 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         step = _step_length(at, dg, dlam, options)
         # corrected step, where the cones' curvature cuts Newton's short and the other is much longer
         if step < options.short:
-            curved, missed = _bend(at, dg, dlam, min(1.0, step + 0.3))
+            curved, missed = _bend(at, dg, dlam, min(1.0, step + options.reach))
             other_dg, other_dlam = _direction(at, _right_side(at, aim + missed) - curved, aim + missed, tol)
             other = _step_length(at, other_dg, other_dlam, options)
-            if other > 1.2 * step:
+            if other > options.longer * step:
                 step, dg, dlam = other, other_dg, other_dlam
-        if not step > 1e-10:
+        if not step > options.least:
             status, reason = Status.STALLED, "steps became too short"
             if step != step:
                 status, reason = Status.BREAKDOWN, "not a number in the Newton step"
@@ -243,10 +247,10 @@ def _step_length(at: Linearised, dg: Array, dlam: Array, options: PDIP) -> float
     if not np.isfinite(problem.sum(dg.sum() + dlam.sum())):
         return np.nan
     step = min(1.0, options.boundary * problem.min(min(step_to_boundary(g, dg, cone.mu), step_to_zero(lam, dlam))))
-    while step > 1e-10:
+    while step > options.least:
         gap = -(lam + step * dlam) * cone.value(g + step * dg)
         mean = problem.sum(gap.sum()) / problem.size
         if problem.min(gap.min(initial=np.inf)) >= options.neighbourhood * mean:
             break
-        step *= 0.8
+        step *= options.back
     return step
