@@ -30,7 +30,7 @@ from dem.contact import find_contacts
 from dem.scenes import Mixer
 from dem.system import ContactSystem
 from pctt import ccp
-from pctt.ccp.newton.contact import ContactForm
+from pctt.ccp.newton.forms import ContactForm
 from pctt.ksp_options import entered
 from pctt.pc import TensorTrain
 from pctt.pc.sparse_train import SparseTrain

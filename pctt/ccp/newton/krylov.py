@@ -35,7 +35,6 @@ _REMEMBERING = {"pbjacobi", "sor"}  # the inverse diagonal blocks of the first m
 _REASONS = {
     value: name.lower() for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)
 }
-WAIT_FOR_OTHERS = 60.0  # seconds that a rank waits for the others if it has failed in a collective call
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ class Krylov:
         with entered(self._options):
             error = on_all_ranks(self.comm, lambda: self._set_up(A, P, keep))
             setup = _now(self.comm)
-            error = error or on_all_ranks(self.comm, lambda: self._iterate(b, x), WAIT_FOR_OTHERS)
+            error = error or on_all_ranks(self.comm, lambda: self._iterate(b, x), patience=60.0)
         if error:
             self.forget()
             x.zeroEntries()
