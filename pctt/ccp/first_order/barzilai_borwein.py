@@ -98,7 +98,7 @@ def _descend(
     y = scaled.gradient(x)
     step = 1.0  # A has a diagonal of about one
     while progress.goes_on(x, y):
-        d = scaled.projected_move(x, y, step)
+        d = scaled.cones.move(x, y, step)
         Ad = scaled.product(d)
         progress.iterations += 1
         slope, length, curvature, stretch = scaled.dots((y, d), (d, d), (d, Ad), (Ad, Ad))

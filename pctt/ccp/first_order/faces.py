@@ -35,7 +35,7 @@ def kucera(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrd
     projection = GradientProjection(scaled)
     x = scaled.start(guess)
     y = scaled.gradient(x)
-    face = Face(x, scaled.mu)
+    face = Face(x, scaled.cones.mu)
     p = Ap = np.zeros_like(x)  # the last conjugate direction in this face
     curvature, fresh = 1.0, True
     while progress.goes_on(x, y):
@@ -57,7 +57,7 @@ def kucera(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrd
         if leaves:
             x, y, products = projection.step(x, y)
             progress.iterations += products
-            face = Face(x, scaled.mu)
+            face = Face(x, scaled.cones.mu)
         fresh = leaves
     return progress.result()
 
@@ -75,20 +75,20 @@ def gpminres(problem: ConeProblem, guess: Array, limits: Limits, options: FirstO
     projection = GradientProjection(scaled)
     x = scaled.start(guess)
     y = scaled.gradient(x)
-    face = Face(x, scaled.mu)
+    face = Face(x, scaled.cones.mu)
     while progress.goes_on(x, y):
         for _ in range(10):
             before = face
             x, y, products = projection.step(x, y)
             progress.iterations += products
-            face = Face(x, scaled.mu)
+            face = Face(x, scaled.cones.mu)
             if not progress.goes_on(x, y) or not problem.max(not face.same(before)):
                 break
         if progress.reason:
             break
         w = _minres(scaled, face, -face.part(y), progress)
         x, y = _projected_search(scaled, x, y, w, progress)
-        face = Face(x, scaled.mu)
+        face = Face(x, scaled.cones.mu)
     return progress.result()
 
 
@@ -185,7 +185,7 @@ class GradientProjection:
 
     def move(self, x: Array, y: Array) -> Array:
         """P(x - 1.9 / L y) - x."""
-        return self.problem.projected_move(x, y, 1.9 / self.lipschitz)
+        return self.problem.cones.move(x, y, 1.9 / self.lipschitz)
 
     def step(self, x: Array, y: Array) -> tuple[Array, Array, int]:
         """The next point, its gradient, and the products with A that it took."""
