@@ -94,8 +94,8 @@ class FrictionCones:
         """`pctt.ccp.cone_loops.accelerated_step` to these cones."""
         return accelerated_step(x, last_x, y, compliance, beta, step, self.mu, float(coulomb), out)
 
-    def move(self, x: Array, y: Array, step: float, coulomb: bool = False) -> Array:
-        """P(x - step y) - x (rows, 3), where y_n gets De Saxce's term for Coulomb's law."""
+    def move(self, x: Array, y: Array, step: Array | float, coulomb: bool = False) -> Array:
+        """P(x - step y) - x (rows, 3) for a step of one length or many, where y_n gets De Saxce's term for Coulomb's law."""
         out = y.copy()
         if coulomb:
             out[: self.count, 0] += self.resisted(y)

@@ -13,7 +13,7 @@ from dem.contact_map import find_halo
 from pctt import ccp
 from pctt.ccp import Limits
 from pctt.ccp.cone import margin, project
-from pctt.ccp.first_order import apgd, barzilai_borwein, gauss_seidel
+from pctt.ccp.first_order import apgd, gauss_seidel, projected_steps
 from pctt.ccp.first_order.faces import Face
 from pctt.ccp.first_order.scaled import Progress, ScaledProblem
 
@@ -98,13 +98,13 @@ def test_the_reach_in_a_face_ends_at_its_boundary():
 
 
 def test_the_line_search_takes_the_whole_step_where_it_may():
-    assert barzilai_borwein.sufficient(-1.0, 1.0, 0.0) == (1.0, -0.5)
-    assert barzilai_borwein.sufficient(-1.0, 3.0, 1.0) == (1.0, 0.5)  # a rise that is allowed
-    fraction, change = barzilai_borwein.sufficient(-1.0, 4.0, 0.0)
+    assert projected_steps.sufficient(-1.0, 1.0, 0.0) == (1.0, -0.5)
+    assert projected_steps.sufficient(-1.0, 3.0, 1.0) == (1.0, 0.5)  # a rise that is allowed
+    fraction, change = projected_steps.sufficient(-1.0, 4.0, 0.0)
     assert fraction == 0.25  # the minimiser on the segment
     assert change == -0.125
-    assert barzilai_borwein.sufficient(-1.0, 1e3, 0.0)[0] >= 1e-4
-    assert barzilai_borwein.sufficient(0.0, 0.0, 0.0) == (1.0, 0.0)
+    assert projected_steps.sufficient(-1.0, 1e3, 0.0)[0] >= 1e-4
+    assert projected_steps.sufficient(0.0, 0.0, 0.0) == (1.0, 0.0)
 
 
 # -- colours and sweeps -------------------------------------------------------------------------------------

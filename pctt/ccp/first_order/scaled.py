@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from mpi4py import MPI
 
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
@@ -128,11 +127,8 @@ class ScaledProblem:
         return self.sums(*(float(np.vdot(x, y)) for x, y in pairs))
 
     def sums(self, *parts: float) -> Array:
-        """Sums of numbers over the ranks, in one reduction; of a buffer, which takes a tenth of the time of objects."""
-        out = np.array(parts, dtype=float)
-        if self.problem.comm.size > 1:
-            self.problem.comm.Allreduce(MPI.IN_PLACE, out)
-        return out
+        """Sums of numbers over the ranks, in one reduction."""
+        return self.problem.sum(np.array(parts, dtype=float))
 
     def block_steps(self) -> Array:
         """1 over the largest eigenvalue of each contact's diagonal block of A, per unknown (nc, 3)."""
@@ -260,3 +256,13 @@ class Progress:
         if self.iterations - self._gain[1] >= self.patience:
             return Status.STALLED, f"no progress in the last {self.patience} of {self.iterations} iterations"
         return Status.STALLED, ""
+
+
+def begin(
+    problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder
+) -> tuple[ScaledProblem, Progress, Array, Array]:
+    """What a method begins with: the problem in its unknowns, its progress, the point of the guess, and the gradient
+    there."""
+    scaled = ScaledProblem(problem)
+    x = scaled.start(guess)
+    return scaled, Progress(scaled, limits, options), x, scaled.gradient(x)
