@@ -22,16 +22,11 @@ def few(request, monkeypatch):
     monkeypatch.setattr(Settings, "few", getattr(request, "param", 0))
 
 
-def definite(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Blocks (count, 3, 3)."""
-    root = rng.standard_normal((count, 3, 3))
-    return root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
-
-
 def barrier_and_side(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
-    """Blocks B and a right-hand side q of ``count`` contacts."""
+    """Definite blocks B (count, 3, 3) and a right-hand side q (count, 3)."""
     rng = np.random.default_rng(0)
-    return definite(rng, count), rng.standard_normal((count, 3))
+    root = rng.standard_normal((count, 3, 3))
+    return root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3), rng.standard_normal((count, 3))
 
 
 @pytest.mark.parallel(1, 2, 3, 4)
@@ -140,9 +135,9 @@ def test_a_solve_begins_from_the_best_combination_of_earlier_solutions(form):
     problem = ccp.ConeProblem(comm, known.r[here], known.mu[here], G=graph.part(comm))
     newton = ccp.Newton(comm, form)
     newton.begin(problem)
-    rng = np.random.default_rng(0)
-    newton.update(definite(rng, 40)[here])
-    q, other = rng.standard_normal((2, 40, 3))
+    barrier, q = barrier_and_side()
+    other = q[::-1]
+    newton.update(barrier[here])
     (dg, x), (_, away) = newton.solve(q[here], 1e-10), newton.solve(other[here], 1e-10)
     iterations = newton.linear.iterations
     again, _ = newton.solve(q[here], 1e-7, earlier=[2 * x + away, away - x, np.zeros_like(x), away])
