@@ -145,3 +145,9 @@ def test_the_nearest_contact_limits_the_step_of_all():
 def test_a_rank_without_contacts_limits_nothing():
     assert step_to_boundary(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)) == np.inf
     assert step_to_zero(np.zeros(0), np.zeros(0)) == np.inf
+
+
+def test_step_to_zero():
+    x = np.array([1.0, 2.0, 3.0])
+    assert step_to_zero(x, np.array([1.0, 0.0, 5.0])) == np.inf
+    assert step_to_zero(x, np.array([-0.5, -4.0, 1.0])) == 0.5
