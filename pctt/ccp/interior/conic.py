@@ -33,8 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pctt.ccp import cone
-from pctt.ccp.cone import Array, NesterovTodd, dot, times
-from pctt.ccp.cone_loops import scaling
+from pctt.ccp.cone import Array, NesterovTodd, dot, scaling, times
 from pctt.ccp.interior import useful_part
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
