@@ -77,6 +77,7 @@ FROM_OUTSIDE = (
     "-steps",
     "-scene_n 0",
     "-scene_radius nan",
+    "-compare nosuch",
     "-ksp_type nosuch",
     "-pc_type nosuch",
     "-pc_python_type nosuch.Thing -pc_type python",
@@ -160,16 +161,11 @@ def test_a_bad_numerical_parameter_of_a_scene_file_is_refused_before_any_work(li
         assert word in str(refusal.value)
 
 
+@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("options", FROM_OUTSIDE)
-def test_a_bad_option_ends_the_program_with_one_line(options, program, results):
-    own = options in ("-stepss 3", "-steps", "-pc_type nosuch")
+def test_a_bad_option_ends_the_program_with_one_line(options, ranks, program, results):
+    own = ranks == 1 and options in ("-stepss 3", "-pc_type nosuch")
     check_words(refused(program, results, *options.split(), own=own).partition(": ")[2], options)
-
-
-@pytest.mark.parallel(2)
-@pytest.mark.parametrize("options", ["-stepss 3", "-scene_n 0", "-compare nosuch", "-pc_type nosuch"])
-def test_two_ranks_speak_with_one_voice(options, program, results):
-    check_words(refused(program, results, *options.split()).partition(": ")[2], options)
 
 
 @pytest.mark.parametrize("words", ["results", "-steps 3 results", "-quiet -steps 3 4", "- -steps 3"])

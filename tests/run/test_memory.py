@@ -41,7 +41,7 @@ if comm.rank == 0:
     print(json.dumps(growth))
 """
 RUNS = [
-    {"ccp_type": "pdip", "ccp_tol": "1e-4", "dump_problem": "problems"},
+    {"ccp_type": "pdip", "ccp_tol": "1e-2", "dump_problem": "problems"},
     {"ccp_type": "apgd", "ccp_tol": "1e-3"},
     {"ccp_type": "conic", "ccp_tol": "1e-4"},
 ]

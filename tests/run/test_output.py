@@ -149,14 +149,6 @@ def test_no_state_is_written_if_none_is_wanted(program, settled, tmp_path):
     ]
 
 
-def test_a_step_that_is_not_solved_says_so(program, settled, tmp_path):
-    alone = ("-ccp_type", "apgd", "-ccp_tol", "1e-10", "-ccp_max_it", 3, "-ccp_fallback", 0)
-    done = program(*SETTLED, "-steps", 1, *alone)
-    (line,) = steps_of(tmp_path / "results")
-    assert line["natural_residual"] > 1e-10
-    assert "NOT CONVERGED" in done.stdout
-
-
 def test_lines_are_plain_where_there_is_no_terminal(program, settled):
     done = program(*SETTLED, "-steps", 2, "-ccp_type", "apgd")
     assert done.stderr == ""
