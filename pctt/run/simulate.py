@@ -73,7 +73,11 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         words = _how_to_go_on(options, output.checkpoint, end - sim.steps)
         raise interrupt.InterruptError(f"interrupted after step {sim.steps}; the same command with {words}")
     if sim.last:
-        _say_end(sim, steps, progress)
+        figures = sim.analyse()
+        if sim.comm.rank == 0:
+            lines = [line for line in output.folder.lines() if line["step"] > end - steps]
+            worst = output.folder.summary["worst_overlap"]
+            progress.say("\n" + report.ending(lines, settings.tol, settings.closing_work, figures, worst))
         if what := newton.linear.what():
             progress.say(f"Newton systems: {what}")
         if compare.names:
@@ -83,25 +87,6 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     if sim.last:
         folder = output.place.folder
         progress.say(f"\nresults: {folder}/state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
-
-
-def _say_end(sim: Simulation, steps: int, progress: report.Progress) -> None:
-    """What the last ``steps`` have taken and shown."""
-    figures, output = sim.analyse(), sim.output
-    if sim.comm.rank > 0:
-        return
-    assert output is not None
-    lines = [line for line in output.folder.lines() if line["step"] > sim.steps - steps]
-    progress.say("\n" + report.phase_table(lines))
-    progress.say(report.law_line(lines, sim.settings.tol))
-    if jumps := report.jumps_line(lines):
-        progress.say(jumps)
-    progress.say(report.forces_line(lines, sim.settings.closing_work))
-    if figures:
-        progress.say(report.figure_table(figures))
-    progress.say(report.overlap_line(output.folder.summary["worst_overlap"]))
-    if outside := sim.figures.get("grains_outside"):
-        progress.say(f"{outside:.0f} grains have left the domain of the scene")
 
 
 def _how_to_go_on(options: Options, state: Path, steps: int) -> str:

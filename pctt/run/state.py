@@ -68,16 +68,13 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     motions = [(body.name, type(body.motion).__name__) for body in large]
     words = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
     words += [repr(scene.sources), repr(scene.outlets)]
-    numbers = [column for table in (*scene.parts, scene.large()) for column in table.columns().values()]
-    numbers += [np.asarray(value) for body in large for shape in body.shapes for value in placed(shape)]
-    of_motions = [np.asarray(value) for body in large for value in getattr(body.motion, "__dict__", {}).values()]
-    of_motions += [np.asarray(body.surface) for body in large]
-    of_motions += [np.asarray(value) for spring in scene.springs.values() for value in vars(spring).values()]
-    of_motions += [np.asarray(value) for load in scene.loads.values() for value in vars(load).values()]
-    numbers += [value for value in of_motions if value.dtype.kind in "fiub"]
-    numbers += [np.array([-np.inf if scene.shear_rate is None else scene.shear_rate, scene.gradient])]
-    numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values()]
-    return repr(words), numbers
+    numbers: list[Any] = [column for table in (*scene.parts, scene.large()) for column in table.columns().values()]
+    numbers += [value for body in large for shape in body.shapes for value in placed(shape)]
+    numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values(), *(body.surface for body in large)]
+    numbers += [-np.inf if scene.shear_rate is None else scene.shear_rate, scene.gradient]
+    for part in (*(body.motion for body in large), *scene.springs.values(), *scene.loads.values()):
+        numbers += getattr(part, "__dict__", {}).values()
+    return repr(words), [value for value in map(np.asarray, numbers) if value.dtype.kind in "fiub"]
 
 
 def world_at_start(experiment: Experiment, scene: Scene, comm: MPI.Comm) -> World:
@@ -207,11 +204,6 @@ def _refuse_other_origin(
 # -- settled states, outside the project's folder ------------------------------------------------------------
 
 
-def cache() -> Path:
-    """The folder of settled states."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pctt"
-
-
 def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_with: dict[str, Any]) -> Path:
     """The file of a scene's settled state. Its name has the scene and a digest of all that influences the state: of a
     run's settings that is ``settle_tol``. OptionError if the scene never settles."""
@@ -231,17 +223,13 @@ def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_
         how["surfaces"] = surfaces
     digest = hashlib.sha256((made_with["scene"] + json.dumps(how, sort_keys=True)).encode()).hexdigest()[:12]
     size = f"_n{about['n']}" if "n" in about else ""
-    return cache() / f"{about['scene']}{size}_{digest}.h5"
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return cache / "pctt" / f"{about['scene']}{size}_{digest}.h5"
 
 
 def unfinished(path: Path) -> Path:
     """The checkpoint that an interrupted settling leaves beside its settled state."""
     return path.with_suffix(".unfinished.h5")
-
-
-def settling_steps(experiment: Experiment, scene: Scene) -> int:
-    """The steps of a settling from time zero."""
-    return math.ceil(experiment.settling_time / time_step.for_settling(scene) * (1 - 1e-12))
 
 
 def settling_distances(experiment: Experiment, scene: Scene) -> tuple[float, float]:
@@ -298,8 +286,9 @@ def _settle(
 
     The last tenth has the contact distance of the scene and ten times the accuracy: otherwise overlaps remain, and the
     first accurate step of a run would push them apart."""
-    end, tol, begun = settling_steps(experiment, scene), settings.settle_tol, time.perf_counter()
-    tenth = max(1, end // 10)
+    dt, (falling, at_rest) = time_step.for_settling(scene), settling_distances(experiment, scene)
+    end = math.ceil(experiment.settling_time / dt * (1 - 1e-12))
+    tenth, tol, begun = max(1, end // 10), settings.settle_tol, time.perf_counter()
     say(f"settling {scene_name(experiment)}, {end} steps with APGD to {tol:g}:")
     world = world_at_start(experiment, scene, comm)
     memory = ImpulseMemory(comm, world.pairs.parts)
@@ -309,7 +298,6 @@ def _settle(
             say(f"  goes on after step {world.step}, from {unfinished(path)}")
         except FileError as error:
             say(f"  {error}; settled from the beginning")
-    dt, (falling, at_rest) = time_step.for_settling(scene), settling_distances(experiment, scene)
     loose = Settings(dt=dt, delta=falling, solver="apgd", tol=tol, law=ccp.RELAXATION).of(experiment)
     with Stepper(loose, world, memory) as stepper:
         while world.step < end:

@@ -87,11 +87,13 @@ class Stepper:
 
     def _step(self) -> dict[str, Any]:
         self._corrections = 0
-        contacts = self._search()
-        if self.settings.projection:
-            problem, guess, result, moving = self._step_with_projection(contacts)
-        else:
-            problem, guess, result, moving = self._step_to_gaps(contacts)
+        with log.phase("search"):
+            come_and_go(self.world)
+            put_back(self.world)
+            rebalance(self.world)
+            contacts = find_contacts(self.world, self.settings.delta, self.settings.dt)
+        impulses = self._with_projection if self.settings.projection else self._to_gaps
+        problem, guess, result, moving = impulses(contacts)
         with log.phase("solve"):
             accuracy = ccp.measure(problem, result.impulse)
         with log.phase("output"):
@@ -111,16 +113,19 @@ class Stepper:
         self._release()
         return self._figures(problem.size, result, accuracy, files)
 
-    def _step_to_gaps(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
+    def _to_gaps(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
         problem, guess = self._assemble(contacts, self.memory)
         result = self.solve(problem, guess)
         while (again := self._unseen(self.contacts, self.system, result.momentum)) is not None:
-            problem, guess = self._assemble(again, self._remembered(result))
+            found = ImpulseMemory(self.world.comm, self.world.pairs.parts)
+            found.remember(self.system.key, result.impulse, self.system.frame)
+            self._slabs = self.world.slabs
+            problem, guess = self._assemble(again, found)
             result = self.solve(problem, guess).after(result)
         return problem, guess, result, None
 
-    def _step_with_projection(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
+    def _with_projection(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
         """Forces of contacts that touch at the start, then positions without overlaps; see `pctt.run.projection`."""
         every = self._system(contacts, impacts=False)
         problem, guess = self._assemble(contacts.take(touching(contacts, every)), self.memory)
@@ -132,14 +137,6 @@ class Stepper:
             if again is None:
                 return problem, guess, result, self.system.velocity_with(result.momentum + shift)
             contacts, every = again, self._system(again, impacts=False)
-
-    def _search(self) -> Contacts:
-        """The contacts of the step."""
-        with log.phase("search"):
-            come_and_go(self.world)
-            put_back(self.world)
-            rebalance(self.world)
-            return find_contacts(self.world, self.settings.delta, self.settings.dt)
 
     def _figures(
         self, contacts: int, result: ccp.Result, accuracy: ccp.Accuracy, files: dict[str, Any]
@@ -189,34 +186,23 @@ class Stepper:
         return self._problem, guess
 
     def _unseen(self, contacts: Contacts, system: ContactSystem, momentum: Array) -> Contacts | None:
-        """The contacts, with those that these momenta show to be missed; None if there are none."""
+        """The contacts, with those that these momenta show to be missed; None if there are none. Three times a step at
+        most with those that overlap at its end because bodies turn, by a tenth of delta."""
+        world, settings = self.world, self.settings
+        delta, dt, recovery = settings.delta, settings.dt, settings.recovery_speed
         with log.phase("search"):
-            velocity, delta, dt = system.velocity_with(momentum), self.settings.delta, self.settings.dt
+            velocity = system.velocity_with(momentum)
             deep = 0.01 * delta  # the overlap that is solved for
-            wider = find_overrun(self.world, contacts, velocity, delta, dt, deep, self.settings.recovery_speed)
+            wider = find_overrun(world, contacts, velocity, delta, dt, deep, recovery)
             if wider is not None:
-                return carried(self.world, contacts, wider) if self._corrections else wider
-            turned = self._turned(contacts, velocity)
-            if turned is None:
-                refuse_passages(self.world, contacts, velocity, delta, dt)
-            return turned
-
-    def _turned(self, contacts: Contacts, velocity: Array) -> Contacts | None:
-        """The contacts, with those that overlap at the end of the step because bodies turn. None if there are none, or
-        after so many corrections."""
-        settings, depth, most = self.settings, 0.1 * self.settings.delta, 3  # overlap that is corrected, and how often
-        if self._corrections == most or self.world.only_spheres:
+                return carried(world, contacts, wider) if self._corrections else wider
+            if self._corrections < 3 and not world.only_spheres:
+                turned = find_turned(world, contacts, velocity, dt, 0.1 * delta, recovery)
+                if turned is not None:
+                    self._corrections += 1
+                    return turned
+            refuse_passages(world, contacts, velocity, delta, dt)
             return None
-        turned = find_turned(self.world, contacts, velocity, settings.dt, depth, settings.recovery_speed)
-        self._corrections += turned is not None
-        return turned
-
-    def _remembered(self, found: ccp.Result) -> ImpulseMemory:
-        """A memory of these impulses of the present contacts."""
-        memory = ImpulseMemory(self.world.comm, self.world.pairs.parts)
-        memory.remember(self.system.key, found.impulse, self.system.frame)
-        self._slabs = self.world.slabs
-        return memory
 
     def solve(self, problem: ccp.ConeProblem, guess: Array) -> ccp.Result:
         """Solve a problem of the step as the settings say."""

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from program import SETTLED, SMALL, steps_of
+from program import SETTLED, SMALL, steps_of, summary_of
 
 from pctt.run.dump import Dump
 
 TOL = ("-ccp_tol", 1e-8)
 PDIP = (*SETTLED, "-ccp_type", "pdip")
 HARD = (*PDIP, "-ccp_max_it", 2)  # no step is solved in two Newton steps
-
-
-def summary(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())
 
 
 def product(group: h5py.Group, x: np.ndarray, transposed: bool = False) -> np.ndarray:
@@ -47,7 +42,7 @@ def test_the_problem_of_a_step_is_written_and_solved_again(program, settled, tmp
         f"{name}.h5" for name in names
     }
     done = program("-problem", *third["dumped"], *TOL, "-output", "again", "-overwrite")  # from the file's guess
-    again = summary(tmp_path / "again")
+    again = summary_of(tmp_path / "again")
     assert again["converged"]
     assert again["contacts"] == third["contacts"]
     assert again["objective"] == pytest.approx(third["objective"], rel=1e-6)
@@ -98,12 +93,12 @@ def test_hard_problems_are_kept_and_the_steps_say_so(program, settled, tmp_path)
     assert sorted(str(p.relative_to(tmp_path)) for p in (tmp_path / "results" / "hard").iterdir()) == kept
     assert re.findall(r"hard problem kept: (\S+)\)", done.stdout) == kept
     program("-problem", kept[1], *TOL, "-output", "solved")
-    solved = summary(tmp_path / "solved")
+    solved = summary_of(tmp_path / "solved")
     assert solved["converged"]
     assert solved["contacts"] == steps[1]["contacts"]
     few = program("-problem", kept[1], "-ccp_type", "pdip", "-ccp_max_it", 2, "-ccp_fallback", 0, "-output", "few")
     assert "NOT CONVERGED" in few.stdout
-    assert (summary(tmp_path / "few")["converged"], summary(tmp_path / "few")["newton_its"]) == (False, 2)
+    assert (summary_of(tmp_path / "few")["converged"], summary_of(tmp_path / "few")["newton_its"]) == (False, 2)
 
 
 def test_a_hard_problem_of_very_many_contacts_is_not_written_unasked(program, settled, tmp_path, monkeypatch):
