@@ -35,6 +35,7 @@ BALANCE = (
     "kinetic_energy", "potential_energy", "spring_energy", "work_of_motions", "friction_loss", "impact_loss",
     "time_stepping",
 )  # fmt: skip
+OTHERS = ("spring_energy_before", "energy_jump", "work_of_cohesion")  # which the figure of the balance stands for
 
 
 def figures(folder: Folder) -> dict[str, Figure]:
@@ -135,6 +136,7 @@ def records(columns: Mapping[str, np.ndarray]) -> dict[str, Figure]:
     heads ``name [unit]`` of the columns. The components of a vector share axes."""
     balance = {f"{name} [J]" for name in BALANCE}
     made = {"energy": energy(columns)} if balance <= set(columns) else {}
+    balance |= {f"{name} [J]" for name in OTHERS}
     units: dict[str, dict[str, list[str]]] = {}
     for head in columns:
         if head not in ("step", "time [s]") and not (made and head in balance):
@@ -175,6 +177,7 @@ def energy(columns: Mapping[str, np.ndarray]) -> Figure:
     first record."""
     time = columns["time [s]"]
     kinetic, potential, spring, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
+    work = work + columns.get("work_of_cohesion [J]", 0.0)
     total = kinetic + spring + potential - potential[0] + np.cumsum(friction + impact - work)
     figure = Figure(figsize=(9.5, 6.4))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
