@@ -51,6 +51,13 @@ def concatenate(parts: Sequence[Bodies]) -> Bodies:
     return Bodies(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
+def none() -> Bodies:
+    """A table without rows."""
+    vectors, numbers, whole = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
+    turn, velocity = np.zeros((0, 4)), np.zeros((0, 6))
+    return Bodies(whole, vectors, turn, velocity, numbers, vectors, whole, whole, vectors, numbers)
+
+
 def is_dynamic(bodies: Bodies) -> Bools:
     """Mask (n,) of the bodies that forces can move."""
     return np.isfinite(bodies.mass)

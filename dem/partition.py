@@ -58,6 +58,8 @@ def frame_of_most(comm: MPI.Comm, positions: Floats) -> Frame:
 def redistribute(world: World) -> None:
     """Give every rank its piece of the curve, sorted by Morton code and then by id; collective."""
     comm, grains = world.comm, world.grains
+    if not world.slabs[-1]:
+        return  # before the first grain of a source, or after the last
     frame = frame_of_most(comm, grains.position)
     if comm.size > 1:
         codes = morton_codes(grains.position, frame)

@@ -21,13 +21,14 @@ from dem.motion import Held
 from dem.period import wrapped
 from dem.step import Step
 from dem.together import SceneError, together
+from dem.world import World
 
 
 def row(step: Step, scene: Experiment) -> dict[str, float]:
     """All quantities of a step by name, with units in brackets. SceneError if the scene's `record` fails or returns
     something else than numbers by name."""
     out = {"step": step.world.step, "time [s]": step.world.time}
-    out |= energy_balance(step) | contact_statistics(step)
+    out |= energy_balance(step) | contact_statistics(step) | passages(step.world)
     if scene.domain is not None:
         out["grains_outside"] = outside(step, *scene.domain)
     for body in step.world.large_bodies:
@@ -59,9 +60,25 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
     return own
 
 
+def passages(world: World) -> dict[str, float]:
+    """What has passed each source and outlet up to now, how many steps a source had no room, and the energies that
+    came and went with grains before this step [J]; nothing of a scene without."""
+    out: dict[str, float] = {}
+    for name, tally in world.tallies.items():
+        out |= {f"count_{name}": tally.count, f"mass_{name} [kg]": tally.mass}
+        if name in world.sources:
+            out[f"refused_{name}"] = tally.refused
+    if out:
+        for kind, names in (("sources", world.sources), ("outlets", world.outlets)):
+            out[f"energy_of_{kind} [J]"] = sum(world.tallies[name].energy for name in names)
+    return out
+
+
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
-    place, lost = wrapped(step.world.grains.position, step.world.period), np.zeros(len(step.world.grains), bool)
+    world = step.world
+    place = wrapped(world.grains.position, world.period, world.shear)
+    lost = np.zeros(len(world.grains), bool)
     for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high))):
         lost |= (place[:, axis] < least) | (place[:, axis] > most)
     return step.total(lost)
@@ -113,7 +130,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     impulses do the work g' D' w. Its tangential part is the friction loss. Its normal part goes to the springs of
     contacts, and the rest is lost in impacts, or pushes overlaps of rigid contacts apart where it is a gain. The work
     of motions is that of prescribed bodies on the others, of the drives of guided and hinged bodies, of what holds
-    bodies in part, of belts, loads and springs. The rest is the error of the semi-implicit step, of the order of dt:
+    bodies in part, of belts, loads, springs and the shear of a
+    cell. The rest is the error of the semi-implicit step, of the order of dt:
     -dt/2 m g (v_new - v_old) per body.
 
     Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be. Where
@@ -149,6 +167,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     belts = 0.0
     if system.surface is not None:
         belts = comm.allreduce(-np.vdot(step.impulse[:, 1:], system.surface))
+    if system.drift is not None:
+        loads += comm.allreduce(-np.vdot(step.impulse, system.drift))
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
     driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + loads + belts + holding
     work = driving - received
@@ -246,7 +266,7 @@ def contact_statistics(step: Step) -> dict[str, float]:
     return {
         "contacts": count,
         "active_contacts": sums[0],
-        "coordination_number": sums[2] / step.world.slabs[-1],
+        "coordination_number": sums[2] / max(step.world.slabs[-1], 1),
         "sliding_fraction": sums[1] / max(sums[0], 1),
         "worst_overlap [m]": comm.allreduce(max(worst, contacts.held_overlap), MPI.MAX),
     }

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Union
+from typing import Any, Union
 
 import numpy as np
 
@@ -20,11 +20,13 @@ from dem import bodies, checks, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.bodies import BOX, CAPSULE, COMPOUND, PLANE, SPHERE, Bodies
 from dem.loads import Law, Load, On
+from dem.measures import Block, Cylinder
 from dem.mesh import Mesh
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
 from dem.pairs import Pairs, checked, tables
 from dem.quaternion import across, length
 from dem.shapes import Box, Shape
+from dem.sources import MOST_IDS, Outlet, Source
 from dem.springs import End, Spring
 
 #: A velocity (3,), or a function of points (n, 3) [m] and outward normals (n, 3) that returns (3,) or (n, 3) [m/s].
@@ -69,15 +71,24 @@ class Scene:
         rolling: float = 0.0,
         spinning: float = 0.0,
         period: Sequence[float | None] | None = None,
+        shear_rate: float | None = None,
+        shear_gradient: str = "y",
     ) -> None:
         """`gravity`: (3,) [m/s^2]. The others are coefficients of the contacts of all pairs of materials, but of those
         of `set_pair`: `friction`, `stiffness` [N/m] (inf: rigid; None: `dem.stiffness.recommended`), `restitution`, the
         attractive force `cohesion` [N] up to a gap of `cohesion_range` [m], and the greatest moments against `rolling`
         and `spinning`, over the normal force [m]. See `dem.pairs` and docs/contact_laws.md.
         `period`: (3,) lengths of the cell, from zero on, that repeats itself along x, y, z [m], None: not along that
-        axis; see docs/periodic.md.
+        axis. `shear_rate`: d v_x / dy of the cell, or d v_x / dz for the `shear_gradient` "z" [1/s]; None: it is at
+        rest. See docs/periodic.md.
         """
         self.period = checks.period(period)
+        self.shear_rate = None if shear_rate is None else float(checks.finite("shear_rate", shear_rate))
+        if shear_gradient not in ("y", "z"):
+            raise ValueError(f"shear_gradient must be 'y' or 'z', got {shear_gradient!r}")
+        self.gradient = "xyz".index(shear_gradient)
+        if shear_rate is not None and (self.period is None or np.isinf(self.period[[0, self.gradient]]).any()):
+            raise ValueError(f"shear_rate needs periods along x and {shear_gradient}")
         self.gravity = checks.vector("gravity", gravity)
         self.large_bodies: list[LargeBody] = []
         #: Names of large bodies that go away from the grains: their speed asks for no stiffness.
@@ -93,6 +104,8 @@ class Scene:
         self.parts: list[Bodies] = []  #: the grains, as they were added
         self.loads: dict[str, Load] = {}  #: by name
         self.springs: dict[str, Spring] = {}  #: by name
+        self.sources: dict[str, Source] = {}  #: by name
+        self.outlets: dict[str, Outlet] = {}  #: by name
 
     def add_spheres(
         self,
@@ -261,6 +274,31 @@ class Scene:
         table = bodies.concatenate(tables).take(rows)
         return table.position[0], table.quaternion[0]
 
+    def add_source(self, name: str, region: Block | Cylinder, *, material: str = "default", **given: Any) -> None:
+        """Let grains come in a region of `dem.measures`, where there is room; `given` are the fields of
+        `dem.sources.Source`: radius [m], density [kg/m^3], mass_rate [kg/s] or number_rate [1/s], and others."""
+        self._refuse_passage(name)
+        self.sources[name] = Source(region, material=self._material(material), **given)
+
+    def add_outlet(self, name: str, region: Block | Cylinder, *, outside: bool = False) -> None:
+        """Let grains leave whose centres are in a region of `dem.measures`; `outside`: those that are not in it."""
+        self._refuse_passage(name)
+        self.outlets[name] = Outlet(region, outside)
+
+    def _refuse_passage(self, name: str) -> None:
+        if not name or set(name) & set(',"\n') or name in {**self.sources, **self.outlets}:
+            raise ValueError(f"sources and outlets need distinct names without commas, got {name!r}")
+
+    @property
+    def first_large(self) -> int:
+        """The id of the first large body: more than that of any grain that may come."""
+        return MOST_IDS if self.sources else sum(len(part) for part in self.parts)
+
+    def expected(self) -> Bodies:
+        """The grains at time zero, and of each source the smallest and the largest that may come."""
+        tables = [self.grains(), *(source.extremes() for source in self.sources.values())]
+        return bodies.concatenate(tables) if len(tables) > 1 else tables[0]
+
     def set_pair(
         self,
         material: str,
@@ -305,19 +343,21 @@ class Scene:
         return any("stiffness" in given for given in (self._usual, *self._pairs.values()))
 
     def grains(self) -> Bodies:
-        """All grains, in the order of their ids. ValueError if there is none, or if a mesh might meet boxes or other
-        meshes, which it cannot touch."""
-        if sum(len(part) for part in self.parts) == 0:
+        """All grains, in the order of their ids. ValueError if there is neither one nor a source, or if a mesh might
+        meet boxes or other meshes, which it cannot touch."""
+        later = [source.extremes() for source in self.sources.values()]
+        if sum(len(part) for part in self.parts) + len(later) == 0:
             raise ValueError("empty scene: there is no grain")
-        _refuse_beside_meshes(self.large_bodies, any((part.shape == BOX).any() for part in self.parts))
-        grains = bodies.concatenate(self.parts)
+        _refuse_beside_meshes(self.large_bodies, any((part.shape == BOX).any() for part in [*self.parts, *later]))
+        grains = bodies.concatenate([bodies.none(), *self.parts])
         if self.period is not None:
-            _refuse_in_cell(self, self.period, float(bodies.bounding_radius(grains).max()))
+            radius = max(float(bodies.bounding_radius(part).max(initial=0.0)) for part in [grains, *later])
+            _refuse_in_cell(self, self.period, radius)
         return grains
 
     def large(self) -> Bodies:
         """The table of the large bodies at time zero, in the order in which they were added."""
-        count, first = len(self.large_bodies), sum(len(part) for part in self.parts)
+        count, first = len(self.large_bodies), self.first_large
         return Bodies(
             id=np.arange(first, first + count),
             **{
@@ -450,6 +490,11 @@ def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
                 f"period of {period[k]:g} m along {'xyz'[k]} is too short: a grain could meet another one on both its "
                 f"sides, or its own image; allowed is more than two greatest diameters, {4.0 * radius:g} m"
             )
+    if scene.shear_rate is not None and scene.large_bodies:
+        raise ValueError(f"large body {scene.large_bodies[0].name!r}: a sheared cell has grains alone")
+    if scene.shear_rate is not None and (scene.sources or scene.outlets):
+        name = next(iter({**scene.sources, **scene.outlets}))
+        raise ValueError(f"{name!r}: a sheared cell has no sources and outlets")
     if scene.springs:
         raise ValueError(f"spring {next(iter(scene.springs))!r}: springs have no images, so periods allow none")
     for body in scene.large_bodies:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -15,10 +15,11 @@ from dem.bodies import Bodies
 from dem.contact import find_contacts
 from dem.exchange import exchange, refuse
 from dem.partition import redistribute
-from dem.period import put_back, wrapped
+from dem.period import put_back, velocity_in_cell, wrapped
 from dem.scene import Scene
+from dem.sources import Tally, from_array
 from dem.step import follow_motions
-from dem.world import World, refuse_load
+from dem.world import Shear, World, refuse_load
 
 
 def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
@@ -28,7 +29,8 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     grains overlap each other or a large body by more than `overlap` radii; SceneError if a motion fails.
     """
     grains = scene.grains()
-    grains.position = wrapped(grains.position, scene.period)
+    grains.velocity = velocity_in_cell(grains.position, grains.velocity, _shear(scene))
+    grains.position = wrapped(grains.position, scene.period, _shear(scene))
     world = _world(scene, comm, grains.take(even_slice(len(grains), comm)))
     follow_motions(world)
     put_back(world)
@@ -55,7 +57,9 @@ def restored_world(
     ]
     refuse(comm, f"arrays of other shapes or types: {', '.join(other)}" if other else "")
     world = _world(scene, comm, Bodies(**{name: np.array(column) for name, column in local.items()}))
-    count = len(scene.grains())
+    if world.tallies:
+        world.tallies = from_array([*world.tallies], np.array(replicated.get("tallies", ())))
+    count = world.ids - sum(world.tallies[name].count for name in world.outlets)
     if world.slabs[-1] != count or len(large["id"]) != len(world.large):
         raise ValueError(
             f"the state has {world.slabs[-1]} grains and {len(large['id'])} large bodies, "
@@ -65,14 +69,18 @@ def restored_world(
     world.time, world.step = float(replicated["time"]), int(replicated["step"])
     expected = np.array(replicated["expected"]) if "expected" in replicated else None
     world.expected = expected if expected is not None and expected.shape == (len(world.springs), 2, 6) else None
-    _refuse_impossible(world, count)
+    if world.shear is not None:
+        rate, shift = np.array(replicated.get("shear", (0.0, np.nan)), float)
+        refuse(comm, "" if np.isfinite([rate, shift]).all() else "the state has no shear of the cell, as the scene has")
+        world.shear = replace(world.shear, rate=float(rate), shift=float(shift))
+    _refuse_impossible(world)
     if len(replicated["slabs"]) != comm.size + 1:
         redistribute(world)
     return world
 
 
-def _refuse_impossible(world: World, count: int) -> None:
-    """ValueError on all ranks for a state of `count` grains that `dem.scene` would refuse to start with; collective."""
+def _refuse_impossible(world: World) -> None:
+    """ValueError on all ranks for a state that `dem.scene` would refuse to start with; collective."""
     wrong = [] if np.isfinite(world.time) and world.time >= 0.0 <= world.step else ["time or step"]
     for table, what in ((world.grains, "grain"), (world.large, "large body")):
         grains = what == "grain"
@@ -88,10 +96,12 @@ def _refuse_impossible(world: World, count: int) -> None:
             "size": np.isfinite(table.size) & (table.size >= 0.0) & (table.size[:, :1] > 0.0 if grains else True),
         }
         wrong += [f"{name} of a {what}" for name, good in right.items() if not good.all()]
-    starts = np.arange(world.comm.size + 1) * count // world.comm.size
+    starts = np.arange(world.comm.size + 1) * world.ids // world.comm.size
     owner = np.clip(np.searchsorted(starts, world.grains.id, side="right") - 1, 0, world.comm.size - 1)
     ids = np.sort(exchange(world.comm, {"id": world.grains.id}, owner)["id"])
-    if not np.array_equal(ids, np.arange(starts[world.comm.rank], starts[world.comm.rank + 1])):
+    most = starts[world.comm.rank : world.comm.rank + 2]
+    missing = not world.outlets and len(ids) != most[1] - most[0]
+    if missing or (np.diff(ids) <= 0).any() or ((ids < most[0]) | (ids >= most[1])).any():
         wrong.append("id of a grain")
     refuse(world.comm, f"a state that no run can have: {', '.join(wrong)}" if wrong else "")
 
@@ -108,10 +118,24 @@ def even_slice(count: int, comm: MPI.Comm) -> slice:
     return slice(count * comm.rank // comm.size, count * (comm.rank + 1) // comm.size)
 
 
+def _shear(scene: Scene) -> Shear | None:
+    """The shear of the cell at time zero."""
+    if scene.shear_rate is None or scene.period is None:
+        return None
+    return Shear(scene.shear_rate, scene.gradient, float(scene.period[scene.gradient]))
+
+
 def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
     world.loads, world.springs, world.period = dict(scene.loads), dict(scene.springs), scene.period
+    world.sources, world.outlets = dict(scene.sources), dict(scene.outlets)
+    world.tallies = {name: Tally() for name in (*world.sources, *world.outlets)}
+    world.initial, world.first_large = sum(map(len, scene.parts)), scene.first_large
+    tied = [name for name, spring in world.springs.items() if any(isinstance(end, int) for end in spring.ends)]
+    if tied and world.outlets:
+        raise ValueError(f"spring {tied[0]!r} holds a grain: scenes with outlets allow springs of large bodies alone")
+    world.shear = _shear(scene)
     for name, load in world.loads.items():
         refuse_load(world, name, load)
     return world

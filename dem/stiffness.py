@@ -21,16 +21,19 @@ import math
 
 import numpy as np
 
-from dem import bodies, checks
+from dem import bodies, checks, quaternion
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.compiled import loop
 from dem.motion import Dynamic
 from dem.pairs import Pairs
 from dem.scene import Scene
+from dem.shapes import Plane, placed
+from dem.sources import bounds
 from dem.time_step import fastest
 
 OVERLAP = 0.003  #: the greatest overlap that `recommended` allows, as a part of a grain's radius
 CHAINS = 4.0  #: the strongest forces between grains over those that a like share of the weight makes
+DENSE = 0.64  #: solid fraction of a bed that sources may make
 DAMPING = 2.0  #: c as a part of 2 sqrt(k m): an impact leaves 5 % of the speed (Schwager, Poeschel); 1: 14 %
 
 
@@ -46,9 +49,10 @@ def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
     The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width, and
     four times as much where a chain of force goes (Radjai, Jean, Moreau, Roux, Phys. Rev. Lett. 77 (1996): a share of
     exp(-1.4 f) bears more than f times the mean). A grain of mass m that a tool of speed v meets is stopped by
-    k d = v sqrt(k m). Cohesion c presses grains together by c / k. Grains that fall from high are not reckoned with.
+    k d = v sqrt(k m). Sources may fill the scene up to their height (`_bed`). Cohesion c presses grains together by
+    c / k. Grains that fall from high are not reckoned with.
     """
-    grains = scene.grains()
+    grains = scene.expected()
     allowed = overlap * bodies.bounding_radius(grains)
     with np.errstate(over="ignore"):  # inf: rigid
         stiffness = float(np.maximum(_load(scene) / allowed, grains.mass * (fastest(scene) / allowed) ** 2).max())
@@ -57,7 +61,7 @@ def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
 
 def expected_overlap(scene: Scene, stiffness: float) -> float:
     """The greatest overlap, as a part of a radius, that `recommended` would expect of a stiffness [N/m]."""
-    grains = scene.grains()
+    grains = scene.expected()
     if np.isinf(stiffness):
         return 0.0
     stopped = fastest(scene) * np.sqrt(grains.mass / stiffness)
@@ -104,16 +108,41 @@ def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float]:
 
 def _load(scene: Scene) -> Floats:
     """The weight (grains,) that the whole bed would lay on each grain, and the strongest cohesion [N]."""
-    grains, gravity = scene.grains(), math.hypot(*scene.gravity)
+    every, gravity = scene.expected(), math.hypot(*scene.gravity)
     pull = scene.pairs(np.inf).cohesion.max()
     if gravity == 0.0:
-        return np.full(len(grains), pull)
+        return np.full(len(every), pull)
     down = np.asarray(scene.gravity) / gravity
+    pressure = max(_pressure(scene, gravity, down), _bed(scene, gravity, down))
+    radius = bodies.bounding_radius(every)
+    return np.maximum(CHAINS * pressure * (2.0 * radius) ** 2, gravity * every.mass) + pull
+
+
+def _pressure(scene: Scene, gravity: float, down: Floats) -> float:
+    """The weight of all bodies at time zero over the area of the bed [Pa]."""
+    grains = scene.grains()
+    if not len(grains):
+        return 0.0
     across = grains.position - np.outer(grains.position @ down, down)
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(across.T, bias=True)), 0.0))[1:]  # in the plane across
     radius = bodies.bounding_radius(grains)
     width = np.sqrt(12.0) * spread + 2.0 * radius.mean()  # of a rectangle of that spread, with the grains at its edges
     free = [(body.mass, body.motion) for body in scene.large_bodies if isinstance(body.motion, Dynamic)]
     others = sum(mass * float(down @ motion.free_directions() @ down) for mass, motion in free)  # the rest is borne
-    pressure = gravity * (grains.mass.sum() + others) / width.prod()
-    return np.maximum(CHAINS * pressure * (2.0 * radius) ** 2, gravity * grains.mass) + pull
+    return float(gravity * (grains.mass.sum() + others) / width.prod())
+
+
+def _bed(scene: Scene, gravity: float, down: Floats) -> float:
+    """The pressure [Pa] at the bottom of a dense bed that reaches from the lowest body to the highest source: no source
+    fills a scene further than that. 0 without sources."""
+    if not scene.sources:
+        return 0.0
+    top = [bounds(source.region) @ down for source in scene.sources.values()]
+    places = [body.position + quaternion.rotate(body.quaternion, placed(shape)[1])
+              for body in scene.large_bodies for shape in body.shapes]  # fmt: skip
+    reach = [0.0 if isinstance(shape, Plane) else float(np.linalg.norm(placed(shape)[3]))
+             for body in scene.large_bodies for shape in body.shapes]  # fmt: skip
+    low = [place @ down + far for place, far in zip(places, reach)] + [ends.max() for ends in top]
+    height = max(low) - min(ends.min() for ends in top)
+    heaviest = max(source.density for source in scene.sources.values())
+    return DENSE * heaviest * gravity * height

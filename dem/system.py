@@ -46,6 +46,7 @@ class ContactSystem:
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
         stiffness (nc,): of the contacts; inf: rigid [N/m]
         compliance (nc,): C, what a normal impulse leaves of the overlap, over dt; 0: rigid [1/kg]
+        drift (nc, 3): velocities of images relative to their bodies, in the frames; None without shear [m/s]
         surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.surface`; None if there is none
         b (nc, 3): (gap / dt, surface) [m/s], see `gap_velocities`
         r (nc, 3): b + D' v_free [m/s]
@@ -96,6 +97,9 @@ class ContactSystem:
         if self.surface is not None:
             self.b[:, 1:] = self.surface
         freely = self.contact_map.relative_velocities(free)
+        self.drift = None if contacts.drift is None else np.einsum("cij,cj->ci", self.frame, contacts.drift)
+        if self.drift is not None:
+            freely += self.drift
         self.attraction = attraction(world, contacts, dt)
         if self.attraction is not None:
             momentum = self.contact_map.momenta(along_normal(-self.attraction))
@@ -116,6 +120,8 @@ class ContactSystem:
         table, a, b = contacts.near.bodies, contacts.a, contacts.b
         e = world.pairs.restitution[table.material[a], table.material[b]]
         came = self.contact_map.relative_velocities(table.velocity)[:, 0]
+        if self.drift is not None:
+            came = came + self.drift[:, 0]
         begin = (e > 0.0) & (came < -self.dt * math.hypot(*world.gravity)) & (contacts.gap + self.dt * freely < 0.0)
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance = np.where(begin, 0.0, self.compliance)
@@ -163,6 +169,9 @@ class ContactSystem:
         self.contact_map.halo.update(after)
         after[self.near.grains + self.near.ghosts :] = large
         normal, tangential, opening = self.contact_map.works(impulse, before, after)
+        if self.drift is not None:
+            normal, opening = normal + float(impulse[:, 0] @ self.drift[:, 0]), opening + self.drift[:, 0]
+            tangential += float(np.vdot(impulse[:, 1:], self.drift[:, 1:]))
         if moment is not None and self.resistance is not None:
             turning = self.resistance.map.turning
             tangential += 0.5 * float(np.vdot(moment, turning(before) + turning(after)))
@@ -177,6 +186,8 @@ def touching(contacts: Contacts, system: ContactSystem) -> Bools:
     radius = np.where(table.shape == COMPOUND, np.inf, bodies.bounding_radius(table))
     radius = np.minimum(radius[contacts.a], radius[contacts.b])
     slip = system.contact_map.relative_velocities(table.velocity)[:, 1:]
+    if system.drift is not None:
+        slip = slip + system.drift[:, 1:]
     near: Bools = contacts.gap <= (system.dt * slip) ** 2 @ np.ones(2) / (2.0 * radius) + 0.01 * radius
     return near if system.attraction is None else near | (system.attraction > 0.0)
 

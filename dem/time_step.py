@@ -43,14 +43,14 @@ def contact_distance(scene: Scene) -> float:
 
 def smallest(scene: Scene) -> float:
     """Radius of the smallest grain [m]; 0.1 m if there is none."""
-    radii: Floats = bodies.bounding_radius(scene.grains())
+    radii: Floats = bodies.bounding_radius(scene.expected())
     return float(radii.min()) if len(radii) else 0.1
 
 
 def fastest(scene: Scene) -> float:
     """The greatest speed of a tool, or of a grain at time zero [m/s]."""
     tools = [_top_speed(body) for body in scene.large_bodies if body.name not in scene.leaving]
-    x, y, z, *_ = scene.grains().velocity.T
+    x, y, z, *_ = scene.expected().velocity.T
     return max([*tools, float(np.hypot(np.hypot(x, y), z).max(initial=0.0))])  # squares could overflow
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, loads, quaternion, springs
+from dem import bodies, checks, loads, quaternion, springs
 from dem import motion as motions
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
@@ -21,8 +21,28 @@ from dem.loads import Load, On
 from dem.motion import Dynamic, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
 from dem.pairs import Pairs
 from dem.scene import LargeBody, SurfaceVelocity, checked_surface
+from dem.sources import Outlet, Source, Tally, as_array
 from dem.springs import Spring
 from dem.together import together
+
+
+@dataclass(frozen=True)
+class Shear:
+    """A simple shear of a periodic cell (Lees and Edwards 1972): flow along x, with its gradient along y or z."""
+
+    rate: float  #: d v_x / d y or z [1/s]
+    axis: int  #: of the gradient: 1 or 2
+    length: float  #: the period along it [m]
+    shift: float = 0.0  #: by how much the images behind that period are moved along x so far [m]
+
+    @property
+    def speed(self) -> float:
+        """Velocity along x of the images behind the period, relative to their grains [m/s]."""
+        return self.rate * self.length
+
+    def after(self, dt: float) -> Shear:
+        """dt [s] later."""
+        return dataclasses.replace(self, shift=self.shift + dt * self.speed)
 
 
 @dataclass
@@ -44,6 +64,12 @@ class World:
     loads: dict[str, Load] = field(default_factory=dict)  #: by name; change them by `set_load` only
     springs: dict[str, Spring] = field(default_factory=dict)  #: by name; change them by `set_spring` only
     period: Floats | None = None  #: (3,) lengths of the cell that repeats itself, inf: none; None: along no axis [m]
+    sources: dict[str, Source] = field(default_factory=dict)  #: by name
+    outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
+    tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets, by name
+    initial: int = 0  #: number of grains at time zero
+    first_large: int = 0  #: id of the first large body
+    shear: Shear | None = None  #: of the cell
     time: float = 0.0  #: [s]
     step: int = 0  #: number of steps done
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
@@ -77,6 +103,10 @@ class World:
         replicated.update(slabs=self.slabs, time=np.array(self.time), step=np.array(self.step))
         if self.expected is not None:
             replicated["expected"] = self.expected
+        if self.tallies:
+            replicated["tallies"] = as_array(self.tallies)
+        if self.shear is not None:
+            replicated["shear"] = np.array([self.shear.rate, self.shear.shift])
         return self.grains.columns(), replicated
 
     def set_grains(self, grains: Bodies) -> None:
@@ -85,6 +115,11 @@ class World:
         counts, spheres = zip(*self.comm.allgather((len(grains), bool((grains.shape == bodies.SPHERE).all()))))
         self.slabs = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.only_spheres = all(spheres)
+
+    @property
+    def ids(self) -> int:
+        """Number of grains that there have been; their ids are less."""
+        return self.initial + sum(self.tallies[name].count for name in self.sources)
 
     @property
     def loaded(self) -> bool:
@@ -110,7 +145,7 @@ class World:
 
     def name_of(self, id: int) -> str:
         """What messages call the body of this id."""
-        first = int(self.slabs[-1])
+        first = self.first_large
         return f"grain {id}" if id < first else f"body {self.large_bodies[id - first].name!r}"
 
     def replace_large(self, body: LargeBody) -> None:
@@ -193,6 +228,13 @@ def _ways(motion: Any) -> Floats:
     return np.array([motion.free_directions(), motion.free_turns()])
 
 
+def set_shear_rate(world: World, rate: float) -> None:
+    """Shear the cell at another rate [1/s] from now on. ValueError if the scene has no `shear_rate`."""
+    if world.shear is None:
+        raise ValueError("shear rate: the cell of this scene is not sheared; give the Scene a shear_rate, or 0")
+    world.shear = dataclasses.replace(world.shear, rate=float(checks.finite("shear rate", rate)))
+
+
 def set_load(world: World, name: str, on: On = None, **values: Any) -> None:
     """Give a load other numbers: `force`, `torque`, `start` or `end`; a name that no load has begins one `on` some
     bodies, all grains if nothing is given. ValueError for what it cannot be."""
@@ -212,7 +254,7 @@ def refuse_load(world: World, name: str, load: Load) -> None:
         if bool(bodies_of_name) == (load.on in world.materials):
             kind = "both a body and a material" if bodies_of_name else "neither a body nor a material"
             raise ValueError(f"load {name!r}: {load.on!r} is {kind}")
-    elif load.ids is not None and len(wrong := load.ids[(load.ids < 0) | (load.ids >= world.slabs[-1])]):
+    elif load.ids is not None and len(wrong := load.ids[(load.ids < 0) | (load.ids >= world.ids)]):
         raise ValueError(f"load {name!r}: there is no grain {wrong[0]}")
 
 

@@ -31,19 +31,20 @@ def sample(folder: Folder, step: int) -> Sample:
     The centres at the start of the step are those of the record less dt times the velocities; that is exact but for
     runs with ``-projection``, and bodies with a prescribed motion that turns."""
     folder.require_frames()
-    frame, grains = folder.frame(step), slice(folder.grains)
+    frame = folder.frame(step)
+    table, grains = frame.table, slice(frame.table.grains)
     contacts = frame.contacts
     start = frame.position - contacts.dt * frame.velocity[:, :3]
     return Sample(
         comm=MPI.COMM_SELF,
-        count=folder.grains,
-        id=np.arange(folder.grains),
+        count=table.grains,
+        id=np.arange(table.grains),
         position=frame.position[grains],
         velocity=frame.velocity[grains],
-        mass=folder.mass[grains],
-        shape=folder.shape[grains],
-        size=folder.size[grains],
-        material=folder.material[grains],
+        mass=table.mass[grains],
+        shape=table.shape[grains],
+        size=table.size[grains],
+        material=table.material[grains],
         materials=tuple(folder.materials),
         bodies=contacts.bodies,
         center=start[contacts.bodies],
@@ -66,7 +67,7 @@ def triangle_forces(folder: Folder, step: int, name: str) -> Floats:
     found, names = sample(folder, step), [body["name"] for body in folder.large]
     if name not in names:
         raise ValueError(f"no large body {name!r}; there are: {', '.join(names) or 'none'}")
-    number = folder.grains + names.index(name)
+    number = found.count + names.index(name)
     shapes = folder.large[names.index(name)]["shapes"]
     if [shape["kind"] for shape in shapes] != ["Mesh"]:
         raise ValueError(f"triangle_forces: the body {name!r} is not one mesh")

@@ -109,20 +109,20 @@ def bodies(scene: Any, frame: Frame) -> Any:
     """
     from pctt.look import surfaces
 
-    folder, grains = scene.folder, slice(scene.folder.grains)
+    table, grains = frame.table, slice(frame.table.grains)
     data = surfaces.polydata(frame.position[grains], "verts", 1)
     columns = {
-        "id": np.arange(folder.grains),
-        "radius": folder.radius,
-        "extent": surfaces.extent(folder),
+        "id": table.id[grains],
+        "radius": table.radius,
+        "extent": surfaces.extent(scene.folder.path, table),
         "quaternion": frame.quaternion[grains],
         "velocity": frame.velocity[grains, :3],
         "angular_velocity": frame.velocity[grains, 3:],
         "speed": frame.speed[grains],
         "force": frame.load()[grains],
-        "mass": folder.mass[grains],
-        "material": folder.material[grains],
-        "shape": folder.shape[grains],
+        "mass": table.mass[grains],
+        "material": table.material[grains],
+        "shape": table.shape[grains],
     }
     surfaces.add_arrays(data.GetPointData(), columns)
     return data
@@ -135,7 +135,7 @@ def contacts(scene: Any, frame: Frame) -> Any:
 
     contact = frame.contacts
     ends = frame.position[contact.bodies]
-    far = contact.bodies >= scene.folder.grains
+    far = contact.bodies >= frame.table.grains
     ends[far] = np.repeat(contact.point[:, None], 2, axis=1)[far]
     data = surfaces.polydata(ends, "lines", 2)
     size = np.linalg.norm(contact.force, axis=1)
@@ -159,7 +159,7 @@ def large(scene: Any, frame: Frame) -> Any:
     parts = []
     for row in range(len(scene.folder.large)):
         part = surfaces.joined([scene.surface(frame, row), scene.planes(frame, row)])
-        body = np.full(part.GetNumberOfCells(), scene.folder.grains + row)
+        body = np.full(part.GetNumberOfCells(), frame.table.grains + row)
         part.GetPointData().Initialize()
         part.GetCellData().Initialize()
         surfaces.add_arrays(part.GetCellData(), {"body": body})

@@ -149,7 +149,8 @@ class Frame:
     position: np.ndarray  #: (n, 3) [m]
     quaternion: np.ndarray  #: (n, 4) (w, x, y, z)
     velocity: np.ndarray  #: (n, 6) linear [m/s] and angular [rad/s]
-    contacts: Contacts
+    contacts: Contacts  #: their bodies are rows
+    table: Table  #: what the bodies are
 
     @property
     def speed(self) -> np.ndarray:
@@ -160,6 +161,23 @@ class Frame:
         """Sums (n,) of the magnitudes of the contact forces on each body [N]."""
         size = np.linalg.norm(self.contacts.force, axis=1)
         return np.bincount(self.contacts.bodies.ravel(), np.repeat(size, 2), minlength=len(self.position))
+
+
+@dataclass(frozen=True)
+class Table:
+    """What the bodies of a frame are, in its rows."""
+
+    id: np.ndarray  #: (n,)
+    shape: np.ndarray  #: (n,) kinds, as of `dem.bodies`
+    size: np.ndarray  #: (n, 3) [m]
+    mass: np.ndarray  #: (n,) [kg]
+    material: np.ndarray  #: (n,)
+    grains: int  #: the first rows
+
+    @property
+    def radius(self) -> np.ndarray:
+        """Radii (grains,) of the spheres that enclose the grains [m]."""
+        return bodies.enclosing_radius(self.shape[: self.grains], self.size[: self.grains])
 
 
 class Folder:
@@ -214,20 +232,34 @@ class Folder:
         self.grains = len(self.shape) - len(self.large)
 
     @property
+    def table(self) -> Table:
+        """What the bodies are; in scenes with sources or outlets those of the first frame, and each frame has its
+        own."""
+        return Table(np.arange(len(self.shape)), self.shape, self.size, self.mass, self.material, self.grains)
+
+    @property
     def radius(self) -> np.ndarray:
         """Radii (grains,) of the spheres that enclose the grains [m]."""
-        return bodies.enclosing_radius(self.shape[: self.grains], self.size[: self.grains])
+        return self.table.radius
 
     def frame(self, step: int) -> Frame:
         """A recorded step; FileError if its file is damaged."""
+        if not hasattr(self, "large"):
+            self.require_frames()
 
         def take(file: h5py.File, sealed: bool) -> Frame:
             contact = file["contact"]
             rows = [contact[name][()] for name in ("body", "point", "frame", "gap", "impulse")]
             moment = contact["moment"][()] if "moment" in contact else None
+            places = {name: file[name][()] for name in ("position", "quaternion", "velocity")}
+            if "id" in file:  # of a scene with sources or outlets
+                own = {name: file[name][()] for name in ("id", "shape", "size", "mass", "material")}
+                table = Table(**own, grains=len(own["id"]) - len(self.large))
+                rows[0] = np.searchsorted(table.id, rows[0])
+            else:
+                table = self.table
             contacts = Contacts(*rows, float(contact.attrs["dt"]), moment)  # type: ignore[call-arg]
-            table = {name: file[name][()] for name in ("position", "quaternion", "velocity")}
-            return Frame(step, float(file.attrs["time"]), **table, contacts=contacts)
+            return Frame(step, float(file.attrs["time"]), **places, contacts=contacts, table=table)
 
         return disk.read(self.frame_path(step), MPI.COMM_SELF, take)
 
@@ -329,12 +361,12 @@ class Snapshot(Folder):
     """The present state of a simulation, as a folder with one recorded step."""
 
     def __init__(
-        self, frame: Frame, shape: np.ndarray, size: np.ndarray, material: np.ndarray, materials: Sequence[str],
-        large: list[dict[str, Any]],
+        self, frame: Frame, materials: Sequence[str], large: list[dict[str, Any]],
     ):  # fmt: skip
         self.path, self.steps, self._present = Path(), [frame.step], frame
-        self.shape, self.size, self.material, self.materials, self.large = shape, size, material, [*materials], large
-        self.grains = len(shape) - len(large)
+        self.shape, self.size, self.mass = frame.table.shape, frame.table.size, frame.table.mass
+        self.material, self.materials, self.large = frame.table.material, [*materials], large
+        self.grains = frame.table.grains
 
     def frame(self, step: int) -> Frame:
         return self._present

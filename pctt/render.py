@@ -115,17 +115,17 @@ def _stage(
     """What draws frames of a folder. The sample decides the camera, and the ends of the colours that are not given."""
     from pctt.look.stage import Paint, Stage  # imported here, because it needs vtk and -help does not
 
-    kinds = np.unique(folder.material[: folder.grains])
+    kinds = np.unique(np.concatenate([frame.table.material[: frame.table.grains] for frame in sample]))
     values: dict[str, Callable[[Frame], np.ndarray]] = {
         "speed": lambda frame: frame.speed,
         "force": lambda frame: frame.load(),
-        "id": lambda _: np.arange(folder.grains),
-        "size": lambda _: 2 * folder.radius,
-        "material": lambda _: np.searchsorted(kinds, folder.material),
+        "id": lambda frame: frame.table.id,
+        "size": lambda frame: 2 * frame.table.radius,
+        "material": lambda frame: np.searchsorted(kinds, frame.table.material),
     }
 
     def value(frame: Frame) -> np.ndarray:
-        return values[colour](frame)[: folder.grains].astype(float)
+        return values[colour](frame)[: frame.table.grains].astype(float)
 
     title, name, ends = COLOURS[colour]
     names = [folder.materials[k] for k in kinds] if colour == "material" else []
@@ -146,7 +146,7 @@ def ends_of(colour: str, values: np.ndarray) -> tuple[float, float]:
         return 0.0, max(high, 1.0)
     if colour == "size":
         return (low, high) if low < 0.999 * high else (0.0, high or 1.0)
-    high = float(np.quantile(values, 0.99)) or 1.0
+    high = (float(np.quantile(values, 0.99)) if len(values) else 0.0) or 1.0
     step = 10 ** np.floor(np.log10(high))
     return 0.0, step * min(k for k in (1, 2, 4, 6, 8, 10) if k * step >= high)  # a quarter has few digits
 

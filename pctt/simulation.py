@@ -16,7 +16,7 @@ import dataclasses
 import html
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,17 +34,18 @@ from dem.loads import Load, On
 from dem.measures import Sample
 from dem.mesh import Mesh
 from dem.motion import Motion
-from dem.period import wrapped
+from dem.period import velocity_in_cell, wrapped
 from dem.scene import LargeBody, Scene, SurfaceVelocity
+from dem.sources import Tally
 from dem.springs import Spring
 from dem.start import step_remark
 from dem.step import Step
 from dem.stiffness import expected_overlap
 from dem.together import meet, together
-from dem.world import set_load, set_motion, set_spring, set_surface
+from dem.world import set_load, set_motion, set_shear_rate, set_spring, set_surface
 from pctt import ccp, log
 from pctt.disk import FileError
-from pctt.folder import Contacts, Frame, Snapshot
+from pctt.folder import Contacts, Frame, Snapshot, Table
 from pctt.options import OptionError, made, refuse_bad
 from pctt.petsc import warn
 from pctt.render import Picture, picture
@@ -214,10 +215,31 @@ class Simulation:
         return self.world.step
 
     @property
+    def ids(self) -> np.ndarray:
+        """Ids (n,) of the grains that there are, in ascending order, on every rank: the order of `positions` and
+        others. They count the grains in the order of the scene, then those of sources as they came."""
+        return self._of_grains("id")
+
+    def source(self, name: str) -> Tally:
+        """What has come from a source: ``count``, ``mass`` [kg], and ``refused``, the steps in which it had no room.
+        ValueError if there is none of that name. Not collective."""
+        return self._passage("source", self.world.sources, name)
+
+    def outlet(self, name: str) -> Tally:
+        """What has left by an outlet: ``count`` and ``mass`` [kg]. ValueError if there is none of that name. Not
+        collective."""
+        return self._passage("outlet", self.world.outlets, name)
+
+    def _passage(self, what: str, there: Mapping[str, Any], name: str) -> Tally:
+        if name not in there:
+            raise ValueError(f"no {what} {name!r}; there are: {', '.join(there) or 'none'}")
+        return dataclasses.replace(self.world.tallies[name])
+
+    @property
     def positions(self) -> Floats:
         """Centres (n, 3) of all grains on every rank, in the order in which the scene added them, within the cell of a
         periodic scene [m]."""
-        return wrapped(self._of_grains("position"), self.world.period)
+        return wrapped(self._of_grains("position"), self.world.period, self.world.shear)
 
     @property
     def orientations(self) -> Floats:
@@ -227,7 +249,9 @@ class Simulation:
     @property
     def velocities(self) -> Floats:
         """Linear and angular velocities (n, 6) of all grains on every rank, in the order of the scene [m/s, rad/s]."""
-        return self._of_grains("velocity")
+        if self.world.shear is None:
+            return self._of_grains("velocity")
+        return velocity_in_cell(self._of_grains("position"), self._of_grains("velocity"), self.world.shear)
 
     @property
     def local(self) -> Bodies:
@@ -262,8 +286,8 @@ class Simulation:
         found = self._gathered(
             "contacts",
             key=own.key,
-            bodies=np.stack([id[own.a], id[own.b]], axis=1),
-            point=wrapped(own.point, self.world.period),
+            bodies=np.searchsorted(np.append(self.ids, self.world.large.id), np.stack([id[own.a], id[own.b]], axis=1)),
+            point=wrapped(own.point, self.world.period, self.world.shear),
             frame=step.system.frame,
             gap=own.gap,
             impulse=step.impulse,
@@ -298,6 +322,13 @@ class Simulation:
         on, values = self.comm.bcast((on, values))
         change = partial(set_load, self.world, name, on, **values)
         together(self.comm, f"load {name}", change, own=(ValueError, TypeError))
+
+    def set_shear_rate(self, rate: float) -> None:
+        """Shear the cell at another rate [1/s]. The first rank's value counts, and checkpoints keep it. ValueError if
+        the scene has no ``shear_rate``."""
+        meet(self.comm, "shear rate")
+        change = partial(set_shear_rate, self.world, self.comm.bcast(rate))
+        together(self.comm, "shear rate", change, own=(ValueError, TypeError))
 
     @property
     def springs(self) -> dict[str, Spring]:
@@ -415,14 +446,15 @@ class Simulation:
     def _snapshot(self) -> Snapshot:
         """All bodies and contacts on every rank, for those that draw."""
         world, large = self.world, self.world.large
-        names = ("position", "quaternion", "velocity", "shape", "size", "material")
+        names = ("position", "quaternion", "velocity", "id", "shape", "size", "mass", "material")
         table = {name: np.concatenate([self._of_grains(name), getattr(large, name)]) for name in names}
         position, turn, velocity = (table.pop(name) for name in names[:3])
         grains = len(position) - len(large)
-        position[:grains] = wrapped(position[:grains], world.period)
+        velocity[:grains] = velocity_in_cell(position[:grains], velocity[:grains], world.shear)
+        position[:grains] = wrapped(position[:grains], world.period, world.shear)
         contacts = self.contacts if self.last else Contacts.none()
-        frame = Frame(self.steps, self.time, position, turn, velocity, contacts)
-        return Snapshot(frame, **table, materials=world.materials, large=described_bodies(world))
+        frame = Frame(self.steps, self.time, position, turn, velocity, contacts, Table(**table, grains=grains))
+        return Snapshot(frame, materials=world.materials, large=described_bodies(world))
 
 
 class Body:

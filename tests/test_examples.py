@@ -108,6 +108,17 @@ def test_the_belt_carries_the_capsules():
     assert records["power [W]"].sum() > 0
 
 
+def test_the_feeder_carries_to_its_end_what_its_source_feeds():
+    scene, records = run("feeder", 400, scene_rate="8", scene_speed="8", dt="0.004", scene_radius="0.03")
+    came, left = records["mass_feed [kg]"], records["mass_end [kg]"]
+    assert left[-1] > 0
+    assert (np.diff(came) >= 0).all()
+    largest = 2500 * 4 / 3 * np.pi * 0.04**3
+    time = records["time [s]"] - 0.004  # grains come before a step
+    assert ((8 * time - came > -1e-9) & (8 * time - came < largest)).all()
+    assert scene.analyse(records)["held [kg]"] == came[-1] - left[-1] > 0
+
+
 def test_the_wheel_drives_itself_with_its_load():
     _, records = run("wheel", 200, scene_settling_time="0.1", scene_length="16")
     assert records["slip"][-1] < 0.6

@@ -64,6 +64,15 @@ def test_the_loads_of_their_page_give_what_it_says(in_folder, capsys):
     assert said == pytest.approx([0.3 * 9.81 - 1.0, -pull, pull, 0.2], rel=0.01)
 
 
+def test_the_hopper_of_the_page_of_sources_fills_and_runs_out(in_folder, capsys):
+    (text,) = blocks("docs/sources.md")
+    exec(text, {})
+    said = re.findall(r"(\d+) grains, ([\d.]+) kg", capsys.readouterr().out)
+    assert said[0] == said[1]
+    assert said[0][0] == "60"
+    assert float(said[0][1]) == pytest.approx(60 * 2500 * 4 / 3 * 3.14159 * 0.02**3, rel=0.05)
+
+
 def test_the_simulation_of_its_page_runs(in_folder, capsys):
     (text,) = blocks("docs/python.md")
     before = PETSc.Options().getAll()

@@ -17,7 +17,7 @@ class Sample:
     """The grains (n) and contacts (nc) of this rank: grains as they are now, contacts as of the step that led there."""
 
     comm: MPI.Comm
-    count: int  #: grains on all ranks; larger numbers are large bodies
+    count: int  #: grains that there have been on all ranks; larger numbers are large bodies
     id: Ints  #: (n,) numbers in the order of the scene
     position: Floats  #: (n, 3) [m]
     velocity: Floats  #: (n, 6) [m/s, rad/s]

@@ -11,8 +11,9 @@ from dem import analysis
 from dem.arrays import Corners, Floats
 from dem.checks import not_negative, positive
 from dem.experiment import option
+from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import ToAndFro, perturbed
+from dem.scenes.lattice import ToAndFro
 from dem.shapes import Box
 from dem.step import Step
 

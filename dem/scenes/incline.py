@@ -14,8 +14,8 @@ from dem.arrays import Floats
 from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
 from dem.measures import Block, solid_fraction
+from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import perturbed
 from dem.shapes import Plane, Sphere
 from dem.step import Step
 

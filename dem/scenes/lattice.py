@@ -15,6 +15,7 @@ from dem.arrays import Bools, Floats
 from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
 from dem.motion import Oscillation
+from dem.packing import perturbed
 from dem.quaternion import length
 from dem.scene import Scene
 from dem.shapes import Plane, Shape
@@ -135,13 +136,6 @@ class SmallSpheres(Spheres):
         places = perturbed(grid[0], grid[1], grid[2], self.perturbation, self.seed)
         places = places[length(np.delete(places, axis, axis=1)) <= self.room]
         return places[np.argsort(places[:, 2], kind="stable")]
-
-
-def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -> Floats:
-    """Points (nx ny nz, 3) of the lattice with these coordinates per axis, each moved by up to `perturbation` [m] per
-    axis."""
-    lattice = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
-    return lattice + perturbation * np.random.default_rng(seed).uniform(-1.0, 1.0, lattice.shape)
 
 
 def rest_after_fall(height: float, gravity: float) -> float:

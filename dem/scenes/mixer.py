@@ -13,8 +13,9 @@ from dem.arrays import Corners, Floats
 from dem.checks import not_negative, positive, positive_or_inf
 from dem.experiment import option
 from dem.motion import Hinged, Rotation
+from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import LargeSpheres, perturbed
+from dem.scenes.lattice import LargeSpheres
 from dem.shapes import Box
 
 

@@ -13,8 +13,9 @@ from dem.arrays import Corners, Floats
 from dem.checks import between, not_negative, positive
 from dem.experiment import option
 from dem.motion import Guided
+from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import ToAndFro, perturbed
+from dem.scenes.lattice import ToAndFro
 from dem.shapes import Box, Plane, Shape
 from dem.step import Step
 

@@ -14,9 +14,10 @@ from dem.checks import between, finite, not_negative, positive
 from dem.experiment import option
 from dem.mesh import Mesh
 from dem.motion import Held
+from dem.packing import perturbed
 from dem.quaternion import exponential
 from dem.scene import Scene
-from dem.scenes.lattice import Spheres, perturbed, rest_after_fall
+from dem.scenes.lattice import Spheres, rest_after_fall
 from dem.shapes import Box, Shape
 from dem.step import Step
 

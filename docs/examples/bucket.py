@@ -17,8 +17,8 @@ import numpy as np
 from dem.experiment import Experiment, option
 from dem.mesh import Mesh
 from dem.motion import Rotation
+from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import perturbed
 from dem.shapes import Plane
 
 RADIUS = 0.004  # of a sphere [m]

@@ -14,8 +14,8 @@ import numpy as np
 from dem.experiment import Experiment, option
 from dem.mesh import Mesh
 from dem.motion import Rotation
+from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import perturbed
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ import numpy as np
 from dem import measures
 from dem.experiment import Experiment, option
 from dem.motion import Oscillation
+from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import perturbed
 from dem.shapes import Plane
 
 

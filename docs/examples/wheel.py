@@ -13,8 +13,8 @@ import numpy as np
 from dem.experiment import Experiment, option
 from dem.mesh import Mesh
 from dem.motion import Held
+from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import perturbed
 from dem.shapes import Box, Plane
 
 

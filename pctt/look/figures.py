@@ -35,7 +35,10 @@ BALANCE = (
     "kinetic_energy", "potential_energy", "spring_energy", "work_of_motions", "friction_loss", "impact_loss",
     "time_stepping",
 )  # fmt: skip
-OTHERS = ("spring_energy_before", "energy_jump", "work_of_cohesion")  # which the figure of the balance stands for
+# energies that some runs have in the balance too, with the sign of what they bring, and those that it explains
+OTHERS = {
+    "work_of_cohesion": 1, "energy_of_sources": 1, "energy_of_outlets": -1, "spring_energy_before": 0, "energy_jump": 0
+}  # fmt: skip
 
 
 def figures(folder: Folder) -> dict[str, Figure]:
@@ -177,7 +180,7 @@ def energy(columns: Mapping[str, np.ndarray]) -> Figure:
     first record."""
     time = columns["time [s]"]
     kinetic, potential, spring, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
-    work = work + columns.get("work_of_cohesion [J]", 0.0)
+    work = work + sum(sign * columns.get(f"{name} [J]", 0.0) for name, sign in OTHERS.items())
     total = kinetic + spring + potential - potential[0] + np.cumsum(friction + impact - work)
     figure = Figure(figsize=(9.5, 6.4))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))

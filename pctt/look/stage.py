@@ -93,10 +93,10 @@ class Stage:
 
     def draw(self, frame: Frame, value: np.ndarray) -> np.ndarray:
         """The picture (height, width, 3) of a frame; ``value`` (grains,) gives the colours of the grains."""
-        folder, scene = self.scene.folder, self.scene
-        place, turn = (a[: folder.grains] for a in (frame.position, frame.quaternion))
-        shape, extent = folder.shape[: folder.grains], surfaces.extent(folder)
-        shown = np.ones(folder.grains, dtype=bool)
+        table, scene = frame.table, self.scene
+        place, turn = (a[: table.grains] for a in (frame.position, frame.quaternion))
+        shape, extent = table.shape[: table.grains], surfaces.extent(scene.folder.path, table)
+        shown = np.ones(table.grains, dtype=bool)
         if self.view.cut:
             shown = (place - scene.box.mean(axis=0)) @ _towards_camera(self.view, level=True) <= 0
         ball, block, long = (np.flatnonzero(shown & (shape == kind)) for kind in (SPHERE, BOX, CAPSULE))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSp
 from dem import quaternion
 from dem.bodies import BOX, CAPSULE, SPHERE
 from pctt.disk import FileError
-from pctt.folder import Folder, Frame
+from pctt.folder import Folder, Frame, Table
 
 if tuple(map(int, vtkVersion.GetVTKVersion().split(".")[:2])) < (9, 4):  # as Debian 12 has it
     raise ModuleNotFoundError(f"vtk {vtkVersion.GetVTKVersion()} is older than 9.4", name="vtkmodules")
@@ -59,8 +60,9 @@ class Scene:
     def __init__(self, folder: Folder, frames: Sequence[Frame]):
         self.folder, self._rows = folder, range(len(folder.large))
         self._hollow = {row for row in self._rows for frame in (frames[0], frames[-1]) if self._is_hollow(frame, row)}
-        radius = folder.radius[:, None]
-        corners = [frame.position[: folder.grains] + sign * radius for frame in frames for sign in (-1, 1)]
+        tables = [frame.table for frame in frames]
+        corners = [frame.position[: table.grains] + sign * table.radius[:, None]
+                   for frame, table in zip(frames, tables) for sign in (-1, 1)]  # fmt: skip
         corners += [points(data) for frame in frames for data in (self.tools(frame), self.shells(frame))]
         self.box = _bounds(corners)
         corners += [wall.center[None] for frame in frames for row in self._hollow for wall in self._boxes(frame, row)]
@@ -112,7 +114,7 @@ class Scene:
         return joined(polydata(polygon, "polys", len(polygon)) for polygon in polygons if len(polygon))
 
     def _pose(self, frame: Frame, row: int) -> tuple[np.ndarray, np.ndarray]:
-        return frame.position[self.folder.grains + row], frame.quaternion[self.folder.grains + row]
+        return frame.position[frame.table.grains + row], frame.quaternion[frame.table.grains + row]
 
     def _planes(self, frame: Frame, row: int) -> list[Wall]:
         (place, turn), found = self._pose(frame, row), []
@@ -146,7 +148,7 @@ class Scene:
         if not len(corners):
             return False
         low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-        grains = frame.position[: self.folder.grains]
+        grains = frame.position[: frame.table.grains]
         within = ((low <= grains) & (grains <= high)).all(axis=1)
         if (low == high).any() or np.count_nonzero(within) < SHARE * len(grains):
             return False
@@ -158,15 +160,16 @@ class Scene:
 
 
 def _bounds(places: Sequence[np.ndarray]) -> np.ndarray:
-    return np.array([np.concatenate(places).min(axis=0), np.concatenate(places).max(axis=0)])
+    found = np.concatenate(places) if sum(map(len, places)) else np.array([[-0.5] * 3, [0.5] * 3])  # no grain yet
+    return np.array([found.min(axis=0), found.max(axis=0)])
 
 
-def extent(folder: Folder) -> np.ndarray:
+def extent(path: Path, table: Table) -> np.ndarray:
     """Widths (grains, 3) of the grains along their own axes [m]."""
-    shape, size = folder.shape[: folder.grains, None], folder.size[: folder.grains]
+    shape, size = table.shape[: table.grains, None], table.size[: table.grains]
     unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE}
     if unknown:
-        raise FileError(f"{folder.path}: no surface is known for grains of shape {unknown.pop()}")
+        raise FileError(f"{path}: no surface is known for grains of shape {unknown.pop()}")
     round_ones = size[:, :1] + [0, 0, 1] * size[:, 1:2]  # a sphere is a capsule of length zero
     return 2 * np.where(shape == BOX, size, round_ones)
 

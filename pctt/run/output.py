@@ -22,7 +22,7 @@ from mpi4py import MPI
 from dem import bodies
 from dem.exchange import exchange
 from dem.experiment import Experiment
-from dem.period import wrapped
+from dem.period import velocity_in_cell, wrapped
 from dem.shapes import described
 from dem.step import Step
 from dem.together import together
@@ -32,6 +32,9 @@ from pctt.disk import FileError, Lock, on_first, texts, write_rows, write_text
 from pctt.folder import DERIVED, FILES, HARD, Folder, dumps, write_table
 from pctt.options import OptionError
 from pctt.petsc import warn
+
+#: What no step changes, but in a world with sources or outlets, whose frames have it too, and the ids.
+TABLE = ("shape", "size", "mass", "material")
 
 
 def refusal(folder: Path, restart: str, overwrite: bool) -> str:
@@ -138,7 +141,8 @@ class Writer:
         self._first_frame: int | None = None
         self._begun = self._stands = self._stale = False
         self.analysis: dict[str, float] | None = None  #: the scene's numbers of all steps so far
-        smallest = float(bodies.least_half_thickness(world.grains).min(initial=np.inf))
+        tables = [world.grains, *(source.extremes() for source in world.sources.values())]
+        smallest = min(float(bodies.least_half_thickness(table).min(initial=np.inf)) for table in tables)
         radius = self.comm.allreduce(smallest, MPI.MIN)
         self._about = {**about, "bodies": world.body_count, "ranks": self.comm.size, "smallest_radius [m]": radius}
         kept = on_first(self.comm, self._lines, lambda: {step for step, _ in self._kept()})  # which can be gone on with
@@ -256,17 +260,17 @@ class Writer:
         world, contacts, frames = step.world, step.contacts, self.place.now / "frames"
         if self._first_frame is None:
             self.place.make("frames")
-            rows = _by_id(world, ("shape", "size", "mass", "material"))
+            rows = _by_id(world, TABLE)
             large = np.bytes_(json.dumps(described_bodies(world)))
             shared = {"materials": texts(world.materials), "large": large}
             write_rows(frames / "bodies.h5", self.comm, rows, shared, {})
             self._first_frame = world.step
         near = contacts.near.bodies
         rows = {
-            **_by_id(world, ("position", "quaternion", "velocity")),
+            **_by_id(world, ("position", "quaternion", "velocity", *(("id", *TABLE) if world.tallies else ()))),
             "contact/key": contacts.key,
             "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
-            "contact/point": wrapped(contacts.point, world.period),
+            "contact/point": wrapped(contacts.point, world.period, world.shear),
             "contact/frame": step.system.frame,
             "contact/gap": contacts.gap,
             "contact/impulse": step.impulse,
@@ -305,8 +309,10 @@ def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:
     grains, comm = world.grains, world.comm
     columns = {"id": grains.id, **{name: getattr(grains, name) for name in names}}
     if "position" in columns:
-        columns["position"] = wrapped(columns["position"], world.period)
-    starts = np.arange(comm.size + 1) * int(world.slabs[-1]) // comm.size
+        if "velocity" in columns:
+            columns["velocity"] = velocity_in_cell(columns["position"], columns["velocity"], world.shear)
+        columns["position"] = wrapped(columns["position"], world.period, world.shear)
+    starts = np.arange(comm.size + 1) * world.ids // comm.size
     rows = exchange(comm, columns, np.searchsorted(starts, grains.id, side="right") - 1)
     order, last = np.argsort(rows["id"]), comm.rank == comm.size - 1
     large = {name: getattr(world.large, name) for name in names}

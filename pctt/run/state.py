@@ -67,6 +67,7 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     large = scene.large_bodies
     motions = [(body.name, type(body.motion).__name__) for body in large]
     words = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
+    words += [repr(scene.sources), repr(scene.outlets)]
     numbers = [column for table in (*scene.parts, scene.large()) for column in table.columns().values()]
     numbers += [np.asarray(value) for body in large for shape in body.shapes for value in placed(shape)]
     of_motions = [np.asarray(value) for body in large for value in getattr(body.motion, "__dict__", {}).values()]
@@ -74,6 +75,7 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     of_motions += [np.asarray(value) for spring in scene.springs.values() for value in vars(spring).values()]
     of_motions += [np.asarray(value) for load in scene.loads.values() for value in vars(load).values()]
     numbers += [value for value in of_motions if value.dtype.kind in "fiub"]
+    numbers += [np.array([-np.inf if scene.shear_rate is None else scene.shear_rate, scene.gradient])]
     numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values()]
     return repr(words), numbers
 
@@ -153,8 +155,9 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
     def take(file: h5py.File, sealed: bool) -> tuple[Any, ...]:
         _refuse_unmarked(file, sealed)
         replicated = {n: file[f"world/{n}"][()] for n in (*(f"large_{n}" for n in columns), "slabs", "time", "step")}
-        if "world/expected" in file:  # of springs
-            replicated["expected"] = file["world/expected"][()]
+        # of springs, of sources and outlets, of a sheared cell
+        for name in {"expected", "tallies", "shear"} & set(file["world"]):
+            replicated[name] = file[f"world/{name}"][()]
         changes = [file[f"world/{n}"].asstr()[0] if f"world/{n}" in file else "{}" for n in CHANGES]
         rows, contacts = restart_rows(replicated["slabs"], comm), even_slice(len(file["contacts/key"]), comm)
         local = {name: file[f"grains/{name}"][rows] for name in columns}

@@ -15,6 +15,7 @@ from dem.contact import Contacts, find_contacts
 from dem.fast import refuse_passages
 from dem.impulses import ImpulseMemory
 from dem.partition import rebalance
+from dem.passage import come_and_go
 from dem.period import put_back
 from dem.step import advance, carried, find_overrun, find_turned
 from dem.system import ContactSystem, touching
@@ -135,6 +136,7 @@ class Stepper:
     def _search(self) -> Contacts:
         """The contacts of the step."""
         with log.phase("search"):
+            come_and_go(self.world)
             put_back(self.world)
             rebalance(self.world)
             return find_contacts(self.world, self.settings.delta, self.settings.dt)

@@ -1,0 +1,113 @@
+"""Places for many grains: a lattice whose points are moved at random, and dense random packings of spheres."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dem import checks
+from dem.arrays import Floats
+from dem.contact.broad import close_pairs
+from dem.insertion import inserted
+from dem.neighbourhood import image_ways
+from dem.quaternion import length
+from dem.sources import Listed, Uniform
+
+SPARSE = 0.1  #: solid fraction up to which spheres are put at random places one after another
+SWELL = 1e-4  #: by how much radii are larger while overlaps are removed, so that none is left
+TRIES = 100  #: places for a sphere
+
+
+def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -> Floats:
+    """Points (nx ny nz, 3) of the lattice with these coordinates per axis, each moved by up to `perturbation` [m] per
+    axis."""
+    lattice = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    return lattice + perturbation * np.random.default_rng(seed).uniform(-1.0, 1.0, lattice.shape)
+
+
+def random_packing(
+    lengths: Sequence[float],
+    radius: float | Uniform | Listed,
+    fraction: float,
+    *,
+    periodic: Sequence[bool] = (False, False, False),
+    seed: int = 0,
+    most: int = 20000,
+) -> tuple[Floats, Floats]:
+    """Centres (n, 3) and radii (n,) [m] of spheres without overlaps in the box from zero to the `lengths` (3,) [m],
+    with at least this solid `fraction`, up to about 0.6.
+
+    Along `periodic` axes the box repeats itself; others have walls, which spheres do not cross. Spheres of a tenth of
+    the volume are put at random places; then they grow from step to step, and what overlaps is pushed apart (Jodrey,
+    Tory, Physical Review A 32 (1985); Lubachevsky, Stillinger, J. Stat. Phys. 60 (1990)). ValueError if `most` rounds
+    of that leave overlaps, as the fraction is too high.
+    """
+    box = checks.vector("lengths of a packing", checks.positive("lengths of a packing", lengths))
+    if not 0.0 < fraction < 0.74:
+        raise ValueError(f"solid fraction must be between 0 and 0.74, got {fraction:g}")
+    sizes = radius if isinstance(radius, (Uniform, Listed)) else Listed((radius,))
+    if 2.0 * sizes.ends[1] * (2.0 if any(periodic) else 1.0) > box.min():
+        raise ValueError(f"spheres of radius {sizes.ends[1]:g} m do not fit into a box with a side of {box.min():g} m")
+    random = np.random.default_rng(seed)
+    wanted = fraction * box.prod()
+    radii = sizes.at(random.random(int(np.ceil(1.2 * wanted / (4 / 3 * np.pi * sizes.ends[0] ** 3))) + 1))
+    radii = radii[: 1 + int(np.searchsorted(np.cumsum(4 / 3 * np.pi * radii**3), wanted * (1.0 - 1e-12)))]
+    radii = np.sort(radii)[::-1].copy()  # large ones find no place among small ones
+    period = np.where(periodic, box, np.inf)
+    part = min((SPARSE / fraction) ** (1 / 3), 1.0)
+    low = np.where(periodic, 0.0, radii[:, None])
+    place = low[:, None] + random.random((len(radii), TRIES, 3)) * (box - 2.0 * low)[:, None]
+    free = np.ones(place.shape[:2], bool)
+    taken = inserted(place, free, part * radii, np.zeros((0, 3)), np.zeros(0), period)
+    if (taken < 0).any():
+        raise ValueError(f"no place for {np.count_nonzero(taken < 0)} of {len(radii)} spheres: the box is too small")
+    position, left = place[np.arange(len(radii)), taken], most
+    while part < 1.0:
+        part = min(1.03 * part, 1.0)
+        position, left = _apart(position, part * radii * (1.0 + SWELL), box, period, left)
+    order = random.permutation(len(radii))
+    return position[order], radii[order]
+
+
+def _apart(position: Floats, radius: Floats, box: Floats, period: Floats, most: int) -> tuple[Floats, int]:
+    """The places (n, 3) of spheres moved until overlaps are less than SWELL radii, and how many of the rounds are left.
+
+    Spheres that overlap are pushed apart by a part of the overlap, and go on for a part of the way of the last round.
+    """
+    way, finite = np.zeros_like(position), np.isfinite(period)
+    for rounds in range(most, 0, -1):
+        one, other, apart = _pairs(position, radius, period)
+        distance = length(apart)
+        reach = radius[one] + radius[other]
+        deep = reach - distance
+        push = (np.maximum(deep, 0.0) / np.maximum(distance, 1e-300))[:, None] * apart
+        shift = np.zeros_like(position)
+        for k in range(3):
+            shift[:, k] = np.bincount(other, push[:, k], len(position)) - np.bincount(one, push[:, k], len(position))
+        walls = np.where(finite, 0.0, np.clip(position, radius[:, None], box - radius[:, None]) - position)
+        if (deep < SWELL * reach / 2.0).all() and (np.abs(walls) < SWELL * radius[:, None] / 2.0).all():
+            return position, rounds
+        way = 0.8 * way + 0.15 * (shift + 2.0 * walls)
+        position = position + way
+        position = np.where(finite, position - box * np.floor(position / box), position)
+    raise ValueError(f"a packing of {len(radius)} spheres still overlaps by {(deep / reach).max():.1e} of their size: "
+                     "take a lower solid fraction")  # fmt: skip
+
+
+def _pairs(position: Floats, radius: Floats, period: Floats) -> tuple[Floats, Floats, Floats]:
+    """Rows (m,) and (m,) of spheres that touch, and the ways (m, 3) from the first to the second or its image."""
+    source, moved = [np.arange(len(position))], [np.zeros_like(position)]
+    for way in image_ways(period)[0] if np.isfinite(period).any() else ():
+        near = ((position + way > -2.0 * radius.max()) & (position + way < np.where(np.isfinite(period), period, np.inf)
+                + 2.0 * radius.max()) | ~np.isfinite(period)).all(axis=1)  # fmt: skip
+        source.append(np.flatnonzero(near))
+        moved.append(np.broadcast_to(way, (len(source[-1]), 3)))
+    row = np.concatenate(source)
+    place = position[row] + np.concatenate(moved)
+    pairs = close_pairs(place, radius[row])
+    pairs = pairs[pairs[:, 0] < len(position)]  # the first is in the box; a pair across a face is found from both
+    one, other = row[pairs[:, 0]], row[pairs[:, 1]]
+    once = (pairs[:, 1] < len(position)) | (one < other)
+    apart = place[pairs[:, 1]] - place[pairs[:, 0]]
+    return one[once], other[once], apart[once]

@@ -1,0 +1,57 @@
+"""Random packings: no overlap, the solid fraction, the sizes, and what is refused."""
+
+import numpy as np
+import pytest
+
+from dem.packing import perturbed, random_packing
+from dem.sources import Listed, Uniform
+
+
+def gaps(position, radius, box, periodic):
+    """The least gap of two spheres or their images, and of spheres and walls."""
+    way = position[:, None] - position
+    way -= np.array(periodic) * box * np.round(way / box)
+    gap = np.linalg.norm(way, axis=2) - radius[:, None] - radius
+    walls = np.minimum(position, box - position) - radius[:, None]
+    return gap[~np.eye(len(radius), dtype=bool)].min(), np.where(periodic, np.inf, walls).min()
+
+
+@pytest.mark.parametrize(("fraction", "periodic"), [
+    (0.15, (False, False, False)), (0.5, (False, False, False)), (0.55, (True, True, False)), (0.6, (True, True, True)),
+])  # fmt: skip
+def test_a_packing_has_its_fraction_and_no_overlap(fraction, periodic):
+    box = np.array([1.0, 0.8, 0.9])
+    position, radius = random_packing(box, Uniform(0.05, 0.08), fraction, periodic=periodic, seed=3)
+    volume = 4 / 3 * np.pi * (radius**3).sum()
+    assert fraction <= volume / box.prod() * (1 + 1e-9) < fraction + 4 / 3 * np.pi * 0.08**3 / box.prod()
+    assert min(gaps(position, radius, box, periodic)) >= 0.0
+    assert radius.min() >= 0.05
+    assert radius.max() <= 0.08
+
+
+def test_a_packing_follows_from_its_seed():
+    one, two, other = (random_packing((1, 1, 1), 0.1, 0.3, seed=seed)[0] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, two)
+    assert len(one) == len(other)
+    assert np.abs(one - other).max() > 0.1
+
+
+def test_sizes_of_a_packing_have_their_shares():
+    radius = random_packing((1, 1, 1), Listed((0.03, 0.06), (3, 1)), 0.3, seed=1)[1]
+    assert (radius == 0.06).mean() == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / len(radius)))
+
+
+def test_what_cannot_be_packed_is_refused():
+    with pytest.raises(ValueError, match="take a lower solid fraction"):
+        random_packing((1, 1, 1), 0.12, 0.73, periodic=(True, True, True), most=200)
+    with pytest.raises(ValueError, match="do not fit into a box"):
+        random_packing((1, 0.1, 1), 0.1, 0.1)
+    with pytest.raises(ValueError, match="between 0 and 0.74"):
+        random_packing((1, 1, 1), 0.1, 0.8)
+
+
+def test_points_of_a_lattice_stay_near_it():
+    x = np.arange(4.0)
+    found = perturbed(x, x, x[:1], 0.1, 2)
+    assert found.shape == (16, 3)
+    assert 0.05 < np.abs(found - np.round(found)).max() <= 0.1

@@ -1,0 +1,133 @@
+"""The grains of sources, and when they are due: distributions, rates, places."""
+
+import numpy as np
+import pytest
+
+from dem.insertion import inserted
+from dem.measures import Block, Cylinder
+from dem.scene import Scene
+from dem.shapes import Box, Capsule
+from dem.sources import Listed, Source, Tally, Uniform, bounds, numbers, points, reach
+
+BLOCK = Block((0, 0, 0), (1, 2, 3))
+TUBE = Cylinder((1, 1, 1), (2, 3, 0), 0.5)
+
+
+def source(**given):
+    return Source(BLOCK, **{"radius": 0.1, "density": 1000.0, "number_rate": 10.0, **given})
+
+
+def test_random_numbers_are_uniform_and_know_their_grain_and_source_alone():
+    found = numbers("a", 7, np.arange(4000), range(5))
+    histogram = np.histogram(found, 50, (0.0, 1.0))[0]
+    expected = found.size / 50
+    assert ((histogram - expected) ** 2 / expected).sum() < 49 + 4 * np.sqrt(2 * 49)
+    correlation = np.corrcoef(np.concatenate([found[:-1].T, found[1:].T]))
+    assert np.abs(correlation - np.eye(10)).max() < 0.08
+    np.testing.assert_array_equal(numbers("a", 7, np.array([17, 5]), range(2, 4)), found[[17, 5], 2:4])
+    for name, seed in (("b", 7), ("a", 8), ("a", -7)):
+        assert not np.isin(numbers(name, seed, np.arange(50), range(5)), found).any()
+
+
+def test_uniform_sizes_have_the_moments_of_theory():
+    size = source(radius=Uniform(0.1, 0.3)).grains("a", np.arange(10000)).size[:, 0]
+    assert size.min() >= 0.1
+    assert size.max() <= 0.3
+    assert size.mean() == pytest.approx(0.2, abs=4 * 0.2 / np.sqrt(12 * 10000))
+    assert size.var() == pytest.approx(0.2**2 / 12, rel=0.04)
+
+
+def test_listed_sizes_have_their_shares():
+    size = source(radius=Listed((0.1, 0.2, 0.4), (5, 3, 2))).grains("a", np.arange(5000)).size[:, 0]
+    counts, expected = np.array([(size == value).sum() for value in (0.1, 0.2, 0.4)]), np.array([2500, 1500, 1000])
+    assert counts.sum() == 5000
+    assert ((counts - expected) ** 2 / expected).sum() < 13.8  # a chance of 0.001
+
+
+def test_boxes_and_capsules_have_the_lengths_of_their_shape_times_the_size_and_any_turn():
+    boxes = source(shape=Box((1, 2, 3))).grains("a", np.arange(3000))
+    np.testing.assert_allclose(boxes.size, np.tile([0.1, 0.2, 0.3], (3000, 1)))
+    np.testing.assert_allclose(boxes.mass, 1000 * 8 * 0.006)
+    np.testing.assert_allclose(np.linalg.norm(boxes.quaternion, axis=1), 1.0)
+    second = np.einsum("ni,nj->ij", boxes.quaternion, boxes.quaternion) / 3000
+    np.testing.assert_allclose(second, np.eye(4) / 4, atol=0.02)  # uniform on the sphere
+    capsule = source(shape=Capsule(1.0, 2.0))
+    np.testing.assert_allclose(reach(capsule.grains("a", np.arange(2))), 0.3)
+
+
+def test_points_are_uniform_in_their_region():
+    random = np.random.default_rng(0).random((20000, 3))
+    for region in (BLOCK, TUBE):
+        found, (low, high) = points(region, random), bounds(region)
+        assert region.contains(found).all()
+        assert (found >= low - 1e-12).all()
+        assert (found <= high + 1e-12).all()
+    along, across = TUBE._split(points(TUBE, random) - np.array(TUBE.start))
+    assert (across**2).sum(axis=1).mean() == pytest.approx(0.5**2 / 2, rel=0.02)  # of a disc
+    assert along.var() == pytest.approx(TUBE.length**2 / 12, rel=0.03)
+
+
+def test_as_many_are_due_as_rate_times_time():
+    given, mass = source(start=1.0, end=3.0, number_rate=10.0, most=15), np.ones(100)
+    due = [given.due(time, Tally(), mass) for time in (0.0, 1.0, 1.1, 1.95, 2.0, 3.0, 9.0)]
+    assert due == [0, 0, 1, 9, 10, 15, 15]
+    assert given.due(2.0, Tally(count=4), mass) == 6
+    by_mass = source(number_rate=None, mass_rate=2.0)
+    assert by_mass.due(3.0, Tally(), np.full(100, 0.5)) == 12
+    assert by_mass.due(3.0, Tally(mass=5.0), np.full(100, 0.75)) == 1
+
+
+def test_spheres_go_to_their_first_free_place_and_the_queue_stops_at_the_first_without():
+    place = np.zeros((4, 2, 3))
+    place[:, :, 0] = [[0, 3], [0.5, 1], [0.1, 0.2], [9, 9]]
+    taken = inserted(place, np.ones((4, 2), bool), np.full(4, 0.4), np.array([[3.1, 0, 0]]), np.array([0.2]))
+    assert taken.tolist() == [0, 1, -1, -1]
+    free = np.array([[False, True], [True, True], [True, True], [True, True]])
+    taken = inserted(place, free, np.full(4, 0.4), np.zeros((0, 3)), np.zeros(0))
+    assert taken.tolist() == [1, 0, -1, -1]  # the first leaves its place to the second
+
+
+@pytest.mark.parametrize("period", [None, np.array([2.0, 2.0, np.inf])])
+def test_inserted_spheres_are_apart(period):
+    random = np.random.default_rng(1)
+    place, radius = random.uniform(0, 2, (150, 60, 3)), random.uniform(0.05, 0.15, 150)
+    taken = inserted(place, np.ones((150, 60), bool), radius, np.full((1, 3), 1.0), np.array([0.3]), period)
+    count = int((taken >= 0).sum())
+    assert count > 50
+    center = np.concatenate([[[1.0, 1.0, 1.0]], place[np.arange(count), taken[:count]]])
+    radius = np.concatenate([[0.3], radius[:count]])
+    way = center[:, None] - center
+    if period is not None:
+        way[..., :2] -= 2.0 * np.round(way[..., :2] / 2.0)
+    gap = np.linalg.norm(way, axis=2) - radius[:, None] - radius
+    assert gap[~np.eye(count + 1, dtype=bool)].min() >= 0.0
+
+
+@pytest.mark.parametrize(("given", "words"), [
+    ({"number_rate": None}, "either a mass_rate"),
+    ({"mass_rate": 1.0}, "either a mass_rate"),
+    ({"number_rate": -1.0}, "rate of a source must be positive"),
+    ({"radius": (0.1, -0.1)}, "size of a grain must be positive"),
+    ({"radius": Uniform(0.1, 0.2), "density": 0.0}, "density of a source must be positive"),
+    ({"start": 2.0, "end": 1.0}, "Source cannot begin at 2 s and end at 1 s"),
+    ({"most": 0}, "at least 1"),
+    ({"shape": "box"}, "allowed is a Box or a Capsule"),
+])  # fmt: skip
+def test_bad_sources_are_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        source(**given)
+
+
+def test_bad_distributions_regions_and_names_are_refused():
+    with pytest.raises(ValueError, match="the second must not be less"):
+        Uniform(0.2, 0.1)
+    with pytest.raises(ValueError, match="2 sizes of grains with 1 shares"):
+        Listed((0.1, 0.2), (1.0,))
+    scene = Scene(0.3)
+    scene.add_outlet("out", BLOCK)
+    with pytest.raises(ValueError, match="distinct names"):
+        scene.add_source("out", BLOCK, radius=0.1, density=1.0, mass_rate=1.0)
+    with pytest.raises(ValueError, match=r"allowed is a Block or a Cylinder"):
+        scene.add_outlet("other", (0, 1))
+    with pytest.raises(ValueError, match="empty scene"):
+        scene.grains()
