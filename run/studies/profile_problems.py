@@ -252,7 +252,7 @@ def tables(rows: Rows) -> str:
         # why solvers did not reach the tightest tolerance
         failed = [row for row in last.values() if not row["reached"]]
         parts.append("\n".join(f"- `{row['method']}`, {row['problem']}: {row['reason']}" for row in failed))
-    return "\n\n".join(parts)
+    return "\n\n".join(filter(None, parts))
 
 
 def _counts(ratio: np.ndarray) -> str:

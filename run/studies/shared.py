@@ -81,18 +81,20 @@ class Table:
 
     def __init__(self, **columns: tuple[str | Callable[[Row], Any], str]):
         self.columns = columns
-        print("  ".join(f"{head.replace('_', ' '):>{self._width(form)}}" for head, (_, form) in columns.items()))
+        print("  ".join(self._text(head.replace("_", " "), form) for head, (_, form) in columns.items()))
 
     @staticmethod
-    def _width(form: str) -> int:
-        return int(form.lstrip("<>,").partition(".")[0].rstrip("defgs,") or 0)
+    def _text(text: str, form: str) -> str:
+        """As wide as numbers of this format, on the right if it does not begin with "<"."""
+        width = form.strip("<defgs").partition(".")[0]
+        return f"{text:{form[0] if form[0] == '<' else '>'}{width}}"
 
     def add(self, row: Row, more: str = "") -> None:
         """Print a row, and what more there is to say of it."""
         cells = []
         for of, form in self.columns.values():
             value = of(row) if callable(of) else row.get(of, "")
-            cells.append(f"{value:>{self._width(form)}}" if isinstance(value, str) else f"{value:{form}}")
+            cells.append(self._text(value, form) if isinstance(value, str) else f"{value:{form}}")
         print("  ".join([*cells, more]).rstrip(), flush=True)
 
 
