@@ -3,6 +3,8 @@
 
 Impulses are arrays (nc, 3), one row per contact in the order (normal, tangent 1, tangent 2); ``mu`` is (nc,).
 
+`FrictionCones` is what solvers ask of the cones of a problem; `pctt.ccp.rolling` has others with the same members.
+
 The cone of friction 1 is its own dual, with the Jordan product x o y = (x'y, x_0 y_1: + y_0 x_1:). Its unit is
 e = (1, 0, 0), the spectral values of x are x_0 +- |x_1:|. Source: Domahidi, Chu and Boyd (2013).
 """
@@ -12,6 +14,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pctt.ccp.cone_loops import (
     TINY,
@@ -20,7 +23,6 @@ from pctt.ccp.cone_loops import (
     determinant,
     nesterov_todd,
     project_to,
-    projected_move,
     step_inside,
     step_to_boundary,
     step_to_zero,
@@ -30,9 +32,7 @@ from pctt.ccp.cone_loops import (
 __all__ = [
     "TINY",
     "Array",
-    "accelerated_step",
     "determinant",
-    "projected_move",
     "step_inside",
     "step_to_boundary",
     "step_to_zero",
@@ -68,6 +68,52 @@ def dot(x: Array, y: Array) -> Array:
     out += x[:, 1] * y[:, 1]
     out += x[:, 2] * y[:, 2]
     return out
+
+
+class FrictionCones:
+    """The cones of all contacts of this rank. Arrays of unknowns are (rows, 3), the first rows with the normals."""
+
+    def __init__(self, mu: Array):
+        self.mu, self.count = mu, len(mu)
+
+    def scaled(self, size: Array, precision: type[np.floating]) -> FrictionCones:
+        """The cones of unknowns multiplied by ``size`` (rows, 3), whose tangential numbers are equal."""
+        return FrictionCones((self.mu * size[:, 1] / size[:, 0]).astype(precision, copy=False))
+
+    def project(self, x: Array, out: Array) -> Array:
+        """The nearest points (rows, 3), into ``out``, which may be x."""
+        return project_to(x, self.mu, out)
+
+    def resisted(self, y: Array) -> Array:
+        """De Saxce's term mu |y_t| (count,): the power that velocities y lose for a unit of normal impulse."""
+        return self.mu * tangential(y)
+
+    def accelerated_step(
+        self, x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, coulomb: bool, out: Array
+    ) -> tuple[float, float, float]:
+        """`pctt.ccp.cone_loops.accelerated_step` to these cones."""
+        return accelerated_step(x, last_x, y, compliance, beta, step, self.mu, float(coulomb), out)
+
+    def move(self, x: Array, y: Array, step: Array | float, coulomb: bool = False) -> Array:
+        """P(x - step y) - x (rows, 3) for a step of one length or many, where y_n gets De Saxce's term for Coulomb's law."""
+        out = y.copy()
+        if coulomb:
+            out[: self.count, 0] += self.resisted(y)
+        out *= -step
+        out += x
+        self.project(out, out)
+        out -= x
+        return out
+
+    def power(self, x: Array, y: Array) -> Array:
+        """x.y of each contact (count,)."""
+        return dot(x, y).reshape(len(x) // max(self.count, 1), self.count).sum(axis=0)
+
+    def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
+        """Mask (count,) of the contacts but those without an impulse at x and last_x whose distance inside the dual
+        cone, y_n less `resisted`, exceeds the ``least``."""
+        x, last_x, opening = x[: self.count, 0], last_x[: self.count, 0], y[: self.count, 0] - self.resisted(y)
+        return (x > 0) | (last_x > 0) | ~(opening > least)
 
 
 # -- the cone of friction 1 -----------------------------------------------------------------------------------

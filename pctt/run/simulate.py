@@ -59,7 +59,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     if settings.tol > report.LOOSE:
         progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE_BECAUSE}")
     if ccp.SOLVERS[settings.solver].newton:
-        progress.say(f"Newton systems: {newton.words()}")
+        progress.say(f"Newton systems: {newton.linear.words()}")
     if steps:
         progress.say(report.columns(newton.compare is not None))
 
@@ -74,7 +74,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         raise interrupt.InterruptError(f"interrupted after step {sim.steps}; the same command with {words}")
     if sim.last:
         _say_end(sim, steps, progress)
-        if what := newton.what():
+        if what := newton.linear.what():
             progress.say(f"Newton systems: {what}")
         if compare.names:
             progress.say("\n" + report.compare_table(compare.summary()))
@@ -162,7 +162,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
             )
         used = result.solver or settings.solver
         by_newton = ccp.SOLVERS[used].newton
-        systems = "; ".join(filter(None, (newton.words(), newton.what()))) if by_newton else ""
+        systems = "; ".join(filter(None, (newton.linear.words(), newton.linear.what()))) if by_newton else ""
     finally:
         newton.destroy()
     seconds = log.take_seconds(("solve", "compare"))

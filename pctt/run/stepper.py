@@ -146,7 +146,7 @@ class Stepper:
     ) -> dict[str, Any]:
         """The line of a step in steps.jsonl."""
         newton = self.newton
-        pc_report = newton.pc_report if newton is not None else []
+        pc_report = newton.linear.report() if newton is not None else []
         compare = newton.compare if newton is not None else None
         more = (["compare"] if compare else []) + (["project"] if self.settings.projection else [])
         phases = ("search", "assembly", "solve", *more, "advance")

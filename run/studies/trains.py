@@ -27,7 +27,7 @@ from shared import Row, Table, figure, listed, median_seconds, next_problem, par
 
 from dem.scenes import Mixer
 from pctt import ccp
-from pctt.ccp.newton.contact import ContactForm
+from pctt.ccp.newton.forms import ContactForm
 from pctt.ksp_options import entered
 from pctt.pc import TensorTrain
 from pctt.pc.sparse_train import SparseTrain

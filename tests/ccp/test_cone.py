@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pctt.ccp.accuracy import _nearest_in_cone
+from pctt.ccp.accuracy import _nearest
 from pctt.ccp.cone import margin, project, step_to_boundary, step_to_zero
 
 FRICTION = [0.0, 1e-9, 0.01, 0.3, 1.0, 7.0, 1e5]
@@ -15,7 +15,7 @@ FRICTION = [0.0, 1e-9, 0.01, 0.3, 1.0, 7.0, 1e5]
 
 def judged(x, mu):
     """The projection that judges the solvers."""
-    return np.array([_nearest_in_cone(*row, slope) for row, slope in zip(x, mu)])
+    return _nearest(x, mu[None])
 
 
 PROJECTIONS = [project, judged]

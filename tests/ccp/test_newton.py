@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from problems import SELF, dense_of, from_graph, from_matrix, heap, matrix, part
+from scipy.linalg import block_diag
 
 from pctt import ccp
 from pctt.ccp import delassus
-from pctt.ccp.newton.body import BodyForm
-from pctt.ccp.newton.contact import ContactForm
-from pctt.ccp.newton.linear import Dense
+from pctt.ccp.newton.forms import BodyForm, ContactForm
+from pctt.ccp.newton.linear import Dense, Settings
 
 FORMS = pytest.mark.parametrize("form", ccp.FORMS)
 
@@ -19,7 +19,7 @@ FORMS = pytest.mark.parametrize("form", ccp.FORMS)
 @pytest.fixture(autouse=True)
 def few(request, monkeypatch):
     """Rows of the problems that get dense factors: none, unless a test says more."""
-    monkeypatch.setattr(ccp.newton, "FEW", getattr(request, "param", 0))
+    monkeypatch.setattr(Settings, "few", getattr(request, "param", 0))
 
 
 def definite(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -58,9 +58,7 @@ def test_the_forms_agree_with_dense_algebra(many, monkeypatch):
     q, e = rng.standard_normal((contacts, 3)), 1e-2
     N = dense @ dense.T
     N += e * np.diag(np.tile([1.0, 0.0, 0.0], contacts))
-    S = N.copy()
-    for c in range(contacts):
-        S[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] += barrier[c]
+    S = N + block_diag(*barrier)
     momenta = rng.standard_normal(6 * bodies)
     mine = slice(6 * own[comm.rank], 6 * own[comm.rank + 1])
     exact = np.linalg.solve(S, q.ravel() + dense @ momenta)
@@ -70,14 +68,14 @@ def test_the_forms_agree_with_dense_algebra(many, monkeypatch):
         newton.begin(problem)
         newton.update(barrier[here])
         dg, x = newton.solve(q[here], 1e-9, momenta[mine])
-        dv = newton.momenta(x, dg, momenta[mine])
+        dv = newton.system.momenta(x, dg, momenta[mine])
         parts = [
             np.abs(dg.ravel() - exact[3 * here.start : 3 * here.stop]).max(),
             np.abs(dv - (dense.T @ exact - momenta)[mine]).max(),
             np.abs(problem.product(q[here]).ravel() - (N @ q.ravel())[3 * here.start : 3 * here.stop]).max(),
         ]
         assert max(parts) < 1e-6, form
-        assert newton.fallbacks == 0
+        assert newton.linear.fallbacks == 0
         assert problem.has_hubs == (many == 20)
         newton.destroy()
 
@@ -126,9 +124,7 @@ def test_one_object_serves_one_problem_after_another(form):
     known, graph = heap(3)
     rng = np.random.default_rng(0)
     barrier, q = definite(rng, 40), rng.standard_normal((40, 3))
-    S = known.N.copy()
-    for c in range(40):
-        S[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] += barrier[c]
+    S = known.N + block_diag(*barrier)
     found, matrices = [], []
     for problem in (*(from_graph(known, graph) for _ in range(2)), from_matrix(known), from_graph(known, graph)):
         newton.begin(problem)
@@ -167,9 +163,9 @@ def test_a_solve_begins_from_the_best_combination_of_earlier_solutions(form):
     newton.update(definite(rng, 40)[here])
     q, other = rng.standard_normal((2, 40, 3))
     (dg, x), (_, away) = newton.solve(q[here], 1e-10), newton.solve(other[here], 1e-10)
-    iterations = newton.ksp_its
+    iterations = newton.linear.iterations
     again, _ = newton.solve(q[here], 1e-7, earlier=[2 * x + away, away - x, np.zeros_like(x), away])
-    assert newton.ksp_its == iterations
+    assert newton.linear.iterations == iterations
     assert np.allclose(again, dg, rtol=0, atol=1e-6)
     newton.destroy()
 
@@ -201,17 +197,15 @@ def test_few_contacts_get_dense_factors(symmetric):
     barrier, q = definite(rng, 40), rng.standard_normal((40, 3))
     if not symmetric:
         barrier[:, 0] *= 1.5
-    S = known.N.copy()
-    for c in range(40):
-        S[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] += barrier[c]
+    S = known.N + block_diag(*barrier)
     newton = ccp.Newton(SELF, "body")
     for problem in (from_graph(known, graph), from_matrix(known)):
         newton.begin(problem)
         newton.update(barrier, symmetric=symmetric)
         dg, _ = newton.solve(q, 1e-12)
         assert np.linalg.norm(S @ dg.ravel() - q.ravel()) <= 2e-12
-        assert newton.takes_any
-        assert (newton.ksp_its <= 2, newton.fallbacks) == (True, 0)
+        assert newton.linear.takes_any
+        assert (newton.linear.iterations <= 2, newton.linear.fallbacks) == (True, 0)
     newton.destroy()
 
 

@@ -84,7 +84,7 @@ def test_the_grid_of_a_dmda():
     ksp = solver(sparse, rank=100)
     ksp.setUp()
     compressed = ksp.pc.getPythonContext().made.compressed
-    assert compressed.order == "grid"
+    assert compressed.layout.order == "grid"
     assert compressed.error < 1e-2
     x, y = sparse.createVecs()
     x.set(1.0)

@@ -307,7 +307,7 @@ def test_the_context_of_a_mat_may_give_entries_and_grid(way):
     mat = PETSc.Mat().createPython(((PETSc.DECIDE, 30), (PETSc.DECIDE, 30)), context, comm=PETSc.COMM_WORLD)
     mat.setUp()
     X = inverse(mat, 1e-10)
-    assert X.getPythonContext().compressed.order == "grid"
+    assert X.getPythonContext().compressed.layout.order == "grid"
     np.testing.assert_allclose(of(X), np.linalg.inv(context.kernel.dense), atol=1e-8)
 
 
@@ -430,7 +430,7 @@ def test_the_order_of_the_rows_is_saved(tmp_path):
     first = sum(share[: mat.comm.rank])
     mat.setAttr("coordinates", points[first : first + share[mat.comm.rank]])
     mat.setUp()
-    assert mat.getPythonContext().compressed.order == "morton"
+    assert mat.getPythonContext().compressed.layout.order == "morton"
     save(mat, tmp_path / "train.h5")
     is_matrix(load(tmp_path / "train.h5"), A)
 

@@ -18,7 +18,7 @@ BLOCKS = st.sampled_from([1, 2, 3])
 
 
 def left_interfaces(A: SparseHierarchy, cores: list[np.ndarray]) -> list[np.ndarray]:
-    x = [A.root()]
+    x = [np.ones((1, 1))]
     for k, core in enumerate(cores[:-1]):
         x.append(A.down(k, x[k], core))
     return x
@@ -31,7 +31,7 @@ def best_cores(A: SparseHierarchy, cores: list[np.ndarray]) -> list[np.ndarray]:
     V = A.leaf_up(cores[-1])
     for k in range(d - 2, -1, -1):
         spread = A.spread(k, V)
-        out.insert(0, A.middle(x[k], spread, V.shape[1]))
+        out.insert(0, A.middle(k, x[k], spread))
         V = A.up(spread, cores[k])
     return out
 
