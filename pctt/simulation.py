@@ -44,7 +44,7 @@ from dem.stiffness import expected_overlap
 from dem.together import meet, together
 from dem.world import set_load, set_motion, set_shear_rate, set_spring, set_surface
 from pctt import ccp, log
-from pctt.disk import FileError, refuse_serial
+from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
 from pctt.options import OptionError, made, refuse_bad
 from pctt.petsc import warn
@@ -355,7 +355,6 @@ class Simulation:
 
     def save(self, path: str | Path) -> None:
         """Keep the state in a checkpoint, from which `load` and ``-restart`` go on. FileError if that fails."""
-        refuse_serial(self.comm)
         refuse_unwritable("save", Path(path).parent, self.comm)
         self._save(Path(path))
 
@@ -382,7 +381,6 @@ class Simulation:
         if self.output is not None:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
         refuse_bad(Run(output_every=every, checkpoint_every=checkpoint_every))
-        refuse_serial(self.comm)
         for name, path in {"write": folder, "problems": problems}.items():
             if path:
                 refuse_unwritable(name, Path(path), self.comm)

@@ -32,7 +32,7 @@ from pctt.blocks import square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.delassus import HUB, rows_in_blocks
 from pctt.ccp.problem import ConeProblem
-from pctt.disk import hdf5, make_hdf5, whole
+from pctt.disk import FileError, hdf5, whole
 
 __all__ = ["FileFormatError", "Info", "Solution", "Stored", "load", "read", "write_global", "write_local"]
 
@@ -371,12 +371,12 @@ def _write(
         try:
             for name, A in matrices.items():
                 data |= {f"{top}/{name}/{part}": values for part, values in _triplets(A).items()}
-            with whole(Path(path)) as temporary:
-                make_hdf5(temporary, sum(values.nbytes for values in data.values()), len(data) + 10)  # and the groups
-                with hdf5(temporary) as file:
-                    for name, values in data.items():
-                        file[name] = values
-        except (OSError, ValueError, RuntimeError) as error:  # h5py raises all three
+            with whole(Path(path)) as temporary, hdf5(temporary) as file:
+                for name, values in data.items():
+                    file[name] = values
+        except FileError as error:
+            failure = str(error)
+        except (ValueError, RuntimeError) as error:  # h5py raises both
             failure = f"{path}: cannot write ({error})"
     failure = comm.bcast(failure)
     if failure:

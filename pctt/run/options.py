@@ -17,7 +17,6 @@ from dem.together import together
 from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
-from pctt.disk import refuse_serial
 from pctt.ksp_options import OF_SOLVERS, entered, keep_from_petsc, refuse_misspelt, refuse_unknown, to_enter
 from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read
 from pctt.petsc import own_errors
@@ -151,7 +150,6 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) ->
 def _refuse_places(run: Run, comm: MPI.Comm) -> None:
     """OptionError for files that are not there, and for folders in which the run cannot write, or which hold another
     run that it neither continues nor has ``-overwrite`` for."""
-    refuse_serial(comm)
     for name, path in {"-restart": run.restart if run.restart != "settled" else "", "-problem": run.problem}.items():
         if not comm.bcast(not path or os.access(path, os.R_OK) and os.path.isfile(path)):
             raise OptionError(f"{name} {path}: no such file, or not readable")

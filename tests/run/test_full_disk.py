@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import resource
 import shutil
 import subprocess
@@ -62,11 +60,11 @@ class Limit:
 @pytest.mark.parametrize(
     ("size", "file", "options"),
     [
-        (40_000, "out/frames/000003.h5", {}),
+        (9_000, "out/frames/000003.h5", {}),
         (500, "out/settings.json", {"output_every": "0"}),
         (2_000, "out/steps.jsonl", {"output_every": "0"}),
-        (40_000, "out/checkpoint.h5", {"output_every": "0"}),
-        (40_000, "problems/step000003_", {"dump_problem": "problems"}),
+        (20_000, "out/checkpoint.h5", {"output_every": "0"}),
+        (20_000, "problems/step000003_", {"dump_problem": "problems"}),
     ],
 )
 def test_a_file_that_cannot_be_written_ends_the_run_and_spares_the_others(size, file, options, tmp_path, monkeypatch):
@@ -95,7 +93,7 @@ def test_a_run_that_cannot_write_its_first_step_leaves_the_one_that_it_was_to_re
 
     run()
     before = contents(tmp_path / "out")
-    for size, every, file in ((40_000, "1", "frames/000001.h5"), (40_000, "0", "checkpoint.h5")):
+    for size, every, file in ((9_000, "1", "frames/000001.h5"), (20_000, "0", "checkpoint.h5")):
         with Limit(size), pytest.raises(FileError, match=rf"out/.new/{file}: cannot write \(File too large\)"):
             run(overwrite="true", output_every=every)
         assert contents(tmp_path / "out") == before
@@ -113,40 +111,31 @@ def test_of_a_line_that_has_no_room_nothing_stays(tmp_path):
     assert path.read_text() == "1\n2\n"
 
 
-def test_the_room_of_a_file_is_taken_until_it_is_written(tmp_path, monkeypatch):
-    """Another program that fills the disk meanwhile does no harm."""
-    data, path, taken = np.ones(300_000), tmp_path / "rows.h5", []
-    probe = tmp_path / "probe"
-    with open(probe, "wb") as file:
-        try:
-            os.posix_fallocate(file.fileno(), 0, data.nbytes)
-        except (AttributeError, OSError):
-            pytest.skip("this file system takes no room in advance")
-    fill = disk._fill
-
-    def look(file, *contents):
-        taken.append(512 * os.stat(disk.temporary_name(path)).st_blocks)
-        fill(file, *contents)
-
-    monkeypatch.setattr(disk, "_fill", look)
-    disk.write_rows(path, MPI.COMM_SELF, {"data": data}, {}, {})
-    assert taken[0] >= data.nbytes
-    np.testing.assert_array_equal(arrays(path)["data"], data)
-    assert path.stat().st_size < 1.01 * data.nbytes  # what was taken beyond need is given back
-
-
-@pytest.mark.parametrize("number", [errno.EBADF, errno.EOPNOTSUPP, errno.ENOSYS, errno.EPERM])
-def test_where_no_room_can_be_taken_files_are_written_and_a_full_disk_is_told(number, tmp_path, monkeypatch):
-    def refuse(*_):
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(os, "posix_fallocate", refuse)
-    data, path = np.arange(20_000.0), tmp_path / "rows.h5"
-    disk.write_rows(path, MPI.COMM_SELF, {"data": data}, {}, {})
+@pytest.mark.parallel(1, 2, 3)
+def test_rows_of_all_ranks_and_rows_that_have_no_room(tmp_path):
+    """The file of before stays, and every rank is told."""
+    comm, path = MPI.COMM_WORLD, tmp_path / "rows.h5"
+    own, none = np.arange(9_000.0).reshape(-1, 3) + comm.rank, np.zeros((0, 2), np.int64)
+    some = own[: 10 * comm.rank, 0] > 2.0  # none on the first rank
+    rows, shared = {"a/own": own, "none": none, "some": some}, {"text": b"once", "more": own[:5]}
+    disk.write_rows(path, comm, rows, shared, {"/": {"format": 1}, "a": {"dt": 0.5}})
     for size in (500, 20_000, 100_000):
         with Limit(size), pytest.raises(FileError, match=r"cannot write \(File too large\)"):
-            disk.write_rows(path, MPI.COMM_SELF, {"data": data, "more": data}, {}, {})
-    np.testing.assert_array_equal(arrays(path)["data"], data)
+            disk.write_rows(path, comm, {**rows, "again": np.repeat(own, 2, axis=0)}, {}, {})
+    comm.Barrier()
+    assert [file.name for file in tmp_path.iterdir()] == ["rows.h5"]
+
+    def take(file, sealed):
+        assert sealed
+        assert (file.attrs["format"], file["a"].attrs["dt"]) == (1, 0.5)
+        return {name: file[name][()] for name in (*rows, *shared)}
+
+    found = disk.read(path, comm, take)
+    for name, values in rows.items():
+        np.testing.assert_array_equal(found[name], np.concatenate(comm.allgather(values)))
+        assert found[name].dtype == values.dtype
+    assert found["text"] == b"once"
+    np.testing.assert_array_equal(found["more"], np.arange(15.0).reshape(5, 3))
 
 
 @pytest.fixture
