@@ -13,6 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
+from dem.applied import slots
 from dem.arrays import ArrayLike, Bools, Floats
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
@@ -150,6 +151,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     if system.surface is not None:
         belts = comm.allreduce(-np.vdot(step.impulse[:, 1:], system.surface))
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
+    holding += _joint_work(step, before[0].velocity, mean)
     driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + loads + belts + holding
     work = driving - received
     still = sums(*(_still(table, world.gravity, system.dt) for table in after))
@@ -200,6 +202,19 @@ def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
             held = np.eye(3) - body.motion.free_directions(), np.eye(3) - body.motion.free_turns()
             work += float(mean[row, :3] @ held[0] @ push[:3] + mean[row, 3:] @ held[1] @ push[3:])
     return work
+
+
+def _joint_work(step: Step, before: Floats, mean: Floats) -> float:
+    """The work [J] of joints and their motors on the bodies that forces move: velocities (grains, 6) of this rank's
+    grains before the step, and means (large, 6) of those before and after; collective."""
+    system, world = step.system, step.world
+    if system.joints is None:
+        return 0.0
+    push = np.einsum("k,knx->nx", step.joint_impulses, system.joints.rows)
+    here, slot = slots(world, world.grains.id)
+    work = 0.5 * float(np.vdot(push[slot], before[here] + world.grains.velocity[here]))
+    of_large = push[len(push) - 1 - len(world.large) : -1] * bodies.is_dynamic(world.large)[:, None]
+    return float(world.comm.allreduce(work) + np.vdot(of_large, mean))
 
 
 def _carried(step: Step, prescribed: Bools) -> float:

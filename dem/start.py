@@ -112,6 +112,9 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
     world.loads, world.springs, world.period = dict(scene.loads), dict(scene.springs), scene.period
+    world.joints = dict(scene.joints)
+    if world.joints and pairs.resists:
+        raise ValueError("joints cannot be in a scene whose contacts resist rolling or spinning")
     for name, load in world.loads.items():
         refuse_load(world, name, load)
     return world

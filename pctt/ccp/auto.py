@@ -9,7 +9,8 @@ For Coulomb's law the conic method stalls often, but the path that it follows le
 So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path. Problems
 so small that they get dense factors are the exception: there it goes on to the end.
 
-Where contacts resist rolling or spinning, it is APGD alone: the conic method has no such cones.
+Where contacts resist rolling or spinning, it is APGD alone: the conic method has no such cones. So it is with joints,
+which its sparse systems do not have.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dem.contact_map.jointed import JointedMap
 from pctt.ccp.cone import Array
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
@@ -49,7 +51,7 @@ def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Auto, newton: Newton, coulomb: bool = False
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
-    if isinstance(problem, RollingProblem):
+    if isinstance(problem, RollingProblem) or isinstance(problem.contact_map, JointedMap):
         first = apgd.solve(problem, guess, limits, apgd.APGD(), coulomb)
         first.solver = "apgd"
         return first

@@ -1,0 +1,183 @@
+"""Joints: closed forms of mechanisms, contacts through joints, restarts, ranks."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import pctt
+from dem.motion import Dynamic
+from dem.scene import Scene
+from dem.shapes import Box, Plane
+
+G = 9.81
+
+
+def simulation(scene, dt=0.002, **given):
+    return pctt.Simulation(scene, dt=dt, tol=1e-9, comm=MPI.COMM_SELF, say=lambda text: None, **given)
+
+
+def pendulum(dt, length=1.0, kind="hinge"):
+    """A small sphere that begins at the height of its hinge."""
+    scene = Scene(friction=0.3)
+    (ball,) = scene.add_spheres([length, 0, 0], 0.05, 1000.0)
+    scene.add_joint("pin", None, ball, kind=kind, anchor=(0, 0, 0), axis=(0, 1, 0))
+    return simulation(scene, dt)
+
+
+def test_pendulum_force_and_distance():
+    sim = pendulum(0.001)
+    mass = sim.local.mass[0]
+    lowest = 0.0
+    while sim.time < 2.0:
+        sim.step()
+        lowest = max(lowest, sim.joint("pin").force[2] / (mass * G))
+        assert np.linalg.norm(sim.positions[0]) == pytest.approx(1.0, abs=1e-4)
+    moment = 1.0 + 0.4 * 0.05**2  # about the hinge, over the mass
+    assert lowest == pytest.approx(1.0 + 2.0 / moment, rel=2e-3)
+
+
+def test_energy_of_a_pendulum_does_not_drift():
+    for kind in ("hinge", "ball"):
+        sim = pendulum(0.002, kind=kind)
+        energies = []
+        while sim.time < 6.0:
+            figures = sim.step()
+            energies.append(figures["kinetic_energy [J]"] + figures["potential_energy [J]"])
+        scale = sim.local.mass[0] * G
+        energies = np.array(energies)
+        assert np.abs(energies).max() < 0.02 * scale
+        assert abs(energies[:1000].mean() - energies[-1000:].mean()) < 2e-3 * scale
+
+
+def test_a_hanging_chain_bears_its_weight():
+    scene = Scene(friction=0.3)
+    ids = scene.add_spheres([[0, 0, -0.3 * k] for k in range(1, 6)], 0.1, 1000.0)
+    for k, one in enumerate([None, *ids[:-1]]):
+        scene.add_joint(f"link {k}", one, ids[k], kind="ball", anchor=(0, 0, -0.3 * k - 0.15))
+    sim = simulation(scene)
+    sim.run(until=0.05)
+    weight = sim.local.mass[0] * G
+    for k in range(5):
+        assert sim.joint(f"link {k}").force == pytest.approx([0, 0, (5 - k) * weight], abs=1e-6 * weight)
+
+
+def test_a_fixed_joint_has_the_force_and_moment_of_its_cut():
+    scene = Scene(friction=0.3)
+    one, two = scene.add_boxes([[0.5, 0, 0], [1.6, 0, 0]], (0.5, 0.1, 0.1), 100.0)
+    scene.add_joint("wall", None, one, kind="fixed", anchor=(0, 0, 0))
+    scene.add_joint("cut", one, two, kind="fixed", anchor=(1.05, 0, 0))
+    sim = simulation(scene)
+    sim.run(until=0.1)
+    weight = 4.0 * G
+    assert sim.joint("cut").force == pytest.approx([0, 0, weight], abs=1e-6)
+    assert sim.joint("cut").torque == pytest.approx([0, -0.55 * weight, 0], abs=1e-5)
+    assert sim.joint("wall").torque == pytest.approx([0, -2.1 * weight, 0], abs=1e-5)
+    assert sim.positions[1] == pytest.approx([1.6, 0, 0], abs=1e-7)
+
+
+def wheel(**motor):
+    scene = Scene(friction=0.3, gravity=(0, 0, 0))
+    (ball,) = scene.add_spheres([0, 0, 0], 0.1, 1000.0)
+    scene.add_joint("axle", None, ball, anchor=(0, 0, 0), axis=(0, 0, 1), **motor)
+    return scene
+
+
+def test_a_motor_keeps_its_speed_and_is_changed_within_the_loop():
+    sim = simulation(wheel(speed=3.0))
+    sim.run(until=0.1)
+    assert sim.joint("axle").speed == pytest.approx(3.0) and sim.joint("axle").angle == pytest.approx(0.3)
+    sim.joint("axle").motor.speed = -1.0
+    sim.run(until=0.2)
+    assert sim.joint("axle").angle == pytest.approx(0.2)
+    sim.joint("axle").motor.target = 0.5
+    sim.step()
+    assert sim.joint("axle").angle == pytest.approx(0.5) and sim.joint("axle").motor.speed is None
+
+
+def test_a_weak_motor_stalls_at_its_torque_and_its_work_is_in_the_balance():
+    sim = simulation(wheel(speed=100.0, strength=0.2))
+    moment = sim.local.inertia[0, 0]
+    figures = sim.step()
+    assert sim.joint("axle").drive == pytest.approx(0.2)
+    assert sim.joint("axle").speed == pytest.approx(0.2 * 0.002 / moment)
+    assert figures["work_of_motions [J]"] == pytest.approx(figures["kinetic_energy [J]"])
+
+
+def test_a_slider_stops_at_its_limit():
+    scene = Scene(friction=0.3)
+    (ball,) = scene.add_spheres([0, 0, 1], 0.1, 1000.0)
+    scene.add_joint("rod", None, ball, kind="slider", anchor=(0, 0, 1), axis=(0, 0, 1), limits=(-0.2, 1.0))
+    sim = simulation(scene)
+    sim.run(until=0.5)
+    assert sim.joint("rod").position == pytest.approx(-0.2, abs=1e-9)
+    assert sim.joint("rod").drive == pytest.approx(sim.local.mass[0] * G)
+
+
+@pytest.mark.parametrize("solver", ["apgd", "auto"])
+def test_contacts_and_joints_are_solved_together(solver):
+    """A lever that is hinged at one end lies with the other on the floor, which bears half of its weight."""
+    scene = Scene(friction=0.0)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    (ball,) = scene.add_spheres([1, 0, 0.1], 0.1, 1000.0)
+    scene.add_body("bar", [Box((0.4, 0.05, 0.05))], Dynamic(), position=(0.45, 0, 0.2), mass=8.0, inertia=(1, 1, 1))
+    scene.add_joint("pin", None, "bar", anchor=(0, 0, 0.2), axis=(0, 1, 0))
+    scene.add_joint("foot", "bar", ball, kind="fixed", anchor=(0.9, 0, 0.2))
+    sim = simulation(scene, solver=solver)
+    sim.run(until=0.1)
+    bears = (8.0 * 0.45 + sim.local.mass[0]) * G  # about the hinge, the arm of the floor is 1 m
+    assert -sim.body("floor").force[2] == pytest.approx(bears, rel=1e-4)
+
+
+def test_other_solvers_refuse():
+    scene = wheel()
+    scene.add_body("floor", [Plane((0, 0, 1), (0, 0, -0.1))])
+    scene.gravity = np.array([0, 0, -9.81])
+    with pytest.raises(ValueError, match="with joints allowed are"):
+        simulation(scene, solver="conic").step()
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ({"kind": "rope"}, "kind of a joint"),
+        ({"speed": 1.0, "target": 1.0}, "not both"),
+        ({"kind": "ball", "speed": 1.0}, "no motor"),
+        ({"limits": (1.0, 0.0)}, "limits"),
+        ({"strength": -1.0}, "strength"),
+    ],
+)
+def test_wrong_joints_are_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        wheel(**given)
+
+
+def pusher():
+    """An arm whose motor pushes through a row of spheres."""
+    scene = Scene(friction=0.3)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_spheres([[0.5 + 0.21 * k, 0.3, 0.1] for k in range(4)], 0.1, 1000.0)
+    scene.add_body("arm", [Box((0.6, 0.05, 0.05))], Dynamic(), position=(0.6, 0, 0.15), mass=5.0, inertia=(1, 1, 1))
+    scene.add_joint("pin", None, "arm", anchor=(0, 0, 0.15), axis=(0, 0, 1), speed=1.0, strength=200.0)
+    return scene
+
+
+def test_a_restart_goes_on_with_the_same_bits(tmp_path):
+    sim = simulation(pusher(), dt=0.01)
+    sim.run(steps=20)
+    sim.joint("pin").motor.speed = 0.5
+    sim.save(tmp_path / "state.h5")
+    sim.run(steps=20)
+    again = pctt.Simulation.load(tmp_path / "state.h5", pusher(), dt=0.01, tol=1e-9, comm=MPI.COMM_SELF)
+    again.run(steps=20)
+    assert np.array_equal(again.positions, sim.positions) and again.joint("pin").angle == sim.joint("pin").angle
+    assert sim.joint("pin").speed == pytest.approx(0.5, rel=2e-3)
+
+
+@pytest.mark.parallel(2, 3)
+def test_joints_do_not_depend_on_the_ranks():
+    alone = simulation(pusher(), dt=0.01)
+    sim = pctt.Simulation(pusher(), dt=0.01, tol=1e-9, comm=MPI.COMM_WORLD)
+    for each in (alone, sim):
+        each.run(steps=40)
+    assert sim.positions == pytest.approx(alone.positions, abs=1e-6)
+    assert sim.joint("pin").force == pytest.approx(alone.joint("pin").force, abs=1e-2)
