@@ -147,8 +147,8 @@ def coupling(joints: Sequence[Joint], row: Ints, ends: Ends, dt: float) -> Coupl
     chosen: list[tuple[int, int]] = []
     target, most, kind = [], [], []  # kind: 0 held, 1 motor, 2 lower limit, 3 upper limit
     for n, joint in enumerate(joints):
-        for way in np.flatnonzero(HOLDS[joint.kind]):
-            chosen.append((n, int(way)))
+        for way in np.flatnonzero(HOLDS[joint.kind]).tolist():
+            chosen.append((n, way))
             target.append(-found.error[n, way] / dt)
             most.append(np.inf)
             kind.append(0)
@@ -158,13 +158,14 @@ def coupling(joints: Sequence[Joint], row: Ints, ends: Ends, dt: float) -> Coupl
             target.append(joint.speed if joint.speed is not None else (joint.target - at) / dt)
             most.append(joint.strength * dt)
             kind.append(1)
-        for code, limit in ((2, joint.low), (3, joint.high)):
+        for side, limit in ((2, joint.low), (3, joint.high)):
             if np.isfinite(limit):
                 chosen.append((n, joint.way))
                 target.append((limit - at) / dt)
                 most.append(np.inf)
-                kind.append(code)
-    which, ways = np.array(chosen, np.int64).reshape(-1, 2).T
+                kind.append(side)
+    rows = np.array(chosen, np.int64).reshape(-1, 2)
+    which, ways = rows[:, 0], rows[:, 1]
     t, bound, code = np.array(target), np.array(most), np.array(kind)
     J = np.zeros((len(t), count, 6))
     for side in (0, 1):

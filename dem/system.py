@@ -22,7 +22,15 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies, stiffness
-from dem.applied import Drives, applied_impulses, drives_of, free_directions, free_velocities, joint_coupling, slots
+from dem.applied import (
+    Drives,
+    applied_impulses,
+    drives_of,
+    free_directions,
+    free_velocities,
+    joint_coupling,
+    slots,
+)
 from dem.arrays import Bools, Floats
 from dem.bodies import COMPOUND, Bodies
 from dem.checks import positive

@@ -85,13 +85,15 @@ def wheel(**motor):
 def test_a_motor_keeps_its_speed_and_is_changed_within_the_loop():
     sim = simulation(wheel(speed=3.0))
     sim.run(until=0.1)
-    assert sim.joint("axle").speed == pytest.approx(3.0) and sim.joint("axle").angle == pytest.approx(0.3)
+    assert sim.joint("axle").speed == pytest.approx(3.0)
+    assert sim.joint("axle").angle == pytest.approx(0.3)
     sim.joint("axle").motor.speed = -1.0
     sim.run(until=0.2)
     assert sim.joint("axle").angle == pytest.approx(0.2)
     sim.joint("axle").motor.target = 0.5
     sim.step()
-    assert sim.joint("axle").angle == pytest.approx(0.5) and sim.joint("axle").motor.speed is None
+    assert sim.joint("axle").angle == pytest.approx(0.5)
+    assert sim.joint("axle").motor.speed is None
 
 
 def test_a_weak_motor_stalls_at_its_torque_and_its_work_is_in_the_balance():
@@ -137,7 +139,7 @@ def test_other_solvers_refuse():
 
 
 @pytest.mark.parametrize(
-    "given, words",
+    ("given", "words"),
     [
         ({"kind": "rope"}, "kind of a joint"),
         ({"speed": 1.0, "target": 1.0}, "not both"),
@@ -169,7 +171,8 @@ def test_a_restart_goes_on_with_the_same_bits(tmp_path):
     sim.run(steps=20)
     again = pctt.Simulation.load(tmp_path / "state.h5", pusher(), dt=0.01, tol=1e-9, comm=MPI.COMM_SELF)
     again.run(steps=20)
-    assert np.array_equal(again.positions, sim.positions) and again.joint("pin").angle == sim.joint("pin").angle
+    assert np.array_equal(again.positions, sim.positions)
+    assert again.joint("pin").angle == sim.joint("pin").angle
     assert sim.joint("pin").speed == pytest.approx(0.5, rel=1e-2)
 
 
