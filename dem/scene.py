@@ -288,7 +288,7 @@ class Scene:
         self.joints[name] = Joint(kind, (one, other), anchors, frames, speed, target, float(strength), low, high)
 
     def _pose(self, name: str, end: End) -> tuple[Floats, Floats]:
-        """Position (3,) and quaternion (4,) of an end of a spring or joint at time zero; ValueError if there is none."""
+        """Position (3,) and quaternion (4,) of an end of a spring or joint at time 0; ValueError if there is none."""
         if end is None:
             return np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
         if isinstance(end, str):
