@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import several_ranks
 
 SOLVE = """
@@ -24,6 +25,7 @@ for rows, solver, law in ((frames_and_arms, "apgd", "coulomb"), (blocks, "conic"
 """
 
 
+@pytest.mark.slow
 def test_the_first_run_on_a_machine_has_the_bits_of_the_next(tmp_path):
     here = str(Path(__file__).parent)
     env = several_ranks.environment(NUMBA_CACHE_DIR=str(tmp_path))
