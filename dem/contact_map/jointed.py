@@ -19,6 +19,7 @@ class JointedMap(ContactMap):
 
     here, slot : own rows of jointed bodies, and their places among all of these
     coupling : K (6 n, 6 n) of the n jointed bodies, the same on all ranks
+    free : the map without joints
     """
 
     def __init__(
@@ -26,7 +27,7 @@ class JointedMap(ContactMap):
         precision: type[np.floating] = np.float64,
     ):  # fmt: skip
         super().__init__(known.comm, known.given, known.halo, known.body, precision)
-        self._free, self._here, self._slot, self._coupling = known, here, slot, coupling
+        self.free, self._here, self._slot, self._coupling = known, here, slot, coupling
 
     def gathered(self, v: Floats) -> Floats:
         """The rows (n, 6) of the jointed bodies among those (columns, 6) of all ranks; collective."""
@@ -78,7 +79,7 @@ class JointedMap(ContactMap):
 
     def scaled(self, size: Floats, precision: type[np.floating] = np.float64) -> JointedMap:
         """The map with its rows multiplied by ``size`` (nc, 3)."""
-        known = self._free.scaled(size, precision)
+        known = self.free.scaled(size, precision)
         return JointedMap(known, self._here, self._slot, self._coupling, precision)
 
     @property

@@ -23,6 +23,8 @@ from dem.contact_map import ContactMap, root_blocks
 from dem.contact_map.map import packed
 from dem.exchange import offsets
 from dem.experiment import Experiment
+from dem.joints import Joint
+from dem.pairs import Pairs
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
@@ -48,8 +50,9 @@ class Dump:
     ):  # fmt: skip
         self._settings, self._experiment, self._world, self._place = settings, experiment, world, place
         self._hard_left, self._folder = hard, folder
-        if folder and world.pairs.resists:
-            raise OptionError("-dump_problem: files have no rolling and spinning; allowed are scenes without them")
+        self._none = unwritten(world.pairs, world.joints)
+        if folder and self._none:
+            raise OptionError(f"-dump_problem: {self._none}")
 
     def step(
         self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result, asked: ccp.Result
@@ -59,11 +62,14 @@ class Dump:
         ``asked`` is the result of the solver that the user chose, ``result`` the one that the step uses. Returns the
         entries for the step's figures. FileError if a file cannot be written.
         """
-        if system.resistance is not None:  # FCLIB's files have a format of their own for these
-            return {"dumped": [], "hard_problem": ""}
         number = self._world.step + 1
         hard = not asked.converged and self._hard_left > 0
         files: dict[str, Any] = {"dumped": [], "hard_problem": ""}
+        if self._none:
+            if hard:
+                self._hard_left = 0
+                warn(self._world.comm, f"step {number} is not solved, and its problem is not written: {self._none}")
+            return files
 
         def write(path: Path) -> None:
             try:
@@ -131,6 +137,13 @@ class Dump:
             else "Solution and guess are those of the convex cone problem, min 1/2 r'Wr + q'r over the friction cones "
             "(no mu |u_t| in the normal velocity). W is positive semidefinite; r need not be unique, u is.",
         )
+
+
+def unwritten(pairs: Pairs, joints: dict[str, Joint]) -> str:
+    """Why problems of a scene with these pairs and joints cannot be written, in words; "" if they can."""
+    if pairs.resists:  # FCLIB's files have a format of their own for these
+        return "files have no rolling and spinning; allowed are scenes without them"
+    return "files have no joints; allowed are scenes without them" if joints else ""
 
 
 def masses_and_map(system: ContactSystem) -> tuple[np.ndarray, Array, ContactMap]:

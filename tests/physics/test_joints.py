@@ -5,9 +5,12 @@ import pytest
 from mpi4py import MPI
 
 import pctt
-from dem.motion import Dynamic
+from dem.motion import Dynamic, Glide
 from dem.scene import Scene
 from dem.shapes import Box, Plane
+from pctt import ccp
+from pctt.options import OptionError
+from pctt.run.stepper import NoSolutionError
 
 G = 9.81
 
@@ -131,11 +134,24 @@ def test_contacts_and_joints_are_solved_together(solver):
 
 
 def test_other_solvers_refuse():
-    scene = wheel()
-    scene.add_body("floor", [Plane((0, 0, 1), (0, 0, -0.1))])
-    scene.gravity = np.array([0, 0, -9.81])
-    with pytest.raises(ValueError, match="with joints allowed are"):
-        simulation(scene, solver="conic").step()
+    for solver in set(ccp.SOLVERS) - {"auto", "apgd"}:
+        with pytest.raises(OptionError, match=f"-ccp_type {solver}: the scene has joints; allowed are auto and apgd"):
+            simulation(wheel(), solver=solver)
+
+
+def test_a_body_that_is_squeezed_against_its_joint_has_no_solution():
+    """A wall runs into a box that a slider holds: no impulse of a rigid contact stops the wall."""
+    for motion, ends in ((Glide((0.5, 0, 0)), True), (Glide((0, 0, 0.5)), False)):
+        scene = Scene(friction=0.0, gravity=(0, 0, 0))
+        scene.add_body("wall", [Box((0.1, 1, 1))], motion, position=(-0.101, 0, 0))
+        (box,) = scene.add_boxes([0.1, 0, 0], (0.1, 0.1, 0.1), 1000.0)
+        scene.add_joint("rail", None, box, kind="slider", anchor=(0.1, 0, 0), axis=(0, 0, 1))
+        sim = simulation(scene, dt=0.01, stiffness=np.inf, max_it=2000)
+        if ends:
+            with pytest.raises(NoSolutionError, match="unbounded"):
+                sim.run(steps=2)
+        else:
+            sim.run(steps=2)
 
 
 @pytest.mark.parametrize(
