@@ -142,6 +142,12 @@ def joint_coupling(world: World, dt: float) -> joints.Coupling | None:
     return world.comm.bcast(found)  # processors may round in other ways
 
 
+def joints_refound(world: World, known: joints.Coupling, push: Floats) -> joints.Coupling | None:
+    """`dem.joints.refound`, by the first rank for all; collective."""
+    found = joints.refound(known, push) if world.comm.rank == 0 else None
+    return world.comm.bcast(found)
+
+
 def slots(world: World, id: Ints) -> tuple[Ints, Ints]:
     """Which rows of bodies with these ids (n,) are among the bodies that joints know, and their rows there."""
     ids, first = jointed(world)[0], int(world.slabs[-1])

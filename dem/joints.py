@@ -7,7 +7,9 @@ A joint has rows J of the velocities of its two bodies. In a step with the free 
 with t = -error / dt for what the joint holds, so that its error is gone at the end of the step, to second order in dt.
 Motors have t = their speed. Their e is 0 if nothing bounds them. A bounded one gives the impulse f which brings it to
 its speed without contacts, within its strength, and e as `dem.motion.Driven` has its grip. Contacts see the joints in
-their inverse mass (`dem.contact_map.jointed`), so joints and contacts are solved together.
+their inverse mass (`dem.contact_map.jointed`), so joints and contacts are solved together. Which limits are reached and
+which motors are too weak is found without contacts first (`coupling`). Where the contacts of the step show another set,
+they are solved once more with it (`refound`).
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from dem import checks, quaternion
-from dem.arrays import Floats, Ints
+from dem.arrays import Bools, Floats, Ints
 from dem.motion import DROOP
 from dem.springs import End, Ends
 
@@ -33,6 +35,8 @@ HOLDS = {
     "ball": (True, True, True, False, False, False),
     "fixed": (True,) * 6,
 }
+
+HELD, MOTOR, LOWER, UPPER = range(4)  #: kinds of rows: what a joint holds, its motor, its limits
 
 
 @dataclass(frozen=True)
@@ -129,44 +133,61 @@ class Coupling:
 
     rows: Floats  #: (k, n, 6) J
     scaled: Floats  #: (k, 6 n) B = J M^-1/2
-    solver: Floats  #: (k, k) (B B' + e)^-1
+    root: Floats  #: (n, 6, 6) M^-1/2
+    joint: Ints  #: (k,) of which joint each row is
+    way: Ints  #: (k,) which of its six coordinates
+    kind: Ints  #: (k,) HELD, MOTOR, LOWER or UPPER
+    target: Floats  #: (k,) t
+    bound: Floats  #: (k,) greatest impulses, inf: none
+    free: Floats  #: (k,) J v*
+    slip: Floats  #: (k,) what bounded motors lose to the load that they can just bear
+    axes: Floats  #: (joints, 3, 3) rows x, y, z in the world
+    on: Bools  #: (k,) the rows that hold
+    given: Floats  #: (k,) impulses of the others: of motors that are too weak
+    solver: Floats  #: (k, k) (B B' + e)^-1 of the rows that hold
     impulse: Floats  #: (k,) without contacts [N s, N m s]
     change: Floats  #: (n, 6) of velocities, by these impulses
     matrix: Floats  #: (6 n, 6 n) K of `dem.contact_map.jointed`
-    joint: Ints  #: (k,) of which joint each row is
-    way: Ints  #: (k,) which of its six coordinates
-    axes: Floats  #: (joints, 3, 3) rows x, y, z in the world
+
+    def impulses(self, push: Floats) -> Floats:
+        """Impulses (k,) of the rows where contacts give the bodies the mass-scaled momenta `push` (n, 6)."""
+        return self.impulse - self.solver @ (self.scaled @ push.ravel())
+
+    @property
+    def decides(self) -> bool:
+        """Whether contacts may change which rows hold: those of limits and of motors with a bound."""
+        return bool(((self.kind > MOTOR) | np.isfinite(self.bound)).any())
 
 
 def coupling(joints: Sequence[Joint], row: Ints, ends: Ends, dt: float) -> Coupling:
     """Of joints between bodies in the rows `row` (n, 2) in a step of dt [s].
 
-    Motors that are too weak, and limits that are not reached, are found without contacts, by an active set."""
+    Motors that are too weak, and limits that are reached, are found without contacts, by an active set."""
     found = geometry(joints, row, ends)
     count = len(ends.free)
     chosen: list[tuple[int, int]] = []
-    target, most, kind = [], [], []  # kind: 0 held, 1 motor, 2 lower limit, 3 upper limit
+    target, most, kinds = [], [], []
     for n, joint in enumerate(joints):
         for way in np.flatnonzero(HOLDS[joint.kind]).tolist():
             chosen.append((n, way))
             target.append(-found.error[n, way] / dt)
             most.append(np.inf)
-            kind.append(0)
+            kinds.append(HELD)
         at = found.error[n, joint.way]
         if joint.driven:
             chosen.append((n, joint.way))
             target.append(joint.speed if joint.speed is not None else (joint.target - at) / dt)
             most.append(joint.strength * dt)
-            kind.append(1)
-        for side, limit in ((2, joint.low), (3, joint.high)):
+            kinds.append(MOTOR)
+        for side, limit in ((LOWER, joint.low), (UPPER, joint.high)):
             if np.isfinite(limit):
                 chosen.append((n, joint.way))
                 target.append((limit - at) / dt)
                 most.append(np.inf)
-                kind.append(side)
+                kinds.append(side)
     rows = np.array(chosen, np.int64).reshape(-1, 2)
     which, ways = rows[:, 0], rows[:, 1]
-    t, bound, code = np.array(target), np.array(most), np.array(kind)
+    t, bound, kind = np.array(target), np.array(most), np.array(kinds)
     J = np.zeros((len(t), count, 6))
     for side in (0, 1):
         np.add.at(J, (np.arange(len(t)), row[which, side]), found.rows[which, ways, side])
@@ -174,29 +195,80 @@ def coupling(joints: Sequence[Joint], row: Ints, ends: Ends, dt: float) -> Coupl
     B = np.einsum("knx,nxy->kny", J, root).reshape(len(t), -1)
     now, free = J.reshape(len(t), -1) @ ends.velocity.ravel(), J.reshape(len(t), -1) @ ends.free.ravel()
     A = B @ B.T
-    on, pushed = code < 2, np.zeros(len(t))  # rows that hold; given impulses of the others
+    slip = np.maximum(DROOP * np.abs(t), np.abs(t - now))
+    motors = np.isfinite(bound)
+    slip[motors] = np.maximum(slip, 1e-9 * np.diag(A) * np.where(motors, bound, 0.0))[motors]
+    on, given = kind <= MOTOR, np.zeros(len(t))
     for _ in range(2 * len(t) + 1):
-        g = pushed.copy()
-        g[on] = np.linalg.lstsq(A[np.ix_(on, on)], (t - free - A @ pushed)[on], rcond=1e-12)[0]
-        after = free + A @ g
-        weak = on & (code == 1) & (np.abs(g) > bound)
-        reached = ~on & (((code == 2) & (after < t - 1e-12)) | ((code == 3) & (after > t + 1e-12)))
-        pulls = on & (((code == 2) & (g < 0.0)) | ((code == 3) & (g > 0.0)))
-        if not (weak | reached | pulls).any():
+        g = _impulses(A, t, free, on, given)
+        wrong = _wrong(kind, t, bound, on, g, free + A @ g, 0.0)
+        if not wrong.any():
             break
-        pushed[weak] = (np.sign(g) * bound)[weak]
-        on = (on | reached) & ~weak & ~pulls
-    slip = np.maximum(np.maximum(DROOP * np.abs(t), np.abs(t - now)), 1e-9 * np.abs(bound) * np.diag(A))
-    room = bound - np.abs(g)
-    bounded = np.isfinite(bound)
-    e = np.where(bounded, np.divide(slip, room, out=np.full_like(slip, np.inf), where=bounded & (room > 0.0)), 0.0)
-    on &= np.isfinite(e)
+        on, given = _turned(kind, bound, on, given, g, wrong)
+    fixed = (J, B, root, which, ways, kind, t, bound, free, slip, found.axes)
+    return Coupling(*fixed, on, given, *_solved(B, root, t, bound, free, slip, on, given))
+
+
+def refound(known: Coupling, push: Floats) -> Coupling | None:
+    """The coupling with other rows that hold, where contacts give the bodies the mass-scaled momenta `push` (n, 6) with
+    the known one and show by it that a limit is passed or pulls, or that a motor is too weak, or strong enough. None if
+    all rows are right; the contacts of the other one are to be solved anew."""
+    g = known.impulses(push)
+    after = known.free + known.scaled @ (push.ravel() + known.scaled.T @ g)
+    wrong = _wrong(known.kind, known.target, known.bound, known.on, g, after, DROOP)
+    if not wrong.any():
+        return None
+    on, given = _turned(known.kind, known.bound, known.on, known.given, g, wrong)
+    numbers = known.target, known.bound, known.free, known.slip
+    solver, impulse, change, matrix = _solved(known.scaled, known.root, *numbers, on, given)
+    return dataclasses.replace(
+        known, on=on, given=given, solver=solver, impulse=impulse, change=change, matrix=matrix
+    )
+
+
+def _impulses(A: Floats, t: Floats, free: Floats, on: Bools, given: Floats) -> Floats:
+    """Impulses (k,) that bring the rows that hold to t; of the others the given ones."""
+    g = given.copy()
+    g[on] = np.linalg.lstsq(A[np.ix_(on, on)], (t - free - A @ given)[on], rcond=1e-12)[0]
+    return g
+
+
+def _wrong(kind: Ints, t: Floats, bound: Floats, on: Bools, g: Floats, after: Floats, loose: float) -> Bools:
+    """Which rows (k,) should hold and do not, or the other way round, with impulses g and velocities `after`. Where
+    solvers are not exact, a part `loose` of the impulses does not count."""
+    little, speed = loose * np.abs(g).max(initial=0.0), 1e-12 + 1e-6 * loose * np.abs(after - t).max(initial=0.0)
+    weak = on & (kind == MOTOR) & (np.abs(g) > (1.0 + loose) * bound)
+    strong = ~on & (kind == MOTOR) & (np.sign(g) * (after - t) > speed)
+    reached = ~on & (((kind == LOWER) & (after < t - speed)) | ((kind == UPPER) & (after > t + speed)))
+    pulls = on & (((kind == LOWER) & (g < -little)) | ((kind == UPPER) & (g > little)))
+    wrong: Bools = weak | strong | reached | pulls
+    return wrong
+
+
+def _turned(kind: Ints, bound: Floats, on: Bools, given: Floats, g: Floats, wrong: Bools) -> tuple[Bools, Floats]:
+    """The rows that hold and the given impulses of the others, after the wrong ones have changed sides."""
+    given = given.copy()
+    given[wrong] = 0.0
+    weak = wrong & on & (kind == MOTOR)
+    given[weak] = np.sign(g[weak]) * bound[weak]
+    return on ^ wrong, given
+
+
+def _solved(
+    B: Floats, root: Floats, t: Floats, bound: Floats, free: Floats, slip: Floats, on: Bools, given: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """`solver`, `impulse`, `change` and `matrix` of a `Coupling`."""
+    A = B @ B.T
+    g = _impulses(A, t, free, on, given)
+    room = bound - np.abs(g)  # not positive where only contacts bring a motor to its speed: it is held there
+    yields = np.isfinite(bound) & (room > 0.0)
+    e = np.divide(slip, room, out=np.zeros_like(slip), where=yields)
     solver = np.zeros_like(A)
     solver[np.ix_(on, on)] = np.linalg.pinv(A[np.ix_(on, on)] + np.diag(e[on]), rcond=1e-12, hermitian=True)
     value, vector = np.linalg.eigh(B.T @ solver @ B)
     K = (vector * (1.0 - np.sqrt(np.clip(1.0 - value, 0.0, 1.0)))) @ vector.T
     change = np.einsum("nxy,ny->nx", root, (B.T @ g).reshape(-1, 6))
-    return Coupling(J, B, solver, g, change, K, which, ways, found.axes)
+    return solver, g, change, K
 
 
 def _roots(matrix: Floats) -> Floats:

@@ -29,6 +29,7 @@ from dem.applied import (
     free_directions,
     free_velocities,
     joint_coupling,
+    joints_refound,
     slots,
 )
 from dem.arrays import Bools, Floats
@@ -41,6 +42,7 @@ from dem.contact_map import CompactRows, ContactMap, Halo
 from dem.contact_map.jointed import JointedMap
 from dem.contact_map.loops import scale
 from dem.contact_map.map import packed
+from dem.joints import Coupling
 from dem.rolling import resistance
 from dem.surface import surface_velocities
 from dem.world import World
@@ -69,10 +71,11 @@ class ContactSystem:
     """
 
     def __init__(
-        self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf, impacts: bool = True
-    ) -> None:
+        self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf, impacts: bool = True,
+        joints: Coupling | None = None,
+    ) -> None:  # fmt: skip
         """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `impacts`:
-        whether contacts that begin bounce."""
+        whether contacts that begin bounce; `joints`: those of this step, if they are known."""
         positive("time step", dt)
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
@@ -98,7 +101,7 @@ class ContactSystem:
         self.applied = applied_impulses(world, dt) if world.loaded else None
         if world.loaded:
             halo.update(free)
-        self.joints = joint_coupling(world, dt)
+        self.joints = joint_coupling(world, dt) if joints is None else joints
         if self.joints is not None:
             here, slot = slots(world, near.bodies.id)
             free[here] += self.joints.change[slot]
@@ -169,8 +172,15 @@ class ContactSystem:
         """Impulses (k,) of the rows of joints with these impulses of contacts (nc, 3) [N s, N m s]; collective."""
         if self.joints is None or not isinstance(self.contact_map, JointedMap):
             return np.zeros(0)
-        pushed = self.contact_map.gathered(self.contact_map.free_momenta(impulse))
-        return self.joints.impulse - self.joints.solver @ (self.joints.scaled @ pushed.ravel())
+        return self.joints.impulses(self.contact_map.gathered(self.contact_map.free_momenta(impulse)))
+
+    def joints_with(self, world: World, impulse: Floats) -> Coupling | None:
+        """The joints of the step if these impulses of contacts (nc, 3) show that other limits and motors hold, else
+        None; collective."""
+        if self.joints is None or not isinstance(self.contact_map, JointedMap) or not self.joints.decides:
+            return None
+        push = self.contact_map.gathered(self.contact_map.free_momenta(impulse))
+        return joints_refound(world, self.joints, push)
 
     def drive_impulse(self, large: Floats) -> Floats:
         """Impulses and angular impulses (large, 6) of the drives and loads of large bodies that have the velocities
