@@ -151,7 +151,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     if system.surface is not None:
         belts = comm.allreduce(-np.vdot(step.impulse[:, 1:], system.surface))
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
-    holding += _joint_work(step, before[0].velocity, mean)
+    joints, joints_at_end = _joint_works(step, before[0].velocity, mean)
+    holding += joints
     driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + loads + belts + holding
     work = driving - received
     still = sums(*(_still(table, world.gravity, system.dt) for table in after))
@@ -163,7 +164,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     change, held = whole[2] + whole[3] - whole[0] - whole[1], whole[7] - whole[6]
     rise, fallen, released = whole[2] - whole[0], whole[1] - whole[3], max(-held, 0.0)
     there = whole[0] + whole[8] + whole[9]
-    pulled = 2.0 * max(whole[10], 0.0)  # with the velocity of the end, for bodies that were at rest
+    # with the velocity of the end, for bodies that were at rest
+    pulled = 2.0 * max(whole[10], 0.0) + max(joints_at_end - joints, 0.0)
     created = rise - fallen - work - released - pulled > CREATED * (there + whole[6] + abs(work))
     driven = max(fallen, 0.0) + max(driving, 0.0) + pulled + released * (whole[9] == 0.0)
     jumps = rise > 0.0 and (created or whole[2] - driven > SUDDEN * there + CREATED * driven)
@@ -204,17 +206,20 @@ def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
     return work
 
 
-def _joint_work(step: Step, before: Floats, mean: Floats) -> float:
-    """The work [J] of joints and their motors on the bodies that forces move: velocities (grains, 6) of this rank's
-    grains before the step, and means (large, 6) of those before and after; collective."""
+def _joint_works(step: Step, before: Floats, mean: Floats) -> tuple[float, float]:
+    """The work [J] of joints and their motors on the bodies that forces move, on the mean velocities of the step and on
+    those of its end: velocities (grains, 6) of this rank's grains before the step, and means (large, 6) of those before
+    and after; collective."""
     system, world = step.system, step.world
     if system.joints is None:
-        return 0.0
+        return 0.0, 0.0
     push = np.einsum("k,knx->nx", step.joint_impulses, system.joints.rows)
     here, slot = slots(world, world.grains.id)
-    work = 0.5 * float(np.vdot(push[slot], before[here] + world.grains.velocity[here]))
+    velocity = world.grains.velocity[here]
+    works = np.array([0.5 * np.vdot(push[slot], before[here] + velocity), np.vdot(push[slot], velocity)])
+    world.comm.Allreduce(MPI.IN_PLACE, works)
     of_large = push[len(push) - 1 - len(world.large) : -1] * bodies.is_dynamic(world.large)[:, None]
-    return float(world.comm.allreduce(work) + np.vdot(of_large, mean))
+    return float(works[0] + np.vdot(of_large, mean)), float(works[1] + np.vdot(of_large, world.large.velocity))
 
 
 def _carried(step: Step, prescribed: Bools) -> float:
