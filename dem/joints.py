@@ -176,7 +176,8 @@ def coupling(joints: Sequence[Joint], row: Ints, ends: Ends, dt: float) -> Coupl
         at = found.error[n, joint.way]
         if joint.driven:
             chosen.append((n, joint.way))
-            target.append(joint.speed if joint.speed is not None else (joint.target - at) / dt)
+            speed = joint.speed if joint.speed is not None else (joint.target - at) / dt
+            target.append(min(max(speed, (joint.low - at) / dt), (joint.high - at) / dt))  # it stops at its limits
             most.append(joint.strength * dt)
             kinds.append(MOTOR)
         for side, limit in ((LOWER, joint.low), (UPPER, joint.high)):

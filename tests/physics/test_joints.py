@@ -167,6 +167,17 @@ def test_a_weak_motor_stalls_at_its_torque_and_its_work_is_in_the_balance():
     assert figures["work_of_motions [J]"] == pytest.approx(figures["kinetic_energy [J]"])
 
 
+@pytest.mark.parametrize("strength", [np.inf, 5.0])
+def test_a_motor_stops_at_its_limit(strength):
+    sim = simulation(wheel(speed=3.0, strength=strength, limits=(-1.0, 0.1)), dt=0.01)
+    for step in range(1, 8):
+        sim.step()
+        assert sim.joint("axle").angle == pytest.approx(min(0.03 * step, 0.1), rel=1e-2)
+        assert sim.joint("axle").angle < 0.1 + 1e-9
+    assert sim.joint("axle").angle == pytest.approx(0.1, rel=1e-9)
+    assert sim.joint("axle").drive == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_slider_stops_at_its_limit():
     scene = Scene(friction=0.3)
     (ball,) = scene.add_spheres([0, 0, 1], 0.1, 1000.0)
