@@ -243,7 +243,7 @@ class Scene:
         if not name or name in self.springs:
             raise ValueError(f"springs need distinct names, got {name!r}")
         spring = Spring((one, other), (anchor, other_anchor), stiffness, damping, 0.0 if length is None else length)
-        poses = [self._pose(name, end) for end in spring.ends]
+        poses = [self._pose(f"spring {name!r}", end) for end in spring.ends]
         places = [place + quaternion.rotate(turn, np.array(at)) for (place, turn), at in zip(poses, spring.anchors)]
         rest = float(np.linalg.norm(places[1] - places[0])) if length is None else length
         self.springs[name] = replace(spring, length=rest)
@@ -277,7 +277,7 @@ class Scene:
         x = across(np.array(z)[None])[0]
         upright = quaternion.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
         anchors, frames = [], []
-        for position, turn in (self._pose(name, one), self._pose(name, other)):
+        for position, turn in (self._pose(f"joint {name!r}", end) for end in (one, other)):
             back = quaternion.conjugate(turn)
             anchors.append(tuple(quaternion.rotate(back, place - position).tolist()))
             frames.append(tuple(quaternion.multiply(back, upright).tolist()))
@@ -287,7 +287,7 @@ class Scene:
         low, high = map(float, limits)
         self.joints[name] = Joint(kind, (one, other), anchors, frames, speed, target, float(strength), low, high)
 
-    def _pose(self, name: str, end: End) -> tuple[Floats, Floats]:
+    def _pose(self, what: str, end: End) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) of an end of a spring or joint at time 0; ValueError if there is none."""
         if end is None:
             return np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
@@ -298,7 +298,7 @@ class Scene:
             tables = self.parts
             rows = np.array([end]) if 0 <= end < sum(map(len, tables)) else np.zeros(0, np.int64)
         if not len(rows):
-            raise ValueError(f"{name!r}: there is no body or grain {end!r} yet")
+            raise ValueError(f"{what}: there is no body or grain {end!r} yet")
         table = bodies.concatenate(tables).take(rows)
         return table.position[0], table.quaternion[0]
 
