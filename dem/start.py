@@ -136,6 +136,9 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     if tied and world.outlets:
         raise ValueError(f"spring {tied[0]!r} holds a grain: scenes with outlets allow springs of large bodies alone")
     world.shear = _shear(scene)
+    world.joints = dict(scene.joints)
+    if world.joints and pairs.resists:
+        raise ValueError("joints cannot be in a scene whose contacts resist rolling or spinning")
     for name, load in world.loads.items():
         refuse_load(world, name, load)
     return world

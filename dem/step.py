@@ -52,6 +52,11 @@ class Step:
         force: Floats = self.system.applied.springs[names.index(name)] / self.system.dt
         return force
 
+    @cached_property
+    def joint_impulses(self) -> Floats:
+        """`ContactSystem.joint_impulses` of this step; collective at its first use."""
+        return self.system.joint_impulses(self.impulse)
+
     def position(self, name: str) -> Floats:
         """Position (3,) of a large body [m]."""
         return self.world.large.position[self.world.large_row(name)].copy()

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, checks, loads, quaternion, springs
+from dem import bodies, checks, joints, loads, quaternion, springs
 from dem import motion as motions
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
+from dem.joints import Joint
 from dem.loads import Load, On
 from dem.motion import Dynamic, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
 from dem.pairs import Pairs
@@ -63,6 +64,7 @@ class World:
     large: Bodies  #: one row per large body
     loads: dict[str, Load] = field(default_factory=dict)  #: by name; change them by `set_load` only
     springs: dict[str, Spring] = field(default_factory=dict)  #: by name; change them by `set_spring` only
+    joints: dict[str, Joint] = field(default_factory=dict)  #: by name; change them by `set_joint` only
     period: Floats | None = None  #: (3,) lengths of the cell that repeats itself, inf: none; None: along no axis [m]
     sources: dict[str, Source] = field(default_factory=dict)  #: by name
     outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
@@ -80,6 +82,8 @@ class World:
     loads_set: set[str] = field(init=False, default_factory=set)  #: loads with other numbers than the scene gave
 
     springs_set: set[str] = field(init=False, default_factory=set)  #: springs with other numbers than the scene gave
+
+    joints_set: set[str] = field(init=False, default_factory=set)  #: joints with other numbers than the scene gave
 
     lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
 
@@ -267,6 +271,21 @@ def set_spring(world: World, name: str, **values: Any) -> None:
     world.springs[name] = dataclasses.replace(world.springs[name], **values)
     world.springs_set.add(name)
     world.applied = {}
+
+
+def set_joint(world: World, name: str, **values: Any) -> None:
+    """Give a joint another `speed`, `target`, `strength`, `low` or `high`. ValueError for what it cannot have."""
+    if name not in world.joints:
+        raise ValueError(f"no joint {name!r}; there are: {', '.join(world.joints) or 'none'}")
+    world.joints[name] = world.joints[name].changed(**values)
+    world.joints_set.add(name)
+
+
+def restore_joints(world: World, text: str) -> None:
+    """Give a world, made from its scene, the joints of `dem.joints.as_text`."""
+    for name, joint in joints.from_text(text).items():
+        world.joints[name] = joint
+        world.joints_set.add(name)
 
 
 def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> Pose:

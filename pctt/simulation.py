@@ -51,6 +51,7 @@ from pctt.petsc import warn
 from pctt.render import Picture, picture
 from pctt.run import report, state
 from pctt.run.dump import Dump
+from pctt.run.joints import JointNow
 from pctt.run.output import Place, Writer, described_bodies, refuse_unwritable
 from pctt.run.settings import Run, Settings, scene_name
 from pctt.run.stepper import NoSolutionError, Stepper
@@ -338,6 +339,11 @@ class Simulation:
         """Force (3,) of a spring on its second end, its mean over the last step [N]. ValueError before the first step,
         KeyError if there is none of that name. Not collective."""
         return self._last.spring_force(name)
+
+    def joint(self, name: str) -> JointNow:
+        """A joint: its force, torque, angle or position, speed and motor; ValueError if there is none of that name. Not
+        collective."""
+        return JointNow(self, name)
 
     def _change(self, what: str, change: Callable[..., None], /, *given: Any, **values: Any) -> None:
         """Call ``change(world, ...)`` with the first rank's values; collective."""

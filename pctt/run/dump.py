@@ -24,6 +24,8 @@ from dem.contact_map import ContactMap, root_blocks
 from dem.contact_map.map import packed
 from dem.exchange import offsets
 from dem.experiment import Experiment
+from dem.joints import Joint
+from dem.pairs import Pairs
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
@@ -49,8 +51,9 @@ class Dump:
     ):  # fmt: skip
         self._settings, self._experiment, self._world, self._place = settings, experiment, world, place
         self._hard_left, self._folder = hard, folder
-        if folder and world.pairs.resists:
-            raise OptionError("-dump_problem: files have no rolling and spinning; allowed are scenes without them")
+        self._none = unwritten(world.pairs, world.joints)
+        if folder and self._none:
+            raise OptionError(f"-dump_problem: {self._none}")
 
     def step(
         self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result, asked: ccp.Result
@@ -61,9 +64,14 @@ class Dump:
         entries for the step's figures. FileError if a file cannot be written.
         """
         files: dict[str, Any] = {"dumped": [], "hard_problem": ""}
-        if system.resistance is not None or not problem.size:  # FCLIB's files have another format for resistance
-            return files
         number, write = self._world.step + 1, partial(self._write, system, problem, guess, result, asked)
+        if self._none:
+            if self._hard_left and not asked.converged:
+                self._hard_left = 0
+                warn(self._world.comm, f"step {number} is not solved, and its problem is not written: {self._none}")
+            return files
+        if not problem.size:
+            return files
         name = f"step{number:06d}_{problem.size}contacts"
         if self._folder:
             files["dumped"] = [str(write(Path(self._folder) / f"{name}.h5"))]
@@ -121,6 +129,13 @@ class Dump:
         except OSError as error:  # raised on all ranks alike
             raise FileError(str(error)) from None
         return path
+
+
+def unwritten(pairs: Pairs, joints: dict[str, Joint]) -> str:
+    """Why problems of a scene with these pairs and joints cannot be written, in words; "" if they can."""
+    if pairs.resists:  # FCLIB's files have a format of their own for these
+        return "files have no rolling and spinning; allowed are scenes without them"
+    return "files have no joints; allowed are scenes without them" if joints else ""
 
 
 def masses_and_map(system: ContactSystem) -> tuple[np.ndarray, Array, ContactMap]:

@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 
 from dem.compiled import tell_first_compilation
@@ -16,7 +17,9 @@ from pctt.ccp.fclib import FileFormatError, Stored
 from pctt.disk import FileError, on_first, write_text
 from pctt.folder import dumps
 from pctt.ksp_options import remark
+from pctt.options import OptionError
 from pctt.run import interrupt, report
+from pctt.run.dump import unwritten
 from pctt.run.output import Place
 from pctt.run.settings import DEMO, Options
 from pctt.run.state import built, settled_state
@@ -34,6 +37,10 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         return
     if options.demo:
         progress.say("no options: the demo; -help lists the options")
+    if run.dump_problem:
+        scene = built(options.scene, comm)
+        if why := unwritten(scene.pairs(np.inf), scene.joints):
+            raise OptionError(f"-dump_problem: {why}")
     compare = ccp.Comparison(comm, run.compared(), run.compare_every)
     with Simulation(
         options.scene, options.settings, comm=comm, restart=run.restart, compare=compare, say=progress.say

@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from dem import loads, springs, stiffness, time_step
+from dem import joints, loads, springs, stiffness, time_step
 from dem.arrays import Floats
 from dem.bodies import Bodies
 from dem.exchange import refuse
@@ -29,7 +29,7 @@ from dem.scene import LargeBody, Scene
 from dem.shapes import placed
 from dem.start import even_slice, new_world, restart_rows, restored_world
 from dem.together import SceneError, together, unlike
-from dem.world import World, changed_motions, restore_loads, restore_motions, restore_springs
+from dem.world import World, changed_motions, restore_joints, restore_loads, restore_motions, restore_springs
 from pctt import ccp
 from pctt.disk import FileError, Lock, on_first, read, texts, write_rows
 from pctt.options import OptionError
@@ -38,7 +38,10 @@ from pctt.run import interrupt
 from pctt.run.settings import Settings, scene_name
 from pctt.run.stepper import Stepper
 
-CHANGES = {"motions": restore_motions, "loads": restore_loads, "springs": restore_springs}  #: made within a run
+#: Made within a run.
+CHANGES = {
+    "motions": restore_motions, "loads": restore_loads, "springs": restore_springs, "joints": restore_joints,
+}  # fmt: skip
 FORMAT, FIRST_FORMAT = "pctt checkpoint 2", "pctt checkpoint 1"  #: the first one had no checksums
 
 Say = Callable[[str], object]  #: told on the first rank
@@ -68,6 +71,7 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     motions = [(body.name, type(body.motion).__name__) for body in large]
     words = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
     words += [repr(scene.sources), repr(scene.outlets)]
+    words.append([(name, repr(joint)) for name, joint in scene.joints.items()])
     numbers: list[Any] = [column for table in (*scene.parts, scene.large()) for column in table.columns().values()]
     numbers += [value for body in large for shape in body.shapes for value in placed(shape)]
     numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values(), *(body.surface for body in large)]
@@ -136,6 +140,8 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
     if world.springs_set:
         changed = {name: world.springs[name] for name in sorted(world.springs_set)}
         shared["world/springs"] = texts([springs.as_text(changed)])
+    if world.joints_set:
+        shared["world/joints"] = texts([joints.as_text({n: world.joints[n] for n in sorted(world.joints_set)})])
     rows |= {"contacts/key": key, "contacts/impulse": impulse}
     write_rows(path, world.comm, rows, shared, {"/": {"format": FORMAT, **made_with}})
 

@@ -14,6 +14,7 @@ from dem.arrays import Ints
 from dem.contact import Contacts, find_contacts
 from dem.fast import refuse_passages
 from dem.impulses import ImpulseMemory
+from dem.joints import Coupling
 from dem.partition import rebalance
 from dem.passage import come_and_go
 from dem.period import put_back
@@ -56,6 +57,8 @@ class Stepper:
         self.settings, self.world, self.memory, self.newton, self.dump = settings, world, memory, newton, dump
         self._problem: ccp.ConeProblem | None = None
         self._corrections = 0  # of the present step
+        self._joints: Coupling | None = None  # of the present step, once its contacts have shown what holds
+        self._rejoined = 0  # how often they have
         self._slabs: Ints | None = None  # those of the last step, or of a solution that is remembered within this one
         if settings.stiffness is not None:
             world.pairs.stiffness[:] = settings.stiffness
@@ -86,7 +89,7 @@ class Stepper:
             raise SceneError(f"step {self.world.step + 1}: {error}") from None
 
     def _step(self) -> dict[str, Any]:
-        self._corrections = 0
+        self._corrections, self._rejoined, self._joints = 0, 0, None
         with log.phase("search"):
             come_and_go(self.world)
             put_back(self.world)
@@ -117,19 +120,22 @@ class Stepper:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
         problem, guess = self._assemble(contacts, self.memory)
         result = self.solve(problem, guess)
-        while (again := self._unseen(self.contacts, self.system, result.momentum)) is not None:
-            found = ImpulseMemory(self.world.comm, self.world.pairs.parts)
-            found.remember(self.system.key, result.impulse, self.system.frame)
-            self._slabs = self.world.slabs
-            problem, guess = self._assemble(again, found)
+        while True:
+            again = self._unseen(self.contacts, self.system, result.momentum)
+            if again is None and self._joints_hold(result):
+                return problem, guess, result, None
+            problem, guess = self._assemble(self.contacts if again is None else again, self._remembered(result))
             result = self.solve(problem, guess).after(result)
-        return problem, guess, result, None
 
     def _with_projection(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
         """Forces of contacts that touch at the start, then positions without overlaps; see `pctt.run.projection`."""
         every = self._system(contacts, impacts=False)
         problem, guess = self._assemble(contacts.take(touching(contacts, every)), self.memory)
         result = self.solve(problem, guess)
+        while not self._joints_hold(result):
+            every = self._system(contacts, impacts=False)
+            problem, guess = self._assemble(self.contacts, self._remembered(result))
+            result = self.solve(problem, guess).after(result)
         while True:
             with log.phase("project"):
                 shift, self.projection_its = projected(every, self.system, result)
@@ -174,7 +180,8 @@ class Stepper:
 
     def _system(self, contacts: Contacts, impacts: bool = True) -> ContactSystem:
         with log.phase("assembly"):
-            return ContactSystem(self.world, contacts, self.settings.dt, self.settings.recovery_speed, impacts)
+            given = self.settings.dt, self.settings.recovery_speed, impacts, self._joints
+            return ContactSystem(self.world, contacts, *given)
 
     def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, Array]:
         """The problem of these contacts, which takes the place of the last, and the impulses remembered."""
@@ -203,6 +210,27 @@ class Stepper:
                     return turned
             refuse_passages(world, contacts, velocity, delta, dt)
             return None
+
+    def _remembered(self, found: ccp.Result) -> ImpulseMemory:
+        """A memory of these impulses of the present contacts."""
+        memory = ImpulseMemory(self.world.comm, self.world.pairs.parts)
+        memory.remember(self.system.key, found.impulse, self.system.frame)
+        self._slabs = self.world.slabs
+        return memory
+
+    def _joints_hold(self, result: ccp.Result) -> bool:
+        """Whether the limits and motors that the joints of the step take as holding are those that do with these
+        impulses, or so many others were tried; else the others are set. Collective."""
+        most = 3
+        if self.system.joints is None or self._rejoined == most:
+            return True
+        with log.phase("assembly"):
+            forces = self.system.net(result.impulse[: len(self.contacts)])
+            found = self.system.joints_with(self.world, forces)
+        if found is not None:
+            self._joints = found
+            self._rejoined += 1
+        return found is None
 
     def solve(self, problem: ccp.ConeProblem, guess: Array) -> ccp.Result:
         """Solve a problem of the step as the settings say."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from mpi4py import MPI
 from program import SETTLED, SMALL, steps_of, summary_of
 
 from pctt.run.dump import Dump
@@ -122,3 +124,40 @@ def test_hard_problems_of_another_run_are_replaced_and_of_this_one_kept(program,
     assert hard() == [first, first + 1, first + 2]
     program(*HARD, "-steps", 1, "-overwrite")
     assert hard() == [first]
+
+
+UNWRITTEN = """
+from dataclasses import dataclass
+from dem.experiment import Experiment
+from dem.scene import Scene
+from dem.shapes import Plane
+
+@dataclass(frozen=True)
+class Row(Experiment):
+    def build(self):
+        scene = Scene(friction=0.3, rolling=ROLLING)
+        scene.add_body("floor", [Plane((0, 0, 1))])
+        ids = scene.add_spheres([[0.2 * k, 0, 0.1] for k in range(4)], 0.1, 1000.0, velocity=(1.0, 0, 0))
+        if not ROLLING:
+            scene.add_joint("bond", ids[0], ids[1], kind="ball", anchor=(0.1, 0, 0.1))
+        return scene
+"""
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize(("rolling", "what"), [(0.01, "rolling"), (0.0, "joints")])
+def test_problems_that_no_file_can_hold_are_not_written(program, tmp_path, rolling, what):
+    (tmp_path / "row.py").write_text(UNWRITTEN.replace("ROLLING", str(rolling)))
+    given = ("-scene", "row.py", "-dt", 0.01, "-ccp_tol", 1e-9, "-ccp_max_it", 2, "-steps", 3)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        program(*given, "-output", "kept")
+    remarks = [str(one.message) for one in said if "is not written" in str(one.message)]
+    assert len(remarks) == (MPI.COMM_WORLD.rank == 0)
+    steps = steps_of(tmp_path / "kept")
+    assert [line["converged"] for line in steps] == [False] * 3
+    assert [line["hard_problem"] for line in steps] == [""] * 3
+    assert not (tmp_path / "kept" / "hard").exists()
+    done = program(*given, "-output", "new", "-dump_problem", "problems", status=2)
+    assert f"-dump_problem: files have no {what}" in done.stderr
+    assert [path for folder in ("new", "problems") for path in (tmp_path / folder).glob("*")] == []
