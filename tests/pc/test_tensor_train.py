@@ -56,17 +56,6 @@ def test_applied_operator_is_symmetric_and_positive(block):
     assert np.linalg.eigvalsh(0.5 * (M + M.T)).min() > 0
 
 
-@pytest.mark.parametrize("ksp_type", ["cg", "bcgs", "gmres", "fgmres"])
-def test_solves_under_every_method_with_fewer_iterations_than_jacobi(ksp_type):
-    plain = solver(poisson(32), ksp_type, rank=1)
-    train = solver(poisson(32), ksp_type, rank=24)
-    jacobi_its, _ = solve(plain)
-    PETSc.Options()["pc_tt_rank"] = "24"
-    train_its, residual = solve(train)
-    assert residual < 1e-6
-    assert train_its < jacobi_its
-
-
 def test_new_values_start_from_the_old_train():
     mat = poisson(16)
     ksp = solver(mat, rank=8, reuse="steps")
@@ -115,10 +104,12 @@ def test_a_kept_train_goes_where_a_new_one_is_better():
     assert its <= 1.2 * cold_its + 1
 
 
-@pytest.mark.parametrize("way", [{"compress": "cross"}, {"scaling": "none"}])
-def test_other_ways_to_a_train(way):
-    ksp = solver(poisson(16), rank=8, **way)
-    jacobi_its, _ = solve(solver(poisson(16), rank=1))
+@pytest.mark.parametrize(("ksp_type", "way"), [
+    ("cg", {}), ("bcgs", {}), ("gmres", {}), ("fgmres", {}), ("cg", {"compress": "cross"}), ("cg", {"scaling": "none"}),
+])  # fmt: skip
+def test_every_way_to_a_train_takes_fewer_iterations_than_jacobi(ksp_type, way):
+    jacobi_its, _ = solve(solver(poisson(16), ksp_type, rank=1))
+    ksp = solver(poisson(16), ksp_type, rank=8, **way)
     its, residual = solve(ksp)
     assert context(ksp).rank == 8, context(ksp).account.fallbacks
     assert residual < 1e-6
