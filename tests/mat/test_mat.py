@@ -39,23 +39,18 @@ def is_matrix(mat: PETSc.Mat, A: np.ndarray, atol: float = 1e-9) -> None:
 
 
 def diagonal_mat(like: PETSc.Mat, kind: str) -> PETSc.Mat:
-    """3 I, as a Mat of several types."""
-    if kind == "constantdiagonal":
-        constant = PETSc.Mat().create(comm=like.comm)
-        constant.setSizes(like.getSizes())
-        constant.setType(kind)
-        constant.setUp()
-        constant.assemble()
-        constant.shift(3.0)
-        return constant
-    mat = PETSc.Mat().createAIJ(like.getSizes(), nnz=2, comm=like.comm)
-    for row in range(*mat.getOwnershipRange()):
-        mat.setValue(row, row, 4.0 if kind == "diagonal" and row == 2 else 3.0)
-    if kind == "aij" and mat.getOwnershipRange()[0] == 0:
-        mat.setValue(0, 1, 0.0)  # a stored zero
-    if kind == "coupled" and mat.getOwnershipRange()[0] == 0:
-        mat.setValue(0, 1, 1e-9)
+    """3 I as a Mat of several types, or something near it."""
+    mat = PETSc.Mat().create(comm=like.comm)
+    mat.setSizes(like.getSizes())
+    mat.setType("constantdiagonal" if kind == "constantdiagonal" else "aij")
+    mat.setUp()
+    if kind != "constantdiagonal":
+        for row in range(*mat.getOwnershipRange()):
+            mat[row, row] = 1.0 if kind == "diagonal" and row == 2 else 0.0
+        if mat.getOwnershipRange()[0] == 0:
+            mat[0, 1] = 1e-9 if kind == "coupled" else 0.0  # a stored zero
     mat.assemble()
+    mat.shift(3.0)
     return mat
 
 
