@@ -80,7 +80,8 @@ def _refuse_impossible(world: World) -> None:
     for table, what in ((world.grains, "grain"), (world.large, "large body")):
         grains = what == "grain"
         heavy = np.concatenate([table.mass, table.inertia.ravel()])
-        kinds = np.isin(table.shape, (bodies.SPHERE, bodies.BOX, bodies.CAPSULE) if grains else (bodies.COMPOUND,))
+        clumps = range(bodies.CLUMP, bodies.CLUMP + len(world.clumps))
+        kinds = np.isin(table.shape, (bodies.SPHERE, bodies.BOX, bodies.CAPSULE, *clumps) if grains else bodies.COMPOUND)
         right = {
             "position": np.isfinite(table.position),
             "velocity": np.isfinite(table.velocity),
@@ -117,6 +118,7 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
     world.loads, world.springs, world.period = dict(scene.loads), dict(scene.springs), scene.period
+    world.clumps = tuple(scene.clumps)
     world.sources, world.outlets = dict(scene.sources), dict(scene.outlets)
     world.tallies = {name: Tally() for name in (*world.sources, *world.outlets)}
     world.initial, world.first_large = sum(map(len, scene.parts)), scene.first_large
