@@ -3,7 +3,7 @@
 The integrals over balls are exact. What two or more of them share counts once: it is taken off again by columns along
 z, in which the integrals are exact, and by the midpoint rule over CELLS x CELLS of them across what is shared. So
 clumps whose spheres do not overlap are exact. The volume of a lens of two balls comes out to 1e-5 of the lens, and the
-moments are as good (tests/dem/test_clumps.py).
+moments are as good (tests/dem/test_clump.py).
 """
 
 from __future__ import annotations

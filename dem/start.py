@@ -12,6 +12,7 @@ from mpi4py import MPI
 from dem import bodies, stiffness
 from dem.arrays import Ints
 from dem.bodies import Bodies
+from dem.clumps import Form
 from dem.contact import find_contacts
 from dem.exchange import exchange, refuse
 from dem.partition import redistribute
@@ -90,6 +91,7 @@ def _refuse_impossible(world: World) -> None:
             "material": (table.material >= 0) & (table.material < len(world.materials)),
             "shape": kinds,
             "size": np.isfinite(table.size) & (table.size >= 0.0) & (table.size[:, :1] > 0.0 if grains else True),
+            "clump": np.array([_is_of(table, n, form) for n, form in enumerate(world.clumps)]),
         }
         wrong += [f"{name} of a {what}" for name, good in right.items() if not good.all()]
     starts = np.arange(world.comm.size + 1) * world.ids // world.comm.size
@@ -100,6 +102,12 @@ def _refuse_impossible(world: World) -> None:
     if missing or (np.diff(ids) <= 0).any() or ((ids < most[0]) | (ids >= most[1])).any():
         wrong.append("id of a grain")
     refuse(world.comm, f"a state that no run can have: {', '.join(wrong)}" if wrong else "")
+
+
+def _is_of(table: Bodies, number: int, form: Form) -> bool:
+    """Whether the clumps of this number in a table have the sizes of the form."""
+    size = table.size[table.shape == bodies.CLUMP + number]
+    return bool(np.allclose(size, form.size, rtol=1e-9, atol=0.0))
 
 
 def restart_rows(slabs: Ints, comm: MPI.Comm) -> slice:

@@ -51,7 +51,7 @@ from pctt.petsc import warn
 from pctt.render import Picture, picture
 from pctt.run import report, state
 from pctt.run.dump import Dump
-from pctt.run.output import Place, Writer, described_bodies, refuse_unwritable
+from pctt.run.output import Place, Writer, described_bodies, described_clumps, refuse_unwritable
 from pctt.run.settings import Run, Settings, scene_name
 from pctt.run.stepper import NoSolutionError, Stepper
 
@@ -445,7 +445,8 @@ class Simulation:
         grains = len(position) - len(large)
         position[:grains] = wrapped(position[:grains], world.period)
         contacts = self.contacts if self.last else Contacts.none()
-        frame = Frame(self.steps, self.time, position, turn, velocity, contacts, Table(**table, grains=grains))
+        what = Table(**table, grains=grains, clumps=described_clumps(world))
+        frame = Frame(self.steps, self.time, position, turn, velocity, contacts, what)
         return Snapshot(frame, materials=world.materials, large=described_bodies(world))
 
 
