@@ -33,8 +33,9 @@ class Bodies:
     inertia: Floats  #: (n, 3) principal moments of inertia in the body frame [kg m^2]
     material: Ints  #: (n,) row of the friction table
     shape: Ints  #: (n,) SPHERE, BOX, CAPSULE, COMPOUND, or CLUMP and the number of the clump
-    size: Floats  #: (n, 3) sphere: (radius, 0, 0); box: half extents; capsule: (radius, half length, 0); clump: radii of
-    #: the sphere that encloses it, of the ball of its volume, and of its largest sphere [m]
+    #: (n, 3) sphere: (radius, 0, 0); box: half extents; capsule: (radius, half length, 0); clump: radii of the sphere
+    #: that encloses it, of the ball of its volume, and of its largest sphere [m]
+    size: Floats
     weight: Floats  #: (n,) contacts owned at the last search, the load that balancing spreads
 
     def __len__(self) -> int:

@@ -9,7 +9,7 @@ moments are as good (tests/dem/test_clump.py).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 
@@ -41,7 +41,7 @@ class Form:
         return np.array([around, np.cbrt(0.75 * self.volume / np.pi), self.radius.max()])
 
 
-@lru_cache(maxsize=None)
+@cache
 def form(shape: Clump) -> Form:
     """The form of a clump; the same object for equal clumps."""
     center, radius = np.array(shape.centres), np.array(shape.radii)

@@ -82,7 +82,8 @@ def _refuse_impossible(world: World) -> None:
         grains = what == "grain"
         heavy = np.concatenate([table.mass, table.inertia.ravel()])
         clumps = range(bodies.CLUMP, bodies.CLUMP + len(world.clumps))
-        kinds = np.isin(table.shape, (bodies.SPHERE, bodies.BOX, bodies.CAPSULE, *clumps) if grains else bodies.COMPOUND)
+        of_grains = (bodies.SPHERE, bodies.BOX, bodies.CAPSULE, *clumps)
+        kinds = np.isin(table.shape, of_grains if grains else (bodies.COMPOUND,))
         right = {
             "position": np.isfinite(table.position),
             "velocity": np.isfinite(table.velocity),

@@ -77,7 +77,8 @@ def test_the_frame_goes_to_the_centre_of_mass():
     shape = Clump([(0, 0, 0), (0.1, 0.2, 0), (0.1, 0.2, 0.3)], [0.05, 0.08, 0.06])
     ids = scene.add_clumps([(1, 2, 3), (4, 5, 6)], shape, 1000.0, quaternions=turn)
     scene.add_clumps((7, 8, 9), Clump([(0, 0, 0), (0.1, 0.2, 0), (0.1, 0.2, 0.3)], [0.05, 0.08, 0.06]), 500.0)
-    assert ids.tolist() == [0, 1] and len(scene.clumps) == 1
+    assert ids.tolist() == [0, 1]
+    assert len(scene.clumps) == 1
     grains, form = scene.grains(), scene.clumps[0]
     assert (grains.shape == CLUMP).all()
     for n, (origin, own) in enumerate([((1, 2, 3), turn), ((4, 5, 6), turn), ((7, 8, 9), np.array([1.0, 0, 0, 0]))]):
@@ -89,11 +90,14 @@ def test_the_frame_goes_to_the_centre_of_mass():
 
 
 @pytest.mark.parametrize(
-    "centres, radii",
-    [([(0, 0, 0)], [0.1, 0.2]), ([(0, 0, 0)], [0.0]), ([(0, 0)], [0.1]), (np.zeros((0, 3)), []), ([(0, 0, np.nan)], [1])],
+    ("centres", "radii"),
+    [
+        ([(0, 0, 0)], [0.1, 0.2]), ([(0, 0, 0)], [0.0]), ([(0, 0)], [0.1]), (np.zeros((0, 3)), []),
+        ([(0, 0, np.nan)], [1]),
+    ],
 )
 def test_bad_clumps(centres, radii):
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="Clump"):
         Clump(centres, radii)
 
 
