@@ -90,6 +90,8 @@ def _meet(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: 
     spin[shape == SPHERE] = 0.0  # their surfaces do not move
     way = dt * (table[row, :3] + spin)
     way = way[:, 1] - way[:, 0]
+    if contacts.drift is not None:
+        way += dt * contacts.drift
     closes: Bools = contacts.gap + np.einsum("ci,ci->c", way, contacts.normal) < -0.01 * delta
     balls = (shape == SPHERE).all(axis=1)
     radii = near.bodies.size[row[balls], 0].sum(axis=1)

@@ -16,7 +16,7 @@ from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.contact_map.halo import Halo
 from dem.exchange import exchange
-from dem.world import World
+from dem.world import Shear, World
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
     columns = dict(grains.columns(), margin=margin, index=mine)
     row, rank = touched(grains.position, radius, boxes[: comm.rank])
     if world.period is not None:
-        ways = image_ways(world.period)
+        ways, _ = image_ways(world.period, world.shear)
         more = [touched(grains.position + way, radius, boxes[: comm.rank]) for way in ways]
         both = np.concatenate([np.stack([rank, row]), *(np.stack(pair[::-1]) for pair in more)], axis=1)
         rank, row = np.unique(both, axis=1)
@@ -81,11 +81,19 @@ def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> 
     return replace(near, bodies=replace(near.bodies, **columns), margin=now(margin, 0.0)[:count])
 
 
-def image_ways(period: Floats) -> Floats:
-    """By what (k, 3) images are moved, for the periods (3,) [m], inf: none."""
-    each = [(-1.0, 0.0, 1.0) if np.isfinite(length) else (0.0,) for length in period]
+def image_ways(period: Floats, shear: Shear | None = None) -> tuple[Floats, Floats]:
+    """By what (k, 3) images are moved, for the periods (3,) [m], inf: none; and how many sheared boundaries (k,) lie
+    between them and the cell. Behind one, images are shifted by up to half a period, so that one more may be near."""
+    each: list[tuple[float, ...]] = [(-1.0, 0.0, 1.0) if np.isfinite(length) else (0.0,) for length in period]
+    if shear is not None:
+        each[0] = (-2.0, -1.0, 0.0, 1.0, 2.0)
     whole = np.array([steps for steps in product(*each) if any(steps)])
-    return whole * np.where(np.isfinite(period), period, 0.0)
+    across = np.zeros(len(whole)) if shear is None else whole[:, shear.axis]
+    near = (np.abs(whole[:, 0]) < 2.0) | (across != 0.0)
+    ways = whole[near] * np.where(np.isfinite(period), period, 0.0)
+    if shear is not None:
+        ways[:, 0] += across[near] * (shear.shift - period[0] * np.round(shear.shift / period[0]))
+    return ways, across[near]
 
 
 def chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:

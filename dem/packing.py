@@ -98,7 +98,7 @@ def _apart(position: Floats, radius: Floats, box: Floats, period: Floats, most: 
 def _pairs(position: Floats, radius: Floats, period: Floats) -> tuple[Floats, Floats, Floats]:
     """Rows (m,) and (m,) of spheres that touch, and the ways (m, 3) from the first to the second or its image."""
     source, moved = [np.arange(len(position))], [np.zeros_like(position)]
-    for way in image_ways(period) if np.isfinite(period).any() else ():
+    for way in image_ways(period)[0] if np.isfinite(period).any() else ():
         near = ((position + way > -2.0 * radius.max()) & (position + way < np.where(np.isfinite(period), period, np.inf)
                 + 2.0 * radius.max()) | ~np.isfinite(period)).all(axis=1)  # fmt: skip
         source.append(np.flatnonzero(near))

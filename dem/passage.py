@@ -91,7 +91,7 @@ def _about(world: World, sources: list[Source]) -> tuple[Floats, Floats]:
     largest = np.array([reach(source.extremes()).max() for source in sources])
     boxes += np.array([-1.0, 1.0])[None, :, None] * largest[:, None, None]
     position, radius = wrapped(world.grains.position, world.period), reach(world.grains)
-    ways = [np.zeros(3)] if world.period is None else [np.zeros(3), *image_ways(world.period)]
+    ways = [np.zeros(3)] if world.period is None else [np.zeros(3), *image_ways(world.period)[0]]
     found = [touched(position + way, radius, boxes[None])[0] for way in ways]
     rows = np.unique(np.concatenate(found)).astype(np.int64)
     parts = world.comm.gather((world.grains.id[rows], position[rows], radius[rows]))
@@ -131,7 +131,7 @@ def _free(world: World, place: Floats, radius: Floats) -> Bools:
     free = np.ones(place.shape[:2], bool)
     if not len(world.large) or not free.size:
         return free
-    ways = [np.zeros(3)] if world.period is None else [np.zeros(3), *image_ways(world.period)]
+    ways = [np.zeros(3)] if world.period is None else [np.zeros(3), *image_ways(world.period)[0]]
     for way in ways:
         free &= _apart(world, place.reshape(-1, 3) + way, np.repeat(radius, place.shape[1])).reshape(free.shape)
     return free

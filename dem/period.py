@@ -9,7 +9,7 @@ the bodies, with the `moved` way from body b to the image that touches body a.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,19 +21,37 @@ from dem.motion import Fixed
 from dem.neighbourhood import Neighbourhood, chunk_boxes, image_ways, touched
 from dem.shapes import Plane, Shape, placed
 from dem.together import SceneError
-from dem.world import World
+from dem.world import Shear, World
 
 AXES = "xyz"
 
 
-def wrapped(position: Floats, period: Floats | None) -> Floats:
+def wrapped(position: Floats, period: Floats | None, shear: Shear | None = None) -> Floats:
     """Positions (n, 3) [m] in the cell of the periods (3,) [m], inf: none; None: no axis has one."""
     if period is None:
         return position
     out = position.copy()
+    if shear is not None:
+        out[:, 0] -= crossed(position, shear) * shear.shift
     for k in np.flatnonzero(np.isfinite(period)):
         out[:, k] -= period[k] * np.floor(out[:, k] / period[k])
         out[out[:, k] >= period[k], k] = 0.0  # a negative number that rounding makes a whole period
+    return out
+
+
+def crossed(position: Floats, shear: Shear) -> Floats:
+    """How many sheared boundaries (n,) lie between positions (n, 3) and the cell."""
+    place = position[:, shear.axis]
+    number = np.floor(place / shear.length)
+    return number + (place - shear.length * number >= shear.length)  # a negative number that rounding makes a period
+
+
+def velocity_in_cell(position: Floats, velocity: Floats, shear: Shear | None) -> Floats:
+    """Velocities (n, 6) that grains at these positions (n, 3) have where they are put back into the cell."""
+    if shear is None:
+        return velocity
+    out = velocity.copy()
+    out[:, 0] -= crossed(position, shear) * shear.speed
     return out
 
 
@@ -46,7 +64,8 @@ def put_back(world: World) -> None:
     period, position = world.period, world.grains.position
     outside = np.maximum(-position, position - period) > 0.25 * period
     if world.comm.allreduce(bool((outside & np.isfinite(period)).any()), MPI.LOR):
-        world.grains.position = wrapped(position, period)
+        world.grains.velocity = velocity_in_cell(position, world.grains.velocity, world.shear)
+        world.grains.position = wrapped(position, period, world.shear)
         world.lists, world.applied = None, {}
 
 
@@ -86,6 +105,11 @@ class Images:
     source: Ints  #: (images,) rows of the grains and ghosts in the table of the neighbourhood
     way: Floats  #: (images, 3) by which they are moved [m]
     base: int  #: number of grains and ghosts
+    across: Floats  #: (images,) number of sheared boundaries between them and their grains
+
+    def moved_on(self, shift: float) -> Images:
+        """The same when those behind a sheared boundary are moved along x by so much more [m]."""
+        return self if shift == 0.0 else replace(self, way=self.way + np.outer(shift * self.across, (1.0, 0.0, 0.0)))
 
     @cached_property
     def rows(self) -> Ints:
@@ -110,6 +134,12 @@ class Images:
         out = np.where(row >= last, row - len(self.source), row)
         out[image] = self.source[row[image] - self.base]
         return out, way
+
+    def boundaries(self, row: Ints) -> Floats:
+        """Numbers (nc,) of sheared boundaries between bodies in rows of the table with images and the cell."""
+        out, image = np.zeros(len(row)), np.flatnonzero((row >= self.base) & (row < len(self.rows)))
+        out[image] = self.across[row[image] - self.base]
+        return out
 
     def own(self, grains: int) -> Bools:
         """Mask (ghosts and images,) of the images of local grains, in a neighbourhood of so many local grains."""
@@ -146,15 +176,16 @@ def images(world: World, near: Neighbourhood) -> Images:
     radius = bodies.enclosing_radius(near.bodies.shape[:count], near.bodies.size[:count]) + near.margin
     own = chunk_boxes(position[: near.grains], radius[: near.grains], 8)
     large = _boxes(world)
-    source, moved = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
-    for way in image_ways(world.period):
+    source, moved, across = [np.zeros(0, np.int64)], [np.zeros((0, 3))], [np.zeros(0)]
+    for way, boundaries in zip(*image_ways(world.period, world.shear)):
         rows = touched(position + way, radius, own[None])[0]
         if len(large):
             of_large = touched(position[: near.grains] + way, radius[: near.grains], large[None])[0]
             rows = np.union1d(rows, of_large)
         source.append(rows)
         moved.append(np.tile(way, (len(rows), 1)))
-    return Images(np.concatenate(source), np.concatenate(moved), count)
+        across.append(np.full(len(rows), boundaries))
+    return Images(np.concatenate(source), np.concatenate(moved), count, np.concatenate(across))
 
 
 def between(pairs: Ints, near: Neighbourhood) -> Ints:

@@ -13,6 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
+from dem.applied import slots
 from dem.arrays import ArrayLike, Bools, Floats
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
@@ -76,7 +77,9 @@ def passages(world: World) -> dict[str, float]:
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
-    place, lost = wrapped(step.world.grains.position, step.world.period), np.zeros(len(step.world.grains), bool)
+    world = step.world
+    place = wrapped(world.grains.position, world.period, world.shear)
+    lost = np.zeros(len(world.grains), bool)
     for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high))):
         lost |= (place[:, axis] < least) | (place[:, axis] > most)
     return step.total(lost)
@@ -128,7 +131,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     impulses do the work g' D' w. Its tangential part is the friction loss. Its normal part goes to the springs of
     contacts, and the rest is lost in impacts, or pushes overlaps of rigid contacts apart where it is a gain. The work
     of motions is that of prescribed bodies on the others, of the drives of guided and hinged bodies, of what holds
-    bodies in part, of belts, loads and springs. The rest is the error of the semi-implicit step, of the order of dt:
+    bodies in part, of belts, loads, springs and the shear of a
+    cell. The rest is the error of the semi-implicit step, of the order of dt:
     -dt/2 m g (v_new - v_old) per body.
 
     Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be. Where
@@ -164,7 +168,11 @@ def energy_balance(step: Step) -> dict[str, float]:
     belts = 0.0
     if system.surface is not None:
         belts = comm.allreduce(-np.vdot(step.impulse[:, 1:], system.surface))
+    if system.drift is not None:
+        loads += comm.allreduce(-np.vdot(step.impulse, system.drift))
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
+    joints, joints_at_end = _joint_works(step, before[0].velocity, mean)
+    holding += joints
     driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + loads + belts + holding
     work = driving - received
     still = sums(*(_still(table, world.gravity, system.dt) for table in after))
@@ -176,7 +184,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     change, held = whole[2] + whole[3] - whole[0] - whole[1], whole[7] - whole[6]
     rise, fallen, released = whole[2] - whole[0], whole[1] - whole[3], max(-held, 0.0)
     there = whole[0] + whole[8] + whole[9]
-    pulled = 2.0 * max(whole[10], 0.0)  # with the velocity of the end, for bodies that were at rest
+    # with the velocity of the end, for bodies that were at rest
+    pulled = 2.0 * max(whole[10], 0.0) + max(joints_at_end - joints, 0.0)
     created = rise - fallen - work - released - pulled > CREATED * (there + whole[6] + abs(work))
     driven = max(fallen, 0.0) + max(driving, 0.0) + pulled + released * (whole[9] == 0.0)
     jumps = rise > 0.0 and (created or whole[2] - driven > SUDDEN * there + CREATED * driven)
@@ -215,6 +224,22 @@ def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
             held = np.eye(3) - body.motion.free_directions(), np.eye(3) - body.motion.free_turns()
             work += float(mean[row, :3] @ held[0] @ push[:3] + mean[row, 3:] @ held[1] @ push[3:])
     return work
+
+
+def _joint_works(step: Step, before: Floats, mean: Floats) -> tuple[float, float]:
+    """The work [J] of joints and their motors on the bodies that forces move, on the mean velocities of the step and on
+    those of its end: velocities (grains, 6) of this rank's grains before the step, and means (large, 6) of those before
+    and after; collective."""
+    system, world = step.system, step.world
+    if system.joints is None:
+        return 0.0, 0.0
+    push = np.einsum("k,knx->nx", step.joint_impulses, system.joints.rows)
+    here, slot = slots(world, world.grains.id)
+    velocity = world.grains.velocity[here]
+    works = np.array([0.5 * np.vdot(push[slot], before[here] + velocity), np.vdot(push[slot], velocity)])
+    world.comm.Allreduce(MPI.IN_PLACE, works)
+    of_large = push[len(push) - 1 - len(world.large) : -1] * bodies.is_dynamic(world.large)[:, None]
+    return float(works[0] + np.vdot(of_large, mean)), float(works[1] + np.vdot(of_large, world.large.velocity))
 
 
 def _carried(step: Step, prescribed: Bools) -> float:

@@ -20,6 +20,7 @@ from dem import bodies, checks, clumps, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.bodies import BOX, CAPSULE, CLUMP, COMPOUND, PLANE, SPHERE, Bodies
 from dem.clumps import Form
+from dem.joints import Joint
 from dem.loads import Law, Load, On
 from dem.measures import Block, Cylinder
 from dem.mesh import Mesh
@@ -72,15 +73,24 @@ class Scene:
         rolling: float = 0.0,
         spinning: float = 0.0,
         period: Sequence[float | None] | None = None,
+        shear_rate: float | None = None,
+        shear_gradient: str = "y",
     ) -> None:
         """`gravity`: (3,) [m/s^2]. The others are coefficients of the contacts of all pairs of materials, but of those
         of `set_pair`: `friction`, `stiffness` [N/m] (inf: rigid; None: `dem.stiffness.recommended`), `restitution`, the
         attractive force `cohesion` [N] up to a gap of `cohesion_range` [m], and the greatest moments against `rolling`
         and `spinning`, over the normal force [m]. See `dem.pairs` and docs/contact_laws.md.
         `period`: (3,) lengths of the cell, from zero on, that repeats itself along x, y, z [m], None: not along that
-        axis; see docs/periodic.md.
+        axis. `shear_rate`: d v_x / dy of the cell, or d v_x / dz for the `shear_gradient` "z" [1/s]; None: it is at
+        rest. See docs/periodic.md.
         """
         self.period = checks.period(period)
+        self.shear_rate = None if shear_rate is None else float(checks.finite("shear_rate", shear_rate))
+        if shear_gradient not in ("y", "z"):
+            raise ValueError(f"shear_gradient must be 'y' or 'z', got {shear_gradient!r}")
+        self.gradient = "xyz".index(shear_gradient)
+        if shear_rate is not None and (self.period is None or np.isinf(self.period[[0, self.gradient]]).any()):
+            raise ValueError(f"shear_rate needs periods along x and {shear_gradient}")
         self.gravity = checks.vector("gravity", gravity)
         self.large_bodies: list[LargeBody] = []
         #: Names of large bodies that go away from the grains: their speed asks for no stiffness.
@@ -99,6 +109,7 @@ class Scene:
         self.springs: dict[str, Spring] = {}  #: by name
         self.sources: dict[str, Source] = {}  #: by name
         self.outlets: dict[str, Outlet] = {}  #: by name
+        self.joints: dict[str, Joint] = {}  #: by name
 
     def add_spheres(
         self,
@@ -277,13 +288,52 @@ class Scene:
         if not name or name in self.springs:
             raise ValueError(f"springs need distinct names, got {name!r}")
         spring = Spring((one, other), (anchor, other_anchor), stiffness, damping, 0.0 if length is None else length)
-        poses = [self._pose(name, end) for end in spring.ends]
+        poses = [self._pose(f"spring {name!r}", end) for end in spring.ends]
         places = [place + quaternion.rotate(turn, np.array(at)) for (place, turn), at in zip(poses, spring.anchors)]
         rest = float(np.linalg.norm(places[1] - places[0])) if length is None else length
         self.springs[name] = replace(spring, length=rest)
 
-    def _pose(self, name: str, end: End) -> tuple[Floats, Floats]:
-        """Position (3,) and quaternion (4,) of the end of a spring at time zero; ValueError if there is none."""
+    def add_joint(
+        self,
+        name: str,
+        one: End,
+        other: End = None,
+        *,
+        kind: str = "hinge",
+        anchor: Sequence[float],
+        axis: Sequence[float] = (0.0, 0.0, 1.0),
+        speed: float | None = None,
+        target: float | None = None,
+        strength: float = np.inf,
+        limits: Sequence[float] = (-np.inf, np.inf),
+    ) -> None:
+        """Join two bodies, or a body and the world (None), by a "hinge", "slider", "ball" or "fixed" joint, see
+        `dem.joints`.
+
+        A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,) are in the
+        world at time zero, where angle and position are zero; they are those of `other` relative to `one`. A motor
+        keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a torque or force of at most `strength`
+        [N m, N]; inf: as much as it takes. `limits` (2,): least and greatest angle [rad] or position [m].
+        """
+        if not name or name in self.joints:
+            raise ValueError(f"joints need distinct names, got {name!r}")
+        place = checks.vector(f"anchor of {name!r}", anchor)
+        z = checks.unit_vector(f"axis of {name!r}", axis)
+        x = across(np.array(z)[None])[0]
+        upright = quaternion.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
+        anchors, frames = [], []
+        for position, turn in (self._pose(f"joint {name!r}", end) for end in (one, other)):
+            back = quaternion.conjugate(turn)
+            anchors.append(tuple(quaternion.rotate(back, place - position).tolist()))
+            frames.append(tuple(quaternion.multiply(back, upright).tolist()))
+        for body in self.large_bodies:
+            if body.name in (one, other) and isinstance(body.motion, Driven):
+                raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
+        low, high = map(float, limits)
+        self.joints[name] = Joint(kind, (one, other), anchors, frames, speed, target, float(strength), low, high)
+
+    def _pose(self, what: str, end: End) -> tuple[Floats, Floats]:
+        """Position (3,) and quaternion (4,) of an end of a spring or joint at time 0; ValueError if there is none."""
         if end is None:
             return np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
         if isinstance(end, str):
@@ -293,7 +343,7 @@ class Scene:
             tables = self.parts
             rows = np.array([end]) if 0 <= end < sum(map(len, tables)) else np.zeros(0, np.int64)
         if not len(rows):
-            raise ValueError(f"spring {name!r}: there is no body or grain {end!r} yet")
+            raise ValueError(f"{what}: there is no body or grain {end!r} yet")
         table = bodies.concatenate(tables).take(rows)
         return table.position[0], table.quaternion[0]
 
@@ -518,8 +568,13 @@ def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
                 f"period of {period[k]:g} m along {'xyz'[k]} is too short: a grain could meet another one on both its "
                 f"sides, or its own image; allowed is more than two greatest diameters, {4.0 * radius:g} m"
             )
-    if scene.springs:
-        raise ValueError(f"spring {next(iter(scene.springs))!r}: springs have no images, so periods allow none")
+    if scene.shear_rate is not None and scene.large_bodies:
+        raise ValueError(f"large body {scene.large_bodies[0].name!r}: a sheared cell has grains alone")
+    if scene.shear_rate is not None and (scene.sources or scene.outlets):
+        name = next(iter({**scene.sources, **scene.outlets}))
+        raise ValueError(f"{name!r}: a sheared cell has no sources and outlets")
+    for name in (*scene.springs, *scene.joints):
+        raise ValueError(f"{name!r}: springs and joints have no images, so periods allow none")
     for body in scene.large_bodies:
         for shape in body.shapes:
             kind, center, turn, size = shapes.placed(shape)

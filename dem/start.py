@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -16,11 +16,11 @@ from dem.clumps import Form
 from dem.contact import find_contacts
 from dem.exchange import exchange, refuse
 from dem.partition import redistribute
-from dem.period import put_back, wrapped
+from dem.period import put_back, velocity_in_cell, wrapped
 from dem.scene import Scene
 from dem.sources import Tally, from_array
 from dem.step import follow_motions
-from dem.world import World, refuse_load
+from dem.world import Shear, World, refuse_load
 
 
 def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
@@ -30,7 +30,8 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     grains overlap each other or a large body by more than `overlap` radii; SceneError if a motion fails.
     """
     grains = scene.grains()
-    grains.position = wrapped(grains.position, scene.period)
+    grains.velocity = velocity_in_cell(grains.position, grains.velocity, _shear(scene))
+    grains.position = wrapped(grains.position, scene.period, _shear(scene))
     world = _world(scene, comm, grains.take(even_slice(len(grains), comm)))
     follow_motions(world)
     put_back(world)
@@ -69,6 +70,10 @@ def restored_world(
     world.time, world.step = float(replicated["time"]), int(replicated["step"])
     expected = np.array(replicated["expected"]) if "expected" in replicated else None
     world.expected = expected if expected is not None and expected.shape == (len(world.springs), 2, 6) else None
+    if world.shear is not None:
+        rate, shift = np.array(replicated.get("shear", (0.0, np.nan)), float)
+        refuse(comm, "" if np.isfinite([rate, shift]).all() else "the state has no shear of the cell, as the scene has")
+        world.shear = replace(world.shear, rate=float(rate), shift=float(shift))
     _refuse_impossible(world)
     if len(replicated["slabs"]) != comm.size + 1:
         redistribute(world)
@@ -123,6 +128,13 @@ def even_slice(count: int, comm: MPI.Comm) -> slice:
     return slice(count * comm.rank // comm.size, count * (comm.rank + 1) // comm.size)
 
 
+def _shear(scene: Scene) -> Shear | None:
+    """The shear of the cell at time zero."""
+    if scene.shear_rate is None or scene.period is None:
+        return None
+    return Shear(scene.shear_rate, scene.gradient, float(scene.period[scene.gradient]))
+
+
 def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
@@ -134,6 +146,10 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     tied = [name for name, spring in world.springs.items() if any(isinstance(end, int) for end in spring.ends)]
     if tied and world.outlets:
         raise ValueError(f"spring {tied[0]!r} holds a grain: scenes with outlets allow springs of large bodies alone")
+    world.shear = _shear(scene)
+    world.joints = dict(scene.joints)
+    if world.joints and pairs.resists:
+        raise ValueError("joints cannot be in a scene whose contacts resist rolling or spinning")
     for name, load in world.loads.items():
         refuse_load(world, name, load)
     return world

@@ -18,10 +18,10 @@ from dem.applied import applied_impulses
 from dem.arrays import ArrayLike, Bools, Floats, Ints, places
 from dem.bodies import SPHERE, Bodies
 from dem.cohesion import along_normal
-from dem.contact import Contacts, contact_order, find_contacts, goes_beyond, ways
+from dem.contact import Contacts, contact_order, find_contacts, goes_beyond, image_way, ways
 from dem.contact_map.loops import relative_velocities
 from dem.measures import Sample
-from dem.period import wrapped
+from dem.period import velocity_in_cell, wrapped
 from dem.system import ContactSystem, contact_arms, contact_frames, gap_velocities
 from dem.together import meet
 from dem.world import World
@@ -51,6 +51,11 @@ class Step:
             raise KeyError(f"no spring {name!r}; there are: {', '.join(names) or 'none'}")
         force: Floats = self.system.applied.springs[names.index(name)] / self.system.dt
         return force
+
+    @cached_property
+    def joint_impulses(self) -> Floats:
+        """`ContactSystem.joint_impulses` of this step; collective at its first use."""
+        return self.system.joint_impulses(self.impulse)
 
     def position(self, name: str) -> Floats:
         """Position (3,) of a large body [m]."""
@@ -89,17 +94,18 @@ class Step:
         point, center = contacts.point, near.position[pair]
         if contacts.moved is not None:
             center[:, 1] += contacts.moved
-            point = wrapped(point, self.world.period)
+            point = wrapped(point, self.world.period, self.world.shear)
             center += (point - contacts.point)[:, None]
         number, first, count = near.id[pair], self.world.first_large, self.world.ids
-        names = ("id", "velocity", "mass", "shape", "size", "material")
+        names = ("id", "mass", "shape", "size", "material")
         return Sample(
             comm=self.world.comm,
             count=count,
             **{name: getattr(grains, name) for name in names},
             materials=self.world.materials,
             bodies=np.where(number < first, number, number - first + count),
-            position=wrapped(grains.position, self.world.period),
+            velocity=velocity_in_cell(grains.position, grains.velocity, self.world.shear),
+            position=wrapped(grains.position, self.world.period, self.world.shear),
             center=center,
             point=point,
             normal=contacts.normal,
@@ -126,6 +132,8 @@ def advance(world: World, velocity: Floats, dt: float, moving: Floats | None = N
     _move(world.large, large_velocity, large_moving, dt)
     if world.springs:
         world.expected = applied_impulses(world, dt).expected
+    if world.shear is not None:
+        world.shear = world.shear.after(dt)
     world.time += dt
     world.step += 1
     follow_motions(world)
@@ -163,6 +171,8 @@ def find_overrun(
     """
     seen = contacts.near.margin[: contacts.near.grains]
     way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
+    if world.shear is not None:
+        way = way + image_way(world, dt)
     large = world.large_velocity(velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
     gone = bool((way > seen).any()), goes_beyond(world, dt * large, contacts.shifts, delta)
@@ -189,7 +199,8 @@ def _opening(contacts: Contacts, position: Floats, velocity: Floats) -> Floats:
     arm = contact_arms(contacts.point, position, row)
     if contacts.moved is not None:
         arm[:, 3:] -= contacts.moved
-    return relative_velocities(contact_frames(contacts.normal).reshape(-1, 9), arm, row, velocity)[:, 0]
+    opening: Floats = relative_velocities(contact_frames(contacts.normal).reshape(-1, 9), arm, row, velocity)[:, 0]
+    return opening if contacts.drift is None else opening + np.einsum("ci,ci->c", contacts.normal, contacts.drift)
 
 
 def find_turned(
@@ -232,6 +243,8 @@ def _at_start(end: Contacts, dt: float) -> tuple[Contacts, Floats]:
     """The contacts of the end of a step as contacts of its start, and by how much (nc,) their gaps grow in it [m]."""
     velocity = end.near.bodies.velocity
     start = replace(end, point=end.point - 0.5 * dt * (velocity[end.a, :3] + velocity[end.b, :3]))
+    if end.drift is not None and end.moved is not None:
+        start = replace(start, point=start.point - 0.5 * dt * end.drift, moved=end.moved - dt * end.drift)
     growth = dt * _opening(start, end.near.bodies.position - dt * velocity[:, :3], velocity)
     return replace(start, gap=end.gap - growth), growth
 

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, loads, quaternion, springs
+from dem import bodies, checks, joints, loads, quaternion, springs
 from dem import motion as motions
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.clumps import Form
+from dem.joints import Joint
 from dem.loads import Load, On
 from dem.motion import Dynamic, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
 from dem.pairs import Pairs
@@ -25,6 +26,25 @@ from dem.scene import LargeBody, SurfaceVelocity, checked_surface
 from dem.sources import Outlet, Source, Tally, as_array
 from dem.springs import Spring
 from dem.together import together
+
+
+@dataclass(frozen=True)
+class Shear:
+    """A simple shear of a periodic cell (Lees and Edwards 1972): flow along x, with its gradient along y or z."""
+
+    rate: float  #: d v_x / d y or z [1/s]
+    axis: int  #: of the gradient: 1 or 2
+    length: float  #: the period along it [m]
+    shift: float = 0.0  #: by how much the images behind that period are moved along x so far [m]
+
+    @property
+    def speed(self) -> float:
+        """Velocity along x of the images behind the period, relative to their grains [m/s]."""
+        return self.rate * self.length
+
+    def after(self, dt: float) -> Shear:
+        """dt [s] later."""
+        return dataclasses.replace(self, shift=self.shift + dt * self.speed)
 
 
 @dataclass
@@ -45,6 +65,7 @@ class World:
     large: Bodies  #: one row per large body
     loads: dict[str, Load] = field(default_factory=dict)  #: by name; change them by `set_load` only
     springs: dict[str, Spring] = field(default_factory=dict)  #: by name; change them by `set_spring` only
+    joints: dict[str, Joint] = field(default_factory=dict)  #: by name; change them by `set_joint` only
     period: Floats | None = None  #: (3,) lengths of the cell that repeats itself, inf: none; None: along no axis [m]
     sources: dict[str, Source] = field(default_factory=dict)  #: by name
     outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
@@ -52,6 +73,7 @@ class World:
     clumps: tuple[Form, ...] = ()  #: shapes of grains, by their numbers
     initial: int = 0  #: number of grains at time zero
     first_large: int = 0  #: id of the first large body
+    shear: Shear | None = None  #: of the cell
     time: float = 0.0  #: [s]
     step: int = 0  #: number of steps done
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
@@ -62,6 +84,8 @@ class World:
     loads_set: set[str] = field(init=False, default_factory=set)  #: loads with other numbers than the scene gave
 
     springs_set: set[str] = field(init=False, default_factory=set)  #: springs with other numbers than the scene gave
+
+    joints_set: set[str] = field(init=False, default_factory=set)  #: joints with other numbers than the scene gave
 
     lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
 
@@ -87,6 +111,8 @@ class World:
             replicated["expected"] = self.expected
         if self.tallies:
             replicated["tallies"] = as_array(self.tallies)
+        if self.shear is not None:
+            replicated["shear"] = np.array([self.shear.rate, self.shear.shift])
         return self.grains.columns(), replicated
 
     def set_grains(self, grains: Bodies) -> None:
@@ -208,6 +234,13 @@ def _ways(motion: Any) -> Floats:
     return np.array([motion.free_directions(), motion.free_turns()])
 
 
+def set_shear_rate(world: World, rate: float) -> None:
+    """Shear the cell at another rate [1/s] from now on. ValueError if the scene has no `shear_rate`."""
+    if world.shear is None:
+        raise ValueError("shear rate: the cell of this scene is not sheared; give the Scene a shear_rate, or 0")
+    world.shear = dataclasses.replace(world.shear, rate=float(checks.finite("shear rate", rate)))
+
+
 def set_load(world: World, name: str, on: On = None, **values: Any) -> None:
     """Give a load other numbers: `force`, `torque`, `start` or `end`; a name that no load has begins one `on` some
     bodies, all grains if nothing is given. ValueError for what it cannot be."""
@@ -240,6 +273,21 @@ def set_spring(world: World, name: str, **values: Any) -> None:
     world.springs[name] = dataclasses.replace(world.springs[name], **values)
     world.springs_set.add(name)
     world.applied = {}
+
+
+def set_joint(world: World, name: str, **values: Any) -> None:
+    """Give a joint another `speed`, `target`, `strength`, `low` or `high`. ValueError for what it cannot have."""
+    if name not in world.joints:
+        raise ValueError(f"no joint {name!r}; there are: {', '.join(world.joints) or 'none'}")
+    world.joints[name] = world.joints[name].changed(**values)
+    world.joints_set.add(name)
+
+
+def restore_joints(world: World, text: str) -> None:
+    """Give a world, made from its scene, the joints of `dem.joints.as_text`."""
+    for name, joint in joints.from_text(text).items():
+        world.joints[name] = joint
+        world.joints_set.add(name)
 
 
 def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> Pose:

@@ -21,7 +21,7 @@ from dem import measures
 from dem.arrays import Floats
 from dem.measures import Fields, Sample
 from dem.mesh import Mesh
-from pctt.disk import make_hdf5, told, whole
+from pctt.disk import hdf5, whole
 from pctt.folder import Folder
 
 
@@ -81,16 +81,14 @@ def write_fields(path: str | Path, fields: Fields) -> None:
     cannot be written. One rank writes."""
     path, shape = Path(path), np.array(fields.density.shape)
     columns = {name: value for name, value in fields._asdict().items() if name not in ("low", "spacing")}
-    with told(path), whole(path) as temporary:
-        make_hdf5(temporary, sum(value.nbytes for value in columns.values()), items=20)
-        with h5py.File(temporary, "r+") as file:
-            root = file.create_group("VTKHDF")
-            root.attrs["Version"] = np.array([1, 0])
-            root.attrs.create("Type", b"ImageData", dtype=h5py.string_dtype("ascii", len("ImageData")))
-            root.attrs["WholeExtent"] = np.stack([np.zeros(3, np.int64), shape], axis=1).ravel()
-            root.attrs["Origin"], root.attrs["Spacing"] = fields.low, fields.spacing
-            root.attrs["Direction"] = np.eye(3).ravel()
-            cells = root.create_group("CellData")
-            for name, value in columns.items():  # x is the fastest, and the components of a cell are together
-                table = value.reshape(*shape, -1).transpose(2, 1, 0, 3)
-                cells[name] = table[..., 0] if value.ndim == 3 else table
+    with whole(path) as temporary, hdf5(temporary) as file:
+        root = file.create_group("VTKHDF")
+        root.attrs["Version"] = np.array([1, 0])
+        root.attrs.create("Type", b"ImageData", dtype=h5py.string_dtype("ascii", len("ImageData")))
+        root.attrs["WholeExtent"] = np.stack([np.zeros(3, np.int64), shape], axis=1).ravel()
+        root.attrs["Origin"], root.attrs["Spacing"] = fields.low, fields.spacing
+        root.attrs["Direction"] = np.eye(3).ravel()
+        cells = root.create_group("CellData")
+        for name, value in columns.items():  # x is the fastest, and the components of a cell are together
+            table = value.reshape(*shape, -1).transpose(2, 1, 0, 3)
+            cells[name] = table[..., 0] if value.ndim == 3 else table

@@ -19,12 +19,10 @@ from dem.contact_map import BlockRows, ContactMap
 from dem.exchange import exchange, offsets
 from pctt.blocks import Array, new_matrix, set_diagonal_blocks, symmetric_shell
 
-ROUNDING = 1e-14  # part of the trace that is added to blocks which rounding may have made singular
-
 
 def inverse_blocks(blocks: Array) -> Array:
     """The inverses of positive definite blocks (nc, 3, 3), also of those that rounding has made singular."""
-    floor = ROUNDING * np.trace(blocks, axis1=1, axis2=2)
+    floor = 1e-14 * np.trace(blocks, axis1=1, axis2=2)  # some tens of roundings of the largest entry
     return np.linalg.inv(blocks + floor[:, None, None] * np.eye(3))
 
 

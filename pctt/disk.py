@@ -3,13 +3,11 @@ spread over the ranks, with a checksum each."""
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import io
 import os
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,51 +16,15 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import exchange
-from pctt.options import OptionError
 
 Found = TypeVar("Found")
 
-#: Bytes for HDF5 beside the numbers: per file, and per data set or attribute. HDF5 was seen to use a quarter of them.
-PER_FILE, PER_ITEM = 16384, 2048
-
-#: What file systems and sandboxes answer that cannot reserve room. EBADF: glibc has tried to read the file instead.
-CANNOT_RESERVE = (errno.EINVAL, errno.EOPNOTSUPP, errno.EBADF, errno.ENOSYS, errno.EPERM)
-
-#: The last bytes of a file of `written` are this word and its checksum. HDF5 does not see them.
+#: The last bytes of a file of `write_rows` are this word and its checksum. HDF5 does not see them.
 SEAL = b"pctt sum"
 
 
 class FileError(RuntimeError):
     """A file that cannot be read or written; raised on all ranks alike."""
-
-
-def temporary_name(path: Path) -> Path:
-    """The name under which a file is written until it is complete."""
-    return path.with_name(f".{path.name}.tmp")
-
-
-@contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """A temporary name for a file. When the block ends, the file is flushed to the disk and replaces ``path``.
-
-    If the block or the disk raises an error, the old file stays as it was, and the temporary file is removed. OSError
-    if ``path`` is a device, a pipe or a folder: no file may take its place.
-    """
-    temporary = temporary_name(path)
-    if path.exists() and not path.is_file():
-        raise OSError("it is no regular file")
-    try:
-        yield temporary
-        _replace(path)
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
-
-
-def _replace(path: Path) -> None:
-    temporary = temporary_name(path)
-    flush(temporary)
-    os.replace(temporary, path)
 
 
 @contextmanager
@@ -74,9 +36,29 @@ def told(path: Path) -> Iterator[None]:
         raise FileError(f"{path}: cannot write ({error.strerror or error})") from error
 
 
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A temporary name for a file. When the block ends, the file is flushed to the disk and replaces ``path``.
+
+    FileError if the block or the disk raises OSError, or if ``path`` is a device, a pipe or a folder: no file may take
+    its place. After an error of any kind the old file is as it was, and the temporary file is removed.
+    """
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with told(path):
+            if path.exists() and not path.is_file():
+                raise OSError("it is no regular file")
+            yield temporary
+            flush(temporary)
+            os.replace(temporary, path)
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
 def write_text(path: Path, text: str) -> None:
     """Replace a text file at one stroke; FileError if that fails."""
-    with told(path), whole(path) as temporary:
+    with whole(path) as temporary:
         temporary.write_text(text)
 
 
@@ -146,20 +128,6 @@ def on_first(comm: MPI.Comm, path: Path, call: Callable[[], Found]) -> Found:
     return exchange.on_first(comm, told(path)(call))
 
 
-def make_hdf5(path: Path, numbers: int, items: int) -> None:
-    """Make an empty HDF5 file and reserve room on the disk for ``numbers`` bytes in ``items`` data sets and attributes.
-
-    The room stays reserved until the file, opened with "r+", is closed. Raises OSError if there is not enough room,
-    also because of a quota or a limit of the process. This is done first because HDF5 does not recover if the disk is
-    full when it closes a file: with 1.10 several ranks wait for each other for ever, and one rank crashes at its end.
-    """
-    size = numbers + PER_FILE + items * PER_ITEM
-    _take_room(path, size)  # before HDF5 writes its first bytes
-    with hdf5(path, "w"):  # this gives the room back
-        pass
-    _take_room(path, size)
-
-
 class _Bytes(io.FileIO):
     """A file whose ``error``, the first one, is kept from HDF5: with one that cannot be written this is lost."""
 
@@ -186,12 +154,12 @@ class _Bytes(io.FileIO):
 
 
 @contextmanager
-def hdf5(path: Path, mode: str = "r+") -> Iterator[h5py.File]:
-    """An HDF5 file that this rank alone writes; "r+": one of `make_hdf5`, "w": a new one. OSError if it cannot be
-    written, where HDF5 itself would end the program with a segmentation fault."""
-    with _Bytes(path, "w+" if mode == "w" else mode) as data:
+def hdf5(path: Path) -> Iterator[h5py.File]:
+    """A new HDF5 file that this rank alone writes. OSError if it cannot be written, where HDF5 itself would end the
+    program with a segmentation fault."""
+    with _Bytes(path, "w+") as data:
         try:
-            with h5py.File(data, mode) as file:
+            with h5py.File(data, "w") as file:
                 yield file
         except (OSError, RuntimeError) as error:  # h5py raises both
             raise data.error or error from None
@@ -199,24 +167,7 @@ def hdf5(path: Path, mode: str = "r+") -> Iterator[h5py.File]:
             raise data.error
 
 
-def _take_room(path: Path, size: int) -> None:
-    if not hasattr(os, "posix_fallocate"):  # macOS
-        return
-    with open(path, "ab") as file:
-        try:
-            os.posix_fallocate(file.fileno(), 0, size)
-        except OSError as error:
-            if error.errno not in CANNOT_RESERVE:
-                raise
-
-
 # -- rows of all ranks ---------------------------------------------------------------------------------------
-
-
-def refuse_serial(comm: MPI.Comm) -> None:
-    """OptionError if h5py cannot write from all ranks."""
-    if comm.size > 1 and not h5py.get_config().mpi:
-        raise OptionError(f"mpiexec -n {comm.size}: this h5py was built without MPI; allowed is 1 rank")
 
 
 def checksum(path: Path, size: int, comm: MPI.Comm) -> int:
@@ -249,64 +200,52 @@ def write_rows(
     """Write an HDF5 file with its checksum; collective. Data sets of ``rows`` are concatenated over the ranks, those
     that are ``shared`` and the attributes of groups ("/": the file) are the same on each.
 
-    Raises FileError on all ranks if the file cannot be written; an earlier file under ``path`` then stays as it is. If
-    one of several ranks fails while all are writing, it prints a message and ends them all.
+    Raises FileError on all ranks if the file cannot be written; an earlier file under ``path`` then stays as it is. The
+    first rank makes the file, and then every rank writes its rows into their places, without HDF5. So this needs no
+    parallel HDF5, some releases of which wait for ever if one rank finds the disk full.
     """
-    what, temporary, first = f"{path}: cannot write", temporary_name(path), comm.rank == 0
-    own = comm.allreduce(sum(array.nbytes for array in rows.values()))
-    same = [np.asarray(value) for values in (shared, *attributes.values()) for value in values.values()]
-    numbers, items = own + sum(array.nbytes for array in same), len(rows) + len(same)
+    ends = np.cumsum(comm.allgather([len(local) for local in rows.values()]), axis=0)
+    tables = [(name, (int(end), *rows[name].shape[1:]), rows[name].dtype) for name, end in zip(rows, ends[-1])]
 
-    def alone() -> None:
+    def lay_out() -> tuple[Path, list[int | None]]:
+        temporary = first.enter_context(whole(path))
         with hdf5(temporary) as file:
-            _fill(file, comm, rows, shared, attributes)
+            places = [_room(file, *table) for table in tables]
+            for name, value in shared.items():
+                file[name] = np.asarray(value)
+            for name, values in attributes.items():
+                file.require_group(name).attrs.update(values)
+        return temporary, places
 
-    try:
-        _together(what, comm, lambda: make_hdf5(temporary, numbers, items) if first else None)
-        if comm.size == 1:
-            _together(what, comm, alone)
-        else:
-            file = _together(what, comm, lambda: h5py.File(temporary, "r+", driver="mpio", comm=comm))
-            try:
-                _fill(file, comm, rows, shared, attributes)
-                file.close()
-            except (OSError, RuntimeError) as error:  # h5py raises both
-                # the other ranks may be within a call that waits for this one
-                sys.stderr.write(f"pctt.run: {what} ({error})\n")
-                sys.stderr.flush()
-                comm.Abort(2)
-        size = comm.bcast(os.path.getsize(temporary) if first else 0)
-        seal = SEAL + checksum(temporary, size, comm).to_bytes(8, "little")
-        _together(what, comm, lambda: _finish(path, seal) if first else None)
-    finally:
-        if first:
-            with suppress(OSError):
-                temporary.unlink()
+    def fill() -> int:
+        with open(temporary, "r+b") as file:
+            for local, place, end in zip(rows.values(), places, ends[comm.rank]):
+                if place is not None:
+                    file.seek(place + local[:1].nbytes * (int(end) - len(local)))
+                    file.write(local.tobytes())
+            file.flush()
+            os.fsync(file.fileno())
+            return os.path.getsize(temporary)
 
+    def finish() -> None:
+        with open(temporary, "ab") as file:
+            file.write(SEAL + total.to_bytes(8, "little"))
+        first.close()
 
-def _fill(
-    file: h5py.File, comm: MPI.Comm, rows: Mapping[str, np.ndarray], shared: Mapping[str, Any],
-    attributes: Mapping[str, Mapping[str, Any]],
-) -> None:  # fmt: skip
-    for name, local in rows.items():
-        ends = np.cumsum(comm.allgather(len(local)))
-        data = file.create_dataset(name, (int(ends[-1]), *local.shape[1:]), local.dtype)
-        if len(local):
-            end = int(ends[comm.rank])
-            data[end - len(local) : end] = local
-    for name, value in shared.items():
-        array = np.asarray(value)
-        data = file.create_dataset(name, array.shape, array.dtype)
-        if comm.rank == 0:
-            data[...] = array
-    for name, values in attributes.items():
-        file.require_group(name).attrs.update(values)
+    with ExitStack() as first:  # what the first rank has open
+        temporary, places = on_first(comm, path, lay_out)
+        size = _together(f"{path}: cannot write", comm, fill)
+        total = checksum(temporary, comm.bcast(size), comm)
+        on_first(comm, path, finish)
 
 
-def _finish(path: Path, seal: bytes) -> None:
-    with open(temporary_name(path), "ab") as file:
-        file.write(seal)
-    _replace(path)
+def _room(file: h5py.File, name: str, shape: tuple[int, ...], dtype: np.dtype) -> int | None:
+    """Make a data set whose numbers come later; where they begin in the file, None if there are none."""
+    plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    plan.set_layout(h5py.h5d.CONTIGUOUS)
+    plan.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    plan.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    return file.create_dataset(name, shape, dtype, dcpl=plan).id.get_offset()
 
 
 def read(path: Path, comm: MPI.Comm, take: Callable[[h5py.File, bool], Found]) -> Found:

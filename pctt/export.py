@@ -22,7 +22,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.bodies import CLUMP
-from pctt.disk import FileError, hdf5, make_hdf5, told, whole, write_text
+from pctt.disk import FileError, hdf5, whole, write_text
 from pctt.folder import RUN_FILES, Folder, Frame
 from pctt.look.program import chosen, made_folder, parser, run, told_steps
 
@@ -83,20 +83,18 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
     if path.resolve().parent == frames or path.resolve() in [(folder.path / name).resolve() for name in RUN_FILES]:
         raise FileError(f"-single {path}: is a file of the run; allowed is another name")
     parts = {"bodies": folder.bodies_path, **{f"steps/{step:06d}": folder.frame_path(step) for step in steps}}
-    with told(path), whole(path) as temporary:
-        make_hdf5(temporary, sum(source.stat().st_size for source in parts.values()), items=0)
-        with hdf5(temporary) as file:
-            source = folder.path / "state.h5"
-            try:
-                if not source.exists():  # of a run that goes on, or was killed
-                    folder.derive()
-                with h5py.File(source, "r") as links:
-                    file.attrs.update({name: value for name, value in links.attrs.items() if name != "links"})
-                for name, source in parts.items():
-                    with h5py.File(source, "r") as part:
-                        file.copy(part["/"], name)
-            except (OSError, RuntimeError) as error:
-                raise FileError(f"{source}: cannot be copied ({error})") from None
+    with whole(path) as temporary, hdf5(temporary) as file:
+        source = folder.path / "state.h5"
+        try:
+            if not source.exists():  # of a run that goes on, or was killed
+                folder.derive()
+            with h5py.File(source, "r") as links:
+                file.attrs.update({name: value for name, value in links.attrs.items() if name != "links"})
+            for name, source in parts.items():
+                with h5py.File(source, "r") as part:
+                    file.copy(part["/"], name)
+        except (OSError, RuntimeError) as error:
+            raise FileError(f"{source}: cannot be copied ({error})") from None
 
 
 def series(name: str, scene: Any, frame: Frame) -> Any:
@@ -189,7 +187,7 @@ def write_vtp(path: Path, data: Any, time: float) -> None:
     writer.SetHeaderTypeToUInt64()
     writer.SetDataModeToAppended()
     writer.EncodeAppendedDataOff()
-    with told(path), whole(path) as temporary:
+    with whole(path) as temporary:
         writer.SetFileName(str(temporary))
         if writer.Write() != 1 or writer.GetErrorCode():
             raise OSError(vtkErrorCode.GetStringFromErrorCode(writer.GetErrorCode()))
@@ -229,10 +227,11 @@ def write_vtkhdf(path: Path, name: str, scene: Any, steps: list[int]) -> None:
     source = Source(nInputPorts=0, outputType="vtkPolyData")
     writer = vtkHDFWriter(write_all_time_steps=True, chunk_size=1000)
     writer.SetInputConnection(source.GetOutputPort())
-    with told(path), whole(path) as temporary:
+    with whole(path) as temporary:
         # VTK's writer tells no errors, and does not return if it cannot open the file, so the room is tried before
-        frames = [scene.folder.frame_path(step).stat().st_size for step in steps]
-        make_hdf5(temporary, 2 * sum(frames), items=200)
+        with open(temporary, "wb") as file:
+            for step in steps:
+                file.write(bytes(2 * scene.folder.frame_path(step).stat().st_size))
         writer.SetFileName(str(temporary))
         writer.Write()
         del writer  # VTK 9.4 closes the file then

@@ -32,7 +32,7 @@ from mpi4py import MPI
 
 from dem import bodies
 from pctt import disk
-from pctt.disk import FileError, told, write_text
+from pctt.disk import FileError, write_text
 
 HARD = "hard"  # folder of the cone problems that were not solved
 DERIVED = ("state.h5", "records.csv", "summary.json", "analysis.csv")
@@ -329,16 +329,13 @@ class Folder:
     def _link(self) -> None:
         """Let state.h5 lead to all recorded steps."""
         self.require_frames()
-        path = self.path / "state.h5"
-        with told(path), disk.whole(path) as temporary:
-            disk.make_hdf5(temporary, numbers=4096 + 128 * len(self.steps), items=0)
-            with disk.hdf5(temporary) as file:
-                file.attrs["scene"] = json.dumps(self._json("settings.json").get("scene", {}))
-                file.attrs["large_bodies"] = [body["name"] for body in self.large]
-                file.attrs["contents"], file.attrs["links"] = CONTENTS, LINKS
-                file["bodies"] = h5py.ExternalLink("frames/bodies.h5", "/")
-                for step in self.steps:
-                    file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
+        with disk.whole(self.path / "state.h5") as temporary, disk.hdf5(temporary) as file:
+            file.attrs["scene"] = json.dumps(self._json("settings.json").get("scene", {}))
+            file.attrs["large_bodies"] = [body["name"] for body in self.large]
+            file.attrs["contents"], file.attrs["links"] = CONTENTS, LINKS
+            file["bodies"] = h5py.ExternalLink("frames/bodies.h5", "/")
+            for step in self.steps:
+                file[f"steps/{step:06d}"] = h5py.ExternalLink(f"frames/{step:06d}.h5", "/")
 
 
 def _records(lines: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:

@@ -5,19 +5,24 @@ Defaults are in the database only while PETSc reads them, as in the options mana
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from petsc4py import PETSc
 
-from pctt.options import OptionError
+from pctt.options import OptionError, nearest, no_such_option
 from pctt.petsc import is_used
 
 #: First words of the options of PETSc's solvers; all others are read when PETSc starts or ends.
 OF_SOLVERS = (
     "ksp_", "pc_", "mat_", "vec_", "sub_", "mg_", "fieldsplit_", "compare_", "fallback_",
+)  # fmt: skip
+
+# those of the others that it reads in a run or at its end; what it has read when it starts is not `unused`
+_LATE = (
+    "is_", "sf_", "dm_", "prefix_", "log_", "options_", "info", "malloc", "memory_", "viewer_", "draw_", "citations",
+    "help", "version", "on_error", "start_in_debugger", "nox", "get_total_flops", "tmp", "shared_tmp", "not_shared_tmp",
 )  # fmt: skip
 
 #: The options of Newton systems that are typed most, for what others are taken to be misspelt.
@@ -91,12 +96,19 @@ def refuse_stray(words: Sequence[str]) -> None:
         before = word if is_option else ""
 
 
+def refuse_unknown(names: Iterable[str], known: Iterable[str]) -> None:
+    """OptionError for a name that neither the project nor PETSc knows; the message has the nearest of our names."""
+    known = set(known)
+    for name in unused(names):
+        if name not in known and not name.startswith(OF_SOLVERS + _LATE):
+            raise no_such_option(name, known)
+
+
 def refuse_misspelt(names: Iterable[str]) -> None:
     """OptionError for a name that nobody has asked for and that is nearly a common one."""
     for name in unused(names):
-        close = difflib.get_close_matches(name, COMMON, n=1, cutoff=0.85)
-        if close and name not in COMMON:
-            raise OptionError(f"-{name}: PETSc has no such option for these systems; did you mean -{close[0]}?")
+        if name not in COMMON and (meant := nearest(name, COMMON, "-", 0.85)):
+            raise OptionError(f"-{name}: PETSc has no such option for these systems{meant}")
 
 
 def remark() -> str:

@@ -154,34 +154,12 @@ def _truth(text: str) -> bool:
     raise ValueError(text)
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """The end of a message: the known name that the user may have meant."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
-    return f"; did you mean {close[0]}?" if close else ""
-
-
-# first words of the names of options that PETSc reads anew in a run or at its end; those that it reads when it starts
-# are known to `pctt.ksp_options.unused`
-_PETSC = (
-    "ksp_", "pc_", "mat_", "vec_", "sub_", "mg_", "fieldsplit_", "is_", "sf_", "dm_", "prefix_", "log_", "options_",
-    "info", "malloc", "memory_", "viewer_", "draw_", "citations", "help", "version", "on_error", "start_in_debugger",
-    "nox", "get_total_flops", "tmp", "shared_tmp", "not_shared_tmp",
-)  # fmt: skip
-
-
-def refuse_unknown(names: Iterable[str], known: Iterable[str], prefixes: Iterable[str] = ()) -> None:
-    """Raise OptionError for a name that neither the project nor PETSc knows; the message has the nearest of our names.
-
-    Names that begin with PETSc's first words, or with one of ``prefixes``, pass.
-    """
-    known = set(known)
-    for name in names:
-        if name not in known and not name.startswith((*_PETSC, *prefixes)):
-            raise no_such_option(name, known)
+def nearest(name: str, known: Iterable[str], dash: str = "", alike: float = 0.6) -> str:
+    """The end of a message: the known name that the user may have meant, if the two are ``alike`` (of `difflib`)."""
+    close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=alike)
+    return f"; did you mean {dash}{close[0]}?" if close else ""
 
 
 def no_such_option(name: str, known: Iterable[str]) -> OptionError:
     """The error for an unknown name; its message has the nearest known name."""
-    close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.5)
-    hint = f"did you mean -{close[0]}?" if close else "-help lists the options"
-    return OptionError(f"-{name}: no such option; {hint}")
+    return OptionError(f"-{name}: no such option{nearest(name, known, '-', 0.5) or '; -help lists the options'}")

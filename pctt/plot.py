@@ -7,7 +7,7 @@ from functools import partial
 
 from mpi4py import MPI
 
-from pctt.disk import FileError, told, whole
+from pctt.disk import FileError, whole
 from pctt.folder import Folder
 from pctt.look.program import made_folder, parser, run
 
@@ -32,7 +32,7 @@ def main(comm: MPI.Comm) -> None:
             raise FileError(f"{folder.path}: nothing to plot: no steps, no records, no comparison")
         for name, figure in made.items():
             path = target / f"{name}.{given.format}"
-            with told(path), whole(path) as temporary:
+            with whole(path) as temporary:
                 figure.savefig(temporary, format=given.format)
     print(f"{len(made)} figures: {target}/" + ", ".join(f"{name}.{given.format}" for name in made))
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from pctt.disk import told, whole
+from pctt.disk import whole
 from pctt.folder import Folder, Frame
 from pctt.look.program import View, checked, chosen, made_folder, parser, run, told_steps
 from pctt.options import POSITIVE, OptionError, made, refuse_bad
@@ -96,7 +96,7 @@ class Picture:
 
     def save(self, path: str | Path) -> None:
         """Write a PNG file, whole or not at all; FileError if that fails."""
-        with told(Path(path)), whole(Path(path)) as temporary:
+        with whole(Path(path)) as temporary:
             temporary.write_bytes(self._repr_png_())
 
 
@@ -159,7 +159,7 @@ def write_film(path: Path, pictures: list[Path], fps: float) -> None:
     kind: dict[str, Any] = {"quality": 7, "output_params": ["-f", "mp4"]}  # the temporary name does not end in it
     if path.suffix == ".gif":
         kind = {"codec": "gif", "pix_fmt_out": "pal8", "output_params": ["-f", "gif", *PALETTE]}
-    with told(path), whole(path) as temporary, Image.open(pictures[0]) as first:
+    with whole(path) as temporary, Image.open(pictures[0]) as first:
         writer = imageio_ffmpeg.write_frames(str(temporary), first.size, fps=fps, macro_block_size=2, **kind)
         writer.send(None)
         for picture in pictures:

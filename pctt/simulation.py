@@ -34,7 +34,7 @@ from dem.loads import Load, On
 from dem.measures import Sample
 from dem.mesh import Mesh
 from dem.motion import Motion
-from dem.period import wrapped
+from dem.period import velocity_in_cell, wrapped
 from dem.scene import LargeBody, Scene, SurfaceVelocity
 from dem.sources import Tally
 from dem.springs import Spring
@@ -42,15 +42,16 @@ from dem.start import step_remark
 from dem.step import Step
 from dem.stiffness import expected_overlap
 from dem.together import meet, together
-from dem.world import set_load, set_motion, set_spring, set_surface
+from dem.world import set_load, set_motion, set_shear_rate, set_spring, set_surface
 from pctt import ccp, log
-from pctt.disk import FileError, refuse_serial
+from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
 from pctt.options import OptionError, made, refuse_bad
 from pctt.petsc import warn
 from pctt.render import Picture, picture
 from pctt.run import report, state
 from pctt.run.dump import Dump
+from pctt.run.joints import JointNow
 from pctt.run.output import Place, Writer, described_bodies, described_clumps, refuse_unwritable
 from pctt.run.settings import Run, Settings, scene_name
 from pctt.run.stepper import NoSolutionError, Stepper
@@ -103,12 +104,9 @@ class Simulation:
             comm, "settings", lambda: made(Settings, given).of(self.experiment, compared), own=(OptionError,)
         )
         scene = state.built(self.experiment, comm)
-        self.settings = self.settings.fitted(scene)
+        self.settings = self.settings.fitted(scene, compared)
         if restart == "settled":
             restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
-        stated = self.settings.stiffness is not None or scene.states_stiffness
-        if not stated and (self.settings.solver == "pdip" or self._compare.names):  # the paper's model
-            self.settings = dataclasses.replace(self.settings, stiffness=math.inf)
         self._origin = state.origin(self.experiment, scene, self.settings.dt)
         if restart:
             self.world, self.memory = state.load(Path(restart), scene, self._origin, comm)
@@ -239,7 +237,7 @@ class Simulation:
     def positions(self) -> Floats:
         """Centres (n, 3) of all grains on every rank, in the order in which the scene added them, within the cell of a
         periodic scene [m]."""
-        return wrapped(self._of_grains("position"), self.world.period)
+        return wrapped(self._of_grains("position"), self.world.period, self.world.shear)
 
     @property
     def orientations(self) -> Floats:
@@ -249,7 +247,9 @@ class Simulation:
     @property
     def velocities(self) -> Floats:
         """Linear and angular velocities (n, 6) of all grains on every rank, in the order of the scene [m/s, rad/s]."""
-        return self._of_grains("velocity")
+        if self.world.shear is None:
+            return self._of_grains("velocity")
+        return velocity_in_cell(self._of_grains("position"), self._of_grains("velocity"), self.world.shear)
 
     @property
     def local(self) -> Bodies:
@@ -285,7 +285,7 @@ class Simulation:
             "contacts",
             key=own.key,
             bodies=np.searchsorted(np.append(self.ids, self.world.large.id), np.stack([id[own.a], id[own.b]], axis=1)),
-            point=wrapped(own.point, self.world.period),
+            point=wrapped(own.point, self.world.period, self.world.shear),
             frame=step.system.frame,
             gap=own.gap,
             impulse=step.impulse,
@@ -316,10 +316,14 @@ class Simulation:
         """Give a load other numbers, ``force=(0, 0, -5.0)`` [N], ``torque`` [N m], ``start`` or ``end`` [s]; or begin
         one ``on`` a body, a material or ids of grains; nothing: all grains. The first rank's values count, and
         checkpoints keep them. ValueError for what it cannot be (`dem.world.set_load`)."""
-        meet(self.comm, f"load {name}")
-        on, values = self.comm.bcast((on, values))
-        change = partial(set_load, self.world, name, on, **values)
-        together(self.comm, f"load {name}", change, own=(ValueError, TypeError))
+        self._change(f"load {name}", set_load, name, on, **values)
+
+    def set_shear_rate(self, rate: float) -> None:
+        """Shear the cell at another rate [1/s]. The first rank's value counts, and checkpoints keep it. ValueError if
+        the scene has no ``shear_rate``."""
+        meet(self.comm, "shear rate")
+        change = partial(set_shear_rate, self.world, self.comm.bcast(rate))
+        together(self.comm, "shear rate", change, own=(ValueError, TypeError))
 
     @property
     def springs(self) -> dict[str, Spring]:
@@ -329,14 +333,23 @@ class Simulation:
     def set_spring(self, name: str, **values: float) -> None:
         """Give a spring another ``stiffness`` [N/m], ``damping`` [N s/m] or rest ``length`` [m]. The first rank's
         values count, and checkpoints keep them. ValueError for what it cannot have."""
-        meet(self.comm, f"spring {name}")
-        change = partial(set_spring, self.world, name, **self.comm.bcast(values))
-        together(self.comm, f"spring {name}", change, own=(ValueError, TypeError))
+        self._change(f"spring {name}", set_spring, name, **values)
 
     def spring_force(self, name: str) -> Floats:
         """Force (3,) of a spring on its second end, its mean over the last step [N]. ValueError before the first step,
         KeyError if there is none of that name. Not collective."""
         return self._last.spring_force(name)
+
+    def joint(self, name: str) -> JointNow:
+        """A joint: its force, torque, angle or position, speed and motor; ValueError if there is none of that name. Not
+        collective."""
+        return JointNow(self, name)
+
+    def _change(self, what: str, change: Callable[..., None], /, *given: Any, **values: Any) -> None:
+        """Call ``change(world, ...)`` with the first rank's values; collective."""
+        meet(self.comm, what)
+        given, values = self.comm.bcast((given, values))
+        together(self.comm, what, partial(change, self.world, *given, **values), own=(ValueError, TypeError))
 
     @property
     def _last(self) -> Step:
@@ -348,7 +361,6 @@ class Simulation:
 
     def save(self, path: str | Path) -> None:
         """Keep the state in a checkpoint, from which `load` and ``-restart`` go on. FileError if that fails."""
-        refuse_serial(self.comm)
         refuse_unwritable("save", Path(path).parent, self.comm)
         self._save(Path(path))
 
@@ -375,7 +387,6 @@ class Simulation:
         if self.output is not None:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
         refuse_bad(Run(output_every=every, checkpoint_every=checkpoint_every))
-        refuse_serial(self.comm)
         for name, path in {"write": folder, "problems": problems}.items():
             if path:
                 refuse_unwritable(name, Path(path), self.comm)
@@ -443,7 +454,8 @@ class Simulation:
         table = {name: np.concatenate([self._of_grains(name), getattr(large, name)]) for name in names}
         position, turn, velocity = (table.pop(name) for name in names[:3])
         grains = len(position) - len(large)
-        position[:grains] = wrapped(position[:grains], world.period)
+        velocity[:grains] = velocity_in_cell(position[:grains], velocity[:grains], world.shear)
+        position[:grains] = wrapped(position[:grains], world.period, world.shear)
         contacts = self.contacts if self.last else Contacts.none()
         what = Table(**table, grains=grains, clumps=described_clumps(world))
         frame = Frame(self.steps, self.time, position, turn, velocity, contacts, what)
@@ -517,10 +529,7 @@ class Body:
 
     @surface_velocity.setter
     def surface_velocity(self, velocity: Sequence[float] | None) -> None:
-        sim, what = self._sim, f"surface velocity of the body {self.name}"
-        meet(sim.comm, what)
-        change = partial(set_surface, sim.world, self.name, sim.comm.bcast(velocity))
-        together(sim.comm, what, change, own=(ValueError, TypeError))
+        self._sim._change(f"surface velocity of the body {self.name}", set_surface, self.name, velocity)
 
     def _applied(self, name: str) -> Floats:
         load = self._sim.world.loads.get(self.name)
@@ -547,11 +556,7 @@ class Body:
 
     def _move(self, motion: Motion | None, **values: Any) -> None:
         """Set the motion, or these parameters of the present one, as the first rank says."""
-        world, comm, what = self._sim.world, self._sim.comm, f"motion of the body {self.name}"
-        meet(comm, what)
-        motion, values = comm.bcast((motion, values))
-        change = partial(set_motion, world, self.name, motion, **values)
-        together(comm, what, change, own=(ValueError, TypeError))
+        self._sim._change(f"motion of the body {self.name}", set_motion, self.name, motion, **values)
 
 
 class BodyMotion:

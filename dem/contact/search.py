@@ -38,6 +38,7 @@ class Contacts:
     near: Neighbourhood  #: the bodies of the rows `a` and `b`
     shifts: Floats  #: (k, large, 6) the ways and turns of the large bodies that the search reckoned with [m, rad]
     moved: Floats | None = None  #: (nc, 3) from body b to its image that touches body a; None without periods [m]
+    drift: Floats | None = None  #: (nc, 3) velocity of that image relative to body b; None without shear [m/s]
     held_overlap: float = 0.0  #: the deepest overlap of bodies that no force can part, left out of the contacts [m]
 
     def __len__(self) -> int:
@@ -45,7 +46,7 @@ class Contacts:
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays with a row per contact by name, without copies."""
-        left = {"near", "shifts", "held_overlap"} | ({"moved"} if self.moved is None else set())
+        left = {"near", "shifts", "held_overlap"} | {name for name in ("moved", "drift") if getattr(self, name) is None}
         return {name: value for name, value in vars(self).items() if name not in left}
 
     def way(self, position: Floats) -> Floats:
@@ -79,13 +80,18 @@ def find_contacts(
         shifts = (dt * large_free_velocity(world, dt) if dt else np.zeros_like(world.large.velocity))[None]
     free = grains_free_velocity(world, dt) if dt else world.grains.velocity
     way = ways(world.grains.shape, world.grains.size, free, dt)
+    if world.shear is not None:
+        way = way + image_way(world, dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
     refuse_short(world, margin)
     lists = grain_lists(world, margin, way)
     base = near = refreshed(lists.near, lists.halo, world, margin)
     grown = _grown(base, shifts, besides)
-    if lists.images is not None:
-        near, grown = lists.images.among(base), grown[lists.images.rows]
+    pictures = lists.images
+    if pictures is not None:
+        if world.shear is not None:
+            pictures = pictures.moved_on(world.shear.shift - lists.shift)
+        near, grown = pictures.among(base), grown[pictures.rows]
     table = lists.table.now(near)
     i, j, reach = meeting(world, near, lists, table, delta, shifts, grown)
     table, i, j, reach = table.of_members(i, j, reach)
@@ -95,8 +101,8 @@ def find_contacts(
         *(table.numbers, FEATURES, near.grains, i, j, pair, feature),
     )
     contacts = Contacts(key, a, b, body, *touch, friction, near, shifts)
-    if lists.images is not None:
-        contacts, weight = _without_images(world, contacts, base, lists.images)
+    if pictures is not None:
+        contacts, weight = _without_images(world, contacts, base, pictures)
     back = np.flatnonzero(np.diff(pair) <= 0)  # other shapes come behind the spheres, and touch in several points
     of_clumps = table.members is not None
     if (len(back) or of_clumps) and lists.images is None:
@@ -115,6 +121,12 @@ def find_contacts(
     return replace(contacts.take(~rigid), held_overlap=-float(contacts.gap[rigid].min(initial=0.0)))
 
 
+def image_way(world: World, dt: float) -> float:
+    """Half the way [m] that images behind a sheared boundary go in dt [s] beside that of their grains: the margins of
+    both grains of a pair have a half."""
+    return 0.0 if world.shear is None else 0.5 * dt * abs(world.shear.speed)
+
+
 def _without_images(
     world: World, contacts: Contacts, near: Neighbourhood, images: Images
 ) -> tuple[Contacts, Floats]:
@@ -122,6 +134,9 @@ def _without_images(
     how many each of the local grains owns (grains,)."""
     (a, way), (b, moved) = images.place(contacts.a), images.place(contacts.b)
     found = replace(contacts, a=a, b=b, near=near, point=contacts.point - way, moved=moved - way)
+    if world.shear is not None:
+        boundaries = images.boundaries(contacts.b) - images.boundaries(contacts.a)
+        found = replace(found, drift=np.outer(world.shear.speed * boundaries, (1.0, 0.0, 0.0)))
     owned = np.minimum(a, b)
     weight = np.bincount(owned[owned < near.grains], minlength=near.grains).astype(float)
     return found.take(contact_order(world, near, a, b, contacts.key)), weight

@@ -14,6 +14,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.contact_map import BlockRows, CompactRows
+from dem.contact_map.jointed import JointedMap
 from dem.exchange import refuse
 from pctt.ccp.accuracy import Accuracy, measure
 from pctt.ccp.cone import Array
@@ -69,7 +70,8 @@ def solve(
     Coulomb's law is found by the method itself if it can (`Solver.has_law`), else by a sequence of cone problems
     (`pctt.ccp.coulomb`).
 
-    A `RollingProblem`, whose impulses are (2 nc, 3), is for `apgd` and `auto` alone, and no other one follows.
+    A `RollingProblem`, whose impulses are (2 nc, 3), and a problem of bodies with joints are for `apgd` and `auto`
+    alone, and no other one follows.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
     the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
@@ -80,20 +82,21 @@ def solve(
     if law not in LAWS:
         raise ValueError(f"the law {law!r}: allowed are {', '.join(LAWS)}")
     rolls = isinstance(problem, RollingProblem)
+    jointed = isinstance(problem.contact_map, JointedMap)
+    if jointed and not SOLVERS[type].has_rolling:
+        raise ValueError(f"the solver {type!r}: with joints allowed are {FOR_ROLLING}")
     if rolls and not SOLVERS[type].has_rolling:
         raise ValueError(f"the solver {type!r}: with rolling or spinning resistance allowed are {FOR_ROLLING}")
     limits = limits or Limits()
     if not limits.tol > 0.0:
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
-    result = _by(type, problem, _start(problem, guess), limits, options, newton, law)
-    other = "conic" if result.solver == "apgd" else "apgd"
-    hopeless = result.final or (result.status is Status.BREAKDOWN and other == "conic")  # products are no numbers
-    if limits.fallback and not hopeless and not rolls:
-        asked = result
-        limits = dataclasses.replace(limits, max_it=-1)
-        second = _by(other, problem, asked.impulse, limits, None, newton, law)
-        result = second if second.final or second.residual < asked.residual else dataclasses.replace(asked)
-        result.after(asked if result is second else second)
+    result = asked = _by(type, problem, _start(problem, guess), limits, options, newton, law)
+    other = "conic" if asked.solver == "apgd" else "apgd"
+    hopeless = asked.final or (asked.status is Status.BREAKDOWN and other == "conic")  # products are no numbers
+    if limits.fallback and not hopeless and not rolls and not jointed:
+        second = _by(other, problem, asked.impulse, dataclasses.replace(limits, max_it=-1), None, newton, law)
+        better = second.final or second.residual < asked.residual
+        result = second.after(asked) if better else dataclasses.replace(asked).after(second)
         result.asked, result.reason = asked, f"{type}: {asked.reason}; {other}: {second.reason}"
     result.momentum = problem.momentum(result.impulse)
     return result
@@ -104,27 +107,24 @@ def _by(
 ) -> Result:
     """What one method makes of the problem. Impulses that are no numbers become zero."""
     method, nothing, coulomb = SOLVERS[name], np.zeros_like(problem.r), law == COULOMB
-    if problem.size == 0:
-        return Result(nothing, Status.CONVERGED, "no contacts", 0.0, 0, solver=name, law=law)
     cold = problem.natural_residual(nothing, problem.r, coulomb)
     if cold == 0:
-        return Result(nothing, Status.CONVERGED, "no contact closes", 0.0, 0, solver=name, law=law)
+        words = "no contact closes" if problem.size else "no contacts"
+        return Result(nothing, Status.CONVERGED, words, 0.0, 0, solver=name, law=law)
     limits = dataclasses.replace(limits, max_it=method.iterations) if limits.max_it < 0 else limits
     own = newton_for(problem.comm, name) if method.newton and newton is None else None
     given = (options or method.options(), *([newton or own] if method.newton else []))
 
-    def convex(guess: Array, limits: Limits) -> Result:
-        return method.function(problem, guess, limits, *given)
+    def run(guess: Array, limits: Limits, **law: bool) -> Result:
+        return method.function(problem, guess, limits, *given, **law)
 
     try:
         with phase("CCPSolve"):
-            if not coulomb:
-                result = convex(guess, limits)
-            elif method.has_law:
-                result = method.function(problem, guess, limits, *given, coulomb=True)
-                result.law = COULOMB
+            if coulomb and not method.has_law:
+                result = fixed_point(run, problem, guess, limits)
             else:
-                result = fixed_point(convex, problem, guess, limits)
+                result = run(guess, limits, coulomb=True) if coulomb else run(guess, limits)
+                result.law = law
     finally:
         if own is not None:
             own.destroy()

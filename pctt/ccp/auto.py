@@ -9,15 +9,19 @@ For Coulomb's law the conic method stalls often, but the path that it follows le
 So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path. Problems
 so small that they get dense factors are the exception: there it goes on to the end.
 
-Where contacts resist rolling or spinning, it is APGD alone: the conic method has no such cones.
+Where contacts resist rolling or spinning, it is APGD alone: the conic method has no such cones. So it is with joints,
+which its sparse systems do not have.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
+from dem.contact_map.jointed import JointedMap
 from pctt.ccp.cone import Array
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
@@ -49,31 +53,29 @@ def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Auto, newton: Newton, coulomb: bool = False
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
-    if isinstance(problem, RollingProblem):
-        first = apgd.solve(problem, guess, limits, apgd.APGD(), coulomb)
-        first.solver = "apgd"
-        return first
-    dense = newton.has_few(problem)
-    most = options.iterations(problem.size, limits.tol, coulomb, dense)
+    tried: list[Result] = []
+
+    def attempt(method: ModuleType, guess: Array, limits: Limits, *more: Any) -> Result:
+        result: Result = method.solve(problem, guess, limits, *more, coulomb=coulomb)
+        result.solver = "conic" if method is conic else "apgd"
+        result.newton_its = result.iterations if method is conic else 0
+        tried.append(result)
+        return result
+
+    alone = isinstance(problem, RollingProblem) or isinstance(problem.contact_map, JointedMap)  # apgd takes them alone
+    dense = not alone and newton.has_few(problem)
+    most = limits.max_it if alone else options.iterations(problem.size, limits.tol, coulomb, dense)
     few = min(limits.max_it, problem.comm.bcast(most))
-    first = apgd.solve(problem, guess, replace(limits, max_it=few), apgd.APGD(), coulomb)
-    first.solver = "apgd"
-    if first.final or few == limits.max_it:
-        return first
-    inner, start = replace(limits, max_it=min(60, limits.max_it)), options.start * first.residual
-    if not coulomb:
-        second = conic.solve(problem, first.impulse, inner, conic.Conic(start=min(conic.Conic().start, start)), newton)
-        second.solver, second.newton_its = "conic", second.iterations
-        second.reason = f"apgd: {first.reason}; conic: {second.reason}"
-        return second.after(first)
-    if not dense:
-        inner = replace(inner, tol=max(limits.tol, options.basin), closing_work=np.inf)
-    second = conic.solve(problem, guess, inner, conic.Conic(), newton, coulomb)
-    second.solver, second.newton_its = "conic", second.iterations
-    if dense and second.final:
-        second.reason = f"apgd: {first.reason}; conic: {second.reason}"
-        return second.after(first)
-    begin = second.impulse if second.iterations else first.impulse
-    last = apgd.solve(problem, begin, limits, apgd.APGD(), coulomb)
-    last.solver, last.reason = "apgd", f"apgd: {first.reason}; conic: {second.reason}; apgd: {last.reason}"
-    return last.after(first, second)
+    last = first = attempt(apgd, guess, replace(limits, max_it=few), apgd.APGD())
+    if not first.final and few < limits.max_it:
+        inner, settings, begin = replace(limits, max_it=min(60, limits.max_it)), conic.Conic(), guess
+        if not coulomb:
+            settings = conic.Conic(start=min(settings.start, options.start * first.residual))
+            begin = first.impulse
+        elif not dense:
+            inner = replace(inner, tol=max(limits.tol, options.basin), closing_work=np.inf)
+        last = second = attempt(conic, begin, inner, settings, newton)
+        if coulomb and not (dense and second.final):
+            last = attempt(apgd, second.impulse if second.iterations else first.impulse, limits, apgd.APGD())
+        last.reason = "; ".join(f"{result.solver}: {result.reason}" for result in tried)
+    return last.after(*tried[:-1])

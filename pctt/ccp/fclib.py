@@ -32,12 +32,9 @@ from pctt.blocks import square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.delassus import HUB, rows_in_blocks
 from pctt.ccp.problem import ConeProblem
-from pctt.disk import hdf5, make_hdf5, whole
+from pctt.disk import FileError, hdf5, whole
 
 __all__ = ["FileFormatError", "Info", "Solution", "Stored", "load", "read", "write_global", "write_local"]
-
-
-SINGLE = ("mu", "compliance")  # of the vectors with one number per contact
 
 
 class FileFormatError(ValueError):
@@ -101,12 +98,6 @@ def load(path: str | Path, comm: MPI.Comm) -> Stored:
     if comm.rank == 0:
         try:
             matrix, vectors, words = _contents(Path(path))
-            count = len(vectors["mu"])
-            for name, x in {"matrix": matrix.shape[0], **vectors}.items():
-                numbers = count if name in SINGLE else 3 * count
-                size = x if name == "matrix" else numbers if x is None else np.size(x)
-                if size != numbers:
-                    raise FileFormatError(f"{count} friction coefficients, but its {name} has {size} rows or numbers")
             parts = [_part(matrix, vectors, rank, comm.size) | words for rank in range(comm.size)]
         except Exception as reason:  # of any kind, as bad data surprise h5py, numpy and scipy; other ranks wait
             error = f"{path}: no FCLIB problem: {reason}"
@@ -115,13 +106,13 @@ def load(path: str | Path, comm: MPI.Comm) -> Stored:
         raise FileFormatError(error)
     part = comm.scatter(parts)
     rows, N = part["matrix"], None
-    C = 0.0 if part["compliance"] is None else part["compliance"]
     try:
         if rows.blocksize == (3, 6):
             operator: dict[str, Any] = {"G": BlockRows(rows.indptr, rows.indices, rows.data, part["columns"])}
         else:
             operator = {"N": (N := square_block_matrix(comm, rows))}
-        problem = ConeProblem(comm, part["r"], part["mu"], **operator, point=part["point"], compliance=C)
+        more = {name: part[name] for name in ("point", "compliance")}
+        problem = ConeProblem(comm, part["r"], part["mu"], **operator, **more)
     except ValueError as reason:  # on all ranks alike
         raise FileFormatError(f"{path}: no FCLIB problem: {reason}") from None
     finally:
@@ -153,15 +144,29 @@ def _contents(path: Path) -> tuple[sp.bsr_matrix, dict[str, Any], dict[str, Any]
         else:
             f, w, H = group["vectors/f"][:], spatial(group["vectors/w"][:]), spatial(_matrix(group["H"]).T).T
             matrix, r, note = without_velocities(_matrix(group["M"]), H.tocsr(), f, w)
-        solution, guess = (_impulses(file, f"{name}/r") for name in ("solution", "guesses/1"))
+
+        def optional(name: str, otherwise: Any = None) -> Any:
+            return file[name][()] if name in file else otherwise
+
+        def impulses(name: str) -> Any:
+            stored = optional(name)
+            return spatial(stored) if np.any(stored) else None
+
         vectors = {
             "r": r,
             "mu": mu,
-            "solution": None if solution is None else spatial(solution),
-            "guess": None if guess is None else spatial(guess),
-            "point": file["pctt/point"][()] if "pctt/point" in file else None,
-            "compliance": file["pctt/compliance"][()] if "pctt/compliance" in file else None,
+            "solution": impulses("solution/r"),
+            "guess": impulses("guesses/1/r"),
+            "point": optional("pctt/point"),
+            "compliance": optional("pctt/compliance", np.zeros(len(mu))),
         }
+        for name, x in vectors.items():
+            shape = (len(mu),) if name in ("mu", "compliance") else (len(mu), 3)
+            if x is not None and np.size(x) != np.prod(shape):
+                raise FileFormatError(f"{len(mu)} friction coefficients, but its {name} has {np.size(x)} numbers")
+            vectors[name] = None if x is None else np.reshape(x, shape)
+        if matrix.shape[0] != 3 * len(mu):
+            raise FileFormatError(f"{len(mu)} friction coefficients, but its matrix has {matrix.shape[0]} rows")
         title = _text(group["info/title"][()]) if "info/title" in group else ""
         return matrix, vectors, {"form": f"FCLIB {form}", "title": title, "note": note}
 
@@ -173,13 +178,11 @@ def _part(A: sp.bsr_matrix, vectors: Mapping[str, Any], rank: int, ranks: int) -
     near = slice(A.indptr[mine.start], A.indptr[mine.stop])
     pointers = A.indptr[mine.start : mine.stop + 1] - near.start
     shape = (3 * (mine.stop - mine.start), A.shape[1])
-    part: dict[str, Any] = {
+    return {
         "matrix": sp.bsr_matrix((A.data[near], A.indices[near], pointers), shape=shape),
         "columns": columns * (rank + 1) // ranks - columns * rank // ranks,
+        **{name: None if x is None else x[mine] for name, x in vectors.items()},
     }
-    for name, x in vectors.items():
-        part[name] = None if x is None else x[mine] if name in SINGLE else np.reshape(x, (-1, 3))[mine]
-    return part
 
 
 def _matrix(group: h5py.Group) -> sp.csr_matrix:
@@ -197,12 +200,6 @@ def _matrix(group: h5py.Group) -> sp.csr_matrix:
     matrix.check_format(full_check=True)
     matrix.sum_duplicates()
     return matrix.tocsr()
-
-
-def _impulses(file: h5py.File, name: str) -> Array | None:
-    """Impulses of a solution or guess; None where there is none but zeros."""
-    impulses = file[name][()] if name in file else np.zeros(0)
-    return impulses if impulses.any() else None
 
 
 def _text(stored: Any) -> str:
@@ -317,7 +314,7 @@ def write_local(
     N.destroy()
     vectors = {"q": problem.r, "mu": problem.mu}
     extra = {"point": problem.point, "compliance": problem.compliance[:, 0] if problem.yields else None}
-    _write(path, problem.comm, "local", {"W": W}, vectors, info, {"solution": solution, "guesses/1": guess}, extra)
+    _write(path, problem.comm, "local", {"W": W}, vectors, info, solution, guess, extra)
 
 
 def write_global(
@@ -342,8 +339,8 @@ def write_global(
     ranks if the file cannot be written.
     """
     matrices = {"M": _gathered(comm, M.tocsr()), "H": _gathered(comm, Ht.tocsr()).T}
-    vectors, states = {"f": f, "w": w, "mu": mu}, {"solution": solution, "guesses/1": guess}
-    _write(path, comm, "global", matrices, vectors, info, states, {"point": point, "compliance": compliance})
+    vectors, extra = {"f": f, "w": w, "mu": mu}, {"point": point, "compliance": compliance}
+    _write(path, comm, "global", matrices, vectors, info, solution, guess, extra)
 
 
 def _write(
@@ -353,32 +350,33 @@ def _write(
     matrices: dict[str, sp.csr_matrix],
     vectors: dict[str, Array],
     info: Info | None,
-    states: dict[str, Solution | None],
+    solution: Solution | None,
+    guess: Solution | None,
     extra: dict[str, Any],
 ) -> None:
     """Gather the vectors, then write ``/fclib_local`` or ``/fclib_global`` under a temporary name until it is whole."""
-    top, data = f"fclib_{form}", {}
-    for name, x in vectors.items():
-        data[f"{top}/vectors/{name}"] = _gathered_rows(comm, x).ravel()
-    for name, state in states.items():
+    top = f"fclib_{form}"
+    arrays = {f"{top}/vectors/{name}": np.ravel(x) for name, x in vectors.items()}
+    for name, state in (("solution", solution), ("guesses/1", guess)):
         parts = {} if state is None else vars(state)
-        data |= {f"{name}/{letter}": _gathered_rows(comm, x).ravel() for letter, x in parts.items() if x is not None}
-    if states["guesses/1"] is not None:
-        data["guesses/number_of_guesses"] = _integers([1])
-    data |= {f"pctt/{name}": _gathered_rows(comm, x) for name, x in extra.items() if x is not None}
+        arrays |= {f"{name}/{letter}": np.ravel(x) for letter, x in parts.items() if x is not None}
+    arrays |= {f"pctt/{name}": x for name, x in extra.items() if x is not None}
+    data = {name: _gathered_rows(comm, x) for name, x in arrays.items()}
     data |= {f"{top}/info/{name}": _string(text) for name, text in vars(info or Info()).items()}
     data[f"{top}/spacedim"] = _integers([3])
+    if guess is not None:
+        data["guesses/number_of_guesses"] = _integers([1])
     failure = None
     if comm.rank == 0:
         try:
             for name, A in matrices.items():
                 data |= {f"{top}/{name}/{part}": values for part, values in _triplets(A).items()}
-            with whole(Path(path)) as temporary:
-                make_hdf5(temporary, sum(values.nbytes for values in data.values()), len(data) + 10)  # and the groups
-                with hdf5(temporary) as file:
-                    for name, values in data.items():
-                        file[name] = values
-        except (OSError, ValueError, RuntimeError) as error:  # h5py raises all three
+            with whole(Path(path)) as temporary, hdf5(temporary) as file:
+                for name, values in data.items():
+                    file[name] = values
+        except FileError as error:
+            failure = str(error)
+        except (ValueError, RuntimeError) as error:  # h5py raises both
             failure = f"{path}: cannot write ({error})"
     failure = comm.bcast(failure)
     if failure:

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
 from dem.exchange import refuse
-from pctt.ccp.cone_loops import Array, squared_moves, wrong_works
+from pctt.ccp.cone import Array, FrictionCones, dot
 from pctt.ccp.delassus import BlockMap, GivenMatrix, delassus, without_hubs
 
 Given = Union[BlockRows, CompactRows, ContactMap]
@@ -33,10 +33,9 @@ class ConeProblem:
     key : (nc,) persistent names of the contacts or None
     compliance : (nc, 3) the diagonal of C, (C_n, 0, 0) per contact (1/kg); given as a number or (nc,)
     yields : whether C is not zero, the same on all ranks
+    cones : those of the contacts of this rank
     size : contacts on all ranks, Nc
     """
-
-    rows_of_contact = 1  # of three numbers each; `pctt.ccp.rolling` has two
 
     def __init__(
         self,
@@ -58,7 +57,8 @@ class ConeProblem:
         self.mu = np.ascontiguousarray(mu, dtype=float)
         if count := self.sum(_not_finite(self.r) + np.sum(~((self.mu >= 0) & (self.mu < np.inf)))):
             raise ValueError(f"{count} contacts with a NaN, infinite or negative coefficient")
-        self.size = self.sum(len(self.mu) // self.rows_of_contact)
+        self.cones = self._cones()
+        self.size = self.sum(self.cones.count)
         self.contact_map = None if G is None else _map(comm, G)
         self.operator: ContactMap | GivenMatrix = self.contact_map or GivenMatrix(comm, N)
         # the diagonal blocks have squares of all numbers of G
@@ -72,6 +72,9 @@ class ConeProblem:
     def __repr__(self) -> str:
         given = "N" if self.contact_map is None else "G"
         return f"ConeProblem({self.size} contacts, {self.comm.size} ranks, given by {given})"
+
+    def _cones(self) -> FrictionCones:
+        return FrictionCones(self.mu)
 
     # -- the operator ---------------------------------------------------------------------------------------
 
@@ -92,28 +95,28 @@ class ConeProblem:
         """G v: velocities of the contacts (nc, 3) for those of the bodies; N g where the problem is given by N."""
         return self.operator.velocities(momentum)
 
+    @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
     def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
         """||g - P(g - y / mean diag N)|| / ||g||, velocities y = N g + r: the stop test of every solver. For Coulomb's
         law y gets De Saxce's term.
 
         inf if that is undefined: for g = 0, unless it solves the problem, and if g or y has a nan or inf."""
-        square = squared_moves(g, y, 1.0 / self.mean_diagonal, self.mu, float(coulomb)).sum()
-        distance, norm = np.sqrt(self.sum(np.array([square, np.vdot(g, g)])))
+        move = self.cones.move(g, y, 1.0 / self.mean_diagonal, coulomb)
+        distance, norm = np.sqrt(self.sum(np.array([dot(move, move).sum(), np.vdot(g, g)])))
         if distance == 0:
             return 0.0
         residual = float(distance / norm) if norm > 0 else np.inf
         return residual if residual == residual else np.inf
 
+    @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
     def wrong_work(self, g: Array, y: Array) -> float:
         """The larger of the closing and the opening work, over 1/2 g'Ng: the sums of g_n max(-y_n, 0) and of
         max(g.y, 0) over the contacts; velocities y = N g + r. 0 without impulses, inf if it is no number."""
-        closing, opening, energy = self.sum(np.array(self.works(g, y)))
+        closing = g[: self.cones.count, 0] @ np.maximum(-y[: self.cones.count, 0], 0.0)
+        opening = np.maximum(self.cones.power(g, y), 0.0).sum()
+        closing, opening, energy = self.sum(np.array([closing, opening, 0.5 * np.vdot(g, y - self.r)]))
         work = 0.0 if energy <= 0 else float(np.maximum(closing, opening) / energy)
         return work if work == work else np.inf
-
-    def works(self, g: Array, y: Array) -> tuple[float, float, float]:
-        """Closing work, opening work and 1/2 g'Ng of this rank."""
-        return wrong_works(g, y, self.r)
 
     @cached_property
     def N(self) -> PETSc.Mat:
@@ -168,7 +171,7 @@ class ConeProblem:
     @cached_property
     def all_yield(self) -> bool:
         """Whether all contacts have compliance; the same on all ranks."""
-        normal = self.compliance[: len(self.compliance) // self.rows_of_contact, 0]
+        normal = self.compliance[: self.cones.count, 0]
         return self.yields and self.min(normal.min(initial=np.inf)) > 0.0
 
     @cached_property

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pctt.ccp import auto
-from pctt.ccp.first_order import apgd, barzilai_borwein, faces, gauss_seidel, jacobi
+from pctt.ccp.first_order import apgd, faces, gauss_seidel, projected_steps
 from pctt.ccp.first_order.scaled import FirstOrder
 from pctt.ccp.interior import conic, pdip
 from pctt.ccp.result import Result
@@ -60,9 +60,9 @@ SOLVERS = {
         Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
                "accelerated projected gradient descent with restart", "Mazhar et al. 2015", has_law=True,
                has_rolling=True),
-        Solver("barzilai_borwein", barzilai_borwein.adaptive, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,
+        Solver("barzilai_borwein", projected_steps.adaptive, projected_steps.BarzilaiBorwein, PRODUCT, 20_000,
                "projected Barzilai-Borwein steps with an adaptive nonmonotone line search", "Dai, Fletcher 2005"),
-        Solver("spectral", barzilai_borwein.spectral, barzilai_borwein.BarzilaiBorwein, PRODUCT, 20_000,
+        Solver("spectral", projected_steps.spectral, projected_steps.BarzilaiBorwein, PRODUCT, 20_000,
                "preconditioned spectral projected gradient with fallback (P-SPG-FB)",
                "Heyn et al. 2013; Birgin, Martinez, Raydan 2000"),
         Solver("kucera", faces.kucera, FirstOrder, PRODUCT, 20_000,
@@ -73,7 +73,7 @@ SOLVERS = {
         Solver("gauss_seidel", gauss_seidel.solve, gauss_seidel.GaussSeidel, MATRIX, 20_000,
                "projected block Gauss-Seidel over the colours of the contact graph",
                "Tasora, Anitescu 2011; Jones, Plassmann 1993"),
-        Solver("jacobi", jacobi.solve, FirstOrder, PRODUCT, 50_000,
+        Solver("jacobi", projected_steps.jacobi, FirstOrder, PRODUCT, 50_000,
                "projected block Jacobi, relaxed by an exact line search", "Tasora, Anitescu 2011"),
     )
 }  # fmt: skip

@@ -22,25 +22,52 @@ from mpi4py import MPI
 from dem.compiled import inlined, loop
 from dem.contact_map import BlockRows, TurningMap
 from dem.exchange import refuse
-from pctt.ccp.cone_loops import (
+from pctt.ccp.cone import (
     ONE,
     STRIP,
     ZERO,
     Array,
+    FrictionCones,
     add_compliance,
     add_products,
     add_squares,
     add_work,
     extrapolate,
+    tangential,
 )
 from pctt.ccp.problem import ConeProblem
+
+
+class RollingCones(FrictionCones):
+    """The cones of contacts with coefficients ``mu`` (2 count,), of friction and of rolling, and ``spinning``."""
+
+    def __init__(self, mu: Array, spinning: Array):
+        self.mu, self.spinning, self.count = mu, spinning, len(spinning)
+
+    def scaled(self, size: Array, precision: type[np.floating]) -> RollingCones:
+        """The cones of unknowns multiplied by ``size`` (2 count, 3): spin and rolls have sizes of their own, so that
+        discs stay discs."""
+        normal = size[: self.count, 0]
+        mu = self.mu * size[:, 1] / np.concatenate([normal, normal])
+        spinning = self.spinning * size[self.count :, 0] / normal
+        return RollingCones(mu.astype(precision, copy=False), spinning.astype(precision, copy=False))
+
+    def project(self, x: Array, out: Array) -> Array:
+        return project_to(x, self.mu, self.spinning, out)
+
+    def resisted(self, y: Array) -> Array:
+        slides, rolls = (self.mu * tangential(y)).reshape(2, -1)
+        return slides + rolls + self.spinning * np.abs(y[self.count :, 0])
+
+    def accelerated_step(
+        self, x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, coulomb: bool, out: Array
+    ) -> tuple[float, float, float]:
+        return accelerated_step(x, last_x, y, compliance, beta, step, self.mu, self.spinning, float(coulomb), out)
 
 
 class RollingProblem(ConeProblem):
     """A `ConeProblem` whose ``mu`` (2 nc,) has the coefficients of friction, then those of rolling over the lengths of
     the contacts, as ``spinning`` (nc,) has them of spinning."""
-
-    rows_of_contact = 2
 
     def __init__(
         self, comm: MPI.Comm, r: Array, mu: Array, rolling: Array, spinning: Array, *, G: TurningMap | BlockRows,
@@ -50,21 +77,14 @@ class RollingProblem(ConeProblem):
         nc = len(mu)
         fits = np.shape(rolling) == np.shape(spinning) == (nc,) and (np.asarray(spinning) >= 0.0).all()
         refuse(comm, "" if fits else f"rolling or spinning: allowed are numbers >= 0, one for each of {nc} contacts")
+        self.spinning = np.ascontiguousarray(spinning, dtype=float)
         twice = None if point is None else np.concatenate([point, point])
         soft = np.concatenate([np.broadcast_to(compliance, nc), np.zeros(nc)])
         super().__init__(comm, r, np.concatenate([mu, rolling]), G=G, point=twice, compliance=soft)
-        self.key, self.spinning = key, np.ascontiguousarray(spinning, dtype=float)
+        self.key = key
 
-    def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
-        moves = squared_moves(g, y, 1.0 / self.mean_diagonal, self.mu, self.spinning, float(coulomb))
-        distance, norm = np.sqrt(self.sum(np.array([moves, np.vdot(g, g)])))
-        if distance == 0:
-            return 0.0
-        residual = float(distance / norm) if norm > 0 else np.inf
-        return residual if residual == residual else np.inf
-
-    def works(self, g: Array, y: Array) -> tuple[float, float, float]:
-        return wrong_works(g, y, self.r)
+    def _cones(self) -> RollingCones:
+        return RollingCones(self.mu, self.spinning)
 
 
 @inlined
@@ -118,60 +138,11 @@ def project_to(x: Array, mu: Array, sigma: Array, out: Array) -> Array:
 
 
 @loop
-def not_idle(x: Array, last_x: Array, y: Array, mu: Array, sigma: Array, least: float) -> np.ndarray:
-    """`pctt.ccp.cone_loops.not_idle` for these cones."""
-    out = np.empty(len(sigma), np.bool_)
-    for c in range(len(sigma)):
-        opening = y[c, 0] - _resisted(y, c, mu, sigma)
-        out[c] = (x[c, 0] > ZERO) | (last_x[c, 0] > ZERO) | (not opening > least)
-    return out
-
-
-@inlined
-def _resisted(y, c, mu, sigma):
-    """mu |y_t| + rho |w_roll| + sigma |w_spin| of the contact c."""
-    d = len(sigma) + c
-    return mu[c] * size_of(y[c, 1], y[c, 2]) + mu[d] * size_of(y[d, 1], y[d, 2]) + sigma[c] * abs(y[d, 0])
-
-
-@loop
-def squared_moves(x: Array, y: Array, step: float, mu: Array, sigma: Array, de_saxce: float) -> float:
-    """The sum of |P(x - step y) - x|^2, where y_n gets De Saxce's term if ``de_saxce`` is 1."""
-    count, total, p = len(sigma), 0.0, np.empty(6)
-    for c in range(count):
-        d = count + c
-        p[0] = x[c, 0] - step * (y[c, 0] + de_saxce * _resisted(y, c, mu, sigma))
-        p[1], p[2] = x[c, 1] - step * y[c, 1], x[c, 2] - step * y[c, 2]
-        for k in range(3):
-            p[3 + k] = x[d, k] - step * y[d, k]
-        n, t, r, s = nearest(p[0], size_of(p[1], p[2]), size_of(p[4], p[5]), abs(p[3]), mu[c], mu[d], sigma[c])
-        total += (n - x[c, 0]) ** 2 + (t * p[1] - x[c, 1]) ** 2 + (t * p[2] - x[c, 2]) ** 2
-        total += (s * p[3] - x[d, 0]) ** 2 + (r * p[4] - x[d, 1]) ** 2 + (r * p[5] - x[d, 2]) ** 2
-    return total
-
-
-@loop
-def wrong_works(g: Array, y: Array, r: Array) -> tuple[float, float, float]:
-    """`pctt.ccp.cone_loops.wrong_works` of these contacts."""
-    closing, opening, energy, count = 0.0, 0.0, 0.0, len(g) // 2
-    for c in range(count):
-        along, free = 0.0, 0.0
-        for k in range(3):
-            for row in (c, count + c):
-                along += g[row, k] * y[row, k]
-                free += g[row, k] * r[row, k]
-        closing += g[c, 0] * (0.0 if y[c, 0] > 0.0 else -y[c, 0])
-        opening += 0.0 if along < 0.0 else along
-        energy += 0.5 * (along - free)
-    return closing, opening, energy
-
-
-@loop
 def accelerated_step(
     x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, sigma: Array,
     de_saxce: float, out: Array,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """`pctt.ccp.cone_loops.accelerated_step` for these cones, of which both halves of the rows go through strips."""
+    """`pctt.ccp.cone.accelerated_step` for these cones, of which both halves of the rows go through strips."""
     count, soft = len(sigma), len(compliance) > 0
     part, way, saxce = x.dtype.type(beta), x.dtype.type(step), x.dtype.type(de_saxce)
     x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)

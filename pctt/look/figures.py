@@ -35,6 +35,10 @@ BALANCE = (
     "kinetic_energy", "potential_energy", "spring_energy", "work_of_motions", "friction_loss", "impact_loss",
     "time_stepping",
 )  # fmt: skip
+# energies that some runs have in the balance too, with the sign of what they bring, and those that it explains
+OTHERS = {
+    "work_of_cohesion": 1, "energy_of_sources": 1, "energy_of_outlets": -1, "spring_energy_before": 0, "energy_jump": 0
+}  # fmt: skip
 
 
 def figures(folder: Folder) -> dict[str, Figure]:
@@ -135,6 +139,7 @@ def records(columns: Mapping[str, np.ndarray]) -> dict[str, Figure]:
     heads ``name [unit]`` of the columns. The components of a vector share axes."""
     balance = {f"{name} [J]" for name in BALANCE}
     made = {"energy": energy(columns)} if balance <= set(columns) else {}
+    balance |= {f"{name} [J]" for name in OTHERS}
     units: dict[str, dict[str, list[str]]] = {}
     for head in columns:
         if head not in ("step", "time [s]") and not (made and head in balance):
@@ -175,7 +180,7 @@ def energy(columns: Mapping[str, np.ndarray]) -> Figure:
     first record."""
     time = columns["time [s]"]
     kinetic, potential, spring, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
-    work = work + columns.get("energy_of_sources [J]", 0.0) - columns.get("energy_of_outlets [J]", 0.0)
+    work = work + sum(sign * columns.get(f"{name} [J]", 0.0) for name, sign in OTHERS.items())
     total = kinetic + spring + potential - potential[0] + np.cumsum(friction + impact - work)
     figure = Figure(figsize=(9.5, 6.4))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))

@@ -179,6 +179,12 @@ def is_symmetric(entries: Entries, rows: int) -> bool:
     return entries.comm.bcast(bool(np.linalg.norm(here - there) <= 1e-8 * np.linalg.norm(here)))
 
 
+def diagonal(P: PETSc.Mat) -> Array:
+    """This rank's part of the diagonal, for a Mat with `has_entries`; collective."""
+    here = np.arange(*P.getOwnershipRange())
+    return Entries.of(P).own(here, here)
+
+
 def diagonal_blocks(P: PETSc.Mat) -> Array:
     """The diagonal blocks (n, bs, bs) of this rank's block rows, for a Mat with `has_entries`; collective."""
     bs = P.getBlockSize()

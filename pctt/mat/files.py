@@ -22,6 +22,7 @@ from petsc4py import PETSc
 from dem.exchange import on_first
 from pctt.disk import read, write_rows
 from pctt.mat.grid_train import GridTrain
+from pctt.mat.order import Layout
 from pctt.mat.tensor_train import Options, TensorTrain, compressed, mat_of
 from pctt.tt.quantise import GridDigits
 from pctt.tt.train import Train
@@ -39,16 +40,17 @@ def save(mat: PETSc.Mat, path: str | os.PathLike[str]) -> None:
     if matrix is None:
         raise ValueError(f"pctt.mat.save: a Mat of type {mat.getType()}; allowed is a Mat of pctt.mat.TensorTrain")
     context: TensorTrain = mat.getPythonContext()
+    layout = matrix.layout
     values: dict[str, Any] = {
-        "format": FORMAT, "order": matrix.order, "origin": matrix.origin, "shift": matrix.shift,
+        "format": FORMAT, "order": layout.order, "origin": matrix.origin, "shift": matrix.shift,
         "scale": matrix.scale, "error": matrix.error, "symmetric": matrix.symmetric, "eps": context.options.eps,
         "residual": np.nan if matrix.residual is None else matrix.residual, "max_rank": context.options.max_rank,
-        "grid": matrix.digits.shape, "block": matrix.digits.block,
+        "grid": layout.digits.shape, "block": layout.digits.block,
     }  # fmt: skip
     arrays = {f"cores/{k}": core for k, core in enumerate(matrix.train.cores)}
-    if matrix.rows is not None:
-        arrays["rows"] = matrix.rows
-    on_first(matrix.comm, lambda: write_rows(Path(path), MPI.COMM_SELF, {}, arrays, {"/": values}))
+    if layout.rows is not None:
+        arrays["rows"] = layout.rows
+    on_first(layout.comm, lambda: write_rows(Path(path), MPI.COMM_SELF, {}, arrays, {"/": values}))
 
 
 def load(path: str | os.PathLike[str], comm: MPI.Comm | PETSc.Comm | None = None) -> PETSc.Mat:
@@ -63,9 +65,9 @@ def load(path: str | os.PathLike[str], comm: MPI.Comm | PETSc.Comm | None = None
     digits = GridDigits(values["grid"], values["block"])
     points = digits.rows // digits.block
     counts = points // mpi.size + (np.arange(mpi.size) < points % mpi.size)  # as PETSc does it
+    layout = Layout(mpi, counts * digits.block, digits, rows, values["order"])
     matrix = GridTrain(
-        mpi, counts * digits.block, digits, rows, values["order"], train, values["shift"], values["scale"],
-        values["error"], values["symmetric"], values["origin"],
+        layout, train, values["shift"], values["scale"], values["error"], values["symmetric"], values["origin"],
         residual=None if np.isnan(values["residual"]) else values["residual"],
     )  # fmt: skip
     return mat_of(matrix, Options(values["eps"], values["max_rank"]))

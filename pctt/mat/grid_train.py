@@ -14,6 +14,7 @@ from numpy.typing import DTypeLike
 
 from dem.exchange import on_first
 from pctt.mat.entries import Combination, Entry
+from pctt.mat.order import Layout
 from pctt.petsc import warn
 from pctt.tt.apply import Apply
 from pctt.tt.cross import Cross
@@ -48,14 +49,13 @@ class TrainProduct:
     counts : number of rows of each rank
     slots : (rows,) slot of each row of all ranks in the train; other slots get zeros
     size : number of slots
-    train : matrix train; `set_train` takes another one with the same modes
     flops : operations of this rank in a product
 
     Every rank gathers x and multiplies with its part of the rows of the train. If the slots of the ranks overlap, they
     also gather the product.
     """
 
-    def __init__(self, comm: MPI.Comm, counts: Array, slots: Array, size: int, train: Train) -> None:
+    def __init__(self, comm: MPI.Comm, counts: Array, slots: Array, size: int) -> None:
         self.comm, self.size = comm, size
         rows = len(slots)
         if comm.size > 1 and rows > 1_000_000:
@@ -80,10 +80,10 @@ class TrainProduct:
         self._slots = slice(None) if rows == size and _consecutive(slots) else slots
         here = slots[self._gather.mine] - (bounds[0] if self._apart else 0)
         self._here = slice(None) if self._apart and _consecutive(here) else here
-        self._dtype: DTypeLike = train.dtype
-        self.set_train(train)
+        self._dtype: DTypeLike = float
 
     def set_train(self, train: Train) -> None:
+        """Multiply with this matrix train of `size` rows and columns from now on."""
         self.train = train
         self._applies: dict[np.dtype, Apply] = {}
 
@@ -123,10 +123,7 @@ def _consecutive(numbers: Array) -> bool:
 class GridTrain:
     """A = shift I + scale T, the same on all ranks. Methods return another matrix and change none.
 
-    digits : of the grid
-    rows : the row at each point of the grid, or None if the rows are in the order of the points
-    order : name of the order of the rows
-    counts : number of rows of each rank
+    layout : of the rows
     error : relative to ||A - shift I||_F; of an inverse X of a matrix A, ||b - A X b|| / ||b|| for a random b
     origin : where the error is from, in words
     symmetric : whether T is symmetric up to rounding
@@ -135,11 +132,7 @@ class GridTrain:
     function : the exact entries; None if those of the train count as exact
     """
 
-    comm: MPI.Comm
-    counts: Array
-    digits: GridDigits
-    rows: Array | None
-    order: str
+    layout: Layout
     train: Train
     shift: float
     scale: float
@@ -174,15 +167,11 @@ class GridTrain:
     def zero(self) -> GridTrain:
         """The zero matrix on the same grid."""
         nothing = zeros(self.train.rows, self.train.columns)
-        return replace(
-            self, train=nothing, shift=0.0, scale=1.0, error=0.0, symmetric=True, origin="exact", residual=None,
-            function=Combination(0.0, ()),
-        )  # fmt: skip
+        return GridTrain(self.layout, nothing, 0.0, 1.0, 0.0, True, "exact", self.found, function=Combination(0.0, ()))
 
     def plus(self, factor: float, other: GridTrain, eps: float, max_rank: int) -> GridTrain:
         """A + factor times another matrix on the same grid, rounded. ValueError if the grid is not the same."""
-        same = np.array_equal(self.counts, other.counts) and self.digits.modes == other.digits.modes
-        if not same or not np.array_equal(self._places, other._places):
+        if not self.layout.agrees(other.layout):
             raise ValueError("a sum of trains on different grids; allowed are trains with the same grid and rows")
         mine, others = self.scale * self.train, factor * other.scale * other.train
 
@@ -192,11 +181,11 @@ class GridTrain:
             parts = [left * norm, self.error * mine.norm(), other.error * others.norm()]
             return train, train.norm(), float(np.linalg.norm(parts))
 
-        train, norm, left = on_first(self.comm, total)
-        return replace(
-            self, train=train, shift=self.shift + factor * other.shift, scale=1.0,
-            error=left / norm if norm else 0.0, symmetric=self.symmetric and other.symmetric,
-            origin="bound for a sum", residual=None, function=self._combination.plus(factor, other._combination),
+        train, norm, left = on_first(self.layout.comm, total)
+        return GridTrain(
+            self.layout, train, self.shift + factor * other.shift, 1.0, left / norm if norm else 0.0,
+            self.symmetric and other.symmetric, "bound for a sum", self.found,
+            function=self._combination.plus(factor, other._combination),
         )  # fmt: skip
 
     def rounded(self, eps: float, max_rank: int) -> GridTrain:
@@ -205,7 +194,7 @@ class GridTrain:
         If shift is not positive, T has its factor, and shift and scale stay as they are.
         """
         # results may differ in the last bit: all ranks take the first one's
-        train, left = on_first(self.comm, lambda: rounded(self.train, eps, max_rank))
+        train, left = on_first(self.layout.comm, lambda: rounded(self.train, eps, max_rank))
         error = float(np.hypot(self.error, left))
         if self.shift <= 0 or self.shift == self.scale:
             return replace(self, train=train, error=error)
@@ -213,20 +202,11 @@ class GridTrain:
 
     def norm(self) -> float:
         """||A||_F, of the rows of the grid without padded ones."""
-        shift, T = identity(self.train.rows), self.train
-        if self.digits.padded != self.digits.shape:
-            inside = _inside(self.digits)
-            shift, T = _diagonal(inside), _diagonal(inside) @ T @ _diagonal(inside)
-        return on_first(self.comm, lambda: (self.shift * shift + self.scale * T).norm())
-
-    @cached_property
-    def _places(self) -> Array:
-        """The slot of each row of the Mat in the train."""
-        if self.rows is None:
-            return self.digits.places
-        places = np.empty(self.digits.rows, np.int64)
-        places[self.rows] = self.digits.places
-        return places
+        shift, T, digits = identity(self.train.rows), self.train, self.layout.digits
+        if digits.padded != digits.shape:
+            shift = _inside(digits)
+            T = shift @ T @ shift
+        return on_first(self.layout.comm, lambda: (self.shift * shift + self.scale * T).norm())
 
     @property
     def _combination(self) -> Combination:
@@ -234,12 +214,15 @@ class GridTrain:
 
     def entries(self, i: Array, j: Array) -> Array:
         """The entries (p,) of the train at rows i and columns j of the Mat."""
-        place = self._places
-        return self.shift * (i == j) + self.scale * self.train.entries(place[i], place[j])
+        slots = self.layout.slots
+        return self.shift * (i == j) + self.scale * self.train.entries(slots[i], slots[j])
 
     def product(self, train: Train) -> TrainProduct:
         """The product with a train, with rows in the order of the Mat."""
-        return TrainProduct(self.comm, self.counts, self._places, self.digits.size, train)
+        layout = self.layout
+        product = TrainProduct(layout.comm, layout.counts, layout.slots, layout.digits.size)
+        product.set_train(train)
+        return product
 
     @cached_property
     def _product(self) -> TrainProduct:
@@ -256,14 +239,14 @@ class GridTrain:
     @property
     def flops(self) -> int:
         """Operations of this rank in `times`."""
-        return self._product.flops + 3 * int(self.counts[self.comm.rank])
+        return self._product.flops + 3 * int(self.layout.counts[self.layout.comm.rank])
 
     def words(self) -> str:
         """Ranks, bytes, compression, error."""
-        less = 8 * float(self.digits.rows) ** 2 / self.bytes
+        less = 8 * float(self.layout.digits.rows) ** 2 / self.bytes
         return (
-            f"{self.order} order, {len(self.train)} modes, ranks {'-'.join(map(str, self.ranks))}, {self.bytes} bytes "
-            f"({less:.3g} times less than dense), error {self.error:.2g} {self.origin}"
+            f"{self.layout.order} order, {len(self.train)} modes, ranks {'-'.join(map(str, self.ranks))}, "
+            f"{self.bytes} bytes ({less:.3g} times less than dense), error {self.error:.2g} {self.origin}"
         )
 
 
@@ -274,15 +257,10 @@ def rounded(train: Train, eps: float, max_rank: int) -> tuple[Train, float]:
 
 
 def _inside(digits: GridDigits) -> Train:
-    """The train of a vector: 1 at the points of the grid, 0 at those that fill it up."""
+    """The diagonal matrix with 1 at the points of the grid, and 0 at those that fill it up."""
     cores: list[Array] = []
     for n, padded in zip(digits.shape, digits.padded):
         if padded > 1:
             cores += decompose((np.arange(padded) < n).astype(float), 1e-14, modes=bases(n)).cores
-    cores = cores or [np.ones((1, 1, 1))]
-    return Train([*cores[:-1], np.repeat(cores[-1], digits.block, axis=1)])
-
-
-def _diagonal(vector: Train) -> Train:
-    """The diagonal matrix of a vector."""
-    return Train(core[:, :, None] * np.eye(core.shape[1])[:, :, None] for core in vector.cores)
+    cores[-1] = np.repeat(cores[-1], digits.block, axis=1)
+    return Train(core[:, :, None] * np.eye(core.shape[1])[:, :, None] for core in cores)

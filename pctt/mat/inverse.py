@@ -10,6 +10,7 @@ from petsc4py import PETSc
 from dem.exchange import on_first
 from pctt.mat.entries import has_entries, multiplies
 from pctt.mat.grid_train import GridTrain
+from pctt.mat.order import layout_of
 from pctt.mat.tensor_train import MAX_RANK, MISSED, Options, compressed, compressed_entries, mat_of
 from pctt.petsc import own_errors
 from pctt.tt.inverse import invert_positive
@@ -76,7 +77,7 @@ def _train_of(A: PETSc.Mat, options: Options) -> GridTrain:
             "with the attribute entries"
         )
     with own_errors(), PETSc.Log.Event("TTCompress"):
-        matrix = compressed_entries(A, options.eps, options.max_rank)
+        matrix = compressed_entries(A, layout_of(A), options.eps, options.max_rank)
     if matrix.error > MISSED * options.eps:
         raise ValueError(
             f"pctt.mat.inverse: the train of the matrix has an error of {matrix.error:.1e} at rank "

@@ -14,6 +14,7 @@ from __future__ import annotations
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import prod
 from typing import Any
 
@@ -64,7 +65,9 @@ def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), told: Array | None = N
     grids = [dm for dm in fitting if dm.getType() == PETSc.DM.Type.DA and dm.getDof() == P.getBlockSize()]
     if shape is None and grids:
         shape, source = tuple(grids[0].getSizes())[::-1], "a DMDA"  # the first coordinate is the fastest
-        row_at = _natural_order(grids[0], P.getBlockSize()) if comm.size > 1 else None
+        if comm.size > 1:
+            first = np.arange(0, P.getSize()[0], P.getBlockSize(), dtype=PETSc.IntType)  # of each point
+            row_at = grids[0].getAO().app2petsc(first).astype(np.int64) // P.getBlockSize()
     points, whence = given(P, "coordinates"), "the attribute coordinates"
     check_points(points, P, "coordinates of the Mat")
     if points is not None:
@@ -149,18 +152,6 @@ def whole_numbers(grid: Any) -> tuple[int, ...] | None:
         return None
 
 
-def _natural_order(dm: PETSc.DM, block: int) -> Array:
-    """Block row of each point of a distributed DMDA in the natural order, on all ranks."""
-    own, natural = dm.createGlobalVec(), dm.createNaturalVec()
-    first, last = own.getOwnershipRange()
-    own.array_w[:] = np.arange(first, last)
-    dm.globalToNatural(own, natural)
-    parts = dm.comm.tompi4py().allgather(natural.array_r[::block].copy())
-    for vec in (own, natural):
-        vec.destroy()
-    return (np.concatenate(parts) / block).round().astype(np.int64)
-
-
 def _other_points(dms: Sequence[PETSc.DM], P: PETSc.Mat, comm: MPI.Comm) -> tuple[Array | None, str]:
     """Points from the coordinates of a DM, or from a near null space; None if there are none."""
     count = P.getLocalSize()[0] // P.getBlockSize()
@@ -242,12 +233,44 @@ def chosen_order(order: str, places: Places, name: str, stored: bool = False, ke
     return order
 
 
-def digits_of(
-    P: PETSc.Mat, order: str, name: str, places: Places | None = None
-) -> tuple[GridDigits, Array | None, str]:
-    """The digits of P's rows, the row at each point (None if rows are in the order of points), and the chosen order.
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """The rows of a Mat on the ranks and in a train; the same on all ranks.
+
+    counts : number of rows of each rank
+    digits : of the grid of the points
+    rows : the row at each point, or None if the rows are in the order of the points
+    order : its name
+    """
+
+    comm: MPI.Comm
+    counts: Array
+    digits: GridDigits
+    rows: Array | None
+    order: str
+
+    @cached_property
+    def slots(self) -> Array:
+        """The slot of each row in the train."""
+        if self.rows is None:
+            return self.digits.places
+        slots = np.empty(self.digits.rows, np.int64)
+        slots[self.rows] = self.digits.places
+        return slots
+
+    def agrees(self, other: Layout) -> bool:
+        """Whether trains of both layouts can be added."""
+        return (
+            np.array_equal(self.counts, other.counts) and self.digits.modes == other.digits.modes
+            and np.array_equal(self.slots, other.slots)
+        )  # fmt: skip
+
+
+def layout_of(P: PETSc.Mat, order: str = "auto", name: str = "order", places: Places | None = None) -> Layout:
+    """The layout of the train of P. Collective; ValueError on all ranks for a bad grid.
 
     order, name : as in `chosen_order`, without rcm
+    places : as `places_of` finds them
     """
     block, comm = P.getBlockSize(), P.comm.tompi4py()
     places = places or places_of(P)
@@ -259,4 +282,4 @@ def digits_of(
         rows = np.argsort(morton_codes(np.concatenate(comm.allgather(places.points))), kind="stable")
     if rows is not None and block > 1:
         rows = np.add.outer(rows * block, np.arange(block)).ravel()
-    return GridDigits(shape, block=block), rows, order
+    return Layout(comm, np.array(comm.allgather(P.getLocalSize()[0])), GridDigits(shape, block), rows, order)

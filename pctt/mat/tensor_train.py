@@ -13,9 +13,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.exchange import on_first, refuse
-from pctt.mat.entries import Entries, Entry, given, is_symmetric
+from pctt.mat.entries import Entries, Entry, diagonal, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
-from pctt.mat.order import Places, digits_of, whole_numbers
+from pctt.mat.order import Layout, layout_of, whole_numbers
 from pctt.options import AT_LEAST_ONE, FRACTION, OptionError, describe, option, read, refuse_bad
 from pctt.petsc import Context, given_options, on_axpy, on_getinfo, own_errors, warn
 from pctt.tt.cross import EntryMatrix, compress_cross
@@ -58,31 +58,27 @@ class Options:
 
 
 def compressed_entries(
-    P: PETSc.Mat, eps: float, max_rank: int, order: str = "auto", name: str = "order",
-    start: GridTrain | None = None, places: Places | None = None, work: Work | None = None,
-) -> GridTrain:  # fmt: skip
+    P: PETSc.Mat, layout: Layout, eps: float, max_rank: int, start: GridTrain | None = None, work: Work | None = None
+) -> GridTrain:
     """A = c (I + T) for a matrix A that is given by its entries; c is the mean of the diagonal. Collective.
 
     Both the Mat and the PC use it. If the mean is not positive, shift is 0 and scale is 1. The error is estimated from
-    entries that the compression has not used. On all ranks EntriesError or ValueError for bad entries or a bad grid,
-    TooMuchWorkError at the limit of `work`.
+    entries that the compression has not used. On all ranks EntriesError for bad entries, TooMuchWorkError at the limit
+    of `work`.
 
-    order, name, places : as in `digits_of`
     start : an earlier result for a similar matrix
     """
-    comm, entries = P.comm.tompi4py(), Entries.of(P)
-    digits, rows, order = digits_of(P, order, name, places)
-    counts = np.array(comm.allgather(P.getLocalSize()[0]))
-    matrix = EntryMatrix(entries, digits, rows, comm.bcast)
-    known = start.found if start is not None and start.digits.modes == digits.modes else None
+    entries = Entries.of(P)
+    matrix = EntryMatrix(entries, layout.digits, layout.rows, layout.comm.bcast)
+    known = start.found if start is not None and start.layout.digits.modes == layout.digits.modes else None
     found = compress_cross(matrix, max_rank, eps, known, work=work)
     train, error = found.train, found.error
-    symmetric = is_symmetric(entries, digits.rows)
+    symmetric = is_symmetric(entries, layout.digits.rows)
     if symmetric:
-        train, left = on_first(comm, lambda: _symmetric(found.train, eps, max_rank))
+        train, left = on_first(layout.comm, lambda: _symmetric(found.train, eps, max_rank))
         error = float(np.hypot(error, left))
     return GridTrain(
-        comm, counts, digits, rows, order, train, matrix.shift, 1 / matrix.scale, error, symmetric,
+        layout, train, matrix.shift, 1 / matrix.scale, error, symmetric,
         f"estimated from fresh entries, {found.evaluations} entries evaluated", found, function=given(P, "entries"),
     )  # fmt: skip
 
@@ -156,10 +152,10 @@ class TensorTrain(Context):
         if not hasattr(self, "compressed"):
             self.options = self.options.given_for(mat)
             self.options.check(mat.comm.tompi4py())
-            found = compressed_entries(mat, self.options.eps, self.options.max_rank)
+            found = compressed_entries(mat, layout_of(mat), self.options.eps, self.options.max_rank)
             if found.error > MISSED * self.options.eps:
                 warn(
-                    found.comm,
+                    found.layout.comm,
                     f"pctt.mat.TensorTrain: an error of {found.error:.1e} is left at rank {self.options.max_rank}, "
                     f"{self.options.eps:.1e} was asked for",
                 )
@@ -184,9 +180,8 @@ class TensorTrain(Context):
             y.array_w[:] = self.compressed.times(x.array_r, transposed=True)
             PETSc.Log.logFlops(self.compressed.flops)
 
-    def getDiagonal(self, mat: PETSc.Mat, diagonal: PETSc.Vec) -> None:
-        here = np.arange(*mat.getOwnershipRange())
-        diagonal.array_w[:] = Entries.of(mat).own(here, here)
+    def getDiagonal(self, mat: PETSc.Mat, vec: PETSc.Vec) -> None:
+        vec.array_w[:] = diagonal(mat)
 
     # -- arithmetic -----------------------------------------------------------------------------------------
 
@@ -225,7 +220,7 @@ class TensorTrain(Context):
     def copy(self, mat: PETSc.Mat, other: PETSc.Mat, structure: int) -> None:
         """ValueError on all ranks if the other Mat is not a train with the same distribution of rows."""
         context = _context(other)
-        if context is None or not np.array_equal(context.compressed.counts, self.compressed.counts):
+        if context is None or not np.array_equal(context.compressed.layout.counts, self.compressed.layout.counts):
             raise ValueError(
                 f"pctt.mat.TensorTrain: a copy into a Mat of type {other.getType()}; allowed is a Mat of "
                 "pctt.mat.TensorTrain with the same rows on each rank, for example a duplicate"
@@ -268,15 +263,15 @@ def compressed(P: PETSc.Mat) -> GridTrain | None:
 
 def mat_of(matrix: GridTrain, options: Options) -> PETSc.Mat:
     """A new Mat for a train. Collective."""
-    rows, here = matrix.digits.rows, int(matrix.counts[matrix.comm.rank])
-    context = TensorTrain()
+    layout, context = matrix.layout, TensorTrain()
+    rows, here = layout.digits.rows, int(layout.counts[layout.comm.rank])
     context.compressed, context.options = matrix, options
-    mat = PETSc.Mat().create(comm=matrix.comm)
-    mat.setSizes(((here, rows), (here, rows)), matrix.digits.block)
+    mat = PETSc.Mat().create(comm=layout.comm)
+    mat.setSizes(((here, rows), (here, rows)), layout.digits.block)
     mat.setType(PETSc.Mat.Type.PYTHON)
     mat.setPythonContext(context)
-    if matrix.order == "grid" and matrix.rows is None:
-        mat.setAttr("grid", matrix.digits.shape)
+    if layout.order == "grid" and layout.rows is None:
+        mat.setAttr("grid", layout.digits.shape)
     mat.setUp()
     return mat
 

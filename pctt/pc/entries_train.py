@@ -14,12 +14,14 @@ from mpi4py import MPI
 from numpy.typing import DTypeLike
 from petsc4py import PETSc
 
-from pctt.mat.entries import DENSE, Entries, is_symmetric, multiplies
-from pctt.mat.grid_train import GridTrain, WholeVectors
-from pctt.mat.order import Places, digits_of
+from dem.exchange import on_first
+from pctt.blocks import symmetric_shell
+from pctt.mat.entries import DENSE, Entries, diagonal, is_symmetric, multiplies
+from pctt.mat.grid_train import GridTrain, TrainProduct, WholeVectors
+from pctt.mat.order import Layout, Places, layout_of
 from pctt.mat.tensor_train import compressed, compressed_entries
 from pctt.pc.mat import finds_negative, iterations_with_the_diagonal
-from pctt.pc.train_options import Account, Options
+from pctt.pc.options import Account, Options
 from pctt.tt import differences
 from pctt.tt.cross import CROSS
 from pctt.tt.inverse import Inverse, invert_positive
@@ -34,33 +36,29 @@ class DifferencesInverse:
     iterations : those of conjugate gradients on a part of the grid, to 1e-8
     """
 
-    def __init__(
-        self, comm: MPI.Comm, counts: Array, order: Array | None, transform: differences.FastTransform, iterations: int,
-    ) -> None:  # fmt: skip
-        self.gather, self.order = WholeVectors(comm, counts), order
+    def __init__(self, layout: Layout, transform: differences.FastTransform, iterations: int) -> None:
+        self.gather, self.order = WholeVectors(layout.comm, layout.counts), layout.rows
         self.transform, self.iterations = transform, iterations
 
     @classmethod
-    def of(cls, P: PETSc.Mat, order: str, name: str, places: Places | None = None) -> DifferencesInverse | None:
+    def of(cls, P: PETSc.Mat, layout: Layout) -> DifferencesInverse | None:
         """For a Mat with entries; None if they do not depend on differences, or are not symmetric and positive.
 
-        order, name, places : as in `digits_of`. Collective; EntriesError or ValueError on all ranks.
+        Collective; EntriesError on all ranks.
         """
         if P.getBlockSize() > 1:
             return None
-        comm, entries = P.comm.tompi4py(), Entries.of(P)
-        digits, rows, _ = digits_of(P, order, name, places)
-        even = differences.depend_on_differences(entries, digits.shape, rows, np.random.default_rng(0))
-        if even is None or not is_symmetric(entries, digits.rows):
+        entries, shape, comm = Entries.of(P), layout.digits.shape, layout.comm
+        even = differences.depend_on_differences(entries, shape, layout.rows, np.random.default_rng(0))
+        if even is None or not is_symmetric(entries, layout.digits.rows):
             return None
-        means = differences.means_of_differences(entries, digits.shape, rows, even)
+        means = differences.means_of_differences(entries, shape, layout.rows, even)
         # what other ranks find best may differ by rounding
-        found = comm.bcast(differences.best(means) if comm.rank == 0 else None)
+        found = on_first(comm, lambda: differences.best(means))
         if found is None:
             return None
         transform = differences.FastTransform(means, found[0])
-        counts = np.array(comm.allgather(P.getLocalSize()[0]))
-        return cls(comm, counts, rows, transform, found[1]) if comm.bcast(transform.positive) else None
+        return cls(layout, transform, found[1]) if comm.bcast(transform.positive) else None
 
     def __call__(self, x: Array) -> Array:
         """This rank's part of the product, from its part of x. Every rank transforms the whole vector."""
@@ -91,8 +89,10 @@ class EntriesTrain:
     single_pays = True
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str, places: Places) -> None:
-        self.comm, self.options, self.account, self.prefix = comm, options, account, prefix
-        self._order = (options.order, f"-{prefix}pc_tt_order", places)
+        self.comm, self.options, self.account = comm, options, account
+        self._named = f"-{prefix}pc_tt_"  # how the names of the options begin
+        self._places = places
+        self._layout: Layout | None = None
         self.rank = options.max_rank or 100 if options.automatic else int(options.rank)
         self.transform: DifferencesInverse | None = None
         self.compressed: GridTrain | None = None
@@ -118,27 +118,28 @@ class EntriesTrain:
         if self.rank == 1 or self._distrusted:
             return False
         options, iterations = self.options, 50  # if there is no estimate
-        product = self._product_operations(P)
+        layout = self._layout = self._layout or layout_of(P, options.order, f"{self._named}order", self._places)
+        product = _product_operations(P, layout)
         if options.automatic and options.eps >= options.coarse:
-            self.transform = DifferencesInverse.of(P, *self._order)
+            self.transform = DifferencesInverse.of(P, layout)
         if self.transform is not None:  # an iteration with it takes 1.3 products
             limit = options.part * 1.3 * product * self.transform.iterations
         else:
             if multiplies(A) and (options.automatic or 20 * product < options.pays):  # six products are cheap
-                iterations = self._iterations_with_the_diagonal(A, P)
+                iterations = iterations_with_the_diagonal(A, diagonal(P))
             cost = iterations * product
             limit = options.part * cost if options.automatic else options.pays + cost
         if options.automatic and limit < options.pays:
             if self.transform is None:
                 self.note = f"conjugate gradients take about {iterations} iterations, so a train does not pay"
-            return self._take_no_train(P, "")
-        self._refused = self._refused or self._make_train(P, options.setup_limit or limit)
+            return self._take_no_train(P, layout, "")
+        self._refused = self._refused or self._make_train(P, layout, options.setup_limit or limit)
         if self._refused:
-            return self._take_no_train(P, self._refused)
+            return self._take_no_train(P, layout, self._refused)
         self.transform = None
         return True
 
-    def _take_no_train(self, P: PETSc.Mat, why: str) -> bool:
+    def _take_no_train(self, P: PETSc.Mat, layout: Layout, why: str) -> bool:
         """Use the transform if there is one; False: there is none. ``why``: a train that was tried has failed."""
         self.compressed = self.inverse = None
         if self.transform is not None:
@@ -147,96 +148,83 @@ class EntriesTrain:
             self.account.fall_back(why)
             self.failure = why
             if not self.options.automatic:
-                self.transform = DifferencesInverse.of(P, *self._order)
+                self.transform = DifferencesInverse.of(P, layout)
         return self.transform is not None
 
-    def _iterations_with_the_diagonal(self, A: PETSc.Mat, P: PETSc.Mat) -> int:
-        here = np.arange(*P.getOwnershipRange())
-        diagonal = Entries.of(P).own(here, here)
-        return iterations_with_the_diagonal(A, np.where(diagonal > 0, diagonal, 1.0))
-
-    def _product_operations(self, P: PETSc.Mat) -> float:
-        """Of a product with P, by FFT on a grid twice as wide if P does not show how it multiplies."""
-        known = compressed(P)
-        if known is not None:
-            return apply_operations(known.train)
-        if P.getType() in DENSE:
-            return 0.5 * float(P.getSize()[0]) ** 2
-        shape = digits_of(P, *self._order)[0].shape
-        wide = prod(2 * n for n in shape)
-        return wide * log2(wide)
-
-    def _make_train(self, P: PETSc.Mat, limit: float) -> str:
+    def _make_train(self, P: PETSc.Mat, layout: Layout, limit: float) -> str:
         """Make a train with at most this number of operations; the reason if there is no positive one.
 
         eps is lowered three times if the train of the matrix or of its inverse is not positive.
         """
-        work = Work(limit)
+        work, eps = Work(limit), self.options.eps
         try:
-            for attempt in range(4):
-                eps = self.options.eps * 0.05**attempt
+            for _ in range(4):
                 warm = self.compressed is not None and self.options.reuse != "none"
                 with PETSc.Log.Event("TTCompress"):
-                    self.compressed = self._compress(P, eps, self.compressed if warm else None, work)
-                self.symmetric = self.compressed.symmetric
-                if self.compressed.shift <= 0:
+                    A = self.compressed = self._compress(P, layout, eps, self.compressed if warm else None, work)
+                self.symmetric = A.symmetric
+                if A.shift <= 0:
                     return "the mean of the diagonal is not positive"
                 self.account.reused += warm
                 with PETSc.Log.Event("TTInvert"):
-                    # every rank inverts the same train, but results may differ in the last bit: all take the first's
-                    found, work.spent = self.comm.bcast((self._invert(eps, work), work.spent))
-                    if isinstance(found, TooMuchWorkError):
-                        raise found
-                    self.inverse = found
-                    if found is not None and self._is_positive(found):
-                        return ""
-                if found is not None and found.residual > eps:
-                    break  # the rank cannot reach this accuracy, and even less a higher one
-            return self._why_not_positive()
+                    X = self.inverse = self._invert(A, eps, work)
+                    if X is not None:
+                        self._product = A.product(X.applied)
+                        if X.certain or not self._is_negative(P):
+                            return ""
+                        if X.residual > eps:
+                            break  # the rank cannot reach this accuracy, and even less a higher one
+                eps *= 0.05
+            return self._why_not_positive(A, X)
         except TooMuchWorkError as stopped:
             return self._too_much(str(stopped), work)
 
+    def _compress(
+        self, P: PETSc.Mat, layout: Layout, eps: float, start: GridTrain | None, work: Work
+    ) -> GridTrain:
+        known = compressed(P)
+        if known is not None and known.error <= eps and self.options.order in ("auto", known.layout.order):
+            return known.rounded(0.5 * eps, self.rank)
+        return compressed_entries(P, layout, eps, self.rank, start, work)
+
+    def _invert(self, A: GridTrain, eps: float, work: Work) -> Inverse | None:
+        """The inverse of A / c; None if its train turns out not to be positive."""
+        found, work.spent = on_first(
+            self.comm, lambda: (invert_positive(A.train, self.rank, eps, work=work), work.spent)
+        )
+        return found
+
+    def _is_negative(self, P: PETSc.Mat) -> bool:
+        """Whether a test finds that the train of the inverse is not positive."""
+        assert self.compressed is not None
+        factors = []
+        for product in (self._product, self.compressed.product(self.compressed.train)):
+
+            def times(x: Array, out: Array, product: TrainProduct = product) -> None:
+                out[:] = x + product(x)
+
+            factors.append(symmetric_shell(self.comm, P.getLocalSize()[0], 1, times))
+        found = finds_negative(*factors)
+        for mat in factors:
+            mat.destroy()
+        return found
+
     def _too_much(self, where: str, work: Work) -> str:
-        limit = f"the limit of {work.limit:.1e} operations (-{self.prefix}pc_tt_setup_limit) ends {where}"
+        limit = f"the limit of {work.limit:.1e} operations ({self._named}setup_limit) ends {where}"
         if self.options.setup_limit:
             return f"{limit}: raise it, if the ranks do not grow"
         if where == CROSS:
             return f"{limit}: the ranks of the matrix grow, which is hopeless in this order of the points"
         return f"{limit}: a train costs more than one solution without it; raise the limit for many right-hand sides"
 
-    def _why_not_positive(self) -> str:
-        assert self.compressed is not None
-        missed = f"the train of the matrix leaves {self.compressed.error:.1e} of it"
-        if self.inverse is None:
-            return f"the train of the matrix is not positive, {missed}: lower -{self.prefix}pc_tt_eps"
-        if self.inverse.residual <= self.options.eps:
-            return f"the inverse is not positive, because {missed}: lower -{self.prefix}pc_tt_eps"
-        why = f"the inverse of rank {self.rank} is not positive, it leaves {self.inverse.residual:.1e} of the residual"
-        return f"{why}: " + (f"raise -{self.prefix}pc_tt_rank" if self.inverse.residual < 1 else "this is hopeless")
-
-    def _compress(self, P: PETSc.Mat, eps: float, start: GridTrain | None, work: Work) -> GridTrain:
-        known, (order, name, places) = compressed(P), self._order
-        if known is not None and known.error <= eps and order in ("auto", known.order):
-            return known.rounded(0.5 * eps, self.rank)
-        return compressed_entries(P, eps, self.rank, order, name, start, places, work)
-
-    def _invert(self, eps: float, work: Work) -> Inverse | TooMuchWorkError | None:
-        """The inverse; None if the train of the matrix turns out not to be positive."""
-        assert self.compressed is not None
-        try:
-            return invert_positive(self.compressed.train, self.rank, eps, work=work)
-        except TooMuchWorkError as stopped:  # perhaps on this rank only
-            return stopped
-
-    def _is_positive(self, inverse: Inverse) -> bool:
-        """Take I + Z into use, and tell whether it is positive."""
-        assert self.compressed is not None
-        self._product = self.compressed.product(inverse.applied)
-        if inverse.certain:
-            return True
-        product = self.compressed.product(self.compressed.train)
-        count = int(self.compressed.counts[self.comm.rank])
-        return not finds_negative(lambda x: x + self._product(x), lambda x: x + product(x), count, self.comm)
+    def _why_not_positive(self, A: GridTrain, X: Inverse | None) -> str:
+        missed = f"the train of the matrix leaves {A.error:.1e} of it"
+        if X is None:
+            return f"the train of the matrix is not positive, {missed}: lower {self._named}eps"
+        if X.residual <= self.options.eps:
+            return f"the inverse is not positive, because {missed}: lower {self._named}eps"
+        why = f"the inverse of rank {self.rank} is not positive, it leaves {X.residual:.1e} of the residual"
+        return f"{why}: " + (f"raise {self._named}rank" if X.residual < 1 else "this is hopeless")
 
     # -- application ----------------------------------------------------------------------------------------
 
@@ -254,7 +242,7 @@ class EntriesTrain:
         """Operations of this rank in `times`."""
         return self._product.flops if self.transform is None else self.transform.flops
 
-    def times(self, x: np.ndarray) -> np.ndarray:
+    def times(self, x: Array) -> Array:
         """This rank's part of the product, (x + Z x) / c for a train, from its part of x."""
         if self.transform is not None:
             return self.transform(x)
@@ -271,8 +259,19 @@ class EntriesTrain:
         if self.transform is not None:
             reason = f", because {self.note}" if self.note else ""
             grid = " x ".join(map(str, self.transform.transform.shape))
-            return f"no train but the {self.transform.transform.name} of a grid of {grid}{reason}"
-        if self.inverse is None or self.compressed is None:
-            return self.note
+            return f"no train but {self.base} of a grid of {grid}{reason}"
+        assert self.compressed is not None
+        assert self.inverse is not None
         X = self.inverse.applied
         return f"{self.compressed.words()}; inverse I + Z ranks {X.ranks} residual {self.inverse.residual:.2g}"
+
+
+def _product_operations(P: PETSc.Mat, layout: Layout) -> float:
+    """Of a product with P, by FFT on a grid twice as wide if P does not show how it multiplies."""
+    known = compressed(P)
+    if known is not None:
+        return apply_operations(known.train)
+    if P.getType() in DENSE:
+        return 0.5 * float(P.getSize()[0]) ** 2
+    wide = prod(2 * n for n in layout.digits.shape)
+    return wide * log2(wide)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
+from pctt.blocks import block_csr_matrix
 from pctt.tt.train import Array
 
 
@@ -44,55 +42,26 @@ def residual_norm(A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:
     return norm
 
 
-def product_with(P: PETSc.Mat) -> Callable[[Array], Array]:
-    """The product with P, of this rank's part of a vector."""
-    x, y = P.createVecs()
+def finds_negative(X: PETSc.Mat, A: PETSc.Mat, steps: int = 12) -> bool:
+    """Whether a few steps of conjugate gradients for A with the preconditioner X find a y with y'X y <= 0. Collective.
 
-    def times(v: Array) -> Array:
-        x.array_w[:] = v
-        P.mult(x, y)
-        return y.array_r.copy()
+    The residuals r are orthogonal in the form of X. So the first r with r'X r <= 0 shows that X is not positive on the
+    Krylov space, and the method ends with this reason. If X is near A^-1, all eigenvalues of X A except the wrong ones
+    are near one, so the method finds the wrong ones quickly: 1 to 9 steps were enough for indefinite trains that a
+    search with trains of rank 8 took for positive. If A itself is not positive, the result is True too.
 
-    return times
-
-
-def finds_negative(
-    X: Callable[[Array], Array], A: Callable[[Array], Array], size: int, comm: MPI.Comm, steps: int = 12
-) -> bool:
-    """Whether a few steps of Lanczos' method find a direction y with y'X y <= 0. Collective.
-
-    The method works on X A, which is self-adjoint in the inner product of A for any signs of X. Its tridiagonal matrix
-    has a negative pivot if and only if it has a negative Ritz value. Then y = A v has y'X y < 0 for the Ritz vector v.
-    If X is near A^-1, all eigenvalues except the wrong ones are near one, so the method finds the wrong ones quickly:
-    1 to 9 steps were enough for indefinite trains that a search with trains of rank 8 took for positive. If A itself is
-    not positive, the result is True too.
-
-    X, A : symmetric products; each gives this rank's part of the product from its part (`size`,) of a vector
+    X, A : symmetric, with products
     """
-
-    def dot(u: Array, v: Array) -> float:
-        return float(comm.allreduce(float(u @ v)))
-
-    w = np.random.default_rng(comm.rank).standard_normal(size)
-    v, beta, pivot = np.zeros(size), 0.0, np.inf
-    Aw = A(w)
-    square = dot(w, Aw)
-    for _ in range(steps):
-        if not square > 0:
-            return True
-        beta = float(np.sqrt(square)) if np.isfinite(pivot) else 0.0
-        old, v, Av = v, w / np.sqrt(square), Aw / np.sqrt(square)
-        w = X(Av)
-        alpha = dot(w, Av)
-        pivot = alpha - beta**2 / pivot
-        if not pivot > 0:
-            return True
-        w = w - alpha * v - beta * old
-        Aw = A(w)
-        square = dot(w, Aw)
-        if abs(square) <= 1e-24 * alpha**2:  # rounding
-            return False  # the space is invariant
-    return False
+    w, b = A.createVecs()
+    w.array_w[:] = np.random.default_rng(A.comm.rank).standard_normal(w.getLocalSize())
+    A.mult(w, b)
+    squares = [w.dot(b)]
+    X.mult(b, w)
+    squares.append(w.dot(b))
+    if not min(squares) > 0:  # the method takes two negative forms for positive ones
+        return True
+    reason, _ = _conjugate_gradients(A, X, PETSc.PC.Type.MAT, b, steps)
+    return reason < 0 and reason != PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT
 
 
 def iterations_with_the_diagonal(A: PETSc.Mat, diagonal: Array, most: int = 500) -> int:
@@ -100,23 +69,30 @@ def iterations_with_the_diagonal(A: PETSc.Mat, diagonal: Array, most: int = 500)
 
     They are extrapolated from the first six.
     """
-    probe, digits = 6, 8.0
-    times, comm = product_with(A), A.comm.tompi4py()
+    probe, digits, count = 6, 8.0, len(diagonal)
+    diagonal = np.where(diagonal > 0, diagonal, 1.0)
+    b = A.createVecLeft()
+    b.array_w[:] = np.random.default_rng(A.comm.rank).standard_normal(count) * np.sqrt(diagonal)
+    first = A.getOwnershipRange()[0]
+    rows = np.arange(count + 1)
+    D = block_csr_matrix(A.comm, count, count, rows, first + rows[:-1], diagonal.reshape(-1, 1, 1))
+    _, norms = _conjugate_gradients(A, D, PETSc.PC.Type.JACOBI, b, probe)
+    D.destroy()
+    found = float(np.log10(norms[0] / max(norms[-1], 1e-16 * norms[0])))
+    return int(A.comm.tompi4py().bcast(min(most, probe * digits / max(found, probe * digits / most))))
 
-    def dot(u: Array, v: Array) -> float:
-        return float(comm.allreduce(float(u @ v)))
 
-    r = np.random.default_rng(A.comm.rank).standard_normal(len(diagonal)) * np.sqrt(np.abs(diagonal))
-    p = r / diagonal
-    first = square = dot(r, p)
-    for _ in range(probe):
-        q = times(p)
-        curvature = dot(p, q)
-        if not curvature > 0:
-            break
-        r = r - square / curvature * q
-        z = r / diagonal
-        square, before = dot(r, z), square
-        p = z + square / before * p
-    found = 0.5 * float(np.log10(abs(first) / max(abs(square), 1e-32 * abs(first))))
-    return int(comm.bcast(min(most, probe * digits / max(found, probe * digits / most))))
+def _conjugate_gradients(A: PETSc.Mat, M: PETSc.Mat, kind: str, b: PETSc.Vec, steps: int) -> tuple[int, Array]:
+    """Why the method ends, and the norms r'M^-1 r of its residuals. ``kind`` is the preconditioner that M makes."""
+    ksp, x = PETSc.KSP().create(A.comm), b.duplicate()
+    ksp.setOperators(A, M)
+    ksp.setType(PETSc.KSP.Type.CG)
+    ksp.setNormType(PETSc.KSP.NormType.NATURAL)
+    ksp.setTolerances(rtol=1e-12, atol=0.0, max_it=steps)
+    ksp.setConvergenceHistory()
+    ksp.pc.setType(kind)
+    ksp.solve(b, x)
+    found = ksp.getConvergedReason(), ksp.getConvergenceHistory().copy()
+    for thing in (ksp, x, b):
+        thing.destroy()
+    return found

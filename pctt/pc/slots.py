@@ -25,9 +25,9 @@ from pctt.blocks import inverse_diagonal_blocks
 from pctt.mat.grid_train import TrainProduct
 from pctt.mat.order import Places, chosen_order
 from pctt.tt.quantise import GridDigits, group_modes
-from pctt.tt.train import Train
+from pctt.tt.train import Array
 
-CSR = tuple[np.ndarray, np.ndarray, np.ndarray]  # row pointers, columns, values of this rank's rows
+CSR = tuple[Array, Array, Array]  # row pointers, columns, values of this rank's rows
 
 
 class Slots:
@@ -85,12 +85,12 @@ class Slots:
         self.place, self.first, self.size = slots[first:last], 0, digits.size
         self.capacity = self.size
 
-    def _remember(self, keys: np.ndarray) -> None:
+    def _remember(self, keys: Array) -> None:
         by_key = np.argsort(keys)
         self._keys, self._key_places = np.asarray(keys)[by_key], self.place[by_key]
 
     @property
-    def slots(self) -> np.ndarray:
+    def slots(self) -> Array:
         """(n,) slot of each block row of the present matrix, among those of all ranks."""
         return self.first + self.place
 
@@ -111,7 +111,7 @@ class Slots:
         self._remember(keys)
         return True
 
-    def _follow(self, keys: np.ndarray, points: np.ndarray) -> np.ndarray | None:
+    def _follow(self, keys: Array, points: Array) -> Array | None:
         """The new places: a known row stays within one box of its box; of the others 2 % may go beyond 12 boxes."""
         if len(keys) > self.capacity:
             return None
@@ -134,7 +134,7 @@ class Slots:
         return None if far.sum() > 0.02 * len(keys) else place
 
 
-def _local_order(P: PETSc.Mat, points: np.ndarray | None, order: str) -> np.ndarray:
+def _local_order(P: PETSc.Mat, points: Array | None, order: str) -> Array:
     """The block rows of this rank, a permutation of 0 ... n-1: along a curve, by reverse Cuthill-McKee, or as given."""
     bs = P.getBlockSize()
     count = P.getLocalSize()[0] // bs
@@ -149,7 +149,7 @@ def _local_order(P: PETSc.Mat, points: np.ndarray | None, order: str) -> np.ndar
     return rows if len(rows) == count else rows[rows % bs == 0] // bs
 
 
-def _nearest_in_order(wanted: np.ndarray, empty: np.ndarray) -> np.ndarray:
+def _nearest_in_order(wanted: Array, empty: Array) -> Array:
     """A different slot of ``empty`` for each slot of ``wanted`` (n,), at or after it if possible; both ascend."""
     turn = np.arange(len(wanted))
     at = np.maximum.accumulate(np.searchsorted(empty, wanted) - turn) + turn
@@ -165,6 +165,7 @@ class SlottedMatrix:
     Attributes
     ----------
     size : number of slots of all ranks
+    modes : slot modes of a grid; empty without a grid
     places : (rows,) slot of each block row of all ranks
     rows, columns : (nb,) slots of the local off-diagonal blocks
     root : (n, bs, bs) R_i = L_i^-1 of each local block row; identities without scaling
@@ -172,13 +173,11 @@ class SlottedMatrix:
 
     def __init__(self, P: PETSc.Mat, slots: Slots, comm: MPI.Comm, scaled: bool):
         self.comm, self.block, self.scaled = comm, P.getBlockSize(), scaled
-        count = P.getLocalSize()[0] // self.block
-        self._counts = np.array(comm.allgather(count))
-        self._total = int(self._counts.sum())
-        self.size, self._slots = slots.size, slots.slots
+        self.size, self.modes, self._slots = slots.size, slots.modes, slots.slots
+        self._counts = np.array(comm.allgather(len(self._slots)))
         self.places = self._gathered(self._slots)
-        self.root = np.tile(np.eye(self.block), (count, 1, 1))
-        self._csr: tuple[np.ndarray, ...] | None = None  # the pattern that is listed
+        self.root = np.tile(np.eye(self.block), (len(self._slots), 1, 1))
+        self._csr: tuple[Array, ...] | None = None  # the pattern that is listed
 
     def lists(self, csr: CSR) -> bool:
         """Whether `list_blocks` has seen this pattern; collective. A Mat may get another one with as many nonzeros."""
@@ -190,20 +189,22 @@ class SlottedMatrix:
         self._csr = csr[:2]
         indptr, indices, values = csr
         numbers = np.arange(1, len(values) + 1, dtype=np.int32)  # of P's values
-        scalar = sp.csr_matrix((numbers, indices, indptr), shape=(len(indptr) - 1, self.block * self._total))
+        scalar = sp.csr_matrix((numbers, indices, indptr), shape=(len(indptr) - 1, self.block * len(self.places)))
         pattern = scalar.tobsr((self.block, self.block))
         self._order = pattern.data - 1  # index of each entry of the blocks in P's values, -1 if P does not store it
-        self._pointers, self._column = pattern.indptr, pattern.indices
-        row = np.repeat(np.arange(len(self._slots)), np.diff(pattern.indptr))
+        self._row = np.repeat(np.arange(len(self._slots)), np.diff(pattern.indptr))
+        self._column = pattern.indices
         own = int(self._counts[: self.comm.rank].sum())  # the first block row of this rank
-        self._kept = pattern.indices != own + row if self.scaled else np.ones(len(row), bool)
-        self.rows = self._slots[row[self._kept]]
-        self.columns = self.places[pattern.indices[self._kept]]
-        if not self.scaled:  # empty slots hold a multiple of the identity; each rank has a share of them
+        empty = np.zeros(0, np.int64)
+        if self.scaled:
+            kept = np.flatnonzero(self._column != own + self._row)
+            self._order, self._row, self._column = self._order[kept], self._row[kept], self._column[kept]
+        else:  # empty slots hold a multiple of the identity; each rank has a share of them
             empty = np.setdiff1d(np.arange(self.size), self.places)
             empty = np.array_split(empty, self.comm.size)[self.comm.rank]
-            self._empty = len(empty)
-            self.rows, self.columns = np.append(self.rows, empty), np.append(self.columns, empty)
+        self._empty = len(empty)
+        self.rows = np.append(self._slots[self._row], empty)
+        self.columns = np.append(self.places[self._column], empty)
 
     def scale(self, P: PETSc.Mat) -> bool:
         """Compute the roots of the present diagonal blocks of P; False if one of them is not positive definite."""
@@ -215,35 +216,33 @@ class SlottedMatrix:
             good = False
         return self.comm.allreduce(good, op=MPI.LAND)
 
-    def load(self, P: PETSc.Mat, csr: CSR) -> np.ndarray:
+    def load(self, P: PETSc.Mat, csr: CSR) -> Array:
         """The present blocks (nb, bs, bs) of P at ``rows`` and ``columns``, with scaling multiplied by the roots of
         ``scale``."""
         blocks = np.append(csr[2], 0.0)[self._order]
-        if not self.scaled:
-            typical = P.getDiagonal().sum() / P.getSize()[0]
-            return np.concatenate([blocks, np.tile(typical * np.eye(self.block), (self._empty, 1, 1))])
-        everywhere = self._gathered(self.root)
-        left = np.repeat(self.root, np.diff(self._pointers), axis=0)[self._kept]
-        return left @ blocks[self._kept] @ everywhere[self._column[self._kept]].transpose(0, 2, 1)
+        if self.scaled:
+            return self.root[self._row] @ blocks @ self._gathered(self.root)[self._column].transpose(0, 2, 1)
+        typical = P.getDiagonal().sum() / P.getSize()[0]
+        return np.concatenate([blocks, np.tile(typical * np.eye(self.block), (self._empty, 1, 1))])
 
-    def _gathered(self, local: np.ndarray) -> np.ndarray:
+    def _gathered(self, local: Array) -> Array:
         """Rows (n, ...) of all ranks, in the order of the global block rows."""
         if self.comm.size == 1:
             return local
         width = int(np.prod(local.shape[1:]))
-        out = np.empty((self._total, *local.shape[1:]), local.dtype)
+        out = np.empty((int(self._counts.sum()), *local.shape[1:]), local.dtype)
         self.comm.Allgatherv(np.ascontiguousarray(local), [out, self._counts * width])
         return out
 
-    def scaled_vector(self, x: np.ndarray) -> np.ndarray:
+    def scaled_vector(self, x: Array) -> Array:
         """This rank's part (n bs,) of L^-1 x."""
         return np.matmul(self.root, x.reshape(-1, self.block, 1)).ravel()
 
-    def unscaled(self, z: np.ndarray) -> np.ndarray:
+    def unscaled(self, z: Array) -> Array:
         """This rank's part (n bs,) of L^-T z."""
         return np.matmul(self.root.transpose(0, 2, 1), z.reshape(-1, self.block, 1)).ravel()
 
-    def product(self, train: Train) -> TrainProduct:
+    def product(self) -> TrainProduct:
         """The product with a train of the slots, with rows in the order of the Mat."""
         slots = np.add.outer(self.places * self.block, np.arange(self.block)).ravel()
-        return TrainProduct(self.comm, self._counts * self.block, slots, self.size * self.block, train)
+        return TrainProduct(self.comm, self._counts * self.block, slots, self.size * self.block)

@@ -16,16 +16,19 @@ from mpi4py import MPI
 from numpy.typing import DTypeLike
 from petsc4py import PETSc
 
+from dem.exchange import on_first
 from pctt import memory
+from pctt.blocks import symmetric_shell
 from pctt.mat.grid_train import TrainProduct
 from pctt.mat.order import Places, chosen_order
-from pctt.pc.mat import finds_negative, is_symmetric, product_with
-from pctt.pc.slots import CSR, Slots, SlottedMatrix
-from pctt.pc.train_options import Account, Options
+from pctt.pc.mat import finds_negative, is_symmetric
+from pctt.pc.options import Account, Options
+from pctt.pc.slots import Slots, SlottedMatrix
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.inverse import Inverse, invert, invert_near_identity
 from pctt.tt.quantise import choose_modes
 from pctt.tt.sparse import Compression, SparseHierarchy, compress
+from pctt.tt.train import Array
 
 LEAF = 16  # least number of blocks in the first and in the last mode
 
@@ -34,35 +37,33 @@ class SparseTrain:
     """`make` makes a train for a matrix, `times` multiplies with it.
 
     inverse, compression : the inverse in use, and the newest train of a matrix; None before `make`, and after a failure
-    slots, hierarchy : slots and block pairs of the present structure
+    slots, hierarchy : slots and block pairs of the present structure; None before a train is made for it
     tree : slots that are kept from structure to structure
     rank : cap of the ranks
     failure : why a train that was asked for is not used; it is not tried again before the next structure
     """
 
-    slots: SlottedMatrix
-    places: Places
     note, base = "", "block Jacobi"
     single_pays = False
+    _product: TrainProduct  # of the inverse in use
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account) -> None:
         self.comm, self.options, self.account = comm, options, account
         self.rank = 1 if options.automatic else int(options.rank)
         self._block = 0  # block size of the last structure
-        self._forget_structure()
         self._forget_trains()
 
     def _forget_structure(self) -> None:
-        self._begun = False  # whether there are slots for the present structure
+        self.slots: SlottedMatrix | None = None
         self.hierarchy: SparseHierarchy | None = None
 
     def _forget_trains(self) -> None:
+        self._forget_structure()
         self.tree: Slots | None = None
         self.compression: Compression | Cross | None = None
         self.inverse: Inverse | None = None
         self._opening: Inverse | None = None  # the inverse for the first matrix of a structure
         self._age, self._trial = 0, 2  # set-ups since a train was new, and the one at which another is tried
-        self._product: TrainProduct | None = None
 
     def begin(self, P: PETSc.Mat, places: Places) -> None:
         """Begin a new structure; ValueError on all ranks if it lacks what the order needs."""
@@ -79,91 +80,72 @@ class SparseTrain:
         if self.rank == 1 or self.failure:
             return False
         if self.options.reuse == "none":
-            self._forget_structure()
             self._forget_trains()
-        first = not self._begun
+        first = self.slots is None
         if first:
             # a first set-up takes ten times the memory of the entries; measured at 142,000 contacts
             needed = 80.0 * self.comm.allreduce(P.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_used"], op=MPI.MAX)
             if needed >= memory.available(self.comm):
                 return self._refuse("there is no memory for the tables of a train")
-            self._take_slots(P)
-        if not self.slots.scale(P):
+        slots = self.slots = self._slots_of(P) if self.slots is None else self.slots
+        if not slots.scale(P):
             return self._refuse("a diagonal block is not positive definite")
         kept = (self._opening if first else self.inverse) if self.options.reuse == "trains" else None
         self._age += 1
         if kept is not None and self._age < self._trial:
             self._use(kept)
             self.account.kept += 1
-        elif not self._try_new(P, kept):
+        elif not self._try_new(P, slots, kept):
             return False
         if first:
             self._opening = self.inverse
         return True
 
-    def _try_new(self, P: PETSc.Mat, kept: Inverse | None) -> bool:
+    def _slots_of(self, P: PETSc.Mat) -> SlottedMatrix:
+        """The slots of P's block rows; those of the last structure if they fit."""
+        if self.tree is not None and not self.tree.follow(P, self.places, self._all):
+            self.account.resets += 1
+            self._forget_trains()
+        if self.tree is None:
+            self.tree = Slots(P, self.places, LEAF, self.options.order)
+        slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaling == "block")
+        self._product = slots.product()
+        return slots
+
+    def _try_new(self, P: PETSc.Mat, slots: SlottedMatrix, kept: Inverse | None) -> bool:
         """Make a train for P and use it, or use the kept train if it is as good; False if no train is positive."""
         csr = P.getValuesCSR()
         if not self._all(bool(np.isfinite(csr[2]).all())):
             return self._refuse("the matrix has entries that are no numbers")
-        if self.hierarchy is None or not self.slots.lists(csr):
+        if self.hierarchy is None or not slots.lists(csr):
             with PETSc.Log.Event("TTBuild"):
-                self.hierarchy = self._block_pairs(csr)
-        self.hierarchy.set_values(self.slots.load(P, csr))
+                slots.list_blocks(csr)
+                modes = slots.modes or choose_modes(slots.size, LEAF)
+                self.hierarchy = SparseHierarchy(
+                    slots.rows, slots.columns, modes, slots.block, self._add, self.comm.bcast
+                )
+        self.hierarchy.set_values(slots.load(P, csr))
         warm = self.compression is not None
         with PETSc.Log.Event("TTCompress"):
             self.compression = self._compress(warm)
         with PETSc.Log.Event("TTInvert"):
-            # every rank inverts the same train, but results may differ in the last bit: all take the first rank's
-            new = self.comm.bcast(self._invert(warm))
+            new = on_first(self.comm, lambda: self._invert(warm))
             self._use(new)
             positive = self._is_positive(P)
         self.account.reused += warm
         if kept is None:
             self._age, self._trial = 0, 2
             return positive or self._refuse(f"the inverse of rank {self.rank} is not positive")
-        left = [np.inf, np.inf]
-        for which, inverse in enumerate((new, kept)):
-            if inverse is kept or positive:
-                self._use(inverse)
-                left[which] = self._left(P)
-        left = self.comm.bcast(left)
-        if not left[0] * 1.1 >= left[1]:  # it gains 10 %; True if the kept train leaves no number
+        news = self._left(P, slots) if positive else np.inf
+        self._use(kept)
+        olds = self._left(P, slots)
+        if not news * 1.1 >= olds:  # it gains 10 %; True if the kept train leaves no number
             self._use(new)
             self._age, self._trial = 0, 2
         else:
             self._trial = 2 * self._age + 1
             self.account.kept += 1
         return True
-
-    def _is_positive(self, P: PETSc.Mat) -> bool:
-        """Whether the train in use is positive, as far as a test shows."""
-        return not finds_negative(self.times, product_with(P), P.getLocalSize()[0], self.comm)
-
-    def _left(self, P: PETSc.Mat) -> float:
-        """||w - S X w|| / ||w|| for a random vector w, where S is the scaled matrix."""
-        w = np.random.default_rng(self.options.seed).standard_normal(P.getLocalSize()[0])
-        left = w - self.slots.scaled_vector(product_with(P)(self.slots.unscaled(self._inverse_times(w))))
-        squares = self.comm.allreduce(np.array([left @ left, w @ w]))
-        return float(np.sqrt(squares[0] / squares[1]))
-
-    def _take_slots(self, P: PETSc.Mat) -> None:
-        """Give slots to P's block rows; use those of the last structure if they fit."""
-        if self.tree is not None and not self.tree.follow(P, self.places, self._all):
-            self.account.resets += 1
-            self._forget_trains()
-        if self.tree is None:
-            self.tree = Slots(P, self.places, LEAF, self.options.order)
-        self.slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaling == "block")
-        self._begun = True
-        self._product = None  # rows have other slots
-
-    def _block_pairs(self, csr: CSR) -> SparseHierarchy:
-        assert self.tree is not None
-        slots = self.slots
-        slots.list_blocks(csr)
-        modes = self.tree.modes or choose_modes(slots.size, LEAF)
-        return SparseHierarchy(slots.rows, slots.columns, modes, slots.block, self._add, self.comm.bcast)
 
     def _compress(self, warm: bool) -> Compression | Cross:
         assert self.hierarchy is not None
@@ -181,30 +163,57 @@ class SparseTrain:
         rng = np.random.default_rng(self.options.seed)
         return method(self.compression.train, self.rank, start, eps=self.options.eps, rng=rng)
 
+    def _is_positive(self, P: PETSc.Mat) -> bool:
+        """Whether the train in use is positive, as far as a test shows."""
+
+        def times(x: Array, out: Array) -> None:
+            out[:] = self.times(x)
+
+        X = symmetric_shell(self.comm, P.getLocalSize()[0], 1, times)
+        negative = finds_negative(X, P)
+        X.destroy()
+        return not negative
+
+    def _left(self, P: PETSc.Mat, slots: SlottedMatrix) -> float:
+        """||w - S X w|| / ||w|| for a random vector w, where S is the scaled matrix; the same on all ranks."""
+        x, y = P.createVecs()
+        w = np.random.default_rng(self.options.seed).standard_normal(x.getLocalSize())
+        x.array_w[:] = slots.unscaled(self._inverse_times(w))
+        P.mult(x, y)
+        left = w - slots.scaled_vector(y.array_r)
+        squares = self.comm.allreduce(np.array([left @ left, w @ w]))
+        return float(self.comm.bcast(np.sqrt(squares[0] / squares[1])))
+
     def _refuse(self, why: str) -> bool:
         self.account.fall_back(why)
         self.failure = why
         self.compression = self.inverse = self._opening = None
         return False
 
+    def _all(self, here: bool) -> bool:
+        return bool(self.comm.allreduce(here, op=MPI.LAND))
+
+    def _add(self, x: Array) -> Array:
+        if self.comm.size == 1:
+            return x
+        out = np.empty(x.shape, x.dtype)
+        self.comm.Allreduce(np.ascontiguousarray(x), out)
+        return out
+
     # -- application ----------------------------------------------------------------------------------------
 
     def _use(self, inverse: Inverse) -> None:
         self.inverse = inverse
-        if self._product is None:
-            self._product = self.slots.product(inverse.applied)
-        else:
-            self._product.set_train(inverse.applied)
+        self._product.set_train(inverse.applied)
 
     def use(self, dtype: DTypeLike) -> None:
         """Multiply in this precision."""
-        assert self._product is not None
         self._product.use(dtype)
 
     @property
     def flops(self) -> int:
         """Operations of this rank in `times`."""
-        assert self._product is not None
+        assert self.slots is not None
         return self._product.flops + 4 * self.slots.root.size
 
     def distrust(self, why: str) -> None:
@@ -214,26 +223,16 @@ class SparseTrain:
         else:
             self.failure = why
 
-    def times(self, x: np.ndarray) -> np.ndarray:
+    def times(self, x: Array) -> Array:
         """This rank's part of L^-T X L^-1 x, from its part of x."""
+        assert self.slots is not None
         return self.slots.unscaled(self._inverse_times(self.slots.scaled_vector(x)))
 
-    def _inverse_times(self, x: np.ndarray) -> np.ndarray:
+    def _inverse_times(self, x: Array) -> Array:
         """This rank's part of X x, from its part of x."""
         assert self.inverse is not None
-        assert self._product is not None
         product = self._product(x)
         return x + product if self.inverse.identity else product
-
-    def _all(self, here: bool) -> bool:
-        return bool(self.comm.allreduce(here, op=MPI.LAND))
-
-    def _add(self, x: np.ndarray) -> np.ndarray:
-        if self.comm.size == 1:
-            return x
-        out = np.empty(x.shape, x.dtype)
-        self.comm.Allreduce(np.ascontiguousarray(x), out)
-        return out
 
     def words(self) -> str:
         """Ranks, errors and sizes."""

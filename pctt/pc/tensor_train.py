@@ -16,11 +16,11 @@ from petsc4py import PETSc
 from pctt.blocks import block_diagonal
 from pctt.mat.entries import diagonal_blocks, has_entries
 from pctt.mat.order import Places, places_of
-from pctt.pc.base import PythonPC
+from pctt.options import describe, read
 from pctt.pc.entries_train import EntriesTrain
+from pctt.pc.options import Account, Options
 from pctt.pc.sparse_train import SparseTrain
-from pctt.pc.train_options import Account, Options
-from pctt.petsc import on_coordinates, set_failed, warn
+from pctt.petsc import Context, given_options, on_coordinates, set_failed, warn
 
 NOT_SYMMETRIC = "the matrix is not symmetric, so a train for its inverse may be useless"
 NOWHERE = (
@@ -39,21 +39,26 @@ SPOILT = {
 }
 
 
-class TensorTrain(PythonPC):
+class TensorTrain(Context):
     """The python PC; see the module and ``Options``. It works on symmetric positive definite Mats of any block size."""
 
+    name = "pctt.pc.TensorTrain"  #: for ``-pc_python_type``
     options_class = Options
     options_prefix = "pc_tt_"
-    options: Options
+    without = PETSc.PC.Type.NONE
     made: SparseTrain | EntriesTrain  #: the maker of trains
     sparse_train: type[SparseTrain] = SparseTrain
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
+        self.options, self.prefix = Options(), ""
         self.account = Account()
+        self.P: PETSc.Mat | None = None  # the matrix, or a copy of it in AIJ; None if it has no rows
         self.rank = 1
         self.failed = False  # whether there is no preconditioner, by -pc_tt_fallback none
         self.places = Places()
+        self._structure: tuple | None = None
+        self._copy: list[PETSc.Mat] = []  # P, if it is a copy
         self._own: list[PETSc.Object] = []  # block Jacobi and its matrix
         self._warned: set[str] = set()
         self._points: np.ndarray | None = None
@@ -62,7 +67,14 @@ class TensorTrain(PythonPC):
 
     def destroy(self, pc: PETSc.PC) -> None:
         self._on_coordinates = on_coordinates(pc, None)  # the function refers to this context
+        self.P = None
+        _destroy(self._own)
+        _destroy(self._copy)
         super().destroy(pc)
+
+    def reset(self, pc: PETSc.PC) -> None:
+        """Forget the matrix; keep everything that the next matrix can use."""
+        self._structure = self.P = None
 
     def _take_points(self, points: np.ndarray) -> None:
         """The points (n, d) of this rank's block rows, from ``PCSetCoordinates``."""
@@ -71,25 +83,67 @@ class TensorTrain(PythonPC):
 
     # -- set-up ---------------------------------------------------------------------------------------------
 
-    def takes(self, P: PETSc.Mat) -> bool:
-        return has_entries(P)
+    def setFromOptions(self, pc: PETSc.PC) -> None:
+        """Read the options with the prefix of the PC; OptionError for a bad value or a misspelt name.
 
-    def build(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
-        """ValueError on all ranks if coordinates, grid or modes do not fit the matrix."""
+        The next set-up uses them.
+        """
+        self.prefix = pc.getOptionsPrefix() or ""
+        prefix = self.prefix + self.options_prefix
+        before, self.options = self.options, read(Options, given_options(Options, prefix), prefix)
+        if self.options != before:
+            self._structure = None
+        if PETSc.Options().hasName("help"):
+            PETSc.Sys.Print("\n".join(map(str, describe(Options, prefix))), comm=pc.comm)
+
+    def setUp(self, pc: PETSc.PC) -> None:
+        """ValueError on all ranks if the matrix is not square or has no entries, or if places do not fit it."""
+        _, P = pc.getOperators()
+        rows, columns = P.getSize()
+        if rows != columns:
+            raise ValueError(f"{self.name}: the matrix has {rows} rows and {columns} columns; allowed is a square one")
+        structure: tuple = (P.handle, rows)
+        if rows == 0:
+            self.P, self._structure = None, structure
+            return
+        if not has_entries(P):
+            P = self._in_aij(P)
+            structure += (P.getInfo()["nz_used"],)
+        self.P = P
+        if structure != self._structure:
+            self._begin(pc, P)
+            self._structure = structure
+        self.update(pc, P)
+
+    def _in_aij(self, P: PETSc.Mat) -> PETSc.Mat:
+        """P, or a copy of P in AIJ if P has another type than AIJ and BAIJ."""
+        kind = P.getType().removeprefix("seq").removeprefix("mpi")
+        if kind.startswith(("aij", "baij")):
+            return P
+        if not kind.startswith(("sbaij", "dense")):
+            allowed = "allowed are aij, baij, sbaij, dense"
+            raise ValueError(f"{self.name}: a Mat of type {P.getType()} has no entries to read; {allowed}")
+        sparse = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
+        if sparse.getBlockSize() != P.getBlockSize():
+            sparse.setBlockSize(P.getBlockSize())
+        for attribute in ("coordinates", "grid", "key"):
+            sparse.setAttr(attribute, P.getAttr(attribute))
+        _destroy(self._copy)
+        self._copy = [sparse]
+        return sparse
+
+    def _begin(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
+        """Take what depends on the structure of P only."""
         self.comm = P.comm.tompi4py()
         self.places = places_of(P, (pc.getDM(), pc.getOperators()[0].getDM()), self._points)
         if has_entries(P):
             self.made = EntriesTrain(self.comm, self.options, self.account, self.prefix, self.places)
-        else:
-            made = getattr(self, "made", None)
-            if not isinstance(made, SparseTrain) or made.options != self.options:
-                made = self.sparse_train(self.comm, self.options, self.account)
-            self.made = made
-            made.begin(P, self.places)
-        self.release()
-        self._jacobi = PETSc.PC().create(P.comm)
-        self._jacobi.setType(PETSc.PC.Type.PBJACOBI)
-        self._own = [self._jacobi]
+            return
+        made = getattr(self, "made", None)
+        if not isinstance(made, SparseTrain) or made.options != self.options:
+            made = self.sparse_train(self.comm, self.options, self.account)
+        self.made = made
+        made.begin(P, self.places)
 
     def _warn(self, words: str) -> None:
         """Warn, once in the life of this preconditioner; collective."""
@@ -120,18 +174,22 @@ class TensorTrain(PythonPC):
             PETSc.Sys.Print(f"  {self.name}: {self._line()}", comm=P.comm)
 
     def _make_block_jacobi(self, P: PETSc.Mat) -> None:
-        old = self._own[1:]
+        _destroy(self._own)
         diagonal = block_diagonal(P, diagonal_blocks(P) if has_entries(P) else None)
+        self._jacobi = PETSc.PC().create(P.comm)
+        self._jacobi.setType(PETSc.PC.Type.PBJACOBI)
         self._jacobi.setOperators(diagonal)
         self._jacobi.setUp()
         self._own = [self._jacobi, diagonal]
-        for mat in old:
-            mat.destroy()
 
     # -- application ----------------------------------------------------------------------------------------
 
-    def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x, where M is block Jacobi or the train; if the set-up failed, y has no numbers."""
+        if self._structure is None:  # PETSc does not set up a new context of a PC that is set up (`-pc_python_type`)
+            self.setUp(pc)
+        if self.P is None:
+            return
         if self.failed:
             y.set(np.inf)
         elif self.rank == 1:
@@ -141,12 +199,12 @@ class TensorTrain(PythonPC):
                 y.array_w[:] = self.made.times(x.array_r)
                 PETSc.Log.logFlops(self.made.flops)
 
-    def multiply_transpose(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def applyTranspose(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M' x; trains are symmetric, blocks of a matrix may be not."""
-        if self.rank == 1 and not self.failed:
+        if self._structure is not None and self.P is not None and self.rank == 1 and not self.failed:
             self._jacobi.applyTranspose(x, y)
         else:
-            self.multiply(x, y)
+            self.apply(pc, x, y)
 
     # -- watching the solves --------------------------------------------------------------------------------
 
@@ -213,18 +271,26 @@ class TensorTrain(PythonPC):
 
     # -- words ----------------------------------------------------------------------------------------------
 
+    def view(self, pc: PETSc.PC, viewer: PETSc.Viewer | None = None) -> None:
+        if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII:
+            lines = ["no matrix with rows"] if self.P is None else self.report()
+            for line in pc.comm.tompi4py().bcast(lines):
+                viewer.printfASCII(f"  {line}\n")
+
     def report(self) -> list[str]:
-        a = self.account
-        lines = [
+        """Lines for ``-ksp_view``."""
+        a, symmetric = self.account, self.P is None or self.made.symmetric
+        return [
             f"tensor train: {self._line()}",
             f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, kept {a.kept} times, "
             f"trees made anew {a.resets}",
             f"rows ordered by {self.places.source}",
+            *([] if symmetric else [NOT_SYMMETRIC]),
+            *(f"fell back: {why} ({count} times)" for why, count in a.fallbacks.items()),
         ]
-        lines += [] if self.P is None or self.made.symmetric else [NOT_SYMMETRIC]
-        return lines + [f"fell back: {why} ({count} times)" for why, count in a.fallbacks.items()]
 
     def what(self) -> str:
+        """What the preconditioner really was over its solves, in a few words."""
         return self.account.what()
 
     def _used(self) -> int | str:
@@ -244,7 +310,7 @@ class TensorTrain(PythonPC):
         digits = "single" if self._last_precision is np.float32 and self.made.inverse is not None else "double"
         return f"{self.made.words()}, {digits} precision, set up in {self._made_in:.2e} s"
 
-    def release(self) -> None:
-        for thing in self._own:
-            thing.destroy()
-        self._own = []
+
+def _destroy(things: list[PETSc.Object]) -> None:
+    while things:
+        things.pop().destroy()

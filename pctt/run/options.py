@@ -17,9 +17,8 @@ from dem.together import together
 from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
-from pctt.disk import refuse_serial
-from pctt.ksp_options import OF_SOLVERS, entered, keep_from_petsc, refuse_misspelt, to_enter, unused
-from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read, refuse_unknown
+from pctt.ksp_options import OF_SOLVERS, entered, keep_from_petsc, refuse_misspelt, refuse_unknown, to_enter
+from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read
 from pctt.petsc import own_errors
 from pctt.run.output import refusal, refuse_unwritable
 from pctt.run.settings import DEMO, Options, Run, Settings, find_scene
@@ -42,7 +41,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     solver = ccp.SOLVERS[asked.solver]
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in option_groups(scene_class) for d in describe(group, start)]
-    refuse_unknown(unused(database), known, prefixes=OF_SOLVERS)  # PETSc has asked for its own when it started
+    refuse_unknown(database, known)  # PETSc has asked for its own when it started
     keep_from_petsc(known)
     _refuse_without_effect(database, run, asked)
     what = f"options of the scene {scene_class.__name__}"
@@ -151,7 +150,6 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) ->
 def _refuse_places(run: Run, comm: MPI.Comm) -> None:
     """OptionError for files that are not there, and for folders in which the run cannot write, or which hold another
     run that it neither continues nor has ``-overwrite`` for."""
-    refuse_serial(comm)
     for name, path in {"-restart": run.restart if run.restart != "settled" else "", "-problem": run.problem}.items():
         if not comm.bcast(not path or os.access(path, os.R_OK) and os.path.isfile(path)):
             raise OptionError(f"{name} {path}: no such file, or not readable")

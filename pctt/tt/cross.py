@@ -139,8 +139,7 @@ class _Entries:
         return [np.unique(keys // w) for w in self.width], [np.unique(keys % w) for w in self.width]
 
     def of_train(self, train: Train, keys: Array) -> Array:
-        digits = np.stack([keys // w % square for w, square in zip(self.width[1:], self.squares)])
-        return train.at(digits)
+        return train.at(np.stack(np.unravel_index(keys, self.squares)))
 
     def error(self, train: Train, keys: Array, weights: Array) -> float:
         """The estimated relative error."""

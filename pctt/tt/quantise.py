@@ -5,8 +5,8 @@ m_1 m_2 ... m_d >= n. The last mode is the leaf, a run of neighbouring slots tha
 a train are the slot modes, with the leaf multiplied by the block size. Slots keep their order.
 
 On a grid a coordinate 0 <= c_a < n_a is written in digits. Their bases are small primes with a product p_a >= n_a, so
-there is little padding. The modes are the digits of one axis after the other. Row numbers, places in the train and keys
-of pairs of points are all sums of one number per axis, and small tables have these numbers.
+there is little padding. The modes are the digits of one axis after the other, so the slots of the train are the points
+of a grid of shape (p_1, ..., p_D), in the order of a numpy array.
 """
 
 from __future__ import annotations
@@ -117,7 +117,8 @@ class GridDigits:
     block : unknowns per point, the fastest digit of a row
 
     modes : modes of the train, the same for rows and columns
-    places : (n_1 ... n_D block,) place of each row among the `slots_of(modes)` rows of the train
+    padded : shape of the grid that the digits fill; its rows, numbered in the same way, are the slots of the train
+    size : number of slots
 
     >>> GridDigits((8, 6)).modes
     (2, 2, 2, 3, 2)
@@ -128,37 +129,16 @@ class GridDigits:
         if min((*self.shape, self.block)) < 1:
             raise ValueError(f"a grid of shape {self.shape} with blocks of {self.block}; allowed are numbers >= 1")
         axes = [bases(n) for n in self.shape]
-        modes = [base for digits in axes for base in digits] or [1]
-        self.modes = scalar_modes(modes, self.block)
-        self._tables(axes)
-
-    def _tables(self, axes: list[list[int]]) -> None:
-        """Make the tables. For each axis they have the contribution of its coordinate to a place in the train and to
-        the two halves of a key. For each mode they have the contribution of a pair of digits to the pair of padded
-        rows."""
         self.padded = tuple(prod(digits) for digits in axes)
+        self.modes = scalar_modes([base for digits in axes for base in digits] or [1], self.block)
         self.size = slots_of(self.modes)
         if self.size >= 2**31:
             raise ValueError(f"too many points for a train: a grid of shape {self.shape}")
-        width = [int(w) for w in np.cumprod([1, *self.modes[::-1]])[-2::-1]]  # weight of a digit in a place
-        square = [w * w for w in width]  # weight of a pair of digits in a key
-        stride = np.cumprod([1, *self.padded[::-1]])[-2::-1] * self.block
-        self.place, self.row_key, self.column_key = ([np.zeros(p, np.int64) for p in self.padded] for _ in range(3))
-        row_of = [np.zeros(m, np.int64) for m in self.modes]
-        k = 0
-        for a, bases_of_axis in enumerate(axes):
-            for level, base in enumerate(bases_of_axis):
-                weight = prod(bases_of_axis[level + 1 :])
-                below = self.modes[k] // base  # in the last mode the block, otherwise 1
-                digit = np.arange(self.padded[a]) // weight % base * below
-                self.place[a] += digit * width[k]
-                self.row_key[a] += digit * self.modes[k] * square[k]
-                self.column_key[a] += digit * square[k]
-                row_of[k] += np.arange(self.modes[k]) // below * (weight * int(stride[a]))
-                k += 1
-        row_of[-1] += np.arange(self.modes[-1]) % self.block
-        self._pairs = [(row[:, None] * self.size + row).ravel() for row in row_of]
-        self._square = square
+        # for each mode, the contribution of a pair of digits to row * size + column
+        widths = np.cumprod([1, *self.modes[::-1]], dtype=np.int64)[-2::-1]
+        digits = [np.arange(m) * width for m, width in zip(self.modes, widths)]
+        self._pairs = [np.add.outer(digit * self.size, digit).ravel() for digit in digits]
+        self._squares = widths**2
 
     @property
     def rows(self) -> int:
@@ -167,40 +147,51 @@ class GridDigits:
 
     @property
     def places(self) -> Array:
-        out = np.zeros(1, np.int64)
-        for table, n in zip(self.place, self.shape):
-            out = np.add.outer(out, table[:n]).ravel()
-        return np.add.outer(out, np.arange(self.block)).ravel()
+        """(rows,) the slot of each row."""
+        return np.arange(self.size).reshape(*self.padded, self.block)[tuple(map(slice, self.shape))].ravel()
 
     def key(self, row: Array, column: Array) -> Array:
         """Keys of pairs of points with coordinates (D + 1, ...); the last coordinate is the unknown in the block."""
-        out = row[-1] * self.modes[-1] + column[-1]
-        for a in range(len(self.shape)):
-            out = out + self.row_key[a][row[a]] + self.column_key[a][column[a]]
-        return out
+        row, column = (np.ravel_multi_index(tuple(x), (*self.padded, self.block)) for x in (row, column))
+        return pair_keys(row, column, self.modes)
 
     def pair(self, keys: Array) -> Array:
-        """Pairs row * size + column, of padded rows and columns, for keys with the digits i_k m_k + j_k of base m_k^2.
+        """row * size + column of the slots with these `pair_keys`.
 
         If keys share no digit, the pair of their sum is the sum of their pairs.
         """
         pair = np.zeros(keys.shape, np.int64)
-        for table, square in zip(self._pairs, self._square):
+        for table, square in zip(self._pairs, self._squares):
             digit, keys = np.divmod(keys, square)
             pair += table[digit]
         return pair
 
-    def within(self, padded: Array) -> tuple[Array, Array]:
-        """The rows of the matrix for padded rows, and a mask of those that exist; the other numbers mean nothing."""
+    def within(self, slots: Array) -> tuple[Array, Array]:
+        """The rows of the matrix at slots, and a mask of those that exist; the other numbers mean nothing."""
+        inside = np.ones(slots.shape, bool)
         if self.padded == self.shape:
-            return padded, np.ones(padded.shape, bool)
-        *coordinates, inner = np.unravel_index(padded, (*self.padded, self.block))
-        inside = np.ones(padded.shape, bool)
-        row = np.zeros(padded.shape, np.int64)
+            return slots, inside
+        *coordinates, inner = np.unravel_index(slots, (*self.padded, self.block))
+        row = np.zeros(slots.shape, np.int64)
         for c, n in zip(coordinates, self.shape):
             inside &= c < n
             row = row * n + c
         return row * self.block + inner, inside
+
+
+def pair_keys(rows: Array | int, columns: Array | int, modes: Sequence[int]) -> Array:
+    """One number for each pair of slots, with the digits i_k m_k + j_k of base m_k^2; the first is most significant.
+
+    >>> pair_keys(np.array([0, 5]), 3, [2, 4])
+    array([ 3, 39])
+    """
+    if float(slots_of(modes)) ** 2 >= 2.0**63:
+        raise ValueError(f"too many slots for one key of 64 bits: modes {list(modes)}")
+    key = np.zeros(1, np.int64)
+    i, j = (np.unravel_index(np.asarray(x), modes) for x in (rows, columns))
+    for m, row, column in zip(modes, i, j):
+        key = key * (m * m) + row * m + column
+    return key
 
 
 def bases(n: int) -> list[int]:

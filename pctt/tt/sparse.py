@@ -29,7 +29,7 @@ import numpy as np
 from scipy import sparse
 
 from pctt.tt.projection import columns, rows
-from pctt.tt.quantise import scalar_modes, slots_of
+from pctt.tt.quantise import pair_keys, scalar_modes, slots_of
 from pctt.tt.train import Array, Train, full_ranks, matrix_train, zeros
 
 Reduction = Callable[[Array], Array]
@@ -71,7 +71,8 @@ class SparseHierarchy:
         self.modes = scalar_modes(self.slot_modes, block)
         self.block = int(block)
         self.reduce, self.agree = reduce, agree
-        keys = _hierarchical_keys(rows, columns, self.slot_modes)
+        slots = np.arange(1 + max(np.max(rows, initial=0), np.max(columns, initial=0)))
+        keys = pair_keys(slots, 0, self.slot_modes)[rows] + pair_keys(0, slots, self.slot_modes)[columns]
         self._order = np.argsort(keys, kind="stable")
         keys = keys[self._order]
         new = _starts(keys)
@@ -84,17 +85,17 @@ class SparseHierarchy:
 
     def _index_leaf(self) -> Array:
         """Make the row pointers and columns of the leaf matrix, and return the keys of its rows. It has a row per node
-        of the last bond, with the entries of the leaf of this node.
-
-        Its columns have the order (i, j, s, t), slots before places in the block, so blocks are contiguous.
+        of the last bond, with the entries of the leaf of this node, and a column per pair of digits of the last core.
         """
-        square, bb = self.slot_modes[-1] ** 2, self.block**2
-        starts = _starts(self.keys // square)
-        wide = np.int64 if len(self.keys) * bb >= 2**31 else np.int32
-        digit: Array = (self.keys % square).astype(wide)
-        self._leaf_columns = np.add.outer(digit * bb, np.arange(bb, dtype=wide)).ravel()
-        self._leaf_pointers = (np.append(starts, len(self.keys)) * bb).astype(wide)
-        return self.keys[starts] // square
+        m, b = self.slot_modes[-1], self.block
+        starts = _starts(self.keys // m**2)
+        wide = np.int64 if len(self.keys) * b * b >= 2**31 else np.int32
+        digit: Array = self.keys % m**2
+        first = (digit // m * self.modes[-1] + digit % m) * b  # column of the first entry of each block
+        place = np.add.outer(np.arange(b) * self.modes[-1], np.arange(b)).astype(wide)
+        self._leaf_columns = np.add.outer(first.astype(wide), place).ravel()
+        self._leaf_pointers = (np.append(starts, len(self.keys)) * b * b).astype(wide)
+        return self.keys[starts] // m**2
 
     def _index_bonds(self, keys: Array) -> None:
         """Make, for each bond, the places parent * m^2 + digit of its nodes among all children of their parents."""
@@ -210,10 +211,6 @@ class SparseHierarchy:
 
     # Contractions; cores are flat, (r, m^2, r')
 
-    def root(self) -> Array:
-        """The left interface of bond 0."""
-        return np.ones((1, 1))
-
     def down(self, k: int, x: Array, core: Array) -> Array:
         """The left interface (nodes[k+1], r') of bond k+1, from that of bond k, x (nodes[k], r), and core k."""
         r, m2, r_ = core.shape
@@ -230,49 +227,24 @@ class SparseHierarchy:
         """The matrix contracted with the right interface and one more core: (nodes[k], r) from `spread`."""
         return spread @ core.reshape(len(core), -1).T
 
-    def middle(self, x: Array, spread: Array, rank: int) -> Array:
-        """The matrix contracted with both interfaces of core k: (r, m^2, rank), summed over the ranks."""
-        return self.reduce(x.T @ spread).reshape(x.shape[1], -1, rank)
+    def middle(self, k: int, x: Array, spread: Array) -> Array:
+        """The matrix contracted with both interfaces of core k: (r, m^2, r'), summed over the ranks."""
+        return self.reduce(x.T @ spread).reshape(x.shape[1], self.slot_modes[k] ** 2, -1)
 
     def leaf_core(self, x: Array) -> Array:
         """The matrix contracted with the last left interface x: the last core (r, m^2, 1), summed over ranks."""
-        core = np.ascontiguousarray((self._leaf_transposed @ x).T)
-        return self._leaf_order(self.reduce(core), to_train=True)
+        return self.reduce(np.ascontiguousarray((self._leaf_transposed @ x).T))[:, :, None]
 
     def leaf_up(self, core: Array) -> Array:
         """The matrix contracted with the last core (r, m^2, 1): (nodes of the last bond, r)."""
-        return self._leaf @ np.ascontiguousarray(self.leaf_row(core).T)
-
-    def leaf_row(self, core: Array) -> Array:
-        """The last core (r, m^2, 1) as a matrix (r, m^2), in the column order of the leaf matrix."""
-        return self._leaf_order(core, to_train=False)
+        return self._leaf @ np.ascontiguousarray(core[:, :, 0].T)
 
     def inner(self, cores: Sequence[Array]) -> float:
         """Sum of products of the entries with those of a train."""
-        x = self.root()
+        x = np.ones((1, 1))
         for k, core in enumerate(cores[:-1]):
             x = self.down(k, x, core)
         return float(np.vdot(self.leaf_core(x), cores[-1]))
-
-    def _leaf_order(self, core: Array, to_train: bool) -> Array:
-        """Convert between the column order (i, j, s, t) of the leaf matrix and the order (i, s, j, t) of a core."""
-        q, b = self.slot_modes[-1], self.block
-        shape = (-1, q, q, b, b) if to_train else (-1, q, b, q, b)
-        rank = len(core)
-        core = core.reshape(shape).transpose(0, 1, 3, 2, 4)
-        return core.reshape(rank, -1, 1) if to_train else core.reshape(rank, -1)
-
-
-def _hierarchical_keys(rows: Array, columns: Array, modes: Sequence[int]) -> Array:
-    """Keys that sort pairs of slots by (i_1, j_1), then (i_2, j_2), ...: digits of base m_1^2, m_2^2, ..."""
-    if float(slots_of(modes)) ** 2 >= 2.0**63:
-        raise ValueError(f"too many slots for one key of 64 bits: modes {list(modes)}")
-    row_key = np.zeros(1, np.int64)
-    column_key = np.zeros(1, np.int64)
-    for m in modes:
-        row_key = (row_key[:, None] * (m * m) + np.arange(m) * m).ravel()
-        column_key = (column_key[:, None] * (m * m) + np.arange(m)).ravel()
-    return row_key[rows] + column_key[columns]
 
 
 def _starts(keys: Array) -> Array:
@@ -322,10 +294,14 @@ def compress(
         return _exact(matrix)
     cores = [] if start is None else start.flat()
     sweeps = (0 if cores else 1) if sweeps is None else sweeps
-    wide = Train(_widen(matrix, cores, max_rank, rng)).right_orthogonal()
-    cores, x = forward(matrix, _spreads(matrix, wide.flat()))
+    wide = Train(_widen(matrix, cores, max_rank, rng)).right_orthogonal().cores
+    cores, x = forward(matrix, backward(matrix, wide[-1], lambda k, _: wide[k]))
     for _ in range(sweeps):
-        cores, x = forward(matrix, backward(matrix, x, cores[-1]))
+
+        def best(k: int, spread: Array, x: list[Array] = x) -> Array:
+            return rows(matrix.middle(k, x[k], spread))
+
+        cores, x = forward(matrix, backward(matrix, rows(cores[-1]), best))
     error = matrix.agree(max(0.0, 1 - float(np.vdot(cores[-1], cores[-1])) / norm**2) ** 0.5)
     train = matrix_train(cores, matrix.modes)
     slack = (eps**2 - error**2) ** 0.5 if error < eps else eps
@@ -340,37 +316,24 @@ def forward(matrix: SparseHierarchy, spreads: list[Array]) -> tuple[list[Array],
 
     Returns the new flat cores and their left interfaces. All cores except the last are left-orthogonal.
     """
-    x, cores = [matrix.root()], []
+    x, cores = [np.ones((1, 1))], []
     for k, spread in enumerate(spreads):
-        rank = spread.shape[1] // matrix.slot_modes[k] ** 2
-        core = matrix.middle(x[k], spread, rank)
-        cores.append(columns(core))
+        cores.append(columns(matrix.middle(k, x[k], spread)))
         x.append(matrix.down(k, x[k], cores[k]))
     return [*cores, matrix.leaf_core(x[-1])], x
 
 
-def backward(matrix: SparseHierarchy, x: list[Array], last: Array) -> list[Array]:
-    """A pass from the last core to the first, from left interfaces and the best last core for them.
+def backward(matrix: SparseHierarchy, last: Array, core_of: Callable[[int, Array], Array]) -> list[Array]:
+    """The matrix contracted with the right interfaces of all cores except the first, from the last core to the first.
 
-    Returns the matrix contracted with the new right interfaces.
+    core_of : gives core k from the matrix contracted with the cores after it
     """
-    right = rows(last)
-    V = matrix.leaf_up(right)
-    spreads = [matrix.spread(len(x) - 2, V)]
-    for k in range(len(x) - 2, 0, -1):
-        right = rows(matrix.middle(x[k], spreads[0], V.shape[1]))
-        V = matrix.up(spreads[0], right)
-        spreads.insert(0, matrix.spread(k - 1, V))
-    return spreads
-
-
-def _spreads(matrix: SparseHierarchy, cores: list[Array]) -> list[Array]:
-    """The matrix contracted with the right interfaces of all cores except the first."""
-    V = matrix.leaf_up(cores[-1])
-    spreads = [matrix.spread(len(cores) - 2, V)]
-    for k in range(len(cores) - 2, 0, -1):
-        V = matrix.up(spreads[0], cores[k])
-        spreads.insert(0, matrix.spread(k - 1, V))
+    V = matrix.leaf_up(last)
+    spreads: list[Array] = []
+    for k in range(len(matrix.modes) - 2, -1, -1):
+        spreads.insert(0, matrix.spread(k, V))
+        if k > 0:
+            V = matrix.up(spreads[0], core_of(k, spreads[0]))
     return spreads
 
 
@@ -391,7 +354,7 @@ def _exact(matrix: SparseHierarchy) -> Compression:
     """The exact train of a matrix that is zero or has a single mode."""
     if len(matrix.modes) > 1:
         return Compression(zeros(matrix.modes, matrix.modes), 0.0, 0)
-    return Compression(matrix_train([matrix.leaf_core(matrix.root())], matrix.modes), 0.0, 0)
+    return Compression(matrix_train([matrix.leaf_core(np.ones((1, 1)))], matrix.modes), 0.0, 0)
 
 
 def _widen(matrix: SparseHierarchy, cores: list[Array], rank: int, rng: np.random.Generator) -> list[Array]:

@@ -5,28 +5,25 @@ them. docs/cluster.md explains. Writes results/cluster_model_nN.json."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
-import subprocess
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import shared
 from mpi4py import MPI
 from petsc4py import PETSc
-from shared import Counter, median_seconds, record, say_machine
+from shared import Row, markdown, median_seconds, next_problem, settled
 
 from dem.contact import find_contacts
 from dem.exchange import offsets
 from dem.partition import imbalance, rebalance
 from dem.scenes import Mixer
-from dem.system import ContactSystem
 from pctt import ccp
 from pctt.ccp.first_order.scaled import ScaledProblem
-from pctt.run.stepper import cone_problem
-from pctt.simulation import Simulation
 
 TOL = 1e-6
 SOLVERS = ("apgd", "conic")
@@ -38,21 +35,43 @@ MESSAGES_PER_DOUBLING = 2.5  # beyond the ranks counted here; partitions alone, 
 SOLVED = 4  # ranks up to which the step is solved: more wait for each other on few cores, and do the same
 SMALL, LARGE = 8, 2**20  # bytes of the messages that latency and bandwidth are measured with
 
+class Counter:
+    """Counts the calls of methods of a class while it is entered."""
+
+    def __init__(self, of: type, *names: str):
+        self.of, self.calls, self.originals = of, 0, {name: getattr(of, name) for name in names}
+
+    def __enter__(self) -> Counter:
+        for name, original in self.originals.items():
+            setattr(self.of, name, self._counted(original))
+        return self
+
+    def _counted(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def method(*arguments: Any) -> Any:
+            self.calls += 1
+            return original(*arguments)
+
+        return method
+
+    def __exit__(self, *exception: object) -> None:
+        for name, original in self.originals.items():
+            setattr(self.of, name, original)
+
+
 # -- on many ranks: counts ----------------------------------------------------------------------------------
 
 
-def count(n: int) -> dict[str, Any]:
+def count(n: int) -> Row:
     """The figures of the first step after the settled state of a mixer; collective."""
     comm = MPI.COMM_WORLD
     for name, value in {"ksp_type": "cg", "pc_type": "pbjacobi"}.items():  # factors are another story
         PETSc.Options().setValue(name, value)
-    sim = Simulation(Mixer(n=n), restart="settled", dt=0.025)
+    sim = settled(Mixer(n=n), dt=0.025, comm=comm)
     world, settings = sim.world, sim.settings
     contacts = find_contacts(world, settings.delta, settings.dt)
     if rebalance(world):
-        contacts = find_contacts(world, settings.delta, settings.dt)
-    system = ContactSystem(world, contacts, settings.dt, settings.recovery_speed)
-    with cone_problem(system, comm) as problem:
+        contacts = None
+    with next_problem(sim, contacts) as problem:
         row = {"ranks": comm.size, "imbalance": imbalance(world), **shares(problem)}
         for solver in SOLVERS if comm.size <= SOLVED else ():
             row |= {f"{solver} {name}": value for name, value in solved(problem, solver).items()}
@@ -61,7 +80,7 @@ def count(n: int) -> dict[str, Any]:
     return row
 
 
-def shares(problem: ccp.ConeProblem) -> dict[str, Any]:
+def shares(problem: ccp.ConeProblem) -> Row:
     """What each rank has: contacts, bodies, ghosts, and the ranks that it hears from and speaks to."""
     G, comm = problem.contact_map.given, problem.comm
     starts = offsets(comm, G.columns)
@@ -84,7 +103,7 @@ def shares(problem: ccp.ConeProblem) -> dict[str, Any]:
     }
 
 
-def solved(problem: ccp.ConeProblem, solver: str) -> dict[str, Any]:
+def solved(problem: ccp.ConeProblem, solver: str) -> Row:
     """Iterations, products and reductions of a cold start, rank 0's."""
     krylov = ccp.newton_for(problem.comm, solver) if ccp.SOLVERS[solver].newton else None
     ccp.solve(problem, None, solver, ccp.Limits(0.1), newton=krylov)  # loads compiled loops
@@ -143,7 +162,7 @@ def ping_pong() -> tuple[float, float]:
 # -- the model ----------------------------------------------------------------------------------------------
 
 
-def modelled(rows: list[dict[str, Any]], fixed: float, ranks: int, bodies: int, contacts: int, latency: float,
+def modelled(rows: list[Row], fixed: float, ranks: int, bodies: int, contacts: int, latency: float,
              bandwidth: float) -> tuple[float, float]:  # fmt: skip
     """Seconds of an iteration of APGD on so many ranks, and those of them that are work on contacts.
 
@@ -166,39 +185,37 @@ def modelled(rows: list[dict[str, Any]], fixed: float, ranks: int, bodies: int, 
     return fixed + work + one["apgd products"] / its * product + reductions * reduction, work
 
 
-def table(rows: list[dict[str, Any]]) -> str:
+def table(rows: list[Row]) -> str:
     """What was counted, of the rank that has the most of it."""
     heads = ["ranks", "contacts, most / mean", "bodies", "ghosts", "ghosts / bodies^(2/3)", "neighbours"]
     heads += ["messages, kB per product", *(f"{solver}: iterations, products, reductions" for solver in SOLVERS)]
-    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    lines = []
     for row in rows:
         surface = row["ghosts"]["most"] / row["bodies"]["mean"] ** (2 / 3)
-        cells = [
-            str(row["ranks"]),
-            f"{row['contacts']['most']:,} / {row['contacts']['most'] / row['contacts']['mean']:.2f}",
+        lines.append([
+            row["ranks"], f"{row['contacts']['most']:,} / {row['contacts']['most'] / row['contacts']['mean']:.2f}",
             f"{row['bodies']['most']:,}", f"{row['ghosts']['most']:,}", f"{surface:.1f}",
-            str(row["neighbours"]["most"]), f"{row['messages']['most']}, {row['bytes']['most'] / 1e3:.0f}",
-        ]  # fmt: skip
+            row["neighbours"]["most"], f"{row['messages']['most']}, {row['bytes']['most'] / 1e3:.0f}",
+        ])  # fmt: skip
         for solver in SOLVERS:
             counts = (row.get(f"{solver} {name}") for name in ("its", "products", "reductions"))
-            cells.append(", ".join("" if count is None else f"{count:,.0f}" for count in counts).strip(", "))
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+            lines[-1].append(", ".join("" if count is None else f"{count:,.0f}" for count in counts).strip(", "))
+    return markdown(heads, lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="run/study cluster_model", description=__doc__)
-    parser.add_argument("n", type=int, nargs="?", default=8, help="size of the mixer")
-    parser.add_argument("-ranks", default="1,2,4,8,16", help="of this machine, with commas between; 1 is the first")
-    parser.add_argument("-latency", type=float, default=2e-6, help="seconds of a message between nodes, assumed")
-    parser.add_argument("-bandwidth", type=float, default=1e9, help="bytes per second of a rank between nodes, assumed")
-    words = parser.parse_args()
+    line = shared.parser("cluster_model", __doc__)
+    line.add_argument("n", type=int, nargs="?", default=8, help="size of the mixer")
+    line.add_argument("-ranks", type=shared.listed(int), default="1,2,4,8,16", help="of this machine; 1 is the first")
+    line.add_argument("-latency", type=float, default=2e-6, help="seconds of a message between nodes, assumed")
+    line.add_argument("-bandwidth", type=float, default=1e9, help="bytes per second of a rank between nodes, assumed")
+    words = line.parse_args()
     if words.n < 1 or not words.latency > 0 or not words.bandwidth > 0:
-        parser.error("n, -latency, -bandwidth: allowed are numbers > 0")
-    ranks = [int(word) if word.isdigit() else 0 for word in words.ranks.split(",")]
-    if ranks[0] != 1 or len(ranks) < 2 or sorted(set(ranks)) != ranks:
-        parser.error(f"-ranks {words.ranks}: allowed are whole numbers that grow, the first of them 1")
-    about = say_machine() | {"latency": words.latency, "bandwidth": words.bandwidth}
+        line.error("n, -latency, -bandwidth: allowed are numbers > 0")
+    ranks = words.ranks
+    if ranks[:1] != [1] or len(ranks) < 2 or sorted(set(ranks)) != ranks:
+        line.error(f"-ranks {','.join(map(str, ranks))}: allowed are whole numbers that grow, the first of them 1")
+    about = shared.say_machine() | {"latency": words.latency, "bandwidth": words.bandwidth}
     about["here"] = dict(zip(("latency", "bandwidth"), start(2, "--ping")))
     print(f"a message here takes {about['here']['latency'] * 1e6:.1f} us, {about['here']['bandwidth'] / 1e9:.1f} GB/s")
     rows = []
@@ -217,7 +234,7 @@ def main() -> None:
     per_contact = SIZES[32][0] / SIZES[32][1]
     grown = {r: modelled(rows, fixed, r, int(r * SHARE * per_contact), r * SHARE, *ways) for r in MODEL}
     say(f"{SHARE:,} contacts per rank", grown)
-    record(f"cluster_model_n{words.n}", about, rows)
+    shared.record(f"cluster_model_n{words.n}", about, rows)
 
 
 def say(name: str, iteration: dict[int, tuple[float, float]]) -> None:
@@ -228,11 +245,10 @@ def say(name: str, iteration: dict[int, tuple[float, float]]) -> None:
 
 def start(ranks: int, *words: str) -> Any:
     """What rank 0 of this script says on so many ranks."""
-    command = [".venv/bin/mpiexec", "-n", str(ranks), sys.executable, __file__, *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"run/study cluster_model: {' '.join(command)} failed:\n{done.stderr}")
-    return json.loads(done.stdout.splitlines()[-1])
+    said, failure = shared.lines_of([shared.MPIEXEC, "-n", ranks, sys.executable, __file__, *words])
+    if failure:
+        sys.exit(f"run/study cluster_model: {' '.join(words)} on {ranks} ranks: {failure}")
+    return said[-1]
 
 
 if __name__ == "__main__":

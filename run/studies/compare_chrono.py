@@ -29,21 +29,19 @@ the assembly as well.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import statistics
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
-from shared import record, results, say_machine
+from shared import Row, Table, keep_to_one_core, listed, medians, parser, record, say_machine, settled, settled_steps
 
 from dem import quaternion
 from dem.bodies import SPHERE
@@ -57,12 +55,12 @@ from dem.start import new_world
 from dem.system import ContactSystem, contact_frames
 from dem.world import World
 from pctt import ccp
-from pctt.simulation import Simulation
 
 COMM = MPI.COMM_SELF
 TOLERANCES = (1e-4, 1e-6)
 SOLVERS = ("multicore apgd", "multicore bb", "core psor", "core bb")
 REPEATS = 3
+PHASES = ("collision", "setup", "solve", "step")
 CLOSE_ENOUGH = 1.1  # between the least number of iterations and the one that is timed
 CONTACT = np.dtype(
     [("body", "f8", 2), ("impulse", "f8", 3), ("normal", "f8", 3), ("on_first", "f8", 3), ("on_second", "f8", 3)]
@@ -85,7 +83,7 @@ class State(NamedTuple):
 def settled_mixer(n: int) -> State:
     """The settled mixer, with a body for each of its walls: so two bodies have one contact at most."""
     mixer = Mixer(n=n)
-    sim = Simulation(mixer, restart="settled", dt=0.025)
+    sim = settled(mixer, dt=0.025)
     found, grains = sim.world, sim.world.grains
     scene = Scene(mixer.friction, found.gravity.tolist())
     speeds = {"velocity": grains.velocity[:, :3], "angular_velocity": grains.velocity[:, 3:]}
@@ -217,9 +215,9 @@ class Chrono:
     step: Step
     solver: str
     seconds: float  #: of a run, after which no longer one is begun
-    kept: dict[int, dict[str, Any]] = field(default_factory=dict)
+    kept: dict[int, Row] = field(default_factory=dict)
 
-    def run(self, iterations: int, repeats: int = 1) -> dict[str, Any]:
+    def run(self, iterations: int, repeats: int = 1) -> Row:
         """Seconds, and the accuracy of the impulses as solutions of our problem."""
         if iterations in self.kept and repeats == 1:
             return self.kept[iterations]
@@ -230,13 +228,13 @@ class Chrono:
                 raise DriverError(f"Chrono's driver failed: {done.stderr.strip() or done.returncode}")
             theirs = np.fromfile(file.name, CONTACT)
         said = json.loads(done.stdout.splitlines()[-1])
-        figures = {name: statistics.median(said[name]) for name in ("solve", "step", "collision", "setup")}
+        seconds = [dict(zip(PHASES, each)) for each in zip(*(said[name] for name in PHASES))]
+        row = {"solver": f"Chrono {said['version']} {self.solver}", "iterations": iterations}
         impulse = mapped(self.step.body, self.step.frame, theirs)
-        row = {"solver": f"Chrono {said['version']} {self.solver}", "iterations": iterations} | figures
-        self.kept[iterations] = row | accuracy(self.step, impulse)
+        self.kept[iterations] = row | medians(seconds, *PHASES) | accuracy(self.step, impulse)
         return self.kept[iterations]
 
-    def least(self, tol: float, start: int = 25) -> dict[str, Any] | None:
+    def least(self, tol: float, start: int = 25) -> Row | None:
         """The run with the least iterations, to CLOSE_ENOUGH, that gets to the residual; None if none does in time."""
         below, above = 0, start
         while self.run(above)["residual"] > tol:
@@ -269,7 +267,7 @@ def warm_up() -> None:
         ccp.solve(problem, None, "apgd", ccp.Limits(1e-8))
 
 
-def own(state: State, tol: float, repeats: int) -> dict[str, Any]:
+def own(state: State, tol: float, repeats: int) -> Row:
     """`apgd` from a cold start."""
     seconds: list[dict[str, float]] = []
     for _ in range(repeats):
@@ -280,66 +278,48 @@ def own(state: State, tol: float, repeats: int) -> dict[str, Any]:
         ready = time.perf_counter()
         found = ccp.solve(step.problem, None, "apgd", ccp.Limits(tol, 10_000_000, np.inf))
         end = time.perf_counter()
-        parts = {"collision": searched - start, "setup": ready - searched, "solve": end - ready}
-        seconds.append(parts | {"step": end - start})
-    figures = {name: statistics.median(each[name] for each in seconds) for name in seconds[0]}
-    row = {"solver": "pctt apgd", "iterations": found.iterations} | figures
+        parts = (searched - start, ready - searched, end - ready, end - start)
+        seconds.append(dict(zip(PHASES, parts)))
+    row = {"solver": "pctt apgd", "iterations": found.iterations} | medians(seconds, *PHASES)
     return row | accuracy(step, found.impulse)
 
 
-def warm(n: int, tol: float) -> dict[str, Any]:
+def warm(n: int, tol: float) -> Row:
     """Steps of a run of the mixer, each from the impulses of the last."""
-    words = ["-scene", "mixer", "-scene_n", n, "-restart", "settled", "-steps", 6, "-output_every", 0]
-    words += ["-ccp_closing_work", "inf"]
-    _, lines = results(1, *words, "-ccp_type", "apgd", "-ccp_tol", tol, "-law", "relaxation")
-    lines = lines[1:]
-    row = {"solver": "pctt apgd, warm", "iterations": statistics.median(line["iterations"] for line in lines)}
-    row |= {"solve": statistics.median(line["phases"]["solve"] for line in lines)}
-    return row | {"step": statistics.median(line["seconds"] for line in lines)}
+    words = ("-output_every", 0, "-ccp_closing_work", "inf", "-ccp_type", "apgd", "-ccp_tol", tol, "-law", "relaxation")
+    _, lines = settled_steps("mixer", n, 6, *words)
+    lines = [line | {"solve": line["phases"]["solve"], "step": line["seconds"]} for line in lines[1:]]
+    return {"solver": "pctt apgd, warm", **medians(lines, "iterations", "solve", "step")}
 
 
 # -- the table ----------------------------------------------------------------------------------------------------
 
 
-def show(row: dict[str, Any], ours: dict[str, Any]) -> None:
-    per = 1e3 * row["solve"] / max(row["iterations"], 1)
-    residual = f"{row['residual']:.1e}" if "residual" in row else ""
-    ratio = f"{row['solve'] / ours['solve']:8.2f} {row['step'] / ours['step']:8.2f}"
-    print(
-        f"{row['solver']:28} {row['tol']:7.0e} {row['iterations']:10.0f} {residual:>9} {row['solve']:9.3f} "
-        f"{per:7.2f} {row['step']:9.3f} {ratio}",
-        flush=True,
-    )
-
-
-def compare(state: State, words: argparse.Namespace, path: Path) -> list[dict[str, Any]]:
+def compare(state: State, n: int, solvers: list[str], seconds: float, path: Path) -> list[Row]:
     step = assembled(state, find_contacts(state.world, state.delta))
     print(f"{state.name}, {step.problem.size} contacts, medians of {REPEATS}")
-    print(
-        f"{'':28} {'to':>7} {'iterations':>10} {'residual':>9} {'solve s':>9} {'ms each':>7} {'step s':>9} "
-        f"{'solve /':>8} {'step / apgd':>8}"
-    )
-    rows: list[dict[str, Any]] = []
-    theirs = [Chrono(path, step, solver, words.seconds) for solver in words.solvers]
+    table = Table(
+        solver=("solver", "<28"), to=("tol", "7.0e"), iterations=("iterations", "10.0f"),
+        residual=(lambda row: f"{row['residual']:.1e}" if "residual" in row else "", "9"), solve_s=("solve", "9.3f"),
+        ms_each=(lambda row: 1e3 * row["solve"] / max(row["iterations"], 1), "7.2f"), step_s=("step", "9.3f"),
+        solve_to_apgd=(lambda row: row["solve"] / ours["solve"], "13.2f"),
+        step_to_apgd=(lambda row: row["step"] / ours["step"], "12.2f"),
+    )  # fmt: skip
+    rows: list[Row] = []
+    theirs = [Chrono(path, step, solver, seconds) for solver in solvers]
     for tol in TOLERANCES:
-        ours = own(state, tol, REPEATS) | {"tol": tol}
-        rows.append(ours)
-        show(ours, ours)
-        rows.append(warm(words.n, tol) | {"tol": tol})
-        show(rows[-1], ours)
+        ours = own(state, tol, REPEATS)
+        rows += [found | {"tol": tol} for found in (ours, warm(n, tol))]
+        for row in rows[-2:]:
+            table.add(row)
         for chrono in theirs:
             least = chrono.least(tol)
             if least is None:
-                best = min(chrono.kept.values(), key=lambda run: run["residual"])
-                print(
-                    f"Chrono {chrono.solver:21} {tol:7.0e} not within {chrono.seconds:g} s: {best['residual']:.1e} "
-                    f"after {best['iterations']} iterations and {best['solve']:.1f} s",
-                    flush=True,
-                )
-                rows.append(best | {"tol": tol, "reached": False})
-                continue
-            rows.append(chrono.run(least["iterations"], REPEATS) | {"tol": tol})
-            show(rows[-1], ours)
+                rows.append(min(chrono.kept.values(), key=lambda run: run["residual"]) | {"tol": tol, "reached": False})
+                table.add(rows[-1], f"not within {seconds:g} s")
+            else:
+                rows.append(chrono.run(least["iterations"], REPEATS) | {"tol": tol})
+                table.add(rows[-1])
     reference = own(state, 1e-9, 1) | {"tol": 1e-9}
     print("agreement: objective [J] and force on the floor [N]")
     for row in [reference, *(row for row in rows if "objective" in row)]:
@@ -350,19 +330,13 @@ def compare(state: State, words: argparse.Namespace, path: Path) -> list[dict[st
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="run/study compare_chrono", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("n", type=int, nargs="?", default=8, help="size of the mixer")
-    parser.add_argument("--solvers", default=",".join(SOLVERS[:3]), help=f"of {', '.join(SOLVERS)}")
-    parser.add_argument("--seconds", type=float, default=100.0, help="limit of a run of Chrono")
-    words = parser.parse_args()
-    words.solvers = words.solvers.split(",")
-    for name in words.solvers:
-        if name not in SOLVERS:
-            parser.error(f"--solvers {name}: allowed is {', '.join(SOLVERS)}")
-    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    os.environ["OMP_NUM_THREADS"] = "1"
+    line = parser("compare_chrono", __doc__)
+    line.add_argument("n", type=int, nargs="?", default=8, help="size of the mixer (8)")
+    solvers, known = ",".join(SOLVERS[:3]), ", ".join(SOLVERS)
+    line.add_argument("--solvers", type=listed(known=SOLVERS), default=solvers, help=f"of {known} (the first three)")
+    line.add_argument("--seconds", type=float, default=100.0, help="limit of a run of Chrono (100)")
+    words = line.parse_args()
+    keep_to_one_core()
     try:
         driver()
         about = say_machine()
@@ -371,9 +345,9 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "scene.txt"
             path.write_text(scene_text(state))
-            record("compare_chrono", about, compare(state, words, path))
+            record("compare_chrono", about, compare(state, words.n, words.solvers, words.seconds, path))
     except DriverError as error:
-        parser.exit(1, f"{error}\n")
+        line.exit(1, f"{error}\n")
 
 
 if __name__ == "__main__":

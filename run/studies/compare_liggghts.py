@@ -25,8 +25,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import multiprocessing
-import os
 import re
 import resource
 import shutil
@@ -35,18 +33,16 @@ import string
 import subprocess
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from mpi4py import MPI
+import shared
 from scipy.spatial import cKDTree
-from shared import figure, record, say_machine
+from shared import Row, Table, settings_of, settled, spread
 
 from dem.scenes import Mixer
-from pctt.simulation import Simulation
 
 FORGETS = 0.1  # [s] from the start, not part of means and overlaps
 SAMPLES = 0.025  # [s] between two samples of positions
@@ -70,7 +66,6 @@ OURS = (
     "dt=.0025,tol=3e-4,closing_work=inf,projection=1",
 )
 LETTERS = string.ascii_lowercase + string.ascii_uppercase  # of the rows, in the figure
-FIELDS = {"dt": float, "tol": float, "closing_work": float, "stiffness": float, "projection": lambda text: text == "1"}
 
 
 class LiggghtsError(Exception):
@@ -123,18 +118,10 @@ class Course(NamedTuple):
     unsolved: int  #: time steps
 
 
-def opened(n: int, seed: int, **settings: Any) -> Simulation:
-    """The settled mixer with spheres moved by up to MOVED."""
-    sim = Simulation(Mixer(n=n), restart="settled", comm=MPI.COMM_SELF, solver="apgd", **settings)
-    grains = sim.world.grains
-    moved = MOVED * np.random.default_rng(seed).uniform(-1.0, 1.0, grains.position.shape)
-    grains.position += moved[grains.id]
-    return sim
-
-
 def start_of(n: int, seed: int) -> Start:
-    with opened(n, seed) as sim:
-        mixer, paddle = Mixer(n=n), sim.body("mixer")
+    mixer = Mixer(n=n)
+    with settled(mixer, seed, MOVED, solver="apgd") as sim:
+        paddle = sim.body("mixer")
         angle = 2 * math.atan2(paddle.orientation[3], paddle.orientation[0])
         return Start(mixer, sim.positions, sim.velocities, angle, paddle.position[2])
 
@@ -166,9 +153,10 @@ def peak_memory(process: int | str) -> float:
 
 def ours(n: int, seed: int, seconds: float, settings: dict[str, Any]) -> Course:
     """Steps of a simulation; a step of another one first, which loads compiled loops."""
-    with opened(n, seed, **settings) as first:
+    settings = {"solver": "apgd", **settings}
+    with settled(Mixer(n=n), seed, MOVED, **settings) as first:
         first.step()
-    with opened(n, seed, **settings) as sim:
+    with settled(Mixer(n=n), seed, MOVED, **settings) as sim:
         begun, dt, spent, unsolved = sim.time, sim.settings.dt, 0.0, 0
         box, every, rows, samples = len(sim.positions), max(1, round(SAMPLES / dt)), [], []
         for step in range(1, round(seconds / dt) + 1):
@@ -181,12 +169,6 @@ def ours(n: int, seed: int, seconds: float, settings: dict[str, Any]) -> Course:
             if step % every == 0:
                 samples.append((sim.time - begun, sim.positions))
     return Course(*np.array(rows).T, samples, spent, peak_memory("self"), unsolved)
-
-
-def in_new_process(*arguments: Any) -> Course:
-    """`ours` where nothing else takes memory."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(ours, *arguments).result()
 
 
 # -- LIGGGHTS ---------------------------------------------------------------------------------------------------
@@ -334,23 +316,7 @@ def theirs(start: Start, stiffness: float, seconds: float) -> Course:
 # -- the table ----------------------------------------------------------------------------------------------------
 
 
-def settings_of(words: str) -> dict[str, Any]:
-    """Of `dt=.01,projection=1`; ValueError for a name or value that there is not."""
-    if words == "default":
-        return {}
-    pairs = [word.partition("=")[::2] for word in words.split(",")]
-    if bad := [name for name, _ in pairs if name not in FIELDS]:
-        raise ValueError(f"{bad[0]}: allowed are {', '.join(FIELDS)}")
-    return {name: FIELDS[name](value) for name, value in pairs}
-
-
-def spread(values: list[float]) -> tuple[float, float]:
-    """Mean, and its standard error; NaN of one value."""
-    error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.nan
-    return statistics.fmean(values), error
-
-
-def row(start: Start, seconds: float, courses: list[Course]) -> dict[str, Any]:
+def row(start: Start, seconds: float, courses: list[Course]) -> Row:
     """Of the starts of one setting."""
     late = [course.time > FORGETS for course in courses]
     torque, error = spread([float(course.torque[part].mean()) / 1e3 for course, part in zip(courses, late)])
@@ -367,7 +333,7 @@ def row(start: Start, seconds: float, courses: list[Course]) -> dict[str, Any]:
     }
 
 
-def limit_of(rows: list[dict[str, Any]]) -> tuple[float, float]:
+def limit_of(rows: list[Row]) -> tuple[float, float]:
     """The torque for small steps and stiff contacts and its standard error, as the top of the file says."""
     stiffest = max((each for each in rows if each["code"] == "LIGGGHTS"), key=lambda each: each["stiffness"])
     estimates = [(stiffest["torque"], stiffest["torque_error"])]
@@ -389,38 +355,35 @@ def limit_of(rows: list[dict[str, Any]]) -> tuple[float, float]:
     return value, of_starts if len(values) == 1 else max(of_starts, of_estimates)
 
 
-def show(row: dict[str, Any], letter: str) -> None:
-    print(
-        f"{letter} {row['name']:66} {row['cpu']:7.2f} {row['overlap']:7.2f} {row['torque']:8.2f} +- "
-        f"{row['torque_error']:5.2f} {row['floor']:6.3f} {row['memory']:6.0f} {row['unsolved']:4d}",
-        flush=True,
-    )
-
-
-def compare(n: int, words: argparse.Namespace) -> list[dict[str, Any]]:
+def compare(n: int, words: argparse.Namespace) -> list[Row]:
     starts = [start_of(n, seed) for seed in range(words.starts)]
     print(f"mixer n = {n}, {len(starts[0].position)} spheres, {words.starts} starts of {words.seconds:g} s")
-    print(f"{'':68} {'CPU s/s':>7} {'overlap':>7} {'torque kN m':>17} {'floor':>6} {'MiB':>6} unsolved")
-    rows: list[dict[str, Any]] = []
+    table = Table(
+        row=("letter", "3"), name=("name", "<66"), CPU_s_per_s=("cpu", "11.2f"), overlap=("overlap", "7.2f"),
+        torque_kN_m=("torque", "11.2f"), error=("torque_error", "5.2f"), floor=("floor", "6.3f"),
+        MiB=("memory", "6.0f"), unsolved=("unsolved", "8d"),
+    )  # fmt: skip
+    rows: list[Row] = []
+
+    def add(about: Row, courses: list[Course]) -> None:
+        rows.append(about | row(starts[0], words.seconds, courses) | {"letter": LETTERS[len(rows)]})
+        table.add(rows[-1])
+
     for stiffness in words.stiffness:
         about = {"code": "LIGGGHTS", "name": f"LIGGGHTS k = {stiffness:g} N/m", "stiffness": stiffness}
-        courses = [theirs(start, stiffness, words.seconds) for start in starts]
-        rows.append(about | row(starts[0], words.seconds, courses))
-        show(rows[-1], LETTERS[len(rows) - 1])
+        add(about, [theirs(start, stiffness, words.seconds) for start in starts])
     for setting in words.ours:
-        about = {"code": "pctt", "name": f"pctt {setting}"} | settings_of(setting)
-        courses = [in_new_process(n, seed, words.seconds, settings_of(setting)) for seed in range(words.starts)]
-        rows.append(about | row(starts[0], words.seconds, courses))
-        show(rows[-1], LETTERS[len(rows) - 1])
+        about, seeds = {"code": "pctt", "name": f"pctt {setting}", **settings_of(setting)}, range(words.starts)
+        add(about, [shared.in_new_process(ours, n, seed, words.seconds, settings_of(setting)) for seed in seeds])
     limit, error = limit_of(rows)
     print(f"limit {limit:.2f} +- {error:.2f} kN m")
     case = {"n": n, "seconds": words.seconds, "starts": words.starts, "limit": limit, "limit_error": error}
     return [case | row for row in rows]
 
 
-def draw(sizes: list[list[dict[str, Any]]]) -> None:
+def draw(sizes: list[list[Row]]) -> None:
     """Error of the torque over CPU seconds, a panel for each size, with the letters of the rows."""
-    with figure("compare_liggghts", len(sizes)) as panels:
+    with shared.figure("compare_liggghts", len(sizes)) as panels:
         for axes, rows in zip(panels, sizes):
             limit, blur = rows[0]["limit"], 100 * rows[0]["limit_error"] / rows[0]["limit"]
             for label, marker, chosen in (
@@ -434,7 +397,7 @@ def draw(sizes: list[list[dict[str, Any]]]) -> None:
                 axes.errorbar([row["cpu"] for row in chosen], off, bars, fmt=marker, capsize=2, label=label)
                 for row, error in zip(chosen, off):
                     place = (5, 3) if row.get("projection") else (5, -9)
-                    axes.annotate(LETTERS[rows.index(row)], (row["cpu"], error), place, textcoords="offset points")
+                    axes.annotate(row["letter"], (row["cpu"], error), place, textcoords="offset points")
             axes.axhspan(-blur, blur, color="0.9", zorder=0, label="standard error of the limit")
             axes.axhline(0.0, color="0.6", linewidth=0.8)
             axes.set(xscale="log", xlabel="CPU s per simulated s", ylabel="torque off its limit, %")
@@ -448,37 +411,30 @@ def draw(sizes: list[list[dict[str, Any]]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="run/study compare_liggghts", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("n", type=int, nargs="*", default=[4, 8], help="sizes of the mixer")
-    parser.add_argument("--seconds", type=float, default=0.5, help="simulated")
-    parser.add_argument("--starts", type=int, default=3)
-    parser.add_argument("--stiffness", default="1e7,1e8", help="of LIGGGHTS [N/m]")
-    parser.add_argument("--ours", nargs="+", default=OURS, help="settings, see above")
-    words = parser.parse_args()
-    words.stiffness = [float(each) for each in words.stiffness.split(",")]
+    line = shared.parser("compare_liggghts", __doc__)
+    line.add_argument("n", type=int, nargs="*", default=[4, 8], help="sizes of the mixer (4 8)")
+    line.add_argument("--seconds", type=float, default=0.5, help="simulated (0.5)")
+    line.add_argument("--starts", type=shared.at_least_one, default=3, help="of each setting (3)")
+    line.add_argument("--stiffness", type=shared.listed(float), default="1e7,1e8", help="of LIGGGHTS [N/m] (1e7,1e8)")
+    line.add_argument("--ours", nargs="+", default=OURS, help="settings, see above")
+    words = line.parse_args()
     try:
-        for setting in words.ours:
-            settings_of(setting)
+        _ = [settings_of(setting) for setting in words.ours]
     except ValueError as error:
-        parser.error(f"--ours {error}")
+        line.error(f"--ours {error}")
     if words.seconds <= FORGETS + SAMPLES:
-        parser.error(f"--seconds {words.seconds:g}: allowed is more than {FORGETS + SAMPLES}")
-    if words.starts < 1:
-        parser.error(f"--starts {words.starts}: allowed are 1 and more")
+        line.error(f"--seconds {words.seconds:g}: allowed is more than {FORGETS + SAMPLES}")
     if not shutil.which("liggghts"):
-        parser.exit(1, "there is no program liggghts on the path; on Debian: apt-get install liggghts\n")
-    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    os.environ["OMP_NUM_THREADS"] = "1"
-    about = say_machine()
+        line.exit(1, "there is no program liggghts on the path; on Debian: apt-get install liggghts\n")
+    shared.keep_to_one_core()
+    about = shared.say_machine()
     try:
         sizes = []
         for n in words.n:
             sizes.append(compare(n, words))
-            record("compare_liggghts", about, [row for rows in sizes for row in rows])
+            shared.record("compare_liggghts", about, [row for rows in sizes for row in rows])
     except LiggghtsError as error:
-        parser.exit(1, f"{error}\n")
+        line.exit(1, f"{error}\n")
     draw(sizes)
 
 

@@ -7,7 +7,6 @@ where only one triangle is stored, it is mirrored.
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import tempfile
@@ -16,6 +15,7 @@ from pathlib import Path
 import scipy.sparse as sp
 import siconos_text
 from mpi4py import MPI
+from shared import called_from, parser
 
 from pctt.blocks import square_block_matrix
 from pctt.ccp import ConeProblem, fclib
@@ -88,17 +88,13 @@ def _info(path: Path, note: str) -> fclib.Info:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        prog="run/study convert_problems", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("files", nargs="+", metavar="FILE", help="text file of Siconos")
-    parser.add_argument("-to", required=True, metavar="DIR", help="folder for the FCLIB files, made if need be")
-    words = parser.parse_args()
-    here = Path(os.environ.get("CALLED_FROM", "."))
-    status = 0
+    line = parser("convert_problems", __doc__)
+    line.add_argument("files", nargs="+", metavar="FILE", help="text file of Siconos")
+    line.add_argument("-to", required=True, metavar="DIR", help="folder for the FCLIB files, made if need be")
+    words, status = line.parse_args(), 0
     for name in words.files:
         try:
-            target, note = convert(Path(os.path.normpath(here / name)), Path(os.path.normpath(here / words.to)))
+            target, note = convert(called_from(name), called_from(words.to))
             print(f"{target}{note and ': ' + note}")
         except (FileFormatError, OSError) as error:  # noqa: PERF203 - as many files as there are
             print(f"run/study convert_problems: {error}", file=sys.stderr)

@@ -12,14 +12,11 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import sys
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from math import prod
-from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -29,10 +26,11 @@ from scipy import fft, linalg
 
 petsc4py.init([sys.argv[0]])
 from petsc4py import PETSc
-from shared import record, say_machine
+from shared import Row, lines_of, parser, record, say_machine
 
 Array = np.ndarray
 Product = Callable[[Array], Array]
+Kernel = Callable[[Array, float], Array]  # takes distances, and the spacing of the grid
 TORUS = 4096  # points along a side of the torus on which a fractional Laplacian is computed
 SQUARE_LOG = -1.0612  # mean of log r over a square of side 1 around 0
 CUBE = 2.38  # mean of 1/r over a cube of side 1 around 0
@@ -48,15 +46,33 @@ CLOSE, FAR = 2.0, 3.0  # ratios to the fastest that the totals count
 # -- matrices -------------------------------------------------------------------------------------------------
 
 
-class Differences:
+class Problem:
+    """A matrix of the unknowns of a grid by its ``entries``. ``times``: its product, None if there is no fast one."""
+
+    table: Array | None = None
+
+    def __init__(
+        self, grid: tuple[int, ...], entries: Callable[[Array, Array], Array], times: Product | None, nugget: float
+    ):  # fmt: skip
+        self.grid, self.entries, self.times, self.nugget, self.size = grid, entries, times, nugget, prod(grid)
+
+    def product(self) -> Product:
+        """Without a fast one: with the dense matrix."""
+        if self.times is not None:
+            return self.times
+        j = np.arange(self.size)
+        dense = np.stack([self.entries(np.full(self.size, i), j) for i in j])
+        return lambda v: dense @ v
+
+
+class Differences(Problem):
     """A(i, j) = table[|x_i - x_j|] for the points x of a grid; the nugget is in table[0]."""
 
-    def __init__(self, name: str, table: Array, nugget: float) -> None:
-        self.name, self.table, self.nugget = name, table, nugget
-        self.grid, self.size = table.shape, table.size
-        self.fast = True
+    def __init__(self, table: Array, nugget: float = 0.0):
+        super().__init__(table.shape, self._entry, None, nugget)
+        self.table = table
 
-    def entries(self, i: Array, j: Array) -> Array:
+    def _entry(self, i: Array, j: Array) -> Array:
         x, y = np.unravel_index(i, self.grid), np.unravel_index(j, self.grid)
         return self.table[tuple(np.abs(a - b) for a, b in zip(x, y))]
 
@@ -77,167 +93,116 @@ class Differences:
         return times
 
 
-@dataclass
-class General:
-    """A matrix whose entries do not depend on differences. ``times``: its product, None if there is no fast one."""
-
-    name: str
-    grid: tuple[int, ...]
-    entries: Callable[[Array, Array], Array]
-    times: Product | None = None
-    nugget: float = 0.0
-
-    @property
-    def size(self) -> int:
-        return prod(self.grid)
-
-    @property
-    def fast(self) -> bool:
-        return self.times is not None
-
-    def product(self) -> Product:
-        """Without a fast one: with the dense matrix."""
-        if self.times is not None:
-            return self.times
-        j = np.arange(self.size)
-        dense = np.stack([self.entries(np.full(self.size, i), j) for i in j])
-        return lambda v: dense @ v
-
-
-def radial(name: str, shape: tuple[int, ...], h: float, kernel: Callable[[Array], Array], nugget: float) -> Differences:
-    """kernel : takes distances"""
+def radial(shape: tuple[int, ...], kernel: Kernel, nugget: float = 0.0, h: float | None = None) -> Differences:
+    """Of points on a grid with the spacing h; without h the first side of the grid is of length 1."""
+    h = h or 1 / shape[0]
     squares = sum(np.meshgrid(*[(np.arange(n) * h) ** 2 for n in shape], indexing="ij", sparse=True))
-    table = np.asarray(kernel(np.sqrt(squares)), float)
+    table = np.asarray(kernel(np.sqrt(squares), h), float)
     table.flat[0] += nugget
-    return Differences(name, table, nugget)
+    return Differences(table, nugget)
 
 
-def log(n: int, factor: float, nugget: float) -> Differences:
+def log(factor: float) -> Kernel:
     """factor h^2 (-log(r / 2)): of a square with a diagonal shorter than 2, so it is positive definite."""
-    h = 1 / n
-
-    def kernel(r: Array) -> Array:
-        return -factor * h**2 * np.where(r > 0, np.log(np.maximum(r, h) / 2), np.log(h / 2) + SQUARE_LOG)
-
-    name = f"I + {factor:g} log r" if nugget == 1 else f"log r + {nugget:g}"
-    return radial(f"{name}, {n}^2", (n, n), h, kernel, nugget)
+    own = SQUARE_LOG
+    return lambda r, h: -factor * h**2 * np.where(r > 0, np.log(np.maximum(r, h) / 2), np.log(h / 2) + own)
 
 
-def exponential(shape: tuple[int, int], length: float, nugget: float, h: float) -> Differences:
-    name = f"exp l={length:g}, nugget {nugget:g}, {shape[0]} x {shape[1]}"
-    return radial(name, shape, h, lambda r: np.exp(-r / length), nugget)
+def exponential(length: float) -> Kernel:
+    return lambda r, h: np.exp(-r / length)
 
 
-def matern(n: int, length: float, nugget: float) -> Differences:
+def matern(length: float) -> Kernel:
     """Matern's covariance of smoothness 3/2."""
-
-    def kernel(r: Array) -> Array:
-        return (1 + 3**0.5 * r / length) * np.exp(-(3**0.5) * r / length)
-
-    return radial(f"Matern 3/2 l={length:g}, nugget {nugget:g}, {n}^2", (n, n), 1 / n, kernel, nugget)
+    c = 3**0.5 / length
+    return lambda r, h: (1 + c * r) * np.exp(-c * r)
 
 
-def yukawa(n: int, k: float, factor: float, nugget: float) -> Differences:
-    h = 1 / n
-
-    def kernel(r: Array) -> Array:
-        return factor * h**3 / (4 * np.pi) * np.exp(-k * r) * np.where(r > 0, 1 / np.maximum(r, h), CUBE / h)
-
-    name = f"I + {factor:g} Yukawa k={k:g}" if nugget == 1 else f"Yukawa k={k:g}, nugget {nugget:g}"
-    return radial(f"{name}, {n}^3", (n,) * 3, h, kernel, nugget)
+def yukawa(k: float, factor: float) -> Kernel:
+    own = factor / (4 * np.pi)
+    return lambda r, h: own * h**3 * np.exp(-k * r) * np.where(r > 0, 1 / np.maximum(r, h), CUBE / h)
 
 
 def fractional(n: int, power: float) -> Differences:
     """(-Laplace)^power by the symbol (4 - 2 cos - 2 cos)^power, restricted to a square: zero outside."""
     t = 2 - 2 * np.cos(2 * np.pi * np.arange(TORUS) / TORUS)
     table = fft.irfft2((t[:, None] + t[: TORUS // 2 + 1]) ** power)[:n, :n]
-    return Differences(f"(-Laplace)^{power:g}, {n}^2", np.ascontiguousarray(table), 0.0)
+    return Differences(np.ascontiguousarray(table))
 
 
-def multiquadric(n: int, width: float) -> Differences:
-    return radial(f"inverse multiquadric {width:g}h, {n}", (n,), 1.0, lambda r: 1 / np.sqrt(1 + (r / width) ** 2), 0.0)
+def multiquadric(width: float) -> Kernel:
+    """The inverse one."""
+    return lambda r, h: 1 / np.sqrt(1 + (r / width) ** 2)
 
 
-def wendland(n: int, radius: float) -> Differences:
-    def kernel(r: Array) -> Array:
-        return np.maximum(1 - r / radius, 0) ** 4 * (4 * r / radius + 1)
-
-    return radial(f"Wendland C2 {radius:g}h, {n}", (n,), 1.0, kernel, 0.0)
+def wendland(radius: float) -> Kernel:
+    """C2"""
+    return lambda r, h: np.maximum(1 - r / radius, 0) ** 4 * (4 * r / radius + 1)
 
 
-def gauss(shape: tuple[int, int], h: float) -> Differences:
-    name = f"I + 100 Gauss w=.1, {shape[0]} x {shape[1]}"
-    return radial(name, shape, h, lambda r: 100 * h**2 * np.exp(-(r**2) / 0.02), 1.0)
+def gauss(factor: float, width: float) -> Kernel:
+    return lambda r, h: factor * h**2 * np.exp(-((r / width) ** 2) / 2)
 
 
-def nineteen() -> dict[str, Callable[[], Differences]]:
-    """The kernels with a product by FFT, by short names. Nuggets of the covariances are .01 if nothing else is said."""
-    odd = (509, 521)
+def nineteen() -> dict[str, Callable[[], Problem]]:
+    """The kernels with a product by FFT. A nugget of 1 makes an integral equation of the second kind."""
+    small, large, cube, row, odd = (256, 256), (512, 512), (64, 64, 64), (2**16,), (509, 521)
     return {
-        "log1": lambda: log(512, 100, 1.0),
-        "log3": lambda: log(512, 1, 1e-3),
-        "log5": lambda: log(512, 1, 1e-5),
-        "exp02": lambda: exponential((256, 256), 0.02, 0.01, 1 / 256),
-        "exp05": lambda: exponential((512, 512), 0.05, 0.01, 1 / 512),
-        "exp1": lambda: exponential((256, 256), 0.1, 0.01, 1 / 256),
-        "matern256": lambda: matern(256, 0.02, 0.01),
-        "matern512": lambda: matern(512, 0.02, 0.01),
-        "yukawa1000": lambda: yukawa(64, 10, 1000, 1.0),
-        "yukawa1": lambda: yukawa(64, 1, 1, 1e-3),
-        "yukawa10": lambda: yukawa(64, 10, 1, 1e-5),
-        "yukawa50": lambda: yukawa(64, 50, 1, 1e-6),
+        "log1": lambda: radial(large, log(100), 1.0),
+        "log3": lambda: radial(large, log(1), 1e-3),
+        "log5": lambda: radial(large, log(1), 1e-5),
+        "exp02": lambda: radial(small, exponential(0.02), 0.01),
+        "exp05": lambda: radial(large, exponential(0.05), 0.01),
+        "exp1": lambda: radial(small, exponential(0.1), 0.01),
+        "matern256": lambda: radial(small, matern(0.02), 0.01),
+        "matern512": lambda: radial(large, matern(0.02), 0.01),
+        "yukawa1000": lambda: radial(cube, yukawa(10, 1000), 1.0),
+        "yukawa1": lambda: radial(cube, yukawa(1, 1), 1e-3),
+        "yukawa10": lambda: radial(cube, yukawa(10, 1), 1e-5),
+        "yukawa50": lambda: radial(cube, yukawa(50, 1), 1e-6),
         "laplace3": lambda: fractional(256, 0.3),
         "laplace7": lambda: fractional(256, 0.7),
-        "imq1": lambda: multiquadric(2**16, 1),
-        "imq3": lambda: multiquadric(2**16, 3),
-        "wendland": lambda: wendland(2**16, 30),
-        "gauss_odd": lambda: gauss(odd, 1 / 512),
-        "exp_odd": lambda: exponential(odd, 0.02, 0.1, 1 / 512),
+        "imq1": lambda: radial(row, multiquadric(1), h=1.0),
+        "imq3": lambda: radial(row, multiquadric(3), h=1.0),
+        "wendland": lambda: radial(row, wendland(30), h=1.0),
+        "gauss_odd": lambda: radial(odd, gauss(100, 0.1), 1.0, 1 / 512),
+        "exp_odd": lambda: radial(odd, exponential(0.02), 0.1, 1 / 512),
     }
 
 
-def weighted(n: int, name: str, weight: Callable[[Array, Array], Array]) -> General:
+def weighted(n: int, weight: Callable[[Array, Array], Array]) -> Problem:
     """I + a K a with K = 100 h^2 exp(-10 r) and a weight a(x, y) of the points of the square."""
-    kernel = radial("", (n, n), 1 / n, lambda r: 100 / n**2 * np.exp(-10 * r), 0.0)
+    kernel = radial((n, n), lambda r, h: 100 * h**2 * np.exp(-10 * r))
     axis = (np.arange(n) + 0.5) / n
     a = np.broadcast_to(weight(axis[:, None], axis), (n, n)).ravel()
     fast = kernel.product()
-    return General(
-        f"I + a K a, a = {name}, {n}^2", (n, n), lambda i, j: (i == j) + a[i] * kernel.entries(i, j) * a[j],
-        lambda v: v + a * fast(a * v), 1.0,
+    return Problem(
+        (n, n), lambda i, j: (i == j) + a[i] * kernel.entries(i, j) * a[j], lambda v: v + a * fast(a * v), 1.0
     )  # fmt: skip
 
 
-def scattered(n: int, name: str, points: Array) -> General:
+def scattered(points: Array) -> Problem:
     """The inverse multiquadric of width 1 between points on a line, plus .01 I."""
-    return General(
-        f"inverse multiquadric, {name}, {n}", (n,),
-        lambda i, j: 0.01 * (i == j) + 1 / np.hypot(1, points[i] - points[j]),
-    )  # fmt: skip
+    kernel = multiquadric(1)
+    return Problem((len(points),), lambda i, j: 0.01 * (i == j) + kernel(points[i] - points[j], 1.0), None, 0.0)
 
 
-def hard() -> dict[str, Callable[[], General]]:
-    """Matrices whose entries do not depend on differences."""
-    n = 256
-    rng = np.random.default_rng(5)
-
-    def disc(x: Array, y: Array) -> Array:
-        return 20.0 * (np.hypot(x - 0.5, y - 0.5) < 0.3)
-
-    def checker(x: Array, y: Array) -> Array:
-        return 1 + 29.0 * ((np.floor(8 * x) + np.floor(8 * y)) % 2)
+def hard() -> dict[str, Callable[[], Problem]]:
+    """Matrices whose entries do not depend on differences: weights that are smooth, 20 in a disc, 1 and 30 on a
+    checkerboard, random in 16 x 16 blocks; points that are jittered, or Chebyshev's."""
+    n, rng = 256, np.random.default_rng(5)
 
     def blocks(x: Array, y: Array) -> Array:
         return rng.uniform(0, 3, (16, 16))[np.ix_((16 * x[:, 0]).astype(int), (16 * y).astype(int))]
 
-    few = 2**12
+    few = np.arange(2**12)
     return {
-        "smooth": lambda: weighted(n, "smooth", lambda x, y: 1 + np.sin(3 * x) * np.cos(2 * y)),
-        "disc": lambda: weighted(n, "a disc of 20", disc),
-        "checker": lambda: weighted(n, "a checkerboard of 1 and 30", checker),
-        "blocks": lambda: weighted(n, "16 x 16 random blocks", blocks),
-        "jittered": lambda: scattered(few, "jittered points", np.arange(few) + rng.uniform(-0.3, 0.3, few)),
-        "chebyshev": lambda: scattered(few, "Chebyshev points", 0.5 * few * (1 - np.cos(np.pi * np.arange(few) / few))),
+        "smooth": lambda: weighted(n, lambda x, y: 1 + np.sin(3 * x) * np.cos(2 * y)),
+        "disc": lambda: weighted(n, lambda x, y: 20.0 * (np.hypot(x - 0.5, y - 0.5) < 0.3)),
+        "checker": lambda: weighted(n, lambda x, y: 1 + 29.0 * ((np.floor(8 * x) + np.floor(8 * y)) % 2)),
+        "blocks": lambda: weighted(n, blocks),
+        "jittered": lambda: scattered(few + rng.uniform(-0.3, 0.3, len(few))),
+        "chebyshev": lambda: scattered(0.5 * len(few) * (1 - np.cos(np.pi * few / len(few)))),
     }
 
 
@@ -256,7 +221,7 @@ class Shell:
     apply = mult
 
 
-def circulant(problem: Differences) -> Product:
+def circulant(problem: Problem) -> Product:
     """The circulant nearest to the matrix in Frobenius' norm (T. Chan, SIAM J. Sci. Stat. Comput. 9, 1988), its
     eigenvalues not below a tenth of the nugget or 1e-12 of the largest one."""
     column = problem.table
@@ -275,7 +240,7 @@ def circulant(problem: Differences) -> Product:
     return times
 
 
-def nystrom(problem: Differences | General) -> Product:
+def nystrom(problem: Problem) -> Product:
     """Of A - nugget I by random-pivoted Cholesky in blocks (Chen, Epperly, Tropp & Webber, 2023), plus the nugget."""
     rng = np.random.default_rng(0)
     n = problem.size
@@ -297,16 +262,16 @@ def nystrom(problem: Differences | General) -> Product:
     return lambda r: (r - factor @ linalg.cho_solve(small, factor.T @ r)) / problem.nugget
 
 
-def applies(way: str, problem: Differences | General) -> str:
+def applies(way: str, problem: Problem) -> str:
     """Why a way is no way for this problem; empty if it is one."""
-    if way == "circulant" and not isinstance(problem, Differences):
+    if way == "circulant" and problem.table is None:
         return "entries do not depend on differences"
     if way == "nystrom" and not problem.nugget:
         return "no nugget"
     return ""
 
 
-def solve(way: str, problem: Differences | General) -> dict[str, Any]:
+def solve(way: str, problem: Problem) -> Row:
     """CG to RTOL of the true residual."""
     times = problem.product()
     mat = PETSc.Mat().createPython((problem.size, problem.size), Shell(times), comm=PETSc.COMM_SELF)
@@ -357,26 +322,22 @@ def child(name: str, way: str) -> None:
     print(json.dumps(row), flush=True)
 
 
-def solution(name: str, way: str) -> dict[str, Any]:
+def solution(name: str, way: str) -> Row:
     """That of a child process, or why there is none."""
     limited = f'ulimit -t {LIMIT}; exec timeout {3 * LIMIT} "$@"'
-    command = ["bash", "-c", limited, "-", sys.executable, __file__, "-child", name, way]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
-    if lines:
-        return json.loads(lines[-1])
-    if done.returncode > 0 and done.stderr.strip() and "Killed" not in done.stderr:
-        return {"note": done.stderr.strip().splitlines()[-1]}
-    return {"note": f"not within {LIMIT} s"}
+    rows, failure = lines_of(["bash", "-c", limited, "-", sys.executable, __file__, "-child", name, way])
+    if rows:
+        return rows[-1]
+    return {"note": failure if ":" in failure and "Killed" not in failure else f"not within {LIMIT} s"}
 
 
-def total(row: dict[str, Any]) -> float:
+def total(row: Row) -> float:
     """Seconds; infinite for a failure."""
     good = row.get("reason", -1) > 0 and row["residual"] < 3 * RTOL
     return row["setup_s"] + row["solve_s"] if good else np.inf
 
 
-def text(row: dict[str, Any]) -> str:
+def text(row: Row) -> str:
     if "note" in row:
         return row["note"]
     good = "" if np.isfinite(total(row)) else f" LEFT {row['residual']:.0e}"
@@ -387,15 +348,16 @@ def main(given: argparse.Namespace) -> None:
     about = say_machine()
     names = {**nineteen(), **hard()}
     chosen = given.only or (QUICK if given.quick else list(names))
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for name in chosen:
         problem = names[name]()
         found = {}
         for way in given.ways:
             why = applies(way, problem)
             found[way] = {"note": why} if why else solution(name, way)
-        rows.append({"problem": problem.name, "name": name, "unknowns": problem.size, "ways": found})
-        print(f"{problem.name}: " + " | ".join(f"{way} {text(row)}" for way, row in found.items()), flush=True)
+        rows.append({"name": name, "unknowns": problem.size, "ways": found})
+        said = " | ".join(f"{way} {text(row)}" for way, row in found.items())
+        print(f"{name}, {' x '.join(map(str, problem.grid))}: {said}", flush=True)
         for way in OURS:
             if "what" in found.get(way, {}):
                 row = found[way]
@@ -406,7 +368,7 @@ def main(given: argparse.Namespace) -> None:
     record("kernels", about, rows + [score_ for score_ in totals if score_])
 
 
-def score(rows: list[dict[str, Any]], words: str) -> dict[str, Any]:
+def score(rows: list[Row], words: str) -> Row:
     """How often TensorTrain by its defaults is the fastest, and how far it is behind."""
     ratios = {}
     for row in rows:
@@ -428,7 +390,7 @@ def score(rows: list[dict[str, Any]], words: str) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    words = argparse.ArgumentParser("run/study kernels", description=__doc__)
+    words = parser("kernels", __doc__)
     words.add_argument("-only", nargs="+", choices=[*nineteen(), *hard()], help="problems")
     words.add_argument("-ways", nargs="+", choices=WAYS, default=WAYS, help="ways to solve them")
     words.add_argument("-quick", action="store_true", help="five problems")

@@ -9,7 +9,6 @@ takes minutes. $RANKS (2) is the number of ranks.
 
 from __future__ import annotations
 
-import argparse
 import ast
 import os
 import shlex
@@ -17,7 +16,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from shared import MPIEXEC, PYTHON, ROOT, parser
+
 EXAMPLES = ROOT / "docs" / "examples"
 
 # size, steps from the settled state to the picture, and options of pctt.render
@@ -76,9 +76,9 @@ def keep(picture: Path, target: Path) -> None:
 
 def python(*words: object, folder: str | Path = ROOT) -> None:
     """Run Python with these words, simulations on $RANKS ranks."""
-    line = [str(ROOT / ".venv/bin/python"), *map(str, words)]
+    line = [str(PYTHON), *map(str, words)]
     if words[1] == "pctt.run":
-        line = [str(ROOT / ".venv/bin/mpiexec"), "-n", os.environ.get("RANKS", "2"), *line]
+        line = [str(MPIEXEC), "-n", os.environ.get("RANKS", "2"), *line]
     subprocess.run(line, check=True, cwd=folder)
 
 
@@ -88,9 +88,7 @@ def pictured() -> list[str]:
 
 
 if __name__ == "__main__":
-    words = argparse.ArgumentParser(
-        "run/study pictures", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    words = parser("pictures", __doc__)
     known = [*PICTURES, "examples"]
     words.add_argument("scenes", nargs="*", metavar="WHAT", help=f"of {', '.join(known)}; none: all scenes")
     words.add_argument("-n", type=int, help="size of the scenes; without: that of the pictures in docs")

@@ -14,14 +14,12 @@ residual (for Coulomb's law: its residual) below it. Fast solves are repeated, t
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from argparse import Namespace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +27,25 @@ import numpy as np
 from convert_problems import convert
 from mpi4py import MPI
 from peers import PEERS
-from shared import figure, record, say_machine
+from shared import (
+    Row,
+    called_from,
+    figure,
+    lines_of,
+    listed,
+    markdown,
+    next_problem,
+    parser,
+    record,
+    say_machine,
+    settled,
+)
 
 from dem.contact import find_contacts
 from dem.scenes import Mixer
-from dem.system import ContactSystem
 from pctt import ccp
 from pctt.ccp import fclib
 from pctt.ccp.fclib import FileFormatError
-from pctt.run.stepper import cone_problem
-from pctt.simulation import Simulation
 
 SUFFIXES = (".dat", ".hdf5", ".h5")
 TOLERANCES = (1e-4, 1e-6, 1e-8)
@@ -58,13 +65,14 @@ VARIANTS = {
     "loose": "the packing stretched by 1 % in height, grains at random velocities of 0.5 m/s and falling",
 }
 
-Rows = list[dict[str, Any]]
+Rows = list[Row]
+Problem = tuple[str, Path, int]  # name, file, contacts
 
 
 # -- one solver on one problem, in the process of its own ---------------------------------------------------
 
 
-def solve(path: str, law: str, solver: str, seconds: float) -> Iterator[dict[str, Any]]:
+def solve(path: str, law: str, solver: str, seconds: float) -> Iterator[Row]:
     """What it takes to each tolerance, until the first that is not reached."""
     theirs = 1.0
     for tol in TOLERANCES:
@@ -82,11 +90,11 @@ def solve(path: str, law: str, solver: str, seconds: float) -> Iterator[dict[str
             return
 
 
-def _reached(found: dict[str, Any], tol: float) -> bool:
+def _reached(found: Row, tol: float) -> bool:
     return bool(found["residual"] <= ROUNDING * tol) and "unbounded" not in found["reason"]
 
 
-def fastest(path: str, law: str, solver: str, tol: float, seconds: float) -> dict[str, Any]:
+def fastest(path: str, law: str, solver: str, tol: float, seconds: float) -> Row:
     """The fastest of several solves, each of a problem that was read anew."""
     runs = [once(path, law, solver, tol, seconds)]
     while len(runs) < TIMES and sum(run["seconds"] for run in runs) < AGAIN:
@@ -98,18 +106,7 @@ class OutOfTimeError(Exception):
     """The solver has had its seconds."""
 
 
-def within(look: Callable[..., float], end: float) -> Callable[..., float]:
-    """A function that ends a solver which looks at its residual after this moment."""
-
-    def checked(*arguments: Any, **named: Any) -> float:
-        if time.perf_counter() > end:
-            raise OutOfTimeError
-        return look(*arguments, **named)
-
-    return checked
-
-
-def once(path: str, law: str, solver: str, tol: float, seconds: float) -> dict[str, Any]:
+def once(path: str, law: str, solver: str, tol: float, seconds: float) -> Row:
     """From a cold start. Of a solve that is out of time the best that it looked at is not known."""
     with read(path) as problem:
         impulse, reason = None, f"{seconds:g} s"
@@ -119,7 +116,14 @@ def once(path: str, law: str, solver: str, tol: float, seconds: float) -> dict[s
         else:
             newton = ccp.newton_for(COMM, solver) if ccp.SOLVERS[solver].newton else None
             limits = ccp.Limits(tol, -1 if newton else 10_000_000, np.inf, fallback=False)
-            problem.natural_residual = within(problem.natural_residual, start + seconds)  # type: ignore[method-assign]
+            look = problem.natural_residual
+
+            def in_time(*arguments: Any, **named: Any) -> float:
+                if time.perf_counter() > start + seconds:
+                    raise OutOfTimeError
+                return look(*arguments, **named)
+
+            problem.natural_residual = in_time  # type: ignore[method-assign]
             try:
                 of = ccp.COULOMB if law == "coulomb" else ccp.RELAXATION
                 result = ccp.solve(problem, None, solver, limits, None, newton, of)
@@ -127,8 +131,7 @@ def once(path: str, law: str, solver: str, tol: float, seconds: float) -> dict[s
             except OutOfTimeError:
                 pass
             del problem.natural_residual
-        spent = time.perf_counter() - start
-        found = {"seconds": spent, "reason": reason, "residual": np.inf, "objective": None}
+        found: Row = {"seconds": time.perf_counter() - start, "reason": reason, "residual": np.inf, "objective": None}
         if impulse is not None and np.isfinite(impulse).all():
             accuracy = ccp.measure(problem, impulse)
             residual = accuracy.coulomb_residual if law == "coulomb" else accuracy.natural_residual
@@ -155,28 +158,26 @@ def write(path: Path, problem: ccp.ConeProblem) -> None:
     np.savez(path, r=problem.r, mu=problem.mu, point=problem.point, compliance=problem.compliance[:, 0], **G)
 
 
-def mixers(sizes: list[int], variants: list[str], stiffness: float, folder: Path) -> list[tuple[str, Path, int]]:
-    """Steps of settled mixers, written into the folder: as `problems` has them."""
+def mixers(sizes: list[int], variants: list[str], stiffness: float, folder: Path) -> list[Problem]:
+    """The first steps after the settled states of mixers, written into the folder: as `problems` has them."""
     found = []
-    for n in sizes:
-        for variant in variants:
-            path = folder / f"mixer_{n}_{variant}.npz"
-            with step_problem(n, variant, stiffness) as problem:
-                write(path, problem)
-                found.append((path.stem, path, problem.size))
+    for n, variant in [(n, variant) for n in sizes for variant in variants]:
+        path = folder / f"mixer_{n}_{variant}.npz"
+        with step_problem(n, variant, stiffness) as problem:
+            write(path, problem)
+            found.append((path.stem, path, problem.size))
     return found
 
 
 def step_problem(n: int, variant: str, stiffness: float) -> ccp.ConeProblem:
-    """The cone problem of the first step after the settled state of a mixer."""
-    sim = Simulation(Mixer(n=n), restart="settled", dt=0.025, comm=COMM)
-    world, settings, grains = sim.world, sim.settings, sim.world.grains
+    sim = settled(Mixer(n=n), dt=0.025)
+    grains, settings = sim.world.grains, sim.settings
     if variant == "loose":
         rng = np.random.default_rng(0)
         grains.position[:, 2] *= 1.01
         grains.velocity[:, :3] += 0.5 * rng.normal(size=(len(grains), 3)) - np.array([0, 0, 0.5])
-    world.pairs.stiffness[:] = stiffness
-    contacts = find_contacts(world, settings.delta, settings.dt)
+    sim.world.pairs.stiffness[:] = stiffness
+    contacts = find_contacts(sim.world, settings.delta, settings.dt)
     if variant == "friction":
         contacts.friction[:] = 0.8
     if variant == "heavy":
@@ -184,9 +185,8 @@ def step_problem(n: int, variant: str, stiffness: float) -> ccp.ConeProblem:
         top = touched[np.argmax(grains.position[touched[touched < len(grains)], 2])]
         grains.mass[top] *= HEAVIER
         grains.inertia[top] *= HEAVIER
-        contacts = find_contacts(world, settings.delta, settings.dt)
-    system = ContactSystem(world, contacts, settings.dt, settings.recovery_speed)
-    return cone_problem(system, COMM)
+        contacts = None
+    return next_problem(sim, contacts)
 
 
 # -- all of them --------------------------------------------------------------------------------------------
@@ -194,22 +194,14 @@ def step_problem(n: int, variant: str, stiffness: float) -> ccp.ConeProblem:
 
 def run(path: Path, law: str, solver: str, seconds: float) -> Rows:
     """A row per tolerance, of a process that is ended when its time is over."""
-    words = [sys.executable, __file__, "--one", str(path), law, solver, str(seconds)]
     limit = seconds * (len(TOLERANCES) + (solver in PEERS)) + STARTUP
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, timeout=limit, check=False)
-        said, failed = done.stdout, done.stderr.strip().splitlines()[-1:] if done.returncode else []
-        reason = f"failed: {failed[0]}" if failed else "failed" if done.returncode else ""
-    except subprocess.TimeoutExpired as over:
-        said, reason = (over.stdout or b"").decode(), f"{seconds:g} s"
-    rows = [json.loads(line) for line in said.splitlines() if line.startswith("{")]
-    reason = reason or (rows[-1]["reason"] if rows else "failed")
-    residual = rows[-1]["residual"] if rows else np.inf
-    missing = {"reached": False, "seconds": None, "residual": residual, "reason": reason}
+    rows, failure = lines_of([sys.executable, __file__, "--one", path, law, solver, seconds], limit)
+    last = rows[-1] if rows else {"reason": "failed", "residual": np.inf}
+    missing = {"reached": False, "seconds": None, "residual": last["residual"], "reason": failure or last["reason"]}
     return rows + [{"tol": tol, **missing} for tol in TOLERANCES[len(rows) :]]
 
 
-def problems(folders: list[Path], converted: Path) -> tuple[list[tuple[str, Path, int]], list[str]]:
+def problems(folders: list[Path], converted: Path) -> tuple[list[Problem], list[str]]:
     """The problems of these folders, each with its file's name, the FCLIB file of it, which may be one in
     ``converted``, and its contacts; and what is wrong with the other files."""
     found, refused = [], []
@@ -238,46 +230,41 @@ def ratios(rows: Rows, law: str, tol: float) -> tuple[list[str], np.ndarray]:
 
 def tables(rows: Rows) -> str:
     """What the profiles show, failures with their reasons, and the seconds of every solve, as Markdown."""
-    lines: list[str] = []
+    parts: list[str] = []
     for law, words in LAWS.items():
         mine = [row for row in rows if row["law"] == law]
         if not mine:
             continue
-        names = list(dict.fromkeys(row["problem"] for row in mine))
-        lines += [f"**{words[0].upper()}{words[1:]}**, {len(names)} problems. Each cell: how many were solved; how"]
-        lines += ["many of these in the shortest time of all solvers, in at most twice, and in at most ten times the"]
-        lines += ["shortest time.", ""]
-        lines += [f"| | {' | '.join(f'{tol:.0e}' for tol in TOLERANCES)} |", "|" + "---|" * (len(TOLERANCES) + 1)]
-        profiles = {tol: ratios(rows, law, tol) for tol in TOLERANCES}
-        for k, solver in enumerate(profiles[TOLERANCES[0]][0]):
-            cells = []
-            for tol in TOLERANCES:
-                ratio = profiles[tol][1][k]
-                counts = ", ".join(str(int((ratio <= within).sum())) for within in WITHIN)
-                cells.append(f"{np.isfinite(ratio).sum()}; {counts}")
-            lines.append(f"| `{solver}` | {' | '.join(cells)} |")
-        lines += ["", f"Seconds to {TOLERANCES[-1]:.0e}. If that was not reached, the residual stands in brackets:", ""]
-        solvers = profiles[TOLERANCES[0]][0]
-        lines += [f"| | contacts | {' | '.join(solvers)} |", "|" + "---|" * (len(solvers) + 2)]
         last = {(row["problem"], row["method"]): row for row in mine if row["tol"] == TOLERANCES[-1]}
-        for name in names:
-            row = [last[name, solver] for solver in solvers]
-            lines.append(f"| {name} | {row[0]['contacts']} | {' | '.join(map(_seconds, row))} |")
-        lines += ["", *_failures(mine), ""]
-    return "\n".join(lines)
+        names, solvers = (list(dict.fromkeys(row[key] for row in mine)) for key in ("problem", "method"))
+        parts.append(
+            f"**{words[0].upper()}{words[1:]}**, {len(names)} problems. Each cell: how many were solved; how\n"
+            "many of these in the shortest time of all solvers, in at most twice, and in at most ten times the\n"
+            "shortest time."
+        )
+        profiles = [ratios(rows, law, tol)[1] for tol in TOLERANCES]
+        cells = [[f"`{solver}`", *(_counts(ratio[k]) for ratio in profiles)] for k, solver in enumerate(solvers)]
+        parts.append(markdown(["", *(f"{tol:.0e}" for tol in TOLERANCES)], cells))
+        parts.append(f"Seconds to {TOLERANCES[-1]:.0e}. If that was not reached, the residual stands in brackets:")
+        found = [[last[name, solver] for solver in solvers] for name in names]
+        cells = [[name, row[0]["contacts"], *map(_seconds, row)] for name, row in zip(names, found)]
+        parts.append(markdown(["", "contacts", *solvers], cells))
+        # why solvers did not reach the tightest tolerance
+        failed = [row for row in last.values() if not row["reached"]]
+        parts.append("\n".join(f"- `{row['method']}`, {row['problem']}: {row['reason']}" for row in failed))
+    return "\n\n".join(filter(None, parts))
 
 
-def _seconds(row: dict[str, Any]) -> str:
+def _counts(ratio: np.ndarray) -> str:
+    """How many problems were solved, and within how many times the shortest time, of ratios (problems,)."""
+    return f"{np.isfinite(ratio).sum()}; " + ", ".join(str(int((ratio <= within).sum())) for within in WITHIN)
+
+
+def _seconds(row: Row) -> str:
     """Of a solve; where it failed, the residual that it stopped at in brackets, if there is one."""
     if row["reached"]:
         return f"{row['seconds']:.2g}"
     return f"({row['residual']:.1e})" if row["residual"] <= 1.0 else "-"  # that of no impulses is 1
-
-
-def _failures(rows: Rows) -> list[str]:
-    """Why solvers did not reach the tightest tolerance, a line for each."""
-    failed = [row for row in rows if row["tol"] == TOLERANCES[-1] and not row["reached"]]
-    return [f"- `{row['method']}`, {row['problem']}: {row['reason']}" for row in failed]
 
 
 def plot(rows: Rows) -> None:
@@ -301,41 +288,32 @@ def plot(rows: Rows) -> None:
             axes.legend(fontsize=7, loc="lower right")
 
 
-def read_words() -> tuple[argparse.Namespace, list[Path], dict[str, list[str]]]:
+def read_words() -> tuple[Namespace, list[Path], dict[str, list[str]]]:
     """Options, folders, and solvers by law of the command line."""
     everything = {
         law: OWN[law] + [name for name, peer in PEERS.items() if peer.installed and peer.coulomb == (law == "coulomb")]
         for law in LAWS
     }
-    parser = argparse.ArgumentParser(
-        prog="run/study profile_problems", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("words", nargs="*", metavar="DIR or SOLVER", help="folders of problems; solvers, none: all")
-    parser.add_argument("--seconds", type=float, default=20.0, help="limit of a solve (20)")
-    parser.add_argument("--laws", default=",".join(LAWS), help=f"of {', '.join(LAWS)}, with commas between (both)")
-    parser.add_argument("--mixer", default="", help="sizes of settled mixers, with commas between")
+    line = parser("profile_problems", __doc__)
+    line.add_argument("words", nargs="*", metavar="DIR or SOLVER", help="folders of problems; solvers, none: all")
+    line.add_argument("--seconds", type=float, default=20.0, help="limit of a solve (20)")
+    line.add_argument("--laws", type=listed(known=list(LAWS)), default=",".join(LAWS),
+                      help=f"of {', '.join(LAWS)}, with commas between (both)")  # fmt: skip
+    line.add_argument("--mixer", type=listed(int), default="", help="sizes of settled mixers, with commas between")
     about = "; ".join(f"{name}: {text}" for name, text in VARIANTS.items()).replace("%", "%%")
-    parser.add_argument("--variants", default="settled", help=f"of their steps, with commas between (settled); {about}")
-    parser.add_argument("--stiffness", type=float, default=np.inf, help="of their contacts [N/m] (inf)")
-    given = parser.parse_args()
+    line.add_argument("--variants", type=listed(known=list(VARIANTS)), default="settled",
+                      help=f"of their steps, with commas between (settled); {about}")  # fmt: skip
+    line.add_argument("--stiffness", type=float, default=np.inf, help="of their contacts [N/m] (inf)")
+    given = line.parse_args()
     allowed = sorted({name for names in everything.values() for name in names})
-    paths = {word: Path(os.path.normpath(Path(os.environ.get("CALLED_FROM", ".")) / word)) for word in given.words}
-    folders = [path for path in paths.values() if path.is_dir()]
-    asked = [name for word, path in paths.items() if not path.is_dir() for name in word.split(",")]
-    given.laws, given.variants = given.laws.split(","), given.variants.split(",")
-    given.mixer = [int(word) for word in given.mixer.split(",") if word]
-    for what, names, known in (
-        ("neither a folder nor a solver: ", asked, allowed),
-        ("--laws ", given.laws, LAWS),
-        ("--variants ", given.variants, VARIANTS),
-    ):
-        for name in names:
-            if name not in known:
-                parser.error(f"{what}{name}: allowed are {', '.join(known)}")
+    folders = [called_from(word) for word in given.words if called_from(word).is_dir()]
+    asked = [name for word in given.words if not called_from(word).is_dir() for name in word.split(",")]
+    if unknown := [name for name in asked if name not in allowed]:
+        line.error(f"neither a folder nor a solver: {unknown[0]}: allowed are {', '.join(allowed)}")
     if not folders and not given.mixer:
-        parser.error("no folder with problems given; allowed is run/study profile_problems DIR [DIR ...] [SOLVER ...]")
+        line.error("no folder with problems given; allowed is run/study profile_problems DIR [DIR ...] [SOLVER ...]")
     if not given.seconds > 0:
-        parser.error(f"--seconds {given.seconds:g}: allowed is a number > 0")
+        line.error(f"--seconds {given.seconds:g}: allowed is a number > 0")
     return given, folders, {law: [s for s in everything[law] if not asked or s in asked] for law in given.laws}
 
 
@@ -344,32 +322,29 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as made:
         found, refused = problems(folders, Path(made))
         found += mixers(given.mixer, given.variants, given.stiffness, Path(made))
-        rows = solve_all(found, refused, folders, solvers, given.seconds)
+        for error in refused:
+            print(f"left out: {error}")
+        if not found:
+            places, allowed = ", ".join(map(str, folders)), ", ".join(SUFFIXES)
+            sys.exit(f"run/study profile_problems: no problems in {places}; allowed are files ending in {allowed}")
+        about = say_machine() | {"limit": given.seconds, "refused": refused}
+        rows = solve_all(found, solvers, about)
     show(rows)
 
 
-def solve_all(
-    found: list[tuple[str, Path, int]], refused: list[str], folders: list[Path], solvers: dict[str, list[str]],
-    seconds: float,
-) -> Rows:  # fmt: skip
+def solve_all(found: list[Problem], solvers: dict[str, list[str]], about: Row) -> Rows:
     """The rows of all solves, which are recorded as they come."""
-    for error in refused:
-        print(f"left out: {error}")
-    if not found:
-        places, allowed = ", ".join(map(str, folders)), ", ".join(SUFFIXES)
-        raise SystemExit(f"run/study profile_problems: no problems in {places}; allowed are files ending in {allowed}")
-    about = say_machine() | {"limit": seconds, "refused": refused}
     rows: Rows = []
     for law, names in solvers.items():
         for name, path, contacts in found:
-            print(f"\n{name}, {contacts} contacts, {LAWS[law]}; limit {seconds:g} s\n{'':18}"
-                  + "".join(f"{tol:>10.0e}" for tol in TOLERANCES), flush=True)  # fmt: skip
+            print(f"\n{name}, {contacts} contacts, {LAWS[law]}; limit {about['limit']:g} s")
+            print(f"{'':18}" + "".join(f"{tol:>10.0e}" for tol in TOLERANCES), flush=True)
             for solver in names:
-                mine = run(path, law, solver, seconds)
+                mine = run(path, law, solver, about["limit"])
                 case = {"law": law, "problem": name, "contacts": contacts, "method": solver}
                 rows += [case | row for row in mine]
-                print(f"{solver:18}{''.join(f'{_seconds(row):>10}' for row in mine)}"
-                      f"{'' if mine[-1]['reached'] else '  ' + mine[-1]['reason']}", flush=True)  # fmt: skip
+                why = "" if mine[-1]["reached"] else f"  {mine[-1]['reason']}"
+                print(f"{solver:18}{''.join(f'{_seconds(row):>10}' for row in mine)}{why}", flush=True)
             record("profile", about, rows)
     return rows
 

@@ -1,15 +1,19 @@
-"""What the measuring scripts share: the machine, a run of the program, the record of the result."""
+"""What the studies share: their command line, the machine, settled states and their cone problems, tables, results."""
 
 from __future__ import annotations
 
+import argparse
 import json
+import math
+import multiprocessing
 import os
 import platform
 import statistics
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,34 +22,50 @@ import numpy as np
 import petsc4py
 import scipy
 
+ROOT = Path(__file__).resolve().parents[2]
+PYTHON, MPIEXEC = ROOT / ".venv/bin/python", ROOT / ".venv/bin/mpiexec"
+Row = dict[str, Any]
 
-def machine() -> dict[str, object]:
-    """What the figures were measured on."""
+# -- beginning and end ------------------------------------------------------------------------------------------
+
+
+def parser(name: str, about: str | None) -> argparse.ArgumentParser:
+    """Of the command line of a study; ``about`` is its docstring."""
+    form = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(f"run/study {name}", description=about, formatter_class=form, allow_abbrev=False)
+
+
+def listed(kind: Callable[[str], Any] = str, known: Sequence[str] = ()) -> Callable[[str], list[Any]]:
+    """The argparse type of words with commas between, each of them ``known`` if there is such a list."""
+
+    def read(text: str) -> list[Any]:
+        words = [kind(word) for word in text.split(",") if word]
+        for word in words:
+            if known and word not in known:
+                raise argparse.ArgumentTypeError(f"{word}: allowed are {', '.join(known)}")
+        return words
+
+    read.__name__ = "list"
+    return read
+
+
+def called_from(path: str | Path) -> Path:
+    """A path of the command line, which is relative to the folder where run/study was called."""
+    return Path(os.path.normpath(Path(os.environ.get("CALLED_FROM", ".")) / path))
+
+
+def say_machine() -> Row:
+    """Print and return what the figures are measured on."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
-    cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "?")
-    versions = {"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__}
-    threads = os.environ.get("OMP_NUM_THREADS", "1")
-    petsc = petsc4py.__version__
-    return {"cpu": cpu, "cores": os.cpu_count(), "OMP_NUM_THREADS": threads, "petsc4py": petsc, **versions}
-
-
-def say_machine() -> dict[str, object]:
-    about = machine()
+    about: Row = {"cpu": next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "?")}
+    about |= {"cores": os.cpu_count(), "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
+    about |= {"petsc4py": petsc4py.__version__, "python": platform.python_version()}
+    about |= {"numpy": np.__version__, "scipy": scipy.__version__}
     print(", ".join(f"{name} {value}" for name, value in about.items()), flush=True)
     return about
 
 
-def results(ranks: int, *options: object) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Run pctt.run with these options; its summary.json, and the lines of its steps.jsonl."""
-    with tempfile.TemporaryDirectory() as folder:
-        command = [".venv/bin/mpiexec", "-n", str(ranks), ".venv/bin/python", "-m", "pctt.run"]
-        command += [*map(str, options), "-output", folder]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        lines = (Path(folder) / "steps.jsonl").read_text().splitlines()
-        return json.loads((Path(folder) / "summary.json").read_text()), [json.loads(line) for line in lines]
-
-
-def record(name: str, about: dict[str, object], rows: list[dict]) -> None:
+def record(name: str, about: Row, rows: list[Row]) -> None:
     """Write results/NAME.json."""
     Path("results").mkdir(exist_ok=True)
     path = Path("results") / f"{name}.json"
@@ -53,32 +73,99 @@ def record(name: str, about: dict[str, object], rows: list[dict]) -> None:
     print(path)
 
 
-class Counter:
-    """Counts the calls of methods of a class while it is entered."""
+class Table:
+    """Prints rows as they come, below a line of heads.
 
-    def __init__(self, of: type, *names: str):
-        self.of, self.calls, self.originals = of, 0, {name: getattr(of, name) for name in names}
+    ``columns``: per head the name of the figure in the row, or a function of the row, and a format such as "9.3f".
+    """
 
-    def __enter__(self) -> Counter:
-        for name, original in self.originals.items():
-            setattr(self.of, name, self._counted(original))
-        return self
+    def __init__(self, **columns: tuple[str | Callable[[Row], Any], str]):
+        self.columns = columns
+        print("  ".join(self._text(head.replace("_", " "), form) for head, (_, form) in columns.items()))
 
-    def _counted(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        def method(*arguments: Any) -> Any:
-            self.calls += 1
-            return original(*arguments)
+    @staticmethod
+    def _text(text: str, form: str) -> str:
+        """As wide as numbers of this format, on the right if it does not begin with "<"."""
+        width = form.strip("<defgs").partition(".")[0]
+        return f"{text:{form[0] if form[0] == '<' else '>'}{width}}"
 
-        return method
+    def add(self, row: Row, more: str = "") -> None:
+        """Print a row, and what more there is to say of it."""
+        cells = []
+        for of, form in self.columns.values():
+            value = of(row) if callable(of) else row.get(of, "")
+            cells.append(self._text(value, form) if isinstance(value, str) else f"{value:{form}}")
+        print("  ".join([*cells, more]).rstrip(), flush=True)
 
-    def __exit__(self, *exception: object) -> None:
-        for name, original in self.originals.items():
-            setattr(self.of, name, original)
+
+def markdown(heads: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A table of Markdown."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
 
 
-def exponent(x: Sequence[float], y: Sequence[float]) -> float:
-    """Of y ~ x^p, by least squares of the logarithms; NaN for less than two points."""
-    return float(np.polyfit(np.log(x), np.log(y), 1)[0]) if len(x) > 1 else np.nan
+@contextmanager
+def figure(name: str | Path, panels: int, rows: int = 1) -> Iterator[Any]:
+    """Axes side by side, row by row, saved as results/NAME.png, or at a path; without matplotlib nothing is drawn."""
+    try:
+        import matplotlib as mpl
+    except ImportError:
+        print("no matplotlib: no figure")
+        yield []
+        return
+    mpl.use("agg")
+    from matplotlib import pyplot
+
+    size = 6.4 * panels, 4.8 * rows
+    drawing, axes = pyplot.subplots(rows, panels, figsize=size, layout="constrained", squeeze=False)
+    yield axes.ravel()
+    path = name if isinstance(name, Path) else Path("results") / f"{name}.png"
+    drawing.savefig(path, dpi=150)
+    pyplot.close(drawing)
+    print(path)
+
+
+# -- runs and processes -----------------------------------------------------------------------------------------
+
+
+def results(ranks: int, *options: object) -> tuple[Row, list[Row]]:
+    """Run pctt.run with these options; its summary.json, and the lines of its steps.jsonl."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [MPIEXEC, "-n", ranks, PYTHON, "-m", "pctt.run", *options, "-output", folder]
+        subprocess.run([*map(str, command)], check=True, stdout=subprocess.DEVNULL)
+        lines = (Path(folder) / "steps.jsonl").read_text().splitlines()
+        return json.loads((Path(folder) / "summary.json").read_text()), [json.loads(line) for line in lines]
+
+
+def settled_steps(scene: str, n: int, steps: int, *options: object, ranks: int = 1) -> tuple[Row, list[Row]]:
+    """`results` of steps from the settled state of a scene."""
+    words = ("-scene", scene, "-scene_n", n, "-restart", "settled", "-steps", steps)
+    return results(ranks, *words, *options)
+
+
+def lines_of(command: Sequence[object], seconds: float | None = None) -> tuple[list[Row], str]:
+    """The lines of JSON that a process writes, and why it failed; empty if it did not. It is ended after so long."""
+    words = [*map(str, command)]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=seconds, check=False)
+        said, failure = done.stdout, ""
+        if done.returncode:
+            failure = ": ".join(["failed", *done.stderr.strip().splitlines()[-1:]])
+    except subprocess.TimeoutExpired as over:
+        said, failure = (over.stdout or b"").decode(), "out of time"
+    return [json.loads(line) for line in said.splitlines() if line.startswith(("{", "["))], failure
+
+
+def in_new_process(work: Callable[..., Any], *arguments: Any) -> Any:
+    """What a function gives in a process where nothing else takes memory or time."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(work, *arguments).result()
+
+
+def keep_to_one_core() -> None:
+    """This process and all that it starts."""
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    os.environ["OMP_NUM_THREADS"] = "1"
 
 
 def median_seconds(do: Callable[[], object], repeat: int = 5) -> float:
@@ -92,22 +179,63 @@ def median_seconds(do: Callable[[], object], repeat: int = 5) -> float:
     return statistics.median(seconds)
 
 
-@contextmanager
-def figure(name: str, panels: int, rows: int = 1) -> Iterator[Any]:
-    """Axes side by side, row by row, saved as results/NAME.png; without matplotlib nothing is drawn."""
-    try:
-        import matplotlib as mpl
-    except ImportError:
-        print("no matplotlib: no figure")
-        yield []
-        return
-    mpl.use("agg")
-    from matplotlib import pyplot
+def medians(rows: Sequence[Mapping[str, Any]], *names: str) -> dict[str, float]:
+    """Of these figures of some rows; 0 counts where a row has none."""
+    return {name: statistics.median(row.get(name, 0.0) for row in rows) for name in names}
 
-    size = 6.4 * panels, 4.8 * rows
-    drawing, axes = pyplot.subplots(rows, panels, figsize=size, layout="constrained", squeeze=False)
-    yield axes.ravel()
-    path = Path("results") / f"{name}.png"
-    drawing.savefig(path, dpi=150)
-    pyplot.close(drawing)
-    print(path)
+
+# -- settled states, from several starts ------------------------------------------------------------------------
+
+
+def settled(scene: Any, seed: int | None = None, moved: float = 0.0, **settings: Any) -> Any:
+    """The `pctt.Simulation` of a scene from its settled state, on one rank. With a seed every grain is moved by up to
+    so much per axis [m], so that the courses of several starts part."""
+    from mpi4py import MPI
+
+    from pctt.simulation import Simulation
+
+    sim = Simulation(scene, restart="settled", **{"comm": MPI.COMM_SELF, **settings})
+    if seed is not None:
+        grains = sim.world.grains
+        way = np.random.default_rng(seed).uniform(-1.0, 1.0, grains.position.shape)
+        grains.position += moved * way[grains.id]
+    return sim
+
+
+def next_problem(sim: Any, contacts: Any = None) -> Any:
+    """The `pctt.ccp.ConeProblem` of the next step of a simulation, of these contacts if they are known."""
+    from dem.contact import find_contacts
+    from dem.system import ContactSystem
+    from pctt.run.stepper import cone_problem
+
+    world, settings = sim.world, sim.settings
+    if contacts is None:
+        contacts = find_contacts(world, settings.delta, settings.dt)
+    return cone_problem(ContactSystem(world, contacts, settings.dt, settings.recovery_speed), world.comm)
+
+
+FIELDS = {"dt": float, "tol": float, "closing_work": float, "stiffness": float, "projection": lambda text: text == "1"}
+
+
+def settings_of(words: str) -> dict[str, Any]:
+    """Fields of `pctt.Settings` of `dt=.01,projection=1`, or `default`; ValueError for a name or value that there is
+    not."""
+    if words in ("default", ""):
+        return {}
+    pairs = [word.partition("=")[::2] for word in words.split(",")]
+    if bad := [name for name, _ in pairs if name not in FIELDS]:
+        raise ValueError(f"{bad[0]}: allowed are {', '.join(FIELDS)}")
+    return {name: FIELDS[name](value) for name, value in pairs}
+
+
+def spread(values: Sequence[float]) -> tuple[float, float]:
+    """Mean, and its standard error; NaN of one value."""
+    error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+    return statistics.fmean(values), error
+
+
+def at_least_one(text: str) -> int:
+    """The argparse type of a number of starts."""
+    if int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text}: allowed are 1 and more")
+    return int(text)

@@ -4,13 +4,12 @@ and results/graphs.png, which bodies and contacts touch."""
 
 from __future__ import annotations
 
-import argparse
-import os
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
 from matplotlib.figure import Figure
+from shared import called_from, parser
 
 from pctt.folder import Folder, Frame
 
@@ -114,11 +113,11 @@ def coupling(folder: Folder, frame: Frame) -> sp.csr_matrix:
 
 
 def main() -> None:
-    words = argparse.ArgumentParser("run/study structure", description=__doc__)
+    words = parser("structure", __doc__)
     words.add_argument("folder", type=Path, help="output folder of a run")
     words.add_argument("-step", type=int, help="recorded step; without: the last with contacts")
     given = words.parse_args()
-    folder = Folder(Path(os.environ.get("CALLED_FROM", ".")) / given.folder)
+    folder = Folder(called_from(given.folder))
     folder.require_frames()
     frames = (folder.frame(step) for step in ([given.step] if given.step is not None else reversed(folder.steps)))
     frame = next((frame for frame in frames if len(frame.contacts)), None)

@@ -24,27 +24,21 @@ Writes results/time_steps.json and .png.
 
 from __future__ import annotations
 
-import argparse
 import math
-import multiprocessing
-import os
 import statistics
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from compare_liggghts import settings_of, spread
-from mpi4py import MPI
-from shared import figure, record, say_machine
+import shared
+from shared import Row, Table, settings_of, settled
 
 from dem.experiment import Experiment
 from dem.scenes import Blade, Drum, Mixer, Shear, Silo
 from dem.time_step import recommended
 from dem.together import SceneError
-from pctt.simulation import Simulation
 
 MOVED = 1e-4  # of a radius
 FORGETS = 0.05  # [s] from the start, not part of overlaps
@@ -95,10 +89,10 @@ UNASKED = [name for name in CASES if name != "mixer16"]  # which takes an hour
 
 
 class Course(NamedTuple):
-    """What a run shows."""
+    """What a run shows; figures of the table but for `figure`."""
 
     figure: float
-    overlap: float  #: the worst, as a part of a radius
+    overlap: float  #: the worst, % of a radius
     cpu: float  #: per simulated second [s]
     iterations: float  #: a step
     unsolved: int
@@ -109,78 +103,40 @@ class Course(NamedTuple):
 def settings_for(words: str, scene: Experiment) -> dict[str, Any]:
     """Of `2,tol=1e-3`; ValueError for a name or value that there is not."""
     factor, _, others = words.partition(",")
-    return {"dt": float(factor) * recommended(scene.build()), **settings_of(others or "default")}
-
-
-def opened(case: Case, seed: int, settings: dict[str, Any]) -> Simulation:
-    """The settled scene with spheres moved."""
-    sim = Simulation(case.scene, restart="settled", comm=MPI.COMM_SELF, solver="apgd", **settings)
-    grains = sim.world.grains
-    moved = np.random.default_rng(seed).uniform(-1.0, 1.0, grains.position.shape)
-    grains.position += MOVED * case.scene.radius * moved[grains.id]
-    return sim
+    return {"dt": float(factor) * recommended(scene.build()), **settings_of(others)}
 
 
 def course(name: str, seed: int, words: str) -> Course:
     """Steps of a simulation; a step of another one first, which loads compiled loops."""
-    case = CASES[name]
-    settings = settings_for(words, case.scene)
-    with opened(case, seed, settings) as first:
+    case, radius = CASES[name], CASES[name].scene.radius
+    settings = {"solver": "apgd", **settings_for(words, case.scene)}
+    with settled(case.scene, seed, MOVED * radius, **settings) as first:
         first.step()
-    with opened(case, seed, settings) as sim:
+    with settled(case.scene, seed, MOVED * radius, **settings) as sim:
         begun, before = sim.time, time.process_time()
         rows = [sim.step() for _ in range(math.ceil(case.seconds / settings["dt"] - 1e-9))]
         spent, stiffness = (time.process_time() - before) / (sim.time - begun), float(sim.world.pairs.stiffness.max())
     late = [row for row in rows if row["time"] - begun > case.after]
     records = {key: np.array([row[key] for row in late]) for key, value in late[0].items() if np.isscalar(value)}
-    overlap = max(row["worst_overlap [m]"] for row in rows if row["time"] - begun > FORGETS)
+    overlap = 100 / radius * max(row["worst_overlap [m]"] for row in rows if row["time"] - begun > FORGETS)
     unsolved = sum(not row["converged"] for row in rows)
     iterations = statistics.fmean(row["iterations"] for row in rows)
-    radius = case.scene.radius
-    return Course(case.figure(records), overlap / radius, spent, iterations, unsolved, settings["dt"], stiffness)
+    return Course(case.figure(records), overlap, spent, iterations, unsolved, settings["dt"], stiffness)
 
 
-def row(name: str, words: str, starts: int) -> dict[str, Any]:
+def of_starts(name: str, words: str, starts: int) -> Row:
     """Of the starts of one setting, each in a process of its own."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        found = [pool.submit(course, name, seed, words).result() for seed in range(starts)]
-    value, error = spread([each.figure for each in found])
-    return {
-        "case": name,
-        "settings": words,
-        "dt": found[0].dt,
-        "stiffness": found[0].stiffness,
-        "cpu": statistics.median(each.cpu for each in found),
-        "overlap": 100 * max(each.overlap for each in found),
-        "figure": value,
-        "error": error,
-        "iterations": statistics.fmean(each.iterations for each in found),
-        "unsolved": sum(each.unsolved for each in found),
-    }
+    found = [shared.in_new_process(course, name, seed, words) for seed in range(starts)]
+    value, error = shared.spread([each.figure for each in found])
+    row: Row = {"case": name, "settings": words, **found[0]._asdict(), "figure": value, "error": error}
+    row |= {"cpu": statistics.median(each.cpu for each in found), "overlap": max(each.overlap for each in found)}
+    row["iterations"] = statistics.fmean(each.iterations for each in found)
+    return row | {"unsolved": sum(each.unsolved for each in found)}
 
 
-def shown(name: str, words: str, starts: int) -> list[dict[str, Any]]:
-    """The row, printed; none where grains would pass through others unseen, or contacts have no solution."""
-    try:
-        found = row(name, words, starts)
-    except SceneError as error:
-        print(f"{words:28} ended: {error}", flush=True)
-        return []
-    show(found)
-    return [found]
-
-
-def show(row: dict[str, Any]) -> None:
-    print(
-        f"{row['settings']:28} {1e3 * row['dt']:6.2f} ms {row['cpu']:7.2f} {row['overlap']:6.2f} {row['figure']:9.4g} "
-        f"+- {row['error']:7.2g} {row['iterations']:5.0f} {row['unsolved']:3d}  k {row['stiffness']:.2g}",
-        flush=True,
-    )
-
-
-def draw(cases: list[list[dict[str, Any]]]) -> None:
+def draw(cases: list[list[Row]]) -> None:
     """Error of the figure over CPU seconds, a panel for each case."""
-    with figure("time_steps", min(len(cases), 3), -(-len(cases) // 3)) as panels:
+    with shared.figure("time_steps", min(len(cases), 3), -(-len(cases) // 3)) as panels:
         for axes, rows in zip(panels, cases):
             limit = min(rows, key=lambda row: row["dt"])["figure"]
             plain = sorted((row for row in rows if "," not in row["settings"]), key=lambda row: row["dt"])
@@ -201,32 +157,34 @@ def draw(cases: list[list[dict[str, Any]]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="run/study time_steps", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("case", nargs="*", default=UNASKED, help=f"of {', '.join(CASES)}; mixer16 only if named")
-    parser.add_argument("--starts", type=int, default=3)
-    parser.add_argument("--settings", nargs="+", default=SETTINGS, help="see above")
-    words = parser.parse_args()
-    if unknown := [name for name in words.case if name not in CASES]:
-        parser.error(f"{unknown[0]}: allowed are {', '.join(CASES)}")
-    if words.starts < 1:
-        parser.error(f"--starts {words.starts}: allowed are 1 and more")
+    line = shared.parser("time_steps", __doc__)
+    line.add_argument("case", nargs="*", default=UNASKED, help=f"of {', '.join(CASES)}; mixer16 only if named")
+    line.add_argument("--starts", type=shared.at_least_one, default=3, help="of each setting (3)")
+    line.add_argument("--settings", nargs="+", default=SETTINGS, help="see above")
+    given = line.parse_args()
+    if unknown := [name for name in given.case if name not in CASES]:
+        line.error(f"{unknown[0]}: allowed are {', '.join(CASES)}")
     try:
-        for setting in words.settings:
-            settings_for(setting, Mixer(n=1))
+        _ = [settings_for(words, Mixer(n=1)) for words in given.settings]
     except ValueError as error:
-        parser.error(f"--settings {error}")
-    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    os.environ["OMP_NUM_THREADS"] = "1"
-    about, cases = say_machine(), []
-    for name in words.case:
-        print(f"{name}, {words.starts} starts of {CASES[name].seconds:g} s")
-        print(f"{'dt over default, settings':28} {'dt':>9} {'CPU s/s':>7} overlap {CASES[name].unit:>8} {'its':>16}")
+        line.error(f"--settings {error}")
+    shared.keep_to_one_core()
+    about, cases = shared.say_machine(), []
+    for name in given.case:
+        print(f"{name}, {given.starts} starts of {CASES[name].seconds:g} s; figure in {CASES[name].unit or '1'}")
+        table = Table(
+            settings=("settings", "<28"), dt_ms=(lambda row: 1e3 * row["dt"], "6.2f"), CPU_s_per_s=("cpu", "11.2f"),
+            overlap=("overlap", "7.2f"), figure=("figure", "9.4g"), error=("error", "7.2g"),
+            its=("iterations", "5.0f"), unsolved=("unsolved", "8d"), stiffness=("stiffness", "9.2g"),
+        )  # fmt: skip
         cases.append([])
-        for setting in words.settings:
-            cases[-1] += shown(name, setting, words.starts)
-        record("time_steps", about, [each for rows in cases for each in rows])
+        for words in given.settings:
+            try:
+                cases[-1].append(of_starts(name, words, given.starts))
+                table.add(cases[-1][-1])
+            except SceneError as error:  # noqa: PERF203 - grains would pass others unseen, or there is no solution
+                print(f"{words:28} ended: {error}", flush=True)
+        shared.record("time_steps", about, [row for rows in cases for row in rows])
     draw(cases)
 
 

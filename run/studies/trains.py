@@ -10,12 +10,11 @@ configuration; `apgd` makes the time steps. Writes results/trains_WHAT.json, and
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import petsc4py
 
@@ -24,18 +23,14 @@ petsc4py.init([sys.argv[0]])
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-from shared import exponent, figure, median_seconds, record, say_machine
+from shared import Row, Table, figure, listed, median_seconds, next_problem, parser, record, say_machine, settled
 
-from dem.contact import find_contacts
 from dem.scenes import Mixer
-from dem.system import ContactSystem
 from pctt import ccp
-from pctt.ccp.newton.contact import ContactForm
+from pctt.ccp.newton.forms import ContactForm
 from pctt.ksp_options import entered
 from pctt.pc import TensorTrain
 from pctt.pc.sparse_train import SparseTrain
-from pctt.run.stepper import cone_problem
-from pctt.simulation import Simulation
 
 COMM = MPI.COMM_SELF
 TOL = 1e-4  # natural residual at which the Newton systems end
@@ -52,8 +47,7 @@ EARLY, REPEAT = 6, 3  # `scaling` takes the last two of so many Newton systems, 
 # -- the systems ----------------------------------------------------------------------------------------------
 
 
-@dataclass
-class System:
+class System(NamedTuple):
     """One Newton system S x = b: barrier blocks (nc, 3, 3) of S, and b (3 nc,)."""
 
     barrier: np.ndarray
@@ -94,12 +88,10 @@ class Replay:
 
 def replays(n: int, steps: int = 1, max_it: int = -1) -> Iterator[Replay]:
     """The systems of each of some steps from the settled mixer; ``max_it``: of each, at most."""
-    sim = Simulation(Mixer(n=n), restart="settled", dt=0.025, comm=COMM, solver="apgd", stiffness=np.inf)
-    world, settings = sim.world, sim.settings
+    sim = settled(Mixer(n=n), dt=0.025, solver="apgd", stiffness=np.inf)
     for _ in range(steps):
-        contacts = find_contacts(world, settings.delta, settings.dt)
         newton = Recorder(COMM)
-        with cone_problem(ContactSystem(world, contacts, settings.dt, settings.recovery_speed), COMM) as problem:
+        with next_problem(sim) as problem:
             ccp.solve(problem, None, "pdip", ccp.Limits(TOL, max_it, np.inf, fallback=False), newton=newton)
             replay = Replay(problem, newton.systems)
             yield replay
@@ -114,7 +106,7 @@ def replays(n: int, steps: int = 1, max_it: int = -1) -> Iterator[Replay]:
 class WatchedSparseTrain(SparseTrain):
     """Whose phases are timed into ``rows[-1]``, the list of its `WatchedTrain`."""
 
-    rows: list[dict[str, Any]]
+    rows: list[Row]
 
     def _compress(self, warm: bool):
         start = time.perf_counter()
@@ -148,7 +140,7 @@ class WatchedTrain(TensorTrain):
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
-        self.rows: list[dict[str, Any]] = []
+        self.rows: list[Row] = []
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         assert isinstance(self.made, WatchedSparseTrain)
@@ -174,7 +166,7 @@ def train_pc(**options: Any) -> PETSc.PC:
     return pc
 
 
-def set_up(pc: PETSc.PC, matrix: PETSc.Mat) -> dict[str, Any]:
+def set_up(pc: PETSc.PC, matrix: PETSc.Mat) -> Row:
     """Make the preconditioner; the figures of the set-up."""
     pc.setOperators(matrix)
     pc.setUp()
@@ -184,13 +176,13 @@ def set_up(pc: PETSc.PC, matrix: PETSc.Mat) -> dict[str, Any]:
 # -- ranks ----------------------------------------------------------------------------------------------------
 
 
-def of_cap(replay: Replay, eps: float, cap: int, scaling: str, every: int) -> dict[str, Any]:
+def of_cap(replay: Replay, eps: float, cap: int, scaling: str, every: int) -> Row:
     """Averages over the systems, and seconds per PDIP solve: means times all its Newton steps."""
     pc = train_pc(eps=eps, rank=cap, scaling=scaling, reuse="steps")
     done = [dict(set_up(pc, replay.matrix(system))) for system in replay.systems[::every]]
     pc.destroy()
     rows = [row for row in done if "inverse_rank" in row]
-    row: dict[str, Any] = {"scaling": scaling, "eps": eps, "cap": cap, "contacts": replay.contacts}
+    row: Row = {"scaling": scaling, "eps": eps, "cap": cap, "contacts": replay.contacts}
     row |= {"newton_steps": len(replay.systems), "set_ups": len(done), "positive": sum(row["positive"] for row in rows)}
     row |= {name: float(np.mean([row[name] for row in rows])) for name in ("matrix_rank", "inverse_rank", "error")}
     row["residual"] = float(np.median([row["residual"] for row in rows]))
@@ -199,26 +191,24 @@ def of_cap(replay: Replay, eps: float, cap: int, scaling: str, every: int) -> di
     return row
 
 
-def ranks(given: argparse.Namespace) -> list[dict[str, Any]]:
+def ranks(given: Namespace) -> list[Row]:
     """Average ranks of trains and of their inverses, with and without block scaling."""
     steps = replays(given.n)
     replay = next(steps)
     print(f"mixer n = {given.n}: {replay.contacts} contacts, {len(replay.systems)} Newton steps, 1 rank")
     print("means over the Newton steps (residual: median); seconds per PDIP solve; paper: ranks and seconds")
-    print(f"{'scaling':8} {'eps':>8} {'cap':>5} {'ranks S/X':>12} {'paper':>18} {'error':>10} {'residual':>10} "
-          f"{'positive':>10} {'compress s':>10} {'invert s':>10}")  # fmt: skip
-    rows: list[dict[str, Any]] = []
-    for scaling in ("block", "none"):
-        for cap in given.caps:
-            every = given.every if cap <= 10 else max(given.every, len(replay.systems) // 3)
-            for eps in EPS:
-                row = of_cap(replay, eps, cap, scaling, every)
-                rows.append(row)
-                paper = "{}/{} {} s".format(*PAPER[eps, cap]) if (eps, cap) in PAPER else "-"
-                print(f"{scaling:8} {eps:8.0e} {cap:5d} {row['matrix_rank']:6.1f}/{row['inverse_rank']:5.1f} "
-                      f"{paper:>18} {row['error']:10.3g} {row['residual']:10.3g} "
-                      f"{row['positive']:>7}/{row['set_ups']:2d} {row['compress_s']:10.2f} {row['invert_s']:10.2f}",
-                      flush=True)  # fmt: skip
+    table = Table(
+        scaling=("scaling", "<8"), eps=("eps", "8.0e"), cap=("cap", "5d"), rank_S=("matrix_rank", "6.1f"),
+        rank_X=("inverse_rank", "6.1f"), paper=("paper", "18"), error=("error", "9.3g"), residual=("residual", "9.3g"),
+        positive=(lambda row: f"{row['positive']}/{row['set_ups']}", "8"), compress_s=("compress_s", "10.2f"),
+        invert_s=("invert_s", "10.2f"),
+    )  # fmt: skip
+    rows: list[Row] = []
+    for scaling, cap, eps in [(way, cap, eps) for way in ("block", "none") for cap in given.caps for eps in EPS]:
+        every = given.every if cap <= 10 else max(given.every, len(replay.systems) // 3)
+        rows.append(of_cap(replay, eps, cap, scaling, every))
+        paper = "{}/{} {} s".format(*PAPER[eps, cap]) if (eps, cap) in PAPER else "-"
+        table.add({**rows[-1], "paper": paper})
     steps.close()
     return rows
 
@@ -226,13 +216,14 @@ def ranks(given: argparse.Namespace) -> list[dict[str, Any]]:
 # -- reuse ----------------------------------------------------------------------------------------------------
 
 
-def reuse(given: argparse.Namespace) -> list[dict[str, Any]]:
+def reuse(given: Namespace) -> list[Row]:
     """A row per time step: set-ups of every Newton system by every level of reuse."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     names = [f"{what}, {level}" for level in LEVELS[1:] for what in ("first", "all")]
     print("seconds of set-up without reuse / with reuse within a time step (newton) and from step to step (trains):")
     print("of the first Newton system of a step, and of all")
-    print(f"{'n':>3} {'step':>6} {'contacts':>9} {'Newton':>7}" + "".join(f"{name:>15}" for name in names))
+    table = Table(n=("n", "3d"), step=("step", "6"), contacts=("contacts", "9"), Newton=("newton", "7"),
+                  **{name: (name, "13.2f") for name in names})  # fmt: skip
     for n in given.n:
         pcs = {level: train_pc(reuse=level, rank=10, eps=1e-2) for level in LEVELS}
         for step, replay in enumerate(replays(n, given.steps), start=1):
@@ -243,40 +234,36 @@ def reuse(given: argparse.Namespace) -> list[dict[str, Any]]:
                 for turn in range(len(LEVELS)):
                     level = LEVELS[(k + turn) % len(LEVELS)]  # each is the first, with a cold cache, as often
                     seconds[level].append(set_up(pcs[level], replay.matrix(system))["setup_s"])
-            row: dict[str, Any] = {"n": n, "step": step, "contacts": replay.contacts, "newton": len(replay.systems)}
+            row: Row = {"n": n, "step": step, "contacts": replay.contacts, "newton": len(replay.systems)}
             for level in LEVELS[1:]:
                 row[f"first, {level}"] = seconds["none"][0] / seconds[level][0]
                 row[f"all, {level}"] = sum(seconds["none"]) / sum(seconds[level])
             rows.append(row | {"seconds": seconds})
             if step > 1:  # the first step of a run has nothing to start from
-                cells = "".join(f"{row[name]:15.2f}" for name in names)
-                print(f"{n:3d} {step:6d} {row['contacts']:9d} {row['newton']:7d}{cells}", flush=True)
+                table.add(row)
         for pc in pcs.values():
             pc.destroy()
         later = [row for row in rows if row["n"] == n][1:]
-        medians = [np.median([row[name] for row in later]) for name in names]
-        print(f"{n:3d} {'median':>6} {'':17}" + "".join(f"{median:15.2f}" for median in medians))
+        table.add({"n": n, "step": "median", **{name: np.median([row[name] for row in later]) for name in names}})
     return rows
 
 
 # -- scaling --------------------------------------------------------------------------------------------------
 
 
-def phases(replay: Replay) -> dict[str, float]:
+def phases(replay: Replay) -> Row:
     """Seconds for a cold start with a matrix and a warm one with the next, medians; of an application, and of S x."""
-    runs: list[dict[str, float]] = []
-    for _ in range(REPEAT):
-        run: dict[str, float] = {}
-        for way in ("als", "cross"):
-            pc = train_pc(compress=way, rank=10, eps=1e-2, reuse="steps")
-            for state, system in zip(("cold", "warm"), replay.systems[-2:]):
-                done = set_up(pc, replay.matrix(system))
-                run[f"{way} {state}"] = done["compress_s"]
-                if way == "als":
-                    run |= {f"invert {state}": done["invert_s"], f"set-up {state}": done["setup_s"]}
-            pc.destroy()
-        runs.append(run)
-    row = {name: float(np.median([run[name] for run in runs])) for name in runs[0]}
+    runs: dict[str, list[float]] = {}
+    for way in ("als", "cross") * REPEAT:
+        pc = train_pc(compress=way, rank=10, eps=1e-2, reuse="steps")
+        for state, system in zip(("cold", "warm"), replay.systems[-2:]):
+            done = set_up(pc, replay.matrix(system))
+            runs.setdefault(f"{way} {state}", []).append(done["compress_s"])
+            if way == "als":
+                runs.setdefault(f"invert {state}", []).append(done["invert_s"])
+                runs.setdefault(f"set-up {state}", []).append(done["setup_s"])
+        pc.destroy()
+    row: Row = {name: float(np.median(seconds)) for name, seconds in runs.items()}
     matrix = replay.matrix(replay.systems[-1])
     pc = train_pc(rank=10, eps=1e-2)
     x, y = matrix.createVecs()
@@ -288,20 +275,22 @@ def phases(replay: Replay) -> dict[str, float]:
     return row
 
 
-def scaling(given: argparse.Namespace) -> list[dict[str, Any]]:
-    """A row per size, and the exponents of the seconds in the contacts."""
-    rows: list[dict[str, Any]] = []
+def scaling(given: Namespace) -> list[Row]:
+    """A row per size, and the exponents p of the seconds ~ contacts^p, by least squares of the logarithms."""
+    rows: list[Row] = []
     print(f"rank 10, eps 1e-2, 1 rank; medians of {REPEAT} set-ups, 5 applications; seconds")
     for n in given.n:
-        (row,) = ({"contacts": replay.contacts, **phases(replay)} for replay in replays(n, max_it=EARLY))
-        names = [name for name in row if name != "contacts"]
+        (row,) = ({"n": n, "contacts": replay.contacts, **phases(replay)} for replay in replays(n, max_it=EARLY))
+        names = [*row][2:]
         if not rows:
-            print(f"{'n':>3} {'contacts':>9}" + "".join(f"{name:>12}" for name in names))
-        print(f"{n:3d} {row['contacts']:9d}" + "".join(f"{row[name]:12.4f}" for name in names), flush=True)
-        rows.append({"n": n, **row})
+            table = Table(n=("n", "3"), contacts=("contacts", "9"), **{name: (name, "11.4f") for name in names})
+        rows.append(row)
+        table.add(row)
     contacts = [row["contacts"] for row in rows]
-    powers = {name: exponent(contacts, [row[name] for row in rows]) for name in names}
-    print(f"{'exponent':>13}" + "".join(f"{powers[name]:12.2f}" for name in names))
+    powers: Row = dict.fromkeys(names, np.nan)
+    for name in names if len(rows) > 1 else ():
+        powers[name] = float(np.polyfit(np.log(contacts), np.log([row[name] for row in rows]), 1)[0])
+    table.add({"contacts": "exponent", **powers})
     with figure("trains_scaling", 1) as panels:
         for axes in panels:
             for name in names:
@@ -311,14 +300,12 @@ def scaling(given: argparse.Namespace) -> list[dict[str, Any]]:
     return [*rows, {"exponents": powers}]
 
 
-def main() -> None:
-    words = argparse.ArgumentParser("run/study trains", description=__doc__,
-                                    formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
+if __name__ == "__main__":
+    words = parser("trains", __doc__)
     kinds = words.add_subparsers(dest="what", required=True)
     of_ranks, of_reuse, of_scaling = (kinds.add_parser(name) for name in ("ranks", "reuse", "scaling"))
     of_ranks.add_argument("n", type=int, nargs="?", default=8, help="size of the mixer (8; the paper's is 16)")
-    of_ranks.add_argument("-caps", default="10,100", type=lambda text: [int(word) for word in text.split(",")],
-                          help="caps of the ranks, with commas between (10,100)")  # fmt: skip
+    of_ranks.add_argument("-caps", default="10,100", type=listed(int), help="of ranks, with commas between (10,100)")
     of_ranks.add_argument("-every", type=int, default=1, help="every K-th system (1; caps over 10: three in all)")
     of_reuse.add_argument("n", type=int, nargs="*", default=[4, 8], help="sizes of the mixer (4 8)")
     of_reuse.add_argument("-steps", type=int, default=31, help="time steps of each, the first not counted (31)")
@@ -326,7 +313,3 @@ def main() -> None:
     given = words.parse_args()
     about = say_machine()
     record(f"trains_{given.what}", about, {"ranks": ranks, "reuse": reuse, "scaling": scaling}[given.what](given))
-
-
-if __name__ == "__main__":
-    main()

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from shared import record, say_machine
+from shared import PYTHON, figure, markdown, record, say_machine
 from validation import laws
 from validation.rows import Row
 
@@ -60,8 +60,8 @@ def run(name: str, options: Sequence[object], keep: bool) -> None:
     if keep and mark.exists() and json.loads(mark.read_text())["options"] == words:
         print(f"{name}: kept as it is in {folder}", flush=True)
         return
-    command = [".venv/bin/python", "-m", "pctt.run", "-scene", *map(str, options), "-ccp_type", "apgd"]
-    command += ["-output", str(folder), "-overwrite", "-output_every", "5", "-checkpoint_every", "1000", "-quiet"]
+    command = [str(PYTHON), "-m", "pctt.run", "-scene", *map(str, options), "-ccp_type", "apgd", "-output", str(folder)]
+    command += ["-overwrite", "-output_every", "5", "-checkpoint_every", "1000", "-quiet"]
     started = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
     _, status, used = os.wait4(started.pid, 0)
     if status:
@@ -78,7 +78,7 @@ def _seconds(name: str) -> float:
 
 def table(rows: list[Row]) -> str:
     """The rows in Markdown."""
-    lines = ["| | quantity | reference | found | deviation | source |", "|---|---|---|---|---|---|"]
+    lines = []
     for row in rows:
         reference, unit = row["reference"], f" {row['unit']}" if row["unit"] else ""
         error = f" +- {row['error']:.2g}" if row.get("error") else ""
@@ -90,9 +90,9 @@ def table(rows: list[Row]) -> str:
         else:
             expected = f"[{reference[0]:g}, {reference[1]:g}]{unit}"
             off = "inside" if row["deviation"] == 0.0 else f"{100 * row['deviation']:+.2g} %"
-        words = [row["check"], row["quantity"], expected, f"{row['found']:.4g}{error}{unit}"]
-        lines.append("| " + " | ".join([*words, off if row["agrees"] else f"**{off}**", row["source"]]) + " |")
-    return "\n".join(lines)
+        found, off = f"{row['found']:.4g}{error}{unit}", off if row["agrees"] else f"**{off}**"
+        lines.append([row["check"], row["quantity"], expected, found, off, row["source"]])
+    return markdown(["", "quantity", "reference", "found", "deviation", "source"], lines)
 
 
 def solved(missed: int, steps: int) -> str:
@@ -105,49 +105,38 @@ def solved(missed: int, steps: int) -> str:
 
 def draw(shown: dict[str, dict[str, Any]]) -> None:
     """A panel for each check."""
-    try:
-        import matplotlib as mpl
-    except ImportError:
-        print("no matplotlib: the picture stays as it is")
-        return
-    mpl.use("agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(2, 2, figsize=(10, 7.6), layout="constrained")
     silo, heap, drum, column = (shown[name] for name in ("silo", "heap", "drum", "column"))
-    (one, two), (three, four) = axes
-    wide = np.linspace(-silo["level"] / silo["slope"], 7.0)
-    one.plot(wide, silo["slope"] * wide + silo["level"], color="C7", label="Beverloo's law, fitted")
-    one.plot(silo["outlet"], silo["flow"] ** 0.4, "o", color="C0", label=["silo"] + [None] * (len(SEEDS) - 1))
-    one.set_xlabel("outlet [sphere diameters]")
-    one.set_ylabel("flow$^{2/5}$ [(kg/s)$^{2/5}$]")
-    for mu, angle, z in zip(heap["friction"], heap["angle"], heap["height"]):
-        (line,) = two.plot(
-            *(1e3 * heap["x"], 1e3 * z.mean(axis=0), "o-"),
-            markersize=3,
-            label=f"friction {mu:g}: {angle:.1f} $\\pm$ {heap['error']:.1f} degrees",
-        )
-        two.fill_between(1e3 * heap["x"], 1e3 * z.min(axis=0), 1e3 * z.max(axis=0), color=line.get_color(), alpha=0.15)
-    two.set_xlabel("distance from the edge [mm]")
-    two.set_ylabel("surface, mean and range of beds [mm]")
-    two.set_ylim(0.0, None)
-    three.plot(drum["time"], drum["angle"], linewidth=0.9, label="drum")
-    three.axhspan(20.9, 32.8, color="C7", alpha=0.25, label="glass beads, mu(I)")
-    three.axhline(drum["mean"], color="C0", linestyle=":", label=f"mean, {drum['mean']:.1f} degrees")
-    three.set_xlabel("time [s]")
-    three.set_ylabel("angle of the bed [degrees]")
-    four.plot(column["weight"], 1e3 * column["height"], color="C7", linestyle="--", label="weight above")
-    four.plot(column["law"], 1e3 * column["height"], color="C0", label="vertical stress, Janssen")
-    four.plot(column["vertical"], 1e3 * column["height"], "o", color="C0", label="vertical stress")
-    four.plot(column["ratio"] * column["law"], 1e3 * column["height"], color="C1", label="wall's pressure, Janssen")
-    four.plot(column["pressure"], 1e3 * column["height"], "o", color="C1", label="wall's pressure")
-    four.set_xlabel("stress [Pa]")
-    four.set_ylabel("height [mm]")
-    for panel in axes.flat:
-        panel.grid(alpha=0.3)
-        panel.legend(fontsize="small", frameon=False)
-    figure.savefig(PICTURE, dpi=110)
-    pyplot.close(figure)
+    with figure(PICTURE, 2, 2) as panels:
+        if not len(panels):
+            return
+        one, two, three, four = panels
+        wide = np.linspace(-silo["level"] / silo["slope"], 7.0)
+        one.plot(wide, silo["slope"] * wide + silo["level"], color="C7", label="Beverloo's law, fitted")
+        one.plot(silo["outlet"], silo["flow"] ** 0.4, "o", color="C0", label=["silo"] + [None] * (len(SEEDS) - 1))
+        one.set(xlabel="outlet [sphere diameters]", ylabel="flow$^{2/5}$ [(kg/s)$^{2/5}$]")
+        for mu, angle, z in zip(heap["friction"], heap["angle"], heap["height"]):
+            label = f"friction {mu:g}: {angle:.1f} $\\pm$ {heap['error']:.1f} degrees"
+            (line,) = two.plot(1e3 * heap["x"], 1e3 * z.mean(axis=0), "o-", markersize=3, label=label)
+            low, high = 1e3 * z.min(axis=0), 1e3 * z.max(axis=0)
+            two.fill_between(1e3 * heap["x"], low, high, color=line.get_color(), alpha=0.15)
+        two.set(xlabel="distance from the edge [mm]", ylabel="surface, mean and range of beds [mm]", ylim=(0.0, None))
+        three.plot(drum["time"], drum["angle"], linewidth=0.9, label="drum")
+        three.axhspan(20.9, 32.8, color="C7", alpha=0.25, label="glass beads, mu(I)")
+        three.axhline(drum["mean"], color="C0", linestyle=":", label=f"mean, {drum['mean']:.1f} degrees")
+        three.set(xlabel="time [s]", ylabel="angle of the bed [degrees]")
+        height, law = 1e3 * column["height"], column["law"]
+        for stress, style, label in (
+            (column["weight"], "C7--", "weight above"),
+            (law, "C0-", "vertical stress, Janssen"),
+            (column["vertical"], "C0o", "vertical stress"),
+            (column["ratio"] * law, "C1-", "wall's pressure, Janssen"),
+            (column["pressure"], "C1o", "wall's pressure"),
+        ):
+            four.plot(stress, height, style, label=label)
+        four.set(xlabel="stress [Pa]", ylabel="height [mm]")
+        for panel in panels:
+            panel.grid(alpha=0.3)
+            panel.legend(fontsize="small", frameon=False)
 
 
 def main(names: Sequence[str]) -> None:
@@ -181,16 +170,10 @@ def main(names: Sequence[str]) -> None:
         cores = min(2, os.cpu_count() or 1)
         about["minutes"] = seconds / 60 / cores
         text = TEXT.read_text("utf-8").format(
-            minutes=about["minutes"],
-            cores=cores,
-            cpu=about["cpu"],
-            table=table(rows),
-            rubs=shown["column"]["rubs"],
-            solved=solved(missed, len(lines)),
-            beds=len(SEEDS),
-            scatter=shown["heap"]["scatter"],
+            minutes=about["minutes"], cores=cores, cpu=about["cpu"], table=table(rows), beds=len(SEEDS),
+            rubs=shown["column"]["rubs"], scatter=shown["heap"]["scatter"], solved=solved(missed, len(lines)),
             outlets=", ".join(f"{outlet:g}" for outlet in OUTLETS),
-        )
+        )  # fmt: skip
         PAGE.write_text(text, "utf-8")
         print(PAGE)
 

@@ -12,6 +12,7 @@ from dem.contact_map import BlockRows
 from pctt import ccp, memory
 from pctt.ccp import ConeProblem, Limits, newton_for
 from pctt.ccp.newton.krylov import Krylov
+from pctt.ccp.newton.linear import Settings
 
 FORMS = pytest.mark.parametrize("form", ccp.FORMS)
 CASES = {
@@ -28,7 +29,7 @@ CASES = {
 @pytest.fixture(autouse=True)
 def few(request, monkeypatch):
     """Rows of the problems that get dense factors: none, unless a test says more."""
-    monkeypatch.setattr(ccp.newton, "FEW", getattr(request, "param", 0))
+    monkeypatch.setattr(Settings, "few", getattr(request, "param", 0))
 
 
 def packing(side: int = 5, seed: int = 0) -> tuple[BlockRows, np.ndarray, np.ndarray]:
@@ -107,7 +108,7 @@ def test_its_systems_change_from_block_jacobi_to_factors_if_the_memory_has_room(
     G, r, mu = packing(8 if room else 5)
     newton = newton_for(SELF, "conic")
     assert ccp.solve(ConeProblem(SELF, r, mu, G=G), None, "conic", Limits(1e-6), newton=newton).converged
-    assert newton.fallbacks == 0
+    assert newton.linear.fallbacks == 0
     jacobi, factor = ("cg", "pbjacobi"), ("cg", "python")
     assert list(dict.fromkeys(used)) == ([jacobi, factor] if room else [jacobi])  # in the order of their first use
     newton.destroy()

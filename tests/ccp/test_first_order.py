@@ -13,7 +13,7 @@ from dem.contact_map import find_halo
 from pctt import ccp
 from pctt.ccp import Limits
 from pctt.ccp.cone import margin, project
-from pctt.ccp.first_order import apgd, barzilai_borwein, gauss_seidel
+from pctt.ccp.first_order import apgd, gauss_seidel, projected_steps
 from pctt.ccp.first_order.faces import Face
 from pctt.ccp.first_order.scaled import Progress, ScaledProblem
 
@@ -39,7 +39,7 @@ def test_the_scaled_problem_is_the_same_problem(given):
     N = known.N
     assert scaled.dots((x, scaled.product(x)))[0] == pytest.approx(g.ravel() @ N @ g.ravel())
     assert scaled.dots((x, scaled.b))[0] == pytest.approx(np.vdot(g, known.r))
-    assert np.allclose(margin(x, scaled.mu) > 0, margin(g, known.mu) > 0)
+    assert np.allclose(margin(x, scaled.cones.mu) > 0, margin(g, known.mu) > 0)
     shrink = scaled.shrink.ravel()
     dense = shrink[:, None] * N * shrink
     assert np.allclose(dense @ x.ravel(), scaled.product(x).ravel())
@@ -58,7 +58,7 @@ def test_the_scaled_problem_is_the_same_problem(given):
     z = now.x + 0.7 * (now.x - last.x)
     scaled.rigid_gradient(now, last, 0.7, y)
     curvature, length, uphill = scaled.step(now, last, 0.7, y, 0.3, new)
-    assert np.allclose(new.x, project(z - 0.3 * scaled.gradient(z), scaled.mu))
+    assert np.allclose(new.x, project(z - 0.3 * scaled.gradient(z), scaled.cones.mu))
     assert curvature == pytest.approx(np.vdot(new.x - z, scaled.product(new.x - z)))
     assert length == pytest.approx(np.vdot(new.x - z, new.x - z))
     assert uphill == pytest.approx(np.vdot(scaled.gradient(z), new.x - now.x))
@@ -98,13 +98,13 @@ def test_the_reach_in_a_face_ends_at_its_boundary():
 
 
 def test_the_line_search_takes_the_whole_step_where_it_may():
-    assert barzilai_borwein.sufficient(-1.0, 1.0, 0.0) == (1.0, -0.5)
-    assert barzilai_borwein.sufficient(-1.0, 3.0, 1.0) == (1.0, 0.5)  # a rise that is allowed
-    fraction, change = barzilai_borwein.sufficient(-1.0, 4.0, 0.0)
+    assert projected_steps.sufficient(-1.0, 1.0, 0.0) == (1.0, -0.5)
+    assert projected_steps.sufficient(-1.0, 3.0, 1.0) == (1.0, 0.5)  # a rise that is allowed
+    fraction, change = projected_steps.sufficient(-1.0, 4.0, 0.0)
     assert fraction == 0.25  # the minimiser on the segment
     assert change == -0.125
-    assert barzilai_borwein.sufficient(-1.0, 1e3, 0.0)[0] >= 1e-4
-    assert barzilai_borwein.sufficient(0.0, 0.0, 0.0) == (1.0, 0.0)
+    assert projected_steps.sufficient(-1.0, 1e3, 0.0)[0] >= 1e-4
+    assert projected_steps.sufficient(0.0, 0.0, 0.0) == (1.0, 0.0)
 
 
 # -- colours and sweeps -------------------------------------------------------------------------------------
@@ -142,7 +142,7 @@ def test_a_sweep_is_gauss_seidel_contact_by_contact():
     for c in np.argsort(colour, kind="stable"):
         y = scaled.gradient(expected)[c]
         step = 1.3 * scaled.block_steps()[c, 0]
-        expected[c] = project((expected[c] - step * y)[None], scaled.mu[c : c + 1])[0]
+        expected[c] = project((expected[c] - step * y)[None], scaled.cones.mu[c : c + 1])[0]
     assert np.allclose(swept, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
     assert not np.allclose(swept, x)
 

@@ -9,7 +9,7 @@ from petsc4py import PETSc
 from problems import SELF, dense_of, from_graph, heap, matrix
 
 from pctt import memory
-from pctt.ccp import ConeProblem, Newton
+from pctt.ccp import Newton
 from pctt.ccp.newton.krylov import Krylov
 
 
@@ -100,14 +100,12 @@ def test_a_right_hand_side_of_zero():
 # -- Newton systems -----------------------------------------------------------------------------------------
 
 
-def spd_blocks(count: int, seed: int = 0) -> np.ndarray:
-    A = np.random.default_rng(seed).normal(size=(count, 3, 3))
-    return A @ A.transpose(0, 2, 1) + np.eye(3)
-
-
-def newton_of(problem: ConeProblem) -> Newton:
+def newton_of() -> Newton:
+    """The system of a heap, with the barrier blocks 1 + A A'."""
     newton = Newton(SELF)
-    newton.begin(problem)
+    newton.begin(from_graph(*heap()))
+    A = np.random.default_rng(0).normal(size=(40, 3, 3))
+    newton.update(A @ A.transpose(0, 2, 1) + np.eye(3))
     return newton
 
 
@@ -115,34 +113,27 @@ def solved(newton: Newton, rhs: np.ndarray, rtol: float) -> np.ndarray:
     return newton.solve(rhs, rtol * np.linalg.norm(rhs) / np.sqrt(newton.problem.mean_diagonal))[0]
 
 
-def schur(newton: Newton):
-    return newton.system.matrix
-
-
 @pytest.mark.parametrize("better", ["", "fallback_"])
 def test_where_both_fail_the_step_is_the_better_one(better, database):
     """By the true residual; zero where neither is any good."""
-    known, graph = heap()
-    problem = from_graph(known, graph)
-    blocks, rhs = spd_blocks(40), np.random.default_rng(1).normal(size=(40, 3))
+    rhs = np.random.default_rng(1).normal(size=(40, 3))
     for prefix in ("", "fallback_"):
         database[prefix + "ksp_type"] = "cg"
         database[prefix + "pc_type"] = "jacobi"
         database[prefix + "ksp_max_it"] = 8 if prefix == better else 1
-    newton = newton_of(problem)
-    newton.update(blocks)
-    S = dense_of(schur(newton))
-    x, b = schur(newton).createVecs()
+    newton = newton_of()
+    mat = newton.system.matrix
+    S = dense_of(mat)
+    x, b = mat.createVecs()
     b.array[:] = rhs.ravel()
-    best = Krylov(SELF, better, rtol=1e-12).solve(schur(newton), b, x).true_residual
+    best = Krylov(SELF, better, rtol=1e-12).solve(mat, b, x).true_residual
     assert best < 1.0
     x = solved(newton, rhs, 1e-12)
     assert np.linalg.norm(S @ x.ravel() - rhs.ravel()) / np.linalg.norm(rhs) == pytest.approx(best, rel=1e-6)
     newton.destroy()
     for prefix in ("", "fallback_"):
         database[prefix + "pc_type"] = "python"
-    newton = newton_of(problem)
-    newton.update(blocks)
+    newton = newton_of()
     assert np.array_equal(solved(newton, rhs, 1e-8), np.zeros((40, 3)))
     newton.destroy()
 
@@ -150,8 +141,7 @@ def test_where_both_fail_the_step_is_the_better_one(better, database):
 def test_without_memory_a_failing_ksp_has_no_fallback(database, monkeypatch):
     monkeypatch.setattr(memory, "available", lambda comm: 1e3)
     database["pc_type"] = "python"
-    newton = newton_of(from_graph(*heap()))
-    newton.update(spd_blocks(40))
+    newton = newton_of()
     assert np.array_equal(solved(newton, np.ones((40, 3)), 1e-8), np.zeros((40, 3)))
-    assert newton.fallbacks == 1
+    assert newton.linear.fallbacks == 1
     newton.destroy()

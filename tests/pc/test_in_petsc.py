@@ -10,7 +10,8 @@ import scipy.sparse as sp
 import train_solver
 from mpi4py import MPI
 from petsc4py import PETSc
-from systems import dense, poisson, spd
+from systems import dense, spd
+from train_solver import poisson
 
 SMALL = {"rank": 20}
 

@@ -8,10 +8,8 @@ from itertools import product
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from mpi4py import MPI
 from petsc4py import PETSc
-from systems import poisson
-from train_solver import context, operator, solve, solver
+from train_solver import Kernel, context, dense_mat, operator, poisson, ready, solve, solver
 
 from pctt import tt
 from pctt.pc.mat import finds_negative
@@ -22,10 +20,11 @@ def laplacian(n: int) -> np.ndarray:
     return (0.25 * (sp.kron(line, sp.identity(n)) + sp.kron(sp.identity(n), line))).toarray()
 
 
-def negative(X: np.ndarray, A: np.ndarray, steps: int = 12) -> bool:
-    return finds_negative(lambda x: X @ x, lambda x: A @ x, len(A), MPI.COMM_SELF, steps)
+def negative(X: np.ndarray, A: np.ndarray) -> bool:
+    return finds_negative(dense_mat(X), dense_mat(A))
 
 
+@pytest.mark.parallel(1, 2, 3)
 def test_negative_directions_without_a_train_are_found():
     """X = A^-1 - factor v v' / v'A v, negative at A v: `lowest` looks only at vectors of rank 8, v has none."""
     A, factor = laplacian(32), 1.1
@@ -78,36 +77,9 @@ def test_trains_in_use_are_positive():
     assert used
 
 
-@pytest.mark.parallel(2, 3)
-def test_several_ranks_look_together():
-    comm = MPI.COMM_WORLD
-    A, n = laplacian(8), 64
-    first, last = (n * rank // comm.size for rank in (comm.rank, comm.rank + 1))
-
-    def times(M: np.ndarray):
-        return lambda x: M[first:last] @ np.concatenate(comm.allgather(x))
-
-    X = np.linalg.inv(A)
-    assert not finds_negative(times(X), times(A), last - first, comm)
-    v = np.random.default_rng(0).standard_normal(n)
-    X = X - 1.1 * np.outer(v, v) / (v @ A @ v)
-    assert finds_negative(times(X), times(A), last - first, comm)
-
-
 def test_entries_with_a_long_correlation():
     """The covariance of a smooth field with little noise: trains of its inverse are seldom positive."""
-    n = 16
-
-    def entries(i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        apart = np.subtract(np.unravel_index(i, (n, n)), np.unravel_index(j, (n, n))) / n
-        return 0.1 * (i == j) + np.exp(-(apart**2).sum(axis=0) / (2 * 0.2**2))
-
-    i = np.arange(n * n)
-    A = entries(*(k.ravel() for k in np.meshgrid(i, i, indexing="ij"))).reshape(n * n, -1)
-    mat = PETSc.Mat().createDense((n * n, n * n), array=A, comm=PETSc.COMM_SELF)
-    mat.setAttr("grid", (n, n))
+    kernel = Kernel((16, 16), 0.1, 2 * (0.2 * 16) ** 2)
     for rank in (6, 16):
-        ksp = solver(mat, max_rank=rank)
-        ksp.setUp()
+        ksp = ready(dense_mat(kernel.dense, grid=kernel.grid), rank=rank)
         assert np.linalg.eigvalsh(operator(ksp))[0] > 0
-        ksp.destroy()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from systems import contact_matrix, contacts, dense, poisson
-from train_solver import context, operator, solve, solver
+from systems import contact_matrix, contacts, dense
+from train_solver import context, operator, poisson, ready, report, solve, solver
 
 from pctt import memory
 from pctt.pc import sparse_train
@@ -31,16 +31,14 @@ def test_without_memory_for_a_train_block_jacobi_takes_over(monkeypatch):
     assert context(ksp).rank == 1
     assert "fell back: there is no memory for the tables of a train (1 times)" in context(ksp).report()
     monkeypatch.undo()
-    again = solver(mat, rank=4)
-    again.setUp()
+    again = ready(mat, rank=4)
     assert context(again).rank == 4
 
 
 def test_rank_one_is_block_jacobi():
     G, barrier = contacts(40, 30)
     mat = contact_matrix(G, barrier)
-    ksp = solver(mat, max_rank=1)
-    ksp.setUp()
+    ksp = ready(mat, max_rank=1)
     blocks = dense(mat).reshape(40, 3, 40, 3)[np.arange(40), :, np.arange(40)]
     expected = np.zeros((40, 3, 40, 3))
     expected[np.arange(40), :, np.arange(40)] = np.linalg.inv(blocks)
@@ -51,8 +49,7 @@ def test_rank_one_is_block_jacobi():
 def test_applied_operator_is_symmetric_and_positive(block):
     G, barrier = contacts(60, 25)
     mat = poisson(12) if block == 1 else contact_matrix(G, 30 * barrier)
-    ksp = solver(mat, rank=6)
-    ksp.setUp()
+    ksp = ready(mat, rank=6)
     M = operator(ksp)
     assert context(ksp).rank == 6
     assert np.allclose(M, M.T, atol=1e-10 * np.abs(M).max())
@@ -79,8 +76,7 @@ def test_new_values_start_from_the_old_train():
     assert residual < 1e-6
     assert context(ksp).account.reused == 1
     assert context(ksp).account.kept == 0
-    cold = solver(mat, rank=8)
-    cold.setUp()
+    cold = ready(mat, rank=8)
     assert context(ksp).made.compression.error <= 1.2 * context(cold).made.compression.error
 
 
@@ -116,7 +112,7 @@ def test_a_kept_train_goes_where_a_new_one_is_better():
     mat.scale(2.0)
     set_up(ksp)
     assert context(ksp).made.inverse is not train
-    assert "kept 1 times" in "\n".join(context(ksp).report())
+    assert "kept 1 times" in report(ksp)
     its, _ = solve(ksp)
     cold_its, _ = solve(solver(mat, rank=8))
     assert its <= 1.2 * cold_its + 1
@@ -138,8 +134,7 @@ def test_a_diagonal_that_is_not_positive_falls_back_to_block_jacobi(entry):
     diagonal = mat.getDiagonal()
     diagonal.array[5] = entry
     mat.setDiagonal(diagonal)
-    ksp = solver(mat, "gmres", rank=10)
-    ksp.setUp()
+    ksp = ready(mat, "gmres", rank=10)
     assert context(ksp).rank == 1
     assert any("not positive definite" in why for why in context(ksp).account.fallbacks)
 
@@ -149,7 +144,7 @@ def test_auto_is_block_jacobi_for_a_sparse_matrix():
     for _ in range(3):
         assert solve(ksp)[1] < 1e-6
         assert context(ksp).rank == 1
-    assert "rank 1" in "\n".join(context(ksp).report())
+    assert "rank 1" in report(ksp)
 
 
 def test_it_says_what_it_was():

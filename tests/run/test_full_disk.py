@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import resource
 import shutil
 import subprocess
@@ -11,12 +9,21 @@ import subprocess
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import EVERY, SMALL, arrays, command, environment, recorded_steps, steps_of
+from program import (
+    EVERY,
+    SMALL,
+    arrays,
+    command,
+    contents,
+    environment,
+    one_line,
+    recorded_steps,
+    simulated,
+    steps_of,
+)
 
 from pctt import disk
 from pctt.disk import FileError, append
-from pctt.run.options import read_options
-from pctt.run.simulate import simulate
 
 LOOSE = ("-ccp_type", "apgd", "-ccp_tol", "1e-3")
 SCENE = {"scene_n": "1", "scene_margin": "0.5", "dt": "0.025", "output": "out", "quiet": "true"}
@@ -53,18 +60,18 @@ class Limit:
 @pytest.mark.parametrize(
     ("size", "file", "options"),
     [
-        (40_000, "out/frames/000003.h5", {}),
+        (9_000, "out/frames/000003.h5", {}),
         (500, "out/settings.json", {"output_every": "0"}),
         (2_000, "out/steps.jsonl", {"output_every": "0"}),
-        (40_000, "out/checkpoint.h5", {"output_every": "0"}),
-        (40_000, "problems/step000003_", {"dump_problem": "problems"}),
+        (20_000, "out/checkpoint.h5", {"output_every": "0"}),
+        (20_000, "problems/step000003_", {"dump_problem": "problems"}),
     ],
 )
 def test_a_file_that_cannot_be_written_ends_the_run_and_spares_the_others(size, file, options, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     def run(**more):
-        simulate(read_options({**SCENE, **more}, MPI.COMM_SELF), MPI.COMM_SELF)
+        simulated({**SCENE, **more})
 
     run(steps="2", **options)
     shutil.rmtree("problems", ignore_errors=True)
@@ -82,18 +89,14 @@ def test_a_run_that_cannot_write_its_first_step_leaves_the_one_that_it_was_to_re
     monkeypatch.chdir(tmp_path)
 
     def run(**more):
-        simulate(read_options({**SCENE, "steps": "2", **more}, MPI.COMM_SELF), MPI.COMM_SELF)
-
-    def contents():
-        paths = [path for path in (tmp_path / "out").rglob("*") if path.is_file() and ".new" not in path.parts]
-        return {path: path.read_bytes() for path in paths}
+        simulated({**SCENE, "steps": "2", **more})
 
     run()
-    before = contents()
-    for size, every, file in ((40_000, "1", "frames/000001.h5"), (40_000, "0", "checkpoint.h5")):
+    before = contents(tmp_path / "out")
+    for size, every, file in ((9_000, "1", "frames/000001.h5"), (20_000, "0", "checkpoint.h5")):
         with Limit(size), pytest.raises(FileError, match=rf"out/.new/{file}: cannot write \(File too large\)"):
             run(overwrite="true", output_every=every)
-        assert contents() == before
+        assert contents(tmp_path / "out") == before
     run(overwrite="true", steps="3")
     assert check_whole(tmp_path / "out") == 3
     assert not (tmp_path / "out" / ".new").exists()
@@ -108,40 +111,31 @@ def test_of_a_line_that_has_no_room_nothing_stays(tmp_path):
     assert path.read_text() == "1\n2\n"
 
 
-def test_the_room_of_a_file_is_taken_until_it_is_written(tmp_path, monkeypatch):
-    """Another program that fills the disk meanwhile does no harm."""
-    data, path, taken = np.ones(300_000), tmp_path / "rows.h5", []
-    probe = tmp_path / "probe"
-    with open(probe, "wb") as file:
-        try:
-            os.posix_fallocate(file.fileno(), 0, data.nbytes)
-        except (AttributeError, OSError):
-            pytest.skip("this file system takes no room in advance")
-    fill = disk._fill
-
-    def look(file, *contents):
-        taken.append(512 * os.stat(disk.temporary_name(path)).st_blocks)
-        fill(file, *contents)
-
-    monkeypatch.setattr(disk, "_fill", look)
-    disk.write_rows(path, MPI.COMM_SELF, {"data": data}, {}, {})
-    assert taken[0] >= data.nbytes
-    np.testing.assert_array_equal(arrays(path)["data"], data)
-    assert path.stat().st_size < 1.01 * data.nbytes  # what was taken beyond need is given back
-
-
-@pytest.mark.parametrize("number", [errno.EBADF, errno.EOPNOTSUPP, errno.ENOSYS, errno.EPERM])
-def test_where_no_room_can_be_taken_files_are_written_and_a_full_disk_is_told(number, tmp_path, monkeypatch):
-    def refuse(*_):
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(os, "posix_fallocate", refuse)
-    data, path = np.arange(20_000.0), tmp_path / "rows.h5"
-    disk.write_rows(path, MPI.COMM_SELF, {"data": data}, {}, {})
+@pytest.mark.parallel(1, 2, 3)
+def test_rows_of_all_ranks_and_rows_that_have_no_room(tmp_path):
+    """The file of before stays, and every rank is told."""
+    comm, path = MPI.COMM_WORLD, tmp_path / "rows.h5"
+    own, none = np.arange(9_000.0).reshape(-1, 3) + comm.rank, np.zeros((0, 2), np.int64)
+    some = own[: 10 * comm.rank, 0] > 2.0  # none on the first rank
+    rows, shared = {"a/own": own, "none": none, "some": some}, {"text": b"once", "more": own[:5]}
+    disk.write_rows(path, comm, rows, shared, {"/": {"format": 1}, "a": {"dt": 0.5}})
     for size in (500, 20_000, 100_000):
         with Limit(size), pytest.raises(FileError, match=r"cannot write \(File too large\)"):
-            disk.write_rows(path, MPI.COMM_SELF, {"data": data, "more": data}, {}, {})
-    np.testing.assert_array_equal(arrays(path)["data"], data)
+            disk.write_rows(path, comm, {**rows, "again": np.repeat(own, 2, axis=0)}, {}, {})
+    comm.Barrier()
+    assert [file.name for file in tmp_path.iterdir()] == ["rows.h5"]
+
+    def take(file, sealed):
+        assert sealed
+        assert (file.attrs["format"], file["a"].attrs["dt"]) == (1, 0.5)
+        return {name: file[name][()] for name in (*rows, *shared)}
+
+    found = disk.read(path, comm, take)
+    for name, values in rows.items():
+        np.testing.assert_array_equal(found[name], np.concatenate(comm.allgather(values)))
+        assert found[name].dtype == values.dtype
+    assert found["text"] == b"once"
+    np.testing.assert_array_equal(found["more"], np.arange(15.0).reshape(5, 3))
 
 
 @pytest.fixture
@@ -169,26 +163,21 @@ def small_disk(cache, tmp_path):
 @pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
 def test_a_disk_that_fills_up_ends_the_run(ranks, small_disk, program, tmp_path):
     done = small_disk("size=200k", *SMALL, *EVERY, *LOOSE, "-steps", 40, "-output", "disk/out", ranks=ranks)
-    check_one_line(done, "disk/out/", "cannot write (No space left on device)")
+    said = one_line(done, 2)
+    assert "disk/out/" in said
+    assert "cannot write (No space left on device)" in said
     step = check_whole(tmp_path / "left" / "out")
     assert 2 <= step < 40
     again = ("-restart", "left/out/checkpoint.h5", "-steps", 1, "-output", "left/out")
-    program(*SMALL, *EVERY, *LOOSE, *again, ranks=ranks)
+    program(*SMALL, *EVERY, *LOOSE, *again)
     assert check_whole(tmp_path / "left" / "out") == step + 1
 
 
 @pytest.mark.parametrize("option", ["-output", "-dump_problem"])
 def test_a_folder_on_a_disk_that_cannot_be_written_is_refused_before_any_work(option, small_disk, tmp_path):
     done = small_disk("ro", *SMALL, *EVERY, *LOOSE, "-steps", 1, option, "disk/out")
-    check_one_line(done, f"{option} disk/out", "Read-only file system", "allowed is a folder that can be written")
+    said = one_line(done, 2)
+    for word in (f"{option} disk/out", "Read-only file system", "allowed is a folder that can be written"):
+        assert word in said
     assert done.stdout == ""
     assert not list((tmp_path / "left").iterdir())
-
-
-def check_one_line(done, *words):
-    assert done.returncode == 2, done.stdout + done.stderr
-    (said,) = [line for line in done.stderr.splitlines() if line.startswith("pctt.run: ")]
-    for word in words:
-        assert word in said
-    for word in ("Traceback", "PETSC ERROR", "HDF5"):
-        assert word not in done.stdout + done.stderr

@@ -24,8 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pctt.ccp.cone import Array
-from pctt.ccp.first_order.rolling import in_equal_sizes
-from pctt.ccp.first_order.scaled import FirstOrder, Progress
+from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 from pctt.options import number
@@ -60,13 +59,13 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: APGD, cou
     if problem.contact_map is not None:
         rough = limits.to(max(limits.tol, options.single / np.sqrt(max(problem.size, 1))))
         impatient = replace(options, patience=min(options.patience, 300))  # double precision takes over
-        progress = Progress(in_equal_sizes(problem, coulomb, np.float32), rough, impatient)
+        progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, impatient)
         rough_impulse = _descend(progress, guess, options)
         if progress.best <= limits.tol:
             return progress.result()
         if progress.iterations:  # else rounding would spoil a guess that is good already
             guess = rough_impulse
-    progress = Progress(in_equal_sizes(problem, coulomb), limits, options, progress)
+    progress = Progress(ScaledProblem(problem, coulomb), limits, options, progress)
     _descend(progress, guess, options)
     return progress.result()
 

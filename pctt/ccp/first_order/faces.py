@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from pctt.ccp.cone import Array, step_to_boundary, step_to_zero
-from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
+from pctt.ccp.first_order.projected_steps import minimiser
+from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem, begin
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 
@@ -30,12 +31,9 @@ def kucera(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrd
     Kucera holds contacts on the cone's surface fixed during the conjugate gradients. Here a sliding contact may move
     along its ray, which is a face of the cone too: in a packing a large part of the contacts slides.
     """
-    scaled = ScaledProblem(problem)
-    progress = Progress(scaled, limits, options)
+    scaled, progress, x, y = begin(problem, guess, limits, options)
     projection = GradientProjection(scaled)
-    x = scaled.start(guess)
-    y = scaled.gradient(x)
-    face = Face(x, scaled.mu)
+    face = Face(x, scaled.cones.mu)
     p = Ap = np.zeros_like(x)  # the last conjugate direction in this face
     curvature, fresh = 1.0, True
     while progress.goes_on(x, y):
@@ -57,7 +55,7 @@ def kucera(problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrd
         if leaves:
             x, y, products = projection.step(x, y)
             progress.iterations += products
-            face = Face(x, scaled.mu)
+            face = Face(x, scaled.cones.mu)
         fresh = leaves
     return progress.result()
 
@@ -70,25 +68,22 @@ def gpminres(problem: ConeProblem, guess: Array, limits: Limits, options: FirstO
     Toraldo, SIAM J. Optim. 1 (1991): at most ten projected gradient steps, until the face settles, then a Krylov method
     on the objective in the face, then a search along the projection of the step so found.
     """
-    scaled = ScaledProblem(problem)
-    progress = Progress(scaled, limits, options)
+    scaled, progress, x, y = begin(problem, guess, limits, options)
     projection = GradientProjection(scaled)
-    x = scaled.start(guess)
-    y = scaled.gradient(x)
-    face = Face(x, scaled.mu)
+    face = Face(x, scaled.cones.mu)
     while progress.goes_on(x, y):
         for _ in range(10):
             before = face
             x, y, products = projection.step(x, y)
             progress.iterations += products
-            face = Face(x, scaled.mu)
+            face = Face(x, scaled.cones.mu)
             if not progress.goes_on(x, y) or not problem.max(not face.same(before)):
                 break
         if progress.reason:
             break
         w = _minres(scaled, face, -face.part(y), progress)
         x, y = _projected_search(scaled, x, y, w, progress)
-        face = Face(x, scaled.mu)
+        face = Face(x, scaled.cones.mu)
     return progress.result()
 
 
@@ -135,7 +130,7 @@ def _projected_search(
     Ad = problem.product(d)
     progress.iterations += 1
     curvature = problem.dots((d, Ad))[0]
-    fraction = min(1.0, -slope / curvature) if curvature > 0 else 1.0
+    fraction = minimiser(slope, curvature)
     return x + fraction * d, y + fraction * Ad
 
 
@@ -185,7 +180,7 @@ class GradientProjection:
 
     def move(self, x: Array, y: Array) -> Array:
         """P(x - 1.9 / L y) - x."""
-        return self.problem.projected_move(x, y, 1.9 / self.lipschitz)
+        return self.problem.cones.move(x, y, 1.9 / self.lipschitz)
 
     def step(self, x: Array, y: Array) -> tuple[Array, Array, int]:
         """The next point, its gradient, and the products with A that it took."""

@@ -77,7 +77,7 @@ class Sweep:
         for k in range(comm.allreduce(int(colour.max(initial=-1)), op=MPI.MAX) + 1):
             own = np.flatnonzero(colour == k)
             rows = A[(3 * own[:, None] + np.arange(3)).ravel()].tobsr((3, 3))
-            self._colours.append((own, rows, steps[own], problem.b[own], problem.mu[own]))
+            self._colours.append((own, rows, steps[own], problem.b[own], problem.cones.mu[own]))
 
     def __call__(self, x: Array) -> Array:
         """The point after the sweep, from x (nc, 3)."""

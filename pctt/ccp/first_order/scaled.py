@@ -6,11 +6,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from mpi4py import MPI
 
-from pctt.ccp import cone
 from pctt.ccp.cone import Array
-from pctt.ccp.cone_loops import not_idle, project_scaled
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
@@ -50,7 +47,7 @@ class ScaledProblem:
         size[:, 1] = size[:, 2] = 0.5 * (blocks[:, 1, 1] + blocks[:, 2, 2])
         self._scale = np.sqrt(np.where(size > 0, size, problem.mean_diagonal))
         self.shrink = 1.0 / self._scale  #: (nc, 3) diagonal of S^-1
-        self.mu = self._rounded(problem.mu * self._scale[:, 1] / self._scale[:, 0])
+        self.cones = problem.cones.scaled(self._scale, precision)
         self.b = self._rounded(problem.r * self.shrink)
         self._compliance = self._rounded(problem.compliance * self.shrink**2)
         self._soft = self._compliance[: None if problem.yields else 0]
@@ -62,11 +59,12 @@ class ScaledProblem:
 
     def start(self, guess: Array) -> Array:
         """The scaled point of a first guess of the impulses (nc, 3), in the cones."""
-        return cone.project(self._rounded(guess * self._scale), self.mu)
+        return self.project(self._rounded(guess * self._scale))
 
     def impulse(self, x: Array) -> Array:
         """The impulses (nc, 3) of x, in the cones in double precision too."""
-        return x * self.shrink if self.precision is np.float64 else project_scaled(x, self.shrink, self.problem.mu)
+        g = x * self.shrink
+        return g if self.precision is np.float64 else self.problem.cones.project(g, g)
 
     def product(self, x: Array) -> Array:
         """A x (nc, 3)."""
@@ -88,12 +86,8 @@ class ScaledProblem:
     def iterate(self, x: Array) -> Iterate:
         """The iterate at x (nc, 3), which is kept."""
         found = Iterate(x, self._operator.image())
-        self.find_image(found)
+        self._operator.find_image(*found, self._awake)
         return found
-
-    def find_image(self, iterate: Iterate) -> None:
-        """The image that belongs to the point."""
-        self._operator.find_image(*iterate, self._awake)
 
     def rigid_gradient(self, now: Iterate, last: Iterate, beta: float, out: Array) -> Array:
         """(A - C) z + b (nc, 3) at z = x + beta (x - last_x), into ``out``, from images alone: half a product. Contacts
@@ -112,44 +106,29 @@ class ScaledProblem:
         open five times faster than steps change velocities, which is the root mean square of their ``length`` |L step|.
         A contact too many costs iterations, but no accuracy. ``y`` (nc, 3) is the rigid gradient of all contacts."""
         faster = float(5 * length / np.sqrt(max(self.problem.size, 1)))
-        self._awake = self._operator.among(not_idle(now.x, last.x, y, self.mu, faster))
+        self._awake = self._operator.among(self.cones.not_idle(now.x, last.x, y, faster))
 
-    def step(
-        self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate
-    ) -> list[float]:
+    def step(self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate) -> list[float]:
         """The projected step of this length from z, where the rigid gradient is y, into ``new``; of the step d from z
         d'Ad and |d|^2, and y_z'(x_new - x), with y_z the gradient at z with the De Saxce term of Coulomb's law."""
-        work, square, uphill = cone.accelerated_step(
-            now.x, last.x, y, self._soft, beta, length, self.mu, float(self.coulomb), new.x
+        work, square, uphill = self.cones.accelerated_step(
+            now.x, last.x, y, self._soft, beta, length, self.coulomb, new.x
         )
-        return self.image_of_step(now, last, beta, new, work, square, uphill)
-
-    def image_of_step(
-        self, now: Iterate, last: Iterate, beta: float, new: Iterate, work: float, square: float, uphill: float
-    ) -> list[float]:
-        """Find the image of ``new``, and complete the sums of the step that has led there."""
-        self.find_image(new)
+        self._operator.find_image(*new, self._awake)
         work += self._operator.energy_of_step(new.image, now.image, last.image, beta)
         return self.sums(work, square, uphill).tolist()
 
     def project(self, x: Array) -> Array:
         """x moved to the nearest point of the cones, in place."""
-        return cone.project(x, self.mu, out=x)
-
-    def projected_move(self, x: Array, y: Array, step: float) -> Array:
-        """P(x - step y) - x (nc, 3)."""
-        return cone.projected_move(x, y, step, self.mu)
+        return self.cones.project(x, x)
 
     def dots(self, *pairs: tuple[Array, Array]) -> Array:
         """Scalar products of pairs of arrays over all contacts, in one reduction over the ranks."""
         return self.sums(*(float(np.vdot(x, y)) for x, y in pairs))
 
     def sums(self, *parts: float) -> Array:
-        """Sums of numbers over the ranks, in one reduction; of a buffer, which takes a tenth of the time of objects."""
-        out = np.array(parts, dtype=float)
-        if self.problem.comm.size > 1:
-            self.problem.comm.Allreduce(MPI.IN_PLACE, out)
-        return out
+        """Sums of numbers over the ranks, in one reduction."""
+        return self.problem.sum(np.array(parts, dtype=float))
 
     def block_steps(self) -> Array:
         """1 over the largest eigenvalue of each contact's diagonal block of A, per unknown (nc, 3)."""
@@ -277,3 +256,13 @@ class Progress:
         if self.iterations - self._gain[1] >= self.patience:
             return Status.STALLED, f"no progress in the last {self.patience} of {self.iterations} iterations"
         return Status.STALLED, ""
+
+
+def begin(
+    problem: ConeProblem, guess: Array, limits: Limits, options: FirstOrder
+) -> tuple[ScaledProblem, Progress, Array, Array]:
+    """What a method begins with: the problem in its unknowns, its progress, the point of the guess, and the gradient
+    there."""
+    scaled = ScaledProblem(problem)
+    x = scaled.start(guess)
+    return scaled, Progress(scaled, limits, options), x, scaled.gradient(x)

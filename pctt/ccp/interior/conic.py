@@ -33,8 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pctt.ccp import cone
-from pctt.ccp.cone import Array, NesterovTodd, dot, times
-from pctt.ccp.cone_loops import scaling
+from pctt.ccp.cone import Array, NesterovTodd, dot, scaling, times
 from pctt.ccp.interior import useful_part
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
@@ -57,6 +56,8 @@ class Conic:
     boundary_with_law: float = number(0.9, "the same; with 0.99 it stalls at 1e-4")
     least: float = number(0.06, "part of the complementarity to aim at at least; with 0.01 some end at 1e-9")
     short: float = number(0.8, "the direction of a shorter step is corrected; without, 1.15 times the iterations")
+    reach: float = number(0.3, "how much further than the short step the corrected one is to reach")
+    spread: float = number(10.0, "eigenvalues of s o z within this factor of the target stay (Gondzio)")
     proximal: float = number(1e-9, "compliance within a step [mean diag N], bounds (B + C)^-1; 1e-8 to 1e-12 do too")
     patience: int = number(8, "iterations without progress before it gives up; of Coulomb's law some take 6")
 
@@ -66,12 +67,13 @@ def solve(
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step."""
     newton.begin(problem)
-    if coulomb and not newton.takes_any:
+    linear = newton.linear
+    if coulomb and not linear.takes_any:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
     cones = Cones(problem, options, coulomb)
     forcing = options.forcing_with_law if coulomb else options.forcing
-    forcing = forcing if newton.mends else options.forcing_of_impulses
+    forcing = forcing if newton.system.mends else options.forcing_of_impulses
     at, history, waited, least, last_gap = cones.start(guess), list[float](), 0, np.inf, np.inf
     while True:
         # residuals
@@ -100,7 +102,7 @@ def solve(
             # length: of a step that the cones cut short, towards the central path if that is longer
             step = scaled.step(direction)
             if step < options.short:
-                w += scaled.towards_path(direction, min(1.0, step + 0.3), target)
+                w += scaled.towards_path(direction, min(1.0, step + options.reach), target)
                 other = scaled.direction(newton, w, direction.x)
                 step, direction = max((step, direction), (scaled.step(other), other), key=lambda pair: pair[0])
         # update
@@ -112,7 +114,7 @@ def solve(
         status, words = Status.CONVERGED, limits.met
     elif iterations == limits.max_it:
         status, words = Status.ITERATION_LIMIT, f"{iterations} iterations"
-    return Result(best, status, words, min(history), iterations, newton.ksp_its, newton.fallbacks, history)
+    return Result(best, status, words, min(history), iterations, linear.iterations, linear.fallbacks, history)
 
 
 class Point(NamedTuple):
@@ -236,8 +238,8 @@ class Scaled(NamedTuple):
         uncoupled = times(self.share, self.W.times(w) - self.at.s) - times(self.X, r_z)
         q = self._straight(c - r_z) * scale
         dg, x = newton.solve(q, self.tol, self.found.r_v, earlier, uncoupled * live / scale)
-        dv, ds = newton.momenta(x, dg, self.found.r_v), live * scale * dg
-        if newton.mends:  # r_y vanishes, r_v takes the error of the linear solve
+        dv, ds = newton.system.momenta(x, dg, self.found.r_v), live * scale * dg
+        if newton.system.mends:  # r_y vanishes, r_v takes the error of the linear solve
             problem = cones.problem
             dy = (problem.velocity_of(dv) + problem.compliance * dg) / scale + self.found.r_y
         else:  # r_v vanishes, r_y takes it
@@ -277,13 +279,14 @@ class Scaled(NamedTuple):
         return cone.jordan_divide(self.W.times(self.at.z), aim)
 
     def towards_path(self, d: Direction, reach: float, target: float) -> Array:
-        """What to add to w so that the eigenvalues of s o z, ``reach`` along the direction, come near the target: a
-        tenth to ten times that.
+        """What to add to w so that the eigenvalues of s o z, ``reach`` along the direction, come near the target, up
+        to the factor ``spread``.
 
         Source: Gondzio (1996), multiple centrality corrections; here with the eigenvalues of second-order cones."""
         centre = self.W.times(self.at.z)
         after = cone.jordan_product(centre + reach * self.W.divide(d.ds), centre + reach * self.W.times(d.dz))
-        return cone.jordan_divide(centre, cone.towards_interval(after, 0.1 * target, 10.0 * target))
+        spread = self.cones.options.spread
+        return cone.jordan_divide(centre, cone.towards_interval(after, 1.0 / spread * target, spread * target))
 
 
 def with_de_saxce(y: Array) -> Array:

@@ -50,8 +50,12 @@ class PDIP:
     neighbourhood: float = number(1e-4, "least complementarity of a contact, as a part of the mean; below, steps stick")
     start: float = number(10.0, "normal impulse of new contacts [rms(r) / mean diag N]: 1 N s in a settled packing")
     rtol: float = number(3e-4, "relative residual of a linear solve; with 1 it takes twice the Newton steps")
-    forcing: float = number(0.03, "the same at most [velocity that the natural residual shows]; `_accuracy`")
+    forcing: float = number(0.03, "the same at most [velocity that the natural residual shows]; `solve`")
     short: float = number(0.5, "the direction of a shorter step is corrected; without, 1.7 times the Newton steps")
+    reach: float = number(0.3, "how much further than the short step the corrected one is to reach")
+    longer: float = number(1.2, "times longer that the corrected step must be; else Newton's direction is better")
+    back: float = number(0.8, "factor on a step that leaves the neighbourhood, so a fifth too short at most")
+    least: float = number(1e-10, "shorter steps change the impulses by less than the tightest tolerance asks")
     late: float = number(1e-3, "natural residual below which S has a proximal term; `_next_damping`")
 
 
@@ -108,11 +112,13 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     """Impulses; ``guess`` (nc, 3) gives the normal impulses of persistent contacts, 0 elsewhere."""
     cone = Cone(options.constraint, problem.mu)
     newton.begin(problem)
+    linear = newton.linear
     g, lam = _start(problem, guess, cone, options)
     history: list[float] = []
     earlier: deque[Array] = deque(maxlen=3)
     step, damping = 1.0, 0.0
     for iteration in range(limits.max_it + 1):
+        # residuals
         y = _velocity(problem, g)
         natural = problem.natural_residual(g, y)
         history.append(limits.residual(natural, problem, g, y))
@@ -122,26 +128,40 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         if iteration == limits.max_it:
             status, reason = Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
             break
+        # linearisation
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
         aim = options.centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
-        at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, aim, earlier)
+        at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, earlier)
         damping = _next_damping(damping, step, natural, options)
         newton.update(_barrier_blocks(at, damping * natural * problem.mean_diagonal))
-        step, dg, dlam = _corrected(at, natural, options)
-        if not step > 1e-10:
+        # Newton step. The residual of a solve is a velocity. It must be only a part of those that the natural residual
+        # stands for: otherwise complementarity would fall without them, and near the boundary no step makes up for that
+        q = _right_side(at, aim)
+        shown = natural * problem.norm(g) * problem.mean_diagonal
+        tol = min(options.rtol * problem.norm(q), options.forcing * shown)
+        dg, dlam = _direction(at, q, aim, tol)
+        step = _step_length(at, dg, dlam, options)
+        # corrected step, where the cones' curvature cuts Newton's short and the other is much longer
+        if step < options.short:
+            curved, missed = _bend(at, dg, dlam, min(1.0, step + options.reach))
+            other_dg, other_dlam = _direction(at, _right_side(at, aim + missed) - curved, aim + missed, tol)
+            other = _step_length(at, other_dg, other_dlam, options)
+            if other > options.longer * step:
+                step, dg, dlam = other, other_dg, other_dlam
+        if not step > options.least:
             status, reason = Status.STALLED, "steps became too short"
             if step != step:
                 status, reason = Status.BREAKDOWN, "not a number in the Newton step"
             break
+        # update
         g = g + step * dg
         lam = lam + step * dlam
-    return Result(g, status, reason, history[-1], iteration, newton.ksp_its, newton.fallbacks, history)
+    return Result(g, status, reason, history[-1], iteration, linear.iterations, linear.fallbacks, history)
 
 
 class Linearised(NamedTuple):
     """The data that all directions of a Newton step share: the problem, impulses and multipliers, velocities, the
-    constraints with their first and second derivatives, the target 1/t of the complementarity, and the last solutions
-    of Newton systems."""
+    constraints with their first and second derivatives, and the last solutions of Newton systems."""
 
     problem: ConeProblem
     newton: Newton
@@ -152,17 +172,7 @@ class Linearised(NamedTuple):
     f: Array
     df: Array
     hessian: Array
-    barrier: float
     earlier: deque[Array]
-
-
-def _accuracy(at: Linearised, q: Array, natural: float, options: PDIP) -> float:
-    """How accurately to solve a Newton system with the right-hand side q [m/s].
-
-    The residual of a solve is a velocity. It must be only a part of the velocities that the natural residual stands
-    for: otherwise complementarity would fall without them, and near the boundary no step makes up for that."""
-    shown = natural * at.problem.norm(at.g) * at.problem.mean_diagonal
-    return min(options.rtol * at.problem.norm(q), options.forcing * shown)
 
 
 def _next_damping(damping: float, step: float, natural: float, options: PDIP) -> float:
@@ -176,22 +186,6 @@ def _next_damping(damping: float, step: float, natural: float, options: PDIP) ->
     if step < 0.3:
         return min(max(1.0, 4.0 * damping), 4.0)
     return damping / 4.0 if step > 0.7 else damping
-
-
-def _corrected(at: Linearised, natural: float, options: PDIP) -> tuple[float, Array, Array]:
-    """The step to take, and the direction dg, dlam: Newton's, corrected once where the cones' curvature cuts it short
-    and that makes it much longer."""
-    q = _right_side(at, at.barrier)
-    tol = _accuracy(at, q, natural, options)
-    dg, dlam = _direction(at, q, at.barrier, tol)
-    step = _step_length(at, dg, dlam, options)
-    if not step < options.short:
-        return step, dg, dlam
-    curved, missed = _bend(at, dg, dlam, min(1.0, step + 0.3))
-    aim = at.barrier + missed
-    other_dg, other_dlam = _direction(at, _right_side(at, aim) - curved, aim, tol)
-    other = _step_length(at, other_dg, other_dlam, options)
-    return (other, other_dg, other_dlam) if other > 1.2 * step else (step, dg, dlam)
 
 
 def _right_side(at: Linearised, aim: Array | float) -> Array:
@@ -253,10 +247,10 @@ def _step_length(at: Linearised, dg: Array, dlam: Array, options: PDIP) -> float
     if not np.isfinite(problem.sum(dg.sum() + dlam.sum())):
         return np.nan
     step = min(1.0, options.boundary * problem.min(min(step_to_boundary(g, dg, cone.mu), step_to_zero(lam, dlam))))
-    while step > 1e-10:
+    while step > options.least:
         gap = -(lam + step * dlam) * cone.value(g + step * dg)
         mean = problem.sum(gap.sum()) / problem.size
         if problem.min(gap.min(initial=np.inf)) >= options.neighbourhood * mean:
             break
-        step *= 0.8
+        step *= options.back
     return step

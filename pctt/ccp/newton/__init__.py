@@ -5,8 +5,8 @@ momenta dv with
 
     (N + C + B) dg = q + G r_v,    dv = G' dg - r_v,
 
-N = G G' the Delassus matrix and C the compliance. ``-ccp_newton`` chooses the unknowns: ``contact`` (`contact.py`) or
-``body`` (`body.py`). A `Newton` object lives as long as the simulation: Krylov methods and preconditioners stay from
+N = G G' the Delassus matrix and C the compliance. ``-ccp_newton`` chooses the unknowns: ``contact`` or ``body``
+(`forms.py`). A `Newton` object lives as long as the simulation: Krylov methods and preconditioners stay from
 one cone problem to the next, and matrices too where the contacts are the same.
 """
 
@@ -19,11 +19,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.ccp.cone import TINY, Array
-from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.compare import Comparison
-from pctt.ccp.newton.contact import ContactForm
-from pctt.ccp.newton.form import NewtonForm
-from pctt.ccp.newton.linear import LinearSolver
+from pctt.ccp.newton.forms import BodyForm, ContactForm, NewtonForm
+from pctt.ccp.newton.linear import LinearSolver, Settings
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase
 
@@ -33,7 +31,6 @@ DEFAULTS = {
     "contact": {"ksp_type": "bcgs", "pc_type": "pbjacobi"},
     "body": {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "pc_type": "pbjacobi"},
 }
-FEW = 400  # rows of a problem on one rank up to which `Dense` factors pay: they take .2 ms for 250, 1 ms for 450
 # of a problem that is given by N: a solve as accurate as that of the bodies would be
 GIVEN = {"ksp_type": "gmres", "pc_type": "cholesky"}
 
@@ -46,14 +43,15 @@ class Newton:
 
     Attributes
     ----------
-    system : the present problem's, None before the first
-    ksp_its, fallbacks : of the present problem: Krylov iterations, systems not solved by the first KSP
+    system : the present problem's, not there before the first
+    linear : what solves it
     """
+
+    system: NewtonForm
 
     def __init__(self, comm: MPI.Comm, form: str = "contact", compare: Comparison | None = None):
         self.comm, self.form, self.compare = comm, form, compare
-        self.system: NewtonForm | None = None
-        self._structure: tuple = ()
+        self._structure: tuple | None = None  # of the system's problem
         self._instead = False  # of the bodies' form, which the present problem has not
         self._linear: LinearSolver | None = None
 
@@ -62,24 +60,23 @@ class Newton:
         self.problem = problem
         few = self.has_few(problem)
         instead = self.form == "body" and (few or problem.contact_map is None)
-        structure = problem.structure()
-        same = self.system is not None and instead == self._instead and len(structure) == len(self._structure)
-        same = same and all(map(np.array_equal, structure, self._structure))
         if instead != self._instead:
             self.destroy()
-        self._instead, self._structure = instead, structure
+            self._instead = instead
+        structure, last = problem.structure(), self._structure or ()
+        same = len(structure) == len(last) and all(map(np.array_equal, structure, last))
         self.linear.begin(few)
         if problem.comm.allreduce(same, op=MPI.LAND):
-            assert self.system is not None
             self.system.load(problem)
         else:
             self.forget()
             self.system = FORMS["contact" if instead else self.form](problem)
             self._x, self._b = self.system.matrix.createVecs()
+        self._structure = structure
 
     def has_few(self, problem: ConeProblem) -> bool:
         """Whether the systems of this problem get `Dense` factors."""
-        return self.form == "body" and self._own and problem.comm.size == 1 and problem.r.size <= FEW
+        return self.form == "body" and self._own and problem.comm.size == 1 and problem.r.size <= Settings.few
 
     @property
     def linear(self) -> LinearSolver:
@@ -95,43 +92,10 @@ class Newton:
         """Whether the linear solver is the project's own choice."""
         return self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
 
-    @property
-    def ksp_its(self) -> int:
-        return self.linear.iterations
-
-    @property
-    def fallbacks(self) -> int:
-        return self.linear.fallbacks
-
-    @property
-    def pc_report(self) -> list[str]:
-        """Lines about the preconditioner and its fallbacks so far, if it is one of this package."""
-        return self.linear.report()
-
-    def words(self) -> str:
-        """Krylov method and preconditioner of the present form."""
-        return self.linear.words()
-
-    def what(self) -> str:
-        """What a preconditioner of this package really was so far; empty if there is none."""
-        return self.linear.what()
-
-    @property
-    def takes_any(self) -> bool:
-        """Whether the present systems may be unsymmetric."""
-        return self.linear.own or self.linear.direct
-
-    @property
-    def mends(self) -> bool:
-        """Whether the residual of a solve is one of momenta, see `NewtonForm`."""
-        assert self.system is not None
-        return self.system.mends
-
     def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
         """Set the barrier blocks B (nc, 3, 3). A caller that has (B + C)^-1 more accurately than by inversion passes it
-        as ``inverse``. Only systems with `takes_any` accept blocks that are not ``symmetric``."""
+        as ``inverse``. Only a linear solver that `takes_any` accepts blocks that are not ``symmetric``."""
         with phase("CCPUpdate"):
-            assert self.system is not None
             self.system.update(barrier, inverse, symmetric)
             self.linear.new_matrix(self.system)
 
@@ -148,7 +112,6 @@ class Newton:
         is (B + C)^-1 q, the change of each contact without the others, for callers that have it more accurately than by
         a product."""
         with phase("CCPKrylov"):
-            assert self.system is not None
             b = self.system.right_hand_side(q, r_v, uncoupled)
             x, product = self._start(b, () if self.linear.direct else earlier)
             self._b.array[:] = b - product
@@ -165,7 +128,6 @@ class Newton:
         """Where to begin from, and its product: the earlier solution, or zero. Of several the combination x with the
         least energy 1/2 x'Ax - b'x: in the norm of A, which is then symmetric, no other one is nearer to the
         solution."""
-        assert self.system is not None
         xs = np.array(earlier).reshape(len(earlier), len(b))
         products = np.empty_like(xs)
         for x, product in zip(xs, products):
@@ -186,21 +148,16 @@ class Newton:
         # scaled, as solutions shrink from one Newton step to the next; of nearly parallel ones only the sum counts
         return np.linalg.lstsq(energies / np.outer(size, size), works / size, rcond=1e-10)[0] / size
 
-    def momenta(self, x: Array, dg: Array, r_v: Array) -> Array:
-        """dv (6m,) of a solution x with the impulses dg."""
-        assert self.system is not None
-        return self.system.momenta(x, dg, r_v)
-
     def forget(self) -> None:
         """Drop what belongs to the last problem's structure."""
         if self._linear is not None:
             self._linear.forget()
         if self.compare is not None:
             self.compare.forget()
-        if self.system is not None:
+        if self._structure is not None:
             for thing in (self.system, self._x, self._b):
                 thing.destroy()
-            self.system = None
+            self._structure = None
 
     def destroy(self) -> None:
         self.forget()

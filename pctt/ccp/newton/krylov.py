@@ -15,7 +15,7 @@ from petsc4py import PETSc
 
 from pctt.blocks import block_diagonal, fresh_copy, shell_of
 from pctt.ksp_options import entered, to_enter
-from pctt.pc.base import PythonPC
+from pctt.pc import TensorTrain
 from pctt.pc.mat import residual_norm
 from pctt.petsc import own_errors
 
@@ -35,7 +35,6 @@ _REMEMBERING = {"pbjacobi", "sor"}  # the inverse diagonal blocks of the first m
 _REASONS = {
     value: name.lower() for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)
 }
-WAIT_FOR_OTHERS = 60.0  # seconds that a rank waits for the others if it has failed in a collective call
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ class Krylov:
         with entered(self._options):
             error = on_all_ranks(self.comm, lambda: self._set_up(A, P, keep))
             setup = _now(self.comm)
-            error = error or on_all_ranks(self.comm, lambda: self._iterate(b, x), WAIT_FOR_OTHERS)
+            error = error or on_all_ranks(self.comm, lambda: self._iterate(b, x), patience=60.0)
         if error:
             self.forget()
             x.zeroEntries()
@@ -133,7 +132,9 @@ class Krylov:
     def _set_up(self, A: PETSc.Mat, P: Source, keep: bool) -> None:
         self.ksp.pc.setReusePreconditioner(keep)
         if not keep:
-            form = self._form(self._source(A, P))
+            if P is None or (shell_of(A) and not self.needs_entries):
+                P = A
+            form = self._form(P if isinstance(P, PETSc.Mat) else P())
             self.ksp.setOperators(form if self.kind == "eisenstat" else A, form)
         self.ksp.setUp()
         self.ksp.setUpOnBlocks()
@@ -143,12 +144,6 @@ class Krylov:
         right_hand_side = b.copy()  # an error of PETSc may leave it locked
         self.ksp.solve(right_hand_side, x)
         right_hand_side.destroy()
-
-    def _source(self, A: PETSc.Mat, P: Source) -> PETSc.Mat:
-        """The Mat that the preconditioner is made from."""
-        if P is None or (shell_of(A) and not self.needs_entries):
-            return A
-        return P if isinstance(P, PETSc.Mat) else P()
 
     @property
     def needs_entries(self) -> bool:
@@ -182,11 +177,11 @@ class Krylov:
         return block_diagonal(P) if self.kind == "pbjacobi" else None
 
     @property
-    def own(self) -> PythonPC | None:
+    def own(self) -> TensorTrain | None:
         """The preconditioner, if it is one of the project."""
         pc = self.ksp.pc
         context = pc.getPythonContext() if pc.getType() == PETSc.PC.Type.PYTHON else None
-        return context if isinstance(context, PythonPC) else None
+        return context if isinstance(context, TensorTrain) else None
 
     def report(self) -> list[str]:
         """What a preconditioner of the project tells of itself and its fallbacks, as in ``-ksp_view``."""

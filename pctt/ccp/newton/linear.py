@@ -11,10 +11,8 @@ from scipy.linalg import lapack
 
 from pctt import memory
 from pctt.ccp.cone import Array
-from pctt.ccp.newton.body import BodyForm
 from pctt.ccp.newton.compare import Comparison
-from pctt.ccp.newton.contact import ContactForm
-from pctt.ccp.newton.form import NewtonForm
+from pctt.ccp.newton.forms import BodyForm, ContactForm, NewtonForm
 from pctt.ccp.newton.fronts import FrontPC
 from pctt.ccp.newton.krylov import Krylov, Solve, Source
 from pctt.options import number
@@ -30,8 +28,11 @@ FRONTS = {
 class Settings:
     """Numbers of `LinearSolver`."""
 
+    few: int = number(400, "rows of a problem on one rank up to which `Dense` factors pay: .2 ms for 250, 1 ms for 450")
     easy: float = number(8.0, "iterations with block Jacobi / bodies^0.4 and rank, after which the next matrix gets a "
                               "factor. It costs as much as 10 to 18 on one rank, and no less on more")  # fmt: skip
+    least: float = number(0.1, "drop tolerance of a factor [mass]: entries of a block between bodies that it is better "
+                               "off without")  # fmt: skip
     single: float = number(0.015, "iterations with factors of single precision, in units of easy, after which the "
                                   "next are of double, which cost 10 iterations more (n = 8), 30 (n = 16)")  # fmt: skip
     limit: float = number(3.0, "iterations with block Jacobi at most, in units of easy")
@@ -82,12 +83,9 @@ class LinearSolver:
         comm: MPI.Comm,
         defaults: dict[str, str],
         compare: Comparison | None = None,
-        prefix: str = "",
         own: bool = False,
-        settings: Settings | None = None,
     ):
-        self.comm, self.defaults, self.compare, self.prefix = comm, defaults, compare, prefix
-        self.own, self.settings = own, settings or Settings()
+        self.comm, self.defaults, self.compare, self.own = comm, defaults, compare, own
         self._krylov: dict[tuple[str, bool], Krylov] = {}
         self._symmetric = True
         self.begin()
@@ -106,7 +104,7 @@ class LinearSolver:
             assert isinstance(system, ContactForm)
             self._dense = Dense(system.dense(), system.symmetric)
         bodies = system.matrix.getSize()[0] / 6.0
-        easy = int(self.settings.easy * bodies**0.4 * self.comm.size)
+        easy = int(Settings.easy * bodies**0.4 * self.comm.size)
         self._easy = self.comm.bcast(easy)  # a last bit may differ between processors
         self._hard = self.own and self._worst > self._easy
 
@@ -140,8 +138,9 @@ class LinearSolver:
         return done
 
     def _by_factor(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve | None:
-        """Without room for a factor block Jacobi goes on, if it was our choice; else None."""
-        solver = self._solver("factor")
+        """Fronts are of single precision, until they take many iterations. Without room for a factor block Jacobi goes
+        on, if it was our choice; else None."""
+        solver, system = self._solver("factor"), self.system
         context = solver.ksp.pc.getPythonContext() if solver.kind == "python" else None
         single = isinstance(context, FrontPC) and not self._double
         if self._factored:
@@ -153,29 +152,22 @@ class LinearSolver:
         if not self._has_room(0.5 if single else 1.0):
             return self._run(self._solver("alone"), b, x, rtol) if self.own else None
         if isinstance(context, FrontPC):
-            done = self._by_fronts(solver, context, b, x, rtol)
-        elif isinstance(self.system, BodyForm):
-            part = self.system.stiff_part()
+            assert isinstance(system, BodyForm)
+            context.make = lambda: system.fronts(Settings.least, np.float64 if self._double else np.float32)
+            done = self._run(solver, b, x, rtol, system.matrix)
+            if not self._double:
+                self._double = done.iterations > Settings.single * self._easy and self._has_room()
+                if self._double and not done.converged:
+                    solver.forget()
+                    done = self._run(solver, b, x, rtol, system.matrix)
+        elif isinstance(system, BodyForm):
+            part = system.stiff_part(Settings.least)
             done = self._run(solver, b, x, rtol, part)
             part.destroy()  # the KSP keeps it
         else:
-            done = self._run(solver, b, x, rtol, self.system.entries)
+            done = self._run(solver, b, x, rtol, system.entries)
         self._factored = done.converged
         return done
-
-    def _by_fronts(self, solver: Krylov, pc: FrontPC, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
-        """By factors of single precision, until they take many iterations."""
-        system = self.system
-        assert isinstance(system, BodyForm)
-        if not self._double:
-            pc.make = lambda: system.fronts(np.float32)
-            done = self._run(solver, b, x, rtol, system.matrix)
-            self._double = done.iterations > self.settings.single * self._easy and self._has_room()
-            if done.converged or not self._double:
-                return done
-            solver.forget()
-        pc.make = lambda: system.fronts(np.float64)
-        return self._run(solver, b, x, rtol, system.matrix)
 
     def _run(
         self, solver: Krylov, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: Source = None, keep: bool = False
@@ -186,8 +178,8 @@ class LinearSolver:
 
     def _has_room(self, part: float = 1.0) -> bool:
         """Whether the memory has room for a factor of double precision, or for this part of it; collective."""
-        needed = part * self.settings.factor_bytes * self.system.matrix.getSize()[0] ** (4.0 / 3.0) / self.comm.size
-        return self.comm.bcast(needed < self.settings.spare * memory.available(self.comm))
+        needed = part * Settings.factor_bytes * self.system.matrix.getSize()[0] ** (4.0 / 3.0) / self.comm.size
+        return self.comm.bcast(needed < Settings.spare * memory.available(self.comm))
 
     def _solver(self, name: str) -> Krylov:
         """A Krylov method by its name, "" for the KSP, made when it is first needed. Unsymmetric systems, which are
@@ -202,11 +194,15 @@ class LinearSolver:
             else:
                 options = {**self.defaults, **({} if symmetric else {"ksp_type": "bcgs"})}
                 if self.own:
-                    most = self.settings.alone if name == "alone" else int(self.settings.limit * self._easy)
+                    most = Settings.alone if name == "alone" else int(Settings.limit * self._easy)
                     options["ksp_max_it"] = str(most)
-            prefix = "fallback_" if name == "factor" else self.prefix
-            self._krylov[name, symmetric] = Krylov(self.comm, prefix, options)
+            self._krylov[name, symmetric] = Krylov(self.comm, "fallback_" if name == "factor" else "", options)
         return self._krylov[name, symmetric]
+
+    @property
+    def takes_any(self) -> bool:
+        """Whether the present systems may be unsymmetric."""
+        return self.own or self.direct
 
     def report(self) -> list[str]:
         """Lines about the preconditioner, if it is one of this package."""

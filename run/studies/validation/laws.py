@@ -65,14 +65,8 @@ def heap(folders: Mapping[float, Sequence[Path]]) -> tuple[list[Row], dict]:
         what = f"growth of this angle from friction {mu:g} to {more:g}"
         found.append(above("heap", what, 0.0, float(growth), np.sqrt(2.0) * error, ZHOU, "degrees"))
     height = np.array([[bed.height for bed in several] for several in beds])
-    return found, {
-        "friction": frictions,
-        "angle": angle,
-        "error": error,
-        "scatter": scatter,
-        "x": beds[0][0].x,
-        "height": height,
-    }
+    shown = {"friction": frictions, "angle": angle, "error": error, "scatter": scatter}
+    return found, {**shown, "x": beds[0][0].x, "height": height}
 
 
 class Profile(NamedTuple):
@@ -149,12 +143,5 @@ def column(folder: Path, radius: float = 0.04, bins: int = 8) -> tuple[list[Row]
         band("column", "K, wall's pressure over vertical stress", 0.474, 1.0, ratio, RANKINE, ""),
     ]
     weight_only = weight / area * (1.0 - middle / height)
-    return found, {
-        "height": middle,
-        "pressure": pressure,
-        "vertical": vertical,
-        "law": law,
-        "ratio": ratio,
-        "weight": weight_only,
-        "rubs": rubs,
-    }
+    shown = {"height": middle, "pressure": pressure, "vertical": vertical, "law": law}
+    return found, {**shown, "ratio": ratio, "weight": weight_only, "rubs": rubs}

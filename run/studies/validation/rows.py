@@ -1,4 +1,4 @@
-"""The rows of the table of a validation."""
+"""The rows of the table of a validation: what is compared, with its standard error if it is a mean."""
 
 from __future__ import annotations
 
@@ -8,19 +8,12 @@ Row = dict[str, Any]
 
 
 def row(
-    check: str,
-    quantity: str,
-    reference: float,
-    found: float,
-    source: str,
-    unit: str,
-    allowed: float,
+    check: str, quantity: str, reference: float, found: float, source: str, unit: str, allowed: float,
     error: float | None = None,
-) -> Row:
-    """What is compared, with its standard error if it is a mean; `allowed` is the deviation that is fine, relative, or
-    absolute where the reference is zero."""
-    deviation = found - reference if reference == 0.0 else found / reference - 1.0
-    return _row(check, quantity, reference, found, error, unit, deviation, abs(deviation) <= allowed, source)
+) -> Row:  # fmt: skip
+    """`allowed` is the deviation that is fine, relative, or absolute where the reference is zero."""
+    off = found - reference if reference == 0.0 else found / reference - 1.0
+    return _row(check, quantity, reference, found, source, unit, error, off, abs(off) <= allowed)
 
 
 def band(
@@ -28,37 +21,19 @@ def band(
 ) -> Row:
     """What is to lie in a published band, to two standard errors if it is a mean; the deviation is that from the nearer
     end of the band, relative, zero inside."""
-    deviation = found / min(max(found, low), high) - 1.0
-    spare = 2.0 * (error or 0.0)
-    agrees = low - spare <= found <= high + spare
-    return _row(check, quantity, [low, high], found, error, unit, deviation, agrees, source)
+    off, spare = found / min(max(found, low), high) - 1.0, 2.0 * (error or 0.0)
+    return _row(check, quantity, [low, high], found, source, unit, error, off, low - spare <= found <= high + spare)
 
 
 def above(check: str, quantity: str, low: float, found: float, error: float, source: str, unit: str) -> Row:
     """What is to lie above `low` by more than twice its standard error; the deviation is in standard errors."""
-    deviation = (found - low) / error
-    return _row(check, quantity, [low, None], found, error, unit, deviation, deviation > 2.0, source)
+    off = (found - low) / error
+    return _row(check, quantity, [low, None], found, source, unit, error, off, off > 2.0)
 
 
 def _row(
-    check: str,
-    quantity: str,
-    reference: float | list[float | None],
-    found: float,
-    error: float | None,
-    unit: str,
-    deviation: float,
-    agrees: bool,
-    source: str,
-) -> Row:
-    return {
-        "check": check,
-        "quantity": quantity,
-        "reference": reference,
-        "found": found,
-        "error": error,
-        "unit": unit,
-        "deviation": deviation,
-        "agrees": bool(agrees),
-        "source": source,
-    }
+    check: str, quantity: str, reference: float | list[float | None], found: float, source: str, unit: str,
+    error: float | None, deviation: float, agrees: bool,
+) -> Row:  # fmt: skip
+    row: Row = {"check": check, "quantity": quantity, "reference": reference, "found": found, "error": error}
+    return row | {"unit": unit, "deviation": deviation, "agrees": bool(agrees), "source": source}

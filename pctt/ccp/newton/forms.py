@@ -1,0 +1,202 @@
+"""The two forms of the Newton systems, `ContactForm` and `BodyForm`: the system in certain unknowns x, for one set of
+barrier blocks after another. Both have
+
+    problem : the cone problem
+    matrix : the system's matrix, a function; it is positive definite where it is symmetric
+    symmetric : whether the present matrix is
+    mends : whether the residual of a solve is one of momenta, dv = G' dg - r_v, which the next step of a method with
+        momenta of its own mends; or it is one of velocities, (B + C) dg + G dv = q, where it opens what should touch
+    speed : what a residual of 1 changes the velocities of contacts by, about
+
+and the functions of `ContactForm` but for `dense`.
+"""
+
+from __future__ import annotations
+
+from typing import Union
+
+import numpy as np
+import scipy.sparse as sp
+from petsc4py import PETSc
+
+from dem.contact_map.loops import local_product, pack
+from pctt.blocks import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
+from pctt.body_matrix import BodyOperator, inverse_blocks
+from pctt.ccp.cone import Array, times
+from pctt.ccp.delassus import GivenMatrix
+from pctt.ccp.newton.fronts import Fronts, places_in
+from pctt.ccp.problem import ConeProblem
+
+
+class ContactForm:
+    """The Newton system of the contacts, S = N + C + B (3Nc x 3Nc, block size 3): the paper's Schur complement.
+
+        S dg = q + G r_v,    dv = G' dg - r_v.
+
+    S is a function, S g = N g + (C + B) g, and its entries are made only for a preconditioner that reads them: N's
+    structure and values are copied once per cone problem, and a Newton step writes the diagonal blocks alone. Bodies
+    with very many contacts (a press, a drum) would fill N: preconditioners get it without the columns of these bodies,
+    with the full diagonal blocks.
+    """
+
+    mends = False
+    speed = 1.0
+
+    def __init__(self, problem: ConeProblem):
+        self.problem, self.symmetric = problem, True
+        self._entries: PETSc.Mat | None = None
+        self._N: Array | None = None
+        self.matrix = symmetric_shell(problem.comm, problem.r.size, 3, self._product)
+
+    def load(self, problem: ConeProblem) -> None:
+        """Take another problem with the same contacts between the same bodies."""
+        self.problem, self._loaded, self._N = problem, False, None
+
+    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
+        """Make the matrix for the barrier blocks B (nc, 3, 3), or from ``inverse`` = (B + C)^-1 if the caller has it
+        more accurately. ``symmetric`` says whether the blocks are."""
+        self._blocks, self._made, self.symmetric = self.problem.diagonal_blocks + barrier, False, symmetric
+        self._local = np.empty((len(barrier), 6))
+        pack(barrier + self.problem.compliance_blocks, self._local)
+        set_diagonal_blocks(self.matrix, self._blocks)
+
+    def _product(self, g: Array, out: Array) -> None:
+        g, out = g.reshape(-1, 3), out.reshape(-1, 3)
+        local_product(self._local, g, out)
+        PETSc.Log.logFlops(5 * g.size)
+        self.problem.operator.add_delassus(g, out)
+
+    def entries(self) -> PETSc.Mat:
+        """S without the columns of hubs (BAIJ), with the places and names of the contacts that preconditioners may have
+        as attributes; collective."""
+        if self._entries is None:
+            self._entries = self.problem.N.duplicate(copy=True)
+            self._entries.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        elif not self._loaded:
+            self.problem.N.copy(self._entries, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self._loaded = True
+        if not self._made:
+            put_diagonal_blocks(self._entries, self._blocks)
+            for name, value in (("coordinates", self.problem.point), ("key", self.problem.key)):
+                if value is not None:
+                    self._entries.setAttr(name, value)
+            self._made = True
+        return self._entries
+
+    def dense(self) -> Array:
+        """S of a problem on one rank (3Nc, 3Nc)."""
+        if self._N is None:
+            self._N = _dense(self.problem)
+        matrix, here = self._N.copy(), np.arange(len(self._blocks))
+        matrix.reshape(len(here), 3, len(here), 3)[here, :, here] = self._blocks
+        return matrix
+
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
+        """Of the system for x. ``uncoupled`` is (B + C)^-1 q, if the caller has it more accurately."""
+        return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
+
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
+        """dg (nc, 3) of a solution."""
+        return x.reshape(-1, 3).copy()
+
+    def momenta(self, x: Array, dg: Array, r_v: Array) -> Array:
+        """dv (6m,) of a solution with the impulses dg."""
+        return self.problem.momentum(dg) - r_v
+
+    def destroy(self) -> None:
+        self.matrix.destroy()
+        if self._entries is not None:
+            self._entries.destroy()
+
+
+def _dense(problem: ConeProblem) -> Array:
+    """N of a problem on one rank, without compliance."""
+    if isinstance(problem.operator, GivenMatrix):
+        indptr, indices, values = problem.operator.mat.getValuesCSR()
+        return sp.csr_matrix((values, indices, indptr), shape=(problem.r.size,) * 2).toarray()
+    G = problem.operator.block_rows
+    rows = sp.bsr_matrix((G.blocks, G.indices, G.indptr), shape=(problem.r.size, 6 * G.columns))
+    return (rows @ rows.T).toarray()
+
+
+class BodyForm:
+    """The Newton system of the bodies, K = I + G' (B + C)^-1 G (6M x 6M, block size 6), in mass-scaled velocities: the
+    Schur complement of the bodies.
+
+        K dv = G' (B + C)^-1 q - r_v,    dg = (B + C)^-1 (q - G dv).
+
+    The residual of an inexact solve of K stays in the momenta: nothing multiplies it. K is smaller than the contact
+    system and far better conditioned once contacts open or slide.
+
+    For Coulomb's law (B + C)^-1 is not symmetric, and K is not either.
+    """
+
+    mends = True
+
+    def __init__(self, problem: ConeProblem):
+        assert problem.contact_map is not None
+        self.problem = problem
+        self.operator = BodyOperator(problem.contact_map)
+        self.matrix = self.operator.mat
+        self._places: Array | None = None
+        self._placed = False
+        self.symmetric = True
+
+    def load(self, problem: ConeProblem) -> None:
+        assert problem.contact_map is not None
+        self.problem = problem
+        self.operator.load(problem.contact_map)
+        self._places, self._placed = None, False
+
+    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
+        if inverse is None:
+            inverse = inverse_blocks(barrier + self.problem.compliance_blocks)
+        self._inverse, self.symmetric = inverse, symmetric
+        self.operator.update(inverse, symmetric)
+
+    def entries(self) -> PETSc.Mat:
+        """K as a matrix that preconditioners can read, with the places of the bodies; collective."""
+        entries = self.operator.entries()
+        mat = entries.mat
+        if not self._placed and self.places() is not None:
+            mat.setAttr("coordinates", self.places())
+            self._placed = True
+        return mat
+
+    def places(self) -> Array | None:
+        """Places (n, 3) of this rank's bodies, if the problem has those of its contacts; collective."""
+        if self._places is None and self.problem.point is not None:
+            self._places = self.operator.entries().places(self.problem.point)
+        return self._places
+
+    def stiff_part(self, least: float) -> PETSc.Mat:
+        """K without blocks below ``least`` (`BodyMatrix.stiff_part`), in scalar rows: a new Mat, which the caller
+        destroys."""
+        return self.operator.entries().stiff_mat(least, self.symmetric)
+
+    def fronts(self, least: float, precision: type[np.floating]) -> Fronts:
+        """The factors of this part, which is symmetric and on one rank."""
+        part, points = self.operator.entries().stiff_part(least), self.places()
+        return Fronts(part, places_in(part) if points is None else points, precision)
+
+    @property
+    def speed(self) -> float:
+        return float(self.problem.mean_diagonal**0.5)
+
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
+        push = self.problem.momentum(times(self._inverse, q) if uncoupled is None else uncoupled)
+        return push if r_v is None else push - r_v
+
+    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
+        if uncoupled is None:
+            return times(self._inverse, q - self.problem.velocity_of(x))
+        return uncoupled - times(self._inverse, self.problem.velocity_of(x))
+
+    def momenta(self, x: Array, dg: Array, r_v: Array) -> Array:
+        return x
+
+    def destroy(self) -> None:
+        self.operator.destroy()
+
+
+NewtonForm = Union[ContactForm, BodyForm]
