@@ -16,9 +16,10 @@ from typing import Any, Union
 
 import numpy as np
 
-from dem import bodies, checks, quaternion, shapes
+from dem import bodies, checks, clumps, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints
-from dem.bodies import BOX, CAPSULE, COMPOUND, PLANE, SPHERE, Bodies
+from dem.bodies import BOX, CAPSULE, CLUMP, COMPOUND, PLANE, SPHERE, Bodies
+from dem.clumps import Form
 from dem.joints import Joint
 from dem.loads import Law, Load, On
 from dem.measures import Block, Cylinder
@@ -26,7 +27,7 @@ from dem.mesh import Mesh
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
 from dem.pairs import Pairs, checked, tables
 from dem.quaternion import across, length
-from dem.shapes import Box, Shape
+from dem.shapes import Box, Clump, Shape
 from dem.sources import MOST_IDS, Outlet, Source
 from dem.springs import End, Spring
 
@@ -103,6 +104,7 @@ class Scene:
         self._pairs: dict[tuple[int, int], dict[str, float]] = {}
         self._materials: dict[str, int] = {}
         self.parts: list[Bodies] = []  #: the grains, as they were added
+        self.clumps: list[Form] = []  #: the distinct shapes of clumps; their kinds are CLUMP and the number
         self.loads: dict[str, Load] = {}  #: by name
         self.springs: dict[str, Spring] = {}  #: by name
         self.sources: dict[str, Source] = {}  #: by name
@@ -164,6 +166,36 @@ class Scene:
         """
         lengths = {"radius": radius, "half length": half_length}
         return self._add_grains(CAPSULE, positions, lengths, density, material, quaternions, velocity, angular_velocity)
+
+    def add_clumps(
+        self,
+        positions: ArrayLike,
+        shape: Clump,
+        density: ArrayLike,
+        *,
+        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        material: str = "default",
+        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Ints:
+        """Add solid clumps of spheres of one shape and return their ids (n,).
+
+        positions (n, 3) [m] and quaternions (4,) or (n, 4) are those of the frame in which `shape` has its centres.
+        The grains have theirs at the centre of mass along the principal axes, see `dem.clumps`. density [kg/m^3] one
+        for all or (n,); velocities (3,) or (n, 3), the linear one is that of the centre of mass.
+        """
+        form = clumps.form(shape)
+        if form not in self.clumps:
+            self.clumps.append(form)
+        origins = np.atleast_2d(checks.finite("positions", positions))
+        turns = checks.unit_quaternions("quaternions", quaternions, len(origins))
+        centers = checks.rows("positions", origins, len(origins), 3) + quaternion.rotate(turns, form.place)
+        rho = checks.rows("density", checks.positive("density", density), len(origins))
+        mass, inertia = rho * form.volume, rho[:, None] * form.moments
+        turns = quaternion.multiply(turns, np.tile(form.turn, (len(origins), 1)))
+        size = np.tile(form.size, (len(origins), 1))
+        kind = CLUMP + self.clumps.index(form)
+        return self._append(kind, centers, size, mass, inertia, material, turns, velocity, angular_velocity)
 
     def add_body(
         self,
@@ -421,12 +453,20 @@ class Scene:
     ) -> Ints:  # fmt: skip
         """Add grains of one kind, of which `lengths` has the columns of `size` by name; their ids."""
         centers = np.atleast_2d(checks.finite("positions", positions))
-        count, first = len(centers), sum(len(part) for part in self.parts)
+        count = len(centers)
         size = np.zeros((count, 3))
         for k, (name, values) in enumerate(lengths.items()):
             column, row = (slice(None), (3,)) if kind == BOX else (k, ())
             size[:, column] = checks.rows(name, checks.positive(name, values), count, *row)
         mass, inertia = shapes.solid(kind, size, checks.rows("density", checks.positive("density", density), count))
+        return self._append(kind, centers, size, mass, inertia, material, quaternions, velocity, angular_velocity)
+
+    def _append(
+        self, kind: int, centers: Floats, size: Floats, mass: Floats, inertia: Floats, material: str,
+        quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
+    ) -> Ints:  # fmt: skip
+        """Add grains of one kind with these columns of the table; their ids."""
+        count, first = len(centers), sum(len(part) for part in self.parts)
         table = Bodies(
             id=np.arange(first, first + count),
             position=checks.rows("positions", centers, count, 3),
@@ -471,11 +511,8 @@ def _reframed(body: LargeBody, center: Floats, inner: Floats) -> LargeBody:
 def _centered(body: LargeBody, density: float) -> LargeBody:
     """The same body with its frame at the centre of mass along the principal axes, with mass and moments."""
     mass, center, tensor = shapes.mass_properties(body.shapes, density)
-    moments, axes = np.diag(tensor).copy(), np.eye(3)
-    if np.abs(tensor - np.diag(moments)).max() > 1e-12 * moments.max():
-        moments, axes = np.linalg.eigh(tensor)
-        axes[:, 2] *= np.linalg.det(axes)  # right-handed
-    return replace(_reframed(body, center, quaternion.from_matrix(axes)), mass=mass, inertia=moments)
+    moments, turn = shapes.principal(tensor)
+    return replace(_reframed(body, center, turn), mass=mass, inertia=moments)
 
 
 def _refuse_beside_hinge(body: LargeBody, axis: Floats, arm: Floats) -> None:

@@ -12,6 +12,7 @@ from mpi4py import MPI
 from dem import bodies, stiffness
 from dem.arrays import Ints
 from dem.bodies import Bodies
+from dem.clumps import Form
 from dem.contact import find_contacts
 from dem.exchange import exchange, refuse
 from dem.partition import redistribute
@@ -85,7 +86,9 @@ def _refuse_impossible(world: World) -> None:
     for table, what in ((world.grains, "grain"), (world.large, "large body")):
         grains = what == "grain"
         heavy = np.concatenate([table.mass, table.inertia.ravel()])
-        kinds = np.isin(table.shape, (bodies.SPHERE, bodies.BOX, bodies.CAPSULE) if grains else (bodies.COMPOUND,))
+        clumps = range(bodies.CLUMP, bodies.CLUMP + len(world.clumps))
+        of_grains = (bodies.SPHERE, bodies.BOX, bodies.CAPSULE, *clumps)
+        kinds = np.isin(table.shape, of_grains if grains else (bodies.COMPOUND,))
         right = {
             "position": np.isfinite(table.position),
             "velocity": np.isfinite(table.velocity),
@@ -94,6 +97,7 @@ def _refuse_impossible(world: World) -> None:
             "material": (table.material >= 0) & (table.material < len(world.materials)),
             "shape": kinds,
             "size": np.isfinite(table.size) & (table.size >= 0.0) & (table.size[:, :1] > 0.0 if grains else True),
+            "clump": np.array([_is_of(table, n, form) for n, form in enumerate(world.clumps)]),
         }
         wrong += [f"{name} of a {what}" for name, good in right.items() if not good.all()]
     starts = np.arange(world.comm.size + 1) * world.ids // world.comm.size
@@ -104,6 +108,12 @@ def _refuse_impossible(world: World) -> None:
     if missing or (np.diff(ids) <= 0).any() or ((ids < most[0]) | (ids >= most[1])).any():
         wrong.append("id of a grain")
     refuse(world.comm, f"a state that no run can have: {', '.join(wrong)}" if wrong else "")
+
+
+def _is_of(table: Bodies, number: int, form: Form) -> bool:
+    """Whether the clumps of this number in a table have the sizes of the form."""
+    size = table.size[table.shape == bodies.CLUMP + number]
+    return bool(np.allclose(size, form.size, rtol=1e-9, atol=0.0))
 
 
 def restart_rows(slabs: Ints, comm: MPI.Comm) -> slice:
@@ -129,6 +139,7 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
     world.loads, world.springs, world.period = dict(scene.loads), dict(scene.springs), scene.period
+    world.clumps = tuple(scene.clumps)
     world.sources, world.outlets = dict(scene.sources), dict(scene.outlets)
     world.tallies = {name: Tally() for name in (*world.sources, *world.outlets)}
     world.initial, world.first_large = sum(map(len, scene.parts)), scene.first_large

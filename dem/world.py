@@ -17,6 +17,7 @@ from dem import bodies, checks, joints, loads, quaternion, springs
 from dem import motion as motions
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
+from dem.clumps import Form
 from dem.joints import Joint
 from dem.loads import Load, On
 from dem.motion import Dynamic, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
@@ -69,6 +70,7 @@ class World:
     sources: dict[str, Source] = field(default_factory=dict)  #: by name
     outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
     tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets, by name
+    clumps: tuple[Form, ...] = ()  #: shapes of grains, by their numbers
     initial: int = 0  #: number of grains at time zero
     first_large: int = 0  #: id of the first large body
     shear: Shear | None = None  #: of the cell

@@ -52,7 +52,7 @@ from pctt.render import Picture, picture
 from pctt.run import report, state
 from pctt.run.dump import Dump
 from pctt.run.joints import JointNow
-from pctt.run.output import Place, Writer, described_bodies, refuse_unwritable
+from pctt.run.output import Place, Writer, described_bodies, described_clumps, refuse_unwritable
 from pctt.run.settings import Run, Settings, scene_name
 from pctt.run.stepper import NoSolutionError, Stepper
 
@@ -457,7 +457,8 @@ class Simulation:
         velocity[:grains] = velocity_in_cell(position[:grains], velocity[:grains], world.shear)
         position[:grains] = wrapped(position[:grains], world.period, world.shear)
         contacts = self.contacts if self.last else Contacts.none()
-        frame = Frame(self.steps, self.time, position, turn, velocity, contacts, Table(**table, grains=grains))
+        what = Table(**table, grains=grains, clumps=described_clumps(world))
+        frame = Frame(self.steps, self.time, position, turn, velocity, contacts, what)
         return Snapshot(frame, materials=world.materials, large=described_bodies(world))
 
 

@@ -76,7 +76,8 @@ def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:
     periodic = None if world.period is None else images(world, near)
     wide = near if periodic is None else periodic.among(near)
     seen = wide.grains + wide.ghosts
-    table = primitives(wide, [body.shapes for body in world.large_bodies], world.first_large)
+    large = [body.shapes for body in world.large_bodies]
+    table = primitives(wide, large, world.first_large, world.clumps, world.initial)
     pairs = close_pairs(table.center[:seen], table.radius[:seen] + wide.margin)
     if periodic is not None:
         pairs = between(pairs, wide)

@@ -9,7 +9,7 @@ import numpy as np
 from dem import bodies
 from dem.applied import free_directions, free_turns, grains_free_velocity, large_free_velocity
 from dem.arrays import Bools, Floats, Ints, places
-from dem.bodies import CAPSULE, MESH, SPHERE
+from dem.bodies import CAPSULE, CLUMP, MESH, SPHERE
 from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.candidates import meeting
@@ -94,6 +94,7 @@ def find_contacts(
         near, grown = pictures.among(base), grown[pictures.rows]
     table = lists.table.now(near)
     i, j, reach = meeting(world, near, lists, table, delta, shifts, grown)
+    table, i, j, reach = table.of_members(i, j, reach)
     pair, feature, touch = touches(table, i, j, reach)
     key, a, b, body, friction, weight = named(
         *(table.number, table.row, table.kind, near.index, near.bodies.material, world.pairs.friction),
@@ -103,8 +104,10 @@ def find_contacts(
     if pictures is not None:
         contacts, weight = _without_images(world, contacts, base, pictures)
     back = np.flatnonzero(np.diff(pair) <= 0)  # other shapes come behind the spheres, and touch in several points
-    if len(back) and lists.images is None:
-        left = slice(int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min())), None)
+    of_clumps = table.members is not None
+    if (len(back) or of_clumps) and lists.images is None:
+        first = 0 if of_clumps else int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min()))
+        left = slice(first, None)
         order = contact_order(world, near, a[left], b[left], key[left])
         for column in contacts.columns().values():
             column[left] = column[left].take(order, axis=0)
@@ -210,6 +213,8 @@ def ways(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
         radius = np.sqrt(size[n, 0] ** 2 + size[n, 1] ** 2 + size[n, 2] ** 2)
         if shape[n] == CAPSULE:
             radius = size[n, 0] + size[n, 1]
+        elif shape[n] >= CLUMP:
+            radius = size[n, 0]
         if shape[n] != SPHERE:
             way += radius * spin
         out[n] = min(dt * way, 2.0 * radius) if np.isfinite(way + spin) else np.nan

@@ -187,6 +187,8 @@ class Writer:
             rows = _by_id(world, TABLE)
             large = np.bytes_(json.dumps(described_bodies(world)))
             shared = {"materials": texts(world.materials), "large": large}
+            if world.clumps:
+                shared["clumps"] = np.bytes_(json.dumps(described_clumps(world)))
             write_rows(frames / "bodies.h5", self.comm, rows, shared, {})
         near = contacts.near.bodies
         rows = {
@@ -297,6 +299,11 @@ def described_bodies(world: World) -> list[dict[str, Any]]:
         for body in world.large_bodies
     ]
     return json.loads(json.dumps(large, default=list))  # arrays as lists
+
+
+def described_clumps(world: World) -> list[dict[str, Any]]:
+    """The centres [m], in the frames of the grains, and radii [m] of the spheres of each clump, as JSON has them."""
+    return [{"centres": form.center.tolist(), "radii": form.radius.tolist()} for form in world.clumps]
 
 
 def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:
