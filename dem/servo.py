@@ -9,8 +9,8 @@ The rate follows from the stiffness of the cell. Where nothing gives way, a cont
 n E l / C, so a rate along axis k raises the stress in a step by R_k times it, with R_k = sum (n_k l_k) / (C dt V) |l| of
 the contacts that bear; all axes at once do so, one alone does less. The rate (stress - asked) / (STEPS R_k) thus needs
 STEPS steps at least to take back an error, and is stable for each dt, stiffness and number of grains. In a loose cell
-grains give way: where the last rate has led to a stress below R_k times it over STEPS, it says what R_k is, with a
-factor of STEPS to be safe.
+grains give way: the stress over the last rate is then far less than R_k, and takes its place, with a factor of STEPS^2
+to be safe.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dem.contact import Contacts
 from dem.system import ContactSystem
 from dem.world import World
 
-STEPS = 4.0  #: in which a packing takes back an error of its stress, if it is elastic
+STEPS = 2.0  #: in which a packing takes back an error of its stress, if it is elastic
 #: The greatest rate, as an inertial number: rate times d sqrt(rho / P). A loose cell then closes in quasistatic motion.
 FASTEST = 0.01
 
@@ -69,6 +69,6 @@ def follow_stress(world: World, contacts: Contacts, system: ContactSystem, impul
     fastest = FASTEST * np.sqrt(np.pi / 6.0 * size * np.nan_to_num(servo.asked).max() / mass)
     error = stress - asked
     last = np.abs(servo.rate)
-    response = np.minimum(response, STEPS * np.abs(stress) / np.maximum(last, 1e-300))
+    response = np.minimum(response, STEPS**2 * np.abs(stress) / np.maximum(last, 1e-300))
     slow = np.maximum(STEPS * response, np.abs(error) / max(fastest, 1e-300))
     world.servo = replace(servo, rate=error / np.maximum(slow, 1e-300))

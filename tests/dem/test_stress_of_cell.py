@@ -35,7 +35,7 @@ def stress(sim):
 
 def test_isotropic_cell_reaches_its_stress_and_stays():
     sim = packed()
-    sim.run(steps=150)
+    sim.run(steps=240)
     late = []
     for _ in range(40):
         sim.step()
