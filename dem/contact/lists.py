@@ -59,7 +59,8 @@ class Lists:
             margin = margin + 0.5 * abs(world.shear.shift - self.shift)  # both share the way of an image
         if world.servo is not None and world.period is not None:
             growth = np.abs(world.period - self.period)
-            margin = margin + 0.5 * growth @ (2.0, 1.0, 1.0)  # images of a sheared cell are two periods away along x
+            most = 2.0 + abs(self.shift) / self.period[0]  # periods along x in the ways of images of a sheared cell
+            margin = margin + 0.5 * growth @ (most, 1.0, 1.0)
         same = all(then is now for then, now in zip(self.constant, _constant(world)))
         return same and stays(self.near.bodies.position, self.near.margin, self.margin, world.grains.position, margin)
 
