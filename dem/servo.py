@@ -2,13 +2,14 @@
 
 The cell changes its size by an affine deformation: with the rate E (3,) of its periods the centre of a grain goes by
 dt (v + E x) in a step. So the velocity v of a grain is that beside the motion of the cell, and the relative velocity of
-a contact with the way l from centre to centre has the part E l, its drift (`Contacts.drift`). The impulses g do the work
--g E l on it, which is -dt times the volume times stress times E.
+a contact with the way l from centre to centre has the part E l, its drift (`Contacts.drift`). The impulses g do the
+work -g E l on it, which is -dt times the volume times stress times E.
 
 The rate follows from the stiffness of the cell. Where nothing gives way, a contact of compliance C takes the impulse
-n E l / C, so a rate along axis k raises the stress in a step by R_k times it, with R_k = sum (n_k l_k) / (C dt V) |l| of
-the contacts that bear; all axes at once do so, one alone does less. The rate (stress - asked) / (STEPS R_k) thus needs
-STEPS steps at least to take back an error, and is stable for each dt, stiffness and number of grains. In a loose cell
+n E l / C, so equal rates along all axes raise the stress along axis k in a step by R_k times them, with
+R_k = sum n_k l_k |l| / (C dt V) of the contacts that bear; a rate along one axis does less. The rate
+(stress - asked) / (STEPS R_k) thus needs STEPS steps at least to take back an error, and is stable for each dt,
+stiffness and number of grains. In a loose cell
 grains give way: the stress over the last rate is then far less than R_k, and takes its place, with a factor of STEPS^2
 to be safe.
 """

@@ -118,7 +118,8 @@ class Step:
 def advance(world: World, velocity: Floats, dt: float, moving: Floats | None = None) -> None:
     """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by dt [s]; collective.
 
-    x <- x + dt (v + E x), q <- exp(dt w) q, with the rate E of a cell that changes its size, and the velocities `moving` (owned, 6) in place of these if they are given.
+    x <- x + dt (v + E x), q <- exp(dt w) q, with the rate E of a cell that changes its size, and with the velocities
+    `moving` (owned, 6) in place of these if they are given.
     Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
     """
     moving = velocity if moving is None else moving

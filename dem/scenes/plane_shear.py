@@ -82,8 +82,8 @@ class PlaneShear(Experiment):
         }
 
     def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
-        """Over the last half of the strain: the friction coefficient and inertial number of the mean stresses, the solid
-        fraction, the pressure over that asked, and the standard error of mu from ten parts of that half."""
+        """Over the last half of the strain: the friction coefficient and inertial number of the mean stresses, the
+        solid fraction, the pressure over that asked, and the standard error of mu from ten parts of that half."""
         strain = records["strain"]
         late = (strain >= 0.5 * strain[-1]) & calm(records)
         if not late.any():
