@@ -498,12 +498,12 @@ def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
                 f"sides, or its own image; allowed is more than two greatest diameters, {4.0 * radius:g} m"
             )
     if scene.shear_rate is not None or scene.stress is not None:
-        kind = "sheared cell" if scene.stress is None else "cell of given stress"
+        cell = "sheared cell" if scene.stress is None else "cell of given stress"
         if scene.large_bodies:
-            raise ValueError(f"large body {scene.large_bodies[0].name!r}: a {kind} has grains alone")
+            raise ValueError(f"large body {scene.large_bodies[0].name!r}: a {cell} has grains alone")
         if scene.sources or scene.outlets:
             name = next(iter({**scene.sources, **scene.outlets}))
-            raise ValueError(f"{name!r}: a {kind} has no sources and outlets")
+            raise ValueError(f"{name!r}: a {cell} has no sources and outlets")
     if scene.springs:
         raise ValueError(f"spring {next(iter(scene.springs))!r}: springs have no images, so periods allow none")
     for body in scene.large_bodies:

@@ -57,7 +57,7 @@ class Lists:
         """Whether the lists of this rank have all pairs of these margins (grains,)."""
         if world.shear is not None:
             margin = margin + 0.5 * abs(world.shear.shift - self.shift)  # both share the way of an image
-        if world.servo is not None and world.period is not None:
+        if world.servo is not None and world.period is not None and self.period is not None:
             growth = np.abs(world.period - self.period)
             most = 2.0 + abs(self.shift) / self.period[0]  # periods along x in the ways of images of a sheared cell
             margin = margin + 0.5 * growth @ (most, 1.0, 1.0)
