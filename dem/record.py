@@ -20,6 +20,7 @@ from dem.compiled import loop
 from dem.experiment import Experiment
 from dem.motion import Held
 from dem.period import wrapped
+from dem.servo import cell_stress
 from dem.step import Step
 from dem.together import SceneError, together
 from dem.world import World
@@ -30,6 +31,7 @@ def row(step: Step, scene: Experiment) -> dict[str, float]:
     something else than numbers by name."""
     out = {"step": step.world.step, "time [s]": step.world.time}
     out |= energy_balance(step) | contact_statistics(step) | passages(step.world)
+    out |= cell(step)
     if scene.domain is not None:
         out["grains_outside"] = outside(step, *scene.domain)
     for body in step.world.large_bodies:
@@ -73,6 +75,18 @@ def passages(world: World) -> dict[str, float]:
         for kind, names in (("sources", world.sources), ("outlets", world.outlets)):
             out[f"energy_of_{kind} [J]"] = sum(world.tallies[name].energy for name in names)
     return out
+
+
+def cell(step: Step) -> dict[str, float]:
+    """The periods at the end of the step, and the stress of its contacts and grains; nothing of a scene that is neither
+    sheared nor has a servo, or has a direction without a period."""
+    world, period = step.world, step.world.period
+    if period is None or np.isinf(period).any() or (world.shear is None and world.servo is None):
+        return {}
+    stress = cell_stress(world, step.contacts, step.system, step.impulse)
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    out = {f"period_{axis} [m]": float(period[k]) for k, axis in enumerate("xyz")}
+    return out | {f"stress_{'xyz'[i]}{'xyz'[j]} [Pa]": 0.5 * float(stress[i, j] + stress[j, i]) for i, j in pairs}
 
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:

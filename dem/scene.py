@@ -75,6 +75,7 @@ class Scene:
         period: Sequence[float | None] | None = None,
         shear_rate: float | None = None,
         shear_gradient: str = "y",
+        stress: Sequence[float | None] | None = None,
     ) -> None:
         """`gravity`: (3,) [m/s^2]. The others are coefficients of the contacts of all pairs of materials, but of those
         of `set_pair`: `friction`, `stiffness` [N/m] (inf: rigid; None: `dem.stiffness.recommended`), `restitution`, the
@@ -82,9 +83,15 @@ class Scene:
         and `spinning`, over the normal force [m]. See `dem.pairs` and docs/contact_laws.md.
         `period`: (3,) lengths of the cell, from zero on, that repeats itself along x, y, z [m], None: not along that
         axis. `shear_rate`: d v_x / dy of the cell, or d v_x / dz for the `shear_gradient` "z" [1/s]; None: it is at
-        rest. See docs/periodic.md.
+        rest. `stress`: (3,) that the cell is to have along x, y, z, positive in compression [Pa]: its periods then
+        change; None: not along that axis. See docs/periodic.md.
         """
         self.period = checks.period(period)
+        self.stress = None if stress is None else checks.stress(stress)
+        if stress is not None and (self.period is None or np.isinf(self.period).any()):
+            raise ValueError("stress needs periods along x, y and z")
+        if stress is not None and np.any(gravity):
+            raise ValueError("stress needs gravity (0, 0, 0): in a cell without walls grains would fall for ever")
         self.shear_rate = None if shear_rate is None else float(checks.finite("shear_rate", shear_rate))
         if shear_gradient not in ("y", "z"):
             raise ValueError(f"shear_gradient must be 'y' or 'z', got {shear_gradient!r}")
@@ -568,11 +575,13 @@ def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
                 f"period of {period[k]:g} m along {'xyz'[k]} is too short: a grain could meet another one on both its "
                 f"sides, or its own image; allowed is more than two greatest diameters, {4.0 * radius:g} m"
             )
-    if scene.shear_rate is not None and scene.large_bodies:
-        raise ValueError(f"large body {scene.large_bodies[0].name!r}: a sheared cell has grains alone")
-    if scene.shear_rate is not None and (scene.sources or scene.outlets):
-        name = next(iter({**scene.sources, **scene.outlets}))
-        raise ValueError(f"{name!r}: a sheared cell has no sources and outlets")
+    if scene.shear_rate is not None or scene.stress is not None:
+        cell = "sheared cell" if scene.stress is None else "cell of given stress"
+        if scene.large_bodies:
+            raise ValueError(f"large body {scene.large_bodies[0].name!r}: a {cell} has grains alone")
+        if scene.sources or scene.outlets:
+            name = next(iter({**scene.sources, **scene.outlets}))
+            raise ValueError(f"{name!r}: a {cell} has no sources and outlets")
     for name in (*scene.springs, *scene.joints):
         raise ValueError(f"{name!r}: springs and joints have no images, so periods allow none")
     for body in scene.large_bodies:

@@ -20,7 +20,7 @@ from dem.period import put_back, velocity_in_cell, wrapped
 from dem.scene import Scene
 from dem.sources import Tally, from_array
 from dem.step import follow_motions
-from dem.world import Shear, World, refuse_load
+from dem.world import Servo, Shear, World, refuse_load
 
 
 def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
@@ -70,10 +70,7 @@ def restored_world(
     world.time, world.step = float(replicated["time"]), int(replicated["step"])
     expected = np.array(replicated["expected"]) if "expected" in replicated else None
     world.expected = expected if expected is not None and expected.shape == (len(world.springs), 2, 6) else None
-    if world.shear is not None:
-        rate, shift = np.array(replicated.get("shear", (0.0, np.nan)), float)
-        refuse(comm, "" if np.isfinite([rate, shift]).all() else "the state has no shear of the cell, as the scene has")
-        world.shear = replace(world.shear, rate=float(rate), shift=float(shift))
+    _restore_cell(world, replicated)
     _refuse_impossible(world)
     if len(replicated["slabs"]) != comm.size + 1:
         redistribute(world)
@@ -135,6 +132,21 @@ def _shear(scene: Scene) -> Shear | None:
     return Shear(scene.shear_rate, scene.gradient, float(scene.period[scene.gradient]))
 
 
+def _restore_cell(world: World, replicated: Mapping[str, np.ndarray]) -> None:
+    """Take the shear, the servo and the periods of the cell from a state; ValueError on all ranks if it has none."""
+    comm = world.comm
+    if world.servo is not None:
+        servo = np.array(replicated.get("servo", np.full((3, 3), np.nan)), float)
+        right = servo.shape == (3, 3) and np.isfinite(servo[1:]).all() and (servo[2] > 0.0).all()
+        refuse(comm, "" if right else "the state has no stress of the cell, as the scene has")
+        world.servo, world.period = Servo(servo[0], servo[1]), servo[2]
+    if world.shear is not None and world.period is not None:
+        rate, shift = np.array(replicated.get("shear", (0.0, np.nan)), float)
+        refuse(comm, "" if np.isfinite([rate, shift]).all() else "the state has no shear of the cell, as the scene has")
+        length = float(world.period[world.shear.axis])
+        world.shear = replace(world.shear, rate=float(rate), shift=float(shift), length=length)
+
+
 def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
@@ -150,6 +162,7 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     world.joints = dict(scene.joints)
     if world.joints and pairs.resists:
         raise ValueError("joints cannot be in a scene whose contacts resist rolling or spinning")
+    world.servo = None if scene.stress is None else Servo(scene.stress.copy(), np.zeros(3))
     for name, load in world.loads.items():
         refuse_load(world, name, load)
     return world

@@ -57,7 +57,7 @@ class ContactSystem:
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
         stiffness (nc,): of the contacts; inf: rigid [N/m]
         compliance (nc,): C, what a normal impulse leaves of the overlap, over dt; 0: rigid [1/kg]
-        drift (nc, 3): velocities of images relative to their bodies, in the frames; None without shear [m/s]
+        drift (nc, 3): what the cell adds to relative velocities, in the frames; None: nothing [m/s]
         surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.surface`; None if there is none
         b (nc, 3): (gap / dt, surface) [m/s], see `gap_velocities`
         r (nc, 3): b + D' v_free [m/s]

@@ -47,6 +47,14 @@ class Shear:
         return dataclasses.replace(self, shift=self.shift + dt * self.speed)
 
 
+@dataclass(frozen=True)
+class Servo:
+    """The stresses that a periodic cell is to have: its periods change, and all centres with them; see `dem.servo`."""
+
+    asked: Floats  #: (3,) along x, y, z, positive in compression; NaN: the period stays as it is [Pa]
+    rate: Floats  #: (3,) at which the periods grow in the next step, over themselves [1/s]
+
+
 @dataclass
 class World:
     """Bodies, materials and time.
@@ -74,6 +82,7 @@ class World:
     initial: int = 0  #: number of grains at time zero
     first_large: int = 0  #: id of the first large body
     shear: Shear | None = None  #: of the cell
+    servo: Servo | None = None  #: of the size of the cell
     time: float = 0.0  #: [s]
     step: int = 0  #: number of steps done
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
@@ -113,6 +122,8 @@ class World:
             replicated["tallies"] = as_array(self.tallies)
         if self.shear is not None:
             replicated["shear"] = np.array([self.shear.rate, self.shear.shift])
+        if self.servo is not None:
+            replicated["servo"] = np.array([self.servo.asked, self.servo.rate, self.period])
         return self.grains.columns(), replicated
 
     def set_grains(self, grains: Bodies) -> None:
@@ -239,6 +250,15 @@ def set_shear_rate(world: World, rate: float) -> None:
     if world.shear is None:
         raise ValueError("shear rate: the cell of this scene is not sheared; give the Scene a shear_rate, or 0")
     world.shear = dataclasses.replace(world.shear, rate=float(checks.finite("shear rate", rate)))
+
+
+def set_stress(world: World, stress: Any) -> None:
+    """Ask for other stresses (3,) of the cell along x, y, z [Pa] from now on; None: the period stays as it is.
+    ValueError if the scene has no `stress`."""
+    if world.servo is None:
+        raise ValueError("stress: the periods of this scene are constant; give the Scene a stress along an axis")
+    asked = checks.stress(stress)
+    world.servo = Servo(asked, np.where(np.isnan(asked), 0.0, world.servo.rate))
 
 
 def set_load(world: World, name: str, on: On = None, **values: Any) -> None:

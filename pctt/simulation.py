@@ -42,7 +42,7 @@ from dem.start import step_remark
 from dem.step import Step
 from dem.stiffness import expected_overlap
 from dem.together import meet, together
-from dem.world import set_load, set_motion, set_shear_rate, set_spring, set_surface
+from dem.world import set_load, set_motion, set_shear_rate, set_spring, set_stress, set_surface
 from pctt import ccp, log
 from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
@@ -324,6 +324,19 @@ class Simulation:
         meet(self.comm, "shear rate")
         change = partial(set_shear_rate, self.world, self.comm.bcast(rate))
         together(self.comm, "shear rate", change, own=(ValueError, TypeError))
+
+    @property
+    def period(self) -> Floats | None:
+        """The lengths (3,) of the periodic cell now [m], inf: none along that axis; None: no axis has one. Not
+        collective."""
+        return None if self.world.period is None else self.world.period.copy()
+
+    def set_stress(self, stress: Sequence[float | None]) -> None:
+        """Ask for other stresses (3,) of the cell along x, y, z, positive in compression [Pa]; None: its period stays.
+        The first rank's values count, and checkpoints keep them. ValueError if the scene has no ``stress``."""
+        meet(self.comm, "stress")
+        change = partial(set_stress, self.world, self.comm.bcast(stress))
+        together(self.comm, "stress", change, own=(ValueError, TypeError))
 
     @property
     def springs(self) -> dict[str, Spring]:

@@ -76,6 +76,7 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     numbers += [value for body in large for shape in body.shapes for value in placed(shape)]
     numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values(), *(body.surface for body in large)]
     numbers += [-np.inf if scene.shear_rate is None else scene.shear_rate, scene.gradient]
+    numbers += [np.full(3, -np.inf) if scene.stress is None else np.nan_to_num(scene.stress)]
     for part in (*(body.motion for body in large), *scene.springs.values(), *scene.loads.values()):
         numbers += getattr(part, "__dict__", {}).values()
     return repr(words), [value for value in map(np.asarray, numbers) if value.dtype.kind in "fiub"]
@@ -158,8 +159,8 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
     def take(file: h5py.File, sealed: bool) -> tuple[Any, ...]:
         _refuse_unmarked(file, sealed)
         replicated = {n: file[f"world/{n}"][()] for n in (*(f"large_{n}" for n in columns), "slabs", "time", "step")}
-        # of springs, of sources and outlets, of a sheared cell
-        for name in {"expected", "tallies", "shear"} & set(file["world"]):
+        # of springs, of sources and outlets, of a sheared cell, of its stress
+        for name in {"expected", "tallies", "shear", "servo"} & set(file["world"]):
             replicated[name] = file[f"world/{name}"][()]
         changes = [file[f"world/{n}"].asstr()[0] if f"world/{n}" in file else "{}" for n in CHANGES]
         rows, contacts = restart_rows(replicated["slabs"], comm), even_slice(len(file["contacts/key"]), comm)

@@ -18,12 +18,14 @@ from dem.joints import Coupling
 from dem.partition import rebalance
 from dem.passage import come_and_go
 from dem.period import put_back
+from dem.servo import follow_stress
 from dem.step import advance, carried, find_overrun, find_turned
 from dem.system import ContactSystem, touching
 from dem.together import SceneError
 from dem.world import World
 from pctt import ccp, log
 from pctt.ccp.cone import Array
+from pctt.options import OptionError
 from pctt.run.dump import Dump
 from pctt.run.projection import projected
 from pctt.run.settings import Settings
@@ -62,6 +64,8 @@ class Stepper:
         self._slabs: Ints | None = None  # those of the last step, or of a solution that is remembered within this one
         if settings.stiffness is not None:
             world.pairs.stiffness[:] = settings.stiffness
+        if world.servo is not None and not np.isfinite(world.pairs.stiffness).all():
+            raise OptionError("-stiffness inf: a cell of given stress needs contacts that give way; allowed is less")
 
     def __enter__(self) -> Stepper:
         return self
@@ -111,6 +115,7 @@ class Stepper:
             self.impulse, self.history = self.system.net(forces), result.history
             self.moment = None if self.system.resistance is None else moments
             advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt, moving)
+            follow_stress(self.world, self.contacts, self.system, self.impulse)
             self.memory.remember(self.system.key, result.impulse, self.system.frame)
             self._slabs = self.world.slabs
         self._release()
