@@ -119,6 +119,7 @@ def figure(name: str | Path, panels: int, rows: int = 1) -> Iterator[Any]:
     size = 6.4 * panels, 4.8 * rows
     drawing, axes = pyplot.subplots(rows, panels, figsize=size, layout="constrained", squeeze=False)
     yield axes.ravel()
+    Path("results").mkdir(exist_ok=True)
     path = name if isinstance(name, Path) else Path("results") / f"{name}.png"
     drawing.savefig(path, dpi=150)
     pyplot.close(drawing)
