@@ -53,6 +53,21 @@ def project_to(x: Array, mu: Array, out: Array) -> Array:
 
 
 @loop
+def squared_moves(x: Array, y: Array, step: float, mu: Array, de_saxce: float) -> Array:
+    """|P(x - step y) - x|^2 (nc,), where y gets the term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1. A pass over
+    the memory; `FrictionCones.move` takes several."""
+    out = np.empty(len(mu))
+    x, y = x.ravel(), y.ravel()
+    for c in range(len(mu)):
+        i = 3 * c
+        m, u, v = mu[c], y[i + 1], y[i + 2]
+        w = y[i] + de_saxce * m * np.sqrt(u * u + v * v)
+        n, t_1, t_2 = _nearest(x[i] - step * w, x[i + 1] - step * u, x[i + 2] - step * v, m)
+        out[c] = (n - x[i]) ** 2 + (t_1 - x[i + 1]) ** 2 + (t_2 - x[i + 2]) ** 2
+    return out
+
+
+@loop
 def accelerated_step(
     x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, de_saxce: float,
     out: Array,
@@ -367,6 +382,10 @@ class FrictionCones:
         self.project(out, out)
         out -= x
         return out
+
+    def squared_move(self, x: Array, y: Array, step: float, coulomb: bool) -> float:
+        """||`move`||^2 of this rank's contacts."""
+        return float(squared_moves(x, y, step, self.mu, float(coulomb)).sum())
 
     def power(self, x: Array, y: Array) -> Array:
         """x.y of each contact (count,)."""

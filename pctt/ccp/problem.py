@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
 from dem.exchange import refuse
-from pctt.ccp.cone import Array, FrictionCones, dot
+from pctt.ccp.cone import Array, FrictionCones
 from pctt.ccp.delassus import BlockMap, GivenMatrix, delassus, without_hubs
 
 Given = Union[BlockRows, CompactRows, ContactMap]
@@ -101,8 +101,8 @@ class ConeProblem:
         law y gets De Saxce's term.
 
         inf if that is undefined: for g = 0, unless it solves the problem, and if g or y has a nan or inf."""
-        move = self.cones.move(g, y, 1.0 / self.mean_diagonal, coulomb)
-        distance, norm = np.sqrt(self.sum(np.array([dot(move, move).sum(), np.vdot(g, g)])))
+        square = self.cones.squared_move(g, y, 1.0 / self.mean_diagonal, coulomb)
+        distance, norm = np.sqrt(self.sum(np.array([square, np.vdot(g, g)])))
         if distance == 0:
             return 0.0
         residual = float(distance / norm) if norm > 0 else np.inf

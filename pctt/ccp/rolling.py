@@ -55,6 +55,10 @@ class RollingCones(FrictionCones):
     def project(self, x: Array, out: Array) -> Array:
         return project_to(x, self.mu, self.spinning, out)
 
+    def squared_move(self, x: Array, y: Array, step: float, coulomb: bool) -> float:
+        move = self.move(x, y, step, coulomb)
+        return float(np.vdot(move, move))
+
     def resisted(self, y: Array) -> Array:
         slides, rolls = (self.mu * tangential(y)).reshape(2, -1)
         return slides + rolls + self.spinning * np.abs(y[self.count :, 0])
