@@ -7,6 +7,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 from systems import contacts, dense, spd
+from train_solver import columns
 
 from pctt.blocks import block_csr_matrix, block_diagonal, inverse_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.body_matrix import BodyMatrix
@@ -35,14 +36,7 @@ def preconditioner(krylov: Krylov, mat: PETSc.Mat) -> np.ndarray:
     x, b = mat.createVecs()
     b.set(1.0)
     krylov.solve(mat, b, x, 1e-3)
-    columns = []
-    for i in range(mat.getSize()[0]):
-        b.zeroEntries()
-        b[i] = 1.0
-        b.assemble()
-        krylov.ksp.pc.apply(b, x)
-        columns.append(x.array.copy())
-    return np.array(columns).T
+    return columns(mat, krylov.ksp.pc.apply)
 
 
 TT = {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain"}
