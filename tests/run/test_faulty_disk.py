@@ -8,7 +8,7 @@ import shutil
 import subprocess
 
 import pytest
-from program import SMALL, command, environment
+from program import EVERY, SMALL, command, environment
 from test_full_disk import LOOSE, check_whole
 
 SOURCE = r"""
@@ -77,7 +77,7 @@ def run(library, cache, tmp_path):
 
     def run(call, at, number, *options):
         fault = {"LD_PRELOAD": str(library), "FAULT_CALL": call, "FAULT_AT": str(at), "FAULT_ERRNO": str(number)}
-        words = command(*SMALL, *LOOSE, "-output", "out", "-quiet", *options)
+        words = command(*SMALL, *EVERY, *LOOSE, "-output", "out", "-quiet", *options)
         return subprocess.run(
             words, cwd=tmp_path, env={**environment(cache), **fault}, capture_output=True, text=True, timeout=120
         )
