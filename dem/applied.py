@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, springs
+from dem import bodies, joints, springs
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import Bodies
 from dem.free_motion import free_velocity
@@ -113,6 +113,46 @@ def _ends(world: World, ids: Ints, grains: Floats, large: Floats, dt: float) -> 
         np.concatenate([free, _as_motions_allow(world, pushed, dt), np.zeros((1, 6))]),
         inverse,
     )
+
+
+def jointed(world: World) -> tuple[Ints, Ints]:
+    """The ids of the grains of joints, in order, and the rows (joints, 2) of the ends of joints among these, the large
+    bodies and the world."""
+    ends = [end for joint in world.joints.values() for end in joint.ends]
+    ids = np.unique([end for end in ends if isinstance(end, int)]).astype(np.int64)
+    return ids, np.array([_row_of(world, ids, end) for end in ends]).reshape(-1, 2)
+
+
+def joint_ends(world: World, dt: float) -> tuple[Ints, Ints, Ends]:
+    """What `jointed` gives, and those bodies in a step of dt [s] with what loads and springs give; collective."""
+    ids, row = jointed(world)
+    grains, large = np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity)
+    if world.loaded:
+        given = applied_impulses(world, dt)
+        grains, large = given.grains, given.large
+    return ids, row, _ends(world, ids, grains, large, dt)
+
+
+def joint_coupling(world: World, dt: float) -> joints.Coupling | None:
+    """The joints in the next step of dt [s]; None without any; collective."""
+    if not world.joints:
+        return None
+    _, row, table = joint_ends(world, dt)
+    found = joints.coupling(list(world.joints.values()), row, table, dt) if world.comm.rank == 0 else None
+    return world.comm.bcast(found)  # processors may round in other ways
+
+
+def joints_refound(world: World, known: joints.Coupling, push: Floats) -> joints.Coupling | None:
+    """`dem.joints.refound`, by the first rank for all; collective."""
+    found = joints.refound(known, push) if world.comm.rank == 0 else None
+    return world.comm.bcast(found)
+
+
+def slots(world: World, id: Ints) -> tuple[Ints, Ints]:
+    """Which rows of bodies with these ids (n,) are among the bodies that joints know, and their rows there."""
+    ids, first = jointed(world)[0], int(world.slabs[-1])
+    here = np.flatnonzero(np.isin(id, ids) | (id >= first))
+    return here, np.where(id[here] >= first, len(ids) + id[here] - first, np.searchsorted(ids, id[here]))
 
 
 def velocity_changes(table: Bodies, impulse: Floats) -> Floats:

@@ -14,6 +14,9 @@ from dem.arrays import Bools, Floats, Ints
 #: meshes are parts of large bodies only.
 SPHERE, BOX, COMPOUND, CAPSULE, PLANE, MESH = range(6)
 
+#: Clumps of spheres are the kinds from here on: CLUMP + n is the one of number n in `dem.scene.Scene.clumps`.
+CLUMP = 6
+
 
 @dataclass
 class Bodies:
@@ -29,8 +32,10 @@ class Bodies:
     mass: Floats  #: (n,) [kg]
     inertia: Floats  #: (n, 3) principal moments of inertia in the body frame [kg m^2]
     material: Ints  #: (n,) row of the friction table
-    shape: Ints  #: (n,) SPHERE, BOX, CAPSULE or COMPOUND
-    size: Floats  #: (n, 3) sphere: (radius, 0, 0); box: half extents; capsule: (radius, half length, 0) [m]
+    shape: Ints  #: (n,) SPHERE, BOX, CAPSULE, COMPOUND, or CLUMP and the number of the clump
+    #: (n, 3) sphere: (radius, 0, 0); box: half extents; capsule: (radius, half length, 0); clump: radii of the sphere
+    #: that encloses it, of the ball of its volume, and of its largest sphere [m]
+    size: Floats
     weight: Floats  #: (n,) contacts owned at the last search, the load that balancing spreads
 
     def __len__(self) -> int:
@@ -70,12 +75,15 @@ def bounding_radius(bodies: Bodies) -> Floats:
 
 def enclosing_radius(kind: Ints, size: Floats) -> Floats:
     """Radius (n,) of the sphere about the centre that encloses a shape of kind (n,) and size (n, 3) [m]."""
-    return np.where(kind == CAPSULE, size[:, 0] + size[:, 1], quaternion.length(size))
+    radius = np.where(kind == CAPSULE, size[:, 0] + size[:, 1], quaternion.length(size))
+    clumps = kind >= CLUMP
+    return np.where(clumps, size[:, 0], radius) if clumps.any() else radius
 
 
 def least_half_thickness(bodies: Bodies) -> Floats:
     """Radius (n,) of the greatest sphere that fits into a grain [m]."""
-    return np.where(bodies.shape == BOX, bodies.size.min(axis=1), bodies.size[:, 0])
+    half = np.where(bodies.shape == BOX, bodies.size.min(axis=1), bodies.size[:, 0])
+    return np.where(bodies.shape >= CLUMP, bodies.size[:, 2], half)
 
 
 def inverse_root_inertia(bodies: Bodies) -> Floats:

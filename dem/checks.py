@@ -94,6 +94,13 @@ def check_fields(instance: Any, **checks: Callable[[str, Any], Floats]) -> None:
         object.__setattr__(instance, name, tuple(value) if isinstance(value, list) else value)
 
 
+def stress(values: Any) -> Floats:
+    """Stresses (3,) [Pa], positive in compression, NaN where None stands. ValueError for bad ones."""
+    if len(values) != 3:
+        raise ValueError(f"stress must have three entries, for x, y and z, got {values}")
+    return np.array([np.nan if value is None else float(positive("stress", value)) for value in values])
+
+
 def period(values: Any) -> Floats | None:
     """Lengths (3,) [m] of a periodic cell, inf where None stands; None if there is none. ValueError for bad ones."""
     if values is None or all(value is None for value in values):

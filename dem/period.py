@@ -46,6 +46,17 @@ def crossed(position: Floats, shear: Shear) -> Floats:
     return number + (place - shear.length * number >= shear.length)  # a negative number that rounding makes a period
 
 
+def resize(world: World, dt: float) -> None:
+    """Let the periods grow for dt [s] as the servo of the cell says, and the shift and speed of sheared images with
+    them."""
+    if world.servo is not None and world.period is not None:
+        stretch = 1.0 + dt * world.servo.rate
+        world.period = world.period * stretch
+        if world.shear is not None:
+            length = float(world.period[world.shear.axis])
+            world.shear = replace(world.shear, shift=world.shear.shift * float(stretch[0]), length=length)
+
+
 def velocity_in_cell(position: Floats, velocity: Floats, shear: Shear | None) -> Floats:
     """Velocities (n, 6) that grains at these positions (n, 3) have where they are put back into the cell."""
     if shear is None:
@@ -62,7 +73,9 @@ def put_back(world: World) -> None:
         return
     refuse_across(world)
     period, position = world.period, world.grains.position
-    outside = np.maximum(-position, position - period) > 0.25 * period
+    # where the length along the gradient changes, so does the velocity of a grain outside: none may stay there
+    far = 0.25 if world.servo is None or world.shear is None else 0.0
+    outside = np.maximum(-position, position - period) > far * period
     if world.comm.allreduce(bool((outside & np.isfinite(period)).any()), MPI.LOR):
         world.grains.velocity = velocity_in_cell(position, world.grains.velocity, world.shear)
         world.grains.position = wrapped(position, period, world.shear)
@@ -107,9 +120,15 @@ class Images:
     base: int  #: number of grains and ghosts
     across: Floats  #: (images,) number of sheared boundaries between them and their grains
 
-    def moved_on(self, shift: float) -> Images:
-        """The same when those behind a sheared boundary are moved along x by so much more [m]."""
-        return self if shift == 0.0 else replace(self, way=self.way + np.outer(shift * self.across, (1.0, 0.0, 0.0)))
+    steps: Floats  #: (images, 3) the periods in these ways
+
+    def now(self, world: World) -> Images:
+        """The same where the shear and the size of the cell have brought them."""
+        assert world.period is not None
+        way = self.steps * np.where(np.isfinite(world.period), world.period, 0.0)
+        if world.shear is not None:
+            way[:, 0] += self.across * world.shear.shift
+        return replace(self, way=way)
 
     @cached_property
     def rows(self) -> Ints:
@@ -185,7 +204,10 @@ def images(world: World, near: Neighbourhood) -> Images:
         source.append(rows)
         moved.append(np.tile(way, (len(rows), 1)))
         across.append(np.full(len(rows), boundaries))
-    return Images(np.concatenate(source), np.concatenate(moved), count, np.concatenate(across))
+    way, boundaries = np.concatenate(moved), np.concatenate(across)
+    shift = 0.0 if world.shear is None else world.shear.shift
+    steps = np.round((way - np.outer(shift * boundaries, (1.0, 0.0, 0.0))) / world.period)
+    return Images(np.concatenate(source), way, count, boundaries, steps).now(world)
 
 
 def between(pairs: Ints, near: Neighbourhood) -> Ints:

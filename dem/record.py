@@ -13,12 +13,14 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
+from dem.applied import slots
 from dem.arrays import ArrayLike, Bools, Floats
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
 from dem.experiment import Experiment
 from dem.motion import Held
 from dem.period import wrapped
+from dem.servo import cell_stress
 from dem.step import Step
 from dem.together import SceneError, together
 from dem.world import World
@@ -29,6 +31,7 @@ def row(step: Step, scene: Experiment) -> dict[str, float]:
     something else than numbers by name."""
     out = {"step": step.world.step, "time [s]": step.world.time}
     out |= energy_balance(step) | contact_statistics(step) | passages(step.world)
+    out |= cell(step)
     if scene.domain is not None:
         out["grains_outside"] = outside(step, *scene.domain)
     for body in step.world.large_bodies:
@@ -72,6 +75,18 @@ def passages(world: World) -> dict[str, float]:
         for kind, names in (("sources", world.sources), ("outlets", world.outlets)):
             out[f"energy_of_{kind} [J]"] = sum(world.tallies[name].energy for name in names)
     return out
+
+
+def cell(step: Step) -> dict[str, float]:
+    """The periods at the end of the step, and the stress of its contacts and grains; nothing of a scene that is neither
+    sheared nor has a servo, or has a direction without a period."""
+    world, period = step.world, step.world.period
+    if period is None or np.isinf(period).any() or (world.shear is None and world.servo is None):
+        return {}
+    stress = cell_stress(world, step.contacts, step.system, step.impulse)
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    out = {f"period_{axis} [m]": float(period[k]) for k, axis in enumerate("xyz")}
+    return out | {f"stress_{'xyz'[i]}{'xyz'[j]} [Pa]": 0.5 * float(stress[i, j] + stress[j, i]) for i, j in pairs}
 
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
@@ -170,6 +185,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     if system.drift is not None:
         loads += comm.allreduce(-np.vdot(step.impulse, system.drift))
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
+    joints, joints_at_end = _joint_works(step, before[0].velocity, mean)
+    holding += joints
     driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + loads + belts + holding
     work = driving - received
     still = sums(*(_still(table, world.gravity, system.dt) for table in after))
@@ -181,7 +198,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     change, held = whole[2] + whole[3] - whole[0] - whole[1], whole[7] - whole[6]
     rise, fallen, released = whole[2] - whole[0], whole[1] - whole[3], max(-held, 0.0)
     there = whole[0] + whole[8] + whole[9]
-    pulled = 2.0 * max(whole[10], 0.0)  # with the velocity of the end, for bodies that were at rest
+    # with the velocity of the end, for bodies that were at rest
+    pulled = 2.0 * max(whole[10], 0.0) + max(joints_at_end - joints, 0.0)
     created = rise - fallen - work - released - pulled > CREATED * (there + whole[6] + abs(work))
     driven = max(fallen, 0.0) + max(driving, 0.0) + pulled + released * (whole[9] == 0.0)
     jumps = rise > 0.0 and (created or whole[2] - driven > SUDDEN * there + CREATED * driven)
@@ -220,6 +238,22 @@ def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
             held = np.eye(3) - body.motion.free_directions(), np.eye(3) - body.motion.free_turns()
             work += float(mean[row, :3] @ held[0] @ push[:3] + mean[row, 3:] @ held[1] @ push[3:])
     return work
+
+
+def _joint_works(step: Step, before: Floats, mean: Floats) -> tuple[float, float]:
+    """The work [J] of joints and their motors on the bodies that forces move, on the mean velocities of the step and on
+    those of its end: velocities (grains, 6) of this rank's grains before the step, and means (large, 6) of those before
+    and after; collective."""
+    system, world = step.system, step.world
+    if system.joints is None:
+        return 0.0, 0.0
+    push = np.einsum("k,knx->nx", step.joint_impulses, system.joints.rows)
+    here, slot = slots(world, world.grains.id)
+    velocity = world.grains.velocity[here]
+    works = np.array([0.5 * np.vdot(push[slot], before[here] + velocity), np.vdot(push[slot], velocity)])
+    world.comm.Allreduce(MPI.IN_PLACE, works)
+    of_large = push[len(push) - 1 - len(world.large) : -1] * bodies.is_dynamic(world.large)[:, None]
+    return float(works[0] + np.vdot(of_large, mean)), float(works[1] + np.vdot(of_large, world.large.velocity))
 
 
 def _carried(step: Step, prescribed: Bools) -> float:

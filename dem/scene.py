@@ -16,16 +16,18 @@ from typing import Any, Union
 
 import numpy as np
 
-from dem import bodies, checks, quaternion, shapes
+from dem import bodies, checks, clumps, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints
-from dem.bodies import BOX, CAPSULE, COMPOUND, PLANE, SPHERE, Bodies
+from dem.bodies import BOX, CAPSULE, CLUMP, COMPOUND, PLANE, SPHERE, Bodies
+from dem.clumps import Form
+from dem.joints import Joint
 from dem.loads import Law, Load, On
 from dem.measures import Block, Cylinder
 from dem.mesh import Mesh
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
 from dem.pairs import Pairs, checked, tables
 from dem.quaternion import across, length
-from dem.shapes import Box, Shape
+from dem.shapes import Box, Clump, Shape
 from dem.sources import MOST_IDS, Outlet, Source
 from dem.springs import End, Spring
 
@@ -73,6 +75,7 @@ class Scene:
         period: Sequence[float | None] | None = None,
         shear_rate: float | None = None,
         shear_gradient: str = "y",
+        stress: Sequence[float | None] | None = None,
     ) -> None:
         """`gravity`: (3,) [m/s^2]. The others are coefficients of the contacts of all pairs of materials, but of those
         of `set_pair`: `friction`, `stiffness` [N/m] (inf: rigid; None: `dem.stiffness.recommended`), `restitution`, the
@@ -80,9 +83,15 @@ class Scene:
         and `spinning`, over the normal force [m]. See `dem.pairs` and docs/contact_laws.md.
         `period`: (3,) lengths of the cell, from zero on, that repeats itself along x, y, z [m], None: not along that
         axis. `shear_rate`: d v_x / dy of the cell, or d v_x / dz for the `shear_gradient` "z" [1/s]; None: it is at
-        rest. See docs/periodic.md.
+        rest. `stress`: (3,) that the cell is to have along x, y, z, positive in compression [Pa]: its periods then
+        change; None: not along that axis. See docs/periodic.md.
         """
         self.period = checks.period(period)
+        self.stress = None if stress is None else checks.stress(stress)
+        if stress is not None and (self.period is None or np.isinf(self.period).any()):
+            raise ValueError("stress needs periods along x, y and z")
+        if stress is not None and np.any(gravity):
+            raise ValueError("stress needs gravity (0, 0, 0): in a cell without walls grains would fall for ever")
         self.shear_rate = None if shear_rate is None else float(checks.finite("shear_rate", shear_rate))
         if shear_gradient not in ("y", "z"):
             raise ValueError(f"shear_gradient must be 'y' or 'z', got {shear_gradient!r}")
@@ -102,10 +111,12 @@ class Scene:
         self._pairs: dict[tuple[int, int], dict[str, float]] = {}
         self._materials: dict[str, int] = {}
         self.parts: list[Bodies] = []  #: the grains, as they were added
+        self.clumps: list[Form] = []  #: the distinct shapes of clumps; their kinds are CLUMP and the number
         self.loads: dict[str, Load] = {}  #: by name
         self.springs: dict[str, Spring] = {}  #: by name
         self.sources: dict[str, Source] = {}  #: by name
         self.outlets: dict[str, Outlet] = {}  #: by name
+        self.joints: dict[str, Joint] = {}  #: by name
 
     def add_spheres(
         self,
@@ -162,6 +173,36 @@ class Scene:
         """
         lengths = {"radius": radius, "half length": half_length}
         return self._add_grains(CAPSULE, positions, lengths, density, material, quaternions, velocity, angular_velocity)
+
+    def add_clumps(
+        self,
+        positions: ArrayLike,
+        shape: Clump,
+        density: ArrayLike,
+        *,
+        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        material: str = "default",
+        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Ints:
+        """Add solid clumps of spheres of one shape and return their ids (n,).
+
+        positions (n, 3) [m] and quaternions (4,) or (n, 4) are those of the frame in which `shape` has its centres.
+        The grains have theirs at the centre of mass along the principal axes, see `dem.clumps`. density [kg/m^3] one
+        for all or (n,); velocities (3,) or (n, 3), the linear one is that of the centre of mass.
+        """
+        form = clumps.form(shape)
+        if form not in self.clumps:
+            self.clumps.append(form)
+        origins = np.atleast_2d(checks.finite("positions", positions))
+        turns = checks.unit_quaternions("quaternions", quaternions, len(origins))
+        centers = checks.rows("positions", origins, len(origins), 3) + quaternion.rotate(turns, form.place)
+        rho = checks.rows("density", checks.positive("density", density), len(origins))
+        mass, inertia = rho * form.volume, rho[:, None] * form.moments
+        turns = quaternion.multiply(turns, np.tile(form.turn, (len(origins), 1)))
+        size = np.tile(form.size, (len(origins), 1))
+        kind = CLUMP + self.clumps.index(form)
+        return self._append(kind, centers, size, mass, inertia, material, turns, velocity, angular_velocity)
 
     def add_body(
         self,
@@ -254,13 +295,52 @@ class Scene:
         if not name or name in self.springs:
             raise ValueError(f"springs need distinct names, got {name!r}")
         spring = Spring((one, other), (anchor, other_anchor), stiffness, damping, 0.0 if length is None else length)
-        poses = [self._pose(name, end) for end in spring.ends]
+        poses = [self._pose(f"spring {name!r}", end) for end in spring.ends]
         places = [place + quaternion.rotate(turn, np.array(at)) for (place, turn), at in zip(poses, spring.anchors)]
         rest = float(np.linalg.norm(places[1] - places[0])) if length is None else length
         self.springs[name] = replace(spring, length=rest)
 
-    def _pose(self, name: str, end: End) -> tuple[Floats, Floats]:
-        """Position (3,) and quaternion (4,) of the end of a spring at time zero; ValueError if there is none."""
+    def add_joint(
+        self,
+        name: str,
+        one: End,
+        other: End = None,
+        *,
+        kind: str = "hinge",
+        anchor: Sequence[float],
+        axis: Sequence[float] = (0.0, 0.0, 1.0),
+        speed: float | None = None,
+        target: float | None = None,
+        strength: float = np.inf,
+        limits: Sequence[float] = (-np.inf, np.inf),
+    ) -> None:
+        """Join two bodies, or a body and the world (None), by a "hinge", "slider", "ball" or "fixed" joint, see
+        `dem.joints`.
+
+        A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,) are in the
+        world at time zero, where angle and position are zero; they are those of `other` relative to `one`. A motor
+        keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a torque or force of at most `strength`
+        [N m, N]; inf: as much as it takes. `limits` (2,): least and greatest angle [rad] or position [m].
+        """
+        if not name or name in self.joints:
+            raise ValueError(f"joints need distinct names, got {name!r}")
+        place = checks.vector(f"anchor of {name!r}", anchor)
+        z = checks.unit_vector(f"axis of {name!r}", axis)
+        x = across(np.array(z)[None])[0]
+        upright = quaternion.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
+        anchors, frames = [], []
+        for position, turn in (self._pose(f"joint {name!r}", end) for end in (one, other)):
+            back = quaternion.conjugate(turn)
+            anchors.append(tuple(quaternion.rotate(back, place - position).tolist()))
+            frames.append(tuple(quaternion.multiply(back, upright).tolist()))
+        for body in self.large_bodies:
+            if body.name in (one, other) and isinstance(body.motion, Driven):
+                raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
+        low, high = map(float, limits)
+        self.joints[name] = Joint(kind, (one, other), anchors, frames, speed, target, float(strength), low, high)
+
+    def _pose(self, what: str, end: End) -> tuple[Floats, Floats]:
+        """Position (3,) and quaternion (4,) of an end of a spring or joint at time 0; ValueError if there is none."""
         if end is None:
             return np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
         if isinstance(end, str):
@@ -270,7 +350,7 @@ class Scene:
             tables = self.parts
             rows = np.array([end]) if 0 <= end < sum(map(len, tables)) else np.zeros(0, np.int64)
         if not len(rows):
-            raise ValueError(f"spring {name!r}: there is no body or grain {end!r} yet")
+            raise ValueError(f"{what}: there is no body or grain {end!r} yet")
         table = bodies.concatenate(tables).take(rows)
         return table.position[0], table.quaternion[0]
 
@@ -380,12 +460,20 @@ class Scene:
     ) -> Ints:  # fmt: skip
         """Add grains of one kind, of which `lengths` has the columns of `size` by name; their ids."""
         centers = np.atleast_2d(checks.finite("positions", positions))
-        count, first = len(centers), sum(len(part) for part in self.parts)
+        count = len(centers)
         size = np.zeros((count, 3))
         for k, (name, values) in enumerate(lengths.items()):
             column, row = (slice(None), (3,)) if kind == BOX else (k, ())
             size[:, column] = checks.rows(name, checks.positive(name, values), count, *row)
         mass, inertia = shapes.solid(kind, size, checks.rows("density", checks.positive("density", density), count))
+        return self._append(kind, centers, size, mass, inertia, material, quaternions, velocity, angular_velocity)
+
+    def _append(
+        self, kind: int, centers: Floats, size: Floats, mass: Floats, inertia: Floats, material: str,
+        quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
+    ) -> Ints:  # fmt: skip
+        """Add grains of one kind with these columns of the table; their ids."""
+        count, first = len(centers), sum(len(part) for part in self.parts)
         table = Bodies(
             id=np.arange(first, first + count),
             position=checks.rows("positions", centers, count, 3),
@@ -430,11 +518,8 @@ def _reframed(body: LargeBody, center: Floats, inner: Floats) -> LargeBody:
 def _centered(body: LargeBody, density: float) -> LargeBody:
     """The same body with its frame at the centre of mass along the principal axes, with mass and moments."""
     mass, center, tensor = shapes.mass_properties(body.shapes, density)
-    moments, axes = np.diag(tensor).copy(), np.eye(3)
-    if np.abs(tensor - np.diag(moments)).max() > 1e-12 * moments.max():
-        moments, axes = np.linalg.eigh(tensor)
-        axes[:, 2] *= np.linalg.det(axes)  # right-handed
-    return replace(_reframed(body, center, quaternion.from_matrix(axes)), mass=mass, inertia=moments)
+    moments, turn = shapes.principal(tensor)
+    return replace(_reframed(body, center, turn), mass=mass, inertia=moments)
 
 
 def _refuse_beside_hinge(body: LargeBody, axis: Floats, arm: Floats) -> None:
@@ -490,13 +575,15 @@ def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
                 f"period of {period[k]:g} m along {'xyz'[k]} is too short: a grain could meet another one on both its "
                 f"sides, or its own image; allowed is more than two greatest diameters, {4.0 * radius:g} m"
             )
-    if scene.shear_rate is not None and scene.large_bodies:
-        raise ValueError(f"large body {scene.large_bodies[0].name!r}: a sheared cell has grains alone")
-    if scene.shear_rate is not None and (scene.sources or scene.outlets):
-        name = next(iter({**scene.sources, **scene.outlets}))
-        raise ValueError(f"{name!r}: a sheared cell has no sources and outlets")
-    if scene.springs:
-        raise ValueError(f"spring {next(iter(scene.springs))!r}: springs have no images, so periods allow none")
+    if scene.shear_rate is not None or scene.stress is not None:
+        cell = "sheared cell" if scene.stress is None else "cell of given stress"
+        if scene.large_bodies:
+            raise ValueError(f"large body {scene.large_bodies[0].name!r}: a {cell} has grains alone")
+        if scene.sources or scene.outlets:
+            name = next(iter({**scene.sources, **scene.outlets}))
+            raise ValueError(f"{name!r}: a {cell} has no sources and outlets")
+    for name in (*scene.springs, *scene.joints):
+        raise ValueError(f"{name!r}: springs and joints have no images, so periods allow none")
     for body in scene.large_bodies:
         for shape in body.shapes:
             kind, center, turn, size = shapes.placed(shape)

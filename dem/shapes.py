@@ -11,7 +11,7 @@ import numpy as np
 from dem import quaternion
 from dem.arrays import Floats
 from dem.bodies import BOX, CAPSULE, MESH, PLANE, SPHERE
-from dem.checks import check_fields, positive, unit_quaternion, unit_vector, vector
+from dem.checks import check_fields, finite, positive, rows, unit_quaternion, unit_vector, vector
 from dem.mesh import Mesh
 
 
@@ -65,6 +65,24 @@ class Capsule:
 
 
 Shape = Union[Plane, Box, Sphere, Capsule, Mesh]
+
+
+@dataclass(frozen=True)
+class Clump:
+    """Spheres that are rigidly joined, overlapping or not: a shape of grains, see `dem.scene.Scene.add_clumps`."""
+
+    centres: Sequence[Sequence[float]]  #: (k, 3) in the frame of the clump [m]
+    radii: Sequence[float]  #: (k,) [m]
+
+    def __post_init__(self) -> None:
+        radii = np.atleast_1d(positive("Clump.radii", self.radii))
+        if radii.ndim != 1 or not len(radii):
+            raise ValueError(f"Clump.radii must have shape (k,), got {radii.shape}")
+        centres = rows("Clump.centres", np.atleast_2d(finite("Clump.centres", self.centres)), len(radii), 3)
+        if len(np.atleast_2d(self.centres)) != len(radii):
+            raise ValueError(f"Clump: {len(np.atleast_2d(self.centres))} centres with {len(radii)} radii")
+        object.__setattr__(self, "centres", tuple(map(tuple, centres.tolist())))
+        object.__setattr__(self, "radii", tuple(radii.tolist()))
 
 
 def described(shape: Shape) -> dict[str, Any]:
@@ -135,6 +153,16 @@ def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Flo
     # Parallel axes: m (|r|^2 E - r r') for every part.
     steiner = np.sum(masses * (arms**2).sum(axis=1)) * np.eye(3) - (arms.T * masses) @ arms
     return float(total), center, tensors.sum(axis=0) + steiner
+
+
+def principal(tensor: Floats) -> tuple[Floats, Floats]:
+    """Principal moments (3,) and axes, as a quaternion (4,), of an inertia tensor (3, 3); where it is diagonal the axes
+    stay."""
+    moments, axes = np.diag(tensor).copy(), np.eye(3)
+    if np.abs(tensor - np.diag(moments)).max() > 1e-12 * moments.max():
+        moments, axes = np.linalg.eigh(tensor)
+        axes[:, 2] *= np.linalg.det(axes)  # right-handed
+    return moments, quaternion.from_matrix(axes)
 
 
 def moved(shape: Shape, center: Floats, turn: Floats) -> Shape:

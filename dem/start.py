@@ -12,6 +12,7 @@ from mpi4py import MPI
 from dem import bodies, stiffness
 from dem.arrays import Ints
 from dem.bodies import Bodies
+from dem.clumps import Form
 from dem.contact import find_contacts
 from dem.exchange import exchange, refuse
 from dem.partition import redistribute
@@ -19,7 +20,7 @@ from dem.period import put_back, velocity_in_cell, wrapped
 from dem.scene import Scene
 from dem.sources import Tally, from_array
 from dem.step import follow_motions
-from dem.world import Shear, World, refuse_load
+from dem.world import Servo, Shear, World, refuse_load
 
 
 def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
@@ -69,10 +70,7 @@ def restored_world(
     world.time, world.step = float(replicated["time"]), int(replicated["step"])
     expected = np.array(replicated["expected"]) if "expected" in replicated else None
     world.expected = expected if expected is not None and expected.shape == (len(world.springs), 2, 6) else None
-    if world.shear is not None:
-        rate, shift = np.array(replicated.get("shear", (0.0, np.nan)), float)
-        refuse(comm, "" if np.isfinite([rate, shift]).all() else "the state has no shear of the cell, as the scene has")
-        world.shear = replace(world.shear, rate=float(rate), shift=float(shift))
+    _restore_cell(world, replicated)
     _refuse_impossible(world)
     if len(replicated["slabs"]) != comm.size + 1:
         redistribute(world)
@@ -85,7 +83,9 @@ def _refuse_impossible(world: World) -> None:
     for table, what in ((world.grains, "grain"), (world.large, "large body")):
         grains = what == "grain"
         heavy = np.concatenate([table.mass, table.inertia.ravel()])
-        kinds = np.isin(table.shape, (bodies.SPHERE, bodies.BOX, bodies.CAPSULE) if grains else (bodies.COMPOUND,))
+        clumps = range(bodies.CLUMP, bodies.CLUMP + len(world.clumps))
+        of_grains = (bodies.SPHERE, bodies.BOX, bodies.CAPSULE, *clumps)
+        kinds = np.isin(table.shape, of_grains if grains else (bodies.COMPOUND,))
         right = {
             "position": np.isfinite(table.position),
             "velocity": np.isfinite(table.velocity),
@@ -94,6 +94,7 @@ def _refuse_impossible(world: World) -> None:
             "material": (table.material >= 0) & (table.material < len(world.materials)),
             "shape": kinds,
             "size": np.isfinite(table.size) & (table.size >= 0.0) & (table.size[:, :1] > 0.0 if grains else True),
+            "clump": np.array([_is_of(table, n, form) for n, form in enumerate(world.clumps)]),
         }
         wrong += [f"{name} of a {what}" for name, good in right.items() if not good.all()]
     starts = np.arange(world.comm.size + 1) * world.ids // world.comm.size
@@ -104,6 +105,12 @@ def _refuse_impossible(world: World) -> None:
     if missing or (np.diff(ids) <= 0).any() or ((ids < most[0]) | (ids >= most[1])).any():
         wrong.append("id of a grain")
     refuse(world.comm, f"a state that no run can have: {', '.join(wrong)}" if wrong else "")
+
+
+def _is_of(table: Bodies, number: int, form: Form) -> bool:
+    """Whether the clumps of this number in a table have the sizes of the form."""
+    size = table.size[table.shape == bodies.CLUMP + number]
+    return bool(np.allclose(size, form.size, rtol=1e-9, atol=0.0))
 
 
 def restart_rows(slabs: Ints, comm: MPI.Comm) -> slice:
@@ -125,10 +132,26 @@ def _shear(scene: Scene) -> Shear | None:
     return Shear(scene.shear_rate, scene.gradient, float(scene.period[scene.gradient]))
 
 
+def _restore_cell(world: World, replicated: Mapping[str, np.ndarray]) -> None:
+    """Take the shear, the servo and the periods of the cell from a state; ValueError on all ranks if it has none."""
+    comm = world.comm
+    if world.servo is not None:
+        servo = np.array(replicated.get("servo", np.full((3, 3), np.nan)), float)
+        right = servo.shape == (3, 3) and np.isfinite(servo[1:]).all() and (servo[2] > 0.0).all()
+        refuse(comm, "" if right else "the state has no stress of the cell, as the scene has")
+        world.servo, world.period = Servo(servo[0], servo[1]), servo[2]
+    if world.shear is not None and world.period is not None:
+        rate, shift = np.array(replicated.get("shear", (0.0, np.nan)), float)
+        refuse(comm, "" if np.isfinite([rate, shift]).all() else "the state has no shear of the cell, as the scene has")
+        length = float(world.period[world.shear.axis])
+        world.shear = replace(world.shear, rate=float(rate), shift=float(shift), length=length)
+
+
 def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
     world.loads, world.springs, world.period = dict(scene.loads), dict(scene.springs), scene.period
+    world.clumps = tuple(scene.clumps)
     world.sources, world.outlets = dict(scene.sources), dict(scene.outlets)
     world.tallies = {name: Tally() for name in (*world.sources, *world.outlets)}
     world.initial, world.first_large = sum(map(len, scene.parts)), scene.first_large
@@ -136,6 +159,10 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     if tied and world.outlets:
         raise ValueError(f"spring {tied[0]!r} holds a grain: scenes with outlets allow springs of large bodies alone")
     world.shear = _shear(scene)
+    world.joints = dict(scene.joints)
+    if world.joints and pairs.resists:
+        raise ValueError("joints cannot be in a scene whose contacts resist rolling or spinning")
+    world.servo = None if scene.stress is None else Servo(scene.stress.copy(), np.zeros(3))
     for name, load in world.loads.items():
         refuse_load(world, name, load)
     return world

@@ -18,13 +18,13 @@ from dem.applied import applied_impulses
 from dem.arrays import ArrayLike, Bools, Floats, Ints, places
 from dem.bodies import SPHERE, Bodies
 from dem.cohesion import along_normal
-from dem.contact import Contacts, contact_order, find_contacts, goes_beyond, image_way, ways
+from dem.contact import Contacts, cell_way, contact_order, find_contacts, goes_beyond, ways
 from dem.contact_map.loops import relative_velocities
 from dem.measures import Sample
-from dem.period import velocity_in_cell, wrapped
+from dem.period import resize, velocity_in_cell, wrapped
 from dem.system import ContactSystem, contact_arms, contact_frames, gap_velocities
 from dem.together import meet
-from dem.world import World
+from dem.world import Servo, World
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,11 @@ class Step:
             raise KeyError(f"no spring {name!r}; there are: {', '.join(names) or 'none'}")
         force: Floats = self.system.applied.springs[names.index(name)] / self.system.dt
         return force
+
+    @cached_property
+    def joint_impulses(self) -> Floats:
+        """`ContactSystem.joint_impulses` of this step; collective at its first use."""
+        return self.system.joint_impulses(self.impulse)
 
     def position(self, name: str) -> Floats:
         """Position (3,) of a large body [m]."""
@@ -118,17 +123,22 @@ class Step:
 def advance(world: World, velocity: Floats, dt: float, moving: Floats | None = None) -> None:
     """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by dt [s]; collective.
 
-    x <- x + dt v, q <- exp(dt w) q, with the velocities `moving` (owned, 6) in place of these if they are given.
+    x <- x + dt (v + E x), q <- exp(dt w) q, with the rate E of a cell that changes its size, and with the velocities
+    `moving` (owned, 6) in place of these if they are given.
     Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
     """
     moving = velocity if moving is None else moving
     large_velocity, large_moving = world.large_velocity(velocity), world.large_velocity(moving)
+    start = world.grains.position
     _move(world.grains, velocity[: len(world.grains)], moving[: len(world.grains)], dt)
     _move(world.large, large_velocity, large_moving, dt)
+    if world.servo is not None:
+        world.grains.position = world.grains.position + dt * world.servo.rate * start
     if world.springs:
         world.expected = applied_impulses(world, dt).expected
     if world.shear is not None:
         world.shear = world.shear.after(dt)
+    resize(world, dt)
     world.time += dt
     world.step += 1
     follow_motions(world)
@@ -166,8 +176,7 @@ def find_overrun(
     """
     seen = contacts.near.margin[: contacts.near.grains]
     way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
-    if world.shear is not None:
-        way = way + image_way(world, dt)
+    way = way + cell_way(world, dt)
     large = world.large_velocity(velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
     gone = bool((way > seen).any()), goes_beyond(world, dt * large, contacts.shifts, delta)
@@ -213,7 +222,7 @@ def find_turned(
         return None
     end = find_contacts(advanced(world, velocity, dt), 0.0)
     end = end.take(end.gap < -depth)
-    start, approach = _at_start(end, dt)
+    start, approach = _at_start(end, dt, world.servo)
     overlap = -(dt * gap_velocities(world, start, dt, recovery_speed)[2] + approach)
     a, b, known = _rows_in(contacts, end)
     missed = known & (overlap > depth)
@@ -234,13 +243,17 @@ def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
     return world.comm.allreduce(fast, MPI.LOR) and world.comm.allreduce(finite, MPI.LAND)
 
 
-def _at_start(end: Contacts, dt: float) -> tuple[Contacts, Floats]:
+def _at_start(end: Contacts, dt: float, servo: Servo | None) -> tuple[Contacts, Floats]:
     """The contacts of the end of a step as contacts of its start, and by how much (nc,) their gaps grow in it [m]."""
     velocity = end.near.bodies.velocity
     start = replace(end, point=end.point - 0.5 * dt * (velocity[end.a, :3] + velocity[end.b, :3]))
+    position = end.near.bodies.position - dt * velocity[:, :3]
     if end.drift is not None and end.moved is not None:
         start = replace(start, point=start.point - 0.5 * dt * end.drift, moved=end.moved - dt * end.drift)
-    growth = dt * _opening(start, end.near.bodies.position - dt * velocity[:, :3], velocity)
+    growth = dt * _opening(start, position, velocity)
+    if servo is not None and start.moved is not None:
+        way = dt * servo.rate * position  # of the centres, which the cell takes with it
+        start = replace(start, point=start.point - way[end.a], moved=start.moved + way[end.b] - way[end.a])
     return replace(start, gap=end.gap - growth), growth
 
 

@@ -48,7 +48,8 @@ def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
 
     The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width, and
     four times as much where a chain of force goes (Radjai, Jean, Moreau, Roux, Phys. Rev. Lett. 77 (1996): a share of
-    exp(-1.4 f) bears more than f times the mean). A grain of mass m that a tool of speed v meets is stopped by
+    exp(-1.4 f) bears more than f times the mean). The stress that a periodic cell is to have takes the place of the
+    weight over the area. A grain of mass m that a tool of speed v meets is stopped by
     k d = v sqrt(k m). Sources may fill the scene up to their height (`_bed`). Cohesion c presses grains together by
     c / k. Grains that fall from high are not reckoned with.
     """
@@ -107,13 +108,14 @@ def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float]:
 
 
 def _load(scene: Scene) -> Floats:
-    """The weight (grains,) that the whole bed would lay on each grain, and the strongest cohesion [N]."""
+    """The weight (grains,) that the whole bed, or the stress of the cell, would lay on each grain, and the strongest
+    cohesion [N]."""
     every, gravity = scene.expected(), math.hypot(*scene.gravity)
     pull = scene.pairs(np.inf).cohesion.max()
-    if gravity == 0.0:
-        return np.full(len(every), pull)
-    down = np.asarray(scene.gravity) / gravity
-    pressure = max(_pressure(scene, gravity, down), _bed(scene, gravity, down))
+    pressure = 0.0 if scene.stress is None else float(np.nan_to_num(scene.stress).max())
+    if gravity > 0.0:
+        down = np.asarray(scene.gravity) / gravity
+        pressure = max(_pressure(scene, gravity, down), _bed(scene, gravity, down))
     radius = bodies.bounding_radius(every)
     return np.maximum(CHAINS * pressure * (2.0 * radius) ** 2, gravity * every.mass) + pull
 

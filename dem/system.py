@@ -22,7 +22,16 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies, stiffness
-from dem.applied import Drives, applied_impulses, drives_of, free_directions, free_velocities
+from dem.applied import (
+    Drives,
+    applied_impulses,
+    drives_of,
+    free_directions,
+    free_velocities,
+    joint_coupling,
+    joints_refound,
+    slots,
+)
 from dem.arrays import Bools, Floats
 from dem.bodies import COMPOUND, Bodies
 from dem.checks import positive
@@ -30,8 +39,10 @@ from dem.cohesion import along_normal, attraction
 from dem.compiled import loop
 from dem.contact import Contacts
 from dem.contact_map import CompactRows, ContactMap, Halo
+from dem.contact_map.jointed import JointedMap
 from dem.contact_map.loops import scale
 from dem.contact_map.map import packed
+from dem.joints import Coupling
 from dem.rolling import resistance
 from dem.surface import surface_velocities
 from dem.world import World
@@ -46,7 +57,7 @@ class ContactSystem:
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
         stiffness (nc,): of the contacts; inf: rigid [N/m]
         compliance (nc,): C, what a normal impulse leaves of the overlap, over dt; 0: rigid [1/kg]
-        drift (nc, 3): velocities of images relative to their bodies, in the frames; None without shear [m/s]
+        drift (nc, 3): what the cell adds to relative velocities, in the frames; None: nothing [m/s]
         surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.surface`; None if there is none
         b (nc, 3): (gap / dt, surface) [m/s], see `gap_velocities`
         r (nc, 3): b + D' v_free [m/s]
@@ -56,14 +67,16 @@ class ContactSystem:
         resistance: the rows of `dem.rolling`, or None
         attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.cohesion`
         drives: of the large bodies, the same on all ranks
+        joints: the rows of joints, a `dem.joints.Coupling`; None if there are none
         applied: what loads and springs give, a `dem.applied.Applied`; None if there are none
     """
 
     def __init__(
-        self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf, impacts: bool = True
-    ) -> None:
+        self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf, impacts: bool = True,
+        joints: Coupling | None = None,
+    ) -> None:  # fmt: skip
         """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `impacts`:
-        whether contacts that begin bounce."""
+        whether contacts that begin bounce; `joints`: those of this step, if they are known."""
         positive("time step", dt)
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
@@ -89,6 +102,13 @@ class ContactSystem:
         self.applied = applied_impulses(world, dt) if world.loaded else None
         if world.loaded:
             halo.update(free)
+        self.joints = joint_coupling(world, dt) if joints is None else joints
+        if self.joints is not None:
+            here, slot = slots(world, near.bodies.id)
+            free[here] += self.joints.change[slot]
+            own = here < owned
+            coupling = self.joints.matrix
+            self.contact_map = JointedMap(self.contact_map, here[own], slot[own], coupling)
         self.free_velocity = free[:owned]
         self._free_large = free[near.grains + near.ghosts :]
         self.b = np.zeros((len(contacts), 3))
@@ -136,8 +156,10 @@ class ContactSystem:
 
     def velocity_with(self, momentum: Floats) -> Floats:
         """Velocities (owned, 6) after the step for the mass-scaled momenta G' g (owned, 6), in any shape."""
-        change = np.empty_like(self.free_velocity)
-        scale(self.contact_map.given.root, momentum.reshape(change.shape), change)
+        change, momentum = np.empty_like(self.free_velocity), momentum.reshape(self.free_velocity.shape)
+        if isinstance(self.contact_map, JointedMap):
+            momentum = self.contact_map.coupled(momentum)
+        scale(self.contact_map.given.root, momentum, change)
         return self.free_velocity + change
 
     def impulse_on_large(self, impulse: Floats, moment: Floats | None = None) -> Floats:
@@ -151,6 +173,20 @@ class ContactSystem:
         large = sums[first:].copy()
         self.contact_map.comm.Allreduce(MPI.IN_PLACE, large)
         return large
+
+    def joint_impulses(self, impulse: Floats) -> Floats:
+        """Impulses (k,) of the rows of joints with these impulses of contacts (nc, 3) [N s, N m s]; collective."""
+        if self.joints is None or not isinstance(self.contact_map, JointedMap):
+            return np.zeros(0)
+        return self.joints.impulses(self.contact_map.gathered(self.contact_map.free_momenta(impulse)))
+
+    def joints_with(self, world: World, impulse: Floats) -> Coupling | None:
+        """The joints of the step if these impulses of contacts (nc, 3) show that other limits and motors hold, else
+        None; collective."""
+        if self.joints is None or not isinstance(self.contact_map, JointedMap) or not self.joints.decides:
+            return None
+        push = self.contact_map.gathered(self.contact_map.free_momenta(impulse))
+        return joints_refound(world, self.joints, push)
 
     def drive_impulse(self, large: Floats) -> Floats:
         """Impulses and angular impulses (large, 6) of the drives and loads of large bodies that have the velocities

@@ -48,9 +48,12 @@ def smallest(scene: Scene) -> float:
 
 
 def fastest(scene: Scene) -> float:
-    """The greatest speed of a tool, or of a grain at time zero [m/s]."""
+    """The greatest speed of a tool, or of a grain at time zero [m/s]; in a sheared cell beside the flow."""
     tools = [_top_speed(body) for body in scene.large_bodies if body.name not in scene.leaving]
-    x, y, z, *_ = scene.expected().velocity.T
+    grains = scene.expected()
+    x, y, z, *_ = grains.velocity.T
+    if scene.shear_rate is not None:
+        x = x - scene.shear_rate * grains.position[:, scene.gradient]
     return max([*tools, float(np.hypot(np.hypot(x, y), z).max(initial=0.0))])  # squares could overflow
 
 

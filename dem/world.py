@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, checks, loads, quaternion, springs
+from dem import bodies, checks, joints, loads, quaternion, springs
 from dem import motion as motions
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
+from dem.clumps import Form
+from dem.joints import Joint
 from dem.loads import Load, On
 from dem.motion import Dynamic, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
 from dem.pairs import Pairs
@@ -45,6 +47,14 @@ class Shear:
         return dataclasses.replace(self, shift=self.shift + dt * self.speed)
 
 
+@dataclass(frozen=True)
+class Servo:
+    """The stresses that a periodic cell is to have: its periods change, and all centres with them; see `dem.servo`."""
+
+    asked: Floats  #: (3,) along x, y, z, positive in compression; NaN: the period stays as it is [Pa]
+    rate: Floats  #: (3,) at which the periods grow in the next step, over themselves [1/s]
+
+
 @dataclass
 class World:
     """Bodies, materials and time.
@@ -63,13 +73,16 @@ class World:
     large: Bodies  #: one row per large body
     loads: dict[str, Load] = field(default_factory=dict)  #: by name; change them by `set_load` only
     springs: dict[str, Spring] = field(default_factory=dict)  #: by name; change them by `set_spring` only
+    joints: dict[str, Joint] = field(default_factory=dict)  #: by name; change them by `set_joint` only
     period: Floats | None = None  #: (3,) lengths of the cell that repeats itself, inf: none; None: along no axis [m]
     sources: dict[str, Source] = field(default_factory=dict)  #: by name
     outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
     tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets, by name
+    clumps: tuple[Form, ...] = ()  #: shapes of grains, by their numbers
     initial: int = 0  #: number of grains at time zero
     first_large: int = 0  #: id of the first large body
     shear: Shear | None = None  #: of the cell
+    servo: Servo | None = None  #: of the size of the cell
     time: float = 0.0  #: [s]
     step: int = 0  #: number of steps done
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
@@ -80,6 +93,8 @@ class World:
     loads_set: set[str] = field(init=False, default_factory=set)  #: loads with other numbers than the scene gave
 
     springs_set: set[str] = field(init=False, default_factory=set)  #: springs with other numbers than the scene gave
+
+    joints_set: set[str] = field(init=False, default_factory=set)  #: joints with other numbers than the scene gave
 
     lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
 
@@ -107,6 +122,8 @@ class World:
             replicated["tallies"] = as_array(self.tallies)
         if self.shear is not None:
             replicated["shear"] = np.array([self.shear.rate, self.shear.shift])
+        if self.servo is not None:
+            replicated["servo"] = np.array([self.servo.asked, self.servo.rate, self.period])
         return self.grains.columns(), replicated
 
     def set_grains(self, grains: Bodies) -> None:
@@ -235,6 +252,15 @@ def set_shear_rate(world: World, rate: float) -> None:
     world.shear = dataclasses.replace(world.shear, rate=float(checks.finite("shear rate", rate)))
 
 
+def set_stress(world: World, stress: Any) -> None:
+    """Ask for other stresses (3,) of the cell along x, y, z [Pa] from now on; None: the period stays as it is.
+    ValueError if the scene has no `stress`."""
+    if world.servo is None:
+        raise ValueError("stress: the periods of this scene are constant; give the Scene a stress along an axis")
+    asked = checks.stress(stress)
+    world.servo = Servo(asked, np.where(np.isnan(asked), 0.0, world.servo.rate))
+
+
 def set_load(world: World, name: str, on: On = None, **values: Any) -> None:
     """Give a load other numbers: `force`, `torque`, `start` or `end`; a name that no load has begins one `on` some
     bodies, all grains if nothing is given. ValueError for what it cannot be."""
@@ -267,6 +293,21 @@ def set_spring(world: World, name: str, **values: Any) -> None:
     world.springs[name] = dataclasses.replace(world.springs[name], **values)
     world.springs_set.add(name)
     world.applied = {}
+
+
+def set_joint(world: World, name: str, **values: Any) -> None:
+    """Give a joint another `speed`, `target`, `strength`, `low` or `high`. ValueError for what it cannot have."""
+    if name not in world.joints:
+        raise ValueError(f"no joint {name!r}; there are: {', '.join(world.joints) or 'none'}")
+    world.joints[name] = world.joints[name].changed(**values)
+    world.joints_set.add(name)
+
+
+def restore_joints(world: World, text: str) -> None:
+    """Give a world, made from its scene, the joints of `dem.joints.as_text`."""
+    for name, joint in joints.from_text(text).items():
+        world.joints[name] = joint
+        world.joints_set.add(name)
 
 
 def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> Pose:

@@ -21,6 +21,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from dem.bodies import CLUMP
 from pctt.disk import FileError, hdf5, whole, write_text
 from pctt.folder import RUN_FILES, Folder, Frame
 from pctt.look.program import chosen, made_folder, parser, run, told_steps
@@ -105,16 +106,21 @@ def bodies(scene: Any, frame: Frame) -> Any:
     """The grains as points, with the data for glyphs.
 
     Scale a unit sphere or box by the vector `extent` and turn it by `quaternion`: the result is the grain. `radius` is
-    the radius of the sphere that encloses the grain.
+    the radius of the sphere that encloses the grain. A clump has a point for each of its spheres instead, with the
+    `extent` of the sphere; its other columns are those of the clump.
     """
     from pctt.look import surfaces
 
     table, grains = frame.table, slice(frame.table.grains)
-    data = surfaces.polydata(frame.position[grains], "verts", 1)
+    clump, place, radius = surfaces.members(frame)
+    whole = np.flatnonzero(table.shape[grains] < CLUMP)
+    rows = np.concatenate([whole, clump])
+    data = surfaces.polydata(np.concatenate([frame.position[whole], place]), "verts", 1)
+    extent = surfaces.extent(scene.folder.path, table)[rows]
+    extent[len(whole) :] = 2.0 * radius[:, None]
     columns = {
         "id": table.id[grains],
         "radius": table.radius,
-        "extent": surfaces.extent(scene.folder.path, table),
         "quaternion": frame.quaternion[grains],
         "velocity": frame.velocity[grains, :3],
         "angular_velocity": frame.velocity[grains, 3:],
@@ -124,7 +130,8 @@ def bodies(scene: Any, frame: Frame) -> Any:
         "material": table.material[grains],
         "shape": table.shape[grains],
     }
-    surfaces.add_arrays(data.GetPointData(), columns)
+    each = {name: column[rows] for name, column in columns.items()}
+    surfaces.add_arrays(data.GetPointData(), {"extent": extent, **each})
     return data
 
 

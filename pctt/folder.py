@@ -173,6 +173,7 @@ class Table:
     mass: np.ndarray  #: (n,) [kg]
     material: np.ndarray  #: (n,)
     grains: int  #: the first rows
+    clumps: Sequence[dict[str, Any]] = ()  #: centres (k, 3) and radii (k,) of the spheres of each clump [m]
 
     @property
     def radius(self) -> np.ndarray:
@@ -222,20 +223,23 @@ class Folder:
             raise FileError(f"{self.path}: no recorded steps; run with -output_every 1 or more")
 
         def take(file: h5py.File, sealed: bool) -> list[Any]:
-            return [file[name][()] for name in ("shape", "size", "mass", "material", "materials", "large")]
+            clumps = file["clumps"][()] if "clumps" in file else "[]"
+            return [*(file[name][()] for name in ("shape", "size", "mass", "material", "materials", "large")), clumps]
 
         found = disk.read(self.bodies_path, MPI.COMM_SELF, take)
         self.shape, self.size, self.mass, self.material = found[:4]
         #: names of the materials by their numbers; name and shapes of each large body, the rows after the grains
         self.materials: list[str] = [name.decode() for name in found[4]]
         self.large: list[dict[str, Any]] = json.loads(found[5])
+        self.clumps: list[dict[str, Any]] = json.loads(found[6])
         self.grains = len(self.shape) - len(self.large)
 
     @property
     def table(self) -> Table:
         """What the bodies are; in scenes with sources or outlets those of the first frame, and each frame has its
         own."""
-        return Table(np.arange(len(self.shape)), self.shape, self.size, self.mass, self.material, self.grains)
+        columns = np.arange(len(self.shape)), self.shape, self.size, self.mass, self.material
+        return Table(*columns, self.grains, self.clumps)
 
     @property
     def radius(self) -> np.ndarray:
@@ -254,7 +258,7 @@ class Folder:
             places = {name: file[name][()] for name in ("position", "quaternion", "velocity")}
             if "id" in file:  # of a scene with sources or outlets
                 own = {name: file[name][()] for name in ("id", "shape", "size", "mass", "material")}
-                table = Table(**own, grains=len(own["id"]) - len(self.large))
+                table = Table(**own, grains=len(own["id"]) - len(self.large), clumps=self.clumps)
                 rows[0] = np.searchsorted(table.id, rows[0])
             else:
                 table = self.table
@@ -366,7 +370,7 @@ class Snapshot(Folder):
         self.path, self.steps, self._present = Path(), [frame.step], frame
         self.shape, self.size, self.mass = frame.table.shape, frame.table.size, frame.table.mass
         self.material, self.materials, self.large = frame.table.material, [*materials], large
-        self.grains = frame.table.grains
+        self.grains, self.clumps = frame.table.grains, [*frame.table.clumps]
 
     def frame(self, step: int) -> Frame:
         return self._present

@@ -42,7 +42,7 @@ from dem.start import step_remark
 from dem.step import Step
 from dem.stiffness import expected_overlap
 from dem.together import meet, together
-from dem.world import set_load, set_motion, set_shear_rate, set_spring, set_surface
+from dem.world import set_load, set_motion, set_shear_rate, set_spring, set_stress, set_surface
 from pctt import ccp, log
 from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
@@ -51,7 +51,8 @@ from pctt.petsc import warn
 from pctt.render import Picture, picture
 from pctt.run import report, state
 from pctt.run.dump import Dump
-from pctt.run.output import Place, Writer, described_bodies, refuse_unwritable
+from pctt.run.joints import JointNow
+from pctt.run.output import Place, Writer, described_bodies, described_clumps, refuse_unwritable
 from pctt.run.settings import Run, Settings, scene_name
 from pctt.run.stepper import NoSolutionError, Stepper
 
@@ -103,12 +104,9 @@ class Simulation:
             comm, "settings", lambda: made(Settings, given).of(self.experiment, compared), own=(OptionError,)
         )
         scene = state.built(self.experiment, comm)
-        self.settings = self.settings.fitted(scene)
+        self.settings = self.settings.fitted(scene, compared)
         if restart == "settled":
             restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
-        stated = self.settings.stiffness is not None or scene.states_stiffness
-        if not stated and (self.settings.solver == "pdip" or self._compare.names):  # the paper's model
-            self.settings = dataclasses.replace(self.settings, stiffness=math.inf)
         self._origin = state.origin(self.experiment, scene, self.settings.dt)
         if restart:
             self.world, self.memory = state.load(Path(restart), scene, self._origin, comm)
@@ -318,10 +316,7 @@ class Simulation:
         """Give a load other numbers, ``force=(0, 0, -5.0)`` [N], ``torque`` [N m], ``start`` or ``end`` [s]; or begin
         one ``on`` a body, a material or ids of grains; nothing: all grains. The first rank's values count, and
         checkpoints keep them. ValueError for what it cannot be (`dem.world.set_load`)."""
-        meet(self.comm, f"load {name}")
-        on, values = self.comm.bcast((on, values))
-        change = partial(set_load, self.world, name, on, **values)
-        together(self.comm, f"load {name}", change, own=(ValueError, TypeError))
+        self._change(f"load {name}", set_load, name, on, **values)
 
     def set_shear_rate(self, rate: float) -> None:
         """Shear the cell at another rate [1/s]. The first rank's value counts, and checkpoints keep it. ValueError if
@@ -331,6 +326,19 @@ class Simulation:
         together(self.comm, "shear rate", change, own=(ValueError, TypeError))
 
     @property
+    def period(self) -> Floats | None:
+        """The lengths (3,) of the periodic cell now [m], inf: none along that axis; None: no axis has one. Not
+        collective."""
+        return None if self.world.period is None else self.world.period.copy()
+
+    def set_stress(self, stress: Sequence[float | None]) -> None:
+        """Ask for other stresses (3,) of the cell along x, y, z, positive in compression [Pa]; None: its period stays.
+        The first rank's values count, and checkpoints keep them. ValueError if the scene has no ``stress``."""
+        meet(self.comm, "stress")
+        change = partial(set_stress, self.world, self.comm.bcast(stress))
+        together(self.comm, "stress", change, own=(ValueError, TypeError))
+
+    @property
     def springs(self) -> dict[str, Spring]:
         """The springs by name; `set_spring` changes them. Not collective."""
         return dict(self.world.springs)
@@ -338,14 +346,23 @@ class Simulation:
     def set_spring(self, name: str, **values: float) -> None:
         """Give a spring another ``stiffness`` [N/m], ``damping`` [N s/m] or rest ``length`` [m]. The first rank's
         values count, and checkpoints keep them. ValueError for what it cannot have."""
-        meet(self.comm, f"spring {name}")
-        change = partial(set_spring, self.world, name, **self.comm.bcast(values))
-        together(self.comm, f"spring {name}", change, own=(ValueError, TypeError))
+        self._change(f"spring {name}", set_spring, name, **values)
 
     def spring_force(self, name: str) -> Floats:
         """Force (3,) of a spring on its second end, its mean over the last step [N]. ValueError before the first step,
         KeyError if there is none of that name. Not collective."""
         return self._last.spring_force(name)
+
+    def joint(self, name: str) -> JointNow:
+        """A joint: its force, torque, angle or position, speed and motor; ValueError if there is none of that name. Not
+        collective."""
+        return JointNow(self, name)
+
+    def _change(self, what: str, change: Callable[..., None], /, *given: Any, **values: Any) -> None:
+        """Call ``change(world, ...)`` with the first rank's values; collective."""
+        meet(self.comm, what)
+        given, values = self.comm.bcast((given, values))
+        together(self.comm, what, partial(change, self.world, *given, **values), own=(ValueError, TypeError))
 
     @property
     def _last(self) -> Step:
@@ -453,7 +470,8 @@ class Simulation:
         velocity[:grains] = velocity_in_cell(position[:grains], velocity[:grains], world.shear)
         position[:grains] = wrapped(position[:grains], world.period, world.shear)
         contacts = self.contacts if self.last else Contacts.none()
-        frame = Frame(self.steps, self.time, position, turn, velocity, contacts, Table(**table, grains=grains))
+        what = Table(**table, grains=grains, clumps=described_clumps(world))
+        frame = Frame(self.steps, self.time, position, turn, velocity, contacts, what)
         return Snapshot(frame, materials=world.materials, large=described_bodies(world))
 
 
@@ -524,10 +542,7 @@ class Body:
 
     @surface_velocity.setter
     def surface_velocity(self, velocity: Sequence[float] | None) -> None:
-        sim, what = self._sim, f"surface velocity of the body {self.name}"
-        meet(sim.comm, what)
-        change = partial(set_surface, sim.world, self.name, sim.comm.bcast(velocity))
-        together(sim.comm, what, change, own=(ValueError, TypeError))
+        self._sim._change(f"surface velocity of the body {self.name}", set_surface, self.name, velocity)
 
     def _applied(self, name: str) -> Floats:
         load = self._sim.world.loads.get(self.name)
@@ -554,11 +569,7 @@ class Body:
 
     def _move(self, motion: Motion | None, **values: Any) -> None:
         """Set the motion, or these parameters of the present one, as the first rank says."""
-        world, comm, what = self._sim.world, self._sim.comm, f"motion of the body {self.name}"
-        meet(comm, what)
-        motion, values = comm.bcast((motion, values))
-        change = partial(set_motion, world, self.name, motion, **values)
-        together(comm, what, change, own=(ValueError, TypeError))
+        self._sim._change(f"motion of the body {self.name}", set_motion, self.name, motion, **values)
 
 
 class BodyMotion:

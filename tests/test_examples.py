@@ -219,3 +219,9 @@ def test_the_circulant_has_the_means_of_the_matrix(name, n):
     C = means[offset].reshape(problem.size, -1)
     v = np.random.default_rng(0).standard_normal(problem.size)
     np.testing.assert_allclose(problem.circulant()(C @ v), v, atol=1e-10)
+
+
+def test_arm_digs_within_the_torques_of_its_motors():
+    shoulder, wrist = importlib.import_module("arm").main(until=0.2)
+    assert 0.0 < wrist < 100.0
+    assert 0.0 < shoulder <= 1.2 * 400.0

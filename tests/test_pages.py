@@ -57,8 +57,7 @@ def test_the_measures_of_their_page_are_those_of_a_lattice(in_folder, capsys):
 
 
 def test_the_loads_of_their_page_give_what_it_says(in_folder, capsys):
-    (text,) = blocks("docs/loads.md")
-    exec(text, {})
+    exec(blocks("docs/loads.md")[0], {})
     said = [float(word) for word in re.findall(r"-?\d+\.\d+", capsys.readouterr().out)]
     pull = 0.3 * 2.0 * 9.81
     assert said == pytest.approx([0.3 * 9.81 - 1.0, -pull, pull, 0.2], rel=0.01)
@@ -71,6 +70,16 @@ def test_the_hopper_of_the_page_of_sources_fills_and_runs_out(in_folder, capsys)
     assert said[0] == said[1]
     assert said[0][0] == "60"
     assert float(said[0][1]) == pytest.approx(60 * 2500 * 4 / 3 * 3.14159 * 0.02**3, rel=0.05)
+
+
+def test_the_joints_of_their_page_give_what_it_says(in_folder, capsys):
+    exec(blocks("docs/loads.md")[1], {})
+    said = [float(word) for word in re.findall(r"-?\d+\.\d+", capsys.readouterr().out)]
+    weight = 9.81 * (4.0 * 0.5 + 4000.0 / 3.0 * np.pi * 0.1**3 * 1.15)
+    angle = np.arcsin(0.1 / 1.15)
+    arm = 1.15 * np.cos(angle)
+    floor = (100.0 + weight * np.cos(angle)) / arm, (weight * np.cos(angle) - 50.0) / arm
+    assert said == pytest.approx([-weight, floor[0], angle, floor[1], -0.3, -weight * np.cos(0.3)], rel=2e-3)
 
 
 def test_the_simulation_of_its_page_runs(in_folder, capsys):

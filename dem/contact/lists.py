@@ -50,15 +50,19 @@ class Lists:
     away: Rows  #: pairs of a local grain and a ghost or an image
     images: Images | None  #: of grains and ghosts, in a periodic world
     shift: float  #: of a sheared cell, then [m]
+    period: Floats | None  #: (3,) then [m]
     constant: list[Any]  #: the columns of the world's tables, and the shapes, that no step changes
 
     def hold(self, world: World, margin: Floats) -> bool:
         """Whether the lists of this rank have all pairs of these margins (grains,)."""
         if world.shear is not None:
             margin = margin + 0.5 * abs(world.shear.shift - self.shift)  # both share the way of an image
+        if world.servo is not None and world.period is not None and self.period is not None:
+            growth = np.abs(world.period - self.period)
+            most = 2.0 + abs(self.shift) / self.period[0]  # periods along x in the ways of images of a sheared cell
+            margin = margin + 0.5 * growth @ (most, 1.0, 1.0)
         same = all(then is now for then, now in zip(self.constant, _constant(world)))
         return same and stays(self.near.bodies.position, self.near.margin, self.margin, world.grains.position, margin)
-
 
 def grain_lists(world: World, margin: Floats, way: Floats) -> Lists:
     """Those of the last search if they hold for the margins (grains,) [m], else new ones for grains that go the `way`
@@ -76,7 +80,8 @@ def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:
     periodic = None if world.period is None else images(world, near)
     wide = near if periodic is None else periodic.among(near)
     seen = wide.grains + wide.ghosts
-    table = primitives(wide, [body.shapes for body in world.large_bodies], world.first_large)
+    large = [body.shapes for body in world.large_bodies]
+    table = primitives(wide, large, world.first_large, world.clumps, world.initial)
     pairs = close_pairs(table.center[:seen], table.radius[:seen] + wide.margin)
     if periodic is not None:
         pairs = between(pairs, wide)
@@ -84,7 +89,7 @@ def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:
     owner = np.searchsorted(world.slabs, index, side="right") - 1
     halo = Halo(world.comm, grains, len(near.bodies), np.arange(grains, count), owner, index - world.slabs[owner])
     own, away = (Rows(*in_rows(pairs, table.number, grains, *ends)) for ends in ((0, grains), (grains, seen)))
-    return Lists(near, halo, table, margin, own, away, periodic, _shift(world), _constant(world))
+    return Lists(near, halo, table, margin, own, away, periodic, _shift(world), world.period, _constant(world))
 
 
 def _shift(world: World) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,8 +10,10 @@ import numpy as np
 from dem import quaternion
 from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, MESH, PLANE, SPHERE, enclosing_radius
+from dem.clumps import Form
 from dem.contact.box_box import BOX_FEATURES as FEATURES
 from dem.contact.box_box import box_box
+from dem.contact.clumps import Members, members, more_numbers, spread
 from dem.contact.meshes import PARTS, PlacedMesh, capsule_mesh, plane_mesh, sphere_mesh
 from dem.contact.narrow import (
     Boxes,
@@ -51,6 +53,7 @@ class Primitives(NamedTuple):
     radius: Floats  #: (n,) of the sphere about the centre that encloses it, without meaning for half spaces [m]
     surfaces: dict[int, Surface]  #: of the meshes, by row
     numbers: int  #: more than any of `number`, and those that meshes take after theirs
+    members: Members | None = None  #: the spheres of clumps; None in scenes without
 
     def now(self, near: Neighbourhood) -> Primitives:
         """The same where the bodies are; parts come from the frames of their bodies."""
@@ -65,6 +68,21 @@ class Primitives(NamedTuple):
         columns = (table.position, table.quaternion, table.size)
         center, turn, size = (np.concatenate([c[: parts.start], part]) for c, part in zip(columns, of_parts))
         return self._replace(center=center, quaternion=turn, size=size)
+
+    def of_members(self, i: Ints, j: Ints, reach: Floats) -> tuple[Primitives, Ints, Ints, Floats]:
+        """The table with the spheres of clumps in further rows, and the pairs i, j (m,) of it with their `reach` (m,),
+        in which they stand for the clumps."""
+        if self.members is None:
+            return self, i, j, reach
+        own, first, many = self.members, len(self.kind), len(self.members.row)
+        radii = np.zeros((many, 3))
+        radii[:, 0] = own.radius
+        further = {
+            "number": own.number, "row": own.row, "kind": np.full(many, SPHERE), "size": radii, "radius": own.radius,
+            "center": own.now(self.center, self.quaternion), "quaternion": self.quaternion[own.row],
+        }  # fmt: skip
+        table = self._replace(**{k: np.concatenate([getattr(self, k), more]) for k, more in further.items()})
+        return table, *spread(i, j, reach, own.start, first, table.kind, table.center, table.radius)
 
     def sphere(self, rows: Ints) -> Spheres:
         return Spheres(self.center[rows], self.size[rows, 0])
@@ -83,15 +101,18 @@ class Primitives(NamedTuple):
         return PlacedMesh(self.surfaces[row], self.center[row], quaternion.matrix(self.quaternion[row]))
 
 
-def primitives(near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int) -> Primitives:
+def primitives(
+    near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int, clumps: Sequence[Form] = (), initial: int = 0
+) -> Primitives:
     """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies, for `Primitives.now`; the
-    parts are in the frames of their bodies. `grains` is the number of grains on all ranks."""
+    parts are in the frames of their bodies. `grains` is the number of grains on all ranks, of which those with ids
+    below `initial` may be `clumps`."""
     table, count = near.bodies, near.grains + near.ghosts
     row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
-    members = [shape for body in shapes for shape in body]
-    kinds, centers, turns, sizes = zip(*(placed(shape) for shape in members)) if members else [()] * 4
+    parts_of = [shape for body in shapes for shape in body]
+    kinds, centers, turns, sizes = zip(*(placed(shape) for shape in parts_of)) if parts_of else [()] * 4
     center, turn, size = (np.reshape(c, (len(row), k)) for c, k in ((centers, 3), (turns, 4), (sizes, 3)))
-    spans = [_numbers_of(shape) for shape in members]
+    spans = [_numbers_of(shape) for shape in parts_of]
     columns = {
         "number": (table.id, grains + np.cumsum([0, *spans])[:-1]),
         "row": (np.arange(count), row),
@@ -100,18 +121,20 @@ def primitives(near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int
         "quaternion": (table.quaternion, turn),
         "size": (table.size, size),
     }
-    numbers = grains + sum(spans)
+    after = grains + sum(spans)
+    numbers = after + more_numbers(clumps, initial)
     if numbers > MOST_NUMBERS:
         raise ValueError(
-            f"{grains} grains and {numbers - grains} numbers of parts of large bodies: their contacts have no names of "
+            f"{grains} grains and {numbers - grains} numbers of parts of bodies: their contacts have no names of "
             f"64 bits; allowed are {MOST_NUMBERS} together"
         )
     both = {name: np.concatenate([of_grains[:count], of_parts]) for name, (of_grains, of_parts) in columns.items()}
     return Primitives(
         **both,
         radius=enclosing_radius(both["kind"], both["size"]),
-        surfaces={count + n: shape.surface for n, shape in enumerate(members) if isinstance(shape, Mesh)},
+        surfaces={count + n: shape.surface for n, shape in enumerate(parts_of) if isinstance(shape, Mesh)},
         numbers=numbers,
+        members=members(table.take(slice(0, count)), clumps, after) if clumps else None,
     )
 
 

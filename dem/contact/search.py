@@ -9,7 +9,7 @@ import numpy as np
 from dem import bodies
 from dem.applied import free_directions, free_turns, grains_free_velocity, large_free_velocity
 from dem.arrays import Bools, Floats, Ints, places
-from dem.bodies import CAPSULE, MESH, SPHERE
+from dem.bodies import CAPSULE, CLUMP, MESH, SPHERE
 from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.candidates import meeting
@@ -38,7 +38,7 @@ class Contacts:
     near: Neighbourhood  #: the bodies of the rows `a` and `b`
     shifts: Floats  #: (k, large, 6) the ways and turns of the large bodies that the search reckoned with [m, rad]
     moved: Floats | None = None  #: (nc, 3) from body b to its image that touches body a; None without periods [m]
-    drift: Floats | None = None  #: (nc, 3) velocity of that image relative to body b; None without shear [m/s]
+    drift: Floats | None = None  #: (nc, 3) what the cell adds to the velocity of b relative to a; None: nothing [m/s]
     held_overlap: float = 0.0  #: the deepest overlap of bodies that no force can part, left out of the contacts [m]
 
     def __len__(self) -> int:
@@ -80,8 +80,7 @@ def find_contacts(
         shifts = (dt * large_free_velocity(world, dt) if dt else np.zeros_like(world.large.velocity))[None]
     free = grains_free_velocity(world, dt) if dt else world.grains.velocity
     way = ways(world.grains.shape, world.grains.size, free, dt)
-    if world.shear is not None:
-        way = way + image_way(world, dt)
+    way = way + cell_way(world, dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
     refuse_short(world, margin)
     lists = grain_lists(world, margin, way)
@@ -89,11 +88,12 @@ def find_contacts(
     grown = _grown(base, shifts, besides)
     pictures = lists.images
     if pictures is not None:
-        if world.shear is not None:
-            pictures = pictures.moved_on(world.shear.shift - lists.shift)
+        if world.shear is not None or world.servo is not None:
+            pictures = pictures.now(world)
         near, grown = pictures.among(base), grown[pictures.rows]
     table = lists.table.now(near)
     i, j, reach = meeting(world, near, lists, table, delta, shifts, grown)
+    table, i, j, reach = table.of_members(i, j, reach)
     pair, feature, touch = touches(table, i, j, reach)
     key, a, b, body, friction, weight = named(
         *(table.number, table.row, table.kind, near.index, near.bodies.material, world.pairs.friction),
@@ -103,8 +103,10 @@ def find_contacts(
     if pictures is not None:
         contacts, weight = _without_images(world, contacts, base, pictures)
     back = np.flatnonzero(np.diff(pair) <= 0)  # other shapes come behind the spheres, and touch in several points
-    if len(back) and lists.images is None:
-        left = slice(int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min())), None)
+    of_clumps = table.members is not None
+    if (len(back) or of_clumps) and lists.images is None:
+        first = 0 if of_clumps else int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min()))
+        left = slice(first, None)
         order = contact_order(world, near, a[left], b[left], key[left])
         for column in contacts.columns().values():
             column[left] = column[left].take(order, axis=0)
@@ -118,10 +120,15 @@ def find_contacts(
     return replace(contacts.take(~rigid), held_overlap=-float(contacts.gap[rigid].min(initial=0.0)))
 
 
-def image_way(world: World, dt: float) -> float:
-    """Half the way [m] that images behind a sheared boundary go in dt [s] beside that of their grains: the margins of
-    both grains of a pair have a half."""
-    return 0.0 if world.shear is None else 0.5 * dt * abs(world.shear.speed)
+def cell_way(world: World, dt: float) -> Floats | float:
+    """What margins (grains,) have beside the ways of the grains in dt [s]: half the way of images behind a sheared
+    boundary, as both grains of a pair have a half, and the share of a grain in the way by which a cell that changes its
+    size brings the centres of a pair together [m]."""
+    way: Floats | float = 0.0 if world.shear is None else 0.5 * dt * abs(world.shear.speed)
+    if world.servo is not None and world.servo.rate.any():
+        reach = 3.0 * bodies.bounding_radius(world.grains)  # with a margin of two radii, the greatest of `ways`
+        way = way + dt * np.abs(world.servo.rate).max() * reach
+    return way
 
 
 def _without_images(
@@ -134,6 +141,9 @@ def _without_images(
     if world.shear is not None:
         boundaries = images.boundaries(contacts.b) - images.boundaries(contacts.a)
         found = replace(found, drift=np.outer(world.shear.speed * boundaries, (1.0, 0.0, 0.0)))
+    if world.servo is not None:
+        affine = world.servo.rate * found.way(near.bodies.position)
+        found = replace(found, drift=affine if found.drift is None else found.drift + affine)
     owned = np.minimum(a, b)
     weight = np.bincount(owned[owned < near.grains], minlength=near.grains).astype(float)
     return found.take(contact_order(world, near, a, b, contacts.key)), weight
@@ -210,6 +220,8 @@ def ways(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
         radius = np.sqrt(size[n, 0] ** 2 + size[n, 1] ** 2 + size[n, 2] ** 2)
         if shape[n] == CAPSULE:
             radius = size[n, 0] + size[n, 1]
+        elif shape[n] >= CLUMP:
+            radius = size[n, 0]
         if shape[n] != SPHERE:
             way += radius * spin
         out[n] = min(dt * way, 2.0 * radius) if np.isfinite(way + spin) else np.nan

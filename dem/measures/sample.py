@@ -9,6 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Bools, Floats, Ints
+from dem.bodies import CLUMP
 from dem.shapes import solid
 
 
@@ -42,11 +43,14 @@ class Sample:
 
     @property
     def volume(self) -> Floats:
-        """Volumes (n,) of the grains [m^3]."""
+        """Volumes (n,) of the grains, of clumps those of their unions [m^3]."""
         out = np.zeros(len(self.shape))
         for kind in np.unique(self.shape):
             rows = self.shape == kind
-            out[rows] = solid(int(kind), self.size[rows], np.ones(rows.sum()))[0]
+            if kind >= CLUMP:
+                out[rows] = 4.0 / 3.0 * np.pi * self.size[rows, 1] ** 3
+            else:
+                out[rows] = solid(int(kind), self.size[rows], np.ones(rows.sum()))[0]
         return out
 
 

@@ -8,6 +8,7 @@ from dem.scenes.blade import Blade
 from dem.scenes.drum import Drum
 from dem.scenes.incline import Incline
 from dem.scenes.mixer import Mixer
+from dem.scenes.plane_shear import PlaneShear
 from dem.scenes.shear import Shear
 from dem.scenes.silo import Silo
 from dem.scenes.wheel import Wheel
@@ -21,6 +22,7 @@ SCENES: dict[str, type[Experiment]] = {
     "belt": Belt,
     "wheel": Wheel,
     "incline": Incline,
+    "plane_shear": PlaneShear,
 }
 
-__all__ = ["SCENES", "Belt", "Blade", "Drum", "Incline", "Mixer", "Shear", "Silo", "Wheel"]
+__all__ = ["SCENES", "Belt", "Blade", "Drum", "Incline", "Mixer", "PlaneShear", "Shear", "Silo", "Wheel"]

@@ -14,6 +14,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.contact_map import BlockRows, CompactRows
+from dem.contact_map.jointed import JointedMap
 from dem.exchange import refuse
 from pctt.ccp.accuracy import Accuracy, measure
 from pctt.ccp.cone import Array
@@ -69,7 +70,8 @@ def solve(
     Coulomb's law is found by the method itself if it can (`Solver.has_law`), else by a sequence of cone problems
     (`pctt.ccp.coulomb`).
 
-    A `RollingProblem`, whose impulses are (2 nc, 3), is for `apgd` and `auto` alone, and no other one follows.
+    A `RollingProblem`, whose impulses are (2 nc, 3), and a problem of bodies with joints are for `apgd` and `auto`
+    alone, and no other one follows.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
     the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
@@ -80,6 +82,9 @@ def solve(
     if law not in LAWS:
         raise ValueError(f"the law {law!r}: allowed are {', '.join(LAWS)}")
     rolls = isinstance(problem, RollingProblem)
+    jointed = isinstance(problem.contact_map, JointedMap)
+    if jointed and not SOLVERS[type].has_rolling:
+        raise ValueError(f"the solver {type!r}: with joints allowed are {FOR_ROLLING}")
     if rolls and not SOLVERS[type].has_rolling:
         raise ValueError(f"the solver {type!r}: with rolling or spinning resistance allowed are {FOR_ROLLING}")
     limits = limits or Limits()
@@ -88,7 +93,7 @@ def solve(
     result = asked = _by(type, problem, _start(problem, guess), limits, options, newton, law)
     other = "conic" if asked.solver == "apgd" else "apgd"
     hopeless = asked.final or (asked.status is Status.BREAKDOWN and other == "conic")  # products are no numbers
-    if limits.fallback and not hopeless and not rolls:
+    if limits.fallback and not hopeless and not rolls and not jointed:
         second = _by(other, problem, asked.impulse, dataclasses.replace(limits, max_it=-1), None, newton, law)
         better = second.final or second.residual < asked.residual
         result = second.after(asked) if better else dataclasses.replace(asked).after(second)

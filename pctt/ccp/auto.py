@@ -9,7 +9,8 @@ For Coulomb's law the conic method stalls often, but the path that it follows le
 So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path. Problems
 so small that they get dense factors are the exception: there it goes on to the end.
 
-Where contacts resist rolling or spinning, it is APGD alone: the conic method has no such cones.
+Where contacts resist rolling or spinning, it is APGD alone: the conic method has no such cones. So it is with joints,
+which its sparse systems do not have.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from dem.contact_map.jointed import JointedMap
 from pctt.ccp.cone import Array
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
@@ -60,9 +62,9 @@ def solve(
         tried.append(result)
         return result
 
-    rolls = isinstance(problem, RollingProblem)
-    dense = not rolls and newton.has_few(problem)
-    most = limits.max_it if rolls else options.iterations(problem.size, limits.tol, coulomb, dense)
+    alone = isinstance(problem, RollingProblem) or isinstance(problem.contact_map, JointedMap)  # apgd takes them alone
+    dense = not alone and newton.has_few(problem)
+    most = limits.max_it if alone else options.iterations(problem.size, limits.tol, coulomb, dense)
     few = min(limits.max_it, problem.comm.bcast(most))
     last = first = attempt(apgd, guess, replace(limits, max_it=few), apgd.APGD())
     if not first.final and few < limits.max_it:

@@ -1,5 +1,4 @@
-"""The friction cone |(g_1, g_2)| <= mu g_n and the arithmetic that the solvers need on it; its loops are in
-`cone_loops`.
+"""The friction cone |(g_1, g_2)| <= mu g_n and the arithmetic that the solvers need on it.
 
 Impulses are arrays (nc, 3), one row per contact in the order (normal, tangent 1, tangent 2); ``mu`` is (nc,).
 
@@ -7,6 +6,10 @@ Impulses are arrays (nc, 3), one row per contact in the order (normal, tangent 1
 
 The cone of friction 1 is its own dual, with the Jordan product x o y = (x'y, x_0 y_1: + y_0 x_1:). Its unit is
 e = (1, 0, 0), the spectral values of x are x_0 +- |x_1:|. Source: Domahidi, Chu and Boyd (2013).
+
+Compiled loops take arrays of rows flat: so the compiler knows the distance from one contact to the next, and works on
+several at once. Comparisons are written so that a NaN stays a NaN. Constants have single precision, so that loops on
+arrays of single precision stay in it. They are exact in double precision too.
 """
 
 from __future__ import annotations
@@ -16,28 +19,288 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pctt.ccp.cone_loops import (
-    TINY,
-    Array,
-    accelerated_step,
-    determinant,
-    nesterov_todd,
-    project_to,
-    step_inside,
-    step_to_boundary,
-    step_to_zero,
-    times,
-)
+from dem.compiled import inlined, loop
 
-__all__ = [
-    "TINY",
-    "Array",
-    "determinant",
-    "step_inside",
-    "step_to_boundary",
-    "step_to_zero",
-    "times",
-]
+Array = NDArray[np.float64]
+TINY = float(np.finfo(float).tiny)
+ZERO, ONE = np.float32(0.0), np.float32(1.0)
+STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to the next
+LEAST = 1e-17  # determinant of a unit point that rounding has put on or outside the boundary
+ROUND = 1e-14  # tangential part of a unit scaling point below which it has no direction
+
+
+@inlined
+def _nearest(n, t_1, t_2, mu):
+    """The nearest point of a cone, by selections: a processor could not predict branches."""
+    length = np.sqrt(t_1 * t_1 + t_2 * t_2)
+    height = (mu * length + n) * (ONE / (ONE + mu * mu))
+    height = n if height < n else height
+    height = ZERO if height < ZERO else height
+    radius = mu * height
+    reach = radius if length < radius else length
+    shrink = radius / (ONE if reach == ZERO else reach)
+    return height, t_1 * shrink, t_2 * shrink
+
+
+@loop
+def project_to(x: Array, mu: Array, out: Array) -> Array:
+    """`project` into ``out``, which is C-contiguous."""
+    flat, to = x.ravel(), out.reshape(out.size)
+    for c in range(len(mu)):
+        i = 3 * c
+        to[i], to[i + 1], to[i + 2] = _nearest(flat[i], flat[i + 1], flat[i + 2], mu[c])
+    return out
+
+
+@loop
+def accelerated_step(
+    x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, de_saxce: float,
+    out: Array,
+) -> tuple[float, float, float]:  # fmt: skip
+    """P(z - step y_z) for z = x + beta (x - last_x) and its gradient y_z = y + C z, to which the term (mu |y_t|, 0, 0)
+    of De Saxce is added once (``de_saxce`` 1: Coulomb's law) or not (0). ``compliance`` has the diagonal of C (nc, 3),
+    or no row for C = 0.
+
+    Returned are, for this rank, d'Cd and |d|^2 of d = out - z, and y_z'(out - x); z and y_z are nowhere stored. A
+    contact moves 64 bytes in single precision, 52 without compliance."""
+    part, way, soft = x.dtype.type(beta), x.dtype.type(step), len(compliance) > 0
+    x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)
+    z, y_z = np.empty(3 * STRIP, x.dtype), np.empty(3 * STRIP, x.dtype)
+    squares, products = np.zeros(3 * STRIP, x.dtype), np.zeros(3 * STRIP, x.dtype)
+    work = np.zeros(3 * STRIP, x.dtype)
+    for first in range(0, len(mu), STRIP):
+        friction = mu[first : first + STRIP]
+        a, b = 3 * first, 3 * (first + len(friction))
+        extrapolate(x[a:b], last_x[a:b], part, z)
+        if soft:
+            add_compliance(y[a:b], compliance[a:b], z, y_z)
+        else:
+            y_z[: b - a] = y[a:b]
+        if de_saxce:
+            _add_de_saxce(y_z, friction)
+        _step(z, y_z, way, friction, to[a:b])
+        add_squares(to[a:b], z, squares)
+        add_products(to[a:b], x[a:b], y_z, products)
+        if soft:
+            add_work(to[a:b], z, compliance[a:b], work)
+    return work.sum(), squares.sum(), products.sum()
+
+
+@loop
+def extrapolate(x, last_x, beta, out):
+    for k in range(len(x)):
+        out[k] = x[k] + beta * (x[k] - last_x[k])
+
+
+@loop
+def add_compliance(y, compliance, z, out):
+    for k in range(len(y)):
+        out[k] = y[k] + compliance[k] * z[k]
+
+
+@loop
+def add_work(x, y, compliance, sums):
+    for k in range(len(x)):
+        sums[k] += compliance[k] * (x[k] - y[k]) ** 2
+
+
+@loop
+def _add_de_saxce(y, mu):
+    for c in range(len(mu)):
+        i = 3 * c
+        y[i] += mu[c] * np.sqrt(y[i + 1] * y[i + 1] + y[i + 2] * y[i + 2])
+
+
+@loop
+def _step(x, y, step, mu, out):
+    for c in range(len(mu)):
+        i = 3 * c
+        n, t_1, t_2 = x[i] - step * y[i], x[i + 1] - step * y[i + 1], x[i + 2] - step * y[i + 2]
+        out[i], out[i + 1], out[i + 2] = _nearest(n, t_1, t_2, mu[c])
+
+
+@loop
+def add_squares(x, y, sums):
+    for k in range(len(x)):
+        sums[k] += (x[k] - y[k]) ** 2
+
+
+@loop
+def add_products(x, y, z, sums):
+    for k in range(len(x)):
+        sums[k] += (x[k] - y[k]) * z[k]
+
+
+@loop
+def times(blocks: Array, x: Array) -> Array:
+    """Products of blocks (nc, 3, 3) with rows. (Twice as fast as a batched matrix product.)"""
+    out = np.empty_like(x)
+    for c in range(len(x)):
+        n, t_1, t_2 = x[c, 0], x[c, 1], x[c, 2]
+        for i in range(3):
+            out[c, i] = blocks[c, i, 0] * n + blocks[c, i, 1] * t_1 + blocks[c, i, 2] * t_2
+    return out
+
+
+@loop
+def step_to_boundary(x: Array, dx: Array, mu: Array) -> float:
+    """Largest a such that x + a dx is in the cones of this rank (inf where nothing limits it); x is inside.
+
+    The smaller positive root of |x_t + a dx_t|^2 = mu^2 (x_n + a dx_n)^2, in the form that does not cancel,
+    and the apex x_n + a dx_n = 0 (which alone limits a contact without friction).
+    """
+    x, dx = x.ravel(), dx.ravel()
+    least = np.inf
+    for c in range(len(mu)):
+        i, m = 3 * c, mu[c]
+        n, t_1, t_2 = x[i], x[i + 1], x[i + 2]
+        dn, dt_1, dt_2 = dx[i], dx[i + 1], dx[i + 2]
+        size = np.sqrt(t_1 * t_1 + t_2 * t_2)
+        quadratic = dt_1 * dt_1 + dt_2 * dt_2 - (m * dn) ** 2
+        linear = t_1 * dt_1 + t_2 * dt_2 - m * m * n * dn
+        inside = (m * n - size) * (m * n + size)
+        discriminant = linear * linear + quadratic * inside
+        step = np.inf
+        if linear > 0 and discriminant >= 0:
+            step = inside / (linear + np.sqrt(discriminant))
+        elif linear <= 0 and quadratic > 0 and m > 0:
+            step = (np.sqrt(max(discriminant, 0.0)) - linear) / quadratic
+        if dn < 0 and not -n / dn >= step:
+            step = -n / dn
+        if not step >= least:
+            least = step
+            if step != step:  # no other is smaller
+                break
+    return least
+
+
+@loop
+def step_inside(x: Array, dx: Array) -> float:
+    """`step_to_boundary` in the cones of friction 1, for an x that rounding may have put on the boundary: there it is
+    not zero.
+
+    By the smallest spectral value of dx seen from x (Vandenberghe, "The CVXOPT linear and quadratic cone program
+    solvers", 2010)."""
+    fastest = 0.0
+    for c in range(len(x)):
+        x_0, x_1, x_2 = x[c, 0], x[c, 1], x[c, 2]
+        dx_0, dx_1, dx_2 = dx[c, 0], dx[c, 1], dx[c, 2]
+        size = np.sqrt(_determinant(x_0, x_1, x_2))
+        inner = (x_0 * dx_0 - x_1 * dx_1 - x_2 * dx_2) / size
+        along = (inner + dx_0) / (x_0 + size)
+        turned_1, turned_2 = dx_1 - along * x_1, dx_2 - along * x_2
+        speed = (np.sqrt(turned_1 * turned_1 + turned_2 * turned_2) - inner) / size
+        if not speed <= fastest:
+            fastest = speed
+            if speed != speed:  # no other is larger
+                break
+    return 1.0 / fastest if fastest > 0 else np.inf
+
+
+@loop
+def step_to_zero(x: Array, dx: Array) -> float:
+    """Largest a such that x + a dx >= 0 on this rank, x > 0."""
+    least = np.inf
+    for c in range(len(x)):
+        if dx[c] < 0 and not -x[c] / dx[c] >= least:
+            least = -x[c] / dx[c]
+            if least != least:
+                break
+    return least
+
+
+@loop
+def determinant(x: Array) -> Array:
+    """x_0^2 - |x_1:|^2 (nc,) of points inside, kept positive in spite of rounding.
+
+    Near the boundary rounding is at most 1.5 eps x_0^2: the first difference is exact, and neither the product nor the
+    square is larger than x_0^2 / 2."""
+    out = np.empty(len(x))
+    for c in range(len(x)):
+        out[c] = _determinant(x[c, 0], x[c, 1], x[c, 2])
+    return out
+
+
+@loop
+def scaling(s: Array, z: Array, compliance: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """The Nesterov-Todd scaling W of pairs (s, z) inside the cones x_0 >= |x_1:|, the symmetric W with W z = W^-1 s:
+    its unit hyperbolic vector (nc, 3) and size eta (nc,), see `NesterovTodd`, and the blocks (nc, 3, 3) W^-2,
+    X = (W^-2 + C)^-1 and X W^-2, C the diagonal ``compliance`` (nc, 3), whose two tangential numbers are the same.
+
+    The blocks come from the spectral form, so that no tiny one is inverted: W has the eigenvalues eta spread, eta /
+    spread and eta for (1, u), (1, -u) and (0, u'), u the direction of the scaling point. What C has more (or less)
+    along the normal is a term of rank one. Source: Nesterov and Todd (1997); Andersen, Roos and Terlaky (2003)."""
+    count = len(s)
+    root, size, square = np.empty((count, 3)), np.empty(count), np.empty((count, 3, 3))
+    X, share = np.empty((count, 3, 3)), np.empty((count, 3, 3))
+    for c in range(count):
+        size_s = np.sqrt(_determinant(s[c, 0], s[c, 1], s[c, 2]))
+        size_z = np.sqrt(_determinant(z[c, 0], z[c, 1], z[c, 2]))
+        cosine = (s[c, 0] * z[c, 0] + s[c, 1] * z[c, 1] + s[c, 2] * z[c, 2]) / (size_s * size_z)
+        angle = 0.5 * (1.0 + cosine)
+        angle = np.sqrt(0.5 if angle < 0.5 else angle)
+        of_s, of_z = 0.5 / (angle * size_s), 0.5 / (angle * size_z)
+        first, eta = of_s * s[c, 0] + of_z * z[c, 0], np.sqrt(size_s / size_z)
+        u, v = of_s * s[c, 1] - of_z * z[c, 1], of_s * s[c, 2] - of_z * z[c, 2]
+        length, half = np.sqrt(2.0 * (1.0 + first)), np.sqrt(u * u + v * v)
+        root[c, 0], root[c, 1], root[c, 2], size[c] = (1.0 + first) / length, u / length, v / length, eta
+        spread = first + half
+        u, v = (1.0, 0.0) if half <= ROUND else (u / half, v / half)
+        along, against, across = (eta * spread) ** 2, (eta / spread) ** 2, eta * eta
+        _block(u, v, 1.0 / along, 1.0 / against, 1.0 / across, square[c])
+        e, more = compliance[c, 1], compliance[c, 0] - compliance[c, 1]
+        shares = 1.0 / (1.0 + e * along), 1.0 / (1.0 + e * against), 1.0 / (1.0 + e * across)
+        _block(u, v, along * shares[0], against * shares[1], across * shares[2], X[c])
+        _block(u, v, shares[0], shares[1], shares[2], share[c])
+        if more != 0.0:
+            more /= 1.0 + more * X[c, 0, 0]
+            p_0, p_1, p_2 = X[c, 0, 0], X[c, 1, 0], X[c, 2, 0]
+            for j in range(3):
+                of_share, of_x = more * share[c, 0, j], more * X[c, 0, j]
+                for i, p in enumerate((p_0, p_1, p_2)):
+                    share[c, i, j] -= p * of_share
+                    X[c, i, j] -= p * of_x
+    return root, size, square, X, share
+
+
+@loop
+def nesterov_todd(root: Array, size: Array, x: Array, inverse: bool) -> Array:
+    """W x (nc, 3) for the W of `scaling`, or W^-1 x."""
+    out = np.empty(x.shape)
+    for c in range(len(x)):
+        first, u, v, eta = root[c, 0], root[c, 1], root[c, 2], size[c]
+        if inverse:
+            u, v, eta = -u, -v, 1.0 / eta
+        along = 2.0 * (first * x[c, 0] + u * x[c, 1] + v * x[c, 2])
+        out[c, 0] = (along * first - x[c, 0]) * eta
+        out[c, 1] = (along * u + x[c, 1]) * eta
+        out[c, 2] = (along * v + x[c, 2]) * eta
+    return out
+
+
+@inlined
+def _determinant(x_0, x_1, x_2):
+    small, large = abs(x_1), abs(x_2)
+    if small > large:
+        small, large = large, small
+    found = (x_0 - large) * (x_0 + large) - small * small
+    least = max(LEAST * x_0 * x_0, TINY)
+    return least if found < least else found
+
+
+@inlined
+def _block(u, v, along, against, across, out):
+    """A symmetric block (3, 3) with given eigenvalues for (1, u), (1, -u), (0, u')."""
+    mean, half = 0.5 * (along + against), 0.5 * (along - against)
+    out[0, 0] = mean
+    out[0, 1] = out[1, 0] = half * u
+    out[0, 2] = out[2, 0] = half * v
+    out[1, 1] = mean * u * u + across * v * v
+    out[2, 2] = mean * v * v + across * u * u
+    out[1, 2] = out[2, 1] = (mean - across) * u * v
+
+
+# -- what solvers ask of cones ----------------------------------------------------------------------------------
 
 
 def project(x: Array, mu: Array, out: Array | None = None) -> Array:
@@ -91,11 +354,11 @@ class FrictionCones:
     def accelerated_step(
         self, x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, coulomb: bool, out: Array
     ) -> tuple[float, float, float]:
-        """`pctt.ccp.cone_loops.accelerated_step` to these cones."""
+        """The loop `accelerated_step` for these cones."""
         return accelerated_step(x, last_x, y, compliance, beta, step, self.mu, float(coulomb), out)
 
     def move(self, x: Array, y: Array, step: Array | float, coulomb: bool = False) -> Array:
-        """P(x - step y) - x (rows, 3) for a step of one length or many, where y_n gets De Saxce's term for Coulomb's law."""
+        """P(x - step y) - x (rows, 3) for one length or many; for Coulomb's law y_n gets De Saxce's term."""
         out = y.copy()
         if coulomb:
             out[: self.count, 0] += self.resisted(y)

@@ -22,8 +22,19 @@ from mpi4py import MPI
 from dem.compiled import inlined, loop
 from dem.contact_map import BlockRows, TurningMap
 from dem.exchange import refuse
-from pctt.ccp.cone import Array, FrictionCones, tangential
-from pctt.ccp.cone_loops import ONE, STRIP, ZERO, add_compliance, add_products, add_squares, add_work, extrapolate
+from pctt.ccp.cone import (
+    ONE,
+    STRIP,
+    ZERO,
+    Array,
+    FrictionCones,
+    add_compliance,
+    add_products,
+    add_squares,
+    add_work,
+    extrapolate,
+    tangential,
+)
 from pctt.ccp.problem import ConeProblem
 
 
@@ -131,7 +142,7 @@ def accelerated_step(
     x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, sigma: Array,
     de_saxce: float, out: Array,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """`pctt.ccp.cone_loops.accelerated_step` for these cones, of which both halves of the rows go through strips."""
+    """`pctt.ccp.cone.accelerated_step` for these cones, of which both halves of the rows go through strips."""
     count, soft = len(sigma), len(compliance) > 0
     part, way, saxce = x.dtype.type(beta), x.dtype.type(step), x.dtype.type(de_saxce)
     x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)

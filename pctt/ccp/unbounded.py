@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from dem.contact_map.jointed import JointedMap
+from dem.exchange import offsets
 from pctt.ccp.cone import Array, dot
 from pctt.ccp.problem import ConeProblem
 
@@ -24,7 +26,7 @@ def why_unbounded(problem: ConeProblem, g: Array) -> str:
     large. If all contacts yield no problem is unbounded.
 
     A heavy body, too, has a small part in G'd: a press on a light grain. So where G is known, the impulses of d must
-    cancel on every body in units of its own mass, see `_left_over`.
+    cancel on every body in units of its own mass, see `_left_over`. What joints bear cancels too.
     """
     if problem.all_yield:
         return ""
@@ -50,10 +52,10 @@ def _left_over(problem: ConeProblem, d: Array) -> float:
     """How much impulses d (nc, 3) leave on the bodies: the sum of |G_b' d|^2 / |G_b|^2 over the bodies b, with G_b the
     columns of a body, of which the mass drops out; between 0 and 2 for ||d|| = 1. Collective."""
     assert problem.contact_map is not None
-    G = problem.contact_map.block_rows
-    bodies = problem.sum(G.columns)
-    momenta = np.einsum("kij,ki->jk", G.blocks, d[np.repeat(np.arange(G.rows), np.diff(G.indptr))])
-    columns = [*momenta, (G.blocks**2).sum(axis=(1, 2))]
-    *momenta, size = problem.sum(np.array([np.bincount(G.indices, column, bodies) for column in columns]))
-    momentum = np.sum(np.square(momenta), axis=0)
-    return float(np.divide(momentum, size, out=np.zeros(bodies), where=size > 0).sum())
+    known = problem.contact_map
+    G = (known.free if isinstance(known, JointedMap) else known).block_rows
+    each = np.bincount(G.indices, (G.blocks**2).sum(axis=(1, 2)), problem.sum(G.columns))
+    first = offsets(problem.comm, G.columns)[problem.comm.rank]
+    size = problem.sum(each)[first : first + G.columns]
+    momentum = np.square(problem.momentum(d).reshape(-1, 6)).sum(axis=1)
+    return float(problem.sum(np.divide(momentum, size, out=np.zeros(len(size)), where=size > 0).sum()))

@@ -103,9 +103,12 @@ class Stage:
         # a capsule is a cylinder and two balls
         core = extent - [0, 0, 1] * extent[:, :1]
         tip = quaternion.rotate(turn[long], np.array([0, 0, 0.5]) * core[long])
+        clumps = surfaces.members(frame)
+        clump, member, radius = (column[shown[clumps[0]]] for column in clumps)
         rows = np.concatenate([ball, long, long])
-        centers = np.concatenate([place[ball], place[long] - tip, place[long] + tip])
-        _show(self._spheres, centers, {"value": value[rows], "radius": extent[rows, 0].astype(np.float32) / 2})
+        centers = np.concatenate([place[ball], place[long] - tip, place[long] + tip, member])
+        radii = np.concatenate([extent[rows, 0] / 2, radius]).astype(np.float32)
+        _show(self._spheres, centers, {"value": value[np.concatenate([rows, clump])], "radius": radii})
         for mapper, rows, widths in ((self._boxes, block, extent), (self._cylinders, long, core)):
             _show(mapper, place[rows], {"value": value[rows], "extent": widths[rows], "turn": turn[rows]})
         walls = scene.walls(frame)

@@ -17,7 +17,7 @@ from vtkmodules.vtkFiltersGeneral import vtkTransformFilter
 from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSphereSource
 
 from dem import quaternion
-from dem.bodies import BOX, CAPSULE, SPHERE
+from dem.bodies import BOX, CAPSULE, CLUMP, SPHERE
 from pctt.disk import FileError
 from pctt.folder import Folder, Frame, Table
 
@@ -165,13 +165,27 @@ def _bounds(places: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def extent(path: Path, table: Table) -> np.ndarray:
-    """Widths (grains, 3) of the grains along their own axes [m]."""
+    """Widths (grains, 3) of the grains along their own axes, of clumps of the spheres about them [m]."""
     shape, size = table.shape[: table.grains, None], table.size[: table.grains]
-    unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE}
+    clumps = range(CLUMP, CLUMP + len(table.clumps))
+    unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE, *clumps}
     if unknown:
         raise FileError(f"{path}: no surface is known for grains of shape {unknown.pop()}")
-    round_ones = size[:, :1] + [0, 0, 1] * size[:, 1:2]  # a sphere is a capsule of length zero
+    round_ones = size[:, :1] + [0, 0, 1] * size[:, 1:2] * (shape == CAPSULE)
     return 2 * np.where(shape == BOX, size, round_ones)
+
+
+def members(frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The spheres of all clumps: the row of the grain (m,), centres (m, 3) and radii (m,) [m]."""
+    table = frame.table
+    rows, places, radii = [np.zeros(0, int)], [np.zeros((0, 3))], [np.zeros(0)]
+    for number, clump in enumerate(table.clumps):
+        grains = np.flatnonzero(table.shape[: table.grains] == CLUMP + number)
+        for center, radius in zip(np.array(clump["centres"]), clump["radii"]):
+            rows.append(grains)
+            places.append(frame.position[grains] + quaternion.rotate(frame.quaternion[grains], center))
+            radii.append(np.full(len(grains), radius))
+    return np.concatenate(rows), np.concatenate(places), np.concatenate(radii)
 
 
 def polydata(places: np.ndarray, cells: str, size: int) -> vtkPolyData:

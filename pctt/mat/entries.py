@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.exchange import refuse
 from pctt.tt.train import Array
 
 DENSE = ("dense", "seqdense", "mpidense")
@@ -18,10 +19,6 @@ DENSE = ("dense", "seqdense", "mpidense")
 
 #: Takes rows and columns, integers (p,), and returns numbers (p,).
 Entry = Callable[[Array, Array], Array]
-
-
-class EntriesError(ValueError):
-    """Entries are not numbers, or the function for them fails; raised on all ranks."""
 
 
 def given(P: PETSc.Mat, name: str) -> Any:
@@ -98,7 +95,7 @@ class Entries:
         found = comm.allgather(None if function is None else callable(function))
         lacking = found[0] is None and P.getType() not in DENSE
         if len(set(found)) > 1 or found[0] is False or lacking:
-            raise EntriesError(
+            raise ValueError(
                 f"the attribute entries of the Mat is {found} by rank (None: missing, False: no function); allowed is "
                 "a function of two integer arrays, on all ranks"
             )
@@ -120,41 +117,28 @@ class Entries:
 
     def own(self, i: Array, j: Array) -> Array:
         """Values at rows and columns that only this rank knows; collective."""
-        try:
-            values, wrong = self._evaluate(i, j), ""
-        except Exception as error:  # any kind, because it is the user's code
-            values, wrong = np.zeros(len(i)), _words(error)
-        if self.comm.size > 1 and not self.comm.allreduce(bool(wrong), op=MPI.LOR):
-            return values
-        found = self.comm.allgather(wrong)
-        for rank, wrong in enumerate(found):
-            if wrong:
-                raise EntriesError(
-                    f"entries of the Mat: {wrong}, on rank {rank}; allowed are finite real numbers, as many as indices"
-                )
-        return values
-
-    def _evaluate(self, i: Array, j: Array) -> Array:
-        if len(i) == 0:
-            return np.zeros(0)
-        raw = np.asarray(self.function(i.copy(), j.copy()))  # copies, because the function may change them
-        if raw.shape != i.shape:
-            raise EntriesError(f"an array of shape {raw.shape} for {len(i)} indices")
-        if raw.dtype.kind not in "fiub":
-            raise EntriesError(f"an array of type {raw.dtype}")
-        values = raw.astype(float)
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
-            k = int(bad[0])
-            raise EntriesError(f"{values[k]} at row {i[k]}, column {j[k]}")
+        values, wrong = np.zeros(len(i)), ""
+        if len(i):
+            try:
+                raw = np.asarray(self.function(i.copy(), j.copy()))  # copies, because the function may change them
+            except Exception as error:  # any kind, because it is the user's code
+                frame = traceback.extract_tb(error.__traceback__)[-1]
+                wrong = f"{type(error).__name__}: {error} ({frame.filename}:{frame.lineno})"
+            else:
+                wrong = _what_is_wrong(raw, i, j)
+                values = values if wrong else raw.astype(float)
+        wrong = wrong and f"entries of the Mat: {wrong}; allowed are finite real numbers, as many as indices"
+        refuse(self.comm, wrong)
         return values
 
 
-def _words(error: Exception) -> str:
-    if isinstance(error, EntriesError):
-        return str(error)
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__}: {error} ({frame.filename}:{frame.lineno})"
+def _what_is_wrong(values: Array, i: Array, j: Array) -> str:
+    if values.shape != i.shape:
+        return f"an array of shape {values.shape} for {len(i)} indices"
+    if values.dtype.kind not in "fiub":
+        return f"an array of type {values.dtype}"
+    bad = np.flatnonzero(~np.isfinite(values))
+    return f"{values[bad[0]]} at row {i[bad[0]]}, column {j[bad[0]]}" if len(bad) else ""
 
 
 class DenseEntries(Entries):

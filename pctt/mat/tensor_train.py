@@ -63,7 +63,7 @@ def compressed_entries(
     """A = c (I + T) for a matrix A that is given by its entries; c is the mean of the diagonal. Collective.
 
     Both the Mat and the PC use it. If the mean is not positive, shift is 0 and scale is 1. The error is estimated from
-    entries that the compression has not used. On all ranks EntriesError for bad entries, TooMuchWorkError at the limit
+    entries that the compression has not used. On all ranks ValueError for bad entries, TooMuchWorkError at the limit
     of `work`.
 
     start : an earlier result for a similar matrix
@@ -336,8 +336,7 @@ def from_entries(
     prefix : of the options of the Mat, -PREFIXmat_tt_eps and -PREFIXmat_tt_max_rank, which win over the arguments
 
     The Mat keeps the function as its attribute ``entries``, and the preconditioners of `pctt.pc` use it. Raises
-    EntriesError (a ValueError) on all ranks if entries are not finite numbers, and ValueError for a bad grid or other
-    bad arguments.
+    ValueError on all ranks if entries are not finite numbers, for a bad grid, and for other bad arguments.
 
     >>> A = from_entries(lambda i, j: (i == j) + 0.1 / (1.0 + abs(i - j)), (64,))
     >>> A.getPythonContext().error < 1e-8

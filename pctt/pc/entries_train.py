@@ -44,7 +44,7 @@ class DifferencesInverse:
     def of(cls, P: PETSc.Mat, layout: Layout) -> DifferencesInverse | None:
         """For a Mat with entries; None if they do not depend on differences, or are not symmetric and positive.
 
-        Collective; EntriesError on all ranks.
+        Collective; ValueError on all ranks.
         """
         if P.getBlockSize() > 1:
             return None
@@ -111,7 +111,7 @@ class EntriesTrain:
         3. If there is no train within the limit, or if it is not positive, 1 takes over.
 
         A number as -pc_tt_rank asks for the train of this rank. It may take `pays` operations more than a solution with
-        the diagonal, and 1 takes over if it fails. EntriesError or ValueError on all ranks for bad entries or a bad
+        the diagonal, and 1 takes over if it fails. ValueError on all ranks for bad entries or a bad
         grid.
         """
         self.failure, self.note, self.transform = self._distrusted, "", None

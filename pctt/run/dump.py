@@ -13,6 +13,7 @@ A guided body has only the part of D along its guide. Nothing turns it, so its m
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from dem.contact_map import ContactMap, root_blocks
 from dem.contact_map.map import packed
 from dem.exchange import offsets
 from dem.experiment import Experiment
+from dem.joints import Joint
+from dem.pairs import Pairs
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
@@ -48,8 +51,9 @@ class Dump:
     ):  # fmt: skip
         self._settings, self._experiment, self._world, self._place = settings, experiment, world, place
         self._hard_left, self._folder = hard, folder
-        if folder and world.pairs.resists:
-            raise OptionError("-dump_problem: files have no rolling and spinning; allowed are scenes without them")
+        self._none = unwritten(world.pairs, world.joints)
+        if folder and self._none:
+            raise OptionError(f"-dump_problem: {self._none}")
 
     def step(
         self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result, asked: ccp.Result
@@ -59,44 +63,36 @@ class Dump:
         ``asked`` is the result of the solver that the user chose, ``result`` the one that the step uses. Returns the
         entries for the step's figures. FileError if a file cannot be written.
         """
-        if system.resistance is not None:  # FCLIB's files have a format of their own for these
-            return {"dumped": [], "hard_problem": ""}
-        number = self._world.step + 1
-        hard = not asked.converged and self._hard_left > 0
         files: dict[str, Any] = {"dumped": [], "hard_problem": ""}
-
-        def write(path: Path) -> None:
-            try:
-                self._write(path, system, problem, guess, result, asked)
-            except OSError as error:  # raised on all ranks alike
-                raise FileError(str(error)) from None
-
-        if problem.size and self._folder:
-            path = Path(self._folder) / f"step{number:06d}_{problem.size}contacts.h5"
-            write(path)
-            files["dumped"] = [str(path)]
-        if hard and problem.size > self.most:
+        number, write = self._world.step + 1, partial(self._write, system, problem, guess, result, asked)
+        if self._none:
+            if self._hard_left and not asked.converged:
+                self._hard_left = 0
+                warn(self._world.comm, f"step {number} is not solved, and its problem is not written: {self._none}")
+            return files
+        if not problem.size:
+            return files
+        name = f"step{number:06d}_{problem.size}contacts"
+        if self._folder:
+            files["dumped"] = [str(write(Path(self._folder) / f"{name}.h5"))]
+        if asked.converged or not self._hard_left:
+            return files
+        if problem.size > self.most:
             self._hard_left = 0
             words = f"step {number} is not solved, and its {problem.size} contacts are more than are written unasked"
             warn(self._world.comm, f"{words}; allowed are {self.most}, or -dump_problem")
-        elif problem.size and hard:
+        else:
             self._hard_left -= 1
-            name = f"step{number:06d}_{problem.size}contacts_{asked.iterations}its.h5"
             self._place.make(HARD)
-            write(self._place.now / HARD / name)
-            files["hard_problem"] = str(self._place.folder / HARD / name)
+            path = write(self._place.now / HARD / f"{name}_{asked.iterations}its.h5")
+            files["hard_problem"] = str(self._place.folder / HARD / path.name)
         return files
 
     def _write(
-        self,
+        self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result, asked: ccp.Result,
         path: Path,
-        system: ContactSystem,
-        problem: ccp.ConeProblem,
-        guess: Array,
-        result: ccp.Result,
-        asked: ccp.Result,
-    ) -> None:
-        """The global problem, the guess if there is one, and the solution if the step has one."""
+    ) -> Path:  # fmt: skip
+        """The global problem, the guess if there is one, and the solution if the step has one; the path."""
         dynamic, masses, D = masses_and_map(system)
         v_free = system.free_velocity[dynamic]
         f = np.einsum("bij,bj->bi", masses, v_free).ravel()
@@ -109,28 +105,37 @@ class Dump:
         def state(g: Array) -> fclib.Solution:
             return fclib.Solution(g, problem.product(g) + problem.r, system.velocity(g)[dynamic].ravel())
 
-        fclib.write_global(
-            path, D.comm, M, Ht, f, problem.r - D.velocities(v_free), problem.mu,
-            info=self._info(problem, result, asked),
-            solution=state(result.impulse) if result.converged else None,
-            guess=state(guess) if problem.norm(guess) > 0 else None,
-            point=system.point,
-            compliance=problem.compliance[:, 0] if problem.yields else None,
-        )  # fmt: skip
-
-    def _info(self, problem: ccp.ConeProblem, result: ccp.Result, asked: ccp.Result) -> fclib.Info:
-        settings, world, scene = self._settings, self._world, self._experiment
+        settings = self._settings
         stored = f"The solution has natural residual {result.residual:.3g}." if result.converged else ""
-        return fclib.Info(
-            f"{scene_name(scene)}, step {world.step + 1}",
-            f"{problem.size} contacts of {scene!r}, from time {world.time:g} s over {settings.dt:g} s. "
-            f"{settings.solver} with -ccp_tol {settings.tol:g}: {asked.reason}, {asked.iterations} iterations, "
-            f"natural residual {asked.residual:.3g}. {stored}",
+        info = fclib.Info(
+            f"{scene_name(self._experiment)}, step {self._world.step + 1}",
+            f"{problem.size} contacts of {self._experiment!r}, from time {self._world.time:g} s over "
+            f"{settings.dt:g} s. {settings.solver} with -ccp_tol {settings.tol:g}: {asked.reason}, "
+            f"{asked.iterations} iterations, natural residual {asked.residual:.3g}. {stored}",
             "Solution and guess are those of Coulomb's law (mu |u_t| is added to the normal velocity)."
             if settings.law == ccp.COULOMB
             else "Solution and guess are those of the convex cone problem, min 1/2 r'Wr + q'r over the friction cones "
             "(no mu |u_t| in the normal velocity). W is positive semidefinite; r need not be unique, u is.",
         )
+        try:
+            fclib.write_global(
+                path, D.comm, M, Ht, f, problem.r - D.velocities(v_free), problem.mu,
+                info=info,
+                solution=state(result.impulse) if result.converged else None,
+                guess=state(guess) if problem.norm(guess) > 0 else None,
+                point=system.point,
+                compliance=problem.compliance[:, 0] if problem.yields else None,
+            )  # fmt: skip
+        except OSError as error:  # raised on all ranks alike
+            raise FileError(str(error)) from None
+        return path
+
+
+def unwritten(pairs: Pairs, joints: dict[str, Joint]) -> str:
+    """Why problems of a scene with these pairs and joints cannot be written, in words; "" if they can."""
+    if pairs.resists:  # FCLIB's files have a format of their own for these
+        return "files have no rolling and spinning; allowed are scenes without them"
+    return "files have no joints; allowed are scenes without them" if joints else ""
 
 
 def masses_and_map(system: ContactSystem) -> tuple[np.ndarray, Array, ContactMap]:

@@ -138,7 +138,6 @@ class Writer:
         self._every, self._checkpoint_every = every, checkpoint_every
         self._start = self._recorded = self._saved = world.step
         self._kept_steps = world.step if place.goes_on else 0
-        self._first_frame: int | None = None
         self._begun = self._stands = self._stale = False
         self.analysis: dict[str, float] | None = None  #: the scene's numbers of all steps so far
         tables = [world.grains, *(source.extremes() for source in world.sources.values())]
@@ -173,10 +172,39 @@ class Writer:
             if step <= self._kept_steps:
                 yield step, line
 
-    def record(self, step: Step, row: Mapping[str, float]) -> None:
-        """Write the frame of a step, with the row of its records, if that is due."""
-        if self._every and step.world.step % self._every == 0:
-            self._record(step, row)
+    def record(self, step: Step, row: Mapping[str, float], always: bool = False) -> None:
+        """Write the frame of a step if that is due: its state, the contacts and impulses that led to it, and the row of
+        its records as attributes of the group `record`.
+
+        Bodies are in the order of their ids (grains, then large bodies).
+        """
+        world, contacts, frames = step.world, step.contacts, self.place.now / "frames"
+        due = self._every and (always or world.step % self._every == 0)
+        if not due or self._recorded == world.step:
+            return
+        if self._recorded == self._start:
+            self.place.make("frames")
+            rows = _by_id(world, TABLE)
+            large = np.bytes_(json.dumps(described_bodies(world)))
+            shared = {"materials": texts(world.materials), "large": large}
+            if world.clumps:
+                shared["clumps"] = np.bytes_(json.dumps(described_clumps(world)))
+            write_rows(frames / "bodies.h5", self.comm, rows, shared, {})
+        near = contacts.near.bodies
+        rows = {
+            **_by_id(world, ("position", "quaternion", "velocity", *(("id", *TABLE) if world.tallies else ()))),
+            "contact/key": contacts.key,
+            "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
+            "contact/point": wrapped(contacts.point, world.period, world.shear),
+            "contact/frame": step.system.frame,
+            "contact/gap": contacts.gap,
+            "contact/impulse": step.impulse,
+        }
+        if (moments := step.moments) is not None:
+            rows["contact/moment"] = moments
+        about = {"/": {"step": world.step, "time": world.time}, "record": row, "contact": {"dt": step.system.dt}}
+        write_rows(frames / f"{world.step:06d}.h5", self.comm, rows, {}, about)
+        self._recorded = world.step
 
     def add(self, line: Mapping[str, Any], row: Mapping[str, float]) -> None:
         """Write the figures of a step with the row of its records, and the checkpoint if that is due."""
@@ -208,8 +236,7 @@ class Writer:
 
     def complete(self, step: Step, row: Mapping[str, float]) -> None:
         """Write the frame and the checkpoint of the last step, if they are not there, and what follows from all."""
-        if self._every and self._recorded < self._world.step:
-            self._record(step, row)
+        self.record(step, row, always=True)
         self.keep()
         if self._stale:
             self._derive()
@@ -251,36 +278,6 @@ class Writer:
         self._save(self.checkpoint)
         self._saved = self._world.step
 
-    def _record(self, step: Step, row: Mapping[str, float]) -> None:
-        """Write the state at the end of a step, the contacts and impulses that led to it, and the row of its records
-        as attributes of the group `record`.
-
-        Bodies are in the order of their ids (grains, then large bodies).
-        """
-        world, contacts, frames = step.world, step.contacts, self.place.now / "frames"
-        if self._first_frame is None:
-            self.place.make("frames")
-            rows = _by_id(world, TABLE)
-            large = np.bytes_(json.dumps(described_bodies(world)))
-            shared = {"materials": texts(world.materials), "large": large}
-            write_rows(frames / "bodies.h5", self.comm, rows, shared, {})
-            self._first_frame = world.step
-        near = contacts.near.bodies
-        rows = {
-            **_by_id(world, ("position", "quaternion", "velocity", *(("id", *TABLE) if world.tallies else ()))),
-            "contact/key": contacts.key,
-            "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
-            "contact/point": wrapped(contacts.point, world.period, world.shear),
-            "contact/frame": step.system.frame,
-            "contact/gap": contacts.gap,
-            "contact/impulse": step.impulse,
-        }
-        if (moments := step.moments) is not None:
-            rows["contact/moment"] = moments
-        about = {"/": {"step": world.step, "time": world.time}, "record": row, "contact": {"dt": step.system.dt}}
-        write_rows(frames / f"{world.step:06d}.h5", self.comm, rows, {}, about)
-        self._recorded = world.step
-
     def _remove_later(self, hard: str) -> None:
         """Remove what followed from an earlier run's steps, and its later steps, but not those of this run's first
         step, such as the file ``hard``."""
@@ -288,7 +285,7 @@ class Writer:
         for name in DERIVED:  # first of all: no link is without its file
             (folder.path / name).unlink(missing_ok=True)
         for step in folder.steps:
-            if step > kept and step != self._first_frame:
+            if step > kept and step != self._recorded:
                 folder.frame_path(step).unlink()
         for path in (folder.path / HARD).glob("step??????_*its.h5"):
             if int(path.name[4:10]) > kept and path.name != hard:
@@ -302,6 +299,11 @@ def described_bodies(world: World) -> list[dict[str, Any]]:
         for body in world.large_bodies
     ]
     return json.loads(json.dumps(large, default=list))  # arrays as lists
+
+
+def described_clumps(world: World) -> list[dict[str, Any]]:
+    """The centres [m], in the frames of the grains, and radii [m] of the spheres of each clump, as JSON has them."""
+    return [{"centres": form.center.tolist(), "radii": form.radius.tolist()} for form in world.clumps]
 
 
 def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:

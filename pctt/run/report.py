@@ -137,6 +137,19 @@ def remaining(spent: float, done: int, steps: int) -> str:
     return f"about {minutes} min {seconds:02d} s left" if minutes else f"about {seconds} s left"
 
 
+def ending(
+    steps: Sequence[Mapping[str, Any]], tol: float, closing_work: float, figures: Mapping[str, float],
+    worst: Mapping[str, float],
+) -> str:  # fmt: skip
+    """What steps have taken and shown: the phases, the law, jumps, forces, the numbers of the scene's analysis, and the
+    worst overlap of the run. ``tol`` and ``closing_work`` are those of the settings."""
+    outside = steps[-1]["record"].get("grains_outside")
+    said = [phase_table(steps), law_line(steps, tol), jumps_line(steps), forces_line(steps, closing_work)]
+    said += [figure_table(figures), overlap_line(worst)]
+    said += [f"{outside:.0f} grains have left the domain of the scene"] if outside else []
+    return "\n".join(filter(None, said))
+
+
 def compare_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
     """The compared preconditioners over all systems of the run, the losers too, and what they really were."""
     entries = {name: name if s["type"] == name else f"{name}:{s['type']}" for name, s in summary.items()}

@@ -126,16 +126,20 @@ class Settings(ccp.Limits):
         refuse_bad(whole)
         return whole
 
-    def fitted(self, scene: Scene) -> Settings:
-        """The same, with the time step and the contact distance that a built scene needs where none is given."""
+    def fitted(self, scene: Scene, relaxed: bool = False) -> Settings:
+        """The same, with the time step and the contact distance that a built scene needs where none is given, and with
+        rigid contacts in the paper's model, unless a stiffness is stated."""
+        paper = (relaxed or self.solver == "pdip") and self.stiffness is None and not scene.states_stiffness
+        stiffness = math.inf if paper else self.stiffness
         dt = time_step.recommended(scene) if self.dt is None else self.dt
         delta = time_step.contact_distance(scene) if self.delta is None else self.delta
-        if not ccp.SOLVERS[self.solver].has_rolling and scene.pairs(np.inf).resists:
-            why = f"rolling or spinning resistance; allowed are {ccp.FOR_ROLLING}"
-            raise OptionError(f"-ccp_type {self.solver}: the scene has {why}")
+        resists = scene.pairs(np.inf).resists
+        if not ccp.SOLVERS[self.solver].has_rolling and (resists or scene.joints):
+            why = "rolling or spinning resistance" if resists else "joints"
+            raise OptionError(f"-ccp_type {self.solver}: the scene has {why}; allowed are {ccp.FOR_ROLLING}")
         if delta < scene.reach:
             raise OptionError(f"-delta {delta:g} m: cohesion acts up to {scene.reach:g} m; allowed is at least that")
-        return dataclasses.replace(self, dt=dt, delta=delta)
+        return dataclasses.replace(self, dt=dt, delta=delta, stiffness=stiffness)
 
 
 @dataclasses.dataclass(frozen=True)

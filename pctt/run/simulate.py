@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 
 from dem.compiled import tell_first_compilation
@@ -16,7 +17,9 @@ from pctt.ccp.fclib import FileFormatError, Stored
 from pctt.disk import FileError, on_first, write_text
 from pctt.folder import dumps
 from pctt.ksp_options import remark
+from pctt.options import OptionError
 from pctt.run import interrupt, report
+from pctt.run.dump import unwritten
 from pctt.run.output import Place
 from pctt.run.settings import DEMO, Options
 from pctt.run.state import built, settled_state
@@ -34,6 +37,10 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         return
     if options.demo:
         progress.say("no options: the demo; -help lists the options")
+    if run.dump_problem:
+        scene = built(options.scene, comm)
+        if why := unwritten(scene.pairs(np.inf), scene.joints):
+            raise OptionError(f"-dump_problem: {why}")
     compare = ccp.Comparison(comm, run.compared(), run.compare_every)
     with Simulation(
         options.scene, options.settings, comm=comm, restart=run.restart, compare=compare, say=progress.say
@@ -73,7 +80,11 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         words = _how_to_go_on(options, output.checkpoint, end - sim.steps)
         raise interrupt.InterruptError(f"interrupted after step {sim.steps}; the same command with {words}")
     if sim.last:
-        _say_end(sim, steps, progress)
+        figures = sim.analyse()
+        if sim.comm.rank == 0:
+            lines = [line for line in output.folder.lines() if line["step"] > end - steps]
+            worst = output.folder.summary["worst_overlap"]
+            progress.say("\n" + report.ending(lines, settings.tol, settings.closing_work, figures, worst))
         if what := newton.linear.what():
             progress.say(f"Newton systems: {what}")
         if compare.names:
@@ -83,25 +94,6 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     if sim.last:
         folder = output.place.folder
         progress.say(f"\nresults: {folder}/state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
-
-
-def _say_end(sim: Simulation, steps: int, progress: report.Progress) -> None:
-    """What the last ``steps`` have taken and shown."""
-    figures, output = sim.analyse(), sim.output
-    if sim.comm.rank > 0:
-        return
-    assert output is not None
-    lines = [line for line in output.folder.lines() if line["step"] > sim.steps - steps]
-    progress.say("\n" + report.phase_table(lines))
-    progress.say(report.law_line(lines, sim.settings.tol))
-    if jumps := report.jumps_line(lines):
-        progress.say(jumps)
-    progress.say(report.forces_line(lines, sim.settings.closing_work))
-    if figures:
-        progress.say(report.figure_table(figures))
-    progress.say(report.overlap_line(output.folder.summary["worst_overlap"]))
-    if outside := sim.figures.get("grains_outside"):
-        progress.say(f"{outside:.0f} grains have left the domain of the scene")
 
 
 def _how_to_go_on(options: Options, state: Path, steps: int) -> str:

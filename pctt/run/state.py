@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from dem import loads, springs, stiffness, time_step
+from dem import joints, loads, springs, stiffness, time_step
 from dem.arrays import Floats
 from dem.bodies import Bodies
 from dem.exchange import refuse
@@ -29,7 +29,7 @@ from dem.scene import LargeBody, Scene
 from dem.shapes import placed
 from dem.start import even_slice, new_world, restart_rows, restored_world
 from dem.together import SceneError, together, unlike
-from dem.world import World, changed_motions, restore_loads, restore_motions, restore_springs
+from dem.world import World, changed_motions, restore_joints, restore_loads, restore_motions, restore_springs
 from pctt import ccp
 from pctt.disk import FileError, Lock, on_first, read, texts, write_rows
 from pctt.options import OptionError
@@ -38,7 +38,10 @@ from pctt.run import interrupt
 from pctt.run.settings import Settings, scene_name
 from pctt.run.stepper import Stepper
 
-CHANGES = {"motions": restore_motions, "loads": restore_loads, "springs": restore_springs}  #: made within a run
+#: Made within a run.
+CHANGES = {
+    "motions": restore_motions, "loads": restore_loads, "springs": restore_springs, "joints": restore_joints,
+}  # fmt: skip
 FORMAT, FIRST_FORMAT = "pctt checkpoint 2", "pctt checkpoint 1"  #: the first one had no checksums
 
 Say = Callable[[str], object]  #: told on the first rank
@@ -68,16 +71,15 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     motions = [(body.name, type(body.motion).__name__) for body in large]
     words = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
     words += [repr(scene.sources), repr(scene.outlets)]
-    numbers = [column for table in (*scene.parts, scene.large()) for column in table.columns().values()]
-    numbers += [np.asarray(value) for body in large for shape in body.shapes for value in placed(shape)]
-    of_motions = [np.asarray(value) for body in large for value in getattr(body.motion, "__dict__", {}).values()]
-    of_motions += [np.asarray(body.surface) for body in large]
-    of_motions += [np.asarray(value) for spring in scene.springs.values() for value in vars(spring).values()]
-    of_motions += [np.asarray(value) for load in scene.loads.values() for value in vars(load).values()]
-    numbers += [value for value in of_motions if value.dtype.kind in "fiub"]
-    numbers += [np.array([-np.inf if scene.shear_rate is None else scene.shear_rate, scene.gradient])]
-    numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values()]
-    return repr(words), numbers
+    words.append([(name, repr(joint)) for name, joint in scene.joints.items()])
+    numbers: list[Any] = [column for table in (*scene.parts, scene.large()) for column in table.columns().values()]
+    numbers += [value for body in large for shape in body.shapes for value in placed(shape)]
+    numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values(), *(body.surface for body in large)]
+    numbers += [-np.inf if scene.shear_rate is None else scene.shear_rate, scene.gradient]
+    numbers += [np.full(3, -np.inf) if scene.stress is None else np.nan_to_num(scene.stress)]
+    for part in (*(body.motion for body in large), *scene.springs.values(), *scene.loads.values()):
+        numbers += getattr(part, "__dict__", {}).values()
+    return repr(words), [value for value in map(np.asarray, numbers) if value.dtype.kind in "fiub"]
 
 
 def world_at_start(experiment: Experiment, scene: Scene, comm: MPI.Comm) -> World:
@@ -139,6 +141,8 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
     if world.springs_set:
         changed = {name: world.springs[name] for name in sorted(world.springs_set)}
         shared["world/springs"] = texts([springs.as_text(changed)])
+    if world.joints_set:
+        shared["world/joints"] = texts([joints.as_text({n: world.joints[n] for n in sorted(world.joints_set)})])
     rows |= {"contacts/key": key, "contacts/impulse": impulse}
     write_rows(path, world.comm, rows, shared, {"/": {"format": FORMAT, **made_with}})
 
@@ -155,8 +159,8 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
     def take(file: h5py.File, sealed: bool) -> tuple[Any, ...]:
         _refuse_unmarked(file, sealed)
         replicated = {n: file[f"world/{n}"][()] for n in (*(f"large_{n}" for n in columns), "slabs", "time", "step")}
-        # of springs, of sources and outlets, of a sheared cell
-        for name in {"expected", "tallies", "shear"} & set(file["world"]):
+        # of springs, of sources and outlets, of a sheared cell, of its stress
+        for name in {"expected", "tallies", "shear", "servo"} & set(file["world"]):
             replicated[name] = file[f"world/{name}"][()]
         changes = [file[f"world/{n}"].asstr()[0] if f"world/{n}" in file else "{}" for n in CHANGES]
         rows, contacts = restart_rows(replicated["slabs"], comm), even_slice(len(file["contacts/key"]), comm)
@@ -207,11 +211,6 @@ def _refuse_other_origin(
 # -- settled states, outside the project's folder ------------------------------------------------------------
 
 
-def cache() -> Path:
-    """The folder of settled states."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pctt"
-
-
 def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_with: dict[str, Any]) -> Path:
     """The file of a scene's settled state. Its name has the scene and a digest of all that influences the state: of a
     run's settings that is ``settle_tol``. OptionError if the scene never settles."""
@@ -231,17 +230,13 @@ def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_
         how["surfaces"] = surfaces
     digest = hashlib.sha256((made_with["scene"] + json.dumps(how, sort_keys=True)).encode()).hexdigest()[:12]
     size = f"_n{about['n']}" if "n" in about else ""
-    return cache() / f"{about['scene']}{size}_{digest}.h5"
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return cache / "pctt" / f"{about['scene']}{size}_{digest}.h5"
 
 
 def unfinished(path: Path) -> Path:
     """The checkpoint that an interrupted settling leaves beside its settled state."""
     return path.with_suffix(".unfinished.h5")
-
-
-def settling_steps(experiment: Experiment, scene: Scene) -> int:
-    """The steps of a settling from time zero."""
-    return math.ceil(experiment.settling_time / time_step.for_settling(scene) * (1 - 1e-12))
 
 
 def settling_distances(experiment: Experiment, scene: Scene) -> tuple[float, float]:
@@ -298,8 +293,9 @@ def _settle(
 
     The last tenth has the contact distance of the scene and ten times the accuracy: otherwise overlaps remain, and the
     first accurate step of a run would push them apart."""
-    end, tol, begun = settling_steps(experiment, scene), settings.settle_tol, time.perf_counter()
-    tenth = max(1, end // 10)
+    dt, (falling, at_rest) = time_step.for_settling(scene), settling_distances(experiment, scene)
+    end = math.ceil(experiment.settling_time / dt * (1 - 1e-12))
+    tenth, tol, begun = max(1, end // 10), settings.settle_tol, time.perf_counter()
     say(f"settling {scene_name(experiment)}, {end} steps with APGD to {tol:g}:")
     world = world_at_start(experiment, scene, comm)
     memory = ImpulseMemory(comm, world.pairs.parts)
@@ -309,7 +305,6 @@ def _settle(
             say(f"  goes on after step {world.step}, from {unfinished(path)}")
         except FileError as error:
             say(f"  {error}; settled from the beginning")
-    dt, (falling, at_rest) = time_step.for_settling(scene), settling_distances(experiment, scene)
     loose = Settings(dt=dt, delta=falling, solver="apgd", tol=tol, law=ccp.RELAXATION).of(experiment)
     with Stepper(loose, world, memory) as stepper:
         while world.step < end:

@@ -14,15 +14,18 @@ from dem.arrays import Ints
 from dem.contact import Contacts, find_contacts
 from dem.fast import refuse_passages
 from dem.impulses import ImpulseMemory
+from dem.joints import Coupling
 from dem.partition import rebalance
 from dem.passage import come_and_go
 from dem.period import put_back
+from dem.servo import follow_stress
 from dem.step import advance, carried, find_overrun, find_turned
 from dem.system import ContactSystem, touching
 from dem.together import SceneError
 from dem.world import World
 from pctt import ccp, log
 from pctt.ccp.cone import Array
+from pctt.options import OptionError
 from pctt.run.dump import Dump
 from pctt.run.projection import projected
 from pctt.run.settings import Settings
@@ -56,9 +59,13 @@ class Stepper:
         self.settings, self.world, self.memory, self.newton, self.dump = settings, world, memory, newton, dump
         self._problem: ccp.ConeProblem | None = None
         self._corrections = 0  # of the present step
+        self._joints: Coupling | None = None  # of the present step, once its contacts have shown what holds
+        self._rejoined = 0  # how often they have
         self._slabs: Ints | None = None  # those of the last step, or of a solution that is remembered within this one
         if settings.stiffness is not None:
             world.pairs.stiffness[:] = settings.stiffness
+        if world.servo is not None and not np.isfinite(world.pairs.stiffness).all():
+            raise OptionError("-stiffness inf: a cell of given stress needs contacts that give way; allowed is less")
 
     def __enter__(self) -> Stepper:
         return self
@@ -86,12 +93,14 @@ class Stepper:
             raise SceneError(f"step {self.world.step + 1}: {error}") from None
 
     def _step(self) -> dict[str, Any]:
-        self._corrections = 0
-        contacts = self._search()
-        if self.settings.projection:
-            problem, guess, result, moving = self._step_with_projection(contacts)
-        else:
-            problem, guess, result, moving = self._step_to_gaps(contacts)
+        self._corrections, self._rejoined, self._joints = 0, 0, None
+        with log.phase("search"):
+            come_and_go(self.world)
+            put_back(self.world)
+            rebalance(self.world)
+            contacts = find_contacts(self.world, self.settings.delta, self.settings.dt)
+        impulses = self._with_projection if self.settings.projection else self._to_gaps
+        problem, guess, result, moving = impulses(contacts)
         with log.phase("solve"):
             accuracy = ccp.measure(problem, result.impulse)
         with log.phase("output"):
@@ -106,25 +115,32 @@ class Stepper:
             self.impulse, self.history = self.system.net(forces), result.history
             self.moment = None if self.system.resistance is None else moments
             advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt, moving)
+            follow_stress(self.world, self.contacts, self.system, self.impulse)
             self.memory.remember(self.system.key, result.impulse, self.system.frame)
             self._slabs = self.world.slabs
         self._release()
         return self._figures(problem.size, result, accuracy, files)
 
-    def _step_to_gaps(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
+    def _to_gaps(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
         problem, guess = self._assemble(contacts, self.memory)
         result = self.solve(problem, guess)
-        while (again := self._unseen(self.contacts, self.system, result.momentum)) is not None:
-            problem, guess = self._assemble(again, self._remembered(result))
+        while True:
+            again = self._unseen(self.contacts, self.system, result.momentum)
+            if again is None and self._joints_hold(result):
+                return problem, guess, result, None
+            problem, guess = self._assemble(self.contacts if again is None else again, self._remembered(result))
             result = self.solve(problem, guess).after(result)
-        return problem, guess, result, None
 
-    def _step_with_projection(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
+    def _with_projection(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
         """Forces of contacts that touch at the start, then positions without overlaps; see `pctt.run.projection`."""
         every = self._system(contacts, impacts=False)
         problem, guess = self._assemble(contacts.take(touching(contacts, every)), self.memory)
         result = self.solve(problem, guess)
+        while not self._joints_hold(result):
+            every = self._system(contacts, impacts=False)
+            problem, guess = self._assemble(self.contacts, self._remembered(result))
+            result = self.solve(problem, guess).after(result)
         while True:
             with log.phase("project"):
                 shift, self.projection_its = projected(every, self.system, result)
@@ -132,14 +148,6 @@ class Stepper:
             if again is None:
                 return problem, guess, result, self.system.velocity_with(result.momentum + shift)
             contacts, every = again, self._system(again, impacts=False)
-
-    def _search(self) -> Contacts:
-        """The contacts of the step."""
-        with log.phase("search"):
-            come_and_go(self.world)
-            put_back(self.world)
-            rebalance(self.world)
-            return find_contacts(self.world, self.settings.delta, self.settings.dt)
 
     def _figures(
         self, contacts: int, result: ccp.Result, accuracy: ccp.Accuracy, files: dict[str, Any]
@@ -177,7 +185,8 @@ class Stepper:
 
     def _system(self, contacts: Contacts, impacts: bool = True) -> ContactSystem:
         with log.phase("assembly"):
-            return ContactSystem(self.world, contacts, self.settings.dt, self.settings.recovery_speed, impacts)
+            given = self.settings.dt, self.settings.recovery_speed, impacts, self._joints
+            return ContactSystem(self.world, contacts, *given)
 
     def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, Array]:
         """The problem of these contacts, which takes the place of the last, and the impulses remembered."""
@@ -189,27 +198,23 @@ class Stepper:
         return self._problem, guess
 
     def _unseen(self, contacts: Contacts, system: ContactSystem, momentum: Array) -> Contacts | None:
-        """The contacts, with those that these momenta show to be missed; None if there are none."""
+        """The contacts, with those that these momenta show to be missed; None if there are none. Three times a step at
+        most with those that overlap at its end because bodies turn, by a tenth of delta."""
+        world, settings = self.world, self.settings
+        delta, dt, recovery = settings.delta, settings.dt, settings.recovery_speed
         with log.phase("search"):
-            velocity, delta, dt = system.velocity_with(momentum), self.settings.delta, self.settings.dt
+            velocity = system.velocity_with(momentum)
             deep = 0.01 * delta  # the overlap that is solved for
-            wider = find_overrun(self.world, contacts, velocity, delta, dt, deep, self.settings.recovery_speed)
+            wider = find_overrun(world, contacts, velocity, delta, dt, deep, recovery)
             if wider is not None:
-                return carried(self.world, contacts, wider) if self._corrections else wider
-            turned = self._turned(contacts, velocity)
-            if turned is None:
-                refuse_passages(self.world, contacts, velocity, delta, dt)
-            return turned
-
-    def _turned(self, contacts: Contacts, velocity: Array) -> Contacts | None:
-        """The contacts, with those that overlap at the end of the step because bodies turn. None if there are none, or
-        after so many corrections."""
-        settings, depth, most = self.settings, 0.1 * self.settings.delta, 3  # overlap that is corrected, and how often
-        if self._corrections == most or self.world.only_spheres:
+                return carried(world, contacts, wider) if self._corrections else wider
+            if self._corrections < 3 and not world.only_spheres:
+                turned = find_turned(world, contacts, velocity, dt, 0.1 * delta, recovery)
+                if turned is not None:
+                    self._corrections += 1
+                    return turned
+            refuse_passages(world, contacts, velocity, delta, dt)
             return None
-        turned = find_turned(self.world, contacts, velocity, settings.dt, depth, settings.recovery_speed)
-        self._corrections += turned is not None
-        return turned
 
     def _remembered(self, found: ccp.Result) -> ImpulseMemory:
         """A memory of these impulses of the present contacts."""
@@ -217,6 +222,20 @@ class Stepper:
         memory.remember(self.system.key, found.impulse, self.system.frame)
         self._slabs = self.world.slabs
         return memory
+
+    def _joints_hold(self, result: ccp.Result) -> bool:
+        """Whether the limits and motors that the joints of the step take as holding are those that do with these
+        impulses, or so many others were tried; else the others are set. Collective."""
+        most = 3
+        if self.system.joints is None or self._rejoined == most:
+            return True
+        with log.phase("assembly"):
+            forces = self.system.net(result.impulse[: len(self.contacts)])
+            found = self.system.joints_with(self.world, forces)
+        if found is not None:
+            self._joints = found
+            self._rejoined += 1
+        return found is None
 
     def solve(self, problem: ccp.ConeProblem, guess: Array) -> ccp.Result:
         """Solve a problem of the step as the settings say."""

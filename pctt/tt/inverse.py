@@ -139,7 +139,7 @@ def _sketched(S: Train, X: Train, B: Train) -> float:
     for k, x in enumerate(X.cores):
         width = len(sketch.left[k])
         y = rng.standard_normal((width, *x.shape[1:3], samples)) / width**0.5
-        sketch.step_right(k, y, x)
+        sketch.step(k, 1, y, x)
     d = len(X)
     products = sketch.left_B[d][:, 0] - sketch.left[d][:, 0, 0]
     return float(np.linalg.norm(products) / samples**0.5)
@@ -169,30 +169,28 @@ class Growing:
         self.repaired = 0
         self.estimate = 0.0
 
-    def forward(self) -> None:
-        x, z = self.x, self.z
-        for k in range(len(x) - 1):
-            self._solve(k)
-            new = self.galerkin.rest_left(self.residual, k, x[k])  # (a, m, n, z)
-            z[k] = self.residual.rest(k, x[k])
-            _push_right(x, self.signs, k, self.most[k], self.drop, new)
-            z[k] = columns(z[k])
-            self.galerkin.step_right(k, x[k], x[k])
-            self.residual.step_right(k, z[k], x[k])
-
-    def backward(self) -> None:
-        x, z = self.x, self.z
-        for k in range(len(x) - 1, 0, -1):
-            self._solve(k)
-            new = self.residual.rest_left(self.galerkin, k, x[k])  # (z, m, n, b)
-            z[k] = self.residual.rest(k, x[k])
-            _push_left(x, self.signs, k, self.most[k - 1], self.drop, new)
-            z[k] = rows(z[k])
-            self.galerkin.step_left(k, x[k], x[k])
-            self.residual.step_left(k, z[k], x[k])
+    def sweep(self) -> None:
+        """A pass over the cores there and back."""
+        last = len(self.x) - 1
+        for k in range(last):
+            self._step(k, 1)
+        for k in range(last, 0, -1):
+            self._step(k, -1)
         self._solve(0)
-        z[0] = self.residual.rest(0, x[0])
-        self.estimate = float(np.linalg.norm(z[0]))
+        self.z[0] = self.residual.rest(0, self.x[0])
+        self.estimate = float(np.linalg.norm(self.z[0]))
+
+    def _step(self, k: int, way: int) -> None:
+        """Compute core k, and go to the next one (``way`` 1) or to the one before (-1)."""
+        x, z = self.x, self.z
+        self._solve(k)
+        left, right = (self.galerkin, self.residual)[::way]
+        new = left.rest_left(right, k, x[k])  # (a, m, n, z) or (z, m, n, b)
+        z[k] = self.residual.rest(k, x[k])
+        _push(x, self.signs, k, way, self.most[min(k, k + way)], self.drop, new)
+        z[k] = columns(z[k]) if way > 0 else rows(z[k])
+        self.galerkin.step(k, way, x[k], x[k])
+        self.residual.step(k, way, z[k], x[k])
 
     def words(self, norm: float) -> str:
         """How far it is, for a message. norm : ||B||"""
@@ -262,8 +260,7 @@ def _solve(
     for count in range(1, sweeps + 1):
         begun = work.spent
         try:
-            growing.forward()
-            growing.backward()
+            growing.sweep()
         except TooMuchWorkError:
             raise TooMuchWorkError(growing.words(norm)) from None
         if growing.estimate <= enough * norm:
@@ -307,32 +304,24 @@ def _with_signs(X: Train, most: list[int]) -> tuple[list[Array], list[Array]]:
     signs = [np.ones(1)] * (len(x) + 1)
     for k in range(len(x) - 1, 0, -1):
         signs[k] = np.zeros(len(x[k]))  # no symmetry yet
-        _push_left(x, signs, k, most[k - 1], 0.0)
+        _push(x, signs, k, -1, most[k - 1], 0.0)
     x[0] = 0.5 * (x[0] + _transpose(x[0], signs[0], signs[1]))
     return x, signs
 
 
-def _push_right(
-    x: list[Array], signs: list[Array], k: int, most: int, drop: float, more: Array | None = None
+def _push(
+    x: list[Array], signs: list[Array], k: int, way: int, most: int, drop: float, more: Array | None = None
 ) -> None:
     """Give core k, as a matrix (a m n, b), at most ``most`` orthonormal columns, some of them from ``more``.
 
-    The next core takes the other factor.
+    The next core takes the other factor. With ``way`` -1 the same for the rows (a, m n b), and the core before.
     """
-    Q, R, signs[k + 1] = _basis(x[k], signs[k], signs[k + 1], most, drop, more)
-    x[k] = Q.reshape(*x[k].shape[:3], -1)
-    x[k + 1] = np.tensordot(R, x[k + 1], 1)
-
-
-def _push_left(
-    x: list[Array], signs: list[Array], k: int, most: int, drop: float, more: Array | None = None
-) -> None:
-    """The same for the rows of core k, as a matrix (a, m n b); the core before takes the other factor."""
-    turned = x[k].transpose(3, 1, 2, 0)
-    more = None if more is None else more.transpose(3, 1, 2, 0)
-    Q, R, signs[k] = _basis(turned, signs[k + 1], signs[k], most, drop, more)
-    x[k] = np.ascontiguousarray(Q.reshape(*turned.shape[:3], -1).transpose(3, 1, 2, 0))
-    x[k - 1] = np.tensordot(x[k - 1], R, (3, 1))
+    turn = (0, 1, 2, 3) if way > 0 else (3, 1, 2, 0)
+    here, there = (k, k + 1)[::way]
+    core, more = x[k].transpose(turn), None if more is None else more.transpose(turn)
+    Q, R, signs[there] = _basis(core, signs[here], signs[there], most, drop, more)
+    x[k] = np.ascontiguousarray(Q.reshape(*core.shape[:3], -1).transpose(turn))
+    x[k + way] = np.tensordot(R, x[k + 1], 1) if way > 0 else np.tensordot(x[k - 1], R, (3, 1))
 
 
 def _basis(

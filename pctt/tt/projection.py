@@ -29,21 +29,22 @@ class Projection:
         """A projection for the first core: everything right of it is contracted."""
         new = cls(S, B, len(x))
         for k in range(len(x) - 1, 0, -1):
-            new.step_left(k, y[k], x[k])
+            new.step(k, -1, y[k], x[k])
         return new
 
-    def step_right(self, k: int, y: Array, x: Array) -> None:
-        T = np.tensordot(self.left[k], x, (2, 0))  # (c, R, i', j, b)
-        T = np.tensordot(self.S[k], T, ((0, 2), (1, 2)))  # (i, R', c, j, b)
-        self.left[k + 1] = np.tensordot(y, T, ((0, 1, 2), (2, 0, 3)))
-        if self.B is not None:
+    def step(self, k: int, way: int, y: Array, x: Array) -> None:
+        """Contract core k too: into the left interface (``way`` 1) or into the right one (-1)."""
+        if way > 0:
+            T = np.tensordot(self.left[k], x, (2, 0))  # (c, R, i', j, b)
+            T = np.tensordot(self.S[k], T, ((0, 2), (1, 2)))  # (i, R', c, j, b)
+            self.left[k + 1] = np.tensordot(y, T, ((0, 1, 2), (2, 0, 3)))
+        else:
+            T = np.tensordot(x, self.right[k], (3, 2))  # (a, i', j, c, R)
+            T = np.tensordot(self.S[k], T, ((2, 3), (1, 4)))  # (R, i, a, j, c)
+            self.right[k - 1] = np.tensordot(y, T, ((1, 2, 3), (1, 3, 4)))
+        if self.B is not None and way > 0:
             self.left_B[k + 1] = np.tensordot(y, np.tensordot(self.left_B[k], self.B[k], 1), ((0, 1, 2), (0, 1, 2)))
-
-    def step_left(self, k: int, y: Array, x: Array) -> None:
-        T = np.tensordot(x, self.right[k], (3, 2))  # (a, i', j, c, R)
-        T = np.tensordot(self.S[k], T, ((2, 3), (1, 4)))  # (R, i, a, j, c)
-        self.right[k - 1] = np.tensordot(y, T, ((1, 2, 3), (1, 3, 4)))
-        if self.B is not None:
+        elif self.B is not None:
             T = np.tensordot(self.B[k], self.right_B[k], (3, 1))  # (R, i, j, c)
             self.right_B[k - 1] = np.tensordot(y, T, ((1, 2, 3), (1, 2, 3)))
 
@@ -129,10 +130,10 @@ def lowest(X: Train) -> float:
         before = value
         for k in range(len(v) - 1):
             v[k] = columns(lowest_core(k))
-            galerkin.step_right(k, v[k], v[k])
+            galerkin.step(k, 1, v[k], v[k])
         for k in range(len(v) - 1, 0, -1):
             v[k] = rows(lowest_core(k))
-            galerkin.step_left(k, v[k], v[k])
+            galerkin.step(k, -1, v[k], v[k])
         lowest_core(0)
         if value < 0 or abs(value - before) <= 1e-3 * abs(value):
             break

@@ -183,7 +183,7 @@ def pair_keys(rows: Array | int, columns: Array | int, modes: Sequence[int]) -> 
     """One number for each pair of slots, with the digits i_k m_k + j_k of base m_k^2; the first is most significant.
 
     >>> pair_keys(np.array([0, 5]), 3, [2, 4])
-    array([ 3, 23])
+    array([ 3, 39])
     """
     if float(slots_of(modes)) ** 2 >= 2.0**63:
         raise ValueError(f"too many slots for one key of 64 bits: modes {list(modes)}")

@@ -92,7 +92,7 @@ class SparseHierarchy:
         wide = np.int64 if len(self.keys) * b * b >= 2**31 else np.int32
         digit: Array = self.keys % m**2
         first = (digit // m * self.modes[-1] + digit % m) * b  # column of the first entry of each block
-        place = np.add.outer(np.arange(b, dtype=wide) * self.modes[-1], np.arange(b, dtype=wide))
+        place = np.add.outer(np.arange(b) * self.modes[-1], np.arange(b)).astype(wide)
         self._leaf_columns = np.add.outer(first.astype(wide), place).ravel()
         self._leaf_pointers = (np.append(starts, len(self.keys)) * b * b).astype(wide)
         return self.keys[starts] // m**2

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from pctt.ccp import cone
-from pctt.ccp.cone_loops import accelerated_step as accelerated_step_loop
-from pctt.ccp.cone_loops import scaling
 
 COUNTS = [0, 1, 7, 256, 1000]  # also of whole strips, and not
 
@@ -65,7 +63,7 @@ class Sample:
 
 def stepped(x, last_x, y, compliance, beta, step, mu, opening):
     out = np.zeros_like(x)
-    return *accelerated_step_loop(x, last_x, y, compliance, beta, step, mu, opening, out), out
+    return *cone.accelerated_step(x, last_x, y, compliance, beta, step, mu, opening, out), out
 
 
 NAMES = list(Sample(0).cases)
@@ -127,7 +125,7 @@ def test_the_scaling_is_that_of_nesterov_and_todd(normal, tangential):
     s, z = inside(rng, 200), inside(rng, 200)
     s[:5, 1:] = z[:5, 1:] = 0.0
     compliance = np.tile([normal, tangential, tangential], (200, 1))
-    root, eta, square, X, share = scaling(s, z, compliance)
+    root, eta, square, X, share = cone.scaling(s, z, compliance)
     W = cone.NesterovTodd(root, eta)
     np.testing.assert_allclose(W.times(z), W.divide(s), rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(W.divide(W.times(s)), s, rtol=1e-7, atol=1e-9)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mpi4py import MPI
-from problems import SELF, dense_of, from_graph, from_matrix, heap, matrix, part
+from problems import SELF, dense_of, from_graph, from_matrix, heap, matrix, part, random_graph
 from scipy.linalg import block_diag
 
 from pctt import ccp
@@ -22,62 +22,39 @@ def few(request, monkeypatch):
     monkeypatch.setattr(Settings, "few", getattr(request, "param", 0))
 
 
-def definite(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Blocks (count, 3, 3)."""
+def barrier_and_side(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """Definite blocks B (count, 3, 3) and a right-hand side q (count, 3)."""
+    rng = np.random.default_rng(0)
     root = rng.standard_normal((count, 3, 3))
-    return root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    return root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3), rng.standard_normal((count, 3))
 
 
 @pytest.mark.parallel(1, 2, 3, 4)
+@FORMS
 @pytest.mark.parametrize("many", [20, 1000])
-def test_the_forms_agree_with_dense_algebra(many, monkeypatch):
-    """Also where a body has more contacts than N is filled with."""
+def test_the_forms_agree_with_dense_algebra(form, many, monkeypatch):
+    """Also where a body, here one that half of the contacts touch, has more contacts than N is filled with."""
     monkeypatch.setattr(delassus, "HUB", many)
-    comm = MPI.COMM_WORLD
-    contacts, bodies = 120, 30
-    rng = np.random.default_rng(0)
-    # the last body, a press, has 40 % of the contacts; some contacts are of the press and a wall alone
-    one = rng.integers(0, bodies - 1, contacts)
-    press = rng.random(contacts) < 0.4
-    other = np.where(press, bodies - 1, (one + 1 + rng.integers(0, bodies - 2, contacts)) % (bodies - 1))
-    pairs = np.sort(np.stack([one, other], axis=1), axis=1)
-    pieces = rng.standard_normal((contacts, 2, 3, 6))
-    alone = press & (rng.random(contacts) < 0.2)
-    dense = np.zeros((contacts, 3, bodies, 6))
-    for c in range(contacts):
-        for side in (0, 1):
-            if not (alone[c] and pairs[c, side] != bodies - 1):
-                dense[c, :, pairs[c, side]] += pieces[c, side]
-    dense = dense.reshape(3 * contacts, 6 * bodies)
-    cut, own = ([k * size // comm.size for k in range(comm.size + 1)] for size in (contacts, bodies))
-    here = slice(cut[comm.rank], cut[comm.rank + 1])
-    kept = ~(alone[here, None] & (pairs[here] != bodies - 1))
-    indptr = np.concatenate([[0], np.cumsum(kept.sum(1))])
-    G = ccp.BlockRows(indptr, pairs[here][kept], pieces[here][kept], own[comm.rank + 1] - own[comm.rank])
-    mu, r, barrier = np.full(contacts, 0.5), rng.standard_normal((contacts, 3)), definite(rng, contacts)
-    q, e = rng.standard_normal((contacts, 3)), 1e-2
-    N = dense @ dense.T
-    N += e * np.diag(np.tile([1.0, 0.0, 0.0], contacts))
-    S = N + block_diag(*barrier)
-    momenta = rng.standard_normal(6 * bodies)
-    mine = slice(6 * own[comm.rank], 6 * own[comm.rank + 1])
-    exact = np.linalg.solve(S, q.ravel() + dense @ momenta)
-    for form in ccp.FORMS:
-        problem = ccp.ConeProblem(comm, r[here], mu[here], G=G, compliance=e)
-        newton = ccp.Newton(comm, form)
-        newton.begin(problem)
-        newton.update(barrier[here])
-        dg, x = newton.solve(q[here], 1e-9, momenta[mine])
-        dv = newton.system.momenta(x, dg, momenta[mine])
-        parts = [
-            np.abs(dg.ravel() - exact[3 * here.start : 3 * here.stop]).max(),
-            np.abs(dv - (dense.T @ exact - momenta)[mine]).max(),
-            np.abs(problem.product(q[here]).ravel() - (N @ q.ravel())[3 * here.start : 3 * here.stop]).max(),
-        ]
-        assert max(parts) < 1e-6, form
-        assert newton.linear.fallbacks == 0
-        assert problem.has_hubs == (many == 20)
-        newton.destroy()
+    comm, contacts, bodies, e = MPI.COMM_WORLD, 120, 30, 1e-2
+    graph = random_graph(0, contacts, bodies, hub=True)
+    G, here, own = graph.dense(), part(comm, contacts), part(comm, bodies)
+    barrier, q = barrier_and_side(contacts)
+    momenta = np.random.default_rng(1).standard_normal((bodies, 6))
+    N = G @ G.T + e * np.diag(np.tile([1.0, 0.0, 0.0], contacts))
+    exact = np.linalg.solve(N + block_diag(*barrier), q.ravel() + G @ momenta.ravel())
+    problem = ccp.ConeProblem(comm, q[here], np.full(contacts, 0.5)[here], G=graph.part(comm), compliance=e)
+    newton = ccp.Newton(comm, form)
+    newton.begin(problem)
+    newton.update(barrier[here])
+    r_v = momenta[own].ravel()
+    dg, x = newton.solve(q[here], 1e-9, r_v)
+    dv = newton.system.momenta(x, dg, r_v).reshape(-1, 6)
+    np.testing.assert_allclose(dg, exact.reshape(-1, 3)[here], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(dv, ((G.T @ exact).reshape(-1, 6) - momenta)[own], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(problem.product(q[here]), (N @ q.ravel()).reshape(-1, 3)[here], rtol=0, atol=1e-6)
+    assert newton.linear.fallbacks == 0
+    assert problem.has_hubs == (many == 20)
+    newton.destroy()
 
 
 @FORMS
@@ -122,8 +99,7 @@ def test_one_object_serves_one_problem_after_another(form):
     """Its matrix stays while the contacts are the same. A problem without bodies has the form of the contacts."""
     newton = ccp.Newton(SELF, form)
     known, graph = heap(3)
-    rng = np.random.default_rng(0)
-    barrier, q = definite(rng, 40), rng.standard_normal((40, 3))
+    barrier, q = barrier_and_side()
     S = known.N + block_diag(*barrier)
     found, matrices = [], []
     for problem in (*(from_graph(known, graph) for _ in range(2)), from_matrix(known), from_graph(known, graph)):
@@ -159,9 +135,9 @@ def test_a_solve_begins_from_the_best_combination_of_earlier_solutions(form):
     problem = ccp.ConeProblem(comm, known.r[here], known.mu[here], G=graph.part(comm))
     newton = ccp.Newton(comm, form)
     newton.begin(problem)
-    rng = np.random.default_rng(0)
-    newton.update(definite(rng, 40)[here])
-    q, other = rng.standard_normal((2, 40, 3))
+    barrier, q = barrier_and_side()
+    other = q[::-1]
+    newton.update(barrier[here])
     (dg, x), (_, away) = newton.solve(q[here], 1e-10), newton.solve(other[here], 1e-10)
     iterations = newton.linear.iterations
     again, _ = newton.solve(q[here], 1e-7, earlier=[2 * x + away, away - x, np.zeros_like(x), away])
@@ -177,8 +153,7 @@ def test_a_tolerance_of_the_user_is_kept_where_earlier_solutions_leave_less_than
     problem = ccp.ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF))
     newton = ccp.Newton(SELF, "contact")
     newton.begin(problem)
-    rng = np.random.default_rng(0)
-    barrier, q = definite(rng, 40), rng.standard_normal((40, 3))
+    barrier, q = barrier_and_side()
     newton.update(barrier)
     _, x = newton.solve(q, 1.0)
     newton.update(1.01 * barrier)
@@ -193,8 +168,7 @@ def test_a_tolerance_of_the_user_is_kept_where_earlier_solutions_leave_less_than
 def test_few_contacts_get_dense_factors(symmetric):
     """Of the form of the contacts, whether bodies are known or not; options for the KSP are obeyed instead."""
     known, graph = heap(3)
-    rng = np.random.default_rng(0)
-    barrier, q = definite(rng, 40), rng.standard_normal((40, 3))
+    barrier, q = barrier_and_side()
     if not symmetric:
         barrier[:, 0] *= 1.5
     S = known.N + block_diag(*barrier)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from train_solver import solver
+from train_solver import Kernel, columns, dense_mat, dense_of, gathered, ready
 
 from pctt import tt
 from pctt.disk import FileError, write_rows
@@ -25,66 +25,32 @@ EPS = 1e-12
 FROBENIUS = PETSc.NormType.FROBENIUS
 
 
-class Kernel:
-    """c I + a kernel on a grid, unsymmetric with a skew."""
-
-    def __init__(self, grid: tuple[int, ...], nugget: float = 2.0, width: float = 8.0, skew: float = 0.0) -> None:
-        self.grid, self.nugget, self.width, self.skew = grid, nugget, width, skew
-
-    def __call__(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        apart = np.subtract(np.unravel_index(i, self.grid), np.unravel_index(j, self.grid))
-        smooth = np.exp(-(apart**2).sum(axis=0) / self.width)
-        return self.nugget * (i == j) + smooth * (1 + self.skew * np.sin(i) * np.cos(j))
-
-    @property
-    def dense(self) -> np.ndarray:
-        n = int(np.prod(self.grid))
-        return self(*np.indices((n, n)).reshape(2, -1)).reshape(n, n)
-
-
-def of(mat: PETSc.Mat, transposed: bool = False) -> np.ndarray:
-    """The whole matrix, column by column, on all ranks."""
-    x, y = mat.createVecs()
-    columns = []
-    for k in range(mat.getSize()[1]):
-        x.set(0.0)
-        first, last = x.getOwnershipRange()
-        if first <= k < last:
-            x.array[k - first] = 1.0
-        (mat.multTranspose if transposed else mat.mult)(x, y)
-        columns.append(np.concatenate(mat.comm.tompi4py().allgather(y.array_r.copy())))
-    return np.array(columns).T
+def of(mat: PETSc.Mat) -> np.ndarray:
+    return columns(mat, mat.mult)
 
 
 def is_matrix(mat: PETSc.Mat, A: np.ndarray, atol: float = 1e-9) -> None:
     """Products, transposed products, diagonal, entries and norm are those of A."""
     np.testing.assert_allclose(of(mat), A, atol=atol)
-    np.testing.assert_allclose(of(mat, transposed=True), A.T, atol=atol)
-    own = slice(*mat.getOwnershipRange())
-    np.testing.assert_allclose(mat.getDiagonal().array, np.diag(A)[own], atol=atol)
-    i, j = (k.ravel() for k in np.indices(A.shape))
-    np.testing.assert_allclose(Entries.of(mat)(i, j).reshape(A.shape), A, atol=atol)
+    np.testing.assert_allclose(columns(mat, mat.multTranspose), A.T, atol=atol)
+    np.testing.assert_allclose(gathered(mat.getDiagonal()), np.diag(A), atol=atol)
+    np.testing.assert_allclose(dense_of(Entries.of(mat), len(A)), A, atol=atol)
     assert mat.norm(FROBENIUS) == pytest.approx(np.linalg.norm(A), abs=atol)
 
 
 def diagonal_mat(like: PETSc.Mat, kind: str) -> PETSc.Mat:
-    """3 I, as a Mat of several types."""
-    if kind == "constantdiagonal":
-        constant = PETSc.Mat().create(comm=like.comm)
-        constant.setSizes(like.getSizes())
-        constant.setType(kind)
-        constant.setUp()
-        constant.assemble()
-        constant.shift(3.0)
-        return constant
-    mat = PETSc.Mat().createAIJ(like.getSizes(), nnz=2, comm=like.comm)
-    for row in range(*mat.getOwnershipRange()):
-        mat.setValue(row, row, 4.0 if kind == "diagonal" and row == 2 else 3.0)
-    if kind == "aij" and mat.getOwnershipRange()[0] == 0:
-        mat.setValue(0, 1, 0.0)  # a stored zero
-    if kind == "coupled" and mat.getOwnershipRange()[0] == 0:
-        mat.setValue(0, 1, 1e-9)
+    """3 I as a Mat of several types, or something near it."""
+    mat = PETSc.Mat().create(comm=like.comm)
+    mat.setSizes(like.getSizes())
+    mat.setType("constantdiagonal" if kind == "constantdiagonal" else "aij")
+    mat.setUp()
+    if kind != "constantdiagonal":
+        for row in range(*mat.getOwnershipRange()):
+            mat[row, row] = 1.0 if kind == "diagonal" and row == 2 else 0.0
+        if mat.getOwnershipRange()[0] == 0:
+            mat[0, 1] = 1e-9 if kind == "coupled" else 0.0  # a stored zero
     mat.assemble()
+    mat.shift(3.0)
     return mat
 
 
@@ -177,13 +143,12 @@ def test_a_changed_mat_is_preconditioned_as_it_is_now():
     mat.shift(2.0)
     A = 5 * kernel.dense + 2 * np.eye(108)
     for eps in (1e-2, 1e-11):  # the second is beyond the accuracy of the Mat, so its entries are evaluated
-        ksp = solver(mat, rank=100, eps=eps)
+        ksp = ready(mat, rank=100, eps=eps)
         x, y = mat.createVecs()
         x.set(1.0)
-        ksp.pc.setUp()
         ksp.pc.apply(x, y)
-        expected = np.linalg.solve(A, np.ones(108))[slice(*y.getOwnershipRange())]
-        assert np.linalg.norm(y.array - expected) < 20 * eps * np.linalg.norm(expected)
+        expected = np.linalg.solve(A, np.ones(108))
+        assert np.linalg.norm(gathered(y) - expected) < 20 * eps * np.linalg.norm(expected)
 
 
 @pytest.mark.parallel(1, 2)
@@ -203,7 +168,7 @@ def test_the_cap_of_the_ranks_is_kept_by_symmetric_parts():
     assert max(context.ranks) == 7
     T = context.compressed.train
     assert (T - T.T).norm() < 1e-12 * T.norm()
-    A = rough(*np.indices((64, 64)).reshape(2, -1)).reshape(64, 64)
+    A = dense_of(rough, 64)
     true = np.linalg.norm(of(mat) - A) / np.linalg.norm(A - A.diagonal().mean() * np.eye(64))
     assert 0.5 * true < context.error < 2 * true
 
@@ -282,33 +247,29 @@ def test_a_function_that_changes_its_arguments_spoils_nothing():
 
 
 class Own:
-    """A context that a user has written, with all that a train needs."""
+    """A context that a user has written, with all that a train needs, but without products."""
 
     def __init__(self, grid: tuple[int, ...], way: str) -> None:
-        self.kernel = Kernel(grid)
+        kernel = Kernel(grid)
         if way == "appctx":
-            self.appctx = {"entries": self.kernel, "grid": grid}
-        elif way == "attributes":
-            self.entries, self.grid = self.kernel, grid
+            self.appctx = {"entries": kernel, "grid": grid}
+        else:
+            self.entries, self.grid = kernel, grid if way == "attributes" else lambda: grid
 
 
-class Methods(Own):
-    def entries(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        return self.kernel(i, j)
-
-    def grid(self) -> tuple[int, ...]:
-        return self.kernel.grid
+def own_mat(grid: tuple[int, ...], way: str = "attributes") -> PETSc.Mat:
+    n = int(np.prod(grid))
+    mat = PETSc.Mat().createPython((n, n), Own(grid, way), comm=PETSc.COMM_WORLD)
+    mat.setUp()
+    return mat
 
 
 @pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("way", ["attributes", "methods", "appctx"])
 def test_the_context_of_a_mat_may_give_entries_and_grid(way):
-    context = Methods((5, 6), way) if way == "methods" else Own((5, 6), way)
-    mat = PETSc.Mat().createPython(((PETSc.DECIDE, 30), (PETSc.DECIDE, 30)), context, comm=PETSc.COMM_WORLD)
-    mat.setUp()
-    X = inverse(mat, 1e-10)
+    X = inverse(own_mat((5, 6), way), 1e-10)
     assert X.getPythonContext().compressed.layout.order == "grid"
-    np.testing.assert_allclose(of(X), np.linalg.inv(context.kernel.dense), atol=1e-8)
+    np.testing.assert_allclose(of(X), np.linalg.inv(Kernel((5, 6)).dense), atol=1e-8)
 
 
 @pytest.mark.parallel(1, 2, 3)
@@ -317,15 +278,7 @@ def test_the_context_of_a_mat_may_give_entries_and_grid(way):
 def test_the_inverse_solves_directly(grid, way):
     kernel = Kernel(grid)
     A = kernel.dense
-    if way == "train":
-        mat = from_entries(kernel, grid, EPS)
-    else:
-        mat = PETSc.Mat().createDense((len(A), len(A)), comm=PETSc.COMM_WORLD)
-        mat.setUp()
-        first, last = mat.getOwnershipRange()
-        mat.setValues(np.arange(first, last, dtype=np.int32), np.arange(len(A), dtype=np.int32), A[first:last])
-        mat.assemble()
-        mat.setAttr("grid", grid)
+    mat = from_entries(kernel, grid, EPS) if way == "train" else dense_mat(A, grid=grid)
     exact = np.linalg.inv(A)
     for eps in (1e-3, 1e-9):
         X = inverse(mat, eps)
@@ -355,26 +308,20 @@ def test_the_inverse_is_the_preconditioner_of_pcmat():
     b.array[:] = np.arange(*b.getOwnershipRange())
     ksp.solve(b, x)
     assert ksp.getIterationNumber() <= 2
-    expected = np.linalg.solve(kernel.dense, np.arange(108.0))[slice(*x.getOwnershipRange())]
-    np.testing.assert_allclose(x.array, expected, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(gathered(x), np.linalg.solve(kernel.dense, np.arange(108.0)), rtol=1e-7, atol=1e-7)
 
 
 @pytest.mark.parallel(1, 2)
 def test_an_inverse_that_is_not_there_is_refused_in_words():
-    def sparse() -> PETSc.Mat:
-        mat = PETSc.Mat().createAIJ((30, 30), nnz=1)
-        mat.assemble()
-        return mat
-
     grid = (5, 6)
     indefinite = from_entries(Kernel(grid, nugget=-0.5), grid, EPS)
     refused = {
         "not symmetric": lambda: inverse(from_entries(Kernel(grid, skew=0.3), grid)),
         "not positive definite": lambda: inverse(indefinite),
         "mean of its diagonal is <= 0": lambda: inverse(from_entries(Kernel(grid, nugget=-2.0), grid)),
-        "without entries": lambda: inverse(sparse()),
+        "without entries": lambda: inverse(diagonal_mat(indefinite, "aij")),
         "a residual of .* is left at rank .*above 2": lambda: inverse(from_entries(Kernel(grid), grid), max_rank=2),
-        "the matrix has an error of .* at rank 2": lambda: inverse(dense_mat(grid), 1e-9, max_rank=2),
+        "the matrix has an error of .* at rank 2": lambda: inverse(own_mat(grid), 1e-9, max_rank=2),
         "eps 0: allowed is": lambda: inverse(indefinite, 0),
         "max_rank 0: allowed is": lambda: inverse(indefinite, max_rank=0),
     }
@@ -382,15 +329,6 @@ def test_an_inverse_that_is_not_there_is_refused_in_words():
         with pytest.raises(ValueError, match=words):
             attempt()
     assert MPI.COMM_WORLD.allreduce(1) == MPI.COMM_WORLD.size  # all are here
-
-
-def dense_mat(grid: tuple[int, ...]) -> PETSc.Mat:
-    """A Mat without products and with entries."""
-    kernel = Own(grid, "attributes")
-    n = len(kernel.kernel.dense)
-    mat = PETSc.Mat().createPython((n, n), kernel, comm=PETSc.COMM_WORLD)
-    mat.setUp()
-    return mat
 
 
 @pytest.mark.parallel(1, 2, 3)

@@ -1,4 +1,4 @@
-"""Matrices that the preconditioner tests solve with."""
+"""Matrices of contacts, and small dense ones."""
 
 from __future__ import annotations
 
@@ -9,20 +9,6 @@ from petsc4py import PETSc
 
 from dem.contact_map import BlockRows
 from pctt.blocks import square_block_matrix
-
-
-def poisson(n: int) -> PETSc.Mat:
-    """The five-point stencil on an n x n grid, AIJ, with its points as attribute."""
-    line = sp.diags([-1.0, 2.0, -1.0], [-1, 0, 1], shape=(n, n))
-    A = (sp.kron(line, sp.identity(n)) + sp.kron(sp.identity(n), line)).tocsr()
-    comm = MPI.COMM_WORLD
-    first, last = (n * n * rank // comm.size for rank in (comm.rank, comm.rank + 1))
-    rows = A[first:last]
-    mat = PETSc.Mat().createAIJ(
-        ((last - first, n * n), (last - first, n * n)), csr=(rows.indptr, rows.indices, rows.data), comm=comm
-    )
-    mat.setAttr("coordinates", np.stack(np.divmod(np.arange(first, last), n), axis=1))
-    return mat
 
 
 def contacts(count: int, bodies: int, seed: int = 0) -> tuple[BlockRows, np.ndarray]:

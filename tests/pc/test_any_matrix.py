@@ -11,8 +11,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from petsc4py import PETSc
-from systems import contact_matrix, contacts, poisson
-from train_solver import context, solve, solver
+from systems import contact_matrix, contacts
+from train_solver import context, poisson, ready, report, solve, solver
 
 from pctt.pc.mat import is_symmetric
 from pctt.petsc import own_errors
@@ -91,7 +91,7 @@ def test_a_matrix_that_is_not_symmetric_is_said_to_be_so():
     ksp = solver(mat)
     with pytest.warns(UserWarning, match="not symmetric"):
         ksp.setUp()
-    assert "not symmetric" in " ".join(context(ksp).report())
+    assert "not symmetric" in report(ksp)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         solver(poisson(8)).setUp()
@@ -101,8 +101,7 @@ def test_a_matrix_that_is_not_symmetric_is_said_to_be_so():
 def test_a_solve_that_a_train_has_spoilt_is_made_again(method):
     """With a train of which half the entries have another sign: the solve at hand succeeds, and the next as well."""
     mat = poisson(16)
-    ksp = solver(mat, method, rank=6)
-    ksp.setUp()
+    ksp = ready(mat, method, rank=6)
     assert context(ksp).rank == 6
     spoil = context(ksp).made.slots.unscaled
     sign = np.nan if method == "bcgs" else np.resize([1.0, -1.0], 256)
@@ -110,7 +109,7 @@ def test_a_solve_that_a_train_has_spoilt_is_made_again(method):
     for _ in range(2):
         assert solve(ksp)[1] < 1e-6
         assert ksp.getConvergedReason() > 0
-    assert "solved again" in " ".join(context(ksp).report())
+    assert "solved again" in report(ksp)
     assert context(ksp).what() == "rank 1: block Jacobi"
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from petsc4py import PETSc
+from train_solver import Kernel
 from train_solver import left as left_over
 
 from pctt.mat import from_entries
 from pctt.pc.tensor_train import REFINING, UNHARMED
 
-GRID = (24, 24)
 METHODS = (
     "cg", "fcg", "pipecg", "pipefcg", "gmres", "gmres right", "fgmres", "gcr", "minres", "symmlq", "bcgs",
     "bcgs right", "fbcgs", "tfqmr", "cgne", "lsqr", "chebyshev", "richardson",
@@ -18,14 +18,9 @@ METHODS = (
 TOLERANCES = (1e-4, 1e-8, 1e-12)
 
 
-def kernel(i, j):
-    (x, y), (u, v) = (np.array(np.unravel_index(k, GRID)) / 24 for k in (i, j))
-    return (i == j) + 0.1 * np.exp(-np.hypot(x - u, y - v) / 0.1)
-
-
 @pytest.fixture(scope="module")
 def mat():
-    return from_entries(kernel, GRID, 1e-13)
+    return from_entries(Kernel((24, 24), 8.0, 10.0), (24, 24), 1e-13)
 
 
 def made(mat: PETSc.Mat, precision: str) -> PETSc.PC:

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from petsc4py import PETSc
-from systems import poisson
-from train_solver import context, operator, solve, solver
+from train_solver import Kernel, context, dense_mat, operator, poisson, ready, solve, solver
 
 from pctt import tt
 from pctt.pc.mat import finds_negative
@@ -22,13 +21,7 @@ def laplacian(n: int) -> np.ndarray:
 
 
 def negative(X: np.ndarray, A: np.ndarray) -> bool:
-    """For dense matrices, on all ranks."""
-    comm, mats = PETSc.COMM_WORLD, []
-    for whole in (X, A):
-        first, last = (len(A) * (comm.rank + k) // comm.size for k in (0, 1))
-        sizes = ((last - first, len(A)), (last - first, len(A)))
-        mats.append(PETSc.Mat().createDense(sizes, array=whole[first:last], comm=comm))
-    return finds_negative(*mats)
+    return finds_negative(dense_mat(X), dense_mat(A))
 
 
 @pytest.mark.parallel(1, 2, 3)
@@ -86,18 +79,7 @@ def test_trains_in_use_are_positive():
 
 def test_entries_with_a_long_correlation():
     """The covariance of a smooth field with little noise: trains of its inverse are seldom positive."""
-    n = 16
-
-    def entries(i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        apart = np.subtract(np.unravel_index(i, (n, n)), np.unravel_index(j, (n, n))) / n
-        return 0.1 * (i == j) + np.exp(-(apart**2).sum(axis=0) / (2 * 0.2**2))
-
-    i = np.arange(n * n)
-    A = entries(*(k.ravel() for k in np.meshgrid(i, i, indexing="ij"))).reshape(n * n, -1)
-    mat = PETSc.Mat().createDense((n * n, n * n), array=A, comm=PETSc.COMM_SELF)
-    mat.setAttr("grid", (n, n))
+    kernel = Kernel((16, 16), 0.1, 2 * (0.2 * 16) ** 2)
     for rank in (6, 16):
-        ksp = solver(mat, max_rank=rank)
-        ksp.setUp()
+        ksp = ready(dense_mat(kernel.dense, grid=kernel.grid), rank=rank)
         assert np.linalg.eigvalsh(operator(ksp))[0] > 0
-        ksp.destroy()

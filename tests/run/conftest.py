@@ -11,7 +11,7 @@ from subprocess import CompletedProcess
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from program import SMALL, database, start
+from program import SMALL, database, simulated, start
 
 from pctt.run.__main__ import run as run_program
 from pctt.run.interrupt import SIGNALS
@@ -70,9 +70,13 @@ def program(
 
 
 @pytest.fixture
-def settled(program: Program, cache: Path) -> Path:
-    """The settled state of SMALL."""
-    if not list(cache.glob("pctt/*.h5")):
-        program(*SMALL, "-settle")
+def settled(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The settled state of SMALL, which one rank makes."""
+    comm = MPI.COMM_WORLD
+    if comm.rank == 0 and not list(cache.glob("pctt/*.h5")):
+        with monkeypatch.context() as patch:
+            patch.setenv("XDG_CACHE_HOME", str(cache))
+            simulated(database([*SMALL, "-settle", "-quiet"]))
+    comm.Barrier()
     (path,) = cache.glob("pctt/*.h5")  # tests of other scenes use a cache of their own
     return path

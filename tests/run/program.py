@@ -10,6 +10,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import several_ranks
+from mpi4py import MPI
+
+from pctt.run.options import read_options
+from pctt.run.simulate import simulate
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -73,6 +77,32 @@ def start(words: list[str], ranks: int, folder: Path, cache: Path) -> subprocess
     """Run in a process of its own, or several, as a user does."""
     line, env = command(*words, ranks=ranks), environment(cache)
     return subprocess.run(line, cwd=folder, env=env, capture_output=True, text=True, timeout=300, check=False)
+
+
+def simulated(words: dict[str, str], comm: MPI.Comm = MPI.COMM_SELF) -> None:
+    """What the program does with these options, in this process; errors come out as they are raised."""
+    simulate(read_options(words, comm), comm)
+
+
+def one_line(done: subprocess.CompletedProcess[str], status: int) -> str:
+    """The one line that a run has said at its end, with this status."""
+    assert done.returncode == status, done.stdout + done.stderr
+    said = [line for line in done.stderr.splitlines() if line.startswith("pctt.run: ")]
+    assert len(said) == 1, done.stderr
+    for word in ("Traceback", "PETSC ERROR", "HDF5-DIAG"):
+        assert word not in done.stdout + done.stderr
+    return said[0]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files of a folder, but those of a run that has not replaced another yet."""
+    paths = [path for path in folder.rglob("*") if path.is_file() and ".new" not in path.parts]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def summary_of(folder: Path) -> dict:
+    """The figures of a whole run."""
+    return json.loads((folder / "summary.json").read_text())
 
 
 def arrays(path: Path) -> dict[str, np.ndarray]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
-from program import SETTLED, steps_of
+from program import SETTLED, steps_of, summary_of
 
 # accurate Newton steps, so that every cone problem is solved by PDIP alone
 ACCURATE = ("-ksp_rtol", "1e-6", "-ksp_max_it", "2000", "-ccp_tol", "1e-4")
@@ -16,7 +14,7 @@ TRAIN = ("-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")
 
 def compared(program, folder, *options):
     done = program(*SETTLED, *ACCURATE, "-steps", 3, "-overwrite", *options)
-    summary = json.loads((folder / "results" / "summary.json").read_text())
+    summary = summary_of(folder / "results")
     assert summary["newton_its"] == sum(line["newton_its"] for line in steps_of(folder / "results"))
     table = done.stdout.partition("preconditioner  ")[2].splitlines()
     rows = [line.split(maxsplit=8) for line in table[2:] if line.strip()]
@@ -48,7 +46,7 @@ def test_all_see_the_same_systems_and_the_table_agrees_with_the_summary(program,
 @pytest.mark.mpi
 def test_without_options_the_program_is_the_demo(program, tmp_path):
     done = program(ranks=2, cache=tmp_path / "cache")
-    summary = json.loads((tmp_path / "results" / "demo" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "results" / "demo")
     assert (summary["bodies"], summary["ranks"], summary["steps"]) == (731, 2, 5)
     kinds = {name: record["type"] for name, record in summary["compare"].items()}
     assert kinds == {"auto": "tt", "ten": "tt", "pbjacobi": "pbjacobi", "ilu": "ilu", "none": "none"}

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 
 import pytest
+from mpi4py import MPI
+from program import one_line
 
 #: What `{where}` does on one rank; the line that fails is marked.
 SCENE = '''
@@ -151,16 +153,15 @@ def test_all_ranks_raise_what_one_of_them_has(mpirun, tmp_path):
         assert json.loads(line) == [f"{kind}: {words.format(file=file, line=line_of_failure(text))}"] * 3
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpi)])
+@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize(("where", "status"), [("import", 2), ("record", 1)])
 def test_the_program_says_it_once(where, status, ranks, program, tmp_path):
     text = scene(where, (ranks - 1,))
-    (tmp_path / "mine.py").write_text(text)
+    if MPI.COMM_WORLD.rank == 0:
+        (tmp_path / "mine.py").write_text(text)
+    MPI.COMM_WORLD.Barrier()
     options = ("-scene", "mine.py", "-steps", 4, "-ccp_type", "apgd", "-ccp_tol", "1e-3")
-    done = program(*options, ranks=ranks, status=status)
-    said = [line for line in done.stderr.splitlines() if line.startswith("pctt.run: ")]
-    assert len(said) == 1, done.stderr
-    assert f"mine.py{',' if where == 'record' else ':'} line {line_of_failure(text)}: " in said[0]
-    assert DIVISION in said[0]
-    assert ("rank" in said[0]) == (ranks > 1)
-    assert "Traceback" not in done.stderr
+    said = one_line(program(*options, status=status), status)
+    assert f"mine.py{',' if where == 'record' else ':'} line {line_of_failure(text)}: " in said
+    assert DIVISION in said
+    assert ("rank" in said) == (ranks > 1)

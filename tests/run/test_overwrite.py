@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
-
 import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import DROP, arrays, recorded_steps, steps_of, table
+from program import DROP, arrays, contents, recorded_steps, simulated, steps_of, summary_of, table
 
 from dem.together import SceneError
 from pctt.ccp import BlockRows, ConeProblem, fclib
@@ -33,7 +31,7 @@ def run(tmp_path, monkeypatch):
         words = {"scene": "drop.py", "ccp_type": "apgd", "output": "out", "output_every": "1", "quiet": "true"}
         words |= options
         given = {name: value for name, value in words.items() if value is not None}
-        simulate(read_options(given, SELF), SELF)
+        simulated(given)
 
     return run
 
@@ -47,10 +45,6 @@ def problem(tmp_path, monkeypatch):
     G = BlockRows(np.array([0, 1]), np.array([0]), rows, 1)
     fclib.write_local(tmp_path / "problem.hdf5", ConeProblem(SELF, np.array([[-1.0, 0, 0]]), np.array([0.3]), G=G))
     return "problem.hdf5"
-
-
-def contents(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize(
@@ -110,7 +104,7 @@ def test_a_run_that_replaces_another_leaves_nothing_of_it(run, problem, tmp_path
     assert recorded_steps(arrays(tmp_path / "out" / "state.h5")) == ["000002", "000003"]
     solve_file(read_options({"problem": problem, "output": "out", "overwrite": "true", "quiet": "true"}, SELF), SELF)
     assert set(contents(tmp_path / "out")) == {"summary.json", "notes.txt"}
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["problem"] == problem
+    assert summary_of(tmp_path / "out")["problem"] == problem
 
 
 @pytest.mark.filterwarnings(CHANGED)
@@ -128,22 +122,24 @@ def test_a_run_that_goes_on_makes_anew_what_lies_behind_its_checkpoint(run, tmp_
     run(steps="3", restart="out/checkpoint.h5")
     assert (tmp_path / "out" / "records.csv").read_bytes() == whole["records.csv"]
     assert (tmp_path / "out" / "analysis.csv").read_bytes() == whole["analysis.csv"]
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "out")
     assert (summary["steps"], summary["first_step"], summary["last_step"]) == (6, 1, 6)
     text = DROP.replace('{"twice": 2 * records["time [s]"]}', "{}")
     run(text, steps="1", restart="out/checkpoint.h5")
     assert not (tmp_path / "out" / "analysis.csv").exists()
 
 
-@pytest.mark.mpi
+@pytest.mark.parallel(2)
 def test_two_ranks_replace_a_run(run, program, tmp_path):
-    run(steps="3")
+    if MPI.COMM_WORLD.rank == 0:
+        run(steps="3")
+    MPI.COMM_WORLD.Barrier()
     words = ("-scene", "drop.py", "-ccp_type", "apgd", "-steps", 2, "-output_every", 1, "-output", "out")
-    done = program(*words, ranks=2, status=2)
+    done = program(*words, status=2)
     assert done.stderr.count("pctt.run: -output out: holds a run") == 1
-    program(*words, "-overwrite", ranks=2)
+    program(*words, "-overwrite")
     assert recorded_steps(arrays(tmp_path / "out" / "state.h5")) == ["000001", "000002"]
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["ranks"] == 2
+    assert summary_of(tmp_path / "out")["ranks"] == 2
     assert not (tmp_path / "out" / ".new").exists()
     with h5py.File(tmp_path / "out" / "checkpoint.h5") as file:
         assert file["world/step"][()] == 2

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import re
+import warnings
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from program import SETTLED, SMALL, steps_of
+from mpi4py import MPI
+from program import SETTLED, SMALL, steps_of, summary_of
 
 from pctt.run.dump import Dump
 
 TOL = ("-ccp_tol", 1e-8)
 PDIP = (*SETTLED, "-ccp_type", "pdip")
 HARD = (*PDIP, "-ccp_max_it", 2)  # no step is solved in two Newton steps
-
-
-def summary(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())
 
 
 def product(group: h5py.Group, x: np.ndarray, transposed: bool = False) -> np.ndarray:
@@ -47,7 +44,7 @@ def test_the_problem_of_a_step_is_written_and_solved_again(program, settled, tmp
         f"{name}.h5" for name in names
     }
     done = program("-problem", *third["dumped"], *TOL, "-output", "again", "-overwrite")  # from the file's guess
-    again = summary(tmp_path / "again")
+    again = summary_of(tmp_path / "again")
     assert again["converged"]
     assert again["contacts"] == third["contacts"]
     assert again["objective"] == pytest.approx(third["objective"], rel=1e-6)
@@ -98,12 +95,12 @@ def test_hard_problems_are_kept_and_the_steps_say_so(program, settled, tmp_path)
     assert sorted(str(p.relative_to(tmp_path)) for p in (tmp_path / "results" / "hard").iterdir()) == kept
     assert re.findall(r"hard problem kept: (\S+)\)", done.stdout) == kept
     program("-problem", kept[1], *TOL, "-output", "solved")
-    solved = summary(tmp_path / "solved")
+    solved = summary_of(tmp_path / "solved")
     assert solved["converged"]
     assert solved["contacts"] == steps[1]["contacts"]
     few = program("-problem", kept[1], "-ccp_type", "pdip", "-ccp_max_it", 2, "-ccp_fallback", 0, "-output", "few")
     assert "NOT CONVERGED" in few.stdout
-    assert (summary(tmp_path / "few")["converged"], summary(tmp_path / "few")["newton_its"]) == (False, 2)
+    assert (summary_of(tmp_path / "few")["converged"], summary_of(tmp_path / "few")["newton_its"]) == (False, 2)
 
 
 def test_a_hard_problem_of_very_many_contacts_is_not_written_unasked(program, settled, tmp_path, monkeypatch):
@@ -127,3 +124,40 @@ def test_hard_problems_of_another_run_are_replaced_and_of_this_one_kept(program,
     assert hard() == [first, first + 1, first + 2]
     program(*HARD, "-steps", 1, "-overwrite")
     assert hard() == [first]
+
+
+UNWRITTEN = """
+from dataclasses import dataclass
+from dem.experiment import Experiment
+from dem.scene import Scene
+from dem.shapes import Plane
+
+@dataclass(frozen=True)
+class Row(Experiment):
+    def build(self):
+        scene = Scene(friction=0.3, rolling=ROLLING)
+        scene.add_body("floor", [Plane((0, 0, 1))])
+        ids = scene.add_spheres([[0.2 * k, 0, 0.1] for k in range(4)], 0.1, 1000.0, velocity=(1.0, 0, 0))
+        if not ROLLING:
+            scene.add_joint("bond", ids[0], ids[1], kind="ball", anchor=(0.1, 0, 0.1))
+        return scene
+"""
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize(("rolling", "what"), [(0.01, "rolling"), (0.0, "joints")])
+def test_problems_that_no_file_can_hold_are_not_written(program, tmp_path, rolling, what):
+    (tmp_path / "row.py").write_text(UNWRITTEN.replace("ROLLING", str(rolling)))
+    given = ("-scene", "row.py", "-dt", 0.01, "-ccp_tol", 1e-9, "-ccp_max_it", 2, "-steps", 3)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        program(*given, "-output", "kept")
+    remarks = [str(one.message) for one in said if "is not written" in str(one.message)]
+    assert len(remarks) == (MPI.COMM_WORLD.rank == 0)
+    steps = steps_of(tmp_path / "kept")
+    assert [line["converged"] for line in steps] == [False] * 3
+    assert [line["hard_problem"] for line in steps] == [""] * 3
+    assert not (tmp_path / "kept" / "hard").exists()
+    done = program(*given, "-output", "new", "-dump_problem", "problems", status=2)
+    assert f"-dump_problem: files have no {what}" in done.stderr
+    assert [path for folder in ("new", "problems") for path in (tmp_path / folder).glob("*")] == []

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
-
 import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import SETTLED, steps_of, table
+from program import SETTLED, steps_of, summary_of, table
 
 from dem.scenes import Shear
 from pctt.simulation import Simulation
@@ -20,7 +18,7 @@ def test_a_row_per_step_that_state_and_summary_know_too(program, settled, tmp_pa
     done = program(*SETTLED, *APGD, "-steps", 3)
     rows = table(tmp_path / "results" / "records.csv")
     assert list(rows)[:2] == ["step", "time [s]"]
-    summary, lines = json.loads((tmp_path / "results" / "summary.json").read_text()), steps_of(tmp_path / "results")
+    summary, lines = summary_of(tmp_path / "results"), steps_of(tmp_path / "results")
     for name, own in (("step", "step"), ("time", "time [s]"), ("contacts", "contacts")):
         np.testing.assert_array_equal([line[name] for line in lines], rows[own])
     with h5py.File(tmp_path / "results" / "state.h5", "r") as file:

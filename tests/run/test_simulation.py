@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from program import ROOT, arrays, assert_same_bits, database, table
+from program import DROP, ROOT, arrays, assert_same_bits, database, table
 
 import pctt
 from dem.experiment import Experiment, option
@@ -314,40 +314,29 @@ def test_a_loaded_simulation_goes_on_with_the_same_bits(tmp_path):
         sim.run(steps=3)
         sim.save(tmp_path / f"{sim is whole}.h5")
     assert_same_bits(tmp_path / "True.h5", tmp_path / "False.h5")
-    if WORLD.size == 1:
-        alone = pctt.Simulation.load(tmp_path / "half.h5", Lidded(), solver="apgd", tol=1e-6, comm=SELF)
-        assert alone.body("lid").motion.velocity == (0.0, 0.0, 1.0)
     twice = pctt.Simulation.load(tmp_path / "half.h5", Lidded(), dt=0.02)
-    same = pctt.Simulation.load(tmp_path / "half.h5", Lidded())
-    np.testing.assert_allclose(twice.memory.state()[1], 2.0 * same.memory.state()[1])
+    assert twice.body("lid").motion.velocity == (0.0, 0.0, 1.0)
+    time = twice.time
     twice.run(steps=2)
-    assert twice.time == pytest.approx(same.time + 0.04)
+    assert twice.time == pytest.approx(time + 0.04)
     with pytest.raises(FileError, match="damaged, or no such file"):
         pctt.Simulation.load(tmp_path / "none.h5", Lidded())
 
 
-@pytest.mark.parallel(1, 3)
+@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize(
-    ("words", "scene", "solver"),
-    [
-        (["-scene_n", "2", "-scene_margin", "0.4"], Mixer(n=2, margin=0.4), "pdip"),
-        (["-scene", "stirred.py"], None, "apgd"),
-    ],
+    ("words", "solver"), [(["-scene_n", "1", "-scene_margin", "0.4"], "pdip"), (["-scene", "drop.py"], "apgd")]
 )
-def test_it_does_what_the_program_does(words, scene, solver, tmp_path, monkeypatch):
+def test_it_does_what_the_program_does(words, solver, tmp_path, monkeypatch):
     """The files of both have the same bits, but for the seconds."""
     monkeypatch.chdir(tmp_path)
     if WORLD.rank == 0:
-        text = (ROOT / "tests" / "run" / "test_simulation.py").read_text()
-        imports = "from dataclasses import dataclass\nfrom dem.experiment import Experiment, option\n"
-        imports += "from dem.motion import Hinged\nfrom dem.scene import Scene\nfrom dem.shapes import Box, Plane\n"
-        begin = text.index("@dataclass(frozen=True)\nclass Stirred")
-        (tmp_path / "stirred.py").write_text(imports + text[begin : text.index("# -- mechanics")])
+        (tmp_path / "drop.py").write_text(DROP)
     WORLD.Barrier()
     more = [*words, "-ccp_type", solver, "-steps", "5", "-output_every", "2", "-checkpoint_every", "3", "-quiet"]
     options = read_options(database([*more, "-output", "program"]), WORLD)
     simulate(options, WORLD)
-    with pctt.Simulation(scene or type(options.scene)(), solver=solver) as sim:
+    with pctt.Simulation(options.scene, solver=solver) as sim:
         sim.write("object", every=2, checkpoint_every=3)
         for _ in range(5):
             sim.step()
@@ -389,23 +378,6 @@ def test_the_folder_of_a_run_is_written_from_then_on(tmp_path):
         pctt.Simulation(Stirred(), comm=SELF).write(tmp_path / "new", checkpoint_every=0)
 
 
-def test_a_settled_state_is_made_at_first_use_with_a_word(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-
-    @dataclass(frozen=True)
-    class Settled(Stirred):
-        settling_time = 0.1
-
-    sim = pctt.Simulation(Settled(), restart="settled", comm=SELF)
-    assert sim.steps == 15
-    assert "settling Settled, 15 steps with APGD to 0.001:" in capsys.readouterr().out
-    (state,) = tmp_path.glob("pctt/Settled_*.h5")
-    made = state.stat().st_mtime_ns
-    assert pctt.Simulation(Settled(), restart="settled", comm=SELF).time == pytest.approx(0.1065)
-    assert state.stat().st_mtime_ns == made
-    assert capsys.readouterr().out == ""
-
-
 # -- ranks --------------------------------------------------------------------------------------------------
 
 
@@ -428,7 +400,7 @@ def test_arrays_of_all_ranks_are_in_the_order_of_the_scene():
     assert sim.figures["contacts"] == 0
 
 
-@pytest.mark.parallel(2, 3)
+@pytest.mark.parallel(2)
 def test_contacts_and_forces_are_the_same_on_all_ranks_and_as_on_one(double):
     alone, sim = (pctt.Simulation(Stirred(), solver="apgd", tol=1e-9, comm=comm) for comm in (SELF, WORLD))
     for each in (alone, sim):

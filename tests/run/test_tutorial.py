@@ -7,14 +7,13 @@ import re
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import ROOT
+from program import ROOT, simulated
 
 from dem.experiment import from_file
 from dem.together import SceneError
 from pctt.options import OptionError
 from pctt.run.options import read_options
 from pctt.run.settings import find_scene
-from pctt.run.simulate import simulate
 from pctt.simulation import Simulation
 
 
@@ -104,4 +103,4 @@ def test_faults_of_a_scene_end_the_run(message, tmp_path, monkeypatch):
     how = {"settle": "true"} if FAULTS[message] is GOOD else {"steps": "1", "ccp_type": "apgd"}
     words = {"scene": "mine.py", **how}
     with pytest.raises((OptionError, SceneError), match=re.escape(message)):
-        simulate(read_options(words, MPI.COMM_SELF), MPI.COMM_SELF)
+        simulated(words)

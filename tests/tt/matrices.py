@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
+from mpi4py import MPI
 
 from pctt import tt
 
@@ -28,6 +29,12 @@ class Triplets(NamedTuple):
         )
         A.set_values(self.blocks[keep])
         return A
+
+    def part(self, modes: tuple[int, ...], bounds: list[int] | np.ndarray):
+        """On several ranks: rank r has the rows from bounds[r - 1] to bounds[r]."""
+        comm = MPI.COMM_WORLD
+        owner = np.searchsorted(bounds[: comm.size - 1], self.rows, "right")
+        return self.hierarchy(modes, owner == comm.rank, reduce=comm.allreduce, agree=comm.bcast)
 
 
 def scattered(rng: np.random.Generator, slots: int, number: int, block: int) -> Triplets:

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matrices import laplacian, of_sparse, positive, scattered
-from ranks import on_ranks
+from mpi4py import MPI
 
 from pctt import tt
 
@@ -104,15 +104,14 @@ def test_cross_is_sublinear_and_survives_nearly_empty_matrices() -> None:
         assert found.train.norm() == 0
 
 
+@pytest.mark.parallel(2, 3)
 @BOTH
-@pytest.mark.parametrize("ranks", [2, 3])
-def test_split_rows_give_the_same_train(ranks: int, compress: Callable[..., Any]) -> None:
-    triplets = positive(np.random.default_rng(1), 100, 2)
+def test_split_rows_give_the_same_train(compress: Callable[..., Any]) -> None:
+    triplets, comm = positive(np.random.default_rng(1), 100, 2), MPI.COMM_WORLD
     modes = tt.choose_modes(100, leaf=6)
     alone = compress(triplets.hierarchy(modes), 6, 1e-2)
-    owner = np.searchsorted([37, 80][: ranks - 1], triplets.rows, "right")
-    results = on_ranks(ranks, lambda rank, add: compress(triplets.hierarchy(modes, owner == rank, reduce=add), 6, 1e-2))
-    for found in results:
-        assert found.train.ranks == alone.train.ranks
-        assert (found.train - alone.train).norm() < 1e-8 * alone.train.norm()
-        assert found.error == pytest.approx(alone.error, rel=1e-6)
+    found = compress(triplets.part(modes, [37, 80]), 6, 1e-2)
+    assert found.train.ranks == alone.train.ranks
+    assert (found.train - alone.train).norm() < 1e-8 * alone.train.norm()
+    assert found.error == pytest.approx(alone.error, rel=1e-6)
+    assert len(set(comm.allgather(found.error))) == 1

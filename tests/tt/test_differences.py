@@ -43,16 +43,6 @@ def test_eigenvalues_and_inverse_are_those_of_the_nearest_matrix(shape: tuple[in
     np.testing.assert_allclose(of.product(a)(v), A @ v, atol=1e-9 * a.flat[0])
 
 
-@pytest.mark.parametrize("share", of.SHARES)
-def test_the_inverse_is_symmetric_and_positive(share: float) -> None:
-    """Of tridiag(-1, 2.5, -1)."""
-    a = np.zeros(64)
-    a[:2] = 2.5, -1
-    M = np.stack([of.FastTransform(a, share).solve(column) for column in np.eye(64)])
-    np.testing.assert_allclose(M, M.T, atol=1e-14)
-    assert np.linalg.eigvalsh(M)[0] > 0
-
-
 def test_the_best_share_is_chosen() -> None:
     i = np.arange(48)
     squares = i[:, None] ** 2 + i**2

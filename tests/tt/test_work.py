@@ -15,22 +15,21 @@ def smooth(i: np.ndarray, j: np.ndarray) -> np.ndarray:
 
 
 def test_a_limit_ends_compression_and_inversion_at_the_same_place() -> None:
-    digits = tt.GridDigits((256,))
+    spent: list[float] = []
 
     def both(work: Work) -> None:
-        T = tt.compress_cross(tt.EntryMatrix(smooth, digits), 40, 1e-6, work=work).train.symmetric_part(1e-8)
-        invert_near_identity(T, 40, eps=1e-6, work=work)
+        found = tt.compress_cross(tt.EntryMatrix(smooth, tt.GridDigits((256,))), 40, 1e-6, work=work)
+        spent.append(work.spent)
+        assert work.spent > 200 * found.evaluations * 0.99
+        assert invert_near_identity(found.train.symmetric_part(1e-8), 40, eps=1e-6, work=work).residual <= 1e-6
+        spent.append(work.spent)
 
-    free = [Work(), Work()]
-    for work in free:
-        found = tt.compress_cross(tt.EntryMatrix(smooth, digits), 40, 1e-6, work=work)
-    assert free[0].spent == free[1].spent > 200 * found.evaluations * 0.99
-    T = found.train.symmetric_part(1e-8)
-    before = free[0].spent
-    whole = invert_near_identity(T, 40, eps=1e-6, work=free[0])
-    assert whole.residual <= 1e-6
-    for limit, phase in ((0.5 * before, "the compression"), (0.5 * (before + free[0].spent), "the inversion")):
+    both(Work())
+    both(Work())
+    compression, whole, *again = spent
+    assert again == [compression, whole]
+    for limit, phase in ((0.5 * compression, "the compression"), (0.5 * (compression + whole), "the inversion")):
         work = Work(limit)
         with pytest.raises(TooMuchWorkError, match=phase):
             both(work)
-        assert work.spent < 2 * free[0].spent
+        assert work.spent < 2 * whole

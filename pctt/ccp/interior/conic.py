@@ -33,8 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pctt.ccp import cone
-from pctt.ccp.cone import Array, NesterovTodd, dot, times
-from pctt.ccp.cone_loops import scaling
+from pctt.ccp.cone import Array, NesterovTodd, dot, scaling, times
 from pctt.ccp.interior import useful_part
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
@@ -57,7 +56,7 @@ class Conic:
     boundary_with_law: float = number(0.9, "the same; with 0.99 it stalls at 1e-4")
     least: float = number(0.06, "part of the complementarity to aim at at least; with 0.01 some end at 1e-9")
     short: float = number(0.8, "the direction of a shorter step is corrected; without, 1.15 times the iterations")
-    reach: float = number(0.3, "how much further than the short step the corrected one is to reach (Gondzio)")
+    reach: float = number(0.3, "how much further than the short step the corrected one is to reach")
     spread: float = number(10.0, "eigenvalues of s o z within this factor of the target stay (Gondzio)")
     proximal: float = number(1e-9, "compliance within a step [mean diag N], bounds (B + C)^-1; 1e-8 to 1e-12 do too")
     patience: int = number(8, "iterations without progress before it gives up; of Coulomb's law some take 6")

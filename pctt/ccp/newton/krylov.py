@@ -132,7 +132,9 @@ class Krylov:
     def _set_up(self, A: PETSc.Mat, P: Source, keep: bool) -> None:
         self.ksp.pc.setReusePreconditioner(keep)
         if not keep:
-            form = self._form(self._source(A, P))
+            if P is None or (shell_of(A) and not self.needs_entries):
+                P = A
+            form = self._form(P if isinstance(P, PETSc.Mat) else P())
             self.ksp.setOperators(form if self.kind == "eisenstat" else A, form)
         self.ksp.setUp()
         self.ksp.setUpOnBlocks()
@@ -142,12 +144,6 @@ class Krylov:
         right_hand_side = b.copy()  # an error of PETSc may leave it locked
         self.ksp.solve(right_hand_side, x)
         right_hand_side.destroy()
-
-    def _source(self, A: PETSc.Mat, P: Source) -> PETSc.Mat:
-        """The Mat that the preconditioner is made from."""
-        if P is None or (shell_of(A) and not self.needs_entries):
-            return A
-        return P if isinstance(P, PETSc.Mat) else P()
 
     @property
     def needs_entries(self) -> bool:

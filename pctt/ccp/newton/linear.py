@@ -138,8 +138,9 @@ class LinearSolver:
         return done
 
     def _by_factor(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve | None:
-        """Without room for a factor block Jacobi goes on, if it was our choice; else None."""
-        solver = self._solver("factor")
+        """Fronts are of single precision, until they take many iterations. Without room for a factor block Jacobi goes
+        on, if it was our choice; else None."""
+        solver, system = self._solver("factor"), self.system
         context = solver.ksp.pc.getPythonContext() if solver.kind == "python" else None
         single = isinstance(context, FrontPC) and not self._double
         if self._factored:
@@ -151,29 +152,22 @@ class LinearSolver:
         if not self._has_room(0.5 if single else 1.0):
             return self._run(self._solver("alone"), b, x, rtol) if self.own else None
         if isinstance(context, FrontPC):
-            done = self._by_fronts(solver, context, b, x, rtol)
-        elif isinstance(self.system, BodyForm):
-            part = self.system.stiff_part(Settings.least)
+            assert isinstance(system, BodyForm)
+            context.make = lambda: system.fronts(Settings.least, np.float64 if self._double else np.float32)
+            done = self._run(solver, b, x, rtol, system.matrix)
+            if not self._double:
+                self._double = done.iterations > Settings.single * self._easy and self._has_room()
+                if self._double and not done.converged:
+                    solver.forget()
+                    done = self._run(solver, b, x, rtol, system.matrix)
+        elif isinstance(system, BodyForm):
+            part = system.stiff_part(Settings.least)
             done = self._run(solver, b, x, rtol, part)
             part.destroy()  # the KSP keeps it
         else:
-            done = self._run(solver, b, x, rtol, self.system.entries)
+            done = self._run(solver, b, x, rtol, system.entries)
         self._factored = done.converged
         return done
-
-    def _by_fronts(self, solver: Krylov, pc: FrontPC, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve:
-        """By factors of single precision, until they take many iterations."""
-        system = self.system
-        assert isinstance(system, BodyForm)
-        if not self._double:
-            pc.make = lambda: system.fronts(Settings.least, np.float32)
-            done = self._run(solver, b, x, rtol, system.matrix)
-            self._double = done.iterations > Settings.single * self._easy and self._has_room()
-            if done.converged or not self._double:
-                return done
-            solver.forget()
-        pc.make = lambda: system.fronts(Settings.least, np.float64)
-        return self._run(solver, b, x, rtol, system.matrix)
 
     def _run(
         self, solver: Krylov, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: Source = None, keep: bool = False

@@ -1,0 +1,94 @@
+"""Pairs with clumps as pairs of their spheres, for the narrow phase."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dem import quaternion
+from dem.arrays import Floats, Ints
+from dem.bodies import CLUMP, PLANE, Bodies
+from dem.clumps import Form
+from dem.compiled import inlined, loop
+
+
+class Members(NamedTuple):
+    """The spheres of the clumps of a table of bodies."""
+
+    start: Ints  #: (rows + 1,) of the spheres of each body; those that are no clumps have none
+    row: Ints  #: (m,) of the body
+    number: Ints  #: (m,) distinct, and not those of other primitives; the first sphere has the id of its clump
+    center: Floats  #: (m, 3) in the frame of the body [m]
+    radius: Floats  #: (m,) [m]
+
+    def now(self, position: Floats, turn: Floats) -> Floats:
+        """Centres (m, 3) of the spheres of bodies with these positions (rows, 3) and quaternions (rows, 4)."""
+        return position[self.row] + quaternion.rotate(turn[self.row], self.center)
+
+
+def more_numbers(forms: Sequence[Form], grains: int) -> int:
+    """How many numbers the spheres of so many grains take beyond those that have the ids of their clumps."""
+    return grains * (max((len(form.radius) for form in forms), default=1) - 1)
+
+
+def members(table: Bodies, forms: Sequence[Form], first: int) -> Members:
+    """The spheres of all clumps of a table of grains; the numbers beyond the ids go from `first` on."""
+    clump = np.flatnonzero(table.shape >= CLUMP)
+    which = table.shape[clump] - CLUMP
+    many = np.array([len(form.radius) for form in forms])
+    count = np.zeros(len(table), np.int64)
+    count[clump] = many[which]
+    start = np.concatenate([[0], np.cumsum(count)])
+    row = np.repeat(np.arange(len(table)), count)
+    k = np.arange(len(row)) - start[row]
+    of_form = np.repeat((np.cumsum(many) - many)[which], many[which]) + k
+    number = np.where(k == 0, table.id[row], first + table.id[row] * (many.max() - 1) + k - 1)
+    center = np.concatenate([form.center for form in forms])[of_form]
+    return Members(start, row, number, center, np.concatenate([form.radius for form in forms])[of_form])
+
+
+@loop
+def spread(i, j, reach, start, first, kind, center, radius):
+    """Pairs of rows and their reach, of which spheres stand for clumps, from the pairs i, j (m,) with their `reach`
+    (m,): body n has the spheres `start` (rows + 1,) of those in the rows from `first` on. Of pairs with clumps those
+    of spheres are left out that are further apart than their reach."""
+    count = 0
+    for p in range(len(i)):
+        a, b = _ends(i[p], start, first)
+        c, d = _ends(j[p], start, first)
+        for m in range(a, b):
+            for n in range(c, d):
+                count += _near(m, n, reach[p], first, kind, center, radius)
+    one, two, far = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
+    to = 0
+    for p in range(len(i)):
+        a, b = _ends(i[p], start, first)
+        c, d = _ends(j[p], start, first)
+        for m in range(a, b):
+            for n in range(c, d):
+                if _near(m, n, reach[p], first, kind, center, radius):
+                    one[to], two[to], far[to] = m, n, reach[p]
+                    to += 1
+    return one, two, far
+
+
+@inlined
+def _ends(row, start, first):
+    """The first row of the spheres of a clump and that after the last; else the row itself and the next."""
+    low, high = row, row + 1
+    if row < len(start) - 1 and start[row + 1] > start[row]:
+        low, high = first + start[row], first + start[row + 1]
+    return low, high
+
+
+@inlined
+def _near(m, n, reach, first, kind, center, radius):
+    """Whether the spheres about two primitives are within reach; of pairs without a sphere of a clump it is known."""
+    near = True
+    if (m >= first or n >= first) and kind[m] != PLANE and kind[n] != PLANE:
+        u, v, w = center[n, 0] - center[m, 0], center[n, 1] - center[m, 1], center[n, 2] - center[m, 2]
+        most = (radius[m] + radius[n] + reach) * (1.0 + 1e-9)
+        near = u * u + v * v + w * w <= most * most
+    return near

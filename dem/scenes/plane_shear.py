@@ -1,0 +1,101 @@
+"""Plane shear: spheres in a cell that is sheared at a constant rate under a constant pressure along the gradient."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import pi, sqrt
+from typing import ClassVar
+
+import numpy as np
+
+from dem.analysis import calm
+from dem.arrays import Floats
+from dem.checks import between, not_negative, positive
+from dem.experiment import Experiment, option
+from dem.packing import random_packing
+from dem.record import cell
+from dem.scene import Scene
+from dem.sources import Uniform
+from dem.step import Step
+
+
+@dataclass(frozen=True)
+class PlaneShear(Experiment):
+    """Spheres in a cell with three periods: flow along x, gradient and pressure along z. There are no walls, and no
+    gravity, so the flow is the same everywhere, and friction and solid fraction depend on the inertial number alone:
+    GDR MiDi, Eur. Phys. J. E 14 (2004) 341; da Cruz et al., Physical Review E 72 (2005) 021309.
+    """
+
+    n: int = option(8, "", "width of the cell in diameters along x, y and, at the start, z", between(6))
+    inertial: float = option(0.1, "", "inertial number: rate times d sqrt(rho / P)", positive)
+    pressure: float = option(1000.0, "Pa", "normal stress along the gradient", positive)
+    radius: float = option(0.005, "m", "mean radius of the spheres", positive)
+    spread: float = option(0.2, "", "radii are uniform within this part of the mean", between(0.0, 0.5))
+    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)", positive)
+    friction: float = option(0.5, "", "friction coefficient of all contacts", not_negative)
+    fraction: float = option(0.55, "", "solid fraction at the start", between(0.1, 0.58))
+    seed: int = option(1, "", "seed of the places and radii", not_negative)
+
+    STRAIN: ClassVar[float] = 0.01  #: shear strain in a step
+    PASSING: ClassVar[float] = 0.1  #: the step, in the time d sqrt(rho / P) in which the pressure closes a hole
+
+    @property
+    def time(self) -> float:
+        """d sqrt(rho / P) [s]."""
+        return 2.0 * self.radius * sqrt(self.density / self.pressure)
+
+    @property
+    def rate(self) -> float:
+        """The shear rate [1/s]."""
+        return self.inertial / self.time
+
+    @property
+    def dt(self) -> float:  # type: ignore[override]
+        """Recommended time step [s]."""
+        return float(f"{min(self.STRAIN / self.rate, self.PASSING * self.time):.2g}")
+
+    def build(self) -> Scene:
+        """The scene, with the velocities of the shear."""
+        side, r = 2.0 * self.n * self.radius, self.radius
+        sizes = Uniform(r * (1.0 - self.spread), r * (1.0 + self.spread)) if self.spread else r
+        place, radius = random_packing((side,) * 3, sizes, self.fraction, periodic=(True,) * 3, seed=self.seed)
+        scene = Scene(
+            self.friction, (0.0, 0.0, 0.0), period=(side,) * 3, shear_rate=self.rate, shear_gradient="z",
+            stress=(None, None, self.pressure),
+        )  # fmt: skip
+        scene.add_spheres(place, radius, self.density, velocity=place[:, [2, 2, 2]] * [self.rate, 0.0, 0.0])
+        return scene
+
+    def record(self, step: Step) -> dict[str, float]:
+        """Shear strain, friction coefficient of the flow, inertial number by the stress that there is, and solid
+        fraction."""
+        of_cell, shear = cell(step), step.world.shear
+        rate = 0.0 if shear is None else shear.rate
+        pressure = max(of_cell["stress_zz [Pa]"], 1e-300)
+        volume = step.total(4.0 / 3.0 * pi * step.world.grains.size[:, 0] ** 3)
+        return {
+            "strain": rate * step.world.time,
+            "mu": -of_cell["stress_xz [Pa]"] / pressure,
+            "inertial_number": rate * 2.0 * self.radius * sqrt(self.density / pressure),
+            "solid_fraction": volume / (of_cell["period_x [m]"] * of_cell["period_y [m]"] * of_cell["period_z [m]"]),
+        }
+
+    def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
+        """Over the last half of the strain: the friction coefficient and inertial number of the mean stresses, the
+        solid fraction, the pressure over that asked, and the standard error of mu from ten parts of that half."""
+        strain = records["strain"]
+        late = (strain >= 0.5 * strain[-1]) & calm(records)
+        if not late.any():
+            return {}
+        shear, pressure = -records["stress_xz [Pa]"][late], records["stress_zz [Pa]"][late]
+        mean = float(pressure.mean())
+        parts = min(10, len(pressure))
+        found = [a.mean() / b.mean() for a, b in zip(np.array_split(shear, parts), np.array_split(pressure, parts))]
+        return {
+            "mu": float(shear.mean()) / mean,
+            "mu_error": float(np.std(found) / sqrt(max(parts - 1, 1))),
+            "inertial_number": self.rate * 2.0 * self.radius * sqrt(self.density / mean),
+            "solid_fraction": float(records["solid_fraction"][late].mean()),
+            "pressure_ratio": mean / self.pressure,
+        }

@@ -1,0 +1,109 @@
+"""A joint of a simulation, as it is now: what `Simulation.joint` returns."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from dem.applied import joint_ends
+from dem.arrays import Floats
+from dem.joints import HOLDS, Geometry, Joint, geometry
+from dem.together import meet, together
+from dem.world import set_joint
+
+
+class JointNow:
+    """A joint of a simulation. Its members are collective; vectors are in the world frame."""
+
+    def __init__(self, sim: Any, name: str):
+        if name not in sim.world.joints:
+            raise ValueError(f"no joint {name!r}; there are: {', '.join(sim.world.joints) or 'none'}")
+        self._sim, self.name = sim, name
+        self._number = list(sim.world.joints).index(name)
+
+    @property
+    def _now(self) -> tuple[Joint, Geometry, Floats]:
+        """The joint, its geometry, and the velocities (6,) of its second end relative to the first."""
+        meet(self._sim.comm, f"joint {self.name}")
+        world = self._sim.world
+        joint = world.joints[self.name]
+        _, row, ends = joint_ends(world, self._sim.settings.dt)
+        row = row[self._number : self._number + 1]
+        found = geometry([joint], row, ends)
+        velocity = np.einsum("wsx,sx->w", found.rows[0], ends.velocity[row[0]])
+        return joint, found, velocity
+
+    @property
+    def force(self) -> Floats:
+        """Force (3,) on the second end at the anchor, with that of a motor, its mean over the last step [N]."""
+        return self._mean(slice(0, 3))
+
+    @property
+    def torque(self) -> Floats:
+        """Torque (3,) on the second end about the anchor, with that of a motor, its mean over the last step [N m]."""
+        return self._mean(slice(3, 6))
+
+    @property
+    def drive(self) -> float:
+        """Torque [N m] or force [N] of the motor and the limits along the axis, its mean over the last step."""
+        joint = self._sim.world.joints[self.name]
+        return 0.0 if all(HOLDS[joint.kind]) else float(self._impulses[joint.way] / self._sim.settings.dt)
+
+    @property
+    def angle(self) -> float:
+        """Angle of a hinge, between -pi and pi [rad]."""
+        return self._coordinate("hinge")
+
+    @property
+    def position(self) -> float:
+        """Way of a slider [m]."""
+        return self._coordinate("slider")
+
+    @property
+    def speed(self) -> float:
+        """Of a hinge [rad/s] or a slider [m/s] in the last step."""
+        joint, _, velocity = self._now
+        return float(velocity[joint.way])
+
+    @property
+    def motor(self) -> Motor:
+        """The motor, whose ``speed``, ``target``, ``strength``, ``low`` and ``high`` can be set on all ranks; the first
+        rank's value counts, and checkpoints keep it."""
+        return Motor(self)
+
+    def _coordinate(self, kind: str) -> float:
+        joint, found, _ = self._now
+        if joint.kind != kind:
+            raise ValueError(f"joint {self.name!r} is a {joint.kind}, and no {kind}")
+        return float(found.error[0, joint.way])
+
+    @property
+    def _impulses(self) -> Floats:
+        """Impulses (6,) of the last step, along and about the axes of the joint as it was at its start."""
+        step = self._sim._last
+        found, out = step.system.joints, np.zeros(6)
+        rows = np.flatnonzero(found.joint == self._number)
+        np.add.at(out, found.way[rows], step.joint_impulses[rows])
+        return out
+
+    def _mean(self, part: slice) -> Floats:
+        axes: Floats = self._sim._last.system.joints.axes[self._number]
+        return self._impulses[part] @ axes / self._sim.settings.dt
+
+
+class Motor:
+    """The numbers of the motor and the limits of a joint, to read and to set."""
+
+    def __init__(self, joint: JointNow):
+        object.__setattr__(self, "_joint", joint)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._joint._sim.world.joints[self._joint.name], name)
+
+    def __setattr__(self, name: str, value: float | None) -> None:
+        sim, what = self._joint._sim, f"joint {self._joint.name}"
+        meet(sim.comm, what)
+        change = partial(set_joint, sim.world, self._joint.name, **sim.comm.bcast({name: value}))
+        together(sim.comm, what, change, own=(ValueError, TypeError))

@@ -1,0 +1,174 @@
+"""The servo of a periodic cell: its stress, the work of its deformation, and its state."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import pctt
+from dem.scene import Scene
+from dem.scenes import PlaneShear
+from dem.shapes import Plane
+
+PRESSURE = 1000.0
+OF_RUNS = {"dt": 0.001, "solver": "apgd", "tol": 1e-6}
+
+
+def packed(comm=MPI.COMM_SELF, stress=(PRESSURE,) * 3, capsules=False, sheared=False):
+    """A dense cell of 64 grains, a little moved and turned from a lattice; contacts close to it."""
+    shear = {"shear_rate": 2.0, "shear_gradient": "z"} if sheared else {}
+    scene = Scene(0.4, (0.0, 0.0, 0.0), 27000.0, period=(0.0404, 0.0408, 0.0402), stress=stress, **shear)
+    random = np.random.default_rng(3)
+    grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
+    place = grid * [0.0101, 0.0102, 0.01005] + random.uniform(-4e-5, 4e-5, grid.shape)
+    speed = random.normal(scale=0.02, size=place.shape)
+    speed[:, 0] += 2.0 * place[:, 2] * sheared
+    if capsules:
+        scene.add_capsules(place, 0.0045, 0.0004, 2500.0, velocity=speed, angular_velocity=(2.0, 1.0, -3.0))
+    else:
+        scene.add_spheres(place, np.linspace(0.0049, 0.005, len(place)), 2500.0, velocity=speed)
+    return pctt.Simulation(scene, comm=comm, **OF_RUNS)
+
+
+def stress(sim):
+    return np.array([sim.figures[f"stress_{axis}{axis} [Pa]"] for axis in "xyz"])
+
+
+def error(sim, asked):
+    return np.abs(stress(sim) / asked - 1.0).max()
+
+
+def test_isotropic_cell_reaches_its_stress_and_stays():
+    sim = packed()
+    sim.run(steps=600, stop=lambda sim: error(sim, PRESSURE) < 0.02)
+    late = []
+    for _ in range(40):
+        sim.step()
+        late.append(error(sim, PRESSURE))
+    assert max(late) < 0.05
+    assert sim.period.prod() < 0.0404 * 0.0408 * 0.0402
+    asked = np.array([1.0, 1.0, 1.2]) * PRESSURE
+    sim.set_stress(asked)
+    sim.run(steps=300, stop=lambda sim: error(sim, asked) < 0.03)
+    assert error(sim, asked) < 0.03
+    sim.set_stress((None, None, 2.0 * PRESSURE))
+    before = sim.period
+    sim.run(steps=3)
+    np.testing.assert_array_equal(sim.period[:2], before[:2])
+
+
+def test_loose_cell_closes_affinely():
+    """Grains that touch nothing keep their places relative to the cell, and their velocities beside it."""
+    scene = Scene(0.4, (0.0, 0.0, 0.0), 1e4, period=(0.1, 0.1, 0.1), stress=(None, None, PRESSURE))
+    place = np.array([[0.02, 0.03, 0.01], [0.05, 0.06, 0.05], [0.07, 0.05, 0.09]])
+    scene.add_spheres(place, 0.005, 2500.0)
+    sim = pctt.Simulation(scene, **OF_RUNS)
+    sim.run(steps=20)
+    assert 0.9 * 0.1 < sim.period[2] < 0.999 * 0.1
+    np.testing.assert_allclose(sim.positions / sim.period, place / 0.1, rtol=1e-12)
+    np.testing.assert_array_equal(sim.velocities, 0.0)
+
+
+@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parametrize("sheared", [False, True])
+def test_work_is_stress_times_strain_and_closes_the_balance(sheared):
+    sim = packed(MPI.COMM_WORLD, (PRESSURE, None, 3.0 * PRESSURE), sheared=sheared)
+    sim.run(steps=3)
+    lost = 0.0
+    for _ in range(8):
+        rate, shear = sim.world.servo.rate, 0.0 if sim.world.shear is None else sim.world.shear.rate
+        sim.step()
+        assert np.abs(rate[[0, 2]]).min() > 0.0
+        lost += sim.figures["friction_loss [J]"] + sim.figures["impact_loss [J]"]
+        assert abs(sim.figures["time_stepping [J]"]) < 1e-9 * sim.figures["kinetic_energy [J]"]
+        if not sheared:
+            kinetic = sim.comm.allreduce(of_motion(sim))
+            power = sim.period.prod() * (stress(sim) - kinetic / sim.period.prod()) @ rate
+            np.testing.assert_allclose(sim.figures["work_of_motions [J]"], -OF_RUNS["dt"] * power, rtol=1e-9)
+        assert shear in (0.0, 2.0)
+    assert lost > 0.0
+
+
+def of_motion(sim):
+    """The kinetic part of the stress of this rank's grains, times the volume; their mean velocity is zero here."""
+    total = sim.comm.allreduce(sim.local.mass.sum())
+    mean = sim.comm.allreduce(sim.local.mass @ sim.local.velocity[:, :3]) / total
+    return sim.local.mass @ (sim.local.velocity[:, :3] - mean) ** 2
+
+
+@pytest.mark.parallel(1, 2)
+def test_restart_goes_on_with_the_same_bits(tmp_path):
+    sim = packed(MPI.COMM_WORLD, (PRESSURE, None, PRESSURE), sheared=True)
+    sim.run(steps=6)
+    sim.set_stress((PRESSURE, 2.0 * PRESSURE, PRESSURE))
+    sim.run(steps=3)
+    sim.save(tmp_path / "state.h5")
+    other = pctt.Simulation.load(tmp_path / "state.h5", sim.experiment, comm=MPI.COMM_WORLD, **OF_RUNS)
+    for each in (sim, other):
+        each.run(steps=4)
+    assert np.array_equal(sim.period, other.period)
+    assert np.array_equal(sim.world.servo.asked, other.world.servo.asked)
+    assert np.array_equal(sim.positions, other.positions)
+    assert np.array_equal(sim.velocities, other.velocities)
+
+
+@pytest.mark.parallel(2, 3)
+@pytest.mark.parametrize("capsules", [False, True])
+def test_ranks_change_nothing(capsules):
+    alone, together = (packed(comm, capsules=capsules, sheared=True) for comm in (MPI.COMM_SELF, MPI.COMM_WORLD))
+    for sim in (alone, together):
+        sim.run(steps=6)
+    np.testing.assert_allclose(together.period, alone.period, rtol=1e-5)
+    np.testing.assert_allclose(together.positions, alone.positions, atol=1e-6)
+    assert len(together.contacts) == len(alone.contacts) > 10
+
+
+def test_refused():
+    def scene(**more):
+        built = Scene(0.3, **{"gravity": (0.0, 0.0, 0.0), "period": (0.5,) * 3, "stress": (1e3, None, None), **more})
+        built.add_spheres([[0.1, 0.1, 0.1]], radius=0.05, density=1000.0)
+        return built
+
+    for more, words in {
+        "periods along x, y and z": {"period": (0.5, 0.5, None)},
+        "stress needs gravity": {"gravity": (0.0, 0.0, -9.8)},
+        "three entries": {"stress": (1e3,)},
+        "must be positive": {"stress": (-1e3, None, None)},
+    }.items():
+        with pytest.raises(ValueError, match=more):
+            scene(**words)
+    walled = scene()
+    walled.add_body("floor", [Plane(normal=(0, 0, 1))])
+    with pytest.raises(ValueError, match="'floor': a cell of given stress has grains alone"):
+        walled.grains()
+    with pytest.raises(ValueError, match="contacts that give way"):
+        pctt.Simulation(scene(stiffness=np.inf), dt=0.01)
+    with pytest.raises(ValueError, match="periods of this scene are constant"):
+        pctt.Simulation(scene(stress=None), dt=0.01).set_stress((None, None, 1e3))
+
+
+@pytest.mark.slow
+def test_friction_of_plane_shear_grows_with_the_inertial_number():
+    slow, fast = flow(0.03, 0.57), flow(0.3, 0.53)
+    assert abs(slow / jop(0.03) - 1.0) < 0.2
+    assert abs(fast / jop(0.3) - 1.0) < 0.2
+    assert fast > slow + 0.05
+
+
+def flow(inertial, fraction):
+    """The friction coefficient of plane shear."""
+    sim, shear, pressure = pctt.Simulation(PlaneShear(n=6, inertial=inertial, fraction=fraction), solver="apgd"), [], []
+
+    def keep(sim):
+        shear.append(-sim.figures["stress_xz [Pa]"])
+        pressure.append(sim.figures["stress_zz [Pa]"])
+
+    sim.run(until=2.0 / sim.world.shear.rate, call=keep)
+    late = slice(len(shear) // 2, None)
+    assert 0.75 < np.mean(pressure[late]) / PRESSURE < 1.3
+    return np.mean(shear[late]) / np.mean(pressure[late])
+
+
+def jop(inertial):
+    """Of glass beads: Jop, Forterre, Pouliquen, Nature 441 (2006) 727."""
+    low, high = np.tan(np.radians([20.9, 32.8]))
+    return low + (high - low) / (1.0 + 0.279 / inertial)

@@ -1,0 +1,334 @@
+"""Joints: closed forms of mechanisms, contacts through joints, restarts, ranks."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from scipy.special import ellipk
+
+import pctt
+from dem.motion import Dynamic, Glide
+from dem.scene import Scene
+from dem.shapes import Box, Plane
+from pctt import ccp
+from pctt.options import OptionError
+from pctt.run.stepper import NoSolutionError
+
+G = 9.81
+
+
+def simulation(scene, dt=0.002, **given):
+    return pctt.Simulation(scene, dt=dt, tol=1e-9, comm=MPI.COMM_SELF, say=lambda text: None, **given)
+
+
+def pendulum(dt, length=1.0, kind="hinge"):
+    """A small sphere that begins at the height of its hinge."""
+    scene = Scene(friction=0.3)
+    (ball,) = scene.add_spheres([length, 0, 0], 0.05, 1000.0)
+    scene.add_joint("pin", None, ball, kind=kind, anchor=(0, 0, 0), axis=(0, 1, 0))
+    return simulation(scene, dt)
+
+
+def test_pendulum_force_and_distance():
+    sim = pendulum(0.005)
+    mass = sim.local.mass[0]
+    lowest = 0.0
+    while sim.time < 0.8:
+        sim.step()
+        lowest = max(lowest, sim.joint("pin").force[2] / (mass * G))
+        assert np.linalg.norm(sim.positions[0]) == pytest.approx(1.0, abs=1e-3)
+    moment = 1.0 + 0.4 * 0.05**2  # about the hinge, over the mass
+    assert lowest == pytest.approx(1.0 + 2.0 / moment, rel=1e-2)
+
+
+def energies(sim, until):
+    """Of each step, over m g of the first grain: the velocities of a step are those of its middle, so the potential
+    energy is that of the mean of two places."""
+    out, mass, before = [], sim.local.mass, sim.positions[:, 2]
+    while sim.time < until - 1e-9:
+        kinetic = sim.step()["kinetic_energy [J]"]
+        after = sim.positions[:, 2]
+        out.append((kinetic + G * mass @ (before + after) / 2.0) / (mass[0] * G))
+        before = after
+    return np.array(out)
+
+
+@pytest.mark.parametrize("kind", ["hinge", "ball"])
+def test_energy_of_a_pendulum_is_of_second_order_and_does_not_drift(kind):
+    coarse, fine = (np.abs(energies(pendulum(dt, kind=kind), 2.2)) for dt in (0.02, 0.01))
+    assert fine.max() < 2e-3
+    assert coarse.max() > 3.5 * fine.max()
+
+
+def test_the_period_of_a_pendulum_is_that_of_the_elliptic_integral():
+    """From 90 degrees, 2 K(1/2) sqrt(I / m g l) pass between two passages of the lowest point."""
+    moment = 1.0 + 0.4 * 0.05**2
+    exact, errors = 2.0 * ellipk(0.5) * np.sqrt(moment / G), []
+    for dt in (0.02, 0.01):
+        sim, passed, before = pendulum(dt), [], 1.0
+        while len(passed) < 2:
+            sim.step()
+            x = sim.positions[0, 0]
+            if x * before < 0.0:
+                passed.append(sim.time - dt * x / (x - before))
+            before = x
+        errors.append(abs((passed[1] - passed[0]) / exact - 1.0))
+    assert errors[1] < 5e-4
+    assert errors[0] > 3.0 * errors[1]
+
+
+def test_energy_of_a_double_pendulum_is_of_second_order():
+    worst = []
+    for dt in (0.01, 0.005):
+        scene = Scene(friction=0.3)
+        one, two = scene.add_spheres([[0.5, 0, 0], [1.0, 0, 0]], 0.05, 1000.0)
+        scene.add_joint("pin", None, one, anchor=(0, 0, 0), axis=(0, 1, 0))
+        scene.add_joint("elbow", one, two, anchor=(0.5, 0, 0), axis=(0, 1, 0))
+        worst.append(np.abs(energies(simulation(scene, dt), 1.2)).max())
+    assert worst[1] < 0.01
+    assert worst[0] > 3.0 * worst[1]
+
+
+def test_a_slider_crank_moves_as_its_geometry_says():
+    """Joints and motor have 21 rows for the 18 velocities of three bodies: some are redundant."""
+    crank, rod, errors = 0.3, 1.0, []
+    for dt in (0.02, 0.01):
+        scene = Scene(friction=0.3)
+        one = scene.add_boxes([crank / 2, 0, 0], (crank / 2, 0.05, 0.05), 500.0)[0]
+        two = scene.add_boxes([crank + rod / 2, 0.3, 0], (rod / 2, 0.05, 0.05), 500.0)[0]
+        (three,) = scene.add_spheres([crank + rod, 0.6, 0], 0.05, 500.0)
+        scene.add_joint("crank", None, one, anchor=(0, 0, 0), axis=(0, 1, 0), speed=3.0)
+        scene.add_joint("knee", one, two, anchor=(crank, 0.15, 0), axis=(0, 1, 0))
+        scene.add_joint("head", two, three, anchor=(crank + rod, 0.45, 0), axis=(0, 1, 0))
+        scene.add_joint("bore", None, three, kind="slider", anchor=(crank + rod, 0.6, 0), axis=(1, 0, 0))
+        sim, worst = simulation(scene, dt), 0.0
+        while sim.time < 1.2:
+            sim.step()
+            angle = 3.0 * sim.time
+            exact = crank * np.cos(angle) + np.sqrt(rod**2 - (crank * np.sin(angle)) ** 2)
+            worst = max(worst, abs(sim.positions[2, 0] - exact))
+        errors.append(worst)
+    assert errors[1] < 1e-3
+    assert errors[0] > 3.0 * errors[1]
+
+
+def test_a_hanging_chain_bears_its_weight():
+    scene = Scene(friction=0.3)
+    ids = scene.add_spheres([[0, 0, -0.3 * k] for k in range(1, 6)], 0.1, 1000.0)
+    for k, one in enumerate([None, *ids[:-1]]):
+        scene.add_joint(f"link {k}", one, ids[k], kind="ball", anchor=(0, 0, -0.3 * k - 0.15))
+    sim = simulation(scene)
+    sim.run(until=0.05)
+    weight = sim.local.mass[0] * G
+    for k in range(5):
+        assert sim.joint(f"link {k}").force == pytest.approx([0, 0, (5 - k) * weight], abs=1e-6 * weight)
+
+
+def test_a_fixed_joint_has_the_force_and_moment_of_its_cut():
+    scene = Scene(friction=0.3)
+    one, two = scene.add_boxes([[0.5, 0, 0], [1.6, 0, 0]], (0.5, 0.1, 0.1), 100.0)
+    scene.add_joint("wall", None, one, kind="fixed", anchor=(0, 0, 0))
+    scene.add_joint("cut", one, two, kind="fixed", anchor=(1.05, 0, 0))
+    sim = simulation(scene)
+    sim.run(until=0.1)
+    weight = 4.0 * G
+    assert sim.joint("cut").force == pytest.approx([0, 0, weight], abs=1e-6)
+    assert sim.joint("cut").torque == pytest.approx([0, -0.55 * weight, 0], abs=1e-5)
+    assert sim.joint("wall").torque == pytest.approx([0, -2.1 * weight, 0], abs=1e-5)
+    assert sim.positions[1] == pytest.approx([1.6, 0, 0], abs=1e-7)
+
+
+def wheel(**motor):
+    scene = Scene(friction=0.3, gravity=(0, 0, 0))
+    (ball,) = scene.add_spheres([0, 0, 0], 0.1, 1000.0)
+    scene.add_joint("axle", None, ball, anchor=(0, 0, 0), axis=(0, 0, 1), **motor)
+    return scene
+
+
+def test_a_motor_keeps_its_speed_and_is_changed_within_the_loop():
+    sim = simulation(wheel(speed=3.0))
+    sim.run(until=0.1)
+    assert sim.joint("axle").speed == pytest.approx(3.0)
+    assert sim.joint("axle").angle == pytest.approx(0.3)
+    sim.joint("axle").motor.speed = -1.0
+    sim.run(until=0.2)
+    assert sim.joint("axle").angle == pytest.approx(0.2)
+    sim.joint("axle").motor.target = 0.5
+    sim.step()
+    assert sim.joint("axle").angle == pytest.approx(0.5)
+    assert sim.joint("axle").motor.speed is None
+
+
+def test_a_weak_motor_stalls_at_its_torque_and_its_work_is_in_the_balance():
+    sim = simulation(wheel(speed=100.0, strength=0.2))
+    moment = sim.local.inertia[0, 0]
+    figures = sim.step()
+    assert sim.joint("axle").drive == pytest.approx(0.2)
+    assert sim.joint("axle").speed == pytest.approx(0.2 * 0.002 / moment)
+    assert figures["work_of_motions [J]"] == pytest.approx(figures["kinetic_energy [J]"])
+
+
+@pytest.mark.parametrize("strength", [np.inf, 5.0])
+def test_a_motor_stops_at_its_limit(strength):
+    sim = simulation(wheel(speed=3.0, strength=strength, limits=(-1.0, 0.1)), dt=0.01)
+    for step in range(1, 8):
+        sim.step()
+        assert sim.joint("axle").angle == pytest.approx(min(0.03 * step, 0.1), rel=1e-2)
+        assert sim.joint("axle").angle < 0.1 + 1e-9
+    assert sim.joint("axle").angle == pytest.approx(0.1, rel=1e-9)
+    assert sim.joint("axle").drive == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_slider_stops_at_its_limit():
+    scene = Scene(friction=0.3)
+    (ball,) = scene.add_spheres([0, 0, 1], 0.1, 1000.0)
+    scene.add_joint("rod", None, ball, kind="slider", anchor=(0, 0, 1), axis=(0, 0, 1), limits=(-0.2, 1.0))
+    sim = simulation(scene)
+    sim.run(until=0.5)
+    assert sim.joint("rod").position == pytest.approx(-0.2, abs=1e-9)
+    assert sim.joint("rod").drive == pytest.approx(sim.local.mass[0] * G)
+
+
+def test_a_hinge_rests_at_its_limit():
+    scene = Scene(friction=0.3)
+    (ball,) = scene.add_spheres([1, 0, 0], 0.05, 1000.0)
+    scene.add_joint("pin", None, ball, anchor=(0, 0, 0), axis=(0, 1, 0), limits=(-1.0, 0.5))
+    sim = simulation(scene, 0.01)
+    while sim.time < 0.6:
+        sim.step()
+        assert sim.joint("pin").angle < 0.5 + 1e-9
+    assert sim.joint("pin").angle == pytest.approx(0.5, abs=1e-9)
+    assert sim.joint("pin").drive == pytest.approx(-sim.local.mass[0] * G * np.cos(0.5), rel=1e-4)
+
+
+def test_a_limit_holds_against_what_contacts_push():
+    """A heavy wall runs into a ball, which would pass its limit within the same step."""
+    scene = Scene(friction=0.0, gravity=(0, 0, 0))
+    given = {"position": (-0.21, 0, 0), "mass": 50.0, "inertia": (1, 1, 1), "velocity": (2.0, 0, 0)}
+    scene.add_body("wall", [Box((0.1, 1, 1))], Dynamic(), **given)
+    (ball,) = scene.add_spheres([0, 0, 0], 0.1, 1000.0)
+    scene.add_joint("rail", None, ball, kind="slider", anchor=(0, 0, 0), axis=(1, 0, 0), limits=(-0.1, 0.02))
+    sim, pushes = simulation(scene, 0.02), []
+    for _ in range(5):
+        sim.step()
+        assert sim.joint("rail").position < 0.02 + 1e-9
+        pushes.append(sim.joint("rail").drive)
+    assert max(pushes) < 1e-6  # it pushes back, and pulls never
+    assert min(pushes) < -1000.0
+    assert pushes[-1] == 0.0  # the wall has gone
+
+
+def test_a_motor_that_runs_into_a_stop_pushes_with_its_bound():
+    scene = Scene(friction=0.0, gravity=(0, 0, 0))
+    scene.add_spheres([0, 0, 5], 0.1, 1000.0)
+    scene.add_body("stop", [Box((0.1, 0.1, 0.1))], position=(0.8, 0.16, 0))
+    scene.add_body("arm", [Box((0.5, 0.05, 0.05))], Dynamic(), position=(0.5, 0, 0), mass=3.0, inertia=(1, 1, 1))
+    scene.add_joint("pin", None, "arm", anchor=(0, 0, 0), axis=(0, 0, 1), speed=1.0, strength=2000.0)
+    sim = simulation(scene, 0.002, stiffness=np.inf)
+    sim.step()
+    for _ in range(20):
+        sim.step()
+        assert abs(sim.joint("pin").drive) <= 2000.0 * (1.0 + 1e-3)
+    assert sim.joint("pin").drive == pytest.approx(2000.0, rel=1e-3)
+    assert sim.joint("pin").speed == pytest.approx(0.0, abs=1e-6)
+    assert sim.body("stop").torque + np.cross([0.8, 0.16, 0], sim.body("stop").force) == pytest.approx(
+        [0, 0, 2000.0], rel=1e-3, abs=1.0
+    )
+
+
+def test_friction_of_jointed_bodies_that_slide_is_coulombs():
+    """Two spheres that a fixed joint keeps from rolling slide with the deceleration mu g."""
+    scene = Scene(friction=0.3)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    one, two = scene.add_spheres([[0, 0, 0.1], [0.5, 0, 0.1]], 0.1, 1000.0, velocity=(1.0, 0, 0))
+    scene.add_joint("bar", one, two, kind="fixed", anchor=(0.25, 0, 0.1))
+    sim = simulation(scene, 0.005)
+    sim.run(until=0.2)
+    assert sim.velocities[:, 0] == pytest.approx([1.0 - 0.3 * G * 0.2] * 2, rel=1e-4)
+    weight = 2.0 * sim.local.mass[0] * G
+    assert sim.body("floor").force == pytest.approx([0.3 * weight, 0, -weight], rel=1e-4, abs=1e-3)
+    sim.run(until=0.5)
+    assert sim.velocities == pytest.approx(np.zeros((2, 6)), abs=1e-5)
+
+
+@pytest.mark.parametrize("solver", ["apgd", "auto"])
+def test_contacts_and_joints_are_solved_together(solver):
+    """A lever that is hinged at one end lies with the other on the floor, which bears half of its weight."""
+    scene = Scene(friction=0.0)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    (ball,) = scene.add_spheres([1, 0, 0.1], 0.1, 1000.0)
+    scene.add_body("bar", [Box((0.4, 0.05, 0.05))], Dynamic(), position=(0.45, 0, 0.2), mass=8.0, inertia=(1, 1, 1))
+    scene.add_joint("pin", None, "bar", anchor=(0, 0, 0.2), axis=(0, 1, 0))
+    scene.add_joint("foot", "bar", ball, kind="fixed", anchor=(0.9, 0, 0.2))
+    sim = simulation(scene, solver=solver)
+    sim.run(until=0.1)
+    bears = (8.0 * 0.45 + sim.local.mass[0]) * G  # about the hinge, the arm of the floor is 1 m
+    assert -sim.body("floor").force[2] == pytest.approx(bears, rel=1e-4)
+
+
+def test_other_solvers_refuse():
+    for solver in set(ccp.SOLVERS) - {"auto", "apgd"}:
+        with pytest.raises(OptionError, match=f"-ccp_type {solver}: the scene has joints; allowed are auto and apgd"):
+            simulation(wheel(), solver=solver)
+
+
+def test_a_body_that_is_squeezed_against_its_joint_has_no_solution():
+    """A wall runs into a box that a slider holds: no impulse of a rigid contact stops the wall."""
+    for motion, ends in ((Glide((0.5, 0, 0)), True), (Glide((0, 0, 0.5)), False)):
+        scene = Scene(friction=0.0, gravity=(0, 0, 0))
+        scene.add_body("wall", [Box((0.1, 1, 1))], motion, position=(-0.101, 0, 0))
+        (box,) = scene.add_boxes([0.1, 0, 0], (0.1, 0.1, 0.1), 1000.0)
+        scene.add_joint("rail", None, box, kind="slider", anchor=(0.1, 0, 0), axis=(0, 0, 1))
+        sim = simulation(scene, dt=0.01, stiffness=np.inf, max_it=2000)
+        if ends:
+            with pytest.raises(NoSolutionError, match="unbounded"):
+                sim.run(steps=2)
+        else:
+            sim.run(steps=2)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"kind": "rope"}, "kind of a joint"),
+        ({"speed": 1.0, "target": 1.0}, "not both"),
+        ({"kind": "ball", "speed": 1.0}, "no motor"),
+        ({"limits": (1.0, 0.0)}, "limits"),
+        ({"strength": -1.0}, "strength"),
+    ],
+)
+def test_wrong_joints_are_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        wheel(**given)
+
+
+def pusher():
+    """An arm whose motor pushes through a row of spheres."""
+    scene = Scene(friction=0.3)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_spheres([[0.5 + 0.21 * k, 0.3, 0.1] for k in range(4)], 0.1, 1000.0)
+    scene.add_body("arm", [Box((0.6, 0.05, 0.05))], Dynamic(), position=(0.6, 0, 0.15), mass=5.0, inertia=(1, 1, 1))
+    scene.add_joint("pin", None, "arm", anchor=(0, 0, 0.15), axis=(0, 0, 1), speed=1.0, strength=200.0)
+    return scene
+
+
+def test_a_restart_goes_on_with_the_same_bits(tmp_path):
+    sim = simulation(pusher(), dt=0.01)
+    sim.run(steps=20)
+    sim.joint("pin").motor.speed = 0.5
+    sim.save(tmp_path / "state.h5")
+    sim.run(steps=20)
+    again = pctt.Simulation.load(tmp_path / "state.h5", pusher(), dt=0.01, tol=1e-9, comm=MPI.COMM_SELF)
+    again.run(steps=20)
+    assert np.array_equal(again.positions, sim.positions)
+    assert again.joint("pin").angle == sim.joint("pin").angle
+    assert sim.joint("pin").speed == pytest.approx(0.5, rel=1e-2)
+
+
+@pytest.mark.parallel(2, 3)
+def test_joints_do_not_depend_on_the_ranks():
+    alone = simulation(pusher(), dt=0.01)
+    sim = pctt.Simulation(pusher(), dt=0.01, tol=1e-9, comm=MPI.COMM_WORLD)
+    for each in (alone, sim):
+        each.run(steps=20)
+    assert sim.positions == pytest.approx(alone.positions, abs=1e-6)
+    assert sim.joint("pin").force == pytest.approx(alone.joint("pin").force, abs=1e-2)
