@@ -237,6 +237,7 @@ def test_a_restart_goes_on_with_the_same_bits(tmp_path):
         Simulation.load(tmp_path / "state.h5", other_scene, comm=comm, **WORDS)
 
 
+@pytest.mark.slow
 def test_a_hopper_fills_and_runs_out():
     """Rain into a cone that a gate shuts; then the gate goes, and all run through the outlet below."""
     scene = Scene(0.2)

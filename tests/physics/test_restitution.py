@@ -35,7 +35,7 @@ def test_two_spheres_of_other_masses_part_as_newton_says(stiffness, projection, 
 
 
 @STIFF
-@pytest.mark.parametrize(("dt", "rel"), [(0.01, 0.12), (0.001, 0.012)])
+@pytest.mark.parametrize(("dt", "rel"), [(0.01, 0.12), pytest.param(0.001, 0.012, marks=pytest.mark.slow)])
 def test_a_ball_bounces_to_e2_of_its_height_and_comes_to_rest(stiffness, dt, rel):
     e, fall = 0.7, 1.0
     scene = Scene(friction=0.3, stiffness=stiffness)
