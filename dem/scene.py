@@ -582,9 +582,9 @@ def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
         if scene.sources or scene.outlets:
             name = next(iter({**scene.sources, **scene.outlets}))
             raise ValueError(f"{name!r}: a {cell} has no sources and outlets")
-    for kind, names in {"spring": scene.springs, "joint": scene.joints}.items():
+    for what, names in (("spring", list(scene.springs)), ("joint", list(scene.joints))):
         if names:
-            raise ValueError(f"{kind} {next(iter(names))!r}: {kind}s have no images, so periods allow none")
+            raise ValueError(f"{what} {names[0]!r}: {what}s have no images, so periods allow none")
     for body in scene.large_bodies:
         for shape in body.shapes:
             kind, center, turn, size = shapes.placed(shape)
