@@ -68,6 +68,19 @@ def squared_moves(x: Array, y: Array, step: float, mu: Array, de_saxce: float) -
 
 
 @loop
+def wrong_works(g: Array, y: Array, r: Array) -> tuple[float, float, float]:
+    """Closing work, opening work and 1/2 g.(y - r), summed over the contacts. Comparisons let a NaN through."""
+    closing, opening, energy = 0.0, 0.0, 0.0
+    for c in range(len(g)):
+        n, u, v = g[c, 0], g[c, 1], g[c, 2]
+        along = n * y[c, 0] + u * y[c, 1] + v * y[c, 2]
+        closing += n * (0.0 if y[c, 0] > 0.0 else -y[c, 0])
+        opening += 0.0 if along < 0.0 else along
+        energy += 0.5 * (along - (n * r[c, 0] + u * r[c, 1] + v * r[c, 2]))
+    return closing, opening, energy
+
+
+@loop
 def accelerated_step(
     x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, de_saxce: float,
     out: Array,
@@ -387,9 +400,9 @@ class FrictionCones:
         """||`move`||^2 of this rank's contacts."""
         return float(squared_moves(x, y, step, self.mu, float(coulomb)).sum())
 
-    def power(self, x: Array, y: Array) -> Array:
-        """x.y of each contact (count,)."""
-        return dot(x, y).reshape(len(x) // max(self.count, 1), self.count).sum(axis=0)
+    def wrong_works(self, g: Array, y: Array, r: Array) -> tuple[float, float, float]:
+        """Closing work, opening work and 1/2 g.(y - r) of this rank's contacts; see `ConeProblem.wrong_work`."""
+        return wrong_works(g, y, r)
 
     def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
         """Mask (count,) of the contacts but those without an impulse at x and last_x whose distance inside the dual

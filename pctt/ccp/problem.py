@@ -112,9 +112,7 @@ class ConeProblem:
     def wrong_work(self, g: Array, y: Array) -> float:
         """The larger of the closing and the opening work, over 1/2 g'Ng: the sums of g_n max(-y_n, 0) and of
         max(g.y, 0) over the contacts; velocities y = N g + r. 0 without impulses, inf if it is no number."""
-        closing = g[: self.cones.count, 0] @ np.maximum(-y[: self.cones.count, 0], 0.0)
-        opening = np.maximum(self.cones.power(g, y), 0.0).sum()
-        closing, opening, energy = self.sum(np.array([closing, opening, 0.5 * np.vdot(g, y - self.r)]))
+        closing, opening, energy = self.sum(np.array(self.cones.wrong_works(g, y, self.r)))
         work = 0.0 if energy <= 0 else float(np.maximum(closing, opening) / energy)
         return work if work == work else np.inf
 

@@ -59,6 +59,11 @@ class RollingCones(FrictionCones):
         move = self.move(x, y, step, coulomb)
         return float(np.vdot(move, move))
 
+    def wrong_works(self, g: Array, y: Array, r: Array) -> tuple[float, float, float]:
+        normal, push = y[: self.count, 0], g[: self.count, 0]
+        power = (g * y).sum(axis=1).reshape(2, -1).sum(axis=0)
+        return push @ np.maximum(-normal, 0.0), np.maximum(power, 0.0).sum(), 0.5 * np.vdot(g, y - r)
+
     def resisted(self, y: Array) -> Array:
         slides, rolls = (self.mu * tangential(y)).reshape(2, -1)
         return slides + rolls + self.spinning * np.abs(y[self.count :, 0])

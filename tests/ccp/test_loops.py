@@ -111,10 +111,12 @@ def test_sums_of_a_problem_from_its_cones():
     term = np.stack([mu * np.hypot(y[:, 1], y[:, 2]), 0 * mu, 0 * mu], axis=1)
     for coulomb, target in ((False, x - 0.3 * y), (True, x - 0.3 * (y + term))):
         np.testing.assert_allclose(cones.move(x, y, 0.3, coulomb), nearest(target, mu) - x, atol=1e-14)
-    np.testing.assert_allclose(cones.power(x, y), (x * y).sum(axis=1))
+    power = (x * y).sum(axis=1)
+    works = x[:, 0] @ np.maximum(-y[:, 0], 0), np.maximum(power, 0).sum(), 0.5 * (power.sum() - (x * x).sum())
+    np.testing.assert_allclose(cones.wrong_works(x, y, x), works)
     open_ones = (x[:, 0] <= 0) & (y[:, 0] - term[:, 0] > 0.1)
     assert np.array_equal(cones.not_idle(x, x, y, 0.1), ~open_ones)
-    assert cone.FrictionCones(np.zeros(0)).power(x[:0], y[:0]).shape == (0,)
+    assert cone.FrictionCones(np.zeros(0)).wrong_works(x[:0], y[:0], x[:0]) == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("tangential", [1e-9, 0.3])
