@@ -1,7 +1,7 @@
 """The accuracy of a solution: figures that judge every method, computed by code of their own, which no solver uses.
 
-The projection below is not the solvers', and y = N g is a product of its own. So a mistake in a solver's own arithmetic
-shows.
+The loop below, with its projection, is not the solvers', and y = N g is a product of its own. So a mistake in a
+solver's own arithmetic shows.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dem.compiled import inlined, loop
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.rolling import RollingProblem
@@ -47,28 +48,16 @@ class Accuracy:
     velocity_norm: float
 
 
-@np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
 def measure(problem: ConeProblem, g: Array) -> Accuracy:
     """The figures of an impulse g (nc, 3), the same on every rank."""
     y = problem.product(g) + problem.r
-    most = problem.mu[None]
+    step = 1.0 / problem.mean_diagonal
     if isinstance(problem, RollingProblem):
-        most = np.concatenate([problem.mu.reshape(2, -1), problem.spinning[None]])
-    count = most.shape[1]
-    (g_n, sizes), (y_n, speeds) = _parts(g, most), _parts(y, most)
-    resisted, along = (most * speeds).sum(axis=0), (g * y).sum(axis=1)
-    along = along[:count] + (along[count:] if len(along) > count else 0.0)
-    target = g - y / problem.mean_diagonal
-    natural = ((_nearest(target, most) - g) ** 2).sum()
-    target[:count, 0] -= resisted / problem.mean_diagonal
-    coulomb = ((_nearest(target, most) - g) ** 2).sum()
-    sums = [
-        np.vdot(g, g), np.vdot(y, y), np.vdot(g, y + problem.r), np.vdot(g, y - problem.r),
-        g_n @ np.maximum(-y_n, 0.0), np.maximum(along, 0.0).sum(), natural, coulomb,
-    ]  # fmt: skip
-    greatest = [np.max(x, initial=0.0) for x in (sizes - most * g_n, resisted - y_n, np.abs(along))]
-    square, speed, power, pushed, closing, opening, natural, coulomb = problem.sum(np.array(sums)).tolist()
-    cone, dual, complementarity = problem.max(np.array(greatest)).tolist()
+        sums, greatest = _judged_rolling(problem, g, y, step)
+    else:
+        sums, greatest = _judged(g, y, problem.r, problem.mu, step)
+    square, speed, power, pushed, closing, opening, natural, coulomb = problem.sum(sums).tolist()
+    cone, dual, complementarity = problem.max(greatest).tolist()
     norm, energy = float(np.sqrt(square)), 0.5 * pushed
     per = 1.0 / max(norm, float(np.finfo(float).tiny))
     return Accuracy(
@@ -93,29 +82,79 @@ def _part(work: float, energy: float) -> float:
     return part if part == part else np.inf
 
 
-def _parts(x: Array, most: Array) -> tuple[Array, Array]:
-    """The normal numbers (count,) of unknowns, and the sizes (1 or 3, count) of what the coefficients ``most`` bound:
-    along the tangents, and of moments about them and about the normal."""
-    count = most.shape[1]
-    sizes = np.sqrt(x[:, 1] ** 2 + x[:, 2] ** 2).reshape(len(most) // 2 + 1, count)
-    if len(most) > 1:
-        sizes = np.concatenate([sizes, np.abs(x[None, count:, 0])])
-    return x[:count, 0], sizes
+@loop
+def _judged(g: Array, y: Array, r: Array, mu: Array, step: float) -> tuple[Array, Array]:
+    """Of impulses g and velocities y = N g + r (nc, 3) the sums (8,) over the contacts: of |g|^2, |y|^2, g.(y + r),
+    g.(y - r), the closing and the opening work, |g - P(g - step y)|^2 and the same of Coulomb's law; and the greatest
+    (3,): distances outside the cone and outside the dual one, and |g.y|. Comparisons let a NaN through."""
+    sums, greatest = np.zeros(8), np.zeros(3)
+    for c in range(len(mu)):
+        n, u, v, m = g[c, 0], g[c, 1], g[c, 2], mu[c]
+        y_n, y_u, y_v = y[c, 0], y[c, 1], y[c, 2]
+        along = n * y_n + u * y_u + v * y_v
+        free = n * r[c, 0] + u * r[c, 1] + v * r[c, 2]
+        slip = np.sqrt(y_u * y_u + y_v * y_v)
+        sums[0] += n * n + u * u + v * v
+        sums[1] += y_n * y_n + y_u * y_u + y_v * y_v
+        sums[2] += along + free
+        sums[3] += along - free
+        sums[4] += n * (0.0 if y_n > 0.0 else -y_n)
+        sums[5] += 0.0 if along < 0.0 else along
+        a_n, a_u, a_v = _nearest_in_cone(n - step * y_n, u - step * y_u, v - step * y_v, m)
+        sums[6] += (n - a_n) ** 2 + (u - a_u) ** 2 + (v - a_v) ** 2
+        a_n, a_u, a_v = _nearest_in_cone(n - step * (y_n + m * slip), u - step * y_u, v - step * y_v, m)
+        sums[7] += (n - a_n) ** 2 + (u - a_u) ** 2 + (v - a_v) ** 2
+        greatest[0] = max(greatest[0], np.sqrt(u * u + v * v) - m * n)
+        greatest[1] = max(greatest[1], m * slip - y_n)
+        greatest[2] = max(greatest[2], abs(along))
+    return sums, greatest
 
 
-def _nearest(x: Array, most: Array) -> Array:
-    """The nearest points of the cones, sizes <= most height. The height, by Newton's method: its steps ascend from
-    below and end after one more than there are kinks, as the function is concave."""
-    count = most.shape[1]
-    normal, sizes = _parts(x, most)
-    height = normal
-    for _ in range(len(most) + 1):
-        beyond = sizes > most * height
-        height = (normal + (most * sizes * beyond).sum(axis=0)) / (1.0 + (most**2 * beyond).sum(axis=0))
-    height = np.maximum(height, 0.0)
-    shrink = np.minimum(1.0, most * height / np.maximum(sizes, 1e-300))
-    out = np.repeat(shrink[:1].T, 3, axis=1) * x[:count]
-    out[:, 0] = height
-    if len(most) > 1:
-        out = np.concatenate([out, shrink[[2, 1, 1]].T * x[count:]])
-    return out
+@inlined
+def _nearest_in_cone(n, u, v, mu):
+    """Projection on the cone of slope mu, in the half plane of axis and point: the nearest point of the surface's ray,
+    unless the point is inside."""
+    tangential = np.sqrt(u * u + v * v)
+    ray = 1.0 / np.sqrt(1.0 + mu * mu)
+    along = ray * (n + mu * tangential)
+    along = 0.0 if along < 0.0 else along
+    if not (n >= 0.0 and tangential <= mu * n):
+        turn = ray * mu * along / tangential if tangential > 0.0 else 0.0
+        n, u, v = ray * along, turn * u, turn * v
+    return n, u, v
+
+
+def _judged_rolling(problem: RollingProblem, g: Array, y: Array, step: float) -> tuple[Array, Array]:
+    """The figures of `_judged` with resistance to rolling and spinning; the height of a projection by Newton's method,
+    whose steps ascend to it from below and end after three, as the function is concave with three kinks."""
+    nc, r = len(problem.spinning), problem.r
+    most = np.stack([problem.mu[:nc], problem.mu[nc:], problem.spinning])
+
+    def parts(x: Array) -> tuple[Array, Array]:
+        sizes = np.hypot(x[:nc, 1], x[:nc, 2]), np.hypot(x[nc:, 1], x[nc:, 2]), np.abs(x[nc:, 0])
+        return x[:nc, 0], np.stack(sizes)
+
+    def squared_move(y_n: Array) -> float:
+        target = g - step * y
+        target[:nc, 0] = g[:nc, 0] - step * y_n
+        normal, sizes = parts(target)
+        height = normal
+        for _ in range(5):
+            beyond = sizes > most * height
+            height = (normal + (most * sizes * beyond).sum(axis=0)) / (1.0 + (most**2 * beyond).sum(axis=0))
+        height = np.maximum(height, 0.0)
+        shrink = np.minimum(1.0, most * height / np.maximum(sizes, 1e-300))
+        target[:nc] *= np.stack([np.ones(nc), shrink[0], shrink[0]], axis=1)
+        target[nc:] *= np.stack([shrink[2], shrink[1], shrink[1]], axis=1)
+        target[:nc, 0] = height
+        return float(((target - g) ** 2).sum())
+
+    (g_n, sizes), (y_n, speeds) = parts(g), parts(y)
+    resisted, along = (most * speeds).sum(axis=0), np.einsum("ck,ck->c", g, y)
+    along = along[:nc] + along[nc:]
+    sums = [
+        np.vdot(g, g), np.vdot(y, y), np.vdot(g, y + r), np.vdot(g, y - r),
+        g_n @ np.maximum(-y_n, 0.0), np.maximum(along, 0.0).sum(), squared_move(y_n), squared_move(y_n + resisted),
+    ]  # fmt: skip
+    outside = np.max(sizes - most * g_n, initial=0.0), np.max(resisted - y_n, initial=0.0)
+    return np.array(sums), np.array([*outside, np.abs(along).max(initial=0.0)])

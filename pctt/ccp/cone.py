@@ -53,6 +53,18 @@ def project_to(x: Array, mu: Array, out: Array) -> Array:
 
 
 @loop
+def not_idle(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDArray[np.bool_]:
+    """The loop of `FrictionCones.not_idle`."""
+    out, enough = np.empty(len(mu), np.bool_), x.dtype.type(least)
+    x, last_x, y = x.ravel(), last_x.ravel(), y.ravel()
+    for c in range(len(mu)):
+        i = 3 * c
+        opening = y[i] - mu[c] * np.sqrt(y[i + 1] * y[i + 1] + y[i + 2] * y[i + 2])
+        out[c] = (x[i] > 0) | (last_x[i] > 0) | (not opening > enough)
+    return out
+
+
+@loop
 def squared_moves(x: Array, y: Array, step: float, mu: Array, de_saxce: float) -> Array:
     """|P(x - step y) - x|^2 (nc,), where y gets the term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1. A pass over
     the memory; `FrictionCones.move` takes several."""
@@ -407,8 +419,7 @@ class FrictionCones:
     def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
         """Mask (count,) of the contacts but those without an impulse at x and last_x whose distance inside the dual
         cone, y_n less `resisted`, exceeds the ``least``."""
-        x, last_x, opening = x[: self.count, 0], last_x[: self.count, 0], y[: self.count, 0] - self.resisted(y)
-        return (x > 0) | (last_x > 0) | ~(opening > least)
+        return not_idle(x, last_x, y, self.mu, least)
 
 
 # -- the cone of friction 1 -----------------------------------------------------------------------------------

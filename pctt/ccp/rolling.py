@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import NDArray
 
 from dem.compiled import inlined, loop
 from dem.contact_map import BlockRows, TurningMap
@@ -63,6 +64,10 @@ class RollingCones(FrictionCones):
         normal, push = y[: self.count, 0], g[: self.count, 0]
         power = (g * y).sum(axis=1).reshape(2, -1).sum(axis=0)
         return push @ np.maximum(-normal, 0.0), np.maximum(power, 0.0).sum(), 0.5 * np.vdot(g, y - r)
+
+    def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
+        x, last_x, opening = x[: self.count, 0], last_x[: self.count, 0], y[: self.count, 0] - self.resisted(y)
+        return (x > 0) | (last_x > 0) | ~(opening > least)
 
     def resisted(self, y: Array) -> Array:
         slides, rolls = (self.mu * tangential(y)).reshape(2, -1)

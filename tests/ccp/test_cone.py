@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pctt.ccp.accuracy import _nearest
+from pctt.ccp.accuracy import _nearest_in_cone
 from pctt.ccp.cone import margin, project, step_to_boundary, step_to_zero
 
 FRICTION = [0.0, 1e-9, 0.01, 0.3, 1.0, 7.0, 1e5]
@@ -15,7 +15,7 @@ FRICTION = [0.0, 1e-9, 0.01, 0.3, 1.0, 7.0, 1e5]
 
 def judged(x, mu):
     """The projection that judges the solvers."""
-    return _nearest(x, mu[None])
+    return np.array([_nearest_in_cone(*row, slope) for row, slope in zip(x, mu)])
 
 
 PROJECTIONS = [project, judged]
@@ -74,6 +74,15 @@ def test_the_polar_cone_goes_to_zero_exactly(projection):
     assert np.array_equal(projection(np.zeros((2, 3)), np.array([0.0, 0.5])), np.zeros((2, 3)))
 
 
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_known_projections(projection):
+    x = np.array([[1, 0, 2], [0, 3, 4], [-1, 0, 3], [2, 5, 0], [1, 0, 0], [1e-3, 2, 0.0]])
+    mu = np.array([1, 1, 1, 0, 0.5, 1e6])
+    # on the surface at 45 degrees: the mean of normal and tangential part; a cone that is nearly a half space
+    expected = [[1.5, 0, 1.5], [2.5, 1.5, 2], [1, 0, 1], [2, 0, 0], [1, 0, 0], [1e-3, 2, 0]]
+    assert np.allclose(projection(x, mu), expected, atol=1e-11)
+
+
 def test_margin_is_positive_inside_only():
     x = np.array([[1.0, 0.0, 0.2], [1.0, 0.3, 0.4], [1.0, 3.0, 4.0]])
     assert np.allclose(margin(x, np.full(3, 0.5)), [0.3, 0.0, -4.5])
@@ -126,6 +135,16 @@ def test_a_step_across_the_cone_from_its_surface_ends_at_the_other_side():
     for gap in (0.0, 1e-17, 1e-14, 1e-10):
         assert step_to_boundary(np.array([[1.0, 0.5 - gap, 0.0]]), across, mu) == pytest.approx(1.0)
     assert step_to_boundary(np.array([[1.0, 0.5, 0.0]]), -across, mu) == 0.0
+
+
+def test_steps_along_the_surface():
+    mu = np.array([0.5])
+    x = np.array([[1.0, 0.1, 0.2]])
+    along = np.array([[1.0, 0.5 * np.cos(1.1), 0.5 * np.sin(1.1)]])
+    assert step_to_boundary(x, along, mu) > 1e10
+    assert step_to_boundary(np.array([[1.0, 0.0, 0.0]]), -along, mu) == pytest.approx(0.5)
+    surface = np.array([[1.0, 0.5, 0.0]])
+    assert step_to_boundary(surface, -surface, mu) == pytest.approx(1.0)
 
 
 def test_without_friction_the_apex_alone_limits_a_step():
