@@ -150,7 +150,7 @@ def joints_refound(world: World, known: joints.Coupling, push: Floats) -> joints
 
 def slots(world: World, id: Ints) -> tuple[Ints, Ints]:
     """Which rows of bodies with these ids (n,) are among the bodies that joints know, and their rows there."""
-    ids, first = jointed(world)[0], int(world.slabs[-1])
+    ids, first = jointed(world)[0], world.first_large
     here = np.flatnonzero(np.isin(id, ids) | (id >= first))
     return here, np.where(id[here] >= first, len(ids) + id[here] - first, np.searchsorted(ids, id[here]))
 

@@ -155,9 +155,10 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     world.sources, world.outlets = dict(scene.sources), dict(scene.outlets)
     world.tallies = {name: Tally() for name in (*world.sources, *world.outlets)}
     world.initial, world.first_large = sum(map(len, scene.parts)), scene.first_large
-    tied = [name for name, spring in world.springs.items() if any(isinstance(end, int) for end in spring.ends)]
-    if tied and world.outlets:
-        raise ValueError(f"spring {tied[0]!r} holds a grain: scenes with outlets allow springs of large bodies alone")
+    for what, members in (("spring", world.springs), ("joint", scene.joints)):
+        tied = [name for name, member in members.items() if any(isinstance(end, int) for end in member.ends)]
+        if tied and world.outlets:
+            raise ValueError(f"{what} {tied[0]!r} holds a grain: with outlets {what}s may hold large bodies alone")
     world.shear = _shear(scene)
     world.joints = dict(scene.joints)
     if world.joints and pairs.resists:

@@ -6,6 +6,7 @@ from mpi4py import MPI
 from scipy.special import ellipk
 
 import pctt
+from dem.measures import Block
 from dem.motion import Dynamic, Glide
 from dem.scene import Scene
 from dem.shapes import Box, Plane
@@ -332,3 +333,33 @@ def test_joints_do_not_depend_on_the_ranks():
         each.run(steps=20)
     assert sim.positions == pytest.approx(alone.positions, abs=1e-6)
     assert sim.joint("pin").force == pytest.approx(alone.joint("pin").force, abs=1e-2)
+
+
+@pytest.mark.parallel(1, 2)
+def test_a_flap_swings_as_ever_while_grains_come_and_go_elsewhere():
+    """Large bodies have other numbers in scenes with sources."""
+    angles = []
+    for more in (False, True):
+        scene = Scene(friction=0.3)
+        scene.add_spheres([5, 0, 0], 0.05, 1000.0)
+        scene.add_body("flap", [Box((0.2, 0.2, 0.02))], Dynamic(), position=(0.25, 0, 0), density=800.0)
+        scene.add_joint("hinge", None, "flap", kind="hinge", anchor=(0, 0, 0), axis=(0, 1, 0))
+        if more:
+            region = Block((4, 4, 4), (5, 5, 5))
+            scene.add_source("rain", region, radius=0.05, density=1000.0, number_rate=100.0)
+            scene.add_outlet("drain", Block((4, 4, 0), (5, 5, 3.9)))
+        sim = pctt.Simulation(scene, dt=0.005, delta=0.01, tol=1e-9, comm=MPI.COMM_WORLD)
+        sim.run(until=0.4)
+        angles.append(sim.joint("hinge").angle)
+    assert sim.outlet("drain").count > 0
+    assert abs(angles[0]) > 0.5
+    assert angles[1] == pytest.approx(angles[0], abs=1e-9)
+
+
+def test_a_joint_of_a_grain_is_refused_beside_an_outlet():
+    scene = Scene(friction=0.3)
+    (ball,) = scene.add_spheres([1, 0, 0], 0.05, 1000.0)
+    scene.add_joint("pin", None, ball, kind="ball", anchor=(0, 0, 0))
+    scene.add_outlet("drain", Block((4, 4, 0), (5, 5, 3.9)))
+    with pytest.raises(OptionError, match="joint 'pin' holds a grain"):
+        simulation(scene)
