@@ -10,7 +10,7 @@ from dem.experiment import Experiment, option
 from dem.mesh import Mesh
 from dem.motion import Glide
 from dem.scene import Scene
-from dem.scenes.lattice import perturbed
+from dem.packing import perturbed
 from dem.shapes import Plane
 
 RADIUS = 0.005  # of a sphere [m]

@@ -9,7 +9,7 @@ import numpy as np
 from dem.experiment import Experiment, option
 from dem.motion import Glide
 from dem.scene import Scene
-from dem.scenes.lattice import perturbed
+from dem.packing import perturbed
 from dem.shapes import Box, Plane
 
 RADIUS = 0.005  # of the greatest spheres [m]
