@@ -44,7 +44,8 @@ def test_the_true_residual_is_the_true_one(pc, method):
     solution, rhs = (np.concatenate(comm.allgather(v.array)) for v in (x, b))
     residual = np.linalg.norm(rhs - dense @ solution) / np.linalg.norm(rhs)
     assert done.true_residual == pytest.approx(residual, rel=1e-3, abs=1e-12)
-    assert done.converged == (done.true_residual <= 2e-7)
+    assert done.true_residual <= 2e-7 or not done.converged
+    assert done.true_residual > 5e-8 or done.converged  # a KSP measures in a norm of its own
     if method == "bcgs" and pc != "none":
         assert done.converged
     assert min(done.setup_s, done.solve_s) > 0
