@@ -16,3 +16,9 @@ Import from the modules: `dem.scene`, `dem.shapes`, `dem.motion` describe what t
 scene, and `dem.scenes` has ready-made ones; `dem.record`, `dem.measures` and `dem.analysis` say what steps and runs
 show. All quantities are in SI units.
 """
+
+__all__ = [
+    "analysis", "bodies", "checks", "contact", "contact_map", "experiment", "impulses", "joints", "loads", "measures",
+    "mesh", "motion", "neighbourhood", "packing", "pairs", "partition", "record", "scene", "scenes", "shapes",
+    "sources", "springs", "start", "step", "stiffness", "system", "time_step", "world",
+]  # fmt: skip

@@ -138,7 +138,8 @@ def joint_coupling(world: World, dt: float) -> joints.Coupling | None:
     if not world.joints:
         return None
     _, row, table = joint_ends(world, dt)
-    found = joints.coupling(list(world.joints.values()), row, table, dt) if world.comm.rank == 0 else None
+    given = list(world.joints.values()), row, table, dt, world.period
+    found = joints.coupling(*given) if world.comm.rank == 0 else None
     return world.comm.bcast(found)  # processors may round in other ways
 
 

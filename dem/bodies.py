@@ -17,6 +17,9 @@ SPHERE, BOX, COMPOUND, CAPSULE, PLANE, MESH = range(6)
 #: Clumps of spheres are the kinds from here on: CLUMP + n is the one of number n in `dem.scene.Scene.clumps`.
 CLUMP = 6
 
+#: Convex polyhedra are the kinds from here on: POLYHEDRON + n is the one of number n in `dem.scene.Scene.polyhedra`.
+POLYHEDRON = 1 << 20
+
 
 @dataclass
 class Bodies:
@@ -32,9 +35,9 @@ class Bodies:
     mass: Floats  #: (n,) [kg]
     inertia: Floats  #: (n, 3) principal moments of inertia in the body frame [kg m^2]
     material: Ints  #: (n,) row of the friction table
-    shape: Ints  #: (n,) SPHERE, BOX, CAPSULE, COMPOUND, or CLUMP and the number of the clump
-    #: (n, 3) sphere: (radius, 0, 0); box: half extents; capsule: (radius, half length, 0); clump: radii of the sphere
-    #: that encloses it, of the ball of its volume, and of its largest sphere [m]
+    shape: Ints  #: (n,) SPHERE, BOX, CAPSULE, COMPOUND, or CLUMP or POLYHEDRON and the number of the shape
+    #: (n, 3) sphere: (radius, 0, 0); box: half extents; capsule: (radius, half length, 0); clump and polyhedron: radii
+    #: of the sphere that encloses it, of the ball of its volume, and of its largest sphere [m]
     size: Floats
     weight: Floats  #: (n,) contacts owned at the last search, the load that balancing spreads
 

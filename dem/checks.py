@@ -54,9 +54,14 @@ def between(low: float, high: float = np.inf) -> Callable[[str, float], None]:
 def rows(name: str, values: ArrayLike, count: int, *row: int) -> Floats:
     """`values` as finite numbers (count, *row); one row stands for all."""
     array = finite(name, values)
+    shape(name, array, count, *row)
+    return np.broadcast_to(array, (count, *row)).copy()
+
+
+def shape(name: str, array: Floats, count: int, *row: int) -> None:
+    """ValueError unless an array has the shape (count, *row), or that of one row."""
     if array.shape not in (row, (count, *row)):
         raise ValueError(f"{name} must have shape {row} or {(count, *row)}, got {array.shape}")
-    return np.broadcast_to(array, (count, *row)).copy()
 
 
 def vector(name: str, values: ArrayLike) -> Floats:
@@ -73,18 +78,18 @@ def unit_vector(name: str, values: ArrayLike) -> Floats:
     return array if abs(length - 1.0) < 1e-15 else array / length
 
 
-def unit_quaternions(name: str, values: ArrayLike, count: int) -> Floats:
-    """Rows (count, 4), scaled to unit norm; one row (4,) stands for all."""
-    array = rows(name, values, count, 4)
-    norm = np.linalg.norm(array, axis=1, keepdims=True)
-    if (norm == 0.0).any():
+def not_zero(name: str, values: ArrayLike) -> Floats:
+    """`values` as a float array; ValueError if one of the quaternions in its rows is zero."""
+    array = finite(name, values)
+    if (np.linalg.norm(np.atleast_1d(array), axis=-1) == 0.0).any():
         raise ValueError(f"{name}: zero quaternion")
-    return array / norm
+    return array
 
 
 def unit_quaternion(name: str, values: ArrayLike) -> Floats:
     """One quaternion (4,), scaled to unit norm."""
-    return unit_quaternions(name, values, 1)[0]
+    array = rows(name, not_zero(name, values), 1, 4)
+    return (array / np.linalg.norm(array, axis=1, keepdims=True))[0]
 
 
 def check_fields(instance: Any, **checks: Callable[[str, Any], Floats]) -> None:
@@ -99,6 +104,13 @@ def stress(values: Any) -> Floats:
     if len(values) != 3:
         raise ValueError(f"stress must have three entries, for x, y and z, got {values}")
     return np.array([np.nan if value is None else float(positive("stress", value)) for value in values])
+
+
+def strain_rate(values: Any) -> Floats:
+    """Strain rates (3,) [1/s], positive in compression, NaN where None stands. ValueError for bad ones."""
+    if len(values) != 3:
+        raise ValueError(f"strain_rate must have three entries, for x, y and z, got {values}")
+    return np.array([np.nan if value is None else float(finite("strain_rate", value)) for value in values])
 
 
 def period(values: Any) -> Floats | None:

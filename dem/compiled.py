@@ -2,17 +2,50 @@
 
 numba is imported, and a loop compiled, at its first call: the import takes half a second. The machine code is kept on
 disk. Arrays are C-contiguous; of other types or layouts a loop would be compiled once more.
+
+A loop over `prange` whose passes do not depend on each other is compiled twice, for one thread and for several
+(`set_threads`). Sums are of parts of fixed length, so that they do not depend on the number of threads.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property, update_wrapper
+from types import FunctionType
 from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+prange = range  #: in compiled loops that of numba: passes of the loop go to threads, where there are several
+PART = 4096  #: rows of a sum's part: 100 kB of impulses, enough work for a thread
+
+_threads = 1
+
+
+def threads() -> int:
+    """The number of threads that loops run on."""
+    return _threads
+
+
+def set_threads(count: int) -> None:
+    """Let compiled loops over contacts and bodies run on so many threads of this process, 1 or more.
+
+    Results do not depend on the number, but on whether it is 1, by rounding. ValueError for more threads than the
+    process may use cores; mpiexec often binds each rank to one."""
+    global _threads
+    if count < 1:
+        raise ValueError(f"threads {count}: allowed are whole numbers >= 1")
+    if count > 1:
+        import numba
+
+        if count > (most := numba.config.NUMBA_NUM_THREADS):
+            raise ValueError(
+                f"threads {count}: this process may use {most} cores; give a rank more of them, for example with "
+                f"mpiexec --bind-to none, or set NUMBA_NUM_THREADS={count}"
+            )
+        numba.set_num_threads(count)
+    _threads = count
 
 
 class Loop:
@@ -21,47 +54,39 @@ class Loop:
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]):
         update_wrapper(self, function)
         self._function, self._options = function, {"error_model": "numpy", **options}
+        self._spreads = "prange" in function.__code__.co_names
 
     def __call__(self, *arguments: Any) -> Any:
-        return self.compiled(*arguments)
+        return (self._on_threads if self._spreads and _threads > 1 else self.compiled)(*arguments)
 
     @cached_property
     def compiled(self) -> Callable[..., Any]:
-        """What numba makes of the function."""
+        """What numba makes of the function, on one thread."""
+        return self._compiled(self._function, self._options)
+
+    @cached_property
+    def _on_threads(self) -> Callable[..., Any]:
+        f = self._function
+        other = FunctionType(f.__code__, f.__globals__, f.__name__, f.__defaults__, f.__closure__)
+        other.__module__, other.__qualname__ = f.__module__, f.__qualname__ + "_on_threads"  # a file of its own on disk
+        return self._compiled(other, {**self._options, "parallel": True})
+
+    def _compiled(self, function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
         import numba
 
+        from dem.machine_code import MachineCode
+
         names = self._function.__globals__
+        if self._spreads:
+            names["prange"] = numba.prange
         for name in self._function.__code__.co_names:  # the compiler knows no loop that it has not made
             if isinstance(names.get(name), Loop):
                 names[name] = names[name].compiled
-        try:
-            compiled = numba.njit(cache=True, **self._options)(self._function)
-        except RuntimeError:  # no folder to keep the machine code in
-            return numba.njit(**self._options)(self._function)
-        if compiled is not self._function:  # as NUMBA_DISABLE_JIT leaves it
-            _mend_cache(compiled._cache)
+        compiled = numba.njit(**options)(function)
+        if compiled is not function:  # as NUMBA_DISABLE_JIT leaves it
+            with suppress(RuntimeError):  # no file of its own: typed at a prompt
+                compiled._cache = MachineCode(function)
         return compiled
-
-
-def _mend_cache(cache: Any) -> None:
-    """Let numba's cache of a loop make damaged files anew, with a warning, and do without files that it cannot write:
-    numba itself would end the program."""
-    load, save = cache.load_overload, cache.save_overload
-
-    def load_overload(*arguments: Any) -> Any:
-        try:
-            return load(*arguments)
-        except Exception as error:  # of any kind, as the files are pickles
-            warnings.warn(f"machine code in {cache.cache_path} is damaged ({error}), and made anew", stacklevel=2)
-            with suppress(OSError):
-                cache.flush()
-            return None
-
-    def save_overload(*arguments: Any) -> None:
-        with suppress(OSError):
-            save(*arguments)
-
-    cache.load_overload, cache.save_overload = load_overload, save_overload
 
 
 def loop(function: Function) -> Function:

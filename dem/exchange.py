@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from mpi4py import MPI
 
-from dem.arrays import Ints
+from dem.arrays import Floats, Ints
 
 Out = TypeVar("Out")
 
 
+#: Exchanges have two tags in turn: a rank may begin the next one while another still listens for messages of this one.
+TAGS, _TURN = (4712, 4713), MPI.Comm.Create_keyval()
+
+
 def exchange(comm: MPI.Comm, columns: Mapping[str, np.ndarray], destination: Ints) -> dict[str, np.ndarray]:
-    """Send row i of every column to the rank destination[i]; collective.
+    """Send row i of every column to the rank destination[i]; collective. Messages go only to ranks that get rows.
 
     columns: arrays (n, ...) of the same names, types and trailing shapes on every rank; destination: (n,).
     Rows arrive in the order of the sending ranks and, from one rank, in the order sent. A single rank gets the arrays
@@ -25,13 +29,8 @@ def exchange(comm: MPI.Comm, columns: Mapping[str, np.ndarray], destination: Int
     order = np.argsort(destination, kind="stable")
     # All columns travel as one message: each row is the bytes of its entries side by side.
     packed = np.concatenate([_as_bytes(column) for column in columns.values()], axis=1)[order]
-    send = np.bincount(destination, minlength=comm.size)
-    receive = np.empty_like(send)
-    comm.Alltoall(send, receive)
-    arrived = np.empty((int(receive.sum()), packed.shape[1]), np.uint8)
-    row = MPI.BYTE.Create_contiguous(packed.shape[1]).Commit()
-    comm.Alltoallv([packed, (send, None), row], [arrived, (receive, None), row])
-    row.Free()
+    ranks, first = np.unique(destination[order], return_index=True)
+    arrived = _delivered(comm, dict(zip(ranks.tolist(), np.split(packed, first[1:]))), packed[:0])
     out, start = {}, 0
     for name, column in columns.items():
         width = _as_bytes(column[:0]).shape[1]
@@ -39,6 +38,31 @@ def exchange(comm: MPI.Comm, columns: Mapping[str, np.ndarray], destination: Int
         out[name] = block.view(column.dtype).reshape((len(arrived), *column.shape[1:]))
         start += width
     return out
+
+
+def _delivered(comm: MPI.Comm, parts: dict[int, np.ndarray], none: np.ndarray) -> np.ndarray:
+    """The rows that other ranks have for this one, in the order of the ranks; `parts`: the rows of bytes for each rank
+    that gets some, `none`: no rows. Collective.
+
+    No rank knows who sends to it. So it takes what comes until its own messages have been taken, says so in a barrier
+    that does not block, and takes what comes until all have said so: Hoefler, Siebert, Lumsdaine, "Scalable
+    communication protocols for dynamic sparse data exchange", PPoPP 2010."""
+    turn = comm.Get_attr(_TURN) or 0
+    comm.Set_attr(_TURN, 1 - turn)
+    tag, row = TAGS[turn], MPI.BYTE.Create_contiguous(none.shape[1]).Commit()
+    found = {comm.rank: parts.pop(comm.rank, none)}
+    sent = [comm.Issend([part, len(part), row], rank, tag) for rank, part in parts.items()]
+    status, said = MPI.Status(), None
+    while said is None or not said.Test():
+        message = comm.Improbe(MPI.ANY_SOURCE, tag, status)
+        if message is not None:
+            part = np.empty((status.Get_count(row), none.shape[1]), np.uint8)
+            message.Recv([part, len(part), row])
+            found[status.Get_source()] = part
+        elif said is None and MPI.Request.Testall(sent):
+            said = comm.Ibarrier()
+    row.Free()
+    return np.concatenate([found[rank] for rank in sorted(found)])
 
 
 def _as_bytes(column: np.ndarray) -> np.ndarray:
@@ -59,6 +83,28 @@ def on_any(comm: MPI.Comm, *here: bool) -> list[bool]:
     held = np.array(here, dtype=np.int64)
     comm.Allreduce(MPI.IN_PLACE, held, MPI.MAX)
     return held.astype(bool).tolist()
+
+
+def reduced(
+    comm: MPI.Comm, sums: Sequence[float] | Floats, most: Sequence[float] | Floats
+) -> tuple[list[float], list[float]]:
+    """Some numbers summed over the ranks, and the greatest of some others, by one reduction. Collective."""
+    numbers = np.array([len(sums), *sums, *most], float)
+    if comm.size > 1:
+        kind = MPI.DOUBLE.Create_contiguous(len(numbers)).Commit()  # so that MPI never cuts the numbers apart
+        comm.Allreduce(MPI.IN_PLACE, [numbers, 1, kind], _SUMS_AND_MOST)
+        kind.Free()
+    return numbers[1 : len(sums) + 1].tolist(), numbers[len(sums) + 1 :].tolist()
+
+
+def _sums_and_most(here: Any, everywhere: Any, kind: MPI.Datatype) -> None:
+    one, both = np.frombuffer(here), np.frombuffer(everywhere)
+    most = int(one[0]) + 1
+    both[1:most] += one[1:most]
+    np.maximum(both[most:], one[most:], out=both[most:])
+
+
+_SUMS_AND_MOST = MPI.Op.Create(_sums_and_most, commute=True)
 
 
 def refuse(comm: MPI.Comm, wrong: str) -> None:

@@ -14,6 +14,7 @@ from dem import bodies
 from dem.arrays import Bools, Floats, places
 from dem.bodies import SPHERE
 from dem.contact import Contacts, find_contacts
+from dem.exchange import reduced
 from dem.quaternion import cross, length
 from dem.system import contact_arms
 from dem.together import SceneError
@@ -36,10 +37,10 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
     speed = length(velocity[: len(grains), :3])
     way, most = dt * speed, FAR * bodies.bounding_radius(grains)
     fast = (way > most) & np.isfinite(way)
-    furthest, count = float((way / most)[fast].max(initial=0.0)), int(fast.sum())
-    if not (furthest := world.comm.allreduce(furthest, MPI.MAX)):
+    furthest = float((way / most)[fast].max(initial=0.0))
+    (count,), (furthest,) = reduced(world.comm, (fast.sum(),), (furthest,))
+    if not furthest:
         return
-    count = world.comm.allreduce(count)
     weight, reach, seen = grains.weight, 1.0, contacts.near.margin[: len(grains)]
     while reach < furthest:
         reach *= 2.0
@@ -90,8 +91,8 @@ def _meet(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: 
     spin[shape == SPHERE] = 0.0  # their surfaces do not move
     way = dt * (table[row, :3] + spin)
     way = way[:, 1] - way[:, 0]
-    if contacts.drift is not None:
-        way += dt * contacts.drift
+    if (flow := contacts.flow(world, near.bodies.position)) is not None:
+        way += dt * flow
     closes: Bools = contacts.gap + np.einsum("ci,ci->c", way, contacts.normal) < -0.01 * delta
     balls = (shape == SPHERE).all(axis=1)
     radii = near.bodies.size[row[balls], 0].sum(axis=1)

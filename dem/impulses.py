@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from dem.arrays import Bools, Floats, Ints, places
+from dem.arrays import Bools, Floats, Ints, Keys, mixed, places
 from dem.compiled import loop
 from dem.exchange import exchange
 
@@ -22,15 +22,15 @@ class ImpulseMemory:
     def __init__(self, comm: MPI.Comm, parts: int = 1) -> None:
         """`parts`: how often a contact has three numbers, see `dem.pairs.Pairs.parts`."""
         self._comm, self._parts = comm, parts
-        self.restore(np.zeros(0, np.int64), np.zeros((0, 4 * parts)))
+        self.restore(np.zeros(0, np.complex128), np.zeros((0, 4 * parts)))
 
-    def remember(self, key: Ints, impulse: Floats, frame: Floats) -> None:
+    def remember(self, key: Keys, impulse: Floats, frame: Floats) -> None:
         """Replace the memory by impulses (parts nc, 3) of contacts with keys (nc,) and frames (nc, 3, 3)."""
         each = impulse.reshape(self._parts, len(key), 3)
         rows = [in_world(part, frame) for part in each]
         self.restore(key, rows[0] if self._parts == 1 else np.concatenate(rows, axis=1))
 
-    def recall(self, key: Ints, frame: Floats, elsewhere: bool = True) -> tuple[Floats, Bools]:
+    def recall(self, key: Keys, frame: Floats, elsewhere: bool = True) -> tuple[Floats, Bools]:
         """Impulses (parts nc, 3) in the given frames (nc, 3, 3), zero where unknown, and the mask (nc,) of those
         known. `elsewhere`: whether other ranks may have stored them, as grains have changed their rank since; the same
         on all ranks.
@@ -47,7 +47,7 @@ class ImpulseMemory:
         found = [in_frames(np.ascontiguousarray(part), place, frame) for part in each]
         return found[0] if self._parts == 1 else np.concatenate(found), place >= 0
 
-    def _elsewhere(self, asked: Ints, key: Ints, impulse: Floats) -> tuple[Ints, Floats]:
+    def _elsewhere(self, asked: Keys, key: Keys, impulse: Floats) -> tuple[Ints, Floats]:
         """Which of the keys `asked` (m,) other ranks offer in their `key` (n,), and their impulses; collective."""
         comm, many = self._comm, len(asked)
         both = np.concatenate([asked, key])
@@ -57,22 +57,29 @@ class ImpulseMemory:
             "rank": np.full(len(both), comm.rank),
             "impulse": np.concatenate([np.zeros((many, 4 * self._parts)), impulse]),
         }
-        # Fibonacci hashing: the low bits of keys are mostly zero and must not choose the rank.
-        mixed = (both.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)
-        met = exchange(comm, rows, (mixed % np.uint64(comm.size)).astype(np.int64))
+        met = exchange(comm, rows, homes(both, comm.size))
         offered, wanted = np.flatnonzero(met["row"] < 0), np.flatnonzero(met["row"] >= 0)
         place = places(met["key"][offered], met["key"][wanted])
         wanted, offered = wanted[place >= 0], offered[place[place >= 0]]
         answer = exchange(comm, {"row": met["row"][wanted], "impulse": met["impulse"][offered]}, met["rank"][wanted])
         return answer["row"], answer["impulse"]
 
-    def state(self) -> tuple[Ints, Floats]:
+    def state(self) -> tuple[Keys, Floats]:
         """Keys (n,) and impulses (n, 4 parts) (normal, tangential vector) that this rank stores, for `restore`."""
         return self._key, self._impulse
 
-    def restore(self, key: Ints, stored: Floats) -> None:
+    def restore(self, key: Keys, stored: Floats) -> None:
         """Replace the memory by rows of `state`, distributed in any way."""
         self._key, self._impulse = key, stored
+
+
+@loop
+def homes(key: Keys, ranks: int) -> Ints:
+    """The ranks (n,) on which keys (n,) meet."""
+    out = np.empty(len(key), np.int64)
+    for n in range(len(key)):
+        out[n] = (mixed(key[n]) >> np.uint64(32)) % np.uint64(ranks)
+    return out
 
 
 @loop

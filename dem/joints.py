@@ -92,6 +92,15 @@ class Joint:
         return dataclasses.replace(self, **values)
 
 
+def whole_periods(way: Floats, period: Floats | None) -> Floats:
+    """The part (..., 3) of ways (..., 3) that is whole periods (3,) of the cell [m]; without it, ways lead to the
+    nearest image."""
+    if period is None:
+        return np.zeros_like(way)
+    cell = np.where(np.isfinite(period), period, 1.0)
+    return np.where(np.isfinite(period), cell * np.round(way / cell), 0.0)
+
+
 @dataclass(frozen=True)
 class Geometry:
     """Joints as they are: n of them."""
@@ -101,8 +110,9 @@ class Geometry:
     axes: Floats  #: (n, 3, 3) rows x, y, z in the world
 
 
-def geometry(joints: Sequence[Joint], row: Ints, ends: Ends) -> Geometry:
-    """Of joints between bodies in the rows `row` (n, 2)."""
+def geometry(joints: Sequence[Joint], row: Ints, ends: Ends, period: Floats | None = None) -> Geometry:
+    """Of joints between bodies in the rows `row` (n, 2). With a `period` (3,) of the cell [m] the second ends are those
+    images whose anchors are nearest to the first ones."""
     anchors, frames = (np.array([getattr(joint, name) for joint in joints]) for name in ("anchors", "frames"))
     turn = [quaternion.normalized(quaternion.multiply(ends.quaternion[row[:, k]], frames[:, k])) for k in (0, 1)]
     places = [ends.position[row[:, k]] + quaternion.rotate(ends.quaternion[row[:, k]], anchors[:, k]) for k in (0, 1)]
@@ -117,10 +127,12 @@ def geometry(joints: Sequence[Joint], row: Ints, ends: Ends) -> Geometry:
     turned[hinge, 0], turned[hinge, 1] = -z[hinge, 1], z[hinge, 0]
     turned[hinge, 2] = 2.0 * np.arctan2(relative[hinge, 3], relative[hinge, 0])
     d = places[1] - places[0]
+    image = whole_periods(d, period)
+    d -= image
     error = np.concatenate([np.einsum("nij,nj->ni", axes, d), turned], axis=1)
     out = np.zeros((len(joints), 6, 2, 6))
     for k, sign in ((0, -1.0), (1, 1.0)):
-        arm = places[1] - ends.position[row[:, k]]
+        arm = places[1] - (1 - k) * image - ends.position[row[:, k]]
         out[:, :3, k, :3] = sign * axes
         out[:, :3, k, 3:] = sign * np.cross(arm[:, None], axes)
         out[:, 3:, k, 3:] = sign * axes
@@ -159,11 +171,11 @@ class Coupling:
         return bool(((self.kind > MOTOR) | np.isfinite(self.bound)).any())
 
 
-def coupling(joints: Sequence[Joint], row: Ints, ends: Ends, dt: float) -> Coupling:
-    """Of joints between bodies in the rows `row` (n, 2) in a step of dt [s].
+def coupling(joints: Sequence[Joint], row: Ints, ends: Ends, dt: float, period: Floats | None = None) -> Coupling:
+    """Of joints between bodies in the rows `row` (n, 2) in a step of dt [s], with the period of the cell.
 
     Motors that are too weak, and limits that are reached, are found without contacts, by an active set."""
-    found = geometry(joints, row, ends)
+    found = geometry(joints, row, ends, period)
     count = len(ends.free)
     chosen: list[tuple[int, int]] = []
     target, most, kinds = [], [], []

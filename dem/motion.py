@@ -19,7 +19,7 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
-from dem.checks import check_fields, finite, positive, rows, unit_quaternions, unit_vector, vector
+from dem.checks import check_fields, finite, positive, rows, unit_quaternion, unit_vector, vector
 
 DROOP = 1e-3  #: of its speed that a servo loses at most under a load that it can bear
 
@@ -312,7 +312,7 @@ def checked_pose(motion: Prescribed, time: float, position: Floats, orientation:
     ValueError if it is no pose."""
     place, turn = motion.pose(time, position.copy(), orientation.copy())
     what = f"of the pose of {type(motion).__name__} at {time:g} s"
-    return rows(f"position {what}", place, 1, 3)[0], unit_quaternions(f"quaternion {what}", turn, 1)[0]
+    return rows(f"position {what}", place, 1, 3)[0], unit_quaternion(f"quaternion {what}", turn)
 
 
 def mean_velocity(motion: Prescribed, time: float, dt: float, position: Floats, orientation: Floats) -> Floats:

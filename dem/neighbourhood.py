@@ -115,8 +115,9 @@ def touched(position: Floats, radius: Floats, boxes: Floats) -> tuple[Ints, Ints
     rows, ranks = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     if len(position) and len(boxes):
         low, high = (position - radius[:, None]).min(axis=0), (position + radius[:, None]).max(axis=0)
-        for rank, theirs in enumerate(boxes):
-            near = theirs[((theirs[:, 0] <= high) & (theirs[:, 1] >= low)).all(axis=1)]
+        meets = ((boxes[:, :, 0] <= high) & (boxes[:, :, 1] >= low)).all(axis=2)
+        for rank in np.flatnonzero(meets.any(axis=1)):
+            near = boxes[rank, meets[rank]]
             outside = np.maximum(near[:, 0] - position[:, None], position[:, None] - near[:, 1]).max(axis=2)
             row = np.flatnonzero((outside <= radius[:, None]).any(axis=1))
             rows.append(row)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from dem import checks
-from dem.arrays import Floats
+from dem.arrays import Floats, Rule
 from dem.contact.broad import close_pairs
 from dem.insertion import inserted
 from dem.neighbourhood import image_ways
@@ -19,11 +20,29 @@ SWELL = 1e-4  #: by how much radii are larger while overlaps are removed, so tha
 TRIES = 100  #: places for a sphere
 
 
-def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -> Floats:
+def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -> Rule:
     """Points (nx ny nz, 3) of the lattice with these coordinates per axis, each moved by up to `perturbation` [m] per
-    axis."""
-    lattice = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
-    return lattice + perturbation * np.random.default_rng(seed).uniform(-1.0, 1.0, lattice.shape)
+    axis; z goes on from row to row."""
+    count = len(x) * len(y) * len(z)
+    shift = uniform(-1.0, 1.0, (count, 3), seed)
+
+    def make(first: int, end: int) -> Floats:
+        i, j, k = np.unravel_index(np.arange(first, end), (len(x), len(y), len(z)))
+        return np.stack([x[i], y[j], z[k]], axis=-1) + perturbation * shift[first:end]
+
+    return Rule(count, make)
+
+
+def uniform(low: float, high: float, shape: tuple[int, ...], seed: int) -> Rule:
+    """The array of this shape that `default_rng(seed).uniform` gives, of which any rows are made without the others: of
+    the generator PCG64 every number takes one step, and it can jump (`advance`)."""
+    width = math.prod(shape[1:])
+
+    def make(first: int, end: int) -> Floats:
+        generator = np.random.Generator(np.random.PCG64(seed).advance(first * width))
+        return generator.uniform(low, high, (end - first, *shape[1:]))
+
+    return Rule(shape[0], make)
 
 
 def random_packing(

@@ -11,29 +11,37 @@ from mpi4py import MPI
 
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
-from dem.exchange import exchange
+from dem.exchange import exchange, reduced
 from dem.morton import BITS, Frame, morton_codes
 from dem.world import World
 
 
-def splitters(comm: MPI.Comm, codes: Ints, weights: Floats, pieces: int) -> Ints:
-    """Codes (pieces - 1,) at which the curve is cut into pieces of equal weight; collective.
+def splitters(comm: MPI.Comm, codes: Ints, weights: Floats, pieces: int, part: float = 1e-3) -> Ints:
+    """Codes (pieces - 1,) at which the curve is cut into pieces of equal weight, but for this `part` of a piece;
+    collective.
 
-    codes (n,), weights (n,): of the local grains, in any order. Cut k is the greatest code with at most the
-    fraction (k + 1) / pieces of the weight below it, found digit by digit from weighted histograms.
+    codes (n,), weights (n,): of the local grains, in any order; weights are whole numbers, so that sums are the same on
+    any number of ranks. Cut k has at most the fraction (k + 1) / pieces of the weight below it. It is found digit by
+    digit from histograms of weights and grains, and is the greatest such code, or one with few grains between them.
     """
     order = np.argsort(codes)
     ordered = codes[order]
     cumulative = np.concatenate([[0.0], np.cumsum(weights[order])])
-    total = comm.allreduce(float(cumulative[-1]))
-    target = total * np.arange(1, pieces) / pieces
-    cuts = np.zeros(pieces - 1, dtype=np.int64)
-    digit = 9  # bits that one reduction settles: 63 / 9 = 7 reductions of 511 numbers per splitter
-    for shift in range(3 * BITS - digit, -1, -digit):
-        candidates = cuts[:, None] + (np.arange(1, 2**digit) << shift)
-        below = cumulative[np.searchsorted(ordered, candidates)]
-        comm.Allreduce(MPI.IN_PLACE, below)
-        cuts += np.count_nonzero(below <= target[:, None], axis=1) << shift
+    cuts, below, shift, found = np.zeros(pieces - 1, np.int64), np.zeros((2, pieces - 1)), 3 * BITS, False
+    digit = max(4, 12 - pieces.bit_length())  # bits that one reduction settles: of few pieces more at once
+    while shift > 0 and not found:
+        step, shift = min(shift, digit), max(shift - digit, 0)
+        last = cuts[:, None] + (np.arange(2**step) << shift) + ((1 << shift) - 1)  # codes of each cell
+        rows = np.append(np.searchsorted(ordered, last, side="right"), len(codes))
+        up_to = np.stack([cumulative[rows], rows])
+        comm.Allreduce(MPI.IN_PLACE, up_to)
+        target = up_to[0, -1] * np.arange(1, pieces) / pieces
+        cells = np.concatenate([below[:, :, None], up_to[:, :-1].reshape(2, pieces - 1, -1)], axis=2)
+        cell = np.count_nonzero(cells[0, :, 1:-1] <= target[:, None], axis=1)
+        cuts += cell << shift
+        below, beyond = (cells[:, np.arange(pieces - 1), cell + k] for k in (0, 1))
+        weight, grains = beyond - below
+        found = bool(((weight <= part * target[0]) | (grains <= 1.0)).all())
     return cuts
 
 
@@ -42,17 +50,17 @@ def frame_of_most(comm: MPI.Comm, positions: Floats) -> Frame:
     the others would share one cell with all others. Collective.
 
     Along each axis it leaves out what is further from the middle half of the positions than 16 times its width."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    ends = np.full((2, 3), np.inf)
     if len(positions):
-        low, high = positions.min(axis=0), positions.max(axis=0)
-    comm.Allreduce(MPI.IN_PLACE, low, MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, MPI.MAX)
-    width = np.maximum(high - low, np.finfo(float).tiny)
-    for axis in range(3):
-        codes = ((positions[:, axis] - low[axis]) / width[axis] * 2.0**53).astype(np.int64)
-        first, _, third = low[axis] + splitters(comm, codes, np.ones(len(codes)), 4) / 2.0**53 * width[axis]
-        low[axis], high[axis] = max(low[axis], 17 * first - 16 * third), min(high[axis], 17 * third - 16 * first)
-    return Frame.between(low, high)
+        ends = np.array([positions.min(axis=0), -positions.max(axis=0)])
+    comm.Allreduce(MPI.IN_PLACE, ends, MPI.MIN)
+    low, high = ends[0], -ends[1]
+    # the quarters along the three axes are cuts of one curve, on which the axes follow each other
+    width, axis, length = np.maximum(high - low, np.finfo(float).tiny), np.arange(3) << 61, 2.0**61
+    codes = ((positions - low) / width * 2.0**53).astype(np.int64).clip(0, 2**53 - 1) << 8
+    cuts = splitters(comm, (codes + axis).ravel(), np.ones(codes.size), 12, 0.1)
+    first, third = (low + (cuts[k::4] - axis) / length * width for k in (0, 2))
+    return Frame.between(np.maximum(low, 17 * first - 16 * third), np.minimum(high, 17 * third - 16 * first))
 
 
 def redistribute(world: World) -> None:
@@ -86,10 +94,8 @@ def rebalance(world: World, tolerance: float = 1.05) -> bool:
     return True
 
 
-def _loads(world: World) -> Floats:
+def _loads(world: World) -> tuple[float, float, float]:
     """The greatest load of a rank, the greatest of a grain and the mean load of the ranks; collective."""
-    comm, load = world.comm, world.grains.weight + 1.0
-    most, total = np.array([load.sum(), load.max(initial=0.0)]), np.array([load.sum()])
-    comm.Allreduce(MPI.IN_PLACE, most, MPI.MAX)
-    comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
-    return np.append(most, total / comm.size)
+    load = world.grains.weight + 1.0
+    (total,), (greatest, heaviest) = reduced(world.comm, [load.sum()], [load.sum(), load.max(initial=0.0)])
+    return greatest, heaviest, total / world.comm.size

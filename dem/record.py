@@ -17,12 +17,13 @@ from dem.applied import slots
 from dem.arrays import ArrayLike, Bools, Floats
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
+from dem.exchange import reduced
 from dem.experiment import Experiment
 from dem.motion import Held
 from dem.period import wrapped
 from dem.servo import cell_stress
 from dem.step import Step
-from dem.together import SceneError, together
+from dem.together import SceneError, digest, together
 from dem.world import World
 
 
@@ -57,8 +58,9 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
         return {name: float(value) for name, value in own.items()}
 
     own = together(step.world.comm, what, record)
-    names = step.world.comm.allgather(list(own))
-    if any(other != names[0] for other in names):
+    names = digest(str(list(own))) >> 8  # 52 bits
+    _, (most, least) = reduced(step.world.comm, (), (names, -names))
+    if most != -least:
         raise SceneError(f"{what}: it must return the same names on all ranks, in the same order")
     return own
 
@@ -83,7 +85,7 @@ def cell(step: Step) -> dict[str, float]:
     world, period = step.world, step.world.period
     if period is None or np.isinf(period).any() or (world.shear is None and world.servo is None):
         return {}
-    stress = cell_stress(world, step.contacts, step.system, step.impulse)
+    stress = cell_stress(world, step.contacts, step.force)
     pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     out = {f"period_{axis} [m]": float(period[k]) for k, axis in enumerate("xyz")}
     return out | {f"stress_{'xyz'[i]}{'xyz'[j]} [Pa]": 0.5 * float(stress[i, j] + stress[j, i]) for i, j in pairs}
@@ -219,12 +221,13 @@ def energy_balance(step: Step) -> dict[str, float]:
 
 def _still(table: Bodies, gravity: Floats, dt: float) -> float:
     """The kinetic energy [J] that bodies at rest may have by the errors of a solver: a part SLOW of what gravity gives
-    in a step, or a way of CREEP radii."""
-    radius = bodies.bounding_radius(table)
-    creep = CREEP * np.where(np.isfinite(radius), radius, 0.0) / dt
-    speed = np.maximum(SLOW * dt * math.hypot(*gravity), creep)
+    in a step, or a way of CREEP radii, of large bodies those of gyration."""
     moves = bodies.is_dynamic(table)
-    return 0.5 * float(table.mass[moves] @ speed[moves] ** 2)
+    mass, gyration = table.mass[moves], np.sqrt(table.inertia[moves].min(axis=1) / table.mass[moves])
+    radius = np.where(table.shape[moves] == COMPOUND, gyration, bodies.bounding_radius(table)[moves])
+    creep = CREEP * np.where(np.isfinite(radius), radius, 0.0) / dt  # what cannot turn has none
+    speed = np.maximum(SLOW * dt * math.hypot(*gravity), creep)
+    return 0.5 * float(mass @ speed**2)
 
 
 def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
@@ -292,17 +295,17 @@ def contact_statistics(step: Step) -> dict[str, float]:
     number of active contacts per grain.
     """
     comm, contacts, impulse = step.world.comm, step.contacts, step.in_cone
-    count, weight = comm.allreduce(np.array([len(contacts), impulse[:, 0].sum()]))
+    (count, weight), _ = reduced(comm, (len(contacts), impulse[:, 0].sum()), ())
     grain = contacts.near.bodies.shape != COMPOUND
     least = 0.01 * weight / max(count, 1.0)
     *sums, worst = counted(impulse, contacts.friction, contacts.gap, contacts.a, contacts.b, grain, least)
-    sums = comm.allreduce(np.array(sums))
+    sums, (worst,) = reduced(comm, sums, (max(worst, contacts.held_overlap),))
     return {
         "contacts": count,
         "active_contacts": sums[0],
         "coordination_number": sums[2] / max(step.world.slabs[-1], 1),
         "sliding_fraction": sums[1] / max(sums[0], 1),
-        "worst_overlap [m]": comm.allreduce(max(worst, contacts.held_overlap), MPI.MAX),
+        "worst_overlap [m]": worst,
     }
 
 

@@ -6,6 +6,9 @@ A scene is the same on every rank and knows nothing of ranks; `dem.start.new_wor
     scene.add_body("floor", [Plane(normal=(0, 0, 1))])
     scene.add_spheres(positions, radius=0.1, density=2500.0)
     world = new_world(scene, MPI.COMM_WORLD)
+
+It keeps what is given of grains, and makes their table in parts: each rank makes the rows that it needs. What is given
+by a `dem.arrays.Rule` takes no memory at all.
 """
 
 from __future__ import annotations
@@ -15,21 +18,24 @@ from dataclasses import dataclass, replace
 from typing import Any, Union
 
 import numpy as np
+from mpi4py import MPI
 
-from dem import bodies, checks, clumps, quaternion, shapes
-from dem.arrays import ArrayLike, Floats, Ints
-from dem.bodies import BOX, CAPSULE, CLUMP, COMPOUND, PLANE, SPHERE, Bodies
+from dem import bodies, checks, clumps, polyhedra, quaternion, shapes
+from dem.arrays import ArrayLike, Floats, Ints, Rule
+from dem.bodies import BOX, CAPSULE, CLUMP, COMPOUND, MESH, PLANE, POLYHEDRON, SPHERE, Bodies
 from dem.clumps import Form
-from dem.joints import Joint
+from dem.joints import Joint, whole_periods
 from dem.loads import Law, Load, On
 from dem.measures import Block, Cylinder
 from dem.mesh import Mesh
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
 from dem.pairs import Pairs, checked, tables
+from dem.polyhedra import Solid
 from dem.quaternion import across, length
-from dem.shapes import Box, Clump, Shape
+from dem.shapes import Box, Capsule, Clump, Shape
 from dem.sources import MOST_IDS, Outlet, Source
 from dem.springs import End, Spring
+from dem.survey import Survey, survey
 
 #: A velocity (3,), or a function of points (n, 3) [m] and outward normals (n, 3) that returns (3,) or (n, 3) [m/s].
 SurfaceVelocity = Union[Sequence[float], Callable[[Floats, Floats], ArrayLike]]
@@ -58,6 +64,70 @@ class LargeBody:
     surface: SurfaceVelocity | None = None  #: of its surface along itself, in the body frame [m/s]
 
 
+@dataclass(frozen=True)
+class Column:
+    """A quantity of grains that were added together: one row for all, a row for each, or a `Rule` for the rows."""
+
+    name: str
+    values: Floats | Rule
+    row: tuple[int, ...]
+    check: Callable[[str, ArrayLike], Floats]
+
+    @classmethod
+    def of(
+        cls, name: str, values: ArrayLike, count: int, *row: int, check: Callable[..., Floats] = checks.finite
+    ) -> Column:
+        """ValueError for what is none; rows by a rule are checked when they are made."""
+        if not isinstance(values, Rule):
+            values = np.array(check(name, values))
+            checks.shape(name, values, count, *row)
+        elif len(values) != count:
+            raise ValueError(f"{name} must have {count} rows, got {len(values)}")
+        return cls(name, values, row, check)
+
+    def part(self, first: int, end: int) -> Floats:
+        """The rows (end - first, ...) from `first` on and before `end`."""
+        one = not isinstance(self.values, Rule) and self.values.shape == self.row
+        rows = self.values if one else self.check(self.name, self.values[first:end])  # type: ignore[index]
+        return checks.rows(self.name, rows, end - first, *self.row)
+
+    def sample(self) -> Floats:
+        """What was given; of a rule rows of the beginning and the end."""
+        if not isinstance(self.values, Rule):
+            return self.values
+        count = len(self.values)
+        return np.concatenate([self.part(0, min(count, 1000)), self.part(max(0, count - 1000), count)])
+
+
+@dataclass(frozen=True)
+class Part:
+    """Grains of one kind that were added together."""
+
+    count: int
+    kind: int
+    material: int
+    given: dict[str, Column]
+    #: from the columns of `given`: position, quaternion, size, mass and inertia, as of `Bodies`
+    solid: Callable[[dict[str, Floats]], tuple[Floats, ...]]
+
+    def rows(self, first: int, end: int) -> Bodies:
+        """The table of the grains from `first` on and before `end`, counted within this part."""
+        given, many = {name: column.part(first, end) for name, column in self.given.items()}, end - first
+        position, turn, size, mass, inertia = self.solid(given)
+        return Bodies(
+            id=np.arange(first, end),
+            position=position,
+            quaternion=turn,
+            velocity=np.hstack([given["velocity"], given["angular velocity"]]),
+            mass=mass,
+            inertia=inertia,
+            material=np.full(many, self.material),
+            shape=np.full(many, self.kind),
+            size=size,
+            weight=np.zeros(many),
+        )
+
+
 class Scene:
     """Collects grains, large bodies, materials and gravity; checks each as it comes (ValueError)."""
 
@@ -76,6 +146,8 @@ class Scene:
         shear_rate: float | None = None,
         shear_gradient: str = "y",
         stress: Sequence[float | None] | None = None,
+        strain_rate: Sequence[float | None] | None = None,
+        strain_start: float = 0.0,
     ) -> None:
         """`gravity`: (3,) [m/s^2]. The others are coefficients of the contacts of all pairs of materials, but of those
         of `set_pair`: `friction`, `stiffness` [N/m] (inf: rigid; None: `dem.stiffness.recommended`), `restitution`, the
@@ -84,14 +156,18 @@ class Scene:
         `period`: (3,) lengths of the cell, from zero on, that repeats itself along x, y, z [m], None: not along that
         axis. `shear_rate`: d v_x / dy of the cell, or d v_x / dz for the `shear_gradient` "z" [1/s]; None: it is at
         rest. `stress`: (3,) that the cell is to have along x, y, z, positive in compression [Pa]: its periods then
-        change; None: not along that axis. See docs/periodic.md.
+        change; None: not along that axis. `strain_rate`: (3,) at which it is compressed along x, y, z [1/s] from the
+        time `strain_start` [s] on, in the place of the stress along that axis. See docs/periodic.md.
         """
         self.period = checks.period(period)
         self.stress = None if stress is None else checks.stress(stress)
-        if stress is not None and (self.period is None or np.isinf(self.period).any()):
-            raise ValueError("stress needs periods along x, y and z")
-        if stress is not None and np.any(gravity):
-            raise ValueError("stress needs gravity (0, 0, 0): in a cell without walls grains would fall for ever")
+        self.strain_rate = None if strain_rate is None else checks.strain_rate(strain_rate)
+        self.strain_start = float(checks.not_negative("strain_start", strain_start))
+        what = "strain_rate" if stress is None else "stress"
+        if self.deforms and (self.period is None or np.isinf(self.period).any()):
+            raise ValueError(f"{what} needs periods along x, y and z")
+        if self.deforms and np.any(gravity):
+            raise ValueError(f"{what} needs gravity (0, 0, 0): in a cell without walls grains would fall for ever")
         self.shear_rate = None if shear_rate is None else float(checks.finite("shear_rate", shear_rate))
         if shear_gradient not in ("y", "z"):
             raise ValueError(f"shear_gradient must be 'y' or 'z', got {shear_gradient!r}")
@@ -110,13 +186,20 @@ class Scene:
         )  # fmt: skip
         self._pairs: dict[tuple[int, int], dict[str, float]] = {}
         self._materials: dict[str, int] = {}
-        self.parts: list[Bodies] = []  #: the grains, as they were added
+        self.parts: list[Part] = []  #: the grains, as they were added
+        self._survey: Survey | None = None
         self.clumps: list[Form] = []  #: the distinct shapes of clumps; their kinds are CLUMP and the number
+        self.polyhedra: list[Solid] = []  #: the same of polyhedra, and POLYHEDRON
         self.loads: dict[str, Load] = {}  #: by name
         self.springs: dict[str, Spring] = {}  #: by name
         self.sources: dict[str, Source] = {}  #: by name
         self.outlets: dict[str, Outlet] = {}  #: by name
         self.joints: dict[str, Joint] = {}  #: by name
+
+    @property
+    def deforms(self) -> bool:
+        """Whether the periods of the cell change, by a stress or a strain rate."""
+        return self.stress is not None or self.strain_rate is not None
 
     def add_spheres(
         self,
@@ -127,10 +210,11 @@ class Scene:
         material: str = "default",
         velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> Ints:
+    ) -> Ints | range:
         """Add solid spheres and return their ids (n,).
 
-        positions (n, 3) [m]; radius [m] and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3).
+        positions (n, 3) [m]; radius [m] and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3). What has a
+        row for each sphere may be a `dem.arrays.Rule`, of which every rank makes its part alone; so of other grains.
         """
         upright, lengths = (1.0, 0.0, 0.0, 0.0), {"radius": radius}
         return self._add_grains(SPHERE, positions, lengths, density, material, upright, velocity, angular_velocity)
@@ -145,7 +229,7 @@ class Scene:
         material: str = "default",
         velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> Ints:
+    ) -> Ints | range:
         """Add solid boxes and return their ids (n,).
 
         positions (n, 3) and half extents (3,) or (n, 3) [m]; density [kg/m^3] one for all or (n,);
@@ -165,7 +249,7 @@ class Scene:
         material: str = "default",
         velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> Ints:
+    ) -> Ints | range:
         """Add solid capsules, along the z axes of their frames, and return their ids (n,).
 
         positions (n, 3) [m]; radius, half length of the core segment [m] and density [kg/m^3] one for all or (n,);
@@ -184,7 +268,7 @@ class Scene:
         material: str = "default",
         velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> Ints:
+    ) -> Ints | range:
         """Add solid clumps of spheres of one shape and return their ids (n,).
 
         positions (n, 3) [m] and quaternions (4,) or (n, 4) are those of the frame in which `shape` has its centres.
@@ -194,15 +278,54 @@ class Scene:
         form = clumps.form(shape)
         if form not in self.clumps:
             self.clumps.append(form)
-        origins = np.atleast_2d(checks.finite("positions", positions))
-        turns = checks.unit_quaternions("quaternions", quaternions, len(origins))
-        centers = checks.rows("positions", origins, len(origins), 3) + quaternion.rotate(turns, form.place)
-        rho = checks.rows("density", checks.positive("density", density), len(origins))
-        mass, inertia = rho * form.volume, rho[:, None] * form.moments
-        turns = quaternion.multiply(turns, np.tile(form.turn, (len(origins), 1)))
-        size = np.tile(form.size, (len(origins), 1))
+        place, turn, size = form.place, form.turn, form.size
+
+        def solid(given: dict[str, Floats]) -> tuple[Floats, ...]:
+            turns, rho, many = _unit(given["quaternions"]), given["density"], len(given["density"])
+            centers = given["positions"] + quaternion.rotate(turns, place)
+            turns = quaternion.multiply(turns, np.tile(turn, (many, 1)))
+            return centers, turns, np.tile(size, (many, 1)), rho * form.volume, rho[:, None] * form.moments
+
         kind = CLUMP + self.clumps.index(form)
-        return self._append(kind, centers, size, mass, inertia, material, turns, velocity, angular_velocity)
+        return self._append(
+            kind, positions, {}, density, material, quaternions, velocity, angular_velocity, solid
+        )
+
+    def add_polyhedra(
+        self,
+        positions: ArrayLike,
+        vertices: ArrayLike,
+        density: ArrayLike,
+        *,
+        scale: ArrayLike = 1.0,
+        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        material: str = "default",
+        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Ints | range:
+        """Add solid convex polyhedra of one shape, the hull of 4 to 32 `vertices` (v, 3) [m], and return their ids
+        (n,).
+
+        positions (n, 3) [m] and quaternions (4,) or (n, 4) are those of the frame of the vertices, which a grain has
+        times its `scale`. The grains have theirs at the centre of mass along the principal axes, see `dem.polyhedra`.
+        scale and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3), the linear one is that of the centre
+        of mass. ValueError for vertices that are not the corners of a convex solid.
+        """
+        form = polyhedra.solid(vertices)
+        if form not in self.polyhedra:
+            self.polyhedra.append(form)
+
+        def solid(given: dict[str, Floats]) -> tuple[Floats, ...]:
+            turns, rho, times = _unit(given["quaternions"]), given["density"][:, None], given["scale"][:, None]
+            centers = given["positions"] + quaternion.rotate(turns, times * form.place)
+            turns = quaternion.multiply(turns, np.tile(form.turn, (len(rho), 1)))
+            mass, inertia = (rho * times**3 * form.volume)[:, 0], rho * times**5 * form.moments
+            return centers, turns, times * form.size, mass, inertia
+
+        kind = POLYHEDRON + self.polyhedra.index(form)
+        return self._append(
+            kind, positions, {"scale": scale}, density, material, quaternions, velocity, angular_velocity, solid
+        )
 
     def add_body(
         self,
@@ -234,7 +357,8 @@ class Scene:
             raise ValueError(f"large body {name!r} has no shape")
         place = checks.vector(f"position of {name!r}", position)
         turn = checks.unit_quaternion(f"quaternion of {name!r}", quaternion)
-        speed = _velocities(velocity, angular_velocity, 1)[0]
+        speed = np.hstack([checks.vector(f"{kind}velocity", given)
+                           for kind, given in (("", velocity), ("angular ", angular_velocity))])  # fmt: skip
         refuse_ignored(motion)
         _refuse_speed(name, motion, speed)
         body = LargeBody(name, tuple(shapes), motion, -1, place, turn, speed, np.inf, np.full(3, np.inf))
@@ -330,8 +454,9 @@ class Scene:
         upright = quaternion.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
         anchors, frames = [], []
         for position, turn in (self._pose(f"joint {name!r}", end) for end in (one, other)):
-            back = quaternion.conjugate(turn)
-            anchors.append(tuple(quaternion.rotate(back, place - position).tolist()))
+            back, arm = quaternion.conjugate(turn), place - position
+            arm = arm - whole_periods(arm, self.period)
+            anchors.append(tuple(quaternion.rotate(back, arm).tolist()))
             frames.append(tuple(quaternion.multiply(back, upright).tolist()))
         for body in self.large_bodies:
             if body.name in (one, other) and isinstance(body.motion, Driven):
@@ -344,14 +469,11 @@ class Scene:
         if end is None:
             return np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
         if isinstance(end, str):
-            tables = [self.large()]
-            rows = np.flatnonzero([body.name == end for body in self.large_bodies])
+            table = self.large().take(np.flatnonzero([body.name == end for body in self.large_bodies]))
         else:
-            tables = self.parts
-            rows = np.array([end]) if 0 <= end < sum(map(len, tables)) else np.zeros(0, np.int64)
-        if not len(rows):
+            table = self._rows(end, end + 1) if 0 <= end < self.count else bodies.none()
+        if not len(table):
             raise ValueError(f"{what}: there is no body or grain {end!r} yet")
-        table = bodies.concatenate(tables).take(rows)
         return table.position[0], table.quaternion[0]
 
     def add_source(self, name: str, region: Block | Cylinder, *, material: str = "default", **given: Any) -> None:
@@ -372,12 +494,42 @@ class Scene:
     @property
     def first_large(self) -> int:
         """The id of the first large body: more than that of any grain that may come."""
-        return MOST_IDS if self.sources else sum(len(part) for part in self.parts)
+        return MOST_IDS if self.sources else self.count
+
+    @property
+    def count(self) -> int:
+        """Number of the grains at time zero."""
+        return sum(part.count for part in self.parts)
+
+    def survey(self, comm: MPI.Comm = MPI.COMM_SELF) -> Survey:
+        """Of the grains at time zero; collective. It is made once, and then known to this rank alone."""
+        if self._survey is None:
+            self._survey = survey(self._rows, self.count, self.speeds, comm)
+        return self._survey
+
+    def speeds(self, grains: Bodies) -> Floats:
+        """Speeds (n,) of grains, in a sheared cell beside the flow [m/s]."""
+        x, y, z, *_ = grains.velocity.T
+        if self.shear_rate is not None:
+            x = x - self.shear_rate * grains.position[:, self.gradient]
+        return np.hypot(np.hypot(x, y), z)  # squares could overflow
 
     def expected(self) -> Bodies:
-        """The grains at time zero, and of each source the smallest and the largest that may come."""
-        tables = [self.grains(), *(source.extremes() for source in self.sources.values())]
-        return bodies.concatenate(tables) if len(tables) > 1 else tables[0]
+        """Grains that stand for those of time zero, see `Survey`, and those of sources: of each the smallest and the
+        largest that may come. A scene without both has its large bodies that forces move, as spheres that fit into
+        their shapes. ValueError as of `grains`."""
+        self.grains(0, 0)
+        found = bodies.concatenate([self.survey().extremes, *(s.extremes() for s in self.sources.values())])
+        return found if len(found) else self._free()
+
+    def _free(self) -> Bodies:
+        """The large bodies that forces move, as spheres that fit into the thinnest of their shapes. Half spaces have no
+        size, and bodies of these alone are not among them."""
+        moves = np.array([isinstance(body.motion, Dynamic) for body in self.large_bodies], bool)
+        radius = np.array([least_half(body) for body in self.large_bodies], float)
+        rows = np.flatnonzero(moves & np.isfinite(radius))
+        size = np.outer(radius[rows], [1.0, 0.0, 0.0])
+        return replace(self.large().take(rows), shape=np.full(len(rows), SPHERE), size=size)
 
     def set_pair(
         self,
@@ -422,18 +574,30 @@ class Scene:
         """Whether the stiffness of all or some contacts was stated."""
         return any("stiffness" in given for given in (self._usual, *self._pairs.values()))
 
-    def grains(self) -> Bodies:
-        """All grains, in the order of their ids. ValueError if there is neither one nor a source, or if a mesh might
-        meet boxes or other meshes, which it cannot touch."""
+    def grains(self, first: int = 0, end: int | None = None) -> Bodies:
+        """The grains from the id `first` on and before `end`, all by default. ValueError if there is nothing that
+        moves, or if shapes might meet that cannot touch: meshes and boxes, polyhedra or other meshes; capsules and
+        polyhedra."""
         later = [source.extremes() for source in self.sources.values()]
-        if sum(len(part) for part in self.parts) + len(later) == 0:
-            raise ValueError("empty scene: there is no grain")
-        _refuse_beside_meshes(self.large_bodies, any((part.shape == BOX).any() for part in [*self.parts, *later]))
-        grains = bodies.concatenate([bodies.none(), *self.parts])
+        if self.count + len(later) + len(self._free()) == 0:
+            raise ValueError("empty scene: there is no grain, and no large body that forces move")
+        of_grains = {part.kind for part in self.parts}.union(*(table.shape.tolist() for table in later))
+        _refuse_beside_meshes(self.large_bodies, of_grains)
+        _refuse_capsules(self.large_bodies, of_grains)
         if self.period is not None:
-            radius = max(float(bodies.bounding_radius(part).max(initial=0.0)) for part in [grains, *later])
-            _refuse_in_cell(self, self.period, radius)
-        return grains
+            tables = [self.survey().extremes, *later]
+            _refuse_in_cell(self, self.period, max(float(bodies.bounding_radius(t).max(initial=0.0)) for t in tables))
+        return self._rows(first, self.count if end is None else end)
+
+    def _rows(self, first: int, end: int) -> Bodies:
+        tables, before = [], 0
+        for part in self.parts:
+            low, high = max(first - before, 0), min(end - before, part.count)
+            if low < high:
+                tables.append(part.rows(low, high))
+                tables[-1].id += before
+            before += part.count
+        return tables[0] if len(tables) == 1 else bodies.concatenate([bodies.none(), *tables])
 
     def large(self) -> Bodies:
         """The table of the large bodies at time zero, in the order in which they were added."""
@@ -457,37 +621,46 @@ class Scene:
     def _add_grains(
         self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike, material: str,
         quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
-    ) -> Ints:  # fmt: skip
+    ) -> Ints | range:  # fmt: skip
         """Add grains of one kind, of which `lengths` has the columns of `size` by name; their ids."""
-        centers = np.atleast_2d(checks.finite("positions", positions))
-        count = len(centers)
-        size = np.zeros((count, 3))
-        for k, (name, values) in enumerate(lengths.items()):
-            column, row = (slice(None), (3,)) if kind == BOX else (k, ())
-            size[:, column] = checks.rows(name, checks.positive(name, values), count, *row)
-        mass, inertia = shapes.solid(kind, size, checks.rows("density", checks.positive("density", density), count))
-        return self._append(kind, centers, size, mass, inertia, material, quaternions, velocity, angular_velocity)
+
+        def solid(given: dict[str, Floats]) -> tuple[Floats, ...]:
+            size = np.zeros((len(given["density"]), 3))
+            for k, name in enumerate(lengths):
+                size[:, slice(None) if kind == BOX else k] = given[name]
+            return given["positions"], _unit(given["quaternions"]), size, *shapes.solid(kind, size, given["density"])
+
+        return self._append(
+            kind, positions, lengths, density, material, quaternions, velocity, angular_velocity, solid
+        )
 
     def _append(
-        self, kind: int, centers: Floats, size: Floats, mass: Floats, inertia: Floats, material: str,
+        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike, material: str,
         quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
-    ) -> Ints:  # fmt: skip
-        """Add grains of one kind with these columns of the table; their ids."""
-        count, first = len(centers), sum(len(part) for part in self.parts)
-        table = Bodies(
-            id=np.arange(first, first + count),
-            position=checks.rows("positions", centers, count, 3),
-            quaternion=checks.unit_quaternions("quaternions", quaternions, count),
-            velocity=_velocities(velocity, angular_velocity, count),
-            mass=mass,
-            inertia=inertia,
-            material=np.full(count, self._material(material)),
-            shape=np.full(count, kind),
-            size=size,
-            weight=np.zeros(count),
-        )
-        self.parts.append(table)
-        return table.id
+        solid: Callable[[dict[str, Floats]], tuple[Floats, ...]],
+    ) -> Ints | range:  # fmt: skip
+        """Add grains of one kind; their ids, a range where the positions are a `Rule`."""
+        if not isinstance(positions, Rule):
+            positions = np.atleast_2d(checks.finite("positions", positions))
+        count, first = len(positions), self.count
+        columns = [Column.of("positions", positions, count, 3)]
+        row = (3,) if kind == BOX else ()
+        columns += [Column.of(name, values, count, *row, check=checks.positive) for name, values in lengths.items()]
+        columns += [
+            Column.of("density", density, count, check=checks.positive),
+            Column.of("quaternions", quaternions, count, 4, check=checks.not_zero),
+            Column.of("velocity", velocity, count, 3),
+            Column.of("angular velocity", angular_velocity, count, 3),
+        ]
+        given = {column.name: column for column in columns}
+        self.parts.append(Part(count, kind, self._material(material), given, solid))
+        self._survey = None
+        ids = range(first, first + count)
+        return ids if isinstance(positions, Rule) else np.array(ids, np.int64)
+
+
+def _unit(quaternions: Floats) -> Floats:
+    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
 
 
 def _refuse_speed(name: str, motion: Motion, speed: Floats) -> None:
@@ -545,13 +718,24 @@ def _turning(body: LargeBody, motion: Dynamic) -> LargeBody:
     return replace(turned, quaternion=upright, inertia=np.array([np.inf, np.inf, moment]))
 
 
-def _refuse_beside_meshes(members: Sequence[LargeBody], box_grains: bool) -> None:
-    """ValueError for pairs of a mesh and a box or another mesh that might meet: they have no contacts."""
+def _refuse_capsules(members: Sequence[LargeBody], of_grains: set[int]) -> None:
+    """ValueError for capsules that might meet polyhedra, if there are such among the kinds of grains."""
+    if max(of_grains, default=0) >= POLYHEDRON:
+        of_bodies = [body.name for body in members if any(isinstance(shape, Capsule) for shape in body.shapes)]
+        if CAPSULE in of_grains or of_bodies:
+            what = f"the capsule of {of_bodies[0]!r}" if of_bodies else "grains that are capsules"
+            raise ValueError(f"polyhedra cannot touch {what}: take spheres, boxes, planes or clumps of spheres")
+
+
+def _refuse_beside_meshes(members: Sequence[LargeBody], of_grains: set[int]) -> None:
+    """ValueError for pairs of a mesh and a box or another mesh that might meet, and for grains that are boxes or
+    polyhedra, by their kinds: they have no contacts."""
     for body in members:
         if not any(isinstance(shape, Mesh) for shape in body.shapes):
             continue
-        if box_grains:
-            raise ValueError(f"grains that are boxes cannot touch the mesh of {body.name!r}: take spheres or capsules")
+        if BOX in of_grains or max(of_grains, default=0) >= POLYHEDRON:
+            what = "boxes" if BOX in of_grains else "polyhedra"
+            raise ValueError(f"grains that are {what} cannot touch the mesh of {body.name!r}: take spheres or capsules")
         for other in members:
             moves = isinstance(body.motion, Dynamic) or isinstance(other.motion, Dynamic)
             kinds = [type(shape).__name__ for shape in other.shapes if isinstance(shape, (Box, Mesh))]
@@ -562,8 +746,11 @@ def _refuse_beside_meshes(members: Sequence[LargeBody], box_grains: bool) -> Non
                 )
 
 
-def _velocities(linear: ArrayLike, angular: ArrayLike, count: int) -> Floats:
-    return np.hstack([checks.rows("velocity", linear, count, 3), checks.rows("angular velocity", angular, count, 3)])
+def least_half(body: LargeBody) -> float:
+    """The least half extent of the shapes of a large body [m]; inf of half spaces."""
+    parts = [shapes.placed(shape) for shape in body.shapes]
+    halves = [size.min() if kind in (BOX, MESH) else size[0] for kind, _, _, size in parts if kind != PLANE]
+    return float(min(halves, default=np.inf))
 
 
 def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
@@ -575,16 +762,17 @@ def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
                 f"period of {period[k]:g} m along {'xyz'[k]} is too short: a grain could meet another one on both its "
                 f"sides, or its own image; allowed is more than two greatest diameters, {4.0 * radius:g} m"
             )
-    if scene.shear_rate is not None or scene.stress is not None:
-        cell = "sheared cell" if scene.stress is None else "cell of given stress"
+    if scene.shear_rate is not None or scene.deforms:
+        cell = "cell of given stress" if scene.deforms else "sheared cell"
         if scene.large_bodies:
             raise ValueError(f"large body {scene.large_bodies[0].name!r}: a {cell} has grains alone")
         if scene.sources or scene.outlets:
             name = next(iter({**scene.sources, **scene.outlets}))
             raise ValueError(f"{name!r}: a {cell} has no sources and outlets")
-    for what, names in (("spring", list(scene.springs)), ("joint", list(scene.joints))):
-        if names:
-            raise ValueError(f"{what} {names[0]!r}: {what}s have no images, so periods allow none")
+        if scene.joints:
+            raise ValueError(f"joint {next(iter(scene.joints))!r}: a {cell} has no joints")
+    if scene.springs:
+        raise ValueError(f"spring {next(iter(scene.springs))!r}: springs have no images, so periods allow none")
     for body in scene.large_bodies:
         for shape in body.shapes:
             kind, center, turn, size = shapes.placed(shape)

@@ -6,8 +6,9 @@ these. So no generator has a state, and a run that goes on from a checkpoint has
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,10 @@ from dem.shapes import Box, Capsule
 from dem.together import digest
 
 #: In scenes with sources grains have ids below this number, and large bodies from it on.
-MOST_IDS = 10**8
+MOST_IDS = 10**12
 
 TRIES = 64  #: places that are tried for a grain in a step
+CHANGES = ("mass_rate", "number_rate", "velocity", "start", "before")  #: fields of a source that change within a run
 
 
 @dataclass(frozen=True)
@@ -92,13 +94,15 @@ class Source(Timed):
     start: float = 0.0  #: [s]
     end: float = np.inf  #: [s]
     seed: int = 0
+    before: float = 0.0  #: what was due before `start`, with other rates [kg] or grains
 
     def __post_init__(self) -> None:
         self._check_times()
         _refuse_region("source", self.region)
         if (self.mass_rate is None) == (self.number_rate is None):
             raise ValueError("a source has either a mass_rate [kg/s] or a number_rate [1/s]")
-        checks.positive("rate of a source", [rate for rate in (self.mass_rate, self.number_rate) if rate is not None])
+        given = [rate for rate in (self.mass_rate, self.number_rate) if rate is not None]
+        checks.not_negative("rate of a source", given)
         checks.positive("density of a source", self.density)
         if not isinstance(self.radius, (Uniform, Listed)):
             object.__setattr__(self, "radius", Listed(tuple(np.atleast_1d(np.asarray(self.radius, float)).tolist())))
@@ -148,14 +152,34 @@ class Source(Timed):
 
     def due(self, time: float, tally: Tally, mass: Floats) -> int:
         """How many of the next grains, of masses (n,), have come by the time [s], as rate times time says."""
-        gone, count = self.gone(time), len(mass)
+        due, count = self.amount(time) * (1.0 + 1e-12), len(mass)
         if self.number_rate is not None:
-            count = min(count, int(np.floor(self.number_rate * gone * (1.0 + 1e-12) + 1e-9)) - tally.count)
+            count = min(count, int(np.floor(due + 1e-9)) - tally.count)
         else:
-            assert self.mass_rate is not None
             held = np.cumsum(np.concatenate([[tally.mass], mass]))[1:]  # one after another, in parts of any lengths
-            count = int(np.searchsorted(held, self.mass_rate * gone * (1.0 + 1e-12), side="right"))
+            count = int(np.searchsorted(held, due, side="right"))
         return max(int(min(count, self.most - tally.count)), 0)
+
+    def amount(self, time: float) -> float:
+        """What is due by the time [s]: mass [kg], or number of grains."""
+        rate = self.number_rate if self.mass_rate is None else self.mass_rate
+        assert rate is not None
+        return self.before + rate * self.gone(time)
+
+    def changed(self, time: float, tally: Tally, **values: Any) -> Source:
+        """The same with another `mass_rate`, `number_rate` or `velocity` from the time [s] on. What was due before and
+        found no place stays due, but where masses take the place of numbers or the other way round."""
+        if other := sorted(set(values) - {"mass_rate", "number_rate", "velocity"}):
+            raise ValueError(f"{other[0]} of a source cannot be set; allowed are mass_rate, number_rate and velocity")
+        rates = {name: values[name] for name in ("mass_rate", "number_rate") if values.get(name) is not None}
+        out: dict[str, Any] = {"velocity": values["velocity"]} if "velocity" in values else {}
+        if rates:
+            kind = next(iter(rates))
+            same = getattr(self, kind) is not None
+            came = tally.mass if kind == "mass_rate" else float(tally.count)
+            out |= {"mass_rate": None, "number_rate": None, **rates}
+            out |= {"before": self.amount(time) if same else came, "start": min(max(time, self.start), self.end)}
+        return replace(self, **out)
 
     def places(self, name: str, serial: Ints) -> Floats:
         """Places (n, TRIES, 3) in the region where grains of these numbers may come, in the order of trying [m]."""
@@ -187,6 +211,20 @@ class Tally:
     mass: float = 0.0  #: [kg]
     energy: float = 0.0  #: kinetic and potential, of the last step alone [J]
     refused: int = 0  #: steps in which the next grain of a source was due, but found no place
+
+
+def as_text(sources: dict[str, Source]) -> str:
+    """What `Source.changed` may change of sources as text, for `from_text`."""
+    numbers = {name: {key: getattr(source, key) for key in CHANGES} for name, source in sources.items()}
+    return json.dumps(numbers, default=lambda array: array.tolist())
+
+
+def from_text(text: str, sources: dict[str, Source]) -> dict[str, Source]:
+    """These sources of a scene as a text says. ValueError for a source that the scene does not have."""
+    found = json.loads(text)
+    if other := sorted(set(found) - set(sources)):
+        raise ValueError(f"the scene has no source {other[0]!r}")
+    return {name: replace(sources[name], **values) for name, values in found.items()}
 
 
 def as_array(tallies: dict[str, Tally]) -> Floats:

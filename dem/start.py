@@ -17,6 +17,7 @@ from dem.contact import find_contacts
 from dem.exchange import exchange, refuse
 from dem.partition import redistribute
 from dem.period import put_back, velocity_in_cell, wrapped
+from dem.polyhedra import Solid
 from dem.scene import Scene
 from dem.sources import Tally, from_array
 from dem.step import follow_motions
@@ -26,13 +27,15 @@ from dem.world import Servo, Shear, World, refuse_load
 def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     """The scene at time zero, distributed; collective.
 
-    Bodies of prescribed motion are where their motions put them at time zero. ValueError if there is no grain, or if
+    Bodies of prescribed motion are where their motions put them at time zero. ValueError if nothing moves, or if
     grains overlap each other or a large body by more than `overlap` radii; SceneError if a motion fails.
     """
-    grains = scene.grains()
+    scene.survey(comm)
+    rows = even_slice(scene.count, comm)
+    grains = scene.grains(rows.start, rows.stop)
     grains.velocity = velocity_in_cell(grains.position, grains.velocity, _shear(scene))
     grains.position = wrapped(grains.position, scene.period, _shear(scene))
-    world = _world(scene, comm, grains.take(even_slice(len(grains), comm)))
+    world = _world(scene, comm, grains)
     follow_motions(world)
     put_back(world)
     redistribute(world)
@@ -66,7 +69,7 @@ def restored_world(
             f"the state has {world.slabs[-1]} grains and {len(large['id'])} large bodies, "
             f"the scene {count} and {len(world.large)}"
         )
-    world.large = Bodies(**large)
+    world.large = Bodies(**{**large, "id": world.large.id})  # versions before had others beside sources
     world.time, world.step = float(replicated["time"]), int(replicated["step"])
     expected = np.array(replicated["expected"]) if "expected" in replicated else None
     world.expected = expected if expected is not None and expected.shape == (len(world.springs), 2, 6) else None
@@ -84,7 +87,8 @@ def _refuse_impossible(world: World) -> None:
         grains = what == "grain"
         heavy = np.concatenate([table.mass, table.inertia.ravel()])
         clumps = range(bodies.CLUMP, bodies.CLUMP + len(world.clumps))
-        of_grains = (bodies.SPHERE, bodies.BOX, bodies.CAPSULE, *clumps)
+        polyhedra = range(bodies.POLYHEDRON, bodies.POLYHEDRON + len(world.polyhedra))
+        of_grains = (bodies.SPHERE, bodies.BOX, bodies.CAPSULE, *clumps, *polyhedra)
         kinds = np.isin(table.shape, of_grains if grains else (bodies.COMPOUND,))
         right = {
             "position": np.isfinite(table.position),
@@ -95,6 +99,7 @@ def _refuse_impossible(world: World) -> None:
             "shape": kinds,
             "size": np.isfinite(table.size) & (table.size >= 0.0) & (table.size[:, :1] > 0.0 if grains else True),
             "clump": np.array([_is_of(table, n, form) for n, form in enumerate(world.clumps)]),
+            "polyhedron": np.array([_is_scaled(table, n, form) for n, form in enumerate(world.polyhedra)]),
         }
         wrong += [f"{name} of a {what}" for name, good in right.items() if not good.all()]
     starts = np.arange(world.comm.size + 1) * world.ids // world.comm.size
@@ -111,6 +116,12 @@ def _is_of(table: Bodies, number: int, form: Form) -> bool:
     """Whether the clumps of this number in a table have the sizes of the form."""
     size = table.size[table.shape == bodies.CLUMP + number]
     return bool(np.allclose(size, form.size, rtol=1e-9, atol=0.0))
+
+
+def _is_scaled(table: Bodies, number: int, form: Solid) -> bool:
+    """Whether the polyhedra of this number in a table have the sizes of the form, up to a scale."""
+    size = table.size[table.shape == bodies.POLYHEDRON + number] / form.size
+    return bool(np.allclose(size, size[:, :1], rtol=1e-9, atol=0.0))
 
 
 def restart_rows(slabs: Ints, comm: MPI.Comm) -> slice:
@@ -136,10 +147,10 @@ def _restore_cell(world: World, replicated: Mapping[str, np.ndarray]) -> None:
     """Take the shear, the servo and the periods of the cell from a state; ValueError on all ranks if it has none."""
     comm = world.comm
     if world.servo is not None:
-        servo = np.array(replicated.get("servo", np.full((3, 3), np.nan)), float)
-        right = servo.shape == (3, 3) and np.isfinite(servo[1:]).all() and (servo[2] > 0.0).all()
-        refuse(comm, "" if right else "the state has no stress of the cell, as the scene has")
-        world.servo, world.period = Servo(servo[0], servo[1]), servo[2]
+        servo = np.array(replicated.get("servo", np.full((5, 3), np.nan)), float)
+        right = servo.shape == (5, 3) and np.isfinite(servo[2:]).all() and (servo[4] > 0.0).all()
+        refuse(comm, "" if right else "the state has no stress or strain rate of the cell, as the scene has")
+        world.servo, world.period = Servo(servo[0], servo[1], float(servo[2, 0]), servo[3]), servo[4]
     if world.shear is not None and world.period is not None:
         rate, shift = np.array(replicated.get("shear", (0.0, np.nan)), float)
         refuse(comm, "" if np.isfinite([rate, shift]).all() else "the state has no shear of the cell, as the scene has")
@@ -151,19 +162,20 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
     world.loads, world.springs, world.period = dict(scene.loads), dict(scene.springs), scene.period
-    world.clumps = tuple(scene.clumps)
+    world.clumps, world.polyhedra = tuple(scene.clumps), tuple(scene.polyhedra)
     world.sources, world.outlets = dict(scene.sources), dict(scene.outlets)
     world.tallies = {name: Tally() for name in (*world.sources, *world.outlets)}
-    world.initial, world.first_large = sum(map(len, scene.parts)), scene.first_large
+    world.initial, world.first_large = scene.count, scene.first_large
     for what, members in (("spring", world.springs), ("joint", scene.joints)):
         tied = [name for name, member in members.items() if any(isinstance(end, int) for end in member.ends)]
         if tied and world.outlets:
             raise ValueError(f"{what} {tied[0]!r} holds a grain: with outlets {what}s may hold large bodies alone")
     world.shear = _shear(scene)
     world.joints = dict(scene.joints)
-    if world.joints and pairs.resists:
-        raise ValueError("joints cannot be in a scene whose contacts resist rolling or spinning")
-    world.servo = None if scene.stress is None else Servo(scene.stress.copy(), np.zeros(3))
+    if scene.deforms:
+        none = np.full(3, np.nan)
+        asked, strain = (none if given is None else given for given in (scene.stress, scene.strain_rate))
+        world.servo = Servo(asked, strain, scene.strain_start)
     for name, load in world.loads.items():
         refuse_load(world, name, load)
     return world

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from mpi4py import MPI
 
 from dem import bodies, quaternion
 from dem.applied import applied_impulses
@@ -20,11 +19,12 @@ from dem.bodies import SPHERE, Bodies
 from dem.cohesion import along_normal
 from dem.contact import Contacts, cell_way, contact_order, find_contacts, goes_beyond, ways
 from dem.contact_map.loops import relative_velocities
+from dem.exchange import on_any
 from dem.measures import Sample
 from dem.period import resize, velocity_in_cell, wrapped
 from dem.system import ContactSystem, contact_arms, contact_frames, gap_velocities
 from dem.together import meet
-from dem.world import Servo, World
+from dem.world import World
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Step:
     @cached_property
     def joint_impulses(self) -> Floats:
         """`ContactSystem.joint_impulses` of this step; collective at its first use."""
-        return self.system.joint_impulses(self.impulse)
+        return self.system.joint_impulses(self.impulse, self.moment)
 
     def position(self, name: str) -> Floats:
         """Position (3,) of a large body [m]."""
@@ -68,14 +68,19 @@ class Step:
     def total(self, values: ArrayLike) -> float:
         """The sum of values (grains,) over all grains; each rank passes those of its `world.grains`. Collective: the
         `record` of a scene must call it on all ranks."""
-        meet(self.world.comm, "Step.total")
-        return float(self.world.comm.allreduce(float(np.sum(values))))
+        return meet(self.world.comm, "Step.total", number=float(np.sum(values)))
 
     @property
     def in_cone(self) -> Floats:
         """The impulses (nc, 3) without the attraction of contacts, which are in the friction cones [N s]."""
         attraction = self.system.attraction
         return self.impulse if attraction is None else self.impulse + along_normal(attraction)
+
+    @cached_property
+    def force(self) -> Floats:
+        """Forces (nc, 3) on the second bodies in the world, averaged over the step [N]."""
+        force: Floats = np.einsum("ci,cij->cj", self.impulse, self.system.frame) / self.system.dt
+        return force
 
     @property
     def moments(self) -> Floats | None:
@@ -110,7 +115,7 @@ class Step:
             point=point,
             normal=contacts.normal,
             gap=contacts.gap,
-            force=np.einsum("ci,cij->cj", self.impulse, self.system.frame) / self.system.dt,
+            force=self.force,
             moment=self.moments,
         )
 
@@ -128,7 +133,9 @@ def advance(world: World, velocity: Floats, dt: float, moving: Floats | None = N
     Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
     """
     moving = velocity if moving is None else moving
-    large_velocity, large_moving = world.large_velocity(velocity), world.large_velocity(moving)
+    large_velocity = large_moving = world.large_velocity(velocity)
+    if moving is not velocity:
+        large_moving = world.large_velocity(moving)
     start = world.grains.position
     _move(world.grains, velocity[: len(world.grains)], moving[: len(world.grains)], dt)
     _move(world.large, large_velocity, large_moving, dt)
@@ -180,7 +187,7 @@ def find_overrun(
     large = world.large_velocity(velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
     gone = bool((way > seen).any()), goes_beyond(world, dt * large, contacts.shifts, delta)
-    further, beyond = map(any, zip(*world.comm.allgather(gone)))
+    further, beyond = on_any(world.comm, *gone)
     if not (further or beyond):
         return None
     shifts = np.concatenate([contacts.shifts, dt * large[None]]) if beyond else contacts.shifts
@@ -190,21 +197,22 @@ def find_overrun(
     table[: len(seen)] = velocity[: len(seen)]
     world.lists.halo.update(table)
     table[unseen.near.grains + unseen.near.ghosts :] = large
-    opening = _opening(unseen, unseen.near.bodies.position, table)
+    opening = _opening(world, unseen, unseen.near.bodies.position, table)
     overlap = -dt * (gap_velocities(world, unseen, dt, recovery_speed)[2] + opening)
-    if not world.comm.allreduce(bool((overlap > depth).any()), MPI.LOR):
+    if not on_any(world.comm, bool((overlap > depth).any()))[0]:
         return None
     return find_contacts(world, delta, dt, margin, shifts)
 
 
-def _opening(contacts: Contacts, position: Floats, velocity: Floats) -> Floats:
+def _opening(world: World, contacts: Contacts, position: Floats, velocity: Floats) -> Floats:
     """Normal velocities (nc,) of contacts of bodies with these positions and velocities (rows, 3 and 6)."""
     row = np.stack([contacts.a, contacts.b], axis=1).astype(np.uint32)
     arm = contact_arms(contacts.point, position, row)
     if contacts.moved is not None:
         arm[:, 3:] -= contacts.moved
     opening: Floats = relative_velocities(contact_frames(contacts.normal).reshape(-1, 9), arm, row, velocity)[:, 0]
-    return opening if contacts.drift is None else opening + np.einsum("ci,ci->c", contacts.normal, contacts.drift)
+    flow = contacts.flow(world, position)
+    return opening if flow is None else opening + np.einsum("ci,ci->c", contacts.normal, flow)
 
 
 def find_turned(
@@ -222,11 +230,11 @@ def find_turned(
         return None
     end = find_contacts(advanced(world, velocity, dt), 0.0)
     end = end.take(end.gap < -depth)
-    start, approach = _at_start(end, dt, world.servo)
+    start, approach = _at_start(world, end, dt)
     overlap = -(dt * gap_velocities(world, start, dt, recovery_speed)[2] + approach)
     a, b, known = _rows_in(contacts, end)
     missed = known & (overlap > depth)
-    if not world.comm.allreduce(bool(missed.any()), MPI.LOR):
+    if not on_any(world.comm, bool(missed.any()))[0]:
         return None
     found = replace(start, a=a, b=b, near=contacts.near).take(missed)
     return _joined(world, contacts.take(places(found.key, contacts.key) < 0), found)
@@ -240,19 +248,21 @@ def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
     grains = world.grains
     way = dt * bodies.bounding_radius(grains) * quaternion.length(velocity[:, 3:])
     fast, finite = bool((way[grains.shape != SPHERE] > depth).any()), bool(np.isfinite(velocity).all())
-    return world.comm.allreduce(fast, MPI.LOR) and world.comm.allreduce(finite, MPI.LAND)
+    fast, not_finite = on_any(world.comm, fast, not finite)
+    return fast and not not_finite
 
 
-def _at_start(end: Contacts, dt: float, servo: Servo | None) -> tuple[Contacts, Floats]:
+def _at_start(world: World, end: Contacts, dt: float) -> tuple[Contacts, Floats]:
     """The contacts of the end of a step as contacts of its start, and by how much (nc,) their gaps grow in it [m]."""
     velocity = end.near.bodies.velocity
     start = replace(end, point=end.point - 0.5 * dt * (velocity[end.a, :3] + velocity[end.b, :3]))
     position = end.near.bodies.position - dt * velocity[:, :3]
-    if end.drift is not None and end.moved is not None:
-        start = replace(start, point=start.point - 0.5 * dt * end.drift, moved=end.moved - dt * end.drift)
-    growth = dt * _opening(start, position, velocity)
-    if servo is not None and start.moved is not None:
-        way = dt * servo.rate * position  # of the centres, which the cell takes with it
+    flow = end.flow(world, end.near.bodies.position)
+    if flow is not None and end.moved is not None:
+        start = replace(start, point=start.point - 0.5 * dt * flow, moved=end.moved - dt * flow)
+    growth = dt * _opening(world, start, position, velocity)
+    if world.servo is not None and start.moved is not None:
+        way = dt * world.servo.rate * position  # of the centres, which the cell takes with it
         start = replace(start, point=start.point - way[end.a], moved=start.moved + way[end.b] - way[end.a])
     return replace(start, gap=end.gap - growth), growth
 

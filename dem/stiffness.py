@@ -108,8 +108,8 @@ def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float]:
 
 
 def _load(scene: Scene) -> Floats:
-    """The weight (grains,) that the whole bed, or the stress of the cell, would lay on each grain, and the strongest
-    cohesion [N]."""
+    """The weight that the whole bed, or the stress of the cell, would lay on each of the grains that stand for all, and
+    the strongest cohesion (n,) [N]."""
     every, gravity = scene.expected(), math.hypot(*scene.gravity)
     pull = scene.pairs(np.inf).cohesion.max()
     pressure = 0.0 if scene.stress is None else float(np.nan_to_num(scene.stress).max())
@@ -122,16 +122,17 @@ def _load(scene: Scene) -> Floats:
 
 def _pressure(scene: Scene, gravity: float, down: Floats) -> float:
     """The weight of all bodies at time zero over the area of the bed [Pa]."""
-    grains = scene.grains()
-    if not len(grains):
+    grains = scene.survey()
+    if not grains.count:
         return 0.0
-    across = grains.position - np.outer(grains.position @ down, down)
-    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(across.T, bias=True)), 0.0))[1:]  # in the plane across
-    radius = bodies.bounding_radius(grains)
-    width = np.sqrt(12.0) * spread + 2.0 * radius.mean()  # of a rectangle of that spread, with the grains at its edges
+    across = np.eye(3) - np.outer(down, down)
+    spread = across @ grains.spread @ across / grains.count
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(spread), 0.0))[1:]  # in the plane across
+    radius = grains.radius / grains.count
+    width = np.sqrt(12.0) * spread + 2.0 * radius  # of a rectangle of that spread, with the grains at its edges
     free = [(body.mass, body.motion) for body in scene.large_bodies if isinstance(body.motion, Dynamic)]
     others = sum(mass * float(down @ motion.free_directions() @ down) for mass, motion in free)  # the rest is borne
-    return float(gravity * (grains.mass.sum() + others) / width.prod())
+    return float(gravity * (grains.mass + others) / width.prod())
 
 
 def _bed(scene: Scene, gravity: float, down: Floats) -> float:

@@ -39,11 +39,13 @@ from dem.cohesion import along_normal, attraction
 from dem.compiled import loop
 from dem.contact import Contacts
 from dem.contact_map import CompactRows, ContactMap, Halo
+from dem.contact_map.cell import CellMap
 from dem.contact_map.jointed import JointedMap
 from dem.contact_map.loops import scale
 from dem.contact_map.map import packed
 from dem.joints import Coupling
 from dem.rolling import resistance
+from dem.servo import cell_of
 from dem.surface import surface_velocities
 from dem.world import World
 
@@ -57,12 +59,15 @@ class ContactSystem:
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
         stiffness (nc,): of the contacts; inf: rigid [N/m]
         compliance (nc,): C, what a normal impulse leaves of the overlap, over dt; 0: rigid [1/kg]
-        drift (nc, 3): what the cell adds to relative velocities, in the frames; None: nothing [m/s]
+        cell: its part in the step, a `dem.contact_map.cell.Cell`; None where its size is constant
+        drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
+        last step, in a cell that deforms [m/s]
         surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.surface`; None if there is none
         b (nc, 3): (gap / dt, surface) [m/s], see `gap_velocities`
-        r (nc, 3): b + D' v_free [m/s]
+        r (nc, 3): b + D' v_free [m/s]; zero where it is below `rounding_of`
         near: the bodies about this rank
         contact_map: G, with the halo of the bodies; the rows of its tables are those of `near`
+        problem_map: G of the cone problem: with the rows of turning, where contacts resist it
         free_velocity (owned, 6): velocities without contacts, but with their attraction
         resistance: the rows of `dem.rolling`, or None
         attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.cohesion`
@@ -102,10 +107,12 @@ class ContactSystem:
         self.applied = applied_impulses(world, dt) if world.loaded else None
         if world.loaded:
             halo.update(free)
+        rounding = rounding_of(arm, row, free)
         self.joints = joint_coupling(world, dt) if joints is None else joints
         if self.joints is not None:
             here, slot = slots(world, near.bodies.id)
             free[here] += self.joints.change[slot]
+            rounding += rounding_of(arm, row, free)
             own = here < owned
             coupling = self.joints.matrix
             self.contact_map = JointedMap(self.contact_map, here[own], slot[own], coupling)
@@ -117,20 +124,35 @@ class ContactSystem:
         if self.surface is not None:
             self.b[:, 1:] = self.surface
         freely = self.contact_map.relative_velocities(free)
-        self.drift = None if contacts.drift is None else np.einsum("cij,cj->ci", self.frame, contacts.drift)
-        if self.drift is not None:
-            freely += self.drift
+        self.take_flow(world, contacts)
+        self.cell = cell_of(world, contacts, self.frame, dt)
+        if self.cell is not None:
+            self.contact_map = CellMap(self.contact_map, self.cell)
+            self.contact_map.add_rates(self.cell.free, freely)
+        if contacts.drift is not None:
+            freely += np.einsum("cij,cj->ci", self.frame, contacts.drift)
+        self._attracted: Floats | float = 0.0  #: mass-scaled momenta of the attraction
         self.attraction = attraction(world, contacts, dt)
         if self.attraction is not None:
-            momentum = self.contact_map.momenta(along_normal(-self.attraction))
+            self._attracted = momentum = self.contact_map.momenta(along_normal(-self.attraction))
             self.free_velocity = self.velocity_with(momentum)
             freely += self.contact_map.velocities(momentum)
-        self.resistance = resistance(world, contacts, self.contact_map, self.frame, free)
-        if self.attraction is not None and self.resistance is not None:
-            self.resistance.velocity[:] += self.resistance.map.velocities(momentum)[len(contacts) :]
+        known = self.contact_map.free if isinstance(self.contact_map, CellMap) else self.contact_map
+        self.resistance = resistance(world, contacts, known, self.frame, free)
+        self.problem_map: ContactMap = self.contact_map
+        if self.resistance is not None:
+            self.problem_map = self.resistance.map
+            if isinstance(self.contact_map, JointedMap):
+                self.problem_map = self.contact_map.of(self.resistance.map)
+            if self.cell is not None:
+                self.problem_map = CellMap(self.resistance.map, self.cell)
+            if self.attraction is not None:
+                self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
         if impacts and world.pairs.restitution.any():
             self._bounce(world, contacts, freely[:, 0])
         self.r = self.b + freely
+        for speed in (self.r, *([] if self.resistance is None else [self.resistance.velocity])):
+            speed[np.abs(speed) <= rounding[:, None]] = 0.0
 
     def _bounce(self, world: World, contacts: Contacts, freely: Floats) -> None:
         """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton).
@@ -156,11 +178,23 @@ class ContactSystem:
 
     def velocity_with(self, momentum: Floats) -> Floats:
         """Velocities (owned, 6) after the step for the mass-scaled momenta G' g (owned, 6), in any shape."""
-        change, momentum = np.empty_like(self.free_velocity), momentum.reshape(self.free_velocity.shape)
+        change, momentum = np.empty_like(self.free_velocity), momentum.reshape(-1, 6)[: len(self.free_velocity)]
         if isinstance(self.contact_map, JointedMap):
             momentum = self.contact_map.coupled(momentum)
         scale(self.contact_map.given.root, momentum, change)
         return self.free_velocity + change
+
+    def set_rate(self, world: World, momentum: Floats) -> None:
+        """Give a cell that deforms the rate of its periods in this step, for the momenta of `velocity_with`;
+        collective."""
+        if isinstance(self.contact_map, CellMap) and world.servo is not None:
+            rate = self.contact_map.rate_of(momentum.reshape(-1, 6) + self._attracted)
+            world.servo = replace(world.servo, rate=self.contact_map.cell.free + rate)
+
+    def take_flow(self, world: World, contacts: Contacts) -> None:
+        """Take the drift of the contacts from the shear and the rate of the cell."""
+        flow = contacts.flow(world, contacts.near.bodies.position)
+        self.drift = None if flow is None else np.einsum("cij,cj->ci", self.frame, flow)
 
     def impulse_on_large(self, impulse: Floats, moment: Floats | None = None) -> Floats:
         """Impulses and angular impulses D g (large, 6) on the large bodies, the same on all ranks, from the impulses
@@ -174,19 +208,25 @@ class ContactSystem:
         self.contact_map.comm.Allreduce(MPI.IN_PLACE, large)
         return large
 
-    def joint_impulses(self, impulse: Floats) -> Floats:
-        """Impulses (k,) of the rows of joints with these impulses of contacts (nc, 3) [N s, N m s]; collective."""
-        if self.joints is None or not isinstance(self.contact_map, JointedMap):
+    def joint_impulses(self, impulse: Floats, moment: Floats | None = None) -> Floats:
+        """Impulses (k,) of the rows of joints with these impulses and moments of contacts (nc, 3) [N s, N m s];
+        collective."""
+        if self.joints is None:
             return np.zeros(0)
-        return self.joints.impulses(self.contact_map.gathered(self.contact_map.free_momenta(impulse)))
+        return self.joints.impulses(self._push(impulse, moment))
 
-    def joints_with(self, world: World, impulse: Floats) -> Coupling | None:
-        """The joints of the step if these impulses of contacts (nc, 3) show that other limits and motors hold, else
-        None; collective."""
-        if self.joints is None or not isinstance(self.contact_map, JointedMap) or not self.joints.decides:
+    def joints_with(self, world: World, impulse: Floats, moment: Floats | None = None) -> Coupling | None:
+        """The joints of the step if these impulses and moments of contacts (nc, 3) show that other limits and motors
+        hold, else None; collective."""
+        if self.joints is None or not self.joints.decides:
             return None
-        push = self.contact_map.gathered(self.contact_map.free_momenta(impulse))
-        return joints_refound(world, self.joints, push)
+        return joints_refound(world, self.joints, self._push(impulse, moment))
+
+    def _push(self, impulse: Floats, moment: Floats | None) -> Floats:
+        """What contacts alone give the jointed bodies (n, 6), mass-scaled."""
+        known = self.problem_map
+        assert isinstance(known, JointedMap)
+        return known.gathered(known.free.momenta(impulse if moment is None else np.concatenate([impulse, moment])))
 
     def drive_impulse(self, large: Floats) -> Floats:
         """Impulses and angular impulses (large, 6) of the drives and loads of large bodies that have the velocities
@@ -295,6 +335,24 @@ def contact_arms(point: Floats, position: Floats, row: np.ndarray) -> Floats:
         for k in range(3):
             out[c, k] = point[c, k] - position[row[c, 0], k]
             out[c, 3 + k] = point[c, k] - position[row[c, 1], k]
+    return out
+
+
+@loop
+def rounding_of(arm: Floats, row: np.ndarray, velocity: Floats) -> Floats:
+    """Differences (nc,) that are rounding between the velocities of two bodies at their contact: 1e-12 of these [m/s].
+
+    What closes more slowly makes an overlap of 1e-12 v dt, until it counts by its gap. Bodies that fly side by side
+    would else get impulses of 1e-25 N s, and solvers take hundreds of iterations for what is noise."""
+    out = np.zeros(len(row))
+    for c in range(len(row)):
+        for k in range(2):
+            speed, spin, reach = 0.0, 0.0, 0.0
+            for i in range(3):
+                speed += abs(velocity[row[c, k], i])
+                spin += abs(velocity[row[c, k], 3 + i])
+                reach += abs(arm[c, 3 * k + i])
+            out[c] += 1e-12 * (speed + spin * reach)
     return out
 
 

@@ -50,11 +50,7 @@ def smallest(scene: Scene) -> float:
 def fastest(scene: Scene) -> float:
     """The greatest speed of a tool, or of a grain at time zero [m/s]; in a sheared cell beside the flow."""
     tools = [_top_speed(body) for body in scene.large_bodies if body.name not in scene.leaving]
-    grains = scene.expected()
-    x, y, z, *_ = grains.velocity.T
-    if scene.shear_rate is not None:
-        x = x - scene.shear_rate * grains.position[:, scene.gradient]
-    return max([*tools, float(np.hypot(np.hypot(x, y), z).max(initial=0.0))])  # squares could overflow
+    return max([*tools, float(scene.speeds(scene.expected()).max(initial=0.0))])
 
 
 def _fall(scene: Scene) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Floats
+from dem.exchange import reduced
 
 Result = TypeVar("Result")
 
@@ -49,13 +50,15 @@ def together(
     return result
 
 
-def meet(comm: MPI.Comm, where: str, failure: tuple[type[Exception], str] | None = None) -> None:
-    """Wait for all ranks at a place in the code of a scene. Raises if one has failed or is at another place."""
-    here = digest(where)
-    wrong = np.array([failure is not None, here, -here])
-    comm.Allreduce(MPI.IN_PLACE, wrong, MPI.MAX)
-    if not wrong[0] and wrong[1] == -wrong[2]:
-        return
+def meet(
+    comm: MPI.Comm, where: str, failure: tuple[type[Exception], str] | None = None, number: float = 0.0
+) -> float:
+    """Wait for all ranks at a place in the code of a scene; the sum of a number over them. Raises if one has failed or
+    is at another place."""
+    here = digest(where) >> 8  # 52 bits
+    (total,), (wrong, most, least) = reduced(comm, (number,), (failure is not None, here, -here))
+    if not wrong and most == -least:
+        return total
     places, failures = zip(*comm.allgather((where, failure)))
     failed = [rank for rank in range(comm.size) if failures[rank]]
     if failed:
@@ -64,9 +67,8 @@ def meet(comm: MPI.Comm, where: str, failure: tuple[type[Exception], str] | None
         remark = "" if len(alike) == comm.size else f" ({_ranks(alike)} of {comm.size})"
         others = [rank for rank in failed if rank not in alike]
         raise kind(text + remark + (f"; another failure on {_ranks(others)}" if others else ""))
-    if len(set(places)) > 1:
-        listed = ", ".join(f"rank {rank} at {place}" for rank, place in enumerate(places))
-        raise SceneError(f"the code of a scene must make the same calls on all ranks, but {listed}")
+    listed = ", ".join(f"rank {rank} at {place}" for rank, place in enumerate(places))
+    raise SceneError(f"the code of a scene must make the same calls on all ranks, but {listed}")
 
 
 def digest(words: str) -> int:
@@ -79,20 +81,26 @@ def unlike(comm: MPI.Comm, words: str, numbers: Sequence[Floats] = (), rounding:
 
     Of each array its shape and a sum with fixed weights are compared. Sums may differ by ``rounding`` times the largest
     number and the root of their count, as processors of other kinds have other last bits."""
-    arrays = [np.ravel(array).astype(float) for array in numbers]
-    here = np.array([digest(words + str([np.shape(array) for array in numbers])), *(_weighted(x) for x in arrays)])
+    sums, sizes = zip(*(_weighted(np.ravel(array)) for array in numbers)) if numbers else ((), ())
+    here = np.array([digest(words + str([np.shape(array) for array in numbers])), *sums])
     first = comm.bcast(here)
     same = len(here) == len(first) and here[0] == first[0]
     if same:
-        sizes = [np.abs(x[np.isfinite(x)]).max(initial=0.0) * max(len(x), 1) ** 0.5 for x in arrays]
         same = bool(np.all(np.abs(here - first)[1:] <= rounding * np.array(sizes)))
     found = comm.allreduce(comm.size if same else comm.rank, MPI.MIN)
     return found % comm.size
 
 
-def _weighted(x: Floats) -> float:
-    weight = (np.arange(1, len(x) + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)).astype(float) / 2.0**64
-    return float(weight @ np.where(np.isfinite(x), x, 0.25 * np.pi))
+def _weighted(numbers: Floats) -> tuple[float, float]:
+    """The sum of numbers (n,) with fixed weights, and the largest number times the root of n."""
+    total, most, many = 0.0, 0.0, 2**16
+    for start in range(0, len(numbers), many):  # as the array may be large
+        x = numbers[start : start + many].astype(float)
+        place = np.arange(start + 1, start + len(x) + 1, dtype=np.uint64)
+        weight = (place * np.uint64(0x9E3779B97F4A7C15)).astype(float) / 2.0**64
+        total += float(weight @ np.where(np.isfinite(x), x, 0.25 * np.pi))
+        most = max(most, float(np.abs(x[np.isfinite(x)]).max(initial=0.0)))
+    return total, most * len(numbers) ** 0.5
 
 
 def in_words(error: BaseException) -> str:

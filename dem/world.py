@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, checks, joints, loads, quaternion, springs
+from dem import bodies, checks, joints, loads, quaternion, sources, springs
 from dem import motion as motions
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
@@ -22,6 +22,7 @@ from dem.joints import Joint
 from dem.loads import Load, On
 from dem.motion import Dynamic, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
 from dem.pairs import Pairs
+from dem.polyhedra import Solid
 from dem.scene import LargeBody, SurfaceVelocity, checked_surface
 from dem.sources import Outlet, Source, Tally, as_array
 from dem.springs import Spring
@@ -49,10 +50,18 @@ class Shear:
 
 @dataclass(frozen=True)
 class Servo:
-    """The stresses that a periodic cell is to have: its periods change, and all centres with them; see `dem.servo`."""
+    """The stresses or strain rates that a periodic cell is to have: its periods change, and all centres with them; see
+    `dem.servo`."""
 
-    asked: Floats  #: (3,) along x, y, z, positive in compression; NaN: the period stays as it is [Pa]
-    rate: Floats  #: (3,) at which the periods grow in the next step, over themselves [1/s]
+    asked: Floats  #: (3,) stresses along x, y, z, positive in compression; NaN: none [Pa]
+    strain: Floats  #: (3,) strain rates in the place of the stresses from `start` on, likewise [1/s]
+    start: float = 0.0  #: [s]
+    rate: Floats = field(default_factory=lambda: np.zeros(3))  #: (3,) of the periods in the last step, over them [1/s]
+
+    def given_at(self, time: float, dt: float) -> Floats:
+        """Rates (3,) at which the periods are to grow in the step of dt [s] from the `time` [s]; NaN: what the asked
+        stress needs, or none [1/s]."""
+        return -self.strain if time >= self.start - 1e-6 * dt else np.full(3, np.nan)
 
 
 @dataclass
@@ -79,6 +88,7 @@ class World:
     outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
     tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets, by name
     clumps: tuple[Form, ...] = ()  #: shapes of grains, by their numbers
+    polyhedra: tuple[Solid, ...] = ()  #: shapes of grains, by their numbers
     initial: int = 0  #: number of grains at time zero
     first_large: int = 0  #: id of the first large body
     shear: Shear | None = None  #: of the cell
@@ -95,6 +105,8 @@ class World:
     springs_set: set[str] = field(init=False, default_factory=set)  #: springs with other numbers than the scene gave
 
     joints_set: set[str] = field(init=False, default_factory=set)  #: joints with other numbers than the scene gave
+
+    sources_set: set[str] = field(init=False, default_factory=set)  #: sources that the scene gave otherwise
 
     lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
 
@@ -123,15 +135,17 @@ class World:
         if self.shear is not None:
             replicated["shear"] = np.array([self.shear.rate, self.shear.shift])
         if self.servo is not None:
-            replicated["servo"] = np.array([self.servo.asked, self.servo.rate, self.period])
+            servo = self.servo
+            replicated["servo"] = np.array([servo.asked, servo.strain, [servo.start] * 3, servo.rate, self.period])
         return self.grains.columns(), replicated
 
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
         self.grains, self.lists, self.applied = grains, None, {}
-        counts, spheres = zip(*self.comm.allgather((len(grains), bool((grains.shape == bodies.SPHERE).all()))))
-        self.slabs = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        self.only_spheres = all(spheres)
+        everyone = np.zeros((self.comm.size + 1, 2), np.int64)
+        self.comm.Allgather(np.array([len(grains), (grains.shape != bodies.SPHERE).any()], np.int64), everyone[1:])
+        self.slabs = np.cumsum(everyone[:, 0])
+        self.only_spheres = not everyone[:, 1].any()
 
     @property
     def ids(self) -> int:
@@ -185,8 +199,7 @@ class World:
         """Places (3,) and quaternions (4,) of the large bodies of prescribed motion at `time` [s], by row; collective.
         SceneError if a motion fails."""
         if time not in self._poses:  # the end of a step is the start of the next
-            found = together(self.comm, "motion of a large body", lambda: self._each(time))
-            self._poses = {**dict([*self._poses.items()][-1:]), time: found}
+            self._keep(time, together(self.comm, "motion of a large body", lambda: self._each(time)))
         return self._poses[time]
 
     def prescribed_velocity(self, dt: float) -> Floats:
@@ -194,16 +207,22 @@ class World:
         SceneError if a motion fails."""
         asked = (self.time, dt)
         if asked not in self._followed:  # a step asks several times
-            start, end = self.poses(self.time), self.poses(self.time + dt)
+            start = self.poses(self.time)
 
-            def follow() -> dict[int, Floats]:
-                return {row: velocity_between(start[row], end[row], dt) for row in start}
+            def follow() -> tuple[dict[int, Pose], dict[int, Floats]]:
+                end = self._poses.get(self.time + dt) or self._each(self.time + dt)
+                return end, {row: velocity_between(start[row], end[row], dt) for row in start}
 
-            self._followed = {asked: together(self.comm, "motion of a large body", follow)}
+            end, means = together(self.comm, "motion of a large body", follow)
+            self._followed = {asked: means}
+            self._keep(self.time + dt, end)
         velocity = self.large.velocity.copy()
         for row, mean in self._followed[asked].items():
             velocity[row] = mean
         return velocity
+
+    def _keep(self, time: float, poses: dict[int, Pose]) -> None:
+        self._poses = {**dict([*self._poses.items()][-1:]), time: poses}
 
     def _each(self, time: float) -> dict[int, Pose]:
         return {
@@ -253,12 +272,22 @@ def set_shear_rate(world: World, rate: float) -> None:
 
 
 def set_stress(world: World, stress: Any) -> None:
-    """Ask for other stresses (3,) of the cell along x, y, z [Pa] from now on; None: the period stays as it is.
-    ValueError if the scene has no `stress`."""
+    """Ask for other stresses (3,) of the cell along x, y, z [Pa] from now on; None: none. ValueError if the scene has
+    neither `stress` nor `strain_rate`."""
+    world.servo = dataclasses.replace(_servo(world, "stress"), asked=checks.stress(stress))
+
+
+def set_strain_rate(world: World, strain_rate: Any) -> None:
+    """Compress the cell at other rates (3,) along x, y, z [1/s] from now on; None: the stress that is asked for, or
+    none. ValueError as of `set_stress`."""
+    servo = _servo(world, "strain_rate")
+    world.servo = dataclasses.replace(servo, strain=checks.strain_rate(strain_rate), start=world.time)
+
+
+def _servo(world: World, what: str) -> Servo:
     if world.servo is None:
-        raise ValueError("stress: the periods of this scene are constant; give the Scene a stress along an axis")
-    asked = checks.stress(stress)
-    world.servo = Servo(asked, np.where(np.isnan(asked), 0.0, world.servo.rate))
+        raise ValueError(f"{what}: the periods of this scene are constant; give the Scene a stress or a strain_rate")
+    return world.servo
 
 
 def set_load(world: World, name: str, on: On = None, **values: Any) -> None:
@@ -293,6 +322,22 @@ def set_spring(world: World, name: str, **values: Any) -> None:
     world.springs[name] = dataclasses.replace(world.springs[name], **values)
     world.springs_set.add(name)
     world.applied = {}
+
+
+def set_source(world: World, name: str, **values: Any) -> None:
+    """Give a source another `mass_rate` [kg/s] or `number_rate` [1/s], and `velocity` [m/s], from now on. ValueError
+    for what it cannot have."""
+    if name not in world.sources:
+        raise ValueError(f"no source {name!r}; there are: {', '.join(world.sources) or 'none'}")
+    world.sources[name] = world.sources[name].changed(world.time, world.tallies[name], **values)
+    world.sources_set.add(name)
+
+
+def restore_sources(world: World, text: str) -> None:
+    """Give a world, made from its scene, the sources of `dem.sources.as_text`. ValueError if that fails."""
+    for name, source in sources.from_text(text, world.sources).items():
+        world.sources[name] = source
+        world.sources_set.add(name)
 
 
 def set_joint(world: World, name: str, **values: Any) -> None:

@@ -2,52 +2,81 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+DOCS = Path(__file__).resolve().parent
+sys.path[:0] = [str(DOCS.parent), str(DOCS)]
 
 import petsc4py
 
 petsc4py.init([])  # before modules of pctt take what the command line of sphinx-build says
 
+import pages
+
 import pctt
-from pctt.run.help import help_text
 
 project = "pctt"
 author = copyright = "The pctt developers"
 release = version = pctt.__version__
 
-extensions = ["myst_parser", "sphinx_copybutton"]
+extensions = ["myst_parser", "sphinx_copybutton", "sphinx_design"]
 extensions += [f"sphinx.ext.{name}" for name in ("autodoc", "napoleon", "mathjax", "viewcode")]
-exclude_patterns = ["examples/*"]
-myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
+exclude_patterns = ["examples/*", "made/*.md", "paper/*"]
+myst_enable_extensions = ["attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 
 default_role = "code"
 napoleon_google_docstring = False
+napoleon_use_ivar = True
 
 suppress_warnings = ["ref.python"]  # words of a description that are names of members too
 
 html_theme = "furo"
-html_title = f"pctt {release}"
+html_title = f"pctt {release}"  # at the head of every page
+# one file of MathJax, so that formulas show without a network
+mathjax = Path(importlib.util.find_spec("sphinx-mathjax-offline").origin).parent / "static" / "mathjax" / "tex-svg.js"
+html_static_path = ["_static", str(mathjax)]
+html_show_search_summary = False  # the search would need a server
+html_css_files = ["tables.css"]
+html_favicon = "_static/icon.svg"
+mathjax_path = mathjax.name
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings say shapes and units
-autodoc_default_options = {"members": True, "show-inheritance": False}
+autodoc_default_options = {"members": True}
 
 
 def as_text(app, what, name, obj, options, lines: list[str]) -> None:
-    """Docstrings are text with formulas in it: |g| is no substitution and g* no emphasis, but within ``literals``."""
+    """Docstrings are text with formulas in it: |g| is no substitution and g* no emphasis, but within ``literals``.
+    Where there are no sections of numpydoc, lines such as "name, other : meaning" become fields."""
+    sections = any(line.startswith("---") for line in lines)
+    if what in ("attribute", "property"):
+        lines.insert(0, "")  # else napoleon takes words before a colon for a type
+    if sections:  # a doctest after the last section is none of its parameters
+        starts = [i for i, line in enumerate(lines) if line.startswith(">>>") and not lines[i - 1]]
+        lines[:] = lines[: starts[0]] + ["Examples", "--------"] + lines[starts[0] :] if starts else lines
     for i, line in enumerate(lines):
+        if line.startswith((">>>", "...")):
+            continue
+        line = line if sections else re.sub(r"^([a-z]\w*(?:, \w+)*) : ", r":\1: ", line)
         parts = line.split("``")
         parts[::2] = [re.sub(r"([|*]|_(?=\W|$))", r"\\\1", part) for part in parts[::2]]
         lines[i] = "``".join(parts)
 
 
+def mark_long_cells(app, doctree, name: str) -> None:
+    """Cells of tables with several words are not to be narrow: _static/tables.css."""
+    from docutils import nodes
+
+    for cell in doctree.findall(nodes.entry):
+        words = len(cell.astext().split())
+        cell["classes"] += ["long"] * (words > 10) or ["some"] * (words > 2)
+
+
 def setup(app) -> None:
     app.connect("autodoc-process-docstring", as_text, priority=100)  # before napoleon
-    text = help_text({})
-    (Path(app.srcdir) / "options.txt").write_text(text + "\n")
+    app.connect("doctree-resolved", mark_long_cells)
+    pages.write(Path(app.srcdir))

@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from pctt.simulation import Settings as Settings
     from pctt.simulation import Simulation as Simulation
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
+__all__ = ["Settings", "Simulation"]  # noqa: F822, made at first use
 
 
 def __getattr__(name: str) -> Any:

@@ -38,24 +38,35 @@ class BodyOperator:
         self._matrix: BodyMatrix | None = None
         self.load(contact_map)
         self.mat = symmetric_shell(contact_map.comm, 6 * contact_map.columns, 6, self._product)
+        self._x, self._y = self.mat.createVecs()
 
     def load(self, contact_map: ContactMap) -> None:
         """Take another map of the same structure."""
         self.contact_map, self._loaded = contact_map, False
 
     def update(self, inverse: Array, symmetric: bool = True) -> None:
-        """Take the blocks H (nc, 3, 3) of K, which may be unsymmetric."""
+        """Take the blocks H (nc, 3, 3) of K, which may be unsymmetric, or those (nc, 6, 6) of contacts with moments: K
+        is then multiplied by its entries, as no loop has these blocks."""
         self._inverse, self._made = inverse, False
-        self._weight = self.contact_map.weights(inverse, symmetric)
-        set_diagonal_blocks(self.mat, self.contact_map.body_blocks(self._weight), symmetric)
+        if inverse.shape[1] == 3:
+            self._weight = self.contact_map.weights(inverse, symmetric)
+            set_diagonal_blocks(self.mat, self.contact_map.body_blocks(self._weight), symmetric)
+        else:
+            set_diagonal_blocks(self.mat, self.entries().diagonal_blocks, symmetric)
 
     def _product(self, v: Array, out: Array) -> None:
-        self.contact_map.through(self._weight, v, out)
+        if self._inverse.shape[1] == 3:
+            self.contact_map.through(self._weight, v, out)
+        else:
+            self._x.array[:] = v.ravel()
+            self.entries().mat.mult(self._x, self._y)
+            out[:] = self._y.array_r.reshape(out.shape)
 
     def entries(self) -> BodyMatrix:
         """The entries of K with its present values; collective."""
         if self._matrix is None:
-            self._matrix = BodyMatrix(self.contact_map.comm, self.contact_map.block_rows)
+            parts = self._inverse.shape[1] // 3
+            self._matrix = BodyMatrix(self.contact_map.comm, self.contact_map.block_rows, parts)
         elif not self._loaded:
             self._matrix.load(self.contact_map.block_rows)
         if not self._made:
@@ -64,7 +75,8 @@ class BodyOperator:
         return self._matrix
 
     def destroy(self) -> None:
-        self.mat.destroy()
+        for thing in (self.mat, self._x, self._y):
+            thing.destroy()
         if self._matrix is not None:
             self._matrix.destroy()
 
@@ -82,10 +94,12 @@ class BodyMatrix:
 
     Each rank multiplies the rows of its own contacts. It sends the blocks of bodies that other ranks own to these
     ranks, by a pattern that is computed once. The blocks are always added in the same order.
+
+    parts : block rows of G for each contact, which are so many times as many as contacts: 2 with moments
     """
 
-    def __init__(self, comm: MPI.Comm, G: BlockRows):
-        self.comm = comm
+    def __init__(self, comm: MPI.Comm, G: BlockRows, parts: int = 1):
+        self.comm, self._parts = comm, parts
         self._whole: PETSc.Mat | None = None
         # 64 bits, because each pair of bodies gets a number
         self.bodies, column = np.unique(np.asarray(G.indices, np.int64), return_inverse=True)
@@ -101,18 +115,21 @@ class BodyMatrix:
             self._columns = self._rows.T.tobsr()
 
     def _product(self, inverse: Array) -> sp.bsr_matrix:
-        """G' H G of the contacts and bodies of this rank, for the blocks H (nc, 3, 3)."""
-        count = len(inverse)
+        """G' H G of the contacts and bodies of this rank, for the blocks H (nc, 3 parts, 3 parts)."""
+        count, parts = len(inverse), self._parts
         if len(self.bodies) == 0:
             return sp.bsr_matrix((0, 0), blocksize=(6, 6))
-        weight = sp.bsr_matrix((inverse, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
+        blocks = inverse.reshape(count, parts, 3, parts, 3).transpose(1, 0, 3, 2, 4).reshape(-1, 3, 3)
+        column = np.tile((np.arange(count)[:, None] + count * np.arange(parts)).ravel(), parts)
+        rows = parts * count
+        weight = sp.bsr_matrix((blocks, column, parts * np.arange(rows + 1)), shape=(3 * rows, 3 * rows))
         return self._columns @ (weight @ self._rows)
 
     def _index(self, G: BlockRows) -> None:
         """Find the owners of the blocks to which this rank's contacts contribute, and the pattern of the own rows."""
         starts = offsets(self.comm, G.columns)
         self._first, own = int(starts[self.comm.rank]), G.columns
-        local = self._product(np.tile(np.eye(3), (G.rows, 1, 1)))
+        local = self._product(np.tile(np.eye(3 * self._parts), (G.rows // self._parts, 1, 1)))
         row = np.repeat(self.bodies, np.diff(local.indptr))
         column = self.bodies[local.indices]
         self._owner = np.searchsorted(starts, row, side="right") - 1
@@ -129,7 +146,7 @@ class BodyMatrix:
         self._sizes = ((6 * own, PETSc.DETERMINE), (6 * own, PETSc.DETERMINE))
 
     def update(self, inverse: Array) -> None:
-        """Compute K for the blocks H (nc, 3, 3)."""
+        """Compute K for the blocks H (nc, 3 parts, 3 parts)."""
         blocks = self._product(inverse).data.reshape(-1, 6, 6)
         self._values = np.zeros((len(self._indices), 6, 6))
         self._values[self._own_places] = blocks[~self._away] if self._away.any() else blocks
@@ -138,6 +155,12 @@ class BodyMatrix:
             np.add.at(self._values, self._received_places, received["blocks"])
         self._values[self._diagonal] += np.eye(6)
         self._current = False
+
+    @property
+    def diagonal_blocks(self) -> Array:
+        """Those of this rank's bodies (n, 6, 6)."""
+        blocks: Array = self._values[self._diagonal]
+        return blocks
 
     def _indptr(self, rows: np.ndarray) -> np.ndarray:
         """Where each of this rank's block rows begins in the sorted ``rows`` of blocks."""

@@ -21,6 +21,7 @@ Found = TypeVar("Found")
 
 #: The last bytes of a file of `write_rows` are this word and its checksum. HDF5 does not see them.
 SEAL = b"pctt sum"
+CHUNK = 2**23  #: bytes of which a checksum is found at a time
 
 
 class FileError(RuntimeError):
@@ -171,19 +172,38 @@ def hdf5(path: Path) -> Iterator[h5py.File]:
 
 
 def checksum(path: Path, size: int, comm: MPI.Comm) -> int:
-    """The checksum modulo 2^64 of the first ``size`` bytes of a file, of which each rank reads a part; collective.
-
-    It is the sum of (2 i + 1) u_i over the numbers u_i of eight bytes. The factors are odd, so that one flipped bit
-    always changes the sum."""
-    count, chunk, total = -(-size // 8), 1 << 20, np.zeros(1, np.uint64)
-    first, last = count * comm.rank // comm.size, count * (comm.rank + 1) // comm.size
+    """The checksum of the first ``size`` bytes of a file, of which each rank reads a part; collective."""
+    ends = [size * rank // comm.size for rank in (comm.rank, comm.rank + 1)]
     with open(path, "rb") as file:
-        file.seek(8 * first)
-        for start in range(first, last, chunk):
-            data = file.read(min(8 * min(start + chunk, last), size) - 8 * start)
-            words = np.frombuffer(data + bytes(-len(data) % 8), "<u8")
-            total += np.dot(words, np.arange(2 * start + 1, 2 * (start + len(words)) + 1, 2, dtype=np.uint64))
-    return int(comm.allreduce(total)[0])
+        total = _of_range(file, *ends)
+    comm.Allreduce(MPI.IN_PLACE, total)
+    return int(total[0])
+
+
+def _of_range(file: Any, start: int, end: int) -> np.ndarray:
+    """What the bytes of a file from ``start`` on and before ``end`` add to its checksum, read part by part."""
+    total = np.zeros(1, np.uint64)
+    file.seek(start)
+    while start < end and (data := file.read(min(end - start, CHUNK))):
+        total += summed(np.frombuffer(data, np.uint8), start)
+        start += len(data)
+    return total
+
+
+def summed(data: np.ndarray, start: int) -> np.ndarray:
+    """What bytes (n,) that are in a file from the place ``start`` on add to its checksum (1,), modulo 2^64.
+
+    That is the sum of (2 i + 1) u_i over the numbers u_i of eight bytes. The factors are odd, so that one flipped bit
+    always changes the sum. Each byte adds its own part: so the ranks that write a file know its sum without reading
+    it."""
+    total = np.zeros(1, np.uint64)
+    for first in range(0, len(data), CHUNK):
+        part, (word, lead) = data[first : first + CHUNK], divmod(start + first, 8)
+        padded = np.zeros(-(-(lead + len(part)) // 8) * 8, np.uint8)
+        padded[lead : lead + len(part)] = part
+        words = padded.view("<u8")
+        total += np.dot(words, np.arange(2 * word + 1, 2 * (word + len(words)) + 1, 2, dtype=np.uint64))
+    return total
 
 
 def texts(words: Sequence[str]) -> np.ndarray:
@@ -201,13 +221,18 @@ def write_rows(
     that are ``shared`` and the attributes of groups ("/": the file) are the same on each.
 
     Raises FileError on all ranks if the file cannot be written; an earlier file under ``path`` then stays as it is. The
-    first rank makes the file, and then every rank writes its rows into their places, without HDF5. So this needs no
-    parallel HDF5, some releases of which wait for ever if one rank finds the disk full.
+    first rank makes the file, and then every rank writes its rows into their places, without HDF5, and waits until they
+    are on the disk: all do so at once. So this needs no parallel HDF5, some releases of which wait for ever if one rank
+    finds the disk full.
     """
-    ends = np.cumsum(comm.allgather([len(local) for local in rows.values()]), axis=0)
+    ends = np.empty((comm.size, len(rows)), np.int64)
+    comm.Allgather(np.array([len(local) for local in rows.values()], np.int64), ends)
+    ends = np.cumsum(ends, axis=0)
     tables = [(name, (int(end), *rows[name].shape[1:]), rows[name].dtype) for name, end in zip(rows, ends[-1])]
+    mine = [np.ascontiguousarray(local).reshape(-1).view(np.uint8) for local in rows.values()]
 
-    def lay_out() -> tuple[Path, list[int | None]]:
+    def lay_out() -> tuple[Path, list[int | None], int, np.ndarray]:
+        """The temporary file, the places of the rows, its size, and the checksum of all that is no row."""
         temporary = first.enter_context(whole(path))
         with hdf5(temporary) as file:
             places = [_room(file, *table) for table in tables]
@@ -215,28 +240,34 @@ def write_rows(
                 file[name] = np.asarray(value)
             for name, values in attributes.items():
                 file.require_group(name).attrs.update(values)
-        return temporary, places
+        sizes = [int(np.prod(shape)) * dtype.itemsize for _, shape, dtype in tables]
+        spans = sorted((place, place + size) for place, size in zip(places, sizes) if place is not None)
+        end = max([os.path.getsize(temporary), *(last for _, last in spans)])
+        with open(temporary, "rb") as data:
+            between = zip([0, *(last for _, last in spans)], [*(place for place, _ in spans), end])
+            rest = sum((_of_range(data, *gap) for gap in between), np.zeros(1, np.uint64))
+        return temporary, places, int(end), rest
 
-    def fill() -> int:
+    def fill() -> None:
         with open(temporary, "r+b") as file:
-            for local, place, end in zip(rows.values(), places, ends[comm.rank]):
-                if place is not None:
-                    file.seek(place + local[:1].nbytes * (int(end) - len(local)))
-                    file.write(local.tobytes())
+            for place, data in written:
+                file.seek(place)
+                file.write(data.data)
+            if comm.rank == 0:
+                file.seek(size)
+                file.write(SEAL + int(total[0]).to_bytes(8, "little"))
             file.flush()
             os.fsync(file.fileno())
-            return os.path.getsize(temporary)
-
-    def finish() -> None:
-        with open(temporary, "ab") as file:
-            file.write(SEAL + total.to_bytes(8, "little"))
-        first.close()
 
     with ExitStack() as first:  # what the first rank has open
-        temporary, places = on_first(comm, path, lay_out)
-        size = _together(f"{path}: cannot write", comm, fill)
-        total = checksum(temporary, comm.bcast(size), comm)
-        on_first(comm, path, finish)
+        temporary, places, size, total = on_first(comm, path, lay_out)
+        before = [local[:1].nbytes * (int(end) - len(local)) for local, end in zip(rows.values(), ends[comm.rank])]
+        written = [(place + start, data) for place, start, data in zip(places, before, mine) if place is not None]
+        here = sum((summed(data, place) for place, data in written), np.zeros(1, np.uint64))
+        comm.Allreduce(MPI.IN_PLACE, here)
+        total = total + here
+        _together(f"{path}: cannot write", comm, fill)
+        on_first(comm, path, first.close)
 
 
 def _room(file: h5py.File, name: str, shape: tuple[int, ...], dtype: np.dtype) -> int | None:

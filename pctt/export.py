@@ -1,9 +1,9 @@
 """``python -m pctt.export DIR``: the recorded steps of a run as time series for ParaView, or as one HDF5 file.
 
-The program writes DIR/paraview/bodies.pvd, contacts.pvd and large.pvd. Each is a list of .vtp files, one per step. Any
-number of ranks share the steps. Every ParaView and VTK of the last fifteen years reads these formats. With
-``-format vtkhdf`` the first rank writes bodies.vtkhdf, contacts.vtkhdf and large.vtkhdf instead, for ParaView 5.12 or
-newer. Each of these files has all steps.
+The program writes DIR/paraview/bodies.pvd, contacts.pvd and large.pvd, and polyhedra.pvd if there are such grains. Each
+is a list of .vtp files, one per step. Any number of ranks share the steps. Every ParaView and VTK of the last fifteen
+years reads these formats. With ``-format vtkhdf`` the first rank writes files of these names and the ending .vtkhdf
+instead, for ParaView 5.12 or newer. Each of these files has all steps.
 
 With ``-single FILE.h5`` the first rank writes one HDF5 file instead. It has the data that state.h5 links to, in the
 same groups.
@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from dem.bodies import CLUMP
+from dem.bodies import CLUMP, POLYHEDRON
 from pctt.disk import FileError, hdf5, whole, write_text
 from pctt.folder import RUN_FILES, Folder, Frame
 from pctt.look.program import chosen, made_folder, parser, run, told_steps
@@ -53,24 +53,25 @@ def main(comm: MPI.Comm) -> None:
     from pctt.look.surfaces import Scene  # imported here, because it needs vtk and -help does not
 
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # the writers' results are checked
+    names = [*SERIES, *(["polyhedra"] if folder.polyhedra else [])]
     scene = Scene(folder, [folder.frame(step) for step in (steps[0], steps[-1])])
     if given.format == "vtp":
         times = {}
         for step in steps[comm.rank :: comm.size]:
             frame = folder.frame(step)
             times[step] = frame.time
-            for name in SERIES:
+            for name in names:
                 write_vtp(target / f"{name}_{step:06d}.vtp", series(name, scene, frame), frame.time)
         shared = comm.gather(times)
     if comm.rank == 0:
-        for name in SERIES:
+        for name in names:
             if given.format == "vtp":
                 together = {step: time for part in shared or [] for step, time in part.items()}
                 write_pvd(target / f"{name}.pvd", {f"{name}_{step:06d}.vtp": together[step] for step in steps})
             else:
                 write_vtkhdf(target / f"{name}.vtkhdf", name, scene, steps)
         kind = "pvd" if given.format == "vtp" else "vtkhdf"
-        print(f"{told_steps(folder, steps)}: {target}/" + ", ".join(f"{name}.{kind}" for name in SERIES))
+        print(f"{told_steps(folder, steps)}: {target}/" + ", ".join(f"{name}.{kind}" for name in names))
     comm.Barrier()  # all files exist when any rank returns
 
 
@@ -98,8 +99,9 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
 
 
 def series(name: str, scene: Any, frame: Frame) -> Any:
-    """One step of the series ``name``, one of SERIES, as vtkPolyData; ``scene`` is a `pctt.look.surfaces.Scene`."""
-    return {"bodies": bodies, "contacts": contacts, "large": large}[name](scene, frame)
+    """One step of the series ``name``, one of SERIES or polyhedra, as vtkPolyData; ``scene`` is a
+    `pctt.look.surfaces.Scene`."""
+    return {"bodies": bodies, "contacts": contacts, "large": large, "polyhedra": polyhedra}[name](scene, frame)
 
 
 def bodies(scene: Any, frame: Frame) -> Any:
@@ -107,18 +109,38 @@ def bodies(scene: Any, frame: Frame) -> Any:
 
     Scale a unit sphere or box by the vector `extent` and turn it by `quaternion`: the result is the grain. `radius` is
     the radius of the sphere that encloses the grain. A clump has a point for each of its spheres instead, with the
-    `extent` of the sphere; its other columns are those of the clump.
+    `extent` of the sphere; its other columns are those of the clump. Polyhedra have the `extent` of the sphere about
+    them.
     """
     from pctt.look import surfaces
 
     table, grains = frame.table, slice(frame.table.grains)
     clump, place, radius = surfaces.members(frame)
-    whole = np.flatnonzero(table.shape[grains] < CLUMP)
+    shape = table.shape[grains]
+    whole = np.flatnonzero((shape < CLUMP) | (shape >= POLYHEDRON))
     rows = np.concatenate([whole, clump])
     data = surfaces.polydata(np.concatenate([frame.position[whole], place]), "verts", 1)
     extent = surfaces.extent(scene.folder.path, table)[rows]
     extent[len(whole) :] = 2.0 * radius[:, None]
-    columns = {
+    each = {name: column[rows] for name, column in _of_grains(frame).items()}
+    surfaces.add_arrays(data.GetPointData(), {"extent": extent, **each})
+    return data
+
+
+def polyhedra(scene: Any, frame: Frame) -> Any:
+    """The surfaces of the grains that are polyhedra, with the data of the grain for each triangle."""
+    from pctt.look import surfaces
+
+    rows, corners = surfaces.faces(frame)
+    data = surfaces.polydata(corners, "polys", 3)
+    surfaces.add_arrays(data.GetCellData(), {name: column[rows] for name, column in _of_grains(frame).items()})
+    return data
+
+
+def _of_grains(frame: Frame) -> dict[str, np.ndarray]:
+    """What the files have of each grain."""
+    table, grains = frame.table, slice(frame.table.grains)
+    return {
         "id": table.id[grains],
         "radius": table.radius,
         "quaternion": frame.quaternion[grains],
@@ -130,9 +152,6 @@ def bodies(scene: Any, frame: Frame) -> Any:
         "material": table.material[grains],
         "shape": table.shape[grains],
     }
-    each = {name: column[rows] for name, column in columns.items()}
-    surfaces.add_arrays(data.GetPointData(), {"extent": extent, **each})
-    return data
 
 
 def contacts(scene: Any, frame: Frame) -> Any:

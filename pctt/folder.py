@@ -174,6 +174,7 @@ class Table:
     material: np.ndarray  #: (n,)
     grains: int  #: the first rows
     clumps: Sequence[dict[str, Any]] = ()  #: centres (k, 3) and radii (k,) of the spheres of each clump [m]
+    polyhedra: Sequence[dict[str, Any]] = ()  #: vertices (v, 3) [m] and triangles (t, 3) of each
 
     @property
     def radius(self) -> np.ndarray:
@@ -223,8 +224,8 @@ class Folder:
             raise FileError(f"{self.path}: no recorded steps; run with -output_every 1 or more")
 
         def take(file: h5py.File, sealed: bool) -> list[Any]:
-            clumps = file["clumps"][()] if "clumps" in file else "[]"
-            return [*(file[name][()] for name in ("shape", "size", "mass", "material", "materials", "large")), clumps]
+            forms = [file[name][()] if name in file else "[]" for name in ("clumps", "polyhedra")]
+            return [*(file[name][()] for name in ("shape", "size", "mass", "material", "materials", "large")), *forms]
 
         found = disk.read(self.bodies_path, MPI.COMM_SELF, take)
         self.shape, self.size, self.mass, self.material = found[:4]
@@ -232,6 +233,7 @@ class Folder:
         self.materials: list[str] = [name.decode() for name in found[4]]
         self.large: list[dict[str, Any]] = json.loads(found[5])
         self.clumps: list[dict[str, Any]] = json.loads(found[6])
+        self.polyhedra: list[dict[str, Any]] = json.loads(found[7])
         self.grains = len(self.shape) - len(self.large)
 
     @property
@@ -239,7 +241,7 @@ class Folder:
         """What the bodies are; in scenes with sources or outlets those of the first frame, and each frame has its
         own."""
         columns = np.arange(len(self.shape)), self.shape, self.size, self.mass, self.material
-        return Table(*columns, self.grains, self.clumps)
+        return Table(*columns, self.grains, self.clumps, self.polyhedra)
 
     @property
     def radius(self) -> np.ndarray:
@@ -258,7 +260,8 @@ class Folder:
             places = {name: file[name][()] for name in ("position", "quaternion", "velocity")}
             if "id" in file:  # of a scene with sources or outlets
                 own = {name: file[name][()] for name in ("id", "shape", "size", "mass", "material")}
-                table = Table(**own, grains=len(own["id"]) - len(self.large), clumps=self.clumps)
+                count = len(own["id"]) - len(self.large)
+                table = Table(**own, grains=count, clumps=self.clumps, polyhedra=self.polyhedra)
                 rows[0] = np.searchsorted(table.id, rows[0])
             else:
                 table = self.table
@@ -371,6 +374,7 @@ class Snapshot(Folder):
         self.shape, self.size, self.mass = frame.table.shape, frame.table.size, frame.table.mass
         self.material, self.materials, self.large = frame.table.material, [*materials], large
         self.grains, self.clumps = frame.table.grains, [*frame.table.clumps]
+        self.polyhedra = [*frame.table.polyhedra]
 
     def frame(self, step: int) -> Frame:
         return self._present

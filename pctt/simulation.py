@@ -1,4 +1,4 @@
-"""A simulation as an object: make steps, look at bodies and forces, change motions, write the files of a run.
+"""A simulation as an object: make steps, look at bodies and forces, change motions, write the files of a run::
 
     import pctt
 
@@ -42,7 +42,16 @@ from dem.start import step_remark
 from dem.step import Step
 from dem.stiffness import expected_overlap
 from dem.together import meet, together
-from dem.world import set_load, set_motion, set_shear_rate, set_spring, set_stress, set_surface
+from dem.world import (
+    set_load,
+    set_motion,
+    set_shear_rate,
+    set_source,
+    set_spring,
+    set_strain_rate,
+    set_stress,
+    set_surface,
+)
 from pctt import ccp, log
 from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
@@ -52,7 +61,7 @@ from pctt.render import Picture, picture
 from pctt.run import report, state
 from pctt.run.dump import Dump
 from pctt.run.joints import JointNow
-from pctt.run.output import Place, Writer, described_bodies, described_clumps, refuse_unwritable
+from pctt.run.output import Place, Writer, described_bodies, described_forms, refuse_unwritable
 from pctt.run.settings import Run, Settings, scene_name
 from pctt.run.stepper import NoSolutionError, Stepper
 
@@ -223,6 +232,12 @@ class Simulation:
         ValueError if there is none of that name. Not collective."""
         return self._passage("source", self.world.sources, name)
 
+    def set_source(self, name: str, **values: ArrayLike) -> None:
+        """Give a source another ``mass_rate`` [kg/s] or ``number_rate`` [1/s], 0 for none, or another ``velocity``
+        [m/s] from now on. The first rank's values count, and checkpoints keep them. ValueError for what it cannot
+        have."""
+        self._change(f"source {name}", set_source, name, **values)
+
     def outlet(self, name: str) -> Tally:
         """What has left by an outlet: ``count`` and ``mass`` [kg]. ValueError if there is none of that name. Not
         collective."""
@@ -271,9 +286,9 @@ class Simulation:
     @property
     def kinetic_energy(self) -> float:
         """Of all bodies that forces move [J]."""
-        meet(self.comm, "kinetic_energy of a Simulation")
         tables = [self.world.grains] + [self.world.large] * (self.comm.rank == 0)
-        return float(self.comm.allreduce(sum(recording.energy(table, self.world.gravity)[0] for table in tables)))
+        energy = sum(recording.energy(table, self.world.gravity)[0] for table in tables)
+        return meet(self.comm, "kinetic_energy of a Simulation", number=energy)
 
     @property
     def contacts(self) -> Contacts:
@@ -321,9 +336,7 @@ class Simulation:
     def set_shear_rate(self, rate: float) -> None:
         """Shear the cell at another rate [1/s]. The first rank's value counts, and checkpoints keep it. ValueError if
         the scene has no ``shear_rate``."""
-        meet(self.comm, "shear rate")
-        change = partial(set_shear_rate, self.world, self.comm.bcast(rate))
-        together(self.comm, "shear rate", change, own=(ValueError, TypeError))
+        self._change("shear rate", set_shear_rate, rate)
 
     @property
     def period(self) -> Floats | None:
@@ -332,11 +345,16 @@ class Simulation:
         return None if self.world.period is None else self.world.period.copy()
 
     def set_stress(self, stress: Sequence[float | None]) -> None:
-        """Ask for other stresses (3,) of the cell along x, y, z, positive in compression [Pa]; None: its period stays.
-        The first rank's values count, and checkpoints keep them. ValueError if the scene has no ``stress``."""
-        meet(self.comm, "stress")
-        change = partial(set_stress, self.world, self.comm.bcast(stress))
-        together(self.comm, "stress", change, own=(ValueError, TypeError))
+        """Ask for other stresses (3,) of the cell along x, y, z, positive in compression [Pa]; None: none.
+        The first rank's values count, and checkpoints keep them. ValueError if the scene has neither ``stress`` nor
+        ``strain_rate``."""
+        self._change("stress", set_stress, stress)
+
+    def set_strain_rate(self, strain_rate: Sequence[float | None]) -> None:
+        """Compress the cell at other rates (3,) along x, y, z [1/s] from now on, in the place of a stress; None: it has
+        the stress that is asked for, or keeps its period. The first rank's values count, and checkpoints keep them.
+        ValueError if the scene has neither ``stress`` nor ``strain_rate``."""
+        self._change("strain rate", set_strain_rate, strain_rate)
 
     @property
     def springs(self) -> dict[str, Spring]:
@@ -387,26 +405,28 @@ class Simulation:
         overwrite: bool = False,
         every: int = 1,
         checkpoint_every: int = 1,
+        checkpoint_minutes: float | None = None,
         hard: int = 5,
         problems: str | Path = "",
     ) -> None:
         """From now on write the files of a run (docs/files.md) to a folder, as ``-output`` does: a frame every so many
-        steps (0: none), a checkpoint every so many, and the first ``hard`` cone problems that the solver leaves; to the
-        folder ``problems`` those of all steps.
+        steps (0: none), a checkpoint every so many, or in place of that after so many minutes, and the first ``hard``
+        cone problems that the solver leaves; to the folder ``problems`` those of all steps.
 
         ``overwrite`` replaces another run there once a step is made. A simulation loaded from the folder's own
         checkpoint goes on with its files. FileError if another run has the folder.
         """
         if self.output is not None:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
-        refuse_bad(Run(output_every=every, checkpoint_every=checkpoint_every))
+        run = Run(output_every=every, checkpoint_every=checkpoint_every, checkpoint_minutes=checkpoint_minutes)
+        refuse_bad(run)
         for name, path in {"write": folder, "problems": problems}.items():
             if path:
                 refuse_unwritable(name, Path(path), self.comm)
         place = Place(Path(folder), self.comm, self.restart, overwrite)
         about = {"scene": json.loads(self._origin["scene"]), "settings": dataclasses.asdict(self.settings)}
         about["stiffness"] = self.world.pairs.stiffness.tolist()
-        self.output = Writer(place, self.world, about, self._save, self._compare.summary, every, checkpoint_every)
+        self.output = Writer(place, self.world, about, self._save, self._compare.summary, run)
         self.stepper.dump = Dump(self.settings, self.experiment, self.world, place, hard, str(problems))
 
     def complete(self) -> None:
@@ -470,7 +490,8 @@ class Simulation:
         velocity[:grains] = velocity_in_cell(position[:grains], velocity[:grains], world.shear)
         position[:grains] = wrapped(position[:grains], world.period, world.shear)
         contacts = self.contacts if self.last else Contacts.none()
-        what = Table(**table, grains=grains, clumps=described_clumps(world))
+        forms = described_forms(world)
+        what = Table(**table, grains=grains, clumps=forms["clumps"], polyhedra=forms["polyhedra"])
         frame = Frame(self.steps, self.time, position, turn, velocity, contacts, what)
         return Snapshot(frame, materials=world.materials, large=described_bodies(world))
 

@@ -101,6 +101,18 @@ def test_both_sizes_fall_in_the_shaken_box():
     np.testing.assert_allclose(records["segregation"], (large - small) / (large + small))
 
 
+@pytest.mark.parametrize("shape", ["stones", "dodecahedra"])
+def test_the_sleeper_comes_down_on_the_ballast(shape):
+    _, records = run("ballast", 120, scene_n="2", scene_settling_time="0", scene_shape=shape)
+    assert records["force_sleeper_z [N]"].max() > 500
+    assert records["sleeper [m]"][0] > records["sleeper [m]"][-1] > records["stones [m]"][-1]
+
+
+def test_ballast_of_an_unknown_shape_is_refused():
+    with pytest.raises(ValueError, match="shape cones: allowed is one of stones"):
+        from_file(EXAMPLES / "ballast.py")(shape="cones")
+
+
 def test_the_belt_carries_the_capsules():
     _, records = run("conveyor", 100, scene_layers="1")
     assert records["arrived"][-1] > 0

@@ -131,11 +131,3 @@ def test_a_problem_is_copied_as_on_the_page_of_files(in_folder):
     exec("\n".join(lines), {"comm": MPI.COMM_SELF})
     copy = fclib.load(in_folder / "copy.hdf5", MPI.COMM_SELF)
     assert (copy.title, copy.problem.size) == ("a title", 3)
-
-
-def test_the_reference_has_all_public_names_of_the_cone_problem():
-    text = (ROOT / "docs" / "reference.md").read_text()
-    public = [name for name in ccp.__all__ if not name.isupper()]
-    assert [name for name in public if f"pctt.ccp.{name}\n" not in text] == []
-    named = re.findall(r"auto(?:class|function):: pctt\.ccp\.(\w+)\n", text)
-    assert [name for name in named if not hasattr(ccp, name)] == []

@@ -9,7 +9,7 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats, Ints
-from dem.bodies import CLUMP, PLANE, Bodies
+from dem.bodies import CLUMP, PLANE, POLYHEDRON, Bodies
 from dem.clumps import Form
 from dem.compiled import inlined, loop
 
@@ -35,7 +35,7 @@ def more_numbers(forms: Sequence[Form], grains: int) -> int:
 
 def members(table: Bodies, forms: Sequence[Form], first: int) -> Members:
     """The spheres of all clumps of a table of grains; the numbers beyond the ids go from `first` on."""
-    clump = np.flatnonzero(table.shape >= CLUMP)
+    clump = np.flatnonzero((table.shape >= CLUMP) & (table.shape < POLYHEDRON))
     which = table.shape[clump] - CLUMP
     many = np.array([len(form.radius) for form in forms])
     count = np.zeros(len(table), np.int64)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 
 from dem import bodies
 from dem.arrays import Floats, Ints
@@ -19,6 +18,7 @@ from dem.compiled import loop
 from dem.contact.broad import close_pairs
 from dem.contact.primitives import Primitives, primitives
 from dem.contact_map import Halo
+from dem.exchange import on_any
 from dem.neighbourhood import Neighbourhood, neighbourhood
 from dem.period import Images, between, images
 from dem.world import World
@@ -64,11 +64,12 @@ class Lists:
         same = all(then is now for then, now in zip(self.constant, _constant(world)))
         return same and stays(self.near.bodies.position, self.near.margin, self.margin, world.grains.position, margin)
 
+
 def grain_lists(world: World, margin: Floats, way: Floats) -> Lists:
     """Those of the last search if they hold for the margins (grains,) [m], else new ones for grains that go the `way`
     (grains,) [m] in a step; collective."""
     last = world.lists
-    if world.comm.allreduce(last is None or not last.hold(world, margin), MPI.LOR):
+    if on_any(world.comm, last is None or not last.hold(world, margin))[0]:
         world.lists = last = _new_lists(world, margin, way)
     return last
 
@@ -81,7 +82,7 @@ def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:
     wide = near if periodic is None else periodic.among(near)
     seen = wide.grains + wide.ghosts
     large = [body.shapes for body in world.large_bodies]
-    table = primitives(wide, large, world.first_large, world.clumps, world.initial)
+    table = primitives(wide, large, world.first_large, world.clumps, world.initial, world.polyhedra)
     pairs = close_pairs(table.center[:seen], table.radius[:seen] + wide.margin)
     if periodic is not None:
         pairs = between(pairs, wide)

@@ -1,7 +1,7 @@
-"""Narrow phase of capsules and half spaces, and what that of boxes and of meshes shares with it.
+"""Narrow phase of capsules and half spaces, and what that of polyhedra and of meshes shares with it.
 
 Each function takes m pairs of a first and a second shape, and returns a `Touch` if they touch in one point, else a
-`Manifold`. Spheres are in `spheres`, boxes on boxes in `box_box`, surfaces of triangles in `meshes`.
+`Manifold`. Spheres are in `spheres`, polyhedra in `polyhedra`, surfaces of triangles in `meshes`.
 
 Capsules touch at the ends of what lies side by side, and at the closest point between them; docs/mechanics.md says why.
 """
@@ -40,13 +40,6 @@ class Boxes(NamedTuple):
     center: Floats  #: (m, 3) [m]
     turn: Floats  #: (m, 3, 3) from the frame of the box to the world
     half: Floats  #: (m, 3) half extents [m]
-
-    def take(self, rows: Ints | Bools | slice) -> Boxes:
-        return Boxes(*(column[rows] for column in self))
-
-    def corners(self) -> Floats:
-        """Places (m, 8, 3), in the order of CORNERS [m]."""
-        return self.center[:, None] + (self.half[:, None] * CORNERS) @ self.turn.transpose(0, 2, 1)
 
 
 class Capsules(NamedTuple):
@@ -148,11 +141,6 @@ def balls_plane(center: Floats, radius: Floats, plane: Planes, delta: Floats) ->
     gap, normal = gap[pair, feature], -plane.outward[pair]
     ahead = radius[pair] + 0.5 * gap
     return Manifold(pair, feature, Touch(center[pair, feature] + ahead[:, None] * normal, normal, gap))
-
-
-def box_plane(box: Boxes, plane: Planes, delta: Floats) -> Manifold:
-    """The corners."""
-    return balls_plane(box.corners(), np.zeros(len(box.center)), plane, delta)
 
 
 def sphere_box(ball: Spheres, box: Boxes) -> Touch:

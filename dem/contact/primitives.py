@@ -9,10 +9,8 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats, Ints
-from dem.bodies import BOX, CAPSULE, MESH, PLANE, SPHERE, enclosing_radius
+from dem.bodies import BOX, CAPSULE, CLUMP, MESH, PLANE, POLYHEDRON, SPHERE, enclosing_radius
 from dem.clumps import Form
-from dem.contact.box_box import BOX_FEATURES as FEATURES
-from dem.contact.box_box import box_box
 from dem.contact.clumps import Members, members, more_numbers, spread
 from dem.contact.meshes import PARTS, PlacedMesh, capsule_mesh, plane_mesh, sphere_mesh
 from dem.contact.narrow import (
@@ -22,7 +20,6 @@ from dem.contact.narrow import (
     Planes,
     Spheres,
     Touch,
-    box_plane,
     capsule_box,
     capsule_capsule,
     capsule_plane,
@@ -31,28 +28,34 @@ from dem.contact.narrow import (
     reversed_touch,
     sphere_capsule,
 )
+from dem.contact.polyhedra import (
+    Hulls,
+    Polyhedra,
+    hulls_of,
+    polyhedra_planes,
+    polyhedra_polyhedra,
+    spheres_polyhedra,
+)
 from dem.contact.spheres import touch_spheres
 from dem.mesh import Mesh, Surface
 from dem.neighbourhood import Neighbourhood
+from dem.polyhedra import Solid
 from dem.shapes import Shape, placed
-
-#: What `Primitives.numbers` can be: a contact is known by two of them and a feature, in 63 bits.
-MOST_NUMBERS = int((2**63 // FEATURES) ** 0.5) - 1
 
 
 class Primitives(NamedTuple):
-    """Spheres, boxes, capsules, half spaces and meshes in the world frame; first all grains, then parts of large
+    """Spheres, polyhedra, capsules, half spaces and meshes in the world frame; first all grains, then parts of large
     bodies."""
 
     number: Ints  #: (n,) of the grain its id, of parts the numbers that follow: the same at all times
     row: Ints  #: (n,) row of the body
-    kind: Ints  #: (n,) SPHERE, BOX, CAPSULE, PLANE or MESH
+    kind: Ints  #: (n,) SPHERE, BOX, CAPSULE, PLANE, MESH, or POLYHEDRON and the number of the shape
     center: Floats  #: (n, 3); a point of the surface of a half space, the middle of a mesh [m]
     quaternion: Floats  #: (n, 4)
     size: Floats  #: (n, 3) as of `dem.shapes.placed` [m]; the normals of half spaces are those in the world
     radius: Floats  #: (n,) of the sphere about the centre that encloses it, without meaning for half spaces [m]
     surfaces: dict[int, Surface]  #: of the meshes, by row
-    numbers: int  #: more than any of `number`, and those that meshes take after theirs
+    hulls: Hulls  #: of boxes and of the polyhedra of the scene
     members: Members | None = None  #: the spheres of clumps; None in scenes without
 
     def now(self, near: Neighbourhood) -> Primitives:
@@ -90,6 +93,12 @@ class Primitives(NamedTuple):
     def box(self, rows: Ints) -> Boxes:
         return Boxes(self.center[rows], quaternion.matrix(self.quaternion[rows]), self.size[rows])
 
+    def polyhedron(self, rows: Ints) -> Polyhedra:
+        """Boxes are some."""
+        hull, size = np.maximum(self.kind[rows] - POLYHEDRON + 1, 0), self.size[rows]
+        scale = np.where(hull[:, None] > 0, size[:, :1] / self.hulls.radius[hull, None], size)
+        return Polyhedra(self.center[rows], quaternion.matrix(self.quaternion[rows]), scale, hull, self.hulls)
+
     def capsule(self, rows: Ints) -> Capsules:
         axis = quaternion.rotate(self.quaternion[rows], np.array([0.0, 0.0, 1.0]))
         return Capsules(self.center[rows], axis, self.size[rows, 1], self.size[rows, 0])
@@ -102,17 +111,18 @@ class Primitives(NamedTuple):
 
 
 def primitives(
-    near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int, clumps: Sequence[Form] = (), initial: int = 0
-) -> Primitives:
+    near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int, clumps: Sequence[Form] = (), initial: int = 0,
+    polyhedra: tuple[Solid, ...] = (),
+) -> Primitives:  # fmt: skip
     """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies, for `Primitives.now`; the
     parts are in the frames of their bodies. `grains` is the number of grains on all ranks, of which those with ids
-    below `initial` may be `clumps`."""
-    table, count = near.bodies, near.grains + near.ghosts
+    below `initial` may be `clumps`, and which may be `polyhedra`. ValueError if there are more than have names."""
+    table, count, hulls = near.bodies, near.grains + near.ghosts, hulls_of(polyhedra)
     row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
     parts_of = [shape for body in shapes for shape in body]
     kinds, centers, turns, sizes = zip(*(placed(shape) for shape in parts_of)) if parts_of else [()] * 4
     center, turn, size = (np.reshape(c, (len(row), k)) for c, k in ((centers, 3), (turns, 4), (sizes, 3)))
-    spans = [_numbers_of(shape) for shape in parts_of]
+    spans = [numbers_of(shape, hulls.features) for shape in parts_of]
     columns = {
         "number": (table.id, grains + np.cumsum([0, *spans])[:-1]),
         "row": (np.arange(count), row),
@@ -123,19 +133,24 @@ def primitives(
     }
     after = grains + sum(spans)
     numbers = after + more_numbers(clumps, initial)
-    if numbers > MOST_NUMBERS:
+    if numbers > (most := most_numbers(hulls.features)):
         raise ValueError(
-            f"{grains} grains and {numbers - grains} numbers of parts of bodies: their contacts have no names of "
-            f"64 bits; allowed are {MOST_NUMBERS} together"
+            f"{grains} grains and {numbers - grains} numbers of parts of bodies: their contacts have no keys; "
+            f"allowed are {most} together"
         )
     both = {name: np.concatenate([of_grains[:count], of_parts]) for name, (of_grains, of_parts) in columns.items()}
     return Primitives(
         **both,
         radius=enclosing_radius(both["kind"], both["size"]),
         surfaces={count + n: shape.surface for n, shape in enumerate(parts_of) if isinstance(shape, Mesh)},
-        numbers=numbers,
+        hulls=hulls,
         members=members(table.take(slice(0, count)), clumps, after) if clumps else None,
     )
+
+
+def most_numbers(features: int) -> int:
+    """The most numbers of shapes: of the two numbers of a key one is this times a feature of so many."""
+    return 2**53 // features
 
 
 def extents(shapes: list[tuple[Shape, ...]]) -> Floats:
@@ -149,23 +164,25 @@ def extents(shapes: list[tuple[Shape, ...]]) -> Floats:
     return np.array([max(extent(shape) for shape in parts) for parts in shapes])
 
 
-def _numbers_of(shape: Shape) -> int:
-    """How many numbers a part takes, that its features may be distinct: boxes have the most but for meshes."""
-    return 1 + (PARTS * shape.surface.features - 1) // FEATURES if isinstance(shape, Mesh) else 1
+def numbers_of(shape: Shape, features: int) -> int:
+    """How many numbers a part takes, that its features may be distinct: polyhedra have the most but for meshes."""
+    return 1 + (PARTS * shape.surface.features - 1) // features if isinstance(shape, Mesh) else 1
 
 
 def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     """All contacts of gap at most `delta` (m,) [m] of the pairs of rows i, j (m,); normals point from i to j. Those of
     spheres come first, in the order of the pairs.
 
-    Two half spaces have none, nor have meshes with boxes or meshes: `dem.scene` refuses those.
+    Two half spaces have none, nor have meshes with polyhedra or meshes, and capsules with polyhedra that are no boxes:
+    `dem.scene` refuses those.
     """
     pair, point, normal, gap, others = touch_spheres(
         table.kind, table.center, table.quaternion, table.size, i, j, delta
     )
     found = [Manifold(pair, np.zeros_like(pair), Touch(point, normal, gap))]
     i, j, delta = i[others], j[others], delta[others]
-    code = 8 * table.kind[i] + table.kind[j]
+    kind = np.where(table.kind >= POLYHEDRON, _POLYHEDRON, table.kind)
+    code = 8 * kind[i] + kind[j]
     for one, two in (divmod(int(kinds), 8) for kinds in np.flatnonzero(np.bincount(code))):
         rows = np.flatnonzero(code == 8 * one + two)
         if (one, two) in _TOUCH:
@@ -181,9 +198,9 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
 
 def _touching(table: Primitives, one: int, two: int, i: Ints, j: Ints, delta: Floats) -> Manifold:
     """The contacts of pairs of rows i, j (m,) of the kinds `one` and `two`; with meshes mesh by mesh."""
-    contacts, first = _TOUCH[one, two], _SHAPE[one]
-    if two != MESH:
-        return contacts(first(table, i), _SHAPE[two](table, j), delta)
+    contacts, first, second = _TOUCH[one, two]
+    if second is not None:
+        return contacts(first(table, i), second(table, j), delta)
     found = []
     for mesh in np.unique(j):
         rows = np.flatnonzero(j == mesh)
@@ -192,17 +209,25 @@ def _touching(table: Primitives, one: int, two: int, i: Ints, j: Ints, delta: Fl
     return joined(found)
 
 
-_SHAPE: dict[int, Callable[..., Any]] = {
-    SPHERE: Primitives.sphere, BOX: Primitives.box, CAPSULE: Primitives.capsule, PLANE: Primitives.plane
+#: The kind of polyhedra that are no boxes, in pairs: clumps are their spheres there.
+_POLYHEDRON = CLUMP
+
+#: For pairs of kinds the contacts, and what these take of each of the two; None: mesh by mesh.
+_TOUCH: dict[tuple[int, int], tuple[Callable[..., Manifold], Callable[..., Any], Callable[..., Any] | None]] = {
+    (SPHERE, CAPSULE): (
+        lambda ball, capsule, delta: manifold(delta, [sphere_capsule(ball, capsule)]),
+        Primitives.sphere, Primitives.capsule,
+    ),
+    (CAPSULE, CAPSULE): (capsule_capsule, Primitives.capsule, Primitives.capsule),
+    (CAPSULE, BOX): (capsule_box, Primitives.capsule, Primitives.box),
+    (CAPSULE, PLANE): (capsule_plane, Primitives.capsule, Primitives.plane),
+    (BOX, BOX): (polyhedra_polyhedra, Primitives.polyhedron, Primitives.polyhedron),
+    (BOX, _POLYHEDRON): (polyhedra_polyhedra, Primitives.polyhedron, Primitives.polyhedron),
+    (_POLYHEDRON, _POLYHEDRON): (polyhedra_polyhedra, Primitives.polyhedron, Primitives.polyhedron),
+    (SPHERE, _POLYHEDRON): (spheres_polyhedra, Primitives.sphere, Primitives.polyhedron),
+    (BOX, PLANE): (polyhedra_planes, Primitives.polyhedron, Primitives.plane),
+    (_POLYHEDRON, PLANE): (polyhedra_planes, Primitives.polyhedron, Primitives.plane),
+    (SPHERE, MESH): (sphere_mesh, Primitives.sphere, None),
+    (CAPSULE, MESH): (capsule_mesh, Primitives.capsule, None),
+    (PLANE, MESH): (plane_mesh, Primitives.plane, None),
 }  # fmt: skip
-_TOUCH: dict[tuple[int, int], Callable[..., Manifold]] = {
-    (SPHERE, CAPSULE): lambda ball, capsule, delta: manifold(delta, [sphere_capsule(ball, capsule)]),
-    (CAPSULE, CAPSULE): capsule_capsule,
-    (CAPSULE, BOX): capsule_box,
-    (CAPSULE, PLANE): capsule_plane,
-    (BOX, BOX): box_box,
-    (BOX, PLANE): box_plane,
-    (SPHERE, MESH): sphere_mesh,
-    (CAPSULE, MESH): capsule_mesh,
-    (PLANE, MESH): plane_mesh,
-}

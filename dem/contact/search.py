@@ -8,13 +8,13 @@ import numpy as np
 
 from dem import bodies
 from dem.applied import free_directions, free_turns, grains_free_velocity, large_free_velocity
-from dem.arrays import Bools, Floats, Ints, places
+from dem.arrays import Bools, Floats, Ints, Keys, places
 from dem.bodies import CAPSULE, CLUMP, MESH, SPHERE
 from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.candidates import meeting
 from dem.contact.lists import grain_lists
-from dem.contact.primitives import FEATURES, extents, touches
+from dem.contact.primitives import extents, touches
 from dem.neighbourhood import Neighbourhood, refreshed
 from dem.period import Images, refuse_short
 from dem.quaternion import cross, length
@@ -27,7 +27,7 @@ class Contacts:
     is prescribed, then the others. Each part is ordered by the row of the body that owns the contact, and then by
     key."""
 
-    key: Ints  #: (nc,) the same for the same two shapes and feature at all times and on any number of ranks
+    key: Keys  #: (nc,) the same for the same two shapes and feature at all times and on any number of ranks
     a: Ints  #: (nc,) row of the first body in `near.bodies`, the one of lower id
     b: Ints  #: (nc,) row of the second body in `near.bodies`
     body: Ints  #: (nc, 2) global indices of the two bodies
@@ -38,7 +38,7 @@ class Contacts:
     near: Neighbourhood  #: the bodies of the rows `a` and `b`
     shifts: Floats  #: (k, large, 6) the ways and turns of the large bodies that the search reckoned with [m, rad]
     moved: Floats | None = None  #: (nc, 3) from body b to its image that touches body a; None without periods [m]
-    drift: Floats | None = None  #: (nc, 3) what the cell adds to the velocity of b relative to a; None: nothing [m/s]
+    drift: Floats | None = None  #: (nc, 3) what the shear adds to the velocity of b relative to a; None: nothing [m/s]
     held_overlap: float = 0.0  #: the deepest overlap of bodies that no force can part, left out of the contacts [m]
 
     def __len__(self) -> int:
@@ -53,6 +53,14 @@ class Contacts:
         """From the centre of body a to that of body b, or of its image (nc, 3), at these positions (rows, 3) [m]."""
         way = position[self.b] - position[self.a]
         return way if self.moved is None else way + self.moved
+
+    def flow(self, world: World, position: Floats) -> Floats | None:
+        """What the cell adds to the velocities of b relative to a (nc, 3) in a step from these positions (rows, 3), by
+        its shear and by the rates of its periods; None: nothing [m/s]."""
+        if world.servo is None:
+            return self.drift
+        affine: Floats = world.servo.rate * self.way(position)
+        return affine if self.drift is None else self.drift + affine
 
     def take(self, rows: np.ndarray) -> Contacts:
         """The contacts of the given rows (index array or mask)."""
@@ -97,7 +105,7 @@ def find_contacts(
     pair, feature, touch = touches(table, i, j, reach)
     key, a, b, body, friction, weight = named(
         *(table.number, table.row, table.kind, near.index, near.bodies.material, world.pairs.friction),
-        *(table.numbers, FEATURES, near.grains, i, j, pair, feature),
+        *(table.hulls.features, near.grains, i, j, pair, feature),
     )
     contacts = Contacts(key, a, b, body, *touch, friction, near, shifts)
     if pictures is not None:
@@ -141,9 +149,6 @@ def _without_images(
     if world.shear is not None:
         boundaries = images.boundaries(contacts.b) - images.boundaries(contacts.a)
         found = replace(found, drift=np.outer(world.shear.speed * boundaries, (1.0, 0.0, 0.0)))
-    if world.servo is not None:
-        affine = world.servo.rate * found.way(near.bodies.position)
-        found = replace(found, drift=affine if found.drift is None else found.drift + affine)
     owned = np.minimum(a, b)
     weight = np.bincount(owned[owned < near.grains], minlength=near.grains).astype(float)
     return found.take(contact_order(world, near, a, b, contacts.key)), weight
@@ -160,12 +165,13 @@ def _grown(near: Neighbourhood, shifts: Floats, besides: Contacts | None) -> Boo
 
 
 @loop
-def named(number, row, kind, index, material, friction, numbers, features, grains, i, j, pair, feature):
+def named(number, row, kind, index, material, friction, features, grains, i, j, pair, feature):
     """Of contacts of the pairs of rows i, j (m,) of `Primitives`, with their number `pair` (nc,) and `feature` (nc,):
     key, rows a and b of the bodies, `index` of the bodies (nc, 2), friction; and how many each of the `grains` owns.
 
-    Keys are distinct, and the same at all times: a mesh takes further numbers for its features."""
-    key, a, b = np.empty(len(pair), np.int64), np.empty(len(pair), np.int64), np.empty(len(pair), np.int64)
+    Keys are distinct, and the same at all times: the number of the one, and that of the other with the feature. A mesh
+    takes further numbers for its features."""
+    key, a, b = np.empty(len(pair), np.complex128), np.empty(len(pair), np.int64), np.empty(len(pair), np.int64)
     body, mu, owned = np.empty((len(pair), 2), np.int64), np.empty(len(pair)), np.zeros(grains)
     for c in range(len(pair)):
         p, q = i[pair[c]], j[pair[c]]
@@ -174,7 +180,7 @@ def named(number, row, kind, index, material, friction, numbers, features, grain
             one += further
         else:
             two += further
-        key[c] = (one * numbers + two) * features + feature[c] % features
+        key[c] = complex(one, two * features + feature[c] % features)
         a[c], b[c] = row[p], row[q]
         body[c, 0], body[c, 1] = index[a[c]], index[b[c]]
         mu[c] = friction[material[a[c]], material[b[c]]]
@@ -184,7 +190,7 @@ def named(number, row, kind, index, material, friction, numbers, features, grain
     return key, a, b, body, mu, owned
 
 
-def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Ints) -> Ints:
+def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Keys) -> Ints:
     """The order of contacts of bodies in the rows a, b (nc,): first those whose solution needs no other rank, of bodies
     that this rank owns or whose motion is prescribed; each part by the row of the owner and by key."""
     foreign = np.zeros(len(near.bodies), dtype=bool)

@@ -19,15 +19,14 @@ class JointedMap(ContactMap):
 
     here, slot : own rows of jointed bodies, and their places among all of these
     coupling : K (6 n, 6 n) of the n jointed bodies, the same on all ranks
-    free : the map without joints
+    free : the map without joints, perhaps with moments
     """
 
-    def __init__(
-        self, known: ContactMap, here: Ints, slot: Ints, coupling: Floats,
-        precision: type[np.floating] = np.float64,
-    ):  # fmt: skip
-        super().__init__(known.comm, known.given, known.halo, known.body, precision)
-        self.free, self._here, self._slot, self._coupling = known, here, slot, coupling
+    has_rows = False
+
+    def __init__(self, known: ContactMap, here: Ints, slot: Ints, coupling: Floats):
+        super().__init__(known.comm, known.given, known.halo, known.body, known.precision)
+        self.free, self.rows, self._here, self._slot, self._coupling = known, known.rows, here, slot, coupling
 
     def gathered(self, v: Floats) -> Floats:
         """The rows (n, 6) of the jointed bodies among those (columns, 6) of all ranks; collective."""
@@ -43,20 +42,20 @@ class JointedMap(ContactMap):
         out[self._here] -= change[self._slot].astype(v.dtype)
         return out
 
-    def free_momenta(self, g: Floats) -> Floats:
-        """G' g (columns, 6) of the contacts without joints; collective."""
-        return super().momenta(g)
+    def of(self, known: ContactMap) -> JointedMap:
+        """The same joints in another map of these bodies."""
+        return JointedMap(known, self._here, self._slot, self._coupling)
 
     def velocities(self, v: Floats) -> Floats:
-        """G R v (nc, 3)."""
-        return super().velocities(self.coupled(shaped("velocities of bodies", v, self.columns, 6)))
+        """G R v (rows, 3)."""
+        return self.free.velocities(self.coupled(shaped("velocities of bodies", v, self.columns, 6)))
 
     def momenta(self, g: Floats) -> Floats:
         """R G' g (columns, 6)."""
-        return self.coupled(super().momenta(g))
+        return self.coupled(self.free.momenta(g))
 
     def add_delassus(self, g: Floats, y: Floats) -> None:
-        """y += G R R G' g; y (nc, 3) is C-contiguous."""
+        """y += G R R G' g; y (rows, 3) is C-contiguous."""
         y = shaped("velocities of contacts", y, self.rows, 3)
         y += self.velocities(self.momenta(g))
 
@@ -65,22 +64,25 @@ class JointedMap(ContactMap):
         return np.zeros((self.columns, 6), self.precision)
 
     def find_image(self, x: Floats, image: Floats, some: Some) -> None:
-        self._collect(x, self._m, some)
+        self.free._collect(x, self._m, some)
         image[:] = self.coupled(self._left())
 
     def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats, some: Some) -> None:
         z = image + self.precision(beta) * (image - last)
-        self._enter(self._root, self.coupled(z))
-        self._set_velocities(before, y, some)
+        self.free._enter(self._root, self.coupled(z))
+        self.free._set_velocities(before, y, some)
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
         step = new - image - self.precision(beta) * (image - last)
         return float(np.vdot(step, step))
 
+    def contact_blocks(self) -> Floats:
+        """Those of the map without joints: a scale for unknowns."""
+        return self.free.contact_blocks()
+
     def scaled(self, size: Floats, precision: type[np.floating] = np.float64) -> JointedMap:
-        """The map with its rows multiplied by ``size`` (nc, 3)."""
-        known = self.free.scaled(size, precision)
-        return JointedMap(known, self._here, self._slot, self._coupling, precision)
+        """The map with its rows multiplied by ``size`` (rows, 3)."""
+        return self.of(self.free.scaled(size, precision))
 
     @property
     def block_rows(self) -> BlockRows:  # type: ignore[override]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from dem.arrays import Floats
-from dem.compiled import inlined, loop
+from dem.compiled import PART, inlined, loop, prange
 
 
 @inlined
@@ -46,7 +46,7 @@ def push(c, arm, body, f0, f1, f2, m):
 @loop
 def set_velocities(which, frame, arm, body, before, y, w):
     """y = before + D' w (nc, 3) in the contacts ``which`` (n,), uint32; y may be ``before``. The others keep theirs."""
-    for k in range(len(which)):
+    for k in prange(len(which)):
         c = which[k]
         u0, u1, u2 = velocity_at(c, arm, body, w)
         y[c, 0] = before[c, 0] + (frame[c, 0] * u0 + frame[c, 1] * u1 + frame[c, 2] * u2)
@@ -96,6 +96,64 @@ def add_momenta_of(which, frame, arm, body, g, m):
         f1 = frame[c, 1] * g0 + frame[c, 4] * g1 + frame[c, 7] * g2
         f2 = frame[c, 2] * g0 + frame[c, 5] * g1 + frame[c, 8] * g2
         push(c, arm, body, f0, f1, f2, m)
+
+
+@loop
+def find_forces(frame, g, f):
+    """f = F' g (nc, 3), the impulses g (nc, 3) in the axes of the world."""
+    for c in prange(len(f)):
+        g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
+        f[c, 0] = frame[c, 0] * g0 + frame[c, 3] * g1 + frame[c, 6] * g2
+        f[c, 1] = frame[c, 1] * g0 + frame[c, 4] * g1 + frame[c, 7] * g2
+        f[c, 2] = frame[c, 2] * g0 + frame[c, 5] * g1 + frame[c, 8] * g2
+
+
+@loop
+def find_forces_through(arm, body, weight, w, f):
+    """f = F' H D' w (nc, 3) for the ``weight`` of `weights`."""
+    for c in prange(len(f)):
+        u0, u1, u2 = velocity_at(c, arm, body, w)
+        f[c, 0], f[c, 1], f[c, 2] = weighted(weight, c, u0, u1, u2)
+
+
+@loop
+def ends_of_bodies(body, moves):
+    """The contacts of each body that ``moves`` (bodies,): those of body i are side e % 2 of contact e // 2, for the e
+    in ends[start[i]:start[i + 1]], in the order of contacts. The others have none."""
+    start, ends = np.zeros(len(moves) + 1, np.uint32), np.empty(2 * len(body), np.uint32)
+    for c in range(len(body)):
+        for side in range(2):
+            start[body[c, side] + 1] += moves[body[c, side]]
+    for i in range(len(moves)):
+        start[i + 1] += start[i]
+    next_of = start[:-1].copy()
+    for c in range(len(body)):
+        for side in range(2):
+            i = body[c, side]
+            if moves[i]:
+                ends[next_of[i]] = 2 * c + side
+                next_of[i] += 1
+    return start, ends
+
+
+@loop
+def sum_forces(start, ends, arm, f, m):
+    """m = D g (bodies, 6) from forces f (nc, 3) of contacts, body by body, so that threads do not meet; ``start``
+    (bodies + 1,) and ``ends`` are those of `ends_of_bodies`."""
+    for i in prange(len(m)):
+        m0 = m1 = m2 = m3 = m4 = m5 = f.dtype.type(0)
+        for k in range(start[i], start[i + 1]):
+            c, side = ends[k] >> 1, ends[k] & 1
+            sign = f.dtype.type(2 * side) - f.dtype.type(1)
+            f0, f1, f2 = sign * f[c, 0], sign * f[c, 1], sign * f[c, 2]
+            r0, r1, r2 = arm[c, 3 * side], arm[c, 3 * side + 1], arm[c, 3 * side + 2]
+            m0 += f0
+            m1 += f1
+            m2 += f2
+            m3 += r1 * f2 - r2 * f1
+            m4 += r2 * f0 - r0 * f2
+            m5 += r0 * f1 - r1 * f0
+        m[i, 0], m[i, 1], m[i, 2], m[i, 3], m[i, 4], m[i, 5] = m0, m1, m2, m3, m4, m5
 
 
 @inlined
@@ -212,7 +270,7 @@ def scaled_row(root, i, x0, x1, x2, x3, x4, x5):
 @loop
 def scale(root, v, out):
     """out = R v for v and out (bodies, 6); out may have more rows."""
-    for i in range(len(root)):
+    for i in prange(len(root)):
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(
             root, i, v[i, 0], v[i, 1], v[i, 2], v[i, 3], v[i, 4], v[i, 5]
         )
@@ -228,7 +286,7 @@ def scale_extrapolated(mass, m, last_m, beta, out):
     """out = M^-1 (m + beta (m - last_m)) for the bodies of ``mass``, which is M^-1 in the format of
     `CompactRows.root`."""
     way = m.dtype.type(beta)
-    for i in range(len(mass)):
+    for i in prange(len(mass)):
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(
             mass, i, extrapolated(m, last_m, way, i, 0), extrapolated(m, last_m, way, i, 1),
             extrapolated(m, last_m, way, i, 2), extrapolated(m, last_m, way, i, 3),
@@ -240,6 +298,15 @@ def scale_extrapolated(mass, m, last_m, beta, out):
 def energy_of_step(mass, new_m, m, last_m, beta):
     """d' M^-1 d of d = new_m - (m + beta (m - last_m)), summed in double precision over the bodies of ``mass``."""
     way = m.dtype.type(beta)
+    sums = np.zeros((len(mass) + PART - 1) // PART)
+    for part in prange(len(sums)):
+        a, b = part * PART, min(part * PART + PART, len(mass))
+        sums[part] = _energy_of_part(mass[a:b], new_m[a:b], m[a:b], last_m[a:b], way)
+    return sums.sum()
+
+
+@loop
+def _energy_of_part(mass, new_m, m, last_m, way):
     energy = 0.0
     for i in range(len(mass)):
         d0 = new_m[i, 0] - extrapolated(m, last_m, way, i, 0)

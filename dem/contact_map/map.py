@@ -16,6 +16,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Floats, Ints
+from dem.compiled import threads
 from dem.contact_map import loops
 from dem.contact_map.halo import Halo, find_halo
 from dem.exchange import refuse
@@ -111,6 +112,8 @@ class ContactMap:
     precision : of the arrays that products take and return; single precision moves half of the bytes
     """
 
+    has_rows = True  #: whether `block_rows` can have it, else it is for methods that need products alone
+
     def __init__(
         self,
         comm: MPI.Comm,
@@ -202,16 +205,26 @@ class ContactMap:
     def through(self, weight: Floats, v: Floats, out: Floats) -> None:
         """out = v + G' H G v (columns, 6); out is C-contiguous."""
         v = v.reshape(-1, 6)
-        self._m[:] = 0.0
         self._enter(self._root, v)
+        if threads() > 1:
+            _, arm, body = self._arrays
+            self.halo.end_update(self._w)
+            loops.find_forces_through(arm, body, weight, self._w, self._forces)
+            self._sum_forces(self._m)
+        else:
+            self._add_through(weight)
+        np.add(v, self._left(), out=out.reshape(-1, 6))
+        self.log_flops(72 * self.rows + 18 * self.columns)
+
+    def _add_through(self, weight: Floats) -> None:
+        """The momenta G' H G v, not yet scaled by masses, of the velocities that are on their way."""
+        self._m[:] = 0.0
         self._add(loops.add_through, self._half, weight, self._w, self._m)
         self.halo.end_update(self._w)
         self._add(loops.add_through, self._away, weight, self._w, self._m)
         self.halo.begin_add(self._m)
         self._add(loops.add_through, self._rest, weight, self._w, self._m)
         self.halo.end_add(self._m)
-        np.add(v, self._left(), out=out.reshape(-1, 6))
-        self.log_flops(72 * self.rows + 18 * self.columns)
 
     def relative_velocities(self, v: Floats) -> Floats:
         """D' v (nc, 3) for the velocities (rows, 6) of all rows of a table of the halo, without a message."""
@@ -249,6 +262,10 @@ class ContactMap:
     def _collect(self, g: Floats, m: Floats, some: Some) -> None:
         """m = the momenta that the impulses of some contacts give to the bodies, not yet scaled by masses."""
         g = self._floats(shaped("impulses", g, self.rows, 3))
+        if threads() > 1:  # of all contacts
+            loops.find_forces(self._arrays[0], g, self._forces)
+            self._sum_forces(m)
+            return
         own, away = some
         m[:] = 0.0
         if len(away):
@@ -256,6 +273,24 @@ class ContactMap:
         self.halo.begin_add(m)
         loops.add_momenta_of(own, *self._arrays, g, m)
         self.halo.end_add(m)
+
+    def _sum_forces(self, m: Floats) -> None:
+        """m = the momenta of the bodies by the impulses in ``_forces``, on several threads."""
+        (start, ends), (_, arm, _), own = self._ends, self._arrays, self.columns
+        loops.sum_forces(start[own:], ends, arm, self._forces, m[own:])
+        self.halo.begin_add(m)
+        loops.sum_forces(start[: own + 1], ends, arm, self._forces, m[:own])
+        self.halo.end_add(m)
+
+    @cached_property
+    def _forces(self) -> Floats:
+        return np.zeros((self.rows, 3), self.precision)
+
+    @cached_property
+    def _ends(self) -> tuple[Ints, Ints]:
+        moves = np.zeros(self.halo.rows, bool)
+        moves[: self.columns] = moves[self.halo.ghosts] = True
+        return loops.ends_of_bodies(self.body, moves)
 
     def _add(self, loop: Callable[..., None], part: tuple[Any, ...], each: Floats, *others: Floats) -> None:
         """Run a loop over a part of the contacts, with an array (nc, ...) that has a row for each contact."""
@@ -300,6 +335,8 @@ class ContactMap:
         frame = (self.given.frame.reshape(-1, 3, 3) * size[:, :, None]).reshape(-1, 9)
         other = ContactMap(self.comm, replace(self.given, frame=frame), self.halo, self.body, precision)
         other.log_flops = self.log_flops
+        if threads() > 1:
+            other._ends = self._ends
         return other
 
     def structure(self) -> tuple[np.ndarray, ...]:

@@ -11,6 +11,7 @@ from dem.scenes.mixer import Mixer
 from dem.scenes.plane_shear import PlaneShear
 from dem.scenes.shear import Shear
 from dem.scenes.silo import Silo
+from dem.scenes.triaxial import Triaxial
 from dem.scenes.wheel import Wheel
 
 SCENES: dict[str, type[Experiment]] = {
@@ -23,6 +24,7 @@ SCENES: dict[str, type[Experiment]] = {
     "wheel": Wheel,
     "incline": Incline,
     "plane_shear": PlaneShear,
+    "triaxial": Triaxial,
 }
 
-__all__ = ["SCENES", "Belt", "Blade", "Drum", "Incline", "Mixer", "PlaneShear", "Shear", "Silo", "Wheel"]
+__all__ = ["SCENES", "Belt", "Blade", "Drum", "Incline", "Mixer", "PlaneShear", "Shear", "Silo", "Triaxial", "Wheel"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dem import analysis
-from dem.arrays import Corners, Floats
+from dem.arrays import Corners, Floats, Rule
 from dem.checks import not_negative, positive
 from dem.experiment import option
 from dem.packing import perturbed
@@ -75,7 +75,7 @@ class Blade(ToAndFro):
         """The inside of the box [m]."""
         return (-self.length / 2, -self.width / 2, 0.0), (self.length / 2, self.width / 2, self.height)
 
-    def positions(self) -> Floats:
+    def positions(self) -> Rule:
         """Centres ((2n+1)^3, 3) of the spheres at the start [m], between the blade and the far end."""
         steps = (np.arange(2 * self.n + 1) + 0.5) * self.pitch
         x = self.start + self.thickness / 2 + self.margin / 2 + steps

@@ -9,11 +9,12 @@ from math import atan2, ceil, degrees, pi, sin, sqrt
 import numpy as np
 
 from dem.analysis import calm
-from dem.arrays import Corners, Floats
+from dem.arrays import Corners, Floats, Rule
 from dem.checks import between, not_negative, positive
 from dem.experiment import option
 from dem.mesh import Mesh
 from dem.motion import Rotation
+from dem.packing import uniform
 from dem.scene import Scene
 from dem.scenes.lattice import SmallSpheres, rest_after_fall
 from dem.step import Step
@@ -41,8 +42,8 @@ class Drum(SmallSpheres):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.spheres > len(self._lattice()):
-            room = f"{self.spheres} spheres, but only {len(self._lattice())} have room at the start"
+        if self.spheres > (most := len(self._lattice())):
+            room = f"{self.spheres} spheres, but only {most} have room at the start"
             self.refuse("fill", f"needs {room}; take a smaller fill or a larger n")
 
     @property
@@ -74,18 +75,19 @@ class Drum(SmallSpheres):
         high = (self.container_radius, self.width / 2, self.container_radius)
         return (-high[0], -high[1], -high[2]), high
 
-    def positions(self) -> Floats:
+    def positions(self) -> Rule:
         """Centres (spheres, 3) of the spheres at the start [m], the lowest of a lattice in the drum."""
-        return self._lattice()[: self.spheres]
+        return self._lattice(self.spheres)
 
-    def _lattice(self) -> Floats:
-        """All places of the lattice in the drum, the lowest first."""
+    def _lattice(self, most: int | None = None) -> Rule:
+        """Places of the lattice in the drum, the lowest first: so many, or all."""
         slots = max(int((self.width - 2 * self.radius - 2 * self.perturbation) / self.pitch) + 1, 1)
-        return self.in_container((np.arange(slots) - (slots - 1) / 2) * self.pitch, axis=1)
+        return self.in_container((np.arange(slots) - (slots - 1) / 2) * self.pitch, 1, most)
 
     def build(self) -> Scene:
         """The scene, with the large bodies "drum" and "ends"."""
-        radii = self.radius * np.random.default_rng(self.seed).uniform(1.0 - self.spread, 1.0, self.spheres)
+        part = uniform(1.0 - self.spread, 1.0, (self.spheres,), self.seed)
+        radii = Rule(self.spheres, lambda first, end: self.radius * part[first:end])
         scene = self.spheres_alone(radii, "spheres")
         scene.set_pair("spheres", "side", friction=self.wall_friction)
         scene.set_pair("spheres", "ends", friction=self.end_friction)

@@ -52,7 +52,7 @@ class Incline(Experiment):
         gravity = (self.gravity * sin(tilt), 0.0, -self.gravity * cos(tilt))
         scene = Scene(self.friction, gravity=gravity, period=(*self.cell, None))
         x, y = (np.arange(count) + 0.5 for count in (self.length, self.width))
-        fixed = perturbed(x * space, y * space, np.zeros(1), 0.4 * space, self.seed) * [1.0, 1.0, 0.0]
+        fixed = perturbed(x * space, y * space, np.zeros(1), 0.4 * space, self.seed)[:] * [1.0, 1.0, 0.0]
         bottom = [Sphere(radius=r, center=tuple(place)) for place in fixed.tolist()]
         scene.add_body("bottom", [Plane(normal=(0.0, 0.0, 1.0)), *bottom])
         layers = 2.0 * r + space * (np.arange(self.n) + 0.5)

@@ -3,7 +3,7 @@ fro, and lengths in scenes of small spheres."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import ceil, cos, pi, sqrt
 from typing import Any, ClassVar
@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dem.analysis import calm
-from dem.arrays import Bools, Floats
+from dem.arrays import Bools, Floats, Ints, Rule
 from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
 from dem.motion import Oscillation
@@ -45,11 +45,15 @@ class Spheres(Experiment):
             way = "half the free space between spheres of the lattice"
             self.refuse("perturbation", f"must be less than pitch / 2 - radius = {free:g} m, {way}")
 
-    def positions(self) -> Floats:
+    def positions(self) -> Rule:
         """Centres (spheres, 3) of the spheres at the start [m]."""
         raise NotImplementedError
 
-    def spheres_alone(self, radius: float | Floats, material: str = "default") -> Scene:
+    def highest(self) -> float:
+        """Height of the highest centre at the start [m]."""
+        return max(float(part[:, 2].max()) for _, part in self.positions().chunks())
+
+    def spheres_alone(self, radius: float | Rule, material: str = "default") -> Scene:
         """A scene with the spheres, of one radius or of radii (spheres,) [m]."""
         scene = Scene(self.friction, gravity=(0.0, 0.0, -self.gravity))
         scene.add_spheres(self.positions(), radius, self.density, material=material)
@@ -127,15 +131,30 @@ class SmallSpheres(Spheres):
         """Greatest distance of a lattice point from the axis of the container [m]."""
         return self.container_radius * cos(pi / self.sides) - self.radius - 2 * self.perturbation
 
-    def in_container(self, along: Floats, axis: int) -> Floats:
+    def in_container(self, along: Floats, axis: int, most: int | None = None) -> Rule:
         """The places of the perturbed lattice in the container, at the coordinates `along` its axis (of this number),
-        the lowest first."""
+        the lowest first; the first `most` of them."""
         count = int(self.room / self.pitch)
         grid = [np.arange(-count, count + 1) * self.pitch] * 3
         grid[axis] = along
-        places = perturbed(grid[0], grid[1], grid[2], self.perturbation, self.seed)
-        places = places[length(np.delete(places, axis, axis=1)) <= self.room]
-        return places[np.argsort(places[:, 2], kind="stable")]
+        x, y, z = grid
+        places, layers = perturbed(x, y, z, self.perturbation, self.seed), len(z)
+
+        def inside() -> Iterator[tuple[Ints, Floats]]:
+            """The layers (n,) of places (n, 3) in the container, which do not overlap in height."""
+            for first, part in places.chunks():
+                row = np.flatnonzero(length(np.delete(part, axis, axis=1)) <= self.room)
+                yield (first + row) % layers, part[row]
+
+        ends = np.cumsum(sum(np.bincount(layer, minlength=layers) for layer, _ in inside()))
+
+        def make(first: int, end: int) -> Floats:
+            low, high = np.searchsorted(ends, (first, end - 1), side="right")
+            found = np.concatenate([part[(low <= layer) & (layer <= high)] for layer, part in inside()])
+            before = ends[low - 1] if low else 0
+            return found[np.argsort(found[:, 2], kind="stable")][first - before : end - before]
+
+        return Rule(int(ends[-1] if most is None else min(most, ends[-1])), make)
 
 
 def rest_after_fall(height: float, gravity: float) -> float:

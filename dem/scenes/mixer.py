@@ -9,7 +9,7 @@ from math import inf, isinf, pi, sqrt
 import numpy as np
 
 from dem import analysis
-from dem.arrays import Corners, Floats
+from dem.arrays import Corners, Floats, Rule
 from dem.checks import not_negative, positive, positive_or_inf
 from dem.experiment import option
 from dem.motion import Hinged, Rotation
@@ -69,7 +69,7 @@ class Mixer(LargeSpheres):
         height = self.lattice_bottom + 2 * self.n * self.pitch + self.perturbation
         return sqrt(2 * height / self.gravity) + 2.0
 
-    def positions(self) -> Floats:
+    def positions(self) -> Rule:
         """Centres ((2n+1)^3, 3) of the spheres at the start [m]; the floor is z = 0, the axis x = y = 0."""
         side = np.arange(-self.n, self.n + 1) * self.pitch
         height = self.lattice_bottom + np.arange(2 * self.n + 1) * self.pitch

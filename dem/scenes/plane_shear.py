@@ -13,7 +13,7 @@ from dem.analysis import calm
 from dem.arrays import Floats
 from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
-from dem.packing import random_packing
+from dem.packing import perturbed, random_packing
 from dem.record import cell
 from dem.scene import Scene
 from dem.sources import Uniform
@@ -25,25 +25,34 @@ class PlaneShear(Experiment):
     """Spheres in a cell with three periods: flow along x, gradient and pressure along z. There are no walls, and no
     gravity, so the flow is the same everywhere, and friction and solid fraction depend on the inertial number alone:
     GDR MiDi, Eur. Phys. J. E 14 (2004) 341; da Cruz et al., Physical Review E 72 (2005) 021309.
+
+    A `layer` is the plane flow of disks of da Cruz et al.: one layer of spheres across y, in a cell that is LAYERS
+    diameters thick, so that no images touch across it. With P the force on a length over the mean diameter, the
+    inertial number is that of disks, rate times sqrt(m / (P d)) with the mass m of the mean sphere.
     """
 
-    n: int = option(8, "", "width of the cell in diameters along x, y and, at the start, z", between(6))
+    n: int = option(8, "", "width of the cell in diameters along x, y and, at the start, z; spheres of a layer along x",
+                    between(6))  # fmt: skip
+    layer: bool = option(False, "", "one layer of spheres, which move in the plane of flow and gradient")
     inertial: float = option(0.1, "", "inertial number: rate times d sqrt(rho / P)", positive)
-    pressure: float = option(1000.0, "Pa", "normal stress along the gradient", positive)
+    pressure: float = option(1000.0, "Pa", "normal stress along the gradient; of a layer the force on a length over d",
+                             positive)  # fmt: skip
     radius: float = option(0.005, "m", "mean radius of the spheres", positive)
     spread: float = option(0.2, "", "radii are uniform within this part of the mean", between(0.0, 0.5))
     density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)", positive)
     friction: float = option(0.5, "", "friction coefficient of all contacts", not_negative)
-    fraction: float = option(0.55, "", "solid fraction at the start", between(0.1, 0.58))
+    fraction: float = option(0.55, "", "solid fraction at the start; a layer starts as a lattice", between(0.1, 0.58))
     seed: int = option(1, "", "seed of the places and radii", not_negative)
 
     STRAIN: ClassVar[float] = 0.01  #: shear strain in a step
+    LAYERS: ClassVar[float] = 6.0  #: thickness of the cell of a layer, in diameters
     PASSING: ClassVar[float] = 0.1  #: the step, in the time d sqrt(rho / P) in which the pressure closes a hole
 
     @property
     def time(self) -> float:
-        """d sqrt(rho / P) [s]."""
-        return 2.0 * self.radius * sqrt(self.density / self.pressure)
+        """d sqrt(rho / P), of a layer sqrt(m / (P d)) [s]."""
+        shape = pi / 6.0 if self.layer else 1.0
+        return 2.0 * self.radius * sqrt(shape * self.density / self.pressure)
 
     @property
     def rate(self) -> float:
@@ -57,33 +66,57 @@ class PlaneShear(Experiment):
 
     def build(self) -> Scene:
         """The scene, with the velocities of the shear."""
-        side, r = 2.0 * self.n * self.radius, self.radius
-        sizes = Uniform(r * (1.0 - self.spread), r * (1.0 + self.spread)) if self.spread else r
-        place, radius = random_packing((side,) * 3, sizes, self.fraction, periodic=(True,) * 3, seed=self.seed)
+        lengths, place, radius = self._lattice() if self.layer else self._packing()
         scene = Scene(
-            self.friction, (0.0, 0.0, 0.0), period=(side,) * 3, shear_rate=self.rate, shear_gradient="z",
-            stress=(None, None, self.pressure),
+            self.friction, (0.0, 0.0, 0.0), period=lengths, shear_rate=self.rate, shear_gradient="z",
+            stress=(None, None, self._asked),
         )  # fmt: skip
         scene.add_spheres(place, radius, self.density, velocity=place[:, [2, 2, 2]] * [self.rate, 0.0, 0.0])
         return scene
 
+    def _packing(self) -> tuple[tuple[float, float, float], Floats, Floats]:
+        """Periods, places and radii of a random packing in a cube."""
+        side, r = 2.0 * self.n * self.radius, self.radius
+        sizes = Uniform(r * (1.0 - self.spread), r * (1.0 + self.spread)) if self.spread else r
+        place, radius = random_packing((side,) * 3, sizes, self.fraction, periodic=(True,) * 3, seed=self.seed)
+        return (side,) * 3, place, radius
+
+    def _lattice(self) -> tuple[tuple[float, float, float], Floats, Floats]:
+        """Periods, places and radii of a layer: a square lattice with room for all sizes, higher than wide, as it
+        closes."""
+        high, pitch = round(1.6 * self.n), 2.02 * (1.0 + self.spread) * self.radius
+        x, z = (pitch * (np.arange(count) + 0.5) for count in (self.n, high))
+        thick = 2.0 * self.LAYERS * self.radius
+        place = perturbed(x, np.array([0.5 * thick]), z, 0.009 * pitch, self.seed)[:]
+        place[:, 1] = 0.5 * thick
+        share = np.random.default_rng(self.seed).uniform(-1.0, 1.0, len(place))
+        return (self.n * pitch, thick, high * pitch), place, self.radius * (1.0 + self.spread * share)
+
     def record(self, step: Step) -> dict[str, float]:
         """Shear strain, friction coefficient of the flow, inertial number by the stress that there is, and solid
-        fraction."""
+        fraction, of a layer the part of the area."""
         of_cell, shear = cell(step), step.world.shear
         rate = 0.0 if shear is None else shear.rate
-        pressure = max(of_cell["stress_zz [Pa]"], 1e-300)
-        volume = step.total(4.0 / 3.0 * pi * step.world.grains.size[:, 0] ** 3)
+        pressure, radius = max(of_cell["stress_zz [Pa]"], 1e-300), step.world.grains.size[:, 0]
+        room, filled = of_cell["period_x [m]"] * of_cell["period_z [m]"], pi * radius**2
+        if not self.layer:
+            room, filled = room * of_cell["period_y [m]"], 4.0 / 3.0 * pi * radius**3
         return {
             "strain": rate * step.world.time,
             "mu": -of_cell["stress_xz [Pa]"] / pressure,
-            "inertial_number": rate * 2.0 * self.radius * sqrt(self.density / pressure),
-            "solid_fraction": volume / (of_cell["period_x [m]"] * of_cell["period_y [m]"] * of_cell["period_z [m]"]),
+            "inertial_number": rate * self.time * sqrt(self._asked / pressure),
+            "solid_fraction": step.total(filled) / room,
         }
+
+    @property
+    def _asked(self) -> float:
+        """The stress of the cell along z [Pa]."""
+        return self.pressure / (self.LAYERS if self.layer else 1.0)
 
     def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:
         """Over the last half of the strain: the friction coefficient and inertial number of the mean stresses, the
-        solid fraction, the pressure over that asked, and the standard error of mu from ten parts of that half."""
+        solid fraction, the pressure over that asked and its deviation over its mean, and the standard error of mu from
+        ten parts of that half."""
         strain = records["strain"]
         late = (strain >= 0.5 * strain[-1]) & calm(records)
         if not late.any():
@@ -95,7 +128,8 @@ class PlaneShear(Experiment):
         return {
             "mu": float(shear.mean()) / mean,
             "mu_error": float(np.std(found) / sqrt(max(parts - 1, 1))),
-            "inertial_number": self.rate * 2.0 * self.radius * sqrt(self.density / mean),
+            "inertial_number": self.inertial * sqrt(self._asked / mean),
             "solid_fraction": float(records["solid_fraction"][late].mean()),
-            "pressure_ratio": mean / self.pressure,
+            "pressure_ratio": mean / self._asked,
+            "pressure_swing": float(pressure.std()) / mean,
         }

@@ -9,7 +9,7 @@ from math import pi
 import numpy as np
 
 from dem import analysis
-from dem.arrays import Corners, Floats
+from dem.arrays import Corners, Floats, Rule
 from dem.checks import between, not_negative, positive
 from dem.experiment import option
 from dem.motion import Guided
@@ -73,7 +73,7 @@ class Shear(ToAndFro):
         """The inside of the box at the greatest displacement [m]."""
         return (-self.length / 2, -self.width / 2, 0.0), (self.length / 2 + self.travel, self.width / 2, self.width)
 
-    def positions(self) -> Floats:
+    def positions(self) -> Rule:
         """Centres ((3n+1)(2n+1)^2, 3) of the spheres at the start [m]; the floor is z = 0."""
         x = (np.arange(3 * self.n + 1) - 1.5 * self.n) * self.pitch
         y = np.arange(-self.n, self.n + 1) * self.pitch

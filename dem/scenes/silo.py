@@ -8,7 +8,7 @@ from math import ceil, pi, radians, sqrt, tan
 
 import numpy as np
 
-from dem.arrays import Floats
+from dem.arrays import Floats, Rule
 from dem.checks import between, positive
 from dem.experiment import option
 from dem.mesh import Mesh
@@ -64,16 +64,16 @@ class Silo(SmallSpheres):
         """Time [s] after which the gate opens."""
         return rest_after_fall(2 * self.filling * self.container_radius, self.gravity) - 1.4
 
-    def positions(self) -> Floats:
+    def positions(self) -> Rule:
         """Centres (spheres, 3) of the spheres at the start [m], a lattice in the cylinder above the cone."""
         layers = ceil(self.spheres * self.pitch**2 / (2 * self.room**2))  # more than enough: pi > 2
-        return self.in_container(self.cone_height + (np.arange(layers) + 0.6) * self.pitch, axis=2)[: self.spheres]
+        return self.in_container(self.cone_height + (np.arange(layers) + 0.6) * self.pitch, 2, self.spheres)
 
     def build(self) -> Scene:
         """The scene, with the large bodies "silo", "gate" and "floor"."""
         scene = self.spheres_alone(self.radius)
         wide, hole = self.container_radius, self.outlet_radius
-        top = scene.grains().position[:, 2].max() + 2 * self.radius
+        top = self.highest() + 2 * self.radius
         profile = [(hole, 0.0), (wide, self.cone_height), (wide, top)]
         scene.add_body("silo", [Mesh.revolved(profile, self.sides)])
         # Down and through the floor, in a twentieth of a second. Drawn aside it would wedge spheres against the rim.

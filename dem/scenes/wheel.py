@@ -9,7 +9,7 @@ from math import ceil, pi, sqrt
 import numpy as np
 
 from dem.analysis import calm
-from dem.arrays import Corners, Floats
+from dem.arrays import Corners, Floats, Rule
 from dem.checks import between, finite, not_negative, positive
 from dem.experiment import option
 from dem.mesh import Mesh
@@ -86,14 +86,14 @@ class Wheel(Spheres):
     @property
     def settling_time(self) -> float:
         """Time [s] after which the wheel turns."""
-        return rest_after_fall(self.positions()[:, 2].max() + self.wheel_radius, self.gravity)
+        return rest_after_fall(self.highest() + self.wheel_radius, self.gravity)
 
     @property
     def domain(self) -> Corners:
         """The inside of the bin, which is open at the top [m]."""
         return (0.0, -self.bin_width / 2, 0.0), (self.length, self.bin_width / 2, np.inf)
 
-    def positions(self) -> Floats:
+    def positions(self) -> Rule:
         """Centres of the spheres at the start [m]; settled they fill the depth."""
         x, y = (self._places(extent) for extent in (self.length, self.bin_width))
         volume = self.packing * self.depth * self.wheel_radius * self.length * self.bin_width
@@ -115,7 +115,7 @@ class Wheel(Spheres):
         scene.add_body("walls", walls, material="walls")
         forwards = None if self.free else self.spin * self.wheel_radius * (1.0 - self.slip)
         rig = Held((forwards, 0.0, None), (0.0, self.spin, 0.0), start=self.settling_time)
-        height = self.positions()[:, 2].max() + 1.1 * self.radius + self.wheel_radius + self.perturbation
+        height = self.highest() + 1.1 * self.radius + self.wheel_radius + self.perturbation
         place = (1.5 * self.wheel_radius, 0.0, height)
         scene.add_body("wheel", self._shapes(), rig, position=place, mass=self.mass, material="spheres")
         if self.free:

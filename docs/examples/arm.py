@@ -1,6 +1,11 @@
-"""A bucket on an arm of two hinged links digs in spheres: motors with bounded torques. Start this file as a program."""
+"""A bucket on an arm of two hinged links digs in spheres: motors with bounded torques::
+
+    python docs/examples/arm.py arm.png
+"""
 
 from __future__ import annotations
+
+import sys
 
 import numpy as np
 
@@ -23,19 +28,22 @@ def arm(n: int = 4) -> Scene:
     return scene
 
 
-def main(until: float = 1.0) -> tuple[float, float]:
-    """The greatest torques of both motors [N m] while the bucket digs."""
+def main(picture: str = "", until: float = 3.0) -> tuple[float, float]:
+    """The greatest torques of both motors [N m]: the bucket digs, then lifts; a picture from between, if it has a
+    name."""
     sim = pctt.Simulation(arm(), dt=0.01, tol=1e-5, say=lambda text: None)
     shoulder, wrist, most = sim.joint("shoulder"), sim.joint("wrist"), np.zeros(2)
     while sim.time < until - 1e-9:
         sim.step()
         most = np.maximum(most, np.abs([shoulder.drive, wrist.drive]))
-        if sim.time > 0.5 * until:
+        if sim.time > 0.5 * until and shoulder.motor.speed > 0:
             shoulder.motor.speed = -0.3  # it lifts
+            if picture:
+                sim.render(elevation=10, width=640, height=480).save(picture)
     print(f"angles {shoulder.angle:.3f} and {wrist.angle:.3f} rad")
     print(f"greatest torques {most[0]:.0f} and {most[1]:.0f} N m")
     return float(most[0]), float(most[1])
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

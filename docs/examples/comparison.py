@@ -189,3 +189,20 @@ def compare(problem: Problem, eps: float | None = 1e-6, dense: bool = True) -> l
     fast.destroy()
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
     return rows
+
+
+def draw(**tables: list[Row]) -> None:
+    """Seconds of set-up and solve of each way, side by side for the titles, into the file that the command names."""
+    if not sys.argv[1:]:
+        return
+    import matplotlib.pyplot as plt
+
+    ways = [row.way for row in next(iter(tables.values()))]
+    figure, columns = plt.subplots(1, len(tables), sharey=True, squeeze=False, figsize=(6.4, 3.2), layout="constrained")
+    for (title, rows), axes in zip(tables.items(), columns[0]):
+        took = {row.way: row.setup_s + row.solve_s for row in rows}
+        axes.barh(ways[::-1], [took.get(way, 0.0) for way in ways[::-1]])
+        wide = max(took.values()) > 30 * min(took.values())
+        axes.set(title=title, xscale="log" if wide else "linear")
+    figure.supxlabel("CPU s of set-up and solve", fontsize=10)
+    figure.savefig(sys.argv[1], dpi=100)

@@ -1,6 +1,7 @@
 """Capsules fall on a belt, which throws them into a box; how many arrive is recorded::
 
-    mpiexec -n 2 python -m pctt.run -scene docs/examples/conveyor.py -steps 1000 -output conveyor
+    python -m pctt.run -scene docs/examples/conveyor.py -steps 1000 -output_every 10 -output conveyor
+    python -m pctt.render conveyor -elevation 40 -size 640x480
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """A source feeds a belt, which carries the grains to its end; there they fall and leave by an outlet::
 
-    mpiexec -n 2 python -m pctt.run -scene docs/examples/feeder.py -steps 2000 -output feeder
+    python -m pctt.run -scene docs/examples/feeder.py -steps 2000 -output_every 20 -output feeder
+    python -m pctt.render feeder -color size -elevation 15 -size 640x480
 """
 
 from __future__ import annotations

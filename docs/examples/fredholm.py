@@ -1,7 +1,10 @@
-"""A Fredholm equation of the second kind on a square, 1024^2: .venv/bin/python docs/examples/fredholm.py"""
+"""A Fredholm equation of the second kind on a square of 1024^2 points, solved in several ways::
 
-from comparison import compare
+    python docs/examples/fredholm.py fredholm.png
+"""
+
+from comparison import compare, draw
 from integral_problems import fredholm
 
 if __name__ == "__main__":
-    compare(fredholm(1024), eps=1e-9)
+    draw(Fredholm=compare(fredholm(1024), eps=1e-9))

@@ -19,7 +19,7 @@ from pctt.mat import from_entries
 
 
 def main(n: int, picture: str = "") -> tuple[int, float]:
-    """Solve u(x) + 100 int exp(-|x - y|^2 / 2 w^2) u(y) dy = f(x), w = .1, f = 1 in the left half and 0 in the right
+    """Solve u(x) + 100 int exp(-|x - y|^2 / 2 w^2) u(y) dy = f(x), w = 0.1, f = 1 in the left half and 0 in the right
     one; iterations and residual."""
     grid = (n, n)
 

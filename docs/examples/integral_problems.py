@@ -70,7 +70,7 @@ class Problem:
 
 
 def fredholm(n: int) -> Problem:
-    """u(x) + 100 int exp(-|x - y|^2 / 2 w^2) u(y) dy = f(x) on a square, w = .1: of the second kind."""
+    """u(x) + 100 int exp(-|x - y|^2 / 2 w^2) u(y) dy = f(x) on a square, w = 0.1: of the second kind."""
     return Problem(f"Fredholm {n}^2", n, 2, lambda r: 100 / n**2 * np.exp(-(r**2) / 0.02))
 
 

@@ -2,12 +2,13 @@
 contact. The acceleration of a case is compared with g (sin a - mu cos a), or zero where the box sticks. The ranks share
 the cases, and each rank makes its simulations alone::
 
-    mpiexec -n 2 python docs/examples/sweep.py
+    mpiexec -n 2 python docs/examples/sweep.py sweep.png
 """
 
 from __future__ import annotations
 
 import itertools
+import sys
 from math import cos, radians, sin
 
 from mpi4py import MPI
@@ -43,9 +44,24 @@ def main() -> list[tuple[float, str, float, float]]:
     return rows
 
 
+def draw(table: list[tuple[float, str, float, float]], picture: str) -> None:
+    """Accelerations against friction, and the theory as a line."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(5, 4))
+    for law, mark in zip(LAWS, "ox"):
+        axes.plot(FRICTIONS, [value for _, name, value, _ in table if name == law], mark, label=law)
+    axes.plot(FRICTIONS, [theory for *_, theory in table[:: len(LAWS)]], label="theory")
+    axes.set(xlabel="friction coefficient", ylabel="acceleration [m/s$^2$]")
+    axes.legend()
+    figure.savefig(picture, dpi=100)
+
+
 if __name__ == "__main__":
     table = main()
     if MPI.COMM_WORLD.rank == 0:
         print("friction  law         acceleration  theory   [m/s^2]")
         for friction, law, value, theory in table:
             print(f"{friction:8.1f}  {law:10}  {value:12.5f}  {theory:.5f}")
+        if sys.argv[1:]:
+            draw(table, sys.argv[1])

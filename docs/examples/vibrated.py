@@ -1,6 +1,7 @@
 """Large spheres rise among small ones in a shaken box, the Brazil nut effect::
 
-    mpiexec -n 2 python -m pctt.run -scene docs/examples/vibrated.py -ccp_type apgd -steps 1500 -output vibrated
+    python -m pctt.run -scene docs/examples/vibrated.py -ccp_type apgd -steps 1500 -output_every 10 -output vibrated
+    python -m pctt.render vibrated -color size -size 640x480
 """
 
 from __future__ import annotations

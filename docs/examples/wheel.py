@@ -1,6 +1,7 @@
 """A tyre with lugs drives itself over sand and pulls a load::
 
-    mpiexec -n 2 python -m pctt.run -scene docs/examples/wheel.py -steps 1500 -output wheel
+    python -m pctt.run -scene docs/examples/wheel.py -steps 1500 -output_every 10 -output wheel
+    python -m pctt.render wheel -elevation 15 -size 640x480
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.contact_map import BlockRows, CompactRows
-from dem.contact_map.jointed import JointedMap
 from dem.exchange import refuse
 from pctt.ccp.accuracy import Accuracy, measure
 from pctt.ccp.cone import Array
@@ -22,7 +21,7 @@ from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.newton import FORMS, Newton
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.registry import FOR_ROLLING, NEWTON, SOLVERS
+from pctt.ccp.registry import NEWTON, SOLVERS, why_refused
 from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Limits, Result, Status
 from pctt.ccp.rolling import RollingProblem
 from pctt.ccp.unbounded import why_unbounded
@@ -31,7 +30,6 @@ from pctt.log import phase
 __all__ = [
     "COULOMB",
     "FORMS",
-    "FOR_ROLLING",
     "LAWS",
     "NEWTON",
     "RELAXATION",
@@ -70,8 +68,8 @@ def solve(
     Coulomb's law is found by the method itself if it can (`Solver.has_law`), else by a sequence of cone problems
     (`pctt.ccp.coulomb`).
 
-    A `RollingProblem`, whose impulses are (2 nc, 3), and a problem of bodies with joints are for `apgd` and `auto`
-    alone, and no other one follows.
+    A `RollingProblem`, whose impulses are (2 nc, 3), is for `conic`, `apgd` and `auto`. A problem of bodies with joints
+    or in a cell that deforms is for `apgd` and `auto`, and no other one follows.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
     the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
@@ -82,18 +80,18 @@ def solve(
     if law not in LAWS:
         raise ValueError(f"the law {law!r}: allowed are {', '.join(LAWS)}")
     rolls = isinstance(problem, RollingProblem)
-    jointed = isinstance(problem.contact_map, JointedMap)
-    if jointed and not SOLVERS[type].has_rolling:
-        raise ValueError(f"the solver {type!r}: with joints allowed are {FOR_ROLLING}")
-    if rolls and not SOLVERS[type].has_rolling:
-        raise ValueError(f"the solver {type!r}: with rolling or spinning resistance allowed are {FOR_ROLLING}")
+    coupled = problem.contact_map is not None and not problem.contact_map.has_rows
+    if why := why_refused(type, rolls, "joints, or a cell that deforms" if coupled else ""):
+        raise ValueError(f"the solver {type!r}: the problem has {why}")
+    if rolls and newton is not None and newton.form != "body":
+        raise ValueError(f"the Newton form {newton.form!r}: with rolling or spinning resistance allowed is body")
     limits = limits or Limits()
     if not limits.tol > 0.0:
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
     result = asked = _by(type, problem, _start(problem, guess), limits, options, newton, law)
     other = "conic" if asked.solver == "apgd" else "apgd"
     hopeless = asked.final or (asked.status is Status.BREAKDOWN and other == "conic")  # products are no numbers
-    if limits.fallback and not hopeless and not rolls and not jointed:
+    if limits.fallback and not hopeless and not coupled:
         second = _by(other, problem, asked.impulse, dataclasses.replace(limits, max_it=-1), None, newton, law)
         better = second.final or second.residual < asked.residual
         result = second.after(asked) if better else dataclasses.replace(asked).after(second)

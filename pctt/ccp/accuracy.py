@@ -11,18 +11,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from dem.compiled import inlined, loop
+from dem.exchange import reduced
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.rolling import RollingProblem
 
+ROUNDINGS = 8.0 * float(np.finfo(float).eps)
+
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Figures of an impulse g with velocities y = N g + r (see ``docs/ccp.md``).
+    """Figures of an impulse g with velocities y = N g + r (see ``docs/accuracy.md``).
 
     Attributes
     ----------
-    natural_residual : ||g - P(g - s y)|| / ||g||, s = 1 / mean(diag N)
+    natural_residual : ||g - P(g - s y)|| / ||g||, s = 1 / mean(diag N); a contact whose part is below 8 roundings of
+        its s y does not count
     coulomb_residual : the same with y_n + mu |y_t| for y_n: zero where impulses obey Coulomb's law (``coulomb.py``)
     objective : 1/2 g'Ng + r'g (J)
     cone_violation : largest distance |g_t| - mu g_n outside the friction cone (N s)
@@ -56,8 +60,8 @@ def measure(problem: ConeProblem, g: Array) -> Accuracy:
         sums, greatest = _judged_rolling(problem, g, y, step)
     else:
         sums, greatest = _judged(g, y, problem.r, problem.mu, step)
-    square, speed, power, pushed, closing, opening, natural, coulomb = problem.sum(sums).tolist()
-    cone, dual, complementarity = problem.max(greatest).tolist()
+    of_all, (cone, dual, complementarity) = reduced(problem.comm, sums, greatest)
+    square, speed, power, pushed, closing, opening, natural, coulomb = of_all
     norm, energy = float(np.sqrt(square)), 0.5 * pushed
     per = 1.0 / max(norm, float(np.finfo(float).tiny))
     return Accuracy(
@@ -100,10 +104,12 @@ def _judged(g: Array, y: Array, r: Array, mu: Array, step: float) -> tuple[Array
         sums[3] += along - free
         sums[4] += n * (0.0 if y_n > 0.0 else -y_n)
         sums[5] += 0.0 if along < 0.0 else along
-        a_n, a_u, a_v = _nearest_in_cone(n - step * y_n, u - step * y_u, v - step * y_v, m)
-        sums[6] += (n - a_n) ** 2 + (u - a_u) ** 2 + (v - a_v) ** 2
-        a_n, a_u, a_v = _nearest_in_cone(n - step * (y_n + m * slip), u - step * y_u, v - step * y_v, m)
-        sums[7] += (n - a_n) ** 2 + (u - a_u) ** 2 + (v - a_v) ** 2
+        noise = ROUNDINGS * step * np.sqrt(y_n * y_n + slip * slip)
+        for law in range(2):
+            w = y_n + m * slip if law else y_n
+            a_n, a_u, a_v = _nearest_in_cone(n - step * w, u - step * y_u, v - step * y_v, m)
+            distance = np.sqrt((n - a_n) ** 2 + (u - a_u) ** 2 + (v - a_v) ** 2)
+            sums[6 + law] += 0.0 if distance <= noise else distance * distance
         greatest[0] = max(greatest[0], np.sqrt(u * u + v * v) - m * n)
         greatest[1] = max(greatest[1], m * slip - y_n)
         greatest[2] = max(greatest[2], abs(along))
@@ -147,7 +153,9 @@ def _judged_rolling(problem: RollingProblem, g: Array, y: Array, step: float) ->
         target[:nc] *= np.stack([np.ones(nc), shrink[0], shrink[0]], axis=1)
         target[nc:] *= np.stack([shrink[2], shrink[1], shrink[1]], axis=1)
         target[:nc, 0] = height
-        return float(((target - g) ** 2).sum())
+        squares = ((target - g) ** 2).sum(axis=1).reshape(2, nc).sum(axis=0)
+        noise = ROUNDINGS * step * np.sqrt((y * y).sum(axis=1).reshape(2, nc).sum(axis=0))
+        return float(squares[~(np.sqrt(squares) <= noise)].sum())
 
     (g_n, sizes), (y_n, speeds) = parts(g), parts(y)
     resisted, along = (most * speeds).sum(axis=0), np.einsum("ck,ck->c", g, y)

@@ -2,15 +2,14 @@
 
 What the conic method costs is regular: as many iterations of APGD as 48 for each digit of the tolerance, times the cube
 root of the number of contacts, within a quarter of what was measured on settled mixers of 18,483 and 142,175 contacts
-(docs/ccp.md). So a problem that is hard for APGD costs one and a half times what the conic method alone would, and one
-that is easy costs nothing more.
+(docs/methods.md). So a problem that is hard for APGD costs one and a half times what the conic method alone would, and
+one that is easy costs nothing more.
 
 For Coulomb's law the conic method stalls often, but the path that it follows leads to the neighbourhood of a solution.
 So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path. Problems
 so small that they get dense factors are the exception: there it goes on to the end.
 
-Where contacts resist rolling or spinning, it is APGD alone: the conic method has no such cones. So it is with joints,
-which its sparse systems do not have.
+With joints, which the sparse systems of the conic method do not have, it is APGD alone.
 """
 
 from __future__ import annotations
@@ -21,14 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from dem.contact_map.jointed import JointedMap
 from pctt.ccp.cone import Array
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
-from pctt.ccp.rolling import RollingProblem
 from pctt.options import number
 
 
@@ -62,7 +59,7 @@ def solve(
         tried.append(result)
         return result
 
-    alone = isinstance(problem, RollingProblem) or isinstance(problem.contact_map, JointedMap)  # apgd takes them alone
+    alone = problem.contact_map is not None and not problem.contact_map.has_rows  # apgd takes it alone
     dense = not alone and newton.has_few(problem)
     most = limits.max_it if alone else options.iterations(problem.size, limits.tol, coulomb, dense)
     few = min(limits.max_it, problem.comm.bcast(most))

@@ -19,14 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dem.compiled import inlined, loop
+from dem.compiled import PART, inlined, loop, prange
 
 Array = NDArray[np.float64]
 TINY = float(np.finfo(float).tiny)
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to the next
 LEAST = 1e-17  # determinant of a unit point that rounding has put on or outside the boundary
-ROUND = 1e-14  # tangential part of a unit scaling point below which it has no direction
+NO_MOVE = 64.0 * float(np.finfo(float).eps) ** 2  # (8 eps)^2: |move|^2 / |step y|^2 that rounding makes
 
 
 @inlined
@@ -66,8 +66,9 @@ def not_idle(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDAr
 
 @loop
 def squared_moves(x: Array, y: Array, step: float, mu: Array, de_saxce: float) -> Array:
-    """|P(x - step y) - x|^2 (nc,), where y gets the term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1. A pass over
-    the memory; `FrictionCones.move` takes several."""
+    """|P(x - step y) - x|^2 (nc,), where y gets the term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1; zero below
+    the rounding of step y: a contact that slides has 0 = P(-step y) only up to that. A pass over the memory;
+    `FrictionCones.move` takes several."""
     out = np.empty(len(mu))
     x, y = x.ravel(), y.ravel()
     for c in range(len(mu)):
@@ -75,7 +76,8 @@ def squared_moves(x: Array, y: Array, step: float, mu: Array, de_saxce: float) -
         m, u, v = mu[c], y[i + 1], y[i + 2]
         w = y[i] + de_saxce * m * np.sqrt(u * u + v * v)
         n, t_1, t_2 = _nearest(x[i] - step * w, x[i + 1] - step * u, x[i + 2] - step * v, m)
-        out[c] = (n - x[i]) ** 2 + (t_1 - x[i + 1]) ** 2 + (t_2 - x[i + 2]) ** 2
+        square = (n - x[i]) ** 2 + (t_1 - x[i + 1]) ** 2 + (t_2 - x[i + 2]) ** 2
+        out[c] = 0.0 if square <= NO_MOVE * (step * step) * (y[i] * y[i] + u * u + v * v) else square
     return out
 
 
@@ -104,6 +106,17 @@ def accelerated_step(
     Returned are, for this rank, d'Cd and |d|^2 of d = out - z, and y_z'(out - x); z and y_z are nowhere stored. A
     contact moves 64 bytes in single precision, 52 without compliance."""
     part, way, soft = x.dtype.type(beta), x.dtype.type(step), len(compliance) > 0
+    sums = np.zeros(((len(mu) + PART - 1) // PART, 3))
+    for k in prange(len(sums)):
+        a, b = k * PART, min(k * PART + PART, len(mu))
+        stiff = compliance[a:b] if soft else compliance
+        sums[k] = _step_of_part(x[a:b], last_x[a:b], y[a:b], stiff, part, way, mu[a:b], de_saxce, out[a:b])
+    return sums[:, 0].sum(), sums[:, 1].sum(), sums[:, 2].sum()
+
+
+@loop
+def _step_of_part(x, last_x, y, compliance, part, way, mu, de_saxce, out):
+    soft = len(compliance) > 0
     x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)
     z, y_z = np.empty(3 * STRIP, x.dtype), np.empty(3 * STRIP, x.dtype)
     squares, products = np.zeros(3 * STRIP, x.dtype), np.zeros(3 * STRIP, x.dtype)
@@ -262,45 +275,26 @@ def determinant(x: Array) -> Array:
 
 
 @loop
-def scaling(s: Array, z: Array, compliance: Array) -> tuple[Array, Array, Array, Array, Array]:
+def scaling(s: Array, z: Array) -> tuple[Array, Array]:
     """The Nesterov-Todd scaling W of pairs (s, z) inside the cones x_0 >= |x_1:|, the symmetric W with W z = W^-1 s:
-    its unit hyperbolic vector (nc, 3) and size eta (nc,), see `NesterovTodd`, and the blocks (nc, 3, 3) W^-2,
-    X = (W^-2 + C)^-1 and X W^-2, C the diagonal ``compliance`` (nc, 3), whose two tangential numbers are the same.
+    its unit hyperbolic vector (nc, 3) and size eta (nc,), see `NesterovTodd`.
 
-    The blocks come from the spectral form, so that no tiny one is inverted: W has the eigenvalues eta spread, eta /
-    spread and eta for (1, u), (1, -u) and (0, u'), u the direction of the scaling point. What C has more (or less)
-    along the normal is a term of rank one. Source: Nesterov and Todd (1997); Andersen, Roos and Terlaky (2003)."""
-    count = len(s)
-    root, size, square = np.empty((count, 3)), np.empty(count), np.empty((count, 3, 3))
-    X, share = np.empty((count, 3, 3)), np.empty((count, 3, 3))
-    for c in range(count):
+    W has the eigenvalues eta (w_0 + |w_1:|), eta / (w_0 + |w_1:|) and eta for (1, u), (1, -u) and (0, u'), where u is
+    the direction of the unit scaling point w. Source: Nesterov and Todd (1997); Andersen, Roos and Terlaky (2003)."""
+    root, size = np.empty((len(s), 3)), np.empty(len(s))
+    for c in range(len(s)):
         size_s = np.sqrt(_determinant(s[c, 0], s[c, 1], s[c, 2]))
         size_z = np.sqrt(_determinant(z[c, 0], z[c, 1], z[c, 2]))
         cosine = (s[c, 0] * z[c, 0] + s[c, 1] * z[c, 1] + s[c, 2] * z[c, 2]) / (size_s * size_z)
         angle = 0.5 * (1.0 + cosine)
         angle = np.sqrt(0.5 if angle < 0.5 else angle)
         of_s, of_z = 0.5 / (angle * size_s), 0.5 / (angle * size_z)
-        first, eta = of_s * s[c, 0] + of_z * z[c, 0], np.sqrt(size_s / size_z)
-        u, v = of_s * s[c, 1] - of_z * z[c, 1], of_s * s[c, 2] - of_z * z[c, 2]
-        length, half = np.sqrt(2.0 * (1.0 + first)), np.sqrt(u * u + v * v)
-        root[c, 0], root[c, 1], root[c, 2], size[c] = (1.0 + first) / length, u / length, v / length, eta
-        spread = first + half
-        u, v = (1.0, 0.0) if half <= ROUND else (u / half, v / half)
-        along, against, across = (eta * spread) ** 2, (eta / spread) ** 2, eta * eta
-        _block(u, v, 1.0 / along, 1.0 / against, 1.0 / across, square[c])
-        e, more = compliance[c, 1], compliance[c, 0] - compliance[c, 1]
-        shares = 1.0 / (1.0 + e * along), 1.0 / (1.0 + e * against), 1.0 / (1.0 + e * across)
-        _block(u, v, along * shares[0], against * shares[1], across * shares[2], X[c])
-        _block(u, v, shares[0], shares[1], shares[2], share[c])
-        if more != 0.0:
-            more /= 1.0 + more * X[c, 0, 0]
-            p_0, p_1, p_2 = X[c, 0, 0], X[c, 1, 0], X[c, 2, 0]
-            for j in range(3):
-                of_share, of_x = more * share[c, 0, j], more * X[c, 0, j]
-                for i, p in enumerate((p_0, p_1, p_2)):
-                    share[c, i, j] -= p * of_share
-                    X[c, i, j] -= p * of_x
-    return root, size, square, X, share
+        first, size[c] = of_s * s[c, 0] + of_z * z[c, 0], np.sqrt(size_s / size_z)
+        length = np.sqrt(2.0 * (1.0 + first))
+        root[c, 0] = (1.0 + first) / length
+        root[c, 1] = (of_s * s[c, 1] - of_z * z[c, 1]) / length
+        root[c, 2] = (of_s * s[c, 2] - of_z * z[c, 2]) / length
+    return root, size
 
 
 @loop
@@ -326,18 +320,6 @@ def _determinant(x_0, x_1, x_2):
     found = (x_0 - large) * (x_0 + large) - small * small
     least = max(LEAST * x_0 * x_0, TINY)
     return least if found < least else found
-
-
-@inlined
-def _block(u, v, along, against, across, out):
-    """A symmetric block (3, 3) with given eigenvalues for (1, u), (1, -u), (0, u')."""
-    mean, half = 0.5 * (along + against), 0.5 * (along - against)
-    out[0, 0] = mean
-    out[0, 1] = out[1, 0] = half * u
-    out[0, 2] = out[2, 0] = half * v
-    out[1, 1] = mean * u * u + across * v * v
-    out[2, 2] = mean * v * v + across * u * u
-    out[1, 2] = out[2, 1] = (mean - across) * u * v
 
 
 # -- what solvers ask of cones ----------------------------------------------------------------------------------
@@ -376,8 +358,28 @@ def dot(x: Array, y: Array) -> Array:
 class FrictionCones:
     """The cones of all contacts of this rank. Arrays of unknowns are (rows, 3), the first rows with the normals."""
 
+    #: of each Lorentz cone of a contact, which numbers of the contact it has beside the first (`interior.lorentz`)
+    tangents: tuple[tuple[int, ...], ...] = ((1, 2),)
+
     def __init__(self, mu: Array):
         self.mu, self.count = mu, len(mu)
+
+    @property
+    def coefficients(self) -> Array:
+        """(k, count) of the k Lorentz cones."""
+        return self.mu[None]
+
+    def joined(self, x: Array) -> Array:
+        """The numbers (count, width) of each contact, of rows (rows, 3)."""
+        return x
+
+    def rows(self, x: Array) -> Array:
+        """The rows (rows, 3) of the numbers (count, width) of each contact."""
+        return x
+
+    def times(self, blocks: Array, x: Array) -> Array:
+        """Products of blocks (count, width, width) with the numbers of contacts, in rows (rows, 3)."""
+        return times(blocks, x)
 
     def scaled(self, size: Array, precision: type[np.floating]) -> FrictionCones:
         """The cones of unknowns multiplied by ``size`` (rows, 3), whose tangential numbers are equal."""
@@ -423,8 +425,6 @@ class FrictionCones:
 
 
 # -- the cone of friction 1 -----------------------------------------------------------------------------------
-
-J = np.array([1.0, -1.0, -1.0])
 
 
 def jordan_product(x: Array, y: Array) -> Array:

@@ -1,8 +1,9 @@
 """Cone problems in FCLIB files (HDF5), the library of friction contact problems of Acary et al. (2014).
 
 A local problem holds W and q of u = W r + q; a global one M, H, f, w of M v = H r + f, u = H'v + w. Either
-way the cone problem has N = W = H' M^-1 H and r = q = w + H' M^-1 f. Bilateral constraints (G, b of a global
-problem, V, R, s of a local one) are not part of a cone problem and are refused.
+way the cone problem has N = W = H' M^-1 H and r = q = w + H' M^-1 f. A global problem with rolling has five rows for
+each contact, the last two those of rolling, and mu_r beside mu; it is read, not written. Bilateral constraints (G, b of
+a global problem, V, R, s of a local one) are not part of a cone problem and are refused.
 
 FCLIB's own problem statement adds mu |u_t| to the normal velocity (Coulomb's law); the cone problem is the
 convex one without that term. The data of the two are the same, the solutions are not where contacts slide.
@@ -32,6 +33,7 @@ from pctt.blocks import square_block_matrix
 from pctt.ccp.cone import Array
 from pctt.ccp.delassus import HUB, rows_in_blocks
 from pctt.ccp.problem import ConeProblem
+from pctt.ccp.rolling import RollingProblem
 from pctt.disk import FileError, hdf5, whole
 
 __all__ = ["FileFormatError", "Info", "Solution", "Stored", "load", "read", "write_global", "write_local"]
@@ -81,7 +83,8 @@ class Solution:
 
 
 def read(path: str | Path, comm: MPI.Comm) -> ConeProblem:
-    """The cone problem of an FCLIB file, its contacts in equal parts over the ranks; collective.
+    """The cone problem of an FCLIB file, its contacts in equal parts over the ranks; collective. One with rolling is a
+    `RollingProblem`, whose M must have 6 x 6 blocks.
 
     A local problem is given by N = W. A global one is given by the map G = H' L^-T of the bodies, with M = L L', where
     M has 6 x 6 blocks on its diagonal and nothing else, and otherwise by N = H' M^-1 H. Raises FileFormatError on every
@@ -112,7 +115,11 @@ def load(path: str | Path, comm: MPI.Comm) -> Stored:
         else:
             operator = {"N": (N := square_block_matrix(comm, rows))}
         more = {name: part[name] for name in ("point", "compliance")}
-        problem = ConeProblem(comm, part["r"], part["mu"], **operator, **more)
+        if (rolling := part["mu_r"]) is None:
+            problem = ConeProblem(comm, part["r"], part["mu"], **operator, **more)
+        else:
+            more |= {"rolling": rolling, "spinning": np.zeros_like(rolling)}
+            problem = RollingProblem(comm, part["r"], part["mu"], **operator, **more)
     except ValueError as reason:  # on all ranks alike
         raise FileFormatError(f"{path}: no FCLIB problem: {reason}") from None
     finally:
@@ -126,13 +133,14 @@ def _contents(path: Path) -> tuple[sp.bsr_matrix, dict[str, Any], dict[str, Any]
     if path.is_file() and not h5py.is_hdf5(path):
         raise FileFormatError("it is not HDF5; run/study convert_problems makes FCLIB files of Siconos' text files")
     with h5py.File(path, "r") as file:
-        form = next((form for form in ("local", "global") if f"fclib_{form}" in file), None)
+        form = next((form for form in ("local", "global", "global_rolling") if f"fclib_{form}" in file), None)
         if form is None:
-            raise FileFormatError("it has neither fclib_local nor fclib_global")
-        group = file[f"fclib_{form}"]
+            raise FileFormatError("it has neither fclib_local nor fclib_global nor fclib_global_rolling")
+        group, rolls = file[f"fclib_{form}"], form == "global_rolling"
         dimension = int(np.ravel(group["spacedim"][()])[0])
-        if dimension not in (2, 3):
-            raise FileFormatError(f"its space dimension is {dimension}; allowed are 2 and 3")
+        allowed = (5,) if rolls else (2, 3)
+        if dimension not in allowed:
+            raise FileFormatError(f"its space dimension is {dimension}; allowed is {' or '.join(map(str, allowed))}")
         for name in ("V", "R") if form == "local" else ("G",):
             if name in group:
                 raise FileFormatError(f"it has bilateral constraints ({name}), which a cone problem has not")
@@ -144,6 +152,8 @@ def _contents(path: Path) -> tuple[sp.bsr_matrix, dict[str, Any], dict[str, Any]
         else:
             f, w, H = group["vectors/f"][:], spatial(group["vectors/w"][:]), spatial(_matrix(group["H"]).T).T
             matrix, r, note = without_velocities(_matrix(group["M"]), H.tocsr(), f, w)
+            if rolls and matrix.blocksize != (3, 6):
+                raise FileFormatError("its mass matrix couples bodies, or has no 6 x 6 blocks, as rolling needs them")
 
         def optional(name: str, otherwise: Any = None) -> Any:
             return file[name][()] if name in file else otherwise
@@ -155,33 +165,40 @@ def _contents(path: Path) -> tuple[sp.bsr_matrix, dict[str, Any], dict[str, Any]
         vectors = {
             "r": r,
             "mu": mu,
+            "mu_r": group["vectors/mu_r"][:] if rolls else None,
             "solution": impulses("solution/r"),
             "guess": impulses("guesses/1/r"),
             "point": optional("pctt/point"),
             "compliance": optional("pctt/compliance", np.zeros(len(mu))),
         }
+        rows = len(mu) * (2 if rolls else 1)
         for name, x in vectors.items():
-            shape = (len(mu),) if name in ("mu", "compliance") else (len(mu), 3)
+            shape = (len(mu),) if name in ("mu", "mu_r", "compliance") else (len(mu) if name == "point" else rows, 3)
             if x is not None and np.size(x) != np.prod(shape):
                 raise FileFormatError(f"{len(mu)} friction coefficients, but its {name} has {np.size(x)} numbers")
             vectors[name] = None if x is None else np.reshape(x, shape)
-        if matrix.shape[0] != 3 * len(mu):
+        if matrix.shape[0] != 3 * rows:
             raise FileFormatError(f"{len(mu)} friction coefficients, but its matrix has {matrix.shape[0]} rows")
         title = _text(group["info/title"][()]) if "info/title" in group else ""
-        return matrix, vectors, {"form": f"FCLIB {form}", "title": title, "note": note}
+        return matrix, vectors, {"form": f"FCLIB {form.replace('_', ' ')}", "title": title, "note": note}
 
 
 def _part(A: sp.bsr_matrix, vectors: Mapping[str, Any], rank: int, ranks: int) -> dict[str, Any]:
     """What one rank gets: the rows of its contacts, and how many of the block columns (bodies) it owns."""
     contacts, columns = len(vectors["mu"]), A.shape[1] // A.blocksize[1]
-    mine = slice(contacts * rank // ranks, contacts * (rank + 1) // ranks)
-    near = slice(A.indptr[mine.start], A.indptr[mine.stop])
-    pointers = A.indptr[mine.start : mine.stop + 1] - near.start
-    shape = (3 * (mine.stop - mine.start), A.shape[1])
+    first, last = contacts * rank // ranks, contacts * (rank + 1) // ranks
+
+    def own(x: np.ndarray) -> np.ndarray:
+        """The rows of the contacts, and of their moments if there are some behind those of all contacts."""
+        return np.concatenate([x[first:last], x[contacts:][first:last]])
+
+    lengths = own(np.diff(A.indptr))
+    near = np.repeat(own(A.indptr[:-1]) - np.cumsum(lengths) + lengths, lengths) + np.arange(lengths.sum())
+    pointers = np.concatenate([[0], np.cumsum(lengths)])
     return {
-        "matrix": sp.bsr_matrix((A.data[near], A.indices[near], pointers), shape=shape),
+        "matrix": sp.bsr_matrix((A.data[near], A.indices[near], pointers), shape=(3 * len(lengths), A.shape[1])),
         "columns": columns * (rank + 1) // ranks - columns * rank // ranks,
-        **{name: None if x is None else x[mine] for name, x in vectors.items()},
+        **{name: None if x is None else own(x) for name, x in vectors.items()},
     }
 
 
@@ -212,13 +229,17 @@ def _text(stored: Any) -> str:
 
 def in_space(x: Any, dimension: int, contacts: int) -> Any:
     """The rows (3 nc, ...) in space of those of contacts in the plane, (2 nc, ...): normal and one tangent. No impulse
-    along the second tangent moves anything. With dimension 3, x itself. ValueError for another number of rows."""
+    along the second tangent moves anything. With dimension 3, x itself. With 5, which is rolling in space, (6 nc, ...):
+    normal and tangents of all contacts, then zero and two rolls. ValueError for another number of rows."""
     if dimension == 3:
         return x
-    rows = (3 * np.arange(contacts)[:, None] + np.arange(2)).ravel()
-    lift = sp.csr_matrix((np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=(3 * contacts, len(rows)))
-    if x.shape[0] != len(rows):
-        raise ValueError(f"{x.shape[0]} rows for {contacts} contacts in the plane")
+    if x.shape[0] != dimension * contacts:
+        raise ValueError(f"{x.shape[0]} rows for {contacts} contacts of {dimension} rows each")
+    every, known = np.arange(dimension * contacts), [0, 1, 2, 4, 5][:dimension]
+    contact, number = np.divmod(every, dimension)
+    part, number = np.divmod(np.array(known)[number], 3)
+    rows = 3 * (contacts * part + contact) + number
+    lift = sp.csr_matrix((np.ones(len(every)), (rows, every)), shape=(3 * contacts * (dimension // 2), len(every)))
     return lift @ x
 
 

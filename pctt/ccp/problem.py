@@ -55,19 +55,20 @@ class ConeProblem:
         refuse(comm, _wrong(r, mu, G, N, point, key, compliance))
         self.r = np.ascontiguousarray(r, dtype=float).reshape(-1, 3)
         self.mu = np.ascontiguousarray(mu, dtype=float)
-        if count := self.sum(_not_finite(self.r) + np.sum(~((self.mu >= 0) & (self.mu < np.inf)))):
-            raise ValueError(f"{count} contacts with a NaN, infinite or negative coefficient")
-        self.cones = self._cones()
-        self.size = self.sum(self.cones.count)
-        self.contact_map = None if G is None else _map(comm, G)
-        self.operator: ContactMap | GivenMatrix = self.contact_map or GivenMatrix(comm, N)
-        # the diagonal blocks have squares of all numbers of G
-        if wrong := self.sum(_not_finite(self._rigid_blocks)):
-            self.destroy()
-            raise ValueError(f"G has a NaN or an infinite number in {wrong} contacts")
         self.compliance = np.zeros_like(self.r)
         self.compliance[:, 0] = compliance
-        self.yields = bool(self.max(bool(self.compliance.any())))
+        self.cones = self._cones()
+        self.contact_map = None if G is None else _map(comm, G)
+        self.operator: ContactMap | GivenMatrix = self.contact_map or GivenMatrix(comm, N)
+        bad = _not_finite(self.r) + np.sum(~((self.mu >= 0) & (self.mu < np.inf)))
+        # the diagonal blocks have squares of all numbers of G
+        here = np.array([bad, _not_finite(self._rigid_blocks), self.cones.count, self.compliance.any()], np.int64)
+        bad, wrong, self.size, soft = self.sum(here).tolist()
+        if bad or wrong:
+            self.destroy()
+            what = f"{bad} contacts with a" if bad else f"G has a NaN or an infinite number in {wrong} contacts"
+            raise ValueError(f"{what} NaN, infinite or negative coefficient" if bad else what)
+        self.yields = bool(soft)
 
     def __repr__(self) -> str:
         given = "N" if self.contact_map is None else "G"

@@ -1,5 +1,5 @@
-"""The solvers of the cone problem. ``-ccp_type`` and the tests are made from this list, and the table of docs/ccp.md is
-compared with it."""
+"""The solvers of the cone problem. ``-ccp_type`` and the tests are made from this list, and the table of
+docs/solvers.md is compared with it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ class Solver:
 
     ``needs`` is PRODUCT, MATRIX, NEWTON or EITHER; ``iterations`` the default limit (``-ccp_max_it``). A method that
     ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself; one that ``has_rolling``
-    takes a `pctt.ccp.rolling.RollingProblem`.
+    takes a `pctt.ccp.rolling.RollingProblem`, and one that ``has_coupled`` a problem of bodies with joints or
+    in a cell that deforms.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Solver:
     source: str
     has_law: bool = False
     has_rolling: bool = False
+    has_coupled: bool = False
 
     @property
     def newton(self) -> bool:
@@ -53,13 +55,13 @@ SOLVERS = {
                "the paper's primal-dual interior point method", "the paper, section 2.4"),
         Solver("conic", conic.solve, conic.Conic, NEWTON, 60,
                "symmetric cone interior point method, Nesterov-Todd scaling, Mehrotra's corrector",
-               "Nesterov, Todd 1997; Acary et al. 2023", has_law=True),
+               "Nesterov, Todd 1997; Acary et al. 2023", has_law=True, has_rolling=True),
         Solver("auto", auto.solve, auto.Auto, EITHER, 20_000,
                "`apgd` for as many iterations as half of `conic` costs, then `conic`", "`pctt/ccp/auto.py`",
-               has_law=True, has_rolling=True),
+               has_law=True, has_rolling=True, has_coupled=True),
         Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
                "accelerated projected gradient descent with restart", "Mazhar et al. 2015", has_law=True,
-               has_rolling=True),
+               has_rolling=True, has_coupled=True),
         Solver("barzilai_borwein", projected_steps.adaptive, projected_steps.BarzilaiBorwein, PRODUCT, 20_000,
                "projected Barzilai-Borwein steps with an adaptive nonmonotone line search", "Dai, Fletcher 2005"),
         Solver("spectral", projected_steps.spectral, projected_steps.BarzilaiBorwein, PRODUCT, 20_000,
@@ -78,5 +80,14 @@ SOLVERS = {
     )
 }  # fmt: skip
 
-#: The methods for contacts that resist rolling, as messages name them.
-FOR_ROLLING = " and ".join(name for name, method in SOLVERS.items() if method.has_rolling)
+
+def why_refused(type: str, rolls: bool, coupled: str) -> str:
+    """In words, why a method cannot take problems with resistance to rolling or spinning, or with what is said to
+    couple the bodies, and which methods can; "" if it can."""
+    with_coupled = [name for name, method in SOLVERS.items() if method.has_coupled]
+    with_rolling = [name for name, method in SOLVERS.items() if method.has_rolling]
+    if coupled and type not in with_coupled:
+        return f"{coupled}; allowed are {', '.join(with_coupled)}"
+    if rolls and type not in with_rolling:
+        return f"rolling or spinning resistance; allowed are {', '.join(with_rolling)}"
+    return ""

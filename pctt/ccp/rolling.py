@@ -21,9 +21,10 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from dem.compiled import inlined, loop
-from dem.contact_map import BlockRows, TurningMap
+from dem.contact_map import BlockRows, ContactMap
 from dem.exchange import refuse
 from pctt.ccp.cone import (
+    NO_MOVE,
     ONE,
     STRIP,
     ZERO,
@@ -42,8 +43,23 @@ from pctt.ccp.problem import ConeProblem
 class RollingCones(FrictionCones):
     """The cones of contacts with coefficients ``mu`` (2 count,), of friction and of rolling, and ``spinning``."""
 
+    tangents = ((1, 2), (4, 5), (3,))
+
     def __init__(self, mu: Array, spinning: Array):
         self.mu, self.spinning, self.count = mu, spinning, len(spinning)
+
+    @property
+    def coefficients(self) -> Array:
+        return np.stack([self.mu[: self.count], self.mu[self.count :], self.spinning])
+
+    def joined(self, x: Array) -> Array:
+        return np.concatenate([x[: self.count], x[self.count :]], axis=1)
+
+    def rows(self, x: Array) -> Array:
+        return np.concatenate([x[:, :3], x[:, 3:]])
+
+    def times(self, blocks: Array, x: Array) -> Array:
+        return self.rows(np.einsum("cij,cj->ci", blocks, self.joined(x)))
 
     def scaled(self, size: Array, precision: type[np.floating]) -> RollingCones:
         """The cones of unknowns multiplied by ``size`` (2 count, 3): spin and rolls have sizes of their own, so that
@@ -57,8 +73,9 @@ class RollingCones(FrictionCones):
         return project_to(x, self.mu, self.spinning, out)
 
     def squared_move(self, x: Array, y: Array, step: float, coulomb: bool) -> float:
-        move = self.move(x, y, step, coulomb)
-        return float(np.vdot(move, move))
+        both = self.move(x, y, step, coulomb), step * y
+        move, speed = (np.square(z).sum(axis=1).reshape(2, -1).sum(axis=0) for z in both)
+        return float(move[~(move <= NO_MOVE * speed)].sum())
 
     def wrong_works(self, g: Array, y: Array, r: Array) -> tuple[float, float, float]:
         normal, push = y[: self.count, 0], g[: self.count, 0]
@@ -84,7 +101,7 @@ class RollingProblem(ConeProblem):
     the contacts, as ``spinning`` (nc,) has them of spinning."""
 
     def __init__(
-        self, comm: MPI.Comm, r: Array, mu: Array, rolling: Array, spinning: Array, *, G: TurningMap | BlockRows,
+        self, comm: MPI.Comm, r: Array, mu: Array, rolling: Array, spinning: Array, *, G: ContactMap | BlockRows,
         point: Array | None = None, key: np.ndarray | None = None, compliance: Array | float = 0.0,
     ):  # fmt: skip
         """r (2 nc, 3); the others as of a `ConeProblem`, with a row for each contact."""

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from dem.contact_map import find_halo
+from dem.contact_map.cell import CellMap
 from dem.contact_map.jointed import JointedMap
-from dem.exchange import offsets
 from pctt.ccp.cone import Array, dot
 from pctt.ccp.problem import ConeProblem
 
@@ -53,9 +54,10 @@ def _left_over(problem: ConeProblem, d: Array) -> float:
     columns of a body, of which the mass drops out; between 0 and 2 for ||d|| = 1. Collective."""
     assert problem.contact_map is not None
     known = problem.contact_map
-    G = (known.free if isinstance(known, JointedMap) else known).block_rows
-    each = np.bincount(G.indices, (G.blocks**2).sum(axis=(1, 2)), problem.sum(G.columns))
-    first = offsets(problem.comm, G.columns)[problem.comm.rank]
-    size = problem.sum(each)[first : first + G.columns]
-    momentum = np.square(problem.momentum(d).reshape(-1, 6)).sum(axis=1)
+    G = (known.free if isinstance(known, (CellMap, JointedMap)) else known).block_rows
+    halo, body = find_halo(problem.comm, G.columns, G.indices)
+    each = np.bincount(body, (G.blocks**2).sum(axis=(1, 2)), halo.rows)
+    halo.add(each)
+    size = each[: G.columns]
+    momentum = np.square(problem.momentum(d).reshape(-1, 6)[: G.columns]).sum(axis=1)
     return float(problem.sum(np.divide(momentum, size, out=np.zeros(len(size)), where=size > 0).sum()))

@@ -71,7 +71,8 @@ class Stage:
         self._spheres = vtkOpenGLSphereMapper(scale_array="radius")  # round at any size, and thousands cost little
         self._boxes = _glyphs(surfaces.made(vtkCubeSource()))
         self._cylinders = _glyphs(surfaces.cylinder(0.5, 1.0, caps=False))
-        for mapper in (self._spheres, self._boxes, self._cylinders):
+        self._polyhedra = vtkPolyDataMapper()
+        for mapper in (self._spheres, self._boxes, self._cylinders, self._polyhedra):
             mapper.SetScalarModeToUsePointFieldData()
             mapper.SelectColorArray("value")
             mapper.SetLookupTable(colours)
@@ -111,6 +112,11 @@ class Stage:
         _show(self._spheres, centers, {"value": value[np.concatenate([rows, clump])], "radius": radii})
         for mapper, rows, widths in ((self._boxes, block, extent), (self._cylinders, long, core)):
             _show(mapper, place[rows], {"value": value[rows], "extent": widths[rows], "turn": turn[rows]})
+        grain, corners = surfaces.faces(frame)
+        grain, corners = grain[shown[grain]], corners[shown[grain]]
+        polyhedra = surfaces.polydata(corners, "polys", 3)
+        surfaces.add_arrays(polyhedra.GetPointData(), {"value": np.repeat(value[grain], 3)})
+        self._polyhedra.SetInputDataObject(polyhedra)
         walls = scene.walls(frame)
         self._walls.SetInputDataObject(walls)
         self._edges.SetInputDataObject(surfaces.made(vtkFeatureEdges(coloring=False), walls))

@@ -17,7 +17,7 @@ from vtkmodules.vtkFiltersGeneral import vtkTransformFilter
 from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSphereSource
 
 from dem import quaternion
-from dem.bodies import BOX, CAPSULE, CLUMP, SPHERE
+from dem.bodies import BOX, CAPSULE, CLUMP, POLYHEDRON, SPHERE
 from pctt.disk import FileError
 from pctt.folder import Folder, Frame, Table
 
@@ -165,10 +165,11 @@ def _bounds(places: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def extent(path: Path, table: Table) -> np.ndarray:
-    """Widths (grains, 3) of the grains along their own axes, of clumps of the spheres about them [m]."""
+    """Widths (grains, 3) of the grains along their own axes, of clumps and polyhedra of the spheres about them [m]."""
     shape, size = table.shape[: table.grains, None], table.size[: table.grains]
     clumps = range(CLUMP, CLUMP + len(table.clumps))
-    unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE, *clumps}
+    polyhedra = range(POLYHEDRON, POLYHEDRON + len(table.polyhedra))
+    unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE, *clumps, *polyhedra}
     if unknown:
         raise FileError(f"{path}: no surface is known for grains of shape {unknown.pop()}")
     round_ones = size[:, :1] + [0, 0, 1] * size[:, 1:2] * (shape == CAPSULE)
@@ -186,6 +187,20 @@ def members(frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             places.append(frame.position[grains] + quaternion.rotate(frame.quaternion[grains], center))
             radii.append(np.full(len(grains), radius))
     return np.concatenate(rows), np.concatenate(places), np.concatenate(radii)
+
+
+def faces(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """The triangles of all polyhedra: the row of the grain (m,) and the corners (m, 3, 3) [m]."""
+    table = frame.table
+    rows, corners = [np.zeros(0, int)], [np.zeros((0, 3, 3))]
+    for number, own in enumerate(table.polyhedra):
+        grains = np.flatnonzero(table.shape[: table.grains] == POLYHEDRON + number)
+        vertex, triangle = np.array(own["vertices"]), np.array(own["triangles"])
+        scale = table.size[grains, 0] / np.linalg.norm(vertex, axis=1).max()
+        places = quaternion.rotate(frame.quaternion[grains, None], scale[:, None, None] * vertex[None])
+        corners.append((frame.position[grains, None] + places)[:, triangle].reshape(-1, 3, 3))
+        rows.append(np.repeat(grains, len(triangle)))
+    return np.concatenate(rows), np.concatenate(corners)
 
 
 def polydata(places: np.ndarray, cells: str, size: int) -> vtkPolyData:

@@ -51,7 +51,7 @@ class Dump:
     ):  # fmt: skip
         self._settings, self._experiment, self._world, self._place = settings, experiment, world, place
         self._hard_left, self._folder = hard, folder
-        self._none = unwritten(world.pairs, world.joints)
+        self._none = unwritten(world.pairs, world.joints, world.servo is not None)
         if folder and self._none:
             raise OptionError(f"-dump_problem: {self._none}")
 
@@ -131,10 +131,13 @@ class Dump:
         return path
 
 
-def unwritten(pairs: Pairs, joints: dict[str, Joint]) -> str:
-    """Why problems of a scene with these pairs and joints cannot be written, in words; "" if they can."""
+def unwritten(pairs: Pairs, joints: dict[str, Joint], deforms: bool) -> str:
+    """Why problems of a scene with these pairs and joints, or whose cell `deforms`, cannot be written, in words; "" if
+    they can."""
     if pairs.resists:  # FCLIB's files have a format of their own for these
         return "files have no rolling and spinning; allowed are scenes without them"
+    if deforms:
+        return "files have no cells that deform; allowed are scenes without them"
     return "files have no joints; allowed are scenes without them" if joints else ""
 
 

@@ -31,7 +31,7 @@ class JointNow:
         joint = world.joints[self.name]
         _, row, ends = joint_ends(world, self._sim.settings.dt)
         row = row[self._number : self._number + 1]
-        found = geometry([joint], row, ends)
+        found = geometry([joint], row, ends, world.period)
         velocity = np.einsum("wsx,sx->w", found.rows[0], ends.velocity[row[0]])
         return joint, found, velocity
 

@@ -12,6 +12,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.compiled import set_threads
 from dem.experiment import Experiment
 from dem.together import together
 from pctt import ccp
@@ -26,7 +27,7 @@ from pctt.run.settings import DEMO, Options, Run, Settings, find_scene
 #: Options of simulations, beside those of the scene; those that settled states depend on, and -quiet.
 OF_STEPS = {
     "scene", "steps", "dt", "delta", "stiffness", "projection", "recovery_speed", "restart", "settle", "output_every",
-    "checkpoint_every", "dump_problem",
+    "checkpoint_every", "checkpoint_minutes", "dump_problem",
 }  # fmt: skip
 OF_SETTLING = {"settle", "scene", "quiet"}
 
@@ -52,7 +53,15 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         form = ccp.newton_for(comm, asked.solver, asked.newton, compare).form
         _refuse_for_petsc(database, form, comm)
     _refuse_places(run, comm)
+    together(comm, "option -threads", lambda: _start_threads(run.threads), own=(OptionError,))
     return Options(run, scene, asked.of(scene, relaxed=bool(run.problem or run.compare)), demo)
+
+
+def _start_threads(count: int) -> None:
+    try:
+        set_threads(count)
+    except ValueError as error:
+        raise OptionError(f"-{error}") from None
 
 
 def _read_scene(name: str, scene_class: type[Experiment], database: Mapping[str, str]) -> Experiment:

@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
@@ -22,7 +23,10 @@ from mpi4py import MPI
 from dem import bodies
 from dem.exchange import exchange
 from dem.experiment import Experiment
+from dem.motion import Dynamic
 from dem.period import velocity_in_cell, wrapped
+from dem.polyhedra import triangles
+from dem.scene import least_half
 from dem.shapes import described
 from dem.step import Step
 from dem.together import together
@@ -32,6 +36,7 @@ from pctt.disk import FileError, Lock, on_first, texts, write_rows, write_text
 from pctt.folder import DERIVED, FILES, HARD, Folder, dumps, write_table
 from pctt.options import OptionError
 from pctt.petsc import warn
+from pctt.run.settings import Run
 
 #: What no step changes, but in a world with sources or outlets, whose frames have it too, and the ids.
 TABLE = ("shape", "size", "mass", "material")
@@ -124,18 +129,19 @@ class Place:
 class Writer:
     """Writes the steps of a run to a place: of each by `record` and then `add`, and at the end by `complete`.
 
-    A frame is recorded every ``every`` steps (0: never), and ``save(path)`` writes a checkpoint every
-    ``checkpoint_every``. A run that goes on from the folder's own checkpoint adds to the files of the earlier run; any
-    other run replaces them. Either removes nothing before its first step is written. Methods are collective.
+    The options ``run`` say when a frame is recorded, and when ``save(path)`` writes a checkpoint: after some steps, or
+    after some minutes by the clock of the first rank. A run that goes on from the folder's own checkpoint adds to the
+    files of the earlier run; any other run replaces them. Either removes nothing before its first step is written.
+    Methods are collective.
     """
 
     def __init__(
         self, place: Place, world: World, about: dict[str, Any], save: Callable[[Path], None],
-        compare: Callable[[], dict[str, Any]], every: int, checkpoint_every: int,
+        compare: Callable[[], dict[str, Any]], run: Run,
     ):  # fmt: skip
         """``about``: what settings.json says; ``compare()``: the summary of the compared preconditioners."""
         self.place, self._world, self._save, self._compare, self.comm = place, world, save, compare, world.comm
-        self._every, self._checkpoint_every = every, checkpoint_every
+        self._run, self._saved_at = run, time.monotonic()
         self._start = self._recorded = self._saved = world.step
         self._kept_steps = world.step if place.goes_on else 0
         self._begun = self._stands = self._stale = False
@@ -143,6 +149,8 @@ class Writer:
         tables = [world.grains, *(source.extremes() for source in world.sources.values())]
         smallest = min(float(bodies.least_half_thickness(table).min(initial=np.inf)) for table in tables)
         radius = self.comm.allreduce(smallest, MPI.MIN)
+        if np.isinf(radius):
+            radius = min(least_half(body) for body in world.large_bodies if isinstance(body.motion, Dynamic))
         self._about = {**about, "bodies": world.body_count, "ranks": self.comm.size, "smallest_radius [m]": radius}
         kept = on_first(self.comm, self._lines, lambda: {step for step, _ in self._kept()})  # which can be gone on with
         if place.goes_on and len(kept) <= self._start - min(kept, default=self._start):
@@ -179,7 +187,8 @@ class Writer:
         Bodies are in the order of their ids (grains, then large bodies).
         """
         world, contacts, frames = step.world, step.contacts, self.place.now / "frames"
-        due = self._every and (always or world.step % self._every == 0)
+        every = self._run.output_every
+        due = every and (always or world.step % every == 0)
         if not due or self._recorded == world.step:
             return
         if self._recorded == self._start:
@@ -187,8 +196,9 @@ class Writer:
             rows = _by_id(world, TABLE)
             large = np.bytes_(json.dumps(described_bodies(world)))
             shared = {"materials": texts(world.materials), "large": large}
-            if world.clumps:
-                shared["clumps"] = np.bytes_(json.dumps(described_clumps(world)))
+            for name, shapes in described_forms(world).items():
+                if shapes:
+                    shared[name] = np.bytes_(json.dumps(shapes))
             write_rows(frames / "bodies.h5", self.comm, rows, shared, {})
         near = contacts.near.bodies
         rows = {
@@ -209,9 +219,8 @@ class Writer:
     def add(self, line: Mapping[str, Any], row: Mapping[str, float]) -> None:
         """Write the figures of a step with the row of its records, and the checkpoint if that is due."""
         self.place.make()
-        on_first(self.comm, self._lines, lambda: self._add(dumps({**line, "record": row})))
-        # after the figures: a run that goes on from the checkpoint must find the step
-        if (self._world.step - self._start) % self._checkpoint_every == 0:
+        due = on_first(self.comm, self._lines, lambda: self._add(dumps({**line, "record": row})))
+        if due:  # after the figures: a run that goes on from the checkpoint must find the step
             self._checkpoint()
         if not self._stands:
             self.place.take()
@@ -219,11 +228,18 @@ class Writer:
             self._stands = True
         self.analysis, self._stale = None, True
 
-    def _add(self, line: str) -> None:
-        """The first line replaces the file, with the lines that stay; every other one is a single write."""
+    def _add(self, line: str) -> bool:
+        """Whether a checkpoint is due after this line. The first line replaces the file, with the lines that stay;
+        every other one is a single write."""
         if self._begun:
             disk.append(self._lines, line)
-            return
+        else:
+            self._begin(line)
+        if self._run.checkpoint_minutes is not None:
+            return time.monotonic() - self._saved_at >= 60.0 * self._run.checkpoint_minutes
+        return (self._world.step - self._start) % self._run.checkpoint_every == 0
+
+    def _begin(self, line: str) -> None:
         write_text(self.place.now / "settings.json", dumps(self._about, indent=1) + "\n")
         with disk.whole(self._lines) as temporary, open(temporary, "w") as file:
             file.writelines(f"{text}\n" for text in chain((text for _, text in self._kept()), [line]))
@@ -276,7 +292,7 @@ class Writer:
         """The lines of steps.jsonl come to the disk first: a run goes on from the checkpoint with them."""
         on_first(self.comm, self._lines, lambda: disk.flush(self._lines))
         self._save(self.checkpoint)
-        self._saved = self._world.step
+        self._saved, self._saved_at = self._world.step, time.monotonic()
 
     def _remove_later(self, hard: str) -> None:
         """Remove what followed from an earlier run's steps, and its later steps, but not those of this run's first
@@ -301,9 +317,14 @@ def described_bodies(world: World) -> list[dict[str, Any]]:
     return json.loads(json.dumps(large, default=list))  # arrays as lists
 
 
-def described_clumps(world: World) -> list[dict[str, Any]]:
-    """The centres [m], in the frames of the grains, and radii [m] of the spheres of each clump, as JSON has them."""
-    return [{"centres": form.center.tolist(), "radii": form.radius.tolist()} for form in world.clumps]
+def described_forms(world: World) -> dict[str, list[dict[str, Any]]]:
+    """In the frames of the grains, as JSON has them: "clumps", the centres [m] and radii [m] of the spheres of each,
+    and "polyhedra", the vertices [m] of each, times the scale of the grain, and the rows of these of its triangles."""
+    solids = [solid.faces for solid in world.polyhedra]
+    return {
+        "clumps": [{"centres": form.center.tolist(), "radii": form.radius.tolist()} for form in world.clumps],
+        "polyhedra": [{"vertices": own.vertex.tolist(), "triangles": triangles(own).tolist()} for own in solids],
+    }
 
 
 def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:

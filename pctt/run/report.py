@@ -196,7 +196,8 @@ def law_line(steps: Sequence[Mapping[str, Any]], tol: float) -> str:
     said = f"law of contact: {counted}; Coulomb residual at most {worst:.1e}"
     if RELAXATION not in laws or worst <= max(LARGE_OPENING, 10 * tol):
         return said
-    return f"{said}: sliding contacts open by dt mu |v_t|; -law coulomb keeps them closed (docs/ccp.md)"
+    relaxed = "this run solved the relaxed law of friction, in which sliding contacts open by dt mu |v_t|"
+    return f"{said}; {relaxed}; add -law coulomb for Coulomb's law (docs/ccp.md)"
 
 
 def jumps_line(steps: Sequence[Mapping[str, Any]]) -> str:
@@ -218,7 +219,7 @@ def forces_line(steps: Sequence[Mapping[str, Any]], limit: float) -> str:
     if worst[kind] <= LARGE_CLOSING_WORK:
         return said
     hint = f"-ccp_closing_work {LARGE_CLOSING_WORK}" if limit > LARGE_CLOSING_WORK else "a smaller -ccp_tol"
-    return f"WARNING: {said}: forces on bodies may be far off; try {hint} (docs/ccp.md)"
+    return f"WARNING: {said}: forces on bodies may be far off; try {hint} (docs/accuracy.md)"
 
 
 def overlap_line(worst: Mapping[str, float]) -> str:

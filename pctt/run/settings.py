@@ -15,6 +15,7 @@ from dem.experiment import SCENE_FILE, Experiment, Given, SceneFileError, from_f
 from dem.scene import Scene
 from dem.scenes import SCENES
 from pctt import ccp
+from pctt.ccp.registry import why_refused
 from pctt.options import (
     AT_LEAST_ONE,
     COUNT,
@@ -134,9 +135,11 @@ class Settings(ccp.Limits):
         dt = time_step.recommended(scene) if self.dt is None else self.dt
         delta = time_step.contact_distance(scene) if self.delta is None else self.delta
         resists = scene.pairs(np.inf).resists
-        if not ccp.SOLVERS[self.solver].has_rolling and (resists or scene.joints):
-            why = "rolling or spinning resistance" if resists else "joints"
-            raise OptionError(f"-ccp_type {self.solver}: the scene has {why}; allowed are {ccp.FOR_ROLLING}")
+        coupled = "joints" if scene.joints else "a cell that deforms" if scene.deforms else ""
+        if why := why_refused(self.solver, resists, coupled):
+            raise OptionError(f"-ccp_type {self.solver}: the scene has {why}")
+        if resists and self.newton == "contact":
+            raise OptionError("-ccp_newton contact: the scene has rolling or spinning resistance; allowed is body")
         if delta < scene.reach:
             raise OptionError(f"-delta {delta:g} m: cohesion acts up to {scene.reach:g} m; allowed is at least that")
         return dataclasses.replace(self, dt=dt, delta=delta, stiffness=stiffness)
@@ -163,6 +166,9 @@ class Run:
     )
     output_every: int = option(10, "steps between two records in state.h5, and the last one; 0: none", check=COUNT)
     checkpoint_every: int = option(10, "steps between two checkpoints, and one at the end", check=AT_LEAST_ONE)
+    checkpoint_minutes: Optional[float] = option(
+        None, "time between two checkpoints by the clock, in place of -checkpoint_every", unit="min", check=NOT_NEGATIVE
+    )
     problem: str = option("", "FCLIB file with a cone problem to solve instead of a scene")
     dump_problem: str = option("", "folder for the steps' cone problems as FCLIB files")
     compare: str = option(
@@ -171,6 +177,8 @@ class Run:
         "one have the prefix compare_LABEL_",
     )
     compare_every: int = option(1, "compare on every k-th Newton system", check=AT_LEAST_ONE)
+    threads: int = option(1, "threads of each rank for the loops of the solver, where ranks have several cores",
+                          check=AT_LEAST_ONE)  # fmt: skip
     quiet: bool = option(False, "print nothing but errors")
 
     def steps_of(self, dt: float) -> int:

@@ -39,7 +39,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         progress.say("no options: the demo; -help lists the options")
     if run.dump_problem:
         scene = built(options.scene, comm)
-        if why := unwritten(scene.pairs(np.inf), scene.joints):
+        if why := unwritten(scene.pairs(np.inf), scene.joints, scene.deforms):
             raise OptionError(f"-dump_problem: {why}")
     compare = ccp.Comparison(comm, run.compared(), run.compare_every)
     with Simulation(
@@ -49,7 +49,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
             progress.say(f"from {sim.restart}: step {sim.steps}, time {sim.time:g} s")
         sim.write(
             run.output, overwrite=run.overwrite, every=run.output_every, checkpoint_every=run.checkpoint_every,
-            problems=run.dump_problem,
+            checkpoint_minutes=run.checkpoint_minutes, problems=run.dump_problem,
         )  # fmt: skip
         _make_steps(options, sim, progress, compare)
 

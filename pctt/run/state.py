@@ -17,9 +17,12 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from dem import joints, loads, springs, stiffness, time_step
-from dem.arrays import Floats
+from dem import joints, loads, sources, springs, stiffness, time_step
+from dem.arrays import Floats, Keys
 from dem.bodies import Bodies
+from dem.contact.clumps import more_numbers
+from dem.contact.polyhedra import hulls_of
+from dem.contact.primitives import numbers_of
 from dem.exchange import refuse
 from dem.experiment import Experiment
 from dem.impulses import ImpulseMemory
@@ -29,7 +32,15 @@ from dem.scene import LargeBody, Scene
 from dem.shapes import placed
 from dem.start import even_slice, new_world, restart_rows, restored_world
 from dem.together import SceneError, together, unlike
-from dem.world import World, changed_motions, restore_joints, restore_loads, restore_motions, restore_springs
+from dem.world import (
+    World,
+    changed_motions,
+    restore_joints,
+    restore_loads,
+    restore_motions,
+    restore_sources,
+    restore_springs,
+)
 from pctt import ccp
 from pctt.disk import FileError, Lock, on_first, read, texts, write_rows
 from pctt.options import OptionError
@@ -41,8 +52,10 @@ from pctt.run.stepper import Stepper
 #: Made within a run.
 CHANGES = {
     "motions": restore_motions, "loads": restore_loads, "springs": restore_springs, "joints": restore_joints,
+    "sources": restore_sources,
 }  # fmt: skip
-FORMAT, FIRST_FORMAT = "pctt checkpoint 2", "pctt checkpoint 1"  #: the first one had no checksums
+#: The third has keys of two numbers. The first one had no checksums.
+FORMAT, SECOND_FORMAT, FIRST_FORMAT = (f"pctt checkpoint {number}" for number in (3, 2, 1))
 
 Say = Callable[[str], object]  #: told on the first rank
 
@@ -62,6 +75,7 @@ def built(scene: Experiment, comm: MPI.Comm) -> Scene:
     if other := unlike(comm, words, numbers):
         allowed = "allowed is the same scene on all ranks (random numbers need a seed, and no rank a part of its own)"
         raise SceneError(f"{what}: rank {other} has built other bodies or materials than rank 0; {allowed}")
+    found.survey(comm)
     return found
 
 
@@ -69,14 +83,18 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     """What a scene is made of, in words and numbers, for `unlike`."""
     large = scene.large_bodies
     motions = [(body.name, type(body.motion).__name__) for body in large]
-    words = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
+    words: list[Any] = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
     words += [repr(scene.sources), repr(scene.outlets)]
+    words.append([(part.count, part.kind, part.material) for part in scene.parts])
     words.append([(name, repr(joint)) for name, joint in scene.joints.items()])
-    numbers: list[Any] = [column for table in (*scene.parts, scene.large()) for column in table.columns().values()]
+    numbers: list[Any] = [column.sample() for part in scene.parts for column in part.given.values()]
+    numbers += scene.large().columns().values()
     numbers += [value for body in large for shape in body.shapes for value in placed(shape)]
     numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values(), *(body.surface for body in large)]
     numbers += [-np.inf if scene.shear_rate is None else scene.shear_rate, scene.gradient]
-    numbers += [np.full(3, -np.inf) if scene.stress is None else np.nan_to_num(scene.stress)]
+    of_cell = (scene.stress, scene.strain_rate)
+    numbers += [np.full(3, -np.inf) if given is None else np.nan_to_num(given) for given in of_cell]
+    numbers += [scene.strain_start]
     for part in (*(body.motion for body in large), *scene.springs.values(), *scene.loads.values()):
         numbers += getattr(part, "__dict__", {}).values()
     return repr(words), [value for value in map(np.asarray, numbers) if value.dtype.kind in "fiub"]
@@ -143,6 +161,8 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
         shared["world/springs"] = texts([springs.as_text(changed)])
     if world.joints_set:
         shared["world/joints"] = texts([joints.as_text({n: world.joints[n] for n in sorted(world.joints_set)})])
+    if world.sources_set:
+        shared["world/sources"] = texts([sources.as_text({n: world.sources[n] for n in sorted(world.sources_set)})])
     rows |= {"contacts/key": key, "contacts/impulse": impulse}
     write_rows(path, world.comm, rows, shared, {"/": {"format": FORMAT, **made_with}})
 
@@ -176,6 +196,8 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
         for restore, text in zip(CHANGES.values(), changes):
             restore(world, text)
         memory, (key, impulse) = ImpulseMemory(comm, world.pairs.parts), impulses
+        if key.dtype.kind != "c":
+            key = _keys_of_before(key, world)
         right = np.isfinite(impulse).all() and impulse.shape == (len(key), 4 * world.pairs.parts)
         right = right and len(np.unique(key)) == len(key)
         refuse(comm, "" if right else "impulses of contacts that are no numbers, or two of one contact")
@@ -185,8 +207,19 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
     return world, memory
 
 
+def _keys_of_before(key: np.ndarray, world: World) -> Keys:
+    """The keys of contacts in files of the first two formats, which have them as one number of 64 bits."""
+    first = 10**8 if world.sources else world.first_large  # number of the first part of a large body
+    features = hulls_of(()).features  # there were no polyhedra but boxes
+    parts = sum(numbers_of(shape, features) for body in world.large_bodies for shape in body.shapes)
+    pair, feature = np.divmod(key, features)
+    both = np.array(np.divmod(pair, first + parts + more_numbers(world.clumps, world.initial)))
+    one, two = np.where(both < first, both, both - first + world.first_large)
+    return one + 1j * (two * features + feature)
+
+
 def _refuse_unmarked(file: h5py.File, sealed: bool) -> None:
-    if (file.attrs.get("format"), sealed) not in ((FORMAT, True), (FIRST_FORMAT, False)):
+    if (file.attrs.get("format"), sealed) not in ((FORMAT, True), (SECOND_FORMAT, True), (FIRST_FORMAT, False)):
         raise ValueError(f"it is not marked '{FORMAT}', or has no checksum")
 
 

@@ -12,13 +12,13 @@ from mpi4py import MPI
 
 from dem.arrays import Ints
 from dem.contact import Contacts, find_contacts
+from dem.exchange import reduced
 from dem.fast import refuse_passages
 from dem.impulses import ImpulseMemory
 from dem.joints import Coupling
 from dem.partition import rebalance
 from dem.passage import come_and_go
 from dem.period import put_back
-from dem.servo import follow_stress
 from dem.step import advance, carried, find_overrun, find_turned
 from dem.system import ContactSystem, touching
 from dem.together import SceneError
@@ -87,10 +87,15 @@ class Stepper:
     def step(self) -> dict[str, Any]:
         """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no number), or if
         the contacts have no solution: any impulses would be invented, and those of the solver throw bodies away."""
+        servo = self.world.servo
         try:
             return self._step()
         except FloatingPointError as error:  # raised on all ranks alike
+            self.world.servo = servo
             raise SceneError(f"step {self.world.step + 1}: {error}") from None
+        except SceneError:
+            self.world.servo = servo
+            raise
 
     def _step(self) -> dict[str, Any]:
         self._corrections, self._rejoined, self._joints = 0, 0, None
@@ -114,8 +119,8 @@ class Stepper:
             forces, moments = np.split(result.impulse, [len(self.contacts)])
             self.impulse, self.history = self.system.net(forces), result.history
             self.moment = None if self.system.resistance is None else moments
+            self.system.take_flow(self.world, self.contacts)
             advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt, moving)
-            follow_stress(self.world, self.contacts, self.system, self.impulse)
             self.memory.remember(self.system.key, result.impulse, self.system.frame)
             self._slabs = self.world.slabs
         self._release()
@@ -204,6 +209,7 @@ class Stepper:
         delta, dt, recovery = settings.delta, settings.dt, settings.recovery_speed
         with log.phase("search"):
             velocity = system.velocity_with(momentum)
+            system.set_rate(world, momentum)
             deep = 0.01 * delta  # the overlap that is solved for
             wider = find_overrun(world, contacts, velocity, delta, dt, deep, recovery)
             if wider is not None:
@@ -230,8 +236,9 @@ class Stepper:
         if self.system.joints is None or self._rejoined == most:
             return True
         with log.phase("assembly"):
-            forces = self.system.net(result.impulse[: len(self.contacts)])
-            found = self.system.joints_with(self.world, forces)
+            forces, moments = np.split(result.impulse, [len(self.contacts)])
+            resists = None if self.system.resistance is None else moments
+            found = self.system.joints_with(self.world, self.system.net(forces), resists)
         if found is not None:
             self._joints = found
             self._rejoined += 1
@@ -248,15 +255,16 @@ class Stepper:
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
-    G, point, key = system.contact_map, system.point, system.key
+    G, point, key = system.problem_map, system.point, system.key
     if (resists := system.resistance) is not None:
         r, more = np.concatenate([system.r, resists.velocity]), (resists.rolling, resists.spinning)
         soft = system.compliance
-        return ccp.RollingProblem(comm, r, system.mu, *more, G=resists.map, point=point, key=key, compliance=soft)
+        return ccp.RollingProblem(comm, r, system.mu, *more, G=G, point=point, key=key, compliance=soft)
     return ccp.ConeProblem(comm, system.r, system.mu, G=G, point=point, key=key, compliance=system.compliance)
 
 
 def _peak_memory(comm: MPI.Comm) -> int:
     """The most memory that the ranks have had so far, their sum [bytes]; collective."""
     unit = 1 if sys.platform == "darwin" else 1024
-    return int(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit))
+    (most,), _ = reduced(comm, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit,), ())
+    return int(most)

@@ -1,4 +1,4 @@
-"""Quantised tensor trains: approximate sparse matrices, their inverses and products, in numpy.
+"""Quantised tensor trains: approximate sparse matrices, their inverses and products, in numpy::
 
     modes = choose_modes(slots)                            cut the index
     A = SparseHierarchy(rows, columns, modes, block)       once per pattern

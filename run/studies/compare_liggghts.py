@@ -3,15 +3,15 @@
     run/study compare_liggghts [N ...] [--seconds S] [--starts M] [--stiffness K,K] [--ours SETTINGS ...]
 
 LIGGGHTS is not part of this project: apt-get install liggghts. It has linear springs and dashpots, kt = 2/7 kn,
-restitution .3, and steps of a tenth of the contact time, as its users choose them. SETTINGS of ours are fields of
-`pctt.Settings`, dt=.01,tol=1e-3,projection=1, or `default`; the solver is `apgd`.
+restitution 0.3, and steps of a tenth of the contact time, as its users choose them. SETTINGS of ours are fields of
+`pctt.Settings`, dt=0.01,tol=1e-3,projection=1, or `default`; the solver is `apgd`.
 
 A start is the settled state of the mixer with every sphere moved by up to a hundredth of a millimetre, another way in
 every start, so that the courses part. Both codes take the same starts. For each of them the table has
 
 - CPU seconds per simulated second on one core, without start-up: median of the starts;
 - the worst overlap, of samples 25 ms apart, by one formula for both;
-- the torque on the paddle and the force on the floor over the weight, means of the time after the first .1 s, in which
+- the torque on the paddle and the force on the floor over the weight, means of the time after the first 0.1 s, in which
   both codes forget how the bed was settled, with the standard error that the starts show;
 - the peak of memory in RAM.
 

@@ -182,7 +182,7 @@ def weighted(n: int, weight: Callable[[Array, Array], Array]) -> Problem:
 
 
 def scattered(points: Array) -> Problem:
-    """The inverse multiquadric of width 1 between points on a line, plus .01 I."""
+    """The inverse multiquadric of width 1 between points on a line, plus 0.01 I."""
     kernel = multiquadric(1)
     return Problem((len(points),), lambda i, j: 0.01 * (i == j) + kernel(points[i] - points[j], 1.0), None, 0.0)
 

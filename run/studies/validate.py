@@ -6,20 +6,28 @@ import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from shared import PYTHON, figure, markdown, record, say_machine
-from validation import laws
+from validation import benchmarks, closed_forms, laws, packings
+from validation.panels import PANELS
 from validation.rows import Row
 
-RUNS, PAGE, PICTURE = Path("results/validation"), Path("docs/validation.md"), Path("docs/validation.png")
+from pctt.folder import Folder
+
+RUNS, PAGE = Path("results/validation"), Path("docs/validation.md")
+PICTURES = {
+    Path("docs/validation.png"): ("silo", "heap", "drum", "column"),
+    Path("docs/benchmarks.png"): ("mankoc", "dosta", "collapse", "packing", "intrusion"),
+}
 TEXT = Path("run/studies/validation/page.md")  # of the page, with the places of the figures
-OUTLETS = (4.5, 5.5, 6.5)
+OUTLETS, SMALL_OUTLETS = (4.5, 5.5, 6.5), (4.0, 5.5)
 FRICTIONS = (0.1, 0.3, 0.6)
+ASPECTS = {0.6: 1.2, 1.2: 1.4, 2.4: 1.6}  # of the columns that collapse, and the seconds of their runs
 SEEDS = (1, 2, 3, 4)  # a bed of the silo for each outlet and each of them, and of the heap for each friction
 
 #: The runs of each check: names and options of ``python -m pctt.run``.
@@ -32,6 +40,13 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
         for outlet, seconds in zip(OUTLETS, (2.6, 1.75, 1.4))
         for seed in SEEDS
     },
+    "mankoc": {
+        f"mankoc_{outlet:g}": (
+            *("silo", "-scene_n", 8, "-scene_filling", 1.2, "-scene_half_angle", 90, "-scene_outlet", outlet),
+            *("-seconds", 1.4, "-output_every", 0),
+        )
+        for outlet in SMALL_OUTLETS
+    },
     "heap": {
         f"heap_{friction:g}_{seed}": (
             *("run/studies/validation/heap.py", "-scene_friction", friction, "-scene_seed", seed),
@@ -42,14 +57,35 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
     },
     "drum": {"drum": ("drum", "-scene_n", 8, "-seconds", 3.2)},
     "column": {"column": ("run/studies/validation/column.py", "-seconds", 1.2)},
+    "dosta": {
+        "dosta_large": (
+            *("run/studies/validation/dosta_silo.py", "-scene_outlet", 15, "-scene_n", 19, "-scene_filling", 0.45),
+            *("-seconds", 0.78, "-output_every", 0),
+        ),
+        "dosta_small": ("run/studies/validation/dosta_silo.py", "-seconds", 1.2, "-output_every", 0),
+        "dosta_drum": ("run/studies/validation/dosta_drum.py", "-seconds", 2.5, "-output_every", 0),
+    },
+    "collapse": {
+        f"collapse_{aspect:g}": (
+            *("run/studies/validation/collapse.py", "-scene_aspect", aspect, "-seconds", seconds),
+        )
+        for aspect, seconds in ASPECTS.items()
+    },
+    "intrusion": {"intrusion": ("run/studies/validation/intrusion.py", "-seconds", 1.55, "-output_every", 0)},
 }
 
 #: What reads the runs of each check: rows of the table, and what the figure shows.
 CHECKS: dict[str, Callable[[], tuple[list[Row], dict[str, Any]]]] = {
+    "closed_forms": lambda: (closed_forms.rows(), {}),
     "silo": lambda: laws.silo({D: [RUNS / f"silo_{D:g}_{seed}" for seed in SEEDS] for D in OUTLETS}),
     "drum": lambda: laws.drum(RUNS / "drum"),
     "heap": lambda: laws.heap({mu: [RUNS / f"heap_{mu:g}_{seed}" for seed in SEEDS] for mu in FRICTIONS}),
     "column": lambda: laws.column(RUNS / "column"),
+    "mankoc": lambda: benchmarks.mankoc({D: RUNS / f"mankoc_{D:g}" for D in SMALL_OUTLETS}),
+    "dosta": lambda: benchmarks.dosta(*(RUNS / f"dosta_{name}" for name in ("small", "large", "drum"))),
+    "collapse": lambda: benchmarks.collapse([RUNS / f"collapse_{aspect:g}" for aspect in ASPECTS]),
+    "intrusion": lambda: benchmarks.intrusion(RUNS / "intrusion"),
+    "packing": packings.rows,
 }
 
 
@@ -60,8 +96,8 @@ def run(name: str, options: Sequence[object], keep: bool) -> None:
     if keep and mark.exists() and json.loads(mark.read_text())["options"] == words:
         print(f"{name}: kept as it is in {folder}", flush=True)
         return
-    command = [str(PYTHON), "-m", "pctt.run", "-scene", *map(str, options), "-ccp_type", "apgd", "-output", str(folder)]
-    command += ["-overwrite", "-output_every", "5", "-checkpoint_every", "1000", "-quiet"]
+    command = [str(PYTHON), "-m", "pctt.run", "-ccp_type", "apgd", "-output", str(folder)]
+    command += ["-overwrite", "-output_every", "5", "-checkpoint_every", "1000", "-quiet", "-scene", *map(str, options)]
     started = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
     _, status, used = os.wait4(started.pid, 0)
     if status:
@@ -85,6 +121,7 @@ def table(rows: list[Row]) -> str:
         if not isinstance(reference, list):
             expected = f"{reference:.4g}{unit}"
             off = f"{row['deviation']:.1e}" if reference == 0.0 else f"{100 * row['deviation']:+.2g} %"
+            off = "exact" if abs(row["deviation"]) < 1e-8 else off
         elif reference[1] is None:
             expected, off = f"above {reference[0]:g}{unit}", f"{row['deviation']:+.2g} errors"
         else:
@@ -103,44 +140,19 @@ def solved(missed: int, steps: int) -> str:
     return f"{missed} of the {steps} steps did not reach the tolerance; {why}."
 
 
-def draw(shown: dict[str, dict[str, Any]]) -> None:
-    """A panel for each check."""
-    silo, heap, drum, column = (shown[name] for name in ("silo", "heap", "drum", "column"))
-    with figure(PICTURE, 2, 2) as panels:
-        if not len(panels):
-            return
-        one, two, three, four = panels
-        wide = np.linspace(-silo["level"] / silo["slope"], 7.0)
-        one.plot(wide, silo["slope"] * wide + silo["level"], color="C7", label="Beverloo's law, fitted")
-        one.plot(silo["outlet"], silo["flow"] ** 0.4, "o", color="C0", label=["silo"] + [None] * (len(SEEDS) - 1))
-        one.set(xlabel="outlet [sphere diameters]", ylabel="flow$^{2/5}$ [(kg/s)$^{2/5}$]")
-        for mu, angle, z in zip(heap["friction"], heap["angle"], heap["height"]):
-            label = f"friction {mu:g}: {angle:.1f} $\\pm$ {heap['error']:.1f} degrees"
-            (line,) = two.plot(1e3 * heap["x"], 1e3 * z.mean(axis=0), "o-", markersize=3, label=label)
-            low, high = 1e3 * z.min(axis=0), 1e3 * z.max(axis=0)
-            two.fill_between(1e3 * heap["x"], low, high, color=line.get_color(), alpha=0.15)
-        two.set(xlabel="distance from the edge [mm]", ylabel="surface, mean and range of beds [mm]", ylim=(0.0, None))
-        three.plot(drum["time"], drum["angle"], linewidth=0.9, label="drum")
-        three.axhspan(20.9, 32.8, color="C7", alpha=0.25, label="glass beads, mu(I)")
-        three.axhline(drum["mean"], color="C0", linestyle=":", label=f"mean, {drum['mean']:.1f} degrees")
-        three.set(xlabel="time [s]", ylabel="angle of the bed [degrees]")
-        height, law = 1e3 * column["height"], column["law"]
-        for stress, style, label in (
-            (column["weight"], "C7--", "weight above"),
-            (law, "C0-", "vertical stress, Janssen"),
-            (column["vertical"], "C0o", "vertical stress"),
-            (column["ratio"] * law, "C1-", "wall's pressure, Janssen"),
-            (column["pressure"], "C1o", "wall's pressure"),
-        ):
-            four.plot(stress, height, style, label=label)
-        four.set(xlabel="stress [Pa]", ylabel="height [mm]")
-        for panel in panels:
+def draw(picture: Path, names: Sequence[str], shown: dict[str, dict[str, Any]]) -> None:
+    """A panel for each check of a picture."""
+    with figure(picture, (len(names) + 1) // 2, 2) as panels:
+        for panel, name in zip(panels, names):
+            PANELS[name](panel, shown[name])
             panel.grid(alpha=0.3)
             panel.legend(fontsize="small", frameon=False)
+        for panel in panels[len(names) :]:
+            panel.set_axis_off()
 
 
 def main(names: Sequence[str]) -> None:
-    known = ("closed_forms", *JOBS)
+    known = tuple(CHECKS)
     keep, names = "-keep" in names, [name for name in names if name != "-keep"]
     if unknown := set(names) - set(known):
         sys.exit(f"run/validate: {unknown.pop()}: allowed are -keep, {', '.join(known)}")
@@ -151,26 +163,26 @@ def main(names: Sequence[str]) -> None:
     with ThreadPoolExecutor(max(1, min(len(jobs), os.cpu_count() or 1))) as pool:
         list(pool.map(lambda job: run(*job, keep), jobs))
     rows: list[Row] = []
-    if "closed_forms" in chosen:
-        from validation import closed_forms
-
-        rows += closed_forms.rows()
     shown = {}
-    for name in [name for name in chosen if name in CHECKS]:
+    for name in chosen:
         found, shown[name] = CHECKS[name]()
         rows += found
     print(table(rows))
     record("validate", about, rows)
+    for picture, names in PICTURES.items():
+        if set(names) <= set(chosen):
+            draw(picture, names, shown)
     if chosen is known:
-        draw(shown)
-        seconds = sum(_seconds(name) for jobs in JOBS.values() for name in jobs)
-        files = [RUNS / name / "steps.jsonl" for jobs in JOBS.values() for name in jobs]
+        names = [name for jobs in JOBS.values() for name in jobs]
+        seconds = sum(map(_seconds, names)) + time.process_time()
+        files = [RUNS / name / "steps.jsonl" for name in names]
         lines = [json.loads(line) for file in files for line in file.read_text().splitlines()]
         missed = sum(not line["converged"] for line in lines)
         cores = min(2, os.cpu_count() or 1)
         about["minutes"] = seconds / 60 / cores
         text = TEXT.read_text("utf-8").format(
-            minutes=about["minutes"], cores=cores, cpu=about["cpu"], table=table(rows), beds=len(SEEDS),
+            minutes=about["minutes"], cores=cores, cpu_minutes=seconds / 60, cpu=about["cpu"], table=table(rows),
+            beds=len(SEEDS), bodies={name: Folder(RUNS / name).summary["bodies"] for name in names},
             rubs=shown["column"]["rubs"], scatter=shown["heap"]["scatter"], solved=solved(missed, len(lines)),
             outlets=", ".join(f"{outlet:g}" for outlet in OUTLETS),
         )  # fmt: skip

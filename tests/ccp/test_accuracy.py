@@ -43,6 +43,46 @@ def test_two_contacts_worked_out_by_hand():
     assert figures.velocity_norm == pytest.approx(np.sqrt(1 + 1.5**2 + 3.7**2 + 0.4**2))
 
 
+def residuals(problem: ccp.ConeProblem, g: np.ndarray) -> list[float]:
+    """Of the judge and of the solvers, for Coulomb's law and for its relaxation."""
+    y, figures = problem.product(g) + problem.r, ccp.measure(problem, g)
+    judged = [figures.coulomb_residual, figures.natural_residual]
+    return judged + [problem.natural_residual(g, y, coulomb) for coulomb in (True, False)]
+
+
+@pytest.mark.parametrize("rolls", [False, True])
+def test_what_slides_without_pressure_needs_no_impulse(rolls):
+    """y_n = 0 and y_t any: up to rounding zero is the nearest point, so the residuals are zero. But a velocity of 1e-13
+    against the normal counts, as it is more than rounding."""
+    rng = np.random.default_rng(4)
+    slip = rng.normal(size=(200, 2))
+    mu = rng.uniform(0.1, 2.0, 200)
+    r = np.column_stack([np.zeros(200), slip])
+    if rolls:
+        turning, more = rng.normal(size=(200, 3)), rng.uniform(0.1, 2.0, (2, 200))
+        blocks = np.tile(np.eye(3, 6), (400, 1, 1))
+        G = ccp.BlockRows(np.arange(401), np.arange(400), blocks, 400)
+        rows = np.concatenate([r, turning])
+
+        def made(r: np.ndarray) -> ccp.ConeProblem:
+            return ccp.RollingProblem(SELF, np.concatenate([r, turning]), mu, *more, G=G)
+
+        dual = mu * np.hypot(*slip.T) + more[0] * np.hypot(*turning[:, 1:].T) + more[1] * np.abs(turning[:, 0])
+    else:
+        rows, dual = r, mu * np.hypot(*slip.T)
+
+        def made(r: np.ndarray) -> ccp.ConeProblem:
+            return problem(np.ones(600), r, mu)
+
+    nothing = np.zeros_like(rows)
+    assert residuals(made(r), nothing)[::2] == [0.0, 0.0]
+    assert residuals(made(r + np.outer(dual, [1, 0, 0])), nothing)[1::2] == [0.0, 0.0]
+    size = np.linalg.norm(rows)
+    closing = made(r - [1e-13 * size, 0, 0])
+    assert closing.natural_residual(nothing, closing.r, coulomb=True) == np.inf
+    assert ccp.measure(closing, nothing).coulomb_residual > 1e100
+
+
 def test_impulses_that_are_no_numbers_have_no_small_figures():
     three = problem(2 * np.ones(9), np.zeros((3, 3)), [0.5, 0.5, 0])
     g = np.full((3, 3), np.nan)

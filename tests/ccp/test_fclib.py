@@ -140,6 +140,71 @@ def test_a_problem_in_the_plane_is_solved_in_space(tmp_path, form):
         np.testing.assert_allclose(result.impulse[:, :2], g, atol=1e-5)
 
 
+def rolling_spheres(path: Path) -> tuple[Path, np.ndarray]:
+    """Spheres that roll on a plane, in a file of Siconos' layout: a row each for normal, two tangents and two rolls.
+    The path, and the impulses (n, 5) of Coulomb's law: those of a rolling sphere that a moment slows, as in
+    tests/physics/test_rolling_resistance.py."""
+    count, R, mass, g, dt, mu, lever = 6, 0.1, 3.0, 9.81, 0.01, 0.5, 0.004
+    inertia, speed = 0.4 * mass * R**2, 1.0 + np.arange(count)
+    M, H = np.diag(np.tile([mass] * 3 + [inertia] * 3, count)), np.zeros((6 * count, 5 * count))
+    velocity = np.zeros((count, 6))
+    velocity[:, 0], velocity[:, 4], velocity[:, 2] = speed, speed / R, -g * dt
+    for n in range(count):
+        arm = np.array([0.0, 0.0, -R])
+        frame = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+        H[6 * n : 6 * n + 3, 5 * n : 5 * n + 3] = frame.T
+        H[6 * n + 3 : 6 * n + 6, 5 * n : 5 * n + 3] = np.cross(arm, frame).T
+        H[6 * n + 3 : 6 * n + 6, 5 * n + 3 : 5 * n + 5] = frame[1:].T
+    with h5py.File(path, "w") as file:
+        group = file.create_group("fclib_global_rolling")
+        group["spacedim"] = np.array([5])
+        write_matrix(group.create_group("M"), M, "triplets")
+        write_matrix(group.create_group("H"), H, "triplets")
+        group["vectors/f"], group["vectors/w"] = M @ velocity.ravel(), np.zeros(5 * count)
+        group["vectors/mu"], group["vectors/mu_r"] = np.full(count, mu), np.full(count, lever)
+    slower = 5 / 7 * g * lever / R
+    alone = [mass * g * dt, -mass * slower * dt, 0.0, 0.0, -lever * mass * g * dt]
+    return path, np.tile(alone, (count, 1))
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("solver", ["apgd", "conic"])
+def test_a_problem_with_rolling_is_read_and_solved(tmp_path, solver):
+    """The frames of all ranks' contacts, in the rows of `pctt.ccp.RollingProblem`: forces, then spin and rolls."""
+    comm = MPI.COMM_WORLD
+    path = tmp_path / "rolling.hdf5"
+    if comm.rank == 0:
+        rolling_spheres(path)
+    comm.Barrier()
+    expected = rolling_spheres(tmp_path / f"again {comm.rank}.hdf5")[1][part(comm, 6)]
+    stored = fclib.load(path, comm)
+    assert stored.form == "FCLIB global rolling"
+    limits = Limits(1e-9, closing_work=np.inf, fallback=False)
+    found = ccp.solve(stored.problem, None, solver, limits, law=ccp.COULOMB)
+    assert found.converged, found.reason
+    impulse = np.concatenate(np.split(found.impulse, 2), axis=1)
+    np.testing.assert_allclose(impulse[:, [0, 1, 2, 4, 5]], expected, atol=1e-7)
+    assert not impulse[:, 3].any()
+
+
+def test_the_numbers_of_a_contact_with_rolling(tmp_path):
+    path, _ = rolling_spheres(tmp_path / "rolling.hdf5")
+    with h5py.File(path, "a") as file:
+        H = _dense_triplets(file["fclib_global_rolling/H"])
+        file["solution/r"] = np.arange(30.0)
+    stored = fclib.load(path, SELF)
+    numbers = np.arange(30.0).reshape(6, 5)
+    np.testing.assert_array_equal(stored.solution[:6], numbers[:, :3])
+    np.testing.assert_array_equal(stored.solution[6:], np.column_stack([np.zeros(6), numbers[:, 3:]]))
+    blocks = (H.T @ np.diag(np.tile([1 / 3.0] * 3 + [1 / 0.012] * 3, 6)) @ H).reshape(6, 5, 6, 5)[range(6), :, range(6)]
+    np.testing.assert_allclose(stored.problem.diagonal_blocks[:6], blocks[:, :3, :3])
+    np.testing.assert_allclose(stored.problem.diagonal_blocks[6:, 1:, 1:], blocks[:, 3:, 3:])
+    with h5py.File(path, "a") as file:
+        file["fclib_global_rolling/spacedim"][:] = 3
+    with pytest.raises(FileFormatError, match="dimension is 3; allowed is 5"):
+        fclib.load(path, SELF)
+
+
 @pytest.mark.parametrize("triangle", [np.triu, np.tril])
 @pytest.mark.parametrize("coupled", [False, True], ids=["bodies", "coupled masses"])
 def test_one_triangle_of_the_mass_matrix_is_mirrored(tmp_path, triangle, coupled):

@@ -37,8 +37,9 @@ def test_the_scaled_problem_is_the_same_problem(given):
     x = rng.normal(size=(40, 3))
     g = scaled.impulse(x)
     N = known.N
-    assert scaled.dots((x, scaled.product(x)))[0] == pytest.approx(g.ravel() @ N @ g.ravel())
-    assert scaled.dots((x, scaled.b))[0] == pytest.approx(np.vdot(g, known.r))
+    square = scaled.unit**2
+    assert square * scaled.dots((x, scaled.product(x)))[0] == pytest.approx(g.ravel() @ N @ g.ravel())
+    assert square * scaled.dots((x, scaled.b))[0] == pytest.approx(np.vdot(g, known.r))
     assert np.allclose(margin(x, scaled.cones.mu) > 0, margin(g, known.mu) > 0)
     shrink = scaled.shrink.ravel()
     dense = shrink[:, None] * N * shrink

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from pctt.ccp import cone
+from pctt.ccp.interior.lorentz import LorentzCones
+from pctt.ccp.rolling import RollingCones
 
 COUNTS = [0, 1, 7, 256, 1000]  # also of whole strips, and not
 
@@ -119,25 +121,78 @@ def test_sums_of_a_problem_from_its_cones():
     assert cone.FrictionCones(np.zeros(0)).wrong_works(x[:0], y[:0], x[:0]) == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("tangential", [1e-9, 0.3])
-@pytest.mark.parametrize("normal", [1e-9, 1e-3, 0.3, 10.0])
-def test_the_scaling_is_that_of_nesterov_and_todd(normal, tangential):
-    """W z = W^-1 s, and the blocks are those of the formulas, for a compliance that is another along the normal."""
+def test_the_scaling_is_that_of_nesterov_and_todd():
     rng = np.random.default_rng(0)
     s, z = inside(rng, 200), inside(rng, 200)
     s[:5, 1:] = z[:5, 1:] = 0.0
-    compliance = np.tile([normal, tangential, tangential], (200, 1))
-    root, eta, square, X, share = cone.scaling(s, z, compliance)
-    W = cone.NesterovTodd(root, eta)
+    W = cone.NesterovTodd(*cone.scaling(s, z))
     np.testing.assert_allclose(W.times(z), W.divide(s), rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(W.divide(W.times(s)), s, rtol=1e-7, atol=1e-9)
-    dense = np.stack([W.divide(W.divide(np.tile(e, (200, 1)))) for e in np.eye(3)], axis=2)
-    big = np.abs(square).max(axis=(1, 2), keepdims=True)
-    np.testing.assert_allclose(square / big, dense / big, atol=1e-10)
-    whole = square + compliance[:, :, None] * np.eye(3)
-    for found, expected in ((X @ whole, np.eye(3)), (whole @ share, square)):
-        size = np.abs(whole).max(axis=(1, 2), keepdims=True) * np.maximum(1, np.abs(X).max(axis=(1, 2), keepdims=True))
-        assert (np.abs(found - expected) <= 1e-12 * size).all()
+
+
+@pytest.mark.parametrize("tangential", [1e-9, 0.3])
+@pytest.mark.parametrize("normal", [1e-9, 1e-3, 0.3, 10.0])
+@pytest.mark.parametrize("coulomb", [False, True])
+@pytest.mark.parametrize("rolls", [False, True])
+def test_blocks_of_cones_that_share_a_normal_number(rolls, coulomb, normal, tangential):
+    """B = A' T^-1 W^-2 A and X = (B + C)^-1 by their definitions, and the parts of a step that need no product with
+    W^-2."""
+    rng, count = np.random.default_rng(0), 60
+    mu = rng.uniform(0.05, 1.5, (3, count)) * (rng.random((3, count)) > 0.2)
+    cones = RollingCones(np.concatenate(mu[:2]), mu[2]) if rolls else cone.FrictionCones(mu[0])
+    lorentz = LorentzCones(cones)
+    rows = len(lorentz.known)
+    A = np.stack([lorentz.of(e.reshape(rows, 3)).ravel() for e in np.eye(3 * rows)], axis=1)
+    known = np.diag(lorentz.known.ravel())
+    z = rng.normal(size=(lorentz.number * count, 3))
+    np.testing.assert_allclose(lorentz.back(z).ravel(), A.T @ z.ravel(), atol=1e-12)
+    g = known @ rng.normal(size=3 * rows)
+    np.testing.assert_allclose(lorentz.impulses((A @ g).reshape(-1, 3)).ravel(), g, atol=1e-12)
+    np.testing.assert_allclose(lorentz.back(lorentz.spread(g.reshape(-1, 3))).ravel(), g, atol=1e-12)
+
+    there = np.abs(A).sum(axis=1).reshape(-1, 3) > 0
+    s, z = (inside(rng, len(there)) * there for _ in range(2))
+    u = np.zeros_like(s)
+    if coulomb:
+        u[:, 1:] = z[:, 1:] / np.maximum(np.hypot(z[:, 1], z[:, 2]), 1e-300)[:, None]
+    W = cone.NesterovTodd(*cone.scaling(s, z))
+    inverse = np.stack([W.divide(W.divide(np.tile(e, (len(s), 1)))) for e in np.eye(3)], axis=2)
+    turned = inverse.copy()
+    turned[:, 0] -= np.einsum("cj,cjk->ck", u, inverse)
+    dense = np.zeros((len(s), 3, len(s), 3))
+    dense[range(len(s)), :, range(len(s))] = turned
+    dense = dense.reshape(3 * len(s), -1)
+    B, soft = A.T @ dense @ A, np.full(count, normal)
+    C = np.zeros((rows, 3)) + tangential
+    C[:count, 0] = normal
+    arrows = lorentz.arrows(*W, u, soft, tangential)
+    barriers = lorentz.barriers(*W, u, 1.0)
+
+    def whole(blocks):
+        """The matrix of blocks, in rows."""
+        numbers = cones.joined(np.arange(3 * rows).reshape(rows, 3)).astype(int)
+        out = np.zeros((3 * rows, 3 * rows))
+        out[numbers[:, :, None], numbers[:, None, :]] = blocks
+        return out
+
+    size = np.abs(B).max()
+    np.testing.assert_allclose(known @ whole(barriers) @ known / size, B / size, atol=1e-12)
+    there = known.diagonal() > 0
+    X, system = whole(arrows.X), B + np.diag(C.ravel())
+    assert not X[~there].any()
+    assert not X[:, ~there].any()
+    X, system = X[np.ix_(there, there)], system[np.ix_(there, there)]
+    assert np.abs(X @ system - np.eye(len(X))).max() <= 1e-12 * max(1.0, np.abs(X).max()) * np.abs(system).max()
+
+    f, r = W.times(rng.normal(size=s.shape) * (np.abs(A).sum(axis=1).reshape(-1, 3) > 0)) - s, g.reshape(-1, 3)
+    alone = arrows.alone(f, r)
+    expected = (A.T @ dense @ f.ravel() - g)[there]
+    off = system @ alone.ravel()[there] - expected
+    assert np.abs(off).max() <= 1e-11 * np.abs(system).max() * np.abs(alone).max()
+    ds = lorentz.of(alone)
+    straight = dense @ (f - ds).ravel()
+    dz = arrows.split((A.T @ straight).reshape(-1, 3), f, ds)
+    np.testing.assert_allclose(dz.ravel(), straight, atol=1e-9 * np.abs(straight).max())
 
 
 def test_pairs_on_the_central_path():

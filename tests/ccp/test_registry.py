@@ -12,7 +12,7 @@ from pctt import ccp
 from pctt.ccp import Limits
 from pctt.options import describe
 
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "ccp.md"
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "solvers.md"
 
 
 def table():

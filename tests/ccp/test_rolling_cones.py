@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from scipy.optimize import minimize_scalar
 
 from pctt import ccp
 from pctt.ccp import rolling
 from tests.ccp.problems import SELF
+from tests.ccp.problems import part as part_of
 
 
 def height_by_search(x, mu, rho, sigma):
@@ -79,8 +81,10 @@ def test_solutions_meet_the_law(law):
             assert part @ speed == pytest.approx(-most * g[c, 0] * np.linalg.norm(speed), abs=1e-6)
             resisted += most * np.linalg.norm(speed)
         assert y[c, 0] == pytest.approx(0.0 if law == ccp.COULOMB else resisted, abs=1e-6)
-    with pytest.raises(ValueError, match="allowed are auto and apgd"):
-        ccp.solve(problem, None, "conic")
+    with pytest.raises(ValueError, match="allowed are conic, auto, apgd"):
+        ccp.solve(problem, None, "pdip")
+    with pytest.raises(ValueError, match="allowed is body"):
+        ccp.solve(problem, None, "conic", newton=ccp.newton_for(SELF, "conic", "contact"))
     with pytest.raises(ValueError, match="one for each of 6 contacts"):
         ccp.RollingProblem(SELF, r, mu, rho[1:], sigma, G=G)
 
@@ -95,3 +99,55 @@ def test_without_resistance_it_is_the_problem_of_friction():
     alone = ccp.solve(ccp.ConeProblem(SELF, r[:5], mu, G=plain), None, "apgd", limits)
     np.testing.assert_allclose(with_moments.impulse[:5], alone.impulse, atol=1e-6)
     assert not with_moments.impulse[5:].any()
+
+
+@pytest.mark.parametrize("law", ccp.LAWS)
+@pytest.mark.parametrize(("contacts", "bodies"), [(1, 2), (40, 30), (60, 45)])
+def test_conic_agrees_with_apgd(law, contacts, bodies):
+    """A third of the contacts has no friction, no rolling or no spinning resistance, and half of them yield."""
+    rng = np.random.default_rng(contacts)
+    G, r = blocks(rng, contacts, bodies), rng.standard_normal((2 * contacts, 3)) - [1, 0, 0]
+    some = rng.uniform(0.05, 0.6, (3, contacts)) * (np.arange(3)[:, None] != np.arange(contacts) % 9)
+    problem = ccp.RollingProblem(SELF, r, *some, G=G, compliance=np.where(np.arange(contacts) % 2, 0.05, 0.0))
+    limits = ccp.Limits(1e-10, closing_work=np.inf, fallback=False)
+    one, other = (ccp.solve(problem, None, name, limits, law=law) for name in ("conic", "apgd"))
+    assert one.converged, one.reason
+    assert one.iterations < 25
+    assert one.fallbacks == 0
+    assert ccp.measure(problem, one.impulse).cone_violation < 1e-12
+    velocities = [problem.product(found.impulse) for found in (one, other)]
+    np.testing.assert_allclose(*velocities, atol=1e-8 * np.linalg.norm(r))
+
+
+def test_conic_finds_the_impulse_of_a_contact_alone():
+    """With N = 1, g is the projection of -r for the relaxation."""
+    rng = np.random.default_rng(5)
+    count = 30
+    r, some = rng.standard_normal((2 * count, 3)), rng.uniform(0.1, 1.0, (3, count))
+    rows = 2 * count
+    G = ccp.BlockRows(np.arange(rows + 1), np.arange(rows), np.tile(np.eye(3, 6), (rows, 1, 1)), rows)
+    problem = ccp.RollingProblem(SELF, r, *some, G=G)
+    found = ccp.solve(problem, None, "conic", ccp.Limits(1e-10, closing_work=np.inf, fallback=False))
+    assert found.converged, found.reason
+    exact = rolling.project_to(-r, np.concatenate(some[:2]), some[2], np.zeros_like(r))
+    np.testing.assert_allclose(found.impulse, exact, atol=1e-9)
+
+
+@pytest.mark.parallel(2)
+@pytest.mark.parametrize("law", ccp.LAWS)
+def test_conic_does_not_depend_on_the_ranks(law):
+    comm, count, bodies = MPI.COMM_WORLD, 40, 30
+    rng = np.random.default_rng(6)
+    G, r = blocks(rng, count, bodies), rng.standard_normal((2 * count, 3)) - [1, 0, 0]
+    some = rng.uniform(0.1, 0.6, (3, count))
+    limits = ccp.Limits(1e-9, closing_work=np.inf, fallback=False)
+    alone = ccp.solve(ccp.RollingProblem(SELF, r, *some, G=G), None, "conic", limits, law=law)
+    here = part_of(comm, count)
+    rows = np.r_[here, count + np.arange(count)[here]]
+    near = np.concatenate([2 * rows[:, None] + [0, 1]], axis=1).ravel()
+    own = part_of(comm, bodies)
+    mine = ccp.BlockRows(2 * np.arange(len(rows) + 1), G.indices[near], G.blocks[near], own.stop - own.start)
+    problem = ccp.RollingProblem(comm, r[rows], *some[:, here], G=mine)
+    found = ccp.solve(problem, None, "conic", limits, law=law)
+    assert found.converged, found.reason
+    np.testing.assert_allclose(found.impulse, alone.impulse[rows], atol=1e-6)

@@ -51,6 +51,20 @@ def check(known: Known, problem: ccp.ConeProblem, result: ccp.Result, tol: float
     assert np.linalg.norm(velocity - known.y) <= 1e3 * tol * np.linalg.norm(known.r)
 
 
+@EVERY
+@pytest.mark.parametrize("factor", [1e-20, 1e20])
+def test_impulses_scale_with_r(solver, factor):
+    """The problem has no unit of velocity: any r is as easy, and none is too small to be solved."""
+    known, graph = heap(bodies=60)
+    one, other = (from_graph(dataclasses.replace(known, r=size * known.r), graph) for size in (1.0, factor))
+    tol = tolerance(solver, 1e-6)
+    usual, found = (ccp.solve(each, type=solver, limits=Limits(tol)) for each in (one, other))
+    assert found.converged, found.reason
+    assert found.iterations < 1.2 * usual.iterations + 10
+    velocity = other.product(found.impulse) / factor + known.r
+    assert np.linalg.norm(velocity - known.y) <= 1e3 * tol * np.linalg.norm(known.r)
+
+
 @pytest.mark.parametrize(("solver", "name", "way"), CASES)
 def test_reaches_the_known_optimum(solver, name, way):
     known, graph = heap(**PROBLEMS[name])

@@ -9,10 +9,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from dem import quaternion
-from dem.contact.box_box import CORNER_OF_SECOND, EDGES, FLUSH, SNAP, box_box
-from dem.contact.narrow import Boxes
+from dem.contact.polyhedra import FLUSH, SNAP, Polyhedra, hulls_of, polyhedra_polyhedra
 
 DELTA = 0.1
+BOXES = hulls_of(())
+
+#: Features: corners of the first box, corners of the second, and from here on edges.
+CORNER_OF_SECOND, EDGES = 8, 16
 
 
 def turned(*rotations):
@@ -29,7 +32,8 @@ def box(half, center=(0.0, 0.0, 0.0), frame=None):
 
 def touch(one, other, delta=DELTA):
     """The contacts of two boxes: features, points, normals, gaps, ordered by gap and place."""
-    found = box_box(*(Boxes(*(column[None] for column in side[:3])) for side in (one, other)), np.array([delta]))
+    sides = (Polyhedra(*(c[None] for c in side[:3]), np.zeros(1, int), BOXES) for side in (one, other))
+    found = polyhedra_polyhedra(*sides, np.array([delta]))
     order = np.lexsort((*np.round(found.touch.point, 9).T, np.round(found.touch.gap, 9)))
     return (found.feature[order], *(values[order] for values in found.touch))
 
@@ -102,8 +106,8 @@ def test_crossed_edges_touch_in_one_point(gap):
 def test_boxes_out_of_reach_and_no_boxes():
     assert len(touch(box((1, 1, 1)), box((1, 1, 1), (0, 0, 2.11)))[3]) == 0
     assert len(touch(box((1, 1, 1)), box((1, 1, 1), (0, 0, 2.1 - 1e-12)))[3]) == 4
-    none = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
-    found = box_box(Boxes(*none), Boxes(*none), np.zeros(0))
+    none = Polyhedra(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0, int), BOXES)
+    found = polyhedra_polyhedra(none, none, np.zeros(0))
     assert len(found.pair) == len(found.touch.gap) == 0
 
 

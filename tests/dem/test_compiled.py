@@ -7,6 +7,7 @@ import importlib
 import numpy as np
 import pytest
 from cases import random_quaternions
+from numba.core.caching import CompileResultCacheImpl
 
 from dem import quaternion
 from dem.bodies import SPHERE
@@ -108,6 +109,29 @@ def test_damaged_machine_code_is_made_anew(tmp_path, monkeypatch):
         with pytest.warns(UserWarning, match="is damaged .* and made anew"):
             assert importlib.reload(module).twice(1.5) == 3.0
         assert importlib.reload(module).twice(1.5) == 3.0
+
+
+def test_machine_code_that_was_installed_is_read_where_nobody_can_write(tmp_path, monkeypatch):
+    """As in a container: neither the folder of the source nor, in the second round, that of the user can be written."""
+    (tmp_path / "thrice.py").write_text(
+        "from dem.compiled import loop\n\n@loop\ndef thrice(x: float) -> float:\n    return 3.0 * x\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+    module = importlib.import_module("thrice")
+    assert module.thrice(1.5) == 4.5
+    assert {path.suffix for path in (tmp_path / "__pycache__").iterdir()} >= {".nbi", ".nbc"}
+
+    def refuse(locator):
+        raise OSError("read-only file system")
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    for locator in CompileResultCacheImpl._locator_classes[1:3]:  # numba tries these two in turn
+        monkeypatch.setattr(locator, "ensure_cache_path", refuse)
+        module = importlib.reload(module)
+        assert module.thrice(1.5) == 4.5
+        assert sum(module.thrice.compiled.stats.cache_hits.values()) == 1
+        assert module.thrice(2) == 6  # what was not installed is compiled
 
 
 def test_a_loop_runs_where_numba_may_not_compile(monkeypatch):

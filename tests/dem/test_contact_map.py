@@ -46,7 +46,8 @@ CASES = {
 
 @pytest.mark.parallel(1, 2, 3)
 @pytest.mark.parametrize("case", CASES)
-def test_products_are_those_of_the_definition(case):
+@pytest.mark.parametrize("threads", [1, 2], indirect=True)
+def test_products_are_those_of_the_definition(case, threads):
     """Of D' from frames and arms, and M^-1/2 of all bodies; the halo is that of the search."""
     comm = MPI.COMM_WORLD
     make, width = CASES[case]
@@ -69,6 +70,10 @@ def test_products_are_those_of_the_definition(case):
     np.testing.assert_allclose(G.momenta(g), momenta[own], **close)
     change = np.einsum("bpij,bpj->bpi", roots, momenta.reshape(-1, 2, 3)).reshape(-1, 6)[own]
     np.testing.assert_allclose(system.velocity(g), system.free_velocity + change, **close)
+    out, H = np.zeros((G.columns, 6)), np.tile(np.diag([2.0, 1.0, 1.0]), (G.rows, 1, 1))
+    G.through(G.weights(H), v[own], out)
+    weighed = comm.allreduce(dense.T @ (dense @ v.ravel() * np.tile([2.0, 1.0, 1.0], G.rows))).reshape(-1, 6)
+    np.testing.assert_allclose(out, v[own] + weighed[own], **close)
     again = type(G)(comm, G.given)  # with a halo that is found from the numbers of the bodies
     np.testing.assert_allclose(again.momenta(g), G.momenta(g), **close)
     assert len(again.halo.ghosts) == len(G.halo.ghosts)  # none that no contact touches

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from dem.exchange import exchange
+from dem.exchange import exchange, reduced
 
 
 @pytest.mark.parallel(1, 2, 3, 4)
@@ -32,3 +32,14 @@ def test_rows_arrive_in_the_order_of_ranks():
         out[name][:] = 0  # writable
     nothing = exchange(comm, {"x": np.zeros((0, 4))}, np.zeros(0, np.int64))
     assert nothing["x"].shape == (0, 4)
+
+
+@pytest.mark.parallel(1, 2, 3)
+def test_sums_and_greatest_numbers_by_one_reduction():
+    comm = MPI.COMM_WORLD
+    ranks = np.arange(comm.size)
+    sums, most = reduced(comm, [comm.rank, 0.5], [-comm.rank, 7 if comm.rank == 0 else 2])
+    assert (sums, most) == ([ranks.sum(), 0.5 * comm.size], [0.0, 7.0])
+    assert reduced(comm, (), np.array([comm.rank])) == ([], [comm.size - 1])
+    sums, _ = reduced(comm, np.full(2000, 1.0 + comm.rank), ())
+    assert sums == [float((1 + ranks).sum())] * 2000

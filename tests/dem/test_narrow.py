@@ -14,12 +14,12 @@ from dem.contact.narrow import (
     Planes,
     Spheres,
     Touch,
-    box_plane,
     closest_on_lines,
     sphere_box,
     sphere_capsule,
     sphere_sphere,
 )
+from dem.contact.polyhedra import Polyhedra, hulls_of, polyhedra_planes
 from dem.contact.spheres import touch_spheres
 
 RNG = np.random.default_rng(2)
@@ -82,7 +82,8 @@ def test_corners_of_a_box_on_a_plane():
     turn = quaternion.matrix(quaternion.exponential(np.array([[0.0, np.pi / 4, 0.0]])))
     center, half = np.array([[0.0, 0, 1.5]]), np.array([[1.0, 2.0, 1.0]])
     plane = Planes(np.array([[0.0, 0, 1]]), np.zeros((1, 3)))
-    feature, touch = box_plane(Boxes(center, turn, half), plane, np.array([9.0]))[1:]
+    body = Polyhedra(center, turn, half, np.zeros(1, int), hulls_of(()))
+    feature, touch = polyhedra_planes(body, plane, np.array([9.0]))[1:]
     tip = center + (half * CORNERS) @ turn[0].T
     np.testing.assert_array_equal(feature, np.arange(8))
     np.testing.assert_allclose(touch.gap, tip[:, 2], atol=1e-14)

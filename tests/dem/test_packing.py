@@ -52,6 +52,6 @@ def test_what_cannot_be_packed_is_refused():
 
 def test_points_of_a_lattice_stay_near_it():
     x = np.arange(4.0)
-    found = perturbed(x, x, x[:1], 0.1, 2)
+    found = perturbed(x, x, x[:1], 0.1, 2)[:]
     assert found.shape == (16, 3)
     assert 0.05 < np.abs(found - np.round(found)).max() <= 0.1

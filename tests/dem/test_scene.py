@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from mpi4py import MPI
 
+from dem.arrays import Rule
 from dem.bodies import bounding_radius
 from dem.motion import Dynamic, Glide, Guided, Hinged, Oscillation, Path, Rotation
+from dem.packing import perturbed
 from dem.scene import Scene
+from dem.scenes import Mixer
 from dem.shapes import Box, Plane, Sphere
 from dem.start import new_world
+from dem.stiffness import pairs
+from dem.time_step import fastest, smallest
 
 SELF = MPI.COMM_SELF
 
@@ -79,6 +86,87 @@ def test_capsules_and_the_spheres_that_enclose_them():
     np.testing.assert_array_equal(ids, [1, 2])
     np.testing.assert_allclose(bounding_radius(grains), [1.3, 0.3, 0.6])
     np.testing.assert_allclose(grains.mass[1:], np.pi * 0.01 * np.array([0.4 + 0.4 / 3, 2 * (1.0 + 0.4 / 3)]) * 1000)
+
+
+def by_rule(rule, kinds):
+    """A scene of 300 grains in contact with the floor, given by arrays or by rules that make the same rows."""
+    rng = np.random.default_rng(5)
+    place = np.stack(np.meshgrid(*[np.arange(n) for n in (10, 10, 3)]), axis=-1).reshape(-1, 3) + 0.55
+    place += rng.uniform(-0.05, 0.05, place.shape)
+    size, turn = rng.uniform(0.15, 0.25, (300, 3)), rng.normal(size=(300, 4))
+    velocity = rng.normal(size=(300, 3))
+    if rule:
+        given = (place, size, turn, velocity)
+        place, size, turn, velocity = (Rule(300, lambda a, b, x=x: x[a:b].copy()) for x in given)
+    scene = Scene(friction=0.3, restitution=0.5)
+    scene.add_body("floor", FLOOR)
+    if "spheres" in kinds:
+        scene.add_spheres(place, Rule(300, lambda a, b: size[a:b, 0]) if rule else size[:, 0], 1e3, velocity=velocity)
+    if "boxes" in kinds:
+        above = Rule(300, lambda a, b: place[a:b] + [0, 0, 4]) if rule else place + [0, 0, 4]
+        scene.add_boxes(above, size, 2e3, quaternions=turn)
+    return scene
+
+
+@pytest.mark.parallel(1, 3)
+def test_grains_by_a_rule_make_the_same_world_as_arrays(ranks, monkeypatch):
+    """In parts of any size, of which each rank makes some."""
+    monkeypatch.setattr(Rule, "CHUNK", 37)
+    comm = MPI.COMM_WORLD
+    worlds = [new_world(by_rule(rule, ("spheres", "boxes")), comm) for rule in (False, True)]
+    alone = new_world(by_rule(False, ("spheres", "boxes")), SELF)
+    for name, column in worlds[1].grains.columns().items():
+        np.testing.assert_array_equal(column, getattr(worlds[0].grains, name))
+        whole = np.concatenate(comm.allgather(column))
+        np.testing.assert_array_equal(whole, getattr(alone.grains, name))  # in the same order too
+    assert worlds[1].pairs.stiffness == worlds[0].pairs.stiffness == alone.pairs.stiffness
+
+
+def test_the_survey_is_that_of_all_grains(monkeypatch):
+    monkeypatch.setattr(Rule, "CHUNK", 64)
+    scene = by_rule(True, ("spheres",))
+    found, grains = scene.survey(), scene.grains()
+    assert (found.count, found.mass) == (300, pytest.approx(grains.mass.sum()))
+    assert found.radius == pytest.approx(grains.size[:, 0].sum())
+    np.testing.assert_allclose(found.spread, 300 * np.cov(grains.position.T, bias=True), rtol=1e-12)
+    assert fastest(scene) == pytest.approx(np.linalg.norm(grains.velocity[:, :3], axis=1).max(), rel=1e-12)
+    assert smallest(scene) == grains.size[:, 0].min()
+
+
+def test_a_scene_of_the_package_takes_no_memory_for_its_grains(monkeypatch):
+    """Nor for its time step and stiffness: 43 MB would be the table of all grains."""
+    monkeypatch.setattr(Rule, "CHUNK", 2**12)
+    tracemalloc.start()
+    scene = Mixer(n=30).build()
+    assert scene.count == 226_981
+    assert pairs(scene).stiffness.max() > 0.0
+    assert fastest(scene) > 0.0
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 5e6
+
+
+def test_a_rule_of_a_million_million_rows_makes_those_that_are_asked_for():
+    count = 10**12
+    scene = Scene(friction=0.3)
+    ids = scene.add_spheres(Rule(count, lambda a, b: np.arange(a, b)[:, None] * [1.0, 0.0, 0.0]), 0.4, 1e3)
+    assert (len(ids), scene.first_large) == (count, count)
+    last = scene.grains(count - 2, count)
+    np.testing.assert_array_equal(last.id, [count - 2, count - 1])
+    np.testing.assert_array_equal(last.position[:, 0], [count - 2.0, count - 1.0])
+    lattice = perturbed(*[np.arange(10_000.0)] * 3, 0.1, 7)
+    np.testing.assert_array_equal(np.round(lattice[count - 2 :]), [[9999, 9999, 9998], [9999, 9999, 9999]])
+
+
+def test_bad_rows_of_a_rule_are_refused_when_they_are_made():
+    scene = Scene(friction=0.3)
+    scene.add_spheres(Rule(4, lambda a, b: np.zeros((b - a, 2))), 0.1, 1e3)
+    with pytest.raises(ValueError, match=r"positions must have shape \(3,\) or \(4, 3\), got \(4, 2\)"):
+        scene.grains()
+    with pytest.raises(ValueError, match="positions must have shape"):
+        new_world(scene, SELF)
+    with pytest.raises(ValueError, match="radius must have 2 rows, got 4"):
+        scene.add_spheres(np.zeros((2, 3)), Rule(4, lambda a, b: np.ones(b - a)), 1e3)
 
 
 def test_an_empty_scene_is_refused():

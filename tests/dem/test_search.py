@@ -11,9 +11,10 @@ from convex import signed_distance
 from mpi4py import MPI
 
 from dem import quaternion
+from dem.arrays import places
 from dem.bodies import BOX, CAPSULE, COMPOUND, SPHERE
 from dem.contact import find_contacts
-from dem.contact.primitives import FEATURES, MOST_NUMBERS, primitives
+from dem.contact.primitives import most_numbers, primitives
 from dem.motion import Dynamic, Fixed, Glide
 from dem.scene import Scene
 from dem.shapes import Box, Capsule, Plane, Sphere
@@ -219,9 +220,13 @@ def test_a_lost_grain_is_an_error():
         find_contacts(world, 0.02)
 
 
-def test_more_bodies_than_keys_of_64_bits_tell_apart_are_refused():
+def test_keys_tell_the_contacts_of_a_million_million_grains_apart():
     near = find_contacts(new_world(heap(1, side=2, boxes=False), SELF), 0.0).near
-    primitives(near, [], MOST_NUMBERS)
-    assert MOST_NUMBERS**2 * FEATURES < 2**63
-    with pytest.raises(ValueError, match="their contacts have no names of 64 bits; allowed are 240095969 together"):
-        primitives(near, [], 240_100_000)
+    features = primitives(near, [], 10**12).hulls.features
+    most = most_numbers(features)
+    with pytest.raises(ValueError, match=f"their contacts have no keys; allowed are {most} together"):
+        primitives(near, [], most + 1)
+    last = np.arange(10**12 - 3, 10**12)
+    key = np.concatenate([one + 1j * (last * features + features - 1) for one in last])
+    np.testing.assert_array_equal(places(key, key[::-1]), np.arange(9)[::-1])
+    assert places(key, key[:1] - 1j).tolist() == [-1]

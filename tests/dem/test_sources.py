@@ -77,6 +77,25 @@ def test_as_many_are_due_as_rate_times_time():
     assert by_mass.due(3.0, Tally(mass=5.0), np.full(100, 0.75)) == 1
 
 
+def test_a_changed_rate_counts_from_its_time_on_and_keeps_what_was_due():
+    first, mass, tally = source(start=1.0, end=3.0), np.ones(100), Tally(count=4, mass=4.0)  # 6 more found no place
+    faster = first.changed(2.0, tally, number_rate=20.0, velocity=(0, 0, -1))
+    assert [faster.amount(time) for time in (2.0, 2.5, 3.0, 9.0)] == pytest.approx([10, 20, 30, 30])
+    assert faster.due(2.0, tally, mass) == 6
+    assert faster.grains("a", np.arange(2)).velocity[0, 2] == -1.0
+    shut = faster.changed(2.5, tally, number_rate=0.0)
+    assert shut.amount(9.0) == pytest.approx(20)
+    by_mass = first.changed(2.0, tally, mass_rate=3.0)
+    assert [by_mass.amount(time) for time in (2.0, 3.0)] == pytest.approx([4, 7])
+    early, late = (first.changed(time, Tally(), number_rate=20.0) for time in (0.5, 9.0))
+    assert [early.amount(time) for time in (1.0, 2.0)] == pytest.approx([0, 20])
+    assert late.amount(9.0) == pytest.approx(20)
+    for words, values in {"radius of a source cannot be set": {"radius": 1.0},
+                          "either a mass_rate": {"mass_rate": 1.0, "number_rate": 1.0}}.items():  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            first.changed(2.0, tally, **values)
+
+
 def test_spheres_go_to_their_first_free_place_and_the_queue_stops_at_the_first_without():
     place = np.zeros((4, 2, 3))
     place[:, :, 0] = [[0, 3], [0.5, 1], [0.1, 0.2], [9, 9]]
@@ -106,7 +125,7 @@ def test_inserted_spheres_are_apart(period):
 @pytest.mark.parametrize(("given", "words"), [
     ({"number_rate": None}, "either a mass_rate"),
     ({"mass_rate": 1.0}, "either a mass_rate"),
-    ({"number_rate": -1.0}, "rate of a source must be positive"),
+    ({"number_rate": -1.0}, "rate of a source must not be negative"),
     ({"radius": (0.1, -0.1)}, "size of a grain must be positive"),
     ({"radius": Uniform(0.1, 0.2), "density": 0.0}, "density of a source must be positive"),
     ({"start": 2.0, "end": 1.0}, "Source cannot begin at 2 s and end at 1 s"),

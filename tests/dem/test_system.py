@@ -121,3 +121,14 @@ def test_no_contacts_and_bad_arguments():
         ContactSystem(world, contacts, 0.0)
     with pytest.raises(ValueError, match="recovery speed"):
         ContactSystem(world, contacts, DT, -1.0)
+
+
+@pytest.mark.parametrize(("approach", "counts"), [(1e-8, True), (1e-11, False)])
+def test_only_what_is_more_than_rounding_closes(approach, counts):
+    """Two spheres that fly side by side at 100 m/s: differences below 1e-12 of that are no velocities."""
+    scene = Scene(friction=0.3, gravity=(0, 0, 0))
+    scene.add_spheres([[0, 0, 0], [0.5, 0, 0]], 0.25, 1000.0, velocity=[[100.0, 0, 0], [100.0 - approach, 0, 0]])
+    world = new_world(scene, SELF)
+    system = ContactSystem(world, find_contacts(world, 0.01), DT)
+    assert system.r[0, 0] == pytest.approx(-approach if counts else 0.0, rel=1e-4, abs=0.0)
+    assert not system.r[0, 1:].any()

@@ -11,6 +11,7 @@ from dem.motion import Dynamic, Glide
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from pctt import ccp
+from pctt.folder import Folder
 from pctt.options import OptionError
 from pctt.run.stepper import NoSolutionError
 
@@ -39,6 +40,22 @@ def test_pendulum_force_and_distance():
         assert np.linalg.norm(sim.positions[0]) == pytest.approx(1.0, abs=1e-3)
     moment = 1.0 + 0.4 * 0.05**2  # about the hinge, over the mass
     assert lowest == pytest.approx(1.0 + 2.0 / moment, rel=1e-2)
+
+
+@pytest.mark.parametrize("kind", ["ball", "hinge", "fixed", None])
+def test_bodies_that_fall_side_by_side_have_no_impulses(kind):
+    """Boxes that touch, and pendula that swing in parallel: what closes is the rounding of their velocities alone."""
+    scene = Scene(friction=0.3)
+    boxes = scene.add_boxes([[0, 0.013, 5.1], [0.3, 0, 5.1], [0.6, 0.03, 5.1]], (0.15, 0.1, 0.1), 1000.0)
+    scene.add_boxes([[0, 0.213, 5.1]], (0.15, 0.1, 0.1), 300.0)
+    if kind is not None:
+        scene.add_joint("link", boxes[0], boxes[1], kind=kind, anchor=(0.15, 0, 5.1), axis=(0, 1, 0))
+        for k, ball in enumerate(scene.add_spheres([[1, 0.2 * k, 0] for k in range(3)], 0.1, 1000.0)):
+            scene.add_joint(f"pin {k}", None, ball, kind="ball", anchor=(0, 0.2 * k, 0))
+    sim = simulation(scene, 0.005)
+    for _ in range(40):
+        figures = sim.step()
+        assert (figures["converged"], figures["iterations"], figures["impulse_norm"]) == (True, 0, 0.0)
 
 
 def energies(sim, until):
@@ -220,20 +237,39 @@ def test_a_limit_holds_against_what_contacts_push():
 
 def test_a_motor_that_runs_into_a_stop_pushes_with_its_bound():
     scene = Scene(friction=0.0, gravity=(0, 0, 0))
-    scene.add_spheres([0, 0, 5], 0.1, 1000.0)
     scene.add_body("stop", [Box((0.1, 0.1, 0.1))], position=(0.8, 0.16, 0))
     scene.add_body("arm", [Box((0.5, 0.05, 0.05))], Dynamic(), position=(0.5, 0, 0), mass=3.0, inertia=(1, 1, 1))
     scene.add_joint("pin", None, "arm", anchor=(0, 0, 0), axis=(0, 0, 1), speed=1.0, strength=2000.0)
     sim = simulation(scene, 0.002, stiffness=np.inf)
     sim.step()
     for _ in range(20):
-        sim.step()
+        assert sim.step()["energy_jump [J]"] == 0.0
         assert abs(sim.joint("pin").drive) <= 2000.0 * (1.0 + 1e-3)
     assert sim.joint("pin").drive == pytest.approx(2000.0, rel=1e-3)
     assert sim.joint("pin").speed == pytest.approx(0.0, abs=1e-6)
     assert sim.body("stop").torque + np.cross([0.8, 0.16, 0], sim.body("stop").force) == pytest.approx(
         [0, 0, 2000.0], rel=1e-3, abs=1.0
     )
+
+
+@pytest.mark.parallel(1, 2)
+def test_a_mechanism_of_large_bodies_alone(tmp_path):
+    """A boom falls on a post; time step, contact distance and stiffness are those that the scene needs."""
+    scene = Scene(friction=0.0)
+    scene.add_body("post", [Box((0.05, 0.05, 0.05))], position=(0.8, 0, -0.35))
+    boom = {"mass": 4.0, "inertia": (0.01, 0.33, 0.33)}
+    scene.add_body("boom", [Box((0.5, 0.03, 0.03))], Dynamic(), position=(0.5, 0, 0), **boom)
+    scene.add_joint("pin", None, "boom", anchor=(0, 0, 0), axis=(0, 1, 0))
+    with pctt.Simulation(scene, tol=1e-8, comm=MPI.COMM_WORLD, say=lambda text: None) as sim:
+        assert sim.settings.delta == pytest.approx(0.03 / 5)
+        sim.write(tmp_path / "out")
+        sim.run(until=1.0)
+        at = sim.joint("pin").angle
+        # an edge of the post touches the lower side of the boom
+        assert 0.85 * np.sin(at) - 0.3 * np.cos(at) == pytest.approx(-0.03, abs=1e-3)
+        push = sim.body("post").force
+        assert np.cross([0.85, 0, -0.3], -push)[1] == pytest.approx(-4.0 * G * 0.5 * np.cos(at), rel=1e-2)
+        assert Folder(tmp_path / "out").summary["worst_overlap"]["smallest_radius [m]"] == 0.03
 
 
 def test_friction_of_jointed_bodies_that_slide_is_coulombs():
@@ -266,9 +302,85 @@ def test_contacts_and_joints_are_solved_together(solver):
     assert -sim.body("floor").force[2] == pytest.approx(bears, rel=1e-4)
 
 
+def test_a_cart_whose_wheels_resist_rolling_comes_to_rest():
+    """Of two wheels of mass m and a bar of mass M, with N on both together, v' (2 m + M + 2 I / R^2) = -rho N / R."""
+    R, rho, M, v, dt = 0.1, 0.004, 8.0, 0.5, 0.005
+    scene = Scene(0.6, rolling=rho)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    given = {"mass": M, "inertia": (1, 1, 1), "velocity": (v, 0, 0)}
+    scene.add_body("bar", [Box((0.05, 0.02, 0.02))], Dynamic(), position=(0, 0, R), **given)
+    turning = {"velocity": (v, 0, 0), "angular_velocity": (0, v / R, 0)}
+    wheels = scene.add_spheres([[-0.3, 0, R], [0.3, 0, R]], R, 1000.0, **turning)
+    for x, wheel in zip((-0.3, 0.3), wheels):
+        scene.add_joint(f"axle {x}", "bar", wheel, anchor=(x, 0, R), axis=(0, 1, 0))
+    sim = simulation(scene, dt, stiffness=np.inf)
+    m = sim.local.mass[0]
+    slower = rho * (2 * m + M) * G / R / (2 * m + M + 2 * 0.4 * m)
+    sim.run(steps=20)
+    assert sim.body("bar").velocity[0] == pytest.approx(v - slower * sim.time, rel=1e-5)
+    force = sim.joint("axle 0.3").force  # on the wheel: it brings the wheel and half of the bar to rest
+    assert force == pytest.approx([-0.5 * M * -slower, 0, -0.5 * M * G], rel=1e-4, abs=1e-4)
+    sim.run(until=1.1 * v / slower)
+    assert abs(sim.body("bar").velocity).max() < 1e-5
+
+
+def test_a_joint_goes_through_the_boundary_of_a_periodic_cell():
+    """A dumbbell that flies and turns, with periods and without; begun across the boundary, too."""
+    runs = []
+    for period, place in ((None, 0.0), ((1.0, 1.0, None), 0.0), ((1.0, 1.0, None), 0.45)):
+        scene = Scene(friction=0.3, gravity=(0, 0, 0), period=period)
+        begin = np.array([[0.4, 0.5, 0.0], [0.6, 0.5, 0.0]]) + [place, 0, 0]
+        inside = begin if period is None else begin % 1.0 * [1, 1, 0]
+        velocity = [[1.0, 0.4, 0], [1.0, 0.8, 0]]
+        one, two = scene.add_spheres(inside, 0.08, 1000.0, velocity=velocity)
+        scene.add_joint("bar", one, two, kind="fixed", anchor=(0.5 + place, 0.5, 0))
+        sim = simulation(scene, 0.005)
+        sim.run(until=1.3)
+        runs.append((sim.velocities, sim.positions - begin, sim.joint("bar").force))
+    for velocity, way, force in runs[1:]:
+        assert velocity == pytest.approx(runs[0][0], abs=1e-9)
+        off = way - runs[0][1]
+        assert off == pytest.approx(np.round(off), abs=1e-9)
+        assert force == pytest.approx(runs[0][2], abs=1e-6)
+
+
+def test_joints_are_refused_in_cells_that_are_sheared():
+    scene = Scene(friction=0.3, period=(1.0, 1.0, 1.0), shear_rate=0.1)
+    one, two = scene.add_spheres([[0.3, 0.5, 0.5], [0.6, 0.5, 0.5]], 0.1, 1000.0)
+    scene.add_joint("bar", one, two, kind="fixed", anchor=(0.45, 0.5, 0.5))
+    with pytest.raises(ValueError, match="joint 'bar': a sheared cell has no joints"):
+        simulation(scene)
+
+
+def test_joints_and_limits_hold_with_projection():
+    """The boom of docs/loads.md is lowered until its head rests on the floor: forces are those of the closed form, and
+    nothing overlaps or leaves its hinge by more than a part of what one step goes."""
+    scene = Scene(friction=0.0)
+    scene.add_body("floor", [Plane((0, 0, 1), (0, 0, 0.8))])
+    boom = {"mass": 4.0, "inertia": (0.01, 0.33, 0.33)}
+    scene.add_body("boom", [Box((0.5, 0.03, 0.03))], Dynamic(), position=(0.5, 0, 1), **boom)
+    (head,) = scene.add_spheres([1.15, 0, 1], 0.1, 1000.0)
+    hinge = {"anchor": (0, 0, 1), "axis": (0, 1, 0)}
+    scene.add_joint("shoulder", None, "boom", **hinge, speed=0.2, strength=100.0, limits=(-0.3, 1.0))
+    scene.add_joint("weld", "boom", head, kind="fixed", anchor=(1, 0, 1))
+    sim = simulation(scene, 0.005, projection=True, stiffness=np.inf)
+    mass = sim.local.mass[0]
+    angle = np.arcsin(0.1 / 1.15)
+    while sim.time < 0.8:
+        sim.step()
+        assert sim.positions[0, 2] > 0.9 - 1e-6  # of the head: it touches, and stays above the floor
+        assert sim.joint("shoulder").angle < angle + 1e-6
+    moment = (4.0 * 0.5 + mass * 1.15) * G * np.cos(angle)
+    bears = (100.0 + moment) / (1.15 * np.cos(angle))
+    assert -sim.body("floor").force[2] == pytest.approx(bears, rel=2e-3)
+    sim.joint("shoulder").motor.speed = -0.2
+    sim.run(until=3.5)
+    assert sim.joint("shoulder").angle == pytest.approx(-0.3, abs=1e-9)
+
+
 def test_other_solvers_refuse():
     for solver in set(ccp.SOLVERS) - {"auto", "apgd"}:
-        with pytest.raises(OptionError, match=f"-ccp_type {solver}: the scene has joints; allowed are auto and apgd"):
+        with pytest.raises(OptionError, match=f"-ccp_type {solver}: the scene has joints; allowed are auto, apgd"):
             simulation(wheel(), solver=solver)
 
 

@@ -237,6 +237,31 @@ def test_a_restart_goes_on_with_the_same_bits(tmp_path):
         Simulation.load(tmp_path / "state.h5", other_scene, comm=comm, **WORDS)
 
 
+@pytest.mark.parallel(1, 2)
+def test_a_source_that_was_set_goes_on_after_a_restart(tmp_path):
+    comm = MPI.COMM_WORLD
+    sim = Simulation(chute(), comm=comm, **WORDS)
+    sim.run(steps=20)
+    sim.set_source("rain", number_rate=500.0, velocity=(0.0, 0.0, -1.0))
+    with pytest.raises(ValueError, match="no source 'snow'; there are: rain"):
+        sim.set_source("snow", number_rate=1.0)
+    came = sim.source("rain").count
+    sim.run(steps=10)
+    assert came + 9 <= sim.source("rain").count <= came + 10
+    sim.save(tmp_path / "state.h5")
+    again = Simulation.load(tmp_path / "state.h5", chute(), comm=comm, **WORDS)
+    for each in (sim, again):
+        each.run(steps=20)
+    one, other = state(sim), state(again)
+    for name, column in one.items():
+        np.testing.assert_array_equal(column, other[name])
+    assert vars(sim.source("rain")) == vars(again.source("rain"))
+    count = sim.source("rain").count
+    sim.set_source("rain", number_rate=0.0)
+    sim.run(steps=20)
+    assert sim.source("rain").count <= count + 1
+
+
 @pytest.mark.slow
 def test_a_hopper_fills_and_runs_out():
     """Rain into a cone that a gate shuts; then the gate goes, and all run through the outlet below."""

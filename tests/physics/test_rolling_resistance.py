@@ -31,7 +31,7 @@ def on_a_plane(slope=0.0, rolling=0.0, spinning=0.0, velocity=(0, 0, 0), angular
     return scene
 
 
-@pytest.mark.parametrize("more", [{"solver": "apgd"}, {"projection": True}])
+@pytest.mark.parametrize("more", [{"solver": "apgd"}, {"solver": "conic"}, {"projection": True}])
 def test_a_sphere_rolls_to_rest(more):
     """v falls by 5/7 g rho / R: m v' = -F, and I v' / R = F R - rho m g."""
     rho, v, dt = 0.004, 0.5, 0.01
@@ -84,9 +84,11 @@ def test_the_relaxation_opens_what_rolls():
 
 
 def test_other_solvers_refuse():
-    for solver in set(ccp.SOLVERS) - {"auto", "apgd"}:
-        with pytest.raises(OptionError, match=f"-ccp_type {solver}: .* rolling .* allowed are auto and apgd"):
+    for solver in set(ccp.SOLVERS) - {"auto", "apgd", "conic"}:
+        with pytest.raises(OptionError, match=f"-ccp_type {solver}: .* rolling .* allowed are conic, auto, apgd"):
             pctt.Simulation(on_a_plane(rolling=0.01), solver=solver)
+    with pytest.raises(OptionError, match="-ccp_newton contact: .* allowed is body"):
+        pctt.Simulation(on_a_plane(rolling=0.01), newton="contact")
     with pytest.raises(ValueError, match="rolling must not be negative"):
         Scene(0.5, rolling=-1.0)
 

@@ -33,7 +33,7 @@ def test_steps_with_coulombs_law(program, settled, tmp_path):
     worst = max(line["coulomb_residual"] for line in steps(tmp_path))
     assert all(line["law"] == "relaxation" for line in steps(tmp_path))
     assert f"law of contact: relaxation in 2 steps; Coulomb residual at most {worst:.1e}" in done.stdout
-    assert ("-law coulomb keeps them closed" in done.stdout) == (worst > LARGE_OPENING)
+    assert ("add -law coulomb" in done.stdout) == (worst > LARGE_OPENING)
 
 
 PRESS = """

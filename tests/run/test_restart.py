@@ -29,6 +29,8 @@ from program import (
     summary_of,
 )
 
+import pctt
+from dem.contact.polyhedra import hulls_of
 from dem.experiment import Experiment
 from dem.scene import Scene
 from dem.scenes import Mixer
@@ -37,7 +39,7 @@ from pctt.disk import FileError, Lock
 from pctt.folder import Folder
 from pctt.options import OptionError
 from pctt.run.settings import Settings
-from pctt.run.state import origin, settled_path, unfinished
+from pctt.run.state import FIRST_FORMAT, origin, settled_path, unfinished
 from pctt.simulation import Simulation
 
 
@@ -58,6 +60,24 @@ def test_on_as_many_ranks_the_way_is_the_same_bit_for_bit(solver, program, settl
         # numpy's arctan2, in which it is measured, may round otherwise at another place in memory
         assert one["natural_residual"] == pytest.approx(two["natural_residual"], rel=1e-9)
     assert len(steps[0]) == len(steps[1]) == 3
+
+
+def test_a_checkpoint_of_before_has_the_impulses_of_its_contacts(tmp_path):
+    """It named a contact by one number of 64 bits."""
+    sim = pctt.Simulation(Mixer(n=1), dt=0.02, solver="apgd", comm=MPI.COMM_SELF)
+    sim.run(steps=40)
+    sim.save(tmp_path / "new.h5")
+    key = sim.memory.state()[0]
+    numbers, features = 27 + 5 + 1, hulls_of(()).features  # spheres, walls and the paddle; a corner or edges of boxes
+    old = ((key.real * numbers + key.imag // features) * features + key.imag % features).astype(np.int64)
+    assert len(np.unique(old)) == len(key) > 10
+    shutil.copy(tmp_path / "new.h5", tmp_path / "old.h5")
+    with h5py.File(tmp_path / "old.h5", "r+") as file:
+        del file["contacts/key"]
+        file["contacts/key"] = old
+        file.attrs["format"] = FIRST_FORMAT  # without a checksum
+    again = pctt.Simulation.load(tmp_path / "old.h5", Mixer(n=1), dt=0.02, solver="apgd", comm=MPI.COMM_SELF)
+    np.testing.assert_array_equal(again.memory.state()[0], key)
 
 
 @pytest.mark.parallel(3)

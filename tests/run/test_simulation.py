@@ -350,6 +350,16 @@ def test_it_does_what_the_program_does(words, solver, tmp_path, monkeypatch):
         assert (tmp_path / "program" / name).read_bytes() == (tmp_path / "object" / name).read_bytes()
 
 
+@pytest.mark.parametrize("minutes", [0.0, 1e6])
+def test_checkpoints_by_the_clock(tmp_path, minutes):
+    sim = pctt.Simulation(Stirred(), solver="apgd", comm=SELF)
+    sim.write(tmp_path, checkpoint_minutes=minutes)
+    sim.step()
+    assert (tmp_path / "checkpoint.h5").exists() == (minutes == 0.0)
+    sim.close()
+    assert arrays(tmp_path / "checkpoint.h5")["world/step"] == 1
+
+
 def test_the_folder_of_a_run_is_written_from_then_on(tmp_path):
     sim = pctt.Simulation(Stirred(), solver="apgd", comm=SELF)
     sim.run(steps=2)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from validation import laws
+from validation import benchmarks, laws, packings
 
 
 def test_flows_of_beverloo_give_his_constants(tmp_path):
@@ -78,3 +78,61 @@ def test_a_wedge_has_its_angle(monkeypatch):
     assert found.x == pytest.approx(0.015 + 0.01 * np.arange(11))
     assert found.height == pytest.approx(0.01 + found.x * np.tan(np.radians(25.0)), rel=0.1)
     assert found.moving == pytest.approx(0.1, abs=0.001)
+
+
+def test_flow_of_small_outlets_is_that_of_large_ones_in_the_limit_and_half_of_it_at_a_diameter():
+    """Glass of 1 mm: 64.6 spheres a second; the laws agree where D/d - 1 is far above 1/b = 20."""
+    outlet = np.array([1.001, 1001.0])
+    flow = benchmarks.mankoc_flow(outlet) * np.sqrt(9.81 / 0.001) / (outlet - 1.0) ** 2.5
+    assert flow == pytest.approx([64.6 / 2, 64.6], rel=1e-3)
+
+
+def test_run_outs_of_two_experiments_are_a_band():
+    assert benchmarks.runout(1.0) == pytest.approx((1.0, 1.24))
+    assert benchmarks.runout(2.0) == pytest.approx((2.0, 1.6 * 2**0.5))
+    assert benchmarks.runout(12.0) == pytest.approx((1.6 * 12**0.5, 6.0))
+
+
+def test_the_front_of_a_disc_of_grains_is_its_edge():
+    """Grains at random in a cylinder 0.1 m wide and 20 mm high, with a solid fraction of 0.58, and some far away."""
+    rng = np.random.default_rng(1)
+    radius, angle = 0.1 * np.sqrt(rng.random(20000)), rng.uniform(0.0, 2 * np.pi, 20000)
+    place = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.02 * rng.random(20000)], axis=1)
+    place[:20, 0] += 0.3
+    volume = np.full(20000, 0.58 * np.pi * 0.1**2 * 0.02 / 20000)
+    assert benchmarks.front(place, volume) == pytest.approx(0.1, abs=0.005)
+
+
+def test_bearing_capacity_is_that_of_the_tables():
+    """N_q = 1 without friction; at 30 degrees N_q = 18.4, N_gamma = 22.4; a disc has the factors 1 + tan 30 and 0.6."""
+    assert benchmarks.bearing_capacity(0.0) == pytest.approx((1.0, 0.0))
+    assert benchmarks.bearing_capacity(30.0) == pytest.approx((18.4 * (1 + 3**-0.5), 0.3 * 22.4), rel=1e-3)
+
+
+def test_grains_that_bear_nothing_are_taken_away_with_those_that_hung_on_them():
+    """A tetrahedron, and a chain that hangs on it and ends nowhere."""
+    bodies = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3], [3, 4], [4, 5], [5, 6]])
+    held, alive = packings.backbone(bodies, 8, 2)
+    assert held.tolist() == [True] * 6 + [False] * 3
+    assert alive.tolist() == [True] * 4 + [False] * 4
+
+
+@pytest.mark.parametrize("b", [0.0, 0.75])
+def test_the_decay_of_forces_is_found_again(b):
+    """Exponential forces with a decay of 1.5, of which a part b exp(-f^2) is thrown away."""
+    rng = np.random.default_rng(1)
+    force = rng.exponential(1 / 1.5, 100000)
+    force = force[rng.random(len(force)) > b * np.exp(-(force**2))]
+    assert packings.exponential_tail(force) == pytest.approx((b, 1.5), abs=0.05)
+    f = np.linspace(0.0, 20.0, 20001)
+    assert 0.001 * packings.mueth(f, b, 1.5).sum() == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_a_packing_without_friction_has_as_many_contacts_as_degrees_of_freedom(monkeypatch):
+    """Within what a few hundred spheres scatter; random close packing has a solid fraction of 0.64."""
+    monkeypatch.setattr(packings, "COUNT", 400)
+    found = packings.packing(0.0, 1)
+    assert found.contacts == pytest.approx(6.0, rel=0.03)
+    assert found.fraction == pytest.approx(0.64, abs=0.015)
+    assert packings.exponential_tail(found.force)[1] == pytest.approx(1.6, abs=0.4)

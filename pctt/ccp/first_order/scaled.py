@@ -13,7 +13,7 @@ from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.options import number
 
-RATIO = 0.4  # of the natural residual to |L step| / |x|: .3 to .5 from the second step on, in all scenes and both laws
+RATIO = 0.4  # of the natural residual to |L step| / |x|: 0.3 to 0.5 from the second step on, all scenes, both laws
 
 
 class Iterate(NamedTuple):
@@ -27,11 +27,12 @@ class Iterate(NamedTuple):
 
 
 class ScaledProblem:
-    """min 1/2 x'Ax + b'x over friction cones, where the diagonal of A is about one.
+    """min 1/2 x'Ax + b'x over friction cones, where the diagonal of A and the largest r are about one.
 
-    x = S g, A = S^-1 N S^-1, b = S^-1 r. The diagonal S has two values per contact, the roots of its normal and
+    x = S g / u, A = S^-1 N S^-1, b = S^-1 r / u. The diagonal S has two values per contact, the roots of its normal and
     of its mean tangential entry of diag N: the cones stay friction cones, of friction mu s_t / s_n. This is
-    diagonal preconditioning by a metric in which the projection is still exact.
+    diagonal preconditioning by a metric in which the projection is still exact. The unit u is a power of two about the
+    largest number of r: squares of small velocities are no numbers of single precision.
 
     With ``coulomb`` it is Coulomb's law, in the same variables: x is a solution if the projected step from x along the
     gradient *with its De Saxce term* (mu |y_t|, 0, 0) leads back to x.
@@ -48,7 +49,8 @@ class ScaledProblem:
         self._scale = np.sqrt(np.where(size > 0, size, problem.mean_diagonal))
         self.shrink = 1.0 / self._scale  #: (nc, 3) diagonal of S^-1
         self.cones = problem.cones.scaled(self._scale, precision)
-        self.b = self._rounded(problem.r * self.shrink)
+        self.unit = 2.0 ** np.frexp(problem.max(float(np.abs(problem.r).max(initial=0.0))))[1]
+        self.b = self._rounded(problem.r * (self.shrink / self.unit))
         self._compliance = self._rounded(problem.compliance * self.shrink**2)
         self._soft = self._compliance[: None if problem.yields else 0]
         self._operator = problem.operator.scaled(self.shrink, precision)
@@ -59,11 +61,11 @@ class ScaledProblem:
 
     def start(self, guess: Array) -> Array:
         """The scaled point of a first guess of the impulses (nc, 3), in the cones."""
-        return self.project(self._rounded(guess * self._scale))
+        return self.project(self._rounded(guess * (self._scale / self.unit)))
 
     def impulse(self, x: Array) -> Array:
         """The impulses (nc, 3) of x, in the cones in double precision too."""
-        g = x * self.shrink
+        g = x * (self.shrink * self.unit)
         return g if self.precision is np.float64 else self.problem.cones.project(g, g)
 
     def product(self, x: Array) -> Array:
@@ -138,7 +140,7 @@ class ScaledProblem:
 
     def velocities(self, gradient: Array) -> Array:
         """The velocities N g + r (nc, 3) that belong to a gradient."""
-        return gradient * self._scale
+        return gradient * (self._scale * self.unit)
 
     def largest_curvature(self, steps: int = 10) -> float:
         """Estimate from below of the largest eigenvalue of A: ``steps`` power iterations from b."""
@@ -205,8 +207,10 @@ class Progress:
         if residual < self.best or self._looks == 0:
             self.best, self._point = residual, x.copy()
         self._looks += 1
-        norm = np.sqrt(self.problem.dots((x, x))[0])
-        self._last_look = (residual, self._size) if self._size > 0 else (RATIO, float(norm))
+        if self._size > 0:
+            self._last_look = (residual, self._size)
+        else:
+            self._last_look = (RATIO, float(np.sqrt(self.problem.dots((x, x))[0])))
         self.status, self.reason = self._why_stop(residual)
         return not self.reason
 

@@ -1,22 +1,23 @@
 """Symmetric cone interior point method: Nesterov-Todd scaling, Mehrotra's predictor and corrector.
 
-In the variables s = (mu g_n, g_t) and z = (y_n / mu, y_t) all cones are the same and self-dual. The method follows
-the central path s o z = t e of
+In the variables s = (mu g_n, g_t) and z = (y_n / mu, y_t) all cones are the same and self-dual. A contact that resists
+rolling and spinning has three such pairs, with one g_n, and y_n is what their z sum to (`lorentz.py`): s = A g and
+y = A'z. The method follows the central path s o z = t e of
 
     v = G' g,    y = G v + C g + r,    s and z in the cones, s'z = 0,
 
 with the mass-scaled momenta v as unknowns of their own: the residual of an inexact linear solve (``-ccp_newton body``)
 spoils v = G' g alone, and the next step mends that. With W the scaling of the pair (s, z), a step solves
 
-    dz = G dv + C dg + r_z,    dv = G' dg - r_v,    W^-1 ds + W dz = w - W z.
+    A'dz = G dv + C dg + r_y,    dv = G' dg - r_v,    W^-1 ds + W dz = w - W z,    ds = A dg.
 
 Late in an iteration W^2 is large along an impulse that slides, and the product W^2 z, which equals s, drowns in
-rounding. So the change of each contact without the others, ds = W w - s, is formed from s instead.
+rounding. So the change of each cone without the others, ds = W w - s, is formed from s instead.
 
 For Coulomb's law z belongs to the De Saxce velocity, (y_n / mu + |y_t|, y_t), and the step takes the derivative of its
 term along: with u = y_t / |y_t|,
 
-    dz = T (G dv + C dg) + r_z,    T = 1 + e_n u',
+    A'T^-1 dz = G dv + C dg + r_y,    T = 1 + e_n u',
 
 which makes the Newton systems unsymmetric. (Terms that lag behind converge by a fifth per cone problem, each solved
 exactly.) A step is straight in y, so that z takes the term as it is, and not by its derivative.
@@ -33,8 +34,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pctt.ccp import cone
-from pctt.ccp.cone import Array, NesterovTodd, dot, scaling, times
+from pctt.ccp.cone import Array, NesterovTodd, dot, scaling
 from pctt.ccp.interior import useful_part
+from pctt.ccp.interior.lorentz import Arrows, LorentzCones
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
@@ -89,12 +91,13 @@ def solve(
             break
         # scaling
         scaled = cones.scaled(at, found, forcing)
-        newton.update(scaled.B, scaled.H, symmetric=not coulomb)
+        barrier = None if newton.system.mends else scaled.barrier()
+        newton.update(barrier, scaled.arrows.X, symmetric=not coulomb)
         # affine step
         with phase("ConicPredictor"):
             affine = scaled.direction(newton, np.zeros_like(at.z))
         # centring: the further the affine step may go, the less (Mehrotra)
-        target = max((1.0 - min(1.0, scaled.reach(affine))) ** 3, options.least) * gap / problem.size
+        target = max((1.0 - min(1.0, scaled.reach(affine))) ** 3, options.least) * gap / cones.count
         with phase("ConicCorrector"):
             # combined step, with the second-order term of the affine one
             w = scaled.centred(affine, target)
@@ -118,7 +121,7 @@ def solve(
 
 
 class Point(NamedTuple):
-    """An iterate: scaled impulses and velocities (nc, 3) inside the cones, mass-scaled momenta."""
+    """An iterate: s and z inside the Lorentz cones, mass-scaled momenta."""
 
     s: Array
     z: Array
@@ -126,8 +129,8 @@ class Point(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Of an iterate: its impulses and their velocities y = N g + r (nc, 3), the natural residual, v - G' g, and in the
-    scaled variables y - z with the y of v, z without De Saxce's term."""
+    """Of an iterate: its impulses and their velocities y = N g + r (rows, 3), the natural residual, v - G' g, and
+    y - A'z with the y of v, z without De Saxce's term."""
 
     g: Array
     y: Array
@@ -148,60 +151,53 @@ class Direction(NamedTuple):
 
 
 class Cones:
-    """The problem in the scaled variables s = scale g, z = y / scale.
+    """The problem in its Lorentz cones: s = A g, y = A'z.
 
-    scale : (nc, 3) mu, 1, 1 per contact; 1, 1, 1 without friction
-    live : (nc, 3) 1; 0 for tangential parts without friction, which the problem does not have
-    compliance : (nc, 3) the diagonal of C within a step
+    compliance : (count,) the normal part of C within a step; ``proximal`` is the tangential one
     """
 
     def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool):
         self.problem, self.options, self.coulomb = problem, options, coulomb
-        self.scale, self.live = np.ones_like(problem.r), np.ones_like(problem.r)
-        self.scale[:, 0] = np.where(problem.mu > 0, problem.mu, 1.0)
-        self.live[problem.mu == 0, 1:] = 0.0
+        self.lorentz = LorentzCones(problem.cones)
+        self.count = problem.size * self.lorentz.number  # of Lorentz cones on all ranks
         self.proximal = options.proximal * problem.mean_diagonal
-        self.compliance = problem.compliance / self.scale**2 + self.proximal
+        self.compliance = problem.compliance[: self.lorentz.count, 0] + self.proximal * (self.lorentz.weight**2).sum(0)
         self.boundary = options.boundary_with_law if coulomb else options.boundary
 
     def start(self, guess: Array) -> Point:
-        """A pair on the central path near the guess: s - tau z = s_0 - tau z_0."""
-        problem, scale = self.problem, self.scale
-        guess = useful_part(problem, guess) * self.live
-        y = (problem.product(guess) + problem.r) * self.live
-        diagonal = np.diagonal(problem.diagonal_blocks, axis1=1, axis2=2) / scale**2
+        """A pair on the central path near the guess: s - tau z = s_0 - tau z_0. Where cones share a normal impulse all
+        get the greatest one."""
+        problem, lorentz = self.problem, self.lorentz
+        guess = useful_part(problem, guess) * lorentz.known
+        y = (problem.product(guess) + problem.r) * lorentz.known
+        diagonal = lorentz.of(np.einsum("cii->ci", problem.diagonal_blocks))
+        diagonal[:, 0] /= lorentz.weight.ravel() ** 3
         tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
         amount = self.options.start * problem.dot(problem.r, problem.r) / problem.size / problem.mean_diagonal
-        s, z = cone.central_pair(guess * scale - tau[:, None] * y / scale, tau, amount)
-        return Point(s, z, problem.momentum(s / scale))
+        z = lorentz.spread(y)
+        s, z = cone.central_pair(lorentz.of(guess) - tau[:, None] * z, tau, amount)
+        g = lorentz.impulses(s)
+        return Point(lorentz.of(g), z, problem.momentum(g))
 
     def residuals(self, at: Point) -> Residuals:
-        problem, g = self.problem, at.s / self.scale
+        problem, lorentz = self.problem, self.lorentz
+        g = lorentz.impulses(at.s)
         momentum = problem.momentum(g)
         rest = problem.compliance * g + problem.r
-        y = (problem.velocity_of(momentum) + rest) * self.live
-        r_y = (problem.velocity_of(at.v) + rest) * self.live / self.scale
-        r_y -= without_de_saxce(at.z) if self.coulomb else at.z
+        y = (problem.velocity_of(momentum) + rest) * lorentz.known
+        r_y = (problem.velocity_of(at.v) + rest) * lorentz.known
+        r_y -= lorentz.back(without_de_saxce(at.z) if self.coulomb else at.z)
         return Residuals(g, y, problem.natural_residual(g, y, self.coulomb), at.v - momentum, r_y)
 
     def scaled(self, at: Point, found: Residuals, forcing: float) -> Scaled:
         """The linear equations of an iterate."""
         with phase("CCPBarrier"):
-            root, eta, B, X, share = scaling(at.s, at.z, self.compliance)
-            H, u = X, None
-            if self.coulomb:
-                u = sliding_directions(at.z)
-                B[:, 0] -= times(B.transpose(0, 2, 1), u)
-                X, H, share = with_de_saxce_terms(X, share, u, self.compliance)
-            B[:, [0, 1, 2], [0, 1, 2]] += self.proximal
-            free, d = self.live[:, 1] == 0, self.problem.mean_diagonal
-            B *= self.scale[:, :, None] * self.scale[:, None, :]
-            B[free, 1, 1] = B[free, 2, 2] = 1e12 * np.maximum(B[free, 0, 0], d)
-            sides = self.live / self.scale
-            H = H * (sides[:, :, None] * sides[:, None, :])
+            W = NesterovTodd(*scaling(at.s, at.z))
+            u = sliding_directions(at.z) if self.coulomb else np.zeros_like(at.z)
+            arrows = self.lorentz.arrows(*W, u, self.compliance, self.proximal)
         # the velocities that the natural residual stands for
-        shown = found.natural * self.problem.norm(found.g) * d
-        return Scaled(self, at, found, NesterovTodd(root, eta), B, X, H, share, u, forcing * shown)
+        shown = found.natural * self.problem.norm(found.g) * self.problem.mean_diagonal
+        return Scaled(self, at, found, W, u, arrows, forcing * shown)
 
     def moved(self, at: Point, d: Direction, step: float) -> Point:
         """The point after a step; for Coulomb's law with De Saxce's terms of its velocities."""
@@ -214,9 +210,8 @@ class Scaled(NamedTuple):
 
     at, found : the iterate and its residuals
     W : scaling of the pair
-    B, H : blocks (nc, 3, 3) of the Newton system: T^-1 W^-2, and X T = (B + C)^-1
-    X, share : in the scaled variables (W^-2 + T C)^-1, and that times W^-2
-    u : (nc, 3) directions in which contacts slide, for T; None without Coulomb's law: T = 1
+    u : directions in which contacts slide, for T; zero without Coulomb's law
+    arrows : (B + C)^-1
     tol : residual to which Newton systems are solved [m/s]
     """
 
@@ -224,47 +219,54 @@ class Scaled(NamedTuple):
     at: Point
     found: Residuals
     W: NesterovTodd
-    B: Array
-    X: Array
-    H: Array
-    share: Array
-    u: Array | None
+    u: Array
+    arrows: Arrows
     tol: float
+
+    def barrier(self) -> Array:
+        """The blocks B of the Newton system, with the compliance that problems do not have."""
+        cones, lorentz = self.cones, self.cones.lorentz
+        B = lorentz.barriers(*self.W, self.u, cones.problem.mean_diagonal)
+        B[:, range(lorentz.width), range(lorentz.width)] += cones.proximal
+        B[:, 0, 0] += cones.compliance - cones.problem.compliance[: lorentz.count, 0] - cones.proximal
+        return B
 
     def direction(self, newton: Newton, w: Array, *earlier: Array) -> Direction:
         """The direction of the right-hand side w; ``earlier``: solutions of the Newton system to begin from."""
-        cones, scale, live = self.cones, self.cones.scale, self.cones.live
-        c, r_z = self.W.divide(w) - self.at.z, self._turned(self.found.r_y)
-        uncoupled = times(self.share, self.W.times(w) - self.at.s) - times(self.X, r_z)
-        q = self._straight(c - r_z) * scale
-        dg, x = newton.solve(q, self.tol, self.found.r_v, earlier, uncoupled * live / scale)
-        dv, ds = newton.system.momenta(x, dg, self.found.r_v), live * scale * dg
+        problem, lorentz, found = self.cones.problem, self.cones.lorentz, self.found
+        c = self.W.divide(w) - self.at.z
+        q = lorentz.back(self._straight(c)) - found.r_y
+        f = self.W.times(w) - self.at.s
+        dg, x = newton.solve(q, self.tol, found.r_v, earlier, self.arrows.alone(f, found.r_y))
+        dv, ds = newton.system.momenta(x, dg, found.r_v), lorentz.of(dg)
         if newton.system.mends:  # r_y vanishes, r_v takes the error of the linear solve
-            problem = cones.problem
-            dy = (problem.velocity_of(dv) + problem.compliance * dg) / scale + self.found.r_y
+            dy = problem.velocity_of(dv) + problem.compliance * dg + found.r_y
+            dz = self.arrows.split(dy, f, ds)
         else:  # r_v vanishes, r_y takes it
-            dy = self._straight(c - self.W.divide(self.W.divide(ds)))
-        return Direction(ds, self._turned(live * dy), live * dy, dv, x)
+            dz = self._straight(c - self.W.divide(self.W.divide(ds)))
+        return Direction(ds, self._turned(dz), dz, dv, x)
 
     def _turned(self, dy: Array) -> Array:
-        """T dy (nc, 3), the change of z to first order."""
-        if self.u is None:
+        """T dy, the change of z to first order."""
+        if not self.cones.coulomb:
             return dy
         dz = dy.copy()
         dz[:, 0] += dot(self.u, dy)
         return dz
 
     def _straight(self, dz: Array) -> Array:
-        """T^-1 dz (nc, 3), in place."""
-        if self.u is not None:
-            dz[:, 0] -= dot(self.u, dz)
-        return dz
+        """T^-1 dz."""
+        if not self.cones.coulomb:
+            return dz
+        dy = dz.copy()
+        dy[:, 0] -= dot(self.u, dz)
+        return dy
 
     def reach(self, d: Direction) -> float:
         """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""
         problem, at = self.cones.problem, self.at
         normal = without_de_saxce(at.z)[:, 0]
-        of_z = cone.step_inside(at.z, d.dz) if self.u is None else cone.step_to_zero(normal, d.dy[:, 0])
+        of_z = cone.step_to_zero(normal, d.dy[:, 0]) if self.cones.coulomb else cone.step_inside(at.z, d.dz)
         longest = problem.min(min(cone.step_inside(at.s, d.ds), of_z))
         return longest if np.isfinite(problem.sum(float(d.ds.sum() + d.dz.sum()))) else 0.0
 
@@ -308,16 +310,3 @@ def sliding_directions(z: Array) -> Array:
     u = z.copy()
     u[:, 0] = 0.0
     return u / np.maximum(cone.tangential(z), cone.TINY)[:, None]
-
-
-def with_de_saxce_terms(Y: Array, share: Array, u: Array, compliance: Array) -> tuple[Array, Array, Array]:
-    """X = (W^-2 + T C)^-1, X T and X W^-2 (nc, 3, 3) for T = 1 + e_n u', of Y = (W^-2 + C)^-1 and Y W^-2.
-
-    With e the diagonal of C and p = Y e_n, X = (1 - p (e u)' / d) Y and X T = Y + p (u - Y (e u))' / d, where
-    d = 1 + (e u)'p."""
-    p, eu = Y[:, :, 0], compliance * u
-    d = 1.0 + dot(eu, p)[:, None]
-    of_Y = times(Y, eu)  # it is symmetric
-    of_share = times(share.transpose(0, 2, 1), eu)
-    p = p[:, :, None] / d[:, :, None]
-    return Y - p * of_Y[:, None], Y + p * (u - of_Y)[:, None], share - p * of_share[:, None]

@@ -76,7 +76,8 @@ class Newton:
 
     def has_few(self, problem: ConeProblem) -> bool:
         """Whether the systems of this problem get `Dense` factors."""
-        return self.form == "body" and self._own and problem.comm.size == 1 and problem.r.size <= Settings.few
+        few = problem.comm.size == 1 and problem.r.size <= Settings.few and len(problem.r) == problem.cones.count
+        return self.form == "body" and self._own and few
 
     @property
     def linear(self) -> LinearSolver:
@@ -92,9 +93,10 @@ class Newton:
         """Whether the linear solver is the project's own choice."""
         return self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
 
-    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
+    def update(self, barrier: Array | None, inverse: Array | None = None, symmetric: bool = True) -> None:
         """Set the barrier blocks B (nc, 3, 3). A caller that has (B + C)^-1 more accurately than by inversion passes it
-        as ``inverse``. Only a linear solver that `takes_any` accepts blocks that are not ``symmetric``."""
+        as ``inverse``; a system that `mends` needs no B then. Only a linear solver that `takes_any` accepts blocks that
+        are not ``symmetric``."""
         with phase("CCPUpdate"):
             self.system.update(barrier, inverse, symmetric)
             self.linear.new_matrix(self.system)

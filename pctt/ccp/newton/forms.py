@@ -22,7 +22,7 @@ from petsc4py import PETSc
 from dem.contact_map.loops import local_product, pack
 from pctt.blocks import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.body_matrix import BodyOperator, inverse_blocks
-from pctt.ccp.cone import Array, times
+from pctt.ccp.cone import Array
 from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.newton.fronts import Fronts, places_in
 from pctt.ccp.problem import ConeProblem
@@ -52,9 +52,10 @@ class ContactForm:
         """Take another problem with the same contacts between the same bodies."""
         self.problem, self._loaded, self._N = problem, False, None
 
-    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
+    def update(self, barrier: Array | None, inverse: Array | None = None, symmetric: bool = True) -> None:
         """Make the matrix for the barrier blocks B (nc, 3, 3), or from ``inverse`` = (B + C)^-1 if the caller has it
         more accurately. ``symmetric`` says whether the blocks are."""
+        assert barrier is not None
         self._blocks, self._made, self.symmetric = self.problem.diagonal_blocks + barrier, False, symmetric
         self._local = np.empty((len(barrier), 6))
         pack(barrier + self.problem.compliance_blocks, self._local)
@@ -128,7 +129,7 @@ class BodyForm:
     The residual of an inexact solve of K stays in the momenta: nothing multiplies it. K is smaller than the contact
     system and far better conditioned once contacts open or slide.
 
-    For Coulomb's law (B + C)^-1 is not symmetric, and K is not either.
+    For Coulomb's law (B + C)^-1 is not symmetric, and K is not either. With moments its blocks are (nc, 6, 6).
     """
 
     mends = True
@@ -148,8 +149,9 @@ class BodyForm:
         self.operator.load(problem.contact_map)
         self._places, self._placed = None, False
 
-    def update(self, barrier: Array, inverse: Array | None = None, symmetric: bool = True) -> None:
+    def update(self, barrier: Array | None, inverse: Array | None = None, symmetric: bool = True) -> None:
         if inverse is None:
+            assert barrier is not None
             inverse = inverse_blocks(barrier + self.problem.compliance_blocks)
         self._inverse, self.symmetric = inverse, symmetric
         self.operator.update(inverse, symmetric)
@@ -184,10 +186,12 @@ class BodyForm:
         return float(self.problem.mean_diagonal**0.5)
 
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
+        times = self.problem.cones.times
         push = self.problem.momentum(times(self._inverse, q) if uncoupled is None else uncoupled)
         return push if r_v is None else push - r_v
 
     def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
+        times = self.problem.cones.times
         if uncoupled is None:
             return times(self._inverse, q - self.problem.velocity_of(x))
         return uncoupled - times(self._inverse, self.problem.velocity_of(x))

@@ -28,7 +28,7 @@ FRONTS = {
 class Settings:
     """Numbers of `LinearSolver`."""
 
-    few: int = number(400, "rows of a problem on one rank up to which `Dense` factors pay: .2 ms for 250, 1 ms for 450")
+    few: int = number(400, "rows on one rank up to which `Dense` factors pay: 0.2 ms for 250, 1 ms for 450")
     easy: float = number(8.0, "iterations with block Jacobi / bodies^0.4 and rank, after which the next matrix gets a "
                               "factor. It costs as much as 10 to 18 on one rank, and no less on more")  # fmt: skip
     least: float = number(0.1, "drop tolerance of a factor [mass]: entries of a block between bodies that it is better "

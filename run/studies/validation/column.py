@@ -9,8 +9,8 @@ import numpy as np
 from dem.experiment import Experiment, option
 from dem.mesh import Mesh
 from dem.motion import Glide
-from dem.scene import Scene
 from dem.packing import perturbed
+from dem.scene import Scene
 from dem.shapes import Plane
 
 RADIUS = 0.005  # of a sphere [m]

@@ -8,8 +8,8 @@ import numpy as np
 
 from dem.experiment import Experiment, option
 from dem.motion import Glide
-from dem.scene import Scene
 from dem.packing import perturbed
+from dem.scene import Scene
 from dem.shapes import Box, Plane
 
 RADIUS = 0.005  # of the greatest spheres [m]

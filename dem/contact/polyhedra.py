@@ -1,0 +1,739 @@
+"""Narrow phase of convex polyhedra, boxes among them, compiled.
+
+The planes of the faces, and where those overlap the common normals of edges, give the axis along which two polyhedra
+are furthest apart, or overlap least (Gottschalk, Lin, Manocha 1996, "OBBTree"; which edges make a face of the
+Minkowski difference, Gregorius 2013, "The separating axis test between convex polyhedra"). Where that is the normal of
+a face, the face is laid over the face of the other that looks back at it, and the corners of the polygon that they
+share are contacts. Otherwise two edges cross in one point, or corners are nearest to edges or corners: the distance is
+then that of Gilbert, Johnson, Keerthi 1988.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from dem.arrays import Floats, Ints
+from dem.compiled import loop
+from dem.contact.narrow import CORNERS, Manifold, Planes, Spheres, Touch
+from dem.polyhedra import Solid, hull
+
+#: Polyhedra touch on faces if the smallest gap there is within this share of the contact distance of their distance; if
+#: not, in the closest points alone.
+FLUSH = 0.1
+
+#: Corners and edges that are closer to each other across the normal than this share of the lesser half thickness of the
+#: two count as one on top of the other.
+SNAP = 1e-3
+
+#: Lengths that differ by less than this share of the lesser half thickness are equal: what is chosen among equals does
+#: not depend on rounding.
+TIE = 1e-9
+
+#: Two points that are closer than this share of the lesser half thickness give no direction.
+CLOSE = 1e-7
+
+#: Edges whose angle has a sine below this are parallel and have no normal in common.
+PARALLEL = 1e-5
+
+
+class Hulls(NamedTuple):
+    """The different polyhedra of a scene, `dem.polyhedra.Faces` of each in rows of the same lengths."""
+
+    radius: Floats  #: (h,) of the spheres about their origins that enclose them
+    counts: Ints  #: (h, 3) vertices, faces, edges
+    vertex: Floats  #: (h, v, 3)
+    normal: Floats  #: (h, f, 3)
+    corner: Ints  #: (h, f, s)
+    side: Ints  #: (h, f, s)
+    edge: Ints  #: (h, e, 2)
+    wing: Ints  #: (h, e, 2)
+
+    @property
+    def features(self) -> int:
+        """Of a pair: a corner of the first, a corner of the second, two edges."""
+        return 2 * self.vertex.shape[1] + self.edge.shape[1] ** 2
+
+
+@cache
+def hulls_of(solids: tuple[Solid, ...]) -> Hulls:
+    """The box of half extents one, which is number 0, and these."""
+    each = [hull(CORNERS), *(solid.faces for solid in solids)]
+    counts = np.array([(len(own.vertex), len(own.normal), len(own.edge)) for own in each])
+
+    def padded(columns: Sequence[np.ndarray]) -> np.ndarray:
+        shape = np.max([column.shape for column in columns], axis=0)
+        out = np.full((len(columns), *shape), -1, columns[0].dtype)
+        for row, column in zip(out, columns):
+            row[tuple(slice(n) for n in column.shape)] = column
+        return out
+
+    radius = np.array([np.linalg.norm(own.vertex, axis=1).max() for own in each])
+    return Hulls(radius, counts, *(padded([own[k] for own in each]) for k in range(6)))
+
+
+class Polyhedra(NamedTuple):
+    """Convex polyhedra in the world frame."""
+
+    center: Floats  #: (m, 3) [m]
+    turn: Floats  #: (m, 3, 3) from their frames to the world
+    scale: Floats  #: (m, 3) of the hull along the axes of its frame; of boxes the half extents
+    hull: Ints  #: (m,) rows of `hulls`
+    hulls: Hulls
+
+    def columns(self) -> tuple[Floats, Floats, Floats, Ints]:
+        """Without the table of hulls, as loops take them."""
+        center, turn, scale = (np.ascontiguousarray(column) for column in (self.center, self.turn, self.scale))
+        return center, turn, scale, self.hull
+
+
+def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> Manifold:
+    """Contacts of gap at most `delta` (m,) [m]: on faces the corners of a polygon, all with the same normal.
+
+    The features are independent of which of the two faces gives the normal.
+    """
+    most = 4 * first.hulls.corner.shape[2] + 2 * first.hulls.vertex.shape[1]
+    done, found, room = 0, 0, 4 * len(delta) + most
+    pair, feature, out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7))
+    sides = *first.columns(), *second.columns()
+    while True:
+        done, found = _pairs(*first.hulls[1:], *sides, delta, most, done, found, pair, feature, out)
+        if done == len(delta):
+            return _manifold(pair[:found], feature[:found], out[:found])
+        pair, feature, out = (np.concatenate([column, np.empty_like(column)]) for column in (pair, feature, out))
+
+
+def spheres_polyhedra(ball: Spheres, body: Polyhedra, delta: Floats) -> Manifold:
+    """One contact, at the closest point; a centre inside is pushed out through the nearest face."""
+    pair, out = np.empty(len(delta), np.int64), np.empty((len(delta), 7))
+    found = _spheres(*body.hulls[1:], *ball, *body.columns(), delta, pair, out)
+    return _manifold(pair[:found], np.zeros(found, np.int64), out[:found])
+
+
+def polyhedra_planes(body: Polyhedra, plane: Planes, delta: Floats) -> Manifold:
+    """The corners."""
+    room = len(delta) * body.hulls.vertex.shape[1]
+    pair, feature, out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7))
+    found = _planes(body.hulls.counts, body.hulls.vertex, *body.columns(), *plane, delta, pair, feature, out)
+    return _manifold(pair[:found], feature[:found], out[:found])
+
+
+def _manifold(pair: Ints, feature: Ints, out: Floats) -> Manifold:
+    return Manifold(pair, feature, Touch(*(np.ascontiguousarray(c) for c in (out[:, :3], out[:, 3:6], out[:, 6]))))
+
+
+@loop
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@loop
+def _set(out, k, x, y, z, u, v, w, gap):
+    out[k, 0], out[k, 1], out[k, 2], out[k, 3], out[k, 4], out[k, 5], out[k, 6] = x, y, z, u, v, w, gap
+
+
+@loop
+def _planes(count, vertex, center, turn, scale, hull, outward, origin, delta, pair, feature, out):
+    """Fill in the contacts of polyhedra with half spaces; their number."""
+    found = 0
+    for m in range(len(hull)):
+        h = hull[m]
+        for k in range(count[h, 0]):
+            gap = 0.0
+            for n in range(3):
+                place = center[m, n]
+                for i in range(3):
+                    place += turn[m, n, i] * (scale[m, i] * vertex[h, k, i])
+                out[found, n] = place
+                gap += (place - origin[m, n]) * outward[m, n]
+            if gap <= delta[m]:
+                for n in range(3):
+                    out[found, n] -= 0.5 * gap * outward[m, n]
+                    out[found, 3 + n] = -outward[m, n]
+                out[found, 6], pair[found], feature[found] = gap, m, k
+                found += 1
+                if found == len(out):
+                    return found
+    return found
+
+
+@loop
+def _place(count, vertex, normal, corner, turn, scale, x, y, z, points, normals, level):
+    """Fill in the vertices, the normals and, along these, the levels of the faces of a polyhedron at x, y, z; its half
+    thickness: how far its faces are from its centre at least."""
+    for k in range(count[0]):
+        a, b, c = scale[0] * vertex[k, 0], scale[1] * vertex[k, 1], scale[2] * vertex[k, 2]
+        points[k, 0] = x + (turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c)
+        points[k, 1] = y + (turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c)
+        points[k, 2] = z + (turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c)
+    thick = np.inf
+    for f in range(count[1]):
+        a, b, c = normal[f, 0] / scale[0], normal[f, 1] / scale[1], normal[f, 2] / scale[2]
+        per = 1.0 / np.sqrt(a * a + b * b + c * c)
+        u = (turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c) * per
+        v = (turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c) * per
+        w = (turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c) * per
+        k = corner[f, 0]
+        normals[f, 0], normals[f, 1], normals[f, 2] = u, v, w
+        level[f] = u * points[k, 0] + v * points[k, 1] + w * points[k, 2]
+        thick = min(thick, level[f] - (u * x + v * y + w * z))
+    return thick
+
+
+@loop
+def _beyond(faces, normals, level, points, many, reach, tie, best, face):
+    """The face whose plane is furthest from the points on its outer side, and how far that is, if it is more than
+    `best`; else `best` and `face`. Ends early where it is more than the reach."""
+    for f in range(faces):
+        u, v, w = normals[f, 0], normals[f, 1], normals[f, 2]
+        least = np.inf
+        for k in range(many):
+            least = min(least, u * points[k, 0] + v * points[k, 1] + w * points[k, 2])
+        if least - level[f] > best + tie:
+            best, face = least - level[f], f
+            if best > reach:
+                break
+    return best, face
+
+
+@loop
+def _slopes(edges, edge, points, faces, normals, out):
+    """Fill in the scalar products of the edges with normals of the other polyhedron."""
+    for e in range(edges):
+        a, b = edge[e, 0], edge[e, 1]
+        x, y, z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+        for f in range(faces):
+            out[e, f] = x * normals[f, 0] + y * normals[f, 1] + z * normals[f, 2]
+
+
+@loop
+def _crossing(edges, edge, wing, p, p_normal, p_slope, others, other_edge, other_wing, q, q_slope, tie, axis):
+    """The two edges along whose common normal the polyhedra are furthest apart, and how far: two edges whose normals
+    cross on the sphere make a face of the difference of the two. Fills in the normal, the axis."""
+    best, one, two = -np.inf, -1, -1
+    for e in range(edges):
+        left, right = wing[e, 0], wing[e, 1]
+        a, b = edge[e, 0], edge[e, 1]
+        x, y, z = p[b, 0] - p[a, 0], p[b, 1] - p[a, 1], p[b, 2] - p[a, 2]
+        square = x * x + y * y + z * z
+        for d in range(others):
+            s, t = p_slope[e, other_wing[d, 0]], q_slope[d, right]
+            if s * p_slope[e, other_wing[d, 1]] < 0.0 and q_slope[d, left] * t < 0.0 and s * t < 0.0:
+                c, k = other_edge[d, 0], other_edge[d, 1]
+                i, j, k = q[k, 0] - q[c, 0], q[k, 1] - q[c, 1], q[k, 2] - q[c, 2]
+                u, v, w = y * k - z * j, z * i - x * k, x * j - y * i
+                sine = np.sqrt(u * u + v * v + w * w)
+                if sine <= PARALLEL * np.sqrt(square * (i * i + j * j + k * k)):
+                    continue
+                out = u * (p_normal[left, 0] + p_normal[right, 0]) + v * (p_normal[left, 1] + p_normal[right, 1])
+                per = np.copysign(1.0 / sine, out + w * (p_normal[left, 2] + p_normal[right, 2]))
+                u, v, w = u * per, v * per, w * per
+                apart = u * (q[c, 0] - p[a, 0]) + v * (q[c, 1] - p[a, 1]) + w * (q[c, 2] - p[a, 2])
+                if apart > best + tie:
+                    best, one, two = apart, e, d
+                    axis[0], axis[1], axis[2] = u, v, w
+    return best, one, two
+
+
+@loop
+def _towards(many, corner, points, normals, axis, sign, slack):
+    """The face that looks along the axis, or with `sign` -1 against it, the most among those with most vertices at the
+    end of that way, within the slack."""
+    far = -np.inf
+    for k in range(many[0]):
+        far = max(far, sign * _dot(axis, points[k]))
+    best, most, face = -np.inf, 0, 0
+    for f in range(many[1]):
+        foremost = 0
+        for s in range(corner.shape[1]):
+            if corner[f, s] < 0:
+                break
+            foremost += sign * _dot(axis, points[corner[f, s]]) >= far - slack
+        ahead = sign * _dot(axis, normals[f])
+        if foremost > most or (foremost == most and ahead > best + TIE):
+            best, most, face = ahead, foremost, f
+    return face
+
+
+@loop
+def _polygon(corner, points, normal, frame, sign, flat, line, plane):
+    """Fill in the corners of a face in a frame (rows of unit vectors): two coordinates, and the height along the third
+    axis; the lines of its sides, outward normal and level; and its plane, slopes and height at the origin. The number
+    of corners, zero where the frame sees the face from its side. `sign` is -1 where the corners turn to the right."""
+    many = 0
+    while many < len(corner) and corner[many] >= 0:
+        k = corner[many]
+        for n in range(3):
+            flat[many, n] = _dot(frame[n], points[k])
+        many += 1
+    for k in range(many):
+        after = k + 1 if k + 1 < many else 0
+        x, y = flat[after, 0] - flat[k, 0], flat[after, 1] - flat[k, 1]
+        per = sign / max(np.sqrt(x * x + y * y), 1e-300)
+        line[k, 0], line[k, 1] = y * per, -x * per
+        line[k, 2] = line[k, 0] * flat[k, 0] + line[k, 1] * flat[k, 1]
+    u, v, w = _dot(frame[0], normal), _dot(frame[1], normal), _dot(frame[2], normal)
+    if abs(w) < PARALLEL:
+        return 0
+    plane[0], plane[1] = -u / w, -v / w
+    plane[2] = flat[0, 2] - plane[0] * flat[0, 0] - plane[1] * flat[0, 1]
+    return many
+
+
+@loop
+def _corners(many, flat, beyond, others, other, other_beyond, plane, other_plane, sign, thick, most, spots, code):
+    """Fill in the places, the gaps and the numbers of the corners of a polygon that are over another one, if the gap is
+    at most `most`; how many, and the least gap of all. A corner on a corner is one contact, in the middle of the two,
+    and one of the first polygon, `sign` 1."""
+    found, least = 0, np.inf
+    for k in range(many):
+        if not _inside(beyond[k], others, thick):
+            continue
+        x, y = flat[k, 0], flat[k, 1]
+        own, opposite = flat[k, 2], other_plane[0] * x + other_plane[1] * y + other_plane[2]
+        twin = -1
+        for n in range(others):
+            u, v = other[n, 0] - x, other[n, 1] - y
+            if u * u + v * v <= 4.0 * thick * thick and _inside(other_beyond[n], many, thick):
+                twin = n
+                break
+        if twin >= 0:
+            if sign < 0.0:
+                continue
+            u, v = other[twin, 0], other[twin, 1]
+            own, opposite = 0.5 * (own + plane[0] * u + plane[1] * v + plane[2]), 0.5 * (opposite + other[twin, 2])
+            x, y = 0.5 * (x + u), 0.5 * (y + v)
+        gap = sign * (opposite - own)
+        least = min(least, gap)
+        if gap <= most:
+            spots[found, 0], spots[found, 1], spots[found, 2], spots[found, 3] = x, y, 0.5 * (own + opposite), gap
+            code[found] = k
+            found += 1
+    return found, least
+
+
+@loop
+def _inside(beyond, many, thick):
+    """Whether a point is beyond none of the lines of a polygon, to a tolerance."""
+    inside = True
+    for n in range(many):
+        inside &= beyond[n] <= thick
+    return inside
+
+
+@loop
+def _crossings(many, flat, beyond, others, other, other_beyond, thick, most, spots, code):
+    """The same of the crossings of the sides of two polygons, which have the numbers k S + n of two sides, for S in a
+    row: the ends of each are on both sides of the other, none of them just on it."""
+    found, least = 0, np.inf
+    for k in range(many):
+        after = k + 1 if k + 1 < many else 0
+        for n in range(others):
+            then = n + 1 if n + 1 < others else 0
+            i, j, s, t = beyond[k, n], beyond[after, n], other_beyond[n, k], other_beyond[then, k]
+            if i * j >= 0.0 or s * t >= 0.0 or min(min(abs(i), abs(j)), min(abs(s), abs(t))) <= thick:
+                continue
+            i, s = i / (i - j), s / (s - t)
+            low = flat[k, 2] + i * (flat[after, 2] - flat[k, 2])
+            high = other[n, 2] + s * (other[then, 2] - other[n, 2])
+            least = min(least, high - low)
+            if high - low <= most:
+                spots[found, 0] = flat[k, 0] + i * (flat[after, 0] - flat[k, 0])
+                spots[found, 1] = flat[k, 1] + i * (flat[after, 1] - flat[k, 1])
+                spots[found, 2], spots[found, 3], code[found] = 0.5 * (low + high), high - low, k * len(other) + n
+                found += 1
+    return found, least
+
+
+@loop
+def _overlaid(corners, p, normal, other_corners, q, other_normal, frame, thick, most, flat, line, plane, beyond,
+              spots, code):  # fmt: skip
+    """The corners of the polygon that is common to two faces, seen along the third axis of the frame: how many corners
+    of the first, of the second, and crossings have a gap of at most `most`, and the least gap of all; fills in these
+    and leaves their numbers in `code`."""
+    many = _polygon(corners, p, normal, frame, 1.0, flat[0], line[0], plane[0])
+    others = _polygon(other_corners, q, other_normal, frame, -1.0, flat[1], line[1], plane[1])
+    if many == 0 or others == 0:
+        return 0, 0, 0, np.inf
+    for k in range(many):
+        for n in range(others):
+            beyond[0, k, n] = line[1, n, 0] * flat[0, k, 0] + line[1, n, 1] * flat[0, k, 1] - line[1, n, 2]
+            beyond[1, n, k] = line[0, k, 0] * flat[1, n, 0] + line[0, k, 1] * flat[1, n, 1] - line[0, k, 2]
+    of_first, least = _corners(
+        many, flat[0], beyond[0], others, flat[1], beyond[1], plane[0], plane[1], 1.0, thick, most, spots, code
+    )
+    of_second, lesser = _corners(
+        others, flat[1], beyond[1], many, flat[0], beyond[0], plane[1], plane[0], -1.0, thick, most, spots[of_first:],
+        code[of_first:],
+    )  # fmt: skip
+    both = of_first + of_second
+    crossed, lowest = _crossings(
+        many, flat[0], beyond[0], others, flat[1], beyond[1], thick, most, spots[both:], code[both:]
+    )
+    return of_first, of_second, crossed, min(least, min(lesser, lowest))
+
+
+@loop
+def _on_triangle(a, b, c, share):
+    """Fill in the shares of the corners of a triangle in its point nearest to the origin (Ericson 2005, "Real-time
+    collision detection", 5.1.5); its squared distance."""
+    aa, bb, cc, ab, ac, bc = _dot(a, a), _dot(b, b), _dot(c, c), _dot(a, b), _dot(a, c), _dot(b, c)
+    d1, d2, d3, d4, d5, d6 = aa - ab, aa - ac, ab - bb, ab - bc, ac - bc, ac - cc
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    if d1 <= 0.0 and d2 <= 0.0:
+        v, w = 0.0, 0.0
+    elif d3 >= 0.0 and d4 <= d3:
+        v, w = 1.0, 0.0
+    elif d6 >= 0.0 and d5 <= d6:
+        v, w = 0.0, 1.0
+    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v, w = d1 / (d1 - d3), 0.0
+    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        v, w = 0.0, d2 / (d2 - d6)
+    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        v = 1.0 - w
+    else:
+        v, w = vb / (va + vb + vc), vc / (va + vb + vc)
+    u = 1.0 - v - w
+    share[0], share[1], share[2] = u, v, w
+    x, y, z = u * a[0] + v * b[0] + w * c[0], u * a[1] + v * b[1] + w * c[1], u * a[2] + v * b[2] + w * c[2]
+    return x * x + y * y + z * z
+
+
+@loop
+def _distance(p, many, q, others, x, y, z, reach, size, way, ends, share, parts):
+    """How many points of the difference of two polyhedra that do not overlap span what is nearest to the origin, and
+    the distance, or that it is more than the reach: zero and inf. Fills in the points, the rows of the vertices of
+    both, and the shares of the points. x, y, z: a way about from the first to the second."""
+    count, square = 0, np.inf
+    for _ in range(64):
+        least, most, i, j = np.inf, -np.inf, 0, 0
+        for k in range(many):
+            ahead = x * p[k, 0] + y * p[k, 1] + z * p[k, 2]
+            if ahead > most:
+                most, i = ahead, k
+        for k in range(others):
+            ahead = x * q[k, 0] + y * q[k, 1] + z * q[k, 2]
+            if ahead < least:
+                least, j = ahead, k
+        if least - most > reach * np.sqrt(x * x + y * y + z * z):
+            return 0, np.inf
+        if count > 0 and square - (least - most) <= 1e-12 * square + 4e-16 * size * np.sqrt(square):
+            break
+        ends[count, 0], ends[count, 1] = i, j
+        for n in range(3):
+            way[count, n] = q[j, n] - p[i, n]
+        first, second, better = 0, 0, np.inf  # the new simplex: `first`, `second` and the last of the points
+        if count == 0:
+            better = _dot(way[0], way[0])
+            parts[0], parts[1], parts[2] = 0.0, 0.0, 1.0
+        elif count == 1:
+            a, b = _dot(way[0], way[0]), _dot(way[0], way[1])
+            t = min(max((a - b) / (a - 2.0 * b + _dot(way[1], way[1])), 0.0), 1.0)
+            parts[0], parts[1], parts[2], better = 1.0 - t, 0.0, t, 0.0
+            for n in range(3):
+                better += ((1.0 - t) * way[0, n] + t * way[1, n]) ** 2
+        else:
+            for one in range(count - 1):
+                for two in range(one + 1, count):
+                    found = _on_triangle(way[one], way[two], way[count], parts[3:])
+                    if found < better:
+                        better, first, second = found, one, two
+                        parts[0], parts[1], parts[2] = parts[3], parts[4], parts[5]
+        if not better < square:
+            break
+        square, last, count = better, count, 0
+        x, y, z = 0.0, 0.0, 0.0
+        for n in range(3):
+            k = first if n == 0 else second if n == 1 else last
+            if parts[n] > 0.0:
+                share[count], ends[count, 0], ends[count, 1] = parts[n], ends[k, 0], ends[k, 1]
+                way[count, 0], way[count, 1], way[count, 2] = way[k, 0], way[k, 1], way[k, 2]
+                x, y, z = x + parts[n] * way[k, 0], y + parts[n] * way[k, 1], z + parts[n] * way[k, 2]
+                count += 1
+    return count, np.sqrt(square)
+
+
+@loop
+def _witness(points, ends, share, count, place):
+    """Fill in the point of a polyhedron that has these shares of vertices; the vertex of the greatest share, and
+    another one, -1 if there is none."""
+    place[0], place[1], place[2] = 0.0, 0.0, 0.0
+    one, two, most = -1, -1, 0.0
+    for k in range(count):
+        for n in range(3):
+            place[n] += share[k] * points[ends[k], n]
+        if share[k] > most:
+            one, most = ends[k], share[k]
+    for k in range(count):
+        if ends[k] != one:
+            two = ends[k]
+    return one, two
+
+
+@loop
+def _edge_of(edges, edge, one, two):
+    """The number of the edge between two vertices, -1 if there is none."""
+    for e in range(edges):
+        if (edge[e, 0] == one and edge[e, 1] == two) or (edge[e, 0] == two and edge[e, 1] == one):
+            return e
+    return -1
+
+
+@loop
+def _on_edges(points, many, others, count, edges, edge, axis, sign, slack, most, first, found, out, feature):
+    """Add the vertices of a polyhedron, of those that are foremost along the axis (`sign` -1: against it) within the
+    slack, that are at most `most` from edges of the other one, which has such vertices too; the new number of contacts,
+    and the least distance. `first` is the number of the first vertex among the features."""
+    front, back, least = -np.inf, np.inf, np.inf
+    for k in range(many):
+        front = max(front, sign * _dot(axis, points[k]))
+    for k in range(count):
+        back = min(back, sign * _dot(axis, others[k]))
+    for k in range(many):
+        if sign * _dot(axis, points[k]) < front - slack:
+            continue
+        best, x, y, z = np.inf, 0.0, 0.0, 0.0
+        for e in range(edges):
+            a, b = edge[e, 0], edge[e, 1]
+            if min(sign * _dot(axis, others[a]), sign * _dot(axis, others[b])) > back + slack:
+                continue
+            u, v, w = others[b, 0] - others[a, 0], others[b, 1] - others[a, 1], others[b, 2] - others[a, 2]
+            i, j, s = points[k, 0] - others[a, 0], points[k, 1] - others[a, 1], points[k, 2] - others[a, 2]
+            t = min(max((i * u + j * v + s * w) / (u * u + v * v + w * w), 0.0), 1.0)
+            i, j, s = t * u - i, t * v - j, t * w - s
+            square = i * i + j * j + s * s
+            if square < best:
+                best, x, y, z = square, i, j, s
+        gap = np.sqrt(best)
+        if gap <= most:
+            least = min(least, gap)
+            per, i, j, s = sign / gap, points[k, 0] + 0.5 * x, points[k, 1] + 0.5 * y, points[k, 2] + 0.5 * z
+            _set(out, found, i, j, s, x * per, y * per, z * per, gap)
+            feature[found] = first + k
+            found += 1
+    return found, least
+
+
+@loop
+def _frame(normal, sign, one, other, frame):
+    """Fill in a normal as the third axis, and two across it; the way from one point to the other is across it."""
+    x, y, z = other[0] - one[0], other[1] - one[1], other[2] - one[2]
+    per = 1.0 / np.sqrt(x * x + y * y + z * z)
+    x, y, z = x * per, y * per, z * per
+    u, v, w = sign * normal[0], sign * normal[1], sign * normal[2]
+    frame[0, 0], frame[0, 1], frame[0, 2] = x, y, z
+    frame[1, 0], frame[1, 1], frame[1, 2] = v * z - w * y, w * x - u * z, u * y - v * x
+    frame[2, 0], frame[2, 1], frame[2, 2] = u, v, w
+
+
+@loop
+def _pairs(
+    count, vertex, normal, corner, side, edge, wing, center, turn, scale, hull, other_center, other_turn, other_scale,
+    other_hull, delta, most, done, found, pair, feature, out,
+):  # fmt: skip
+    """Add to the first contacts those of the pairs that are not done, as long as there is room for the `most` that a
+    pair has; new numbers of pairs done and contacts found."""
+    v, f, s, e = vertex.shape[1], normal.shape[1], corner.shape[2], edge.shape[1]
+    points, normals, level = np.empty((2, v, 3)), np.empty((2, f, 3)), np.empty((2, f))
+    slopes, axis, frame, place = np.empty((2, e, f)), np.empty(3), np.empty((3, 3)), np.empty((2, 3))
+    flat, line, plane, beyond = np.empty((2, s, 3)), np.empty((2, s, 3)), np.empty((2, 3)), np.empty((2, s, s))
+    spots, code = np.empty((4 * s, 4)), np.empty(4 * s, np.int64)
+    way, ends, share, parts = np.empty((4, 3)), np.empty((4, 2), np.int64), np.empty(4), np.empty(6)
+    p, q, p_normal, q_normal = points[0], points[1], normals[0], normals[1]
+    for m in range(done, len(hull)):
+        if found + most > len(out):
+            return m, found
+        g, h, reach, start = hull[m], other_hull[m], delta[m], found
+        many, others = count[g], count[h]
+        a, b, c = center[m, 0], center[m, 1], center[m, 2]
+        x, y, z = other_center[m, 0] - a, other_center[m, 1] - b, other_center[m, 2] - c
+        size = _place(many, vertex[g], normal[g], corner[g], turn[m], scale[m], 0.0, 0.0, 0.0, p, p_normal, level[0])
+        size = min(size, _place(
+            others, vertex[h], normal[h], corner[h], other_turn[m], other_scale[m], x, y, z, q, q_normal, level[1]
+        ))  # fmt: skip
+        tie, tolerance = TIE * size, FLUSH * reach + 2.0 * SNAP * size
+        flush, one = _beyond(many[1], p_normal, level[0], q, others[0], reach, tie, -np.inf, -1)
+        if flush > reach:
+            continue
+        flush, other = _beyond(others[1], q_normal, level[1], p, many[0], reach, tie, flush, -1)
+        if flush > reach:
+            continue
+
+        # Where faces part the two, the edges matter only if these are as close as touching.
+        crossed, one_edge, other_edge = -np.inf, -1, -1
+        if flush <= CLOSE * size:
+            _slopes(many[2], edge[g], p, others[1], q_normal, slopes[0])
+            _slopes(others[2], edge[h], q, many[1], p_normal, slopes[1])
+            crossed, one_edge, other_edge = _crossing(
+                many[2], edge[g], wing[g], p, p_normal, slopes[0], others[2], edge[h], wing[h], q, slopes[1], tie, axis
+            )
+        apart = max(flush, crossed)
+        if apart > reach:
+            continue
+
+        if flush >= apart - tolerance:
+            if other < 0:
+                _frame(p_normal[one], 1.0, p[corner[g, one, 0]], p[corner[g, one, 1]], frame)
+                last = _towards(others, corner[h], q, q_normal, frame[2], -1.0, tolerance)
+            else:
+                last = other
+                _frame(q_normal[last], -1.0, q[corner[h, last, 0]], q[corner[h, last, 1]], frame)
+                one = _towards(many, corner[g], p, p_normal, frame[2], 1.0, tolerance)
+            of_first, of_second, of_both, least = _overlaid(
+                corner[g, one], p, p_normal[one], corner[h, last], q, q_normal[last], frame, SNAP * size, reach, flat,
+                line, plane, beyond, spots, code,
+            )  # fmt: skip
+            if least <= apart + tolerance:
+                for k in range(of_first + of_second + of_both):
+                    if k < of_first:
+                        feature[found] = corner[g, one, code[k]]
+                    elif k < of_first + of_second:
+                        feature[found] = v + corner[h, last, code[k]]
+                    else:
+                        feature[found] = 2 * v + e * side[g, one, code[k] // s] + side[h, last, code[k] % s]
+                    pair[found], out[found, 6] = m, spots[k, 3]
+                    for n in range(3):
+                        out[found, n] = center[m, n]
+                        for i in range(3):
+                            out[found, n] += spots[k, i] * frame[i, n]
+                        out[found, 3 + n] = frame[2, n]
+                    found += 1
+                continue
+
+        gap = apart
+        if apart > tie:
+            extent = np.sqrt(x * x + y * y + z * z)
+            points_in, gap = _distance(p, many[0], q, others[0], x, y, z, reach, extent, way, ends, share, parts)
+            if gap > reach:
+                continue
+        if gap > CLOSE * size:
+            i, k = _witness(p, ends[:, 0], share, points_in, place[0])
+            j, n = _witness(q, ends[:, 1], share, points_in, place[1])
+            for t in range(3):
+                axis[t] = place[1, t] - place[0, t]
+            gap = np.sqrt(_dot(axis, axis))
+            for t in range(3):
+                axis[t] /= gap
+            far = min(gap + tolerance, reach)
+            found, least = _on_edges(
+                p, many[0], q, others[0], others[2], edge[h], axis, 1.0, tolerance, far, 0, found, out, feature
+            )
+            own = found
+            found, lesser = _on_edges(
+                q, others[0], p, many[0], many[2], edge[g], axis, -1.0, tolerance, far, v, found, out, feature
+            )
+            found = _each_once(out, feature, start, own, found, 1e-6 * size)
+            if gap < min(least, lesser) - tie:
+                one_edge, other_edge = _edge_of(many[2], edge[g], i, k), _edge_of(others[2], edge[h], j, n)
+                name = i
+                if k >= 0 and n < 0:
+                    name = v + j
+                elif one_edge >= 0 and other_edge >= 0:
+                    name = 2 * v + e * one_edge + other_edge
+                at = start
+                while at < found and feature[at] != name:
+                    at += 1
+                feature[at], found = name, max(found, at + 1)
+                _set(
+                    out, at, 0.5 * (place[0, 0] + place[1, 0]), 0.5 * (place[0, 1] + place[1, 1]),
+                    0.5 * (place[0, 2] + place[1, 2]), axis[0], axis[1], axis[2], gap,
+                )  # fmt: skip
+        elif one_edge >= 0 and crossed >= flush - tolerance:
+            _between(
+                p[edge[g, one_edge, 0]], p[edge[g, one_edge, 1]], q[edge[h, other_edge, 0]], q[edge[h, other_edge, 1]],
+                place,
+            )  # fmt: skip
+            feature[found] = 2 * v + e * one_edge + other_edge
+            _set(
+                out, found, 0.5 * (place[0, 0] + place[1, 0]), 0.5 * (place[0, 1] + place[1, 1]),
+                0.5 * (place[0, 2] + place[1, 2]), axis[0], axis[1], axis[2], crossed,
+            )  # fmt: skip
+            found += 1
+        else:  # a corner in a face that the faces of the other, seen from it, are all too steep for
+            sign, best, k = 1.0 if other < 0 else -1.0, np.inf, 0
+            for n in range(others[0] if other < 0 else many[0]):
+                ahead = sign * _dot(frame[2], q[n] if other < 0 else p[n])
+                if ahead < best:
+                    best, k = ahead, n
+            feature[found] = v + k if other < 0 else k
+            for n in range(3):
+                tip = q[k, n] if other < 0 else p[k, n]
+                out[found, n], out[found, 3 + n] = tip - 0.5 * sign * flush * frame[2, n], frame[2, n]
+            out[found, 6] = flush
+            found += 1
+        for k in range(start, found):
+            pair[k] = m
+            for n in range(3):
+                out[k, n] += center[m, n]
+    return len(hull), found
+
+
+@loop
+def _each_once(out, feature, start, own, found, close):
+    """Leave out the contacts from `own` on that are in the place of one from `start` on; the new number of contacts."""
+    to = own
+    for k in range(own, found):
+        alone = True
+        for n in range(start, own):
+            x, y, z = out[k, 0] - out[n, 0], out[k, 1] - out[n, 1], out[k, 2] - out[n, 2]
+            alone &= x * x + y * y + z * z > close * close
+        if alone:
+            out[to], feature[to] = out[k], feature[k]
+            to += 1
+    return to
+
+
+@loop
+def _between(a, b, c, d, place):
+    """Fill in the points of two edges, from a to b and from c to d, where their lines are closest, or their ends."""
+    u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    i, j, k = d[0] - c[0], d[1] - c[1], d[2] - c[2]
+    x, y, z = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    uu, ii, ui = u * u + v * v + w * w, i * i + j * j + k * k, u * i + v * j + w * k
+    ux, ix = u * x + v * y + w * z, i * x + j * y + k * z
+    square = uu * ii - ui * ui
+    s = min(max((ux * ii - ix * ui) / square, 0.0), 1.0)
+    t = min(max((ux * ui - ix * uu) / square, 0.0), 1.0)
+    for n in range(3):
+        place[0, n], place[1, n] = a[n] + s * (b[n] - a[n]), c[n] + t * (d[n] - c[n])
+
+
+@loop
+def _spheres(
+    count, vertex, normal, corner, side, edge, wing, ball, radius, center, turn, scale, hull, delta, pair, out
+):
+    """Fill in the contacts of spheres with polyhedra; their number."""
+    points, normals, level = np.empty(vertex.shape[1:]), np.empty(normal.shape[1:]), np.empty(normal.shape[1])
+    way, ends, share, parts = np.empty((4, 3)), np.empty((4, 2), np.int64), np.empty(4), np.empty(6)
+    middle, found = np.zeros((1, 3)), 0
+    for m in range(len(hull)):
+        h, reach = hull[m], delta[m] + radius[m]
+        x, y, z = center[m, 0] - ball[m, 0], center[m, 1] - ball[m, 1], center[m, 2] - ball[m, 2]
+        size = _place(
+            count[h], vertex[h], normal[h], corner[h], turn[m], scale[m], x, y, z, points, normals, level
+        )
+        gap, face = _beyond(count[h, 1], normals, level, middle, 1, reach, TIE * size, -np.inf, -1)
+        if gap > reach:
+            continue
+        u, v, w = -normals[face, 0], -normals[face, 1], -normals[face, 2]
+        if gap > CLOSE * size:
+            extent = np.sqrt(x * x + y * y + z * z)
+            many, gap = _distance(middle, 1, points, count[h, 0], x, y, z, reach, extent, way, ends, share, parts)
+            if gap > reach:
+                continue
+            u, v, w = 0.0, 0.0, 0.0
+            for k in range(many):
+                u, v, w = u + share[k] * way[k, 0], v + share[k] * way[k, 1], w + share[k] * way[k, 2]
+            gap = np.sqrt(u * u + v * v + w * w)
+            u, v, w = u / gap, v / gap, w / gap
+        gap -= radius[m]
+        ahead = radius[m] + 0.5 * gap
+        pair[found] = m
+        _set(out, found, ball[m, 0] + ahead * u, ball[m, 1] + ahead * v, ball[m, 2] + ahead * w, u, v, w, gap)
+        found += 1
+    return found

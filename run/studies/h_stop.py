@@ -1,0 +1,100 @@
+"""Where flows down a rough incline stop: the scene `incline` is tilted less and less, until it rests.
+
+    run/study h_stop [LAYERS ...] [--rate DEGREES] [--seeds M]
+
+A bed of so many layers (default 2 3 4 6 8 12) flows for two seconds at 32 degrees, of less than four layers at 40. Then
+the angle falls at the rate (0.5) in degrees a second. It has stopped when its mean speed is below a hundredth of
+sqrt(g d), over half a second. Prints the height h / d, from the mass with a solid fraction of 0.59, the angle at which
+it stops, and that of the law of glass beads, h_stop = 1.65 d (tan 32.8 - tan a) / (tan a - tan 20.9). Its form is that
+of Pouliquen, Phys. Fluids 11 (1999) 542, with constants of Jop, Forterre, Pouliquen, Nature 441 (2006) 727, and
+Forterre, Pouliquen, J. Fluid Mech. 486 (2003) 21. Writes results/h_stop.json.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import atan, degrees, pi, radians, sqrt, tan
+from typing import Any
+
+import numpy as np
+from shared import Table, at_least_one, parser, record, say_machine
+
+import pctt
+from dem.experiment import option
+from dem.scene import Scene
+from dem.scenes import Incline
+
+FLOWS = 2.0  # s at the first angle
+SLOW, LASTING = 0.01, 0.5  # of sqrt(g d); s
+FRACTION = 0.59
+LOW, HIGH, LENGTH = 20.9, 32.8, 1.65  # degrees, degrees, diameters
+
+
+@dataclass(frozen=True)
+class Levelled(Incline):
+    """An incline whose angle falls after a while."""
+
+    fall: float = option(0.5, "deg/s", "rate at which the angle falls after two seconds")
+
+    def angle_at(self, time: float) -> float:
+        """[degrees]"""
+        return self.angle - self.fall * max(time - FLOWS, 0.0)
+
+    def build(self) -> Scene:
+        """The scene: a load turns the gravity of the first angle."""
+        scene = super().build()
+
+        def turn(time: float, table: Any) -> Any:
+            now = radians(self.angle_at(time))
+            pull = self.gravity * np.array([np.sin(now), 0.0, -np.cos(now)])
+            return table.mass[:, None] * (pull - np.asarray(scene.gravity))
+
+        scene.add_load("tilt", force=turn)
+        return scene
+
+    @property
+    def layer_height(self) -> float:
+        """Of the bed at rest over the diameter."""
+        return self.n * pi / 6.0 / ((self.pitch / 2.0) ** 2 * FRACTION)
+
+
+def law(height: float) -> float:
+    """The angle [degrees] at which a bed of glass beads of this height over diameter stops."""
+    low, high = tan(radians(LOW)), tan(radians(HIGH))
+    return degrees(atan((height * low + LENGTH * high) / (height + LENGTH)))
+
+
+def stopped(layers: int, rate: float, seed: int) -> dict[str, Any]:
+    """The angle at which a bed stops, and what it took."""
+    scene = Levelled(n=layers, angle=40.0 if layers < 4 else 32.0, fall=rate, seed=seed)
+    sim = pctt.Simulation(scene, solver="apgd")
+    limit, calm = SLOW * sqrt(2.0 * scene.gravity * scene.radius), 0
+    steps, missed = round(LASTING / sim.settings.dt), 0
+    while scene.angle_at(sim.time) > 10.0 and calm < steps:
+        sim.step()
+        missed += not sim.figures["converged"]
+        calm = calm + 1 if sim.figures["speed [m/s]"] < limit else 0
+    angle, height = scene.angle_at(sim.time - LASTING), scene.layer_height
+    found = {"layers": layers, "seed": seed, "spheres": len(sim.ids), "height [d]": height, "angle": angle}
+    return found | {"glass beads": law(height), "steps": sim.steps, "missed": missed}
+
+
+def main() -> None:
+    words = parser("h_stop", __doc__)
+    words.add_argument("layers", nargs="*", type=at_least_one, metavar="LAYERS", help="(2 3 4 6 8 12)")
+    words.add_argument("--rate", type=float, default=0.5, help="at which the angle falls, degrees a second (0.5)")
+    words.add_argument("--seeds", type=at_least_one, default=1, help="beds of each height (1)")
+    given = words.parse_args()
+    about, rows = say_machine(), []
+    table = Table(layers=("layers", "6d"), seed=("seed", "4d"), h_over_d=("height [d]", "8.2f"),
+                  stops_at=("angle", "8.2f"), glass_beads=("glass beads", "11.2f"),
+                  missed=("missed", "6d"))  # fmt: skip
+    for layers in given.layers or (2, 3, 4, 6, 8, 12):
+        for seed in range(1, given.seeds + 1):
+            rows.append(stopped(layers, given.rate, seed))
+            table.add(rows[-1])
+    record("h_stop", about, rows)
+
+
+if __name__ == "__main__":
+    main()
