@@ -56,7 +56,8 @@ def test_version_and_licence_are_the_same_everywhere(recipes):
 
 def test_an_address_of_the_project_is_that_of_pyproject(recipes):
     assert recipes.project("Source") == ADDRESS
-    texts = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *PACKAGING.rglob("*.*"), ROOT / "CITATION.cff"]
+    recipes_of = [path for path in PACKAGING.rglob("*.*") if path.suffix != ".pyc"]
+    texts = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *recipes_of, ROOT / "CITATION.cff"]
     found = {url for path in texts for url in re.findall(r"https?://[^\s\"'<>)]*/pctt\b", path.read_text())}
     assert {url for url in found if "pypi.org/" not in url} <= {ADDRESS}
 
