@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mpi4py import MPI
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear
 from scipy.spatial import ConvexHull
 
 from dem import quaternion
@@ -100,10 +100,11 @@ def test_pairs_without_contacts_are_refused():
 
 
 def signed_distance(one, other):
-    """Of two hulls of points: the least distance by non-negative least squares (Lawson and Hanson 1974, chapter 23),
-    and the depth by the hull of the differences."""
+    """Of two hulls of points: the least distance by non-negative least squares (Lawson and Hanson 1974, chapter 23; nnls
+    of scipy 1.15 ends before), and the depth by the hull of the differences."""
     apart = (other[:, None] - one).reshape(-1, 3)
-    share = nnls(np.vstack([apart.T, np.ones(len(apart))]), np.array([0, 0, 0, 1.0]))[0]
+    rows, one_of_all = np.vstack([apart.T, np.ones(len(apart))]), np.array([0, 0, 0, 1.0])
+    share = lsq_linear(rows, one_of_all, (0, np.inf), method="bvls", tol=1e-14).x
     gap = np.linalg.norm(share @ apart) / share.sum()
     return gap if gap > 1e-9 else ConvexHull(apart).equations[:, 3].max()
 
