@@ -100,8 +100,8 @@ def test_pairs_without_contacts_are_refused():
 
 
 def signed_distance(one, other):
-    """Of two hulls of points: the least distance by non-negative least squares (Lawson and Hanson 1974, chapter 23; nnls
-    of scipy 1.15 ends before), and the depth by the hull of the differences."""
+    """Of two hulls of points: the least distance by non-negative least squares (Lawson and Hanson 1974, chapter 23; the
+    nnls of scipy 1.15 ends before), and the depth by the hull of the differences."""
     apart = (other[:, None] - one).reshape(-1, 3)
     rows, one_of_all = np.vstack([apart.T, np.ones(len(apart))]), np.array([0, 0, 0, 1.0])
     share = lsq_linear(rows, one_of_all, (0, np.inf), method="bvls", tol=1e-14).x
