@@ -18,7 +18,7 @@ from pctt.folder import Folder
 from pctt.options import AT_LEAST_ONE, POSITIVE, option
 
 LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")
-EXTRA = "the extra `pictures` has the libraries that draw: pip install -e '.[pictures]' in the project's folder"
+EXTRA = "the extra `pictures` has the libraries that draw: pip install 'pctt[pictures]', in a checkout -e '.[pictures]'"
 
 ANGLE = ("a number between -90 and 90", lambda degrees: -90 < degrees < 90)
 OPACITY = ("a number from 0 to 1", lambda opacity: 0 <= opacity <= 1)

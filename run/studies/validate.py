@@ -22,7 +22,7 @@ from pctt.folder import Folder
 RUNS, PAGE = Path("results/validation"), Path("docs/validation.md")
 PICTURES = {
     Path("docs/validation.png"): ("silo", "heap", "drum", "column"),
-    Path("docs/benchmarks.png"): ("mankoc", "dosta", "collapse", "packing", "intrusion"),
+    Path("docs/published.png"): ("mankoc", "dosta", "collapse", "packing", "intrusion"),
 }
 TEXT = Path("run/studies/validation/page.md")  # of the page, with the places of the figures
 OUTLETS, SMALL_OUTLETS = (4.5, 5.5, 6.5), (4.0, 5.5)

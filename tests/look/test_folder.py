@@ -145,7 +145,7 @@ runpy.run_module("pctt.{program}", run_name="__main__")
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"pctt.{program}: No module named ")
     assert missing in line or program == "render"  # which may ask for matplotlib first
-    assert "pip install -e '.[pictures]'" in line
+    assert "pip install 'pctt[pictures]'" in line
 
 
 FAILS = """
