@@ -144,12 +144,11 @@ def energy_balance(step: Step) -> dict[str, float]:
                                                  + time stepping
 
     With g the impulses and w the mean of the velocities before and after (of prescribed motions: that of the step), the
-    impulses do the work g' D' w. Its tangential part is the friction loss. Its normal part goes to the springs of
-    contacts, and the rest is lost in impacts, or pushes overlaps of rigid contacts apart where it is a gain. The work
-    of motions is that of prescribed bodies on the others, of the drives of guided and hinged bodies, of what holds
-    bodies in part, of belts, loads, springs and the shear of a
-    cell. The rest is the error of the semi-implicit step, of the order of dt:
-    -dt/2 m g (v_new - v_old) per body.
+    impulses do the work g' D' w. What its tangential part does not give to the springs of contacts is the friction
+    loss. What its normal part does not is lost in impacts, or pushes overlaps of rigid contacts apart where it is a
+    gain. The work of motions is that of prescribed bodies on the others, of the drives of guided and hinged bodies, of
+    what holds bodies in part, of belts, loads, springs and the shear of a cell. The rest is the error of the semi-
+    implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
 
     Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be. Where
     spheres slide these differ by (dt v_t)^2 / 2R. With stiff contacts and large dt that is as much as the overlaps, and
@@ -177,6 +176,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     speeds = [table.velocity for table in after]
     normal, tangential, opening = system.works(step.in_cone, velocity, speeds[0], speeds[1], step.moment)
     springs = spring_energies(system.stiffness, step.contacts.gap, opening, system.dt)
+    along = strain_energies(system.compliance, system.held, step.impulse)
     received = np.vdot(step.impulse_on_large[~moves], mean[~moves])
     loads = 0.0
     if system.applied is not None:
@@ -195,23 +195,23 @@ def energy_balance(step: Step) -> dict[str, float]:
     cohesion = 0.0
     if system.attraction is not None:
         cohesion = system.works(step.impulse, velocity, *speeds)[0] - normal
-    whole = np.array([*was, *now, normal, tangential, *springs, still, _carried(step, ~moves), cohesion])
+    whole = np.array([*was, *now, normal, tangential, *springs, still, _carried(step, ~moves), cohesion, *along])
     comm.Allreduce(MPI.IN_PLACE, whole)
-    change, held = whole[2] + whole[3] - whole[0] - whole[1], whole[7] - whole[6]
-    rise, fallen, released = whole[2] - whole[0], whole[1] - whole[3], max(-held, 0.0)
+    change, held, strained = whole[2] + whole[3] - whole[0] - whole[1], whole[7] - whole[6], whole[12] - whole[11]
+    rise, fallen, released = whole[2] - whole[0], whole[1] - whole[3], max(-held, 0.0) + max(-strained, 0.0)
     there = whole[0] + whole[8] + whole[9]
     # with the velocity of the end, for bodies that were at rest
     pulled = 2.0 * max(whole[10], 0.0) + max(joints_at_end - joints, 0.0)
-    created = rise - fallen - work - released - pulled > CREATED * (there + whole[6] + abs(work))
+    created = rise - fallen - work - released - pulled > CREATED * (there + whole[6] + whole[11] + abs(work))
     driven = max(fallen, 0.0) + max(driving, 0.0) + pulled + released * (whole[9] == 0.0)
     jumps = rise > 0.0 and (created or whole[2] - driven > SUDDEN * there + CREATED * driven)
     return {
         "kinetic_energy [J]": whole[2],
         "potential_energy [J]": whole[3],
-        "spring_energy_before [J]": whole[6],
-        "spring_energy [J]": whole[7],
+        "spring_energy_before [J]": whole[6] + whole[11],
+        "spring_energy [J]": whole[7] + whole[12],
         "work_of_motions [J]": work,
-        "friction_loss [J]": belts - whole[5],  # nothing is zero, not -0
+        "friction_loss [J]": belts - whole[5] - strained,  # nothing is zero, not -0
         "impact_loss [J]": 0.0 - whole[4] - held,
         **({} if system.attraction is None else {"work_of_cohesion [J]": whole[10]}),
         "time_stepping [J]": change - work - whole[4] - whole[5] - whole[10] + belts,
@@ -283,6 +283,18 @@ def spring_energies(stiffness: Floats, gap: Floats, opening: Floats, dt: float) 
         k = 0.0 if np.isinf(stiffness[c]) else stiffness[c]
         start += 0.5 * k * max(-gap[c], 0.0) ** 2
         end += 0.5 * k * max(-gap[c] - dt * opening[c], 0.0) ** 2
+    return start, end
+
+
+@loop
+def strain_energies(compliance: Floats, held: Floats, impulse: Floats) -> tuple[float, float]:
+    """What contacts hold in the springs of their tangents at the start and at the end of a step [J], with the
+    impulses `held` (nc, 2) at its start: C/2 |g_t|^2."""
+    start, end = 0.0, 0.0
+    for c in range(len(held)):
+        for k in range(2):
+            start += 0.5 * compliance[c, 1] * held[c, k] ** 2
+            end += 0.5 * compliance[c, 1] * impulse[c, 1 + k] ** 2
     return start, end
 
 

@@ -10,9 +10,18 @@ a compliance C = 1 / (k dt^2 + c dt) on the diagonal of the Delassus matrix, and
 limit, the overlap of bodies at rest does not depend on it, and no step adds energy: an implicit spring gives back what
 it holds at most. Rigid contacts are k = inf.
 
+Along the surfaces there is a spring of stiffness k_t = TANGENTIAL k that friction stretches no further than it holds.
+It is stretched by what the last step left in it, g_t / (k_t dt), and by dt v_t where the contact sticks, so that with
+the tangential impulse held of the last step
+
+    v_t + (g_t - held) / (k_t dt^2) = 0.
+
+A contact that sticks under a constant load does not move: the spring remembers.
+
 Source: Negrut, Serban, Tasora, "Posing multibody dynamics with friction and contact as a differential complementarity
 problem", J. Comput. Nonlinear Dynam. 13 (2017), for the compliance; Schwager, Poeschel, "Coefficient of restitution
-and linear-dashpot model revisited", Granular Matter 9 (2007), for impacts with springs that do not pull.
+and linear-dashpot model revisited", Granular Matter 9 (2007), for impacts with springs that do not pull; Cundall,
+Strack, "A discrete numerical model for granular assemblies", Geotechnique 29 (1979), for the tangential spring.
 """
 
 from __future__ import annotations
@@ -34,6 +43,7 @@ from dem.time_step import fastest
 OVERLAP = 0.003  #: the greatest overlap that `recommended` allows, as a part of a grain's radius
 CHAINS = 4.0  #: the strongest forces between grains over those that a like share of the weight makes
 DENSE = 0.64  #: solid fraction of a bed that sources may make
+TANGENTIAL = 2.0 / 7.0  #: k_t / k: both directions of an impact of spheres take as long (Silbert et al., PRE 64, 2001)
 DAMPING = 2.0  #: c as a part of 2 sqrt(k m): an impact leaves 5 % of the speed (Schwager, Poeschel); 1: 14 %
 
 
@@ -81,14 +91,15 @@ def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:
 def gap_velocities(
     stiffness: Floats, material: Ints, mass: Floats, a: Ints, b: Ints, gap: Floats, dt: float, recovery_speed: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Stiffness (nc,), compliance (nc,) and the part of r (nc,) that closes gaps or pushes overlaps apart: gap / dt, of
-    stiff contacts that overlap the share of `compliance`, of rigid ones at most the recovery speed.
+    """Stiffness (nc,), compliance (nc, 2) of normals and tangents, and the part of r (nc,) that closes gaps or pushes
+    overlaps apart: gap / dt, of stiff contacts that overlap the share of `compliance`, of rigid ones at most the
+    recovery speed.
 
     `stiffness` (materials, materials); `material` and `mass` of the bodies, which have the rows a, b (nc,)."""
-    k, C, speed = np.empty(len(gap)), np.empty(len(gap)), np.empty(len(gap))
+    k, C, speed = np.empty(len(gap)), np.empty((len(gap), 2)), np.empty(len(gap))
     for c in range(len(gap)):
         k[c] = stiffness[material[a[c]], material[b[c]]]
-        C[c], share = compliance(k[c], 1.0 / (1.0 / mass[a[c]] + 1.0 / mass[b[c]]), dt)
+        C[c, 0], C[c, 1], share = compliance(k[c], 1.0 / (1.0 / mass[a[c]] + 1.0 / mass[b[c]]), dt)
         speed[c] = gap[c] / dt
         if speed[c] < 0.0:
             speed[c] *= share
@@ -98,13 +109,22 @@ def gap_velocities(
 
 
 @loop
-def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float]:
-    """C [1/kg] and the share of gap / dt of an overlapping contact, for its stiffness [N/m] and the reduced mass of its
-    bodies [kg]; 0 and 1 of a rigid one."""
+def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float, float]:
+    """C of the normal and of the tangents [1/kg], and the share of gap / dt of an overlapping contact, for its
+    stiffness [N/m] and the reduced mass of its bodies [kg]; 0, 0 and 1 of a rigid one."""
     if np.isinf(stiffness):
-        return 0.0, 1.0
-    C = 1.0 / (stiffness * dt**2 + 2.0 * DAMPING * np.sqrt(stiffness * mass) * dt)
-    return C, stiffness * dt**2 * C
+        return 0.0, 0.0, 1.0
+    spring = stiffness * dt**2
+    C = 1.0 / (spring + 2.0 * DAMPING * np.sqrt(stiffness * mass) * dt)
+    return C, 1.0 / (TANGENTIAL * spring), spring * C
+
+
+@loop
+def pull_back(r: Floats, compliance: Floats, held: Floats) -> None:
+    """Take from r (nc, 3) what tangential springs give that held these impulses (rows, 3) before the step."""
+    for c in range(len(r)):
+        for k in range(1, 3):
+            r[c, k] -= compliance[c, 1] * held[c, k]
 
 
 def _load(scene: Scene) -> Floats:

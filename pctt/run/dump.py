@@ -124,7 +124,7 @@ class Dump:
                 solution=state(result.impulse) if result.converged else None,
                 guess=state(guess) if problem.norm(guess) > 0 else None,
                 point=system.point,
-                compliance=problem.compliance[:, 0] if problem.yields else None,
+                compliance=problem.compliance[:, :2] if problem.yields else None,
             )  # fmt: skip
         except OSError as error:  # raised on all ranks alike
             raise FileError(str(error)) from None

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 
 from pctt import ccp
 from pctt.options import OptionError, describe
-from pctt.pc import TensorTrain
 from pctt.run.options import option_groups
 from pctt.run.settings import DEMO, find_scene
 
@@ -40,6 +39,8 @@ def _help_sections(database: Mapping[str, str]) -> Iterator[tuple[str, str, str]
     for title, (group, prefix) in zip(titles, option_groups(find_scene(scene))):
         topic = prefix.partition("_")[0] or "run"  # the first word of the options
         yield topic, title, "\n".join(map(str, describe(group, prefix)))
+    from pctt.pc import TensorTrain  # here, as its import would slow down every start
+
     title = "-pc_type python -pc_python_type pctt.pc.TensorTrain"
     yield "pc", title, "\n".join(map(str, describe(TensorTrain.options_class, TensorTrain.options_prefix)))
     yield "ksp", "Newton systems", NEWTON_HELP

@@ -33,8 +33,8 @@ def projected(every: ContactSystem, touching: ContactSystem, found: ccp.Result) 
     r = np.zeros_like(every.r)
     r[:, 0] = (every.contact_map.velocities(found.momentum) + every.r)[:, 0]
     held = found.impulse[: len(touching.key), 0]  # by springs; moments come behind
-    r[places(every.key, touching.key), 0] += touching.compliance * held
+    r[places(every.key, touching.key), 0] += touching.compliance[:, 0] * held
     G, free = every.contact_map, np.zeros(len(r))
-    problem = ccp.ConeProblem(G.comm, r, free, G=G, point=every.point, key=every.key, compliance=every.compliance)
+    problem = ccp.ConeProblem(G.comm, r, free, G=G, point=every.point, key=every.key, compliance=every.compliance[:, 0])
     result = ccp.solve(problem, None, "apgd", LIMITS)
     return result.momentum, result.iterations

@@ -128,7 +128,7 @@ class Stepper:
 
     def _to_gaps(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
-        problem, guess = self._assemble(contacts, self.memory)
+        problem, guess = self._assemble(contacts)
         result = self.solve(problem, guess)
         while True:
             again = self._unseen(self.contacts, self.system, result.momentum)
@@ -140,7 +140,7 @@ class Stepper:
     def _with_projection(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
         """Forces of contacts that touch at the start, then positions without overlaps; see `pctt.run.projection`."""
         every = self._system(contacts, impacts=False)
-        problem, guess = self._assemble(contacts.take(touching(contacts, every)), self.memory)
+        problem, guess = self._assemble(contacts.take(touching(contacts, every)))
         result = self.solve(problem, guess)
         while not self._joints_hold(result):
             every = self._system(contacts, impacts=False)
@@ -193,13 +193,17 @@ class Stepper:
             given = self.settings.dt, self.settings.recovery_speed, impacts, self._joints
             return ContactSystem(self.world, contacts, *given)
 
-    def _assemble(self, contacts: Contacts, memory: ImpulseMemory) -> tuple[ccp.ConeProblem, Array]:
-        """The problem of these contacts, which takes the place of the last, and the impulses remembered."""
+    def _assemble(self, contacts: Contacts, found: ImpulseMemory | None = None) -> tuple[ccp.ConeProblem, Array]:
+        """The problem of these contacts, which takes the place of the last, and a guess: the impulses of the last step,
+        or those found within this one."""
         self._release()
         self.contacts, self.system = contacts, self._system(contacts)
         with log.phase("assembly"):
+            place = self.system.key, self.system.frame
+            held, _ = self.memory.recall(*place, self._slabs is not self.world.slabs)
+            guess = held if found is None else found.recall(*place, elsewhere=False)[0]
+            self.system.take_hold(held)
             self._problem = cone_problem(self.system, self.world.comm)
-            guess, _ = memory.recall(self.system.key, self.system.frame, self._slabs is not self.world.slabs)
         return self._problem, guess
 
     def _unseen(self, contacts: Contacts, system: ContactSystem, momentum: Array) -> Contacts | None:
@@ -226,7 +230,6 @@ class Stepper:
         """A memory of these impulses of the present contacts."""
         memory = ImpulseMemory(self.world.comm, self.world.pairs.parts)
         memory.remember(self.system.key, found.impulse, self.system.frame)
-        self._slabs = self.world.slabs
         return memory
 
     def _joints_hold(self, result: ccp.Result) -> bool:

@@ -155,7 +155,7 @@ def read(path: str | Path) -> ccp.ConeProblem:
 def write(path: Path, problem: ccp.ConeProblem) -> None:
     """A problem of frames and arms, for `read`: in an FCLIB file it would lose them."""
     G = vars(problem.contact_map.given)
-    np.savez(path, r=problem.r, mu=problem.mu, point=problem.point, compliance=problem.compliance[:, 0], **G)
+    np.savez(path, r=problem.r, mu=problem.mu, point=problem.point, compliance=problem.compliance[:, :2], **G)
 
 
 def mixers(sizes: list[int], variants: list[str], stiffness: float, folder: Path) -> list[Problem]:

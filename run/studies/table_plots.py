@@ -33,13 +33,13 @@ def seconds(cell: str) -> float:
 
 
 def cluster(axes: Any) -> None:
-    """Seconds of a solve against ranks, by the model."""
-    heads, rows = table("cluster.md", "| ranks | n = 8, APGD, s")
-    for k, label in enumerate(heads[1:], 1):
-        line = "--" if "conic" in label else "-"
-        ranks, took = [seconds(row[0]) for row in rows], [seconds(row[k]) for row in rows]
-        axes.plot(ranks, took, "o" + line, label=label.replace("`", "").removesuffix(", s"))
-    axes.set(xscale="log", yscale="log", xlabel="ranks", ylabel="s of a solve to 1e-6, by the model")
+    """Milliseconds of a step against ranks, by the model."""
+    heads, rows = table("cluster.md", "| ranks | n = 8, iteration")
+    ranks = [seconds(row[0]) for row in rows]
+    for k, label in enumerate(heads):
+        if label.endswith(", step, ms"):
+            axes.plot(ranks, [seconds(row[k]) for row in rows], "o-", label=label.removesuffix(", step, ms"))
+    axes.set(xscale="log", yscale="log", xlabel="ranks", ylabel="ms of a step, by the model")
 
 
 def kernels(axes: Any) -> None:

@@ -15,7 +15,7 @@ SETTINGS begin with the time step as a multiple of the scene's default; fields o
 every start, so that the courses part. The solver is `apgd`. For each setting the table has
 
 - CPU seconds per simulated second on one core, without start-up: median of the starts;
-- the worst overlap after any step but those of the first 0.05 s, in % of a radius;
+- the worst overlap after any step but those of the first 0.1 s, in % of a radius;
 - the figure, its standard error as the starts show it, and how far it is off that of the smallest step;
 - iterations a step, and steps that are not solved; of a setting that ends before its time it says why.
 
@@ -41,10 +41,9 @@ from dem.time_step import recommended
 from dem.together import SceneError
 
 MOVED = 1e-4  # of a radius
-FORGETS = 0.05  # [s] from the start, not part of overlaps
+FORGETS = 0.1  # [s] from the start, not part of overlaps
 SETTINGS = (
-    "6", "3", "2", "1", ".5", ".25,tol=1e-4", "1,tol=1e-3", "1,tol=1e-4", "1,tol=1e-4,closing_work=.05",
-    "1,stiffness=1e8", "1,stiffness=inf", "2,projection=1", "3,projection=1",
+    "6", "3", "2", "1", ".5", ".25,tol=2e-4", "1,tol=1e-3", "1,tol=1e-4", "1,stiffness=inf", "2,projection=1",
 )  # fmt: skip
 Records = dict[str, np.ndarray]
 
@@ -73,7 +72,8 @@ def flow(records: Records) -> float:
 
 
 def torque(n: int) -> Case:
-    return Case(Mixer(n=n), 0.5, 0.1, mean("torque_mixer_z [N m]", -1e-3), "kN m")
+    """Its mean over half a second scatters by a tenth; three seconds of the largest take an hour."""
+    return Case(Mixer(n=n), 3.0 if n < 16 else 0.5, FORGETS, mean("torque_mixer_z [N m]", -1e-3), "kN m")
 
 
 CASES = {

@@ -25,10 +25,12 @@ PICTURES = {
     Path("docs/published.png"): ("mankoc", "dosta", "collapse", "packing", "intrusion"),
 }
 TEXT = Path("run/studies/validation/page.md")  # of the page, with the places of the figures
-OUTLETS, SMALL_OUTLETS = (4.5, 5.5, 6.5), (4.0, 5.5)
+OUTLETS, FULL_OUTLETS = (4.5, 5.5, 6.5), (5.5, 6.4)
 FRICTIONS = (0.1, 0.3, 0.6)
-ASPECTS = {0.6: 1.2, 1.2: 1.4, 2.4: 1.6}  # of the columns that collapse, and the seconds of their runs
 SEEDS = (1, 2, 3, 4)  # a bed of the silo for each outlet and each of them, and of the heap for each friction
+FEW_SEEDS = (1, 2)  # of Mankoc's silo for each outlet
+#: Height over radius and diameters to a radius of the columns that collapse: seconds and seeds of their runs.
+COLUMNS = {(0.6, 8): (1.2, (1, 2)), (1.2, 8): (1.4, (1, 2)), (2.4, 8): (1.6, (1,)), (0.6, 12): (1.3, (1,))}
 
 #: The runs of each check: names and options of ``python -m pctt.run``.
 JOBS: dict[str, dict[str, Sequence[object]]] = {
@@ -41,11 +43,12 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
         for seed in SEEDS
     },
     "mankoc": {
-        f"mankoc_{outlet:g}": (
+        f"mankoc_{outlet:g}_{seed}": (
             *("silo", "-scene_n", 8, "-scene_filling", 1.2, "-scene_half_angle", 90, "-scene_outlet", outlet),
-            *("-seconds", 1.4, "-output_every", 0),
+            *("-scene_seed", seed, "-seconds", 1.9, "-output_every", 0),
         )
-        for outlet in SMALL_OUTLETS
+        for outlet in FULL_OUTLETS
+        for seed in FEW_SEEDS
     },
     "heap": {
         f"heap_{friction:g}_{seed}": (
@@ -66,12 +69,19 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
         "dosta_drum": ("run/studies/validation/dosta_drum.py", "-seconds", 2.5, "-output_every", 0),
     },
     "collapse": {
-        f"collapse_{aspect:g}": (
-            *("run/studies/validation/collapse.py", "-scene_aspect", aspect, "-seconds", seconds),
+        f"collapse_{aspect:g}_{wide}_{seed}": (
+            *("run/studies/validation/collapse.py", "-scene_aspect", aspect, "-scene_width", wide),
+            *("-scene_seed", seed, "-seconds", seconds),
         )
-        for aspect, seconds in ASPECTS.items()
+        for (aspect, wide), (seconds, seeds) in COLUMNS.items()
+        for seed in seeds
     },
-    "intrusion": {"intrusion": ("run/studies/validation/intrusion.py", "-seconds", 1.55, "-output_every", 0)},
+    "intrusion": {
+        f"intrusion_{seed}": (
+            *("run/studies/validation/intrusion.py", "-scene_seed", seed, "-seconds", 1.55, "-output_every", 0),
+        )
+        for seed in SEEDS[:3]
+    },
 }
 
 #: What reads the runs of each check: rows of the table, and what the figure shows.
@@ -81,10 +91,17 @@ CHECKS: dict[str, Callable[[], tuple[list[Row], dict[str, Any]]]] = {
     "drum": lambda: laws.drum(RUNS / "drum"),
     "heap": lambda: laws.heap({mu: [RUNS / f"heap_{mu:g}_{seed}" for seed in SEEDS] for mu in FRICTIONS}),
     "column": lambda: laws.column(RUNS / "column"),
-    "mankoc": lambda: benchmarks.mankoc({D: RUNS / f"mankoc_{D:g}" for D in SMALL_OUTLETS}),
+    "mankoc": lambda: benchmarks.mankoc(
+        {D: [RUNS / f"mankoc_{D:g}_{seed}" for seed in FEW_SEEDS] for D in FULL_OUTLETS}
+    ),
     "dosta": lambda: benchmarks.dosta(*(RUNS / f"dosta_{name}" for name in ("small", "large", "drum"))),
-    "collapse": lambda: benchmarks.collapse([RUNS / f"collapse_{aspect:g}" for aspect in ASPECTS]),
-    "intrusion": lambda: benchmarks.intrusion(RUNS / "intrusion"),
+    "collapse": lambda: benchmarks.collapse(
+        [
+            (wide, [RUNS / f"collapse_{aspect:g}_{wide}_{seed}" for seed in seeds])
+            for (aspect, wide), (_, seeds) in COLUMNS.items()
+        ]
+    ),
+    "intrusion": lambda: benchmarks.intrusion([RUNS / f"intrusion_{seed}" for seed in SEEDS[:3]]),
     "packing": packings.rows,
 }
 

@@ -144,11 +144,13 @@ def test_little_compliance_on_a_rank_deficient_heap(form):
 # -- compliance ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("along", [0.0, 3.5])
 @pytest.mark.parametrize("compliance", [1e-5, 1e-4, 1e-2])
-def test_methods_agree_on_the_compliant_optimum(compliance):
-    """Its normal impulses are unique as well."""
+def test_methods_agree_on_the_compliant_optimum(compliance, along):
+    """Its normal impulses are unique as well. The tangents yield, too, or do not."""
     known, graph = heap(bodies=8)
-    problem = ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF), compliance=compliance)
+    soft = np.tile([compliance, along * compliance], (len(known.mu), 1))
+    problem = ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF), compliance=soft)
     tol = 1e-3 * compliance
     found = {name: ccp.solve(problem, type=name, limits=Limits(tol)) for name in ("conic", "pdip", "apgd")}
     for result in found.values():

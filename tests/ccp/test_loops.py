@@ -163,9 +163,12 @@ def test_blocks_of_cones_that_share_a_normal_number(rolls, coulomb, normal, tang
     dense[range(len(s)), :, range(len(s))] = turned
     dense = dense.reshape(3 * len(s), -1)
     B, soft = A.T @ dense @ A, np.full(count, normal)
-    C = np.zeros((rows, 3)) + tangential
-    C[:count, 0] = normal
-    arrows = lorentz.arrows(*W, u, soft, tangential)
+    along = tangential * rng.uniform(0.5, 2.0, (lorentz.number, count))
+    C = np.zeros((rows, 3))
+    C[:count] = np.stack([soft, along[0], along[0]], axis=1)
+    if rolls:
+        C[count:] = np.stack([along[2], along[1], along[1]], axis=1)
+    arrows = lorentz.arrows(*W, u, soft, along.ravel())
     barriers = lorentz.barriers(*W, u, 1.0)
 
     def whole(blocks):

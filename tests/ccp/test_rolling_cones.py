@@ -108,7 +108,8 @@ def test_conic_agrees_with_apgd(law, contacts, bodies):
     rng = np.random.default_rng(contacts)
     G, r = blocks(rng, contacts, bodies), rng.standard_normal((2 * contacts, 3)) - [1, 0, 0]
     some = rng.uniform(0.05, 0.6, (3, contacts)) * (np.arange(3)[:, None] != np.arange(contacts) % 9)
-    problem = ccp.RollingProblem(SELF, r, *some, G=G, compliance=np.where(np.arange(contacts) % 2, 0.05, 0.0))
+    soft = np.where(np.arange(contacts) % 2, 0.05, 0.0)[:, None] * [1.0, 3.5]
+    problem = ccp.RollingProblem(SELF, r, *some, G=G, compliance=soft)
     limits = ccp.Limits(1e-10, closing_work=np.inf, fallback=False)
     one, other = (ccp.solve(problem, None, name, limits, law=law) for name in ("conic", "apgd"))
     assert one.converged, one.reason

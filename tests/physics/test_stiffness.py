@@ -92,7 +92,7 @@ def test_what_was_squeezed_gives_back_at_most_what_it_holds(dt):
 
 @pytest.mark.parametrize("steps", [500, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_a_block_on_an_incline_does_not_creep(steps):
-    """Sticking contacts have no velocity: the springs are in the normals alone."""
+    """A sticking contact under a constant load does not move: its spring remembers what it holds."""
     angle = np.radians(15.0)
     scene = Scene(friction=0.5, gravity=(G * np.sin(angle), 0, -G * np.cos(angle)), stiffness=1e6)
     scene.add_body("floor", [Plane((0, 0, 1))])
@@ -103,6 +103,26 @@ def test_a_block_on_an_incline_does_not_creep(steps):
         sim.run(steps=steps)
         moved = np.abs(sim.positions[0] - before).max()
     assert moved < 1e-8 * steps
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.01])
+@pytest.mark.parametrize("solver", ["apgd", "conic"])
+def test_friction_gives_way_by_a_spring_and_gives_back(solver, dt):
+    """A box on four contacts, each of k_t = 2/7 k, that a force pulls aside: by F / 4 k_t, and then lets go."""
+    stiffness, force = 1e6, 40.0  # with twice as much, as it swings, no contact slides
+    scene = Scene(friction=0.5, stiffness=stiffness)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_boxes([[0, 0, 0.05]], (0.2, 0.15, 0.05), DENSITY)
+    scene.add_load("push", force=(force, 0, 0), start=0.4, end=0.8)
+    with pctt.Simulation(scene, dt=dt, solver=solver, **EXACT) as sim:
+        place, energy = [], []
+        for until in (0.4, 0.8, 1.2):
+            sim.run(until=until)
+            place.append(sim.positions[0, 0])
+            energy.append(sim.figures["spring_energy [J]"])
+    springs = 4 * 2 / 7 * stiffness
+    np.testing.assert_allclose(np.diff(place), np.array([1, -1]) * force / springs, rtol=0.05)  # it tilts by 2 %
+    np.testing.assert_allclose(np.diff(energy), np.array([1, -1]) * 0.5 * force**2 / springs, rtol=0.1)
 
 
 def test_the_recommended_stiffness_holds_the_bed_and_the_tool():
@@ -135,9 +155,11 @@ def test_pairs_of_materials_and_moduli():
     np.testing.assert_array_equal(pairs(scene).stiffness, [[2e6, 7e6], [7e6, np.inf]])
     assert scene.states_stiffness
     assert not Scene(friction=0.3).states_stiffness
-    C, share = zip(*(compliance(k, 1.0, 0.01) for k in (np.inf, 1e6)))
-    assert (C[0], share[0]) == (0.0, 1.0)
-    assert C[1] == pytest.approx(1 / (1e6 * 1e-4 + 4 * 1e3 * 0.01))
+    assert compliance(np.inf, 1.0, 0.01) == (0.0, 0.0, 1.0)
+    normal, tangential, share = compliance(1e6, 1.0, 0.01)
+    assert normal == pytest.approx(1 / (1e6 * 1e-4 + 4 * 1e3 * 0.01))
+    assert tangential == pytest.approx(1 / (2 / 7 * 1e6 * 1e-4))
+    assert share == pytest.approx(normal * 1e6 * 1e-4)
     for bad in (0.0, -1.0, np.nan):
         with pytest.raises(ValueError, match="stiffness must be positive, or inf"):
             scene.set_pair("glass", "glass", stiffness=bad)

@@ -50,7 +50,8 @@ class ScaledProblem:
         self.shrink = 1.0 / self._scale  #: (nc, 3) diagonal of S^-1
         self.cones = problem.cones.scaled(self._scale, precision)
         self.unit = 2.0 ** np.frexp(problem.max(float(np.abs(problem.r).max(initial=0.0))))[1]
-        self.b = self._rounded(problem.r * (self.shrink / self.unit))
+        self._impulse, self._velocity = self.shrink * self.unit, self._scale * self.unit  # of x, of a gradient
+        self.b = self._rounded(problem.r / self._velocity)
         self._compliance = self._rounded(problem.compliance * self.shrink**2)
         self._soft = self._compliance[: None if problem.yields else 0]
         self._operator = problem.operator.scaled(self.shrink, precision)
@@ -61,11 +62,11 @@ class ScaledProblem:
 
     def start(self, guess: Array) -> Array:
         """The scaled point of a first guess of the impulses (nc, 3), in the cones."""
-        return self.project(self._rounded(guess * (self._scale / self.unit)))
+        return self.project(self._rounded(guess / self._impulse))
 
     def impulse(self, x: Array) -> Array:
         """The impulses (nc, 3) of x, in the cones in double precision too."""
-        g = x * (self.shrink * self.unit)
+        g = x * self._impulse
         return g if self.precision is np.float64 else self.problem.cones.project(g, g)
 
     def product(self, x: Array) -> Array:
@@ -140,7 +141,7 @@ class ScaledProblem:
 
     def velocities(self, gradient: Array) -> Array:
         """The velocities N g + r (nc, 3) that belong to a gradient."""
-        return gradient * (self._scale * self.unit)
+        return gradient * self._velocity
 
     def largest_curvature(self, steps: int = 10) -> float:
         """Estimate from below of the largest eigenvalue of A: ``steps`` power iterations from b."""
@@ -160,7 +161,7 @@ class ScaledProblem:
 class FirstOrder:
     """Options of every first-order method."""
 
-    check: int = number(10, "iterations between two looks at the natural residual, each of the cost of a product")
+    check: int = number(20, "iterations between two looks at the natural residual, each of the cost of a product")
     patience: int = number(5000, "iterations without progress before it has stalled: there are plateaus of thousands")
 
 

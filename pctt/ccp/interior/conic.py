@@ -153,7 +153,7 @@ class Direction(NamedTuple):
 class Cones:
     """The problem in its Lorentz cones: s = A g, y = A'z.
 
-    compliance : (count,) the normal part of C within a step; ``proximal`` is the tangential one
+    compliance, tangential : (count,), and of all cones (k count,), the parts of C within a step
     """
 
     def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool):
@@ -162,6 +162,8 @@ class Cones:
         self.count = problem.size * self.lorentz.number  # of Lorentz cones on all ranks
         self.proximal = options.proximal * problem.mean_diagonal
         self.compliance = problem.compliance[: self.lorentz.count, 0] + self.proximal * (self.lorentz.weight**2).sum(0)
+        self.tangential = np.full(self.lorentz.weight.size, self.proximal)
+        self.tangential[: self.lorentz.count] += problem.compliance[: self.lorentz.count, 1]
         self.boundary = options.boundary_with_law if coulomb else options.boundary
 
     def start(self, guess: Array) -> Point:
@@ -194,7 +196,7 @@ class Cones:
         with phase("CCPBarrier"):
             W = NesterovTodd(*scaling(at.s, at.z))
             u = sliding_directions(at.z) if self.coulomb else np.zeros_like(at.z)
-            arrows = self.lorentz.arrows(*W, u, self.compliance, self.proximal)
+            arrows = self.lorentz.arrows(*W, u, self.compliance, self.tangential)
         # the velocities that the natural residual stands for
         shown = found.natural * self.problem.norm(found.g) * self.problem.mean_diagonal
         return Scaled(self, at, found, W, u, arrows, forcing * shown)

@@ -78,9 +78,9 @@ class LorentzCones:
         z[:, 0] = (y[: self.count, 0] / self.weight / self.number).ravel()
         return z
 
-    def arrows(self, root: Array, size: Array, u: Array, normal: Array, tangential: float) -> Arrows:
+    def arrows(self, root: Array, size: Array, u: Array, normal: Array, tangential: Array) -> Arrows:
         """Of scalings ``root``, ``size`` (`pctt.ccp.cone.scaling`) and directions of sliding ``u`` (k count, 3), zero
-        without Coulomb's law, where C is ``normal`` (count,) and, in all tangential numbers, ``tangential``."""
+        without Coulomb's law, where C is ``normal`` (count,) and, in tangential numbers, ``tangential`` (k count,)."""
         shape = (self.count, self.width, self.width)
         given = self.weight.ravel(), self.live.ravel(), self.place, normal, tangential
         X = np.zeros(shape)
@@ -98,7 +98,7 @@ class Arrows(NamedTuple):
     ``part`` (k count,) of sigma (count,); and ``rise`` (k count,) and ``turn`` (k count, 2), see `split`."""
 
     lorentz: LorentzCones
-    tangential: float
+    tangential: Array
     X: Array
     right: Array
     left: Array
@@ -146,7 +146,7 @@ def _arrows(root, size, u, weight, live, place, normal, tangential, X):
             h = np.sqrt(x * x + y * y)
             x, y = (1.0, 0.0) if h <= ROUND else (x / h, y / h)
             along, across = (1.0 + 2.0 * h * h) / squared, 1.0 / squared
-            of_along, of_across = live[i] / (along + tangential), live[i] / (across + tangential)
+            of_along, of_across = live[i] / (along + tangential[i]), live[i] / (across + tangential[i])
             slope = 2.0 * np.sqrt(1.0 + h * h) * h / squared * of_along
             slides = x * u[i, 1] + y * u[i, 2]
             sideways = across * of_across
@@ -156,7 +156,8 @@ def _arrows(root, size, u, weight, live, place, normal, tangential, X):
             D[i, 0] = of_along * x * x + of_across * y * y
             D[i, 1] = (of_along - of_across) * x * y
             D[i, 2] = of_along * y * y + of_across * x * x
-            part[i] = (across * across + along * tangential) / (along + tangential) + tangential * slope * slides
+            part[i] = (across * across + along * tangential[i]) / (along + tangential[i])
+            part[i] += tangential[i] * slope * slides
             sigma[c] += weight[i] * weight[i] * part[i]
             slope = 2.0 * np.sqrt(1.0 + h * h) * h / (1.0 + 2.0 * h * h)
             rise[i], turn[i, 0], turn[i, 1] = across / (1.0 + 2.0 * h * h), slope * x + u[i, 1], slope * y + u[i, 2]
@@ -185,7 +186,7 @@ def _alone(f, r, weight, place, tangential, right, left, D, part, sigma, out):
         for i in range(c, total, count):
             sums = part[i] * f[i, 0]
             for a in range(2):
-                sums -= tangential * left[i, a] * f[i, 1 + a]
+                sums -= tangential[i] * left[i, a] * f[i, 1 + a]
                 if place[i // count, a] >= 0:
                     sums -= left[i, a] * r[c, place[i // count, a]]
             normal += weight[i] * sums
@@ -193,7 +194,7 @@ def _alone(f, r, weight, place, tangential, right, left, D, part, sigma, out):
         out[c, 0] = normal
         for i in range(c, total, count):
             m, n = place[i // count, 0], place[i // count, 1]
-            x, y = tangential * f[i, 1] + r[c, m], tangential * f[i, 2] + (r[c, n] if n >= 0 else 0.0)
+            x, y = tangential[i] * f[i, 1] + r[c, m], tangential[i] * f[i, 2] + (r[c, n] if n >= 0 else 0.0)
             more = weight[i] * normal - f[i, 0]
             out[c, m] = f[i, 1] - (D[i, 0] * x + D[i, 1] * y) + right[i, 0] * more
             if n >= 0:

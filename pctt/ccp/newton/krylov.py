@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Union
+from typing import TYPE_CHECKING, Union
 
 import numpy as np
 from mpi4py import MPI
@@ -15,9 +15,10 @@ from petsc4py import PETSc
 
 from pctt.blocks import block_diagonal, fresh_copy, shell_of
 from pctt.ksp_options import entered, to_enter
-from pctt.pc import TensorTrain
-from pctt.pc.mat import residual_norm
 from pctt.petsc import own_errors
+
+if TYPE_CHECKING:
+    from pctt.pc import TensorTrain
 
 # the Mat from which a preconditioner is made, or a function that makes it, for those that read entries
 Source = Union[PETSc.Mat, Callable[[], PETSc.Mat], None]
@@ -180,7 +181,11 @@ class Krylov:
     def own(self) -> TensorTrain | None:
         """The preconditioner, if it is one of the project."""
         pc = self.ksp.pc
-        context = pc.getPythonContext() if pc.getType() == PETSc.PC.Type.PYTHON else None
+        if pc.getType() != PETSc.PC.Type.PYTHON:
+            return None
+        from pctt.pc import TensorTrain  # here, as its import would slow down every start
+
+        context = pc.getPythonContext()
         return context if isinstance(context, TensorTrain) else None
 
     def report(self) -> list[str]:
@@ -215,7 +220,11 @@ class Krylov:
 
 def _true_residual(S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:
     """||b - S x|| / ||b||; an x that is no number is replaced by zero, and leaves 1."""
-    norm, reference = residual_norm(S, b, x), b.norm()
+    residual = b.duplicate()
+    S.mult(x, residual)
+    residual.aypx(-1.0, b)
+    norm, reference = residual.norm(), b.norm()
+    residual.destroy()
     if not np.isfinite(norm):
         x.zeroEntries()
         return 1.0

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from shared import spread
 from validation.laws import DENSITY, DIAMETER, GRAVITY, PACKING
 from validation.rows import Row, band, row
 
@@ -20,7 +21,7 @@ LUBE = "Lajeunesse, Mangeney-Castelnau, Vilotte 2004; Lube, Huppert, Sparks, Hal
 VESIC = "bearing capacity: Prandtl, Reissner; Vesić 1973 for a disc"
 BRZINSKI = "Brzinski, Mayor, Durian 2013 (arXiv:1307.4638): 35 tan(angle)"
 
-INTERNAL = (21.1, 26.8)  # degrees: such spheres in plane shear (docs/periodic.md), and in a heap
+INTERNAL = (20.6, 26.8)  # degrees: such spheres in plane shear (docs/periodic.md), and in a heap
 
 #: Times [s] and parts of M1 in the quadrant x < 0, z < 0 of the drum: its maximum, its fall to 0.1 and return to it.
 DRUM = ((0.6, 0.765), (1.22, 0.1), (1.91, 0.1))
@@ -35,21 +36,23 @@ def mankoc_flow(outlet: Floats) -> Floats:
     return 64.6 / np.sqrt(GRAVITY / 0.001) * (1.0 - 0.5 * np.exp(-0.051 * wide)) * wide**2.5
 
 
-def mankoc(folders: Mapping[float, Path], since: float = 0.2) -> Found:
-    """Flows of a silo as wide and as full as the law asks, from `since` after the gate has opened [s]."""
-    outlet, sphere = np.array(list(folders)), DENSITY * np.pi / 6 * DIAMETER**3 * np.sqrt(GRAVITY / DIAMETER)
-    flow = []
-    for folder in folders.values():
+def mankoc(folders: Mapping[float, Sequence[Path]], since: float = 0.2) -> Found:
+    """Flows of a silo as wide and as full as the law asks, from `since` after the gate has opened [s]; means of some
+    beds for each outlet."""
+    sphere = DENSITY * np.pi / 6 * DIAMETER**3 * np.sqrt(GRAVITY / DIAMETER)
+
+    def flow(folder: Path) -> float:
         records = Folder(folder).records()
         time, out = records["time [s]"], records["discharged [kg]"]
         late = time > time[out > 0.0][0] + since
-        flow.append(np.polyfit(time[late], out[late], 1)[0] / sphere)
-    law = mankoc_flow(outlet)
-    what = "spheres a second over sqrt(g/d), outlet of {:g} diameters"
-    found = [
-        row("mankoc", what.format(D), float(w), float(f), MANKOC, "", 0.1) for D, w, f in zip(outlet, law, flow)
-    ]
-    return found, {"outlet": outlet, "flow": np.array(flow)}
+        return float(np.polyfit(time[late], out[late], 1)[0] / sphere)
+
+    outlet, found = np.array(list(folders)), []
+    means, errors = zip(*(spread([flow(folder) for folder in several]) for several in folders.values()))
+    for D, law, mean, error in zip(outlet, mankoc_flow(outlet), means, errors):
+        what = f"spheres a second over sqrt(g/d), outlet of {D:g} diameters"
+        found.append(row("mankoc", what, float(law), mean, MANKOC, "", 0.1, error))
+    return found, {"outlet": outlet, "flow": np.array(means), "error": np.array(errors)}
 
 
 def dosta(small: Path, large: Path, drum: Path) -> Found:
@@ -92,24 +95,30 @@ def front(place: Floats, volume: Floats, least: float = 0.5 * DIAMETER) -> float
     return float((k - 0.5 + (thick[k - 1] - least) / (thick[k - 1] - thick[k])) * DIAMETER)
 
 
-def collapse(folders: Sequence[Path], radius: float = 8 * DIAMETER, start: float = 0.5) -> Found:
-    """Run-out of columns of this radius [m] and of some heights, from the time `start` [s], by two experiments."""
+def collapse(beds: Sequence[tuple[float, Sequence[Path]]]) -> Found:
+    """Run-out of columns of such radii [sphere diameters], means of some beds of each, by two experiments."""
     found: list[Row] = []
-    shown: dict[str, list[float]] = {"aspect": [], "runout": []}
-    for folder in folders:
-        run = Folder(folder)
-        run.require_frames()
-        frames = [run.frame(step) for step in run.steps]
-        before, after = next(frame for frame in reversed(frames) if frame.time <= start), frames[-1]
-        spheres = slice(run.grains)
-        mass, volume = run.mass[spheres], run.mass[spheres] / DENSITY
-        aspect = 2.0 * float(mass @ before.position[spheres, 2] / mass.sum()) / radius
-        grown = front(after.position[spheres], volume) / radius - 1.0
-        what = f"column of {aspect:.2f} radii: growth of the radius"
-        found.append(band("collapse", what, *np.round(runout(aspect), 2), grown, LUBE, "radii"))
-        shown["aspect"].append(aspect)
-        shown["runout"].append(grown)
+    shown: dict[str, list[float]] = {"aspect": [], "runout": [], "error": []}
+    for wide, folders in beds:
+        aspects, growths = zip(*(_fallen(Folder(folder), wide * DIAMETER) for folder in folders))
+        aspect, grown = float(np.mean(aspects)), float(np.mean(growths))
+        error = spread(growths)[1] if len(growths) > 1 else 0.0
+        what = f"column of {aspect:.2f} radii, {wide:g} diameters to a radius: growth of the radius"
+        found.append(band("collapse", what, *np.round(runout(aspect), 2), grown, LUBE, "radii", error))
+        for name, value in zip(shown, (aspect, grown, error)):
+            shown[name].append(value)
     return found, shown
+
+
+def _fallen(run: Folder, radius: float, start: float = 0.5) -> tuple[float, float]:
+    """Height of a column over its radius [m] at the time `start` [s], and by how much its radius grows, over it."""
+    run.require_frames()
+    frames = [run.frame(step) for step in run.steps]
+    before, after = next(frame for frame in reversed(frames) if frame.time <= start), frames[-1]
+    spheres = slice(run.grains)
+    mass = run.mass[spheres]
+    height = 2.0 * float(mass @ before.position[spheres, 2] / mass.sum())
+    return height / radius, front(after.position[spheres], mass / DENSITY) / radius - 1.0
 
 
 def bearing_capacity(degrees: float) -> tuple[float, float]:
@@ -121,21 +130,26 @@ def bearing_capacity(degrees: float) -> tuple[float, float]:
     return float(N * (1.0 + t)), float(0.6 * (N + 1.0) * t)
 
 
-def intrusion(folder: Path, radius: float = 3 * DIAMETER) -> Found:
-    """Pressure on a plate from a depth of one sphere on: its slope, and its value at a depth of one radius."""
-    records = Folder(folder).records()
-    depth, force = records["surface [m]"] - records["plate [m]"], records["force_plate_z [N]"]
-    deep = depth > DIAMETER
-    pressure = force / (np.pi * radius**2)
-    slope, level = np.polyfit(depth[deep], pressure[deep], 1)
+def intrusion(folders: Sequence[Path], radius: float = 3 * DIAMETER) -> Found:
+    """Pressure on a plate from a depth of one sphere on, means of some beds: its slope, and its value at a depth of one
+    radius; the first bed is shown."""
+    curves = [_pressure(Folder(folder), radius) for folder in folders]
+    fits = [np.polyfit(depth[depth > DIAMETER], pressure[depth > DIAMETER], 1) for depth, pressure in curves]
     weight = PACKING * DENSITY * GRAVITY
-    K, total = float(slope / weight), float((slope + level / radius) / weight)
+    K, K_error = spread([float(slope / weight) for slope, _ in fits])
+    total, error = spread([float((slope + level / radius) / weight) for slope, level in fits])
     (q, s), (q2, s2) = map(bearing_capacity, INTERNAL)
     friction = [35.0 * float(np.tan(np.radians(angle))) for angle in INTERNAL]
     slopes, totals = np.round((q, q2), 1), np.round((q + 2 * s, q2 + 2 * s2), 1)
     what = "pressure on a plate at a depth of its radius, over that of the bed"
     return [
-        band("intrusion", "slope of the pressure on a plate, over that of the bed", *slopes, K, VESIC, ""),
-        band("intrusion", what, *totals, total, VESIC, ""),
-        band("intrusion", "the same", *np.round(friction, 1), total, BRZINSKI, ""),
-    ], {"depth": depth, "pressure": pressure, "fit": (slope, level)}
+        band("intrusion", "slope of the pressure on a plate, over that of the bed", *slopes, K, VESIC, "", K_error),
+        band("intrusion", what, *totals, total, VESIC, "", error),
+        band("intrusion", "the same", *np.round(friction, 1), total, BRZINSKI, "", error),
+    ], {"depth": curves[0][0], "pressure": curves[0][1], "fit": tuple(fits[0])}
+
+
+def _pressure(run: Folder, radius: float) -> tuple[Floats, Floats]:
+    """Depth [m] of a plate and pressure on it [Pa], at each step."""
+    records = run.records()
+    return records["surface [m]"] - records["plate [m]"], records["force_plate_z [N]"] / (np.pi * radius**2)

@@ -1,4 +1,4 @@
-"""Sliding, rolling and a stack, whose motions and forces are known in closed form."""
+"""Sliding, rolling, a stack and a lattice, whose motions and forces are known in closed form."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
 from pctt.run.stepper import cone_problem
+from pctt.simulation import Simulation
 
 G, DT = 9.81, 0.002
 RADIUS = 0.1
+THORNTON = "Thornton 1979, and the balance of the forces"
 
 
 def tilted(degrees: float, friction: float, floor: Shape) -> Scene:
@@ -106,7 +108,7 @@ def rows() -> list[Row]:
     out.append(row("rolling", what, 15 / 7, float(world.grains.velocity[0, 0]), law, "m/s", 1e-3))
     what = "the same sphere: sideways"
     out.append(row("rolling", what, 0.0, float(world.grains.position[0, 1]) - 0.01, law, "m", 1e-6))
-    return out + stack()
+    return [*out, *stack(), lattice(0.25), lattice(0.5)]
 
 
 def stack(count: int = 5) -> list[Row]:
@@ -138,3 +140,26 @@ def stack(count: int = 5) -> list[Row]:
         row("stack", f"{count} boxes: worst error of what a face bears", 0.0, worst, balance, "", 1e-6),
         row("stack", what, 0.0, apart, "four contacts, three conditions of balance", "", 0.5),
     ]
+
+
+def lattice(friction: float, cells: int = 3) -> Row:
+    """The greatest ratio of stresses in a triaxial test of a face-centred cubic lattice. The contacts across its axis
+    open. Of the others, all at 45 degrees, each bears N and slides with T = friction N: (N + T) along the axis, of
+    which all take part, and (N - T) along each side, of which one half does."""
+    diameter, pressure, rate, start = 0.01, 1000.0, 0.01, 0.05
+    corner = np.stack(np.meshgrid(*[np.arange(cells)] * 3), axis=-1).reshape(-1, 1, 3)
+    face = 0.5 * np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]])
+    side = np.sqrt(2.0) * diameter
+    scene = Scene(
+        friction, (0.0, 0.0, 0.0), stiffness=1e4 * pressure * diameter, period=(cells * side,) * 3,
+        stress=(pressure,) * 3, strain_rate=(None, None, rate), strain_start=start,
+    )  # fmt: skip
+    scene.add_spheres((corner + face).reshape(-1, 3) * side, diameter / 2, 2500.0)
+    sim = Simulation(scene, dt=0.001, solver="apgd", tol=1e-6, comm=MPI.COMM_SELF)
+    ratio = 0.0
+    while sim.time < start + 3e-4 / rate:
+        sim.step()
+        x, y, z = (sim.figures[f"stress_{axis}{axis} [Pa]"] for axis in "xyz")
+        ratio = max(ratio, 2.0 * z / (x + y))
+    what = f"cubic lattice of spheres, friction f = {friction:g}: ratio of stresses at failure, 2 (1 + f) / (1 - f)"
+    return row("lattice", what, 2 * (1 + friction) / (1 - friction), ratio, THORNTON, "", 0.01)

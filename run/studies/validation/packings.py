@@ -31,16 +31,17 @@ class Packing(NamedTuple):
     force: np.ndarray  #: (nc,) normal forces over their mean
 
 
-def packing(friction: float, seed: int) -> Packing:
-    """Spheres that are pressed together, from a random packing; then the pressure falls to a tenth, so that they
-    overlap by 5e-4 diameters. Without friction they begin denser, as a packing closes slowly near its end."""
-    first = 0.45 if friction else 0.58
+def packing(friction: float, seed: int, first: float | None = None, tol: float = 1e-4) -> Packing:
+    """Spheres that are pressed together, from a random packing of the solid fraction `first`; then the pressure falls
+    to a tenth, so that they overlap by 5e-4 diameters. Without friction they begin denser (if `first` is not given), as
+    a packing closes slowly near its end. Coulomb's law is solved to `tol`."""
+    first = first or (0.45 if friction else 0.58)
     side = DIAMETER * (COUNT * np.pi / 6 / first) ** (1 / 3)
     place, radius = random_packing((side,) * 3, DIAMETER / 2, first, periodic=(True,) * 3, seed=seed)
     stress = (PRESSURE,) * 3
     scene = Scene(friction, (0, 0, 0), stiffness=1000 * PRESSURE * DIAMETER, period=(side,) * 3, stress=stress)
     scene.add_spheres(place, radius, DENSITY)
-    sim = Simulation(scene, dt=0.003, solver="apgd", tol=1e-4, comm=MPI.COMM_SELF)
+    sim = Simulation(scene, dt=0.003, solver="apgd", tol=tol, comm=MPI.COMM_SELF)
     sim.run(steps=400 if friction else 800)
     sim.set_stress((PRESSURE / 10,) * 3)
     sim.run(steps=200)

@@ -22,7 +22,7 @@ def silo(panel: Any, shown: Shown) -> None:
 def mankoc(panel: Any, shown: Shown) -> None:
     wide = np.linspace(1.5, 7.0)
     panel.plot(wide, benchmarks.mankoc_flow(wide), color="C7", label="Mankoc et al., glass")
-    panel.plot(shown["outlet"], shown["flow"], "o", color="C0", label="silo")
+    panel.errorbar(shown["outlet"], shown["flow"], shown["error"], fmt="o", color="C0", label="means of beds")
     panel.set(xlabel="outlet [sphere diameters]", ylabel="spheres a second / (g/d)$^{1/2}$")
 
 
@@ -65,7 +65,7 @@ def collapse(panel: Any, shown: Shown) -> None:
     aspect = np.linspace(0.2, 3.5)
     band = np.array([benchmarks.runout(a) for a in aspect])
     panel.fill_between(aspect, *band.T, color="C7", alpha=0.4, label="Lajeunesse et al., Lube et al.")
-    panel.plot(shown["aspect"], shown["runout"], "o", color="C0", label="columns")
+    panel.errorbar(shown["aspect"], shown["runout"], shown["error"], fmt="o", color="C0", label="means of beds")
     panel.set(xlabel="height over radius", ylabel="growth of the radius, over the radius")
 
 
