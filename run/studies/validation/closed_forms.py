@@ -157,7 +157,7 @@ def lattice(friction: float, cells: int = 3) -> Row:
     scene.add_spheres((corner + face).reshape(-1, 3) * side, diameter / 2, 2500.0)
     sim = Simulation(scene, dt=0.001, solver="apgd", tol=1e-6, comm=MPI.COMM_SELF)
     ratio = 0.0
-    while sim.time < start + 3e-4 / rate:
+    while sim.time < start + 1e-3 / rate:
         sim.step()
         x, y, z = (sim.figures[f"stress_{axis}{axis} [Pa]"] for axis in "xyz")
         ratio = max(ratio, 2.0 * z / (x + y))
