@@ -23,6 +23,7 @@ from dem.motion import Held
 from dem.period import wrapped
 from dem.servo import cell_stress
 from dem.step import Step
+from dem.stiffness import strain_energy
 from dem.together import SceneError, digest, together
 from dem.world import World
 
@@ -176,7 +177,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     speeds = [table.velocity for table in after]
     normal, tangential, opening = system.works(step.in_cone, velocity, speeds[0], speeds[1], step.moment)
     springs = spring_energies(system.stiffness, step.contacts.gap, opening, system.dt)
-    along = strain_energies(system.compliance, system.held, step.impulse)
+    both = system.held, system.held_after(step.impulse)
+    along = [strain_energy(system.stiffness, held, system.dt) for held in both]
     received = np.vdot(step.impulse_on_large[~moves], mean[~moves])
     loads = 0.0
     if system.applied is not None:
@@ -283,18 +285,6 @@ def spring_energies(stiffness: Floats, gap: Floats, opening: Floats, dt: float) 
         k = 0.0 if np.isinf(stiffness[c]) else stiffness[c]
         start += 0.5 * k * max(-gap[c], 0.0) ** 2
         end += 0.5 * k * max(-gap[c] - dt * opening[c], 0.0) ** 2
-    return start, end
-
-
-@loop
-def strain_energies(compliance: Floats, held: Floats, impulse: Floats) -> tuple[float, float]:
-    """What contacts hold in the springs of their tangents at the start and at the end of a step [J], with the
-    impulses `held` (nc, 2) at its start: C/2 |g_t|^2."""
-    start, end = 0.0, 0.0
-    for c in range(len(held)):
-        for k in range(2):
-            start += 0.5 * compliance[c, 1] * held[c, k] ** 2
-            end += 0.5 * compliance[c, 1] * impulse[c, 1 + k] ** 2
     return start, end
 
 

@@ -10,13 +10,13 @@ a compliance C = 1 / (k dt^2 + c dt) on the diagonal of the Delassus matrix, and
 limit, the overlap of bodies at rest does not depend on it, and no step adds energy: an implicit spring gives back what
 it holds at most. Rigid contacts are k = inf.
 
-Along the surfaces there is a spring of stiffness k_t = TANGENTIAL k that friction stretches no further than it holds.
-It is stretched by what the last step left in it, g_t / (k_t dt), and by dt v_t where the contact sticks, so that with
-the tangential impulse held of the last step
+Along the surfaces there is a spring with a damper, too, of TANGENTIAL times the constants, which friction stretches no
+further than it holds. With the impulse h that the spring held at the end of the last step, a contact that sticks has
 
-    v_t + (g_t - held) / (k_t dt^2) = 0.
+    v_t + C_t (g_t - h) = 0,    C_t = C / TANGENTIAL,
 
-A contact that sticks under a constant load does not move: the spring remembers.
+and then its spring holds h + share (g_t - h), with the share k dt^2 C; where it slides, v_t less the slip takes the
+place of v_t. A contact that sticks under a constant load does not move: the spring remembers.
 
 Source: Negrut, Serban, Tasora, "Posing multibody dynamics with friction and contact as a differential complementarity
 problem", J. Comput. Nonlinear Dynam. 13 (2017), for the compliance; Schwager, Poeschel, "Coefficient of restitution
@@ -116,15 +116,36 @@ def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float, 
         return 0.0, 0.0, 1.0
     spring = stiffness * dt**2
     C = 1.0 / (spring + 2.0 * DAMPING * np.sqrt(stiffness * mass) * dt)
-    return C, 1.0 / (TANGENTIAL * spring), spring * C
+    return C, C / TANGENTIAL, spring * C
 
 
 @loop
 def pull_back(r: Floats, compliance: Floats, held: Floats) -> None:
-    """Take from r (nc, 3) what tangential springs give that held these impulses (rows, 3) before the step."""
+    """Take from r (nc, 3) what tangential springs give that held these impulses (nc, 2) before the step."""
     for c in range(len(r)):
-        for k in range(1, 3):
-            r[c, k] -= compliance[c, 1] * held[c, k]
+        for k in range(2):
+            r[c, 1 + k] -= compliance[c, 1] * held[c, k]
+
+
+@loop
+def held_after(stiffness: Floats, compliance: Floats, dt: float, held: Floats, impulse: Floats) -> Floats:
+    """The impulses (nc, 2) that tangential springs hold after a step, with the impulses (nc, 3) of the step; all of
+    rigid contacts, and none of those that bounce, whose C is zero."""
+    out = np.empty((len(held), 2))
+    for c in range(len(held)):
+        share = 1.0 if np.isinf(stiffness[c]) else stiffness[c] * dt**2 * compliance[c, 0]
+        for k in range(2):
+            out[c, k] = held[c, k] + share * (impulse[c, 1 + k] - held[c, k]) if share > 0.0 else 0.0
+    return out
+
+
+@loop
+def strain_energy(stiffness: Floats, held: Floats, dt: float) -> float:
+    """The energy [J] of springs along the tangents that hold these impulses (nc, 2) over dt [s]; 0 of rigid ones."""
+    energy = 0.0
+    for c in range(len(held)):
+        energy += 0.5 * (held[c, 0] ** 2 + held[c, 1] ** 2) / (TANGENTIAL * stiffness[c] * dt**2)
+    return energy
 
 
 def _load(scene: Scene) -> Floats:

@@ -60,7 +60,7 @@ class ContactSystem:
         stiffness (nc,): of the contacts; inf: rigid [N/m]
         compliance (nc, 2): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
         spring; 0: rigid [1/kg]
-        held (nc, 2): what tangential springs held at the end of the last step, from `take_hold` [N s]
+        held (nc, 2): what tangential springs hold at the start of the step, from `take_hold` [N s]
         cell: its part in the step, a `dem.contact_map.cell.Cell`; None where its size is constant
         drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
         last step, in a cell that deforms [m/s]
@@ -171,11 +171,15 @@ class ContactSystem:
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
 
-    def take_hold(self, impulse: Floats) -> None:
-        """Let tangential springs begin with what they held at the end of the last step: its impulses (nc, 3) in the
-        frames of this one [N s]."""
-        self.held = impulse[: len(self.key), 1:]
-        stiffness.pull_back(self.r, self.compliance, impulse)
+    def take_hold(self, held: Floats) -> None:
+        """Let tangential springs begin with what they held at the end of the last step (nc, 2), in the frames of this
+        one [N s]."""
+        self.held = held
+        stiffness.pull_back(self.r, self.compliance, held)
+
+    def held_after(self, impulse: Floats) -> Floats:
+        """What tangential springs hold (nc, 2) at the end of the step, with its impulses (nc, 3) [N s]."""
+        return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
 
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""

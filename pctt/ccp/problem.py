@@ -56,7 +56,7 @@ class ConeProblem:
         refuse(comm, _wrong(r, mu, G, N, point, key, compliance))
         self.r = np.ascontiguousarray(r, dtype=float).reshape(-1, 3)
         self.mu = np.ascontiguousarray(mu, dtype=float)
-        self.compliance = diagonal(compliance, len(self.r))
+        self.compliance = compliances(compliance, len(self.r))
         self.cones = self._cones()
         self.contact_map = None if G is None else _map(comm, G)
         self.operator: ContactMap | GivenMatrix = self.contact_map or GivenMatrix(comm, N)
@@ -154,6 +154,11 @@ class ConeProblem:
             blocks[:, k, k] += self.compliance[:, k]
         return blocks
 
+    @property
+    def diagonal(self) -> Array:
+        """The diagonal of N (nc, 3), hubs and the compliance included."""
+        return np.einsum("cii->ci", self._rigid_blocks) + self.compliance
+
     @cached_property
     def compliance_blocks(self) -> Array:
         """C as blocks (nc, 3, 3)."""
@@ -221,7 +226,7 @@ class ConeProblem:
             self.__dict__.pop("N").destroy()
 
 
-def diagonal(compliance: Array | float, contacts: int) -> Array:
+def compliances(compliance: Array | float, contacts: int) -> Array:
     """The diagonal of C (nc, 3), of so many contacts, from what a `ConeProblem` takes as the compliance."""
     out, given = np.zeros((contacts, 3)), np.asarray(compliance, dtype=float)
     if given.ndim == 2:

@@ -37,7 +37,7 @@ from pctt.ccp.cone import (
     extrapolate,
     tangential,
 )
-from pctt.ccp.problem import ConeProblem, diagonal
+from pctt.ccp.problem import ConeProblem, compliances
 
 
 class RollingCones(FrictionCones):
@@ -110,7 +110,7 @@ class RollingProblem(ConeProblem):
         refuse(comm, "" if fits else f"rolling or spinning: allowed are numbers >= 0, one for each of {nc} contacts")
         self.spinning = np.ascontiguousarray(spinning, dtype=float)
         twice = None if point is None else np.concatenate([point, point])
-        soft = np.concatenate([diagonal(compliance, nc)[:, :2], np.zeros((nc, 2))])
+        soft = np.concatenate([compliances(compliance, nc)[:, :2], np.zeros((nc, 2))])
         super().__init__(comm, r, np.concatenate([mu, rolling]), G=G, point=twice, compliance=soft)
         self.key = key
 

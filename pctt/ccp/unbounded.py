@@ -35,7 +35,7 @@ def why_unbounded(problem: ConeProblem, g: Array) -> str:
     r[problem.mu == 0, 1:] = 0.0  # sliding that no impulse answers
     sizes, speeds = np.sqrt(dot(g, g)), dot(r, r)
     share = np.maximum(sizes / max(problem.max(sizes.max(initial=0.0)), 1e-300), 1e-6)
-    alone = np.einsum("cii,c->", problem.diagonal_blocks, dot(g, g)) / 3.0
+    alone = problem.diagonal.sum(axis=1) @ dot(g, g) / 3.0
     parts = (np.vdot(r, g), share @ speeds, np.vdot(problem.compliance, g**2), sizes @ sizes, alone)
     along, closing, yielding, length, alone = problem.sum(np.array(parts))
     size, speed = np.sqrt(length), np.sqrt(closing)

@@ -121,7 +121,9 @@ class Stepper:
             self.moment = None if self.system.resistance is None else moments
             self.system.take_flow(self.world, self.contacts)
             advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt, moving)
-            self.memory.remember(self.system.key, result.impulse, self.system.frame)
+            kept = result.impulse.copy()
+            kept[: len(forces), 1:] = self.system.held_after(forces)  # with which springs begin the next step
+            self.memory.remember(self.system.key, kept, self.system.frame)
             self._slabs = self.world.slabs
         self._release()
         return self._figures(problem.size, result, accuracy, files)
@@ -200,9 +202,9 @@ class Stepper:
         self.contacts, self.system = contacts, self._system(contacts)
         with log.phase("assembly"):
             place = self.system.key, self.system.frame
-            held, _ = self.memory.recall(*place, self._slabs is not self.world.slabs)
-            guess = held if found is None else found.recall(*place, elsewhere=False)[0]
-            self.system.take_hold(held)
+            last, _ = self.memory.recall(*place, self._slabs is not self.world.slabs)
+            guess = last if found is None else found.recall(*place, elsewhere=False)[0]
+            self.system.take_hold(last[: len(contacts), 1:])
             self._problem = cone_problem(self.system, self.world.comm)
         return self._problem, guess
 

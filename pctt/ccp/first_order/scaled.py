@@ -42,10 +42,8 @@ class ScaledProblem:
 
     def __init__(self, problem: ConeProblem, coulomb: bool = False, precision: type[np.floating] = np.float64):
         self.problem, self.coulomb, self.precision = problem, coulomb, precision
-        blocks = problem.diagonal_blocks
-        size = np.empty_like(problem.r)
-        size[:, 0] = blocks[:, 0, 0]
-        size[:, 1] = size[:, 2] = 0.5 * (blocks[:, 1, 1] + blocks[:, 2, 2])
+        size = problem.diagonal
+        size[:, 1] = size[:, 2] = 0.5 * (size[:, 1] + size[:, 2])
         self._scale = np.sqrt(np.where(size > 0, size, problem.mean_diagonal))
         self.shrink = 1.0 / self._scale  #: (nc, 3) diagonal of S^-1
         self.cones = problem.cones.scaled(self._scale, precision)

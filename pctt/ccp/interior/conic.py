@@ -172,7 +172,7 @@ class Cones:
         problem, lorentz = self.problem, self.lorentz
         guess = useful_part(problem, guess) * lorentz.known
         y = (problem.product(guess) + problem.r) * lorentz.known
-        diagonal = lorentz.of(np.einsum("cii->ci", problem.diagonal_blocks))
+        diagonal = lorentz.of(problem.diagonal)
         diagonal[:, 0] /= lorentz.weight.ravel() ** 3
         tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
         amount = self.options.start * problem.dot(problem.r, problem.r) / problem.size / problem.mean_diagonal
