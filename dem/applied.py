@@ -14,7 +14,7 @@ from dem.arrays import Bools, Floats, Ints
 from dem.bodies import Bodies
 from dem.free_motion import free_velocity
 from dem.loads import Load
-from dem.motion import Driven, Dynamic, Guided
+from dem.motion import DROOP, Driven, Dynamic, Guided
 from dem.neighbourhood import Neighbourhood
 from dem.scene import LargeBody
 from dem.springs import Ends
@@ -168,13 +168,13 @@ def velocity_changes(table: Bodies, impulse: Floats) -> Floats:
     return change
 
 
-def free_velocities(world: World, near: Neighbourhood, dt: float) -> Floats:
+def free_velocities(world: World, near: Neighbourhood, dt: float, drives: Drives) -> Floats:
     """Velocities (rows, 6) of all bodies of `near` over a step of dt [s] without contacts; those of ghosts lack what
-    loads give."""
+    loads give. Collective."""
     free = free_velocity(near.bodies, world.gravity, dt)
     if world.loaded:
         free[: near.grains] += velocity_changes(world.grains, applied_impulses(world, dt).grains)
-    free[near.grains + near.ghosts :] = large_free_velocity(world, dt)
+    free[near.grains + near.ghosts :] = drives.free
     return free
 
 
@@ -184,24 +184,14 @@ def grains_free_velocity(world: World, dt: float) -> Floats:
     return free + velocity_changes(world.grains, applied_impulses(world, dt).grains) if world.loaded else free
 
 
-def large_free_velocity(world: World, dt: float) -> Floats:
-    """Velocities (large bodies, 6) over a step of dt [s] without contacts: guided bodies along their guides with the
-    forces of their drives, hinged ones with their torques, prescribed ones on their paths; collective."""
-    table = world.large
-    free = free_velocity(table, world.gravity, dt) + velocity_changes(table, drives_of(world, dt).impulse)
-    return _as_motions_allow(world, free, dt)
-
-
 def _as_motions_allow(world: World, velocity: Floats, dt: float) -> Floats:
     """These velocities (large, 6), with what motions hold or prescribe over a step of dt [s]; collective."""
-    free = np.empty_like(velocity)
-    free[:, :3] = (free_directions(world.large_bodies) @ velocity[:, :3, None])[:, :, 0]
-    free[:, 3:] = (free_turns(world.large_bodies) @ velocity[:, 3:, None])[:, :, 0]
+    free = world.prescribed_velocity(dt)
     for row, body in enumerate(world.large_bodies):
-        if isinstance(body.motion, Dynamic):
-            free[row] += body.motion.held(world.time, dt)
-    prescribed = ~bodies.is_dynamic(world.large)
-    free[prescribed] = world.prescribed_velocity(dt)[prescribed]
+        if isinstance(motion := body.motion, Dynamic):
+            free[row, :3] = motion.free_directions() @ velocity[row, :3]
+            free[row, 3:] = motion.free_turns() @ velocity[row, 3:]
+            free[row] += motion.held(world.time, dt)
     return free
 
 
@@ -212,25 +202,56 @@ class Drives:
     impulse: Floats  #: (large, 6) impulses and angular impulses, of servos if nothing touches their bodies
     line: Floats  #: (large, 6) unit vectors of the lines of drives
     grip: Floats  #: (large,) what servos add to the inertia along them [kg or kg m^2], see `dem.motion.Driven`
+    speed: Floats  #: (large,) that servos keep along them [m/s or rad/s]
+    most: Floats  #: (large,) greatest impulses of servos [N s or N m s]
+    spent: Ints  #: (large,) 1 or -1 of servos that contacts have shown to give all that, forward or back; else 0
+    #: (large, 6) velocities over the step without contacts: guided bodies along their guides with the forces of their
+    #: drives, hinged ones with their torques, prescribed ones on their paths
+    free: Floats
+
+    def refound(self, impulse: Floats, velocity: Floats) -> Ints | None:
+        """``spent`` as a step shows it to be right in which the drives gave impulses (large, 6) and which ends with
+        velocities (large, 6); None if that is what it is."""
+        along, now = (np.einsum("bi,bi->b", self.line, x) for x in (impulse, velocity))
+        weak = (self.grip > 0.0) & (np.abs(along) > (1.0 + DROOP) * self.most)
+        again = np.where(self.spent * (self.speed - now) < 0.0, 0, self.spent)
+        spent = np.where(weak, np.sign(along).astype(int), again)
+        return None if np.array_equal(spent, self.spent) else spent
 
 
-def drives_of(world: World, dt: float) -> Drives:
-    """Of the next step of dt [s], the same on all ranks; collective."""
-    impulse = np.zeros_like(world.large.velocity)
-    line, grip = np.zeros_like(impulse), np.zeros(len(impulse))
-    free = free_velocity(world.large, world.gravity, dt)
+def drives_of(world: World, dt: float, spent: Ints | None = None) -> Drives:
+    """Of the next step of dt [s], the same on all ranks, with that ``spent``; collective."""
+    if spent is not None:
+        return _drives(world, dt, spent)
+    asked = (world.time, dt)
+    if asked not in world.drives:  # a step asks several times
+        world.drives = {asked: _drives(world, dt, np.zeros(len(world.large), int))}
+    return world.drives[asked]
+
+
+def _drives(world: World, dt: float, spent: Ints) -> Drives:
+    table, impulse = world.large, np.zeros_like(world.large.velocity)
+    line, (grip, speed, most) = np.zeros_like(impulse), np.zeros((3, len(impulse)))
+    if not bodies.is_dynamic(table).any():
+        return Drives(impulse, line, grip, speed, most, spent, world.prescribed_velocity(dt))
+    free = falling = free_velocity(table, world.gravity, dt)
     if world.loaded:
         impulse += applied_impulses(world, dt).large
-        free += velocity_changes(world.large, impulse)
+        free = falling + velocity_changes(table, impulse)
     for row, body in enumerate(world.large_bodies):
         motion = body.motion
         if isinstance(motion, Driven):
             part, inertia = (slice(0, 3), body.mass) if isinstance(motion, Guided) else (slice(3, 6), body.inertia[2])
             line[row, part] = motion.line
-            lack = inertia / dt * ((motion.speed or 0.0) - float(free[row] @ line[row]))
+            speed[row] = motion.speed or 0.0
+            lack = inertia / dt * (speed[row] - float(free[row] @ line[row]))
+            lack = spent[row] * np.inf if spent[row] else lack
+            most[row] = dt * motion.strength(world.time, dt)
             impulse[row, part] += dt * motion.mean_drive(world.time, dt, lack)
             grip[row] = motion.grip(world.time, dt, inertia, float(world.large.velocity[row] @ line[row]), lack)
-    return Drives(impulse, line, grip)
+    if impulse.any():
+        falling = falling + velocity_changes(table, impulse)
+    return Drives(impulse, line, grip, speed, most, spent, _as_motions_allow(world, falling, dt))
 
 
 def free_directions(members: Sequence[LargeBody]) -> Floats:

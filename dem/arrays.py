@@ -67,21 +67,36 @@ def mixed(key):
 
 @loop
 def places(keys: Keys, asked: Keys) -> Ints:
-    """Where the keys `asked` (m,) are among distinct ones (n,), -1 for those that are not there. A hash table with open
+    """Where the keys `asked` (m,) are among distinct ones (n,), -1 for those that are not there.
+
+    Most are where they are to be if both have the same order but for a few that came or went: each is sought behind the
+    last one found, the further the more were sought in vain. What is left of both meets in a hash table with open
     addresses: a third of the time of sorting."""
+    out, taken = np.full(len(asked), -1, np.int64), np.zeros(len(keys), np.bool_)
+    start, ahead, left, rest = 0, 4, 2 * len(keys), len(keys)
+    for n in range(len(asked)):
+        end = min(start + min(ahead, left), len(keys))
+        k = start
+        while k < end and keys[k] != asked[n]:
+            k += 1
+        if k < end:
+            out[n], taken[k], start, ahead, rest = k, True, k + 1, 4, rest - 1
+        else:
+            left, ahead = left - (end - start), 2 * ahead
     bits = 4
-    while (1 << bits) < 2 * len(keys):
+    while (1 << bits) < 2 * rest:
         bits += 1
     table, shift, last = np.full(1 << bits, -1, np.int32), np.uint64(64 - bits), (1 << bits) - 1
     for n in range(len(keys)):
-        slot = np.int64(mixed(keys[n]) >> shift)
-        while table[slot] >= 0:
-            slot = (slot + 1) & last
-        table[slot] = n
-    out = np.empty(len(asked), np.int64)
+        if not taken[n]:
+            slot = np.int64(mixed(keys[n]) >> shift)
+            while table[slot] >= 0:
+                slot = (slot + 1) & last
+            table[slot] = n
     for n in range(len(asked)):
-        slot = np.int64(mixed(asked[n]) >> shift)
-        while table[slot] >= 0 and keys[table[slot]] != asked[n]:
-            slot = (slot + 1) & last
-        out[n] = table[slot]
+        if out[n] < 0:
+            slot = np.int64(mixed(asked[n]) >> shift)
+            while table[slot] >= 0 and keys[table[slot]] != asked[n]:
+                slot = (slot + 1) & last
+            out[n] = table[slot]
     return out

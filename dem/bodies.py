@@ -9,6 +9,7 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
+from dem.compiled import loop
 
 #: Kinds of bodies (the column `shape`); a COMPOUND is a large body, its primitives are kept elsewhere. Half spaces and
 #: meshes are parts of large bodies only.
@@ -46,7 +47,7 @@ class Bodies:
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays by name, without copies."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return dict(vars(self))
 
     def take(self, rows: Ints | Bools | slice) -> Bodies:
         """The bodies of the given rows (index array, mask or slice)."""
@@ -76,11 +77,18 @@ def bounding_radius(bodies: Bodies) -> Floats:
     return enclosing_radius(bodies.shape, bodies.size)
 
 
+@loop
 def enclosing_radius(kind: Ints, size: Floats) -> Floats:
     """Radius (n,) of the sphere about the centre that encloses a shape of kind (n,) and size (n, 3) [m]."""
-    radius = np.where(kind == CAPSULE, size[:, 0] + size[:, 1], quaternion.length(size))
-    clumps = kind >= CLUMP
-    return np.where(clumps, size[:, 0], radius) if clumps.any() else radius
+    out = np.empty(len(kind))
+    for n in range(len(kind)):
+        if kind[n] == CAPSULE:
+            out[n] = size[n, 0] + size[n, 1]
+        elif kind[n] >= CLUMP:
+            out[n] = size[n, 0]
+        else:
+            out[n] = np.sqrt(size[n, 0] ** 2 + size[n, 1] ** 2 + size[n, 2] ** 2)
+    return out
 
 
 def least_half_thickness(bodies: Bodies) -> Floats:

@@ -88,8 +88,11 @@ def not_zero(name: str, values: ArrayLike) -> Floats:
 
 def unit_quaternion(name: str, values: ArrayLike) -> Floats:
     """One quaternion (4,), scaled to unit norm."""
-    array = rows(name, not_zero(name, values), 1, 4)
-    return (array / np.linalg.norm(array, axis=1, keepdims=True))[0]
+    array = rows(name, values, 1, 4)
+    size = np.linalg.norm(array, axis=1, keepdims=True)
+    if size[0, 0] == 0.0:
+        raise ValueError(f"{name}: zero quaternion")
+    return (array / size)[0]
 
 
 def check_fields(instance: Any, **checks: Callable[[str, Any], Floats]) -> None:

@@ -40,7 +40,7 @@ class Experiment:
 
     #: Recommended time step [s]; None: `dem.time_step.recommended`.
     dt: ClassVar[Any] = None
-    #: Recommended contact distance: pairs with smaller gaps are contacts [m]; None: a fifth of the smallest radius.
+    #: Recommended contact distance: pairs with smaller gaps are contacts [m]; None: a twentieth of the smallest radius.
     delta: ClassVar[Any] = None
     #: Contact distance while settling, as falling bodies come closer within a step [m]; None: the smallest radius.
     settle_delta: ClassVar[Any] = None

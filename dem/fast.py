@@ -13,8 +13,9 @@ from mpi4py import MPI
 from dem import bodies
 from dem.arrays import Bools, Floats, places
 from dem.bodies import SPHERE
+from dem.compiled import loop
 from dem.contact import Contacts, find_contacts
-from dem.exchange import reduced
+from dem.exchange import on_any, reduced
 from dem.quaternion import cross, length
 from dem.system import contact_arms
 from dem.together import SceneError
@@ -34,13 +35,14 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
     first search tells.
     """
     grains = world.grains
-    speed = length(velocity[: len(grains), :3])
-    way, most = dt * speed, FAR * bodies.bounding_radius(grains)
-    fast = (way > most) & np.isfinite(way)
-    furthest = float((way / most)[fast].max(initial=0.0))
-    (count,), (furthest,) = reduced(world.comm, (fast.sum(),), (furthest,))
-    if not furthest:
+    most = FAR * bodies.bounding_radius(grains)
+    here, own = beyond(velocity, most, dt)
+    if not on_any(world.comm, here > 0)[0]:
         return
+    (count,), (furthest,) = reduced(world.comm, (here,), (own,))
+    speed = length(velocity[: len(grains), :3])
+    way = dt * speed
+    fast = (way > most) & np.isfinite(way)
     weight, reach, seen = grains.weight, 1.0, contacts.near.margin[: len(grains)]
     while reach < furthest:
         reach *= 2.0
@@ -54,7 +56,7 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
             grains.weight = weight
             wide = wide.take(places(contacts.key, wide.key) < 0)
             met = wide.take(_meet(world, wide, velocity, delta, dt))
-            table = _velocities(world, wide, velocity)
+            table = _velocities(world, wide, velocity, dt)
             if len(met):
                 pair = np.stack([met.a, met.b], axis=1)
                 grain = pair < met.near.grains + met.near.ghosts
@@ -68,20 +70,32 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
             raise SceneError(_refusal(world, worst, dt, furthest))
 
 
-def _velocities(world: World, contacts: Contacts, velocity: Floats) -> Floats:
+@loop
+def beyond(velocity: Floats, most: Floats, dt: float) -> tuple[int, float]:
+    """How many bodies of velocities (n or more, 6) go further in dt [s] than `most` (n,), and the furthest over that;
+    zero if none does."""
+    count, furthest = 0, 0.0
+    for n in range(len(most)):
+        way = dt * np.sqrt(velocity[n, 0] ** 2 + velocity[n, 1] ** 2 + velocity[n, 2] ** 2)
+        if way > most[n] and np.isfinite(way):
+            count, furthest = count + 1, max(furthest, way / most[n])
+    return count, furthest
+
+
+def _velocities(world: World, contacts: Contacts, velocity: Floats, dt: float) -> Floats:
     """Velocities (bodies of `near`, 6) of all bodies about this rank, from those (owned, 6); collective."""
     near = contacts.near
     table = np.zeros((len(near.bodies), 6))
     table[: near.grains] = velocity[: near.grains]
     world.lists.halo.update(table)
-    table[near.grains + near.ghosts :] = world.large_velocity(velocity)
+    table[near.grains + near.ghosts :] = world.large_velocity(velocity, dt)
     return table
 
 
 def _meet(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Bools:
     """Which of the contacts (nc,) close within dt, to a hundredth of delta, with the velocities (owned, 6) of the
     bodies; collective."""
-    table = _velocities(world, contacts, velocity)
+    table = _velocities(world, contacts, velocity, dt)
     near, row = contacts.near, np.stack([contacts.a, contacts.b], axis=1)
     arm = contact_arms(contacts.point, near.bodies.position, row.astype(np.uint32)).reshape(-1, 2, 3)
     if contacts.moved is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dem import bodies
-from dem.arrays import Floats
+from dem.arrays import Floats, Ints
 from dem.bodies import SPHERE, Bodies
 from dem.compiled import loop
 
@@ -17,11 +17,10 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
     """
     with np.errstate(over="ignore"):  # `dem.neighbourhood` refuses bodies that are lost
         change = dt * gravity
-    velocity = falling(table.velocity, table.mass, change)
-    # The torque vanishes where all moments are equal, as for spheres.
-    rows = np.flatnonzero(bodies.is_dynamic(table) & (table.shape != SPHERE))
-    if not len(rows):
+    velocity, others = falling(table.velocity, table.mass, table.shape, change)
+    if not others:  # the torque vanishes where all moments are equal, as for spheres
         return velocity
+    rows = np.flatnonzero(bodies.is_dynamic(table) & (table.shape != SPHERE))
     a, b, c = table.inertia[rows].T
     rows = rows[np.isfinite(a + b + c) & ((a != b) | (b != c))]  # guided bodies do not turn
     velocity[rows, 3:] = free_spin(table.quaternion[rows], velocity[rows, 3:], table.inertia[rows], dt)
@@ -29,14 +28,16 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
 
 
 @loop
-def falling(velocity: Floats, mass: Floats, change: Floats) -> Floats:
-    """The velocities (n, 6), with a change (3,) of the linear ones of bodies whose mass (n,) is finite."""
-    out = velocity.copy()
+def falling(velocity: Floats, mass: Floats, shape: Ints, change: Floats) -> tuple[Floats, int]:
+    """The velocities (n, 6), with a change (3,) of the linear ones of bodies whose mass (n,) is finite, and how many of
+    these are no spheres."""
+    out, others = velocity.copy(), 0
     for n in range(len(mass)):
         if np.isfinite(mass[n]):
+            others += shape[n] != SPHERE
             for k in range(3):
                 out[n, k] += change[k]
-    return out
+    return out, others
 
 
 @loop

@@ -43,7 +43,7 @@ class ImpulseMemory:
             row, impulse = self._elsewhere(key[missing], self._key[left], self._impulse[left])
             place[missing[row]] = len(stored) + np.arange(len(row))
             stored = np.concatenate([stored, impulse])
-        each = np.split(stored, self._parts, axis=1)
+        each = [stored] if self._parts == 1 else np.split(stored, self._parts, axis=1)
         found = [in_frames(np.ascontiguousarray(part), place, frame) for part in each]
         return found[0] if self._parts == 1 else np.concatenate(found), place >= 0
 

@@ -62,7 +62,7 @@ class Driven(Dynamic, Timed):
     A servo is implicit in the step: with f the force of `mean_drive`, which brings the body to its speed if nothing
     touches it, and v_free what that gives, it acts with f + c (v_free - v) at the end of the step. c is such that all
     its strength is used where the body is as far from its speed as it was before the step, or by DROOP of the speed.
-    Where a load grows at once to more than it can bear, it pushes with more in that one step.
+    Where a load proves to be more than it can bear, the step is solved anew with all its strength and no more.
     """
 
     speed: float | None
@@ -82,17 +82,21 @@ class Driven(Dynamic, Timed):
         """Unit vector (3,) of the line."""
         return np.array(getattr(self, self._line))
 
+    def strength(self, time: float, dt: float) -> float:
+        """The greatest mean force or torque from `time` to `time + dt` [s]."""
+        return float(getattr(self, self._strength) * (self.gone(time + dt) - self.gone(time)) / dt)
+
     def mean_drive(self, time: float, dt: float, lack: float) -> Floats:
         """Mean force or torque (3,) of the drive from `time` to `time + dt` [s]; of a servo what lacks to the speed at
         the end of the step, `lack` [N or N m], as far as its strength goes."""
-        most = getattr(self, self._strength) * (self.gone(time + dt) - self.gone(time)) / dt
+        most = self.strength(time, dt)
         return (most if self.speed is None else min(max(lack, -most), most)) * self.line
 
     def grip(self, time: float, dt: float, mass: float, speed: float, lack: float) -> float:
         """c dt of a servo [kg or kg m^2], for the mass or moment, and the `speed` before the step; else 0."""
         if self.speed is None:
             return 0.0
-        most = getattr(self, self._strength) * (self.gone(time + dt) - self.gone(time)) / dt
+        most = self.strength(time, dt)
         slip = max(DROOP * abs(self.speed), abs(self.speed - speed), 1e-6 * dt * most / mass)
         return dt * max(most - abs(lack), 0.0) / slip if most > 0.0 else 0.0
 

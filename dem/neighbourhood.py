@@ -68,17 +68,19 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
 def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> Neighbourhood:
     """The same bodies as they are now, with these margins (grains,) [m] of the local ones; the halo is that of the
     grains of `near`; collective."""
-    count = near.grains + near.ghosts
-
-    def now(own: Floats, large: Floats | float) -> Floats:
-        column = np.empty((len(near.bodies), *own.shape[1:]))
-        column[: near.grains], column[count:] = own, large
-        halo.update(column)
-        return column
-
-    names = ("position", "quaternion", "velocity")
-    columns: dict[str, Any] = {name: now(getattr(world.grains, name), getattr(world.large, name)) for name in names}
-    return replace(near, bodies=replace(near.bodies, **columns), margin=now(margin, 0.0)[:count])
+    grains, count = near.grains, near.grains + near.ghosts
+    ghosts = np.empty((0, 14))
+    if world.comm.size > 1:  # one message with all that steps change
+        moved = np.empty((count, 14))
+        own = world.grains.position, world.grains.quaternion, world.grains.velocity, margin[:, None]
+        np.concatenate(own, axis=1, out=moved[:grains])
+        halo.update(moved)
+        ghosts = moved[grains:]
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(world.grains, name), ghosts[:, part], getattr(world.large, name)])
+        for name, part in (("position", slice(3)), ("quaternion", slice(3, 7)), ("velocity", slice(7, 13)))
+    }
+    return replace(near, bodies=replace(near.bodies, **columns), margin=np.concatenate([margin, ghosts[:, 13]]))
 
 
 def image_ways(period: Floats, shear: Shear | None = None) -> tuple[Floats, Floats]:

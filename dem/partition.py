@@ -87,8 +87,10 @@ def imbalance(world: World) -> float:
 def rebalance(world: World, tolerance: float = 1.05) -> bool:
     """Redistribute if a rank has more than `tolerance` times the mean load of the last search, and the load of the
     heaviest grain beside it, as no cut divides that; say if it did; collective."""
+    if world.comm.size == 1:
+        return False
     greatest, heaviest, mean = _loads(world)
-    if world.comm.size == 1 or greatest <= tolerance * mean + heaviest:
+    if greatest <= tolerance * mean + heaviest:
         return False
     redistribute(world)
     return True

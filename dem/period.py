@@ -79,7 +79,8 @@ def put_back(world: World) -> None:
     if world.comm.allreduce(bool((outside & np.isfinite(period)).any()), MPI.LOR):
         world.grains.velocity = velocity_in_cell(position, world.grains.velocity, world.shear)
         world.grains.position = wrapped(position, period, world.shear)
-        world.lists, world.applied = None, {}
+        world.lists = None
+        world.act_anew()
 
 
 def refuse_across(world: World) -> None:

@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from dem import bodies
 from dem.applied import slots
-from dem.arrays import ArrayLike, Bools, Floats
+from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
 from dem.exchange import reduced
@@ -23,7 +23,6 @@ from dem.motion import Held
 from dem.period import wrapped
 from dem.servo import cell_stress
 from dem.step import Step
-from dem.stiffness import strain_energy
 from dem.together import SceneError, digest, together
 from dem.world import World
 
@@ -45,6 +44,8 @@ def row(step: Step, scene: Experiment) -> dict[str, float]:
 
 def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str, float]:
     """The quantities of the scene's own."""
+    if getattr(scene.record, "__func__", None) is Experiment.record:
+        return {}
     what = f"record of the scene {type(scene).__name__}"
 
     def record() -> dict[str, float]:
@@ -94,12 +95,18 @@ def cell(step: Step) -> dict[str, float]:
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
-    world = step.world
-    place = wrapped(world.grains.position, world.period, world.shear)
-    lost = np.zeros(len(world.grains), bool)
-    for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high))):
-        lost |= (place[:, axis] < least) | (place[:, axis] > most)
-    return step.total(lost)
+    place = wrapped(step.world.grains.position, step.world.period, step.world.shear)
+    return step.total(outside_of(place, np.asarray(low, float), np.asarray(high, float)))
+
+
+@loop
+def outside_of(place: Floats, low: Floats, high: Floats) -> int:
+    """How many places (n, 3) are outside the box from `low` to `high` (3,)."""
+    lost = 0
+    for n in range(len(place)):
+        x, y, z = place[n, 0], place[n, 1], place[n, 2]
+        lost += x < low[0] or x > high[0] or y < low[1] or y > high[1] or z < low[2] or z > high[2]
+    return lost
 
 
 #: A step has a jump of energy where the kinetic energy rises by more than its sources give, by this part of all that is
@@ -176,9 +183,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     mean = 0.5 * (velocity[first:] + world.large.velocity)
     speeds = [table.velocity for table in after]
     normal, tangential, opening = system.works(step.in_cone, velocity, speeds[0], speeds[1], step.moment)
-    springs = spring_energies(system.stiffness, step.contacts.gap, opening, system.dt)
-    both = system.held, system.held_after(step.impulse)
-    along = [strain_energy(system.stiffness, held, system.dt) for held in both]
+    *springs, strained, strained_at_end = system.spring_energies(step.contacts.gap, opening, step.impulse)
     received = np.vdot(step.impulse_on_large[~moves], mean[~moves])
     loads = 0.0
     if system.applied is not None:
@@ -197,6 +202,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     cohesion = 0.0
     if system.attraction is not None:
         cohesion = system.works(step.impulse, velocity, *speeds)[0] - normal
+    along = strained, strained_at_end
     whole = np.array([*was, *now, normal, tangential, *springs, still, _carried(step, ~moves), cohesion, *along])
     comm.Allreduce(MPI.IN_PLACE, whole)
     change, held, strained = whole[2] + whole[3] - whole[0] - whole[1], whole[7] - whole[6], whole[12] - whole[11]
@@ -224,12 +230,22 @@ def energy_balance(step: Step) -> dict[str, float]:
 def _still(table: Bodies, gravity: Floats, dt: float) -> float:
     """The kinetic energy [J] that bodies at rest may have by the errors of a solver: a part SLOW of what gravity gives
     in a step, or a way of CREEP radii, of large bodies those of gyration."""
-    moves = bodies.is_dynamic(table)
-    mass, gyration = table.mass[moves], np.sqrt(table.inertia[moves].min(axis=1) / table.mass[moves])
-    radius = np.where(table.shape[moves] == COMPOUND, gyration, bodies.bounding_radius(table)[moves])
-    creep = CREEP * np.where(np.isfinite(radius), radius, 0.0) / dt  # what cannot turn has none
-    speed = np.maximum(SLOW * dt * math.hypot(*gravity), creep)
-    return 0.5 * float(mass @ speed**2)
+    radius, fall = bodies.bounding_radius(table), SLOW * dt * math.hypot(*gravity)
+    return still_energy(table.mass, table.inertia, table.shape, radius, fall, CREEP / dt)
+
+
+@loop
+def still_energy(mass: Floats, inertia: Floats, shape: Ints, radius: Floats, fall: float, creep: float) -> float:
+    """The kinetic energy [J] of n bodies with the speed `fall` [m/s], or with `creep` radii [1/s] if that is more."""
+    energy = 0.0
+    for n in range(len(mass)):
+        if np.isfinite(mass[n]):
+            size = radius[n]
+            if shape[n] == COMPOUND:
+                size = np.sqrt(min(inertia[n, 0], inertia[n, 1], inertia[n, 2]) / mass[n])
+            speed = max(fall, creep * size if np.isfinite(size) else 0.0)  # what cannot turn has no radius
+            energy += 0.5 * mass[n] * speed**2
+    return energy
 
 
 def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
@@ -267,25 +283,29 @@ def _carried(step: Step, prescribed: Bools) -> float:
     velocity = np.where(prescribed[:, None], step.world.large.velocity, 0.0)
     if not velocity.any():
         return 0.0
-    near = step.contacts.near
-    table = np.zeros((len(near.bodies), 6))
-    table[near.grains + near.ghosts :] = velocity
-    speed = step.system.contact_map.relative_velocities(table)
-    mass = near.bodies.mass
-    lighter = np.minimum(mass[step.contacts.a], mass[step.contacts.b])
-    return float(0.5 * lighter @ np.einsum("ci,ci->c", speed, speed))
+    near, arm = step.contacts.near, step.system.contact_map.given.arm
+    first, mass = near.grains + near.ghosts, near.bodies.mass
+    return carried_energy(velocity, first, mass, step.contacts.a, step.contacts.b, arm)
 
 
 @loop
-def spring_energies(stiffness: Floats, gap: Floats, opening: Floats, dt: float) -> tuple[float, float]:
-    """What contacts hold as springs at the start and at the end of a step [J]: k/2 d^2 of an overlap d, which changes
-    in the step by dt times the normal velocity at its end, `opening` (nc,). Rigid ones hold nothing."""
-    start, end = 0.0, 0.0
-    for c in range(len(gap)):
-        k = 0.0 if np.isinf(stiffness[c]) else stiffness[c]
-        start += 0.5 * k * max(-gap[c], 0.0) ** 2
-        end += 0.5 * k * max(-gap[c] - dt * opening[c], 0.0) ** 2
-    return start, end
+def carried_energy(velocity: Floats, first: int, mass: Floats, a: Ints, b: Ints, arm: Floats) -> float:
+    """The kinetic energy [J] that the lighter bodies of contacts with arms (nc, 6) between rows a, b (nc,) have at the
+    relative velocity of these: `velocity` (large, 6) from the row `first` on, and zero before."""
+    energy = 0.0
+    for c in range(len(b)):
+        if b[c] < first and a[c] < first:
+            continue
+        u, v, w = 0.0, 0.0, 0.0
+        for side, row in ((0, a[c]), (3, b[c])):
+            if row >= first:
+                x, y, z, sign = arm[c, side], arm[c, side + 1], arm[c, side + 2], 1.0 if side else -1.0
+                s = velocity[row - first]
+                u += sign * (s[0] + s[4] * z - s[5] * y)
+                v += sign * (s[1] + s[5] * x - s[3] * z)
+                w += sign * (s[2] + s[3] * y - s[4] * x)
+        energy += 0.5 * min(mass[a[c]], mass[b[c]]) * (u * u + v * v + w * w)
+    return energy
 
 
 def contact_statistics(step: Step) -> dict[str, float]:

@@ -133,9 +133,9 @@ def advance(world: World, velocity: Floats, dt: float, moving: Floats | None = N
     Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
     """
     moving = velocity if moving is None else moving
-    large_velocity = large_moving = world.large_velocity(velocity)
+    large_velocity = large_moving = world.large_velocity(velocity, dt)
     if moving is not velocity:
-        large_moving = world.large_velocity(moving)
+        large_moving = world.large_velocity(moving, dt)
     start = world.grains.position
     _move(world.grains, velocity[: len(world.grains)], moving[: len(world.grains)], dt)
     _move(world.large, large_velocity, large_moving, dt)
@@ -184,7 +184,7 @@ def find_overrun(
     seen = contacts.near.margin[: contacts.near.grains]
     way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
     way = way + cell_way(world, dt)
-    large = world.large_velocity(velocity)
+    large = world.large_velocity(velocity, dt)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
     gone = bool((way > seen).any()), goes_beyond(world, dt * large, contacts.shifts, delta)
     further, beyond = on_any(world.comm, *gone)

@@ -32,7 +32,7 @@ import numpy as np
 
 from dem import bodies, checks, quaternion
 from dem.arrays import ArrayLike, Floats, Ints
-from dem.compiled import loop
+from dem.compiled import inlined, loop
 from dem.motion import Dynamic
 from dem.pairs import Pairs
 from dem.scene import Scene
@@ -97,9 +97,13 @@ def gap_velocities(
 
     `stiffness` (materials, materials); `material` and `mass` of the bodies, which have the rows a, b (nc,)."""
     k, C, speed = np.empty(len(gap)), np.empty((len(gap), 2)), np.empty(len(gap))
+    last, one, two, normal, tangent, share = -1.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for c in range(len(gap)):
         k[c] = stiffness[material[a[c]], material[b[c]]]
-        C[c, 0], C[c, 1], share = compliance(k[c], 1.0 / (1.0 / mass[a[c]] + 1.0 / mass[b[c]]), dt)
+        if k[c] != last or mass[a[c]] != one or mass[b[c]] != two:  # many contacts are those of like bodies
+            last, one, two = k[c], mass[a[c]], mass[b[c]]
+            normal, tangent, share = compliance(last, 1.0 / (1.0 / one + 1.0 / two), dt)
+        C[c, 0], C[c, 1] = normal, tangent
         speed[c] = gap[c] / dt
         if speed[c] < 0.0:
             speed[c] *= share
@@ -129,23 +133,44 @@ def pull_back(r: Floats, compliance: Floats, held: Floats) -> None:
 
 @loop
 def held_after(stiffness: Floats, compliance: Floats, dt: float, held: Floats, impulse: Floats) -> Floats:
-    """The impulses (nc, 2) that tangential springs hold after a step, with the impulses (nc, 3) of the step; all of
-    rigid contacts, and none of those that bounce, whose C is zero."""
-    out = np.empty((len(held), 2))
+    """The impulses (nc or more, 3) of a step, with what tangential springs hold after it in the place of the tangential
+    ones of the first nc: all of these in rigid contacts, and nothing in those that bounce, whose C is zero."""
+    out = np.empty((len(impulse), 3))
     for c in range(len(held)):
-        share = 1.0 if np.isinf(stiffness[c]) else stiffness[c] * dt**2 * compliance[c, 0]
-        for k in range(2):
-            out[c, k] = held[c, k] + share * (impulse[c, 1 + k] - held[c, k]) if share > 0.0 else 0.0
+        out[c, 0] = impulse[c, 0]
+        out[c, 1], out[c, 2] = _kept(stiffness, compliance, dt, held, impulse, c)
+    out[len(held) :] = impulse[len(held) :]
     return out
 
 
+@inlined
+def _kept(stiffness, compliance, dt, held, impulse, c):
+    share = 1.0 if np.isinf(stiffness[c]) else stiffness[c] * dt**2 * compliance[c, 0]
+    one = held[c, 0] + share * (impulse[c, 1] - held[c, 0]) if share > 0.0 else 0.0
+    other = held[c, 1] + share * (impulse[c, 2] - held[c, 1]) if share > 0.0 else 0.0
+    return one, other
+
+
 @loop
-def strain_energy(stiffness: Floats, held: Floats, dt: float) -> float:
-    """The energy [J] of springs along the tangents that hold these impulses (nc, 2) over dt [s]; 0 of rigid ones."""
-    energy = 0.0
-    for c in range(len(held)):
-        energy += 0.5 * (held[c, 0] ** 2 + held[c, 1] ** 2) / (TANGENTIAL * stiffness[c] * dt**2)
-    return energy
+def spring_energies(
+    stiffness: Floats, compliance: Floats, dt: float, gap: Floats, opening: Floats, held: Floats, impulse: Floats
+) -> tuple[float, float, float, float]:
+    """What contacts hold as springs at the start and at the end of a step, along the normals and then along the
+    tangents [J]. Rigid ones hold nothing.
+
+    That is k/2 d^2 of an overlap d, which changes in the step by dt times the normal velocity at its end, `opening`
+    (nc,); and h^2 / (2 k_t dt^2) of the impulse h that a tangential spring holds, `held` (nc, 2) at the start."""
+    start, end, strained, strained_at_end = 0.0, 0.0, 0.0, 0.0
+    for c in range(len(gap)):
+        if np.isinf(stiffness[c]):
+            continue
+        k, per = stiffness[c], TANGENTIAL * stiffness[c] * dt**2
+        start += 0.5 * k * max(-gap[c], 0.0) ** 2
+        end += 0.5 * k * max(-gap[c] - dt * opening[c], 0.0) ** 2
+        one, other = _kept(stiffness, compliance, dt, held, impulse, c)
+        strained += 0.5 * (held[c, 0] ** 2 + held[c, 1] ** 2) / per
+        strained_at_end += 0.5 * (one**2 + other**2) / per
+    return start, end, strained, strained_at_end
 
 
 def _load(scene: Scene) -> Floats:

@@ -32,7 +32,7 @@ from dem.applied import (
     joints_refound,
     slots,
 )
-from dem.arrays import Bools, Floats
+from dem.arrays import Bools, Floats, Ints
 from dem.bodies import COMPOUND, Bodies
 from dem.checks import positive
 from dem.cohesion import along_normal, attraction
@@ -66,7 +66,7 @@ class ContactSystem:
         last step, in a cell that deforms [m/s]
         surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.surface`; None if there is none
         b (nc, 3): (gap / dt, surface) [m/s], see `gap_velocities`
-        r (nc, 3): b + D' v_free [m/s]; zero where it is below `rounding_of`
+        r (nc, 3): b + D' v_free [m/s]; zero where it is rounding, see `_closing`
         near: the bodies about this rank
         contact_map: G, with the halo of the bodies; the rows of its tables are those of `near`
         problem_map: G of the cone problem: with the rows of turning, where contacts resist it
@@ -80,10 +80,11 @@ class ContactSystem:
 
     def __init__(
         self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf, impacts: bool = True,
-        joints: Coupling | None = None,
+        joints: Coupling | None = None, spent: Ints | None = None,
     ) -> None:  # fmt: skip
         """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `impacts`:
-        whether contacts that begin bounce; `joints`: those of this step, if they are known."""
+        whether contacts that begin bounce; `joints`, `spent`: the joints of this step, and what `Drives` has by that
+        name, if contacts have shown them."""
         positive("time step", dt)
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
@@ -97,7 +98,7 @@ class ContactSystem:
         arm = contact_arms(self.point, near.bodies.position, row)
         if contacts.moved is not None:
             arm[:, 3:] -= contacts.moved
-        self.drives = drives_of(world, dt)
+        self.drives = drives_of(world, dt, spent)
         root = inverse_root_masses(world, self.drives)
         rows = CompactRows(self.frame.reshape(-1, 9), arm, body, root, owned)
         ghosts = np.flatnonzero(touched)
@@ -105,16 +106,17 @@ class ContactSystem:
         owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
         halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
         self.contact_map = ContactMap(world.comm, rows, halo, row)
-        free = free_velocities(world, near, dt)
+        free = free_velocities(world, near, dt, self.drives)
         self.applied = applied_impulses(world, dt) if world.loaded else None
         if world.loaded:
             halo.update(free)
-        rounding = rounding_of(arm, row, free)
+        freely, rounding = _closing(rows.frame, arm, row, free)
         self.joints = joint_coupling(world, dt) if joints is None else joints
         if self.joints is not None:
             here, slot = slots(world, near.bodies.id)
             free[here] += self.joints.change[slot]
-            rounding += rounding_of(arm, row, free)
+            freely, more = _closing(rows.frame, arm, row, free)
+            rounding += more
             own = here < owned
             coupling = self.joints.matrix
             self.contact_map = JointedMap(self.contact_map, here[own], slot[own], coupling)
@@ -126,7 +128,6 @@ class ContactSystem:
         self.surface = surface_velocities(world, contacts, self.frame)
         if self.surface is not None:
             self.b[:, 1:] = self.surface
-        freely = self.contact_map.relative_velocities(free)
         self.take_flow(world, contacts)
         self.cell = cell_of(world, contacts, self.frame, dt)
         if self.cell is not None:
@@ -153,9 +154,9 @@ class ContactSystem:
                 self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
         if impacts and world.pairs.restitution.any():
             self._bounce(world, contacts, freely[:, 0])
-        self.r = self.b + freely
-        for speed in (self.r, *([] if self.resistance is None else [self.resistance.velocity])):
-            speed[np.abs(speed) <= rounding[:, None]] = 0.0
+        self.r = _beyond(self.b, freely, rounding)
+        if self.resistance is not None:
+            self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
 
     def _bounce(self, world: World, contacts: Contacts, freely: Floats) -> None:
         """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton).
@@ -178,8 +179,14 @@ class ContactSystem:
         stiffness.pull_back(self.r, self.compliance, held)
 
     def held_after(self, impulse: Floats) -> Floats:
-        """What tangential springs hold (nc, 2) at the end of the step, with its impulses (nc, 3) [N s]."""
+        """Impulses of the step (parts nc, 3), see `dem.pairs.Pairs.parts`, with what tangential springs hold at its end
+        in the place of the tangential ones [N s]."""
         return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
+
+    def spring_energies(self, gap: Floats, opening: Floats, impulse: Floats) -> tuple[float, float, float, float]:
+        """`dem.stiffness.spring_energies` of the step with these impulses (nc, 3)."""
+        given = self.stiffness, self.compliance, self.dt
+        return stiffness.spring_energies(*given, gap, opening, self.held, impulse)
 
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
@@ -227,6 +234,10 @@ class ContactSystem:
         if self.joints is None:
             return np.zeros(0)
         return self.joints.impulses(self._push(impulse, moment))
+
+    def spent_with(self, large: Floats) -> Ints | None:
+        """`Drives.refound` for the velocities (large, 6) of large bodies after the step."""
+        return self.drives.refound(self.drive_impulse(large), large)
 
     def joints_with(self, world: World, impulse: Floats, moment: Floats | None = None) -> Coupling | None:
         """The joints of the step if these impulses and moments of contacts (nc, 3) show that other limits and motors
@@ -297,13 +308,26 @@ def inverse_root_masses(world: World, drives: Drives) -> Floats:
     last = world.comm.rank == world.comm.size - 1
     tables = [world.grains, gripped(world.large, drives)] if last else [world.grains]
     if world.only_spheres and not bodies.is_dynamic(world.large).any():
-        columns = [np.concatenate([table.mass[:, None]] * 3 + [table.inertia], axis=1) for table in tables]
-        return 1.0 / np.sqrt(np.concatenate(columns))
+        parts = [_inverse_roots(table.mass, table.inertia) for table in tables]
+        return np.concatenate(parts) if last else parts[0]
     owned = bodies.concatenate(tables)
     translation = np.eye(3) / np.sqrt(owned.mass)[:, None, None]
     guides = free_directions(world.large_bodies) if last else np.zeros((0, 3, 3))
     translation[len(world.grains) :] = translation[len(world.grains) :] @ guides
     return packed(np.stack([translation, bodies.inverse_root_inertia(owned)], axis=1))
+
+
+@loop
+def _inverse_roots(mass: Floats, inertia: Floats) -> Floats:
+    out = np.empty((len(mass), 6))
+    for n in range(len(mass)):
+        last = max(n - 1, 0)
+        same = n > 0 and mass[n] == mass[last]  # as the last body: many are
+        out[n, :3] = out[last, 0] if same else 1.0 / np.sqrt(mass[n])
+        for k in range(3):
+            same = n > 0 and inertia[n, k] == inertia[last, k]
+            out[n, 3 + k] = out[last, 3 + k] if same else 1.0 / np.sqrt(inertia[n, k])
+    return out
 
 
 def gripped(large: Bodies, drives: Drives) -> Bodies:
@@ -352,20 +376,37 @@ def contact_arms(point: Floats, position: Floats, row: np.ndarray) -> Floats:
 
 
 @loop
-def rounding_of(arm: Floats, row: np.ndarray, velocity: Floats) -> Floats:
-    """Differences (nc,) that are rounding between the velocities of two bodies at their contact: 1e-12 of these [m/s].
+def _closing(frame: Floats, arm: Floats, row: np.ndarray, w: Floats) -> tuple[Floats, Floats]:
+    """D' w (nc, 3) for velocities w (rows, 6) of bodies, and what of it (nc,) is rounding: 1e-12 of the velocities of
+    both bodies at their contact [m/s].
 
     What closes more slowly makes an overlap of 1e-12 v dt, until it counts by its gap. Bodies that fly side by side
     would else get impulses of 1e-25 N s, and solvers take hundreds of iterations for what is noise."""
-    out = np.zeros(len(row))
+    y, rounding = np.empty((len(row), 3)), np.empty(len(row))
     for c in range(len(row)):
-        for k in range(2):
-            speed, spin, reach = 0.0, 0.0, 0.0
-            for i in range(3):
-                speed += abs(velocity[row[c, k], i])
-                spin += abs(velocity[row[c, k], 3 + i])
-                reach += abs(arm[c, 3 * k + i])
-            out[c] += 1e-12 * (speed + spin * reach)
+        a, b = row[c, 0], row[c, 1]
+        r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
+        u0 = w[b, 0] - w[a, 0] + w[b, 4] * s2 - w[b, 5] * s1 - (w[a, 4] * r2 - w[a, 5] * r1)
+        u1 = w[b, 1] - w[a, 1] + w[b, 5] * s0 - w[b, 3] * s2 - (w[a, 5] * r0 - w[a, 3] * r2)
+        u2 = w[b, 2] - w[a, 2] + w[b, 3] * s1 - w[b, 4] * s0 - (w[a, 3] * r1 - w[a, 4] * r0)
+        for k in range(3):
+            y[c, k] = frame[c, 3 * k] * u0 + frame[c, 3 * k + 1] * u1 + frame[c, 3 * k + 2] * u2
+        one = abs(w[a, 0]) + abs(w[a, 1]) + abs(w[a, 2])
+        one += (abs(w[a, 3]) + abs(w[a, 4]) + abs(w[a, 5])) * (abs(r0) + abs(r1) + abs(r2))
+        two = abs(w[b, 0]) + abs(w[b, 1]) + abs(w[b, 2])
+        two += (abs(w[b, 3]) + abs(w[b, 4]) + abs(w[b, 5])) * (abs(s0) + abs(s1) + abs(s2))
+        rounding[c] = 1e-12 * one + 1e-12 * two
+    return y, rounding
+
+
+@loop
+def _beyond(b: Floats, freely: Floats, rounding: Floats) -> Floats:
+    """b + freely (nc, 3), zero where it is not beyond the `rounding` (nc,)."""
+    out = np.empty((len(rounding), 3))
+    for c in range(len(rounding)):
+        for k in range(3):
+            speed = b[c, k] + freely[c, k]
+            out[c, k] = 0.0 if abs(speed) <= rounding[c] else speed
     return out
 
 

@@ -20,7 +20,7 @@ from dem.bodies import Bodies
 from dem.clumps import Form
 from dem.joints import Joint
 from dem.loads import Load, On
-from dem.motion import Dynamic, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
+from dem.motion import Dynamic, Fixed, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
 from dem.pairs import Pairs
 from dem.polyhedra import Solid
 from dem.scene import LargeBody, SurfaceVelocity, checked_surface
@@ -120,6 +120,9 @@ class World:
     #: By time and dt [s]: what loads and springs give in that step, a `dem.applied.Applied`.
     applied: dict[tuple[float, float], Any] = field(init=False, repr=False, default_factory=dict)
 
+    #: Likewise what drives the large bodies, a `dem.applied.Drives`.
+    drives: dict[tuple[float, float], Any] = field(init=False, repr=False, default_factory=dict)
+
     def __post_init__(self) -> None:
         self.set_grains(self.grains)
 
@@ -141,7 +144,8 @@ class World:
 
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
-        self.grains, self.lists, self.applied = grains, None, {}
+        self.grains, self.lists = grains, None
+        self.act_anew()
         everyone = np.zeros((self.comm.size + 1, 2), np.int64)
         self.comm.Allgather(np.array([len(grains), (grains.shape != bodies.SPHERE).any()], np.int64), everyone[1:])
         self.slabs = np.cumsum(everyone[:, 0])
@@ -185,10 +189,17 @@ class World:
         self.large_bodies = (*self.large_bodies[:row], body, *self.large_bodies[row + 1 :])
         self.changed.add(body.name)
         self._poses, self._followed = {}, {}
+        self.act_anew()
 
-    def large_velocity(self, velocity: Floats) -> Floats:
-        """Those (large, 6) of the large bodies, on all ranks, of the velocities (owned, 6) of the bodies whose rows
-        each rank owns; collective."""
+    def act_anew(self) -> None:
+        """Find anew what acts in this step: it is other than it was."""
+        self.applied, self.drives = {}, {}
+
+    def large_velocity(self, velocity: Floats, dt: float) -> Floats:
+        """Those (large, 6) of the large bodies, on all ranks, of the velocities (owned, 6) in the next step of dt [s]
+        of the bodies whose rows each rank owns; collective."""
+        if not bodies.is_dynamic(self.large).any():
+            return self.prescribed_velocity(dt)
         large = np.zeros_like(self.large.velocity)
         count = len(self.grains)
         large[: len(velocity) - count] = velocity[count:]  # all of them on the last rank, none elsewhere
@@ -225,8 +236,11 @@ class World:
         self._poses = {**dict([*self._poses.items()][-1:]), time: poses}
 
     def _each(self, time: float) -> dict[int, Pose]:
+        known = next(reversed(self._poses.values()), {})
         return {
-            row: checked_pose(body.motion, time, body.position, body.quaternion)
+            row: known[row]
+            if row in known and isinstance(body.motion, Fixed)
+            else checked_pose(body.motion, time, body.position, body.quaternion)
             for row, body in enumerate(self.large_bodies)
             if not isinstance(body.motion, Dynamic)
         }
@@ -297,7 +311,7 @@ def set_load(world: World, name: str, on: On = None, **values: Any) -> None:
     refuse_load(world, name, load)
     world.loads[name] = load
     world.loads_set.add(name)
-    world.applied = {}
+    world.act_anew()
 
 
 def refuse_load(world: World, name: str, load: Load) -> None:
@@ -321,7 +335,7 @@ def set_spring(world: World, name: str, **values: Any) -> None:
         raise ValueError(f"spring {name!r}: {other[0]} cannot be set; allowed are stiffness, damping and length")
     world.springs[name] = dataclasses.replace(world.springs[name], **values)
     world.springs_set.add(name)
-    world.applied = {}
+    world.act_anew()
 
 
 def set_source(world: World, name: str, **values: Any) -> None:

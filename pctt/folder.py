@@ -60,7 +60,13 @@ LINKS = (
 
 def dumps(figures: Any, indent: int | None = None) -> str:
     """The JSON text of figures: numbers, and dicts and lists of them."""
-    return json.dumps(_finite(figures), indent=indent, default=lambda number: number.item())  # of numpy
+    def text(figures: Any) -> str:
+        return json.dumps(figures, indent=indent, allow_nan=False, default=lambda number: number.item())  # of numpy
+
+    try:
+        return text(figures)
+    except ValueError:  # a number is not finite
+        return text(_finite(figures))
 
 
 def loads(line: str) -> dict[str, Any]:

@@ -129,11 +129,14 @@ def fill(
                 if square > enough * enough:
                     continue
                 if kind[m] == BOX or kind[m] == MESH:  # of meshes the box about them
-                    a = abs(u * turn[k, 0] + v * turn[k, 3] + w * turn[k, 6]) - size[m, 0]
-                    b = abs(u * turn[k, 1] + v * turn[k, 4] + w * turn[k, 7]) - size[m, 1]
-                    c = abs(u * turn[k, 2] + v * turn[k, 5] + w * turn[k, 8]) - size[m, 2]
-                    a, b, c = max(a, 0.0), max(b, 0.0), max(c, 0.0)
-                    apart = np.sqrt(a * a + b * b + c * c)
+                    apart = 0.0
+                    for axis in range(3):
+                        a = abs(u * turn[k, axis] + v * turn[k, 3 + axis] + w * turn[k, 6 + axis]) - size[m, axis]
+                        if a > far:
+                            apart = np.inf
+                            break
+                        apart += max(a, 0.0) ** 2
+                    apart = np.sqrt(apart)
                 else:
                     apart = np.sqrt(square) - radius[m]
             if apart <= far:

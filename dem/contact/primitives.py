@@ -180,6 +180,8 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
         table.kind, table.center, table.quaternion, table.size, i, j, delta
     )
     found = [Manifold(pair, np.zeros_like(pair), Touch(point, normal, gap))]
+    if not len(others):
+        return found[0]
     i, j, delta = i[others], j[others], delta[others]
     kind = np.where(table.kind >= POLYHEDRON, _POLYHEDRON, table.kind)
     code = 8 * kind[i] + kind[j]

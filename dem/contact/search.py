@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dem import bodies
-from dem.applied import free_directions, free_turns, grains_free_velocity, large_free_velocity
+from dem.applied import drives_of, free_directions, free_turns, grains_free_velocity
 from dem.arrays import Bools, Floats, Ints, Keys, places
 from dem.bodies import CAPSULE, CLUMP, MESH, SPHERE
 from dem.checks import not_negative
@@ -85,7 +85,7 @@ def find_contacts(
     """
     not_negative("contact distance delta", delta)
     if shifts is None:
-        shifts = (dt * large_free_velocity(world, dt) if dt else np.zeros_like(world.large.velocity))[None]
+        shifts = (dt * drives_of(world, dt).free if dt else np.zeros_like(world.large.velocity))[None]
     free = grains_free_velocity(world, dt) if dt else world.grains.velocity
     way = ways(world.grains.shape, world.grains.size, free, dt)
     way = way + cell_way(world, dt)
@@ -110,7 +110,7 @@ def find_contacts(
     contacts = Contacts(key, a, b, body, *touch, friction, near, shifts)
     if pictures is not None:
         contacts, weight = _without_images(world, contacts, base, pictures)
-    back = np.flatnonzero(np.diff(pair) <= 0)  # other shapes come behind the spheres, and touch in several points
+    back = np.flatnonzero(pair[1:] <= pair[:-1])  # other shapes come behind the spheres, and touch in several points
     of_clumps = table.members is not None
     if (len(back) or of_clumps) and lists.images is None:
         first = 0 if of_clumps else int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min()))
@@ -122,6 +122,8 @@ def find_contacts(
         world.grains.weight = weight
     else:
         contacts = contacts.take(places(besides.key, contacts.key) < 0)
+    if not bodies.is_dynamic(world.large).any():
+        return contacts
     rigid = _gives_no_way(world, contacts)
     if not rigid.any():
         return contacts
@@ -175,12 +177,14 @@ def named(number, row, kind, index, material, friction, features, grains, i, j, 
     body, mu, owned = np.empty((len(pair), 2), np.int64), np.empty(len(pair)), np.zeros(grains)
     for c in range(len(pair)):
         p, q = i[pair[c]], j[pair[c]]
-        one, two, further = number[p], number[q], feature[c] // features
-        if kind[p] == MESH:
-            one += further
-        else:
-            two += further
-        key[c] = complex(one, two * features + feature[c] % features)
+        one, two, own = number[p], number[q], feature[c]
+        if own >= features:
+            further, own = own // features, own % features
+            if kind[p] == MESH:
+                one += further
+            else:
+                two += further
+        key[c] = complex(one, two * features + own)
         a[c], b[c] = row[p], row[q]
         body[c, 0], body[c, 1] = index[a[c]], index[b[c]]
         mu[c] = friction[material[a[c]], material[b[c]]]

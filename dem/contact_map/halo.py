@@ -111,6 +111,8 @@ def _free(requests: list[MPI.Prequest]) -> None:
 
 def _pieces(rank: Ints) -> Pieces:
     """The ranks and their parts of a buffer that is sorted by rank, for the ranks (n,) of its rows in any order."""
+    if not len(rank):
+        return []
     ranks, count = np.unique(rank, return_counts=True)
     ends = np.cumsum(count)
     return [(int(rank), slice(int(end - n), int(end))) for rank, n, end in zip(ranks, count, ends)]

@@ -76,11 +76,6 @@ def works(frame, arm, body, g, w, new_w):
     return normal, tangential, velocity
 
 
-def add_momenta(frame, arm, body, g, m) -> None:
-    """m += D g for impulses g (nc, 3)."""
-    add_momenta_of(every(body), frame, arm, body, g, m)
-
-
 def every(body) -> np.ndarray:
     """The indices of all contacts."""
     return np.arange(len(body), dtype=np.uint32)

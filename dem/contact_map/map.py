@@ -16,7 +16,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Floats, Ints
-from dem.compiled import threads
+from dem.compiled import loop, threads
 from dem.contact_map import loops
 from dem.contact_map.halo import Halo, find_halo
 from dem.exchange import refuse
@@ -133,13 +133,9 @@ class ContactMap:
         self._w, self._m = np.zeros((2, halo.rows, 6), precision)
         ghost = np.zeros(halo.rows, bool)
         ghost[halo.ghosts] = True
-        # two halves of the contacts that wait for no other rank, then the other contacts
-        first_away = _first(ghost[body].any(axis=1)) if len(halo.ghosts) else self.rows
-        ends = [0, first_away // 2, first_away, self.rows]
-        pieces = (slice(*pair) for pair in zip(ends, ends[1:]))
-        self._half, self._rest, self._away = ((here, *(x[here] for x in self._arrays)) for here in pieces)
-        self._first_away = first_away
-        self.everything = self.among(np.ones(self.rows, bool))  #: all contacts
+        self._first_away = first_away = first_touching(body, ghost) if len(halo.ghosts) else self.rows
+        every = loops.every(body)
+        self.everything = every[:first_away], every[first_away:]  #: all contacts
         self._flops = 45 * self.rows + 6 * self.columns
 
     # -- products -------------------------------------------------------------------------------------------
@@ -219,12 +215,19 @@ class ContactMap:
     def _add_through(self, weight: Floats) -> None:
         """The momenta G' H G v, not yet scaled by masses, of the velocities that are on their way."""
         self._m[:] = 0.0
-        self._add(loops.add_through, self._half, weight, self._w, self._m)
+        half, rest, away = self._pieces
+        self._add(loops.add_through, half, weight, self._w, self._m)
         self.halo.end_update(self._w)
-        self._add(loops.add_through, self._away, weight, self._w, self._m)
+        self._add(loops.add_through, away, weight, self._w, self._m)
         self.halo.begin_add(self._m)
-        self._add(loops.add_through, self._rest, weight, self._w, self._m)
+        self._add(loops.add_through, rest, weight, self._w, self._m)
         self.halo.end_add(self._m)
+
+    @cached_property
+    def _pieces(self) -> list[tuple[Any, ...]]:
+        """Two halves of the contacts that wait for no other rank, then the other contacts."""
+        ends = [0, self._first_away // 2, self._first_away, self.rows]
+        return [(here, *(x[here] for x in self._arrays)) for here in (slice(*pair) for pair in zip(ends, ends[1:]))]
 
     def relative_velocities(self, v: Floats) -> Floats:
         """D' v (nc, 3) for the velocities (rows, 6) of all rows of a table of the halo, without a message."""
@@ -239,8 +242,7 @@ class ContactMap:
         """D g (rows, 6) of these of this rank's contacts, by rows of a table of the halo, without a message."""
         sums = np.zeros((self.halo.rows, 6))
         g = self._floats(shaped("impulses", g, self.rows, 3))
-        frame, arm, body = (array[contacts] for array in self._arrays)
-        loops.add_momenta(frame, arm, body, g[contacts], sums)
+        loops.add_momenta_of(contacts.astype(np.uint32), *self._arrays, g, sums)
         return sums
 
     def _enter(self, scale: Floats, v: Floats) -> None:
@@ -438,6 +440,10 @@ def _square(root: Floats) -> Floats:
     return packed(blocks @ blocks)
 
 
-def _first(mask: np.ndarray) -> int:
-    """The index of the first True, or the length."""
-    return int(np.argmax(mask)) if mask.any() else len(mask)
+@loop
+def first_touching(body, chosen):
+    """The first contact that touches a ``chosen`` (rows,) body, else how many there are."""
+    for c in range(len(body)):
+        if chosen[body[c, 0]] or chosen[body[c, 1]]:
+            return c
+    return len(body)

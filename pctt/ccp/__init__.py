@@ -2,7 +2,7 @@
 
 >>> from pctt import ccp
 >>> result = ccp.solve(problem)                       # doctest: +SKIP
->>> ccp.measure(problem, result.impulse)              # doctest: +SKIP
+>>> result.accuracy                                   # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -108,7 +108,8 @@ def _by(
     cold = problem.natural_residual(nothing, problem.r, coulomb)
     if cold == 0:
         words = "no contact closes" if problem.size else "no contacts"
-        return Result(nothing, Status.CONVERGED, words, 0.0, 0, solver=name, law=law)
+        accuracy = measure(problem, nothing)
+        return Result(nothing, Status.CONVERGED, words, 0.0, 0, solver=name, law=law, accuracy=accuracy)
     limits = dataclasses.replace(limits, max_it=method.iterations) if limits.max_it < 0 else limits
     own = newton_for(problem.comm, name) if method.newton and newton is None else None
     given = (options or method.options(), *([newton or own] if method.newton else []))
@@ -134,7 +135,8 @@ def _by(
         result.impulse, result.status, result.residual = nothing, Status.BREAKDOWN, cold
     elif unbounded := why_unbounded(problem, result.impulse):
         result.status, result.reason = Status.UNBOUNDED, unbounded
-    elif result.converged and (squeezed := limits.squeezed(problem, result.impulse, coulomb)):
+    result.accuracy = measure(problem, result.impulse)
+    if result.converged and (squeezed := limits.squeezed(result.accuracy, coulomb)):
         result.status, result.reason = Status.SQUEEZED, squeezed
     return result
 

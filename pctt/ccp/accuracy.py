@@ -54,12 +54,13 @@ class Accuracy:
 
 def measure(problem: ConeProblem, g: Array) -> Accuracy:
     """The figures of an impulse g (nc, 3), the same on every rank."""
-    y = problem.product(g) + problem.r
     step = 1.0 / problem.mean_diagonal
     if isinstance(problem, RollingProblem):
-        sums, greatest = _judged_rolling(problem, g, y, step)
+        sums, greatest = _judged_rolling(problem, g, problem.product(g) + problem.r, step)
     else:
-        sums, greatest = _judged(g, y, problem.r, problem.mu, step)
+        rigid, soft = np.zeros_like(problem.r), problem.compliance[: None if problem.yields else 0]
+        problem.operator.add_delassus(g, rigid)
+        sums, greatest = _judged(g, rigid, soft, problem.r, problem.mu, step)
     of_all, (cone, dual, complementarity) = reduced(problem.comm, sums, greatest)
     square, speed, power, pushed, closing, opening, natural, coulomb = of_all
     norm, energy = float(np.sqrt(square)), 0.5 * pushed
@@ -87,14 +88,19 @@ def _part(work: float, energy: float) -> float:
 
 
 @loop
-def _judged(g: Array, y: Array, r: Array, mu: Array, step: float) -> tuple[Array, Array]:
+def _judged(g: Array, rigid: Array, C: Array, r: Array, mu: Array, step: float) -> tuple[Array, Array]:
     """Of impulses g and velocities y = N g + r (nc, 3) the sums (8,) over the contacts: of |g|^2, |y|^2, g.(y + r),
     g.(y - r), the closing and the opening work, |g - P(g - step y)|^2 and the same of Coulomb's law; and the greatest
-    (3,): distances outside the cone and outside the dual one, and |g.y|. Comparisons let a NaN through."""
+    (3,): distances outside the cone and outside the dual one, and |g.y|. Comparisons let a NaN through.
+
+    N g is `rigid`, and C g more, of the diagonal C (nc, 3), or no row of it for zero."""
     sums, greatest = np.zeros(8), np.zeros(3)
     for c in range(len(mu)):
         n, u, v, m = g[c, 0], g[c, 1], g[c, 2], mu[c]
-        y_n, y_u, y_v = y[c, 0], y[c, 1], y[c, 2]
+        y_n, y_u, y_v = rigid[c, 0], rigid[c, 1], rigid[c, 2]
+        if len(C):
+            y_n, y_u, y_v = y_n + C[c, 0] * n, y_u + C[c, 1] * u, y_v + C[c, 2] * v
+        y_n, y_u, y_v = y_n + r[c, 0], y_u + r[c, 1], y_v + r[c, 2]
         along = n * y_n + u * y_u + v * y_v
         free = n * r[c, 0] + u * r[c, 1] + v * r[c, 2]
         slip = np.sqrt(y_u * y_u + y_v * y_v)

@@ -7,7 +7,7 @@ one that is easy costs nothing more.
 
 For Coulomb's law the conic method stalls often, but the path that it follows leads to the neighbourhood of a solution.
 So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path. Problems
-so small that they get dense factors are the exception: there it goes on to the end.
+of few contacts are the exception: there it goes on to the end.
 
 With joints, which the sparse systems of the conic method do not have, it is APGD alone.
 """
@@ -34,14 +34,14 @@ class Auto:
     """Settings of `auto`."""
 
     patience: float = number(25.0, "APGD's iterations per digit of the tolerance and cube root of the contacts")
-    few: float = number(12.0, "the same of problems that get dense factors: all of `conic` costs 7 to 30 there")
+    few: float = number(6.0, "APGD's iterations per digit where contacts are few (`pctt.ccp.newton.few`): 1/2 `conic`")
     law: float = number(5.0, "factor on it for Coulomb's law: more systems, and unsymmetric; docs/notebook_ccp.md")
     start: float = number(3e4, "complementarity of the conic method's start, at most, by APGD's residual")
     basin: float = number(3e-4, "Coulomb residual at which the conic method's path is near enough for APGD")
 
     def iterations(self, contacts: int, tol: float, coulomb: bool, few: bool = False) -> int:
-        """Those of APGD. Small problems have fixed costs, except where they are ``few`` enough for dense factors."""
-        per_digit = self.few * np.cbrt(contacts) if few else self.patience * np.cbrt(max(contacts, 400))
+        """Those of APGD. Small problems have fixed costs; where they are ``few`` those of both methods are calls."""
+        per_digit = self.few if few else self.patience * np.cbrt(max(contacts, 400))
         per_digit *= self.law if coulomb else 1.0
         return int(-np.log10(tol) * per_digit)
 
@@ -60,19 +60,19 @@ def solve(
         return result
 
     alone = problem.contact_map is not None and not problem.contact_map.has_rows  # apgd takes it alone
-    dense = not alone and newton.has_few(problem)
-    most = limits.max_it if alone else options.iterations(problem.size, limits.tol, coulomb, dense)
-    few = min(limits.max_it, problem.comm.bcast(most))
-    last = first = attempt(apgd, guess, replace(limits, max_it=few), apgd.APGD())
-    if not first.final and few < limits.max_it:
+    few = not alone and newton.has_few(problem)
+    most = limits.max_it if alone else options.iterations(problem.size, limits.tol, coulomb, few)
+    begun = min(limits.max_it, problem.comm.bcast(most))
+    last = first = attempt(apgd, guess, replace(limits, max_it=begun), apgd.APGD())
+    if not first.final and begun < limits.max_it:
         inner, settings, begin = replace(limits, max_it=min(60, limits.max_it)), conic.Conic(), guess
         if not coulomb:
             settings = conic.Conic(start=min(settings.start, options.start * first.residual))
             begin = first.impulse
-        elif not dense:
+        elif not few:
             inner = replace(inner, tol=max(limits.tol, options.basin), closing_work=np.inf)
         last = second = attempt(conic, begin, inner, settings, newton)
-        if coulomb and not (dense and second.final):
+        if coulomb and not (few and second.final):
             last = attempt(apgd, second.impulse if second.iterations else first.impulse, limits, apgd.APGD())
         last.reason = "; ".join(f"{result.solver}: {result.reason}" for result in tried)
     return last.after(*tried[:-1])

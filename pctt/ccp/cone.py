@@ -65,20 +65,22 @@ def not_idle(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDAr
 
 
 @loop
-def squared_moves(x: Array, y: Array, step: float, mu: Array, de_saxce: float) -> Array:
-    """|P(x - step y) - x|^2 (nc,), where y gets the term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1; zero below
-    the rounding of step y: a contact that slides has 0 = P(-step y) only up to that. A pass over the memory;
+def squared_move(x: Array, y: Array, step: float, mu: Array, de_saxce: float) -> float:
+    """The sum of |P(x - step y) - x|^2, where y gets the term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1; zero
+    below the rounding of step y: a contact that slides has 0 = P(-step y) only up to that. A pass over the memory;
     `FrictionCones.move` takes several."""
-    out = np.empty(len(mu))
+    sums = np.zeros((len(mu) + STRIP - 1) // STRIP)
     x, y = x.ravel(), y.ravel()
-    for c in range(len(mu)):
-        i = 3 * c
-        m, u, v = mu[c], y[i + 1], y[i + 2]
-        w = y[i] + de_saxce * m * np.sqrt(u * u + v * v)
-        n, t_1, t_2 = _nearest(x[i] - step * w, x[i + 1] - step * u, x[i + 2] - step * v, m)
-        square = (n - x[i]) ** 2 + (t_1 - x[i + 1]) ** 2 + (t_2 - x[i + 2]) ** 2
-        out[c] = 0.0 if square <= NO_MOVE * (step * step) * (y[i] * y[i] + u * u + v * v) else square
-    return out
+    for k in range(len(sums)):
+        for c in range(k * STRIP, min(k * STRIP + STRIP, len(mu))):
+            i = 3 * c
+            m, u, v = mu[c], y[i + 1], y[i + 2]
+            w = y[i] + de_saxce * m * np.sqrt(u * u + v * v)
+            n, t_1, t_2 = _nearest(x[i] - step * w, x[i + 1] - step * u, x[i + 2] - step * v, m)
+            square = (n - x[i]) ** 2 + (t_1 - x[i + 1]) ** 2 + (t_2 - x[i + 2]) ** 2
+            if not square <= NO_MOVE * (step * step) * (y[i] * y[i] + u * u + v * v):
+                sums[k] += square
+    return sums.sum()
 
 
 @loop
@@ -230,7 +232,7 @@ def step_to_boundary(x: Array, dx: Array, mu: Array) -> float:
 @loop
 def step_inside(x: Array, dx: Array) -> float:
     """`step_to_boundary` in the cones of friction 1, for an x that rounding may have put on the boundary: there it is
-    not zero.
+    not zero. It is zero where dx is no number.
 
     By the smallest spectral value of dx seen from x (Vandenberghe, "The CVXOPT linear and quadratic cone program
     solvers", 2010)."""
@@ -245,8 +247,8 @@ def step_inside(x: Array, dx: Array) -> float:
         speed = (np.sqrt(turned_1 * turned_1 + turned_2 * turned_2) - inner) / size
         if not speed <= fastest:
             fastest = speed
-            if speed != speed:  # no other is larger
-                break
+            if speed != speed:
+                return 0.0
     return 1.0 / fastest if fastest > 0 else np.inf
 
 
@@ -302,14 +304,95 @@ def nesterov_todd(root: Array, size: Array, x: Array, inverse: bool) -> Array:
     """W x (nc, 3) for the W of `scaling`, or W^-1 x."""
     out = np.empty(x.shape)
     for c in range(len(x)):
-        first, u, v, eta = root[c, 0], root[c, 1], root[c, 2], size[c]
-        if inverse:
-            u, v, eta = -u, -v, 1.0 / eta
-        along = 2.0 * (first * x[c, 0] + u * x[c, 1] + v * x[c, 2])
-        out[c, 0] = (along * first - x[c, 0]) * eta
-        out[c, 1] = (along * u + x[c, 1]) * eta
-        out[c, 2] = (along * v + x[c, 2]) * eta
+        out[c, 0], out[c, 1], out[c, 2] = _scaled(root, size, c, x, inverse)
     return out
+
+
+@loop
+def pulls(root: Array, size: Array, s: Array, z: Array, u: Array, w: Array) -> tuple[Array, Array]:
+    """T^-1 (W^-1 w - z) and W w - s (nc, 3); u (nc, 3) is the direction of sliding in T = 1 + e u'."""
+    out, other = np.empty(s.shape), np.empty(s.shape)
+    for c in range(len(s)):
+        n, t_1, t_2 = _scaled(root, size, c, w, True)
+        n, t_1, t_2 = n - z[c, 0], t_1 - z[c, 1], t_2 - z[c, 2]
+        out[c, 0], out[c, 1], out[c, 2] = n - (u[c, 1] * t_1 + u[c, 2] * t_2), t_1, t_2
+        n, t_1, t_2 = _scaled(root, size, c, w, False)
+        other[c, 0], other[c, 1], other[c, 2] = n - s[c, 0], t_1 - s[c, 1], t_2 - s[c, 2]
+    return out, other
+
+
+@loop
+def less_inverse_squares(root: Array, size: Array, u: Array, x: Array, y: Array) -> Array:
+    """x - T^-1 W^-2 y (nc, 3), with the T of `pulls`."""
+    out = np.empty(x.shape)
+    for c in range(len(x)):
+        out[c, 0], out[c, 1], out[c, 2] = _scaled(root, size, c, y, True)
+        n, t_1, t_2 = _scaled(root, size, c, out, True)
+        out[c, 0] = x[c, 0] - (n - (u[c, 1] * t_1 + u[c, 2] * t_2))
+        out[c, 1], out[c, 2] = x[c, 1] - t_1, x[c, 2] - t_2
+    return out
+
+
+@loop
+def centring(root: Array, size: Array, z: Array, ds: Array, dz: Array, target: float) -> Array:
+    """The w (nc, 3) with W z o w = target e - W^-1 ds o W dz."""
+    out = np.empty(z.shape)
+    for c in range(len(z)):
+        p, q = _scaled(root, size, c, ds, True), _scaled(root, size, c, dz, False)
+        n, t_1, t_2 = _jordan(p[0], p[1], p[2], q[0], q[1], q[2])
+        x = _scaled(root, size, c, z, False)
+        out[c, 0], out[c, 1], out[c, 2] = _jordan_divide(x[0], x[1], x[2], target - n, -t_1, -t_2)
+    return out
+
+
+@loop
+def towards_path(
+    root: Array, size: Array, z: Array, ds: Array, dz: Array, reach: float, low: float, high: float
+) -> Array:
+    """The w (nc, 3) with W z o w = d: the d that moves the spectral values of (W z + reach W^-1 ds) o (W z + reach W
+    dz) into [low, high], but none by more than ``high`` downwards."""
+    out = np.empty(z.shape)
+    for c in range(len(z)):
+        x, p, q = _scaled(root, size, c, z, False), _scaled(root, size, c, ds, True), _scaled(root, size, c, dz, False)
+        n, t_1, t_2 = _jordan(
+            x[0] + reach * p[0], x[1] + reach * p[1], x[2] + reach * p[2],
+            x[0] + reach * q[0], x[1] + reach * q[1], x[2] + reach * q[2],
+        )  # fmt: skip
+        length = np.sqrt(t_1 * t_1 + t_2 * t_2)
+        more, less = _into(n + length, low, high), _into(n - length, low, high)
+        turn = 0.5 * (more - less) / max(length, TINY)
+        n, t_1, t_2 = 0.5 * (more + less), turn * t_1, turn * t_2
+        out[c, 0], out[c, 1], out[c, 2] = _jordan_divide(x[0], x[1], x[2], n, t_1, t_2)
+    return out
+
+
+@inlined
+def _into(value, low, high):
+    move = min(max(value, low), high) - value
+    return -high if move < -high else move
+
+
+@inlined
+def _scaled(root, size, c, x, inverse):
+    """W x of a contact, or W^-1 x."""
+    first, u, v, eta = root[c, 0], root[c, 1], root[c, 2], size[c]
+    if inverse:
+        u, v, eta = -u, -v, 1.0 / eta
+    along = 2.0 * (first * x[c, 0] + u * x[c, 1] + v * x[c, 2])
+    return (along * first - x[c, 0]) * eta, (along * u + x[c, 1]) * eta, (along * v + x[c, 2]) * eta
+
+
+@inlined
+def _jordan(x_0, x_1, x_2, y_0, y_1, y_2):
+    """x o y."""
+    return x_0 * y_0 + x_1 * y_1 + x_2 * y_2, x_0 * y_1 + y_0 * x_1, x_0 * y_2 + y_0 * x_2
+
+
+@inlined
+def _jordan_divide(x_0, x_1, x_2, y_0, y_1, y_2):
+    """The w with x o w = y; x inside the cone."""
+    first = (x_0 * y_0 - x_1 * y_1 - x_2 * y_2) / _determinant(x_0, x_1, x_2)
+    return first, (y_1 - first * x_1) / x_0, (y_2 - first * x_2) / x_0
 
 
 @inlined
@@ -412,7 +495,7 @@ class FrictionCones:
 
     def squared_move(self, x: Array, y: Array, step: float, coulomb: bool) -> float:
         """||`move`||^2 of this rank's contacts."""
-        return float(squared_moves(x, y, step, self.mu, float(coulomb)).sum())
+        return squared_move(x, y, step, self.mu, float(coulomb))
 
     def wrong_works(self, g: Array, y: Array, r: Array) -> tuple[float, float, float]:
         """Closing work, opening work and 1/2 g.(y - r) of this rank's contacts; see `ConeProblem.wrong_work`."""
@@ -427,23 +510,9 @@ class FrictionCones:
 # -- the cone of friction 1 -----------------------------------------------------------------------------------
 
 
-def jordan_product(x: Array, y: Array) -> Array:
-    """x o y (nc, 3)."""
-    out = x[:, :1] * y + y[:, :1] * x
-    out[:, 0] = dot(x, y)
-    return out
-
-
-def jordan_divide(x: Array, y: Array) -> Array:
-    """The w (nc, 3) with x o w = y; x inside the cones."""
-    first = (x[:, 0] * y[:, 0] - x[:, 1] * y[:, 1] - x[:, 2] * y[:, 2]) / determinant(x)
-    out = (y - first[:, None] * x) / x[:, :1]
-    out[:, 0] = first
-    return out
-
-
 class NesterovTodd(NamedTuple):
-    """The scaling W = eta (2 root root' - J), J = diag(1, -1, -1), of pairs: ``root`` (nc, 3), ``eta`` (nc,).
+    """The scaling W = eta (2 root root' - J), J = diag(1, -1, -1), of pairs: ``root`` (nc, 3), ``eta`` (nc,), as
+    `scaling` has them.
 
     Products by this form. Those by blocks lose a digit of the residual that the conic method reaches."""
 
@@ -459,28 +528,25 @@ class NesterovTodd(NamedTuple):
         return nesterov_todd(self.root, self.eta, x, True)
 
 
-def towards_interval(x: Array, low: float, high: float) -> Array:
-    """What moves the spectral values of x into [low, high], but none by more than ``high`` downwards."""
-    size = tangential(x)
-    values = x[:, 0] + np.stack([size, -size])
-    return _of_spectrum(x, *np.maximum(np.clip(values, low, high) - values, -high))
-
-
+@loop
 def central_pair(x: Array, tau: Array, complementarity: float) -> tuple[Array, Array]:
     """The pair (s, z) inside the cones with s - tau z = x and s o z = complementarity e; tau (nc,).
 
     In the spectral values l of x: s = (l + root(l^2 + 4 complementarity tau)) / 2, and z likewise of -l."""
-    size, room = tangential(x), 4.0 * complementarity * tau
-    values = x[:, 0] + np.stack([size, -size])
-    root = np.sqrt(values**2 + room)
-    larger = 0.5 * (np.abs(values) + root)
-    smaller = 0.25 * room / larger  # the product of both is room / 4; their difference would cancel
-    s, z = np.where(values > 0, larger, smaller), np.where(values > 0, smaller, larger)
-    return _of_spectrum(x, *s), _of_spectrum(-x, *z[::-1]) / tau[:, None]
+    s, z = np.empty(x.shape), np.empty(x.shape)
+    for c in range(len(x)):
+        size = np.sqrt(x[c, 1] * x[c, 1] + x[c, 2] * x[c, 2])
+        high, of_high = _central(x[c, 0] + size, 4.0 * complementarity * tau[c])
+        low, of_low = _central(x[c, 0] - size, 4.0 * complementarity * tau[c])
+        turn, back = 0.5 * (high - low) / max(size, TINY), 0.5 * (of_high - of_low) / max(size, TINY) / tau[c]
+        s[c, 0], s[c, 1], s[c, 2] = 0.5 * (high + low), turn * x[c, 1], turn * x[c, 2]
+        z[c, 0], z[c, 1], z[c, 2] = 0.5 * (of_high + of_low) / tau[c], back * x[c, 1], back * x[c, 2]
+    return s, z
 
 
-def _of_spectrum(x: Array, high: Array, low: Array) -> Array:
-    """The points (nc, 3) in the directions of x with other spectral values."""
-    out = (0.5 * (high - low) / np.maximum(tangential(x), TINY))[:, None] * x
-    out[:, 0] = 0.5 * (high + low)
-    return out
+@inlined
+def _central(value, room):
+    """Two positive numbers whose difference is the value and whose product is room / 4."""
+    larger = 0.5 * (abs(value) + np.sqrt(value * value + room))
+    smaller = 0.25 * room / larger  # their difference would cancel
+    return (larger, smaller) if value > 0 else (smaller, larger)

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.compiled import loop
 from dem.contact_map import BlockRows, ContactMap, Halo, find_halo, loops
 from dem.contact_map.map import Some, checked, shaped
 from dem.exchange import exchange, offsets
@@ -35,27 +37,40 @@ def rows_in_blocks(N: PETSc.Mat) -> sp.bsr_matrix:
 
 class GivenMatrix:
     """N itself, of a problem that knows no bodies, with the members of `ContactMap` that it can have: impulses take the
-    place of momenta, and N g that of the velocities of contacts; an image has both, of all contacts. A copy in 3 x 3
-    blocks (BAIJ) of a Mat of type AIJ, BAIJ, SBAIJ or dense. ValueError on all ranks if it has a NaN or an infinite
-    number."""
+    place of momenta, and N g that of the velocities of contacts; an image has both, of all contacts.
+
+    local : this rank's rows in 3 x 3 blocks, their columns global. Of a Mat of type AIJ, BAIJ, SBAIJ or dense they are
+        a copy. ValueError on all ranks if they have a NaN or an infinite number
+    """
 
     everything: Some = (np.zeros(0, np.uint32), np.zeros(0, np.uint32))
 
-    def __init__(self, comm: MPI.Comm, N: PETSc.Mat):
-        rows = rows_in_blocks(N)
-        if comm.allreduce(not np.isfinite(rows.data).all(), MPI.LOR):
+    def __init__(self, comm: MPI.Comm, N: PETSc.Mat | sp.bsr_matrix):
+        self.local: sp.bsr_matrix = N if isinstance(N, sp.bsr_matrix) else rows_in_blocks(N)
+        if comm.allreduce(not np.isfinite(self.local.data).all(), MPI.LOR):
             raise ValueError("N has a NaN or an infinite number")
-        self.rows, self._first = len(rows.indptr) - 1, N.getOwnershipRange()[0] // 3
-        self._local: sp.bsr_matrix = rows
-        self._size: Array | float = 1.0
-        self.mat = square_block_matrix(comm, rows)
-        self._in, self._out = self.mat.createVecs()
+        self.comm, self.rows = comm, len(self.local.indptr) - 1
+        self._first = offsets(comm, self.rows)[comm.rank]
+        self._size: Array | None = None
+
+    @cached_property
+    def mat(self) -> PETSc.Mat:
+        """N as a Mat (BAIJ), built at its first use and kept; collective."""
+        return square_block_matrix(self.comm, self.local)
+
+    @cached_property
+    def _vectors(self) -> tuple[PETSc.Vec, PETSc.Vec]:
+        return self.mat.createVecs()
 
     def velocities(self, g: Array) -> Array:
         """N g (nc, 3)."""
-        self._in.array[:] = shaped("impulses", g, self.rows, 3).ravel()
-        self.mat.mult(self._in, self._out)
-        return self._out.array.reshape(-1, 3).copy()
+        g = shaped("impulses", g, self.rows, 3)
+        if self.comm.size == 1:
+            return _product(self.local.indptr, self.local.indices, self.local.data, np.ascontiguousarray(g, float))
+        g_of_mat, y = self._vectors
+        g_of_mat.array[:] = g.ravel()
+        self.mat.mult(g_of_mat, y)
+        return y.array.reshape(-1, 3).copy()
 
     def momenta(self, g: Array) -> Array:
         """g (nc, 3)."""
@@ -63,17 +78,20 @@ class GivenMatrix:
 
     def add_delassus(self, g: Array, y: Array) -> None:
         """y += N g; y (nc, 3)."""
-        y += self._size * self.velocities(self._size * g)
+        y += self._scaled_product(g)
+
+    def _scaled_product(self, g: Array) -> Array:
+        return self.velocities(g) if self._size is None else self._size * self.velocities(self._size * g)
 
     def image(self) -> Array:
         """Memory for the image (nc, 6) of impulses: x and N x."""
-        return np.zeros((self.rows, 6), np.asarray(self._size).dtype)
+        return np.zeros((self.rows, 6), float if self._size is None else self._size.dtype)
 
     def among(self, chosen: np.ndarray) -> Some:
         return self.everything
 
     def find_image(self, x: Array, image: Array, some: Some) -> None:
-        image[:, :3], image[:, 3:] = x, self._size * self.velocities(self._size * x)
+        image[:, :3], image[:, 3:] = x, self._scaled_product(x)
 
     def find_velocities(self, image: Array, last: Array, beta: float, before: Array, y: Array, some: Some) -> None:
         y[:] = before + (image + beta * (image - last))[:, 3:]
@@ -84,10 +102,10 @@ class GivenMatrix:
 
     def contact_blocks(self) -> Array:
         """The diagonal blocks of N (nc, 3, 3)."""
-        row = np.repeat(np.arange(self.rows), np.diff(self._local.indptr))
-        near = self._first + row == self._local.indices
+        row = np.repeat(np.arange(self.rows), np.diff(self.local.indptr))
+        near = self._first + row == self.local.indices
         out = np.zeros((self.rows, 3, 3))
-        out[row[near]] = self._local.data[near]
+        out[row[near]] = self.local.data[near]
         return out
 
     def scaled(self, size: Array, precision: type[np.floating] = np.float64) -> GivenMatrix:
@@ -99,11 +117,12 @@ class GivenMatrix:
 
     def structure(self) -> tuple[np.ndarray, ...]:
         """Arrays of this rank that are equal where the places of the blocks are."""
-        return self._local.indptr, self._local.indices
+        return self.local.indptr, self.local.indices
 
     def destroy(self) -> None:
-        for thing in (self.mat, self._in, self._out):
-            thing.destroy()
+        for thing in (*self.__dict__.pop("_vectors", ()), self.__dict__.pop("mat", None)):
+            if thing is not None:
+                thing.destroy()
 
 
 class BlockMap(ContactMap):
@@ -247,6 +266,61 @@ def delassus(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
         data = _sums(place, parts["block"], len(row))
         N = sp.bsr_matrix((data, columns, np.searchsorted(row, np.arange(G.rows + 1))), shape=(3 * G.rows, 3 * total))
     return square_block_matrix(comm, sp.bsr_matrix((N.data, columns, N.indptr), shape=(3 * G.rows, 3 * total)))
+
+
+def all_blocks(G: BlockRows) -> sp.bsr_matrix:
+    """N = G G' of a problem on one rank, hubs included."""
+    indptr, indices, blocks = _all_blocks(G.indptr, G.indices, np.ascontiguousarray(G.blocks), G.columns)
+    return sp.bsr_matrix((blocks, indices, indptr), shape=(3 * G.rows,) * 2)
+
+
+@loop
+def _all_blocks(indptr, indices, blocks, columns):
+    count, start = len(indptr) - 1, np.zeros(columns + 1, np.int64)
+    for body in indices:
+        start[body + 1] += 1
+    start = np.cumsum(start)
+    end, contact, place = start[:-1].copy(), np.empty(len(indices), np.int64), np.empty(len(indices), np.int64)
+    for c in range(count):
+        for p in range(indptr[c], indptr[c + 1]):
+            k = end[indices[p]]
+            contact[k], place[k], end[indices[p]] = c, p, k + 1
+    found = 0
+    for k in range(columns):
+        found += (start[k + 1] - start[k]) ** 2
+    where, starts = np.full(count, -1, np.int64), np.zeros(count + 1, np.int32)
+    near, out = np.empty(found + count, np.int32), np.zeros((found + count, 3, 3))
+    for c in range(count):
+        first = last = starts[c]
+        where[c], near[last] = last, c  # a contact without bodies in G needs a block too
+        last += 1
+        for p in range(indptr[c], indptr[c + 1]):
+            for k in range(start[indices[p]], start[indices[p] + 1]):
+                other, q = contact[k], place[k]
+                if where[other] < first:
+                    where[other], near[last] = last, other
+                    last += 1
+                for i in range(3):
+                    for j in range(3):
+                        for m in range(6):
+                            out[where[other], i, j] += blocks[p, i, m] * blocks[q, j, m]
+        starts[c + 1] = last
+    return starts, near[:last].copy(), out[:last].copy()
+
+
+@loop
+def _product(indptr, indices, blocks, x):
+    """Of block rows with the numbers x (nc, 3) of all contacts."""
+    y = np.empty((len(indptr) - 1, 3))
+    for c in range(len(y)):
+        u, v, w = 0.0, 0.0, 0.0
+        for p in range(indptr[c], indptr[c + 1]):
+            i = indices[p]
+            u += blocks[p, 0, 0] * x[i, 0] + blocks[p, 0, 1] * x[i, 1] + blocks[p, 0, 2] * x[i, 2]
+            v += blocks[p, 1, 0] * x[i, 0] + blocks[p, 1, 1] * x[i, 1] + blocks[p, 1, 2] * x[i, 2]
+            w += blocks[p, 2, 0] * x[i, 0] + blocks[p, 2, 1] * x[i, 1] + blocks[p, 2, 2] * x[i, 2]
+        y[c, 0], y[c, 1], y[c, 2] = u, v, w
+    return y
 
 
 def _sums(row: np.ndarray, blocks: Array, count: int) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from functools import cached_property
 from typing import Union
 
@@ -9,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.compiled import loop
 from dem.contact_map import BlockRows, CompactRows, ContactMap
 from dem.exchange import refuse
 from pctt.ccp.cone import Array, FrictionCones
@@ -36,6 +39,7 @@ class ConeProblem:
     yields : whether C is not zero, the same on all ranks
     cones : those of the contacts of this rank
     size : contacts on all ranks, Nc
+    mean_diagonal : mean of the diagonal of N without compliance (1/kg); 1 for a problem without contacts
     """
 
     def __init__(
@@ -60,15 +64,21 @@ class ConeProblem:
         self.cones = self._cones()
         self.contact_map = None if G is None else _map(comm, G)
         self.operator: ContactMap | GivenMatrix = self.contact_map or GivenMatrix(comm, N)
-        bad = _not_finite(self.r) + np.sum(~((self.mu >= 0) & (self.mu < np.inf)))
-        # the diagonal blocks have squares of all numbers of G
-        here = np.array([bad, _not_finite(self._rigid_blocks), self.cones.count, self.compliance.any()], np.int64)
-        bad, wrong, self.size, soft = self.sum(here).tolist()
+        bad = _not_finite(self.r)
+        if not _none_negative(self.mu):
+            bad += int(np.sum(~((self.mu >= 0) & (self.mu < np.inf))))
+        trace = np.einsum("cii->", self._rigid_blocks)  # has squares of all numbers of G
+        known = self.contact_map is not None and np.isfinite(trace)
+        wrong = 0 if known else _not_finite(self._rigid_blocks)
+        here = np.array([bad, wrong, self.cones.count, self.compliance.max(initial=0.0) > 0.0, self.r.size, trace])
+        *counts, trace = self.sum(here).tolist()
+        bad, wrong, self.size, soft, rows = map(int, counts)
         if bad or wrong:
             self.destroy()
             what = f"{bad} contacts with a" if bad else f"G has a NaN or an infinite number in {wrong} contacts"
             raise ValueError(f"{what} NaN, infinite or negative coefficient" if bad else what)
         self.yields = bool(soft)
+        self.mean_diagonal = trace / rows if trace > 0.0 else 1.0
 
     def __repr__(self) -> str:
         given = "N" if self.contact_map is None else "G"
@@ -96,17 +106,16 @@ class ConeProblem:
         """G v: velocities of the contacts (nc, 3) for those of the bodies; N g where the problem is given by N."""
         return self.operator.velocities(momentum)
 
-    @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
     def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
         """||g - P(g - y / mean diag N)|| / ||g||, velocities y = N g + r: the stop test of every solver. For Coulomb's
         law y gets De Saxce's term.
 
         inf if that is undefined: for g = 0, unless it solves the problem, and if g or y has a nan or inf."""
         square = self.cones.squared_move(g, y, 1.0 / self.mean_diagonal, coulomb)
-        distance, norm = np.sqrt(self.sum(np.array([square, np.vdot(g, g)])))
-        if distance == 0:
+        moved, whole = self.sum(np.array([square, np.vdot(g, g)])).tolist()
+        if moved == 0:
             return 0.0
-        residual = float(distance / norm) if norm > 0 else np.inf
+        residual = math.sqrt(moved) / math.sqrt(whole) if whole > 0 else math.inf
         return residual if residual == residual else np.inf
 
     @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
@@ -154,7 +163,7 @@ class ConeProblem:
             blocks[:, k, k] += self.compliance[:, k]
         return blocks
 
-    @property
+    @cached_property
     def diagonal(self) -> Array:
         """The diagonal of N (nc, 3), hubs and the compliance included."""
         return np.einsum("cii->ci", self._rigid_blocks) + self.compliance
@@ -179,11 +188,11 @@ class ConeProblem:
         normal = self.compliance[: self.cones.count, 0]
         return self.yields and self.min(normal.min(initial=np.inf)) > 0.0
 
-    @cached_property
-    def mean_diagonal(self) -> float:
-        """Mean of the diagonal of N without compliance (1/kg); 1 for a problem without contacts."""
-        trace, rows = self.sum(np.array([np.einsum("cii->", self._rigid_blocks), self.r.size]))
-        return float(trace / rows) if trace > 0 else 1.0
+    def by_matrix(self, N: GivenMatrix) -> ConeProblem:
+        """The same problem given by its N without compliance; it shares all arrays."""
+        other = copy.copy(self)
+        other.contact_map, other.operator = None, N
+        return other
 
     # -- reductions over all contacts -----------------------------------------------------------------------
 
@@ -228,11 +237,19 @@ class ConeProblem:
 
 def compliances(compliance: Array | float, contacts: int) -> Array:
     """The diagonal of C (nc, 3), of so many contacts, from what a `ConeProblem` takes as the compliance."""
-    out, given = np.zeros((contacts, 3)), np.asarray(compliance, dtype=float)
+    given = np.asarray(compliance, dtype=float)
     if given.ndim == 2:
-        out[:] = given[:, [0, 1, 1]]
-    else:
-        out[:, 0] = given
+        return _with_both_tangents(np.ascontiguousarray(given))
+    out = np.zeros((contacts, 3))
+    out[:, 0] = given
+    return out
+
+
+@loop
+def _with_both_tangents(given: Array) -> Array:
+    out = np.empty((len(given), 3))
+    for c in range(len(given)):
+        out[c, 0], out[c, 1], out[c, 2] = given[c, 0], given[c, 1], given[c, 1]
     return out
 
 
@@ -241,6 +258,11 @@ def _not_finite(array: Array) -> int:
     if np.isfinite(array.sum()):  # so are all its numbers
         return 0
     return int((~np.isfinite(array).reshape(len(array), -1).all(axis=1)).sum())
+
+
+def _none_negative(array: Array) -> bool:
+    """Whether all numbers are finite and >= 0."""
+    return bool(array.min(initial=0.0) >= 0.0 and array.max(initial=0.0) < np.inf)
 
 
 def _map(comm: MPI.Comm, G: Given) -> ContactMap:
@@ -277,6 +299,6 @@ def _wrong(
             return f"{name} has the shape {np.shape(given)}; allowed is {(nc, *width)}"
     if np.shape(compliance) not in ((), (nc,), (nc, 2)):
         return f"compliance has the shape {np.shape(compliance)}; allowed are {(nc,)}, {(nc, 2)}, or a number"
-    if not (np.isfinite(compliance).all() and (np.asarray(compliance) >= 0.0).all()):
+    if not _none_negative(np.asarray(compliance)):
         return "compliance: allowed are numbers >= 0"
     return ""

@@ -6,12 +6,16 @@ import dataclasses
 import math
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.options import FRACTION, option
+
+if TYPE_CHECKING:
+    from pctt.ccp.accuracy import Accuracy
 
 #: The laws of contact, and how a law is named that a sequence of cone problems has found.
 RELAXATION, COULOMB, FIXED_POINT = "relaxation", "coulomb", "coulomb by cone problems"
@@ -46,13 +50,11 @@ class Limits:
         work = self.tol / self.closing_work * problem.wrong_work(g, y)
         return min(max(natural, work), ENOUGH * natural)
 
-    def squeezed(self, problem: ConeProblem, g: Array, coulomb: bool) -> str:
-        """The reason, in words, if impulses g (nc, 3) meet the limits although their closing or opening work is above
-        its own; else "". One product with N."""
-        if math.isinf(self.closing_work):
-            return ""
-        y = problem.product(g) + problem.r
-        work, natural = problem.wrong_work(g, y), problem.natural_residual(g, y, coulomb)
+    def squeezed(self, found: Accuracy, coulomb: bool) -> str:
+        """The reason, in words, if impulses of this accuracy meet the limits although their closing or opening work is
+        above its own; else ""."""
+        work = max(found.closing_work, found.opening_work)
+        natural = found.coulomb_residual if coulomb else found.natural_residual
         if work <= self.closing_work or ENOUGH * natural > self.tol:
             return ""
         return (
@@ -102,7 +104,8 @@ class Result:
     solver : name of the method that found the impulses
     newton_its : the Newton steps among the iterations
     law : RELAXATION, COULOMB or FIXED_POINT: the law of the impulses and of the residuals
-    momentum : (6m,) G' g, or g where the problem is given by N
+    accuracy : the figures of the impulses; set by `pctt.ccp.solve`
+    momentum : (6m,) G' g, or g where the problem is given by N; set by `pctt.ccp.solve`
     asked : what the asked method made of it, where another one had to follow; else None
     """
 
@@ -118,6 +121,7 @@ class Result:
     solver: str = ""
     newton_its: int = 0
     law: str = RELAXATION
+    accuracy: Accuracy | None = None
     momentum: Array = field(default_factory=lambda: np.zeros(0))
     asked: Result | None = None
 

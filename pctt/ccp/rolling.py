@@ -72,6 +72,7 @@ class RollingCones(FrictionCones):
     def project(self, x: Array, out: Array) -> Array:
         return project_to(x, self.mu, self.spinning, out)
 
+    @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
     def squared_move(self, x: Array, y: Array, step: float, coulomb: bool) -> float:
         both = self.move(x, y, step, coulomb), step * y
         move, speed = (np.square(z).sum(axis=1).reshape(2, -1).sum(axis=0) for z in both)

@@ -6,18 +6,21 @@ held by friction between them. The natural residual does not show it: it falls l
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from dem.compiled import loop
 from dem.contact_map import find_halo
 from dem.contact_map.cell import CellMap
 from dem.contact_map.jointed import JointedMap
-from pctt.ccp.cone import Array, dot
+from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 
 
-def why_unbounded(problem: ConeProblem, g: Array) -> str:
+def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str:
     """The reason, in words, if the direction d = g / ||g|| of impulses g (nc, 3) in the cones shows that the problem is
-    unbounded; else "". At most one product with N.
+    unbounded; else "". At most one product with N, none if the caller has their velocities y = N g + r.
 
     A solution has velocities y = G v + r in the dual cones, so that d.y >= 0 and ||v|| >= -r.d / ||G'd||. In an
     unbounded problem impulses grow along a d with G'd = 0 and r.d < 0, and this bound is infinite. The problem counts
@@ -31,18 +34,14 @@ def why_unbounded(problem: ConeProblem, g: Array) -> str:
     """
     if problem.all_yield:
         return ""
-    r = problem.r.copy()
-    r[problem.mu == 0, 1:] = 0.0  # sliding that no impulse answers
-    sizes, speeds = np.sqrt(dot(g, g)), dot(r, r)
-    share = np.maximum(sizes / max(problem.max(sizes.max(initial=0.0)), 1e-300), 1e-6)
-    alone = problem.diagonal.sum(axis=1) @ dot(g, g) / 3.0
-    parts = (np.vdot(r, g), share @ speeds, np.vdot(problem.compliance, g**2), sizes @ sizes, alone)
-    along, closing, yielding, length, alone = problem.sum(np.array(parts))
-    size, speed = np.sqrt(length), np.sqrt(closing)
+    largest = problem.max(_largest(g))
+    parts = _parts(g, problem.r, problem.mu, problem.compliance, problem.diagonal, max(largest, 1e-300))
+    along, closing, yielding, length, alone = problem.sum(np.array(parts)).tolist()
+    size, speed = math.sqrt(length), math.sqrt(closing)
     bound = (along / (1e3 * size * speed)) ** 2 if along < 0 < size * speed else 0.0
     if not bound > max(yielding / alone if alone > 0 else 0.0, 1e-15):  # a part of d'Nd, and its rounding
         return ""
-    if alone > 0 and not bound > problem.dot(problem.product(g), g) / alone:
+    if alone > 0 and not bound > problem.dot(problem.product(g) if y is None else y - problem.r, g) / alone:
         return ""
     if problem.contact_map is not None and not bound > _left_over(problem, g / size):
         return ""
@@ -61,3 +60,33 @@ def _left_over(problem: ConeProblem, d: Array) -> float:
     size = each[: G.columns]
     momentum = np.square(problem.momentum(d).reshape(-1, 6)[: G.columns]).sum(axis=1)
     return float(problem.sum(np.divide(momentum, size, out=np.zeros(len(size)), where=size > 0).sum()))
+
+
+@loop
+def _largest(g):
+    """The largest squared size of the rows."""
+    largest = 0.0
+    for c in range(len(g)):
+        square = g[c, 0] * g[c, 0] + g[c, 1] * g[c, 1] + g[c, 2] * g[c, 2]
+        largest = square if not square <= largest else largest
+    return largest
+
+
+@loop
+def _parts(g, r, mu, compliance, diagonal, largest):
+    """The sums of `why_unbounded` over the rows of this rank: r'g; ||r||^2 of what impulses answer, by the shares of
+    the rows in g; g'Cg; g'g; and g'g by the means of the diagonal."""
+    along, closing, yielding, length, alone = 0.0, 0.0, 0.0, 0.0, 0.0
+    for c in range(len(g)):
+        square = g[c, 0] * g[c, 0] + g[c, 1] * g[c, 1] + g[c, 2] * g[c, 2]
+        tangential = r[c, 1] * g[c, 1] + r[c, 2] * g[c, 2], r[c, 1] * r[c, 1] + r[c, 2] * r[c, 2]
+        share = max(np.sqrt(square / largest), 1e-6)
+        along += r[c, 0] * g[c, 0] + (tangential[0] if mu[c] > 0 else 0.0)
+        closing += share * (r[c, 0] * r[c, 0] + (tangential[1] if mu[c] > 0 else 0.0))
+        length += square
+        mean = 0.0
+        for k in range(3):
+            yielding += compliance[c, k] * g[c, k] * g[c, k]
+            mean += diagonal[c, k] / 3.0
+        alone += mean * square
+    return along, closing, yielding, length, alone

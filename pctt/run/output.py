@@ -218,7 +218,6 @@ class Writer:
 
     def add(self, line: Mapping[str, Any], row: Mapping[str, float]) -> None:
         """Write the figures of a step with the row of its records, and the checkpoint if that is due."""
-        self.place.make()
         due = on_first(self.comm, self._lines, lambda: self._add(dumps({**line, "record": row})))
         if due:  # after the figures: a run that goes on from the checkpoint must find the step
             self._checkpoint()
@@ -231,6 +230,7 @@ class Writer:
     def _add(self, line: str) -> bool:
         """Whether a checkpoint is due after this line. The first line replaces the file, with the lines that stay;
         every other one is a single write."""
+        self.place.now.mkdir(parents=True, exist_ok=True)
         if self._begun:
             disk.append(self._lines, line)
         else:

@@ -19,10 +19,10 @@ from pctt.folder import totals
 
 #: What is worth a warning: Coulomb residuals of the relaxation above the first, closing work above the second part of
 #: the impulses' energy, overlaps above the third of the radius of the smallest grain.
-LARGE_OPENING, LARGE_CLOSING_WORK, LARGE_OVERLAP = 1e-3, 0.3, 0.05
+LARGE_OPENING, LARGE_CLOSING_WORK, LARGE_OVERLAP = 1e-3, 0.5, 0.05
 
 #: Tolerances above it are warned of, and why.
-LOOSE, LOOSE_BECAUSE = 1e-3, "forces of dense beds are too small by 5 to 20 % at such tolerances"
+LOOSE, LOOSE_BECAUSE = 2e-3, "forces of dense beds are too small by 5 to 20 % at such tolerances"
 
 #: What helps against jumps of energy; a smaller tolerance does not.
 JUMP_ADVICE = "What helps: a smaller -dt, a -stiffness, or a tool of bounded force or torque (docs/mechanics.md)"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -158,7 +157,6 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
     finally:
         newton.destroy()
     seconds = log.take_seconds(("solve", "compare"))
-    accuracy = ccp.measure(problem, result.impulse)
     solves = compare.take_solves()
     return {
         "problem": options.run.problem,
@@ -171,7 +169,7 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[st
         "solver": used,
         "law": settings.law,
         "mean_compliance": problem.sum(problem.compliance[:, 0].sum()) / max(problem.size, 1),
-        **dataclasses.asdict(accuracy),
+        **vars(result.accuracy),
         "cone_problems": result.cone_problems,
         "newton_its": result.newton_its,
         "iterations": result.iterations,

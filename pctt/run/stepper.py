@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import resource
 import sys
 from typing import Any
@@ -59,8 +58,10 @@ class Stepper:
         self.settings, self.world, self.memory, self.newton, self.dump = settings, world, memory, newton, dump
         self._problem: ccp.ConeProblem | None = None
         self._corrections = 0  # of the present step
-        self._joints: Coupling | None = None  # of the present step, once its contacts have shown what holds
-        self._rejoined = 0  # how often they have
+        # what joints hold and what drives give in the present step, once its contacts have shown it, and how often
+        self._joints: Coupling | None = None
+        self._spent: Ints | None = None
+        self._shown = 0
         self._slabs: Ints | None = None  # those of the last step, or of a solution that is remembered within this one
         if settings.stiffness is not None:
             world.pairs.stiffness[:] = settings.stiffness
@@ -98,7 +99,7 @@ class Stepper:
             raise
 
     def _step(self) -> dict[str, Any]:
-        self._corrections, self._rejoined, self._joints = 0, 0, None
+        self._corrections, self._shown, self._joints, self._spent = 0, 0, None, None
         with log.phase("search"):
             come_and_go(self.world)
             put_back(self.world)
@@ -106,8 +107,6 @@ class Stepper:
             contacts = find_contacts(self.world, self.settings.delta, self.settings.dt)
         impulses = self._with_projection if self.settings.projection else self._to_gaps
         problem, guess, result, moving = impulses(contacts)
-        with log.phase("solve"):
-            accuracy = ccp.measure(problem, result.impulse)
         with log.phase("output"):
             files = self.dump.step(self.system, problem, guess, result, result.asked or result) if self.dump else {}
         if result.status is ccp.Status.UNBOUNDED:
@@ -121,12 +120,11 @@ class Stepper:
             self.moment = None if self.system.resistance is None else moments
             self.system.take_flow(self.world, self.contacts)
             advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt, moving)
-            kept = result.impulse.copy()
-            kept[: len(forces), 1:] = self.system.held_after(forces)  # with which springs begin the next step
+            kept = self.system.held_after(result.impulse)  # with which springs begin the next step
             self.memory.remember(self.system.key, kept, self.system.frame)
             self._slabs = self.world.slabs
         self._release()
-        return self._figures(problem.size, result, accuracy, files)
+        return self._figures(problem.size, result, files)
 
     def _to_gaps(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
@@ -134,7 +132,7 @@ class Stepper:
         result = self.solve(problem, guess)
         while True:
             again = self._unseen(self.contacts, self.system, result.momentum)
-            if again is None and self._joints_hold(result):
+            if again is None and self._machines_are(result):
                 return problem, guess, result, None
             problem, guess = self._assemble(self.contacts if again is None else again, self._remembered(result))
             result = self.solve(problem, guess).after(result)
@@ -144,7 +142,7 @@ class Stepper:
         every = self._system(contacts, impacts=False)
         problem, guess = self._assemble(contacts.take(touching(contacts, every)))
         result = self.solve(problem, guess)
-        while not self._joints_hold(result):
+        while not self._machines_are(result):
             every = self._system(contacts, impacts=False)
             problem, guess = self._assemble(self.contacts, self._remembered(result))
             result = self.solve(problem, guess).after(result)
@@ -156,9 +154,7 @@ class Stepper:
                 return problem, guess, result, self.system.velocity_with(result.momentum + shift)
             contacts, every = again, self._system(again, impacts=False)
 
-    def _figures(
-        self, contacts: int, result: ccp.Result, accuracy: ccp.Accuracy, files: dict[str, Any]
-    ) -> dict[str, Any]:
+    def _figures(self, contacts: int, result: ccp.Result, files: dict[str, Any]) -> dict[str, Any]:
         """The line of a step in steps.jsonl."""
         newton = self.newton
         pc_report = newton.linear.report() if newton is not None else []
@@ -174,7 +170,7 @@ class Stepper:
             "ksp_its": result.ksp_its,
             "cone_problems": result.cone_problems,
             **({"projection_its": self.projection_its} if self.settings.projection else {}),
-            **dataclasses.asdict(accuracy),
+            **vars(result.accuracy),
             "converged": result.converged,
             "status": result.status.value,
             "reason": result.reason,
@@ -192,7 +188,7 @@ class Stepper:
 
     def _system(self, contacts: Contacts, impacts: bool = True) -> ContactSystem:
         with log.phase("assembly"):
-            given = self.settings.dt, self.settings.recovery_speed, impacts, self._joints
+            given = self.settings.dt, self.settings.recovery_speed, impacts, self._joints, self._spent
             return ContactSystem(self.world, contacts, *given)
 
     def _assemble(self, contacts: Contacts, found: ImpulseMemory | None = None) -> tuple[ccp.ConeProblem, Array]:
@@ -234,20 +230,31 @@ class Stepper:
         memory.remember(self.system.key, found.impulse, self.system.frame)
         return memory
 
-    def _joints_hold(self, result: ccp.Result) -> bool:
-        """Whether the limits and motors that the joints of the step take as holding are those that do with these
-        impulses, or so many others were tried; else the others are set. Collective."""
-        most = 3
-        if self.system.joints is None or self._rejoined == most:
+    def _machines_are(self, result: ccp.Result) -> bool:
+        """Whether the limits and motors that the step takes as holding, and the drives that it takes as strong enough,
+        are those with these impulses, or three others were tried; else the others are set. Collective."""
+        if self._shown == 3:
             return True
         with log.phase("assembly"):
-            forces, moments = np.split(result.impulse, [len(self.contacts)])
-            resists = None if self.system.resistance is None else moments
-            found = self.system.joints_with(self.world, self.system.net(forces), resists)
-        if found is not None:
-            self._joints = found
-            self._rejoined += 1
-        return found is None
+            joints, spent = self._joints_with(result), None
+            if self.system.drives.most.any():
+                velocity = self.system.velocity_with(result.momentum)
+                spent = self.system.spent_with(self.world.large_velocity(velocity, self.settings.dt))
+        if joints is None and spent is None:
+            return True
+        self._joints = self._joints if joints is None else joints
+        self._spent = self._spent if spent is None else spent
+        self._shown += 1
+        return False
+
+    def _joints_with(self, result: ccp.Result) -> Coupling | None:
+        """The joints of the step with the limits and motors that hold with these impulses; None if they are those that
+        it takes. Collective."""
+        if self.system.joints is None:
+            return None
+        forces, moments = np.split(result.impulse, [len(self.contacts)])
+        resists = None if self.system.resistance is None else moments
+        return self.system.joints_with(self.world, self.system.net(forces), resists)
 
     def solve(self, problem: ccp.ConeProblem, guess: Array) -> ccp.Result:
         """Solve a problem of the step as the settings say."""

@@ -28,7 +28,7 @@ CASES = {
 
 @pytest.fixture(autouse=True)
 def few(request, monkeypatch):
-    """Rows of the problems that get dense factors: none, unless a test says more."""
+    """Contacts of the problems that get factors by blocks: none, unless a test says more."""
     monkeypatch.setattr(Settings, "few", getattr(request, "param", 0))
 
 

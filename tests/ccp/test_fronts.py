@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from pctt.body_matrix import Part
 from pctt.ccp.newton import fronts
-from pctt.ccp.newton.fronts import Fronts, cover, dissected, places_in
+from pctt.ccp.newton.fronts import Fronts, dissected, places_in, separated
 
 
 def stiff(count: int = 300, hub: bool = False, seed: int = 0) -> tuple[Part, np.ndarray]:
@@ -84,13 +85,51 @@ def test_separators_separate():
     assert leaves.any()
 
 
-def test_a_cover_is_the_smallest():
+def test_a_separator_is_the_smallest_of_the_middle():
     rng = np.random.default_rng(0)
+    subsets = ((np.arange(1 << 8)[:, None] >> np.arange(8)) & 1).astype(bool)
     for _ in range(20):
-        low, high = rng.integers(0, 6, 9), rng.integers(6, 12, 9)
-        mask = cover(low, high, 12)
-        assert (mask[low] | mask[high]).all()
-        subsets = (np.arange(1 << 12)[:, None] >> np.arange(12)) & 1
-        covers = (subsets[:, low] | subsets[:, high]).all(axis=1)
-        assert mask.sum() == subsets[covers].sum(axis=1).min()
-    assert not cover(np.zeros(0, int), np.zeros(0, int), 4).any()
+        place = (np.arange(12) + 0.5) / 12
+        middle = np.flatnonzero(np.abs(place - 0.5) <= fronts.BAND)
+        low, high = np.arange(middle[0]), np.arange(middle[-1] + 1, 12)
+        pairs = np.sort(rng.integers(0, 12, (20, 2)), axis=1)
+        ends = np.isin(pairs[:, 0], low) & np.isin(pairs[:, 1], high)  # no body of the middle keeps these apart
+        pairs = np.unique(pairs[(pairs[:, 0] < pairs[:, 1]) & ~ends], axis=0)
+        between, upper = separated(place, *pairs.T)
+        one, two = pairs.T
+        assert not ((upper[one] != upper[two]) & ~between[one] & ~between[two]).any()
+        assert not upper[low].any()
+        assert upper[high].all()
+        least = 12
+        for chosen in subsets[:, : len(middle)]:
+            kept = np.ones(12, bool)
+            kept[middle] = ~chosen
+            there = kept[one] & kept[two]
+            graph = sp.csr_matrix((np.ones(there.sum()), (one[there], two[there])), shape=(12, 12))
+            part = csgraph.connected_components(graph, directed=False)[1]
+            if not np.isin(part[low], part[high]).any():
+                least = min(least, chosen.sum())
+        assert between.sum() == least
+
+
+def test_a_separator_takes_a_body_of_an_end_where_two_ends_touch():
+    place = (np.arange(12) + 0.5) / 12
+    between, upper = separated(place, np.array([0, 1, 5]), np.array([11, 2, 6]))
+    assert between[0] != between[11]
+    assert not ((upper[0] != upper[11]) & ~between[0] & ~between[11])
+
+
+@pytest.mark.parametrize("fits", [True, False])
+def test_a_dissection_serves_the_next_matrix_too(fits):
+    """Unless bodies have neighbours that had none: these have no front."""
+    part, points = stiff()
+    row = np.repeat(np.arange(len(points)), np.diff(part.indptr))
+    near = (row == part.indices) | ((row < 200) & (part.indices < 200) if fits else (row < 100) & (part.indices < 100))
+    less = Part(np.r_[0, np.cumsum(np.bincount(row[near]))], part.indices[near], part.blocks[near])
+    first, other = (part, less) if fits else (less, part)
+    given = Fronts(first, points).dissection
+    assert given.fits(other) == fits
+    factors = Fronts(other, points, np.float64, given)
+    assert (factors.dissection is given) == fits
+    x = np.random.default_rng(1).standard_normal(6 * len(points))
+    np.testing.assert_allclose(factors.solve(dense(other) @ x), x, atol=1e-8)

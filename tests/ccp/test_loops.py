@@ -169,7 +169,7 @@ def test_blocks_of_cones_that_share_a_normal_number(rolls, coulomb, normal, tang
     if rolls:
         C[count:] = np.stack([along[2], along[1], along[1]], axis=1)
     arrows = lorentz.arrows(*W, u, soft, along.ravel())
-    barriers = lorentz.barriers(*W, u, 1.0)
+    barriers = lorentz.barriers(*W, u, 1.0, np.zeros((count, lorentz.width)))
 
     def whole(blocks):
         """The matrix of blocks, in rows."""
@@ -204,12 +204,42 @@ def test_pairs_on_the_central_path():
     x[:3], x[3:6, 1:] = 0.0, 0.0
     s, z = cone.central_pair(x, tau, 1e-6)
     np.testing.assert_allclose(s - tau[:, None] * z, x, atol=1e-14)
-    np.testing.assert_allclose(cone.jordan_product(s, z), np.tile([1e-6, 0, 0], (100, 1)), atol=1e-14)
-    inner = inside(rng, 100)
-    np.testing.assert_allclose(cone.jordan_product(inner, cone.jordan_divide(inner, x)), x, rtol=1e-6, atol=1e-8)
-    moved = x + cone.towards_interval(x, 0.1, 1.0)
-    values = moved[:, 0] + np.hypot(moved[:, 1], moved[:, 2]) * [[1.0], [-1.0]]
-    assert (values >= 0.1 - 1e-12).all()
+    np.testing.assert_allclose(jordan_product(s, z), np.tile([1e-6, 0, 0], (100, 1)), atol=1e-14)
+
+
+def jordan_product(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    out = x[:, :1] * y + y[:, :1] * x
+    out[:, 0] = (x * y).sum(axis=1)
+    return out
+
+
+@pytest.mark.parametrize("slides", [0.0, 1.0])
+def test_right_hand_sides_of_a_step_by_their_definitions(slides):
+    rng = np.random.default_rng(0)
+    s, z = inside(rng, 100), inside(rng, 100)
+    w, ds, dz = rng.normal(size=(3, 100, 3))
+    u = slides * rng.normal(size=(100, 3)) * [0, 1, 1]
+    W = cone.NesterovTodd(*cone.scaling(s, z))
+    c, f = cone.pulls(*W, s, z, u, w)
+    expected = W.divide(w) - z
+    expected[:, 0] -= (u * expected).sum(axis=1)
+    np.testing.assert_allclose(c, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(f, W.times(w) - s, rtol=1e-9, atol=1e-9)
+    change = W.divide(W.divide(ds))
+    change[:, 0] -= (u * change).sum(axis=1)
+    np.testing.assert_allclose(cone.less_inverse_squares(*W, u, w, ds), w - change, rtol=1e-9, atol=1e-9)
+
+    aim = [0.3, 0, 0] - jordan_product(W.divide(ds), W.times(dz))
+    centred = jordan_product(W.times(z), cone.centring(*W, z, ds, dz, 0.3))
+    np.testing.assert_allclose(centred, aim, rtol=1e-6, atol=1e-6)
+    after = jordan_product(W.times(z) + 0.5 * W.divide(ds), W.times(z) + 0.5 * W.times(dz))
+    low, high = 0.1, 1.0
+    moved = after + jordan_product(W.times(z), cone.towards_path(*W, z, ds, dz, 0.5, low, high))
+    for x, sign in ((moved, 1.0), (moved, -1.0)):
+        length = np.hypot(after[:, 1], after[:, 2])
+        along = (x * after)[:, 1:].sum(axis=1) / np.maximum(length, 1e-300)  # the directions stay
+        value, before = x[:, 0] + sign * along, after[:, 0] + sign * length
+        np.testing.assert_allclose(value, np.maximum(np.clip(before, low, high), before - high), rtol=1e-6, atol=1e-6)
 
 
 def test_a_loop_takes_arrays_of_other_layouts():

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from mpi4py import MPI
 from problems import SELF, dense_of, from_graph, from_matrix, heap, matrix, part, random_graph
 from scipy.linalg import block_diag
 
 from pctt import ccp
 from pctt.ccp import delassus
+from pctt.ccp.newton import few as elimination
+from pctt.ccp.newton.few import Factors, ordered
 from pctt.ccp.newton.forms import BodyForm, ContactForm
-from pctt.ccp.newton.linear import Dense, Settings
+from pctt.ccp.newton.linear import Settings
 
 FORMS = pytest.mark.parametrize("form", ccp.FORMS)
 
 
 @pytest.fixture(autouse=True)
 def few(request, monkeypatch):
-    """Rows of the problems that get dense factors: none, unless a test says more."""
+    """Contacts of the problems that get factors by blocks: none, unless a test says more."""
     monkeypatch.setattr(Settings, "few", getattr(request, "param", 0))
 
 
@@ -165,7 +168,7 @@ def test_a_tolerance_of_the_user_is_kept_where_earlier_solutions_leave_less_than
 
 @pytest.mark.parametrize("few", [400], indirect=True)
 @pytest.mark.parametrize("symmetric", [True, False])
-def test_few_contacts_get_dense_factors(symmetric):
+def test_few_contacts_get_factors_by_blocks(symmetric):
     """Of the form of the contacts, whether bodies are known or not; options for the KSP are obeyed instead."""
     known, graph = heap(3)
     barrier, q = barrier_and_side()
@@ -174,19 +177,94 @@ def test_few_contacts_get_dense_factors(symmetric):
     S = known.N + block_diag(*barrier)
     newton = ccp.Newton(SELF, "body")
     for problem in (from_graph(known, graph), from_matrix(known)):
-        newton.begin(problem)
+        assert newton.begin(problem).contact_map is None
         newton.update(barrier, symmetric=symmetric)
         dg, _ = newton.solve(q, 1e-12)
         assert np.linalg.norm(S @ dg.ravel() - q.ravel()) <= 2e-12
-        assert newton.linear.takes_any
+        assert newton.takes_any
+        assert "matrix" not in vars(newton.system)
         assert (newton.linear.iterations <= 2, newton.linear.fallbacks) == (True, 0)
     newton.destroy()
 
 
-def test_dense_factors_say_where_they_fail():
-    assert Dense(-np.eye(3), True).solve(np.ones(3), 1e-9)[1] == 0
-    assert Dense(np.ones((3, 3)), False).solve(np.arange(3.0), 1e-9)[1] == 0
-    wrong = np.diag([1.0, 2.0, 3.0]) + np.triu(np.full((3, 3), 0.1), 1)  # its factor is that of the lower triangle
-    x, count = Dense(wrong, True).solve(np.ones(3), 1e-12)
-    assert count > 1
-    np.testing.assert_allclose(wrong @ x, 1.0, atol=1e-11)
+@pytest.mark.parametrize("few", [400], indirect=True)
+def test_contacts_that_would_fill_the_factors_are_not_few(monkeypatch):
+    """The same where a body touches too many of them for their matrix to be made."""
+    newton = ccp.Newton(SELF, "body")
+    assert newton.has_few(from_graph(*heap(3, hub=True)))
+    monkeypatch.setattr(elimination, "LEAST", 1)
+    for pairs, rest in ((10, 40), (300, 40), (10**6, 5)):
+        monkeypatch.setattr(Settings, "pairs", pairs)
+        monkeypatch.setattr(Settings, "rest", rest)
+        problem = from_graph(*heap(3, hub=True))
+        assert not newton.has_few(problem)
+        assert newton.begin(problem) is problem
+    newton.destroy()
+
+
+@pytest.mark.parametrize("few", [400], indirect=True)
+def test_where_these_factors_fail_a_ksp_takes_over(monkeypatch):
+    monkeypatch.setattr(Factors, "solve", lambda self, b, wanted: (b, 0))
+    known, graph = heap(3)
+    barrier, q = barrier_and_side()
+    S = known.N + block_diag(*barrier)
+    newton = ccp.Newton(SELF, "body")
+    newton.begin(from_graph(known, graph))
+    for times in (1.0, 2.0):
+        newton.update(times * barrier)
+        dg, _ = newton.solve(q, 1e-9)
+        left = S @ dg.ravel() + (times - 1.0) * block_diag(*barrier) @ dg.ravel() - q.ravel()
+        assert np.linalg.norm(left) <= 2e-9
+    assert newton.linear.fallbacks == 0
+    newton.destroy()
+
+
+# -- factors by blocks ---------------------------------------------------------------------------------------
+
+
+def blocks_of(N: np.ndarray) -> tuple[sp.bsr_matrix, np.ndarray]:
+    """A matrix in 3 x 3 blocks, and those of its diagonal."""
+    here = np.arange(len(N) // 3)
+    return sp.csr_matrix(N).tobsr((3, 3)), N.reshape(len(here), 3, len(here), 3)[here, :, here]
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+@pytest.mark.parametrize("least", [1, 12, 1000])
+def test_an_elimination_by_blocks(symmetric, least, monkeypatch):
+    """With a dense rest and without."""
+    monkeypatch.setattr(elimination, "LEAST", least)
+    for contacts, bodies in ((1, 1), (60, 100), (60, 20), (60, 3)):
+        G = random_graph(0, contacts, bodies).dense()
+        N, diagonal = blocks_of(G @ G.T)
+        barrier, q = barrier_and_side(contacts)
+        barrier[:, 0] *= 1.0 if symmetric else 1.5
+        order = ordered(N.indptr, N.indices, 10**6, contacts)
+        assert np.array_equal(np.sort(order.number), np.arange(contacts))
+        assert order.rest <= (0 if least > contacts else contacts)
+        x, count = Factors(N, order, diagonal + barrier, symmetric).solve(q, 1e-11)
+        left = (G @ G.T + block_diag(*barrier)) @ x.ravel() - q.ravel()
+        assert np.linalg.norm(left) <= 2e-11
+        assert count <= 2
+
+
+@pytest.mark.parametrize("spread", [1e6, 1e12])
+def test_an_elimination_keeps_the_digits_of_blocks_of_very_different_numbers(spread):
+    """Barriers have eigenvalues that differ by so much; the residual is one of rounding in the sizes of the terms."""
+    G = random_graph(0, 60, 40).dense()
+    N, diagonal = blocks_of(G @ G.T)
+    rng = np.random.default_rng(0)
+    axis = rng.standard_normal((60, 3, 1))
+    barrier, q = spread * axis @ axis.transpose(0, 2, 1) + 1e-3 * np.eye(3), rng.standard_normal((60, 3))
+    order = ordered(N.indptr, N.indices, 10**6, 60)
+    x, count = Factors(N, order, diagonal + barrier, True).solve(q, 1e-13 * spread * np.abs(q).max())
+    assert count == 1
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+@pytest.mark.parametrize("least", [1, 10])
+def test_factors_say_where_they_fail_and_take_what_is_indefinite(symmetric, least, monkeypatch):
+    monkeypatch.setattr(elimination, "LEAST", least)
+    N, _ = blocks_of(np.ones((6, 6)))
+    order = ordered(N.indptr, N.indices, 100, 2)
+    assert Factors(N, order, np.ones((2, 3, 3)), symmetric).solve(np.arange(6.0).reshape(2, 3), 1e-9)[1] == 0
+    assert Factors(N, order, np.tile(-4.0 * np.eye(3), (2, 1, 1)), symmetric).solve(np.ones((2, 3)), 1e-9)[1] > 0

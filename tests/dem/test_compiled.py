@@ -10,6 +10,7 @@ from cases import random_quaternions
 from numba.core.caching import CompileResultCacheImpl
 
 from dem import quaternion
+from dem.arrays import places
 from dem.bodies import SPHERE
 from dem.compiled import loop
 from dem.contact import broad
@@ -143,3 +144,16 @@ def test_a_loop_runs_where_numba_may_not_compile(monkeypatch):
         return 2.0 * x
 
     assert doubled(3.0) == 6.0
+
+
+@pytest.mark.parametrize("order", ["the same", "with gaps", "reversed", "random", "none in common", "empty"])
+def test_places_of_keys_are_found_in_any_order(order):
+    rng = np.random.default_rng(3)
+    keys = np.unique(rng.integers(0, 2**40, 900) + 1j * rng.integers(0, 2**40, 900))[:800]
+    asked = {
+        "the same": keys, "reversed": keys[::-1].copy(), "random": rng.permutation(keys), "none in common": keys + 0.5j,
+        "with gaps": np.insert(np.delete(keys, slice(100, 300)), [50, 50, 400], [1j, 2j, 3j]), "empty": keys[:0],
+    }[order]  # fmt: skip
+    known = {key: place for place, key in enumerate(keys.tolist())}
+    np.testing.assert_array_equal(places(keys, asked), [known.get(key, -1) for key in asked.tolist()])
+    np.testing.assert_array_equal(places(asked[:0], keys), -1)

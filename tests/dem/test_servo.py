@@ -16,7 +16,7 @@ from dem.shapes import Box, Plane, Sphere, mass_properties
 from dem.start import new_world
 from dem.step import advance
 from dem.system import ContactSystem
-from pctt import ccp
+from pctt import Simulation, ccp
 from pctt.run.stepper import cone_problem
 
 SELF, DT = MPI.COMM_SELF, 0.01
@@ -129,3 +129,24 @@ def test_a_servo_keeps_its_speed_under_a_load_that_it_can_bear(load, speed):
         step(world)
     found = world.large.velocity[0, 4]
     assert found == pytest.approx(speed, rel=1.1e-3) if speed else abs(found) < 1e-9
+
+
+@pytest.mark.parametrize("projection", [False, True])
+def test_a_servo_gives_no_more_than_its_strength_when_its_body_strikes_a_wall(projection):
+    """A plate at its speed of 1 m/s meets a wall within a step. The wall takes its momentum of 0.1 N s and what the
+    drive gives, 500 N at most, from the first step on."""
+    scene = Scene(0.5, gravity=(0, 0, 0), stiffness=np.inf)
+    scene.add_body("wall", [Plane((-1, 0, 0))], position=(0.12, 0, 0))
+    scene.add_body("tool", [Box((0.1, 0.1, 0.1))], Guided((1, 0, 0), force=500.0, speed=1.0), mass=0.1)
+    scene.add_spheres([0, 5, 0.1], 0.1, 1000.0)
+    dt, given = 0.01, []
+    with Simulation(scene, comm=SELF, dt=dt, tol=1e-9, solver="apgd", projection=projection) as sim:
+        for _ in range(6):
+            before = sim.body("tool").velocity[0]
+            sim.step()
+            tool = sim.body("tool")
+            given.append(0.1 * (tool.velocity[0] - before) / dt - tool.force[0])
+    assert max(given) == pytest.approx(500.0, rel=1.1e-3)
+    assert min(given) > -1e-6
+    assert given[-1] == pytest.approx(500.0, rel=1.1e-3)
+    assert tool.velocity[0] == pytest.approx(0.0, abs=1e-9)

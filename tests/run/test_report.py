@@ -34,11 +34,11 @@ def test_forces_that_may_be_far_off_are_a_warning():
     works = enumerate((1e-3, 2e-2, 4e-3))
     steps = [{"step": 3 + k, "closing_work": work, "opening_work": 0.5 * work} for k, work in works]
     assert report.forces_line(steps, 0.05) == "closing work 4.0e-03 (median), 2.0e-02 at most, in step 4"
-    far_off = [*steps, {"step": 9, "closing_work": 0.5, "opening_work": 0.1}]
-    opening = [*steps, {"step": 9, "closing_work": 0.0, "opening_work": 0.4}]
-    assert report.forces_line(opening, 0.05).startswith("WARNING: opening work 6.0e-03 (median), 4.0e-01 at most")
+    far_off = [*steps, {"step": 9, "closing_work": 0.6, "opening_work": 0.1}]
+    opening = [*steps, {"step": 9, "closing_work": 0.0, "opening_work": 0.8}]
+    assert report.forces_line(opening, 0.05).startswith("WARNING: opening work 6.0e-03 (median), 8.0e-01 at most")
     assert report.forces_line(far_off, float("inf")).startswith("WARNING: closing work")
-    assert "try -ccp_closing_work 0.3" in report.forces_line(far_off, float("inf"))
+    assert "try -ccp_closing_work 0.5" in report.forces_line(far_off, float("inf"))
     assert "try a smaller -ccp_tol" in report.forces_line(far_off, 0.05)
 
 

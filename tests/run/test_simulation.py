@@ -270,7 +270,7 @@ def test_a_bad_setting_is_named(settings, words):
 def test_settings_are_given_one_by_one_or_together():
     given = pctt.Settings(tol=1e-6, solver="apgd")
     sim = pctt.Simulation(Mixer(n=1), given, dt=0.001, comm=SELF)
-    assert (sim.settings.tol, sim.settings.solver, sim.settings.dt, sim.settings.delta) == (1e-6, "apgd", 0.001, 0.02)
+    assert (sim.settings.tol, sim.settings.solver, sim.settings.dt, sim.settings.delta) == (1e-6, "apgd", 0.001, 0.005)
     assert sim.settings.law == "coulomb"
     assert pctt.Simulation(Mixer(n=1), solver="pdip", comm=SELF).settings.law == "relaxation"
     assert sim.settings.options == APGD()
@@ -456,7 +456,7 @@ def test_a_notebook_shows_the_last_step_as_a_table():
     shown = sim._repr_html_()
     assert "<th>kinetic_energy [J]</th>" in shown
     assert "<th>iterations</th>" in shown
-    assert repr(sim).startswith("<Simulation of Stirred: 14 bodies on 1 ranks, step 2, time 0.02 s, auto to 0.0005, ")
+    assert repr(sim).startswith("<Simulation of Stirred: 14 bodies on 1 ranks, step 2, time 0.02 s, auto to 0.0015, ")
 
 
 def test_a_picture_of_the_present_state(tmp_path):

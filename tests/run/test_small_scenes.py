@@ -61,7 +61,7 @@ def test_what_a_struck_plate_strikes_is_seen(motion):
 
 def test_a_contact_that_does_not_close_needs_no_impulse():
     scene = Scene(0.3, gravity=(0, 0, 0))
-    scene.add_spheres([[0, 0, 0], [0.21, 0, 0]], 0.1, 1000.0)
+    scene.add_spheres([[0, 0, 0], [0.202, 0, 0]], 0.1, 1000.0)
     line = simulation_of(scene).step()
     assert (line["contacts"], line["newton_its"], line["natural_residual"]) == (1, 0, 0.0)
 

@@ -184,12 +184,13 @@ class Progress:
 
     def is_due(self, size: float) -> bool:
         """Whether `goes_on` will look: after ``check`` iterations, or a few after the last look where the residual
-        would be about the tolerance if it had changed as the ``size`` of steps has: |L step|, 0 before the first.
+        would be a little below the tolerance, as a look costs more than an iteration, if it had changed as the ``size``
+        of steps has: |L step|, 0 before the first.
 
         Before there was a step it is taken for RATIO times |L step| / |x|."""
         residual, size_then = self._last_look
         few = self._next_look - self.check + 3
-        if self.iterations >= few and residual * size <= 1.25 * self.limits.tol * size_then:
+        if self.iterations >= few and residual * size <= 0.9 * self.limits.tol * size_then:
             self._next_look = self.iterations
         self._size = size
         return self.iterations >= min(self._next_look, self.limits.max_it)

@@ -68,20 +68,17 @@ def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Conic, newton: Newton, coulomb: bool = False
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step."""
-    newton.begin(problem)
-    linear = newton.linear
-    if coulomb and not linear.takes_any:
+    given, problem, linear = problem, newton.begin(problem), newton.linear
+    if coulomb and not newton.takes_any:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
-    cones = Cones(problem, options, coulomb)
-    forcing = options.forcing_with_law if coulomb else options.forcing
-    forcing = forcing if newton.system.mends else options.forcing_of_impulses
+    cones = Cones(problem, options, coulomb, newton.system.mends)
     at, history, waited, least, last_gap = cones.start(guess), list[float](), 0, np.inf, np.inf
     while True:
         # residuals
         found, gap = cones.residuals(at), problem.dot(at.s, at.z)
         history.append(limits.residual(found.natural, problem, found.g, found.y))
-        unbounded = bool(why_unbounded(problem, found.g))
+        unbounded = bool(why_unbounded(given, found.g, found.y))
         if unbounded or history[-1] == min(history):
             best = found.g
         waited = 0 if found.natural <= 0.9 * least or gap <= 0.5 * last_gap else waited + 1
@@ -90,9 +87,8 @@ def solve(
         if done or len(history) > limits.max_it or waited > options.patience:
             break
         # scaling
-        scaled = cones.scaled(at, found, forcing)
-        barrier = None if newton.system.mends else scaled.barrier()
-        newton.update(barrier, scaled.arrows.X, symmetric=not coulomb)
+        scaled = cones.scaled(at, found)
+        newton.update(*scaled.blocks(), symmetric=not coulomb)
         # affine step
         with phase("ConicPredictor"):
             affine = scaled.direction(newton, np.zeros_like(at.z))
@@ -153,18 +149,25 @@ class Direction(NamedTuple):
 class Cones:
     """The problem in its Lorentz cones: s = A g, y = A'z.
 
+    mends : whether Newton systems mend what an inexact solve leaves
     compliance, tangential : (count,), and of all cones (k count,), the parts of C within a step
+    within : (count, width) the same but for the problem's own C
     """
 
-    def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool):
-        self.problem, self.options, self.coulomb = problem, options, coulomb
+    def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool, mends: bool):
+        self.problem, self.options, self.coulomb, self.mends = problem, options, coulomb, mends
         self.lorentz = LorentzCones(problem.cones)
         self.count = problem.size * self.lorentz.number  # of Lorentz cones on all ranks
         self.proximal = options.proximal * problem.mean_diagonal
         self.compliance = problem.compliance[: self.lorentz.count, 0] + self.proximal * (self.lorentz.weight**2).sum(0)
         self.tangential = np.full(self.lorentz.weight.size, self.proximal)
         self.tangential[: self.lorentz.count] += problem.compliance[: self.lorentz.count, 1]
+        self.within = np.full((self.lorentz.count, self.lorentz.width), self.proximal)
+        self.within[:, 0] = self.proximal * (self.lorentz.weight**2).sum(0)
         self.boundary = options.boundary_with_law if coulomb else options.boundary
+        forcing = options.forcing_with_law if coulomb else options.forcing
+        self.forcing = forcing if mends else options.forcing_of_impulses
+        self._still = np.zeros((self.lorentz.weight.size, 3))
 
     def start(self, guess: Array) -> Point:
         """A pair on the central path near the guess: s - tau z = s_0 - tau z_0. Where cones share a normal impulse all
@@ -191,15 +194,15 @@ class Cones:
         r_y -= lorentz.back(without_de_saxce(at.z) if self.coulomb else at.z)
         return Residuals(g, y, problem.natural_residual(g, y, self.coulomb), at.v - momentum, r_y)
 
-    def scaled(self, at: Point, found: Residuals, forcing: float) -> Scaled:
+    def scaled(self, at: Point, found: Residuals) -> Scaled:
         """The linear equations of an iterate."""
         with phase("CCPBarrier"):
             W = NesterovTodd(*scaling(at.s, at.z))
-            u = sliding_directions(at.z) if self.coulomb else np.zeros_like(at.z)
-            arrows = self.lorentz.arrows(*W, u, self.compliance, self.tangential)
+            u = sliding_directions(at.z) if self.coulomb else self._still
+            arrows = self.lorentz.arrows(*W, u, self.compliance, self.tangential) if self.mends else None
         # the velocities that the natural residual stands for
         shown = found.natural * self.problem.norm(found.g) * self.problem.mean_diagonal
-        return Scaled(self, at, found, W, u, arrows, forcing * shown)
+        return Scaled(self, at, found, W, u, arrows, self.forcing * shown)
 
     def moved(self, at: Point, d: Direction, step: float) -> Point:
         """The point after a step; for Coulomb's law with De Saxce's terms of its velocities."""
@@ -213,7 +216,7 @@ class Scaled(NamedTuple):
     at, found : the iterate and its residuals
     W : scaling of the pair
     u : directions in which contacts slide, for T; zero without Coulomb's law
-    arrows : (B + C)^-1
+    arrows : (B + C)^-1, for systems that mend
     tol : residual to which Newton systems are solved [m/s]
     """
 
@@ -222,31 +225,29 @@ class Scaled(NamedTuple):
     found: Residuals
     W: NesterovTodd
     u: Array
-    arrows: Arrows
+    arrows: Arrows | None
     tol: float
 
-    def barrier(self) -> Array:
-        """The blocks B of the Newton system, with the compliance that problems do not have."""
-        cones, lorentz = self.cones, self.cones.lorentz
-        B = lorentz.barriers(*self.W, self.u, cones.problem.mean_diagonal)
-        B[:, range(lorentz.width), range(lorentz.width)] += cones.proximal
-        B[:, 0, 0] += cones.compliance - cones.problem.compliance[: lorentz.count, 0] - cones.proximal
-        return B
+    def blocks(self) -> tuple[Array | None, Array | None]:
+        """What `Newton.update` takes: the blocks B, with the compliance that problems do not have, or (B + C)^-1."""
+        if self.arrows is not None:
+            return None, self.arrows.X
+        return self.cones.lorentz.barriers(*self.W, self.u, self.cones.problem.mean_diagonal, self.cones.within), None
 
     def direction(self, newton: Newton, w: Array, *earlier: Array) -> Direction:
         """The direction of the right-hand side w; ``earlier``: solutions of the Newton system to begin from."""
         problem, lorentz, found = self.cones.problem, self.cones.lorentz, self.found
-        c = self.W.divide(w) - self.at.z
-        q = lorentz.back(self._straight(c)) - found.r_y
-        f = self.W.times(w) - self.at.s
-        dg, x = newton.solve(q, self.tol, found.r_v, earlier, self.arrows.alone(f, found.r_y))
+        c, f = cone.pulls(*self.W, self.at.s, self.at.z, self.u, w)
+        q = lorentz.back(c) - found.r_y
+        alone = None if self.arrows is None else self.arrows.alone(f, found.r_y)
+        dg, x = newton.solve(q, self.tol, found.r_v, earlier, alone)
         dv, ds = newton.system.momenta(x, dg, found.r_v), lorentz.of(dg)
-        if newton.system.mends:  # r_y vanishes, r_v takes the error of the linear solve
+        if self.arrows is not None:  # r_y vanishes, r_v takes the error of the linear solve
             dy = problem.velocity_of(dv) + problem.compliance * dg + found.r_y
-            dz = self.arrows.split(dy, f, ds)
+            dy = self.arrows.split(dy, f, ds)
         else:  # r_v vanishes, r_y takes it
-            dz = self._straight(c - self.W.divide(self.W.divide(ds)))
-        return Direction(ds, self._turned(dz), dz, dv, x)
+            dy = cone.less_inverse_squares(*self.W, self.u, c, ds)
+        return Direction(ds, self._turned(dy), dy, dv, x)
 
     def _turned(self, dy: Array) -> Array:
         """T dy, the change of z to first order."""
@@ -256,21 +257,14 @@ class Scaled(NamedTuple):
         dz[:, 0] += dot(self.u, dy)
         return dz
 
-    def _straight(self, dz: Array) -> Array:
-        """T^-1 dz."""
-        if not self.cones.coulomb:
-            return dz
-        dy = dz.copy()
-        dy[:, 0] -= dot(self.u, dz)
-        return dy
-
     def reach(self, d: Direction) -> float:
         """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""
         problem, at = self.cones.problem, self.at
-        normal = without_de_saxce(at.z)[:, 0]
-        of_z = cone.step_to_zero(normal, d.dy[:, 0]) if self.cones.coulomb else cone.step_inside(at.z, d.dz)
+        if not self.cones.coulomb:
+            return problem.min(min(cone.step_inside(at.s, d.ds), cone.step_inside(at.z, d.dz)))
+        of_z = cone.step_to_zero(without_de_saxce(at.z)[:, 0], d.dy[:, 0])
         longest = problem.min(min(cone.step_inside(at.s, d.ds), of_z))
-        return longest if np.isfinite(problem.sum(float(d.ds.sum() + d.dz.sum()))) else 0.0
+        return longest if np.isfinite(problem.sum(float(d.dz.sum()))) else 0.0
 
     def step(self, d: Direction) -> float:
         """The step to take, at most 1 and not up to the boundary."""
@@ -278,19 +272,15 @@ class Scaled(NamedTuple):
 
     def centred(self, d: Direction, target: float) -> Array:
         """The w of a direction that aims at s o z = target e, with the second-order term of the last direction."""
-        aim = -cone.jordan_product(self.W.divide(d.ds), self.W.times(d.dz))
-        aim[:, 0] += target
-        return cone.jordan_divide(self.W.times(self.at.z), aim)
+        return cone.centring(*self.W, self.at.z, d.ds, d.dz, target)
 
     def towards_path(self, d: Direction, reach: float, target: float) -> Array:
         """What to add to w so that the eigenvalues of s o z, ``reach`` along the direction, come near the target, up
         to the factor ``spread``.
 
         Source: Gondzio (1996), multiple centrality corrections; here with the eigenvalues of second-order cones."""
-        centre = self.W.times(self.at.z)
-        after = cone.jordan_product(centre + reach * self.W.divide(d.ds), centre + reach * self.W.times(d.dz))
         spread = self.cones.options.spread
-        return cone.jordan_divide(centre, cone.towards_interval(after, 1.0 / spread * target, spread * target))
+        return cone.towards_path(*self.W, self.at.z, d.ds, d.dz, reach, 1.0 / spread * target, spread * target)
 
 
 def with_de_saxce(y: Array) -> Array:

@@ -35,7 +35,7 @@ class LorentzCones:
 
     weight : (k, count) mu, rho, sigma; 1 where they are zero
     live : (k, count) 1; 0 where they are zero: the problem does not have these tangential numbers
-    known : (rows, 3) the same of the numbers of impulses
+    known : (rows, 3) the same of the numbers of impulses, of which a contact has 3 in each part of ``count`` rows
     """
 
     def __init__(self, cones: FrictionCones):
@@ -44,6 +44,7 @@ class LorentzCones:
         self.weight = np.where(coefficient > 0, coefficient, 1.0)
         self.live = (coefficient > 0).astype(float)
         self.width = 1 + sum(map(len, cones.tangents))
+        self.rows = self.count * self.width // 3
         #: (k, 2) of the tangential numbers among those of a contact; -1: there is none
         self.place = np.array([[*where, -1][:2] for where in cones.tangents])
         self.known = self.back(np.ones((coefficient.size, 3)))
@@ -51,26 +52,17 @@ class LorentzCones:
 
     def of(self, g: Array) -> Array:
         """A g of impulses or other numbers of contacts (rows, 3)."""
-        x, s = self.cones.joined(g), np.zeros((self.number, self.count, 3))
-        s[:, :, 0] = self.weight * x[:, 0]
-        for k, where in enumerate(self.cones.tangents):
-            s[k, :, 1 : 1 + len(where)] = x[:, where] * self.live[k, :, None]
-        return s.reshape(-1, 3)
+        out = np.zeros((self.weight.size, 3))
+        _of(g, self.weight, self.live, self.place, out)
+        return out
 
     def back(self, z: Array) -> Array:
         """A'z (rows, 3)."""
-        return self._gathered(z, (self.weight * z[:, 0].reshape(self.number, -1)).sum(axis=0))
+        return _back(z, self.weight, self.live, self.place, np.zeros((self.rows, 3)), False)
 
     def impulses(self, s: Array) -> Array:
         """The g (rows, 3) with A g = s; where the normal numbers of a contact disagree, with the greatest."""
-        return self._gathered(s, (s[:, 0].reshape(self.number, -1) / self.weight).max(axis=0))
-
-    def _gathered(self, z: Array, normal: Array) -> Array:
-        z, x = z.reshape(self.number, self.count, 3), np.zeros((self.count, self.width))
-        x[:, 0] = normal
-        for k, where in enumerate(self.cones.tangents):
-            x[:, where] = z[k, :, 1 : 1 + len(where)] * self.live[k, :, None]
-        return self.cones.rows(x)
+        return _back(s, self.weight, self.live, self.place, np.zeros((self.rows, 3)), True)
 
     def spread(self, y: Array) -> Array:
         """A z with A'z = y (rows, 3): all cones have the same part of the normal numbers."""
@@ -86,10 +78,11 @@ class LorentzCones:
         X = np.zeros(shape)
         return Arrows(self, tangential, X, *_arrows(root, size, u, *given, X))
 
-    def barriers(self, root: Array, size: Array, u: Array, least: float) -> Array:
-        """B (count, width, width); what the problem does not have is held by at least 1e12 times ``least``."""
+    def barriers(self, root: Array, size: Array, u: Array, least: float, more: Array) -> Array:
+        """B (count, width, width), with ``more`` (count, width) on its diagonal; what the problem does not have is held
+        by at least 1e12 times ``least``."""
         B = np.zeros((self.count, self.width, self.width))
-        _barriers(root, size, u, self.weight.ravel(), self.live.ravel(), self.place, least, B)
+        _barriers(root, size, u, self.weight.ravel(), self.live.ravel(), self.place, least, more, B)
         return B
 
 
@@ -129,6 +122,38 @@ class Arrows(NamedTuple):
         parts = self.right, self.left, self.D, self.part, self.sigma
         _alone(f, cones.joined(r), lorentz.weight.ravel(), lorentz.place, self.tangential, *parts, out)
         return cones.rows(out)
+
+
+@loop
+def _of(g, weight, live, place, out):
+    cones, count = weight.shape
+    for k in range(cones):
+        for c in range(count):
+            i = k * count + c
+            out[i, 0] = weight[k, c] * g[c, 0]
+            for a in range(2):
+                m = place[k, a]
+                if m >= 0:
+                    out[i, 1 + a] = g[m // 3 * count + c, m % 3] * live[k, c]
+
+
+@loop
+def _back(z, weight, live, place, out, greatest):
+    """The normal numbers are the sum of those in z times their weights, or the ``greatest`` by them."""
+    cones, count = weight.shape
+    for k in range(cones):
+        for c in range(count):
+            i = k * count + c
+            if greatest:
+                one = z[i, 0] / weight[k, c]
+                out[c, 0] = one if k == 0 or not one <= out[c, 0] else out[c, 0]
+            else:
+                out[c, 0] += weight[k, c] * z[i, 0]
+            for a in range(2):
+                m = place[k, a]
+                if m >= 0:
+                    out[m // 3 * count + c, m % 3] = z[i, 1 + a] * live[k, c]
+    return out
 
 
 @loop
@@ -202,7 +227,7 @@ def _alone(f, r, weight, place, tangential, right, left, D, part, sigma, out):
 
 
 @loop
-def _barriers(root, size, u, weight, live, place, least, B):
+def _barriers(root, size, u, weight, live, place, least, more, B):
     count, total = len(B), len(root)
     for c in range(count):
         for i in range(c, total, count):
@@ -223,3 +248,5 @@ def _barriers(root, size, u, weight, live, place, least, B):
         for m in range(1, B.shape[1]):
             if B[c, m, m] == 0.0:
                 B[c, m, m] = 1e12 * max(B[c, 0, 0], least)
+        for m in range(B.shape[1]):
+            B[c, m, m] += more[c, m]

@@ -12,15 +12,20 @@ one cone problem to the next, and matrices too where the contacts are the same.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.ccp.cone import TINY, Array
+from pctt.ccp.delassus import GivenMatrix, all_blocks
 from pctt.ccp.newton.compare import Comparison
-from pctt.ccp.newton.forms import BodyForm, ContactForm, NewtonForm
+from pctt.ccp.newton.few import Order, ordered
+from pctt.ccp.newton.forms import BodyForm, ContactForm, FewForm, NewtonForm
 from pctt.ccp.newton.linear import LinearSolver, Settings
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase
@@ -39,7 +44,7 @@ class Newton:
     """The Newton systems of one cone problem after another.
 
     form : of FORMS. The body form has its own solver unless the options name a KSP or PC; a problem of few contacts, or
-        one that knows no bodies (given by N), is solved in the form `contact` instead, by a factor.
+        one that knows no bodies (given by N), is solved in the form `contact` instead, by factors.
 
     Attributes
     ----------
@@ -54,30 +59,49 @@ class Newton:
         self._structure: tuple | None = None  # of the system's problem
         self._instead = False  # of the bodies' form, which the present problem has not
         self._linear: LinearSolver | None = None
+        self._looked: tuple[Any, tuple[GivenMatrix, Order] | None] = (None, None)
 
-    def begin(self, problem: ConeProblem) -> None:
-        """Take the next problem; its structure is kept where contacts and bodies are those of the last."""
-        self.problem = problem
-        few = self.has_few(problem)
-        instead = self.form == "body" and (few or problem.contact_map is None)
+    def begin(self, problem: ConeProblem) -> ConeProblem:
+        """Take the next problem; its structure is kept where contacts and bodies are those of the last.
+
+        Returns the problem as its systems know it: given by N where its contacts are few."""
+        few = self._few(problem)
+        instead = self.form == "body" and (few is not None or problem.contact_map is None)
         if instead != self._instead:
             self.destroy()
             self._instead = instead
+        self.problem = problem if few is None else problem.by_matrix(few[0])
         structure, last = problem.structure(), self._structure or ()
         same = len(structure) == len(last) and all(map(np.array_equal, structure, last))
-        self.linear.begin(few)
+        self.linear.begin()
+        self._rtol_is_given = PETSc.Options().hasName("ksp_rtol")  # then the linear solver takes it whatever is wanted
         if problem.comm.allreduce(same, op=MPI.LAND):
-            self.system.load(problem)
+            self.system.load(self.problem)
         else:
             self.forget()
-            self.system = FORMS["contact" if instead else self.form](problem)
-            self._x, self._b = self.system.matrix.createVecs()
+            if few is not None:
+                self.system = FewForm(self.problem, few[1])
+            else:
+                self.system = FORMS["contact" if instead else self.form](problem)
         self._structure = structure
+        return self.problem
 
     def has_few(self, problem: ConeProblem) -> bool:
-        """Whether the systems of this problem get `Dense` factors."""
-        few = problem.comm.size == 1 and problem.r.size <= Settings.few and len(problem.r) == problem.cones.count
-        return self.form == "body" and self._own and few
+        """Whether the systems of this problem get the factors of `FewForm`."""
+        return self._few(problem) is not None
+
+    def _few(self, problem: ConeProblem) -> tuple[GivenMatrix, Order] | None:
+        """N and an order of elimination, if the contacts are few; that of the last problem is kept."""
+        if self._looked[0] is not problem.operator:
+            own = problem.comm.size == 1 and self.form == "body" and self._own
+            few = own and len(problem.r) == problem.cones.count <= Settings.few
+            self._looked = (problem.operator, _eliminated(problem) if few else None)
+        return self._looked[1]
+
+    @property
+    def takes_any(self) -> bool:
+        """Whether the present systems may be unsymmetric."""
+        return self.linear.own or isinstance(self.system, FewForm)
 
     @property
     def linear(self) -> LinearSolver:
@@ -99,7 +123,8 @@ class Newton:
         are not ``symmetric``."""
         with phase("CCPUpdate"):
             self.system.update(barrier, inverse, symmetric)
-            self.linear.new_matrix(self.system)
+            if not isinstance(self.system, FewForm):
+                self.linear.new_matrix(self.system)
 
     def solve(
         self,
@@ -115,11 +140,18 @@ class Newton:
         a product."""
         with phase("CCPKrylov"):
             b = self.system.right_hand_side(q, r_v, uncoupled)
-            x, product = self._start(b, () if self.linear.direct else earlier)
+            wanted = tol / self.system.speed
+            if isinstance(self.system, FewForm):
+                x, count = self.system.factors.solve(b.reshape(-1, 3), max(wanted, 1e-14 * math.sqrt(b @ b)))
+                self.linear.iterations += count
+                if count:
+                    return x, x.ravel()
+                self.system.update_matrix()
+                self.linear.new_matrix(self.system)
+            x, product = self._start(b, earlier)
             self._b.array[:] = b - product
             norm = self._b.norm()
-            wanted = tol / self.system.speed
-            if PETSc.Options().hasName("ksp_rtol"):  # the user's, which the linear solver takes whatever is wanted
+            if self._rtol_is_given:
                 wanted = min(wanted, 0.5 * norm)
             if wanted < norm < np.inf:  # the caller finds no step in a direction that is no number
                 self.linear.solve(self._b, self._x, max(wanted / norm, 1e-14))
@@ -150,6 +182,18 @@ class Newton:
         # scaled, as solutions shrink from one Newton step to the next; of nearly parallel ones only the sum counts
         return np.linalg.lstsq(energies / np.outer(size, size), works / size, rcond=1e-10)[0] / size
 
+    @property
+    def _x(self) -> PETSc.Vec:
+        return self._vectors[0]
+
+    @property
+    def _b(self) -> PETSc.Vec:
+        return self._vectors[1]
+
+    @cached_property
+    def _vectors(self) -> tuple[PETSc.Vec, PETSc.Vec]:
+        return self.system.matrix.createVecs()
+
     def forget(self) -> None:
         """Drop what belongs to the last problem's structure."""
         if self._linear is not None:
@@ -157,7 +201,7 @@ class Newton:
         if self.compare is not None:
             self.compare.forget()
         if self._structure is not None:
-            for thing in (self.system, self._x, self._b):
+            for thing in (self.system, *self.__dict__.pop("_vectors", ())):
                 thing.destroy()
             self._structure = None
 
@@ -168,3 +212,18 @@ class Newton:
             self._linear = None
         if self.compare is not None:
             self.compare.destroy()
+
+
+def _eliminated(problem: ConeProblem) -> tuple[GivenMatrix, Order] | None:
+    """N and the order of `pctt.ccp.newton.few` of a problem on one rank, if it is cheap enough."""
+    if isinstance(problem.operator, GivenMatrix):
+        known = problem.operator
+    elif problem.operator.has_rows:
+        G = problem.operator.block_rows
+        if np.square(np.bincount(G.indices)).sum() > 2 * Settings.pairs + len(G.indices):
+            return None
+        known = GivenMatrix(problem.comm, all_blocks(G))
+    else:
+        return None
+    order = ordered(known.local.indptr, known.local.indices, Settings.pairs, Settings.rest)
+    return None if order is None else (known, order)

@@ -8,15 +8,15 @@ barrier blocks after another. Both have
         momenta of its own mends; or it is one of velocities, (B + C) dg + G dv = q, where it opens what should touch
     speed : what a residual of 1 changes the velocities of contacts by, about
 
-and the functions of `ContactForm` but for `dense`.
+and the functions of `ContactForm`. A third one, `FewForm`, is that of the contacts with factors of its own.
 """
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Union
 
 import numpy as np
-import scipy.sparse as sp
 from petsc4py import PETSc
 
 from dem.contact_map.loops import local_product, pack
@@ -24,7 +24,8 @@ from pctt.blocks import put_diagonal_blocks, set_diagonal_blocks, symmetric_shel
 from pctt.body_matrix import BodyOperator, inverse_blocks
 from pctt.ccp.cone import Array
 from pctt.ccp.delassus import GivenMatrix
-from pctt.ccp.newton.fronts import Fronts, places_in
+from pctt.ccp.newton.few import Factors, Order
+from pctt.ccp.newton.fronts import Dissection, Fronts, places_in
 from pctt.ccp.problem import ConeProblem
 
 
@@ -45,12 +46,14 @@ class ContactForm:
     def __init__(self, problem: ConeProblem):
         self.problem, self.symmetric = problem, True
         self._entries: PETSc.Mat | None = None
-        self._N: Array | None = None
-        self.matrix = symmetric_shell(problem.comm, problem.r.size, 3, self._product)
+
+    @cached_property
+    def matrix(self) -> PETSc.Mat:
+        return symmetric_shell(self.problem.comm, self.problem.r.size, 3, self._product)
 
     def load(self, problem: ConeProblem) -> None:
         """Take another problem with the same contacts between the same bodies."""
-        self.problem, self._loaded, self._N = problem, False, None
+        self.problem, self._loaded = problem, False
 
     def update(self, barrier: Array | None, inverse: Array | None = None, symmetric: bool = True) -> None:
         """Make the matrix for the barrier blocks B (nc, 3, 3), or from ``inverse`` = (B + C)^-1 if the caller has it
@@ -84,14 +87,6 @@ class ContactForm:
             self._made = True
         return self._entries
 
-    def dense(self) -> Array:
-        """S of a problem on one rank (3Nc, 3Nc)."""
-        if self._N is None:
-            self._N = _dense(self.problem)
-        matrix, here = self._N.copy(), np.arange(len(self._blocks))
-        matrix.reshape(len(here), 3, len(here), 3)[here, :, here] = self._blocks
-        return matrix
-
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         """Of the system for x. ``uncoupled`` is (B + C)^-1 q, if the caller has it more accurately."""
         return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
@@ -105,19 +100,34 @@ class ContactForm:
         return self.problem.momentum(dg) - r_v
 
     def destroy(self) -> None:
-        self.matrix.destroy()
+        if "matrix" in self.__dict__:
+            self.matrix.destroy()
         if self._entries is not None:
             self._entries.destroy()
 
 
-def _dense(problem: ConeProblem) -> Array:
-    """N of a problem on one rank, without compliance."""
-    if isinstance(problem.operator, GivenMatrix):
-        indptr, indices, values = problem.operator.mat.getValuesCSR()
-        return sp.csr_matrix((values, indices, indptr), shape=(problem.r.size,) * 2).toarray()
-    G = problem.operator.block_rows
-    rows = sp.bsr_matrix((G.blocks, G.indices, G.indptr), shape=(problem.r.size, 6 * G.columns))
-    return (rows @ rows.T).toarray()
+class FewForm(ContactForm):
+    """The form of the contacts where a problem, given by N, has few of them on one rank: `Factors` solve it, and no
+    object of PETSc is made before these have failed."""
+
+    def __init__(self, problem: ConeProblem, order: Order):
+        self._order = order
+        super().__init__(problem)
+
+    def update(self, barrier: Array | None, inverse: Array | None = None, symmetric: bool = True) -> None:
+        assert barrier is not None
+        assert isinstance(self.problem.operator, GivenMatrix)
+        self._barrier, self.symmetric = barrier, symmetric
+        blocks = self.problem.diagonal_blocks + barrier
+        self.factors = Factors(self.problem.operator.local, self._order, blocks, symmetric)
+
+    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
+        """q: momenta are impulses here, and r_v is rounding."""
+        return q.ravel()
+
+    def update_matrix(self) -> None:
+        """Make the matrix for the present blocks."""
+        super().update(self._barrier, None, self.symmetric)
 
 
 class BodyForm:
@@ -141,13 +151,14 @@ class BodyForm:
         self.matrix = self.operator.mat
         self._places: Array | None = None
         self._placed = False
+        self._dissection: Dissection | None = None
         self.symmetric = True
 
     def load(self, problem: ConeProblem) -> None:
         assert problem.contact_map is not None
         self.problem = problem
         self.operator.load(problem.contact_map)
-        self._places, self._placed = None, False
+        self._places, self._placed, self._dissection = None, False, None
 
     def update(self, barrier: Array | None, inverse: Array | None = None, symmetric: bool = True) -> None:
         if inverse is None:
@@ -177,9 +188,11 @@ class BodyForm:
         return self.operator.entries().stiff_mat(least, self.symmetric)
 
     def fronts(self, least: float, precision: type[np.floating]) -> Fronts:
-        """The factors of this part, which is symmetric and on one rank."""
+        """The factors of this part, which is symmetric and on one rank; all of a problem in the order of the first."""
         part, points = self.operator.entries().stiff_part(least), self.places()
-        return Fronts(part, places_in(part) if points is None else points, precision)
+        fronts = Fronts(part, places_in(part) if points is None else points, precision, self._dissection)
+        self._dissection = fronts.dissection
+        return fronts
 
     @property
     def speed(self) -> float:

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.linalg import lapack
 
 from pctt import memory
-from pctt.ccp.cone import Array
 from pctt.ccp.newton.compare import Comparison
-from pctt.ccp.newton.forms import BodyForm, ContactForm, NewtonForm
+from pctt.ccp.newton.forms import BodyForm, NewtonForm
 from pctt.ccp.newton.fronts import FrontPC
 from pctt.ccp.newton.krylov import Krylov, Solve, Source
 from pctt.options import number
@@ -28,39 +26,20 @@ FRONTS = {
 class Settings:
     """Numbers of `LinearSolver`."""
 
-    few: int = number(400, "rows on one rank up to which `Dense` factors pay: 0.2 ms for 250, 1 ms for 450")
-    easy: float = number(8.0, "iterations with block Jacobi / bodies^0.4 and rank, after which the next matrix gets a "
-                              "factor. It costs as much as 10 to 18 on one rank, and no less on more")  # fmt: skip
+    few: int = number(1000, "contacts on one rank up to which an order of elimination is looked for")
+    pairs: int = number(100_000, "of these, pairs of blocks in an elimination at most: 20 ns each")
+    rest: int = number(133, "of these, contacts in the dense rest at most: 1 ms")
+    easy: float = number(6.0, "iterations with block Jacobi / bodies^0.4 and rank, after which the next matrix gets a "
+                              "factor. It costs as much as 8 to 14 on one rank, and no less on more")  # fmt: skip
     least: float = number(0.1, "drop tolerance of a factor [mass]: entries of a block between bodies that it is better "
                                "off without")  # fmt: skip
-    single: float = number(0.015, "iterations with factors of single precision, in units of easy, after which the "
+    single: float = number(0.02, "iterations with factors of single precision, in units of easy, after which the "
                                   "next are of double, which cost 10 iterations more (n = 8), 30 (n = 16)")  # fmt: skip
-    limit: float = number(3.0, "iterations with block Jacobi at most, in units of easy")
+    limit: float = number(4.0, "iterations with block Jacobi at most, in units of easy")
     alone: int = number(20_000, "the same where the memory has no room for a factor")
     factor_bytes: float = number(210.0, "memory of a factor in double precision / rows^(4/3), the growth of nested "
                                         "dissection in space: 2.7e9 bytes at 35,939 bodies by fronts")  # fmt: skip
     spare: float = number(0.9, "part of the available memory that a factor may take")
-
-
-class Dense:
-    """Factors by LAPACK of a matrix that one rank holds: a KSP takes longer to begin than they take to solve."""
-
-    def __init__(self, matrix: Array, symmetric: bool):
-        names = ("potrf", "potrs") if symmetric else ("getrf", "getrs")
-        factorise, self._solve = lapack.get_lapack_funcs(names, dtype=float)
-        self.matrix, self._side = matrix, {"lower": 1} if symmetric else {}
-        *self._factors, self.failed = factorise(matrix, **self._side)
-
-    def solve(self, b: Array, rtol: float) -> tuple[Array, int]:
-        """x with A x = b to a relative residual of rtol, refined where it must be, and the solves that this took; 0 if
-        it was not reached."""
-        x, left, wanted = np.zeros_like(b), b, rtol * np.linalg.norm(b)
-        for count in range(1, 1 if self.failed else 11):
-            x += self._solve(*self._factors, left, **self._side)[0]
-            left = b - self.matrix @ x
-            if np.linalg.norm(left) <= wanted:
-                return x, count
-        return x, 0
 
 
 class LinearSolver:
@@ -75,7 +54,6 @@ class LinearSolver:
     Attributes
     ----------
     iterations, fallbacks : of the present problem: Krylov iterations, systems that were not solved as planned
-    direct : whether the present problem's systems are solved by `Dense`
     """
 
     def __init__(
@@ -90,19 +68,14 @@ class LinearSolver:
         self._symmetric = True
         self.begin()
 
-    def begin(self, direct: bool = False) -> None:
-        """Another problem; ``direct``: its systems, of the contacts, have few rows and get `Dense` factors."""
-        self.direct = direct
-        self._dense: Dense | None = None
+    def begin(self) -> None:
+        """Another problem."""
         self.iterations = self.fallbacks = 0
         self._worst, self._hard, self._factored, self._double = 0, False, False, False
 
     def new_matrix(self, system: NewtonForm) -> None:
         """The system has new values."""
         self.system, self._symmetric, self._factored = system, system.symmetric, False
-        if self.direct:
-            assert isinstance(system, ContactForm)
-            self._dense = Dense(system.dense(), system.symmetric)
         bodies = system.matrix.getSize()[0] / 6.0
         easy = int(Settings.easy * bodies**0.4 * self.comm.size)
         self._easy = self.comm.bcast(easy)  # a last bit may differ between processors
@@ -111,11 +84,6 @@ class LinearSolver:
     def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
         """x = A^-1 b to a relative residual of rtol; whether that was reached. Otherwise x is the best that was found,
         or zero if nothing leaves less than 1."""
-        if self._dense:
-            x.array[:], count = self._dense.solve(b.array_r, rtol)
-            self.iterations += count
-            if count:
-                return True
         first = None if self._hard else self._by_ksp(b, x, rtol)
         if first and first.converged:
             return True
@@ -198,11 +166,6 @@ class LinearSolver:
                     options["ksp_max_it"] = str(most)
             self._krylov[name, symmetric] = Krylov(self.comm, "fallback_" if name == "factor" else "", options)
         return self._krylov[name, symmetric]
-
-    @property
-    def takes_any(self) -> bool:
-        """Whether the present systems may be unsymmetric."""
-        return self.own or self.direct
 
     def report(self) -> list[str]:
         """Lines about the preconditioner, if it is one of this package."""
