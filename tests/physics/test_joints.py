@@ -261,7 +261,7 @@ def test_a_mechanism_of_large_bodies_alone(tmp_path):
     scene.add_body("boom", [Box((0.5, 0.03, 0.03))], Dynamic(), position=(0.5, 0, 0), **boom)
     scene.add_joint("pin", None, "boom", anchor=(0, 0, 0), axis=(0, 1, 0))
     with pctt.Simulation(scene, tol=1e-8, comm=MPI.COMM_WORLD, say=lambda text: None) as sim:
-        assert sim.settings.delta == pytest.approx(0.03 / 5)
+        assert sim.settings.delta == pytest.approx(0.03 / 20)
         sim.write(tmp_path / "out")
         sim.run(until=1.0)
         at = sim.joint("pin").angle

@@ -186,7 +186,7 @@ def test_defaults_follow_from_what_may_come():
     """The same as those of a scene that has the smallest and the largest grain from the beginning."""
     scene = chute()
     sim = Simulation(scene, comm=MPI.COMM_SELF, solver="apgd")
-    assert sim.settings.delta == pytest.approx(0.015 / 5)
+    assert sim.settings.delta == pytest.approx(0.015 / 20)
     bed = 0.64 * 2500 * 9.81 * 0.2  # from the floor to the top of the source
     expected = max(4 * bed * (2 * r) ** 2 / (0.003 * r) for r in (0.015, 0.025))
     assert float(sim.world.pairs.stiffness.min()) == pytest.approx(expected, rel=0.05)
