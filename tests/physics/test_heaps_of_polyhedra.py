@@ -79,7 +79,7 @@ def test_a_tetrahedron_falls_onto_its_face_and_rests():
 def test_a_heap_loses_energy_and_comes_to_rest():
     with pctt.Simulation(heap(27, others=False), dt=DT, stiffness=1e6) as sim:
         most, lost = 0.0, []
-        for _ in range(500):
+        for _ in range(800):
             row = sim.step()
             lost.append(row["kinetic_energy [J]"] + row["potential_energy [J]"] + row["spring_energy [J]"])
             most = max(most, row["worst_overlap [m]"])
