@@ -41,7 +41,7 @@ from dem.contact import Contacts
 from dem.contact_map import CompactRows, ContactMap, Halo
 from dem.contact_map.cell import CellMap
 from dem.contact_map.jointed import JointedMap
-from dem.contact_map.loops import scale
+from dem.contact_map.loops import closing, scale
 from dem.contact_map.map import packed
 from dem.joints import Coupling
 from dem.rolling import resistance
@@ -66,7 +66,7 @@ class ContactSystem:
         last step, in a cell that deforms [m/s]
         surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.surface`; None if there is none
         b (nc, 3): (gap / dt, surface) [m/s], see `gap_velocities`
-        r (nc, 3): b + D' v_free [m/s]; zero where it is rounding, see `_closing`
+        r (nc, 3): b + D' v_free [m/s]; zero where it is rounding, see `dem.contact_map.loops.closing`
         near: the bodies about this rank
         contact_map: G, with the halo of the bodies; the rows of its tables are those of `near`
         problem_map: G of the cone problem: with the rows of turning, where contacts resist it
@@ -110,12 +110,12 @@ class ContactSystem:
         self.applied = applied_impulses(world, dt) if world.loaded else None
         if world.loaded:
             halo.update(free)
-        freely, rounding = _closing(rows.frame, arm, row, free)
+        freely, rounding = closing(rows.frame, arm, row, free)
         self.joints = joint_coupling(world, dt) if joints is None else joints
         if self.joints is not None:
             here, slot = slots(world, near.bodies.id)
             free[here] += self.joints.change[slot]
-            freely, more = _closing(rows.frame, arm, row, free)
+            freely, more = closing(rows.frame, arm, row, free)
             rounding += more
             own = here < owned
             coupling = self.joints.matrix
@@ -373,30 +373,6 @@ def contact_arms(point: Floats, position: Floats, row: np.ndarray) -> Floats:
             out[c, k] = point[c, k] - position[row[c, 0], k]
             out[c, 3 + k] = point[c, k] - position[row[c, 1], k]
     return out
-
-
-@loop
-def _closing(frame: Floats, arm: Floats, row: np.ndarray, w: Floats) -> tuple[Floats, Floats]:
-    """D' w (nc, 3) for velocities w (rows, 6) of bodies, and what of it (nc,) is rounding: 1e-12 of the velocities of
-    both bodies at their contact [m/s].
-
-    What closes more slowly makes an overlap of 1e-12 v dt, until it counts by its gap. Bodies that fly side by side
-    would else get impulses of 1e-25 N s, and solvers take hundreds of iterations for what is noise."""
-    y, rounding = np.empty((len(row), 3)), np.empty(len(row))
-    for c in range(len(row)):
-        a, b = row[c, 0], row[c, 1]
-        r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
-        u0 = w[b, 0] - w[a, 0] + w[b, 4] * s2 - w[b, 5] * s1 - (w[a, 4] * r2 - w[a, 5] * r1)
-        u1 = w[b, 1] - w[a, 1] + w[b, 5] * s0 - w[b, 3] * s2 - (w[a, 5] * r0 - w[a, 3] * r2)
-        u2 = w[b, 2] - w[a, 2] + w[b, 3] * s1 - w[b, 4] * s0 - (w[a, 3] * r1 - w[a, 4] * r0)
-        for k in range(3):
-            y[c, k] = frame[c, 3 * k] * u0 + frame[c, 3 * k + 1] * u1 + frame[c, 3 * k + 2] * u2
-        one = abs(w[a, 0]) + abs(w[a, 1]) + abs(w[a, 2])
-        one += (abs(w[a, 3]) + abs(w[a, 4]) + abs(w[a, 5])) * (abs(r0) + abs(r1) + abs(r2))
-        two = abs(w[b, 0]) + abs(w[b, 1]) + abs(w[b, 2])
-        two += (abs(w[b, 3]) + abs(w[b, 4]) + abs(w[b, 5])) * (abs(s0) + abs(s1) + abs(s2))
-        rounding[c] = 1e-12 * one + 1e-12 * two
-    return y, rounding
 
 
 @loop

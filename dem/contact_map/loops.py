@@ -62,6 +62,28 @@ def relative_velocities(frame, arm, body, w) -> Floats:
 
 
 @loop
+def closing(frame, arm, body, w) -> tuple[Floats, Floats]:
+    """D' w (nc, 3) for velocities w (rows, 6) of bodies, and what of it (nc,) is rounding: 1e-12 of the velocities of
+    both bodies at their contact [m/s].
+
+    What closes more slowly makes an overlap of 1e-12 v dt, until it counts by its gap. Bodies that fly side by side
+    would else get impulses of 1e-25 N s, and solvers take hundreds of iterations for what is noise."""
+    y, rounding = np.empty((len(body), 3)), np.empty(len(body))
+    for c in range(len(body)):
+        a, b = body[c, 0], body[c, 1]
+        r0, r1, r2, s0, s1, s2 = arm[c, 0], arm[c, 1], arm[c, 2], arm[c, 3], arm[c, 4], arm[c, 5]
+        u0, u1, u2 = velocity_at(c, arm, body, w)
+        for k in range(3):
+            y[c, k] = frame[c, 3 * k] * u0 + frame[c, 3 * k + 1] * u1 + frame[c, 3 * k + 2] * u2
+        one = abs(w[a, 0]) + abs(w[a, 1]) + abs(w[a, 2])
+        one += (abs(w[a, 3]) + abs(w[a, 4]) + abs(w[a, 5])) * (abs(r0) + abs(r1) + abs(r2))
+        two = abs(w[b, 0]) + abs(w[b, 1]) + abs(w[b, 2])
+        two += (abs(w[b, 3]) + abs(w[b, 4]) + abs(w[b, 5])) * (abs(s0) + abs(s1) + abs(s2))
+        rounding[c] = 1e-12 * one + 1e-12 * two
+    return y, rounding
+
+
+@loop
 def works(frame, arm, body, g, w, new_w):
     """g' D' (w + new_w) / 2 of normal and of tangential impulses g (nc, 3), and the normal part (nc,) of D' new_w."""
     normal, tangential, velocity = 0.0, 0.0, np.empty(len(body))
