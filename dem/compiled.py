@@ -100,8 +100,9 @@ def loop(function: Function) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """A function that is compiled as a part of each loop that calls it."""
-    return cast(Function, Loop(function, {"inline": "always"}))
+    """A function that becomes a part of each loop that calls it, at the hands of LLVM: numba's own ``inline`` copies
+    its tree of the function at every call, and took half of the seconds of compilation."""
+    return cast(Function, Loop(function, {"forceinline": True}))
 
 
 def tell_first_compilation(say: Callable[[str], None]) -> None:

@@ -52,7 +52,7 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
             worst = (float(speed[row]), int(grains.id[row]), -1) if row >= 0 else worst
         else:
             margin = np.where(fast, np.minimum(way, reach * most), 0.0)
-            wide = find_contacts(world, delta, dt, np.maximum(seen, margin), contacts.shifts)
+            wide = find_contacts(world, delta, 0.0, np.maximum(seen, margin), contacts.shifts)
             grains.weight = weight
             wide = wide.take(places(contacts.key, wide.key) < 0)
             met = wide.take(_meet(world, wide, velocity, delta, dt))
@@ -107,7 +107,7 @@ def _meet(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: 
     way = way[:, 1] - way[:, 0]
     if (flow := contacts.flow(world, near.bodies.position)) is not None:
         way += dt * flow
-    closes: Bools = contacts.gap + np.einsum("ci,ci->c", way, contacts.normal) < -0.01 * delta
+    closes: Bools = contacts.linear_gap + np.einsum("ci,ci->c", way, contacts.normal) < -0.01 * delta
     balls = (shape == SPHERE).all(axis=1)
     radii = near.bodies.size[row[balls], 0].sum(axis=1)
     apart = contacts.way(near.bodies.position)[balls]

@@ -8,6 +8,7 @@ from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.bodies import SPHERE, Bodies
 from dem.compiled import loop
+from dem.vectors import cross, dot, plus, shares, turned
 
 
 def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
@@ -55,30 +56,30 @@ def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
     half = 0.5 * dt
     for n in range(len(spin)):
         frame, twice = (turn[n, 1], turn[n, 2], turn[n, 3]), 2.0 * turn[n, 0]
-        w = _turned((spin[n, 0], spin[n, 1], spin[n, 2]), frame, -twice, 2.0)
+        w = turned((spin[n, 0], spin[n, 1], spin[n, 2]), frame, -twice, 2.0)
         largest = max(moments[n, 0], moments[n, 1], moments[n, 2])
         inertia = (moments[n, 0] / largest, moments[n, 1] / largest, moments[n, 2] / largest)
-        rotation = _sum(_ZERO, half, w)
-        sine, versed = _shares(rotation)
-        momentum, new = _turned(_each(inertia, w), rotation, -sine, versed), w
+        rotation = plus(_ZERO, half, w)
+        sine, versed = shares(rotation)
+        momentum, new = turned(_each(inertia, w), rotation, -sine, versed), w
         for _ in range(4):  # enough below half a radian a step
-            middle = _turned(_each(inertia, new), rotation, sine, versed)
+            middle = turned(_each(inertia, new), rotation, sine, versed)
             change = _solve(
                 _slope((inertia[0], 0.0, 0.0), (1.0, 0.0, 0.0), rotation, sine, versed, middle, half),
                 _slope((0.0, inertia[1], 0.0), (0.0, 1.0, 0.0), rotation, sine, versed, middle, half),
                 _slope((0.0, 0.0, inertia[2]), (0.0, 0.0, 1.0), rotation, sine, versed, middle, half),
-                _sum(momentum, -1.0, middle),
+                plus(momentum, -1.0, middle),
             )
-            new = _sum(new, 1.0, change)
-            rotation = _sum(_ZERO, half, new)
-            sine, versed = _shares(rotation)
-            if _dot(change, change) <= 1e-16 * _dot(w, w):
+            new = plus(new, 1.0, change)
+            rotation = plus(_ZERO, half, new)
+            sine, versed = shares(rotation)
+            if dot(change, change) <= 1e-16 * dot(w, w):
                 break  # the next change would be its square
-        back = _turned(momentum, rotation, -sine, versed)
-        error = _sum(back, -1.0, _each(inertia, new))
-        if _dot(error, error) <= 1e-12 * _dot(momentum, momentum):  # else a step does not resolve the motion
+        back = turned(momentum, rotation, -sine, versed)
+        error = plus(back, -1.0, _each(inertia, new))
+        if dot(error, error) <= 1e-12 * dot(momentum, momentum):  # else a step does not resolve the motion
             solved = back[0] / inertia[0], back[1] / inertia[1], back[2] / inertia[2]
-            out[n, 0], out[n, 1], out[n, 2] = _turned(solved, frame, twice, 2.0)
+            out[n, 0], out[n, 1], out[n, 2] = turned(solved, frame, twice, 2.0)
     return out
 
 
@@ -88,47 +89,16 @@ _ZERO = (0.0, 0.0, 0.0)
 @loop
 def _slope(along, axis, rotation, sine, versed, middle, half):
     """How the angular momentum in the middle of the step changes with the spin about an axis."""
-    turned = _turned(axis, rotation, 0.5, 1.0 / 6.0)
-    return _sum(_turned(along, rotation, sine, versed), -half, _cross(middle, turned))
-
-
-@loop
-def _turned(v, r, sine, versed):
-    """v + sine r x v + versed r x (r x v): the vector v, turned by the rotation vector r with its `_shares`, or by the
-    quaternion (w, r) with 2 w and 2; with -sine the other way."""
-    once = _cross(r, v)
-    return _sum(_sum(v, sine, once), versed, _cross(r, once))
-
-
-@loop
-def _shares(rotation):
-    """sin(a) / a and (1 - cos(a)) / a^2 of the angle a of a rotation vector."""
-    square = _dot(rotation, rotation)
-    angle = np.sqrt(square)
-    return (np.sin(angle) / angle, (1.0 - np.cos(angle)) / square) if angle > 1e-8 else (1.0, 0.5)
+    about = turned(axis, rotation, 0.5, 1.0 / 6.0)
+    return plus(turned(along, rotation, sine, versed), -half, cross(middle, about))
 
 
 @loop
 def _solve(a, b, c, right):
     """The solution of a matrix with columns a, b, c, by Cramer's rule."""
-    across = _cross(b, c)
-    over = 1.0 / _dot(a, across)
-    return over * _dot(right, across), over * _dot(a, _cross(right, c)), over * _dot(a, _cross(b, right))
-
-
-@loop
-def _cross(a, b):
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@loop
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@loop
-def _sum(a, share, b):
-    return a[0] + share * b[0], a[1] + share * b[1], a[2] + share * b[2]
+    across = cross(b, c)
+    over = 1.0 / dot(a, across)
+    return over * dot(right, across), over * dot(a, cross(right, c)), over * dot(a, cross(b, right))
 
 
 @loop

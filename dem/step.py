@@ -125,20 +125,15 @@ class Step:
         return self.system.impulse_on_large(self.impulse, self.moment)
 
 
-def advance(world: World, velocity: Floats, dt: float, moving: Floats | None = None) -> None:
+def advance(world: World, velocity: Floats, dt: float) -> None:
     """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by dt [s]; collective.
 
-    x <- x + dt (v + E x), q <- exp(dt w) q, with the rate E of a cell that changes its size, and with the velocities
-    `moving` (owned, 6) in place of these if they are given.
+    x <- x + dt (v + E x), q <- exp(dt w) q, with the rate E of a cell that changes its size.
     Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
     """
-    moving = velocity if moving is None else moving
-    large_velocity = large_moving = world.large_velocity(velocity, dt)
-    if moving is not velocity:
-        large_moving = world.large_velocity(moving, dt)
-    start = world.grains.position
-    _move(world.grains, velocity[: len(world.grains)], moving[: len(world.grains)], dt)
-    _move(world.large, large_velocity, large_moving, dt)
+    large_velocity, start = world.large_velocity(velocity, dt), world.grains.position
+    _move(world.grains, velocity[: len(world.grains)], dt)
+    _move(world.large, large_velocity, dt)
     if world.servo is not None:
         world.grains.position = world.grains.position + dt * world.servo.rate * start
     if world.springs:
@@ -166,10 +161,10 @@ def follow_motions(world: World) -> None:
         world.large.position[row], world.large.quaternion[row] = pose
 
 
-def _move(table: Bodies, velocity: Floats, moving: Floats, dt: float) -> None:
+def _move(table: Bodies, velocity: Floats, dt: float) -> None:
     table.velocity = velocity.copy()
-    table.position = table.position + dt * moving[:, :3]
-    table.quaternion = quaternion.integrate(table.quaternion, moving[:, 3:], dt)
+    table.position = table.position + dt * velocity[:, :3]
+    table.quaternion = quaternion.integrate(table.quaternion, velocity[:, 3:], dt)
 
 
 def find_overrun(
@@ -236,6 +231,9 @@ def find_turned(
     missed = known & (overlap > depth)
     if not on_any(world.comm, bool(missed.any()))[0]:
         return None
+    if contacts.linear is not None:
+        moved = np.zeros_like(start.point) if start.moved is None else start.moved
+        start = replace(start, moved=moved, linear=start.gap)
     found = replace(start, a=a, b=b, near=contacts.near).take(missed)
     return _joined(world, contacts.take(places(found.key, contacts.key) < 0), found)
 

@@ -153,20 +153,20 @@ def _kept(stiffness, compliance, dt, held, impulse, c):
 
 @loop
 def spring_energies(
-    stiffness: Floats, compliance: Floats, dt: float, gap: Floats, opening: Floats, held: Floats, impulse: Floats
+    stiffness: Floats, compliance: Floats, dt: float, gap: Floats, after: Floats, held: Floats, impulse: Floats
 ) -> tuple[float, float, float, float]:
     """What contacts hold as springs at the start and at the end of a step, along the normals and then along the
     tangents [J]. Rigid ones hold nothing.
 
-    That is k/2 d^2 of an overlap d, which changes in the step by dt times the normal velocity at its end, `opening`
-    (nc,); and h^2 / (2 k_t dt^2) of the impulse h that a tangential spring holds, `held` (nc, 2) at the start."""
+    That is k/2 d^2 of an overlap d, of the gaps (nc,) at the start and `after` the step [m]; and h^2 / (2 k_t dt^2) of
+    the impulse h that a tangential spring holds, `held` (nc, 2) at the start."""
     start, end, strained, strained_at_end = 0.0, 0.0, 0.0, 0.0
     for c in range(len(gap)):
         if np.isinf(stiffness[c]):
             continue
         k, per = stiffness[c], TANGENTIAL * stiffness[c] * dt**2
         start += 0.5 * k * max(-gap[c], 0.0) ** 2
-        end += 0.5 * k * max(-gap[c] - dt * opening[c], 0.0) ** 2
+        end += 0.5 * k * max(-after[c], 0.0) ** 2
         one, other = _kept(stiffness, compliance, dt, held, impulse, c)
         strained += 0.5 * (held[c, 0] ** 2 + held[c, 1] ** 2) / per
         strained_at_end += 0.5 * (one**2 + other**2) / per

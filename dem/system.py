@@ -32,8 +32,8 @@ from dem.applied import (
     joints_refound,
     slots,
 )
-from dem.arrays import Bools, Floats, Ints
-from dem.bodies import COMPOUND, Bodies
+from dem.arrays import Floats, Ints
+from dem.bodies import Bodies
 from dem.checks import positive
 from dem.cohesion import along_normal, attraction
 from dem.compiled import loop
@@ -79,12 +79,11 @@ class ContactSystem:
     """
 
     def __init__(
-        self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf, impacts: bool = True,
+        self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf,
         joints: Coupling | None = None, spent: Ints | None = None,
     ) -> None:  # fmt: skip
-        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `impacts`:
-        whether contacts that begin bounce; `joints`, `spent`: the joints of this step, and what `Drives` has by that
-        name, if contacts have shown them."""
+        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `joints`,
+        `spent`: the joints of this step, and what `Drives` has by that name, if contacts have shown them."""
         positive("time step", dt)
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
@@ -152,7 +151,7 @@ class ContactSystem:
                 self.problem_map = CellMap(self.resistance.map, self.cell)
             if self.attraction is not None:
                 self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
-        if impacts and world.pairs.restitution.any():
+        if world.pairs.restitution.any():
             self._bounce(world, contacts, freely[:, 0])
         self.r = _beyond(self.b, freely, rounding)
         if self.resistance is not None:
@@ -168,7 +167,8 @@ class ContactSystem:
         came = self.contact_map.relative_velocities(table.velocity)[:, 0]
         if self.drift is not None:
             came = came + self.drift[:, 0]
-        begin = (e > 0.0) & (came < -self.dt * math.hypot(*world.gravity)) & (contacts.gap + self.dt * freely < 0.0)
+        closes = contacts.linear_gap + self.dt * freely < 0.0
+        begin = (e > 0.0) & (came < -self.dt * math.hypot(*world.gravity)) & closes
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
 
@@ -183,10 +183,10 @@ class ContactSystem:
         in the place of the tangential ones [N s]."""
         return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
 
-    def spring_energies(self, gap: Floats, opening: Floats, impulse: Floats) -> tuple[float, float, float, float]:
+    def spring_energies(self, gap: Floats, end: Floats, impulse: Floats) -> tuple[float, float, float, float]:
         """`dem.stiffness.spring_energies` of the step with these impulses (nc, 3)."""
         given = self.stiffness, self.compliance, self.dt
-        return stiffness.spring_energies(*given, gap, opening, self.held, impulse)
+        return stiffness.spring_energies(*given, gap, end, self.held, impulse)
 
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
@@ -278,27 +278,13 @@ class ContactSystem:
         return normal, tangential, opening
 
 
-def touching(contacts: Contacts, system: ContactSystem) -> Bools:
-    """Mask (nc,) of the contacts of a system that touch at the start of its step, to a hundredth of a radius. Bodies
-    that slide along each other are apart by (dt v_t)^2 / (2 R) after a step that has kept them in contact. So do those
-    that attract each other: their force is in both problems of a step."""
-    table = contacts.near.bodies
-    radius = np.where(table.shape == COMPOUND, np.inf, bodies.bounding_radius(table))
-    radius = np.minimum(radius[contacts.a], radius[contacts.b])
-    slip = system.contact_map.relative_velocities(table.velocity)[:, 1:]
-    if system.drift is not None:
-        slip = slip + system.drift[:, 1:]
-    near: Bools = contacts.gap <= (system.dt * slip) ** 2 @ np.ones(2) / (2.0 * radius) + 0.01 * radius
-    return near if system.attraction is None else near | (system.attraction > 0.0)
-
-
 def gap_velocities(
     world: World, contacts: Contacts, dt: float, recovery_speed: float
 ) -> tuple[Floats, Floats, Floats]:
     """`dem.stiffness.gap_velocities` of these contacts."""
     table, rows = contacts.near.bodies, (contacts.a, contacts.b)
     return stiffness.gap_velocities(
-        world.pairs.stiffness, table.material, table.mass, *rows, contacts.gap, dt, float(recovery_speed)
+        world.pairs.stiffness, table.material, table.mass, *rows, contacts.linear_gap, dt, float(recovery_speed)
     )
 
 

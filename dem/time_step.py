@@ -1,8 +1,7 @@
 """The time step and the contact distance that a scene needs, from its sizes and speeds.
 
-A step of dt lets a contact that closes within it act from its start, so forces on tools are too large by a part that
-grows with dt. Two times matter: that in which the fastest tool goes a radius, and that in which a grain falls about
-half of one, sqrt(R / g). docs/measurements.md has the errors of forces on tools of seven scenes over dt.
+Two times matter: that in which the fastest tool goes a radius, and that in which a grain falls about half of one,
+sqrt(R / g). docs/mechanics.md has the errors of forces on tools over dt.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from dem.motion import top_speed
 from dem.scene import LargeBody, Scene
 from dem.shapes import Plane
 
-DRIVEN = 0.05  #: the way of the fastest tool in a step, in radii: docs/mechanics.md has the errors of forces
+DRIVEN = 0.075  #: the way of the fastest tool in a step, in radii: docs/mechanics.md has the errors of forces
 FALLING = 0.1  #: the step in units of sqrt(R / g), where no tool is fast
 PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same and steps take a quarter longer
 

@@ -29,7 +29,7 @@ def sample(folder: Folder, step: int) -> Sample:
     """All grains and contacts of a recorded step. FileError if there is no such step, or if its file is damaged.
 
     The centres at the start of the step are those of the record less dt times the velocities; that is exact but for
-    runs with ``-projection``, and bodies with a prescribed motion that turns."""
+    bodies with a prescribed motion that turns."""
     folder.require_frames()
     frame = folder.frame(step)
     table, grains = frame.table, slice(frame.table.grains)

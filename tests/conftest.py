@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import os
 
 import numpy as np
@@ -18,6 +19,33 @@ MOST_WORKERS = 8  # files go to workers whole, and there is no more work than th
 def pytest_xdist_auto_num_workers() -> int:
     """`-n auto` of pytest-xdist: a worker for each core that this process may use."""
     return min(len(os.sched_getaffinity(0)), MOST_WORKERS)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_compiles():
+    """Workers and ranks need the same loops at the same time. One of them compiles a loop, and the others wait for its
+    machine code, file by file of loops."""
+    from numba.core.dispatcher import Dispatcher
+
+    from dem.machine_code import MachineCode
+
+    compile, held = Dispatcher.compile, set()
+
+    def compile_alone(self, signature):
+        source = self.py_func.__code__.co_filename
+        if source in held or not isinstance(self._cache, MachineCode):
+            return compile(self, signature)
+        with open(source) as file:  # closing it unlocks
+            fcntl.flock(file, fcntl.LOCK_EX)
+            held.add(source)
+            try:
+                return compile(self, signature)
+            finally:
+                held.remove(source)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Dispatcher, "compile", compile_alone)
+        yield
 
 
 @pytest.fixture

@@ -132,8 +132,11 @@ def mpirun(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[..., str]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """What a test on several ranks needs is made inside mpiexec; here only its result is wanted."""
+    """What a test on several ranks needs is made inside mpiexec; here only its result is wanted. Files with such tests
+    come last: then their loops are compiled, and workers that wait for ranks leave them the cores."""
     if not config.getoption(INSIDE):
+        late = {item.path for item in items if item.get_closest_marker("mpi")}
+        items.sort(key=lambda item: item.path in late)
         for item in items:
             if ranks_of(item) > 1:
                 item.fixturenames = ["several_ranks"]
@@ -265,6 +268,7 @@ class Inside:
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         text = report.longrepr[2] if report.skipped else report.longreprtext
         line = {"test": report.nodeid, "when": report.when, "outcome": report.outcome, "text": text}
+        line["seconds"] = round(report.duration, 2)  # for those who wonder what takes long
         with open(self.folder / f"rank-{self.comm.rank}", "a") as file:
             file.write(json.dumps(line) + "\n")
         if report.failed:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ast
-import subprocess
-import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -94,24 +92,6 @@ def test_a_part_does_not_know_of_those_above_it(graph, part, above):
         if within(name, part):
             known = {other for other in graph[name] if not any(within(other, low) for low in SHARED)}
             assert not {other for other in known if any(within(other, high) for high in above)}, name
-
-
-PLAIN = """
-import sys
-from dem.scenes import Mixer
-from pctt.run import help, simulate
-from pctt.simulation import Simulation
-Simulation(Mixer(n=1), solver="apgd").run(steps=1)
-print(*sys.modules)
-"""
-
-
-def test_a_plain_run_does_not_load_what_it_does_not_use():
-    """On a cluster every rank opens the file of every module."""
-    said = subprocess.run([sys.executable, "-c", PLAIN], cwd=ROOT, capture_output=True, text=True, check=True)
-    loaded = set(said.stdout.split())
-    assert "dem.contact" in loaded
-    assert not loaded & {"pctt.tt", "pctt.mat", "pctt.pc", "matplotlib", "vtk", "scipy.fft", "scipy.signal"}
 
 
 def test_mechanics_and_trains_know_nothing_of_petsc():

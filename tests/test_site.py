@@ -24,7 +24,7 @@ WORDS = {
     "periodic": "periodic", "cohesion": "contact_laws", "rolling": "contact_laws", "stiffness": "mechanics",
     "restitution": "mechanics", "STL": "scenes", "ParaView": "looking", "film": "looking", "Slurm": "cluster",
     "wheel": "loads", "clump": "scenes", "spring": "loads", "stress": "measuring", "checkpoint": "scenes",
-    "overlap": "mechanics", "projection": "options", "closing work": "accuracy", "notebook": "python",
+    "overlap": "mechanics", "closing work": "accuracy", "notebook": "python",
     "preconditioner": "preconditioners",
 }  # fmt: skip
 

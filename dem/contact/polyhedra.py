@@ -20,6 +20,7 @@ from dem.arrays import Floats, Ints
 from dem.compiled import loop
 from dem.contact.narrow import CORNERS, Manifold, Planes, Spheres, Touch
 from dem.polyhedra import Solid, hull
+from dem.vectors import dot
 
 #: Polyhedra touch on faces if the smallest gap there is within this share of the contact distance of their distance; if
 #: not, in the closest points alone.
@@ -123,11 +124,6 @@ def polyhedra_planes(body: Polyhedra, plane: Planes, delta: Floats) -> Manifold:
 
 def _manifold(pair: Ints, feature: Ints, out: Floats) -> Manifold:
     return Manifold(pair, feature, Touch(*(np.ascontiguousarray(c) for c in (out[:, :3], out[:, 3:6], out[:, 6]))))
-
-
-@loop
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @loop
@@ -244,15 +240,15 @@ def _towards(many, corner, points, normals, axis, sign, slack):
     end of that way, within the slack."""
     far = -np.inf
     for k in range(many[0]):
-        far = max(far, sign * _dot(axis, points[k]))
+        far = max(far, sign * dot(axis, points[k]))
     best, most, face = -np.inf, 0, 0
     for f in range(many[1]):
         foremost = 0
         for s in range(corner.shape[1]):
             if corner[f, s] < 0:
                 break
-            foremost += sign * _dot(axis, points[corner[f, s]]) >= far - slack
-        ahead = sign * _dot(axis, normals[f])
+            foremost += sign * dot(axis, points[corner[f, s]]) >= far - slack
+        ahead = sign * dot(axis, normals[f])
         if foremost > most or (foremost == most and ahead > best + TIE):
             best, most, face = ahead, foremost, f
     return face
@@ -267,7 +263,7 @@ def _polygon(corner, points, normal, frame, sign, flat, line, plane):
     while many < len(corner) and corner[many] >= 0:
         k = corner[many]
         for n in range(3):
-            flat[many, n] = _dot(frame[n], points[k])
+            flat[many, n] = dot(frame[n], points[k])
         many += 1
     for k in range(many):
         after = k + 1 if k + 1 < many else 0
@@ -275,7 +271,7 @@ def _polygon(corner, points, normal, frame, sign, flat, line, plane):
         per = sign / max(np.sqrt(x * x + y * y), 1e-300)
         line[k, 0], line[k, 1] = y * per, -x * per
         line[k, 2] = line[k, 0] * flat[k, 0] + line[k, 1] * flat[k, 1]
-    u, v, w = _dot(frame[0], normal), _dot(frame[1], normal), _dot(frame[2], normal)
+    u, v, w = dot(frame[0], normal), dot(frame[1], normal), dot(frame[2], normal)
     if abs(w) < PARALLEL:
         return 0
     plane[0], plane[1] = -u / w, -v / w
@@ -380,7 +376,7 @@ def _overlaid(corners, p, normal, other_corners, q, other_normal, frame, thick, 
 def _on_triangle(a, b, c, share):
     """Fill in the shares of the corners of a triangle in its point nearest to the origin (Ericson 2005, "Real-time
     collision detection", 5.1.5); its squared distance."""
-    aa, bb, cc, ab, ac, bc = _dot(a, a), _dot(b, b), _dot(c, c), _dot(a, b), _dot(a, c), _dot(b, c)
+    aa, bb, cc, ab, ac, bc = dot(a, a), dot(b, b), dot(c, c), dot(a, b), dot(a, c), dot(b, c)
     d1, d2, d3, d4, d5, d6 = aa - ab, aa - ac, ab - bb, ab - bc, ac - bc, ac - cc
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     if d1 <= 0.0 and d2 <= 0.0:
@@ -429,11 +425,11 @@ def _distance(p, many, q, others, x, y, z, reach, size, way, ends, share, parts)
             way[count, n] = q[j, n] - p[i, n]
         first, second, better = 0, 0, np.inf  # the new simplex: `first`, `second` and the last of the points
         if count == 0:
-            better = _dot(way[0], way[0])
+            better = dot(way[0], way[0])
             parts[0], parts[1], parts[2] = 0.0, 0.0, 1.0
         elif count == 1:
-            a, b = _dot(way[0], way[0]), _dot(way[0], way[1])
-            t = min(max((a - b) / (a - 2.0 * b + _dot(way[1], way[1])), 0.0), 1.0)
+            a, b = dot(way[0], way[0]), dot(way[0], way[1])
+            t = min(max((a - b) / (a - 2.0 * b + dot(way[1], way[1])), 0.0), 1.0)
             parts[0], parts[1], parts[2], better = 1.0 - t, 0.0, t, 0.0
             for n in range(3):
                 better += ((1.0 - t) * way[0, n] + t * way[1, n]) ** 2
@@ -491,16 +487,16 @@ def _on_edges(points, many, others, count, edges, edge, axis, sign, slack, most,
     and the least distance. `first` is the number of the first vertex among the features."""
     front, back, least = -np.inf, np.inf, np.inf
     for k in range(many):
-        front = max(front, sign * _dot(axis, points[k]))
+        front = max(front, sign * dot(axis, points[k]))
     for k in range(count):
-        back = min(back, sign * _dot(axis, others[k]))
+        back = min(back, sign * dot(axis, others[k]))
     for k in range(many):
-        if sign * _dot(axis, points[k]) < front - slack:
+        if sign * dot(axis, points[k]) < front - slack:
             continue
         best, x, y, z = np.inf, 0.0, 0.0, 0.0
         for e in range(edges):
             a, b = edge[e, 0], edge[e, 1]
-            if min(sign * _dot(axis, others[a]), sign * _dot(axis, others[b])) > back + slack:
+            if min(sign * dot(axis, others[a]), sign * dot(axis, others[b])) > back + slack:
                 continue
             u, v, w = others[b, 0] - others[a, 0], others[b, 1] - others[a, 1], others[b, 2] - others[a, 2]
             i, j, s = points[k, 0] - others[a, 0], points[k, 1] - others[a, 1], points[k, 2] - others[a, 2]
@@ -616,7 +612,7 @@ def _pairs(
             j, n = _witness(q, ends[:, 1], share, points_in, place[1])
             for t in range(3):
                 axis[t] = place[1, t] - place[0, t]
-            gap = np.sqrt(_dot(axis, axis))
+            gap = np.sqrt(dot(axis, axis))
             for t in range(3):
                 axis[t] /= gap
             far = min(gap + tolerance, reach)
@@ -657,7 +653,7 @@ def _pairs(
         else:  # a corner in a face that the faces of the other, seen from it, are all too steep for
             sign, best, k = 1.0 if other < 0 else -1.0, np.inf, 0
             for n in range(others[0] if other < 0 else many[0]):
-                ahead = sign * _dot(frame[2], q[n] if other < 0 else p[n])
+                ahead = sign * dot(frame[2], q[n] if other < 0 else p[n])
                 if ahead < best:
                     best, k = ahead, n
             feature[found] = v + k if other < 0 else k

@@ -12,6 +12,7 @@ from dem.arrays import Bools, Floats, Ints, Keys, places
 from dem.bodies import CAPSULE, CLUMP, MESH, SPHERE
 from dem.checks import not_negative
 from dem.compiled import loop
+from dem.contact.ahead import turn_ahead
 from dem.contact.candidates import meeting
 from dem.contact.lists import grain_lists
 from dem.contact.primitives import extents, touches
@@ -31,13 +32,16 @@ class Contacts:
     a: Ints  #: (nc,) row of the first body in `near.bodies`, the one of lower id
     b: Ints  #: (nc,) row of the second body in `near.bodies`
     body: Ints  #: (nc, 2) global indices of the two bodies
-    point: Floats  #: (nc, 3) middle between the surfaces [m]
-    normal: Floats  #: (nc, 3) unit vector from a to b
-    gap: Floats  #: (nc,) signed distance, negative if the bodies overlap [m]
+    point: Floats  #: (nc, 3) middle between the surfaces, as seen from body a [m]
+    normal: Floats  #: (nc, 3) unit vector from a to b; of spheres that of the end of the step, see `dem.contact.ahead`
+    gap: Floats  #: (nc,) signed distance at the start of the step, negative if the bodies overlap [m]
     friction: Floats  #: (nc,) coefficient
     near: Neighbourhood  #: the bodies of the rows `a` and `b`
     shifts: Floats  #: (k, large, 6) the ways and turns of the large bodies that the search reckoned with [m, rad]
-    moved: Floats | None = None  #: (nc, 3) from body b to its image that touches body a; None without periods [m]
+    #: (nc, 3) from body b to where it is in the contact, as seen from body a: to its image, and ahead to the end of the
+    #: step; None: nowhere [m]
+    moved: Floats | None = None
+    linear: Floats | None = None  #: (nc,) the gaps from which gaps linear in the velocities start; None: `gap` [m]
     drift: Floats | None = None  #: (nc, 3) what the shear adds to the velocity of b relative to a; None: nothing [m/s]
     held_overlap: float = 0.0  #: the deepest overlap of bodies that no force can part, left out of the contacts [m]
 
@@ -46,8 +50,14 @@ class Contacts:
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays with a row per contact by name, without copies."""
-        left = {"near", "shifts", "held_overlap"} | {name for name in ("moved", "drift") if getattr(self, name) is None}
+        left = {"near", "shifts", "held_overlap"}
+        left |= {name for name in ("moved", "linear", "drift") if getattr(self, name) is None}
         return {name: value for name, value in vars(self).items() if name not in left}
+
+    @property
+    def linear_gap(self) -> Floats:
+        """The gaps (nc,) to which the normal velocities of a step times dt are added [m]."""
+        return self.gap if self.linear is None else self.linear
 
     def way(self, position: Floats) -> Floats:
         """From the centre of body a to that of body b, or of its image (nc, 3), at these positions (rows, 3) [m]."""
@@ -107,7 +117,13 @@ def find_contacts(
         *(table.number, table.row, table.kind, near.index, near.bodies.material, world.pairs.friction),
         *(table.hulls.features, near.grains, i, j, pair, feature),
     )
-    contacts = Contacts(key, a, b, body, *touch, friction, near, shifts)
+    moved: Floats | None = None
+    linear: Floats | None = None
+    if dt:
+        rows = table.kind, table.row, table.center, table.quaternion, table.size
+        motions = near.bodies.position, _motions(world, near, pictures, dt)
+        moved, linear = turn_ahead(*rows, *motions, i, j, pair, touch.point, touch.normal, touch.gap, dt)
+    contacts = Contacts(key, a, b, body, *touch, friction, near, shifts, moved, linear)
     if pictures is not None:
         contacts, weight = _without_images(world, contacts, base, pictures)
     back = np.flatnonzero(pair[1:] <= pair[:-1])  # other shapes come behind the spheres, and touch in several points
@@ -130,6 +146,18 @@ def find_contacts(
     return replace(contacts.take(~rigid), held_overlap=-float(contacts.gap[rigid].min(initial=0.0)))
 
 
+def _motions(world: World, near: Neighbourhood, pictures: Images | None, dt: float) -> Floats:
+    """Velocities (rows, 6) before the step of dt [s] of the bodies of a neighbourhood, of prescribed ones those of the
+    step; images and centres have those that a cell gives them."""
+    velocity, seen = near.bodies.velocity.copy(), near.grains + near.ghosts
+    velocity[seen:] = world.prescribed_velocity(dt)
+    if world.shear is not None and pictures is not None:
+        velocity[:seen, 0] += world.shear.speed * pictures.boundaries(np.arange(seen))
+    if world.servo is not None:
+        velocity[:seen, :3] += world.servo.rate * near.bodies.position[:seen]
+    return velocity
+
+
 def cell_way(world: World, dt: float) -> Floats | float:
     """What margins (grains,) have beside the ways of the grains in dt [s]: half the way of images behind a sheared
     boundary, as both grains of a pair have a half, and the share of a grain in the way by which a cell that changes its
@@ -147,7 +175,10 @@ def _without_images(
     """The contacts of a table with images as contacts of the bodies of `near`, at the place of body a and in order, and
     how many each of the local grains owns (grains,)."""
     (a, way), (b, moved) = images.place(contacts.a), images.place(contacts.b)
-    found = replace(contacts, a=a, b=b, near=near, point=contacts.point - way, moved=moved - way)
+    moved = moved - way
+    if contacts.moved is not None:
+        moved += contacts.moved
+    found = replace(contacts, a=a, b=b, near=near, point=contacts.point - way, moved=moved)
     if world.shear is not None:
         boundaries = images.boundaries(contacts.b) - images.boundaries(contacts.a)
         found = replace(found, drift=np.outer(world.shear.speed * boundaries, (1.0, 0.0, 0.0)))
@@ -252,8 +283,9 @@ def _gives_no_way(world: World, contacts: Contacts) -> Bools:
         moves = bodies.is_dynamic(world.large)[:, None, None]
         free, turns = free_directions(world.large_bodies) * moves, free_turns(world.large_bodies) * moves
         normal, opens = these.normal, np.zeros(len(these))
-        for body in (these.a, these.b):
-            arm = these.point - near.bodies.position[body]
+        moved = 0.0 if these.moved is None else these.moved
+        for body, way in ((these.a, 0.0), (these.b, moved)):
+            arm = these.point - near.bodies.position[body] - way
             lever = cross(arm / np.maximum(length(arm), 1e-300)[:, None], normal)
             opens += np.einsum("ci,cij,cj->c", normal, free[body - first], normal)
             opens += np.einsum("ci,cij,cj->c", lever, turns[body - first], lever)

@@ -71,7 +71,7 @@ class Settings(ccp.Limits):
         "but relaxation with pdip, -compare and -problem",
         choices=ccp.LAWS, name="law",
     )  # fmt: skip
-    tol: float = option(1.5e-3, "natural residual at which a cone problem counts as solved", check=FRACTION)
+    tol: float = option(1e-3, "natural residual at which a cone problem counts as solved", check=FRACTION)
     closing_work: float = option(
         0.5, "closing and opening work at which a cone problem counts as solved; inf: any",
         check=("a positive number, or inf", lambda x: x > 0),
@@ -88,10 +88,6 @@ class Settings(ccp.Limits):
         "stiffness of all contacts; inf: rigid; none: what the scene states, else rigid with pdip and in comparisons, "
         "and with other solvers what overlaps of 0.3 % of a radius need",
         unit="N/m", check=("a positive number, or inf", lambda x: x > 0), name="stiffness",
-    )  # fmt: skip
-    projection: bool = option(
-        False, "forces of touching contacts alone, then positions without overlaps: forces depend less on dt",
-        name="projection",
     )  # fmt: skip
     recovery_speed: float = option(
         1.0, "greatest speed at which rigid bodies that overlap are pushed apart", unit="m/s", check=NOT_NEGATIVE,

@@ -19,14 +19,13 @@ from dem.partition import rebalance
 from dem.passage import come_and_go
 from dem.period import put_back
 from dem.step import advance, carried, find_overrun, find_turned
-from dem.system import ContactSystem, touching
+from dem.system import ContactSystem
 from dem.together import SceneError
 from dem.world import World
 from pctt import ccp, log
 from pctt.ccp.cone import Array
 from pctt.options import OptionError
 from pctt.run.dump import Dump
-from pctt.run.projection import projected
 from pctt.run.settings import Settings
 
 
@@ -45,7 +44,6 @@ class Stepper:
     impulse: np.ndarray
     moment: np.ndarray | None  #: where contacts resist rolling or spinning
     history: list[float]  #: natural residual by iteration
-    projection_its: int  #: iterations of the last projection of positions
 
     def __init__(
         self,
@@ -105,8 +103,7 @@ class Stepper:
             put_back(self.world)
             rebalance(self.world)
             contacts = find_contacts(self.world, self.settings.delta, self.settings.dt)
-        impulses = self._with_projection if self.settings.projection else self._to_gaps
-        problem, guess, result, moving = impulses(contacts)
+        problem, guess, result = self._solved(contacts)
         with log.phase("output"):
             files = self.dump.step(self.system, problem, guess, result, result.asked or result) if self.dump else {}
         if result.status is ccp.Status.UNBOUNDED:
@@ -119,48 +116,30 @@ class Stepper:
             self.impulse, self.history = self.system.net(forces), result.history
             self.moment = None if self.system.resistance is None else moments
             self.system.take_flow(self.world, self.contacts)
-            advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt, moving)
+            advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt)
             kept = self.system.held_after(result.impulse)  # with which springs begin the next step
             self.memory.remember(self.system.key, kept, self.system.frame)
             self._slabs = self.world.slabs
         self._release()
         return self._figures(problem.size, result, files)
 
-    def _to_gaps(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
+    def _solved(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result]:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
         problem, guess = self._assemble(contacts)
         result = self.solve(problem, guess)
         while True:
-            again = self._unseen(self.contacts, self.system, result.momentum)
+            again = self._unseen(result.momentum)
             if again is None and self._machines_are(result):
-                return problem, guess, result, None
+                return problem, guess, result
             problem, guess = self._assemble(self.contacts if again is None else again, self._remembered(result))
             result = self.solve(problem, guess).after(result)
-
-    def _with_projection(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result, Array | None]:
-        """Forces of contacts that touch at the start, then positions without overlaps; see `pctt.run.projection`."""
-        every = self._system(contacts, impacts=False)
-        problem, guess = self._assemble(contacts.take(touching(contacts, every)))
-        result = self.solve(problem, guess)
-        while not self._machines_are(result):
-            every = self._system(contacts, impacts=False)
-            problem, guess = self._assemble(self.contacts, self._remembered(result))
-            result = self.solve(problem, guess).after(result)
-        while True:
-            with log.phase("project"):
-                shift, self.projection_its = projected(every, self.system, result)
-            again = self._unseen(contacts, every, result.momentum + shift)
-            if again is None:
-                return problem, guess, result, self.system.velocity_with(result.momentum + shift)
-            contacts, every = again, self._system(again, impacts=False)
 
     def _figures(self, contacts: int, result: ccp.Result, files: dict[str, Any]) -> dict[str, Any]:
         """The line of a step in steps.jsonl."""
         newton = self.newton
         pc_report = newton.linear.report() if newton is not None else []
         compare = newton.compare if newton is not None else None
-        more = (["compare"] if compare else []) + (["project"] if self.settings.projection else [])
-        phases = ("search", "assembly", "solve", *more, "advance")
+        phases = ("search", "assembly", "solve", *(("compare",) if compare else ()), "advance")
         return {
             "step": self.world.step,
             "time": self.world.time,
@@ -169,7 +148,6 @@ class Stepper:
             "iterations": result.iterations,
             "ksp_its": result.ksp_its,
             "cone_problems": result.cone_problems,
-            **({"projection_its": self.projection_its} if self.settings.projection else {}),
             **vars(result.accuracy),
             "converged": result.converged,
             "status": result.status.value,
@@ -186,17 +164,13 @@ class Stepper:
             "phases": log.take_seconds(phases),
         }
 
-    def _system(self, contacts: Contacts, impacts: bool = True) -> ContactSystem:
-        with log.phase("assembly"):
-            given = self.settings.dt, self.settings.recovery_speed, impacts, self._joints, self._spent
-            return ContactSystem(self.world, contacts, *given)
-
     def _assemble(self, contacts: Contacts, found: ImpulseMemory | None = None) -> tuple[ccp.ConeProblem, Array]:
         """The problem of these contacts, which takes the place of the last, and a guess: the impulses of the last step,
         or those found within this one."""
         self._release()
-        self.contacts, self.system = contacts, self._system(contacts)
+        given = self.settings.dt, self.settings.recovery_speed, self._joints, self._spent
         with log.phase("assembly"):
+            self.contacts, self.system = contacts, ContactSystem(self.world, contacts, *given)
             place = self.system.key, self.system.frame
             last, _ = self.memory.recall(*place, self._slabs is not self.world.slabs)
             guess = last if found is None else found.recall(*place, elsewhere=False)[0]
@@ -204,14 +178,14 @@ class Stepper:
             self._problem = cone_problem(self.system, self.world.comm)
         return self._problem, guess
 
-    def _unseen(self, contacts: Contacts, system: ContactSystem, momentum: Array) -> Contacts | None:
-        """The contacts, with those that these momenta show to be missed; None if there are none. Three times a step at
-        most with those that overlap at its end because bodies turn, by a tenth of delta."""
-        world, settings = self.world, self.settings
+    def _unseen(self, momentum: Array) -> Contacts | None:
+        """The present contacts, with those that these momenta show to be missed; None if there are none. Three times a
+        step at most with those that overlap at its end because bodies turn, by a tenth of delta."""
+        world, settings, contacts = self.world, self.settings, self.contacts
         delta, dt, recovery = settings.delta, settings.dt, settings.recovery_speed
         with log.phase("search"):
-            velocity = system.velocity_with(momentum)
-            system.set_rate(world, momentum)
+            velocity = self.system.velocity_with(momentum)
+            self.system.set_rate(world, momentum)
             deep = 0.01 * delta  # the overlap that is solved for
             wider = find_overrun(world, contacts, velocity, delta, dt, deep, recovery)
             if wider is not None:

@@ -4,7 +4,7 @@
 
 LIGGGHTS is not part of this project: apt-get install liggghts. It has linear springs and dashpots, kt = 2/7 kn,
 restitution 0.3, and steps of a tenth of the contact time, as its users choose them. SETTINGS of ours are fields of
-`pctt.Settings`, dt=0.01,tol=1e-3,projection=1, or `default`; the solver is `apgd`.
+`pctt.Settings`, dt=0.01,tol=1e-3,closing_work=inf, or `default`; the solver is `apgd`.
 
 A start is the settled state of the mixer with every sphere moved by up to a hundredth of a millimetre, another way in
 every start, so that the courses part. Both codes take the same starts. For each of them the table has
@@ -16,8 +16,8 @@ every start, so that the courses part. Both codes take the same starts. For each
 - the peak of memory in RAM.
 
 The limit of small steps and stiff contacts, from which errors of the torque are reckoned, is the mean of two that know
-nothing of each other: LIGGGHTS with its stiffest contacts, and our smallest steps without projection. Its standard
-error is what the two show, or what their starts do, if that is more. Writes results/compare_liggghts.json and .png.
+nothing of each other: LIGGGHTS with its stiffest contacts, and our smallest steps. Its standard error is what the two
+show, or what their starts do, if that is more. Writes results/compare_liggghts.json and .png.
 """
 
 from __future__ import annotations
@@ -50,14 +50,12 @@ RESTITUTION = 0.3
 CONTACT_STEPS = 10  # time steps of LIGGGHTS in a contact
 OURS = (
     "default",
-    "dt=.025,tol=3e-4,closing_work=inf,projection=0",
-    "dt=.025,tol=3e-4,closing_work=inf,projection=1",
-    "dt=.01,tol=3e-4,closing_work=inf,projection=0",
-    "dt=.01,tol=5e-4,closing_work=inf,projection=1",
-    "dt=.01,tol=1e-3,closing_work=inf,projection=0",
-    "dt=.005,tol=1e-3,closing_work=inf,projection=0",
-    "dt=.0025,tol=3e-4,closing_work=inf,projection=0",
-    "dt=.001,tol=3e-4,closing_work=inf,projection=0",
+    "dt=.025,tol=3e-4,closing_work=inf",
+    "dt=.01,tol=3e-4,closing_work=inf",
+    "dt=.01,tol=1e-3,closing_work=inf",
+    "dt=.005,tol=1e-3,closing_work=inf",
+    "dt=.0025,tol=3e-4,closing_work=inf",
+    "dt=.001,tol=3e-4,closing_work=inf",
 )
 LETTERS = string.ascii_lowercase + string.ascii_uppercase  # of the rows, in the figure
 
@@ -330,7 +328,7 @@ def row(start: Start, seconds: float, courses: list[Course]) -> Row:
 def limit_of(rows: list[Row]) -> tuple[float, float]:
     """The torque for small steps and stiff contacts and its standard error, as the top of the file says."""
     stiffest = max((row for row in rows if row["code"] == "LIGGGHTS"), key=lambda row: row["stiffness"])
-    own = [row for row in rows if "dt" in row and "stiffness" not in row and not row.get("projection")]
+    own = [row for row in rows if "dt" in row and "stiffness" not in row]
     both = [stiffest, *([min(own, key=lambda row: (row["dt"], row["tol"]))] if own else [])]
     print("limits: " + ", ".join(f"{row['torque']:.2f} +- {row['torque_error']:.2f}" for row in both))
     of_starts = math.hypot(*(row["torque_error"] for row in both)) / len(both)
@@ -368,26 +366,26 @@ def draw(sizes: list[list[Row]]) -> None:
     """Error of the torque over CPU seconds, a panel for each size, with the letters of the rows."""
     with shared.figure("compare_liggghts", len(sizes)) as panels:
         for axes, rows in zip(panels, sizes):
-            limit, blur = rows[0]["limit"], 100 * rows[0]["limit_error"] / rows[0]["limit"]
+            limit = rows[0]["limit"]
+            blur = 100 * np.nan_to_num(rows[0]["limit_error"]) / limit  # one start has no error
             for label, marker, chosen in (
                 ("LIGGGHTS", "s", [row for row in rows if row["code"] == "LIGGGHTS"]),
                 ("pctt, default", "*", [row for row in rows if row["name"] == "pctt default"]),
-                ("pctt", "o", [row for row in rows if row.get("projection") is False]),
-                ("pctt, projection", "^", [row for row in rows if row.get("projection")]),
+                ("pctt", "o", [row for row in rows if "dt" in row]),
             ):
                 if not chosen:
                     continue
                 off = [100 * (row["torque"] / limit - 1) for row in chosen]
-                bars = [100 * row["torque_error"] / limit for row in chosen]
+                bars = [100 * np.nan_to_num(row["torque_error"]) / limit for row in chosen]
                 axes.errorbar([row["cpu"] for row in chosen], off, bars, fmt=marker, capsize=2, label=label)
                 for row, error in zip(chosen, off):
-                    place = (5, 3) if row.get("projection") else (5, -9)
-                    axes.annotate(row["letter"], (row["cpu"], error), place, textcoords="offset points")
+                    axes.annotate(row["letter"], (row["cpu"], error), (5, -9), textcoords="offset points")
             axes.axhspan(-blur, blur, color="0.9", zorder=0, label="standard error of the limit")
             axes.axhline(0.0, color="0.6", linewidth=0.8)
             axes.set(xscale="log", xlabel="CPU s per simulated s", ylabel="torque off its limit, %")
             least, most = min(row["cpu"] for row in rows), max(row["cpu"] for row in rows)
-            axes.set_xticks([cost for cost in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if least <= cost <= most])
+            costs = [digit * 10.0**power for power in range(-1, 4) for digit in (1, 2, 5)]
+            axes.set_xticks([cost for cost in costs if least <= cost <= most])
             axes.set_xlim(0.8 * least, 1.3 * most)
             axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_formatter("")

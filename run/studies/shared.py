@@ -215,11 +215,11 @@ def next_problem(sim: Any, contacts: Any = None) -> Any:
     return cone_problem(ContactSystem(world, contacts, settings.dt, settings.recovery_speed), world.comm)
 
 
-FIELDS = {"dt": float, "tol": float, "closing_work": float, "stiffness": float, "projection": lambda text: text == "1"}
+FIELDS = {"dt": float, "tol": float, "closing_work": float, "stiffness": float}
 
 
 def settings_of(words: str) -> dict[str, Any]:
-    """Fields of `pctt.Settings` of `dt=.01,projection=1`, or `default`; ValueError for a name or value that there is
+    """Fields of `pctt.Settings` of `dt=.01,tol=1e-3`, or `default`; ValueError for a name or a value that there is
     not."""
     if words in ("default", ""):
         return {}

@@ -11,8 +11,8 @@ A case is a scene from its settled state and one figure that its users measure, 
     silo6                    the flow out of the silo
 
 SETTINGS begin with the time step as a multiple of the scene's default; fields of `pctt.Settings` may follow:
-`2,tol=1e-3,projection=1`. Starts are the settled state with every grain moved by up to 1e-4 of a radius, another way in
-every start, so that the courses part. The solver is `apgd`. For each setting the table has
+`2,tol=1e-3,stiffness=inf`. Starts are the settled state with every grain moved by up to 1e-4 of a radius, another way
+in every start, so that the courses part. The solver is `apgd`. For each setting the table has
 
 - CPU seconds per simulated second on one core, without start-up: median of the starts;
 - the worst overlap after any step but those of the first 0.1 s, in % of a radius;
@@ -42,9 +42,7 @@ from dem.together import SceneError
 
 MOVED = 1e-4  # of a radius
 FORGETS = 0.1  # [s] from the start, not part of overlaps
-SETTINGS = (
-    "6", "3", "2", "1", ".5", ".25,tol=2e-4", "1,tol=1e-3", "1,tol=1e-4", "1,stiffness=inf", "2,projection=1",
-)  # fmt: skip
+SETTINGS = ("6", "3", "2", "1", ".5", ".25,tol=2e-4", "1,tol=1e-3", "1,tol=1e-4", "1,stiffness=inf")
 Records = dict[str, np.ndarray]
 
 
@@ -106,6 +104,11 @@ def settings_for(words: str, scene: Experiment) -> dict[str, Any]:
     return {"dt": float(factor) * recommended(scene.build()), **settings_of(others)}
 
 
+def records_of(rows: list[Row]) -> Records:
+    """The numbers of steps as arrays, by their names."""
+    return {key: np.array([row[key] for row in rows]) for key, value in rows[0].items() if np.isscalar(value)}
+
+
 def course(name: str, seed: int, words: str) -> Course:
     """Steps of a simulation; a step of another one first, which loads compiled loops."""
     case, radius = CASES[name], CASES[name].scene.radius
@@ -117,11 +120,10 @@ def course(name: str, seed: int, words: str) -> Course:
         rows = [sim.step() for _ in range(math.ceil(case.seconds / settings["dt"] - 1e-9))]
         spent, stiffness = (time.process_time() - before) / (sim.time - begun), float(sim.world.pairs.stiffness.max())
     late = [row for row in rows if row["time"] - begun > case.after]
-    records = {key: np.array([row[key] for row in late]) for key, value in late[0].items() if np.isscalar(value)}
     overlap = 100 / radius * max(row["worst_overlap [m]"] for row in rows if row["time"] - begun > FORGETS)
     unsolved = sum(not row["converged"] for row in rows)
     iterations = statistics.fmean(row["iterations"] for row in rows)
-    return Course(case.figure(records), overlap, spent, iterations, unsolved, settings["dt"], stiffness)
+    return Course(case.figure(records_of(late)), overlap, spent, iterations, unsolved, settings["dt"], stiffness)
 
 
 def of_starts(name: str, words: str, starts: int) -> Row:
@@ -140,10 +142,9 @@ def draw(cases: list[list[Row]]) -> None:
         for axes, rows in zip(panels, cases):
             limit = min(rows, key=lambda row: row["dt"])["figure"]
             plain = sorted((row for row in rows if "," not in row["settings"]), key=lambda row: row["dt"])
-            groups = {"time steps": plain, "projection": [row for row in rows if "projection" in row["settings"]]}
-            groups["rigid"] = [row for row in rows if "stiffness=inf" in row["settings"]]
+            groups = {"time steps": plain, "rigid": [row for row in rows if "stiffness=inf" in row["settings"]]}
             groups["tolerances"] = [row for row in rows if row["settings"].startswith("1,tol")]
-            for (label, chosen), style in zip(groups.items(), ("o-", "^", "x", ".")):
+            for (label, chosen), style in zip(groups.items(), ("o-", "x", ".")):
                 off = [100 * (row["figure"] / limit - 1) for row in chosen]
                 bars = [100 * row["error"] / abs(limit) for row in chosen]
                 axes.errorbar([row["cpu"] for row in chosen], off, bars, fmt=style, capsize=2, label=label)

@@ -262,7 +262,7 @@ def test_systems_that_the_asked_for_method_cannot_solve_are_solved_and_counted(o
 
 
 
-@pytest.mark.parallel(2, 3, 4)
+@pytest.mark.parallel(2, 4)
 @pytest.mark.parametrize("solver", [solver for solver in ccp.SOLVERS if solver not in SLOW])
 def test_the_answer_does_not_depend_on_the_ranks(solver):
     """Also with ranks that have no contact: all but the last in "uneven", one or more in "few".

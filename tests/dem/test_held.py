@@ -168,7 +168,7 @@ def test_a_surface_velocity_is_that_of_the_body_frame_along_the_surface():
         assert not sim.body("belt").velocity.any()
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(1, 2)
 def test_a_belt_changes_its_speed_within_the_loop_and_keeps_it_in_checkpoints(tmp_path):
     scene = on_belt((0.2, 0, 0))
     scene.add_spheres([[x, 0.3, 0.15] for x in np.arange(4) * 0.11 - 0.3], 0.05, 1000.0)

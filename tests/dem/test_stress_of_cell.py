@@ -174,7 +174,7 @@ def by_images(G, g):
     return y
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("sheared", [False, True])
 def test_work_is_stress_times_strain_and_closes_the_balance(sheared):
     sim = packed(MPI.COMM_WORLD, (PRESSURE, None, 3.0 * PRESSURE), sheared=sheared)

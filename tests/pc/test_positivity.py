@@ -24,7 +24,7 @@ def negative(X: np.ndarray, A: np.ndarray) -> bool:
     return finds_negative(dense_mat(X), dense_mat(A))
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(1, 2)
 def test_negative_directions_without_a_train_are_found():
     """X = A^-1 - factor v v' / v'A v, negative at A v: `lowest` looks only at vectors of rank 8, v has none."""
     A, factor = laplacian(32), 1.1

@@ -70,13 +70,12 @@ def test_springs_bear_the_attraction_whatever_dt_is(dt):
         assert sim.body("floor").force[2] == pytest.approx(-MASS * G, rel=1e-5)
 
 
-@pytest.mark.parametrize("projection", [False, True])
-def test_energy_of_a_pair_that_meets_is_the_work_of_cohesion(projection):
+def test_energy_of_a_pair_that_meets_is_the_work_of_cohesion():
     c, gap = 2.0, 0.008
     scene = Scene(0.5, (0, 0, 0), cohesion=c, cohesion_range=0.01, stiffness=np.inf)
     scene.add_spheres([[0, 0, 0], [2 * R + gap, 0, 0]], R, DENSITY)
     rows = []
-    with pctt.Simulation(scene, dt=1e-3, projection=projection, **EXACT) as sim:
+    with pctt.Simulation(scene, dt=1e-3, **EXACT) as sim:
         sim.run(steps=150, call=lambda sim: rows.append(energy_balance(sim.last)))
         assert np.abs(sim.velocities).max() < 1e-9
         np.testing.assert_allclose(sim.positions[1, 0] - sim.positions[0, 0], 2 * R, atol=1e-7)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drive import HALF, RADIUS, sphere, steps
+from drive import HALF, RADIUS, G, sphere, steps
 from mpi4py import MPI
 
+import pctt
 from dem import quaternion
 from dem.motion import Glide, Rotation
 from dem.scene import Scene
@@ -14,6 +15,7 @@ from dem.scenes.mixer import Mixer
 from dem.shapes import Box, Capsule, Plane
 from dem.start import new_world
 
+EXACT = {"tol": 1e-10, "closing_work": np.inf, "solver": "apgd"}
 DT, DELTA = 0.025, 0.01  #: at 4 m/s a body moves ten times the contact distance in a step
 
 
@@ -85,3 +87,41 @@ def test_a_capsule_that_spins_over_another_stops_on_it(angle):
         pass
     assert world.grains.position[0, 2] == pytest.approx(2 * RADIUS, abs=1e-6)
     np.testing.assert_allclose(world.grains.velocity[0], [0, 0, -gap / dt, 0, 0, spin], atol=1e-4)
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.02])
+def test_a_sphere_lands_without_overlap_and_without_bounce(dt):
+    scene = Scene(friction=0.3, stiffness=np.inf)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_spheres([[0, 0, RADIUS + 0.4]], RADIUS, 2500.0)
+    with pctt.Simulation(scene, dt=dt, **EXACT) as sim:
+        weight = sim.local.mass[0] * G
+        heights, speeds, impulse = [], [], 0.0
+        while sim.time < 0.6:
+            sim.step()
+            heights.append(sim.positions[0, 2])
+            speeds.append(sim.velocities[0, 2])
+            impulse -= dt * sim.body("floor").force[2]
+    assert min(heights) > RADIUS - 1e-9
+    assert min(speeds) == pytest.approx(-np.sqrt(2 * G * 0.4), abs=1.5 * G * dt)
+    assert max(speeds) < 1e-6
+    assert (heights[-1], speeds[-1]) == pytest.approx((RADIUS, 0.0), abs=1e-6)
+    assert impulse == pytest.approx(weight * sim.time, rel=1e-9)  # all momentum of the fall
+
+
+@pytest.mark.parallel(1, 2, 3)
+def test_a_plate_moves_a_row_and_keeps_out_of_it(ranks):
+    """10 cm a step, a radius: every sphere gets the speed of the plate, one after the other, and none overlaps."""
+    scene = Scene(friction=0.3, gravity=(0, 0, 0), stiffness=np.inf)
+    scene.add_body("plate", [Box((0.02, 0.5, 0.5))], Glide((5.0, 0, 0)), position=(-0.05, 0, 0))
+    scene.add_spheres([[0.1 + 0.22 * k, 0, 0] for k in range(6)], 0.1, 2500.0)
+    found = []
+    for comm in (MPI.COMM_WORLD, MPI.COMM_SELF):
+        with pctt.Simulation(scene, dt=0.02, comm=comm, **EXACT) as sim:
+            for _ in range(8):
+                sim.step()
+                assert np.diff(sim.positions[:, 0]).min() > 0.2 - 1e-4
+                assert sim.positions[0, 0] - sim.body("plate").position[0] > 0.12 - 1e-4
+            np.testing.assert_allclose(sim.velocities[:, 0], 5.0, rtol=1e-6)
+            found.append(sim.positions)
+    np.testing.assert_allclose(found[0], found[1], atol=1e-6)

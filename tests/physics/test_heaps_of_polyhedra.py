@@ -91,7 +91,7 @@ def test_a_heap_loses_energy_and_comes_to_rest():
         assert sim.body("box").force[2] == pytest.approx(-weight, rel=0.02)
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(1, 2)
 def test_ranks_and_restarts_agree(tmp_path):
     given = {"dt": DT, "tol": 1e-8, "closing_work": np.inf, "solver": "apgd", "stiffness": 1e6}
     with pctt.Simulation(heap(27, speed=1.0), comm=MPI.COMM_WORLD, **given) as sim:

@@ -72,7 +72,8 @@ def test_a_sphere_on_a_turntable_circles_at_two_sevenths_of_its_speed():
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_a_paddle_gives_a_sphere_its_velocity(solver, friction):
-    """A turning paddle hits a sphere at rest: the point of contact takes the normal velocity of the face."""
+    """A turning paddle hits a sphere at rest: the point of contact takes the normal velocity of the face, which has the
+    direction of the end of the step."""
     speed, arm, dt = 2.0, 0.4, 0.01
     scene = Scene(friction, gravity=(0, 0, 0))
     scene.add_body("paddle", [Box((0.6, 0.02, 0.2))], Rotation((0, 0, speed)))
@@ -80,18 +81,22 @@ def test_a_paddle_gives_a_sphere_its_velocity(solver, friction):
     world = new_world(scene, MPI.COMM_SELF)
     step = make_steps(world, 1, dt, solver)
     assert len(step.contacts) == 1
-    sliding = speed * 0.02  # of the paddle's face at the point of contact, in the direction -x
-    mass, normal_speed = world.grains.mass[0], speed * arm
+    turn = speed * dt
+    along, out = np.array([np.cos(turn), np.sin(turn), 0]), np.array([-np.sin(turn), np.cos(turn), 0])
+    arm, gap = along @ [arm, 0.02 + RADIUS, 0], out @ [arm, 0.02 + RADIUS, 0] - 0.02 - RADIUS  # at the end
+    np.testing.assert_allclose(step.contacts.normal[0], -out, atol=1e-12)
+    sliding = speed * 0.02  # of the paddle's face at the point of contact, against `along`
+    mass, normal_speed = world.grains.mass[0], -gap / dt
     if sliding / 3.5 <= friction * normal_speed:
         p_n, p_t = mass * normal_speed, mass * sliding / 3.5
     else:
         p_n = mass * (normal_speed + friction * sliding) / (1 + 3.5 * friction**2)
         p_t = friction * p_n
-    np.testing.assert_allclose(world.grains.velocity[0, :3], [-p_t / mass, p_n / mass, 0], atol=1e-7)
+    np.testing.assert_allclose(world.grains.velocity[0, :3], (p_n * out - p_t * along) / mass, atol=1e-7)
     spin = -RADIUS * p_t / (0.4 * mass * RADIUS**2)
     np.testing.assert_allclose(world.grains.velocity[0, 3:], [0, 0, spin], atol=1e-6)
     force = step.force_on("paddle")
-    np.testing.assert_allclose(force[:3] * dt, [p_t, -p_n, 0], atol=1e-6 * p_n)
+    np.testing.assert_allclose(force[:3] * dt, p_t * along - p_n * out, atol=1e-6 * p_n)
     assert force[5] * dt == pytest.approx(-p_n * arm - p_t * 0.02, rel=1e-6)
 
 

@@ -43,7 +43,7 @@ def two_steps(comm: MPI.Comm, state: dict[str, np.ndarray], **settings) -> dict[
     return by_id(world)
 
 
-@pytest.mark.parallel(2, 3, 4)
+@pytest.mark.parallel(2, 3)
 @pytest.mark.parametrize(
     "cases", [("given iterations", "pdip"), pytest.param(("apgd",), marks=pytest.mark.slow)], ids=" and ".join
 )

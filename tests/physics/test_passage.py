@@ -216,7 +216,7 @@ def test_the_same_grains_come_and_go_on_any_number_of_ranks():
     assert together.world.slabs[-1] == len(one["ids"])
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(1, 2)
 def test_a_restart_goes_on_with_the_same_bits(tmp_path):
     comm = MPI.COMM_WORLD
     sim = Simulation(chute(), comm=comm, **WORDS)

@@ -34,7 +34,7 @@ def simulation(scene: Scene, dt: float, comm: MPI.Comm = MPI.COMM_SELF) -> pctt.
     return pctt.Simulation(scene, settings, comm=comm, say=lambda line: None)
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("kind", ["box", "mesh", "plane", "sphere"])
 def test_no_fast_grain_ends_behind_what_stands_in_its_way(kind):
     refused = 0

@@ -31,21 +31,21 @@ def on_a_plane(slope=0.0, rolling=0.0, spinning=0.0, velocity=(0, 0, 0), angular
     return scene
 
 
-@pytest.mark.parametrize("more", [{"solver": "apgd"}, {"solver": "conic"}, {"projection": True}])
-def test_a_sphere_rolls_to_rest(more):
+@pytest.mark.parametrize("solver", ["apgd", "conic"])
+def test_a_sphere_rolls_to_rest(solver):
     """v falls by 5/7 g rho / R: m v' = -F, and I v' / R = F R - rho m g."""
     rho, v, dt = 0.004, 0.5, 0.01
     slower = 5 / 7 * G * rho / R
     rows = []
     scene = on_a_plane(rolling=rho, velocity=(v, 0, 0), angular_velocity=(0, v / R, 0))
-    with pctt.Simulation(scene, dt=dt, **more, **EXACT) as sim:
+    with pctt.Simulation(scene, dt=dt, solver=solver, **EXACT) as sim:
         for steps in (10, 30):
             sim.run(steps=steps, call=lambda sim: rows.append(energy_balance(sim.last)))
             exact = v - slower * sim.time
             np.testing.assert_allclose(sim.velocities[0, [0, 4]], [exact, exact / R], rtol=1e-7)
             torque = per_grain(sim.sample).torque[0, 1]
             assert torque == pytest.approx(-INERTIA * slower / R, rel=1e-6)
-            lever = rho + sim.contacts.point[0, 0]
+            lever = rho + (sim.last.contacts.point - sim.last.contacts.moved)[0, 0]  # as seen from the plane
             assert sim.body("plane").torque[1] == pytest.approx(lever * MASS * G, rel=1e-6)
         sim.run(until=1.2 * v / slower, call=lambda sim: rows.append(energy_balance(sim.last)))
         assert np.abs(sim.velocities).max() < 1e-8

@@ -29,7 +29,7 @@ def column(stiffness: float | None, count: int = 5, squeezed: float = 0.0) -> Sc
 @pytest.mark.parametrize(
     "settings",
     [{"solver": solver, "law": law} for solver in ("apgd", "pdip", "conic") for law in ccp.LAWS]
-    + [{"solver": "apgd", "projection": True}, *({"solver": "apgd", "dt": dt} for dt in (0.002, 0.005, 0.02))],
+    + [{"solver": "apgd", "dt": dt} for dt in (0.002, 0.005, 0.02)],
     ids=repr,
 )
 def test_a_column_rests_on_the_overlaps_that_its_weight_makes(settings):
@@ -59,7 +59,7 @@ def heads_on(stiffness: float, dt: float, steps: int) -> tuple[np.ndarray, float
 @pytest.mark.parametrize("dt", [1e-5, 1e-4, 1e-3, 1e-2])
 def test_an_impact_takes_nearly_all_speed_whatever_the_step(dt):
     """5 % are left where the step resolves the impact (Schwager, Poeschel 2007), and none where it is longer."""
-    velocity, lost = heads_on(1e7, dt, max(30, int(0.02 / dt)))
+    velocity, lost = heads_on(1e7, dt, max(30, int(0.01 / dt)))
     assert velocity.sum() == pytest.approx(0.0, abs=1e-9)
     assert -1e-9 <= velocity[1] <= 0.055
     if dt == 1e-5:
@@ -105,8 +105,7 @@ def test_a_block_on_an_incline_does_not_creep(steps):
     assert moved < 1e-8 * steps
 
 
-@pytest.mark.parametrize("dt", [0.002, 0.01])
-@pytest.mark.parametrize("solver", ["apgd", "conic"])
+@pytest.mark.parametrize(("solver", "dt"), [("apgd", 0.002), ("apgd", 0.01), ("conic", 0.01)])
 def test_friction_gives_way_by_a_spring_and_gives_back(solver, dt):
     """A box on four contacts, each of k_t = 2/7 k, that a force pulls aside: by F / 4 k_t, and then lets go."""
     stiffness, force = 1e6, 40.0  # with twice as much, as it swings, no contact slides

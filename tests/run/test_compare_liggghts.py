@@ -40,8 +40,8 @@ def test_overlaps_are_those_of_spheres_walls_and_the_paddle_where_it_has_turned_
 def test_the_limit_is_the_mean_of_two_estimates_with_the_error_that_they_show():
     rows = [{"code": "LIGGGHTS", "stiffness": k, "torque": t, "torque_error": 0.5} for k, t in ((1e7, 50), (1e8, 104))]
     own = {"code": "pctt", "tol": 3e-4, "torque_error": 0.5}
-    rows += [own | {"dt": dt, "projection": False, "torque": t} for dt, t in ((0.01, 200), (0.0025, 100))]
-    rows += [own | {"dt": 0.001, "projection": True, "torque": 96.0}, own | {"torque": 70.0}]
+    rows += [own | {"dt": dt, "torque": t} for dt, t in ((0.01, 200), (0.0025, 100))]
+    rows += [own | {"dt": 0.001, "stiffness": 1e7, "torque": 96.0}, own | {"torque": 70.0}]
     value, error = compare_liggghts.limit_of(rows)  # of 104 and 100
     assert value == pytest.approx(102.0)
     assert error == pytest.approx(2.0)

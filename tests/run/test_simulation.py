@@ -242,6 +242,24 @@ def test_the_options_of_petsc_stay_as_they_are(solver, tmp_path):
         options.delValue("ksp_max_it")
 
 
+PLAIN = """
+import sys
+from dem.scenes import Mixer
+from pctt.run import help, simulate
+from pctt.simulation import Simulation
+Simulation(Mixer(n=1), solver="apgd").run(steps=1)
+print(*sys.modules)
+"""
+
+
+def test_a_plain_run_does_not_load_what_it_does_not_use():
+    """On a cluster every rank opens the file of every module."""
+    said = subprocess.run([sys.executable, "-c", PLAIN], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = set(said.stdout.split())
+    assert "dem.contact" in loaded
+    assert not loaded & {"pctt.tt", "pctt.mat", "pctt.pc", "matplotlib", "vtk", "scipy.fft", "scipy.signal"}
+
+
 def test_to_import_the_package_starts_no_petsc():
     words = "import sys, pctt; assert not any('petsc4py' in name or 'numpy' in name for name in sys.modules), 'slow'"
     words += "; import petsc4py; petsc4py.init(['', '-my_option', '3']); pctt.Simulation; from petsc4py import PETSc"
@@ -456,7 +474,7 @@ def test_a_notebook_shows_the_last_step_as_a_table():
     shown = sim._repr_html_()
     assert "<th>kinetic_energy [J]</th>" in shown
     assert "<th>iterations</th>" in shown
-    assert repr(sim).startswith("<Simulation of Stirred: 14 bodies on 1 ranks, step 2, time 0.02 s, auto to 0.0015, ")
+    assert repr(sim).startswith("<Simulation of Stirred: 14 bodies on 1 ranks, step 2, time 0.02 s, auto to 0.001, ")
 
 
 def test_a_picture_of_the_present_state(tmp_path):
