@@ -183,10 +183,10 @@ class ContactSystem:
         in the place of the tangential ones [N s]."""
         return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
 
-    def spring_energies(self, gap: Floats, end: Floats, impulse: Floats) -> tuple[float, float, float, float]:
+    def spring_energies(self, gap: Floats, after: Floats, impulse: Floats) -> tuple[float, float, float, float]:
         """`dem.stiffness.spring_energies` of the step with these impulses (nc, 3)."""
         given = self.stiffness, self.compliance, self.dt
-        return stiffness.spring_energies(*given, gap, end, self.held, impulse)
+        return stiffness.spring_energies(*given, gap, after, self.held, impulse)
 
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""

@@ -34,7 +34,9 @@ def sample(folder: Folder, step: int) -> Sample:
     frame = folder.frame(step)
     table, grains = frame.table, slice(frame.table.grains)
     contacts = frame.contacts
-    start = frame.position - contacts.dt * frame.velocity[:, :3]
+    center = (frame.position - contacts.dt * frame.velocity[:, :3])[contacts.bodies]
+    if contacts.moved is not None:
+        center[:, 1] += contacts.moved
     return Sample(
         comm=MPI.COMM_SELF,
         count=table.grains,
@@ -47,7 +49,7 @@ def sample(folder: Folder, step: int) -> Sample:
         material=table.material[grains],
         materials=tuple(folder.materials),
         bodies=contacts.bodies,
-        center=start[contacts.bodies],
+        center=center,
         point=contacts.point,
         normal=contacts.normal,
         gap=contacts.gap,

@@ -43,7 +43,7 @@ FILES = (*RUN_FILES, "frames", HARD)
 CONTENTS = (
     "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, by body id; "
     "record: attributes as in records.csv; "
-    "contact: bodies a and b, point m, frame rows (normal from a to b, t1, t2), gap m, "
+    "contact: bodies a and b, point m as seen from a, moved m from b to where it is seen from a, frame rows (normal from a to b, t1, t2), gap m, "
     "impulse on b N s, and moment on b in the world N m where contacts resist rolling or spinning; attribute dt s. "
     "bodies: shape, size m, mass kg, material by body id; "
     "materials: the names of the materials, of which material is the index; "
@@ -118,12 +118,13 @@ class Contacts:
     """The contacts of a step between bodies a and b, and the impulses that acted in the step."""
 
     bodies: np.ndarray  #: (nc, 2) numbers of a and b in the order of the scene: grains, then large bodies
-    point: np.ndarray  #: (nc, 3) in the middle between the surfaces, at the start of the step [m]
+    point: np.ndarray  #: (nc, 3) in the middle between the surfaces, as seen from body a at the start of the step [m]
     frame: np.ndarray  #: (nc, 3, 3) with rows normal (from a to b), t1, t2
     gap: np.ndarray  #: (nc,) at the start of the step, negative if the bodies overlap [m]
     impulse: np.ndarray  #: (nc, 3) on b, in the contact frame [N s]
     dt: float  #: length of the step in which the impulses acted [s]
     moment: np.ndarray | None = None  #: (nc, 3) on b in the world, where contacts resist rolling or spinning [N m]
+    moved: np.ndarray | None = None  #: (nc, 3) from body b to where it is as seen from a; None in files before 0.3 [m]
 
     @classmethod
     def none(cls) -> Contacts:
@@ -262,7 +263,7 @@ class Folder:
         def take(file: h5py.File, sealed: bool) -> Frame:
             contact = file["contact"]
             rows = [contact[name][()] for name in ("body", "point", "frame", "gap", "impulse")]
-            moment = contact["moment"][()] if "moment" in contact else None
+            moment, moved = (contact[name][()] if name in contact else None for name in ("moment", "moved"))
             places = {name: file[name][()] for name in ("position", "quaternion", "velocity")}
             if "id" in file:  # of a scene with sources or outlets
                 own = {name: file[name][()] for name in ("id", "shape", "size", "mass", "material")}
@@ -271,7 +272,7 @@ class Folder:
                 rows[0] = np.searchsorted(table.id, rows[0])
             else:
                 table = self.table
-            contacts = Contacts(*rows, float(contact.attrs["dt"]), moment)  # type: ignore[call-arg]
+            contacts = Contacts(*rows, float(contact.attrs["dt"]), moment, moved)  # type: ignore[call-arg]
             return Frame(step, float(file.attrs["time"]), **places, contacts=contacts, table=table)
 
         return disk.read(self.frame_path(step), MPI.COMM_SELF, take)

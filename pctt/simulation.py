@@ -303,6 +303,7 @@ class Simulation:
             point=wrapped(own.point, self.world.period, self.world.shear),
             frame=step.system.frame,
             gap=own.gap,
+            moved=np.zeros_like(own.point) if own.moved is None else own.moved,
             impulse=step.impulse,
             **({} if step.moments is None else {"moment": step.moments}),
         )

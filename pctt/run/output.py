@@ -207,6 +207,7 @@ class Writer:
             "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
             "contact/point": wrapped(contacts.point, world.period, world.shear),
             "contact/frame": step.system.frame,
+            "contact/moved": np.zeros_like(contacts.point) if contacts.moved is None else contacts.moved,
             "contact/gap": contacts.gap,
             "contact/impulse": step.impulse,
         }

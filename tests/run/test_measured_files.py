@@ -55,6 +55,20 @@ def test_the_samples_of_a_simulation_and_of_its_files_are_alike(results):
     np.testing.assert_allclose(fields.stress, measures.fields(one, WIDE, (4, 4, 4), 0.6).stress, atol=1e-9)
 
 
+def test_centres_of_spheres_that_slide_on_each_other_are_alike(tmp_path):
+    """A contact is that of the end of its step: one of its two bodies is moved ahead, in the files as well."""
+    scene = Scene(0.5, gravity=(0, 0, 0))
+    scene.add_spheres([[0, 0, 0], [0, 0, 0.2]], 0.1, 1000.0, velocity=[[0, 0, 0.1], [0.3, 0, -0.1]])
+    with pctt.Simulation(scene, dt=0.002, comm=MPI.COMM_SELF) as sim:
+        sim.write(tmp_path / "run")
+        sim.run(steps=1)
+        one = sim.sample
+    other = analysis.sample(Folder(tmp_path / "run"), 1)
+    assert one.force[0, 2] > 0.0
+    np.testing.assert_allclose(other.center, one.center, atol=1e-12)
+    np.testing.assert_allclose(one.center[0, 1] - one.point[0], 0.1 * one.normal[0], atol=1e-6)
+
+
 def test_the_triangles_bear_the_weight_of_the_spheres(results):
     sim, folder = results
     force = sim.body("floor").triangle_forces()

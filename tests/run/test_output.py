@@ -118,6 +118,7 @@ def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled,
             "contact/body": (nc, 2),
             "contact/point": (nc, 3),
             "contact/frame": (nc, 3, 3),
+            "contact/moved": (nc, 3),
             "contact/gap": (nc,),
             "contact/impulse": (nc, 3),
         }
