@@ -43,7 +43,8 @@ FILES = (*RUN_FILES, "frames", HARD)
 CONTENTS = (
     "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, by body id; "
     "record: attributes as in records.csv; "
-    "contact: bodies a and b, point m as seen from a, moved m from b to where it is seen from a, frame rows (normal from a to b, t1, t2), gap m, "
+    "contact: bodies a and b, point m as seen from a, moved m from b to where it is as seen from a, "
+    "frame rows (normal from a to b, t1, t2), gap m, "
     "impulse on b N s, and moment on b in the world N m where contacts resist rolling or spinning; attribute dt s. "
     "bodies: shape, size m, mass kg, material by body id; "
     "materials: the names of the materials, of which material is the index; "
