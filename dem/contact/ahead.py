@@ -1,4 +1,4 @@
-"""Contacts of spheres as they will be at the end of the step.
+"""Contacts as they will be at the end of the step.
 
 A step takes the directions of a contact as constant. With those of its start a contact of a tool bears load for half a
 step too long: it acts from the start of the step in which it closes, and on to the end of that in which the grain
@@ -11,77 +11,170 @@ where velocities do not change no overlap is left at the end. The price: the ene
 curve, and angular momentum about a contact, are kept to first order in the step only. What balances forces does not
 depend on that.
 
-Contacts of spheres with spheres, half spaces and boxes are turned; others keep the directions of the start, and those
-that turn far are found anew by `dem.step.find_turned`.
+Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
+the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
+there then goes with the host (`seen_from`, `turn_ahead`).
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from dem.arrays import Floats, Ints
-from dem.bodies import BOX, PLANE, SPHERE
+from dem.arrays import Bools, Floats, Ints
+from dem.bodies import BOX, CAPSULE, CLUMP, MESH, PLANE, POLYHEDRON, SPHERE
 from dem.compiled import inlined, loop
 from dem.contact.spheres import frame_of, to_box
 from dem.vectors import cross, dot, plus, shares, turned
 
-FURTHEST = 0.25  #: radii by which a sphere is moved ahead along another body, at most: its impulses may stop it sooner
+#: Radii (half thicknesses) by which a body is moved ahead along another one, at most: its impulses may stop it sooner.
+FURTHEST = 0.25
+
+#: Half thicknesses of a guest by which a linear gap may overlap before the overlap at the start is looked up.
+DEEP = 0.005
+
+#: Of spheres, boxes, -, capsules, half spaces, meshes, polyhedra: of a pair the one of lower rank is the guest.
+RANK = np.array([0, 2, 9, 1, 4, 5, 3])
+
+
+class Course(NamedTuple):
+    """The bodies in the rows of `Primitives.row`, and how they go on in a step."""
+
+    place: Floats  #: (rows, 3) [m]
+    velocity: Floats  #: (rows, 6) [m/s, rad/s]
+    dt: float  #: [s]
+
+
+def hosts_first(one: Ints, two: Ints) -> Bools:
+    """Of which pairs of kinds (m,) the second is the guest."""
+    first: Bools = RANK[np.minimum(one, CLUMP)] > RANK[np.minimum(two, CLUMP)]
+    return first
+
+
+@loop
+def seen_from(
+    kind: Ints, row: Ints, center: Floats, quaternion: Floats, size: Floats, radius: Floats, inner: Floats,
+    place: Floats, velocity: Floats, dt: float, i: Ints, j: Ints,
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """Centres (m, 3) and quaternions (m, 4) of guests, the rows i (m,) of `Primitives`, at the end of a step, as seen
+    from the bodies of their hosts, the rows j (m,), put back to where these are now. `inner` is that of `Hulls`."""
+    middle, turn = np.empty((len(i), 3)), np.empty((len(i), 4))
+    for p in range(len(i)):
+        a, b = i[p], j[p]
+        A, B = row[a], row[b]
+        h = _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt)
+        u, w = _vector(velocity[A], 3), _vector(velocity[B], 3)
+        far = plus(_vector(place[A], 0), h, _vector(velocity[A], 0))
+        far = plus(far, 1.0, _after(plus(center[a], -1.0, place[A]), u, h))
+        far = _after(plus(plus(far, -h, _vector(velocity[B], 0)), -1.0, place[B]), w, -h)
+        q = _spun(_spun(quaternion[a], u, h), w, -h)
+        for k in range(3):
+            middle[p, k] = place[B, k] + far[k]
+        for k in range(4):
+            turn[p, k] = q[k]
+    return middle, turn
 
 
 @loop
 def turn_ahead(
-    kind: Ints, row: Ints, center: Floats, quaternion: Floats, size: Floats, place: Floats, velocity: Floats, i: Ints,
-    j: Ints, pair: Ints, point: Floats, normal: Floats, gap: Floats, dt: float,
-) -> tuple[Floats, Floats]:  # fmt: skip
+    kind: Ints, row: Ints, center: Floats, quaternion: Floats, size: Floats, radius: Floats, inner: Floats,
+    place: Floats, velocity: Floats, dt: float, i: Ints, j: Ints, pair: Ints, point: Floats, normal: Floats,
+    gap: Floats,
+) -> tuple[Floats, Floats, Ints]:  # fmt: skip
     """Give contacts (nc,) of the pairs of rows i, j (m,) of `Primitives` the normals of the end of a step of dt [s]:
     `point` is then as seen from the present place of body i. Returns (nc, 3) from body j to where it is relative to i
-    then, and the gaps (nc,) from which gaps that are linear in the velocities lead to those of the end [m].
+    then, and the gaps (nc,) from which gaps that are linear in the velocities lead to those of the end [m]. Contacts
+    of guests in the places of `seen_from` get these as their `gap`; returns also which of them overlap by
+    more than DEEP so.
 
     The bodies in the rows of `Primitives.row` are at `place` (rows, 3) and move with `velocity` (rows, 6).
     """
-    moved, linear = np.zeros((len(pair), 3)), gap.copy()
+    moved, linear, deep, found = np.zeros((len(pair), 3)), gap.copy(), np.empty(len(pair), np.int64), 0
     for c in range(len(pair)):
         one, two = i[pair[c]], j[pair[c]]
-        swap = kind[one] != SPHERE
+        swap = RANK[min(kind[one], CLUMP)] > RANK[min(kind[two], CLUMP)]
         a, b = (two, one) if swap else (one, two)
-        if kind[a] != SPHERE or kind[b] not in (SPHERE, PLANE, BOX):
-            continue
-        A, B, radius = row[a], row[b], size[a, 0]
+        A, B, sign = row[a], row[b], -1.0 if swap else 1.0
         V, W, u, w = _vector(velocity[A], 0), _vector(velocity[B], 0), _vector(velocity[A], 3), _vector(velocity[B], 3)
-        lever, other = plus(center[a], -1.0, place[A]), plus(center[b], -1.0, place[B])
-        way = plus(center[a], -1.0, center[b])
-        drift = plus(plus(V, 1.0, cross(u, lever)), -1.0, plus(W, 1.0, cross(w, other)))  # of the centres
-        along = drift if kind[b] == SPHERE else plus(drift, -1.0, cross(w, way))
-        speed, h = np.sqrt(dot(along, along)), dt
-        if speed * dt > FURTHEST * radius:
-            h = FURTHEST * radius / speed
-        ahead, beside = _after(lever, u, h), _after(other, w, h)
-        end = plus(plus(plus(plus(way, h, V), -h, W), -1.0, beside), 1.0, plus(ahead, -1.0, lever))
-        end = plus(end, 1.0, other)
-        if kind[b] == SPHERE:
-            distance = np.sqrt(dot(end, end))
-            if distance == 0.0:
-                continue
-            n, after = (-end[0] / distance, -end[1] / distance, -end[2] / distance), distance - radius - size[b, 0]
-        elif kind[b] == PLANE:
-            m = _after(_vector(size[b], 0), w, h)
-            n, after = (-m[0], -m[1], -m[2]), dot(m, end) - radius
+        h = _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt)
+        here = kind[a] == SPHERE and kind[b] in (SPHERE, PLANE, BOX)
+        if here:
+            lever, other = plus(center[a], -1.0, place[A]), plus(center[b], -1.0, place[B])
+            ahead, beside = _after(lever, u, h), _after(other, w, h)
+            end = plus(plus(plus(plus(center[a], -1.0, center[b]), h, V), -h, W), -1.0, beside)
+            end = plus(plus(end, 1.0, plus(ahead, -1.0, lever)), 1.0, other)
+            if kind[b] == SPHERE:
+                distance = np.sqrt(dot(end, end))
+                if distance == 0.0:
+                    continue
+                n, after = (-end[0] / distance, -end[1] / distance, -end[2] / distance), distance - size[a, 0]
+                after -= size[b, 0]
+            elif kind[b] == PLANE:
+                m = _after(_vector(size[b], 0), w, h)
+                n, after = (-m[0], -m[1], -m[2]), dot(m, end) - size[a, 0]
+            else:
+                back = _after(end, w, -h)
+                x, y, z, after = to_box(back[0], back[1], back[2], size[a, 0], frame_of(quaternion[b]), size[b])
+                n = _after((x, y, z), w, h)
+            half = 0.5 * gap[c]
+            own = plus(ahead, size[a, 0] + half, n)
+            their = plus(plus(beside, 1.0, end), size[a, 0] + after - half, n)
+        elif h == 0.0:
+            continue
         else:
-            back = _after(end, w, -h)
-            x, y, z, after = to_box(back[0], back[1], back[2], radius, frame_of(quaternion[b]), size[b])
-            n = _after((x, y, z), w, h)
-        half = 0.5 * gap[c]
-        own = plus(ahead, radius + half, n)
-        their = plus(plus(beside, 1.0, end), radius + after - half, n)
-        opening = dot(n, plus(plus(W, 1.0, cross(w, their)), -1.0, plus(V, 1.0, cross(u, own))))
-        linear[c] = after - h * opening
-        first, second, sign = (their, own, -1.0) if swap else (own, their, 1.0)
+            n = _after((sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]), w, h)
+            their = _after(plus(point[c], -1.0, place[B]), w, h)
+            own = plus(plus(plus(their, 1.0, place[B]), -1.0, place[A]), h, plus(W, -1.0, V))
+            after = gap[c]
+        linear[c] = after - h * dot(n, plus(plus(W, 1.0, cross(w, their)), -1.0, plus(V, 1.0, cross(u, own))))
+        if not here:
+            gap[c], deep[found] = linear[c], c
+            found += linear[c] < -DEEP * _thickness(kind[a], size[a], inner)
+        first, second = (their, own) if swap else (own, their)
         at, to = (place[B], place[A]) if swap else (place[A], place[B])
         for k in range(3):
             normal[c, k] = sign * n[k]
             point[c, k] = at[k] + first[k]
             moved[c, k] = point[c, k] - second[k] - to[k]
-    return moved, linear
+    return moved, linear, deep[:found]
+
+
+@inlined
+def _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt):
+    """The time by which a pair of a guest a and a host b is foreseen: dt, or less where the surface of the one goes
+    further along the other than FURTHEST allows."""
+    least, other = _thickness(kind[a], size[a], inner), _thickness(kind[b], size[b], inner)
+    if other < np.inf and kind[a] in (SPHERE, CAPSULE) and kind[b] not in (SPHERE, CAPSULE):
+        other = radius[b]  # a plate may be thinner than the way: centre or core do not get into it
+    least = min(least, other)
+    if least == np.inf:
+        return 0.0
+    A, B = row[a], row[b]
+    u, w = _vector(velocity[A], 3), _vector(velocity[B], 3)
+    drift = plus(_vector(velocity[A], 0), 1.0, cross(u, plus(center[a], -1.0, place[A])))
+    drift = plus(drift, -1.0, _vector(velocity[B], 0))
+    seat = center[b] if kind[b] == SPHERE else center[a]  # the spin of a sphere moves no surface
+    drift = plus(drift, -1.0, cross(w, plus(seat, -1.0, place[B])))
+    speed = np.sqrt(dot(drift, drift))
+    if kind[a] != SPHERE:
+        spin = plus(u, -1.0, w)
+        speed += radius[a] * np.sqrt(dot(spin, spin))
+    return dt if speed * dt <= FURTHEST * least else FURTHEST * least / speed
+
+
+@inlined
+def _thickness(kind, size, inner):
+    """Half of it, at the thinnest place; of half spaces and meshes it is infinite."""
+    if kind in (PLANE, MESH):
+        thick = np.inf
+    elif kind == BOX:
+        thick = min(size[0], size[1], size[2])
+    elif kind in (SPHERE, CAPSULE):
+        thick = size[0]
+    else:
+        thick = size[0] * inner[kind - POLYHEDRON + 1]
+    return thick
 
 
 @inlined
@@ -97,3 +190,17 @@ def _after(v, spin, time):
     rotation = time * spin[0], time * spin[1], time * spin[2]
     sine, versed = shares(rotation)
     return turned(v, rotation, sine, versed)
+
+
+@inlined
+def _spun(q, spin, time):
+    """The quaternion q after `time` of turning with the angular velocity `spin`."""
+    half = 0.5 * time * spin[0], 0.5 * time * spin[1], 0.5 * time * spin[2]
+    sine, _ = shares(half)
+    x, y, z, c = sine * half[0], sine * half[1], sine * half[2], np.cos(np.sqrt(dot(half, half)))
+    return (
+        c * q[0] - x * q[1] - y * q[2] - z * q[3],
+        c * q[1] + x * q[0] + y * q[3] - z * q[2],
+        c * q[2] + y * q[0] + z * q[1] - x * q[3],
+        c * q[3] + z * q[0] + x * q[2] - y * q[1],
+    )  # fmt: skip

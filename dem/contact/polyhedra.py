@@ -45,6 +45,7 @@ class Hulls(NamedTuple):
     """The different polyhedra of a scene, `dem.polyhedra.Faces` of each in rows of the same lengths."""
 
     radius: Floats  #: (h,) of the spheres about their origins that enclose them
+    inner: Floats  #: (h,) of the spheres about their origins within them, over `radius`
     counts: Ints  #: (h, 3) vertices, faces, edges
     vertex: Floats  #: (h, v, 3)
     normal: Floats  #: (h, f, 3)
@@ -73,7 +74,8 @@ def hulls_of(solids: tuple[Solid, ...]) -> Hulls:
         return out
 
     radius = np.array([np.linalg.norm(own.vertex, axis=1).max() for own in each])
-    return Hulls(radius, counts, *(padded([own[k] for own in each]) for k in range(6)))
+    inner = np.array([np.einsum("fk,fk->f", own.normal, own.vertex[own.corner[:, 0]]).min() for own in each]) / radius
+    return Hulls(radius, inner, counts, *(padded([own[k] for own in each]) for k in range(6)))
 
 
 class Polyhedra(NamedTuple):
@@ -101,7 +103,7 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
     pair, feature, out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7))
     sides = *first.columns(), *second.columns()
     while True:
-        done, found = _pairs(*first.hulls[1:], *sides, delta, most, done, found, pair, feature, out)
+        done, found = _pairs(*first.hulls[2:], *sides, delta, most, done, found, pair, feature, out)
         if done == len(delta):
             return _manifold(pair[:found], feature[:found], out[:found])
         pair, feature, out = (np.concatenate([column, np.empty_like(column)]) for column in (pair, feature, out))
@@ -110,7 +112,7 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
 def spheres_polyhedra(ball: Spheres, body: Polyhedra, delta: Floats) -> Manifold:
     """One contact, at the closest point; a centre inside is pushed out through the nearest face."""
     pair, out = np.empty(len(delta), np.int64), np.empty((len(delta), 7))
-    found = _spheres(*body.hulls[1:], *ball, *body.columns(), delta, pair, out)
+    found = _spheres(*body.hulls[2:], *ball, *body.columns(), delta, pair, out)
     return _manifold(pair[:found], np.zeros(found, np.int64), out[:found])
 
 

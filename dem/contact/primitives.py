@@ -11,6 +11,7 @@ from dem import quaternion
 from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, CLUMP, MESH, PLANE, POLYHEDRON, SPHERE, enclosing_radius
 from dem.clumps import Form
+from dem.contact.ahead import Course, hosts_first, seen_from, turn_ahead
 from dem.contact.clumps import Members, members, more_numbers, spread
 from dem.contact.meshes import PARTS, PlacedMesh, capsule_mesh, plane_mesh, sphere_mesh
 from dem.contact.narrow import (
@@ -25,7 +26,6 @@ from dem.contact.narrow import (
     capsule_plane,
     joined,
     manifold,
-    reversed_touch,
     sphere_capsule,
 )
 from dem.contact.polyhedra import (
@@ -58,6 +58,15 @@ class Primitives(NamedTuple):
     hulls: Hulls  #: of boxes and of the polyhedra of the scene
     members: Members | None = None  #: the spheres of clumps; None in scenes without
 
+    def take(self, rows: Ints) -> Primitives:
+        """The primitives of these rows, without meshes and clumps."""
+        names = ("number", "row", "kind", "center", "quaternion", "size", "radius")
+        return Primitives(**{name: getattr(self, name)[rows] for name in names}, surfaces={}, hulls=self.hulls)
+
+    def columns(self) -> tuple[Ints, Ints, Floats, Floats, Floats, Floats, Floats]:
+        """What the loops of `dem.contact.ahead` take of it."""
+        return self.kind, self.row, self.center, self.quaternion, self.size, self.radius, self.hulls.inner
+
     def now(self, near: Neighbourhood) -> Primitives:
         """The same where the bodies are; parts come from the frames of their bodies."""
         table, parts = near.bodies, slice(near.grains + near.ghosts, None)
@@ -87,23 +96,23 @@ class Primitives(NamedTuple):
         table = self._replace(**{k: np.concatenate([getattr(self, k), more]) for k, more in further.items()})
         return table, *spread(i, j, reach, own.start, first, table.kind, table.center, table.radius)
 
-    def sphere(self, rows: Ints) -> Spheres:
+    def sphere(self, rows: Any) -> Spheres:
         return Spheres(self.center[rows], self.size[rows, 0])
 
-    def box(self, rows: Ints) -> Boxes:
+    def box(self, rows: Any) -> Boxes:
         return Boxes(self.center[rows], quaternion.matrix(self.quaternion[rows]), self.size[rows])
 
-    def polyhedron(self, rows: Ints) -> Polyhedra:
+    def polyhedron(self, rows: Any) -> Polyhedra:
         """Boxes are some."""
         hull, size = np.maximum(self.kind[rows] - POLYHEDRON + 1, 0), self.size[rows]
         scale = np.where(hull[:, None] > 0, size[:, :1] / self.hulls.radius[hull, None], size)
         return Polyhedra(self.center[rows], quaternion.matrix(self.quaternion[rows]), scale, hull, self.hulls)
 
-    def capsule(self, rows: Ints) -> Capsules:
+    def capsule(self, rows: Any) -> Capsules:
         axis = quaternion.rotate(self.quaternion[rows], np.array([0.0, 0.0, 1.0]))
         return Capsules(self.center[rows], axis, self.size[rows, 1], self.size[rows, 0])
 
-    def plane(self, rows: Ints) -> Planes:
+    def plane(self, rows: Any) -> Planes:
         return Planes(self.size[rows], self.center[rows])
 
     def mesh(self, row: int) -> PlacedMesh:
@@ -169,9 +178,10 @@ def numbers_of(shape: Shape, features: int) -> int:
     return 1 + (PARTS * shape.surface.features - 1) // features if isinstance(shape, Mesh) else 1
 
 
-def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
+def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course | None = None) -> Manifold:
     """All contacts of gap at most `delta` (m,) [m] of the pairs of rows i, j (m,); normals point from i to j. Those of
-    spheres come first, in the order of the pairs.
+    spheres with spheres, half spaces and boxes come first, in the order of the pairs. With a course those that follow
+    are of guests that are where `dem.contact.ahead.seen_from` puts them.
 
     Two half spaces have none, nor have meshes with polyhedra or meshes, and capsules with polyhedra that are no boxes:
     `dem.scene` refuses those.
@@ -183,30 +193,49 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats) -> Manifold:
     if not len(others):
         return found[0]
     i, j, delta = i[others], j[others], delta[others]
+    swap = hosts_first(table.kind[i], table.kind[j])
+    guest, host = np.where(swap, j, i), np.where(swap, i, j)
     kind = np.where(table.kind >= POLYHEDRON, _POLYHEDRON, table.kind)
-    code = 8 * kind[i] + kind[j]
-    for one, two in (divmod(int(kinds), 8) for kinds in np.flatnonzero(np.bincount(code))):
-        rows = np.flatnonzero(code == 8 * one + two)
-        if (one, two) in _TOUCH:
-            pair, feature, touch = _touching(table, one, two, i[rows], j[rows], delta[rows])
-        elif (two, one) in _TOUCH:
-            pair, feature, touch = _touching(table, two, one, j[rows], i[rows], delta[rows])
-            touch = reversed_touch(touch)
-        else:
-            continue
-        found.append(Manifold(others[rows[pair]], feature, touch))
+    code = 8 * kind[guest] + kind[host]
+    for kinds in map(int, np.flatnonzero(np.bincount(code))):
+        if divmod(kinds, 8) in _TOUCH:
+            rows = np.flatnonzero(code == kinds)
+            pair, feature, touch = _touching(table, divmod(kinds, 8), guest[rows], host[rows], delta[rows], course)
+            touch.normal[swap[rows[pair]]] *= -1.0
+            found.append(Manifold(others[rows[pair]], feature, touch))
     return joined(found) if len(found) > 1 else found[0]
 
 
-def _touching(table: Primitives, one: int, two: int, i: Ints, j: Ints, delta: Floats) -> Manifold:
-    """The contacts of pairs of rows i, j (m,) of the kinds `one` and `two`; with meshes mesh by mesh."""
-    contacts, first, second = _TOUCH[one, two]
+def touches_ahead(
+    table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course
+) -> tuple[Manifold, Floats, Floats]:
+    """The contacts as `turn_ahead` gives them directions of the end of a step, and what this returns of them. A deep
+    gap is no deeper than the pair overlaps at the start."""
+    found = touches(table, i, j, delta, course)
+    moved, linear, deep = turn_ahead(*table.columns(), *course, i, j, found.pair, *found.touch)
+    if len(deep):
+        pairs, row = np.unique(found.pair[deep], return_inverse=True)
+        now, least = touches(table, i[pairs], j[pairs], delta[pairs]), delta[pairs]
+        np.minimum.at(least, now.pair, now.touch.gap)
+        found.touch.gap[deep] = np.maximum(linear[deep], least[row])
+    return found, moved, linear
+
+
+def _touching(
+    table: Primitives, kinds: tuple[int, int], i: Ints, j: Ints, delta: Floats, course: Course | None
+) -> Manifold:
+    """The contacts of pairs of rows i, j (m,) of two kinds; with meshes mesh by mesh."""
+    contacts, first, second = _TOUCH[kinds]
+    guests = table.take(i)
+    if course is not None:
+        center, turn = seen_from(*table.columns(), *course, i, j)
+        guests = guests._replace(center=center, quaternion=turn)
     if second is not None:
-        return contacts(first(table, i), second(table, j), delta)
+        return contacts(first(guests, slice(None)), second(table, j), delta)
     found = []
     for mesh in np.unique(j):
         rows = np.flatnonzero(j == mesh)
-        contact = contacts(first(table, i[rows]), table.mesh(int(mesh)), delta[rows])
+        contact = contacts(first(guests, rows), table.mesh(int(mesh)), delta[rows])
         found.append(contact._replace(pair=rows[contact.pair]))
     return joined(found)
 

@@ -12,10 +12,10 @@ from dem.arrays import Bools, Floats, Ints, Keys, places
 from dem.bodies import CAPSULE, CLUMP, MESH, SPHERE
 from dem.checks import not_negative
 from dem.compiled import loop
-from dem.contact.ahead import turn_ahead
+from dem.contact.ahead import Course
 from dem.contact.candidates import meeting
 from dem.contact.lists import grain_lists
-from dem.contact.primitives import extents, touches
+from dem.contact.primitives import extents, touches, touches_ahead
 from dem.neighbourhood import Neighbourhood, refreshed
 from dem.period import Images, refuse_short
 from dem.quaternion import cross, length
@@ -33,8 +33,10 @@ class Contacts:
     b: Ints  #: (nc,) row of the second body in `near.bodies`
     body: Ints  #: (nc, 2) global indices of the two bodies
     point: Floats  #: (nc, 3) middle between the surfaces, as seen from body a [m]
-    normal: Floats  #: (nc, 3) unit vector from a to b; of spheres that of the end of the step, see `dem.contact.ahead`
-    gap: Floats  #: (nc,) signed distance at the start of the step, negative if the bodies overlap [m]
+    normal: Floats  #: (nc, 3) unit vector from a to b, as foreseen for the end of the step by `dem.contact.ahead`
+    #: (nc,) signed distance at the start of the step, negative if the bodies overlap; of capsules, polyhedra and meshes
+    #: the linear one, but no deeper than the two overlap [m]
+    gap: Floats
     friction: Floats  #: (nc,) coefficient
     near: Neighbourhood  #: the bodies of the rows `a` and `b`
     shifts: Floats  #: (k, large, 6) the ways and turns of the large bodies that the search reckoned with [m, rad]
@@ -112,17 +114,17 @@ def find_contacts(
     table = lists.table.now(near)
     i, j, reach = meeting(world, near, lists, table, delta, shifts, grown)
     table, i, j, reach = table.of_members(i, j, reach)
-    pair, feature, touch = touches(table, i, j, reach)
+    moved: Floats | None = None
+    linear: Floats | None = None
+    if dt:
+        course = Course(near.bodies.position, _motions(world, near, pictures, dt), dt)
+        (pair, feature, touch), moved, linear = touches_ahead(table, i, j, reach, course)
+    else:
+        pair, feature, touch = touches(table, i, j, reach)
     key, a, b, body, friction, weight = named(
         *(table.number, table.row, table.kind, near.index, near.bodies.material, world.pairs.friction),
         *(table.hulls.features, near.grains, i, j, pair, feature),
     )
-    moved: Floats | None = None
-    linear: Floats | None = None
-    if dt:
-        rows = table.kind, table.row, table.center, table.quaternion, table.size
-        motions = near.bodies.position, _motions(world, near, pictures, dt)
-        moved, linear = turn_ahead(*rows, *motions, i, j, pair, touch.point, touch.normal, touch.gap, dt)
     contacts = Contacts(key, a, b, body, *touch, friction, near, shifts, moved, linear)
     if pictures is not None:
         contacts, weight = _without_images(world, contacts, base, pictures)

@@ -1,4 +1,4 @@
-"""Contacts of spheres have the directions of the end of the step."""
+"""Contacts have the directions of the end of the step."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from drive import RADIUS, G
 from mpi4py import MPI
 
 import pctt
+from dem.bodies import POLYHEDRON
 from dem.clumps import Clump
 from dem.contact import find_contacts
+from dem.contact.narrow import CORNERS
+from dem.mesh import Mesh
 from dem.motion import Glide, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere
@@ -21,35 +24,60 @@ DENSITY = 2500.0
 EXACT = {"tol": 1e-10, "closing_work": np.inf, "stiffness": np.inf}
 
 
-def crowd(period=None, shear_rate=None):
-    """Spheres, clumps and a box among them, which move and turn, on a plane that turns and a box that glides."""
+TETRAHEDRON = 0.07 * CORNERS[[0, 3, 5, 6]] * [1.0, 0.9, 0.8]
+SHEET = [[-0.3, -0.3, 0], [1.2, -0.3, 0], [-0.3, 1.2, 0], [1.2, 1.2, 0]]
+CELL = {"period": (0.84, 0.84, 0.84), "shear_rate": 0.8, "shear_gradient": "z"}
+
+
+def crowd(grains="clumps", floor="plane", **cell):
+    """Spheres, others and boxes among them, which move and turn, above a floor that turns and beside a box that
+    glides."""
     rng = np.random.default_rng(7)
-    cell = {} if period is None else {"period": period, "shear_rate": shear_rate, "shear_gradient": "z"}
     scene = Scene(0.3, gravity=(0, 0, 0), **cell)
 
     def moves(n):
         return {"velocity": rng.uniform(-0.5, 0.5, (n, 3)), "angular_velocity": rng.uniform(-3, 3, (n, 3))}
 
     places = 0.21 * np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.12
-    scene.add_spheres(places, RADIUS, DENSITY, **moves(64))
-    if period is None:
-        dumbbell = Clump([[0, 0, -0.05], [0, 0, 0.05]], [0.08, 0.08])
-        scene.add_clumps(places[::4] + [0, 0, 0.87], dumbbell, DENSITY, **moves(16))
+    turns = rng.normal(size=(64, 4))
+    if cell or grains == "clumps":
+        scene.add_spheres(places, RADIUS, DENSITY, **moves(64))
+    if cell:
+        return new_world(scene, MPI.COMM_SELF)
+    if grains == "clumps":
+        scene.add_clumps(places[::4] + [0, 0, 0.87], Clump([[0, 0, -0.05], [0, 0, 0.05]], [0.08, 0.08]), DENSITY,
+                         **moves(16))  # fmt: skip
+    elif grains == "capsules":
+        scene.add_capsules(places, 0.06, 0.04, DENSITY, **moves(64), quaternions=turns)
+    else:
+        scene.add_polyhedra(places, TETRAHEDRON, DENSITY, **moves(64), quaternions=turns)
+    if floor == "plane":
         scene.add_boxes(places[:4] + [0.84, 0, 0], (0.1, 0.09, 0.1), DENSITY, **moves(4))
-        scene.add_body("plane", [Plane((0, 0, 1))], Rotation((0.4, -0.3, 0.0)))
-        scene.add_body("box", [Box((0.1, 0.5, 0.5)), Sphere(0.1, (0.0, 0.0, 0.8))], Glide((0.7, 0.0, 0.1)),
-                       position=(-0.1, 0.4, 0.5))  # fmt: skip
+    shape = Plane((0, 0, 1)) if floor == "plane" else Mesh(SHEET, [[0, 1, 2], [1, 3, 2]])
+    scene.add_body("floor", [shape], Rotation((0.4, -0.3, 0.0)))
+    wall = [Box((0.1, 0.5, 0.5)), Sphere(0.1, (0.0, 0.0, 0.8))]
+    scene.add_body("wall", wall, Glide((0.7, 0.0, 0.1)), position=(-0.1, 0.4, 0.5))
     return new_world(scene, MPI.COMM_SELF)
 
 
-@pytest.mark.parametrize("cell", [{}, {"period": (0.84, 0.84, 0.84), "shear_rate": 0.8}])
-def test_where_velocities_stay_the_end_is_met(cell):
+@pytest.mark.parametrize(
+    ("grains", "floor", "cell", "kinds"),
+    [
+        ("clumps", "plane", {}, 8),
+        ("clumps", "plane", CELL, 1),
+        ("clumps", "mesh", {}, 5),
+        ("capsules", "plane", {}, 5),
+        ("capsules", "mesh", {}, 2),
+        ("polyhedra", "plane", {}, 5),
+    ],
+)
+def test_where_velocities_stay_the_end_is_met(grains, floor, cell, kinds):
     """Normals are those that bodies have after the step, and linear gaps lead to the gaps that they have then."""
-    dt = 0.004
-    world = crowd(**cell)
-    contacts = find_contacts(world, 0.04, dt)
+    dt = 0.002  # nothing goes further than FURTHEST
+    world = crowd(grains, floor, **cell)
+    contacts = find_contacts(world, 0.06, dt)
     velocity = np.concatenate([world.grains.velocity, world.prescribed_velocity(dt)])
-    end = find_contacts(advanced(world, velocity, dt), 0.06)
+    end = find_contacts(advanced(world, velocity, dt), 0.08)
     near = contacts.near.bodies.velocity.copy()
     near[len(world.grains) :] = velocity[len(world.grains) :]
     opening = ContactSystem(world, contacts, dt).contact_map.relative_velocities(near)[:, 0]
@@ -58,16 +86,13 @@ def test_where_velocities_stay_the_end_is_met(cell):
     at = {key: k for k, key in enumerate(end.key)}
     turned = np.flatnonzero(contacts.moved.any(axis=1))
     pairs = np.array([(c, at[contacts.key[c]]) for c in turned if contacts.key[c] in at])
-    assert len(pairs) > 100
+    assert len(pairs) > 70
     here, there = pairs.T
     np.testing.assert_allclose(contacts.normal[here], end.normal[there], atol=1e-12)
     np.testing.assert_allclose((contacts.linear + dt * opening)[here], end.gap[there], atol=1e-12)
-    assert np.abs(contacts.linear - contacts.gap).max() > 1e-6  # where surfaces are curved
-    shape = contacts.near.bodies.shape
-    kinds = {tuple(sorted(pair)) for pair in zip(shape[contacts.a[here]], shape[contacts.b[here]])}
-    assert len(kinds) == (1 if cell else 5), kinds
-
-
+    shape = np.minimum(contacts.near.bodies.shape, POLYHEDRON)
+    pairs = {tuple(sorted(pair)) for pair in zip(shape[contacts.a[here]], shape[contacts.b[here]])}
+    assert len(pairs) >= kinds, pairs
 def test_energy_of_smooth_motion_is_of_first_order():
     """A sphere slides without friction off a dome; energy at equal times, with the mean of two velocities."""
     errors = []
