@@ -44,6 +44,8 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
     way = dt * speed
     fast = (way > most) & np.isfinite(way)
     weight, reach, seen = grains.weight, 1.0, contacts.near.margin[: len(grains)]
+    known = find_contacts(world, delta, 0.0, seen, contacts.shifts).key  # where bodies are, not where they will be
+    grains.weight = weight
     while reach < furthest:
         reach *= 2.0
         worst = (0.0, -1, -1)  # speed [m/s], and the ids of the grain and of what it meets
@@ -54,7 +56,7 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
             margin = np.where(fast, np.minimum(way, reach * most), 0.0)
             wide = find_contacts(world, delta, 0.0, np.maximum(seen, margin), contacts.shifts)
             grains.weight = weight
-            wide = wide.take(places(contacts.key, wide.key) < 0)
+            wide = wide.take(places(known, wide.key) < 0)
             met = wide.take(_meet(world, wide, velocity, delta, dt))
             table = _velocities(world, wide, velocity, dt)
             if len(met):

@@ -56,15 +56,16 @@ def hosts_first(one: Ints, two: Ints) -> Bools:
 def seen_from(
     kind: Ints, row: Ints, center: Floats, quaternion: Floats, size: Floats, radius: Floats, inner: Floats,
     place: Floats, velocity: Floats, dt: float, i: Ints, j: Ints,
-) -> tuple[Floats, Floats]:  # fmt: skip
+) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Centres (m, 3) and quaternions (m, 4) of guests, the rows i (m,) of `Primitives`, at the end of a step, as seen
-    from the bodies of their hosts, the rows j (m,), put back to where these are now. `inner` is that of `Hulls`."""
-    middle, turn = np.empty((len(i), 3)), np.empty((len(i), 4))
+    from the bodies of their hosts, the rows j (m,), put back to where these are now; and how far the surfaces of the
+    two go along each other until then (m,), at most. `inner` is that of `Hulls`."""
+    middle, turn, way = np.empty((len(i), 3)), np.empty((len(i), 4)), np.empty(len(i))
     for p in range(len(i)):
         a, b = i[p], j[p]
         A, B = row[a], row[b]
-        h = _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt)
-        u, w = _vector(velocity[A], 3), _vector(velocity[B], 3)
+        h, speed = _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt)
+        u, w, way[p] = _vector(velocity[A], 3), _vector(velocity[B], 3), h * speed
         far = plus(_vector(place[A], 0), h, _vector(velocity[A], 0))
         far = plus(far, 1.0, _after(plus(center[a], -1.0, place[A]), u, h))
         far = _after(plus(plus(far, -h, _vector(velocity[B], 0)), -1.0, place[B]), w, -h)
@@ -73,7 +74,7 @@ def seen_from(
             middle[p, k] = place[B, k] + far[k]
         for k in range(4):
             turn[p, k] = q[k]
-    return middle, turn
+    return middle, turn, way
 
 
 @loop
@@ -97,7 +98,7 @@ def turn_ahead(
         a, b = (two, one) if swap else (one, two)
         A, B, sign = row[a], row[b], -1.0 if swap else 1.0
         V, W, u, w = _vector(velocity[A], 0), _vector(velocity[B], 0), _vector(velocity[A], 3), _vector(velocity[B], 3)
-        h = _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt)
+        h, _ = _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt)
         here = kind[a] == SPHERE and kind[b] in (SPHERE, PLANE, BOX)
         if here:
             lever, other = plus(center[a], -1.0, place[A]), plus(center[b], -1.0, place[B])
@@ -143,13 +144,13 @@ def turn_ahead(
 @inlined
 def _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt):
     """The time by which a pair of a guest a and a host b is foreseen: dt, or less where the surface of the one goes
-    further along the other than FURTHEST allows."""
+    further along the other than FURTHEST allows; and the speed at which it goes."""
     least, other = _thickness(kind[a], size[a], inner), _thickness(kind[b], size[b], inner)
     if other < np.inf and kind[a] in (SPHERE, CAPSULE) and kind[b] not in (SPHERE, CAPSULE):
         other = radius[b]  # a plate may be thinner than the way: centre or core do not get into it
     least = min(least, other)
     if least == np.inf:
-        return 0.0
+        return 0.0, 0.0
     A, B = row[a], row[b]
     u, w = _vector(velocity[A], 3), _vector(velocity[B], 3)
     drift = plus(_vector(velocity[A], 0), 1.0, cross(u, plus(center[a], -1.0, place[A])))
@@ -160,7 +161,7 @@ def _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt)
     if kind[a] != SPHERE:
         spin = plus(u, -1.0, w)
         speed += radius[a] * np.sqrt(dot(spin, spin))
-    return dt if speed * dt <= FURTHEST * least else FURTHEST * least / speed
+    return (dt if speed * dt <= FURTHEST * least else FURTHEST * least / speed), speed
 
 
 @inlined

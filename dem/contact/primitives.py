@@ -181,7 +181,7 @@ def numbers_of(shape: Shape, features: int) -> int:
 def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course | None = None) -> Manifold:
     """All contacts of gap at most `delta` (m,) [m] of the pairs of rows i, j (m,); normals point from i to j. Those of
     spheres with spheres, half spaces and boxes come first, in the order of the pairs. With a course those that follow
-    are of guests that are where `dem.contact.ahead.seen_from` puts them.
+    are of guests that are where `dem.contact.ahead.seen_from` puts them, with gaps that are wider by their ways.
 
     Two half spaces have none, nor have meshes with polyhedra or meshes, and capsules with polyhedra that are no boxes:
     `dem.scene` refuses those.
@@ -210,7 +210,7 @@ def touches_ahead(
     table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course
 ) -> tuple[Manifold, Floats, Floats]:
     """The contacts as `turn_ahead` gives them directions of the end of a step, and what this returns of them. A deep
-    gap is no deeper than the pair overlaps at the start."""
+    gap is no deeper than the pair overlaps at the start, and none is wider than `delta` there."""
     found = touches(table, i, j, delta, course)
     moved, linear, deep = turn_ahead(*table.columns(), *course, i, j, found.pair, *found.touch)
     if len(deep):
@@ -218,6 +218,9 @@ def touches_ahead(
         now, least = touches(table, i[pairs], j[pairs], delta[pairs]), delta[pairs]
         np.minimum.at(least, now.pair, now.touch.gap)
         found.touch.gap[deep] = np.maximum(linear[deep], least[row])
+    if (wide := found.touch.gap > delta[found.pair]).any():
+        found = Manifold(found.pair[~wide], found.feature[~wide], found.touch.take(~wide))
+        moved, linear = moved[~wide], linear[~wide]
     return found, moved, linear
 
 
@@ -228,8 +231,8 @@ def _touching(
     contacts, first, second = _TOUCH[kinds]
     guests = table.take(i)
     if course is not None:
-        center, turn = seen_from(*table.columns(), *course, i, j)
-        guests = guests._replace(center=center, quaternion=turn)
+        center, turn, way = seen_from(*table.columns(), *course, i, j)
+        guests, delta = guests._replace(center=center, quaternion=turn), delta + way
     if second is not None:
         return contacts(first(guests, slice(None)), second(table, j), delta)
     found = []

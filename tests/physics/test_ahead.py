@@ -77,6 +77,8 @@ def test_where_velocities_stay_the_end_is_met(grains, floor, cell, kinds):
     world = crowd(grains, floor, **cell)
     contacts = find_contacts(world, 0.06, dt)
     velocity = np.concatenate([world.grains.velocity, world.prescribed_velocity(dt)])
+    start = find_contacts(world, 0.0, 0.0, contacts.near.margin[: len(world.grains)], contacts.shifts)
+    assert {tuple(pair) for pair in start.body} <= {tuple(pair) for pair in contacts.body}
     end = find_contacts(advanced(world, velocity, dt), 0.08)
     near = contacts.near.bodies.velocity.copy()
     near[len(world.grains) :] = velocity[len(world.grains) :]

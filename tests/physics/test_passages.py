@@ -77,6 +77,18 @@ def test_a_fast_grain_that_meets_nothing_flies_on():
         np.testing.assert_allclose(sim.world.grains.position[order], [[0, 0, 3.0], [2.1 * RADIUS, 0, 5.8]], atol=1e-12)
 
 
+def test_a_grain_that_goes_from_one_triangle_to_the_next_has_met_the_mesh():
+    """A sphere strikes a soft mesh, on another triangle at the end of a step than at its start, while another one flies
+    far."""
+    scene = Scene(0.0, gravity=(0, 0, 0), stiffness=1e4)
+    scene.add_body("floor", [Mesh(np.array(PLATE, dtype=float), np.array([[0, 1, 2], [0, 2, 3]]))])
+    places, speeds = [[0.005, -0.005, RADIUS + 0.002], [0, 0, 3.0]], [[-1.0, 1.0, -1.0], [0, 0, 30.0]]
+    scene.add_spheres(places, RADIUS, 2500.0, velocity=speeds)
+    with simulation(scene, 0.01) as sim:
+        sim.step()
+        assert sim.positions[0][2] < RADIUS - 0.001
+
+
 def test_a_grain_that_an_impulse_throws_is_not_thrown_through_a_plate():
     """A heavy ball sends a light one off at nearly 4 radii a step, at a plate behind it."""
     scene = Scene(0.0, gravity=(0, 0, 0), restitution=1.0)
