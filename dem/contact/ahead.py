@@ -105,29 +105,17 @@ def turn_ahead(
             ahead, beside = _after(lever, u, h), _after(other, w, h)
             end = plus(plus(plus(plus(center[a], -1.0, center[b]), h, V), -h, W), -1.0, beside)
             end = plus(plus(end, 1.0, plus(ahead, -1.0, lever)), 1.0, other)
-            if kind[b] == SPHERE:
-                distance = np.sqrt(dot(end, end))
-                if distance == 0.0:
-                    continue
-                n, after = (-end[0] / distance, -end[1] / distance, -end[2] / distance), distance - size[a, 0]
-                after -= size[b, 0]
-            elif kind[b] == PLANE:
-                m = _after(_vector(size[b], 0), w, h)
-                n, after = (-m[0], -m[1], -m[2]), dot(m, end) - size[a, 0]
-            else:
-                back = _after(end, w, -h)
-                x, y, z, after = to_box(back[0], back[1], back[2], size[a, 0], frame_of(quaternion[b]), size[b])
-                n = _after((x, y, z), w, h)
+            n, after = _from_host(end, kind[b], quaternion[b], size[b], size[a, 0], w, h)
             half = 0.5 * gap[c]
             own = plus(ahead, size[a, 0] + half, n)
             their = plus(plus(beside, 1.0, end), size[a, 0] + after - half, n)
-        elif h == 0.0:
-            continue
         else:
             n = _after((sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]), w, h)
             their = _after(plus(point[c], -1.0, place[B]), w, h)
             own = plus(plus(plus(their, 1.0, place[B]), -1.0, place[A]), h, plus(W, -1.0, V))
             after = gap[c]
+        if h == 0.0 or dot(n, n) == 0.0:
+            continue
         linear[c] = after - h * dot(n, plus(plus(W, 1.0, cross(w, their)), -1.0, plus(V, 1.0, cross(u, own))))
         if not here:
             gap[c], deep[found] = linear[c], c
@@ -139,6 +127,24 @@ def turn_ahead(
             point[c, k] = at[k] + first[k]
             moved[c, k] = point[c, k] - second[k] - to[k]
     return moved, linear, deep[:found]
+
+
+@inlined
+def _from_host(end, kind, quaternion, size, radius, spin, time):
+    """The normal from a sphere to its host, and the gap, where its centre is at `end` from that of the host, which has
+    turned for a time. Concentric spheres have no normal."""
+    if kind == SPHERE:
+        distance = np.sqrt(dot(end, end))
+        per, gap = (-1.0 / distance if distance > 0.0 else 0.0), distance - radius - size[0]
+        x, y, z = per * end[0], per * end[1], per * end[2]
+    elif kind == PLANE:
+        x, y, z = _after((-size[0], -size[1], -size[2]), spin, time)
+        gap = -(x * end[0] + y * end[1] + z * end[2]) - radius
+    else:
+        back = _after(end, spin, -time)
+        x, y, z, gap = to_box(back[0], back[1], back[2], radius, frame_of(quaternion), size)
+        x, y, z = _after((x, y, z), spin, time)
+    return (x, y, z), gap
 
 
 @inlined
