@@ -308,8 +308,9 @@ class Folder:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What summary.json has, or would have."""
-        return self._json("summary.json") or self._summary(self.lines())
+        """What summary.json has, or would have: one of fewer steps is of the run before one that was killed."""
+        found, lines = self._json("summary.json"), self.lines()
+        return found if found and found.get("steps", 0) == len(lines) else self._summary(lines)
 
     def _json(self, name: str) -> dict[str, Any]:
         """A file's contents; nothing if there is none. FileError if it is no JSON."""

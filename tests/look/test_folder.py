@@ -34,6 +34,19 @@ def test_a_run_tells_the_shapes_of_its_bodies(folder):
     assert read.large[1]["shapes"][0]["half_extents"] == list(paddle.half_extents)
 
 
+def test_a_summary_of_fewer_steps_is_that_of_a_run_before(folder, tmp_path):
+    """A run that goes on may be killed before it has removed the summary of the run before it."""
+    made = Folder(folder)
+    lines = made.lines()
+    (tmp_path / "settings.json").write_text((folder / "settings.json").read_text())
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    (tmp_path / "steps.jsonl").write_text(text)
+    (tmp_path / "summary.json").write_text(json.dumps({**made.summary, "steps": 3, "worst": "stale"}))
+    summary = Folder(tmp_path).summary
+    assert summary["steps"] == len(lines) == 4
+    assert "worst" not in summary
+
+
 def test_forces_of_the_contacts_change_the_momentum(folder):
     """Newton's second law from the files alone: m dv = dt (sum of contact forces + weight)."""
     read = Folder(folder)

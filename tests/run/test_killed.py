@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import random
 import signal
@@ -92,8 +93,9 @@ def check_files(folder):
     for steps in (found.steps, noted):  # nothing is missing up to the checkpoint
         assert steps == list(range(steps[0], steps[-1] + 1))
         assert steps[0] <= step <= steps[-1]
-    assert found.summary["steps"] == len(noted)
+    assert found.summary["steps"] == len(noted)  # also where summary.json is still that of a run before
     found.derive()  # what a run would write at its end
+    assert json.loads((folder / "summary.json").read_text())["steps"] == len(noted)
     assert [int(name) for name in recorded_steps(arrays(folder / "state.h5"))] == found.steps
     assert table(folder / "records.csv")["step"].tolist() == noted
     return step
