@@ -308,9 +308,11 @@ class Folder:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What summary.json has, or would have: one of fewer steps is of the run before one that was killed."""
+        """What summary.json has, or would have: one of other steps than steps.jsonl is of a run before, which one that
+        was killed went on from."""
         found, lines = self._json("summary.json"), self.lines()
-        return found if found and found.get("steps", 0) == len(lines) else self._summary(lines)
+        stale = bool(lines) and found.get("steps") != len(lines)
+        return self._summary(lines) if stale or not found else found
 
     def _json(self, name: str) -> dict[str, Any]:
         """A file's contents; nothing if there is none. FileError if it is no JSON."""

@@ -246,7 +246,8 @@ def _touching(
 #: The kind of polyhedra that are no boxes, in pairs: clumps are their spheres there.
 _POLYHEDRON = CLUMP
 
-#: For pairs of kinds the contacts, and what these take of each of the two; None: mesh by mesh.
+#: For pairs of kinds, of guest and host (`dem.contact.ahead.RANK`), the contacts, and what these take of each of the
+#: two; None: mesh by mesh.
 _TOUCH: dict[tuple[int, int], tuple[Callable[..., Manifold], Callable[..., Any], Callable[..., Any] | None]] = {
     (SPHERE, CAPSULE): (
         lambda ball, capsule, delta: manifold(delta, [sphere_capsule(ball, capsule)]),
