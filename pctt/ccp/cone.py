@@ -65,35 +65,34 @@ def not_idle(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDAr
 
 
 @loop
-def squared_move(x: Array, y: Array, step: float, mu: Array, de_saxce: float) -> float:
-    """The sum of |P(x - step y) - x|^2, where y gets the term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1; zero
-    below the rounding of step y: a contact that slides has 0 = P(-step y) only up to that. A pass over the memory;
-    `FrictionCones.move` takes several."""
-    sums = np.zeros((len(mu) + STRIP - 1) // STRIP)
-    x, y = x.ravel(), y.ravel()
-    for k in range(len(sums)):
-        for c in range(k * STRIP, min(k * STRIP + STRIP, len(mu))):
-            i = 3 * c
-            m, u, v = mu[c], y[i + 1], y[i + 2]
-            w = y[i] + de_saxce * m * np.sqrt(u * u + v * v)
-            n, t_1, t_2 = _nearest(x[i] - step * w, x[i + 1] - step * u, x[i + 2] - step * v, m)
-            square = (n - x[i]) ** 2 + (t_1 - x[i + 1]) ** 2 + (t_2 - x[i + 2]) ** 2
-            if not square <= NO_MOVE * (step * step) * (y[i] * y[i] + u * u + v * v):
-                sums[k] += square
-    return sums.sum()
+def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float) -> Array:
+    """Sums (5,) over the contacts: |P(x - step y) - x|^2, where y gets the term (mu |y_t|, 0, 0) of De Saxce if
+    ``de_saxce`` is 1, and below the rounding of step y it is zero: a contact that slides has 0 = P(-step y) only up to
+    that; |x|^2; closing work, opening work and 1/2 x.(y - r)."""
+    sums = np.zeros(5 * STRIP)
+    x, y, r = x.ravel(), y.ravel(), r.ravel()
+    for first in range(0, len(mu), STRIP):
+        friction = mu[first : first + STRIP]
+        a, b = 3 * first, 3 * (first + len(friction))
+        _add_errors(x[a:b], y[a:b], r[a:b], step, friction, de_saxce, sums)
+    return sums.reshape(5, STRIP).sum(axis=1)
 
 
 @loop
-def wrong_works(g: Array, y: Array, r: Array) -> tuple[float, float, float]:
-    """Closing work, opening work and 1/2 g.(y - r), summed over the contacts. Comparisons let a NaN through."""
-    closing, opening, energy = 0.0, 0.0, 0.0
-    for c in range(len(g)):
-        n, u, v = g[c, 0], g[c, 1], g[c, 2]
-        along = n * y[c, 0] + u * y[c, 1] + v * y[c, 2]
-        closing += n * (0.0 if y[c, 0] > 0.0 else -y[c, 0])
-        opening += 0.0 if along < 0.0 else along
-        energy += 0.5 * (along - (n * r[c, 0] + u * r[c, 1] + v * r[c, 2]))
-    return closing, opening, energy
+def _add_errors(x, y, r, step, mu, de_saxce, sums):
+    """Comparisons let a NaN through."""
+    for c in range(len(mu)):
+        i, m = 3 * c, mu[c]
+        n, u, v, y_n, y_u, y_v = x[i], x[i + 1], x[i + 2], y[i], y[i + 1], y[i + 2]
+        w = y_n + de_saxce * m * np.sqrt(y_u * y_u + y_v * y_v)
+        to_n, to_u, to_v = _nearest(n - step * w, u - step * y_u, v - step * y_v, m)
+        square = (to_n - n) ** 2 + (to_u - u) ** 2 + (to_v - v) ** 2
+        along = n * y_n + u * y_u + v * y_v
+        sums[c] += 0.0 if square <= NO_MOVE * (step * step) * (y_n * y_n + y_u * y_u + y_v * y_v) else square
+        sums[STRIP + c] += n * n + u * u + v * v
+        sums[2 * STRIP + c] += n * (0.0 if y_n > 0.0 else -y_n)
+        sums[3 * STRIP + c] += 0.0 if along < 0.0 else along
+        sums[4 * STRIP + c] += 0.5 * (along - (n * r[i] + u * r[i + 1] + v * r[i + 2]))
 
 
 @loop
@@ -493,13 +492,9 @@ class FrictionCones:
         out -= x
         return out
 
-    def squared_move(self, x: Array, y: Array, step: float, coulomb: bool) -> float:
-        """||`move`||^2 of this rank's contacts."""
-        return squared_move(x, y, step, self.mu, float(coulomb))
-
-    def wrong_works(self, g: Array, y: Array, r: Array) -> tuple[float, float, float]:
-        """Closing work, opening work and 1/2 g.(y - r) of this rank's contacts; see `ConeProblem.wrong_work`."""
-        return wrong_works(g, y, r)
+    def errors(self, g: Array, y: Array, r: Array, step: float, coulomb: bool) -> Array:
+        """||`move`||^2, |g|^2, closing work, opening work and 1/2 g.(y - r) of this rank's contacts (5,)."""
+        return errors(g, y, r, step, self.mu, float(coulomb))
 
     def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
         """Mask (count,) of the contacts but those without an impulse at x and last_x whose distance inside the dual

@@ -64,7 +64,7 @@ def fixed_point(
             problem.r = r
         g, spent = inner.impulse, [inner]
         y = problem.product(g) + r
-        history.append(limits.residual(problem.natural_residual(g, y, coulomb=True), problem, g, y))
+        history.append(limits.residual(problem.errors(g, y, coulomb=True)))
         best = inner if history[-1] <= min(history) else best
         failed = 0 if inner.converged else failed + 1
         if history[-1] <= tol or failed > 1 or inner.status is Status.UNBOUNDED:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-import math
 from functools import cached_property
-from typing import Union
+from typing import NamedTuple, Union
 
 import numpy as np
 from mpi4py import MPI
@@ -18,6 +17,21 @@ from pctt.ccp.cone import Array, FrictionCones
 from pctt.ccp.delassus import BlockMap, GivenMatrix, delassus, without_hubs
 
 Given = Union[BlockRows, CompactRows, ContactMap]
+
+
+class Errors(NamedTuple):
+    """Of impulses g and velocities y = N g + r.
+
+    Attributes
+    ----------
+    natural : ||g - P(g - y / mean diag N)|| / ||g||. inf if that is undefined: for g = 0, unless it solves the problem,
+        and if g or y has a nan or inf
+    work : the larger of the closing and the opening work, over 1/2 g'Ng: the sums of g_n max(-y_n, 0) and of max(g.y,
+        0) over the contacts. 0 without impulses, inf if it is no number
+    """
+
+    natural: float
+    work: float
 
 
 class ConeProblem:
@@ -106,25 +120,20 @@ class ConeProblem:
         """G v: velocities of the contacts (nc, 3) for those of the bodies; N g where the problem is given by N."""
         return self.operator.velocities(momentum)
 
-    def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
-        """||g - P(g - y / mean diag N)|| / ||g||, velocities y = N g + r: the stop test of every solver. For Coulomb's
-        law y gets De Saxce's term.
-
-        inf if that is undefined: for g = 0, unless it solves the problem, and if g or y has a nan or inf."""
-        square = self.cones.squared_move(g, y, 1.0 / self.mean_diagonal, coulomb)
-        moved, whole = self.sum(np.array([square, np.vdot(g, g)])).tolist()
-        if moved == 0:
-            return 0.0
-        residual = math.sqrt(moved) / math.sqrt(whole) if whole > 0 else math.inf
-        return residual if residual == residual else np.inf
-
     @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
-    def wrong_work(self, g: Array, y: Array) -> float:
-        """The larger of the closing and the opening work, over 1/2 g'Ng: the sums of g_n max(-y_n, 0) and of
-        max(g.y, 0) over the contacts; velocities y = N g + r. 0 without impulses, inf if it is no number."""
-        closing, opening, energy = self.sum(np.array(self.cones.wrong_works(g, y, self.r)))
-        work = 0.0 if energy <= 0 else float(np.maximum(closing, opening) / energy)
-        return work if work == work else np.inf
+    def errors(self, g: Array, y: Array, coulomb: bool = False) -> Errors:
+        """How far impulses g with the velocities y = N g + r are from a solution. For Coulomb's law y gets De Saxce's
+        term."""
+        here = self.cones.errors(g, y, self.r, 1.0 / self.mean_diagonal, coulomb)
+        moved, whole, closing, opening, energy = self.sum(here)
+        natural = np.sqrt(moved) / np.sqrt(whole) if whole > 0.0 else np.inf
+        work = 0.0 if energy <= 0.0 else np.maximum(closing, opening) / energy
+        natural, work = (float(x) if x == x else np.inf for x in (natural, work))
+        return Errors(0.0 if moved == 0.0 else natural, work)
+
+    def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
+        """That of the `errors`."""
+        return self.errors(g, y, coulomb).natural
 
     @cached_property
     def N(self) -> PETSc.Mat:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pctt.ccp.cone import Array
-from pctt.ccp.problem import ConeProblem
+from pctt.ccp.problem import Errors
 from pctt.options import FRACTION, option
 
 if TYPE_CHECKING:
@@ -40,15 +40,12 @@ class Limits:
     )
     fallback: bool = option(True, "where the solver does not converge, another one goes on from its impulses")
 
-    def residual(self, natural: float, problem: ConeProblem, g: Array, y: Array) -> float:
-        """What ``tol`` is for: the natural residual of impulses g (nc, 3) with y = N g + r, or their closing or opening
-        work in units in which its limit is ``tol``, whichever is larger. It is at most ENOUGH times the natural
-        residual: where bodies are squeezed no accuracy may bring the closing work below its limit. What passes so is
-        `squeezed`."""
-        if math.isinf(self.closing_work):
-            return natural
-        work = self.tol / self.closing_work * problem.wrong_work(g, y)
-        return min(max(natural, work), ENOUGH * natural)
+    def residual(self, errors: Errors) -> float:
+        """What ``tol`` is for: the natural residual, or the closing or opening work in units in which its limit is
+        ``tol``, whichever is larger. It is at most ENOUGH times the natural residual: where bodies are squeezed no
+        accuracy may bring the closing work below its limit. What passes so is `squeezed`."""
+        work = 0.0 if math.isinf(self.closing_work) else self.tol / self.closing_work * errors.work
+        return min(max(errors.natural, work), ENOUGH * errors.natural)
 
     def squeezed(self, found: Accuracy, coulomb: bool) -> str:
         """The reason, in words, if impulses of this accuracy meet the limits although their closing or opening work is

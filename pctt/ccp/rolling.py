@@ -73,15 +73,13 @@ class RollingCones(FrictionCones):
         return project_to(x, self.mu, self.spinning, out)
 
     @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
-    def squared_move(self, x: Array, y: Array, step: float, coulomb: bool) -> float:
-        both = self.move(x, y, step, coulomb), step * y
+    def errors(self, g: Array, y: Array, r: Array, step: float, coulomb: bool) -> Array:
+        both = self.move(g, y, step, coulomb), step * y
         move, speed = (np.square(z).sum(axis=1).reshape(2, -1).sum(axis=0) for z in both)
-        return float(move[~(move <= NO_MOVE * speed)].sum())
-
-    def wrong_works(self, g: Array, y: Array, r: Array) -> tuple[float, float, float]:
         normal, push = y[: self.count, 0], g[: self.count, 0]
         power = (g * y).sum(axis=1).reshape(2, -1).sum(axis=0)
-        return push @ np.maximum(-normal, 0.0), np.maximum(power, 0.0).sum(), 0.5 * np.vdot(g, y - r)
+        works = push @ np.maximum(-normal, 0.0), np.maximum(power, 0.0).sum(), 0.5 * np.vdot(g, y - r)
+        return np.array([move[~(move <= NO_MOVE * speed)].sum(), np.vdot(g, g), *works])
 
     def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
         x, last_x, opening = x[: self.count, 0], last_x[: self.count, 0], y[: self.count, 0] - self.resisted(y)

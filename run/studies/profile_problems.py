@@ -118,21 +118,21 @@ def once(path: str, law: str, solver: str, tol: float, seconds: float) -> Row:
         else:
             newton = ccp.newton_for(COMM, solver) if ccp.SOLVERS[solver].newton else None
             limits = ccp.Limits(tol, -1 if newton else 10_000_000, np.inf, fallback=False)
-            look = problem.natural_residual
+            look = problem.errors
 
-            def in_time(*arguments: Any, **named: Any) -> float:
+            def in_time(*arguments: Any, **named: Any) -> Any:
                 if time.perf_counter() > start + seconds:
                     raise OutOfTimeError
                 return look(*arguments, **named)
 
-            problem.natural_residual = in_time  # type: ignore[method-assign]
+            problem.errors = in_time  # type: ignore[method-assign]
             try:
                 of = ccp.COULOMB if law == "coulomb" else ccp.RELAXATION
                 result = ccp.solve(problem, None, solver, limits, None, newton, of)
                 impulse, reason = result.impulse, result.reason
             except OutOfTimeError:
                 pass
-            del problem.natural_residual
+            del problem.errors
         found: Row = {"seconds": time.perf_counter() - start, "reason": reason, "residual": np.inf, "objective": None}
         if impulse is not None and np.isfinite(impulse).all():
             accuracy = ccp.measure(problem, impulse)

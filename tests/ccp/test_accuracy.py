@@ -88,7 +88,7 @@ def test_impulses_that_are_no_numbers_have_no_small_figures():
     g = np.full((3, 3), np.nan)
     figures = ccp.measure(three, g)
     assert figures.closing_work == figures.opening_work == np.inf
-    assert three.wrong_work(g, three.product(g)) == np.inf
+    assert three.errors(g, three.product(g)) == (np.inf, np.inf)
 
 
 def test_the_closing_work_of_three_contacts_worked_out_by_hand():

@@ -34,6 +34,13 @@ def accelerated_step(x, last_x, y, compliance, beta, step, mu, opening):
     return work, np.vdot(out - z, out - z), np.vdot(y_z, out - x), out
 
 
+def errors(x, y, r, step, mu, opening):
+    term = opening * mu * np.hypot(y[:, 1], y[:, 2])
+    move, power = nearest(x - step * (y + np.outer(term, [1, 0, 0])), mu) - x, (x * y).sum(axis=1)
+    works = x[:, 0] @ np.maximum(-y[:, 0], 0), np.maximum(power, 0).sum(), 0.5 * np.vdot(x, y - r)
+    return np.array([np.vdot(move, move), np.vdot(x, x), *works])
+
+
 def times(blocks, x):
     return np.einsum("nij,nj->ni", blocks, x)
 
@@ -59,6 +66,8 @@ class Sample:
             "project": (cone.project, nearest, (x, mu)),
             "step": (stepped, accelerated_step, (x, dx, y, np.abs(dy), 0.7, 0.3, mu, 1.0)),
             "rigid step": (stepped, accelerated_step, (x, dx, y, dy[:0], 0.7, 0.3, mu, 0.0)),
+            "errors": (cone.errors, errors, (x, y, dy, 0.3, mu, 0.0)),
+            "errors of Coulomb's law": (cone.errors, errors, (x, y, dy, 0.3, mu, 1.0)),
             "times": (cone.times, times, (blocks, x)),
         }  # fmt: skip
 
@@ -113,12 +122,10 @@ def test_sums_of_a_problem_from_its_cones():
     term = np.stack([mu * np.hypot(y[:, 1], y[:, 2]), 0 * mu, 0 * mu], axis=1)
     for coulomb, target in ((False, x - 0.3 * y), (True, x - 0.3 * (y + term))):
         np.testing.assert_allclose(cones.move(x, y, 0.3, coulomb), nearest(target, mu) - x, atol=1e-14)
-    power = (x * y).sum(axis=1)
-    works = x[:, 0] @ np.maximum(-y[:, 0], 0), np.maximum(power, 0).sum(), 0.5 * (power.sum() - (x * x).sum())
-    np.testing.assert_allclose(cones.wrong_works(x, y, x), works)
+        np.testing.assert_allclose(cones.errors(x, y, x, 0.3, coulomb), errors(x, y, x, 0.3, mu, coulomb))
     open_ones = (x[:, 0] <= 0) & (y[:, 0] - term[:, 0] > 0.1)
     assert np.array_equal(cones.not_idle(x, x, y, 0.1), ~open_ones)
-    assert cone.FrictionCones(np.zeros(0)).wrong_works(x[:0], y[:0], x[:0]) == (0.0, 0.0, 0.0)
+    assert not cone.FrictionCones(np.zeros(0)).errors(x[:0], y[:0], x[:0], 0.3, True).any()
 
 
 def test_the_scaling_is_that_of_nesterov_and_todd():

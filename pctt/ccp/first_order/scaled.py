@@ -238,10 +238,10 @@ class Progress:
         """The residual that the tolerance is for, of impulses g and velocities y. Where only the closing work is too
         large, the problem may have no solution: this is found out whenever the natural residual has fallen to a
         tenth."""
-        natural = self.problem.problem.natural_residual(g, y, self.problem.coulomb)
-        residual = self.limits.residual(natural, self.problem.problem, g, y)
-        if natural <= self._suspicious and residual > self.limits.tol:
-            self._suspicious = 0.1 * natural
+        errors = self.problem.problem.errors(g, y, self.problem.coulomb)
+        residual = self.limits.residual(errors)
+        if errors.natural <= self._suspicious and residual > self.limits.tol:
+            self._suspicious = 0.1 * errors.natural
             self._unbounded = why_unbounded(self.problem.problem, g)
         return residual
 

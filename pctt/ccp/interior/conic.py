@@ -38,7 +38,7 @@ from pctt.ccp.cone import Array, NesterovTodd, dot, scaling
 from pctt.ccp.interior import useful_part
 from pctt.ccp.interior.lorentz import Arrows, LorentzCones
 from pctt.ccp.newton import Newton
-from pctt.ccp.problem import ConeProblem
+from pctt.ccp.problem import ConeProblem, Errors
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.log import phase
@@ -77,12 +77,12 @@ def solve(
     while True:
         # residuals
         found, gap = cones.residuals(at), problem.dot(at.s, at.z)
-        history.append(limits.residual(found.natural, problem, found.g, found.y))
+        history.append(limits.residual(found.errors))
         unbounded = bool(why_unbounded(given, found.g, found.y))
         if unbounded or history[-1] == min(history):
             best = found.g
-        waited = 0 if found.natural <= 0.9 * least or gap <= 0.5 * last_gap else waited + 1
-        least, last_gap = min(found.natural, least), gap
+        waited = 0 if found.errors.natural <= 0.9 * least or gap <= 0.5 * last_gap else waited + 1
+        least, last_gap = min(found.errors.natural, least), gap
         done = history[-1] <= limits.tol or unbounded
         if done or len(history) > limits.max_it or waited > options.patience:
             break
@@ -125,12 +125,12 @@ class Point(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Of an iterate: its impulses and their velocities y = N g + r (rows, 3), the natural residual, v - G' g, and
+    """Of an iterate: its impulses and their velocities y = N g + r (rows, 3), their errors, v - G' g, and
     y - A'z with the y of v, z without De Saxce's term."""
 
     g: Array
     y: Array
-    natural: float
+    errors: Errors
     r_v: Array
     r_y: Array
 
@@ -192,7 +192,7 @@ class Cones:
         y = (problem.velocity_of(momentum) + rest) * lorentz.known
         r_y = (problem.velocity_of(at.v) + rest) * lorentz.known
         r_y -= lorentz.back(without_de_saxce(at.z) if self.coulomb else at.z)
-        return Residuals(g, y, problem.natural_residual(g, y, self.coulomb), at.v - momentum, r_y)
+        return Residuals(g, y, problem.errors(g, y, self.coulomb), at.v - momentum, r_y)
 
     def scaled(self, at: Point, found: Residuals) -> Scaled:
         """The linear equations of an iterate."""
@@ -201,7 +201,7 @@ class Cones:
             u = sliding_directions(at.z) if self.coulomb else self._still
             arrows = self.lorentz.arrows(*W, u, self.compliance, self.tangential) if self.mends else None
         # the velocities that the natural residual stands for
-        shown = found.natural * self.problem.norm(found.g) * self.problem.mean_diagonal
+        shown = found.errors.natural * self.problem.norm(found.g) * self.problem.mean_diagonal
         return Scaled(self, at, found, W, u, arrows, self.forcing * shown)
 
     def moved(self, at: Point, d: Direction, step: float) -> Point:

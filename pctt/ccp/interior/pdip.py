@@ -120,8 +120,8 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     for iteration in range(limits.max_it + 1):
         # residuals
         y = _velocity(problem, g)
-        natural = problem.natural_residual(g, y)
-        history.append(limits.residual(natural, problem, g, y))
+        errors = problem.errors(g, y)
+        history.append(limits.residual(errors))
         if history[-1] <= limits.tol:
             status, reason = Status.CONVERGED, limits.met
             break
@@ -132,12 +132,12 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
         aim = options.centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, earlier)
-        damping = _next_damping(damping, step, natural, options)
-        newton.update(_barrier_blocks(at, damping * natural * problem.mean_diagonal))
+        damping = _next_damping(damping, step, errors.natural, options)
+        newton.update(_barrier_blocks(at, damping * errors.natural * problem.mean_diagonal))
         # Newton step. The residual of a solve is a velocity. It must be only a part of those that the natural residual
         # stands for: otherwise complementarity would fall without them, and near the boundary no step makes up for that
         q = _right_side(at, aim)
-        shown = natural * problem.norm(g) * problem.mean_diagonal
+        shown = errors.natural * problem.norm(g) * problem.mean_diagonal
         tol = min(options.rtol * problem.norm(q), options.forcing * shown)
         dg, dlam = _direction(at, q, aim, tol)
         step = _step_length(at, dg, dlam, options)
