@@ -14,7 +14,7 @@ from dem import bodies
 from dem.arrays import Bools, Floats, places
 from dem.bodies import SPHERE
 from dem.compiled import loop
-from dem.contact import Contacts, find_contacts
+from dem.contact import Contacts, find_contacts, velocities_about
 from dem.exchange import on_any, reduced
 from dem.quaternion import cross, length
 from dem.system import contact_arms
@@ -58,7 +58,7 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
             grains.weight = weight
             wide = wide.take(places(known, wide.key) < 0)
             met = wide.take(_meet(world, wide, velocity, delta, dt))
-            table = _velocities(world, wide, velocity, dt)
+            table = velocities_about(world, wide.near, velocity, dt)
             if len(met):
                 pair = np.stack([met.a, met.b], axis=1)
                 grain = pair < met.near.grains + met.near.ghosts
@@ -84,24 +84,12 @@ def beyond(velocity: Floats, most: Floats, dt: float) -> tuple[int, float]:
     return count, furthest
 
 
-def _velocities(world: World, contacts: Contacts, velocity: Floats, dt: float) -> Floats:
-    """Velocities (bodies of `near`, 6) of all bodies about this rank, from those (owned, 6); collective."""
-    near = contacts.near
-    table = np.zeros((len(near.bodies), 6))
-    table[: near.grains] = velocity[: near.grains]
-    world.lists.halo.update(table)
-    table[near.grains + near.ghosts :] = world.large_velocity(velocity, dt)
-    return table
-
-
 def _meet(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Bools:
     """Which of the contacts (nc,) close within dt, to a hundredth of delta, with the velocities (owned, 6) of the
     bodies; collective."""
-    table = _velocities(world, contacts, velocity, dt)
+    table = velocities_about(world, contacts.near, velocity, dt)
     near, row = contacts.near, np.stack([contacts.a, contacts.b], axis=1)
-    arm = contact_arms(contacts.point, near.bodies.position, row.astype(np.uint32)).reshape(-1, 2, 3)
-    if contacts.moved is not None:
-        arm[:, 1] -= contacts.moved
+    arm = contact_arms(contacts, near.bodies.position, row.astype(np.uint32)).reshape(-1, 2, 3)
     spin = cross(table[row, 3:], arm)
     shape = near.bodies.shape[row]
     spin[shape == SPHERE] = 0.0  # their surfaces do not move

@@ -17,7 +17,7 @@ from dem.applied import applied_impulses
 from dem.arrays import ArrayLike, Bools, Floats, Ints, places
 from dem.bodies import SPHERE, Bodies
 from dem.cohesion import along_normal
-from dem.contact import Contacts, cell_way, contact_order, find_contacts, goes_beyond, ways
+from dem.contact import Contacts, cell_way, contact_order, find_contacts, goes_beyond, velocities_about, ways
 from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
 from dem.measures import Sample
@@ -188,10 +188,7 @@ def find_overrun(
     shifts = np.concatenate([contacts.shifts, dt * large[None]]) if beyond else contacts.shifts
     margin = np.maximum(seen, way)
     unseen = find_contacts(world, delta, dt, margin, shifts, besides=contacts)
-    table = np.zeros((len(unseen.near.bodies), 6))
-    table[: len(seen)] = velocity[: len(seen)]
-    world.lists.halo.update(table)
-    table[unseen.near.grains + unseen.near.ghosts :] = large
+    table = velocities_about(world, unseen.near, velocity, dt)
     opening = _opening(world, unseen, unseen.near.bodies.position, table)
     overlap = -dt * (gap_velocities(world, unseen, dt, recovery_speed)[2] + opening)
     if not on_any(world.comm, bool((overlap > depth).any()))[0]:
@@ -202,9 +199,7 @@ def find_overrun(
 def _opening(world: World, contacts: Contacts, position: Floats, velocity: Floats) -> Floats:
     """Normal velocities (nc,) of contacts of bodies with these positions and velocities (rows, 3 and 6)."""
     row = np.stack([contacts.a, contacts.b], axis=1).astype(np.uint32)
-    arm = contact_arms(contacts.point, position, row)
-    if contacts.moved is not None:
-        arm[:, 3:] -= contacts.moved
+    arm = contact_arms(contacts, position, row)
     opening: Floats = relative_velocities(contact_frames(contacts.normal).reshape(-1, 9), arm, row, velocity)[:, 0]
     flow = contacts.flow(world, position)
     return opening if flow is None else opening + np.einsum("ci,ci->c", contacts.normal, flow)

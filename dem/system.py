@@ -94,9 +94,7 @@ class ContactSystem:
         moves = bodies.is_dynamic(near.bodies)
         # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
         row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
-        arm = contact_arms(self.point, near.bodies.position, row)
-        if contacts.moved is not None:
-            arm[:, 3:] -= contacts.moved
+        arm = contact_arms(contacts, near.bodies.position, row)
         self.drives = drives_of(world, dt, spent)
         root = inverse_root_masses(world, self.drives)
         rows = CompactRows(self.frame.reshape(-1, 9), arm, body, root, owned)
@@ -349,15 +347,22 @@ def _frames(normal: Floats) -> Floats:
     return out
 
 
+def contact_arms(contacts: Contacts, position: Floats, row: np.ndarray) -> Floats:
+    """Vectors (nc, 6) from the centres of the two bodies of each contact, or of the image of the second, to its point;
+    `row` (nc, 2) are the bodies' rows, uint32, in a table of positions (rows, 3) [m]."""
+    moved = np.zeros((0, 3)) if contacts.moved is None else contacts.moved
+    return _arms(contacts.point, moved, position, row)
+
+
 @loop
-def contact_arms(point: Floats, position: Floats, row: np.ndarray) -> Floats:
-    """Vectors (nc, 6) from the centres of the two bodies of each contact to its point (nc, 3); `row` (nc, 2) are the
-    bodies' rows in a table of positions (rows, 3)."""
+def _arms(point: Floats, moved: Floats, position: Floats, row: np.ndarray) -> Floats:
     out = np.empty((len(row), 6))
     for c in range(len(row)):
         for k in range(3):
             out[c, k] = point[c, k] - position[row[c, 0], k]
             out[c, 3 + k] = point[c, k] - position[row[c, 1], k]
+            if len(moved):
+                out[c, 3 + k] -= moved[c, k]
     return out
 
 

@@ -160,6 +160,16 @@ def _motions(world: World, near: Neighbourhood, pictures: Images | None, dt: flo
     return velocity
 
 
+def velocities_about(world: World, near: Neighbourhood, velocity: Floats, dt: float) -> Floats:
+    """Velocities (rows, 6) of all bodies of the neighbourhood in a step of dt [s], from those (owned, 6) of the bodies
+    whose rows each rank owns; collective."""
+    table = np.zeros((len(near.bodies), 6))
+    table[: near.grains] = velocity[: near.grains]
+    world.lists.halo.update(table)
+    table[near.grains + near.ghosts :] = world.large_velocity(velocity, dt)
+    return table
+
+
 def cell_way(world: World, dt: float) -> Floats | float:
     """What margins (grains,) have beside the ways of the grains in dt [s]: half the way of images behind a sheared
     boundary, as both grains of a pair have a half, and the share of a grain in the way by which a cell that changes its

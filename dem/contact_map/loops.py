@@ -116,6 +116,14 @@ def add_momenta_of(which, frame, arm, body, g, m):
 
 
 @loop
+def scale_frames(frame, size, out):
+    """out (nc, 9) = the frames with their rows multiplied by ``size`` (nc, 3), in the precision of out."""
+    for c in range(len(out)):
+        for k in range(9):
+            out[c, k] = frame[c, k] * size[c, k // 3]
+
+
+@loop
 def find_forces(frame, g, f):
     """f = F' g (nc, 3), the impulses g (nc, 3) in the axes of the world."""
     for c in prange(len(f)):

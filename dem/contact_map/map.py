@@ -334,7 +334,8 @@ class ContactMap:
 
     def scaled(self, size: Floats, precision: type[np.floating] = np.float64) -> ContactMap:
         """The map with its rows multiplied by ``size`` (nc, 3)."""
-        frame = (self.given.frame.reshape(-1, 3, 3) * size[:, :, None]).reshape(-1, 9)
+        frame = np.empty((self.rows, 9), precision)
+        loops.scale_frames(self.given.frame, size, frame)
         other = ContactMap(self.comm, replace(self.given, frame=frame), self.halo, self.body, precision)
         other.log_flops = self.log_flops
         if threads() > 1:

@@ -96,7 +96,6 @@ def solve(
         better = second.final or second.residual < asked.residual
         result = second.after(asked) if better else dataclasses.replace(asked).after(second)
         result.asked, result.reason = asked, f"{type}: {asked.reason}; {other}: {second.reason}"
-    result.momentum = problem.momentum(result.impulse)
     return result
 
 
@@ -108,8 +107,8 @@ def _by(
     cold = problem.natural_residual(nothing, problem.r, coulomb)
     if cold == 0:
         words = "no contact closes" if problem.size else "no contacts"
-        accuracy = measure(problem, nothing)
-        return Result(nothing, Status.CONVERGED, words, 0.0, 0, solver=name, law=law, accuracy=accuracy)
+        done = Result(nothing, Status.CONVERGED, words, 0.0, 0, solver=name, law=law)
+        return measured(done, problem)
     limits = dataclasses.replace(limits, max_it=method.iterations) if limits.max_it < 0 else limits
     own = newton_for(problem.comm, name) if method.newton and newton is None else None
     given = (options or method.options(), *([newton or own] if method.newton else []))
@@ -135,9 +134,16 @@ def _by(
         result.impulse, result.status, result.residual = nothing, Status.BREAKDOWN, cold
     elif unbounded := why_unbounded(problem, result.impulse):
         result.status, result.reason = Status.UNBOUNDED, unbounded
-    result.accuracy = measure(problem, result.impulse)
+    measured(result, problem)
     if result.converged and (squeezed := limits.squeezed(result.accuracy, coulomb)):
         result.status, result.reason = Status.SQUEEZED, squeezed
+    return result
+
+
+def measured(result: Result, problem: ConeProblem) -> Result:
+    """The result with what its impulses do to the bodies, and how accurate they are."""
+    result.momentum = problem.momentum(result.impulse)
+    result.accuracy = measure(problem, result.impulse, result.momentum)
     return result
 
 

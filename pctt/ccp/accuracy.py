@@ -52,14 +52,15 @@ class Accuracy:
     velocity_norm: float
 
 
-def measure(problem: ConeProblem, g: Array) -> Accuracy:
-    """The figures of an impulse g (nc, 3), the same on every rank."""
+def measure(problem: ConeProblem, g: Array, momentum: Array | None = None) -> Accuracy:
+    """The figures of an impulse g (nc, 3), the same on every rank; ``momentum`` is that of `ConeProblem.momentum`, if
+    it is known."""
     step = 1.0 / problem.mean_diagonal
+    rigid = problem.velocity_of(problem.momentum(g) if momentum is None else momentum)
     if isinstance(problem, RollingProblem):
-        sums, greatest = _judged_rolling(problem, g, problem.product(g) + problem.r, step)
+        sums, greatest = _judged_rolling(problem, g, rigid + problem.compliance * g + problem.r, step)
     else:
-        rigid, soft = np.zeros_like(problem.r), problem.compliance[: None if problem.yields else 0]
-        problem.operator.add_delassus(g, rigid)
+        soft = problem.compliance[: None if problem.yields else 0]
         sums, greatest = _judged(g, rigid, soft, problem.r, problem.mu, step)
     of_all, (cone, dual, complementarity) = reduced(problem.comm, sums, greatest)
     square, speed, power, pushed, closing, opening, natural, coulomb = of_all

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dem.compiled import loop
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
@@ -42,15 +43,14 @@ class ScaledProblem:
 
     def __init__(self, problem: ConeProblem, coulomb: bool = False, precision: type[np.floating] = np.float64):
         self.problem, self.coulomb, self.precision = problem, coulomb, precision
-        size = problem.diagonal
-        size[:, 1] = size[:, 2] = 0.5 * (size[:, 1] + size[:, 2])
-        self._scale = np.sqrt(np.where(size > 0, size, problem.mean_diagonal))
-        self.shrink = 1.0 / self._scale  #: (nc, 3) diagonal of S^-1
-        self.cones = problem.cones.scaled(self._scale, precision)
-        self.unit = 2.0 ** np.frexp(problem.max(float(np.abs(problem.r).max(initial=0.0))))[1]
-        self._impulse, self._velocity = self.shrink * self.unit, self._scale * self.unit  # of x, of a gradient
-        self.b = self._rounded(problem.r / self._velocity)
-        self._compliance = self._rounded(problem.compliance * self.shrink**2)
+        shape = problem.r.shape
+        largest = problem.max(max(float(problem.r.max(initial=0.0)), -float(problem.r.min(initial=0.0))))
+        self.unit = 2.0 ** np.frexp(largest)[1]
+        self.shrink, self._impulse, self._velocity = np.empty((3, *shape))  # the diagonal of S^-1; of x, of a gradient
+        self.b, self._compliance = np.empty((2, *shape), precision)
+        given = problem.diagonal, problem.mean_diagonal, self.unit, problem.r, problem.compliance
+        _scale(*given, self.shrink, self._impulse, self._velocity, self.b, self._compliance)
+        self.cones = problem.cones.scaled(self._velocity, precision)
         self._soft = self._compliance[: None if problem.yields else 0]
         self._operator = problem.operator.scaled(self.shrink, precision)
         self._awake = self._operator.everything
@@ -137,9 +137,10 @@ class ScaledProblem:
         largest = np.linalg.eigvalsh(blocks)[:, -1]
         return np.repeat(1.0 / np.where(largest > 0, largest, 1.0), 3).reshape(-1, 3)
 
-    def velocities(self, gradient: Array) -> Array:
-        """The velocities N g + r (nc, 3) that belong to a gradient."""
-        return gradient * self._velocity
+    def unscaled(self, x: Array, gradient: Array) -> tuple[Array, Array]:
+        """The impulses (nc, 3) of x, but for rounding in the cones, and the velocities N g + r (nc, 3) of its
+        gradient."""
+        return x * self._impulse, gradient * self._velocity
 
     def largest_curvature(self, steps: int = 10) -> float:
         """Estimate from below of the largest eigenvalue of A: ``steps`` power iterations from b."""
@@ -153,6 +154,20 @@ class ScaledProblem:
             curvature = self.dots((x, Ax))[0] / norm
             x = Ax
         return max(curvature, 1.0)  # the mean of diag A is 1
+
+
+@loop
+def _scale(diagonal, mean, unit, r, compliance, shrink, impulse, velocity, b, soft):
+    """Fill the last five arrays (nc, 3): those of `ScaledProblem`, for the diagonal of N, its mean, and the unit."""
+    for c in range(len(r)):
+        normal, tangential = diagonal[c, 0], 0.5 * (diagonal[c, 1] + diagonal[c, 2])
+        normal = np.sqrt(normal if normal > 0.0 else mean)
+        tangential = np.sqrt(tangential if tangential > 0.0 else mean)
+        for k in range(3):
+            size = tangential if k else normal
+            shrink[c, k] = 1.0 / size
+            impulse[c, k], velocity[c, k] = unit / size, unit * size
+            b[c, k], soft[c, k] = r[c, k] / velocity[c, k], compliance[c, k] * (shrink[c, k] * shrink[c, k])
 
 
 @dataclass(frozen=True)
@@ -225,12 +240,12 @@ class Progress:
 
     def _residual(self, x: Array, gradient: Array | None) -> float:
         """The residual that the tolerance is for; nan where x or its gradient is no number."""
-        g, problem = self.problem.impulse(x), self.problem.problem
         if gradient is not None:
-            residual = self._judge(g, self.problem.velocities(gradient))
+            residual = self._judge(*self.problem.unscaled(x, gradient))
             # inf where x = 0, or x is no number; methods that update the gradient collect rounding: look twice
             if self.limits.tol < residual < np.inf:
                 return residual
+        g, problem = self.problem.impulse(x), self.problem.problem
         y = problem.product(g) + problem.r  # in double precision
         return self._judge(g, y) if np.isfinite(problem.dot(g, y)) else np.nan
 
