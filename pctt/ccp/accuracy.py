@@ -48,6 +48,7 @@ class Accuracy:
     complementarity: float
     closing_work: float
     opening_work: float
+    closing_speed: float
     impulse_norm: float
     velocity_norm: float
 
@@ -62,7 +63,7 @@ def measure(problem: ConeProblem, g: Array, momentum: Array | None = None) -> Ac
     else:
         soft = problem.compliance[: None if problem.yields else 0]
         sums, greatest = _judged(g, rigid, soft, problem.r, problem.mu, step)
-    of_all, (cone, dual, complementarity) = reduced(problem.comm, sums, greatest)
+    of_all, (cone, dual, complementarity, closes) = reduced(problem.comm, sums, greatest)
     square, speed, power, pushed, closing, opening, natural, coulomb = of_all
     norm, energy = float(np.sqrt(square)), 0.5 * pushed
     per = 1.0 / max(norm, float(np.finfo(float).tiny))
@@ -75,6 +76,7 @@ def measure(problem: ConeProblem, g: Array, momentum: Array | None = None) -> Ac
         complementarity=complementarity,
         closing_work=_part(closing, energy),
         opening_work=_part(opening, energy),
+        closing_speed=closes if closes == closes else np.inf,
         impulse_norm=norm,
         velocity_norm=float(np.sqrt(speed)),
     )
@@ -92,10 +94,10 @@ def _part(work: float, energy: float) -> float:
 def _judged(g: Array, rigid: Array, C: Array, r: Array, mu: Array, step: float) -> tuple[Array, Array]:
     """Of impulses g and velocities y = N g + r (nc, 3) the sums (8,) over the contacts: of |g|^2, |y|^2, g.(y + r),
     g.(y - r), the closing and the opening work, |g - P(g - step y)|^2 and the same of Coulomb's law; and the greatest
-    (3,): distances outside the cone and outside the dual one, and |g.y|. Comparisons let a NaN through.
+    (4,): distances outside the cone and outside the dual one, |g.y|, and -y_n. Comparisons let a NaN through.
 
     N g is `rigid`, and C g more, of the diagonal C (nc, 3), or no row of it for zero."""
-    sums, greatest = np.zeros(8), np.zeros(3)
+    sums, greatest = np.zeros(8), np.zeros(4)
     for c in range(len(mu)):
         n, u, v, m = g[c, 0], g[c, 1], g[c, 2], mu[c]
         y_n, y_u, y_v = rigid[c, 0], rigid[c, 1], rigid[c, 2]
@@ -109,7 +111,8 @@ def _judged(g: Array, rigid: Array, C: Array, r: Array, mu: Array, step: float) 
         sums[1] += y_n * y_n + y_u * y_u + y_v * y_v
         sums[2] += along + free
         sums[3] += along - free
-        sums[4] += n * (0.0 if y_n > 0.0 else -y_n)
+        closing = 0.0 if y_n > 0.0 else -y_n
+        sums[4] += n * closing
         sums[5] += 0.0 if along < 0.0 else along
         noise = ROUNDINGS * step * np.sqrt(y_n * y_n + slip * slip)
         for law in range(2):
@@ -120,6 +123,7 @@ def _judged(g: Array, rigid: Array, C: Array, r: Array, mu: Array, step: float) 
         greatest[0] = max(greatest[0], np.sqrt(u * u + v * v) - m * n)
         greatest[1] = max(greatest[1], m * slip - y_n)
         greatest[2] = max(greatest[2], abs(along))
+        greatest[3] = greatest[3] if closing <= greatest[3] else closing
     return sums, greatest
 
 
@@ -172,4 +176,4 @@ def _judged_rolling(problem: RollingProblem, g: Array, y: Array, step: float) ->
         g_n @ np.maximum(-y_n, 0.0), np.maximum(along, 0.0).sum(), squared_move(y_n), squared_move(y_n + resisted),
     ]  # fmt: skip
     outside = np.max(sizes - most * g_n, initial=0.0), np.max(resisted - y_n, initial=0.0)
-    return np.array(sums), np.array([*outside, np.abs(along).max(initial=0.0)])
+    return np.array(sums), np.array([*outside, np.abs(along).max(initial=0.0), np.max(-y_n, initial=0.0)])

@@ -70,7 +70,7 @@ def solve(
             settings = conic.Conic(start=min(settings.start, options.start * first.residual))
             begin = first.impulse
         elif not few:
-            inner = replace(inner, tol=max(limits.tol, options.basin), closing_work=np.inf)
+            inner = replace(inner, tol=max(limits.tol, options.basin), closing_work=np.inf, closing_speed=np.inf)
         last = second = attempt(conic, begin, inner, settings, newton)
         if coulomb and not (few and second.final):
             last = attempt(apgd, second.impulse if second.iterations else first.impulse, limits, apgd.APGD())

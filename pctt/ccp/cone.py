@@ -65,21 +65,21 @@ def not_idle(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDAr
 
 
 @loop
-def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float) -> Array:
-    """Sums (5,) over the contacts: |P(x - step y) - x|^2, where y gets the term (mu |y_t|, 0, 0) of De Saxce if
+def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float) -> tuple[Array, float]:
+    """Sums (5,) over the contacts and the greatest -y_n, or 0. The sums are of |P(x - step y) - x|^2, where y gets the term (mu |y_t|, 0, 0) of De Saxce if
     ``de_saxce`` is 1, and below the rounding of step y it is zero: a contact that slides has 0 = P(-step y) only up to
     that; |x|^2; closing work, opening work and 1/2 x.(y - r)."""
-    sums = np.zeros(5 * STRIP)
+    sums, most = np.zeros(5 * STRIP), np.zeros(STRIP)
     x, y, r = x.ravel(), y.ravel(), r.ravel()
     for first in range(0, len(mu), STRIP):
         friction = mu[first : first + STRIP]
         a, b = 3 * first, 3 * (first + len(friction))
-        _add_errors(x[a:b], y[a:b], r[a:b], step, friction, de_saxce, sums)
-    return sums.reshape(5, STRIP).sum(axis=1)
+        _add_errors(x[a:b], y[a:b], r[a:b], step, friction, de_saxce, sums, most)
+    return sums.reshape(5, STRIP).sum(axis=1), most.max()
 
 
 @loop
-def _add_errors(x, y, r, step, mu, de_saxce, sums):
+def _add_errors(x, y, r, step, mu, de_saxce, sums, most):
     """Comparisons let a NaN through."""
     for c in range(len(mu)):
         i, m = 3 * c, mu[c]
@@ -90,7 +90,9 @@ def _add_errors(x, y, r, step, mu, de_saxce, sums):
         along = n * y_n + u * y_u + v * y_v
         sums[c] += 0.0 if square <= NO_MOVE * (step * step) * (y_n * y_n + y_u * y_u + y_v * y_v) else square
         sums[STRIP + c] += n * n + u * u + v * v
-        sums[2 * STRIP + c] += n * (0.0 if y_n > 0.0 else -y_n)
+        closing = 0.0 if y_n > 0.0 else -y_n
+        most[c] = most[c] if closing <= most[c] else closing
+        sums[2 * STRIP + c] += n * closing
         sums[3 * STRIP + c] += 0.0 if along < 0.0 else along
         sums[4 * STRIP + c] += 0.5 * (along - (n * r[i] + u * r[i + 1] + v * r[i + 2]))
 
@@ -492,8 +494,9 @@ class FrictionCones:
         out -= x
         return out
 
-    def errors(self, g: Array, y: Array, r: Array, step: float, coulomb: bool) -> Array:
-        """||`move`||^2, |g|^2, closing work, opening work and 1/2 g.(y - r) of this rank's contacts (5,)."""
+    def errors(self, g: Array, y: Array, r: Array, step: float, coulomb: bool) -> tuple[Array, float]:
+        """||`move`||^2, |g|^2, closing work, opening work and 1/2 g.(y - r) of this rank's contacts (5,), and the
+        greatest speed at which one closes."""
         return errors(g, y, r, step, self.mu, float(coulomb))
 
     def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from dem.compiled import loop
 from dem.contact_map import BlockRows, CompactRows, ContactMap
-from dem.exchange import refuse
+from dem.exchange import reduced, refuse
 from pctt.ccp.cone import Array, FrictionCones
 from pctt.ccp.delassus import BlockMap, GivenMatrix, delassus, without_hubs
 
@@ -28,10 +28,12 @@ class Errors(NamedTuple):
         and if g or y has a nan or inf
     work : the larger of the closing and the opening work, over 1/2 g'Ng: the sums of g_n max(-y_n, 0) and of max(g.y,
         0) over the contacts. 0 without impulses, inf if it is no number
+    speed : the greatest -y_n: how fast a contact still closes beyond what its spring gives (m/s)
     """
 
     natural: float
     work: float
+    speed: float
 
 
 class ConeProblem:
@@ -124,12 +126,12 @@ class ConeProblem:
     def errors(self, g: Array, y: Array, coulomb: bool = False) -> Errors:
         """How far impulses g with the velocities y = N g + r are from a solution. For Coulomb's law y gets De Saxce's
         term."""
-        here = self.cones.errors(g, y, self.r, 1.0 / self.mean_diagonal, coulomb)
-        moved, whole, closing, opening, energy = self.sum(here)
+        sums, most = self.cones.errors(g, y, self.r, 1.0 / self.mean_diagonal, coulomb)
+        (moved, whole, closing, opening, energy), (speed,) = reduced(self.comm, sums, (most,))
         natural = np.sqrt(moved) / np.sqrt(whole) if whole > 0.0 else np.inf
         work = 0.0 if energy <= 0.0 else np.maximum(closing, opening) / energy
-        natural, work = (float(x) if x == x else np.inf for x in (natural, work))
-        return Errors(0.0 if moved == 0.0 else natural, work)
+        natural, work, speed = (float(x) if x == x else np.inf for x in (natural, work, speed))
+        return Errors(0.0 if moved == 0.0 else natural, work, speed)
 
     def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
         """That of the `errors`."""

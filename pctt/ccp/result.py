@@ -38,35 +38,43 @@ class Limits:
         "closing and opening work at which a cone problem counts as solved; inf: any",
         check=("a positive number, or inf", lambda x: x > 0),
     )
+    closing_speed: float = option(
+        math.inf, "speed at which a contact may still close where a cone problem counts as solved; inf: any", unit="m/s",
+        check=("a positive number, or inf", lambda x: x > 0),
+    )  # fmt: skip
     fallback: bool = option(True, "where the solver does not converge, another one goes on from its impulses")
 
     def residual(self, errors: Errors) -> float:
-        """What ``tol`` is for: the natural residual, or the closing or opening work in units in which its limit is
-        ``tol``, whichever is larger. It is at most ENOUGH times the natural residual: where bodies are squeezed no
-        accuracy may bring the closing work below its limit. What passes so is `squeezed`."""
-        work = 0.0 if math.isinf(self.closing_work) else self.tol / self.closing_work * errors.work
-        return min(max(errors.natural, work), ENOUGH * errors.natural)
+        """What ``tol`` is for: the natural residual, or the closing or opening work, or the closing speed, each in units
+        in which its limit is ``tol``, whichever is largest. It is at most ENOUGH times the natural residual: where
+        bodies are squeezed no accuracy may bring the others below their limits. What passes so is `squeezed`."""
+        pairs = (errors.work, self.closing_work), (errors.speed, self.closing_speed)
+        others = (self.tol / limit * error for error, limit in pairs if limit < math.inf)
+        return min(max([errors.natural, *others]), ENOUGH * errors.natural)
 
     def squeezed(self, found: Accuracy, coulomb: bool) -> str:
-        """The reason, in words, if impulses of this accuracy meet the limits although their closing or opening work is
-        above its own; else ""."""
-        work = max(found.closing_work, found.opening_work)
+        """The reason, in words, if impulses of this accuracy meet the limits although their closing or opening work, or
+        their closing speed, is above its own; else ""."""
+        work, speed = max(found.closing_work, found.opening_work), found.closing_speed
         natural = found.coulomb_residual if coulomb else found.natural_residual
-        if work <= self.closing_work or ENOUGH * natural > self.tol:
+        if ENOUGH * natural > self.tol or (work <= self.closing_work and speed <= self.closing_speed):
             return ""
-        return (
-            f"squeezed: closing or opening work {work:.2g}, above {self.closing_work:g}, at a natural residual of "
-            f"{natural:.1e}, {ENOUGH:g} times below the tolerance"
-        )
+        above = f"closing or opening work {work:.2g}, above {self.closing_work:g}"
+        if work <= self.closing_work:
+            above = f"closing speed {speed:.2g} m/s, above {self.closing_speed:g}"
+        return f"squeezed: {above}, at a natural residual of {natural:.1e}, {ENOUGH:g} times below the tolerance"
 
     @property
     def met(self) -> str:
         """The reason of a result that meets them."""
-        return f"natural residual{'' if math.isinf(self.closing_work) else ' and closing work'} below the tolerance"
+        limits = {"natural residual": self.tol, "closing work": self.closing_work, "closing speed": self.closing_speed}
+        *names, last = (name for name, limit in limits.items() if limit < math.inf)
+        return f"{', '.join(names)} and {last}".removeprefix(" and ") + " below the tolerance"
 
     def to(self, tol: float) -> Limits:
         """For another tolerance of the same residual."""
-        return dataclasses.replace(self, tol=tol, closing_work=self.closing_work / self.tol * tol)
+        work, speed = (limit / self.tol * tol for limit in (self.closing_work, self.closing_speed))
+        return dataclasses.replace(self, tol=tol, closing_work=work, closing_speed=speed)
 
 
 class Status(Enum):

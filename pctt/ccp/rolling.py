@@ -73,13 +73,15 @@ class RollingCones(FrictionCones):
         return project_to(x, self.mu, self.spinning, out)
 
     @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
-    def errors(self, g: Array, y: Array, r: Array, step: float, coulomb: bool) -> Array:
+    def errors(self, g: Array, y: Array, r: Array, step: float, coulomb: bool) -> tuple[Array, float]:
         both = self.move(g, y, step, coulomb), step * y
         move, speed = (np.square(z).sum(axis=1).reshape(2, -1).sum(axis=0) for z in both)
         normal, push = y[: self.count, 0], g[: self.count, 0]
         power = (g * y).sum(axis=1).reshape(2, -1).sum(axis=0)
-        works = push @ np.maximum(-normal, 0.0), np.maximum(power, 0.0).sum(), 0.5 * np.vdot(g, y - r)
-        return np.array([move[~(move <= NO_MOVE * speed)].sum(), np.vdot(g, g), *works])
+        closing = np.maximum(-normal, 0.0)
+        works = push @ closing, np.maximum(power, 0.0).sum(), 0.5 * np.vdot(g, y - r)
+        sums = np.array([move[~(move <= NO_MOVE * speed)].sum(), np.vdot(g, g), *works])
+        return sums, float(closing.max(initial=0.0))
 
     def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
         x, last_x, opening = x[: self.count, 0], last_x[: self.count, 0], y[: self.count, 0] - self.resisted(y)

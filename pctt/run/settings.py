@@ -30,6 +30,9 @@ from pctt.options import (
     refuse_bad,
 )
 
+#: By how much a contact may close in a step beyond what its spring gives, as a part of the contact distance.
+CLOSING = 0.2
+
 # options of PETSc and of preconditioners in the demo
 DEMO_SOLVERS = {
     "pc_type": "python",
@@ -76,6 +79,12 @@ class Settings(ccp.Limits):
         0.5, "closing and opening work at which a cone problem counts as solved; inf: any",
         check=("a positive number, or inf", lambda x: x > 0),
     )  # fmt: skip
+    closing_speed: Optional[float] = option(
+        None,
+        "speed at which a contact may still close where a cone problem counts as solved; inf: any; none: a fifth of "
+        "-delta in a step, and inf where -ccp_closing_work is inf, with pdip, in comparisons and in -problem",
+        unit="m/s", check=("a positive number, or inf", lambda x: x > 0),
+    )  # fmt: skip
     dt: float = option(
         None, "time step; none: the scene's own, or what its sizes and speeds need", unit="s", check=POSITIVE, name="dt"
     )
@@ -99,7 +108,10 @@ class Settings(ccp.Limits):
     @property
     def limits(self) -> ccp.Limits:
         """When the solver stops."""
-        return ccp.Limits(**{field.name: getattr(self, field.name) for field in dataclasses.fields(ccp.Limits)})
+        given = {field.name: getattr(self, field.name) for field in dataclasses.fields(ccp.Limits)}
+        if given["closing_speed"] is None:
+            given["closing_speed"] = math.inf
+        return ccp.Limits(**given)
 
     @property
     def words(self) -> str:
@@ -139,7 +151,10 @@ class Settings(ccp.Limits):
             raise OptionError("-ccp_newton contact: the scene has rolling or spinning resistance; allowed is body")
         if delta < scene.reach:
             raise OptionError(f"-delta {delta:g} m: cohesion acts up to {scene.reach:g} m; allowed is at least that")
-        return dataclasses.replace(self, dt=dt, delta=delta, stiffness=stiffness)
+        speed = self.closing_speed
+        if speed is None and not paper and 0.0 < delta and self.closing_work < math.inf:
+            speed = CLOSING * delta / dt
+        return dataclasses.replace(self, dt=dt, delta=delta, stiffness=stiffness, closing_speed=speed)
 
 
 @dataclasses.dataclass(frozen=True)

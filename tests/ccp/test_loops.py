@@ -38,7 +38,7 @@ def errors(x, y, r, step, mu, opening):
     term = opening * mu * np.hypot(y[:, 1], y[:, 2])
     move, power = nearest(x - step * (y + np.outer(term, [1, 0, 0])), mu) - x, (x * y).sum(axis=1)
     works = x[:, 0] @ np.maximum(-y[:, 0], 0), np.maximum(power, 0).sum(), 0.5 * np.vdot(x, y - r)
-    return np.array([np.vdot(move, move), np.vdot(x, x), *works])
+    return np.array([np.vdot(move, move), np.vdot(x, x), *works]), np.max(-y[:, 0], initial=0.0)
 
 
 def times(blocks, x):
@@ -122,10 +122,12 @@ def test_sums_of_a_problem_from_its_cones():
     term = np.stack([mu * np.hypot(y[:, 1], y[:, 2]), 0 * mu, 0 * mu], axis=1)
     for coulomb, target in ((False, x - 0.3 * y), (True, x - 0.3 * (y + term))):
         np.testing.assert_allclose(cones.move(x, y, 0.3, coulomb), nearest(target, mu) - x, atol=1e-14)
-        np.testing.assert_allclose(cones.errors(x, y, x, 0.3, coulomb), errors(x, y, x, 0.3, mu, coulomb))
+        for one, other in zip(cones.errors(x, y, x, 0.3, coulomb), errors(x, y, x, 0.3, mu, coulomb)):
+            np.testing.assert_allclose(one, other)
     open_ones = (x[:, 0] <= 0) & (y[:, 0] - term[:, 0] > 0.1)
     assert np.array_equal(cones.not_idle(x, x, y, 0.1), ~open_ones)
-    assert not cone.FrictionCones(np.zeros(0)).errors(x[:0], y[:0], x[:0], 0.3, True).any()
+    sums, most = cone.FrictionCones(np.zeros(0)).errors(x[:0], y[:0], x[:0], 0.3, True)
+    assert most == 0.0 and not sums.any()
 
 
 def test_the_scaling_is_that_of_nesterov_and_todd():
