@@ -107,8 +107,9 @@ def _by(
     cold = problem.natural_residual(nothing, problem.r, coulomb)
     if cold == 0:
         words = "no contact closes" if problem.size else "no contacts"
-        done = Result(nothing, Status.CONVERGED, words, 0.0, 0, solver=name, law=law)
-        return measured(done, problem)
+        result = Result(nothing, Status.CONVERGED, words, 0.0, 0, solver=name, law=law)
+        _measure(problem, result)
+        return result
     limits = dataclasses.replace(limits, max_it=method.iterations) if limits.max_it < 0 else limits
     own = newton_for(problem.comm, name) if method.newton and newton is None else None
     given = (options or method.options(), *([newton or own] if method.newton else []))
@@ -134,17 +135,17 @@ def _by(
         result.impulse, result.status, result.residual = nothing, Status.BREAKDOWN, cold
     elif unbounded := why_unbounded(problem, result.impulse):
         result.status, result.reason = Status.UNBOUNDED, unbounded
-    measured(result, problem)
-    if result.converged and (squeezed := limits.squeezed(result.accuracy, coulomb)):
+    accuracy = _measure(problem, result)
+    if result.converged and (squeezed := limits.squeezed(accuracy, coulomb)):
         result.status, result.reason = Status.SQUEEZED, squeezed
     return result
 
 
-def measured(result: Result, problem: ConeProblem) -> Result:
-    """The result with what its impulses do to the bodies, and how accurate they are."""
+def _measure(problem: ConeProblem, result: Result) -> Accuracy:
+    """Tell the result what its impulses do to the bodies, and how accurate they are."""
     result.momentum = problem.momentum(result.impulse)
     result.accuracy = measure(problem, result.impulse, result.momentum)
-    return result
+    return result.accuracy
 
 
 def _start(problem: ConeProblem, guess: Array | None) -> Array:

@@ -66,9 +66,9 @@ def not_idle(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDAr
 
 @loop
 def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float) -> tuple[Array, float]:
-    """Sums (5,) over the contacts and the greatest -y_n, or 0. The sums are of |P(x - step y) - x|^2, where y gets the term (mu |y_t|, 0, 0) of De Saxce if
-    ``de_saxce`` is 1, and below the rounding of step y it is zero: a contact that slides has 0 = P(-step y) only up to
-    that; |x|^2; closing work, opening work and 1/2 x.(y - r)."""
+    """Sums (5,) over the contacts, and the greatest -y_n, or 0. The sums are of |P(x - step y) - x|^2, where y gets the
+    term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1, and below the rounding of step y it is zero: a contact that
+    slides has 0 = P(-step y) only up to that; of |x|^2; and closing work, opening work and 1/2 x.(y - r)."""
     sums, most = np.zeros(5 * STRIP), np.zeros(STRIP)
     x, y, r = x.ravel(), y.ravel(), r.ravel()
     for first in range(0, len(mu), STRIP):

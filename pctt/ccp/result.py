@@ -39,15 +39,15 @@ class Limits:
         check=("a positive number, or inf", lambda x: x > 0),
     )
     closing_speed: float = option(
-        math.inf, "speed at which a contact may still close where a cone problem counts as solved; inf: any", unit="m/s",
-        check=("a positive number, or inf", lambda x: x > 0),
+        math.inf, "speed at which a contact may still close where a cone problem counts as solved; inf: any",
+        unit="m/s", check=("a positive number, or inf", lambda x: x > 0),
     )  # fmt: skip
     fallback: bool = option(True, "where the solver does not converge, another one goes on from its impulses")
 
     def residual(self, errors: Errors) -> float:
-        """What ``tol`` is for: the natural residual, or the closing or opening work, or the closing speed, each in units
-        in which its limit is ``tol``, whichever is largest. It is at most ENOUGH times the natural residual: where
-        bodies are squeezed no accuracy may bring the others below their limits. What passes so is `squeezed`."""
+        """What ``tol`` is for: the natural residual, or the closing or opening work, or the closing speed, each in
+        units in which its limit is ``tol``, whichever is largest. It is at most ENOUGH times the natural residual:
+        where bodies are squeezed no accuracy may bring the others below their limits. What passes so is `squeezed`."""
         pairs = (errors.work, self.closing_work), (errors.speed, self.closing_speed)
         others = (self.tol / limit * error for error, limit in pairs if limit < math.inf)
         return min(max([errors.natural, *others]), ENOUGH * errors.natural)

@@ -79,7 +79,7 @@ class Settings(ccp.Limits):
         0.5, "closing and opening work at which a cone problem counts as solved; inf: any",
         check=("a positive number, or inf", lambda x: x > 0),
     )  # fmt: skip
-    closing_speed: Optional[float] = option(
+    closing_speed: float = option(
         None,
         "speed at which a contact may still close where a cone problem counts as solved; inf: any; none: a fifth of "
         "-delta in a step, and inf where -ccp_closing_work is inf, with pdip, in comparisons and in -problem",
@@ -152,7 +152,7 @@ class Settings(ccp.Limits):
         if delta < scene.reach:
             raise OptionError(f"-delta {delta:g} m: cohesion acts up to {scene.reach:g} m; allowed is at least that")
         speed = self.closing_speed
-        if speed is None and not paper and 0.0 < delta and self.closing_work < math.inf:
+        if speed is None and not paper and delta > 0.0 and self.closing_work < math.inf:
             speed = CLOSING * delta / dt
         return dataclasses.replace(self, dt=dt, delta=delta, stiffness=stiffness, closing_speed=speed)
 

@@ -175,7 +175,7 @@ def test_one_contact_of_many_does_not_close(solver, law):
 
 
 @pytest.mark.parametrize(
-    "limits, words",
+    ("limits", "words"),
     [
         (ccp.Limits(1e-2, closing_work=1e-30), "closing or opening work "),
         (ccp.Limits(1e-2, closing_work=np.inf, closing_speed=1e-30), "closing speed "),

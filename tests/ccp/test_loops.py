@@ -127,7 +127,8 @@ def test_sums_of_a_problem_from_its_cones():
     open_ones = (x[:, 0] <= 0) & (y[:, 0] - term[:, 0] > 0.1)
     assert np.array_equal(cones.not_idle(x, x, y, 0.1), ~open_ones)
     sums, most = cone.FrictionCones(np.zeros(0)).errors(x[:0], y[:0], x[:0], 0.3, True)
-    assert most == 0.0 and not sums.any()
+    assert most == 0.0
+    assert not sums.any()
 
 
 def test_the_scaling_is_that_of_nesterov_and_todd():
