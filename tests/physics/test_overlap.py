@@ -38,8 +38,8 @@ def test_overlapping_spheres_part_at_the_recovery_speed_at_most(solver, depth, s
 @pytest.mark.parametrize("solver", ["apgd", "auto"])
 def test_light_spheres_that_collide_beside_heavy_ones_overlap_by_little(solver):
     """Heavy spheres at rest, and two that have a millionth of their mass and fly at each other. Their impulse is
-    nothing next to those of the heavy ones, which a step begins with. Without a limit of the closing speed the two overlap
-    by more than a twentieth of a radius."""
+    nothing next to those of the heavy ones, which a step begins with. Without a limit of the closing speed the two
+    overlap by more than a twentieth of a radius."""
     scene = Scene(0.3)
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_spheres([[x, 0, RADIUS] for x in np.arange(10) * 3 * RADIUS], RADIUS, 1e5)
