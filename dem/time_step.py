@@ -17,7 +17,7 @@ from dem.motion import top_speed
 from dem.scene import LargeBody, Scene
 from dem.shapes import Plane
 
-DRIVEN = 0.15  #: the way of the fastest tool in a step, in radii: docs/mechanics.md has the errors of forces
+DRIVEN = 0.1  #: the way of the fastest tool in a step, in radii: docs/mechanics.md has the errors of forces
 FALLING = 0.1  #: the step in units of sqrt(R / g), where no tool is fast
 PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same and steps take a quarter longer
 
