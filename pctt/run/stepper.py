@@ -186,7 +186,8 @@ class Stepper:
         with log.phase("search"):
             velocity = self.system.velocity_with(momentum)
             self.system.set_rate(world, momentum)
-            deep = 0.01 * delta  # the overlap that is solved for
+            left = dt * settings.limits.closing_speed  # what a solution may leave of an overlap
+            deep = max(0.01 * delta, left if left < np.inf else 0.0)
             wider = find_overrun(world, contacts, velocity, delta, dt, deep, recovery)
             if wider is not None:
                 return carried(world, contacts, wider) if self._corrections else wider
