@@ -67,9 +67,9 @@ class Limits:
     @property
     def met(self) -> str:
         """The reason of a result that meets them."""
-        limits = {"natural residual": self.tol, "closing work": self.closing_work, "closing speed": self.closing_speed}
-        *names, last = (name for name, limit in limits.items() if limit < math.inf)
-        return f"{', '.join(names)} and {last}".removeprefix(" and ") + " below the tolerance"
+        others = {"closing work": self.closing_work, "closing speed": self.closing_speed}
+        names = ["natural residual", *(name for name, limit in others.items() if limit < math.inf)]
+        return " and ".join([", ".join(names[:-1]), names[-1]][len(names) < 2 :]) + " below the tolerance"
 
     def to(self, tol: float) -> Limits:
         """For another tolerance of the same residual."""
