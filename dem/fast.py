@@ -44,6 +44,7 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
     way = dt * speed
     fast = (way > most) & np.isfinite(way)
     weight, reach, seen = grains.weight, 1.0, contacts.near.margin[: len(grains)]
+    large = world.large_velocity(velocity, dt)
     known = find_contacts(world, delta, 0.0, seen, contacts.shifts).key  # where bodies are, not where they will be
     grains.weight = weight
     while reach < furthest:
@@ -57,8 +58,8 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
             wide = find_contacts(world, delta, 0.0, np.maximum(seen, margin), contacts.shifts)
             grains.weight = weight
             wide = wide.take(places(known, wide.key) < 0)
-            met = wide.take(_meet(world, wide, velocity, delta, dt))
-            table = velocities_about(world, wide.near, velocity, dt)
+            table = velocities_about(world, wide.near, velocity, large)
+            met = wide.take(_meet(world, wide, table, delta, dt))
             if len(met):
                 pair = np.stack([met.a, met.b], axis=1)
                 grain = pair < met.near.grains + met.near.ghosts
@@ -84,10 +85,9 @@ def beyond(velocity: Floats, most: Floats, dt: float) -> tuple[int, float]:
     return count, furthest
 
 
-def _meet(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> Bools:
-    """Which of the contacts (nc,) close within dt, to a hundredth of delta, with the velocities (owned, 6) of the
-    bodies; collective."""
-    table = velocities_about(world, contacts.near, velocity, dt)
+def _meet(world: World, contacts: Contacts, table: Floats, delta: float, dt: float) -> Bools:
+    """Which of the contacts (nc,) close within dt, to a hundredth of delta, with the velocities (rows, 6) of the bodies
+    of `near`."""
     near, row = contacts.near, np.stack([contacts.a, contacts.b], axis=1)
     arm = contact_arms(contacts, near.bodies.position, row.astype(np.uint32)).reshape(-1, 2, 3)
     spin = cross(table[row, 3:], arm)

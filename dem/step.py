@@ -188,7 +188,7 @@ def find_overrun(
     shifts = np.concatenate([contacts.shifts, dt * large[None]]) if beyond else contacts.shifts
     margin = np.maximum(seen, way)
     unseen = find_contacts(world, delta, dt, margin, shifts, besides=contacts)
-    table = velocities_about(world, unseen.near, velocity, dt)
+    table = velocities_about(world, unseen.near, velocity, large)
     opening = _opening(world, unseen, unseen.near.bodies.position, table)
     overlap = -dt * (gap_velocities(world, unseen, dt, recovery_speed)[2] + opening)
     if not on_any(world.comm, bool((overlap > depth).any()))[0]:

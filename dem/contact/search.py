@@ -160,13 +160,13 @@ def _motions(world: World, near: Neighbourhood, pictures: Images | None, dt: flo
     return velocity
 
 
-def velocities_about(world: World, near: Neighbourhood, velocity: Floats, dt: float) -> Floats:
-    """Velocities (rows, 6) of all bodies of the neighbourhood in a step of dt [s], from those (owned, 6) of the bodies
-    whose rows each rank owns; collective."""
+def velocities_about(world: World, near: Neighbourhood, velocity: Floats, large: Floats) -> Floats:
+    """Velocities (rows, 6) of all bodies of the neighbourhood, from those (owned, 6) of the bodies whose rows each rank
+    owns and those (large, 6) of the large bodies; collective."""
     table = np.zeros((len(near.bodies), 6))
     table[: near.grains] = velocity[: near.grains]
     world.lists.halo.update(table)
-    table[near.grains + near.ghosts :] = world.large_velocity(velocity, dt)
+    table[near.grains + near.ghosts :] = large
     return table
 
 

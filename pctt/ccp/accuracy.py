@@ -123,7 +123,7 @@ def _judged(g: Array, rigid: Array, C: Array, r: Array, mu: Array, step: float) 
         greatest[0] = max(greatest[0], np.sqrt(u * u + v * v) - m * n)
         greatest[1] = max(greatest[1], m * slip - y_n)
         greatest[2] = max(greatest[2], abs(along))
-        greatest[3] = greatest[3] if closing <= greatest[3] else closing
+        greatest[3] = closing if closing > greatest[3] or closing != closing else greatest[3]
     return sums, greatest
 
 

@@ -91,7 +91,7 @@ def _add_errors(x, y, r, step, mu, de_saxce, sums, most):
         sums[c] += 0.0 if square <= NO_MOVE * (step * step) * (y_n * y_n + y_u * y_u + y_v * y_v) else square
         sums[STRIP + c] += n * n + u * u + v * v
         closing = 0.0 if y_n > 0.0 else -y_n
-        most[c] = most[c] if closing <= most[c] else closing
+        most[c] = closing if closing > most[c] or closing != closing else most[c]
         sums[2 * STRIP + c] += n * closing
         sums[3 * STRIP + c] += 0.0 if along < 0.0 else along
         sums[4 * STRIP + c] += 0.5 * (along - (n * r[i] + u * r[i + 1] + v * r[i + 2]))

@@ -152,8 +152,8 @@ class Settings(ccp.Limits):
         if delta < scene.reach:
             raise OptionError(f"-delta {delta:g} m: cohesion acts up to {scene.reach:g} m; allowed is at least that")
         speed = self.closing_speed
-        if speed is None and not paper and delta > 0.0 and self.closing_work < math.inf:
-            speed = CLOSING * delta / dt
+        if speed is None:
+            speed = math.inf if paper or delta == 0.0 or math.isinf(self.closing_work) else CLOSING * delta / dt
         return dataclasses.replace(self, dt=dt, delta=delta, stiffness=stiffness, closing_speed=speed)
 
 
