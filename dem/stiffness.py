@@ -38,10 +38,12 @@ from dem.pairs import Pairs
 from dem.scene import Scene
 from dem.shapes import Plane, placed
 from dem.sources import bounds
-from dem.time_step import fastest
+from dem.time_step import fastest_grain, fastest_tool
 
 OVERLAP = 0.003  #: the greatest overlap that `recommended` allows, as a part of a grain's radius
 CHAINS = 4.0  #: the strongest forces between grains over those that a like share of the weight makes
+RESISTS = 10.0  #: the strongest forces between grains that a tool pushes over those of a bed at rest
+STOPPED = 0.22  #: of v sqrt(m / k): how far a grain of speed v goes into a contact of this DAMPING
 DENSE = 0.64  #: solid fraction of a bed that sources may make
 TANGENTIAL = 2.0 / 7.0  #: k_t / k: both directions of an impact of spheres take as long (Silbert et al., PRE 64, 2001)
 DAMPING = 2.0  #: c as a part of 2 sqrt(k m): an impact leaves 5 % of the speed (Schwager, Poeschel); 1: 14 %
@@ -54,19 +56,26 @@ def pairs(scene: Scene) -> Pairs:
 
 def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
     """The stiffness [N/m] with which no grain of a scene overlaps by more than this part of its radius, whether under
-    the weight of the bed above it or stopped by the fastest tool or grain, to two digits; inf if there is neither.
+    the weight of the bed above it, pushed by the fastest tool, or met by the fastest grain, to two digits; inf if there
+    is none of them.
 
     The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width, and
     four times as much where a chain of force goes (Radjai, Jean, Moreau, Roux, Phys. Rev. Lett. 77 (1996): a share of
     exp(-1.4 f) bears more than f times the mean). The stress that a periodic cell is to have takes the place of the
-    weight over the area. A grain of mass m that a tool of speed v meets is stopped by
-    k d = v sqrt(k m). Sources may fill the scene up to their height (`_bed`). Cohesion c presses grains together by
+    weight over the area. Sources may fill the scene up to their height (`_bed`). Cohesion c presses grains together by
     c / k. Grains that fall from high are not reckoned with.
+
+    A speed v that reaches a row of grains of mass m makes the force k d = v sqrt(k m), a wave along the row. A bed gives
+    way to a tool before that: with at most RESISTS times the force of its weight (docs/mechanics.md), or with that of
+    the single grain that the tool throws.
     """
     grains = scene.expected()
     allowed = overlap * bodies.bounding_radius(grains)
-    with np.errstate(over="ignore"):  # inf: rigid
-        stiffness = float(np.maximum(_load(scene) / allowed, grains.mass * (fastest(scene) / allowed) ** 2).max())
+    with np.errstate(over="ignore", invalid="ignore"):  # inf: rigid
+        needed = _load(scene) / allowed
+        thrown, pushed = (grains.mass * (speed(scene) / allowed) ** 2 for speed in (fastest_grain, fastest_tool))
+        bed = np.where(needed > 0.0, np.maximum(RESISTS * needed, STOPPED**2 * pushed), np.inf)
+        stiffness = float(np.maximum(np.maximum(needed, thrown), np.minimum(pushed, bed)).max())
     return float(f"{stiffness:.1e}") if stiffness > 0.0 else np.inf  # the same on processors that round in other ways
 
 
@@ -75,8 +84,11 @@ def expected_overlap(scene: Scene, stiffness: float) -> float:
     grains = scene.expected()
     if np.isinf(stiffness):
         return 0.0
-    stopped = fastest(scene) * np.sqrt(grains.mass / stiffness)
-    return float((np.maximum(_load(scene) / stiffness, stopped) / bodies.bounding_radius(grains)).max())
+    load = _load(scene) / stiffness
+    thrown, pushed = (speed(scene) * np.sqrt(grains.mass / stiffness) for speed in (fastest_grain, fastest_tool))
+    bed = np.where(load > 0.0, np.maximum(RESISTS * load, STOPPED * pushed), np.inf)
+    most = np.maximum(np.maximum(load, thrown), np.minimum(pushed, bed))
+    return float((most / bodies.bounding_radius(grains)).max())
 
 
 def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:

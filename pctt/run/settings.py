@@ -31,7 +31,7 @@ from pctt.options import (
 )
 
 #: By how much a contact may close in a step beyond what its spring gives, as a part of the contact distance.
-CLOSING = 0.2
+CLOSING = 0.15
 
 # options of PETSc and of preconditioners in the demo
 DEMO_SOLVERS = {
@@ -81,7 +81,7 @@ class Settings(ccp.Limits):
     )  # fmt: skip
     closing_speed: float = option(
         None,
-        "speed at which a contact may still close where a cone problem counts as solved; inf: any; none: a fifth of "
+        "speed at which a contact may still close where a cone problem counts as solved; inf: any; none: 0.15 "
         "-delta in a step, and inf where -ccp_closing_work is inf, with pdip, in comparisons and in -problem",
         unit="m/s", check=("a positive number, or inf", lambda x: x > 0),
     )  # fmt: skip
@@ -89,7 +89,7 @@ class Settings(ccp.Limits):
         None, "time step; none: the scene's own, or what its sizes and speeds need", unit="s", check=POSITIVE, name="dt"
     )
     delta: float = option(
-        None, "gap below which a pair of bodies is a contact; none: the scene's own, or 0.2 radii", unit="m",
+        None, "gap below which a pair of bodies is a contact; none: the scene's own, or a twentieth of the smallest radius", unit="m",
         check=NOT_NEGATIVE, name="delta",
     )  # fmt: skip
     stiffness: Optional[float] = option(

@@ -2,12 +2,13 @@
 
     run/study windows [CASE ...] [--states M] [--settings SETTINGS ...] [--small SETTINGS]
 
-A case is a scene and its figure as in `time_steps`: mixer8, blade4, shear4, ... A run of it is kept every 0.15 s. From
-each of these states every setting goes on for 0.1 s, and its figure of the last 0.08 s is compared with that of
-small steps from the same state (--small: 1 ms to 2e-4). The courses have not yet parted then, so that the mean
-difference is known to half a per cent where means of whole runs scatter by some per cent. What the bed would do later,
-if its packing changed, is not in it. SETTINGS are fields of `pctt.Settings`, dt=0.01,tol=1e-3, or `default`; the solver
-is `apgd`. For each of them the table has
+A case is a scene and its figure as in `time_steps`: mixer8, blade4, shear4, ... A run of it by small steps (--small:
+1 ms to 2e-4) is kept every 0.15 s. From each of these states every setting goes on for 0.1 s, and its figure of the
+last 0.08 s is compared with that of small steps from the same state. The courses have not yet parted then, so that the
+mean difference is known to half a per cent where means of whole runs scatter by some per cent. What the bed would do
+later, if its packing changed, is not in it: `time_steps` has that. States of a run by larger steps would mislead: small
+steps need a while to forget them. SETTINGS are fields of `pctt.Settings`, dt=0.01,tol=1e-3, or `default`; the solver is
+`apgd`. For each of them the table has
 
 - the time step, and CPU seconds per simulated second;
 - the worst overlap after a step, in % of a radius;
@@ -45,10 +46,10 @@ def _nothing(words: object) -> None:
     """In the place of a simulation's print."""
 
 
-def keep_states(case: Case, states: int, folder: Path) -> list[Path]:
-    """Files of states of a run by the default settings."""
+def keep_states(case: Case, states: int, folder: Path, words: str) -> list[Path]:
+    """Files of states of a run by these settings."""
     files = [folder / f"{k}.h5" for k in range(states)]
-    with settled(case.scene, 1, 1e-5, solver="apgd", say=_nothing) as sim:
+    with settled(case.scene, 1, 1e-5, solver="apgd", say=_nothing, **settings_of(words)) as sim:
         begun = sim.time + case.after + FIRST
         for k, file in enumerate(files):
             sim.run(until=begun + k * APART)
@@ -86,7 +87,7 @@ def compare(name: str, states: int, choices: list[str], about: Row, rows: list[R
         its=("iterations", "5.0f"), contacts=("contacts", "8.0f"),
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
-        files = keep_states(case, states, Path(folder))
+        files = keep_states(case, states, Path(folder), choices[0])
         for words in choices:
             found = [window(case, file, words) for file in files]
             values = np.array([each["figure"] for each in found])

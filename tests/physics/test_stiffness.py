@@ -10,7 +10,7 @@ from dem.motion import Glide, Rotation
 from dem.scene import Scene
 from dem.scenes import Mixer
 from dem.shapes import Box, Plane
-from dem.stiffness import compliance, expected_overlap, of_youngs_modulus, pairs, recommended
+from dem.stiffness import DAMPING, RESISTS, STOPPED, compliance, expected_overlap, of_youngs_modulus, pairs, recommended
 from pctt import ccp
 
 R, DENSITY, G = 0.1, 2500.0, 9.81
@@ -140,9 +140,32 @@ def test_the_recommended_stiffness_holds_the_bed_and_the_tool():
         assert recommended(scene) == pytest.approx(MASS * (speed / (0.003 * R)) ** 2, rel=0.05)
     scene.leaving.add("tool")
     assert recommended(scene) == np.inf
+    bed = column(None, count=20)
+    bed.add_body("tool", [Box((1.0, 1.0, 1.0))], Glide((0, 3.0, 0)), position=(0, 5, 0))
+    assert recommended(bed) == pytest.approx(RESISTS * stiffness, rel=0.05)  # a bed gives way before a chain does
+    assert expected_overlap(bed, recommended(bed)) == pytest.approx(0.003, rel=0.05)
+    alone = column(None, count=1)
+    alone.add_body("tool", [Box((1.0, 1.0, 1.0))], Glide((0, 30.0, 0)), position=(0, 5, 0))
+    assert recommended(alone) == pytest.approx(MASS * (STOPPED * 30.0 / (0.003 * R)) ** 2, rel=0.05)
     idle = Scene(friction=0.3, gravity=(0, 0, 0))
     idle.add_spheres([[0, 0, 0]], R, DENSITY)
     assert recommended(idle) == np.inf
+
+
+def test_how_far_a_grain_goes_into_a_contact_that_stops_it():
+    """Of v sqrt(m / k), by the closed form of a spring with twice the critical damping."""
+    stiffness, speed = 1e6, 0.5
+    time = np.sqrt(MASS / stiffness)
+    scene = Scene(friction=0.0, stiffness=stiffness, gravity=(0, 0, 0))
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_spheres([[0, 0, R]], R, DENSITY, velocity=[[0, 0, -speed]])
+    with pctt.Simulation(scene, dt=0.005 * time, solver="apgd", **EXACT) as sim:
+        overlaps = [sim.step()["worst_overlap [m]"] for _ in range(300)]
+    slow, fast = DAMPING - np.sqrt(DAMPING**2 - 1), DAMPING + np.sqrt(DAMPING**2 - 1)
+    at = np.log(fast / slow) / (fast - slow)
+    most = (np.exp(-slow * at) - np.exp(-fast * at)) / (fast - slow)
+    assert STOPPED == pytest.approx(most, rel=0.01)
+    assert max(overlaps) == pytest.approx(most * speed * time, rel=0.02)
 
 
 def test_pairs_of_materials_and_moduli():

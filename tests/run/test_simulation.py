@@ -291,7 +291,7 @@ def test_settings_are_given_one_by_one_or_together():
     assert (sim.settings.tol, sim.settings.solver, sim.settings.dt, sim.settings.delta) == (1e-6, "apgd", 0.001, 0.005)
     assert sim.settings.law == "coulomb"
     assert pctt.Simulation(Mixer(n=1), solver="pdip", comm=SELF).settings.law == "relaxation"
-    assert sim.settings.limits.closing_speed == pytest.approx(0.2 * 0.005 / 0.001)  # a fifth of delta in a step
+    assert sim.settings.limits.closing_speed == pytest.approx(0.15 * 0.005 / 0.001)  # of delta in a step
     for given in ({"solver": "pdip"}, {"closing_work": np.inf}, {"closing_speed": np.inf}):
         assert pctt.Simulation(Mixer(n=1), **given, comm=SELF).settings.limits.closing_speed == np.inf
     assert sim.settings.options == APGD()
