@@ -329,7 +329,7 @@ def limit_of(rows: list[Row]) -> tuple[float, float]:
     """The torque for small steps and stiff contacts and its standard error, as the top of the file says."""
     stiffest = max((row for row in rows if row["code"] == "LIGGGHTS"), key=lambda row: row["stiffness"])
     own = [row for row in rows if "dt" in row and "stiffness" not in row]
-    both = [stiffest, *([min(own, key=lambda row: (row["dt"], row["tol"]))] if own else [])]
+    both = [stiffest, *([min(own, key=lambda row: (row["dt"], row.get("tol", 1.0)))] if own else [])]
     print("limits: " + ", ".join(f"{row['torque']:.2f} +- {row['torque_error']:.2f}" for row in both))
     of_starts = math.hypot(*(row["torque_error"] for row in both)) / len(both)
     value, of_codes = spread([row["torque"] for row in both])

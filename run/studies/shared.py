@@ -215,7 +215,7 @@ def next_problem(sim: Any, contacts: Any = None) -> Any:
     return cone_problem(ContactSystem(world, contacts, settings.dt, settings.recovery_speed), world.comm)
 
 
-FIELDS = {"dt": float, "tol": float, "closing_work": float, "stiffness": float}
+FIELDS = dict.fromkeys(("dt", "tol", "closing_work", "closing_speed", "stiffness"), float)
 
 
 def settings_of(words: str) -> dict[str, Any]:
