@@ -65,17 +65,16 @@ def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
     weight over the area. Sources may fill the scene up to their height (`_bed`). Cohesion c presses grains together by
     c / k. Grains that fall from high are not reckoned with.
 
-    A speed v that reaches a row of grains of mass m makes the force k d = v sqrt(k m), a wave along the row. A bed gives
-    way to a tool before that: with at most RESISTS times the force of its weight (docs/mechanics.md), or with that of
-    the single grain that the tool throws.
+    A speed v that reaches a row of grains of mass m makes the force k d = v sqrt(k m), a wave along the row. A bed
+    gives way to a tool before that: with at most RESISTS times the force of its weight (docs/mechanics.md), or with
+    that of the single grain that the tool throws.
     """
     grains = scene.expected()
     allowed = overlap * bodies.bounding_radius(grains)
     with np.errstate(over="ignore", invalid="ignore"):  # inf: rigid
-        needed = _load(scene) / allowed
-        thrown, pushed = (grains.mass * (speed(scene) / allowed) ** 2 for speed in (fastest_grain, fastest_tool))
-        bed = np.where(needed > 0.0, np.maximum(RESISTS * needed, STOPPED**2 * pushed), np.inf)
-        stiffness = float(np.maximum(np.maximum(needed, thrown), np.minimum(pushed, bed)).max())
+        speeds = fastest_grain(scene), fastest_tool(scene)
+        thrown, pushed = (grains.mass * (speed / allowed) ** 2 for speed in speeds)
+        stiffness = float(_strongest(_load(scene) / allowed, thrown, pushed, STOPPED**2).max())
     return float(f"{stiffness:.1e}") if stiffness > 0.0 else np.inf  # the same on processors that round in other ways
 
 
@@ -84,11 +83,10 @@ def expected_overlap(scene: Scene, stiffness: float) -> float:
     grains = scene.expected()
     if np.isinf(stiffness):
         return 0.0
-    load = _load(scene) / stiffness
-    thrown, pushed = (speed(scene) * np.sqrt(grains.mass / stiffness) for speed in (fastest_grain, fastest_tool))
-    bed = np.where(load > 0.0, np.maximum(RESISTS * load, STOPPED * pushed), np.inf)
-    most = np.maximum(np.maximum(load, thrown), np.minimum(pushed, bed))
-    return float((most / bodies.bounding_radius(grains)).max())
+    speeds = fastest_grain(scene), fastest_tool(scene)
+    thrown, pushed = (speed * np.sqrt(grains.mass / stiffness) for speed in speeds)
+    overlaps = _strongest(_load(scene) / stiffness, thrown, pushed, STOPPED)
+    return float((overlaps / bodies.bounding_radius(grains)).max())
 
 
 def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:
@@ -183,6 +181,14 @@ def spring_energies(
         strained += 0.5 * (held[c, 0] ** 2 + held[c, 1] ** 2) / per
         strained_at_end += 0.5 * (one**2 + other**2) / per
     return start, end, strained, strained_at_end
+
+
+def _strongest(weight: Floats, thrown: Floats, pushed: Floats, single: float) -> Floats:
+    """Of what the weight, the fastest grain and the fastest tool ask for on each grain (n,), the most: of the tool no
+    more than the bed, or a `single` grain's part of it, resists. Without weight the bed is taken as stiff."""
+    bed = np.where(weight > 0.0, np.maximum(RESISTS * weight, single * pushed), np.inf)
+    strongest: Floats = np.maximum(np.maximum(weight, thrown), np.minimum(pushed, bed))
+    return strongest
 
 
 def _load(scene: Scene) -> Floats:

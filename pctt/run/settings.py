@@ -89,8 +89,8 @@ class Settings(ccp.Limits):
         None, "time step; none: the scene's own, or what its sizes and speeds need", unit="s", check=POSITIVE, name="dt"
     )
     delta: float = option(
-        None, "gap below which a pair of bodies is a contact; none: the scene's own, or a twentieth of the smallest radius", unit="m",
-        check=NOT_NEGATIVE, name="delta",
+        None, "gap below which a pair of bodies is a contact; none: the scene's own, or 0.05 of the smallest radius",
+        unit="m", check=NOT_NEGATIVE, name="delta",
     )  # fmt: skip
     stiffness: Optional[float] = option(
         None,

@@ -164,7 +164,7 @@ def test_how_far_a_grain_goes_into_a_contact_that_stops_it():
     slow, fast = DAMPING - np.sqrt(DAMPING**2 - 1), DAMPING + np.sqrt(DAMPING**2 - 1)
     at = np.log(fast / slow) / (fast - slow)
     most = (np.exp(-slow * at) - np.exp(-fast * at)) / (fast - slow)
-    assert STOPPED == pytest.approx(most, rel=0.01)
+    assert most == pytest.approx(STOPPED, rel=0.01)
     assert max(overlaps) == pytest.approx(most * speed * time, rel=0.02)
 
 
