@@ -74,7 +74,7 @@ class Settings(ccp.Limits):
         "but relaxation with pdip, -compare and -problem",
         choices=ccp.LAWS, name="law",
     )  # fmt: skip
-    tol: float = option(1e-3, "natural residual at which a cone problem counts as solved", check=FRACTION)
+    tol: float = option(5e-4, "natural residual at which a cone problem counts as solved", check=FRACTION)
     closing_work: float = option(
         0.5, "closing and opening work at which a cone problem counts as solved; inf: any",
         check=("a positive number, or inf", lambda x: x > 0),
