@@ -477,7 +477,7 @@ def test_a_notebook_shows_the_last_step_as_a_table():
     shown = sim._repr_html_()
     assert "<th>kinetic_energy [J]</th>" in shown
     assert "<th>iterations</th>" in shown
-    assert repr(sim).startswith("<Simulation of Stirred: 14 bodies on 1 ranks, step 2, time 0.02 s, auto to 0.001, ")
+    assert repr(sim).startswith("<Simulation of Stirred: 14 bodies on 1 ranks, step 2, time 0.02 s, auto to 0.0005, ")
 
 
 def test_a_picture_of_the_present_state(tmp_path):
