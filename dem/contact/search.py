@@ -21,6 +21,9 @@ from dem.period import Images, refuse_short
 from dem.quaternion import cross, length
 from dem.world import World
 
+#: Margin of a grain over the way that it goes in a step without contact forces: those that push it on often add a part.
+FURTHER = 1.25
+
 
 @dataclass(frozen=True)
 class Contacts:
@@ -85,12 +88,12 @@ def find_contacts(
 ) -> Contacts:  # fmt: skip
     """All contacts that this rank owns of the pairs whose margins meet; collective.
 
-    The margin of a body is delta/2 [m], or the way that it goes in dt [s] without contact forces if that is longer. So
-    a gap of at most `delta` is a contact, and so is a wider one that may close within the step, also when a third body
-    stops one of the two. `margin` (grains,) [m] are the least margins of the local grains, `shifts` (k, large, 6)
-    [m, rad] further ways and turns of the large bodies that their margins are to cover. A contact belongs to the rank
-    that owns the body of lower global index. The numbers of contacts that the grains own are left in
-    `world.grains.weight`.
+    The margin of a body is delta/2 [m], or the way that it goes in dt [s] without contact forces, of a grain FURTHER
+    times that, if it is longer. So a gap of at most `delta` is a contact, and so is a wider one that may close within
+    the step, also when a third body stops one of the two. `margin` (grains,) [m] are the least margins of the local
+    grains, `shifts` (k, large, 6) [m, rad] further ways and turns of the large bodies that their margins are to cover.
+    A contact belongs to the rank that owns the body of lower global index. The numbers of contacts that the grains own
+    are left in `world.grains.weight`.
 
     With `besides`, contacts that a search with margins not greater has found, only those are found that are not among
     them, and the weights stay.
@@ -99,7 +102,7 @@ def find_contacts(
     if shifts is None:
         shifts = (dt * drives_of(world, dt).free if dt else np.zeros_like(world.large.velocity))[None]
     free = grains_free_velocity(world, dt) if dt else world.grains.velocity
-    way = ways(world.grains.shape, world.grains.size, free, dt)
+    way = ways(world.grains.shape, world.grains.size, free, FURTHER * dt)
     way = way + cell_way(world, dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
     refuse_short(world, margin)

@@ -65,36 +65,59 @@ def not_idle(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDAr
 
 
 @loop
-def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float) -> tuple[Array, float]:
+def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float, units: Array) -> tuple[Array, float]:
     """Sums (5,) over the contacts, and the greatest -y_n, or 0. The sums are of |P(x - step y) - x|^2, where y gets the
     term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1, and below the rounding of step y it is zero: a contact that
-    slides has 0 = P(-step y) only up to that; of |x|^2; and closing work, opening work and 1/2 x.(y - r)."""
-    sums, most = np.zeros(5 * STRIP), np.zeros(STRIP)
+    slides has 0 = P(-step y) only up to that; of |x|^2; and closing work, opening work and 1/2 x.(y - r).
+
+    ``units`` (2, nc, 3) multiply x and y, if there are any: (0, nc, 3) is none."""
+    sums, most = np.zeros((5, STRIP)), np.zeros(STRIP)
+    g, v, scaled = np.empty(3 * STRIP), np.empty(3 * STRIP), len(units) > 0
     x, y, r = x.ravel(), y.ravel(), r.ravel()
     for first in range(0, len(mu), STRIP):
         friction = mu[first : first + STRIP]
         a, b = 3 * first, 3 * (first + len(friction))
-        _add_errors(x[a:b], y[a:b], r[a:b], step, friction, de_saxce, sums, most)
-    return sums.reshape(5, STRIP).sum(axis=1), most.max()
+        if scaled:
+            _multiply(x[a:b], units[0].ravel()[a:b], g)
+            _multiply(y[a:b], units[1].ravel()[a:b], v)
+        else:
+            g[: b - a], v[: b - a] = x[a:b], y[a:b]
+        _add_moves(g, v, step, friction, de_saxce, sums[0])
+        _add_works(g, v, r[a:b], len(friction), sums[1], sums[2], sums[3], sums[4], most)
+    return sums.sum(axis=1), most.max()
 
 
 @loop
-def _add_errors(x, y, r, step, mu, de_saxce, sums, most):
-    """Comparisons let a NaN through."""
+def _multiply(x, y, out):
+    for k in range(len(x)):
+        out[k] = x[k] * y[k]
+
+
+@loop
+def _add_moves(x, y, step, mu, de_saxce, squares):
+    """Comparisons, here and below, let a NaN through."""
     for c in range(len(mu)):
         i, m = 3 * c, mu[c]
         n, u, v, y_n, y_u, y_v = x[i], x[i + 1], x[i + 2], y[i], y[i + 1], y[i + 2]
         w = y_n + de_saxce * m * np.sqrt(y_u * y_u + y_v * y_v)
         to_n, to_u, to_v = _nearest(n - step * w, u - step * y_u, v - step * y_v, m)
         square = (to_n - n) ** 2 + (to_u - u) ** 2 + (to_v - v) ** 2
+        squares[c] += 0.0 if square <= NO_MOVE * (step * step) * (y_n * y_n + y_u * y_u + y_v * y_v) else square
+
+
+@loop
+def _add_works(x, y, r, count, squares, closings, openings, energies, most):
+    """In a loop of its own: a compiler makes vectors of two short loops, and not of a long one."""
+    for c in range(count):
+        i = 3 * c
+        n, u, v, y_n, y_u, y_v = x[i], x[i + 1], x[i + 2], y[i], y[i + 1], y[i + 2]
         along = n * y_n + u * y_u + v * y_v
-        sums[c] += 0.0 if square <= NO_MOVE * (step * step) * (y_n * y_n + y_u * y_u + y_v * y_v) else square
-        sums[STRIP + c] += n * n + u * u + v * v
         closing = 0.0 if y_n > 0.0 else -y_n
+        squares[c] += n * n + u * u + v * v
+        closings[c] += n * closing
+        openings[c] += 0.0 if along < 0.0 else along
+        energies[c] += 0.5 * (along - (n * r[i] + u * r[i + 1] + v * r[i + 2]))
         most[c] = closing if closing > most[c] or closing != closing else most[c]
-        sums[2 * STRIP + c] += n * closing
-        sums[3 * STRIP + c] += 0.0 if along < 0.0 else along
-        sums[4 * STRIP + c] += 0.5 * (along - (n * r[i] + u * r[i + 1] + v * r[i + 2]))
 
 
 @loop
@@ -494,10 +517,12 @@ class FrictionCones:
         out -= x
         return out
 
-    def errors(self, g: Array, y: Array, r: Array, step: float, coulomb: bool) -> tuple[Array, float]:
+    def errors(
+        self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Array | None = None
+    ) -> tuple[Array, float]:
         """||`move`||^2, |g|^2, closing work, opening work and 1/2 g.(y - r) of this rank's contacts (5,), and the
-        greatest speed at which one closes."""
-        return errors(g, y, r, step, self.mu, float(coulomb))
+        greatest speed at which one closes. ``units`` (2, rows, 3) multiply g and y."""
+        return errors(g, y, r, step, self.mu, float(coulomb), np.empty((0, *r.shape)) if units is None else units)
 
     def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
         """Mask (count,) of the contacts but those without an impulse at x and last_x whose distance inside the dual

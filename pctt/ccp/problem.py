@@ -123,10 +123,10 @@ class ConeProblem:
         return self.operator.velocities(momentum)
 
     @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
-    def errors(self, g: Array, y: Array, coulomb: bool = False) -> Errors:
+    def errors(self, g: Array, y: Array, coulomb: bool = False, units: Array | None = None) -> Errors:
         """How far impulses g with the velocities y = N g + r are from a solution. For Coulomb's law y gets De Saxce's
-        term."""
-        sums, most = self.cones.errors(g, y, self.r, 1.0 / self.mean_diagonal, coulomb)
+        term. Both are multiplied by ``units`` (2, nc, 3), if these are given."""
+        sums, most = self.cones.errors(g, y, self.r, 1.0 / self.mean_diagonal, coulomb, units)
         (moved, whole, closing, opening, energy), (speed,) = reduced(self.comm, sums, (most,))
         natural = np.sqrt(moved) / np.sqrt(whole) if whole > 0.0 else np.inf
         work = 0.0 if energy <= 0.0 else np.maximum(closing, opening) / energy

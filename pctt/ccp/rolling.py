@@ -73,7 +73,10 @@ class RollingCones(FrictionCones):
         return project_to(x, self.mu, self.spinning, out)
 
     @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
-    def errors(self, g: Array, y: Array, r: Array, step: float, coulomb: bool) -> tuple[Array, float]:
+    def errors(
+        self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Array | None = None
+    ) -> tuple[Array, float]:
+        g, y = (g, y) if units is None else (g * units[0], y * units[1])
         both = self.move(g, y, step, coulomb), step * y
         move, speed = (np.square(z).sum(axis=1).reshape(2, -1).sum(axis=0) for z in both)
         normal, push = y[: self.count, 0], g[: self.count, 0]

@@ -52,7 +52,7 @@ def test_the_scaled_problem_is_the_same_problem(given):
     y = scaled.gradient(scaled.start(g))
     start = scaled.impulse(scaled.start(g))
     expected = problem.natural_residual(start, problem.product(start) + problem.r)
-    assert problem.natural_residual(*scaled.unscaled(scaled.start(g), y)) == pytest.approx(expected)
+    assert scaled.errors(scaled.start(g), y).natural == pytest.approx(expected)
     now, last, new = (scaled.iterate(scaled.project(z)) for z in rng.normal(size=(3, 40, 3)))
     y = np.empty_like(now.x)
     assert np.allclose(scaled.look(now, y), scaled.gradient(now.x))

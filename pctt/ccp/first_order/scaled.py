@@ -9,7 +9,7 @@ import numpy as np
 
 from dem.compiled import loop
 from pctt.ccp.cone import Array
-from pctt.ccp.problem import ConeProblem
+from pctt.ccp.problem import ConeProblem, Errors
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.options import number
@@ -46,7 +46,8 @@ class ScaledProblem:
         shape = problem.r.shape
         largest = problem.max(max(float(problem.r.max(initial=0.0)), -float(problem.r.min(initial=0.0))))
         self.unit = 2.0 ** np.frexp(largest)[1]
-        self.shrink, self._impulse, self._velocity = np.empty((3, *shape))  # the diagonal of S^-1; of x, of a gradient
+        self.shrink, self._units = np.empty(shape), np.empty((2, *shape))  # the diagonal of S^-1; of x, of a gradient
+        self._impulse, self._velocity = self._units
         self.b, self._compliance = np.empty((2, *shape), precision)
         given = problem.diagonal, problem.mean_diagonal, self.unit, problem.r, problem.compliance
         _scale(*given, self.shrink, self._impulse, self._velocity, self.b, self._compliance)
@@ -137,10 +138,9 @@ class ScaledProblem:
         largest = np.linalg.eigvalsh(blocks)[:, -1]
         return np.repeat(1.0 / np.where(largest > 0, largest, 1.0), 3).reshape(-1, 3)
 
-    def unscaled(self, x: Array, gradient: Array) -> tuple[Array, Array]:
-        """The impulses (nc, 3) of x, but for rounding in the cones, and the velocities N g + r (nc, 3) of its
-        gradient."""
-        return x * self._impulse, gradient * self._velocity
+    def errors(self, x: Array, gradient: Array) -> Errors:
+        """Of the impulses of x, but for rounding in the cones, and the velocities N g + r of its gradient A x + b."""
+        return self.problem.errors(x, gradient, self.coulomb, self._units)
 
     def largest_curvature(self, steps: int = 10) -> float:
         """Estimate from below of the largest eigenvalue of A: ``steps`` power iterations from b."""
@@ -241,23 +241,21 @@ class Progress:
     def _residual(self, x: Array, gradient: Array | None) -> float:
         """The residual that the tolerance is for; nan where x or its gradient is no number."""
         if gradient is not None:
-            residual = self._judge(*self.problem.unscaled(x, gradient))
+            residual = self._judge(self.problem.errors(x, gradient), x)
             # inf where x = 0, or x is no number; methods that update the gradient collect rounding: look twice
             if self.limits.tol < residual < np.inf:
                 return residual
         g, problem = self.problem.impulse(x), self.problem.problem
         y = problem.product(g) + problem.r  # in double precision
-        return self._judge(g, y) if np.isfinite(problem.dot(g, y)) else np.nan
+        return self._judge(problem.errors(g, y, self.problem.coulomb), x) if np.isfinite(problem.dot(g, y)) else np.nan
 
-    def _judge(self, g: Array, y: Array) -> float:
-        """The residual that the tolerance is for, of impulses g and velocities y. Where only the closing work is too
-        large, the problem may have no solution: this is found out whenever the natural residual has fallen to a
-        tenth."""
-        errors = self.problem.problem.errors(g, y, self.problem.coulomb)
+    def _judge(self, errors: Errors, x: Array) -> float:
+        """The residual that the tolerance is for. Where only the closing work is too large, the problem may have no
+        solution: this is found out at the point x whenever the natural residual has fallen to a tenth."""
         residual = self.limits.residual(errors)
         if errors.natural <= self._suspicious and residual > self.limits.tol:
             self._suspicious = 0.1 * errors.natural
-            self._unbounded = why_unbounded(self.problem.problem, g)
+            self._unbounded = why_unbounded(self.problem.problem, self.problem.impulse(x))
         return residual
 
     def _why_stop(self, residual: float) -> tuple[Status, str]:
