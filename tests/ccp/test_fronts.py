@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from mpi4py import MPI
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from pctt.body_matrix import Part
 from pctt.ccp.newton import fronts
-from pctt.ccp.newton.fronts import Fronts, dissected, places_in, separated
+from pctt.ccp.newton.fronts import Fronts, dissected, separated
+
+SELF = MPI.COMM_SELF
 
 
 def stiff(count: int = 300, hub: bool = False, seed: int = 0) -> tuple[Part, np.ndarray]:
@@ -33,21 +36,34 @@ def stiff(count: int = 300, hub: bool = False, seed: int = 0) -> tuple[Part, np.
     return Part(K.indptr, K.indices, K.data), points
 
 
+def rows_of(part: Part, comm: MPI.Comm) -> tuple[Part, slice]:
+    """Those of this rank, and its bodies; the first rank has none where there are three."""
+    count = len(part.indptr) - 1
+    begin, end = (count * max(rank - (comm.size > 2), 0) // max(comm.size - (comm.size > 2), 1) for rank in (comm.rank, comm.rank + 1))
+    a, b = part.indptr[[begin, end]]
+    return Part(part.indptr[begin : end + 1] - a, part.indices[a:b], part.blocks[a:b]), slice(begin, end)
+
+
 def dense(part: Part) -> np.ndarray:
     return sp.bsr_matrix((part.blocks, part.indices, part.indptr)).toarray()
 
 
+@pytest.mark.parallel(1, 2, 3, 4)
 @pytest.mark.parametrize(("precision", "accuracy"), [(np.float32, 3e-2), (np.float64, 1e-10)])
 @pytest.mark.parametrize("hub", [False, True])
 @pytest.mark.parametrize("known", [False, True])
 def test_the_factors_solve(precision, accuracy, hub, known):
-    """Also where places are not known, with a body that touches hundreds, and with bodies that touch none."""
-    part, points = stiff(hub=hub)
-    factors = Fronts(part, points if known else places_in(part), precision)
-    assert len(factors.fronts) > 10
-    x = np.random.default_rng(1).standard_normal(len(dense(part)))
-    found = factors.solve(dense(part) @ x)
-    assert np.linalg.norm(found - x) <= accuracy * np.linalg.norm(x)
+    """Also where places are not known, with a body that touches hundreds, with bodies that touch none, and with a rank
+    that has no bodies."""
+    comm, (part, points) = MPI.COMM_WORLD, stiff(hub=hub)
+    rows, here = rows_of(part, comm)
+    factors = Fronts(comm, rows, points[here] if known else None, precision)
+    x = np.random.default_rng(1).standard_normal((len(points), 6))
+    found = factors.solve((dense(part) @ x.ravel()).reshape(-1, 6)[here].ravel())
+    assert np.linalg.norm(found - x[here].ravel()) <= accuracy * np.linalg.norm(x)
+    numbers = [sum(front.diagonal.size + front.below.size for front in fronts) for fronts in (factors.own, factors.shared)]
+    assert len(factors.own) + len(factors.shared) > 10 / comm.size
+    assert comm.size == 1 or 0 < numbers[0] < 0.8 * comm.allreduce(numbers[0]) + numbers[1]
 
 
 def test_a_matrix_that_rounding_has_made_indefinite_gets_a_larger_diagonal():
@@ -55,15 +71,15 @@ def test_a_matrix_that_rounding_has_made_indefinite_gets_a_larger_diagonal():
     blocks = part.blocks.copy()
     row = np.repeat(np.arange(len(points)), np.diff(part.indptr))
     blocks[row == part.indices] *= 1 - 1e-4
-    factors = Fronts(part._replace(blocks=blocks), points)
+    factors = Fronts(SELF, part._replace(blocks=blocks), points)
     assert np.isfinite(factors.solve(np.ones(6 * len(points)))).all()
 
 
 def test_nothing_to_factorise():
     empty = Part(np.zeros(1, int), np.zeros(0, int), np.zeros((0, 6, 6)))
-    assert Fronts(empty, np.zeros((0, 3))).solve(np.zeros(0)).shape == (0,)
+    assert Fronts(SELF, empty, np.zeros((0, 3))).solve(np.zeros(0)).shape == (0,)
     alone = Part(np.arange(3), np.arange(2), np.tile(2 * np.eye(6), (2, 1, 1)))
-    np.testing.assert_allclose(Fronts(alone, np.zeros((2, 3))).solve(np.ones(12)), 0.5, rtol=1e-6)
+    np.testing.assert_allclose(Fronts(SELF, alone, np.zeros((2, 3))).solve(np.ones(12)), 0.5, rtol=1e-6)
 
 
 def test_separators_separate():
@@ -72,7 +88,7 @@ def test_separators_separate():
     side = 9
     points = np.stack(np.meshgrid(*[np.arange(float(side))] * 3, indexing="ij"), -1).reshape(-1, 3)
     pairs = cKDTree(points).query_pairs(1.1, output_type="ndarray")
-    order, first = dissected(points, *pairs.T)
+    order, first, _ = dissected(points, *pairs.T)
     assert np.array_equal(np.sort(order), np.arange(side**3))
     sizes = np.diff(first)
     assert first[0] == 0
@@ -127,9 +143,9 @@ def test_a_dissection_serves_the_next_matrix_too(fits):
     near = (row == part.indices) | ((row < 200) & (part.indices < 200) if fits else (row < 100) & (part.indices < 100))
     less = Part(np.r_[0, np.cumsum(np.bincount(row[near]))], part.indices[near], part.blocks[near])
     first, other = (part, less) if fits else (less, part)
-    given = Fronts(first, points).dissection
-    assert given.fits(other) == fits
-    factors = Fronts(other, points, np.float64, given)
+    given = Fronts(SELF, first, points).dissection
+    assert given.fits(np.arange(len(points)), np.diff(other.indptr) == 1) == fits
+    factors = Fronts(SELF, other, points, np.float64, given)
     assert (factors.dissection is given) == fits
     x = np.random.default_rng(1).standard_normal(6 * len(points))
     np.testing.assert_allclose(factors.solve(dense(other) @ x), x, atol=1e-8)

@@ -25,7 +25,7 @@ from pctt.body_matrix import BodyOperator, inverse_blocks
 from pctt.ccp.cone import Array
 from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.newton.few import Factors, Order
-from pctt.ccp.newton.fronts import Dissection, Fronts, places_in
+from pctt.ccp.newton.fronts import Dissection, Fronts
 from pctt.ccp.problem import ConeProblem
 
 
@@ -188,9 +188,9 @@ class BodyForm:
         return self.operator.entries().stiff_mat(least, self.symmetric)
 
     def fronts(self, least: float, precision: type[np.floating]) -> Fronts:
-        """The factors of this part, which is symmetric and on one rank; all of a problem in the order of the first."""
-        part, points = self.operator.entries().stiff_part(least), self.places()
-        fronts = Fronts(part, places_in(part) if points is None else points, precision, self._dissection)
+        """The factors of this part, which is symmetric; all of a problem in the order of the first. Collective."""
+        part = self.operator.entries().stiff_part(least)
+        fronts = Fronts(self.problem.comm, part, self.places(), precision, self._dissection)
         self._dissection = fronts.dissection
         return fronts
 

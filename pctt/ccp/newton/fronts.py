@@ -7,6 +7,9 @@ nearly all work is that of dense matrices, and single precision is twice as fast
 preconditioner it is enough for all but the last systems of an interior point method, if the matrix is scaled first so
 that its diagonal blocks are the identity.
 
+On several ranks the first cuts part the bodies among them. Each rank factorises the fronts of its part; those of the
+first separators, to which all parts add, all ranks factorise alike. A rank keeps its own fronts and these.
+
 Source: Duff and Reid (1983), multifrontal method; George (1973), nested dissection; Menger (1927), Dinic (1970), the
 fewest bodies as the maximum flow.
 """
@@ -18,11 +21,13 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
+from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.linalg import blas, lapack
 from scipy.sparse import csgraph
 
 from dem.compiled import inlined, loop
+from dem.exchange import exchange, offsets, on_any, on_first
 from pctt.blocks import Array
 from pctt.body_matrix import Part
 from pctt.petsc import Context
@@ -32,6 +37,7 @@ HUB = 100  # neighbours of a body that is ordered last: such bodies touch both h
 SHIFT = 1.0  # added to the scaled diagonal, in units of rounding; a tenth breaks down, ten times take more iterations
 ONE = np.float32(1.0)
 LEVELS = 30  # of cuts at most
+HUBS = 1 << 61  # the name of their front, behind all others
 BAND = 0.15  # part of the bodies on each side of the middle from which a separator is chosen; 0.1 and 0.2 do too
 FAR = 1000  # bodies there that count as much as one beyond
 
@@ -46,73 +52,124 @@ class Front(NamedTuple):
 
 
 class Dissection(NamedTuple):
-    """The bodies (n,) in the order of nested dissection, those without neighbours first, and where each front begins in
-    it, with n at the end."""
+    """The bodies (n,) in the order of nested dissection, those without neighbours first; where each front begins in it,
+    with n at the end; and the rank that has it, -1: all ranks."""
 
     order: np.ndarray
     first: np.ndarray
+    rank: np.ndarray
 
-    def fits(self, part: Part) -> bool:
-        """Whether it can be the order of this matrix: then its first bodies have no neighbours."""
-        return bool((np.diff(part.indptr)[self.order[: self.first[0]]] == 1).all()) if len(self.first) else True
+    def fits(self, bodies: np.ndarray, alone: np.ndarray) -> bool:
+        """Whether it can be the order of a matrix of these bodies (n,), of which some are ``alone`` (n,), without
+        neighbours: then its first bodies are."""
+        none = self.order[: self.first[0]] if len(self.first) else self.order
+        return bool(alone[np.isin(bodies, none)].all())
+
+    def front_of(self, places: np.ndarray) -> np.ndarray:
+        """The fronts to which these places in the order belong."""
+        return np.searchsorted(self.first, places, "right") - 1
+
+
+#: Of a front: what earlier ones leave in the lower triangle of some bodies, and these.
+Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
 
 
 class Fronts:
-    """L L' of a matrix, scaled to the identity in its diagonal blocks and a little shifted.
+    """L L' of a matrix, scaled to the identity in its diagonal blocks and a little shifted. Collective, as products are.
 
-    points : (n, 1 to 3) places of the bodies, in any unit
+    part : the rows of this rank's bodies
+    points : (n, 1 to 3) places of these bodies, in any unit; None on all ranks where they are not known
     given : the dissection of another matrix of nearly the same pattern; without, or where it does not fit, there is an
         own one, ``dissection``
-    numbers : that factor and fronts hold, for the tests of memory
+    own, shared : the fronts that this rank has, and those that all have
     """
 
     def __init__(
-        self, part: Part, points: Array, precision: type[np.floating] = np.float32, given: Dissection | None = None
-    ):
+        self, comm: MPI.Comm, part: Part, points: Array | None, precision: type[np.floating] = np.float32,
+        given: Dissection | None = None,
+    ):  # fmt: skip
         indptr, column, blocks = part
-        count = len(indptr) - 1
-        row = np.repeat(np.arange(count), np.diff(indptr))
-        upper = row < column
-        found = given if given is not None and given.fits(part) else dissected(points, row[upper], column[upper])
-        self.dissection, (self.order, first) = found, found
+        starts = offsets(comm, len(indptr) - 1)
+        here, count = np.arange(starts[comm.rank], starts[comm.rank + 1]), int(starts[-1])
+        row = np.repeat(here, np.diff(indptr))
+        fits = given is not None and given.fits(here, np.diff(indptr) == 1)
+        if given is None or on_any(comm, not fits)[0]:
+            given = _dissection(comm, points, row, column, count)
+        self.dissection, self._comm, self._precision = given, comm, precision
         root = np.linalg.inv(np.linalg.cholesky(blocks[row == column]))
-        self._precision, self._root = precision, root[self.order].astype(precision)
         new = np.empty(count, np.int64)
-        new[self.order] = np.arange(count)
-        below = np.flatnonzero(new[row] > new[column])
-        below = below[np.lexsort((new[row[below]], new[column[below]]))]
-        scaled = root[row[below]] @ blocks[below] @ root[column[below]].transpose(0, 2, 1)
-        starts = np.searchsorted(new[column[below]], np.arange(count + 1))
-        self.fronts = _factorised(first, starts, new[row[below]], scaled.astype(precision))
-
-    @property
-    def numbers(self) -> int:
-        return sum(front.diagonal.size + front.below.size for front in self.fronts)
+        new[given.order] = np.arange(count)
+        self._here, self._root = new[here], root.astype(precision)
+        rank = np.append(given.rank, -1)[given.front_of(np.arange(count))]
+        self._of_all, self._kept = rank < 0, (rank == comm.rank) | ((rank < 0) & (comm.rank == 0))
+        below, roots = new[row] > new[column], np.concatenate(comm.allgather(root))
+        row, column = row[below], column[below]
+        scaled = (roots[row] @ blocks[below] @ roots[column].transpose(0, 2, 1)).astype(precision)
+        columns = _columns(comm, given, new[row], new[column], scaled)
+        updates: Updates = {}
+        self.own = _factorised(np.flatnonzero(given.rank == comm.rank), given.first, *columns, updates)
+        updates = _of_all_ranks(comm, updates, np.dtype(precision))
+        self.shared = _factorised(np.flatnonzero(given.rank < 0), given.first, *columns, updates)
 
     def solve(self, b: Array) -> Array:
-        """About A^-1 b, for b (6 n,) in double precision."""
-        scaled = b.reshape(-1, 6, 1)[self.order].astype(self._precision)
-        x = (self._root @ scaled).ravel()
+        """About A^-1 b, for this rank's b (6 n,) in double precision; collective."""
+        x = np.zeros((len(self._kept), 6), self._precision)
+        x[self._here] = (self._root @ b.reshape(-1, 6, 1).astype(self._precision))[:, :, 0]
+        x = self._summed(x)
+        x[~self._kept] = 0
+        self._forwards(self.own, x.ravel())
+        x[self._of_all] = self._summed(x[self._of_all])
+        self._forwards(self.shared, x.ravel())
+        self._backwards(self.shared, x.ravel())
+        self._backwards(self.own, x.ravel())
+        x[~self._kept] = 0
+        x = self._summed(x)
+        return (x[self._here, None] @ self._root).astype(float).ravel()
+
+    def _summed(self, x: np.ndarray) -> np.ndarray:
+        """The sum over the ranks."""
+        if self._comm.size > 1:
+            self._comm.Allreduce(MPI.IN_PLACE, x)
+        return x
+
+    def _forwards(self, fronts: list[Front], x: np.ndarray) -> None:
         trsv = blas.get_blas_funcs("trsv", dtype=self._precision)
-        for own, rest, diagonal, below in self.fronts:
+        for own, rest, diagonal, below in fronts:
             x[own] = trsv(diagonal, x[own], lower=1)
             x[rest] -= below @ x[own]
-        for own, rest, diagonal, below in reversed(self.fronts):
+
+    def _backwards(self, fronts: list[Front], x: np.ndarray) -> None:
+        trsv = blas.get_blas_funcs("trsv", dtype=self._precision)
+        for own, rest, diagonal, below in reversed(fronts):
             x[own] = trsv(diagonal, x[own] - below.T @ x[rest], lower=1, trans=1)
-        out = np.empty((len(self.order), 6))
-        out[self.order] = (x.reshape(-1, 1, 6) @ self._root)[:, 0]
-        return out.ravel()
 
 
-def _factorised(first: np.ndarray, starts: np.ndarray, rows: np.ndarray, blocks: np.ndarray) -> list[Front]:
-    """The fronts of the ordered matrix, whose columns below the diagonal have the ``rows`` and ``blocks`` from
-    ``starts`` on; ``first`` says where each front begins, and the number of bodies."""
+def _columns(
+    comm: MPI.Comm, found: Dissection, row: np.ndarray, column: np.ndarray, blocks: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The columns below the diagonal of this rank's fronts and of those of all, from the entries that the ranks have:
+    where each of the ordered matrix begins, rows, blocks."""
+    rank = found.rank[found.front_of(column)]
+    lower, shared = {"row": row, "column": column, "blocks": blocks}, rank < 0
+    parts = comm.allgather({name: values[shared] for name, values in lower.items()})
+    parts.append(exchange(comm, {name: values[~shared] for name, values in lower.items()}, rank[~shared]))
+    row, column, blocks = (np.concatenate([part[name] for part in parts]) for name in lower)
+    order = np.lexsort((row, column))
+    return np.searchsorted(column[order], np.arange(len(found.order) + 1)), row[order], blocks[order]
+
+
+def _factorised(
+    which: np.ndarray, first: np.ndarray, starts: np.ndarray, rows: np.ndarray, blocks: np.ndarray, updates: Updates
+) -> list[Front]:
+    """Some fronts, ascending, of the ordered matrix, whose columns below the diagonal have the ``rows`` and ``blocks``
+    from ``starts`` on; ``first`` says where each front begins, and the number of bodies. What they leave to others is
+    added to the ``updates``."""
     fronts: list[Front] = []
     trsm, syrk = blas.get_blas_funcs(("trsm", "syrk"), dtype=blocks.dtype)
-    updates: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in first[1:]]
     place = np.zeros(len(starts), np.int64)
-    for k, (begin, end) in enumerate(zip(first, first[1:])):
-        touched = [rows[starts[begin] : starts[end]], *(bodies for bodies, _ in updates[k])]
+    for k in which.tolist():
+        begin, end, added = first[k], first[k + 1], updates.pop(k, [])
+        touched = [rows[starts[begin] : starts[end]], *(bodies for bodies, _ in added)]
         bodies = np.unique(np.concatenate(touched))
         bodies = bodies[np.searchsorted(bodies, end) :]
         own, rest = 6 * (end - begin), 6 * len(bodies)
@@ -120,17 +177,32 @@ def _factorised(first: np.ndarray, starts: np.ndarray, rows: np.ndarray, blocks:
         diagonal, below, update = (np.zeros(shape, blocks.dtype, "F") for shape in shapes)
         place[begin:end], place[bodies] = np.arange(end - begin), np.arange(len(bodies))
         add_columns(starts, rows, blocks, begin, end, place, diagonal, below)
-        for others, values in updates[k]:
+        for others, values in added:
             add_update(values, others, end, place, diagonal, below, update)
-        updates[k] = []
         diagonal = _cholesky(diagonal)
         if rest:
             below = trsm(1.0, diagonal, below, side=1, lower=1, trans_a=1, overwrite_b=1)
             update = syrk(-1.0, below, beta=1.0, c=update, lower=1, overwrite_c=1)
-            updates[np.searchsorted(first, bodies[0], "right") - 1].append((bodies, update))
+            updates.setdefault(int(np.searchsorted(first, bodies[0], "right")) - 1, []).append((bodies, update))
         entries = (6 * bodies[:, None] + np.arange(6)).ravel()
         fronts.append(Front(slice(6 * begin, 6 * end), entries, diagonal, below))
     return fronts
+
+
+def _of_all_ranks(comm: MPI.Comm, updates: Updates, kind: np.dtype) -> Updates:
+    """The updates that the ranks leave to the fronts of all, on all ranks."""
+    if comm.size == 1:
+        return updates
+    every: Updates = {}
+    known = [(k, bodies) for k, added in updates.items() for bodies, _ in added]
+    own = iter([values for added in updates.values() for _, values in added])
+    for rank, names in enumerate(comm.allgather(known)):
+        for k, bodies in names:
+            size = 6 * len(bodies)
+            values = next(own) if rank == comm.rank else np.empty((size, size), kind, "F")
+            comm.Bcast(values.T, root=rank)
+            every.setdefault(k, []).append((bodies, values))
+    return every
 
 
 def _cholesky(matrix: np.ndarray) -> np.ndarray:
@@ -185,13 +257,27 @@ def add_update(values, bodies, end, place, diagonal, below, update):
 # -- the order of the bodies ------------------------------------------------------------------------------------
 
 
-def dissected(points: Array, row: np.ndarray, column: np.ndarray) -> Dissection:
+def _dissection(
+    comm: MPI.Comm, points: Array | None, row: np.ndarray, column: np.ndarray, count: int
+) -> Dissection:
+    """That of the bodies of all ranks, found by the first from the entries of each."""
+    upper = row < column
+    parts = comm.gather((np.zeros((0, 1)) if points is None else points, row[upper], column[upper]))
+
+    def find() -> Dissection:
+        places, one, other = (np.concatenate(column) for column in zip(*parts))
+        return dissected(places_in(count, one, other) if points is None else places, one, other, comm.size)
+
+    return on_first(comm, find)
+
+
+def dissected(points: Array, row: np.ndarray, column: np.ndarray, ranks: int = 1) -> Dissection:
     """The `Dissection` of bodies at points (n, 1 to 3); ``row`` and ``column``: the pairs of bodies, each once."""
     count = len(points)
     name, group = np.zeros((2, count), np.int64)  # of a front: a digit for each level, 0 and 1 the halves, 2 between
     neighbours = np.bincount(row, minlength=count) + np.bincount(column, minlength=count)
     active = (neighbours > 0) & (neighbours <= HUB)
-    name[neighbours > HUB], name[neighbours == 0] = 1 << 61, -1
+    name[neighbours > HUB], name[neighbours == 0] = HUBS, -1
     for level in range(LEVELS):
         _, part, sizes = np.unique(group[active], return_inverse=True, return_counts=True)
         active[active] = sizes[part] > LEAF
@@ -204,7 +290,23 @@ def dissected(points: Array, row: np.ndarray, column: np.ndarray) -> Dissection:
         group = 2 * group + high
         active &= ~between
     order = np.argsort(name, kind="stable")
-    return Dissection(order, np.flatnonzero(np.diff(name[order], prepend=-1, append=-1)))
+    first = np.flatnonzero(np.diff(name[order], prepend=-1, append=-1))
+    return Dissection(order, first, _ranks(name[order][first[:-1]], ranks))
+
+
+def _ranks(name: np.ndarray, ranks: int) -> np.ndarray:
+    """Which rank has the fronts of these names, -1: all. The first cuts make 2^k parts, about as many for each rank; what
+    separates parts of several ranks is of all."""
+    levels = (ranks - 1).bit_length()
+    part, parts = np.zeros((2, len(name)), np.int64)
+    parts += 1 << levels
+    for level in range(levels):
+        digit = name >> 2 * (LEVELS - 1 - level) & 3
+        inside = (digit < 2) & (parts == 1 << (levels - level))
+        parts = np.where(inside, parts // 2, parts)
+        part += np.where(inside, digit * parts, 0)
+    one, other = (part * ranks) >> levels, ((part + parts - 1) * ranks) >> levels
+    return np.where((one == other) & (name < HUBS), one, -1)
 
 
 def _places(points: Array, group: np.ndarray, active: np.ndarray) -> Array:
@@ -247,12 +349,11 @@ def separated(place: Array, row: np.ndarray, column: np.ndarray) -> tuple[np.nda
     return entered & ~left, (~left & (place >= 0.0)).astype(np.int64)
 
 
-def places_in(part: Part) -> Array:
-    """Places (n, 1) for bodies whose points are not known: their numbers in a breadth-first order."""
-    count = len(part.indptr) - 1
-    graph = sp.csr_matrix((np.ones(len(part.indices), np.int8), part.indices, part.indptr), shape=(count, count))
+def places_in(count: int, row: np.ndarray, column: np.ndarray) -> Array:
+    """Places (count, 1) for bodies whose points are not known: their numbers in a breadth-first order of the pairs."""
+    graph = sp.csr_matrix((np.ones(len(row), np.int8), (row, column)), shape=(count, count))
     places = np.empty((count, 1))
-    places[csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True), 0] = np.arange(count)
+    places[csgraph.reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True), 0] = np.arange(count)
     return places
 
 

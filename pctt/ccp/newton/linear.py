@@ -15,7 +15,7 @@ from pctt.ccp.newton.fronts import FrontPC
 from pctt.ccp.newton.krylov import Krylov, Solve, Source
 from pctt.options import number
 
-# factors of the part of K on one rank that is worth it
+# factors of the part of a symmetric K that is worth it
 FRONTS = {
     "ksp_type": "cg", "ksp_norm_type": "unpreconditioned",
     "pc_type": "python", "pc_python_type": "pctt.ccp.newton.fronts.FrontPC",
@@ -29,8 +29,8 @@ class Settings:
     few: int = number(1000, "contacts on one rank up to which an order of elimination is looked for")
     pairs: int = number(100_000, "of these, pairs of blocks in an elimination at most: 20 ns each")
     rest: int = number(133, "of these, contacts in the dense rest at most: 1 ms")
-    easy: float = number(6.0, "iterations with block Jacobi / bodies^0.4 and rank, after which the next matrix gets a "
-                              "factor. It costs as much as 8 to 14 on one rank, and no less on more")  # fmt: skip
+    easy: float = number(6.0, "iterations with block Jacobi / bodies^0.4, after which the next matrix gets a factor. It "
+                              "costs as much as 8 to 14")  # fmt: skip
     least: float = number(0.1, "drop tolerance of a factor [mass]: entries of a block between bodies that it is better "
                                "off without")  # fmt: skip
     single: float = number(0.02, "iterations with factors of single precision, in units of easy, after which the "
@@ -77,7 +77,7 @@ class LinearSolver:
         """The system has new values."""
         self.system, self._symmetric, self._factored = system, system.symmetric, False
         bodies = system.matrix.getSize()[0] / 6.0
-        easy = int(Settings.easy * bodies**0.4 * self.comm.size)
+        easy = int(Settings.easy * bodies**0.4)
         self._easy = self.comm.bcast(easy)  # a last bit may differ between processors
         self._hard = self.own and self._worst > self._easy
 
@@ -157,7 +157,7 @@ class LinearSolver:
             if name == "factor":
                 options = {"ksp_type": "gmres", "ksp_gmres_restart": "60", "ksp_max_it": "60"}
                 options["pc_type"] = "cholesky" if symmetric else "lu"
-                if self.comm.size == 1 and symmetric and isinstance(self.system, BodyForm):
+                if symmetric and isinstance(self.system, BodyForm):
                     options |= FRONTS
             else:
                 options = {**self.defaults, **({} if symmetric else {"ksp_type": "bcgs"})}
