@@ -245,7 +245,8 @@ class Factors:
 
     def _made(self, fronts: Fronts, *arguments: Any) -> None:
         self._init(fronts, *arguments)
-        sizes = np.array([(front.diagonal.shape[0], front.below.shape[0]) for front in fronts.own + fronts.shared], float)
+        made = fronts.own + fronts.shared
+        sizes = np.array([(front.diagonal.shape[0], front.below.shape[0]) for front in made], float)
         own, rest = sizes.T
         self.operations.append(float((own**3 / 3 + own**2 * rest + own * rest**2).sum()))
 

@@ -75,7 +75,7 @@ Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
 
 
 class Fronts:
-    """L L' of a matrix, scaled to the identity in its diagonal blocks and a little shifted. Collective, as products are.
+    """L L' of a matrix, scaled to the identity in its diagonal blocks and a little shifted; collective.
 
     part : the rows of this rank's bodies
     points : (n, 1 to 3) places of these bodies, in any unit; None on all ranks where they are not known
@@ -262,7 +262,7 @@ def _dissection(
 ) -> Dissection:
     """That of the bodies of all ranks, found by the first from the entries of each."""
     upper = row < column
-    parts = comm.gather((np.zeros((0, 1)) if points is None else points, row[upper], column[upper]))
+    parts = comm.gather((np.zeros((0, 1)) if points is None else points, row[upper], column[upper])) or []
 
     def find() -> Dissection:
         places, one, other = (np.concatenate(column) for column in zip(*parts))
@@ -295,8 +295,8 @@ def dissected(points: Array, row: np.ndarray, column: np.ndarray, ranks: int = 1
 
 
 def _ranks(name: np.ndarray, ranks: int) -> np.ndarray:
-    """Which rank has the fronts of these names, -1: all. The first cuts make 2^k parts, about as many for each rank; what
-    separates parts of several ranks is of all."""
+    """Which rank has the fronts of these names, -1: all. The first cuts make 2^k parts, about as many for each rank;
+    what separates parts of several ranks is of all."""
     levels = (ranks - 1).bit_length()
     part, parts = np.zeros((2, len(name)), np.int64)
     parts += 1 << levels

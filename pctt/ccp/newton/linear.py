@@ -29,8 +29,8 @@ class Settings:
     few: int = number(1000, "contacts on one rank up to which an order of elimination is looked for")
     pairs: int = number(100_000, "of these, pairs of blocks in an elimination at most: 20 ns each")
     rest: int = number(133, "of these, contacts in the dense rest at most: 1 ms")
-    easy: float = number(6.0, "iterations with block Jacobi / bodies^0.4, after which the next matrix gets a factor. It "
-                              "costs as much as 8 to 14")  # fmt: skip
+    easy: float = number(6.0, "iterations with block Jacobi / bodies^0.4, after which the next matrix gets a factor, "
+                              "which costs as much as 8 to 14")  # fmt: skip
     least: float = number(0.1, "drop tolerance of a factor [mass]: entries of a block between bodies that it is better "
                                "off without")  # fmt: skip
     single: float = number(0.02, "iterations with factors of single precision, in units of easy, after which the "
