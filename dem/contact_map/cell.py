@@ -9,14 +9,15 @@ of the last rank.
 
 from __future__ import annotations
 
+import copy
 from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
-from dem.arrays import Floats
+from dem.arrays import Floats, Ints
 from dem.compiled import loop
-from dem.contact_map.map import BlockRows, ContactMap, Some, shaped
+from dem.contact_map.map import BlockRows, ContactMap, shaped
 
 
 class Cell(NamedTuple):
@@ -38,36 +39,35 @@ class CellMap(ContactMap):
     def __init__(self, free: ContactMap, cell: Cell):
         self.comm, self.given, self.halo, self.body = free.comm, free.given, free.halo, free.body
         self.precision = free.precision
-        self.free, self.cell, self.rows, self.everything = free, cell, free.rows, free.everything
+        self.free, self.cell, self.rows = free, cell, free.rows
         self._last = self.comm.rank == self.comm.size - 1
         self.columns = free.columns + self._last
         self._lever = cell.lever.astype(self.precision, copy=False)
         self._mobility, self._count = cell.root**2, len(self._lever)
         self.log_flops = free.log_flops
 
-    def push(self, g: Floats, some: Some | None = None) -> Floats:
+    def only(self, contacts: Ints) -> CellMap:
+        other = copy.copy(self)
+        other.free, other._lever = self.free.only(contacts), np.take(self._lever, contacts, axis=0)
+        other.rows, other._count = other.free.rows, len(contacts)
+        return other
+
+    def push(self, g: Floats) -> Floats:
         """What impulses g (rows, 3) of all ranks do to E: their sum over the contacts with the ways (3,) [N s m]."""
         out = np.zeros(3)
-        for which in self.everything if some is None else some:
-            if len(which):
-                add_pushes(which, self._lever, g, out)
+        add_pushes(self._lever, g, out)
         if self.comm.size > 1:
             self.comm.Allreduce(MPI.IN_PLACE, out)
         return out
 
-    def add_rates(self, rate: Floats, y: Floats, some: Some | None = None) -> None:
-        """y (rows, 3) += the relative velocities of some contacts that E = `rate` (3,) gives them."""
-        for which in self.everything if some is None else some:
-            if len(which):
-                add_rates(which, self._lever, rate, y)
+    def add_rates(self, rate: Floats, y: Floats) -> None:
+        """y (rows, 3) += the relative velocities that E = `rate` (3,) gives contacts."""
+        add_rates(self._lever, rate, y)
 
     def rate_of(self, v: Floats) -> Floats:
         """E (3,), the same on all ranks, of mass-scaled velocities (columns, 6); collective."""
         rate = self.cell.root * v.reshape(-1, 6)[-1, :3] if self._last else np.empty(3)
         return np.asarray(self.comm.bcast(rate, self.comm.size - 1))
-
-    def among(self, chosen: np.ndarray) -> Some:
-        return self.free.among(chosen)
 
     def velocities(self, v: Floats) -> Floats:
         """G v (rows, 3)."""
@@ -97,14 +97,14 @@ class CellMap(ContactMap):
         """Memory for an image: that of the map without the cell, and a row for the push, the same on all ranks."""
         return np.zeros((len(self.free.image()) + 1, 6), self.precision)
 
-    def find_image(self, x: Floats, image: Floats, some: Some) -> None:
-        self.free.find_image(x, image[:-1], some)
-        image[-1, :3] = self.push(x, some)
+    def find_image(self, x: Floats, image: Floats) -> None:
+        self.free.find_image(x, image[:-1])
+        image[-1, :3] = self.push(x)
 
-    def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats, some: Some) -> None:
-        self.free.find_velocities(image[:-1], last[:-1], beta, before, y, some)
+    def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats) -> None:
+        self.free.find_velocities(image[:-1], last[:-1], beta, before, y)
         push = image[-1, :3] + beta * (image[-1, :3] - last[-1, :3])
-        self.add_rates(self._mobility * push, y, some)
+        self.add_rates(self._mobility * push, y)
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
         energy = self.free.energy_of_step(new[:-1], image[:-1], last[:-1], beta)
@@ -141,11 +141,10 @@ class CellMap(ContactMap):
 
 
 @loop
-def add_pushes(which, lever, g, out):
-    """out (3,) += lever' g of the contacts ``which`` (n,), uint32, in double precision."""
+def add_pushes(lever, g, out):
+    """out (3,) += lever' g of the contacts (nc, 9), in double precision."""
     x, y, z = 0.0, 0.0, 0.0
-    for k in range(len(which)):
-        c = which[k]
+    for c in range(len(lever)):
         x += lever[c, 0] * g[c, 0] + lever[c, 3] * g[c, 1] + lever[c, 6] * g[c, 2]
         y += lever[c, 1] * g[c, 0] + lever[c, 4] * g[c, 1] + lever[c, 7] * g[c, 2]
         z += lever[c, 2] * g[c, 0] + lever[c, 5] * g[c, 1] + lever[c, 8] * g[c, 2]
@@ -155,9 +154,8 @@ def add_pushes(which, lever, g, out):
 
 
 @loop
-def add_rates(which, lever, rate, y):
-    """y (nc, 3) += lever rate in the contacts ``which`` (n,), uint32."""
-    for k in range(len(which)):
-        c = which[k]
+def add_rates(lever, rate, y):
+    """y (nc or more, 3) += lever rate in the contacts (nc, 9)."""
+    for c in range(len(lever)):
         for i in range(3):
             y[c, i] += lever[c, 3 * i] * rate[0] + lever[c, 3 * i + 1] * rate[1] + lever[c, 3 * i + 2] * rate[2]

@@ -7,11 +7,13 @@ of joints have no sign and need no cone; what is left is the same cone problem o
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Floats, Ints
-from dem.contact_map.map import BlockRows, ContactMap, Some, shaped
+from dem.contact_map.map import BlockRows, ContactMap, shaped
 
 
 class JointedMap(ContactMap):
@@ -27,6 +29,12 @@ class JointedMap(ContactMap):
     def __init__(self, known: ContactMap, here: Ints, slot: Ints, coupling: Floats):
         super().__init__(known.comm, known.given, known.halo, known.body, known.precision)
         self.free, self.rows, self._here, self._slot, self._coupling = known, known.rows, here, slot, coupling
+
+    def only(self, contacts: Ints) -> JointedMap:
+        other = copy.copy(self)
+        other.free = self.free.only(contacts)
+        other.rows = other.free.rows
+        return other
 
     def gathered(self, v: Floats) -> Floats:
         """The rows (n, 6) of the jointed bodies among those (columns, 6) of all ranks; collective."""
@@ -63,14 +71,14 @@ class JointedMap(ContactMap):
         """Memory for an image: momenta R G' x (columns, 6)."""
         return np.zeros((self.columns, 6), self.precision)
 
-    def find_image(self, x: Floats, image: Floats, some: Some) -> None:
-        self.free._collect(x, self._m, some)
+    def find_image(self, x: Floats, image: Floats) -> None:
+        self.free._collect(x, self._m)
         image[:] = self.coupled(self._left())
 
-    def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats, some: Some) -> None:
+    def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats) -> None:
         z = image + self.precision(beta) * (image - last)
         self.free._enter(self._root, self.coupled(z))
-        self.free._set_velocities(before, y, some)
+        self.free._set_velocities(before, y)
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
         step = new - image - self.precision(beta) * (image - last)

@@ -44,10 +44,9 @@ def push(c, arm, body, f0, f1, f2, m):
 
 
 @loop
-def set_velocities(which, frame, arm, body, before, y, w):
-    """y = before + D' w (nc, 3) in the contacts ``which`` (n,), uint32; y may be ``before``. The others keep theirs."""
-    for k in prange(len(which)):
-        c = which[k]
+def set_velocities(frame, arm, body, before, y, w):
+    """y = before + D' w (nc, 3); y may be ``before``."""
+    for c in prange(len(body)):
         u0, u1, u2 = velocity_at(c, arm, body, w)
         y[c, 0] = before[c, 0] + (frame[c, 0] * u0 + frame[c, 1] * u1 + frame[c, 2] * u2)
         y[c, 1] = before[c, 1] + (frame[c, 3] * u0 + frame[c, 4] * u1 + frame[c, 5] * u2)
@@ -57,7 +56,7 @@ def set_velocities(which, frame, arm, body, before, y, w):
 def relative_velocities(frame, arm, body, w) -> Floats:
     """D' w (nc, 3)."""
     y = np.zeros((len(body), 3))
-    set_velocities(every(body), frame, arm, body, y, y, w)
+    set_velocities(frame, arm, body, y, y, w)
     return y
 
 
@@ -98,16 +97,10 @@ def works(frame, arm, body, g, w, new_w):
     return normal, tangential, velocity
 
 
-def every(body) -> np.ndarray:
-    """The indices of all contacts."""
-    return np.arange(len(body), dtype=np.uint32)
-
-
 @loop
-def add_momenta_of(which, frame, arm, body, g, m):
-    """m += D g for impulses g (nc, 3) of the contacts ``which`` (n,), uint32."""
-    for k in range(len(which)):
-        c = which[k]
+def add_momenta(frame, arm, body, g, m):
+    """m += D g for impulses g (nc, 3)."""
+    for c in range(len(body)):
         g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
         f0 = frame[c, 0] * g0 + frame[c, 3] * g1 + frame[c, 6] * g2
         f1 = frame[c, 1] * g0 + frame[c, 4] * g1 + frame[c, 7] * g2

@@ -6,6 +6,7 @@ ghosts travel, the loops work on the contacts that do not touch ghosts.
 
 from __future__ import annotations
 
+import copy
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,8 +24,6 @@ from dem.exchange import refuse
 
 #: The entries (xx, xy, xz, yy, yz, zz) of a symmetric matrix among the nine, and the numbers (3, 3) of all among these.
 UPPER, SYMMETRIC = [0, 1, 2, 4, 5, 8], [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
-
-Some = tuple[np.ndarray, np.ndarray]  # a choice of contacts, see `ContactMap.among`
 
 
 @dataclass(frozen=True)
@@ -113,6 +112,7 @@ class ContactMap:
     """
 
     has_rows = True  #: whether `block_rows` can have it, else it is for methods that need products alone
+    has_parts = True  #: whether it has `only`
 
     def __init__(
         self,
@@ -133,9 +133,8 @@ class ContactMap:
         self._w, self._m = np.zeros((2, halo.rows, 6), precision)
         ghost = np.zeros(halo.rows, bool)
         ghost[halo.ghosts] = True
-        self._first_away = first_away = first_touching(body, ghost) if len(halo.ghosts) else self.rows
-        every = loops.every(body)
-        self.everything = every[:first_away], every[first_away:]  #: all contacts
+        self._first_away = first_touching(body, ghost) if len(halo.ghosts) else self.rows
+        self._set_parts()
         self._flops = 45 * self.rows + 6 * self.columns
 
     # -- products -------------------------------------------------------------------------------------------
@@ -144,48 +143,66 @@ class ContactMap:
         """G v (nc, 3)."""
         y = np.zeros((self.rows, 3), self.precision)
         self._enter(self._root, shaped("velocities of bodies", v, self.columns, 6))
-        self._set_velocities(y, y, self.everything)
+        self._set_velocities(y, y)
         self.log_flops(self._flops)
         return y
 
     def momenta(self, g: Floats) -> Floats:
         """G' g (columns, 6)."""
-        self._collect(g, self._m, self.everything)
+        self._collect(g, self._m)
         self.log_flops(self._flops)
         return self._left()
 
     def add_delassus(self, g: Floats, y: Floats) -> None:
         """y += G G' g; y (nc, 3) is C-contiguous."""
         y = shaped("velocities of contacts", y, self.rows, 3)
-        self._collect(g, self._m, self.everything)
+        self._collect(g, self._m)
         self._enter(self._mass, self._m)
-        self._set_velocities(y, y, self.everything)
+        self._set_velocities(y, y)
         self.log_flops(2 * self._flops)
 
     # What an iterate x is to the bodies: its image, the momenta D x, from which velocities G G'x and energies x'G G'x
-    # follow. It is found, and used, for ``some`` contacts: a choice of `among`, or `everything`.
+    # follow. A map of those contacts `only` that have impulses finds the same image.
 
-    def among(self, chosen: np.ndarray) -> Some:
-        """The indices of the contacts of a mask (nc,): of those that wait for no other rank, and of the others."""
-        index = np.flatnonzero(chosen).astype(np.uint32)
-        return index[: (end := np.searchsorted(index, self._first_away))], index[end:]
+    def only(self, contacts: Ints) -> ContactMap:
+        """The map of these contacts, ascending, for images and what follows from them: it shares the memory for
+        velocities and momenta with this one."""
+        other = copy.copy(self)
+        other._take(contacts)
+        return other
+
+    def _take(self, contacts: Ints) -> None:
+        frame, arm, self.body = (np.take(array, contacts, axis=0) for array in self._arrays)
+        self._arrays = frame, arm, self.body
+        self.rows, self._first_away = len(contacts), int(np.searchsorted(contacts, self._first_away))
+        self._flops = 45 * self.rows + 6 * self.columns
+        for name in ("_pieces", "_forces", "_ends", "block_rows"):
+            self.__dict__.pop(name, None)
+        self._set_parts()
+
+    def _set_parts(self) -> None:
+        """Prepare the arrays of the contacts that wait for no other rank, and of the others if there are any."""
+        self._own = self._part(0, self._first_away)
+        self._away = [self._part(self._first_away, self.rows)] if self._first_away < self.rows else []
+
+    def _part(self, begin: int, end: int) -> tuple[Any, ...]:
+        here = slice(begin, end)
+        return (here, *(array[here] for array in self._arrays))
 
     def image(self) -> Floats:
         """Memory for an image: momenta (halo.rows, 6)."""
         return np.zeros((self.halo.rows, 6), self.precision)
 
-    def find_image(self, x: Floats, image: Floats, some: Some) -> None:
-        """image = D x for impulses x (nc, 3), which are zero elsewhere."""
-        self._collect(x, image, some)
+    def find_image(self, x: Floats, image: Floats) -> None:
+        """image = D x for impulses x (nc, 3)."""
+        self._collect(x, image)
         self.log_flops(self._flops)
 
-    def find_velocities(
-        self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats, some: Some
-    ) -> None:
-        """y = before + G G' z (nc, 3) for the z whose image is image + beta (image - last). Elsewhere y stays."""
+    def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats) -> None:
+        """y = before + G G' z (nc, 3) for the z whose image is image + beta (image - last)."""
         loops.scale_extrapolated(self._mass, image, last, beta, self._w)
         self.halo.begin_update(self._w)
-        self._set_velocities(before, y, some)
+        self._set_velocities(before, y)
         self.log_flops(self._flops + 12 * self.columns)
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
@@ -227,7 +244,7 @@ class ContactMap:
     def _pieces(self) -> list[tuple[Any, ...]]:
         """Two halves of the contacts that wait for no other rank, then the other contacts."""
         ends = [0, self._first_away // 2, self._first_away, self.rows]
-        return [(here, *(x[here] for x in self._arrays)) for here in (slice(*pair) for pair in zip(ends, ends[1:]))]
+        return [self._part(*pair) for pair in zip(ends, ends[1:])]
 
     def relative_velocities(self, v: Floats) -> Floats:
         """D' v (nc, 3) for the velocities (rows, 6) of all rows of a table of the halo, without a message."""
@@ -242,7 +259,8 @@ class ContactMap:
         """D g (rows, 6) of these of this rank's contacts, by rows of a table of the halo, without a message."""
         sums = np.zeros((self.halo.rows, 6))
         g = self._floats(shaped("impulses", g, self.rows, 3))
-        loops.add_momenta_of(contacts.astype(np.uint32), *self._arrays, g, sums)
+        frame, arm, body = self._arrays
+        loops.add_momenta(frame[contacts], arm[contacts], body[contacts], g[contacts], sums)
         return sums
 
     def _enter(self, scale: Floats, v: Floats) -> None:
@@ -253,27 +271,27 @@ class ContactMap:
         loops.scale(scale, v, self._w)
         self.halo.begin_update(self._w)
 
-    def _set_velocities(self, before: Floats, y: Floats, some: Some) -> None:
-        """y = before + D' w (nc, 3) in some contacts, with the velocities w that are on their way."""
-        own, away = some
-        loops.set_velocities(own, *self._arrays, before, y, self._w)
+    def _set_velocities(self, before: Floats, y: Floats) -> None:
+        """y = before + D' w (nc, 3), with the velocities w that are on their way."""
+        here, frame, arm, body = self._own
+        loops.set_velocities(frame, arm, body, before[here], y[here], self._w)
         self.halo.end_update(self._w)
-        if len(away):
-            loops.set_velocities(away, *self._arrays, before, y, self._w)
+        for here, frame, arm, body in self._away:
+            loops.set_velocities(frame, arm, body, before[here], y[here], self._w)
 
-    def _collect(self, g: Floats, m: Floats, some: Some) -> None:
-        """m = the momenta that the impulses of some contacts give to the bodies, not yet scaled by masses."""
+    def _collect(self, g: Floats, m: Floats) -> None:
+        """m = the momenta that impulses give to the bodies, not yet scaled by masses."""
         g = self._floats(shaped("impulses", g, self.rows, 3))
-        if threads() > 1:  # of all contacts
+        if threads() > 1:
             loops.find_forces(self._arrays[0], g, self._forces)
             self._sum_forces(m)
             return
-        own, away = some
         m[:] = 0.0
-        if len(away):
-            loops.add_momenta_of(away, *self._arrays, g, m)
+        for here, frame, arm, body in self._away:
+            loops.add_momenta(frame, arm, body, g[here], m)
         self.halo.begin_add(m)
-        loops.add_momenta_of(own, *self._arrays, g, m)
+        here, frame, arm, body = self._own
+        loops.add_momenta(frame, arm, body, g[here], m)
         self.halo.end_add(m)
 
     def _sum_forces(self, m: Floats) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -13,7 +14,7 @@ from dem.arrays import Floats, Ints
 from dem.compiled import loop
 from dem.contact_map import loops
 from dem.contact_map.halo import Halo
-from dem.contact_map.map import BlockRows, CompactRows, ContactMap, Some, root_blocks, shaped
+from dem.contact_map.map import BlockRows, CompactRows, ContactMap, root_blocks, shaped
 
 
 class TurningMap(ContactMap):
@@ -35,30 +36,36 @@ class TurningMap(ContactMap):
         """The turning velocities (nc, 3) of the velocities (rows, 6) of all rows of a table of the halo, without a
         message."""
         y = np.zeros((self.contacts, 3))
-        set_turning(loops.every(self.body), self._turn, self.body, y, y, v)
+        set_turning(self._turn, self.body, y, y, v)
         return y
 
     def sums_of_moments(self, g: Floats, contacts: Ints, sums: Floats) -> None:
         """sums (rows, 6) += the moments g (nc, 3) of these contacts, by rows of a table of the halo; no message."""
-        add_moments_of(contacts.astype(np.uint32), self._turn, self.body, g, sums)
+        add_moments(self._turn[contacts], self.body[contacts], g[contacts], sums)
 
-    def _set_velocities(self, before: Floats, y: Floats, some: Some) -> None:
+    def _take(self, contacts: Ints) -> None:
+        super()._take(contacts)
+        self._turn = np.take(self._turn, contacts, axis=0)
+        self.contacts, self.rows = self.rows, 2 * self.rows
+
+    def _set_velocities(self, before: Floats, y: Floats) -> None:
         n = self.contacts
-        super()._set_velocities(before[:n], y[:n], some)
-        for which in some:
-            set_turning(which, self._turn, self.body, before[n:], y[n:], self._w)
+        super()._set_velocities(before[:n], y[:n])
+        set_turning(self._turn, self.body, before[n:], y[n:], self._w)
 
-    def _collect(self, g: Floats, m: Floats, some: Some) -> None:
+    def _collect(self, g: Floats, m: Floats) -> None:
         g, n = self._floats(shaped("impulses", g, self.rows, 3)), self.contacts
-        own, away = some
         m[:] = 0.0
-        if len(away):
-            loops.add_momenta_of(away, *self._arrays, g[:n], m)
-            add_moments_of(away, self._turn, self.body, g[n:], m)
+        for part in self._away:
+            self._add_impulses(part, g[:n], g[n:], m)
         self.halo.begin_add(m)
-        loops.add_momenta_of(own, *self._arrays, g[:n], m)
-        add_moments_of(own, self._turn, self.body, g[n:], m)
+        self._add_impulses(self._own, g[:n], g[n:], m)
         self.halo.end_add(m)
+
+    def _add_impulses(self, part: tuple[Any, ...], force: Floats, moment: Floats, m: Floats) -> None:
+        here, frame, arm, body = part
+        loops.add_momenta(frame, arm, body, force[here], m)
+        add_moments(self._turn[here], body, moment[here], m)
 
     def contact_blocks(self) -> Floats:
         """The diagonal blocks of G G' (2 nc, 3, 3)."""
@@ -91,10 +98,9 @@ class TurningMap(ContactMap):
 
 
 @loop
-def set_turning(which, turn, body, before, y, w):
-    """y = before + turn (w_b - w_a) in the contacts ``which`` (n,), uint32; y may be ``before``."""
-    for k in range(len(which)):
-        c = which[k]
+def set_turning(turn, body, before, y, w):
+    """y = before + turn (w_b - w_a) (nc, 3); y may be ``before``."""
+    for c in range(len(body)):
         a, b = body[c, 0], body[c, 1]
         u0, u1, u2 = w[b, 3] - w[a, 3], w[b, 4] - w[a, 4], w[b, 5] - w[a, 5]
         y[c, 0] = before[c, 0] + (turn[c, 0] * u0 + turn[c, 1] * u1 + turn[c, 2] * u2)
@@ -103,10 +109,9 @@ def set_turning(which, turn, body, before, y, w):
 
 
 @loop
-def add_moments_of(which, turn, body, g, m):
-    """m (bodies, 6) += the moments g (nc, 3) of the contacts ``which`` (n,), uint32."""
-    for k in range(len(which)):
-        c = which[k]
+def add_moments(turn, body, g, m):
+    """m (bodies, 6) += the moments g (nc, 3)."""
+    for c in range(len(body)):
         a, b = body[c, 0], body[c, 1]
         for i in range(3):
             moment = turn[c, i] * g[c, 0] + turn[c, 3 + i] * g[c, 1] + turn[c, 6 + i] * g[c, 2]

@@ -492,6 +492,14 @@ class FrictionCones:
         """The cones of unknowns multiplied by ``size`` (rows, 3), whose tangential numbers are equal."""
         return FrictionCones((self.mu * size[:, 1] / size[:, 0]).astype(precision, copy=False))
 
+    def rows_of(self, contacts: NDArray[np.intp]) -> NDArray[np.intp]:
+        """The rows of these contacts (n,), ascending."""
+        return contacts
+
+    def only(self, contacts: NDArray[np.intp]) -> FrictionCones:
+        """Those of these contacts (n,)."""
+        return FrictionCones(self.mu[contacts])
+
     def project(self, x: Array, out: Array) -> Array:
         """The nearest points (rows, 3), into ``out``, which may be x."""
         return project_to(x, self.mu, out)

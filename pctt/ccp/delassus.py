@@ -17,7 +17,7 @@ from petsc4py import PETSc
 
 from dem.compiled import loop
 from dem.contact_map import BlockRows, ContactMap, Halo, find_halo, loops
-from dem.contact_map.map import Some, checked, shaped
+from dem.contact_map.map import checked, shaped
 from dem.exchange import exchange, offsets
 from pctt.blocks import Array, square_block_matrix
 
@@ -42,8 +42,6 @@ class GivenMatrix:
     local : this rank's rows in 3 x 3 blocks, their columns global. Of a Mat of type AIJ, BAIJ, SBAIJ or dense they are
         a copy. ValueError on all ranks if they have a NaN or an infinite number
     """
-
-    everything: Some = (np.zeros(0, np.uint32), np.zeros(0, np.uint32))
 
     def __init__(self, comm: MPI.Comm, N: PETSc.Mat | sp.bsr_matrix):
         self.local: sp.bsr_matrix = N if isinstance(N, sp.bsr_matrix) else rows_in_blocks(N)
@@ -87,13 +85,10 @@ class GivenMatrix:
         """Memory for the image (nc, 6) of impulses: x and N x."""
         return np.zeros((self.rows, 6), float if self._size is None else self._size.dtype)
 
-    def among(self, chosen: np.ndarray) -> Some:
-        return self.everything
-
-    def find_image(self, x: Array, image: Array, some: Some) -> None:
+    def find_image(self, x: Array, image: Array) -> None:
         image[:, :3], image[:, 3:] = x, self._scaled_product(x)
 
-    def find_velocities(self, image: Array, last: Array, beta: float, before: Array, y: Array, some: Some) -> None:
+    def find_velocities(self, image: Array, last: Array, beta: float, before: Array, y: Array) -> None:
         y[:] = before + (image + beta * (image - last))[:, 3:]
 
     def energy_of_step(self, new: Array, image: Array, last: Array, beta: float) -> float:
@@ -132,6 +127,8 @@ class BlockMap(ContactMap):
     halo : that of another map between the same bodies, whose rows need no check
     """
 
+    has_parts = False
+
     def __init__(
         self, comm: MPI.Comm, rows: BlockRows, halo: tuple[Halo, np.ndarray] | None = None,
         precision: type[np.floating] = np.float64,
@@ -139,7 +136,6 @@ class BlockMap(ContactMap):
         rows = checked(comm, rows) if halo is None else rows
         self.comm, self.given, self.block_rows, self.precision = comm, rows, rows, precision  # type: ignore[assignment]
         self.rows, self.columns = rows.rows, rows.columns
-        self.everything = GivenMatrix.everything
         self._found = halo or find_halo(comm, rows.columns, rows.indices)
         self.halo, body = self._found
         self._blocks = (np.ascontiguousarray(rows.blocks, precision), rows.indptr, body)
@@ -172,14 +168,10 @@ class BlockMap(ContactMap):
         """Memory for an image: G'x (columns, 6)."""
         return np.zeros((self.columns, 6), self.precision)
 
-    def among(self, chosen: np.ndarray) -> Some:
-        """Every contact: products by blocks have no choice."""
-        return self.everything
-
-    def find_image(self, x: Array, image: Array, some: Some) -> None:
+    def find_image(self, x: Array, image: Array) -> None:
         image[:] = self.momenta(x)
 
-    def find_velocities(self, image: Array, last: Array, beta: float, before: Array, y: Array, some: Some) -> None:
+    def find_velocities(self, image: Array, last: Array, beta: float, before: Array, y: Array) -> None:
         y[:] = before + self.velocities(image + image.dtype.type(beta) * (image - last))
 
     def energy_of_step(self, new: Array, image: Array, last: Array, beta: float) -> float:

@@ -69,6 +69,12 @@ class RollingCones(FrictionCones):
         spinning = self.spinning * size[self.count :, 0] / normal
         return RollingCones(mu.astype(precision, copy=False), spinning.astype(precision, copy=False))
 
+    def rows_of(self, contacts: NDArray[np.intp]) -> NDArray[np.intp]:
+        return np.concatenate([contacts, self.count + contacts])
+
+    def only(self, contacts: NDArray[np.intp]) -> RollingCones:
+        return RollingCones(self.mu[self.rows_of(contacts)], self.spinning[contacts])
+
     def project(self, x: Array, out: Array) -> Array:
         return project_to(x, self.mu, self.spinning, out)
 

@@ -151,14 +151,29 @@ def test_products_with_the_map_of_a_cell_are_those_of_a_matrix(turning):
     assert one == pytest.approx(two, rel=1e-9)
     nothing = G.image()
     image = G.image()
-    G.find_image(g, image, G.everything)
+    G.find_image(g, image)
     energy = comm.allreduce(G.energy_of_step(image, nothing, nothing, 0.0))
     assert energy == pytest.approx(comm.allreduce(np.vdot(g, expected)), rel=1e-9)
+    check_part(G, g, count)
     blocks = free.contact_blocks()
     blocks[:count] += lever @ lever.transpose(0, 2, 1)
     np.testing.assert_allclose(G.contact_blocks(), blocks, rtol=1e-12)
     size = random.uniform(1.0, 2.0, g.shape)
     np.testing.assert_allclose(delassus(G.scaled(size), g), size * delassus(G, size * g), rtol=1e-9, atol=1e-9)
+
+
+def check_part(G, g, count):
+    """The map of every second contact alone, with impulses of these."""
+    some = np.arange(count)[::2]
+    rows = np.concatenate([some, count + some])[: len(some) * len(g) // max(count, 1)]
+    part, impulse = G.only(some), np.zeros_like(g)
+    impulse[rows] = g[rows]
+    image, same, few = G.image(), G.image(), np.zeros_like(g[rows])
+    G.find_image(impulse, image)
+    part.find_image(g[rows], same)
+    np.testing.assert_allclose(same, image, rtol=1e-12, atol=1e-12)
+    part.find_velocities(same, same, 0.5, few, few)
+    np.testing.assert_allclose(few, by_images(G, impulse)[rows], rtol=1e-9, atol=1e-12)
 
 
 def delassus(G, g):
@@ -169,8 +184,8 @@ def delassus(G, g):
 
 def by_images(G, g):
     image, y = G.image(), np.zeros_like(g)
-    G.find_image(g, image, G.everything)
-    G.find_velocities(image, image, 0.5, np.zeros_like(g), y, G.everything)
+    G.find_image(g, image)
+    G.find_velocities(image, image, 0.5, np.zeros_like(g), y)
     return y
 
 

@@ -17,10 +17,10 @@ from several_ranks import alone
 from dem.scenes import Mixer
 from dem.start import new_world, restart_rows, restored_world
 
-# settings, and ten times what was measured between ranks: m, m/s, rad/s
+# settings, and ten times what was measured between ranks (of six states `pdip` leaves 4e-7 to 1.4e-5 m): m, m/s, rad/s
 CASES = {
     "given iterations": ({"solver": "apgd", "iterations": 20}, (1e-13, 1e-12, 1e-11)),
-    "pdip": ({"solver": "pdip", "tol": 1e-5}, (6e-6, 3e-4, 6e-3)),
+    "pdip": ({"solver": "pdip", "tol": 1e-5}, (4e-5, 1e-3, 2e-2)),
     "apgd": ({"solver": "apgd", "tol": 1e-6}, (4e-5, 1e-3, 2e-2)),
 }
 

@@ -6,15 +6,22 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dem.compiled import loop
-from pctt.ccp.cone import Array
+from dem.contact_map import ContactMap
+from pctt.ccp.cone import Array, FrictionCones
+from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.problem import ConeProblem, Errors
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.options import number
 
+MANY = 0.9  # of the contacts awake: to put these side by side would take as long as all take until the next look
 RATIO = 0.4  # of the natural residual to |L step| / |x|: 0.3 to 0.5 from the second step on, all scenes, both laws
+
+
+Rows = NDArray[np.intp]
 
 
 class Iterate(NamedTuple):
@@ -25,6 +32,16 @@ class Iterate(NamedTuple):
 
     def copy(self) -> Iterate:
         return Iterate(self.x.copy(), self.image.copy())
+
+
+class Awake(NamedTuple):
+    """The contacts that iterations work on: all, or those that have not fallen asleep."""
+
+    rows: Rows | None  #: (n,) of the arrays (nc, 3); None: all
+    operator: ContactMap | GivenMatrix
+    cones: FrictionCones
+    b: Array  #: (n, 3)
+    compliance: Array  #: (n, 3), or no row for zero
 
 
 class ScaledProblem:
@@ -52,9 +69,9 @@ class ScaledProblem:
         given = problem.diagonal, problem.mean_diagonal, self.unit, problem.r, problem.compliance
         _scale(*given, self.shrink, self._impulse, self._velocity, self.b, self._compliance)
         self.cones = problem.cones.scaled(self._velocity, precision)
-        self._soft = self._compliance[: None if problem.yields else 0]
         self._operator = problem.operator.scaled(self.shrink, precision)
-        self._awake = self._operator.everything
+        soft = self._compliance[: None if problem.yields else 0]
+        self._all = self._awake = Awake(None, self._operator, self.cones, self.b, soft)
 
     def _rounded(self, x: Array) -> Array:
         return x.astype(self.precision, copy=False)
@@ -88,36 +105,62 @@ class ScaledProblem:
     def iterate(self, x: Array) -> Iterate:
         """The iterate at x (nc, 3), which is kept."""
         found = Iterate(x, self._operator.image())
-        self._operator.find_image(*found, self._awake)
+        self._operator.find_image(*found)
         return found
 
     def rigid_gradient(self, now: Iterate, last: Iterate, beta: float, out: Array) -> Array:
-        """(A - C) z + b (nc, 3) at z = x + beta (x - last_x), into ``out``, from images alone: half a product. Contacts
-        that sleep keep what ``out`` has."""
-        self._operator.find_velocities(now.image, last.image, beta, self.b, out, self._awake)
+        """(A - C) z + b at z = x + beta (x - last_x), into ``out``, from images alone: half a product."""
+        self._awake.operator.find_velocities(now.image, last.image, beta, self._awake.b, out)
         return out
 
     def look(self, now: Iterate, y: Array) -> Array:
-        """A x + b (nc, 3) of all contacts, which wake up, and ``y`` its rigid part."""
-        self._awake = self._operator.everything
+        """A x + b (nc, 3) where all contacts are awake, and ``y`` its rigid part."""
         self.rigid_gradient(now, now, 0.0, y)
         return y + self._compliance * now.x if self.problem.yields else y
 
-    def fall_asleep(self, now: Iterate, last: Iterate, y: Array, length: float) -> None:
+    def wake(self, now: Iterate, last: Iterate, new: Iterate) -> tuple[Iterate, Iterate, Iterate, Array]:
+        """The iterates with all contacts, memory for a new one, and memory (nc, 3) for a gradient."""
+        rows, self._awake = self._awake.rows, self._all
+        if rows is not None:
+            now, last = (self._spread(iterate, rows) for iterate in (now, last))
+        return now, last, Iterate(np.empty_like(now.x), new.image), np.empty_like(now.x)
+
+    def _spread(self, iterate: Iterate, rows: Rows) -> Iterate:
+        x = np.zeros_like(self.b)
+        _put(rows, iterate.x, x)
+        return Iterate(x, iterate.image)
+
+    def fall_asleep(
+        self, now: Iterate, last: Iterate, new: Iterate, y: Array, length: float
+    ) -> tuple[Iterate, Iterate, Iterate, Array]:
         """Let contacts sleep that will stay open until the next look, as far as one can see: they have no impulse, and
         open five times faster than steps change velocities, which is the root mean square of their ``length`` |L step|.
-        A contact too many costs iterations, but no accuracy. ``y`` (nc, 3) is the rigid gradient of all contacts."""
+        A contact too many costs iterations, but no accuracy. ``y`` (nc, 3) is the rigid gradient of all contacts.
+        Returns what `wake` does, of those awake, with this gradient: fewer, side by side, move fewer bytes."""
+        every = self._all
+        if isinstance(every.operator, GivenMatrix) or not every.operator.has_parts:
+            return now, last, new, y
         faster = float(5 * length / np.sqrt(max(self.problem.size, 1)))
-        self._awake = self._operator.among(self.cones.not_idle(now.x, last.x, y, faster))
+        contacts = np.flatnonzero(self.cones.not_idle(now.x, last.x, y, faster))
+        if len(contacts) > MANY * self.cones.count:
+            return now, last, new, y
+        rows = self.cones.rows_of(contacts)
+
+        def awake(array: Array) -> Array:
+            return np.take(array, rows, axis=0) if len(array) else array
+
+        now, last, y = Iterate(awake(now.x), now.image), Iterate(awake(last.x), last.image), awake(y)
+        operator, cones = every.operator.only(contacts), self.cones.only(contacts)
+        self._awake = Awake(rows, operator, cones, awake(every.b), awake(every.compliance))
+        return now, last, Iterate(np.empty_like(y), new.image), y
 
     def step(self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate) -> list[float]:
         """The projected step of this length from z, where the rigid gradient is y, into ``new``; of the step d from z
         d'Ad and |d|^2, and y_z'(x_new - x), with y_z the gradient at z with the De Saxce term of Coulomb's law."""
-        work, square, uphill = self.cones.accelerated_step(
-            now.x, last.x, y, self._soft, beta, length, self.coulomb, new.x
-        )
-        self._operator.find_image(*new, self._awake)
-        work += self._operator.energy_of_step(new.image, now.image, last.image, beta)
+        _, operator, cones, _, soft = self._awake
+        work, square, uphill = cones.accelerated_step(now.x, last.x, y, soft, beta, length, self.coulomb, new.x)
+        operator.find_image(*new)
+        work += operator.energy_of_step(new.image, now.image, last.image, beta)
         return self.sums(work, square, uphill).tolist()
 
     def project(self, x: Array) -> Array:
@@ -168,6 +211,14 @@ def _scale(diagonal, mean, unit, r, compliance, shrink, impulse, velocity, b, so
             shrink[c, k] = 1.0 / size
             impulse[c, k], velocity[c, k] = unit / size, unit * size
             b[c, k], soft[c, k] = r[c, k] / velocity[c, k], compliance[c, k] * (shrink[c, k] * shrink[c, k])
+
+
+@loop
+def _put(rows, x, out):
+    """out[rows] = x (n, 3)."""
+    for k in range(len(rows)):
+        c = rows[k]
+        out[c, 0], out[c, 1], out[c, 2] = x[k, 0], x[k, 1], x[k, 2]
 
 
 @dataclass(frozen=True)
