@@ -371,7 +371,7 @@ def draw(sizes: list[list[Row]]) -> None:
             for label, marker, chosen in (
                 ("LIGGGHTS", "s", [row for row in rows if row["code"] == "LIGGGHTS"]),
                 ("pctt, default", "*", [row for row in rows if row["name"] == "pctt default"]),
-                ("pctt", "o", [row for row in rows if "dt" in row]),
+                ("pctt", "o", [row for row in rows if row["code"] == "pctt" and row["name"] != "pctt default"]),
             ):
                 if not chosen:
                     continue

@@ -75,6 +75,16 @@ def test_a_matrix_that_rounding_has_made_indefinite_gets_a_larger_diagonal():
     assert np.isfinite(factors.solve(np.ones(6 * len(points)))).all()
 
 
+@pytest.mark.parallel(1, 2)
+def test_where_one_rank_fails_all_know():
+    comm, (part, points) = MPI.COMM_WORLD, stiff()
+    rows, here = rows_of(part, comm)
+    row = np.repeat(np.arange(here.start, here.stop), np.diff(rows.indptr))
+    rows.blocks[(row == rows.indices) & (row == len(points) - 1)] *= -1.0  # of the last rank
+    with pytest.raises(np.linalg.LinAlgError):
+        Fronts(comm, rows, points[here])
+
+
 def test_nothing_to_factorise():
     empty = Part(np.zeros(1, int), np.zeros(0, int), np.zeros((0, 6, 6)))
     assert Fronts(SELF, empty, np.zeros((0, 3))).solve(np.zeros(0)).shape == (0,)

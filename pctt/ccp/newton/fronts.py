@@ -17,7 +17,7 @@ fewest bodies as the maximum flow.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -36,6 +36,7 @@ LEAF = 16  # bodies of a part that is not cut further; 40 take as long
 HUB = 100  # neighbours of a body that is ordered last: such bodies touch both halves of nearly every cut
 SHIFT = 1.0  # added to the scaled diagonal, in units of rounding; a tenth breaks down, ten times take more iterations
 ONE = np.float32(1.0)
+Out = TypeVar("Out")
 LEVELS = 30  # of cuts at most
 HUBS = 1 << 61  # the name of their front, behind all others
 BAND = 0.15  # part of the bodies on each side of the middle from which a separator is chosen; 0.1 and 0.2 do too
@@ -75,7 +76,8 @@ Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
 
 
 class Fronts:
-    """L L' of a matrix, scaled to the identity in its diagonal blocks and a little shifted; collective.
+    """L L' of a matrix, scaled to the identity in its diagonal blocks and a little shifted; collective. LinAlgError on
+    all ranks if such a block of any is not positive definite, MemoryError if one has no room.
 
     part : the rows of this rank's bodies
     points : (n, 1 to 3) places of these bodies, in any unit; None on all ranks where they are not known
@@ -96,7 +98,7 @@ class Fronts:
         if given is None or on_any(comm, not fits)[0]:
             given = _dissection(comm, points, row, column, count)
         self.dissection, self._comm, self._precision = given, comm, precision
-        root = np.linalg.inv(np.linalg.cholesky(blocks[row == column]))
+        root = _on_all(comm, lambda: np.linalg.inv(np.linalg.cholesky(blocks[row == column])))
         new = np.empty(count, np.int64)
         new[given.order] = np.arange(count)
         self._here, self._root = new[here], root.astype(precision)
@@ -106,10 +108,11 @@ class Fronts:
         row, column = row[below], column[below]
         scaled = (roots[row] @ blocks[below] @ roots[column].transpose(0, 2, 1)).astype(precision)
         columns = _columns(comm, given, new[row], new[column], scaled)
+        own, shared = np.flatnonzero(given.rank == comm.rank), np.flatnonzero(given.rank < 0)
         updates: Updates = {}
-        self.own = _factorised(np.flatnonzero(given.rank == comm.rank), given.first, *columns, updates)
-        updates = _of_all_ranks(comm, updates, np.dtype(precision))
-        self.shared = _factorised(np.flatnonzero(given.rank < 0), given.first, *columns, updates)
+        self.own = _on_all(comm, lambda: _factorised(own, given.first, *columns, updates))
+        every = _of_all_ranks(comm, updates, np.dtype(precision))
+        self.shared = _on_all(comm, lambda: _factorised(shared, given.first, *columns, every))
 
     def solve(self, b: Array) -> Array:
         """About A^-1 b, for this rank's b (6 n,) in double precision; collective."""
@@ -142,6 +145,18 @@ class Fronts:
         trsv = blas.get_blas_funcs("trsv", dtype=self._precision)
         for own, rest, diagonal, below in reversed(fronts):
             x[own] = trsv(diagonal, x[own] - below.T @ x[rest], lower=1, trans=1)
+
+
+def _on_all(comm: MPI.Comm, work: Callable[[], Out]) -> Out:
+    """What some work gives; if it fails on any rank, an error on all: no rank waits for one that has left."""
+    done, error = None, None
+    try:
+        done = work()
+    except (np.linalg.LinAlgError, MemoryError) as raised:
+        error = raised
+    if on_any(comm, error is not None)[0]:
+        raise error or np.linalg.LinAlgError("factors failed on another rank")
+    return done  # type: ignore[return-value]
 
 
 def _columns(
