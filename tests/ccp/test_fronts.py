@@ -145,6 +145,24 @@ def test_a_separator_takes_a_body_of_an_end_where_two_ends_touch():
     assert not ((upper[0] != upper[11]) & ~between[0] & ~between[11])
 
 
+@pytest.mark.parallel(2, 3)
+def test_a_dissection_of_weaker_ties_does_not_join_the_parts_of_two_ranks():
+    """Without every third pair the first cuts have smaller separators, which do not part the whole matrix."""
+    comm, (part, points) = MPI.COMM_WORLD, stiff()
+    row = np.repeat(np.arange(len(points)), np.diff(part.indptr))
+    kept = (row == part.indices) | ((row + part.indices) % 3 > 0)
+    less = Part(np.r_[0, np.cumsum(np.bincount(row[kept]))], part.indices[kept], part.blocks[kept])
+    (few, here), (every, _) = rows_of(less, comm), rows_of(part, comm)
+    given = Fronts(comm, few, points[here]).dissection
+    assert given.fits(row[kept], less.indices)
+    assert not given.fits(row, part.indices)
+    factors = Fronts(comm, every, points[here], np.float64, given)
+    assert factors.dissection is not given
+    x = np.random.default_rng(1).standard_normal((len(points), 6))
+    found = factors.solve((dense(part) @ x.ravel()).reshape(-1, 6)[here].ravel())
+    np.testing.assert_allclose(found, x[here].ravel(), atol=1e-8)
+
+
 @pytest.mark.parametrize("fits", [True, False])
 def test_a_dissection_serves_the_next_matrix_too(fits):
     """Unless bodies have neighbours that had none: these have no front."""
@@ -154,7 +172,7 @@ def test_a_dissection_serves_the_next_matrix_too(fits):
     less = Part(np.r_[0, np.cumsum(np.bincount(row[near]))], part.indices[near], part.blocks[near])
     first, other = (part, less) if fits else (less, part)
     given = Fronts(SELF, first, points).dissection
-    assert given.fits(np.arange(len(points)), np.diff(other.indptr) == 1) == fits
+    assert given.fits(np.repeat(np.arange(len(points)), np.diff(other.indptr)), other.indices) == fits
     factors = Fronts(SELF, other, points, np.float64, given)
     assert (factors.dissection is given) == fits
     x = np.random.default_rng(1).standard_normal(6 * len(points))

@@ -60,15 +60,29 @@ class Dissection(NamedTuple):
     first: np.ndarray
     rank: np.ndarray
 
-    def fits(self, bodies: np.ndarray, alone: np.ndarray) -> bool:
-        """Whether it can be the order of a matrix of these bodies (n,), of which some are ``alone`` (n,), without
-        neighbours: then its first bodies are."""
-        none = self.order[: self.first[0]] if len(self.first) else self.order
-        return bool(alone[np.isin(bodies, none)].all())
+    def fits(self, row: np.ndarray, column: np.ndarray) -> bool:
+        """Whether it can be the order of a matrix with entries of these bodies: its first bodies have no neighbours
+        there, and no entry joins the parts of two ranks."""
+        front, rank = (of_place[self.places] for of_place in (self.front_of(np.arange(len(self.order))), self.ranks))
+        alone = (row != column) & (np.minimum(front[row], front[column]) < 0)
+        one, other = rank[row], rank[column]
+        return not (alone | ((one >= 0) & (other >= 0) & (one != other))).any()
 
     def front_of(self, places: np.ndarray) -> np.ndarray:
-        """The fronts to which these places in the order belong."""
+        """The fronts to which these places in the order belong; -1: none."""
         return np.searchsorted(self.first, places, "right") - 1
+
+    @property
+    def places(self) -> np.ndarray:
+        """The places (n,) of the bodies in the order."""
+        places = np.empty(len(self.order), np.int64)
+        places[self.order] = np.arange(len(self.order))
+        return places
+
+    @property
+    def ranks(self) -> np.ndarray:
+        """The ranks (n,) of the places in the order, -1: all."""
+        return np.append(self.rank, -1)[self.front_of(np.arange(len(self.order)))]
 
 
 #: Of a front: what earlier ones leave in the lower triangle of some bodies, and these.
@@ -76,8 +90,8 @@ Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
 
 
 class Fronts:
-    """L L' of a matrix, scaled to the identity in its diagonal blocks and a little shifted; collective. LinAlgError on
-    all ranks if such a block of any is not positive definite, MemoryError if one has no room.
+    """L L' of a matrix, scaled to the identity in its diagonal blocks and a little shifted; collective. LinAlgError or
+    MemoryError on all ranks if such a block of any is not positive definite, or one has no room.
 
     part : the rows of this rank's bodies
     points : (n, 1 to 3) places of these bodies, in any unit; None on all ranks where they are not known
@@ -94,15 +108,12 @@ class Fronts:
         starts = offsets(comm, len(indptr) - 1)
         here, count = np.arange(starts[comm.rank], starts[comm.rank + 1]), int(starts[-1])
         row = np.repeat(here, np.diff(indptr))
-        fits = given is not None and given.fits(here, np.diff(indptr) == 1)
-        if given is None or on_any(comm, not fits)[0]:
+        if given is None or on_any(comm, not given.fits(row, column))[0]:
             given = _dissection(comm, points, row, column, count)
         self.dissection, self._comm, self._precision = given, comm, precision
         root = _on_all(comm, lambda: np.linalg.inv(np.linalg.cholesky(blocks[row == column])))
-        new = np.empty(count, np.int64)
-        new[given.order] = np.arange(count)
+        new, rank = given.places, given.ranks
         self._here, self._root = new[here], root.astype(precision)
-        rank = np.append(given.rank, -1)[given.front_of(np.arange(count))]
         self._of_all, self._kept = rank < 0, (rank == comm.rank) | ((rank < 0) & (comm.rank == 0))
         below, roots = new[row] > new[column], np.concatenate(comm.allgather(root))
         row, column = row[below], column[below]
