@@ -202,6 +202,18 @@ def on_coordinates(pc: PETSc.PC, take: Callable[[np.ndarray], None] | None) -> A
     return function
 
 
+def block_values(mat: PETSc.Mat) -> np.ndarray:
+    """The blocks (nb, b, b) of a sequential BAIJ Mat, transposed, as they are in its memory: valid while it has them."""
+    size, count = mat.getBlockSize(), len(mat.getRowIJ(compressed=True)[1])
+    values = ctypes.POINTER(ctypes.c_double)()
+    of = ctypes.c_void_p(mat.handle)
+    if count == 0 or _library.MatSeqBAIJGetArray(of, ctypes.byref(values)):
+        return np.zeros((0, size, size))
+    array = np.ctypeslib.as_array(values, (count, size, size))
+    _library.MatSeqBAIJRestoreArray(of, ctypes.byref(values))
+    return array
+
+
 _MAT = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p)
 _pointer = ctypes.pythonapi.PyCapsule_GetPointer
 _pointer.restype, _pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
