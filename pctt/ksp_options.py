@@ -1,6 +1,9 @@
-"""PETSc's options database: the options of a KSP that the project makes, and those that nothing has read.
+"""PETSc's options database: the options of the KSPs that the project makes, and those that had no effect.
 
-Defaults are in the database only while PETSc reads them, as in the options manager of petsctools.
+The project's KSPs have the prefix `OWN`, so that the options of a program that uses the library are its own. The
+program ``pctt.run`` takes the options without prefix for those of its KSPs (`taken_over`). Defaults are in the database
+only while PETSc reads them, as in the options manager of petsctools. PETSc marks an option as used when somebody looks
+it up; here it has the mark once a system was solved with it.
 """
 
 from __future__ import annotations
@@ -13,6 +16,8 @@ from petsc4py import PETSc
 
 from pctt.options import OptionError, nearest, no_such_option
 from pctt.petsc import is_used
+
+OWN = "ccp_"  #: Prefix of the project's own KSPs.
 
 #: First words of the options of PETSc's solvers; all others are read when PETSc starts or ends.
 OF_SOLVERS = (
@@ -31,37 +36,81 @@ COMMON = (
     "ksp_converged_reason", "ksp_gmres_restart", "pc_type", "pc_python_type", "pc_factor_levels",
     "pc_factor_shift_type", "pc_factor_mat_solver_type", "pc_factor_mat_ordering_type",
 )  # fmt: skip
+_NO_PREFIX = {"compare_every"}  # an option of the program that begins like those of a compared preconditioner
+
+
+# -- what stands in the database for a while -------------------------------------------------------------------------
 
 
 @contextmanager
-def entered(options: Mapping[str, str | None]) -> Iterator[None]:
-    """Put these options into the database within the block; afterwards it has the user's options again."""
+def entered(
+    options: Mapping[str, str | None], sources: Mapping[str, str] | None = None, hidden: Iterable[str] = ()
+) -> Iterator[None]:
+    """Put these options into the database within the block; afterwards it has the user's options again.
+
+    ``sources`` are the user's options from which some were made, by their names: those are used when these are. The
+    options ``hidden`` are not there within the block.
+    """
     database = PETSc.Options()
-    users = {name: value for name, value in database.getAll().items() if name in options}
+    users = {name: value for name, value in database.getAll().items() if name in options or name in hidden}
+    used = set(users) - set(unused(users))
+    for name in users:
+        database.delValue(name)
     for name, value in options.items():
         database[name] = value
     try:
         yield
     finally:
+        used |= set(options) - set(unused(options))
         for name in options:
             database.delValue(name)
         for name, value in users.items():
             database[name] = value
-        keep_from_petsc(users)
+        used |= {source for name, source in (sources or {}).items() if name in used}
+        mark_used(used & database.getAll().keys())
 
 
-def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> dict[str, str | None]:
-    """The options to enter for a KSP with this prefix.
+@contextmanager
+def unmarked() -> Iterator[set[str]]:
+    """Look-ups within the block leave no mark. After it the set has the names that were looked up."""
+    database, found = PETSc.Options(), set[str]()
+    before = unused(database.getAll())
+    try:
+        yield found
+    finally:
+        present = database.getAll()
+        found |= {name for name in before if name in present and is_used(name)}
+        for name in found:
+            database.delValue(name)
+            database[name] = present[name]
 
-    They are the defaults of options that the user has not given. Factorisations are those of MUMPS if PETSc has it: its
-    own have natural orders and one rank only. On several ranks block Jacobi replaces ILU and ICC, which PETSc has for
-    one rank only; they become the solvers of its blocks.
+
+def mark_used(names: Iterable[str]) -> None:
+    """Mark options as used; PETSc warns of the others at its end."""
+    for name in names:
+        PETSc.Options().hasName(name)
+
+
+def unused(names: Iterable[str]) -> list[str]:
+    """Those of the names in PETSc's database that have no mark."""
+    return [name for name in names if not is_used(name)]
+
+
+def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> tuple[dict[str, str | None], dict[str, str]]:
+    """The options to enter for a KSP with this prefix, and their sources (`entered`).
+
+    They are the defaults of options that the user has not given; before these, a KSP with another prefix than `OWN` has
+    the ``ksp_`` options of that one. Factorisations are those of MUMPS if PETSc has it: its own have natural orders and
+    one rank only. On several ranks block Jacobi replaces ILU and ICC, which PETSc has for one rank only; they become
+    the solvers of its blocks.
     """
-    database = PETSc.Options()
-    options: dict[str, str | None] = {  # PETSc looks them up: options of mg_levels_ are also those of mg_levels_1_
-        prefix + name: value for name, value in defaults.items() if not database.hasName(prefix + name)
-    }
-    everything = {**database.getAll(), **options}
+    given = PETSc.Options().getAll()
+    of_main = [name for name in given if name.startswith(f"{OWN}ksp_") and prefix != OWN]
+    shared = {prefix + name[len(OWN) :]: name for name in of_main}
+    ours = {prefix + name: value for name, value in defaults.items() if prefix + name not in given}
+    sources = {name: source for name, source in shared.items() if name not in given and name not in ours}
+    options: dict[str, str | None] = {**ours, **{name: given[source] for name, source in sources.items()}}
+    everything = {**given, **options}
     kind, solver = everything.get(prefix + "pc_type"), prefix + "pc_factor_mat_solver_type"
     if kind in ("cholesky", "lu") and solver not in everything and PETSc.Sys.hasExternalPackage("mumps"):
         options[solver] = "mumps"
@@ -69,21 +118,47 @@ def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> dict[str, 
         options |= {} if room in everything else {room: "100"}
     if ranks > 1 and kind in ("ilu", "icc"):
         options |= {prefix + "pc_type": "bjacobi", prefix + "sub_pc_type": kind}
-        factor = {name: value for name, value in everything.items() if name.startswith(prefix + "pc_factor_")}
-        options |= {f"{prefix}sub_{name[len(prefix):]}": value for name, value in factor.items()}
-        keep_from_petsc(factor)
-    return options
+        start = f"{prefix}pc_factor_"
+        factor = {f"{prefix}sub_{name[len(prefix):]}": name for name in everything if name.startswith(start)}
+        options |= {name: everything[source] for name, source in factor.items()}
+        sources |= factor
+    return options, sources
 
 
-def keep_from_petsc(names: Iterable[str]) -> None:
-    """Keep PETSc from warnings about these options: it warns at the end of options that nothing has read."""
-    for name in names:
-        PETSc.Options().hasName(name)
+# -- the options of the program --------------------------------------------------------------------------------------
 
 
-def unused(names: Iterable[str]) -> list[str]:
-    """Those of the names in PETSc's database that nobody has asked for."""
-    return [name for name in names if not is_used(name)]
+def solver_options(database: Mapping[str, str | None]) -> dict[str, str]:
+    """The options of solvers in the database: by their names without prefix, as they are spelt there.
+
+    OptionError for one that is there in both spellings with different values.
+    """
+    found: dict[str, str] = {}
+    for name, value in database.items():
+        short = name[len(OWN) :] if name.startswith(OWN) else name
+        if short.startswith(OF_SOLVERS) and short not in _NO_PREFIX:
+            other = found.setdefault(short, name)
+            if database[other] != value:
+                twice = " and ".join(_with_value(spelt, database) for spelt in sorted((name, other), key=len))
+                raise OptionError(f"{twice}: the same option; allowed is one value")
+    return found
+
+
+@contextmanager
+def taken_over(database: Mapping[str, str | None]) -> Iterator[None]:
+    """Within the block the options of solvers without prefix are also those of the project's KSPs. An OptionError names
+    an option as it is spelt in the database."""
+    sources = {OWN + short: spelt for short, spelt in solver_options(database).items()}
+    try:
+        with entered({name: database[spelt] for name, spelt in sources.items()}, sources):
+            yield
+    except OptionError as error:
+        starts = "|".join(OF_SOLVERS)
+
+        def spelt(match: re.Match[str]) -> str:
+            return match[0] if match[1] in database else f"-{match[1].removeprefix(OWN)}"
+
+        raise OptionError(re.sub(rf"-({OWN}(?:{starts})\w*)", spelt, str(error))) from None
 
 
 def refuse_stray(words: Sequence[str]) -> None:
@@ -100,21 +175,32 @@ def refuse_unknown(names: Iterable[str], known: Iterable[str]) -> None:
     """OptionError for a name that neither the project nor PETSc knows; the message has the nearest of our names."""
     known = set(known)
     for name in unused(names):
-        if name not in known and not name.startswith(OF_SOLVERS + _LATE):
+        if name not in known and not name.removeprefix(OWN).startswith(OF_SOLVERS) and not name.startswith(_LATE):
             raise no_such_option(name, known)
 
 
-def refuse_misspelt(names: Iterable[str]) -> None:
-    """OptionError for a name that nobody has asked for and that is nearly a common one."""
-    for name in unused(names):
-        if name not in COMMON and (meant := nearest(name, COMMON, "-", 0.85)):
-            raise OptionError(f"-{name}: PETSc has no such option for these systems{meant}")
+def refuse_misspelt(given: Mapping[str, str]) -> None:
+    """OptionError for an option of `solver_options` that no KSP has asked for and that is nearly a common one."""
+    for short, spelt in given.items():
+        if not is_used(OWN + short) and short not in COMMON and (meant := nearest(short, COMMON, "-", 0.85)):
+            raise OptionError(f"-{spelt}: PETSc has no such option for these systems{meant}")
 
 
-def remark() -> str:
-    """A line that names the options of solvers that had no effect; empty if there are none."""
-    database = PETSc.Options().getAll()
-    left = unused(name for name in database if name.startswith(OF_SOLVERS))
-    keep_from_petsc(left)
-    listed = ", ".join(f"-{name} {database[name] or ''}".strip() for name in left)
-    return f"options without effect in this run: {listed}" if listed else ""
+def remark(database: Mapping[str, str | None], systems: int) -> str:
+    """A line that names the options of a run that had no effect; empty if there are none.
+
+    ``database`` has the options of the user, ``systems`` is the number of systems that were solved by a KSP.
+    """
+    given = solver_options(database)
+    left = [spelt for short, spelt in given.items() if not {spelt, OWN + short} - set(unused({spelt, OWN + short}))]
+    if not systems:
+        left = [*(name for name in ("compare", "compare_every") if name in database), *given.values()]
+    if "options_left" not in database:  # which says the same
+        mark_used(left)
+    listed = ", ".join(_with_value(name, database) for name in left)
+    why = "" if systems else ", as no Newton system was solved by a KSP"
+    return f"options without effect in this run{why}: {listed}" if listed else ""
+
+
+def _with_value(name: str, database: Mapping[str, str | None]) -> str:
+    return f"-{name} {database[name] or ''}".rstrip()

@@ -187,6 +187,16 @@ def set_failed(pc: PETSc.PC, failed: bool) -> None:
     _library.PCSetFailedReason(ctypes.c_void_p(pc.handle), ctypes.c_int(-1 if failed else 0))  # PC_SETUP_ERROR
 
 
+@contextmanager
+def set_skip_pc(ksp: PETSc.KSP) -> Iterator[None]:
+    """Within the block ``KSPSetFromOptions`` leaves the preconditioner alone (``KSPSetSkipPCSetFromOptions``)."""
+    _library.KSPSetSkipPCSetFromOptions(ctypes.c_void_p(ksp.handle), ctypes.c_int(1))
+    try:
+        yield
+    finally:
+        _library.KSPSetSkipPCSetFromOptions(ctypes.c_void_p(ksp.handle), ctypes.c_int(0))
+
+
 def on_coordinates(pc: PETSc.PC, take: Callable[[np.ndarray], None] | None) -> Any:
     """Let ``PCSetCoordinates`` call ``take`` with the points (n, d); None: nothing is called any more.
 

@@ -30,7 +30,7 @@ except ImportError as error:
 
 from dem.together import SceneError, unlike
 from pctt.disk import FileError
-from pctt.ksp_options import entered, keep_from_petsc, refuse_stray
+from pctt.ksp_options import entered, mark_used, refuse_stray, taken_over
 from pctt.options import OptionError
 from pctt.run.help import help_text
 from pctt.run.interrupt import InterruptError, heed
@@ -52,10 +52,11 @@ def main(comm: MPI.Comm) -> None:
         return
     refuse_stray(sys.argv[1:])
     options = read_options(database, comm)
-    if options.run.problem:
-        solve_file(options, comm)
-    else:
-        with entered(DEMO_SOLVERS if options.demo else {}):
+    users = DEMO_SOLVERS if options.demo else database
+    with entered(users if options.demo else {}), taken_over(users):
+        if options.run.problem:
+            solve_file(options, comm)
+        else:
             simulate(options, comm)
 
 
@@ -100,7 +101,7 @@ def run() -> int:
         status = next(status for kind, status in STATUS.items() if isinstance(error, kind))
         if comm.rank == 0:
             print(f"pctt.run: {error}", file=sys.stderr, flush=True)
-        keep_from_petsc(PETSc.Options().getAll())
+        mark_used(PETSc.Options().getAll())
         return status
     except BaseException as error:
         if comm.size == 1 or isinstance(error, SystemExit):

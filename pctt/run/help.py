@@ -13,7 +13,8 @@ NEWTON_HELP = """\
   The KSP without prefix, e.g. -ksp_type bcgs -ksp_max_it 1000 -ksp_pc_side right -pc_type pbjacobi (the defaults of
   pdip), -ksp_rtol 1e-3 (in place of a tolerance that follows the accuracy of the step), -ksp_monitor, -ksp_view,
   -log_view. A compared preconditioner NAME has the prefix -compare_NAME_, e.g. -compare_ilu_pc_factor_levels 1. On
-  several ranks ilu and icc work within each rank."""
+  several ranks ilu and icc work within each rank. Any of them without -ccp_type takes pdip. PETSc shows these KSPs
+  with their prefix ccp_ (-ccp_ksp_type is the same option)."""
 TOPICS = {"run": "the run itself", "scene": "the scene of -scene", "ccp": "cone problems and their solvers",
           "pc": "preconditioners of this package", "ksp": "Newton systems"}  # fmt: skip
 

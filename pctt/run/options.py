@@ -18,7 +18,18 @@ from dem.together import together
 from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
-from pctt.ksp_options import OF_SOLVERS, entered, keep_from_petsc, refuse_misspelt, refuse_unknown, to_enter
+from pctt.ksp_options import (
+    OF_SOLVERS,
+    OWN,
+    entered,
+    mark_used,
+    refuse_misspelt,
+    refuse_unknown,
+    solver_options,
+    taken_over,
+    to_enter,
+    unmarked,
+)
 from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read
 from pctt.petsc import own_errors
 from pctt.run.output import refusal, refuse_unwritable
@@ -37,13 +48,13 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     demo = not database
     database = DEMO if demo else database
     run, asked = read(Run, database), read(Settings, database, "ccp_")
-    if run.compare and "ccp_type" not in database:
+    if (run.compare or solver_options(database)) and "ccp_type" not in database:
         asked = dataclasses.replace(asked, solver="pdip")  # the paper's
     solver = ccp.SOLVERS[asked.solver]
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))
     known = [d.name for group, start in option_groups(scene_class) for d in describe(group, start)]
     refuse_unknown(database, known)  # PETSc has asked for its own when it started
-    keep_from_petsc(known)
+    mark_used(known)
     _refuse_without_effect(database, run, asked)
     what = f"options of the scene {scene_class.__name__}"
     scene = together(comm, what, lambda: _read_scene(run.scene, scene_class, database), own=(OptionError,))
@@ -54,7 +65,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         _refuse_for_petsc(database, form, comm)
     _refuse_places(run, comm)
     together(comm, "option -threads", lambda: _start_threads(run.threads), own=(OptionError,))
-    return Options(run, scene, asked.of(scene, relaxed=bool(run.problem or run.compare)), demo)
+    return Options(run, scene, asked.of(scene, relaxed=bool(run.problem or run.compare)), demo, database)
 
 
 def _start_threads(count: int) -> None:
@@ -108,8 +119,11 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, asked: Setting
     solver = ccp.SOLVERS[asked.solver]
     newton = ", ".join(name for name, solver in ccp.SOLVERS.items() if solver.newton)
     of_others = tuple(other.prefix for other in ccp.SOLVERS.values() if other is not solver)
-    compared = ("compare_every", *map(prefix, labelled(run.compared())))
-    strangers = {name for name in database if name.startswith("compare_") and not name.startswith(compared)}
+    compared = tuple(map(prefix, labelled(run.compared())))
+    solvers = solver_options(database)
+    strangers = {
+        name for short, name in solvers.items() if short.startswith("compare_") and not short.startswith(compared)
+    }
     strangers |= {"compare_every"} if not run.compare else set()
     own = {field.name for field in dataclasses.fields(Run)}
 
@@ -117,8 +131,8 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, asked: Setting
     no_newton = f"-ccp_type {asked.solver} solves no Newton systems; allowed is {newton}"
     rules: list[tuple[Any, set[str], tuple[str, ...], str]] = [  # if, which options by name or by beginning, why not
         (run.problem, OF_STEPS, ("scene_",), f"-problem {run.problem} makes no steps; allowed is one of the two"),
-        (run.settle, own - OF_SETTLING | {"law"}, ("ccp_", *OF_SOLVERS), settles),
-        (not solver.newton, {"compare", "ccp_newton"}, OF_SOLVERS, no_newton),
+        (run.settle, own - OF_SETTLING | {"law", *solvers.values()}, ("ccp_",), settles),
+        (not solver.newton, {"compare", "compare_every", "ccp_newton", *solvers.values()}, (), no_newton),
         (True, strangers, (), f"its preconditioner is not compared; -compare lists {run.compare or 'none'}"),
         (True, set(), of_others, f"belongs to another -ccp_type than {asked.solver}"),
     ]
@@ -131,26 +145,29 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, asked: Setting
 def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) -> None:
     """OptionError for options of the KSP that PETSc refuses or does not know. PETSc itself would complain only at the
     first Newton system, or never."""
-    given = {name: value for name, value in database.items() if name.startswith(("ksp_", "pc_"))}
+    given = {n: spelt for n, spelt in solver_options(database).items() if n.startswith(("ksp_", "pc_"))}
+    spelt = given.get("ksp_rtol", "")
     try:
-        rtol = float(given.get("ksp_rtol") or 0.0)
+        rtol = float(database.get(spelt) or 0.0)
     except ValueError:
         rtol = 0.0  # PETSc says what is no number
     if not 0.0 <= rtol < 1.0:  # releases of PETSc differ in what numbers they refuse
-        raise OptionError(f"-ksp_rtol {database['ksp_rtol']}: allowed is a number >= 0 and below 1")
-    known = PETSc.Options().getAll()
-    absent = {name: value for name, value in given.items() if name not in known}
+        raise OptionError(f"-{spelt} {database[spelt]}: allowed is a number >= 0 and below 1")
     ksp = PETSc.KSP().create(comm)
+    ksp.setOptionsPrefix(OWN)
     try:
-        with entered({**to_enter("", DEFAULTS[form], comm.size), **absent}), own_errors():
-            ksp.setFromOptions()
-            refuse_misspelt(given)
+        with unmarked(), taken_over(database):
+            options, sources = to_enter(OWN, DEFAULTS[form], comm.size)
+            with entered(options), own_errors():
+                ksp.setFromOptions()
+                moved = set(sources.values())
+                refuse_misspelt({n: spelt for n, spelt in given.items() if OWN + n not in moved})
     except OptionError:  # also from a preconditioner of ours
         raise
     except Exception as error:  # PETSc's own, and whatever importing a -pc_python_type raises
         reason = str(error).splitlines()[-1]
         reason = reason.partition("] ")[2] or reason
-        listed = ", ".join(f"-{name} {value or ''}".strip() for name, value in given.items())
+        listed = ", ".join(f"-{spelt} {database[spelt] or ''}".strip() for spelt in given.values())
         raise OptionError(f"{listed}: PETSc refuses: {reason}") from None
     finally:
         ksp.destroy()

@@ -65,7 +65,8 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     if settings.tol > report.LOOSE:
         progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE_BECAUSE}")
     if ccp.SOLVERS[settings.solver].newton:
-        progress.say(f"Newton systems: {newton.linear.words()}")
+        some = " of conic, for steps that apgd leaves to it" if settings.solver == "auto" else ""
+        progress.say(f"Newton systems{some}: {newton.linear.words()}")
     if steps:
         progress.say(report.columns(newton.compare is not None))
 
@@ -88,7 +89,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
             progress.say(f"Newton systems: {what}")
         if compare.names:
             progress.say("\n" + report.compare_table(compare.summary()))
-    if left := remark():
+    if left := remark(options.given, newton.systems):
         progress.say(left)
     if sim.last:
         folder = output.place.folder
@@ -114,8 +115,9 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
     except FileFormatError as error:
         raise FileError(str(error)) from None
     compare = ccp.Comparison(comm, options.run.compared(), options.run.compare_every)
+    newton = ccp.newton_for(comm, options.settings.solver, options.settings.newton, compare)
     with stored.problem:
-        summary = _solve(stored, options, compare)
+        summary = _solve(stored, options, compare, newton)
     progress = report.Progress(comm, options.run.quiet)
     width = max(map(len, summary))
     for name, value in summary.items():
@@ -129,7 +131,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         progress.say("\n" + report.compare_table(compare.summary()))
     if not summary["converged"]:
         progress.say(f"NOT CONVERGED: {summary['reason']}")
-    if left := remark():
+    if left := remark(options.given, newton.systems):
         progress.say(left)
     place = Place(Path(options.run.output), comm, overwrite=options.run.overwrite)
     try:
@@ -141,11 +143,10 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         place.leave()
 
 
-def _solve(stored: Stored, options: Options, compare: ccp.Comparison) -> dict[str, Any]:
+def _solve(stored: Stored, options: Options, compare: ccp.Comparison, newton: ccp.Newton) -> dict[str, Any]:
     """The figures of solving a stored problem as the options say."""
     problem, guess, comm = stored.problem, stored.guess, stored.problem.comm
     settings = options.settings
-    newton = ccp.newton_for(comm, settings.solver, settings.newton, compare)
     try:
         with log.phase("solve"):
             result = ccp.solve(

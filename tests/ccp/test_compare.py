@@ -92,10 +92,10 @@ def test_what_fails_is_recorded_as_failed(failing):
 
 def test_the_first_that_converged_is_used(database):
     """In the order of the names, whatever the residuals; and not one that gave up at a smaller residual."""
-    database["compare_sor_ksp_rtol"] = 1e-12
-    database["compare_jacobi_ksp_max_it"] = 1
-    database["compare_icc_ksp_rtol"] = 1e-16
-    database["compare_icc_ksp_max_it"] = 30
+    database["ccp_compare_sor_ksp_rtol"] = 1e-12
+    database["ccp_compare_jacobi_ksp_max_it"] = 1
+    database["ccp_compare_icc_ksp_rtol"] = 1e-16
+    database["ccp_compare_icc_ksp_max_it"] = 30
     dense, S, b, x = system()
 
     def used(*names: str) -> str:
@@ -116,8 +116,8 @@ def test_the_first_that_converged_is_used(database):
 
 
 def test_where_none_converged_the_best_is_used_and_the_step_is_saved(database):
-    database["ksp_max_it"] = 3
-    database["compare_jacobi_ksp_max_it"] = 1
+    database["ccp_ksp_max_it"] = 3
+    database["ccp_compare_jacobi_ksp_max_it"] = 1
     dense, S, b, x = system()
     comparison = Comparison(SELF, ["jacobi", "python", "icc", "none"])
     done = comparison.run(S, b, x, 1e-12)
@@ -185,8 +185,8 @@ def test_bad_labels_are_refused(entries, words):
 
 
 def test_a_type_stands_in_the_table_several_times_with_options_of_its_own(database):
-    database["compare_ten_pc_tt_rank"] = "10"
-    database["compare_f-2_pc_factor_levels"] = "2"
+    database["ccp_compare_ten_pc_tt_rank"] = "10"
+    database["ccp_compare_f-2_pc_factor_levels"] = "2"
     entries = ["one:tt", "ten:tt", "ilu", "f-2:ilu"]
     comparison = Comparison(SELF, entries)
     _, S, b, x = system()
@@ -213,14 +213,14 @@ def test_own_options_act_on_one_and_those_without_prefix_on_all(database):
         return [solves[0] for solves in compared(names, rtol=rtol).solves.values()]
 
     plain = first(["ilu", "icc"])
-    database["compare_ilu_pc_factor_levels"] = 1
+    database["ccp_compare_ilu_pc_factor_levels"] = 1
     filled = first(["ilu", "icc"])
     assert filled[0].iterations < plain[0].iterations
     assert filled[1].iterations == plain[1].iterations
-    database["ksp_type"] = "gmres"
-    database["ksp_rtol"] = 1e-10
+    database["ccp_ksp_type"] = "gmres"
+    database["ccp_ksp_rtol"] = 1e-10
     assert all(done.converged and done.true_residual < 2e-10 for done in first(["jacobi", "icc"], 1e-2))
-    database["ksp_max_it"] = 4
+    database["ccp_ksp_max_it"] = 4
     assert [(done.iterations, done.converged) for done in first(["none", "jacobi"])] == [(4, False)] * 2
 
 

@@ -114,11 +114,11 @@ def solved(newton: Newton, rhs: np.ndarray, rtol: float) -> np.ndarray:
     return newton.solve(rhs, rtol * np.linalg.norm(rhs) / np.sqrt(newton.problem.mean_diagonal))[0]
 
 
-@pytest.mark.parametrize("better", ["", "fallback_"])
+@pytest.mark.parametrize("better", ["ccp_", "ccp_fallback_"])
 def test_where_both_fail_the_step_is_the_better_one(better, database):
     """By the true residual; zero where neither is any good."""
     rhs = np.random.default_rng(1).normal(size=(40, 3))
-    for prefix in ("", "fallback_"):
+    for prefix in ("ccp_", "ccp_fallback_"):
         database[prefix + "ksp_type"] = "cg"
         database[prefix + "pc_type"] = "jacobi"
         database[prefix + "ksp_max_it"] = 8 if prefix == better else 1
@@ -132,7 +132,7 @@ def test_where_both_fail_the_step_is_the_better_one(better, database):
     x = solved(newton, rhs, 1e-12)
     assert np.linalg.norm(S @ x.ravel() - rhs.ravel()) / np.linalg.norm(rhs) == pytest.approx(best, rel=1e-6)
     newton.destroy()
-    for prefix in ("", "fallback_"):
+    for prefix in ("ccp_", "ccp_fallback_"):
         database[prefix + "pc_type"] = "python"
     newton = newton_of()
     assert np.array_equal(solved(newton, rhs, 1e-8), np.zeros((40, 3)))
@@ -141,7 +141,7 @@ def test_where_both_fail_the_step_is_the_better_one(better, database):
 
 def test_without_memory_a_failing_ksp_has_no_fallback(database, monkeypatch):
     monkeypatch.setattr(memory, "available", lambda comm: 1e3)
-    database["pc_type"] = "python"
+    database["ccp_pc_type"] = "python"
     newton = newton_of()
     assert np.array_equal(solved(newton, np.ones((40, 3)), 1e-8), np.zeros((40, 3)))
     assert newton.linear.fallbacks == 1

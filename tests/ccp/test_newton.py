@@ -151,7 +151,7 @@ def test_a_solve_begins_from_the_best_combination_of_earlier_solutions(form):
 
 def test_a_tolerance_of_the_user_is_kept_where_earlier_solutions_leave_less_than_is_wanted(database):
     """The barrier changes a little; then the earlier solution is good enough for the method, but not for the user."""
-    database["ksp_rtol"] = 1e-10
+    database["ccp_ksp_rtol"] = 1e-10
     known, graph = heap(3)
     problem = ccp.ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF))
     newton = ccp.Newton(SELF, "contact")

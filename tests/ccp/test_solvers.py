@@ -176,7 +176,7 @@ def test_sliding_without_friction_does_not_disturb_the_other_contacts(sliding):
 @pytest.mark.parametrize("seed", [0, 10, 20])
 def test_bodies_of_very_different_mass(solver, seed, database):
     """A mass ratio of 1e4, with Newton systems solved to less than the outer tolerance."""
-    database["ksp_rtol"] = 1e-6
+    database["ccp_ksp_rtol"] = 1e-6
     known, graph = heap(seed, mass_ratio=1e4)
     problem = from_graph(known, graph)
     tol = tolerance(solver, 1e-5)
@@ -237,9 +237,9 @@ def test_giving_up_is_said_and_leaves_an_impulse_in_the_cones(solver, max_it):
 @pytest.mark.parametrize(
     "options",
     [
-        {"ksp_max_it": 1},
-        {"pc_type": "python"},  # without a class: its set-up fails
-        {"ksp_type": "preonly", "pc_type": "jacobi"},  # claims to have converged
+        {"ccp_ksp_max_it": 1},
+        {"ccp_pc_type": "python"},  # without a class: its set-up fails
+        {"ccp_ksp_type": "preonly", "ccp_pc_type": "jacobi"},  # claims to have converged
     ],
     ids=str,
 )

@@ -230,7 +230,7 @@ def test_two_simulations_by_turns_do_not_disturb_each_other():
 @pytest.mark.parametrize("solver", ["apgd", "pdip", "conic"])
 def test_the_options_of_petsc_stay_as_they_are(solver, tmp_path):
     options = PETSc.Options()
-    options["ksp_max_it"] = "500"  # the user's own
+    options["ccp_ksp_max_it"] = "500"  # the user's own
     before = options.getAll()
     try:
         with pctt.Simulation(Mixer(n=1, margin=0.7), solver=solver, comm=SELF) as sim:
@@ -239,7 +239,7 @@ def test_the_options_of_petsc_stay_as_they_are(solver, tmp_path):
             assert options.getAll() == before
         assert options.getAll() == before
     finally:
-        options.delValue("ksp_max_it")
+        options.delValue("ccp_ksp_max_it")
 
 
 PLAIN = """

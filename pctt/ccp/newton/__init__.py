@@ -28,10 +28,11 @@ from pctt.ccp.newton.few import Order, ordered
 from pctt.ccp.newton.forms import BodyForm, ContactForm, FewForm, NewtonForm
 from pctt.ccp.newton.linear import LinearSolver, Settings
 from pctt.ccp.problem import ConeProblem
+from pctt.ksp_options import OWN
 from pctt.log import phase
 
 FORMS: dict[str, Callable[[ConeProblem], NewtonForm]] = {"contact": ContactForm, "body": BodyForm}
-_ASKED = {"pc_type", "ksp_type"}  # options that say how a system is to be solved
+_ASKED = {OWN + "pc_type", OWN + "ksp_type"}  # options that say how a system is to be solved
 DEFAULTS = {
     "contact": {"ksp_type": "bcgs", "pc_type": "pbjacobi"},
     "body": {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "pc_type": "pbjacobi"},
@@ -50,12 +51,14 @@ class Newton:
     ----------
     system : the present problem's, not there before the first
     linear : what solves it
+    systems : the number of systems that a KSP was to solve so far
     """
 
     system: NewtonForm
 
     def __init__(self, comm: MPI.Comm, form: str = "contact", compare: Comparison | None = None):
         self.comm, self.form, self.compare = comm, form, compare
+        self.systems = 0
         self._structure: tuple | None = None  # of the system's problem
         self._instead = False  # of the bodies' form, which the present problem has not
         self._linear: LinearSolver | None = None
@@ -74,7 +77,8 @@ class Newton:
         structure, last = problem.structure(), self._structure or ()
         same = len(structure) == len(last) and all(map(np.array_equal, structure, last))
         self.linear.begin()
-        self._rtol_is_given = PETSc.Options().hasName("ksp_rtol")  # then the linear solver takes it whatever is wanted
+        # then the linear solver takes it whatever is wanted
+        self._rtol_is_given = OWN + "ksp_rtol" in PETSc.Options().getAll()
         if problem.comm.allreduce(same, op=MPI.LAND):
             self.system.load(self.problem)
         else:
@@ -154,6 +158,7 @@ class Newton:
             if self._rtol_is_given:
                 wanted = min(wanted, 0.5 * norm)
             if wanted < norm < np.inf:  # the caller finds no step in a direction that is no number
+                self.systems += 1
                 self.linear.solve(self._b, self._x, max(wanted / norm, 1e-14))
                 x += self._x.array
             return self.system.impulses(x, q, uncoupled), x

@@ -14,6 +14,7 @@ from petsc4py import PETSc
 from pctt import log
 from pctt.blocks import shell_of
 from pctt.ccp.newton.krylov import Krylov, Solve, Source
+from pctt.ksp_options import OWN
 from pctt.options import OptionError
 
 # names beside PETSc's own PC types: options that make them
@@ -29,7 +30,7 @@ class Comparison:
     """Solves every ``every``-th Newton system by each of ``entries`` (``-compare``, ``-compare_every``), of the form
     TYPE or LABEL:TYPE (`labelled`).
 
-    A type is a PETSc PC type or one of NAMED. Its KSP has the prefix ``compare_<label>_`` for further options.
+    A type is a PETSc PC type or one of NAMED. Its KSP has the prefix ``ccp_compare_<label>_`` for further options.
     Raises OptionError for a type that PETSc does not know.
 
     Attributes
@@ -120,7 +121,7 @@ class Comparison:
     def _solver(self, name: str) -> Krylov:
         if name not in self._krylov:
             kind = self.kinds[name]
-            self._krylov[name] = Krylov(self.comm, prefix(name), NAMED.get(kind, {"pc_type": kind}))
+            self._krylov[name] = Krylov(self.comm, OWN + prefix(name), NAMED.get(kind, {"pc_type": kind}))
         return self._krylov[name]
 
     def forget(self) -> None:
@@ -135,7 +136,7 @@ class Comparison:
 
 
 def prefix(label: str) -> str:
-    """The prefix of the options of a compared preconditioner."""
+    """What the options of a compared preconditioner begin with, after `OWN`."""
     return f"compare_{label}_"
 
 

@@ -6,19 +6,17 @@ import re
 import sys
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Union
+from typing import Protocol, Union, runtime_checkable
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.blocks import block_diagonal, fresh_copy, shell_of
-from pctt.ksp_options import entered, to_enter
-from pctt.petsc import own_errors
-
-if TYPE_CHECKING:
-    from pctt.pc import TensorTrain
+from pctt.ksp_options import OWN, entered, mark_used, to_enter, unmarked
+from pctt.petsc import own_errors, set_skip_pc
 
 # the Mat from which a preconditioner is made, or a function that makes it, for those that read entries
 Source = Union[PETSc.Mat, Callable[[], PETSc.Mat], None]
@@ -32,10 +30,23 @@ _WITHIN_RANKS = {"bjacobi", "sor", "eisenstat"}  # of several ranks each works o
 _NAMES = {"bcgs": "BiCGStab", "cg": "CG", "gmres": "GMRES", "fgmres": "FGMRES", "minres": "MINRES"}
 # preconditioners of parts of the matrix; ours have inner ones too, but of other matrices
 _OF_PARTS = re.compile(r"(sub|mg|fieldsplit|composite|telescope)_.*pc_type")
+_VIEWER = re.compile(r"ksp_view.*|ksp_converged_rate.*")
 _REMEMBERING = {"pbjacobi", "sor"}  # the inverse diagonal blocks of the first matrix, see `pctt.blocks`
 _REASONS = {
     value: name.lower() for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)
 }
+
+
+@runtime_checkable
+class Telling(Protocol):
+    """A python preconditioner that tells of itself, as those of the project do: its name for ``-pc_python_type``, lines
+    for ``-ksp_view``, and in a few words what it really was over its solves."""
+
+    name: str
+
+    def report(self) -> list[str]: ...
+
+    def what(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -57,26 +68,30 @@ class Krylov:
 
     Without options: BiCGStab, preconditioned from the right by the inverses of the diagonal blocks, to a
     relative residual of ``rtol`` in at most 1000 iterations (the paper's cap). On several ranks ILU and ICC
-    work within each rank (block Jacobi). A prefixed KSP takes the ``-ksp_*`` options of the one without prefix, so
-    that compared preconditioners work under the same method and tolerance.
+    work within each rank (block Jacobi). A KSP with another prefix takes the ``ksp_`` options of the one with the
+    prefix ``ccp_``, so that compared preconditioners work under the same method and tolerance. Options count as used
+    once a system is solved with them.
     """
 
-    def __init__(self, comm: MPI.Comm, prefix: str = "", defaults: dict[str, str] | None = None, rtol: float = 1e-3):
+    def __init__(self, comm: MPI.Comm, prefix: str = OWN, defaults: dict[str, str] | None = None, rtol: float = 1e-3):
         self.comm, self.prefix = comm, prefix
-        given = PETSc.Options().getAll()
-        shared = {name: value for name, value in given.items() if prefix and name.startswith("ksp_")}
-        types = {"ksp_type": "bcgs", "pc_type": "pbjacobi"}
-        self._options = to_enter(prefix, types | shared | (defaults or {}), comm.size)
+        self._options, self._sources = to_enter(prefix, defaults or {}, comm.size)
         self.ksp = PETSc.KSP().create(comm)
         self.ksp.setOptionsPrefix(prefix)
         self.ksp.setTolerances(rtol=rtol, atol=1e-300, max_it=1000)
-        with entered(self._options), own_errors():
+        with unmarked() as self._read, self._entered(), own_errors():
             self._configure(PETSc.Options(prefix), rtol)
         self._formed: PETSc.Mat | None = None  # what the preconditioner is made from, if not P itself
         self._version: tuple[int, int] | None = None  # of P, when it was
+        self._has_viewers = True
+
+    def _entered(self) -> AbstractContextManager[None]:
+        return entered(self._options, self._sources)
 
     def _configure(self, options: PETSc.Options, rtol: float) -> None:
-        self.method, self.kind = options.getString("ksp_type"), options.getString("pc_type")
+        self.ksp.setType("bcgs")
+        self.ksp.pc.setType("pbjacobi")
+        self.method, self.kind = options.getString("ksp_type", "bcgs"), options.getString("pc_type", "pbjacobi")
         self._pc_name = options.getString("sub_pc_type", "ilu") if self.kind == "bjacobi" else self.kind
         within = {value for name, value in options.getAll().items() if _OF_PARTS.fullmatch(name)}
         self._remembers = bool(_REMEMBERING & within)
@@ -112,7 +127,8 @@ class Krylov:
             self.rtol = float(rtol)
             self.ksp.setTolerances(rtol=self.rtol)
         start = _now(self.comm)
-        with entered(self._options):
+        mark_used(self._read)
+        with self._entered():
             error = on_all_ranks(self.comm, lambda: self._set_up(A, P, keep))
             setup = _now(self.comm)
             error = error or on_all_ranks(self.comm, lambda: self._iterate(b, x), patience=60.0)
@@ -123,14 +139,31 @@ class Krylov:
         reason, iterations = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
         end = _now(self.comm)
         if reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
-            self.ksp.reset()  # else MUMPS, once failed, fails for every later matrix
+            self._reset()  # else MUMPS, once failed, fails for every later matrix
         true = _true_residual(A, b, x)
         # twice: BiCGStab's recursive residual may drift a little without harm
         converged = reason > 0 and true <= 2 * self.rtol
         words = _REASONS.get(reason, str(reason))
         return Solve(converged, words, iterations, setup - start, end - setup, true, self.rtol)
 
+    def _reset(self) -> None:
+        """KSPReset, which drops the viewers of ``-ksp_view`` and the like too."""
+        self.ksp.reset()
+        self._has_viewers = False
+
+    def _read_viewers(self) -> None:
+        """Read the options of viewers alone once more: a second monitor would write beside the first, and a python
+        preconditioner would be made anew. Files are continued."""
+        self._has_viewers = True
+        own = {name: value for name, value in PETSc.Options().getAll().items() if name.startswith(self.prefix + "ksp_")}
+        viewers = {name: value for name, value in own.items() if _VIEWER.fullmatch(name[len(self.prefix) :])}
+        if viewers:
+            with entered({name: _continued(value) for name, value in viewers.items()}, hidden=own), set_skip_pc(self.ksp):
+                self.ksp.setFromOptions()
+
     def _set_up(self, A: PETSc.Mat, P: Source, keep: bool) -> None:
+        if not self._has_viewers:
+            self._read_viewers()
         self.ksp.pc.setReusePreconditioner(keep)
         if not keep:
             if P is None or (shell_of(A) and not self.needs_entries):
@@ -164,7 +197,8 @@ class Krylov:
         if to_scalar and old is not None and self.kind in _FACTORS:
             return P.convert(PETSc.Mat.Type.AIJ, old)  # in place: a factorisation knows its structure
         if self._remembers:  # parts of the matrix
-            self.ksp.reset()
+            self._reset()
+            self._read_viewers()
         if old is not None:
             old.destroy()
         if to_scalar:
@@ -178,18 +212,14 @@ class Krylov:
         return block_diagonal(P) if self.kind == "pbjacobi" else None
 
     @property
-    def own(self) -> TensorTrain | None:
-        """The preconditioner, if it is one of the project."""
+    def own(self) -> Telling | None:
+        """The preconditioner, if it is one that tells of itself."""
         pc = self.ksp.pc
-        if pc.getType() != PETSc.PC.Type.PYTHON:
-            return None
-        from pctt.pc import TensorTrain  # here, as its import would slow down every start
-
-        context = pc.getPythonContext()
-        return context if isinstance(context, TensorTrain) else None
+        context = pc.getPythonContext() if pc.getType() == PETSc.PC.Type.PYTHON else None
+        return context if isinstance(context, Telling) else None
 
     def report(self) -> list[str]:
-        """What a preconditioner of the project tells of itself and its fallbacks, as in ``-ksp_view``."""
+        """What a preconditioner that is `Telling` says of itself and its fallbacks, as in ``-ksp_view``."""
         return self.own.report() if self.own else []
 
     def what(self) -> str:
@@ -207,7 +237,7 @@ class Krylov:
 
     def forget(self) -> None:
         """Prepare for a matrix of another structure. A python preconditioner keeps the data that may serve it too."""
-        self.ksp.reset()
+        self._reset()
         self._version = None
         if self._formed is not None:
             self._formed.destroy()
@@ -216,6 +246,12 @@ class Krylov:
     def destroy(self) -> None:
         self.forget()
         self.ksp.destroy()
+
+
+def _continued(viewer: str | None) -> str | None:
+    """The same viewer TYPE:FILE:FORMAT:MODE, which appends to its file."""
+    parts = (viewer or "").split(":")
+    return ":".join([*parts, ""][:3] + ["append"]) if len(parts) in (2, 3) and parts[1] else viewer
 
 
 def _true_residual(S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:

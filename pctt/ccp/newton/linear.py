@@ -13,6 +13,7 @@ from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.forms import BodyForm, NewtonForm
 from pctt.ccp.newton.fronts import FrontPC
 from pctt.ccp.newton.krylov import Krylov, Solve, Source
+from pctt.ksp_options import OWN
 from pctt.options import number
 
 # factors of the part of a symmetric K that is worth it
@@ -164,7 +165,7 @@ class LinearSolver:
                 if self.own:
                     most = Settings.alone if name == "alone" else int(Settings.limit * self._easy)
                     options["ksp_max_it"] = str(most)
-            self._krylov[name, symmetric] = Krylov(self.comm, "fallback_" if name == "factor" else "", options)
+            self._krylov[name, symmetric] = Krylov(self.comm, OWN + "fallback_" * (name == "factor"), options)
         return self._krylov[name, symmetric]
 
     def report(self) -> list[str]:
