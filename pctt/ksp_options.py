@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from petsc4py import PETSc
 
 from pctt.options import OptionError, nearest, no_such_option
-from pctt.petsc import is_used
+from pctt.petsc import is_used, options_database
 
 #: First words of the options of PETSc's solvers; all others are read when PETSc starts or ends.
 OF_SOLVERS = (
@@ -37,7 +37,7 @@ COMMON = (
 def entered(options: Mapping[str, str | None]) -> Iterator[None]:
     """Put these options into the database within the block; afterwards it has the user's options again."""
     database = PETSc.Options()
-    users = {name: value for name, value in database.getAll().items() if name in options}
+    users = {name: value for name, value in options_database().items() if name in options}
     for name, value in options.items():
         database[name] = value
     try:
@@ -61,7 +61,7 @@ def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> dict[str, 
     options: dict[str, str | None] = {  # PETSc looks them up: options of mg_levels_ are also those of mg_levels_1_
         prefix + name: value for name, value in defaults.items() if not database.hasName(prefix + name)
     }
-    everything = {**database.getAll(), **options}
+    everything = {**options_database(), **options}
     kind, solver = everything.get(prefix + "pc_type"), prefix + "pc_factor_mat_solver_type"
     if kind in ("cholesky", "lu") and solver not in everything and PETSc.Sys.hasExternalPackage("mumps"):
         options[solver] = "mumps"
@@ -113,7 +113,7 @@ def refuse_misspelt(names: Iterable[str]) -> None:
 
 def remark() -> str:
     """A line that names the options of solvers that had no effect; empty if there are none."""
-    database = PETSc.Options().getAll()
+    database = options_database()
     left = unused(name for name in database if name.startswith(OF_SOLVERS))
     keep_from_petsc(left)
     listed = ", ".join(f"-{name} {database[name] or ''}".strip() for name in left)

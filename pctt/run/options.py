@@ -20,7 +20,7 @@ from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
 from pctt.ksp_options import OF_SOLVERS, entered, keep_from_petsc, refuse_misspelt, refuse_unknown, to_enter
 from pctt.options import NOT_NEGATIVE, POSITIVE, OptionError, describe, read
-from pctt.petsc import own_errors
+from pctt.petsc import options_database, own_errors
 from pctt.run.output import refusal, refuse_unwritable
 from pctt.run.settings import DEMO, Options, Run, Settings, find_scene
 
@@ -138,7 +138,7 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) ->
         rtol = 0.0  # PETSc says what is no number
     if not 0.0 <= rtol < 1.0:  # releases of PETSc differ in what numbers they refuse
         raise OptionError(f"-ksp_rtol {database['ksp_rtol']}: allowed is a number >= 0 and below 1")
-    known = PETSc.Options().getAll()
+    known = options_database()
     absent = {name: value for name, value in given.items() if name not in known}
     ksp = PETSc.KSP().create(comm)
     try:

@@ -33,13 +33,10 @@ from dem.together import together
 from dem.world import World
 from pctt import disk
 from pctt.disk import FileError, Lock, on_first, texts, write_rows, write_text
-from pctt.folder import DERIVED, FILES, HARD, Folder, dumps, write_table
+from pctt.folder import DERIVED, FILES, HARD, PLACES, TABLE, Folder, dumps, write_table
 from pctt.options import OptionError
 from pctt.petsc import warn
 from pctt.run.settings import Run
-
-#: What no step changes, but in a world with sources or outlets, whose frames have it too, and the ids.
-TABLE = ("shape", "size", "mass", "material")
 
 
 def refusal(folder: Path, restart: str, overwrite: bool) -> str:
@@ -193,7 +190,7 @@ class Writer:
             return
         if self._recorded == self._start:
             self.place.make("frames")
-            rows = _by_id(world, TABLE)
+            rows = _by_id(world, TABLE[1:])
             large = np.bytes_(json.dumps(described_bodies(world)))
             shared = {"materials": texts(world.materials), "large": large}
             for name, shapes in described_forms(world).items():
@@ -202,7 +199,7 @@ class Writer:
             write_rows(frames / "bodies.h5", self.comm, rows, shared, {})
         near = contacts.near.bodies
         rows = {
-            **_by_id(world, ("position", "quaternion", "velocity", *(("id", *TABLE) if world.tallies else ()))),
+            **_by_id(world, (*PLACES, *(TABLE if world.tallies else ()))),
             "contact/key": contacts.key,
             "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
             "contact/point": wrapped(contacts.point, world.period, world.shear),

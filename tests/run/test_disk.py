@@ -24,7 +24,8 @@ def test_parts_of_a_file_have_its_checksum_together(monkeypatch, tmp_path, chunk
     parts = sum(disk.summed(data[a:b], a) for a, b in zip(cuts, cuts[1:]))
     assert int(parts[0]) == words(data.tobytes())
     (tmp_path / "file").write_bytes(data.tobytes())
-    assert disk.checksum(tmp_path / "file", 203, MPI.COMM_SELF) == words(data.tobytes())
+    with open(tmp_path / "file", "rb") as file:
+        assert disk.checksum(file, 203, MPI.COMM_SELF) == words(data.tobytes())
 
 
 @pytest.mark.parallel(1, 3)

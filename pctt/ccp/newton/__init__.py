@@ -29,6 +29,7 @@ from pctt.ccp.newton.forms import BodyForm, ContactForm, FewForm, NewtonForm
 from pctt.ccp.newton.linear import LinearSolver, Settings
 from pctt.ccp.problem import ConeProblem
 from pctt.log import phase
+from pctt.petsc import options_database
 
 FORMS: dict[str, Callable[[ConeProblem], NewtonForm]] = {"contact": ContactForm, "body": BodyForm}
 _ASKED = {"pc_type", "ksp_type"}  # options that say how a system is to be solved
@@ -115,7 +116,7 @@ class Newton:
     @property
     def _own(self) -> bool:
         """Whether the linear solver is the project's own choice."""
-        return self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
+        return self.compare is None and not _ASKED & options_database().keys()
 
     def update(self, barrier: Array | None, inverse: Array | None = None, symmetric: bool = True) -> None:
         """Set the barrier blocks B (nc, 3, 3). A caller that has (B + C)^-1 more accurately than by inversion passes it

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 
 from pctt.blocks import block_diagonal, fresh_copy, shell_of
 from pctt.ksp_options import entered, to_enter
-from pctt.petsc import own_errors
+from pctt.petsc import options_database, own_errors
 
 if TYPE_CHECKING:
     from pctt.pc import TensorTrain
@@ -63,7 +63,7 @@ class Krylov:
 
     def __init__(self, comm: MPI.Comm, prefix: str = "", defaults: dict[str, str] | None = None, rtol: float = 1e-3):
         self.comm, self.prefix = comm, prefix
-        given = PETSc.Options().getAll()
+        given = options_database()
         shared = {name: value for name, value in given.items() if prefix and name.startswith("ksp_")}
         types = {"ksp_type": "bcgs", "pc_type": "pbjacobi"}
         self._options = to_enter(prefix, types | shared | (defaults or {}), comm.size)
@@ -78,9 +78,9 @@ class Krylov:
     def _configure(self, options: PETSc.Options, rtol: float) -> None:
         self.method, self.kind = options.getString("ksp_type"), options.getString("pc_type")
         self._pc_name = options.getString("sub_pc_type", "ilu") if self.kind == "bjacobi" else self.kind
-        within = {value for name, value in options.getAll().items() if _OF_PARTS.fullmatch(name)}
+        within = {value for name, value in options_database(self.prefix).items() if _OF_PARTS.fullmatch(name)}
         self._remembers = bool(_REMEMBERING & within)
-        shifted = any(name.endswith("pc_factor_shift_type") for name in options.getAll())
+        shifted = any(name.endswith("pc_factor_shift_type") for name in options_database(self.prefix))
         # block Gauss-Seidel over several ranks crashes in PETSc 3.18
         in_blocks = self._pc_name in _IN_BLOCKS or (self.kind == "sor" and self.comm.size == 1)
         self._scalar = not in_blocks or shifted or self._remembers
