@@ -372,17 +372,23 @@ def refuse_links(file: h5py.File) -> None:
     """ValueError for a file that takes data from others, which it names: by external or soft links, external storage or
     virtual data sets. Nobody who reads a file of strangers is to read his own files by it."""
 
-    def look(name: bytes, link: Any) -> None:
+    def look(name: bytes, link: Any) -> str | None:
+        """What is wrong, which ends the visit; an error would be lost in HDF5."""
         text = name.decode(errors="replace")
         if link.type != h5py.h5l.TYPE_HARD:
-            raise ValueError(f"{text} is a link; allowed are data of the file itself")
-        found = h5py.h5o.open(file.id, name)
+            return f"{text} is a link"
+        try:
+            found = h5py.h5o.open(file.id, name)
+        except (KeyError, OSError, RuntimeError, ValueError):
+            return f"{text} is damaged"
         if isinstance(found, h5py.h5d.DatasetID):
             plan = found.get_create_plist()
             if plan.get_external_count() or plan.get_layout() == h5py.h5d.VIRTUAL:
-                raise ValueError(f"{text} has its numbers in other files; allowed are data of the file itself")
+                return f"{text} has its numbers in other files"
+        return None
 
-    file.id.links.visit(look, info=True)
+    if wrong := file.id.links.visit(look, info=True):
+        raise ValueError(f"{wrong}; allowed are data of the file itself")
 
 
 def same_rows(file: h5py.Group, names: Iterable[str], count: int | None = None) -> int:

@@ -74,7 +74,7 @@ def _refuse_unreadable() -> None:
         if word != _text(word):
             raise OptionError(f"{_text(word)}: has bytes that are no text; allowed are words in UTF-8")
     if "'" in (given := os.environ.get("PETSC_OPTIONS", "")):  # PETSc would part the value at its blanks
-        raise OptionError(f"PETSC_OPTIONS {given}: has a single quote; allowed are double ones about values with blanks")
+        raise OptionError(f"PETSC_OPTIONS {given}: has a single quote; allowed are double ones about blanks")
 
 
 def answer(text: str) -> None:

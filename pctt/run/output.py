@@ -1,7 +1,7 @@
 """Writing the folder of a run, whose layout `pctt.folder` has: the place of the files, and what each step adds.
 
-A line is added to steps.jsonl with one write; every other file is written under a temporary name and renamed. So a
-killed run leaves whole files, and what is written per step does not grow with the number of steps.
+A line is added to steps.jsonl with one write; every other file is written as `pctt.disk.whole` does it. So a killed run
+leaves whole files, and what is written per step does not grow with the number of steps.
 """
 
 from __future__ import annotations
