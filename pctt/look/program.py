@@ -53,7 +53,8 @@ def parser(program: str, text: str, folder: str = "", steps: bool = True) -> arg
     )
     line.add_argument("-help", "--help", "-h", action="help", help="print this")
     line.add_argument("folder", type=Path, help="output folder of a run (-output of python -m pctt.run)")
-    line.add_argument("-output", type=checked(str, FOLDER), metavar="DIR", help=f"folder to write to; without: {folder}/ in the folder")
+    target = f"folder to write to; without: {folder}/ in the folder"
+    line.add_argument("-output", type=checked(str, FOLDER), metavar="DIR", help=target)
     if steps:
         line.add_argument("-first", type=int, default=0, metavar="STEP", help="first step")
         line.add_argument("-last", type=int, default=math.inf, metavar="STEP", help="last step")

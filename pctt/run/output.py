@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ def refusal(folder: Path, restart: str, overwrite: bool) -> str:
     there = _held(folder)
     if not there or overwrite or _goes_on(folder, restart):
         return ""
-    goes_on = f", or -restart {folder / 'checkpoint.h5'} to go on with it" * ("checkpoint.h5" in there)
+    goes_on = f", or -restart {quote(str(folder / 'checkpoint.h5'))} to go on with it" * ("checkpoint.h5" in there)
     allowed = f"another folder, -overwrite to replace that run{goes_on}"
     return f"-output {folder}: holds a run ({', '.join(there)}); allowed is {allowed}"
 
