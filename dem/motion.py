@@ -13,7 +13,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import Any, ClassVar, Union
+from typing import Any, ClassVar, Union, get_args
 
 import numpy as np
 
@@ -308,6 +308,8 @@ class Path:
 #: Motions that do not answer to forces.
 Prescribed = Union[Fixed, Rotation, Oscillation, Glide, Path]
 Motion = Union[Dynamic, Prescribed]
+#: The motions of this module by name.
+KINDS = {kind.__name__: kind for kind in (Dynamic, Guided, Hinged, Held, *get_args(Prescribed))}
 Pose = tuple[Floats, Floats]  #: position (3,) [m] and quaternion (4,)
 
 

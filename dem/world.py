@@ -255,11 +255,8 @@ def set_motion(world: World, name: str, motion: Motion | None = None, **values: 
     motion = changed(body.motion, world.time, **values) if motion is None else motion
     pose = body.position, body.quaternion
     motions.refuse_ignored(motion)
-    if isinstance(body.motion, Dynamic) or isinstance(motion, Dynamic):
-        if type(motion) is not type(body.motion) or not np.allclose(_ways(motion), _ways(body.motion), atol=1e-12):
-            kind = f"{type(body.motion).__name__} with another drive" if isinstance(body.motion, Dynamic) else "a path"
-            raise ValueError(f"body {name!r} cannot change its motion to {motion!r}: allowed is {kind}")
-    else:
+    _refuse_other_ways(body, motion)
+    if not isinstance(motion, Dynamic):
         pose = _leading_to(motion, world.time, world.large.position[row], world.large.quaternion[row])
     world.replace_large(dataclasses.replace(body, motion=motion, position=pose[0], quaternion=pose[1]))
 
@@ -271,6 +268,15 @@ def set_surface(world: World, name: str, velocity: SurfaceVelocity | None) -> No
         raise ValueError(f"surface velocity of {name!r} can be set to a vector within a run; a function is the scene's")
     body = world.large_bodies[world.large_row(name)]
     world.replace_large(dataclasses.replace(body, surface=checked_surface(name, velocity)))
+
+
+def _refuse_other_ways(body: LargeBody, motion: Motion) -> None:
+    """ValueError for a motion by which forces would move a body in other ways than by its own, or would begin to."""
+    if not (isinstance(body.motion, Dynamic) or isinstance(motion, Dynamic)):
+        return
+    if type(motion) is not type(body.motion) or not np.allclose(_ways(motion), _ways(body.motion), atol=1e-12):
+        kind = f"{type(body.motion).__name__} with another drive" if isinstance(body.motion, Dynamic) else "a path"
+        raise ValueError(f"body {body.name!r} cannot change its motion to {motion!r}: allowed is {kind}")
 
 
 def _ways(motion: Any) -> Floats:
@@ -398,16 +404,24 @@ def changed_motions(world: World) -> str:
 
 
 def restore_motions(world: World, text: str) -> None:
-    """Give the bodies of a world, made from its scene, the motions of `changed_motions`. ValueError if that fails."""
+    """Give the bodies of a world, made from its scene, the motions of `changed_motions`. ValueError for what is none: a
+    motion is one of `dem.motion` or that of the scene, with parameters that it has, by which the body can move, and the
+    pose is one."""
     for name, entry in json.loads(text).items():
         body = world.large_bodies[world.large_row(name)]
         own = type(body.motion)
-        kind = own if own.__name__ == entry["motion"] else getattr(motions, entry["motion"], None)
+        kind = own if own.__name__ == entry["motion"] else motions.KINDS.get(entry["motion"])
         if kind is None:
             raise ValueError(f"body {name!r}: neither the scene nor dem.motion has the motion {entry['motion']}")
-        place, turn = np.array(entry["position"]), np.array(entry["quaternion"])
-        surface = entry.get("surface", body.surface)
+        if strange := sorted({*entry["values"]} - {field.name for field in dataclasses.fields(kind)}):
+            raise ValueError(f"body {name!r}: its motion {kind.__name__} has no {strange[0]}")
         motion = kind(**entry["values"])
+        _refuse_other_ways(body, motion)
+        place = checks.vector(f"position of {name!r}", entry["position"])
+        turn = checks.rows(f"quaternion of {name!r}", entry["quaternion"], 1, 4)[0]
+        if abs(np.linalg.norm(turn) - 1.0) > 1e-6:
+            raise ValueError(f"quaternion of {name!r} is {turn.tolist()}; allowed is one of unit norm")
+        surface = checked_surface(name, entry["surface"]) if "surface" in entry else body.surface
         world.replace_large(dataclasses.replace(body, motion=motion, position=place, quaternion=turn, surface=surface))
 
 

@@ -1,13 +1,17 @@
-"""Files that are whole at any moment: for a reader, after SIGKILL and on a full disk; and HDF5 files whose rows are
-spread over the ranks, with a checksum each."""
+"""Files that are whole at any moment: for a reader, with several writers, after SIGKILL and on a full disk; and HDF5
+files whose rows are spread over the ranks, with a checksum each."""
 
 from __future__ import annotations
 
 import fcntl
 import io
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+import platform
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,6 +26,10 @@ Found = TypeVar("Found")
 #: The last bytes of a file of `write_rows` are this word and its checksum. HDF5 does not see them.
 SEAL = b"pctt sum"
 CHUNK = 2**23  #: bytes of which a checksum is found at a time
+#: How the folders of writers begin, which hold their files until these are whole; they end with .tmp.
+WRITER = ".pctt-"
+DAY = 86400.0  #: [s] after which the folder of a writer that cannot be asked is taken to be left over
+TRIES = 100  #: to open a file on all ranks while others replace it
 
 
 class FileError(RuntimeError):
@@ -42,19 +50,58 @@ def whole(path: Path) -> Iterator[Path]:
     """A temporary name for a file. When the block ends, the file is flushed to the disk and replaces ``path``.
 
     FileError if the block or the disk raises OSError, or if ``path`` is a device, a pipe or a folder: no file may take
-    its place. After an error of any kind the old file is as it was, and the temporary file is removed.
+    its place. After an error of any kind the old file is as it was, and the temporary file is removed. The name is this
+    writer's alone: of several that write ``path`` at a time, the last one to end replaces the files of the others.
     """
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with told(path):
-            if path.exists() and not path.is_file():
-                raise OSError("it is no regular file")
-            yield temporary
+    with told(path):
+        if path.exists() and not path.is_file():
+            raise OSError("it is no regular file")
+        with _own_folder(path.parent) as own:
+            yield (temporary := own / "file")
             flush(temporary)
             os.replace(temporary, path)
+
+
+@contextmanager
+def _own_folder(folder: Path) -> Iterator[Path]:
+    """A new hidden folder in a folder, for one writer, who has its lock; removed at the end.
+
+    A folder, as HDF5 has a lock of its own on a file. What killed writers have left is removed before."""
+    _sweep(folder)
+    while True:
+        own = Path(tempfile.mkdtemp(".tmp", f"{WRITER}{platform.node()}-", folder))
+        lock = Lock(own)
+        if lock.take() and own.is_dir():
+            break
+        lock.release()  # another process has swept it away before it was locked
+    try:
+        yield own
     finally:
-        with suppress(OSError):
-            temporary.unlink()
+        shutil.rmtree(own, ignore_errors=True)
+        lock.release()
+
+
+_swept: set[Path] = set()
+
+
+def _sweep(folder: Path) -> None:
+    """Remove the folders of killed writers; once in each process, as many files may be there."""
+    if folder.resolve() in _swept:
+        return
+    for own in folder.glob(f"{WRITER}*.tmp"):
+        lock, near = Lock(own), own.name.startswith(f"{WRITER}{platform.node()}-")
+        if lock.take() and (near and lock.works or _age(own) > DAY):  # some file systems have locks for one machine
+            shutil.rmtree(own, ignore_errors=True)
+        lock.release()
+    _swept.add(folder.resolve())
+
+
+def _age(folder: Path) -> float:
+    """Time since a folder or a file in it was changed [s]; 0 if it is removed meanwhile."""
+    try:
+        return time.time() - max(path.stat().st_mtime for path in (folder, *folder.iterdir()))
+    except OSError:
+        return 0.0
 
 
 def write_text(path: Path, text: str) -> None:
@@ -96,10 +143,10 @@ def lines(path: Path) -> Iterator[str]:
 
 class Lock:
     """The lock of a folder or a file. One process has it at a time, until it releases it or ends. On a file system
-    without locks every process has it."""
+    without locks every process has it, and it does not ``works``."""
 
     def __init__(self, path: Path):
-        self._path, self._file = path, -1
+        self._path, self._file, self.works = path, -1, True
 
     def take(self) -> bool:
         """Whether this process has the lock from now on; makes the file if there is none."""
@@ -110,7 +157,7 @@ class Lock:
             self.release()
             return False
         except OSError:
-            pass
+            self.works = False
         return True
 
     def release(self) -> None:
@@ -130,7 +177,8 @@ def on_first(comm: MPI.Comm, path: Path, call: Callable[[], Found]) -> Found:
 
 
 class _Bytes(io.FileIO):
-    """A file whose ``error``, the first one, is kept from HDF5: with one that cannot be written this is lost."""
+    """A file whose ``error``, the first one, is kept from HDF5: with one that cannot be written this is lost, and what
+    cannot be read it takes for read."""
 
     error: OSError | None = None
 
@@ -151,31 +199,39 @@ class _Bytes(io.FileIO):
         return self._tried(super().truncate, size, instead=size or 0)
 
     def readinto(self, data: Any) -> int:
-        return self._tried(super().readinto, data, instead=0) or 0
+        left = memoryview(data).cast("B")
+        while left and (count := self._tried(super().readinto, left, instead=0)):
+            left = left[count:]
+        return len(data) - len(left)
 
 
 @contextmanager
 def hdf5(path: Path) -> Iterator[h5py.File]:
     """A new HDF5 file that this rank alone writes. OSError if it cannot be written, where HDF5 itself would end the
     program with a segmentation fault."""
-    with _Bytes(path, "w+") as data:
-        try:
-            with h5py.File(data, "w") as file:
-                yield file
-        except (OSError, RuntimeError) as error:  # h5py raises both
-            raise data.error or error from None
-        if data.error:
-            raise data.error
+    with _Bytes(path, "w+") as data, _as_hdf5(data, "w") as file:
+        yield file
+
+
+@contextmanager
+def _as_hdf5(data: _Bytes, mode: str) -> Iterator[h5py.File]:
+    """The HDF5 file in an open file, whose first OSError is raised."""
+    try:
+        with h5py.File(data, mode) as file:
+            yield file
+    except (OSError, RuntimeError) as error:  # h5py raises both
+        raise data.error or error from None
+    if data.error:
+        raise data.error
 
 
 # -- rows of all ranks ---------------------------------------------------------------------------------------
 
 
-def checksum(path: Path, size: int, comm: MPI.Comm) -> int:
-    """The checksum of the first ``size`` bytes of a file, of which each rank reads a part; collective."""
+def checksum(file: Any, size: int, comm: MPI.Comm) -> int:
+    """The checksum of the first ``size`` bytes of an open file, of which each rank reads a part; collective."""
     ends = [size * rank // comm.size for rank in (comm.rank, comm.rank + 1)]
-    with open(path, "rb") as file:
-        total = _of_range(file, *ends)
+    total = _together(f"{file.name}: cannot be read", comm, lambda: _of_range(file, *ends))
     comm.Allreduce(MPI.IN_PLACE, total)
     return int(total[0])
 
@@ -282,25 +338,69 @@ def _room(file: h5py.File, name: str, shape: tuple[int, ...], dtype: np.dtype) -
 def read(path: Path, comm: MPI.Comm, take: Callable[[h5py.File, bool], Found]) -> Found:
     """What ``take(file, sealed)`` takes of an HDF5 file on every rank, without calls of MPI; collective.
 
-    FileError on all ranks if a rank cannot read it, or if the file is not as it was written. A file that is not
-    ``sealed`` has no checksum, as those of earlier versions and of others."""
+    FileError on all ranks if a rank cannot read it, if the file is not as it was written, or if it leads to other
+    files. A file that is not ``sealed`` has no checksum, as those of earlier versions and of others. All is read from
+    one file, also if another one replaces it meanwhile."""
     what = f"{path}: damaged, or no such file of this program"
 
     def look() -> tuple[int, bytes]:
-        with open(path, "rb") as file:
-            size = file.seek(0, os.SEEK_END) - 16
-            file.seek(max(size, 0))
-            return size, file.read()
+        size = data.seek(0, os.SEEK_END) - 16
+        data.seek(max(size, 0))
+        return size, data.read()
 
     def call() -> Found:
-        with h5py.File(path, "r") as file:
+        with _as_hdf5(data, "r") as file:
+            refuse_links(file)
             return take(file, sealed)
 
-    size, seal = comm.bcast(_together(what, comm, look))
-    sealed = seal.startswith(SEAL)
-    if sealed and checksum(path, size, comm) != int.from_bytes(seal[8:], "little"):
-        raise FileError(f"{what} (it does not agree with its checksum)")
-    return _together(what, comm, call)
+    with ExitStack() as held:
+        for _ in range(TRIES):  # until all ranks have the same file: two differ in their checksums
+            held.close()
+            data = _together(what, comm, lambda: held.enter_context(_Bytes(path)))
+            size, seal = seen = _together(what, comm, look)
+            if not exchange.on_any(comm, seen != comm.bcast(seen))[0]:
+                break
+        else:
+            raise FileError(f"{what} (others replace it all the time)")
+        sealed = seal.startswith(SEAL)
+        if sealed and checksum(data, size, comm) != int.from_bytes(seal[8:], "little"):
+            raise FileError(f"{what} (it does not agree with its checksum)")
+        return _together(what, comm, call)
+
+
+def refuse_links(file: h5py.File) -> None:
+    """ValueError for a file that takes data from others, which it names: by external or soft links, external storage or
+    virtual data sets. Nobody who reads a file of strangers is to read his own files by it."""
+
+    def look(name: bytes, link: Any) -> str | None:
+        """What is wrong, which ends the visit; an error would be lost in HDF5."""
+        text = name.decode(errors="replace")
+        if link.type != h5py.h5l.TYPE_HARD:
+            return f"{text} is a link"
+        try:
+            found = h5py.h5o.open(file.id, name)
+        except (KeyError, OSError, RuntimeError, ValueError):
+            return f"{text} is damaged"
+        if isinstance(found, h5py.h5d.DatasetID):
+            plan = found.get_create_plist()
+            if plan.get_external_count() or plan.get_layout() == h5py.h5d.VIRTUAL:
+                return f"{text} has its numbers in other files"
+        return None
+
+    if wrong := file.id.links.visit(look, info=True):
+        raise ValueError(f"{wrong}; allowed are data of the file itself")
+
+
+def same_rows(file: h5py.Group, names: Iterable[str], count: int | None = None) -> int:
+    """The number of rows that data sets have in common, ``count`` if that is given. ValueError for one with others."""
+    like = "" if count is None else f"there are {count}"
+    for name in names:
+        shape = file[name].shape
+        if count is None and shape:
+            count, like = shape[0], f"{name} has {shape[0]}"
+        if shape[:1] != (count,):
+            raise ValueError(f"{name} has {shape[0] if shape else 'no'} rows, but {like}")
+    return count or 0
 
 
 def _together(what: str, comm: MPI.Comm, call: Callable[[], Found]) -> Found:

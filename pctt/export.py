@@ -22,7 +22,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.bodies import CLUMP, POLYHEDRON
-from pctt.disk import FileError, hdf5, whole, write_text
+from pctt.disk import FileError, hdf5, refuse_links, whole, write_text
 from pctt.folder import RUN_FILES, Folder, Frame
 from pctt.look.program import chosen, made_folder, parser, run, told_steps
 
@@ -93,8 +93,9 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
                 file.attrs.update({name: value for name, value in links.attrs.items() if name != "links"})
             for name, source in parts.items():
                 with h5py.File(source, "r") as part:
+                    refuse_links(part)
                     file.copy(part["/"], name)
-        except (OSError, RuntimeError) as error:
+        except (OSError, RuntimeError, ValueError) as error:
             raise FileError(f"{source}: cannot be copied ({error})") from None
 
 

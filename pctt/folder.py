@@ -32,8 +32,10 @@ from mpi4py import MPI
 
 from dem import bodies
 from pctt import disk
-from pctt.disk import FileError, write_text
+from pctt.disk import FileError, same_rows, write_text
 
+#: The columns of the bodies: where they are, and what they are; those of the latter but ids are in bodies.h5.
+PLACES, TABLE = ("position", "quaternion", "velocity"), ("id", "shape", "size", "mass", "material")
 HARD = "hard"  # folder of the cone problems that were not solved
 DERIVED = ("state.h5", "records.csv", "summary.json", "analysis.csv")
 #: The files of a run in its folder, and with its folders all that it leaves.
@@ -232,8 +234,9 @@ class Folder:
             raise FileError(f"{self.path}: no recorded steps; run with -output_every 1 or more")
 
         def take(file: h5py.File, sealed: bool) -> list[Any]:
+            same_rows(file, TABLE[1:])
             forms = [file[name][()] if name in file else "[]" for name in ("clumps", "polyhedra")]
-            return [*(file[name][()] for name in ("shape", "size", "mass", "material", "materials", "large")), *forms]
+            return [*(file[name][()] for name in (*TABLE[1:], "materials", "large")), *forms]
 
         found = disk.read(self.bodies_path, MPI.COMM_SELF, take)
         self.shape, self.size, self.mass, self.material = found[:4]
@@ -262,12 +265,14 @@ class Folder:
             self.require_frames()
 
         def take(file: h5py.File, sealed: bool) -> Frame:
-            contact = file["contact"]
-            rows = [contact[name][()] for name in ("body", "point", "frame", "gap", "impulse")]
+            contact, names = file["contact"], ("body", "point", "frame", "gap", "impulse")
+            same_rows(file, (f"contact/{name}" for name in (*names, "moment", "moved") if name in contact))
+            rows = [contact[name][()] for name in names]
             moment, moved = (contact[name][()] if name in contact else None for name in ("moment", "moved"))
-            places = {name: file[name][()] for name in ("position", "quaternion", "velocity")}
+            same_rows(file, (*PLACES, *(TABLE if "id" in file else ())), None if "id" in file else len(self.shape))
+            places = {name: file[name][()] for name in PLACES}
             if "id" in file:  # of a scene with sources or outlets
-                own = {name: file[name][()] for name in ("id", "shape", "size", "mass", "material")}
+                own = {name: file[name][()] for name in TABLE}
                 count = len(own["id"]) - len(self.large)
                 table = Table(**own, grains=count, clumps=self.clumps, polyhedra=self.polyhedra)
                 rows[0] = np.searchsorted(table.id, rows[0])

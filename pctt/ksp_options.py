@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from petsc4py import PETSc
 
 from pctt.options import OptionError, nearest, no_such_option
-from pctt.petsc import is_used
+from pctt.petsc import is_used, options_database
 
 OWN = "ccp_"  #: Prefix of the project's own KSPs.
 
@@ -52,7 +52,7 @@ def entered(
     options ``hidden`` are not there within the block.
     """
     database = PETSc.Options()
-    users = {name: value for name, value in database.getAll().items() if name in options or name in hidden}
+    users = {name: value for name, value in options_database().items() if name in options or name in hidden}
     used = set(users) - set(unused(users))
     for name in users:
         database.delValue(name)
@@ -67,18 +67,18 @@ def entered(
         for name, value in users.items():
             database[name] = value
         used |= {source for name, source in (sources or {}).items() if name in used}
-        mark_used(used & database.getAll().keys())
+        mark_used(used & options_database().keys())
 
 
 @contextmanager
 def unmarked() -> Iterator[set[str]]:
     """Look-ups within the block leave no mark. After it the set has the names that were looked up."""
     database, found = PETSc.Options(), set[str]()
-    before = unused(database.getAll())
+    before = unused(options_database())
     try:
         yield found
     finally:
-        present = database.getAll()
+        present = options_database()
         found |= {name for name in before if name in present and is_used(name)}
         for name in found:
             database.delValue(name)
@@ -104,7 +104,7 @@ def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> tuple[dict
     one rank only. On several ranks block Jacobi replaces ILU and ICC, which PETSc has for one rank only; they become
     the solvers of its blocks.
     """
-    given = PETSc.Options().getAll()
+    given = options_database()
     of_main = [name for name in given if name.startswith(f"{OWN}ksp_") and prefix != OWN]
     shared = {prefix + name[len(OWN) :]: name for name in of_main}
     ours = {prefix + name: value for name, value in defaults.items() if prefix + name not in given}

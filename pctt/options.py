@@ -85,7 +85,7 @@ def describe(group: type, prefix: str = "") -> list[Description]:
 def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "") -> Group:
     """A group with the values in the database; raises OptionError for a bad value.
 
-    ``database`` maps names without the dash to strings, as ``PETSc.Options().getAll()`` does.
+    ``database`` maps names without the dash to strings, as `pctt.petsc.options_database` does.
     """
     types, values = typing.get_type_hints(group), {}
     for name, f in _named(group, prefix).items():

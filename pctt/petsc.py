@@ -140,18 +140,40 @@ def is_used(name: str) -> bool:
     return flag.value != 0
 
 
+def options_database(prefix: str = "") -> dict[str, str]:
+    """The options in PETSc's database whose names begin with the prefix, by the rest of their names, with their values;
+    "" for those without one.
+
+    ``PETSc.Options().getAll()`` cuts a value at its blanks, and takes words of it for options. So PETSc lists those
+    that nobody has asked for, and each of the others is looked up. So none counts as asked for that did not before.
+    """
+    count, names, values = _INT(), ctypes.POINTER(ctypes.c_char_p)(), ctypes.POINTER(ctypes.c_char_p)()
+    left = ctypes.byref(count), ctypes.byref(names), ctypes.byref(values)
+    _library.PetscOptionsLeftGet(None, *left)
+    found = {names[k].decode(): (values[k] or b"").decode() for k in range(count.value)}
+    _library.PetscOptionsLeftRestore(None, *left)
+    found |= {name: _looked_up(name) for name in PETSc.Options().getAll() if name not in found and is_used(name)}
+    return {name[len(prefix) :]: value for name, value in sorted(found.items()) if name.startswith(prefix)}
+
+
+def _looked_up(name: str) -> str:
+    """The value of an option in PETSc's database, which counts as asked for from now on; "" if it has none."""
+    value, there = ctypes.c_char_p(), ctypes.c_int(0)
+    _library.PetscOptionsFindPair(None, None, f"-{name}".encode(), ctypes.byref(value), ctypes.byref(there))
+    return (value.value or b"").decode()
+
+
 def given_options(group: type, prefix: str) -> dict[str, str]:
     """The values that the options database has for a group of options (`pctt.options`), by their names with the prefix.
 
     OptionError for a name with this prefix that the group does not have. PETSc looks the names up, because the options
     of mg_levels_ are also those of mg_levels_1_.
     """
-    database = PETSc.Options()
     known = [line.name for line in describe(group, prefix)]
-    for name in database.getAll():
-        if name.startswith(prefix) and name not in known:
-            raise no_such_option(name, known)
-    return {name: database.getString(name) for name in known if database.hasName(name)}
+    for rest in options_database(prefix):
+        if prefix + rest not in known:
+            raise no_such_option(prefix + rest, known)
+    return {name: _looked_up(name) for name in known if PETSc.Options().hasName(name)}
 
 
 def warn(comm: MPI.Comm, words: str) -> None:

@@ -7,7 +7,29 @@ import pytest
 from petsc4py import PETSc
 
 from pctt.memory import limits
-from pctt.petsc import own_errors, remember, require_real_double
+from pctt.petsc import is_used, options_database, own_errors, remember, require_real_double
+
+
+@pytest.fixture
+def database():
+    """PETSc's database with options whose values have blanks, some of them asked for."""
+    given = {"my_path": "two  words -my_flag", "my_text": "-3 x\t-my_other", "my_long": 3000 * "x" + " y"}
+    given |= {"my_number": "-0.5", "my_empty": "", "my_last": "z -my_number 4"}
+    options = PETSc.Options()
+    for name, value in given.items():
+        options.setValue(name, value)
+    for name in ("my_text", "my_number", "my_long"):
+        options.hasName(name)
+    yield given
+    for name in given:
+        options.delValue(name)
+
+
+def test_values_of_options_with_blanks_are_whole(database):
+    found = options_database()
+    assert {name: value for name, value in found.items() if name.startswith("my_")} == database
+    assert options_database("my_") == {name[3:]: value for name, value in database.items()}
+    assert {name for name in database if is_used(name)} == {"my_text", "my_number", "my_long"}
 
 
 @pytest.mark.parametrize("scalar", [np.complex128, np.float32])

@@ -19,6 +19,7 @@ from petsc4py import PETSc
 
 from pctt.ksp_options import entered
 from pctt.mat import from_entries
+from pctt.petsc import options_database
 
 RTOL = 1e-8
 DENSE = 8192  # unknowns of the largest dense matrix that is factorised; times beyond are extrapolated
@@ -102,7 +103,7 @@ def cg(
         ksp.pc.setPythonContext(pc)
     elif pc != "none":
         ksp.pc.setPythonType("pctt.pc.TensorTrain")
-        with entered({"pc_tt_rank": "100" if pc == "tt" else "auto"} | PETSc.Options().getAll()):
+        with entered({"pc_tt_rank": "100" if pc == "tt" else "auto"} | options_database()):
             ksp.setFromOptions()
     x, b = mat.createVecs()
     b.array[:] = right_side(b.getLocalSize())

@@ -34,7 +34,7 @@ from pctt.ccp.cone import Array
 from pctt.ccp.delassus import HUB, rows_in_blocks
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.rolling import RollingProblem
-from pctt.disk import FileError, hdf5, whole
+from pctt.disk import FileError, hdf5, refuse_links, whole
 
 __all__ = ["FileFormatError", "Info", "Solution", "Stored", "load", "read", "write_global", "write_local"]
 
@@ -133,6 +133,7 @@ def _contents(path: Path) -> tuple[sp.bsr_matrix, dict[str, Any], dict[str, Any]
     if path.is_file() and not h5py.is_hdf5(path):
         raise FileFormatError("it is not HDF5; run/study convert_problems makes FCLIB files of Siconos' text files")
     with h5py.File(path, "r") as file:
+        refuse_links(file)
         form = next((form for form in ("local", "global", "global_rolling") if f"fclib_{form}" in file), None)
         if form is None:
             raise FileFormatError("it has neither fclib_local nor fclib_global nor fclib_global_rolling")

@@ -22,6 +22,7 @@ EXTRA = "the extra `pictures` has the libraries that draw: pip install 'pctt[pic
 
 ANGLE = ("a number between -90 and 90", lambda degrees: -90 < degrees < 90)
 OPACITY = ("a number from 0 to 1", lambda opacity: 0 <= opacity <= 1)
+FOLDER = ("the name of a folder", bool)
 PIXELS = ("a whole number from 32", lambda pixels: pixels >= 32)
 
 
@@ -52,7 +53,8 @@ def parser(program: str, text: str, folder: str = "", steps: bool = True) -> arg
     )
     line.add_argument("-help", "--help", "-h", action="help", help="print this")
     line.add_argument("folder", type=Path, help="output folder of a run (-output of python -m pctt.run)")
-    line.add_argument("-output", type=Path, metavar="DIR", help=f"folder to write to; without: {folder}/ in the folder")
+    target = f"folder to write to; without: {folder}/ in the folder"
+    line.add_argument("-output", type=checked(str, FOLDER), metavar="DIR", help=target)
     if steps:
         line.add_argument("-first", type=int, default=0, metavar="STEP", help="first step")
         line.add_argument("-last", type=int, default=math.inf, metavar="STEP", help="last step")
@@ -120,8 +122,9 @@ def run(main: Callable[[MPI.Comm], None], program: str) -> int:
     return 0
 
 
-def made_folder(path: Path) -> Path:
+def made_folder(path: str | Path) -> Path:
     """Make the folder if it does not exist, and return it; FileError if this is not possible."""
-    with told(path):
-        path.mkdir(parents=True, exist_ok=True)
-    return path
+    folder = Path(path)
+    with told(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -78,8 +78,13 @@ def _taken(file: h5py.File, sealed: bool) -> tuple[dict[str, Any], Train, np.nda
     values = {name: _plain(value) for name, value in file.attrs.items()}
     if values.get("format") != FORMAT or not sealed:
         raise ValueError(f"it is not marked '{FORMAT}', or has no checksum")
-    cores = [file[f"cores/{k}"][()] for k in range(len(file["cores"]))]
-    return values, Train(cores), file["rows"][()] if "rows" in file else None
+    train = Train([file[f"cores/{k}"][()] for k in range(len(file["cores"]))])
+    rows, digits = file["rows"][()] if "rows" in file else None, GridDigits(values["grid"], values["block"])
+    if not train.rows == train.columns == tuple(digits.modes):
+        raise ValueError(f"cores of modes {train.modes} are not those of the grid {values['grid']}")
+    if rows is not None and not np.array_equal(np.sort(rows), np.arange(digits.rows)):
+        raise ValueError(f"rows are not one for each point of the grid {values['grid']}")
+    return values, train, rows
 
 
 def _plain(value: Any) -> Any:

@@ -11,9 +11,16 @@ import warnings
 import petsc4py
 
 HELP, VERSION = {"-help", "--help", "-h"}, {"-version", "--version"}
+
+
+def _text(word: str) -> str:
+    """A word of the command line with a question mark for each byte that is not UTF-8, which PETSc cannot hold."""
+    return word.encode(errors="replace").decode()
+
+
 # before anything else imports PETSc; these are answered here, without PETSc's own hundred lines
 try:
-    petsc4py.init([word for word in sys.argv if word not in HELP | VERSION])
+    petsc4py.init([_text(word) for word in sys.argv if word not in HELP | VERSION])
 except RuntimeError as error:  # of PETSc, which has printed more
     code = str(error).splitlines()[0]
     where = "-options_file, PETSC_OPTIONS or .petscrc"
@@ -32,6 +39,7 @@ from dem.together import SceneError, unlike
 from pctt.disk import FileError
 from pctt.ksp_options import entered, mark_used, refuse_stray, taken_over
 from pctt.options import OptionError
+from pctt.petsc import options_database
 from pctt.run.help import help_text
 from pctt.run.interrupt import InterruptError, heed
 from pctt.run.options import read_options
@@ -40,7 +48,7 @@ from pctt.run.simulate import simulate, solve_file
 
 
 def main(comm: MPI.Comm) -> None:
-    database = PETSc.Options().getAll()
+    database = options_database()
     if HELP & set(sys.argv):
         text = help_text(database, _topic(sys.argv))
         if comm.rank == 0:
@@ -50,6 +58,7 @@ def main(comm: MPI.Comm) -> None:
         if comm.rank == 0:
             answer(versions())
         return
+    _refuse_unreadable()
     refuse_stray(sys.argv[1:])
     options = read_options(database, comm)
     users = DEMO_SOLVERS if options.demo else database
@@ -58,6 +67,15 @@ def main(comm: MPI.Comm) -> None:
             solve_file(options, comm)
         else:
             simulate(options, comm)
+
+
+def _refuse_unreadable() -> None:
+    """OptionError for what does not come to PETSc's database as it was given."""
+    for word in sys.argv[1:]:
+        if word != _text(word):
+            raise OptionError(f"{_text(word)}: has bytes that are no text; allowed are words in UTF-8")
+    if "'" in (given := os.environ.get("PETSC_OPTIONS", "")):  # PETSc would part the value at its blanks
+        raise OptionError(f"PETSC_OPTIONS {given}: has a single quote; allowed are double ones about blanks")
 
 
 def answer(text: str) -> None:
@@ -94,14 +112,14 @@ def run() -> int:
     comm = MPI.COMM_WORLD.Dup()  # a message of a user's scene meets none of ours
     heed(comm)
     try:
-        if other := unlike(comm, repr((sys.argv[1:], sorted(PETSc.Options().getAll().items())))):
+        if other := unlike(comm, repr((sys.argv[1:], sorted(options_database().items())))):
             raise OptionError(f"rank {other} has other options than rank 0; allowed are the same options on all ranks")
         main(comm)
     except tuple(STATUS) as error:
         status = next(status for kind, status in STATUS.items() if isinstance(error, kind))
         if comm.rank == 0:
             print(f"pctt.run: {error}", file=sys.stderr, flush=True)
-        mark_used(PETSc.Options().getAll())
+        mark_used(options_database())
         return status
     except BaseException as error:
         if comm.size == 1 or isinstance(error, SystemExit):

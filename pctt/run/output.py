@@ -1,7 +1,7 @@
 """Writing the folder of a run, whose layout `pctt.folder` has: the place of the files, and what each step adds.
 
-A line is added to steps.jsonl with one write; every other file is written under a temporary name and renamed. So a
-killed run leaves whole files, and what is written per step does not grow with the number of steps.
+A line is added to steps.jsonl with one write; every other file is written as `pctt.disk.whole` does it. So a killed run
+leaves whole files, and what is written per step does not grow with the number of steps.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -33,13 +34,10 @@ from dem.together import together
 from dem.world import World
 from pctt import disk
 from pctt.disk import FileError, Lock, on_first, texts, write_rows, write_text
-from pctt.folder import DERIVED, FILES, HARD, Folder, dumps, write_table
+from pctt.folder import DERIVED, FILES, HARD, PLACES, TABLE, Folder, dumps, write_table
 from pctt.options import OptionError
 from pctt.petsc import warn
 from pctt.run.settings import Run
-
-#: What no step changes, but in a world with sources or outlets, whose frames have it too, and the ids.
-TABLE = ("shape", "size", "mass", "material")
 
 
 def refusal(folder: Path, restart: str, overwrite: bool) -> str:
@@ -47,7 +45,7 @@ def refusal(folder: Path, restart: str, overwrite: bool) -> str:
     there = _held(folder)
     if not there or overwrite or _goes_on(folder, restart):
         return ""
-    goes_on = f", or -restart {folder / 'checkpoint.h5'} to go on with it" * ("checkpoint.h5" in there)
+    goes_on = f", or -restart {quote(str(folder / 'checkpoint.h5'))} to go on with it" * ("checkpoint.h5" in there)
     allowed = f"another folder, -overwrite to replace that run{goes_on}"
     return f"-output {folder}: holds a run ({', '.join(there)}); allowed is {allowed}"
 
@@ -193,7 +191,7 @@ class Writer:
             return
         if self._recorded == self._start:
             self.place.make("frames")
-            rows = _by_id(world, TABLE)
+            rows = _by_id(world, TABLE[1:])
             large = np.bytes_(json.dumps(described_bodies(world)))
             shared = {"materials": texts(world.materials), "large": large}
             for name, shapes in described_forms(world).items():
@@ -202,7 +200,7 @@ class Writer:
             write_rows(frames / "bodies.h5", self.comm, rows, shared, {})
         near = contacts.near.bodies
         rows = {
-            **_by_id(world, ("position", "quaternion", "velocity", *(("id", *TABLE) if world.tallies else ()))),
+            **_by_id(world, (*PLACES, *(TABLE if world.tallies else ()))),
             "contact/key": contacts.key,
             "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
             "contact/point": wrapped(contacts.point, world.period, world.shear),

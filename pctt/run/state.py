@@ -42,7 +42,7 @@ from dem.world import (
     restore_springs,
 )
 from pctt import ccp
-from pctt.disk import FileError, Lock, on_first, read, texts, write_rows
+from pctt.disk import FileError, Lock, on_first, read, same_rows, texts, write_rows
 from pctt.options import OptionError
 from pctt.petsc import warn
 from pctt.run import interrupt
@@ -54,6 +54,7 @@ CHANGES = {
     "motions": restore_motions, "loads": restore_loads, "springs": restore_springs, "joints": restore_joints,
     "sources": restore_sources,
 }  # fmt: skip
+CONTACTS = ("contacts/key", "contacts/impulse")  #: the data sets that have a row for each contact
 #: The third has keys of two numbers. The first one had no checksums.
 FORMAT, SECOND_FORMAT, FIRST_FORMAT = (f"pctt checkpoint {number}" for number in (3, 2, 1))
 
@@ -178,15 +179,18 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
 
     def take(file: h5py.File, sealed: bool) -> tuple[Any, ...]:
         _refuse_unmarked(file, sealed)
+        same_rows(file, (f"world/large_{name}" for name in columns))
+        count, number = same_rows(file, (f"grains/{name}" for name in columns)), same_rows(file, CONTACTS)
         replicated = {n: file[f"world/{n}"][()] for n in (*(f"large_{n}" for n in columns), "slabs", "time", "step")}
         # of springs, of sources and outlets, of a sheared cell, of its stress
         for name in {"expected", "tallies", "shear", "servo"} & set(file["world"]):
             replicated[name] = file[f"world/{name}"][()]
         changes = [file[f"world/{n}"].asstr()[0] if f"world/{n}" in file else "{}" for n in CHANGES]
-        rows, contacts = restart_rows(replicated["slabs"], comm), even_slice(len(file["contacts/key"]), comm)
+        _refuse_other_slabs(replicated["slabs"], count)
+        rows, contacts = restart_rows(replicated["slabs"], comm), even_slice(number, comm)
         local = {name: file[f"grains/{name}"][rows] for name in columns}
         old = {name: file.attrs.get(name) for name in made_with}
-        impulses = file["contacts/key"][contacts], file["contacts/impulse"][contacts]
+        impulses = tuple(file[name][contacts] for name in CONTACTS)
         return old, json.loads(file.attrs["scene"]), replicated, changes, local, impulses
 
     old, scene_of, replicated, changes, local, impulses = read(path, comm, take)
@@ -201,7 +205,7 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
         right = np.isfinite(impulse).all() and impulse.shape == (len(key), 4 * world.pairs.parts)
         right = right and len(np.unique(key)) == len(key)
         refuse(comm, "" if right else "impulses of contacts that are no numbers, or two of one contact")
-    except (KeyError, TypeError, ValueError) as error:  # another text of the scene file may build other bodies
+    except (AttributeError, KeyError, TypeError, ValueError) as error:  # of another scene file
         raise OptionError(f"-restart {path}: {error}") from None
     memory.restore(key, impulse if old["dt"] in (None, made_with["dt"]) else impulse * (made_with["dt"] / old["dt"]))
     return world, memory
@@ -221,6 +225,13 @@ def _keys_of_before(key: np.ndarray, world: World) -> Keys:
 def _refuse_unmarked(file: h5py.File, sealed: bool) -> None:
     if (file.attrs.get("format"), sealed) not in ((FORMAT, True), (SECOND_FORMAT, True), (FIRST_FORMAT, False)):
         raise ValueError(f"it is not marked '{FORMAT}', or has no checksum")
+
+
+def _refuse_other_slabs(slabs: np.ndarray, count: int) -> None:
+    """ValueError unless these are the first rows of the grains of each rank, and behind the last their ``count``."""
+    whole = slabs.dtype.kind == "i" and slabs.ndim == 1 and [*slabs[:1], *slabs[-1:]] == [0, count]
+    if not (whole and (np.diff(slabs) >= 0).all()):
+        raise ValueError(f"world/slabs is {slabs.tolist()}; allowed are numbers that rise from 0 to {count} grains")
 
 
 def _refuse_other_origin(

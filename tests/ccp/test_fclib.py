@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from problems import SELF, Known, dense_of, from_graph, from_matrix, heap, part
 
-from pctt import ccp
+from pctt import ccp, disk
 from pctt.ccp import ConeProblem, Limits, delassus, fclib
 from pctt.ccp.fclib import FileFormatError, Info, Solution
 from pctt.options import OptionError
@@ -331,6 +332,38 @@ def test_broken_files_are_refused_by_name(tmp_path, name):
         fclib.read(path, SELF)
 
 
+def outside(file: h5py.File, secret: Path, kind: str) -> None:
+    """Let the friction coefficients of a local problem come from another file, or by a link."""
+    vectors = file["fclib_local/vectors"]
+    del vectors["mu"]
+    if kind == "external link":
+        vectors["mu"] = h5py.ExternalLink(secret, "mu")
+    elif kind == "link by a group":
+        file["aside"] = h5py.ExternalLink(secret, "/")
+        vectors["mu"] = h5py.SoftLink("/aside/mu")
+    elif kind == "external storage":
+        vectors.create_dataset("mu", (12,), np.float64, external=[(str(secret), 0, 96)])
+    else:
+        layout = h5py.VirtualLayout((12,), np.float64)
+        layout[:] = h5py.VirtualSource(secret, "mu", (12,))
+        vectors.create_virtual_dataset("mu", layout)
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("kind", ["external link", "link by a group", "external storage", "virtual data set"])
+def test_a_problem_that_takes_data_from_another_file_is_refused(tmp_path, kind):
+    path, secret = tmp_path / "strange.hdf5", tmp_path / "secret.h5"
+    if MPI.COMM_WORLD.rank == 0:
+        write_local(path, heap(0, 12, 8)[0])
+        with h5py.File(secret, "w") as file:
+            file["mu"] = np.full(12, 0.3)
+        with h5py.File(path, "a") as file:
+            outside(file, secret, kind)
+    MPI.COMM_WORLD.Barrier()
+    with pytest.raises(FileFormatError, match=r"strange\.hdf5: .*(is a link|in other files); allowed are data of"):
+        fclib.read(path, MPI.COMM_WORLD)
+
+
 def test_a_mass_matrix_without_inverse_is_refused(tmp_path):
     for block_mass in (False, True):
         path, _, _ = write_global(tmp_path / "global.hdf5", block_mass=block_mass)
@@ -438,14 +471,17 @@ def test_a_global_problem_is_written_and_read_again(tmp_path, bodies_alone):
         assert file["guesses/number_of_guesses"][0] == 1
 
 
-def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path):
+def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path, monkeypatch):
+    def full(path):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(disk, "flush", full)
     problem = from_matrix(heap(0, 12, 8)[0])
     path = tmp_path / "there.h5"
     path.write_text("old")
-    (tmp_path / ".there.h5.tmp").mkdir()  # in the way
-    with pytest.raises(OSError, match=r"there\.h5: cannot write"):
+    with pytest.raises(OSError, match=r"there\.h5: cannot write \(No space left"):
         fclib.write_local(path, problem)
-    assert path.read_text() == "old"
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
 
 
 # -- crowded bodies ----------------------------------------------------------------------------------------

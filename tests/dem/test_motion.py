@@ -1,10 +1,17 @@
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from mpi4py import MPI
 
 from dem import quaternion
 from dem.motion import Fixed, Glide, Guided, Oscillation, Path, Rotation, checked_pose, mean_velocity, refuse_ignored
+from dem.scene import Scene
+from dem.shapes import Box
+from dem.start import new_world
+from dem.world import changed_motions, restore_motions
 
 PLACE, TURN = np.array([1.0, 2.0, 3.0]), quaternion.normalized(np.array([1.0, 0.5, 0.0, 0.2]))
 MOTIONS = [Fixed(), Rotation((0.1, 0.0, 1.0), (2.0, 0.0, 0.0)), Oscillation((1.0, 2.0, 0.0), 0.3, 4.0, 0.7)]
@@ -147,3 +154,62 @@ def test_a_path_from_a_file(tmp_path):
         with pytest.raises(ValueError, match=words) as error:
             Path.read(file)
         assert str(file) in str(error.value)
+
+
+# -- motions as text ----------------------------------------------------------------------------------------
+
+
+def tools():
+    scene = Scene(friction=0.3)
+    scene.add_spheres([[0, 0, 3.0]], 0.1, 1000.0)
+    scene.add_body("tool", [Box((0.1, 0.1, 0.1))], Glide((1, 0, 0)), position=(1, 2, 3))
+    scene.add_body("lid", [Box((0.1, 0.1, 0.1))], Guided((0, 0, 1)), density=1000.0, position=(4, 0, 0))
+    return new_world(scene, MPI.COMM_SELF)
+
+
+GOOD = {"motion": "Rotation", "values": {"velocity": [0, 0, 2.0], "end": float("inf")}}
+GOOD |= {"position": [1, 2, 4], "quaternion": [0.0, 1.0, 0.0, 0.0], "surface": [0.5, 0, 0]}
+
+
+def test_a_motion_from_text_is_that_of_the_body():
+    world = tools()
+    restore_motions(world, json.dumps({"tool": GOOD}))
+    (tool, lid), again = world.large_bodies, tools()
+    assert tool.motion == Rotation((0, 0, 2.0))
+    assert (tool.position.tolist(), tool.quaternion.tolist()) == ([1, 2, 4], [0, 1, 0, 0])
+    assert tool.surface == (0.5, 0.0, 0.0)
+    assert lid.motion == Guided((0, 0, 1))
+    restore_motions(again, changed_motions(world))
+    assert again.large_bodies[0].motion == tool.motion
+
+
+STRANGE = {
+    "a class that is no motion": {"motion": "FilePath", "values": {}},
+    "a function": {"motion": "checked_pose", "values": {}},
+    "a base class": {"motion": "Driven", "values": {}},
+    "a module": {"motion": "quaternion", "values": {}},
+    "no name": {"motion": ["Rotation"]},
+    "a parameter that it has not": {"values": {"velocity": [0, 0, 1], "torque": 1.0}},
+    "text for a vector": {"values": {"velocity": "fast"}},
+    "a vector of four": {"values": {"velocity": [1, 2, 3, 4]}},
+    "forces that would begin to move it": {"motion": "Dynamic", "values": {}},
+    "a guide that would begin": {"motion": "Guided", "values": {"direction": [1, 0, 0]}},
+    "no position": {"position": [1, 2]},
+    "a position that is no number": {"position": [1, 2, float("nan")]},
+    "a quaternion of norm two": {"quaternion": [2, 0, 0, 0]},
+    "a surface that is no vector": {"surface": [1]},
+}
+
+
+@pytest.mark.parametrize("what", STRANGE)
+def test_what_is_no_motion_is_refused(what):
+    world = tools()
+    with pytest.raises((TypeError, ValueError)):
+        restore_motions(world, json.dumps({"tool": {**GOOD, **STRANGE[what]}}))
+    assert world.large_bodies[0].motion == Glide((1, 0, 0))
+
+
+def test_another_guide_is_refused():
+    other = {**GOOD, "motion": "Guided", "values": {"direction": [1, 0, 0]}}
+    with pytest.raises(ValueError, match="'lid' cannot change its motion"):
+        restore_motions(tools(), json.dumps({"lid": other}))

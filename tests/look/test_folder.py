@@ -90,6 +90,7 @@ def test_a_run_without_recorded_steps_is_refused(program, show, tmp_path):
     ("program", "options", "words"),
     [
         ("plot", ("-format", "bmp"), ("-format", "png")),
+        ("export", ("-output", ""), ("-output", "the name of a folder")),
         ("export", ("-first", 9), ("-first", "1 to 4")),
         ("export", ("-every", 0), ("-every", ">= 1")),
         ("render", ("-color", "heat"), ("-color", "speed")),

@@ -73,6 +73,10 @@ def test_what_cannot_be_read_or_written_is_named(show, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
     (made / "state.h5").unlink()  # as of a run that was killed: it is made again
     show("export", "-single", tmp_path / "one.h5", "-last", 1, folder=made)
+    with h5py.File(made / "frames" / "000001.h5", "a") as file:
+        file["aside"] = h5py.ExternalLink(str(tmp_path / "one.h5"), "/")
+    said = show("export", "-single", tmp_path / "two.h5", "-last", 1, folder=made, status=2).stderr
+    assert "aside is a link; allowed are data of the file itself" in said
     assert (tmp_path / "one.h5").exists()
 
 

@@ -396,7 +396,17 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path):
     def other() -> None:
         write_rows(path, MPI.COMM_SELF, {}, {"x": 1.0}, {"/": {"format": "else"}})
 
+    def parts(change) -> None:
+        """As another program might write it, with its checksum."""
+        with h5py.File(path, "r") as file:
+            arrays = {f"cores/{k}": file[f"cores/{k}"][()] for k in range(len(file["cores"]))}
+            values = dict(file.attrs)
+        change(arrays, values)
+        write_rows(path, MPI.COMM_SELF, {}, arrays, {"/": values})
+
     ways = {
+        "are not those of the grid": [lambda: parts(lambda arrays, values: values.update(grid=(5, 7)))],
+        "one for each point of the grid": [lambda: parts(lambda arrays, values: arrays.update(rows=np.arange(29)))],
         "it does not agree with its checksum": [flip],
         "it is not marked 'pctt train 2', or has no checksum": [core, other],
         "train.h5: damaged": [lambda: path.write_bytes(whole[: len(whole) // 2]), lambda: path.write_bytes(b"")],

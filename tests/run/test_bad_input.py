@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import SETTLED, SMALL, contents, database, one_line
+from program import DROP, SETTLED, SMALL, contents, database, one_line, steps_of, summary_of
 
 from pctt.options import OptionError
 from pctt.run.options import read_options
@@ -173,6 +173,30 @@ def test_a_stray_word_is_refused(words, program, results):
     said = refused(program, results, *words.split())
     stray = words.split()[0] if words.startswith("- ") else words.split()[-1]
     assert said == f"pctt.run: {stray}: belongs to no option; a value follows its option, as in -output {stray}"
+
+
+@pytest.mark.parametrize("ranks", [1, pytest.param(3, marks=pytest.mark.mpi)])
+def test_values_with_blanks_are_taken_whole(ranks, program, tmp_path):
+    """What stands behind a blank of a value is no option."""
+    out = "my runs -overwrite -scene_n 0"
+    options = ("-scene", "my -quiet scene.py", "-steps", 1, "-quiet", "-scene_height", 0.1)
+    (tmp_path / options[1]).write_text(DROP)
+    program(*options, "-output", out, "-dump_problem", "two  words", ranks=ranks, own=True)
+    assert {path.name for path in tmp_path.iterdir()} - {"__pycache__"} == {out, "two  words", options[1]}
+    (problem,) = (tmp_path / "two  words").iterdir()
+    said = refused(program, tmp_path / out, *options, "-output", out, own=True)
+    assert f"-output {out}: holds a run" in said
+    program(*options, "-output", out, "-restart", f"{out}/checkpoint.h5", ranks=ranks, own=True)
+    assert len(steps_of(tmp_path / out)) == 2
+    program("-problem", problem, "-output", "solved -overwrite", "-quiet", ranks=ranks, own=True)
+    assert summary_of(tmp_path / "solved -overwrite")
+
+
+def test_what_petsc_cannot_hold_is_refused(program, results, monkeypatch):
+    assert refused(program, results, "-output", "") == "pctt.run: -output : allowed is the name of a folder"
+    assert "r?sultats: has bytes that are no text" in refused(program, results, "-output", "r\udce9sultats", own=True)
+    monkeypatch.setenv("PETSC_OPTIONS", "-output 'my runs'")
+    assert "PETSC_OPTIONS -output 'my runs': has a single quote" in refused(program, results, "-steps", "1")
 
 
 @pytest.mark.parallel(1, 2)

@@ -302,6 +302,34 @@ def test_a_state_that_no_run_can_have_is_refused(tmp_path, monkeypatch):
         MPI.COMM_WORLD.Barrier()
 
 
+@pytest.mark.parallel(1, 2)
+def test_columns_of_other_lengths_are_refused(tmp_path, monkeypatch):
+    """Of grains, contacts and large bodies, one row fewer or one more, or none at all."""
+    monkeypatch.chdir(tmp_path)
+    comm, scene = MPI.COMM_WORLD, Mixer(n=1, margin=0.7)
+    if comm.rank == 0:
+        with Simulation(scene, solver="apgd", comm=MPI.COMM_SELF) as sim:
+            sim.run(until=0.6)
+            sim.save("whole.h5")
+    comm.Barrier()
+    with h5py.File("whole.h5", "r") as file:
+        names = [f"{group}/{name}" for group in ("grains", "contacts") for name in file[group]]
+        names += [f"world/{name}" for name in file["world"] if name.startswith("large_")] + ["world/slabs"]
+        kept = {name: file[name][()] for name in names}
+    for turn, (name, rows) in enumerate(kept.items()):
+        change = [rows[:-1], np.concatenate([rows, rows[-1:] + (name == "world/slabs")]), rows.ravel()[0]][turn % 3]
+        if comm.rank == 0:
+            shutil.copy("whole.h5", "edited.h5")
+            with h5py.File("edited.h5", "a") as file:
+                file.attrs["format"] = "pctt checkpoint 1"
+                del file[name]
+                file[name] = change
+        comm.Barrier()
+        with pytest.raises(FileError, match=rf"edited\.h5: damaged.*({name}|{name.partition('/')[0]}/.*) (has|is)"):
+            Simulation.load("edited.h5", scene, solver="apgd")
+        comm.Barrier()
+
+
 @dataclass(frozen=True)
 class Settles(Experiment):
     dt = 0.01

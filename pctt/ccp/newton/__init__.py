@@ -30,6 +30,7 @@ from pctt.ccp.newton.linear import LinearSolver, Settings
 from pctt.ccp.problem import ConeProblem
 from pctt.ksp_options import OWN
 from pctt.log import phase
+from pctt.petsc import options_database
 
 FORMS: dict[str, Callable[[ConeProblem], NewtonForm]] = {"contact": ContactForm, "body": BodyForm}
 _ASKED = {OWN + "pc_type", OWN + "ksp_type"}  # options that say how a system is to be solved
@@ -78,7 +79,7 @@ class Newton:
         same = len(structure) == len(last) and all(map(np.array_equal, structure, last))
         self.linear.begin()
         # then the linear solver takes it whatever is wanted
-        self._rtol_is_given = OWN + "ksp_rtol" in PETSc.Options().getAll()
+        self._rtol_is_given = OWN + "ksp_rtol" in options_database()
         if problem.comm.allreduce(same, op=MPI.LAND):
             self.system.load(self.problem)
         else:
@@ -119,7 +120,7 @@ class Newton:
     @property
     def _own(self) -> bool:
         """Whether the linear solver is the project's own choice."""
-        return self.compare is None and not _ASKED & PETSc.Options().getAll().keys()
+        return self.compare is None and not _ASKED & options_database().keys()
 
     def update(self, barrier: Array | None, inverse: Array | None = None, symmetric: bool = True) -> None:
         """Set the barrier blocks B (nc, 3, 3). A caller that has (B + C)^-1 more accurately than by inversion passes it

@@ -16,7 +16,7 @@ from petsc4py import PETSc
 
 from pctt.blocks import block_diagonal, fresh_copy, shell_of
 from pctt.ksp_options import OWN, entered, mark_used, to_enter, unmarked
-from pctt.petsc import own_errors, set_skip_pc
+from pctt.petsc import options_database, own_errors, set_skip_pc
 
 # the Mat from which a preconditioner is made, or a function that makes it, for those that read entries
 Source = Union[PETSc.Mat, Callable[[], PETSc.Mat], None]
@@ -93,9 +93,9 @@ class Krylov:
         self.ksp.pc.setType("pbjacobi")
         self.method, self.kind = options.getString("ksp_type", "bcgs"), options.getString("pc_type", "pbjacobi")
         self._pc_name = options.getString("sub_pc_type", "ilu") if self.kind == "bjacobi" else self.kind
-        within = {value for name, value in options.getAll().items() if _OF_PARTS.fullmatch(name)}
+        within = {value for name, value in options_database(self.prefix).items() if _OF_PARTS.fullmatch(name)}
         self._remembers = bool(_REMEMBERING & within)
-        shifted = any(name.endswith("pc_factor_shift_type") for name in options.getAll())
+        shifted = any(name.endswith("pc_factor_shift_type") for name in options_database(self.prefix))
         # block Gauss-Seidel over several ranks crashes in PETSc 3.18
         in_blocks = self._pc_name in _IN_BLOCKS or (self.kind == "sor" and self.comm.size == 1)
         self._scalar = not in_blocks or shifted or self._remembers
@@ -155,7 +155,8 @@ class Krylov:
         """Read the options of viewers alone once more: a second monitor would write beside the first, and a python
         preconditioner would be made anew. Files are continued."""
         self._has_viewers = True
-        own = {name: value for name, value in PETSc.Options().getAll().items() if name.startswith(self.prefix + "ksp_")}
+        start = self.prefix + "ksp_"
+        own = {name: value for name, value in options_database().items() if name.startswith(start)}
         viewers = {name: value for name, value in own.items() if _VIEWER.fullmatch(name[len(self.prefix) :])}
         if viewers:
             with entered({name: _continued(value) for name, value in viewers.items()}, hidden=own), set_skip_pc(self.ksp):
