@@ -235,7 +235,7 @@ def on_coordinates(pc: PETSc.PC, take: Callable[[np.ndarray], None] | None) -> A
 
 
 def block_values(mat: PETSc.Mat) -> np.ndarray:
-    """The blocks (nb, b, b) of a sequential BAIJ Mat, transposed, as they are in its memory: valid while it has them."""
+    """The blocks (nb, b, b) of a sequential BAIJ Mat, transposed, in its own memory: valid while it has them."""
     size, count = mat.getBlockSize(), len(mat.getRowIJ(compressed=True)[1])
     values = ctypes.POINTER(ctypes.c_double)()
     of = ctypes.c_void_p(mat.handle)

@@ -7,7 +7,8 @@ keep the pattern of the matrix, break down on them or gain little. Here the matr
 first, and what is kept is chosen by size (`pctt.pc.incomplete_cholesky`).
 
 Rows are eliminated along the longest extent of the points, a sweep through the bed. That needs less memory, takes fewer
-iterations and breaks down less often than an order along a space-filling curve or by dissection (docs/preconditioners.md).
+iterations and breaks down less often than an order along a space-filling curve or by dissection
+(docs/preconditioners.md).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from pctt.mat.order import Places, places_of
 from pctt.options import NOT_NEGATIVE, OptionError, describe, option, read
 from pctt.pc.incomplete_cholesky import BAD_BLOCK, BAD_PIVOT, MOST, Array, Blocks, Factor, factorised
 from pctt.pc.mat import is_symmetric
-from pctt.petsc import Context, block_values, given_options, set_failed, warn
+from pctt.petsc import Context, block_values, given_options, on_coordinates, set_failed, warn
 
 _RAISED = 2.0  # factor on a shift with which a pivot was bad
 _GREATEST = 16.0  # shift: a matrix that is scaled by its diagonal blocks has hardly any off them beside it
@@ -45,7 +46,7 @@ class Options:
     """Options ``-pc_bic_*``, after the prefix of the PC."""
 
     tau: float = option(
-        0.04, "blocks of the factor below it are dropped, of the matrix scaled by its diagonal blocks",
+        0.05, "blocks of the factor below it are dropped, of the matrix scaled by its diagonal blocks",
         check=("a number >= 0 and below 1", lambda x: 0 <= x < 1),
     )
     shift: str = option(
@@ -59,8 +60,8 @@ class Options:
 
 
 class BlockICC(Context):
-    """The python PC; see the module and `Options`. It works on symmetric positive definite Mats of type AIJ, BAIJ, SBAIJ
-    or dense with blocks of any size, and on shells of this project, of which it knows the diagonal blocks alone.
+    """The python PC; see the module and `Options`. It works on symmetric positive definite Mats of type AIJ, BAIJ,
+    SBAIJ or dense with blocks of any size, and on shells of this project, of which it knows the diagonal blocks alone.
 
     The order of the rows is kept while the pattern of the matrix stays."""
 
@@ -77,17 +78,24 @@ class BlockICC(Context):
         self._pattern: tuple[np.ndarray, ...] = ()
         self._shift = 0.0  # with which the last matrix of the same pattern had a factor
         self._warned: set[str] = set()
+        self._points: np.ndarray | None = None
+        self._on_coordinates = on_coordinates(pc, self._take_points)
         self.setups, self.setup_s = 0, 0.0
         self._fills: list[float] = []  # least and greatest of all set-ups, over the ranks, and the greatest shift
         self._shifts: list[float] = []
 
     def destroy(self, pc: PETSc.PC) -> None:
+        self._on_coordinates = on_coordinates(pc, None)  # the function refers to this context
         self.factor = None
         super().destroy(pc)
 
     def reset(self, pc: PETSc.PC) -> None:
         """Forget the matrix."""
         self.factor, self._pattern = None, ()
+
+    def _take_points(self, points: np.ndarray) -> None:
+        """The points (n, d) of this rank's block rows, from ``PCSetCoordinates``."""
+        self._points, self._pattern = points, ()
 
     # -- set-up ---------------------------------------------------------------------------------------------
 
@@ -129,7 +137,7 @@ class BlockICC(Context):
         """Take what depends on the pattern of P only; collective."""
         if not is_symmetric(P):
             self._warn(P.comm.tompi4py(), "the matrix is not symmetric, so a Cholesky factor may be useless")
-        self.places = places_of(P, (pc.getDM(), pc.getOperators()[0].getDM()))
+        self.places = places_of(P, (pc.getDM(), pc.getOperators()[0].getDM()), self._points)
         size, block, (indptr, indices) = P.getLocalSize()[0], P.getBlockSize(), pattern
         of_rows = len(indptr) == size + 1 and size > 0 and not (block == 3 and _has_blocks(P))
         graph = sp.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(len(indptr) - 1,) * 2)
@@ -160,10 +168,10 @@ class BlockICC(Context):
                 return ""
             if found == BAD_BLOCK:
                 return "a diagonal block of the matrix is not positive definite"
-            if found == BAD_PIVOT and not automatic:
-                return f"a pivot is not positive with {named}shift {self.options.shift}: raise it, or leave it to auto"
             if not automatic or shift >= _GREATEST:
-                return f"the factor has more than {MOST:g} times the entries of the matrix: raise {named}tau"
+                why = f"a pivot is not positive with {named}shift {shift:g}: raise it, or leave it to auto"
+                full = f"the factor has more than {MOST:g} times the entries of the matrix: raise {named}tau"
+                return why if found == BAD_PIVOT else full
             shift = max(_RAISED * shift, 1e-3)
 
     def _warn(self, comm: MPI.Comm, words: str) -> None:

@@ -4,10 +4,11 @@ The matrix A of one rank is scaled by the Cholesky factors of its diagonal block
 
     T + shift I = L L' + what was dropped:    a block of L below the diagonal whose Frobenius norm is below ``tau``.
 
-The shift makes up for what is dropped: without it a pivot may become negative. The factor is computed in single
-precision and kept in 16 bits a number: entries of L are at most 1, and what they are rounded by is far less than what
-was dropped. Products are in double precision, so that the preconditioner (L L')^-1 is linear to rounding, as BiCGStab
-wants it.
+The shift makes up for what is dropped: without it a pivot may become negative.
+
+L takes eight bits a number. Its entries are at most the root of 1 + shift, so these bits round them by 0.004, which is
+little beside ``tau``; the factorisation goes on from the rounded numbers, so that L L' has no further error. Products
+are in double precision: the preconditioner is linear to rounding, as BiCGStab wants it.
 
 Rows are taken three at a time in the order of elimination: three unknowns of a contact, half of those of a body, or any
 three neighbours. So a matrix may have blocks of any size, and there is one set of loops.
@@ -33,9 +34,9 @@ DONE, FULL, BAD_PIVOT, BAD_BLOCK = range(4)  # ends of a factorisation
 
 
 class Blocks(NamedTuple):
-    """A symmetric matrix by blocks: its pattern (CSR), the ``order`` (n,) in which its block rows are eliminated, and their
-    ``number`` in it, and ``rows`` (n, 3), the three rows of the matrix in each block of this order. The last block may have less: its
-    rows from ``size`` on are none."""
+    """A symmetric matrix by blocks: its pattern (CSR), the ``order`` (n,) in which its block rows are eliminated, their
+    ``number`` in it, and ``rows`` (n, 3), the three rows of the matrix in each block of this order. The last block may
+    have less: its rows from ``size`` on are none."""
 
     indptr: np.ndarray
     indices: np.ndarray
@@ -68,9 +69,9 @@ class Blocks(NamedTuple):
 
 
 class Factor(NamedTuple):
-    """L by columns: where they start (n + 1,), the block rows ``below`` the diagonal (m,) and their blocks ``L`` (m, 3, 4)
-    with a column in each row, in units of ``unit``; the inverses of the diagonal blocks of L and those of D (n, 6), by
-    rows of their lower triangles."""
+    """L by columns: where they start (n + 1,), the block rows ``below`` the diagonal (m,) and their blocks ``L``
+    (m, 3, 4) with a column in each row, in units of ``unit``; the inverses of the diagonal blocks of L and those of D
+    (n, 6), by rows of their lower triangles."""
 
     blocks_of: Blocks
     starts: np.ndarray
@@ -96,16 +97,15 @@ class Factor(NamedTuple):
     def solve(self, b: Array, out: Array) -> None:
         """out = (D L L' D')^-1 b."""
         of = self.blocks_of
-        _solve(
-            self.starts, self.below, self.L, self.unit, self.pivots, self.scale, of.rows, of.size, self.work, b, out
-        )  # fmt: skip
+        L = self.starts, self.below, self.L, self.unit
+        _solve(*L, self.pivots, self.scale, of.rows, of.size, self.work, b, out)
 
 
 def factorised(of: Blocks, blocks: Array, tau: float, shift: float) -> Factor | int:
     """The factor of a matrix whose blocks (nb, 3, 3) are transposed; or why there is none: FULL, BAD_PIVOT, or
     BAD_BLOCK if a block on the diagonal is not positive definite."""
     n = len(of.number)
-    scale, pivots, starts = np.empty((n, 6)), np.empty((n, 6)), np.zeros(n + 1, np.int64)
+    scale, pivots, starts = np.empty((n, 6)), np.empty((n, 6), np.float32), np.zeros(n + 1, np.int64)
     if not _scales(of.indptr, of.indices, blocks, of.number, of.size, scale):
         return BAD_BLOCK
     unit = np.sqrt(1.0 + shift) / 127.0  # the squares in a row of L sum to no more than 1 + shift
@@ -117,13 +117,14 @@ def factorised(of: Blocks, blocks: Array, tau: float, shift: float) -> Factor | 
         room *= 3
     if ended != DONE:
         return ended
-    return Factor(of, starts, below[: starts[-1]].copy(), L[: starts[-1]].copy(), unit, pivots, scale, np.zeros((n, 4)), shift)
+    below, L, scale = below[: starts[-1]].copy(), L[: starts[-1]].copy(), scale.astype(np.float32)
+    return Factor(of, starts, below, L, unit, pivots, scale, np.zeros((n, 4)), shift)
 
 
 @inlined
 def _inverse(a, b, c, d, e, f, least, last):
-    """The inverse of the Cholesky factor of a block, both by rows of the lower triangle; and whether the second pivot is
-    above ``least`` and the third one above ``last``."""
+    """The inverse of the Cholesky factor of a block, both by rows of the lower triangle; and whether the second pivot
+    is above ``least`` and the third one above ``last``."""
     p = np.sqrt(a)
     b, d = b / p, d / p
     q = c - b * b
@@ -156,15 +157,16 @@ def _scales(indptr, indices, blocks, number, size, scale):
 
 @loop
 def _factorise(indptr, indices, blocks, number, order, scale, tau2, shift, unit, starts, pivots, rows, L):
-    """The rows and blocks of L by columns, if there is room. Each column is that of T less the products of columns before
-    it that have a block in its row; these are linked in lists."""
+    """The rows and blocks of L by columns, if there is room. Each column is that of T less the products of columns
+    before it that have a block in its row; these are linked in lists."""
     n, m = len(order), 0
     found, w, place = np.empty(n, np.int32), np.empty((n, 3, 4), np.float32), np.full(n, -1, np.int32)
     sorted_rows, slot = np.empty(n + 1, np.int32), np.empty(n + 1, np.int32)  # of those that are kept
     first, following, at = np.full(n, -1, np.int32), np.full(n, -1, np.int32), np.zeros(n, np.int64)
-    zero, one = np.float32(0.0), np.float32(1.0)
+    zero, one, most = np.float32(0.0), np.float32(1.0), np.float32(127.0)
     least, unit, per_unit = np.float32(0.1) * shift, np.float32(unit), np.float32(1.0 / unit)
     for j in range(n):
+        # the column of T below the diagonal
         own, count = order[j], 0
         g, h, i, k, l, r = scale[j, 0], scale[j, 1], scale[j, 2], scale[j, 3], scale[j, 4], scale[j, 5]  # noqa: E741
         for p in range(indptr[own], indptr[own + 1]):
@@ -185,6 +187,7 @@ def _factorise(indptr, indices, blocks, number, order, scale, tau2, shift, unit,
                 w[count, 2, 0], w[count, 2, 1], w[count, 2, 2] = d * o, e * o + f * q, t * o + u * q + v * s
                 w[count, 0, 3] = w[count, 1, 3] = w[count, 2, 3] = zero
                 count += 1
+        # less the products of earlier columns; the diagonal block by rows of its lower triangle
         a = c = f = one + shift
         b = d = e = zero
         k = first[j]
@@ -231,7 +234,9 @@ def _factorise(indptr, indices, blocks, number, order, scale, tau2, shift, unit,
         if not (good and a > least):
             return BAD_PIVOT
         pivots[j, 0], pivots[j, 1], pivots[j, 2], pivots[j, 3], pivots[j, 4], pivots[j, 5] = g, h, i, k, l, r
-        g, h, i, k, l, r = np.float32(g), np.float32(h), np.float32(i), np.float32(k), np.float32(l), np.float32(r)  # noqa: E741, E501
+        g, h, i = np.float32(g), np.float32(h), np.float32(i)
+        k, l, r = np.float32(k), np.float32(l), np.float32(r)  # noqa: E741
+        # times the inverse of the block's factor; what is small is dropped
         kept = 0
         for s in range(count):
             size = zero
@@ -245,14 +250,15 @@ def _factorise(indptr, indices, blocks, number, order, scale, tau2, shift, unit,
             kept += size >= tau2
         if m + kept > len(rows):
             return FULL
-        for s in range(kept):  # in order, as lists begin with the next row
+        # in order, as lists begin with the next row; an entry that is too large makes a later pivot negative
+        for s in range(kept):
             row, p, q = sorted_rows[s], m, slot[s]
             for o in range(kept):
                 p += sorted_rows[o] < row
             rows[p] = row
             for u in range(3):
                 for v in range(4):
-                    L[p, u, v] = np.int8(np.rint(w[q, u, v] * per_unit))
+                    L[p, u, v] = np.int8(min(max(np.rint(w[q, u, v] * per_unit), -most), most))
         m += kept
         starts[j + 1], at[j] = m, starts[j]
         if kept > 0:
@@ -265,14 +271,13 @@ def _factorise(indptr, indices, blocks, number, order, scale, tau2, shift, unit,
 def _solve(starts, below, L, unit, pivots, scale, rows, size, x, b, out):
     """Unsigned places: they need no test for negative ones."""
     n, t = len(pivots), np.empty((3, 4))
+    x[:] = 0.0
     for j in range(n):
         u = b[rows[j, 0]]
         v = b[rows[j, 1]] if 3 * j + 1 < size else 0.0
         w = b[rows[j, 2]] if 3 * j + 2 < size else 0.0
-        x[j, 0], x[j, 1] = scale[j, 0] * u, scale[j, 1] * u + scale[j, 2] * v
-        x[j, 2], x[j, 3] = scale[j, 3] * u + scale[j, 4] * v + scale[j, 5] * w, 0.0
-    for j in range(n):
-        a, c, d = x[j, 0], x[j, 1], x[j, 2]
+        a, c = x[j, 0] + scale[j, 0] * u, x[j, 1] + scale[j, 1] * u + scale[j, 2] * v
+        d = x[j, 2] + scale[j, 3] * u + scale[j, 4] * v + scale[j, 5] * w
         u, v = pivots[j, 0] * a, pivots[j, 1] * a + pivots[j, 2] * c
         w = pivots[j, 3] * a + pivots[j, 4] * c + pivots[j, 5] * d
         x[j, 0], x[j, 1], x[j, 2] = u, v, w

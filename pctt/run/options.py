@@ -19,7 +19,6 @@ from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
 from pctt.ksp_options import (
-    OF_SOLVERS,
     OWN,
     entered,
     mark_used,

@@ -38,7 +38,8 @@ def test_the_view_is_on_the_terminal_without_a_file(program, settled):
 
 
 @pytest.mark.parametrize(
-    "options", [("-ksp_type", "gmres"), ("-ccp_pc_type", "jacobi"), ("-sub_pc_type", "icc"), ("-mat_mumps_icntl_14", 30)]
+    "options",
+    [("-ksp_type", "gmres"), ("-ccp_pc_type", "jacobi"), ("-sub_pc_type", "icc"), ("-mat_mumps_icntl_14", 30)],
 )
 def test_options_of_linear_solvers_alone_take_pdip(options, program, settled, tmp_path):
     done = program(*SETTLED, "-steps", 1, *options)

@@ -114,7 +114,9 @@ class Newton:
         if self._linear is None:
             own = self.form == "body" and not self._instead and self._own
             defaults = GIVEN if self._instead else DEFAULTS[self.form]
-            self._linear = LinearSolver(self.comm, defaults, self.compare, own=own)
+            free = self.compare is None and OWN + "pc_type" not in options_database()
+            incomplete = self.form == "contact" and free
+            self._linear = LinearSolver(self.comm, defaults, self.compare, own, incomplete)
         return self._linear
 
     @property

@@ -22,6 +22,7 @@ NAMED: dict[str, dict[str, str]] = {
     "ilu-shifted": {"pc_type": "ilu", "pc_factor_shift_type": "positive_definite"},
     "icc-shifted": {"pc_type": "icc", "pc_factor_shift_type": "positive_definite"},
     "cholesky": {"pc_type": "cholesky", "ksp_type": "gmres"},
+    "bic": {"pc_type": "python", "pc_python_type": "pctt.pc.BlockICC"},
     "tt": {"pc_type": "python", "pc_python_type": "pctt.pc.TensorTrain"},
 }
 

@@ -21,6 +21,8 @@ FRONTS = {
     "ksp_type": "cg", "ksp_norm_type": "unpreconditioned",
     "pc_type": "python", "pc_python_type": "pctt.ccp.newton.fronts.FrontPC",
 }  # fmt: skip
+# of the contacts, where block Jacobi takes long
+INCOMPLETE = {"pc_type": "python", "pc_python_type": "pctt.pc.BlockICC"}
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,8 @@ class Settings:
     few: int = number(1000, "contacts on one rank up to which an order of elimination is looked for")
     pairs: int = number(100_000, "of these, pairs of blocks in an elimination at most: 20 ns each")
     rest: int = number(133, "of these, contacts in the dense rest at most: 1 ms")
+    jacobi: int = number(12, "iterations of BiCGStab with block Jacobi, after which the next systems of contacts get "
+                             "an incomplete factor, which costs as much as 30")  # fmt: skip
     easy: float = number(6.0, "iterations with block Jacobi / bodies^0.4, after which the next matrix gets a factor, "
                               "which costs as much as 8 to 14")  # fmt: skip
     least: float = number(0.1, "drop tolerance of a factor [mass]: entries of a block between bodies that it is better "
@@ -50,6 +54,7 @@ class LinearSolver:
     own : whether the KSP is the project's own choice, conjugate gradients with block Jacobi. Systems get harder from
         one iteration of an interior point method to the next; so once they take many iterations, the rest of the
         problem is left to factors. The choice rests on iteration counts, so that a repeated run repeats it.
+    incomplete : whether incomplete factors take over from block Jacobi where that takes long, by iteration counts too
     compare : its preconditioners are tried in place of the KSP
 
     Attributes
@@ -63,8 +68,9 @@ class LinearSolver:
         defaults: dict[str, str],
         compare: Comparison | None = None,
         own: bool = False,
+        incomplete: bool = False,
     ):
-        self.comm, self.defaults, self.compare, self.own = comm, defaults, compare, own
+        self.comm, self.defaults, self.compare, self.own, self.incomplete = comm, defaults, compare, own, incomplete
         self._krylov: dict[tuple[str, bool], Krylov] = {}
         self._symmetric = True
         self.begin()
@@ -102,7 +108,10 @@ class LinearSolver:
             done = self.compare.run(self.system.matrix, b, x, rtol, self.system.entries)
             self.iterations += done.iterations
         else:
-            done = self._run(self._solver(""), b, x, rtol, self.system.entries)
+            long = self.incomplete and self._worst > Settings.jacobi
+            done = self._run(self._solver("incomplete" if long else ""), b, x, rtol, self.system.entries)
+            if long:
+                return done
         self._worst = max(self._worst, done.iterations)
         return done
 
@@ -151,8 +160,8 @@ class LinearSolver:
         return self.comm.bcast(needed < Settings.spare * memory.available(self.comm))
 
     def _solver(self, name: str) -> Krylov:
-        """A Krylov method by its name, "" for the KSP, made when it is first needed. Unsymmetric systems, which are
-        those of Coulomb's law, have others."""
+        """A Krylov method by its name, "" for the first one, made when it is first needed. Unsymmetric systems, which
+        are those of Coulomb's law, have others."""
         symmetric = self._symmetric
         if (name, symmetric) not in self._krylov:
             if name == "factor":
@@ -162,6 +171,7 @@ class LinearSolver:
                     options |= FRONTS
             else:
                 options = {**self.defaults, **({} if symmetric else {"ksp_type": "bcgs"})}
+                options |= INCOMPLETE if name == "incomplete" else {}
                 if self.own:
                     most = Settings.alone if name == "alone" else int(Settings.limit * self._easy)
                     options["ksp_max_it"] = str(most)
@@ -174,7 +184,10 @@ class LinearSolver:
 
     def words(self) -> str:
         """Krylov method and preconditioner."""
-        return "CG, pbjacobi until it takes long, then cholesky" if self.own else self._solver("").words()
+        if self.own:
+            return "CG, pbjacobi until it takes long, then cholesky"
+        later = f" until it takes long, then {INCOMPLETE['pc_python_type']}" if self.incomplete else ""
+        return self._solver("").words() + later
 
     def what(self) -> str:
         """What a preconditioner of this package really was; empty for others."""
