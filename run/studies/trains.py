@@ -13,27 +13,21 @@ from __future__ import annotations
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import petsc4py
 
 petsc4py.init([sys.argv[0]])
 
 import numpy as np
-from mpi4py import MPI
+from newton_systems import COMM, Replay, replays
 from petsc4py import PETSc
-from shared import Row, Table, figure, listed, median_seconds, next_problem, parser, record, say_machine, settled
+from shared import Row, Table, figure, listed, median_seconds, parser, record, say_machine
 
-from dem.scenes import Mixer
-from pctt import ccp
-from pctt.ccp.newton.forms import ContactForm
 from pctt.ksp_options import entered
 from pctt.pc import TensorTrain
 from pctt.pc.sparse_train import SparseTrain
 
-COMM = MPI.COMM_SELF
-TOL = 1e-4  # natural residual at which the Newton systems end
 EPS = (1e-2, 1e-3, 1e-4)
 # (eps, cap): average ranks of matrix and inverse, seconds of compression and inversion per PDIP solve
 PAPER = {
@@ -43,62 +37,6 @@ PAPER = {
 }  # fmt: skip
 LEVELS = ("none", "newton", "trains")  # of reuse
 EARLY, REPEAT = 6, 3  # `scaling` takes the last two of so many Newton systems, so often
-
-# -- the systems ----------------------------------------------------------------------------------------------
-
-
-class System(NamedTuple):
-    """One Newton system S x = b: barrier blocks (nc, 3, 3) of S, and b (3 nc,)."""
-
-    barrier: np.ndarray
-    b: np.ndarray
-
-
-class Recorder(ccp.Newton):
-    """Newton systems as pdip has them solved by block Jacobi, kept for later."""
-
-    def begin(self, problem: ccp.ConeProblem) -> None:
-        super().begin(problem)
-        self.systems: list[System] = []
-
-    def update(self, barrier: np.ndarray, *more: Any, **named: Any) -> None:
-        self._barrier = barrier.copy()
-        super().update(barrier, *more, **named)
-
-    def solve(self, q: np.ndarray, *more: Any, **named: Any) -> tuple[np.ndarray, np.ndarray]:
-        self.systems.append(System(self._barrier, q.ravel().copy()))
-        return super().solve(q, *more, **named)
-
-
-class Replay:
-    """The recorded systems of one cone problem."""
-
-    def __init__(self, problem: ccp.ConeProblem, systems: list[System]):
-        self.contacts, self.systems = problem.size, systems
-        self._of = ContactForm(problem)
-
-    def matrix(self, system: System) -> PETSc.Mat:
-        """S, the same Mat with new values."""
-        self._of.update(system.barrier)
-        return self._of.entries()
-
-    def destroy(self) -> None:
-        self._of.destroy()
-
-
-def replays(n: int, steps: int = 1, max_it: int = -1) -> Iterator[Replay]:
-    """The systems of each of some steps from the settled mixer; ``max_it``: of each, at most."""
-    sim = settled(Mixer(n=n), dt=0.025, solver="apgd", stiffness=np.inf)
-    for _ in range(steps):
-        newton = Recorder(COMM)
-        with next_problem(sim) as problem:
-            ccp.solve(problem, None, "pdip", ccp.Limits(TOL, max_it, np.inf, fallback=False), newton=newton)
-            replay = Replay(problem, newton.systems)
-            yield replay
-            replay.destroy()
-        newton.destroy()
-        sim.step()
-
 
 # -- set-ups, watched -----------------------------------------------------------------------------------------
 
