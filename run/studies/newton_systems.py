@@ -1,4 +1,4 @@
-"""Newton systems of `pdip`, recorded from steps of a settled mixer, for studies that hand them to many configurations."""
+"""Newton systems of `pdip` from steps of a settled mixer, recorded and handed to many configurations."""
 
 from __future__ import annotations
 
@@ -29,18 +29,20 @@ class System(NamedTuple):
 
 
 class Recorder(ccp.Newton):
-    """Newton systems as pdip has them solved by block Jacobi, kept for later."""
+    """Newton systems as pdip has them solved by block Jacobi, kept for later: of each matrix the first."""
 
     def begin(self, problem: ccp.ConeProblem) -> ccp.ConeProblem:
         self.systems: list[System] = []
         return super().begin(problem)
 
     def update(self, barrier: np.ndarray, *more: Any, **named: Any) -> None:
-        self._barrier = barrier.copy()
+        self._new: np.ndarray | None = barrier.copy()
         super().update(barrier, *more, **named)
 
     def solve(self, q: np.ndarray, *more: Any, **named: Any) -> tuple[np.ndarray, np.ndarray]:
-        self.systems.append(System(self._barrier, q.ravel().copy()))
+        if self._new is not None:
+            self.systems.append(System(self._new, q.ravel().copy()))
+            self._new = None
         return super().solve(q, *more, **named)
 
 
