@@ -138,7 +138,7 @@ def unfoldings(given: Namespace) -> list[Row]:
         of = Matrices(next(steps))
         print(f"mixer n = {given.n}, pdip of the {form}: {len(of.order)} contacts, {len(of.systems)} Newton steps")
         print(f"bonds at {', '.join(map(str, BONDS))} contacts: singular values, ranks at {EPS[0]:g} and {EPS[1]:g},")
-        print("part of the squared norm that rank 10 has; and the norm of what couples contacts over that of the matrix")
+        print("part of the squared norm that rank 10 has; norm of what couples contacts over that of the matrix")
         table = Table(matrix=("matrix", "<25"), step=("step", "<10"), full=(cell("full"), "16"),
                       at_1e_1=(cell("at 0.1"), "16"), at_1e_2=(cell("at 0.01"), "16"),
                       rank_10=(cell("rank 10", ".2f"), "18"), coupling=("coupling", "9.2g"))  # fmt: skip

@@ -164,8 +164,8 @@ def reuse(given: Namespace) -> list[Row]:
     names = [f"{what}, {level}" for level in LEVELS[1:] for what in ("first", "all")]
     print("seconds of set-up without reuse / with reuse within a time step (newton) and from step to step (trains):")
     print("of the first Newton system of a step, and of all; then how many trains the last level made, how many")
-    print("set-ups kept one or had no positive one, and how often its slots were found anew; BiCGStab iterations for the")
-    print("middle Newton system with a train of its own, with that of the last level, and with block Jacobi")
+    print("set-ups kept one or had no positive one, and how often its slots were found anew; BiCGStab iterations for")
+    print("the middle Newton system with a train of its own, with that of the last level, and with block Jacobi")
     table = Table(n=("n", "3d"), step=("step", "6"), contacts=("contacts", "9"), Newton=("newton", "7"),
                   **{name: (name, "13.2f") for name in names}, **{name: (name, "7") for name in COUNTS},
                   **{f"its_{name}": (f"its {name}", "10") for name in SOLVED})  # fmt: skip
