@@ -177,7 +177,7 @@ def bounds(given: Namespace) -> list[Row]:
     print(f"mixer n = {given.n}, {len(of.systems)} Newton steps; {FEW} of {len(of.order)} contacts, bond at {BOX}")
     print(f"BiCGStab to 1e-4 and a true residual of 2e-4, at most {CAP} iterations; '>': not solved")
     table = Table(step=("step", "<10"), preconditioner=("preconditioner", "<24"), rank=("rank", "5"),
-                  captured=("captured", "9.4f"), positive=("positive", "8"), iterations=("said", "10"))  # fmt: skip
+                  captured=("captured", "9.4f"), iterations=("said", "10"))  # fmt: skip
     rows: list[Row] = []
     for part, k in zip(("early", "middle", "late"), (np.array([1, 2, 3]) * len(of.systems)) // 4):
         system = of.systems[k]
@@ -190,7 +190,6 @@ def bounds(given: Namespace) -> list[Row]:
         tried += [("rank r of the inverse", r, share, M) for r, share, M in truncated(inverse, OF_INVERSE)]
         for name, rank, share, M in tried:
             row: Row = {"step": f"{part} {k}", "preconditioner": name, "rank": rank or "", "captured": share}
-            row["positive"] = "yes" if M is None or is_positive(M) else "no"
             if M is not None and name.startswith("inverse"):
                 M = np.linalg.inv(M)
             row["iterations"], row["residual"] = bicgstab(S, b, M)
@@ -213,14 +212,6 @@ def truncated(A: np.ndarray, ranks: tuple[int, ...]) -> Iterator[tuple[int, floa
         best = vectors[:, :rank] @ (vectors[:, :rank].T @ unfolding)
         M = best.reshape(boxes, boxes, box, box).transpose(0, 2, 1, 3).reshape(n, n)
         yield rank, float(squares[:rank].sum() / squares.sum()), np.eye(n) + (M + M.T) / 2
-
-
-def is_positive(A: np.ndarray) -> bool:
-    try:
-        np.linalg.cholesky(A)
-    except np.linalg.LinAlgError:
-        return False
-    return True
 
 
 def bicgstab(A: sp.csr_matrix, b: np.ndarray, inverse: np.ndarray | None) -> tuple[int, float]:
