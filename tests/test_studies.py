@@ -7,7 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import scipy.sparse as sp
 
 ROOT = Path(__file__).parents[1]
 STUDIES = ROOT / "run" / "studies"
@@ -43,6 +45,7 @@ def test_pages_name_studies_that_there_are():
         "trains ranks 1 -caps 10 -every 12",
         "trains reuse 1 -steps 2",
         "trains scaling 1",
+        "ranks unfoldings 1",
     ],
 )
 def test_a_study_of_the_smallest_size_runs(words, tmp_path):
@@ -50,3 +53,17 @@ def test_a_study_of_the_smallest_size_runs(words, tmp_path):
     done = subprocess.run([sys.executable, STUDIES / f"{name}.py", *rest], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert list((tmp_path / "results").glob(f"{name}*.json"))
+
+
+def test_the_ranks_of_unfoldings_are_those_of_the_train_that_svd_makes(monkeypatch):
+    from pctt.tt.train import decompose_matrix
+
+    monkeypatch.syspath_prepend(STUDIES)
+    ranks = __import__("ranks")
+    A = np.random.default_rng(0).standard_normal((24, 24)) * (np.random.default_rng(1).random((24, 24)) < 0.2)
+    values = ranks.singular_values(sp.csr_matrix(A), 6)
+    assert np.linalg.norm(values) == pytest.approx(np.linalg.norm(A))
+    for eps in (0.3, 0.1, 1e-6):
+        assert ranks.rank_at(values, eps) == decompose_matrix(A, [4, 6], eps=eps).ranks[1]
+    left = np.linalg.norm(A - decompose_matrix(A, [4, 6], max_rank=2, eps=0).full()) / np.linalg.norm(A)
+    assert ranks.captured(values, 2) == pytest.approx(1 - left**2)

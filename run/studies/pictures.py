@@ -20,7 +20,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from shared import MPIEXEC, PYTHON, ROOT, parser
+from shared import MPIEXEC, PYTHON, ROOT, parser, reduce_colours
 
 from dem.scenes import SCENES
 
@@ -45,7 +45,6 @@ STEPS = {
     "drum": 240, "hopper": 120, "incline": 60, "blade": 160, "bucket": 260, "conveyor": 200, "feeder": 1500,
     "vibrated": 1500, "wheel": 1000, "ballast": 1600,
 }  # fmt: skip
-COLOURS = 256  # of a picture, which makes it a third as large
 
 
 def draw(scene: str, n: int | None, target: Path) -> None:
@@ -100,10 +99,7 @@ def draw_notebook(name: str) -> None:
 
 def keep(picture: Path, target: Path, name: str, seconds: float) -> None:
     """Put a small copy of a picture into its place, and what it took into the list of the gallery."""
-    from PIL import Image
-
-    with Image.open(picture) as image:
-        image.convert("RGB").quantize(COLOURS).save(target, optimize=True)
+    reduce_colours(picture, target)
     print(f"{target}: {seconds:.1f} CPU s", flush=True)
     if target.is_relative_to(GALLERY.parent):
         took = {**json.loads(GALLERY.read_text()), name: round(seconds, 1)}

@@ -1,11 +1,12 @@
 """Trains on the Newton systems of settled mixer steps, as the paper measures them:
 
     run/study trains ranks [N] [-caps 10,100] [-every K]   its tables 1 and 2: ranks, errors and seconds per PDIP solve
-    run/study trains reuse [N ...] [-steps K]              seconds of set-up without over those with reuse of trains
+    run/study trains reuse [N ...] [-steps K] [-every K]   seconds of set-up without over those with reuse of trains,
+                                                           set-ups that keep or make one, iterations with either
     run/study trains scaling [N ...]                       seconds of set-up and application against the contacts
 
 The systems are those of `pdip` with block Jacobi, from a cold start and of rigid contacts, recorded and handed to every
-configuration; `apgd` makes the time steps. Writes results/trains_WHAT.json, and results/trains_scaling.png.
+configuration; `apgd` makes the time steps. Writes results/trains_WHAT.json, and figures of reuse and scaling.
 """
 
 from __future__ import annotations
@@ -13,27 +14,21 @@ from __future__ import annotations
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import petsc4py
 
 petsc4py.init([sys.argv[0]])
 
 import numpy as np
-from mpi4py import MPI
+from newton_systems import COMM, Replay, replays
 from petsc4py import PETSc
-from shared import Row, Table, figure, listed, median_seconds, next_problem, parser, record, say_machine, settled
+from shared import Row, Table, figure, listed, median_seconds, parser, record, say_machine
 
-from dem.scenes import Mixer
-from pctt import ccp
-from pctt.ccp.newton.forms import ContactForm
 from pctt.ksp_options import entered
 from pctt.pc import TensorTrain
 from pctt.pc.sparse_train import SparseTrain
 
-COMM = MPI.COMM_SELF
-TOL = 1e-4  # natural residual at which the Newton systems end
 EPS = (1e-2, 1e-3, 1e-4)
 # (eps, cap): average ranks of matrix and inverse, seconds of compression and inversion per PDIP solve
 PAPER = {
@@ -42,63 +37,10 @@ PAPER = {
     (1e-4, 10): (9.1, 9.0, 16), (1e-4, 100): (68.6, 58.1, 2740), (1e-4, 1000): (113.3, 91.2, 8157),
 }  # fmt: skip
 LEVELS = ("none", "newton", "trains")  # of reuse
+COUNTS = ("made", "kept", "none", "anew")  # of the last level
+SOLVED = ("none", "trains", "pbjacobi")  # levels whose trains solve a system, and the preconditioner without a train
+CAP = 1000  # iterations
 EARLY, REPEAT = 6, 3  # `scaling` takes the last two of so many Newton systems, so often
-
-# -- the systems ----------------------------------------------------------------------------------------------
-
-
-class System(NamedTuple):
-    """One Newton system S x = b: barrier blocks (nc, 3, 3) of S, and b (3 nc,)."""
-
-    barrier: np.ndarray
-    b: np.ndarray
-
-
-class Recorder(ccp.Newton):
-    """Newton systems as pdip has them solved by block Jacobi, kept for later."""
-
-    def begin(self, problem: ccp.ConeProblem) -> None:
-        super().begin(problem)
-        self.systems: list[System] = []
-
-    def update(self, barrier: np.ndarray, *more: Any, **named: Any) -> None:
-        self._barrier = barrier.copy()
-        super().update(barrier, *more, **named)
-
-    def solve(self, q: np.ndarray, *more: Any, **named: Any) -> tuple[np.ndarray, np.ndarray]:
-        self.systems.append(System(self._barrier, q.ravel().copy()))
-        return super().solve(q, *more, **named)
-
-
-class Replay:
-    """The recorded systems of one cone problem."""
-
-    def __init__(self, problem: ccp.ConeProblem, systems: list[System]):
-        self.contacts, self.systems = problem.size, systems
-        self._of = ContactForm(problem)
-
-    def matrix(self, system: System) -> PETSc.Mat:
-        """S, the same Mat with new values."""
-        self._of.update(system.barrier)
-        return self._of.entries()
-
-    def destroy(self) -> None:
-        self._of.destroy()
-
-
-def replays(n: int, steps: int = 1, max_it: int = -1) -> Iterator[Replay]:
-    """The systems of each of some steps from the settled mixer; ``max_it``: of each, at most."""
-    sim = settled(Mixer(n=n), dt=0.025, solver="apgd", stiffness=np.inf)
-    for _ in range(steps):
-        newton = Recorder(COMM)
-        with next_problem(sim) as problem:
-            ccp.solve(problem, None, "pdip", ccp.Limits(TOL, max_it, np.inf, fallback=False), newton=newton)
-            replay = Replay(problem, newton.systems)
-            yield replay
-            replay.destroy()
-        newton.destroy()
-        sim.step()
-
 
 # -- set-ups, watched -----------------------------------------------------------------------------------------
 
@@ -221,31 +163,75 @@ def reuse(given: Namespace) -> list[Row]:
     rows: list[Row] = []
     names = [f"{what}, {level}" for level in LEVELS[1:] for what in ("first", "all")]
     print("seconds of set-up without reuse / with reuse within a time step (newton) and from step to step (trains):")
-    print("of the first Newton system of a step, and of all")
+    print("of the first Newton system of a step, and of all; then how many trains the last level made, how many")
+    print("set-ups kept one or had no positive one, and how often its slots were found anew; BiCGStab iterations for")
+    print("the middle Newton system with a train of its own, with that of the last level, and with block Jacobi")
     table = Table(n=("n", "3d"), step=("step", "6"), contacts=("contacts", "9"), Newton=("newton", "7"),
-                  **{name: (name, "13.2f") for name in names})  # fmt: skip
+                  **{name: (name, "13.2f") for name in names}, **{name: (name, "7") for name in COUNTS},
+                  **{f"its_{name}": (f"its {name}", "10") for name in SOLVED})  # fmt: skip
     for n in given.n:
         pcs = {level: train_pc(reuse=level, rank=10, eps=1e-2) for level in LEVELS}
+        account, before = pcs["trains"].getPythonContext().account, dict.fromkeys(COUNTS, 0)
         for step, replay in enumerate(replays(n, given.steps), start=1):
             seconds: dict[str, list[float]] = {level: [] for level in LEVELS}
+            row: Row = {"n": n, "step": step, "contacts": replay.contacts, "newton": len(replay.systems)}
             for pc in pcs.values():
                 pc.reset()
+            timed = (step - 2) % given.every == 0
+            levels = LEVELS if timed else LEVELS[-1:]
             for k, system in enumerate(replay.systems):
-                for turn in range(len(LEVELS)):
-                    level = LEVELS[(k + turn) % len(LEVELS)]  # each is the first, with a cold cache, as often
-                    seconds[level].append(set_up(pcs[level], replay.matrix(system))["setup_s"])
-            row: Row = {"n": n, "step": step, "contacts": replay.contacts, "newton": len(replay.systems)}
-            for level in LEVELS[1:]:
+                matrix = replay.matrix(system)
+                for turn in range(len(levels)):
+                    level = levels[(k + turn) % len(levels)]  # each is the first, with a cold cache, as often
+                    seconds[level].append(set_up(pcs[level], matrix)["setup_s"])
+                if timed and k == len(replay.systems) // 2:
+                    row |= {f"its {name}": iterations(pcs.get(name), matrix, system.b) for name in SOLVED}
+            for level in LEVELS[1:] if timed else ():
                 row[f"first, {level}"] = seconds["none"][0] / seconds[level][0]
                 row[f"all, {level}"] = sum(seconds["none"]) / sum(seconds[level])
+            none = sum(account.fallbacks.values())
+            after = {"made": account.setups - account.kept - none, "kept": account.kept, "none": none}
+            after["anew"] = account.resets
+            row |= {name: after[name] - before[name] for name in COUNTS}
+            before = after
             rows.append(row | {"seconds": seconds})
             if step > 1:  # the first step of a run has nothing to start from
                 table.add(row)
         for pc in pcs.values():
             pc.destroy()
         later = [row for row in rows if row["n"] == n][1:]
-        table.add({"n": n, "step": "median", **{name: np.median([row[name] for row in later]) for name in names}})
+        every = [*names, *(f"its {name}" for name in SOLVED)]
+        timed_rows = [row for row in later if names[0] in row]
+        medians = {name: float(np.median([row[name] for row in timed_rows])) for name in every}
+        table.add({"n": n, "step": "median", **medians})
+        table.add({"n": n, "step": "sum", **{name: sum(row[name] for row in later) for name in ("newton", *COUNTS)}})
+        with figure(f"trains_reuse_n{n}", 2) as panels:
+            for axes, what in zip(panels, ("first", "all")):
+                for level in LEVELS[1:]:
+                    ratios = [row[f"{what}, {level}"] for row in timed_rows]
+                    axes.semilogy([row["step"] for row in timed_rows], ratios, ".", label=level)
+                axes.set(title=f"{what} Newton systems of a step", xlabel="time step", ylabel="set-up without / with")
+                axes.legend()
     return rows
+
+
+def iterations(pc: PETSc.PC | None, matrix: PETSc.Mat, right_side: np.ndarray) -> int:
+    """Of BiCGStab, to 1e-4, with this preconditioner, which is set up, or with block Jacobi; the cap is the paper's."""
+    ksp = PETSc.KSP().create(COMM)
+    if pc is not None:
+        ksp.setPC(pc)
+    ksp.setOperators(matrix)
+    if pc is None:
+        ksp.getPC().setType("pbjacobi")
+    ksp.setType("bcgs")
+    ksp.setPCSide(PETSc.PC.Side.RIGHT)
+    ksp.setTolerances(rtol=1e-4, max_it=CAP)
+    x, b = matrix.createVecs()
+    b.array[:] = right_side
+    ksp.solve(b, x)
+    its = ksp.getIterationNumber()
+    ksp.destroy()
+    return int(its)
 
 
 # -- scaling --------------------------------------------------------------------------------------------------
@@ -309,6 +295,7 @@ if __name__ == "__main__":
     of_ranks.add_argument("-every", type=int, default=1, help="every K-th system (1; caps over 10: three in all)")
     of_reuse.add_argument("n", type=int, nargs="*", default=[4, 8], help="sizes of the mixer (4 8)")
     of_reuse.add_argument("-steps", type=int, default=31, help="time steps of each, the first not counted (31)")
+    of_reuse.add_argument("-every", type=int, default=1, help="levels that forget are set up in every K-th step (1)")
     of_scaling.add_argument("n", type=int, nargs="*", default=[2, 4, 8, 16], help="sizes of the mixer (2 4 8 16)")
     given = words.parse_args()
     about = say_machine()
