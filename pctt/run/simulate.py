@@ -64,7 +64,10 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     progress.say(report.stiffness_line(sim.world.pairs.stiffness, sim.expected_overlap))
     if settings.tol > report.LOOSE:
         progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE_BECAUSE}")
-    if ccp.SOLVERS[settings.solver].newton:
+    solver = ccp.SOLVERS[settings.solver]
+    if solver.newton and solver.has_law and settings.law == ccp.COULOMB and not newton.linear.own:
+        progress.say(f"WARNING: {report.NOT_THE_LAW}")
+    elif solver.newton:
         some = " of conic, for steps that apgd leaves to it" if settings.solver == "auto" else ""
         progress.say(f"Newton systems{some}: {newton.linear.words()}")
     if steps:

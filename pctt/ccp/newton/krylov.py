@@ -158,7 +158,8 @@ class Krylov:
         own = {name: value for name, value in PETSc.Options().getAll().items() if name.startswith(self.prefix + "ksp_")}
         viewers = {name: value for name, value in own.items() if _VIEWER.fullmatch(name[len(self.prefix) :])}
         if viewers:
-            with entered({name: _continued(value) for name, value in viewers.items()}, hidden=own), set_skip_pc(self.ksp):
+            continued = {name: _continued(value) for name, value in viewers.items()}
+            with entered(continued, hidden=own), set_skip_pc(self.ksp):
                 self.ksp.setFromOptions()
 
     def _set_up(self, A: PETSc.Mat, P: Source, keep: bool) -> None:
