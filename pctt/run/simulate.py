@@ -92,7 +92,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
             progress.say(f"Newton systems: {what}")
         if compare.names:
             progress.say("\n" + report.compare_table(compare.summary()))
-    if left := remark(options.given, newton.systems):
+    if left := remark(options.given, newton.ksp_systems):
         progress.say(left)
     if sim.last:
         folder = output.place.folder
@@ -134,7 +134,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         progress.say("\n" + report.compare_table(compare.summary()))
     if not summary["converged"]:
         progress.say(f"NOT CONVERGED: {summary['reason']}")
-    if left := remark(options.given, newton.systems):
+    if left := remark(options.given, newton.ksp_systems):
         progress.say(left)
     place = Place(Path(options.run.output), comm, overwrite=options.run.overwrite)
     try:
