@@ -192,7 +192,7 @@ def remark(database: Mapping[str, str | None], systems: int) -> str:
     ``database`` has the options of the user, ``systems`` is the number of systems that were solved by a KSP.
     """
     given = solver_options(database)
-    left = [spelt for short, spelt in given.items() if not {spelt, OWN + short} - set(unused({spelt, OWN + short}))]
+    left = [spelt for short, spelt in given.items() if not (is_used(spelt) or is_used(OWN + short))]
     if not systems:
         left = [*(name for name in ("compare", "compare_every") if name in database), *given.values()]
     if "options_left" not in database:  # which says the same

@@ -47,7 +47,8 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     demo = not database
     database = DEMO if demo else database
     run, asked = read(Run, database), read(Settings, database, "ccp_")
-    if (run.compare or solver_options(database)) and "ccp_type" not in database:
+    of_systems = [name for name in solver_options(database) if not name.startswith("vec_")]
+    if (run.compare or of_systems) and "ccp_type" not in database:
         asked = dataclasses.replace(asked, solver="pdip")  # the paper's
     solver = ccp.SOLVERS[asked.solver]
     scene_class = together(comm, "scene file", lambda: find_scene(run.scene), own=(OptionError,))

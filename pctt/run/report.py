@@ -24,6 +24,12 @@ LARGE_OPENING, LARGE_CLOSING_WORK, LARGE_OVERLAP = 1e-3, 0.5, 0.05
 #: Tolerances above it are warned of, and why.
 LOOSE, LOOSE_BECAUSE = 2e-3, "forces of dense beds are too small by 5 to 20 % at such tolerances"
 
+#: Why conic does not solve a step of Coulomb's law.
+NOT_THE_LAW = (
+    "no Newton systems: for Coulomb's law conic has a linear solver of its own, so apgd takes the steps; add -law "
+    "relaxation, or leave out -ksp_type, -pc_type and -ccp_newton contact"
+)
+
 #: What helps against jumps of energy; a smaller tolerance does not.
 JUMP_ADVICE = "What helps: a smaller -dt, a -stiffness, or a tool of bounded force or torque (docs/mechanics.md)"
 

@@ -63,9 +63,9 @@ class Settings(ccp.Limits):
     the solver, ``tol``, ``max_it`` and ``closing_work``, are those of `pctt.ccp.Limits`."""
 
     solver: str = option(
-        "auto", "solver of the cone problems; -compare or options of linear solvers take pdip", choices=ccp.SOLVERS,
-        name="ccp_type",
-    )
+        "auto", "solver of the cone problems; -compare or options of linear solvers alone take pdip",
+        choices=ccp.SOLVERS, name="ccp_type",
+    )  # fmt: skip
     newton: str = option(
         "auto", "unknowns of the Newton systems; auto: contact for pdip, body for conic", choices=("auto", *ccp.FORMS)
     )
@@ -206,7 +206,7 @@ class Run:
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Everything that a run of the program needs to know, with the scene's own values filled in; ``scene`` is an
-    instance of a class of ``dem.scenes.SCENES`` or of the user's class, ``given`` are the options as they came."""
+    instance of a class of ``dem.scenes.SCENES`` or of the user's class, ``given`` are the options as typed."""
 
     run: Run
     scene: Any

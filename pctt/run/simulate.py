@@ -64,7 +64,10 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     progress.say(report.stiffness_line(sim.world.pairs.stiffness, sim.expected_overlap))
     if settings.tol > report.LOOSE:
         progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE_BECAUSE}")
-    if ccp.SOLVERS[settings.solver].newton:
+    solver = ccp.SOLVERS[settings.solver]
+    if solver.newton and solver.has_law and settings.law == ccp.COULOMB and not newton.linear.own:
+        progress.say(f"WARNING: {report.NOT_THE_LAW}")
+    elif solver.newton:
         some = " of conic, for steps that apgd leaves to it" if settings.solver == "auto" else ""
         progress.say(f"Newton systems{some}: {newton.linear.words()}")
     if steps:
@@ -89,7 +92,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
             progress.say(f"Newton systems: {what}")
         if compare.names:
             progress.say("\n" + report.compare_table(compare.summary()))
-    if left := remark(options.given, newton.systems):
+    if left := remark(options.given, newton.ksp_systems):
         progress.say(left)
     if sim.last:
         folder = output.place.folder
@@ -131,7 +134,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         progress.say("\n" + report.compare_table(compare.summary()))
     if not summary["converged"]:
         progress.say(f"NOT CONVERGED: {summary['reason']}")
-    if left := remark(options.given, newton.systems):
+    if left := remark(options.given, newton.ksp_systems):
         progress.say(left)
     place = Place(Path(options.run.output), comm, overwrite=options.run.overwrite)
     try:

@@ -211,10 +211,10 @@ def conic(n: int) -> list[Row]:
         for tol in (1e-4, 1e-6):
             for kind, pc in (("apgd", ""), ("conic, block Jacobi", "pbjacobi"), ("conic", "")):
                 if pc:
-                    PETSc.Options().setValue("pc_type", pc)
-                    PETSc.Options().setValue("ksp_type", "cg")
+                    PETSc.Options().setValue("ccp_pc_type", pc)
+                    PETSc.Options().setValue("ccp_ksp_type", "cg")
                 rows.append({**about, "tol": tol, "kind": kind, **solved(problem, kind.partition(",")[0], tol)})
-                for name in ("pc_type", "ksp_type") if pc else ():
+                for name in ("ccp_pc_type", "ccp_ksp_type") if pc else ():
                     PETSc.Options().delValue(name)
     return rows
 

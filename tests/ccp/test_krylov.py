@@ -11,6 +11,7 @@ from problems import SELF, dense_of, from_graph, heap, matrix
 from pctt import memory
 from pctt.ccp import Newton
 from pctt.ccp.newton.krylov import Krylov
+from pctt.ksp_options import unused
 
 
 def system(shift: float = 1.0, comm: MPI.Comm = SELF):
@@ -63,6 +64,50 @@ def test_defaults_and_the_users_options(database):
     database["one_ksp_rtol"] = 1e-9
     ksp = Krylov(SELF, "one_", {"pc_type": "jacobi", "ksp_type": "cg"}, rtol=1e-2).ksp
     assert (ksp.getType(), ksp.pc.getType(), ksp.getTolerances()[0]) == ("cg", "sor", 1e-9)
+
+
+@pytest.mark.parallel(1, 2)
+def test_viewers_and_monitors_outlive_the_structure_of_a_matrix(database, tmp_path, capfd):
+    """KSPReset drops the viewers. Files go on; nothing is shown twice; a python preconditioner stays the same one."""
+    comm = MPI.COMM_WORLD
+    database["ccp_pc_type"], database["ccp_pc_python_type"] = "python", "pctt.pc.TensorTrain"
+    for name in ("ksp_view", "ksp_view_final_residual", "ksp_monitor"):
+        database[f"ccp_{name}"] = f"ascii:{tmp_path}/{name}"
+    database["ccp_ksp_view_pre"], database["ccp_ksp_rtol"], database["ccp_ksp_type"] = None, "1e-9", "cg"
+    before = database.getAll()
+    krylov = Krylov(comm)
+    context = krylov.ksp.pc.getPythonContext()
+    done = []
+    for _ in range(3):
+        _, S, x, b = system(shift=100.0, comm=comm)
+        done += [krylov.solve(S, b, x) for _ in range(2)]
+        assert (krylov.ksp.getType(), krylov.ksp.getTolerances()[0]) == ("cg", 1e-9)
+        assert krylov.ksp.pc.getPythonContext() is context
+        krylov.forget()
+    krylov.destroy()
+    assert database.getAll() == before
+    assert len({solve.iterations for solve in done}) == 1
+    said = comm.allgather(capfd.readouterr().out)[0]
+    comm.Barrier()
+    assert said.count("KSP Object: (ccp_)") == 6
+    texts = {path.name: path.read_text() for path in tmp_path.iterdir()}
+    assert texts["ksp_view"].count("KSP Object: (ccp_)") == texts["ksp_view"].count("tensor train: rank 1") == 6
+    assert texts["ksp_view_final_residual"].count("KSP final norm of residual") == 6
+    assert texts["ksp_monitor"].count("KSP Residual norm") == sum(solve.iterations + 1 for solve in done)
+
+
+def test_options_count_as_used_once_a_system_is_solved_with_them(database):
+    mine = {"ccp_ksp_rtol": "1e-3", "ccp_pc_type": "ilu", "ccp_pc_factor_levels": "1", "ccp_pc_sor_its": "2"}
+    for name, value in mine.items():
+        database[name] = value
+    krylov, other = Krylov(SELF), Krylov(SELF, "ccp_compare_x_", {"pc_type": "jacobi"})
+    assert krylov.words() == "BiCGStab (right), ilu"
+    assert set(unused(mine)) == set(mine)
+    _, S, x, b = system(shift=100.0)
+    other.solve(S, b, x)
+    assert set(unused(mine)) == set(mine) - {"ccp_ksp_rtol"}
+    krylov.solve(S, b, x)
+    assert unused(mine) == ["ccp_pc_sor_its"]
 
 
 def test_eisenstat_works_on_scalar_rows():

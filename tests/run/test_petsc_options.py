@@ -6,8 +6,10 @@ import re
 
 import pytest
 from program import SETTLED, summary_of
+from test_pages import stored_problem
 
 TRAIN = ("-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")
+NONE = "no Newton system was solved by a KSP"
 NO_EFFECT = re.compile(r"^options without effect in this run(?:, as (.*))?: (.*)$", re.MULTILINE)
 
 
@@ -49,6 +51,22 @@ def test_options_of_linear_solvers_alone_take_pdip(options, program, settled, tm
     assert NO_EFFECT.findall(done.stdout) == [("", " ".join(map(str, idle)))] * bool(idle)
 
 
+def test_options_that_are_not_of_newton_systems_leave_the_solver(program, settled):
+    """As in a ~/.petscrc; `auto` solves these steps by apgd."""
+    done = program(*SETTLED, "-steps", 1, "-vec_idle", 3, "-log_view_memory")
+    assert "auto to 0.0005, Coulomb's law" in done.stdout
+    assert NO_EFFECT.findall(done.stdout) == [(NONE, "-vec_idle 3")]
+
+
+def test_a_stored_problem_is_solved_by_pdip_too(program, tmp_path):
+    stored_problem(tmp_path / "problem.hdf5")
+    words = ("-problem", "problem.hdf5", "-overwrite", "-pc_type", "jacobi", "-ksp_max_it", 50)
+    assert not NO_EFFECT.search(program(*words).stdout)
+    figures = summary_of(tmp_path / "results")
+    assert (figures["solver"], figures["newton_systems"]) == ("pdip", "BiCGStab (right), jacobi")
+    assert NO_EFFECT.findall(program(*words, "-ccp_type", "auto").stdout) == [(NONE, "-ksp_max_it 50, -pc_type jacobi")]
+
+
 def test_both_spellings_are_one_option(program, settled, tmp_path):
     counts = []
     for prefix in ("-", "-ccp_"):
@@ -57,9 +75,6 @@ def test_both_spellings_are_one_option(program, settled, tmp_path):
         assert not NO_EFFECT.search(done.stdout)
         counts.append(summary_of(tmp_path / "results")["ksp_its"])
     assert counts[0] == counts[1] > 0
-
-
-NONE = "no Newton system was solved by a KSP"
 
 
 @pytest.mark.parallel(1, 2)
@@ -72,6 +87,17 @@ def test_where_no_newton_system_was_solved_all_their_options_are_named(steps, pr
     (why, named), = NO_EFFECT.findall(done.stdout)
     assert why == NONE
     assert set(named.split(", ")) == {"-pc_type ilu", "-ksp_monitor", "-compare_ilu_ksp_max_it 3", "-compare ilu"}
+
+
+@pytest.mark.parametrize("solver", ["conic", "auto"])
+def test_a_run_says_where_the_law_leaves_a_ksp_nothing_to_do(solver, program, settled):
+    words = (*SETTLED, "-steps", 1, "-ccp_type", solver, "-pc_type", "jacobi", "-overwrite")
+    said = program(*words).stdout
+    assert "WARNING: no Newton systems: for Coulomb's law conic has a linear solver of its own" in said
+    assert NO_EFFECT.findall(said) == [(NONE, "-pc_type jacobi")]
+    said = program(*words, "-law", "relaxation").stdout
+    assert "WARNING: no Newton" not in said
+    assert NO_EFFECT.findall(said) == [(NONE, "-pc_type jacobi")] * (solver == "auto")
 
 
 def test_a_preconditioner_beside_compared_ones_has_no_effect(program, settled):

@@ -52,14 +52,14 @@ class Newton:
     ----------
     system : the present problem's, not there before the first
     linear : what solves it
-    systems : the number of systems that a KSP was to solve so far
+    ksp_systems : the number of systems that a KSP was to solve so far
     """
 
     system: NewtonForm
 
     def __init__(self, comm: MPI.Comm, form: str = "contact", compare: Comparison | None = None):
         self.comm, self.form, self.compare = comm, form, compare
-        self.systems = 0
+        self.ksp_systems = 0
         self._structure: tuple | None = None  # of the system's problem
         self._instead = False  # of the bodies' form, which the present problem has not
         self._linear: LinearSolver | None = None
@@ -161,7 +161,7 @@ class Newton:
             if self._rtol_is_given:
                 wanted = min(wanted, 0.5 * norm)
             if wanted < norm < np.inf:  # the caller finds no step in a direction that is no number
-                self.systems += 1
+                self.ksp_systems += 1
                 self.linear.solve(self._b, self._x, max(wanted / norm, 1e-14))
                 x += self._x.array
             return self.system.impulses(x, q, uncoupled), x

@@ -159,8 +159,8 @@ class Krylov:
         own = {name: value for name, value in options_database().items() if name.startswith(start)}
         viewers = {name: value for name, value in own.items() if _VIEWER.fullmatch(name[len(self.prefix) :])}
         if viewers:
-            again = {name: _continued(value) for name, value in viewers.items()}
-            with entered(again, hidden=own), set_skip_pc(self.ksp):
+            continued = {name: _continued(value) for name, value in viewers.items()}
+            with entered(continued, hidden=own), set_skip_pc(self.ksp):
                 self.ksp.setFromOptions()
 
     def _set_up(self, A: PETSc.Mat, P: Source, keep: bool) -> None:
