@@ -51,7 +51,7 @@ class Solver:
 SOLVERS = {
     solver.name: solver
     for solver in (
-        Solver("pdip", pdip.solve, pdip.PDIP, NEWTON, 100,
+        Solver("pdip", pdip.solve, pdip.PDIP, NEWTON, 200,
                "the paper's primal-dual interior point method", "the paper, section 2.4"),
         Solver("conic", conic.solve, conic.Conic, NEWTON, 60,
                "symmetric cone interior point method, Nesterov-Todd scaling, Mehrotra's corrector",
