@@ -8,10 +8,10 @@ with one constraint per contact. With the multipliers eliminated a step is
 
     S dg = -(N g + r + grad f / (-t f)),    S = N + lambda hess f + lambda/(-f) grad f grad f'.
 
-Where the paper's form creeps, this one differs in these points, each measured in ``docs/notebook_ccp.md``: the constraint
-is the cone's perspective form; steps end at 0.9 of the way to the boundary and inside a neighbourhood of the central path,
-rather than at 0.99 and where ||r_t|| falls; a direction that the cones' curvature cuts short is corrected, and after
-short steps near the solution S has a proximal term.
+Where the paper's form creeps, this one differs, as measured in ``docs/notebook_ccp.md``: the constraint is the cone's
+perspective form; the complementarity aimed at falls by less; steps end at 0.9 of the way to the boundary and inside a
+neighbourhood of the central path, rather than where ||r_t|| falls; a direction that the cones' curvature cuts short is
+corrected, and after short steps near the solution S has a proximal term.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ class PDIP:
     """Options ``-ccp_pdip_*`` and the other numbers of the method; docs/notebook_ccp.md has what was measured."""
 
     form: str = option(
-        PERSPECTIVE, "perspective: one smooth constraint per contact; paper: the paper's two, its start and line search",
+        PERSPECTIVE,
+        "perspective: one smooth constraint per contact; paper: the paper's two, with its start and its line search",
         choices=FORMS,
     )  # fmt: skip
     centering: Optional[float] = option(

@@ -6,9 +6,10 @@ momenta dv with
     (N + C + B) dg = q + G r_v,    dv = G' dg - r_v,
 
 N = G G' the Delassus matrix and C the compliance. ``-ccp_newton`` chooses the unknowns: ``contact`` or ``body``
-(`forms.py`). A method with constraints f <= 0 and multipliers asks for their changes too (`Newton.linearise`, `step`), and
-can have them as unknowns, in the form ``kkt`` (`kkt.py`). A `Newton` object lives as long as the simulation: Krylov methods and preconditioners stay from
-one cone problem to the next, and matrices too where the contacts are the same.
+(`forms.py`). A method with constraints f <= 0 and multipliers asks for the changes of these too (`Newton.linearise`,
+`step`), and can have them as unknowns, in the form ``kkt`` (`kkt.py`). A `Newton` object lives as long as the simulation:
+Krylov methods and preconditioners stay from one cone problem to the next, and matrices too where the contacts are the
+same.
 """
 
 from __future__ import annotations
@@ -130,13 +131,14 @@ class Newton:
                 self.linear.new_matrix(self.system)
 
     def linearise(self, kkt: KKT) -> None:
-        """Set the Newton matrix of a method with constraints and multipliers. Forms other than `kkt` eliminate these."""
+        """Set the Newton matrix of a method with constraints and multipliers. Forms other than `kkt` eliminate them."""
         self._kkt = kkt
-        if not isinstance(self.system, KKTForm):
-            return self.update(kkt.schur())
-        with phase("CCPUpdate"):
-            self.system.linearise(kkt)
-            self.linear.new_matrix(self.system)
+        if isinstance(self.system, KKTForm):
+            with phase("CCPUpdate"):
+                self.system.linearise(kkt)
+                self.linear.new_matrix(self.system)
+        else:
+            self.update(kkt.schur())
 
     def step(
         self, r_g: Array, r_lam: Array, tol: float, earlier: Sequence[Array] = ()
@@ -206,7 +208,7 @@ class Newton:
         ``left``; zeros if the sums are no numbers."""
         sums = self.problem.sum(np.column_stack([left @ products.T, left @ b]))
         if not np.isfinite(sums).all():
-            return np.zeros(len(xs))
+            return np.zeros(len(products))
         energies, works = sums[:, :-1], sums[:, -1]
         size = np.sqrt(np.maximum(np.diagonal(energies), TINY))
         # scaled, as solutions shrink from one Newton step to the next; of nearly parallel ones only the sum counts

@@ -47,11 +47,12 @@ class KKT(NamedTuple):
 
 
 class KKTForm(ContactForm):
-    """The system with the matrix of `KKT` (block size 3 + k: a contact and its multipliers), unsymmetric as in the paper.
+    """The system with the matrix of `KKT`, unsymmetric as in the paper; a contact and its multipliers are a block of
+    3 + k rows.
 
     The rows of multipliers are multiplied by |df| / -f, and the unknowns are |df| dlam. So all unknowns but dg, and all
-    residuals, are velocities, E is the identity, and an inexact solve leaves sqrt(1 + k) times its residual in S dg at most.
-    A preconditioner that reads entries gets an AIJ Mat.
+    residuals, are velocities, E is the identity, and an inexact solve leaves at most sqrt(1 + k) times its residual in
+    S dg. A symmetric scaling has no such bound. A preconditioner that reads entries gets an AIJ Mat.
     """
 
     def __init__(self, problem: ConeProblem):
@@ -122,5 +123,5 @@ class KKTForm(ContactForm):
 
     def changes(self, x: Array) -> tuple[Array, Array]:
         """dg and dlam of a solution."""
-        x = x.reshape(len(self.size), -1)
+        x = x.reshape(self._local.shape[:2])
         return x[:, :3].copy(), x[:, 3:] / self.size
