@@ -7,9 +7,9 @@ momenta dv with
 
 N = G G' the Delassus matrix and C the compliance. ``-ccp_newton`` chooses the unknowns: ``contact`` or ``body``
 (`forms.py`). A method with constraints f <= 0 and multipliers asks for the changes of these too (`Newton.linearise`,
-`step`), and can have them as unknowns, in the form ``kkt`` (`kkt.py`). A `Newton` object lives as long as the simulation:
-Krylov methods and preconditioners stay from one cone problem to the next, and matrices too where the contacts are the
-same.
+`step`), and can have them as unknowns, in the form ``kkt`` (`kkt.py`). A `Newton` object lives as long as the
+simulation: Krylov methods and preconditioners stay from one cone problem to the next, and matrices too where the
+contacts are the same.
 """
 
 from __future__ import annotations
