@@ -10,7 +10,8 @@ The paper asks for "a backtracking line search, and a strategy to increase t", a
 that g_n is the last impulse of a contact or "a constant preset value (e.g. 1)", here 1 N s. What it leaves open is
 taken from Boyd and Vandenberghe, Convex Optimization (2004), section 11.7, whose notation it has:
 
-- the multipliers of the start are -1/f_i, those of t = 1;
+- the multipliers of the start are -1/(t f_i); the t of the start is 2Nc / (|N g + r| |g|). (The book takes t = 1, which
+  has a unit. Steps in which jams come loose are then not solved.)
 - t = 10 m / (-f'lambda), m = 2Nc (algorithm 11.2), but only after a step of at least 0.5, and not after each as in the
   book: so the path would be lost (settled mixer, 2,142 contacts: natural residual 1.2e-3 after 300 steps, where it
   takes 121 to 1e-4);
@@ -48,7 +49,8 @@ def solve(
     newton.begin(problem)
     g = np.zeros_like(problem.r)
     g[:, 0] = np.where(guess[:, 0] > 0, guess[:, 0], 1.0)
-    lam = -1.0 / constraints(g, mu)
+    aim = problem.norm(velocity(problem, g)) * problem.norm(g) / m  # 1/t
+    lam = -aim / constraints(g, mu)
     history, step = list[float](), 1.0
     for iteration in range(limits.max_it + 1):
         y, f, df = velocity(problem, g), constraints(g, mu), gradients(g, mu)
@@ -61,7 +63,7 @@ def solve(
             status, reason = Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
             break
         if step >= 0.5:
-            aim = target * problem.sum(-np.vdot(f, lam)) / m  # 1/t
+            aim = target * problem.sum(-np.vdot(f, lam)) / m
         r_g, r_lam = y + np.einsum("ck,cki->ci", lam, df), -lam * f - aim
         kkt = KKT(curvature(f, lam, mu), df, f, lam)
         newton.linearise(kkt)
