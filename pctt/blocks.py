@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 Array = NDArray[np.float64]
+Product = Callable[[Array, Array], None]
 
 
 def square_block_matrix(comm: MPI.Comm, rows: sp.bsr_matrix) -> PETSc.Mat:
@@ -58,26 +59,30 @@ def new_matrix(
 
 
 class Shell:
-    """The context of a symmetric Mat of type python; it knows the diagonal blocks (n, bs, bs) of this rank's rows."""
+    """The context of a Mat of type python; it knows the diagonal blocks (n, bs, bs) of this rank's rows."""
 
-    def __init__(self, product: Callable[[Array, Array], None]):
-        self.product = product
+    def __init__(self, product: Product, transposed: Product | None = None):
+        self.product, self.transposed = product, transposed or product
         self.blocks: Array | None = None
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         self.product(x.array_r, y.array_w)
 
-    multTranspose = mult  # noqa: N815 - as PETSc names it
+    def multTranspose(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:  # noqa: N802 - as PETSc names it
+        self.transposed(x.array_r, y.array_w)
 
     def getDiagonal(self, mat: PETSc.Mat, diagonal: PETSc.Vec) -> None:
         assert self.blocks is not None
         diagonal.array_w[:] = np.diagonal(self.blocks, axis1=1, axis2=2).ravel()
 
 
-def symmetric_shell(comm: MPI.Comm, rows: int, block: int, product: Callable[[Array, Array], None]) -> PETSc.Mat:
+def symmetric_shell(
+    comm: MPI.Comm, rows: int, block: int, product: Product, transposed: Product | None = None
+) -> PETSc.Mat:
     """A Mat with ``rows`` local rows in blocks of size ``block``. Its product is ``product(x, out)``, which is
-    collective and gets local flat arrays."""
-    mat = PETSc.Mat().createPython(((rows, PETSc.DETERMINE), (rows, PETSc.DETERMINE)), Shell(product), comm=comm)
+    collective and gets local flat arrays. ``transposed`` is that of the transposed matrix, if it is another one."""
+    context = Shell(product, transposed)
+    mat = PETSc.Mat().createPython(((rows, PETSc.DETERMINE), (rows, PETSc.DETERMINE)), context, comm=comm)
     mat.setBlockSize(block)
     mat.setUp()
     mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)

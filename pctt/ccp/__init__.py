@@ -21,7 +21,7 @@ from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.newton import FORMS, Newton
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.registry import NEWTON, SOLVERS, why_refused
+from pctt.ccp.registry import NEWTON, SOLVERS, why_no_form, why_refused
 from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Limits, Result, Status
 from pctt.ccp.rolling import RollingProblem
 from pctt.ccp.unbounded import why_unbounded
@@ -85,6 +85,7 @@ def solve(
         raise ValueError(f"the solver {type!r}: the problem has {why}")
     if rolls and newton is not None and newton.form != "body":
         raise ValueError(f"the Newton form {newton.form!r}: with rolling or spinning resistance allowed is body")
+    _refuse_form(type, newton.form if newton is not None else "")
     limits = limits or Limits()
     if not limits.tol > 0.0:
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
@@ -160,9 +161,16 @@ def _start(problem: ConeProblem, guess: Array | None) -> Array:
 
 
 def newton_for(comm: MPI.Comm, type: str, form: str = "auto", compare: Comparison | None = None) -> Newton:
-    """The Newton systems that a method of SOLVERS works with; ``form`` is auto or of FORMS."""
+    """The Newton systems that a method of SOLVERS works with; ``form`` is auto or of FORMS. ValueError for one that the
+    method cannot have."""
+    _refuse_form(type, form)
     if compare is not None and not compare.names:
         compare = None
     if form == "auto":
         form = "contact" if type == "pdip" or compare is not None else "body"
     return Newton(comm, form, compare)
+
+
+def _refuse_form(type: str, form: str) -> None:
+    if why := why_no_form(type, form):
+        raise ValueError(f"the Newton form {form!r}: {why}")

@@ -23,8 +23,8 @@ class Solver:
 
     ``needs`` is PRODUCT, MATRIX, NEWTON or EITHER; ``iterations`` the default limit (``-ccp_max_it``). A method that
     ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself; one that ``has_rolling``
-    takes a `pctt.ccp.rolling.RollingProblem`, and one that ``has_coupled`` a problem of bodies with joints or
-    in a cell that deforms.
+    takes a `pctt.ccp.rolling.RollingProblem`, one that ``has_coupled`` a problem of bodies with joints or in a cell
+    that deforms, and one that ``has_multipliers`` can have them as unknowns of its Newton systems (the form `kkt`).
     """
 
     name: str
@@ -37,6 +37,7 @@ class Solver:
     has_law: bool = False
     has_rolling: bool = False
     has_coupled: bool = False
+    has_multipliers: bool = False
 
     @property
     def newton(self) -> bool:
@@ -51,8 +52,8 @@ class Solver:
 SOLVERS = {
     solver.name: solver
     for solver in (
-        Solver("pdip", pdip.solve, pdip.PDIP, NEWTON, 100,
-               "the paper's primal-dual interior point method", "the paper, section 2.4"),
+        Solver("pdip", pdip.solve, pdip.PDIP, NEWTON, 200,
+               "the paper's primal-dual interior point method", "the paper, section 2.4", has_multipliers=True),
         Solver("conic", conic.solve, conic.Conic, NEWTON, 60,
                "symmetric cone interior point method, Nesterov-Todd scaling, Mehrotra's corrector",
                "Nesterov, Todd 1997; Acary et al. 2023", has_law=True, has_rolling=True),
@@ -91,3 +92,11 @@ def why_refused(type: str, rolls: bool, coupled: str) -> str:
     if rolls and type not in with_rolling:
         return f"rolling or spinning resistance; allowed are {', '.join(with_rolling)}"
     return ""
+
+
+def why_no_form(type: str, form: str) -> str:
+    """In words, why a method cannot have its Newton systems in a form, and which are allowed; "" if it can."""
+    if form != "kkt" or SOLVERS[type].has_multipliers:
+        return ""
+    allowed = ", ".join(name for name, method in SOLVERS.items() if method.has_multipliers)
+    return f"{type} has no constraints with multipliers; allowed with it are contact and body, and kkt with {allowed}"

@@ -15,7 +15,7 @@ from dem.experiment import SCENE_FILE, Experiment, Given, SceneFileError, from_f
 from dem.scene import Scene
 from dem.scenes import SCENES
 from pctt import ccp
-from pctt.ccp.registry import why_refused
+from pctt.ccp.registry import why_no_form, why_refused
 from pctt.options import (
     AT_LEAST_ONE,
     COUNT,
@@ -67,7 +67,8 @@ class Settings(ccp.Limits):
         choices=ccp.SOLVERS, name="ccp_type",
     )  # fmt: skip
     newton: str = option(
-        "auto", "unknowns of the Newton systems; auto: contact for pdip, body for conic", choices=("auto", *ccp.FORMS)
+        "auto", "unknowns of the Newton systems, kkt for pdip alone; auto: contact for pdip, body for conic",
+        choices=("auto", *ccp.FORMS),
     )
     law: str = option(
         "",
@@ -126,6 +127,8 @@ class Settings(ccp.Limits):
         are. OptionError for a bad value."""
         refuse_bad(self)
         law = self.law or (ccp.RELAXATION if relaxed or self.solver == "pdip" else ccp.COULOMB)
+        if why := why_no_form(self.solver, self.newton):
+            raise OptionError(f"newton {self.newton}: {why}")
         kind, options = ccp.SOLVERS[self.solver].options, self.options
         if options is None or isinstance(options, Mapping):
             options = made(kind, options or {})

@@ -18,7 +18,7 @@ from pctt.ccp.newton.forms import ContactForm
 COMM = MPI.COMM_SELF
 TOL = 1e-4  # natural residual at which the Newton systems end
 #: The options of `pdip`: those of the program, and those nearest to the paper.
-FORMS = {"program": PDIP(), "paper": PDIP(constraint="quadratic", centering=0.1, boundary=0.99)}
+FORMS = {"program": PDIP(), "paper": PDIP(form="paper")}
 
 
 class System(NamedTuple):

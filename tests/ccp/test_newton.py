@@ -1,6 +1,8 @@
-"""Newton systems in their two forms against dense linear algebra, with hub bodies, on several ranks."""
+"""Newton systems in their forms against dense linear algebra, with hub bodies, on several ranks."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 import pytest
@@ -14,9 +16,10 @@ from pctt.ccp import delassus
 from pctt.ccp.newton import few as elimination
 from pctt.ccp.newton.few import Factors, ordered
 from pctt.ccp.newton.forms import BodyForm, ContactForm
+from pctt.ccp.newton.kkt import KKT
 from pctt.ccp.newton.linear import Settings
 
-FORMS = pytest.mark.parametrize("form", ccp.FORMS)
+FORMS = pytest.mark.parametrize("form", ["contact", "body"])  # those that take any barrier blocks
 
 
 @pytest.fixture(autouse=True)
@@ -60,8 +63,9 @@ def test_the_forms_agree_with_dense_algebra(form, many, monkeypatch):
     newton.destroy()
 
 
-@FORMS
-@pytest.mark.parametrize("solver", ["pdip", "conic"])
+@pytest.mark.parametrize(
+    ("form", "solver"), [*((form, "pdip") for form in ccp.FORMS), ("body", "conic"), ("contact", "conic")]
+)
 def test_every_form_gives_the_optimum(form, solver):
     known, graph = heap(3)
     problem = from_graph(known, graph)
@@ -73,7 +77,7 @@ def test_every_form_gives_the_optimum(form, solver):
 
 
 @pytest.mark.parallel(1, 2)
-@FORMS
+@pytest.mark.parametrize("form", ccp.FORMS)
 def test_a_matrix_with_entries_in_other_places_is_another_one(form):
     """The first N is destroyed: the second one may have its address."""
     comm = MPI.COMM_WORLD
@@ -120,6 +124,95 @@ def test_one_object_serves_one_problem_after_another(form):
     newton.begin(from_graph(*heap(4)))
     assert newton.system.matrix is not matrices[-1]
     newton.destroy()
+
+
+# -- with multipliers ----------------------------------------------------------------------------------------
+
+
+def conditions(contacts: int, each: int, seed: int = 0) -> KKT:
+    """Of so many constraints per contact, with values and multipliers over six orders of magnitude."""
+    rng = np.random.default_rng(seed)
+    f, lam = (10.0 ** rng.uniform(-3, 3, (contacts, each)) for _ in range(2))
+    M = np.zeros((contacts, 3, 3))
+    M[:, [0, 1, 2], [0, 1, 2]] = rng.uniform(0.1, 2.0, (contacts, 3))
+    return KKT(M, rng.standard_normal((contacts, each, 3)), -f, lam)
+
+
+def dense_kkt(N: np.ndarray, kkt: KKT) -> np.ndarray:
+    """[N + M, B; C, E] of the paper."""
+    B = block_diag(*kkt.df).T
+    C = -kkt.lam.reshape(-1, 1) * B.T
+    return np.block([[N + block_diag(*kkt.M), B], [C, np.diag(-kkt.f.ravel())]])
+
+
+@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parametrize("form", ccp.FORMS)
+@pytest.mark.parametrize(("each", "many"), [(1, 1000), (2, 1000), (2, 20)])
+def test_all_forms_give_the_step_of_the_matrix_with_multipliers(form, each, many, monkeypatch, database):
+    """Also where a body has more contacts than N is filled with, and for a second problem of the same contacts."""
+    monkeypatch.setattr(delassus, "HUB", many)
+    database["ksp_max_it"] = 5000
+    comm, contacts, bodies, e = MPI.COMM_WORLD, 60, 20, 1e-2
+    graph, here = random_graph(0, contacts, bodies, hub=True), part(comm, contacts)
+    newton = ccp.Newton(comm, form)
+    for seed in range(2):
+        graph = dataclasses.replace(graph, blocks=(1 + seed) * graph.blocks)
+        G, rows = graph.dense(), graph.part(comm)
+        kkt, rng = conditions(contacts, each, seed), np.random.default_rng(5)
+        r_g, r_lam = rng.standard_normal((contacts, 3)), rng.standard_normal((contacts, each))
+        N = G @ G.T + e * np.diag(np.tile([1.0, 0.0, 0.0], contacts))
+        exact = np.linalg.solve(dense_kkt(N, kkt), np.concatenate([r_g.ravel(), r_lam.ravel()]))
+        newton.begin(ccp.ConeProblem(comm, r_g[here], np.full(contacts, 0.5)[here], G=rows, compliance=e))
+        newton.linearise(KKT(*(part_[here] for part_ in kkt)))
+        dg, dlam, _ = newton.step(r_g[here], r_lam[here], 1e-11 * np.linalg.norm(kkt.reduced(r_g, r_lam)))
+        right_g, right_lam = exact[: 3 * contacts].reshape(-1, 3), exact[3 * contacts :].reshape(-1, each)
+        np.testing.assert_allclose(dg, right_g[here], rtol=0, atol=1e-7 * np.abs(right_g).max())
+        np.testing.assert_allclose(dlam, right_lam[here], rtol=1e-5, atol=1e-7 * np.abs(right_lam).max())
+    newton.destroy()
+
+
+@pytest.mark.parallel(1, 2)
+def test_the_matrix_with_multipliers_has_entries_and_a_transposed_product():
+    comm, contacts = MPI.COMM_WORLD, 40
+    known, graph = heap(3)
+    here, kkt = part(comm, contacts), conditions(contacts, 2)
+    newton = ccp.Newton(comm, "kkt")
+    rng = np.random.default_rng(0)
+    for factor in (1.0, 3.0):  # a second problem of the same contacts
+        rows = dataclasses.replace(graph, blocks=factor * graph.blocks).part(comm)
+        newton.begin(ccp.ConeProblem(comm, known.r[here], known.mu[here], G=rows))
+        newton.linearise(KKT(*(part_[here] for part_ in kkt)))
+        A = newton.system.matrix
+        assert A.getSize() == (5 * contacts, 5 * contacts)
+        entries = newton.system.entries()
+        assert entries.getType() in ("seqaij", "mpiaij")
+        (x, y), u = A.createVecs(), A.createVecLeft()
+        x.array[:] = rng.standard_normal(x.local_size)
+        for one, other in ((A.mult, entries.mult), (A.multTranspose, entries.multTranspose)):
+            one(x, y), other(x, u)
+            np.testing.assert_allclose(y.array, u.array, rtol=0, atol=1e-9 * y.norm())
+        # the paper's matrix, after the scaling of the rows and columns of multipliers
+        order = np.concatenate([3 * np.arange(contacts)[:, None] + [0, 1, 2],
+                                3 * contacts + 2 * np.arange(contacts)[:, None] + [0, 1]], axis=1).ravel()  # fmt: skip
+        size = np.linalg.norm(kkt.df, axis=2)
+        row, column = np.ones((contacts, 5)), np.ones((contacts, 5))
+        row[:, 3:], column[:, 3:] = size / -kkt.f, 1 / size
+        paper = dense_kkt(factor**2 * known.N, kkt)[np.ix_(order, order)] * column.ravel()
+        whole = np.concatenate(comm.allgather(x.array.copy()))
+        A.mult(x, y)
+        expected = (row.ravel() * (paper @ whole)).reshape(contacts, 5)[here].ravel()
+        np.testing.assert_allclose(y.array, expected, rtol=1e-9, atol=1e-9 * y.norm())
+    newton.destroy()
+
+
+def test_methods_without_multipliers_refuse_them_as_unknowns():
+    for solver in ("conic", "auto", "apgd"):
+        with pytest.raises(ValueError, match=f"the Newton form 'kkt': {solver} .* allowed .* pdip"):
+            ccp.newton_for(SELF, solver, "kkt")
+        newton = ccp.Newton(SELF, "kkt")
+        with pytest.raises(ValueError, match="the Newton form 'kkt'"):
+            ccp.solve(from_matrix(heap()[0]), type=solver, newton=newton)
+        newton.destroy()
 
 
 def test_few_contacts_are_never_kept_apart():

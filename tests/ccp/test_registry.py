@@ -20,7 +20,7 @@ def table():
     lines = ["| `-ccp_type` | method | needs | iterations | options and defaults | source |", "|" + "---|" * 6]
     for solver in ccp.SOLVERS.values():
         options = ", ".join(
-            f"`-{d.name} {str(d.default).lower() if isinstance(d.default, bool) else d.default}`"
+            f"`-{d.name} {str(d.default).lower() if isinstance(d.default, (bool, type(None))) else d.default}`"
             for d in describe(solver.options, solver.prefix)
         )
         cells = [f"`{solver.name}`", solver.help, solver.needs, f"{solver.iterations:,}", options, solver.source]

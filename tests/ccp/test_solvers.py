@@ -73,14 +73,6 @@ def test_reaches_the_known_optimum(solver, name, way):
     check(known, problem, ccp.solve(problem, type=solver, limits=Limits(tol)), tol)
 
 
-@pytest.mark.parametrize("constraint", ["perspective", "quadratic"])
-def test_both_forms_of_the_constraint_lead_to_the_optimum(constraint):
-    known, graph = heap(bodies=30)
-    problem = from_graph(known, graph)
-    result = ccp.solve(problem, limits=Limits(1e-5), options=ccp.SOLVERS["pdip"].options(constraint=constraint))
-    check(known, problem, result, 1e-5)
-
-
 def test_contacts_that_share_no_body_are_solved_one_by_one():
     """Isolated contacts, each a problem of its own: also the other way round, all in one."""
     alone = [heap(seed, 1, 1) for seed in range(12)]

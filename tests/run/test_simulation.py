@@ -277,6 +277,7 @@ def test_to_import_the_package_starts_no_petsc():
         ({"slover": "apgd"}, "slover: no such setting; .*; did you mean solver"),
         ({"solver": "apgd", "options": {"memroy": 1}}, "memroy: no such setting"),
         ({"solver": "pdip", "options": APGD()}, "options APGD.*allowed for pdip is a dict or a PDIP"),
+        ({"solver": "conic", "newton": "kkt"}, "newton kkt: conic has no constraints.*allowed.*contact and body"),
         ({"law": "yes"}, "law yes: allowed is one of coulomb, relaxation"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pctt.ccp.cone import TINY, Array
 from pctt.ccp.problem import ConeProblem
@@ -15,3 +16,16 @@ def useful_part(problem: ConeProblem, guess: Array) -> Array:
     dozens of steps to get rid of them, or stalls."""
     along, bent = problem.dot(problem.r, guess), problem.dot(problem.product(guess), guess)
     return float(np.clip(-along / max(bent, TINY), 0.0, 1.0)) * guess
+
+
+def velocity(problem: ConeProblem, g: Array) -> Array:
+    """y = N g + r (nc, 3) but for the sliding of contacts without friction, which no impulse answers."""
+    y = problem.product(g) + problem.r
+    y[problem.mu == 0, 1:] = 0.0
+    return y
+
+
+def hold(blocks: Array, free: NDArray[np.bool_], stiff: Array) -> None:
+    """Hold the tangential impulses of contacts that are ``free`` of friction at zero: in their blocks (nc, 3, 3), with
+    a number that is large beside ``stiff`` (nc,), the normal entry of the barrier."""
+    blocks[free, 1, 1] = blocks[free, 2, 2] = 1e12 * np.maximum(stiff[free], 1.0)

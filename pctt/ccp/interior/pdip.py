@@ -1,52 +1,56 @@
-"""The paper's primal-dual interior point method (PDIP) for the cone problem.
+"""The primal-dual interior point method (PDIP) for the cone problem, in the project's form; `paper` has the paper's.
 
 Newton's method on the perturbed optimality conditions of min 1/2 g'Ng + r'g, f(g) <= 0 (paper, section 2.4):
 
     N g + r + sum lambda_i grad f_i = 0,    -lambda_i f_i = 1/t,
 
-with the multipliers eliminated:
+with one constraint per contact. With the multipliers eliminated a step is
 
     S dg = -(N g + r + grad f / (-t f)),    S = N + lambda hess f + lambda/(-f) grad f grad f'.
 
-Where the paper's form creeps (134 Newton steps at 17,911 contacts, natural residual 6e-5), this one differs
-in five points, each measured in ``docs/notebook_ccp.md``: the constraint is the cone's perspective form; steps end at
-0.9 of the way to the boundary and inside a neighbourhood of the central path, rather than at 0.99 and where the
-multiplier residual falls; a direction that the cones' curvature cuts short is corrected, and after short steps near the
-solution S has a proximal term; and the natural residual alone decides when to stop.
+Where the paper's form creeps, this one differs, as measured in ``docs/notebook_ccp.md``: the constraint is the cone's
+perspective form; the complementarity aimed at falls by less; steps end at 0.9 of the way to the boundary and inside a
+neighbourhood of the central path, rather than where ||r_t|| falls; a direction that the cones' curvature cuts short is
+corrected, and after short steps near the solution S has a proximal term.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Optional
 
 import numpy as np
 
 from pctt.ccp.cone import Array, dot, step_to_boundary, step_to_zero, times
-from pctt.ccp.interior import useful_part
+from pctt.ccp.interior import hold, paper, useful_part, velocity
 from pctt.ccp.newton import Newton
+from pctt.ccp.newton.kkt import KKT
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 from pctt.log import phase
 from pctt.options import FRACTION, number, option
 
-CONSTRAINTS = ("perspective", "quadratic")
+PERSPECTIVE, PAPER = FORMS = ("perspective", "paper")
 
 
 @dataclass(frozen=True)
 class PDIP:
     """Options ``-ccp_pdip_*`` and the other numbers of the method; docs/notebook_ccp.md has what was measured."""
 
-    constraint: str = option(
-        "perspective", "form of the cone constraint; quadratic is the paper's", choices=CONSTRAINTS
-    )
-    centering: float = option(
-        0.3, "complementarity aimed at, as a part of the present one (the paper: 0.1)", check=FRACTION
-    )
-    boundary: float = option(
-        0.9, "part of the way to the cone's boundary that a step may go (the paper: 0.99)", check=FRACTION
-    )
+    form: str = option(
+        PERSPECTIVE,
+        "perspective: one smooth constraint per contact; paper: the paper's two, with its start and its line search",
+        choices=FORMS,
+    )  # fmt: skip
+    centering: Optional[float] = option(
+        None, "complementarity aimed at, as a part of the present one; none: 0.3, and 0.1 in the form paper",
+        check=FRACTION,
+    )  # fmt: skip
+    boundary: Optional[float] = option(
+        None, "part of the way to the boundary that a step may go: of the cones, and in the form paper of lambda > 0; "
+        "none: 0.9, and 0.99 in the form paper", check=FRACTION,
+    )  # fmt: skip
     neighbourhood: float = number(1e-4, "least complementarity of a contact, as a part of the mean; below, steps stick")
     start: float = number(10.0, "normal impulse of new contacts [rms(r) / mean diag N]: 1 N s in a settled packing")
     rtol: float = number(3e-4, "relative residual of a linear solve; with 1 it takes twice the Newton steps")
@@ -61,16 +65,12 @@ class PDIP:
 
 @dataclass(frozen=True)
 class Cone:
-    """The friction cones as constraints f(g) <= 0, whose first and second derivatives exist inside.
-
-    quadratic : the paper's f = 1/2 (|g_t|^2 - mu^2 g_n^2), g_n > 0. Its gradient vanishes at the apex, so that the
-        multipliers of contacts that open diverge.
-    perspective : the same divided by g_n, convex and of degree one. Its gradient stays away from zero.
+    """The friction cones as constraints f(g) <= 0, with first and second derivatives inside: the perspective form
+    f = 1/2 (|g_t|^2 / g_n - mu^2 g_n), convex and of degree one. Its gradient stays away from zero.
 
     A contact without friction has no interior: its constraint is -g_n <= 0.
     """
 
-    constraint: str
     mu: Array
 
     @property
@@ -79,38 +79,33 @@ class Cone:
 
     def value(self, g: Array) -> Array:
         """f (nc,)."""
-        f = 0.5 * (g[:, 1] ** 2 + g[:, 2] ** 2 - (self.mu * g[:, 0]) ** 2)
-        if self.constraint == "perspective":
-            f /= g[:, 0]
+        f = 0.5 * (g[:, 1] ** 2 + g[:, 2] ** 2 - (self.mu * g[:, 0]) ** 2) / g[:, 0]
         return np.where(self.frictionless, -g[:, 0], f)
 
     def gradient(self, g: Array) -> Array:
         """(nc, 3)."""
-        df = g.copy()
-        df[:, 0] *= -(self.mu**2)
-        if self.constraint == "perspective":
-            df[:, 1:] /= g[:, :1]
-            df[:, 0] = -0.5 * (df[:, 1] ** 2 + df[:, 2] ** 2 + self.mu**2)
+        df = g / g[:, :1]
+        df[:, 0] = -0.5 * (df[:, 1] ** 2 + df[:, 2] ** 2 + self.mu**2)
         df[self.frictionless] = [-1.0, 0.0, 0.0]
         return df
 
     def hessian(self, g: Array) -> Array:
         """(nc, 3, 3)."""
-        H = np.zeros((len(g), 3, 3))
+        H, slope = np.zeros((len(g), 3, 3)), g[:, 1:] / g[:, :1]
+        H[:, 0, 0] = (slope**2).sum(1)
+        H[:, 0, 1:] = H[:, 1:, 0] = -slope
         H[:, 1, 1] = H[:, 2, 2] = 1.0
-        H[:, 0, 0] = -(self.mu**2)
-        if self.constraint == "perspective":
-            slope = g[:, 1:] / g[:, :1]
-            H[:, 0, 0] = (slope**2).sum(1)
-            H[:, 0, 1:] = H[:, 1:, 0] = -slope
-            H /= g[:, :1, None]
+        H /= g[:, :1, None]
         H[self.frictionless] = 0.0
         return H
 
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, newton: Newton) -> Result:
     """Impulses; ``guess`` (nc, 3) gives the normal impulses of persistent contacts, 0 elsewhere."""
-    cone = Cone(options.constraint, problem.mu)
+    if options.form == PAPER:
+        return paper.solve(problem, guess, limits, newton, options.centering or 0.1, options.boundary or 0.99)
+    centering, boundary = options.centering or 0.3, options.boundary or 0.9
+    cone = Cone(problem.mu)
     newton.begin(problem)
     linear = newton.linear
     g, lam = _start(problem, guess, cone, options)
@@ -119,7 +114,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     step, damping = 1.0, 0.0
     for iteration in range(limits.max_it + 1):
         # residuals
-        y = _velocity(problem, g)
+        y = velocity(problem, g)
         errors = problem.errors(g, y)
         history.append(limits.residual(errors))
         if history[-1] <= limits.tol:
@@ -130,22 +125,24 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
             break
         # linearisation
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
-        aim = options.centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
-        at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, earlier)
+        aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         damping = _next_damping(damping, step, errors.natural, options)
-        newton.update(_barrier_blocks(at, damping * errors.natural * problem.mean_diagonal))
+        kkt = _matrix(cone, hessian, df, f, lam, damping * errors.natural * problem.mean_diagonal)
+        newton.linearise(kkt)
+        at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, earlier)
         # Newton step. The residual of a solve is a velocity. It must be only a part of those that the natural residual
         # stands for: otherwise complementarity would fall without them, and near the boundary no step makes up for that
-        q = _right_side(at, aim)
+        r_g, r_lam = _right_side(at, aim)
         shown = errors.natural * problem.norm(g) * problem.mean_diagonal
-        tol = min(options.rtol * problem.norm(q), options.forcing * shown)
-        dg, dlam = _direction(at, q, aim, tol)
-        step = _step_length(at, dg, dlam, options)
+        tol = min(options.rtol * problem.norm(kkt.reduced(r_g, r_lam)), options.forcing * shown)
+        dg, dlam = _direction(at, r_g, r_lam, tol)
+        step = _step_length(at, dg, dlam, boundary, options)
         # corrected step, where the cones' curvature cuts Newton's short and the other is much longer
         if step < options.short:
             curved, missed = _bend(at, dg, dlam, min(1.0, step + options.reach))
-            other_dg, other_dlam = _direction(at, _right_side(at, aim + missed) - curved, aim + missed, tol)
-            other = _step_length(at, other_dg, other_dlam, options)
+            r_g, r_lam = _right_side(at, aim + missed)
+            other_dg, other_dlam = _direction(at, r_g - curved, r_lam, tol)
+            other = _step_length(at, other_dg, other_dlam, boundary, options)
             if other > options.longer * step:
                 step, dg, dlam = other, other_dg, other_dlam
         if not step > options.least:
@@ -188,17 +185,17 @@ def _next_damping(damping: float, step: float, natural: float, options: PDIP) ->
     return damping / 4.0 if step > 0.7 else damping
 
 
-def _right_side(at: Linearised, aim: Array | float) -> Array:
-    """Of the Newton system, for the complementarity ``aim``, of all contacts or of each."""
-    return (aim / at.f)[:, None] * at.df - at.y
+def _right_side(at: Linearised, aim: Array | float) -> tuple[Array, Array]:
+    """-r_t, the two parts (nc, 3) and (nc, 1), for the complementarity ``aim`` = 1/t, of all contacts or of each."""
+    return -(at.y + at.lam[:, None] * at.df), (at.lam * at.f + aim)[:, None]
 
 
-def _direction(at: Linearised, q: Array, aim: Array | float, tol: float) -> tuple[Array, Array]:
-    """dg and dlam for the right-hand side q and the complementarity ``aim``."""
-    dg, x = at.newton.solve(q, tol, earlier=at.earlier)
+def _direction(at: Linearised, r_g: Array, r_lam: Array, tol: float) -> tuple[Array, Array]:
+    """dg and dlam for a right-hand side."""
+    dg, dlam, x = at.newton.step(r_g, r_lam, tol, earlier=at.earlier)
     at.earlier.append(x)
     dg[at.cone.frictionless, 1:] = 0.0
-    return dg, -(at.lam + aim / at.f + at.lam / at.f * dot(at.df, dg))
+    return dg, dlam[:, 0]
 
 
 def _bend(at: Linearised, dg: Array, dlam: Array, reach: float) -> tuple[Array, Array]:
@@ -210,43 +207,34 @@ def _bend(at: Linearised, dg: Array, dlam: Array, reach: float) -> tuple[Array, 
     return reach * dlam[:, None] * turned, reach * missed
 
 
-def _velocity(problem: ConeProblem, g: Array) -> Array:
-    """y = N g + r but for the sliding of contacts without friction, which no impulse answers."""
-    y = problem.product(g) + problem.r
-    y[problem.mu == 0, 1:] = 0.0
-    return y
-
-
 def _start(problem: ConeProblem, guess: Array, cone: Cone, options: PDIP) -> tuple[Array, Array]:
     """Impulses on the cones' axes and multipliers of equal complementarity."""
-    closing = problem.norm(_velocity(problem, np.zeros_like(problem.r))) / np.sqrt(problem.size)
+    closing = problem.norm(velocity(problem, np.zeros_like(problem.r))) / np.sqrt(problem.size)
     new = options.start * closing / problem.mean_diagonal
     known = useful_part(problem, guess)[:, 0]
     g = np.zeros_like(problem.r)
     g[:, 0] = np.where(known > 0, np.maximum(known, 0.1 * new), new)
-    speed = problem.norm(_velocity(problem, g)) / np.sqrt(problem.size)
+    speed = problem.norm(velocity(problem, g)) / np.sqrt(problem.size)
     mean_normal = problem.sum(g[:, 0].sum()) / problem.size
     mean_mu = problem.sum(problem.mu.sum()) / problem.size
     return g, 3 * speed * mean_normal * (mean_mu or 1.0) / -cone.value(g)
 
 
-def _barrier_blocks(at: Linearised, proximal: float) -> Array:
-    """lambda hess f + lambda/(-f) grad f grad f' + rho I (nc, 3, 3), positive definite inside the cone."""
+def _matrix(cone: Cone, hessian: Array, df: Array, f: Array, lam: Array, proximal: float) -> KKT:
+    """lambda hess f + rho I, the gradients and the rest of the Newton matrix."""
     with phase("CCPBarrier"):
-        blocks = at.lam[:, None, None] * at.hessian
-        blocks += (at.lam / -at.f)[:, None, None] * at.df[:, :, None] * at.df[:, None, :]
-        blocks[:, [0, 1, 2], [0, 1, 2]] += proximal
-        free = at.cone.frictionless  # hold their tangential impulses at zero
-        blocks[free, 1, 1] = blocks[free, 2, 2] = 1e12 * np.maximum(blocks[free, 0, 0], 1)
-        return blocks
+        M = lam[:, None, None] * hessian
+        M[:, [0, 1, 2], [0, 1, 2]] += proximal
+        hold(M, cone.frictionless, lam / -f)
+        return KKT(M, df[:, None], f[:, None], lam[:, None])
 
 
-def _step_length(at: Linearised, dg: Array, dlam: Array, options: PDIP) -> float:
+def _step_length(at: Linearised, dg: Array, dlam: Array, boundary: float, options: PDIP) -> float:
     """Longest step, at most 1, inside the cones, near the central path; nan if the direction is no number."""
     problem, cone, g, lam = at.problem, at.cone, at.g, at.lam
     if not np.isfinite(problem.sum(dg.sum() + dlam.sum())):
         return np.nan
-    step = min(1.0, options.boundary * problem.min(min(step_to_boundary(g, dg, cone.mu), step_to_zero(lam, dlam))))
+    step = min(1.0, boundary * problem.min(min(step_to_boundary(g, dg, cone.mu), step_to_zero(lam, dlam))))
     while step > options.least:
         gap = -(lam + step * dlam) * cone.value(g + step * dg)
         mean = problem.sum(gap.sum()) / problem.size

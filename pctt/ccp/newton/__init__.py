@@ -1,4 +1,4 @@
-"""Newton systems of the interior point methods, in one of two forms, and their solvers.
+"""Newton systems of the interior point methods, in one of three forms, and their solvers.
 
 An interior point step has barrier blocks B (nc, 3, 3), one per contact, and asks for impulses dg and mass-scaled
 momenta dv with
@@ -6,8 +6,10 @@ momenta dv with
     (N + C + B) dg = q + G r_v,    dv = G' dg - r_v,
 
 N = G G' the Delassus matrix and C the compliance. ``-ccp_newton`` chooses the unknowns: ``contact`` or ``body``
-(`forms.py`). A `Newton` object lives as long as the simulation: Krylov methods and preconditioners stay from
-one cone problem to the next, and matrices too where the contacts are the same.
+(`forms.py`). A method with constraints f <= 0 and multipliers asks for the changes of these too (`Newton.linearise`,
+`step`), and can have them as unknowns, in the form ``kkt`` (`kkt.py`). A `Newton` object lives as long as the
+simulation: Krylov methods and preconditioners stay from one cone problem to the next, and matrices too where the
+contacts are the same.
 """
 
 from __future__ import annotations
@@ -26,16 +28,18 @@ from pctt.ccp.delassus import GivenMatrix, all_blocks
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.few import Order, ordered
 from pctt.ccp.newton.forms import BodyForm, ContactForm, FewForm, NewtonForm
+from pctt.ccp.newton.kkt import KKT, KKTForm
 from pctt.ccp.newton.linear import LinearSolver, Settings
 from pctt.ccp.problem import ConeProblem
 from pctt.ksp_options import OWN
 from pctt.log import phase
 from pctt.petsc import options_database
 
-FORMS: dict[str, Callable[[ConeProblem], NewtonForm]] = {"contact": ContactForm, "body": BodyForm}
+FORMS: dict[str, Callable[[ConeProblem], NewtonForm]] = {"contact": ContactForm, "body": BodyForm, "kkt": KKTForm}
 _ASKED = {OWN + "pc_type", OWN + "ksp_type"}  # options that say how a system is to be solved
 DEFAULTS = {
     "contact": {"ksp_type": "bcgs", "pc_type": "pbjacobi"},
+    "kkt": {"ksp_type": "bcgs", "pc_type": "pbjacobi"},
     "body": {"ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "pc_type": "pbjacobi"},
 }
 # of a problem that is given by N: a solve as accurate as that of the bodies would be
@@ -133,6 +137,28 @@ class Newton:
             if not isinstance(self.system, FewForm):
                 self.linear.new_matrix(self.system)
 
+    def linearise(self, kkt: KKT) -> None:
+        """Set the Newton matrix of a method with constraints and multipliers. Forms other than `kkt` eliminate them."""
+        self._kkt = kkt
+        if isinstance(self.system, KKTForm):
+            with phase("CCPUpdate"):
+                self.system.linearise(kkt)
+                self.linear.new_matrix(self.system)
+        else:
+            self.update(kkt.schur())
+
+    def step(
+        self, r_g: Array, r_lam: Array, tol: float, earlier: Sequence[Array] = ()
+    ) -> tuple[Array, Array, Array]:
+        """dg (nc, 3), dlam (nc, k) and the system's solution x for the right-hand side r_g (nc, 3), r_lam (nc, k) of
+        `KKT`, to a residual of ``tol`` as in `solve`."""
+        if not isinstance(self.system, KKTForm):
+            dg, x = self.solve(self._kkt.reduced(r_g, r_lam), tol, earlier=earlier)
+            return dg, self._kkt.multipliers(dg, r_lam), x
+        with phase("CCPKrylov"):
+            x = self._solution(self.system.right_side(r_g, r_lam), tol, earlier)
+            return (*self.system.changes(x), x)
+
     def solve(
         self,
         q: Array,
@@ -155,36 +181,42 @@ class Newton:
                     return x, x.ravel()
                 self.system.update_matrix()
                 self.linear.new_matrix(self.system)
-            x, product = self._start(b, earlier)
-            self._b.array[:] = b - product
-            norm = self._b.norm()
-            if self._rtol_is_given:
-                wanted = min(wanted, 0.5 * norm)
-            if wanted < norm < np.inf:  # the caller finds no step in a direction that is no number
-                self.ksp_systems += 1
-                self.linear.solve(self._b, self._x, max(wanted / norm, 1e-14))
-                x += self._x.array
+            x = self._solution(b, wanted, earlier)
             return self.system.impulses(x, q, uncoupled), x
+
+    def _solution(self, b: Array, wanted: float, earlier: Sequence[Array]) -> Array:
+        """x of the present system for the right-hand side b, to this residual."""
+        x, product = self._start(b, earlier)
+        self._b.array[:] = b - product
+        norm = self._b.norm()
+        if self._rtol_is_given:
+            wanted = min(wanted, 0.5 * norm)
+        if wanted < norm < np.inf:  # the caller finds no step in a direction that is no number
+            self.ksp_systems += 1
+            self.linear.solve(self._b, self._x, max(wanted / norm, 1e-14))
+            x += self._x.array
+        return x
 
     def _start(self, b: Array, earlier: Sequence[Array]) -> tuple[Array, Array]:
         """Where to begin from, and its product: the earlier solution, or zero. Of several the combination x with the
-        least energy 1/2 x'Ax - b'x: in the norm of A, which is then symmetric, no other one is nearer to the
-        solution."""
+        least energy 1/2 x'Ax - b'x, if A is symmetric: in the norm of A no other one is nearer to the solution; else
+        that with the least residual."""
         xs = np.array(earlier).reshape(len(earlier), len(b))
         products = np.empty_like(xs)
         for x, product in zip(xs, products):
             self._x.array[:] = x
             self.system.matrix.mult(self._x, self._b)
             product[:] = self._b.array
-        share = self._least_energy(xs, products, b) if len(xs) > 1 else np.ones(len(xs))
+        left = xs if self.system.symmetric else products
+        share = self._least(left, products, b) if len(xs) > 1 else np.ones(len(xs))
         return share @ xs, share @ products
 
-    def _least_energy(self, xs: Array, products: Array, b: Array) -> Array:
-        """The coefficients of the combination of vectors xs (k, rows) with the least energy; zeros if the energies are
-        no numbers."""
-        sums = self.problem.sum(np.column_stack([xs @ products.T, xs @ b]))
+    def _least(self, left: Array, products: Array, b: Array) -> Array:
+        """The coefficients of the combination of ``products`` (k, rows) whose difference from b is orthogonal to all of
+        ``left``; zeros if the sums are no numbers."""
+        sums = self.problem.sum(np.column_stack([left @ products.T, left @ b]))
         if not np.isfinite(sums).all():
-            return np.zeros(len(xs))
+            return np.zeros(len(products))
         energies, works = sums[:, :-1], sums[:, -1]
         size = np.sqrt(np.maximum(np.diagonal(energies), TINY))
         # scaled, as solutions shrink from one Newton step to the next; of nearly parallel ones only the sum counts

@@ -8,7 +8,8 @@ barrier blocks after another. Both have
         momenta of its own mends; or it is one of velocities, (B + C) dg + G dv = q, where it opens what should touch
     speed : what a residual of 1 changes the velocities of contacts by, about
 
-and the functions of `ContactForm`. A third one, `FewForm`, is that of the contacts with factors of its own.
+and the functions of `ContactForm`. `FewForm` is that of the contacts with factors of its own, and
+`pctt.ccp.newton.kkt.KKTForm` has the multipliers as unknowns too.
 """
 
 from __future__ import annotations
@@ -73,11 +74,8 @@ class ContactForm:
     def entries(self) -> PETSc.Mat:
         """S without the columns of hubs (BAIJ), with the places and names of the contacts that preconditioners may have
         as attributes; collective."""
-        if self._entries is None:
-            self._entries = self.problem.N.duplicate(copy=True)
-            self._entries.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        elif not self._loaded:
-            self.problem.N.copy(self._entries, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        if self._entries is None or not self._loaded:
+            self._entries = self._with_N(self._entries)
         self._loaded = True
         if not self._made:
             put_diagonal_blocks(self._entries, self._blocks)
@@ -86,6 +84,15 @@ class ContactForm:
                     self._entries.setAttr(name, value)
             self._made = True
         return self._entries
+
+    def _with_N(self, old: PETSc.Mat | None) -> PETSc.Mat:  # noqa: N802 - as in formulas
+        """A Mat with the entries of N: a new one, or the old one."""
+        if old is None:
+            old = self.problem.N.duplicate(copy=True)
+            old.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        else:
+            self.problem.N.copy(old, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        return old
 
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         """Of the system for x. ``uncoupled`` is (B + C)^-1 q, if the caller has it more accurately."""
