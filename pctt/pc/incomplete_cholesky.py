@@ -78,8 +78,8 @@ class Factor(NamedTuple):
     below: np.ndarray
     L: np.ndarray
     unit: float
-    pivots: Array
-    scale: Array
+    pivots: NDArray[np.float32]
+    scale: NDArray[np.float32]
     work: Array
     shift: float
 
@@ -117,8 +117,9 @@ def factorised(of: Blocks, blocks: Array, tau: float, shift: float) -> Factor | 
         room *= 3
     if ended != DONE:
         return ended
-    below, L, scale = below[: starts[-1]].copy(), L[: starts[-1]].copy(), scale.astype(np.float32)
-    return Factor(of, starts, below, L, unit, pivots, scale, np.zeros((n, 4)), shift)
+    kept = slice(starts[-1])
+    single = scale.astype(np.float32)
+    return Factor(of, starts, below[kept].copy(), L[kept].copy(), unit, pivots, single, np.zeros((n, 4)), shift)
 
 
 @inlined

@@ -27,6 +27,7 @@ NOWHERE = (
     "nothing is known of the places of its rows (no grid, coordinates, DM or near null space), so they are in reverse "
     "Cuthill-McKee order"
 )
+FASTER = "for sparse matrices pctt.pc.BlockICC is the better choice"
 #: Krylov methods that are as accurate if the preconditioner rounds to single precision: they multiply by A each vector
 #: that they add to x. Others take a product M A p for the preconditioner of a vector that they never formed.
 UNHARMED = {"cg", "cgne", "fcg", "fgmres", "fbcgs", "fbcgsr", "gcr", "pipefcg", "pipefgmres"}
@@ -160,8 +161,10 @@ class TensorTrain(Context):
         self.failed = bool(made.failure) and self.options.fallback == "none"
         if made.failure:
             takes_over = "there is no preconditioner" if self.failed else f"{made.base} takes over"
-            lost = isinstance(made, SparseTrain) and self.places.source == "nothing" and self.options.order == "auto"
-            self._warn(f"{made.failure}: {takes_over}" + (f"; {NOWHERE}" if lost else ""))
+            sparse = isinstance(made, SparseTrain)
+            lost = sparse and self.places.source == "nothing" and self.options.order == "auto"
+            words = [f"{made.failure}: {takes_over}", *[NOWHERE] * lost, *[FASTER] * sparse]
+            self._warn("; ".join(words))
         if self.rank == 1 and not self.failed:
             self._make_block_jacobi(P)
         set_failed(pc, self.failed)
@@ -306,7 +309,8 @@ class TensorTrain(Context):
             return "made for no system yet"
         if self.rank == 1:
             note = f", because {self.made.note}" if self.made.note else ""
-            return f"rank 1 (block Jacobi{note}), set up in {self._made_in:.2e} s"
+            faster = f"; {FASTER}" if isinstance(self.made, SparseTrain) else ""
+            return f"rank 1 (block Jacobi{note}), set up in {self._made_in:.2e} s{faster}"
         digits = "single" if self._last_precision is np.float32 and self.made.inverse is not None else "double"
         return f"{self.made.words()}, {digits} precision, set up in {self._made_in:.2e} s"
 

@@ -49,7 +49,7 @@ DEMO = {
     "steps": "5",
     "dt": "0.025",
     "ccp_tol": "1e-4",
-    "compare": "auto:tt,ten:tt,pbjacobi,ilu,none",
+    "compare": "bic,pbjacobi,auto:tt,ten:tt,ilu,none",
     "compare_every": "6",
     "output": "results/demo",
     "overwrite": "true",  # nothing but the demo writes to its folder

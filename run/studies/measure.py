@@ -3,8 +3,9 @@
     run/study measure steps [N ...]                                       seconds per phase, 1 and 2 ranks; default 4 8
     run/study measure laws [N ...]             Coulomb's law beside its relaxation, and how high what slides flies; 4
     run/study measure preconditioners [N [-every K] [-names A,B]] [...]    what is not known goes to pctt.run
-    run/study measure paper [-n N ...] [-large N ...]    the paper's comparison on mixer, blade and shear: seconds of a
-                                               PDIP solve and of its set-ups, iterations, for five preconditioners
+    run/study measure paper [-n N ...]         the paper's comparison on mixer, blade and shear: seconds of a PDIP
+                                               solve and of its set-ups, iterations, for nine preconditioners
+    run/study measure pdip [-n N ...]          whole PDIP solves of these scenes, each by one preconditioner
 
 Writes results/measure_WHAT.json (of preconditioners measure_preconditioners_nN.json), and results/reproduction.png.
 """
@@ -19,11 +20,18 @@ from shared import Row, Table, figure, markdown, medians, parser, record, say_ma
 
 STEPS, RANKS = 40, (1, 2)
 PHASES = ("search", "assembly", "solve", "advance", "output")
-NAMES = "none,ilu,ilu-shifted,pbjacobi,sor,icc-shifted,gamg,hypre,cholesky,tt"
+NAMES = "none,ilu,ilu-shifted,pbjacobi,sor,icc-shifted,gamg,hypre,cholesky,tt,bic"
 SCENES = ("mixer", "blade", "shear")
 METHODS = {("apgd", "1e-4"): 20, ("conic", "1e-6"): 5}  # of `laws`, and how many steps
-OF_PAPER = {"none": "red", "ilu": "green", "ilu-shifted": "olive", "pbjacobi": "gray", "tt": "blue"}
-EVERY = {8: 4, 16: 12}  # Newton systems are sampled at these n, where without a preconditioner one takes up to a minute
+OF_PAPER = {
+    "none": "red", "ilu": "green", "ilu-shifted": "olive", "icc": "brown", "pbjacobi": "gray", "tt": "blue",
+    "bic": "orange", "gamg": "purple", "hypre": "pink",
+}  # fmt: skip
+EVERY = {4: 3, 8: 6, 16: 14}  # Newton systems are sampled, as without a preconditioner one takes up to a minute
+WAYS = {
+    "pbjacobi": {"ccp_pc_type": "pbjacobi"}, "default": {},
+    "bic": {"ccp_pc_type": "python", "ccp_pc_python_type": "pctt.pc.BlockICC"},
+}  # fmt: skip
 EXACT = ("-ccp_closing_work", "inf")
 
 
@@ -138,18 +146,19 @@ def cell(converged: bool, iterations: int, seconds: float, residual: float) -> s
 def paper(given: Namespace, about: Row) -> None:
     """The paper's comparison: seconds of a PDIP solve are means over the systems times their number."""
     heads = ["scene", "n", "contacts", "Newton", "systems", "method", "solved", "iterations"]
-    heads += ["setup_s", "solve_s", "pdip_s", "ratio"]
+    heads += ["residual", "setup_s", "solve_s", "pdip_s", "ratio"]
     rows: list[Row] = []
-    for scene, n in [(scene, n) for n in given.n for scene in SCENES] + [("mixer", n) for n in given.large]:
+    for scene, n in [(scene, n) for n in given.n for scene in SCENES]:
         step, found = compared(scene, n, ",".join(OF_PAPER), EVERY.get(n, 1), "-ccp_type", "pdip")
         for row in found:
             case = {"scene": scene, "n": n, "contacts": step["contacts"], "Newton": step["newton_its"]}
             case |= {"systems": row["systems"], "method": row["name"], "solved": row["converged"]}
             times = step["newton_its"] / row["systems"]
-            case |= {"iterations": row["ksp_its_mean"], **{f"{w}_s": times * row[f"{w}_s"] for w in ("setup", "solve")}}
+            case |= {"iterations": row["ksp_its_mean"], "residual": row["excess_max"]}
+            case |= {**{f"{w}_s": times * row[f"{w}_s"] for w in ("setup", "solve")}}
             rows.append(case | {"pdip_s": times * row["total_s"]})
         mine = rows[-len(found) :]
-        base = next(row["pdip_s"] for row in mine if row["method"] == "tt")
+        base = next(row["pdip_s"] for row in mine if row["method"] == "pbjacobi")
         for row in mine:
             row["ratio"] = row["pdip_s"] / base
         print(markdown(heads, [[_short(row[head]) for head in heads] for row in mine]), flush=True)
@@ -167,6 +176,48 @@ def paper(given: Namespace, about: Row) -> None:
             panel.legend()
 
 
+def pdip(given: Namespace, about: Row) -> None:
+    """Whole PDIP solves of the first step after settled states, each by one preconditioner, in turns."""
+    import time
+
+    import numpy as np
+    from mpi4py import MPI
+    from petsc4py import PETSc
+    from shared import next_problem, settled
+
+    import dem.scenes
+    from pctt import ccp
+
+    table = Table(
+        scene=("scene", "6"), n=("n", "2d"), contacts=("contacts", "8d"), way=("way", "9"), Newton=("Newton", "6d"),
+        its=("iterations", "6d"), residual=("residual", "9.1e"), cpu_s=("cpu_s", "8.2f"), ratio=("ratio", "6.2f"),
+    )  # fmt: skip
+    rows: list[Row] = []
+    for scene, n in [(scene, n) for n in given.n for scene in SCENES]:
+        sim = settled(getattr(dem.scenes, scene.title())(n=n), dt=0.025, solver="apgd", stiffness=np.inf)
+        with next_problem(sim) as problem:
+            spent: dict[str, list[float]] = {way: [] for way in WAYS}
+            for way in (*WAYS, *WAYS) if n < 16 else WAYS:
+                for name, value in WAYS[way].items():
+                    PETSc.Options()[name] = value
+                newton = ccp.newton_for(MPI.COMM_SELF, "pdip")
+                start = time.process_time()
+                limits = ccp.Limits(1e-4, -1, np.inf, fallback=False)
+                result = ccp.solve(problem, None, "pdip", limits, None, newton=newton)
+                spent[way].append(time.process_time() - start)
+                newton.destroy()
+                for name in WAYS[way]:
+                    PETSc.Options().delValue(name)
+                case = {"scene": scene, "n": n, "contacts": problem.size, "way": way, "Newton": result.iterations}
+                case |= {"iterations": result.ksp_its, "residual": result.residual, "status": result.status.value}
+                rows = [row for row in rows if (row["scene"], row["n"], row["way"]) != (scene, n, way)]
+                base = min(spent["pbjacobi"])
+                rows.append(case | {"cpu_s": min(spent[way]), "ratio": min(spent[way]) / base})
+        for row in rows[-len(WAYS) :]:
+            table.add(row)
+        record("measure_pdip", about, rows)
+
+
 def _short(value: object) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
@@ -181,9 +232,10 @@ if __name__ == "__main__":
     of_pcs.add_argument("n", type=int, nargs="?", default=4, help="size of the mixer (4)")
     of_pcs.add_argument("-every", type=int, default=1, help="every K-th Newton system (1)")
     of_pcs.add_argument("-names", default=NAMES, help="with commas between")
-    of_paper.add_argument("-n", type=int, nargs="*", default=[2, 3, 4, 8], help="sizes of all three scenes (2 3 4 8)")
-    of_paper.add_argument("-large", type=int, nargs="*", default=[16], help="sizes of the mixer alone (16)")
+    of_paper.add_argument("-n", type=int, nargs="*", default=[4, 8, 16], help="sizes of the scenes (4 8 16)")
+    add("pdip").add_argument("-n", type=int, nargs="*", default=[4, 8, 16], help="sizes of the scenes (4 8 16)")
     given, given.more = words.parse_known_args()
     if given.more and given.what != "preconditioners":
         words.error(f"{' '.join(given.more)}: not an option of {given.what}")
-    {"steps": steps, "laws": laws, "preconditioners": preconditioners, "paper": paper}[given.what](given, say_machine())
+    studies = {"steps": steps, "laws": laws, "preconditioners": preconditioners, "paper": paper, "pdip": pdip}
+    studies[given.what](given, say_machine())
