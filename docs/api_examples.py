@@ -599,6 +599,35 @@ try:
 except fclib.FileFormatError as error:
     print(error)
 
+# %% pctt.pc.BlockICC
+import numpy as np
+import scipy.sparse as sp
+from petsc4py import PETSc
+
+n = 100  # diffusion through a square whose cells conduct better or worse by up to six orders of magnitude
+k = 10.0 ** np.random.default_rng(0).uniform(-3, 3, (n, n)).ravel()
+cell = np.arange(n * n).reshape(n, n)
+i, j = (np.concatenate([a.ravel(), b.ravel()]) for a, b in ((cell[1:], cell[:, 1:]), (cell[:-1], cell[:, :-1])))
+flow = sp.coo_matrix((2 / (1 / k[i] + 1 / k[j]), (i, j)), shape=(n * n, n * n))
+flow = flow + flow.T
+A = sp.csr_matrix(sp.diags(np.asarray(flow.sum(axis=1)).ravel() + k * (np.arange(n * n) < n)) - flow)
+mat = PETSc.Mat().createAIJ(A.shape, csr=(A.indptr, A.indices, A.data))
+x, b = mat.createVecs()
+b.set(1.0)
+for kind in ("jacobi", "icc", "python"):
+    ksp = PETSc.KSP().create()
+    ksp.setOperators(mat)
+    ksp.setType("cg")
+    ksp.setTolerances(rtol=1e-8, max_it=5000)
+    ksp.pc.setType(kind)
+    if kind == "python":
+        ksp.pc.setPythonType("pctt.pc.BlockICC")
+    ksp.solve(b, x)
+    print(kind, ksp.getIterationNumber(), "iterations")
+    if kind == "python":
+        print(ksp.pc.getPythonContext().what())
+    ksp.destroy()
+
 # %% pctt.pc.TensorTrain
 import numpy as np
 from petsc4py import PETSc

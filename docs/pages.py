@@ -21,7 +21,7 @@ from typing import Any
 from dem.scenes import SCENES
 from pctt import ccp
 from pctt.options import Description, describe
-from pctt.pc import TensorTrain
+from pctt.pc import BlockICC, TensorTrain
 from pctt.run.settings import Run, Settings
 
 DOCS = Path(__file__).resolve().parent
@@ -196,9 +196,8 @@ def options() -> str:
     for name, solver in ccp.SOLVERS.items():
         if described := describe(solver.options, solver.prefix):
             text += f"### `-ccp_type {name}`: {solver.help}\n" + rows_of(described)
-    text += "## Preconditioner `pctt.pc.TensorTrain`\n" + rows_of(
-        describe(TensorTrain.options_class, TensorTrain.options_prefix)
-    )
+    for kind in (BlockICC, TensorTrain):
+        text += f"## Preconditioner `{kind.name}`\n" + rows_of(describe(kind.options_class, kind.options_prefix))
     text += "## Scenes\n"
     for name, scene in SCENES.items():
         text += f"### `-scene {name}`\n{first_line(scene)} ([page](scenes.md)).\n\n"

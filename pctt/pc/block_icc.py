@@ -66,6 +66,7 @@ class BlockICC(Context):
     The order of the rows is kept while the pattern of the matrix stays."""
 
     name = "pctt.pc.BlockICC"  #: for ``-pc_python_type``
+    options_class = Options
     options_prefix = "pc_bic_"
     without = PETSc.PC.Type.NONE
 
@@ -145,8 +146,10 @@ class BlockICC(Context):
             order = _sweep(self.places.points)
             if of_rows and block > 1:
                 order = np.add.outer(block * order, np.arange(block)).ravel()
-        else:
+        elif graph.nnz:
             order = reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
+        else:  # a rank without rows
+            order = np.arange(graph.shape[0])
         self._source: np.ndarray | None = None
         if of_rows:
             self._of, self._source = Blocks.of_rows(graph, order)

@@ -40,8 +40,9 @@ def _help_sections(database: Mapping[str, str]) -> Iterator[tuple[str, str, str]
     for title, (group, prefix) in zip(titles, option_groups(find_scene(scene))):
         topic = prefix.partition("_")[0] or "run"  # the first word of the options
         yield topic, title, "\n".join(map(str, describe(group, prefix)))
-    from pctt.pc import TensorTrain  # here, as its import would slow down every start
+    from pctt.pc import BlockICC, TensorTrain  # here, as their import would slow down every start
 
-    title = "-pc_type python -pc_python_type pctt.pc.TensorTrain"
-    yield "pc", title, "\n".join(map(str, describe(TensorTrain.options_class, TensorTrain.options_prefix)))
+    for kind in (BlockICC, TensorTrain):
+        described = "\n".join(map(str, describe(kind.options_class, kind.options_prefix)))
+        yield "pc", f"-pc_type python -pc_python_type {kind.name}", described
     yield "ksp", "Newton systems", NEWTON_HELP

@@ -17,12 +17,12 @@ from program import ROOT, SMALL, command, environment
 import pctt
 from dem.scenes import Mixer
 from pctt import ccp
-from pctt.pc import TensorTrain
+from pctt.pc import BlockICC, TensorTrain
 from pctt.run.settings import Run, Settings
 
 GROUPS = [(Run, ""), (Mixer, "scene_"), (Settings, "ccp_")]
 GROUPS += [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]
-GROUPS += [(TensorTrain.options_class, TensorTrain.options_prefix)]
+GROUPS += [(kind.options_class, kind.options_prefix) for kind in (BlockICC, TensorTrain)]
 
 
 def options_of(group):

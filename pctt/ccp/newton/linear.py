@@ -32,8 +32,10 @@ class Settings:
     few: int = number(1000, "contacts on one rank up to which an order of elimination is looked for")
     pairs: int = number(100_000, "of these, pairs of blocks in an elimination at most: 20 ns each")
     rest: int = number(133, "of these, contacts in the dense rest at most: 1 ms")
-    jacobi: int = number(12, "iterations of BiCGStab with block Jacobi, after which the next systems of contacts get "
-                             "an incomplete factor, which costs as much as 30")  # fmt: skip
+    jacobi: int = number(25, "iterations of BiCGStab with block Jacobi, after which the next matrix of contacts gets an "
+                             "incomplete factor, which costs as much as 25")  # fmt: skip
+    incomplete: int = number(4, "iterations with an incomplete factor, up to which the next matrix gets none: block "
+                                "Jacobi takes 6 to 8 times as many")  # fmt: skip
     easy: float = number(6.0, "iterations with block Jacobi / bodies^0.4, after which the next matrix gets a factor, "
                               "which costs as much as 8 to 14")  # fmt: skip
     least: float = number(0.1, "drop tolerance of a factor [mass]: entries of a block between bodies that it is better "
@@ -54,7 +56,8 @@ class LinearSolver:
     own : whether the KSP is the project's own choice, conjugate gradients with block Jacobi. Systems get harder from
         one iteration of an interior point method to the next; so once they take many iterations, the rest of the
         problem is left to factors. The choice rests on iteration counts, so that a repeated run repeats it.
-    incomplete : whether incomplete factors take over from block Jacobi where that takes long, by iteration counts too
+    incomplete : whether incomplete factors take over from block Jacobi while that would take long. Systems are hard in
+        the middle of a problem, and iteration counts tell here too
     compare : its preconditioners are tried in place of the KSP
 
     Attributes
@@ -79,6 +82,7 @@ class LinearSolver:
         """Another problem."""
         self.iterations = self.fallbacks = 0
         self._worst, self._hard, self._factored, self._double = 0, False, False, False
+        self._with_incomplete, self._latest = False, 0
 
     def new_matrix(self, system: NewtonForm) -> None:
         """The system has new values."""
@@ -87,6 +91,8 @@ class LinearSolver:
         easy = int(Settings.easy * bodies**0.4)
         self._easy = self.comm.bcast(easy)  # a last bit may differ between processors
         self._hard = self.own and self._worst > self._easy
+        most = Settings.incomplete if self._with_incomplete else Settings.jacobi
+        self._with_incomplete, self._latest = self.incomplete and self._latest > most, 0
 
     def solve(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
         """x = A^-1 b to a relative residual of rtol; whether that was reached. Otherwise x is the best that was found,
@@ -108,11 +114,9 @@ class LinearSolver:
             done = self.compare.run(self.system.matrix, b, x, rtol, self.system.entries)
             self.iterations += done.iterations
         else:
-            long = self.incomplete and self._worst > Settings.jacobi
-            done = self._run(self._solver("incomplete" if long else ""), b, x, rtol, self.system.entries)
-            if long:
-                return done
-        self._worst = max(self._worst, done.iterations)
+            name = "incomplete" if self._with_incomplete else ""
+            done = self._run(self._solver(name), b, x, rtol, self.system.entries)
+        self._worst, self._latest = (max(most, done.iterations) for most in (self._worst, self._latest))
         return done
 
     def _by_factor(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> Solve | None:
@@ -186,7 +190,7 @@ class LinearSolver:
         """Krylov method and preconditioner."""
         if self.own:
             return "CG, pbjacobi until it takes long, then cholesky"
-        later = f" until it takes long, then {INCOMPLETE['pc_python_type']}" if self.incomplete else ""
+        later = f", {INCOMPLETE['pc_python_type']} where that takes long" if self.incomplete else ""
         return self._solver("").words() + later
 
     def what(self) -> str:
