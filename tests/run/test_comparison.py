@@ -9,6 +9,7 @@ from program import SETTLED, steps_of, summary_of
 ACCURATE = ("-ksp_rtol", "1e-6", "-ksp_max_it", "2000", "-ccp_tol", "1e-4")
 
 PDIP = ("-ccp_type", "pdip")
+FACTOR = ("-pc_type", "python", "-pc_python_type", "pctt.pc.BlockICC")
 TRAIN = ("-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")
 
 
@@ -73,7 +74,8 @@ def test_fallbacks_of_a_train_reach_the_summary(program, settled, tmp_path):
 @pytest.mark.parametrize(
     ("options", "start", "end"),
     [
-        ((*PDIP,), "BiCGStab (right), pbjacobi, pctt.pc.BlockICC where that takes long", "pctt.pc.BlockICC was fill"),
+        ((*PDIP,), "BiCGStab (right), pbjacobi, pctt.pc.BlockICC where that takes long", None),
+        ((*PDIP, *FACTOR), "BiCGStab (right), pctt.pc.BlockICC", "pctt.pc.BlockICC was fill"),
         ((*PDIP, "-ksp_type", "cg", "-pc_type", "ilu"), "CG, ilu", None),
         (("-ccp_type", "conic"), "CG, pbjacobi until it takes long, then cholesky", None),
         ((*PDIP, *TRAIN), "BiCGStab (right), pctt.pc.TensorTrain", "pctt.pc.TensorTrain was rank 1: block Jacobi"),

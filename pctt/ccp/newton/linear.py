@@ -32,8 +32,8 @@ class Settings:
     few: int = number(1000, "contacts on one rank up to which an order of elimination is looked for")
     pairs: int = number(100_000, "of these, pairs of blocks in an elimination at most: 20 ns each")
     rest: int = number(133, "of these, contacts in the dense rest at most: 1 ms")
-    jacobi: int = number(25, "iterations of BiCGStab with block Jacobi, after which the next matrix of contacts gets an "
-                             "incomplete factor, which costs as much as 25")  # fmt: skip
+    jacobi: int = number(25, "iterations of BiCGStab with block Jacobi, after which the next matrix of contacts gets "
+                             "an incomplete factor, which costs as much as 25")  # fmt: skip
     incomplete: int = number(4, "iterations with an incomplete factor, up to which the next matrix gets none: block "
                                 "Jacobi takes 6 to 8 times as many")  # fmt: skip
     easy: float = number(6.0, "iterations with block Jacobi / bodies^0.4, after which the next matrix gets a factor, "
