@@ -27,7 +27,7 @@ NOWHERE = (
     "nothing is known of the places of its rows (no grid, coordinates, DM or near null space), so they are in reverse "
     "Cuthill-McKee order"
 )
-FASTER = "for sparse matrices pctt.pc.BlockICC is the better choice"
+FASTER = "for sparse matrices try pctt.pc.BlockICC"
 #: Krylov methods that are as accurate if the preconditioner rounds to single precision: they multiply by A each vector
 #: that they add to x. Others take a product M A p for the preconditioner of a vector that they never formed.
 UNHARMED = {"cg", "cgne", "fcg", "fgmres", "fbcgs", "fbcgsr", "gcr", "pipefcg", "pipefgmres"}
