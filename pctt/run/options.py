@@ -18,6 +18,7 @@ from dem.together import together
 from pctt import ccp
 from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
+from pctt.ccp.newton.linear import INCOMPLETE
 from pctt.ccp.registry import why_no_form
 from pctt.ksp_options import (
     OWN,
@@ -63,7 +64,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
     compare = ccp.Comparison(comm, run.compared())  # refuses unknown names
     if solver.newton and not run.settle:
         form = ccp.newton_for(comm, asked.solver, asked.newton, compare).form
-        _refuse_for_petsc(database, form, comm)
+        _refuse_for_petsc(database, form, compare)
     _refuse_places(run, comm)
     together(comm, "option -threads", lambda: _start_threads(run.threads), own=(OptionError,))
     return Options(run, scene, asked.of(scene, relaxed=bool(run.problem or run.compare)), demo, database)
@@ -145,9 +146,10 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, asked: Setting
                 raise OptionError(f"{f'-{name} {value or str()}'.rstrip()}: {reason}")
 
 
-def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) -> None:
-    """OptionError for options of the KSP that PETSc refuses or does not know. PETSc itself would complain only at the
+def _refuse_for_petsc(database: Mapping[str, str], form: str, compare: ccp.Comparison) -> None:
+    """OptionError for options of the KSPs that PETSc refuses or does not know. PETSc itself would complain only at the
     first Newton system, or never."""
+    comm = compare.comm
     given = {n: spelt for n, spelt in solver_options(database).items() if n.startswith(("ksp_", "pc_"))}
     spelt = given.get("ksp_rtol", "")
     try:
@@ -156,15 +158,19 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) ->
         rtol = 0.0  # PETSc says what is no number
     if not 0.0 <= rtol < 1.0:  # releases of PETSc differ in what numbers they refuse
         raise OptionError(f"-{spelt} {database[spelt]}: allowed is a number >= 0 and below 1")
-    ksp = PETSc.KSP().create(comm)
-    ksp.setOptionsPrefix(OWN)
+    ksps = []
+    later = INCOMPLETE if form == "contact" and "pc_type" not in given else {}
     try:
         with unmarked(), taken_over(database):
-            options, sources = to_enter(OWN, DEFAULTS[form], comm.size)
-            with entered(options), own_errors():
-                ksp.setFromOptions()
-                moved = set(sources.values())
-                refuse_misspelt({n: spelt for n, spelt in given.items() if OWN + n not in moved})
+            for defaults in (DEFAULTS[form], DEFAULTS[form] | later):
+                ksps.append(PETSc.KSP().create(comm))
+                ksps[-1].setOptionsPrefix(OWN)
+                options, sources = to_enter(OWN, defaults, comm.size)
+                with entered(options), own_errors():
+                    ksps[-1].setFromOptions()
+            moved = set(sources.values())
+            refuse_misspelt({n: spelt for n, spelt in given.items() if OWN + n not in moved})
+            compare.make_all()
     except OptionError:  # also from a preconditioner of ours
         raise
     except Exception as error:  # PETSc's own, and whatever importing a -pc_python_type raises
@@ -173,7 +179,9 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, comm: MPI.Comm) ->
         listed = ", ".join(f"-{spelt} {database[spelt] or ''}".strip() for spelt in given.values())
         raise OptionError(f"{listed}: PETSc refuses: {reason}") from None
     finally:
-        ksp.destroy()
+        compare.destroy()
+        for ksp in ksps:
+            ksp.destroy()
 
 
 def _refuse_places(run: Run, comm: MPI.Comm) -> None:

@@ -38,6 +38,8 @@ BAD_OPTIONS = {
     "-compare nosuch": ["nosuch", "ilu", "pbjacobi"],
     "-compare ten:tt,tent:tt,tt,x:ilu,x_pc:ilu": ["-compare_x_pc_... would be an option of x too"],
     "-compare_ten_pc_tt_rank 3 -compare auto:tt": ["not compared", "-compare lists auto:tt"],
+    "-compare_ten_pc_tt_rank abc -compare ten:tt": ["-compare_ten_pc_tt_rank abc", "auto or a whole number"],
+    "-pc_bic_tau 2 -ccp_type pdip": ["-pc_bic_tau 2", "below 1"],
     "-compare ilu -ccp_type apgd": ["apgd", "pdip"],
     "-ksp_type nosuch": ["nosuch"],
     "-pc_type nosuch": ["nosuch"],

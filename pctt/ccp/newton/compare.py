@@ -119,6 +119,11 @@ class Comparison:
             for name, solves in fresh.items()
         }
 
+    def make_all(self) -> None:
+        """Make the KSPs of all entries; OptionError for a bad option of one."""
+        for name in self.names:
+            self._solver(name)
+
     def _solver(self, name: str) -> Krylov:
         if name not in self._krylov:
             kind = self.kinds[name]
