@@ -25,7 +25,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from pctt.blocks import shell_of
 from pctt.mat.order import Places, places_of
 from pctt.options import NOT_NEGATIVE, OptionError, describe, option, read
-from pctt.pc.incomplete_cholesky import BAD_BLOCK, BAD_PIVOT, MOST, Array, Blocks, Factor, factorised
+from pctt.pc.incomplete_cholesky import BAD_BLOCK, BAD_PIVOT, MOST, Array, Blocks, Factor, compile_loops, factorised
 from pctt.pc.mat import is_symmetric
 from pctt.petsc import Context, block_values, given_options, on_coordinates, set_failed, warn
 
@@ -72,6 +72,7 @@ class BlockICC(Context):
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
+        compile_loops()
         self.options, self.prefix = Options(), ""
         self.factor: Factor | None = None
         self.places = Places()
@@ -245,7 +246,7 @@ def _pattern_and_values(P: PETSc.Mat) -> tuple[tuple[np.ndarray, np.ndarray], Ar
     shell = shell_of(P)
     if shell is not None and shell.blocks is not None and P.getBlockSize() == 3:
         count = len(shell.blocks)
-        return (np.arange(count + 1), np.arange(count)), shell.blocks.transpose(0, 2, 1)
+        return (np.arange(count + 1), np.arange(count)), np.ascontiguousarray(shell.blocks.transpose(0, 2, 1))
     kind = P.getType().removeprefix("seq").removeprefix("mpi")
     if not kind.startswith(("aij", "baij", "sbaij", "dense")):
         allowed = "allowed are aij, baij, sbaij, dense"

@@ -19,11 +19,13 @@ from the left; Manteuffel (1980) for the shift.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from petsc4py import PETSc
 
 from dem.compiled import inlined, loop
 
@@ -62,7 +64,7 @@ class Blocks(NamedTuple):
         padded = sp.csr_matrix(place[order][:, order])
         padded.resize((3 * count, 3 * count))
         blocks = padded.tobsr((3, 3))
-        source = blocks.data.transpose(0, 2, 1).astype(np.int64) - 1
+        source = np.ascontiguousarray(blocks.data.transpose(0, 2, 1), np.int64) - 1
         rows = np.zeros(3 * count, np.uint32)
         rows[:size] = order
         return cls(blocks.indptr, blocks.indices, *(np.arange(count),) * 2, rows.reshape(count, 3), size), source
@@ -120,6 +122,17 @@ def factorised(of: Blocks, blocks: Array, tau: float, shift: float) -> Factor | 
     kept = slice(starts[-1])
     single = scale.astype(np.float32)
     return Factor(of, starts, below[kept].copy(), L[kept].copy(), unit, pivots, single, np.zeros((n, 4)), shift)
+
+
+@cache
+def compile_loops() -> None:
+    """Compile the loops, or load them, for the arrays that PETSc gives: seconds that belong to no matrix."""
+    index = np.arange(2, dtype=PETSc.IntType)
+    made = factorised(Blocks.of(index, index[:1], np.zeros(1, np.int64)), np.eye(3)[None], 0.0, 0.0)
+    b = np.ones(3)
+    b.flags.writeable = False  # as PETSc's arrays to read are, which is another type to the compiler
+    if isinstance(made, Factor):
+        made.solve(b, np.empty(3))
 
 
 @inlined
