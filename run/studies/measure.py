@@ -163,6 +163,11 @@ def paper(given: Namespace, about: Row) -> None:
             row["ratio"] = row["pdip_s"] / base
         print(markdown(heads, [[_short(row[head]) for head in heads] for row in mine]), flush=True)
         record("measure_paper", about, rows)
+    picture(rows)
+
+
+def picture(rows: list[Row]) -> None:
+    """Seconds and iterations against contacts, a row of panels for each scene."""
     with figure("reproduction", 3, 3) as axes:
         for i, panel in enumerate(axes):
             scene, what = SCENES[i // 3], ("pdip_s", "setup_s", "iterations")[i % 3]
@@ -173,7 +178,8 @@ def paper(given: Namespace, about: Row) -> None:
             words = {"pdip_s": "PDIP solve [s]", "setup_s": "set-ups of a PDIP solve [s]"}
             panel.set(title=scene, xlabel="contacts", ylabel=words.get(what, "mean BiCGStab iterations"))
             panel.grid(alpha=0.3)
-            panel.legend()
+            if i == 0:
+                panel.legend(fontsize="small")
 
 
 def pdip(given: Namespace, about: Row) -> None:
