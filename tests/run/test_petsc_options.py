@@ -22,7 +22,7 @@ def test_petsc_shows_every_solve(ranks, pc, viewed, program, settled, tmp_path):
     """Of two steps, between which contacts come and go; in a process of its own, as PETSc says some at its end."""
     shown = ("-ksp_view", "ascii:view.txt", "-ksp_view_pre", "-ksp_monitor", "-ksp_converged_reason", "-log_view")
     done = program(*SETTLED, "-steps", 2, *pc, *shown, "-options_left", "-sub_mat_idle", 3, ranks=ranks, own=True)
-    solves = re.findall(r"^Linear ccp_ solve (?:converged|did not).* iterations (\d+)", done.stdout, re.MULTILINE)
+    solves = re.findall(r"^ *Linear ccp_ solve (?:converged|did not).* iterations (\d+)", done.stdout, re.MULTILINE)
     assert sum(map(int, solves)) >= summary_of(tmp_path / "results")["ksp_its"] > len(solves) > 10
     assert len(re.findall(r"KSP Residual norm", done.stdout)) == sum(map(int, solves)) + len(solves)
     for text in (done.stdout, (tmp_path / "view.txt").read_text()):
