@@ -30,7 +30,7 @@ _WITHIN_RANKS = {"bjacobi", "sor", "eisenstat"}  # of several ranks each works o
 _NAMES = {"bcgs": "BiCGStab", "cg": "CG", "gmres": "GMRES", "fgmres": "FGMRES", "minres": "MINRES"}
 # preconditioners of parts of the matrix; ours have inner ones too, but of other matrices
 _OF_PARTS = re.compile(r"(sub|mg|fieldsplit|composite|telescope)_.*pc_type")
-_VIEWER = re.compile(r"ksp_view.*|ksp_converged_rate.*")
+_VIEWER = re.compile(r"ksp_view.*|ksp_converged_.*")
 _REMEMBERING = {"pbjacobi", "sor"}  # the inverse diagonal blocks of the first matrix, see `pctt.blocks`
 _REASONS = {
     value: name.lower() for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)
