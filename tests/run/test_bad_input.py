@@ -180,20 +180,20 @@ def test_a_stray_word_is_refused(words, program, results):
     assert said == f"pctt.run: {stray}: belongs to no option; a value follows its option, as in -output {stray}"
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(3, marks=pytest.mark.mpi)])
-def test_values_with_blanks_are_taken_whole(ranks, program, tmp_path):
+@pytest.mark.mpi
+def test_values_with_blanks_are_taken_whole(program, tmp_path):
     """What stands behind a blank of a value is no option."""
     out = "my runs -overwrite -scene_n 0"
     options = ("-scene", "my -quiet scene.py", "-steps", 1, "-quiet", "-scene_height", 0.1)
     (tmp_path / options[1]).write_text(DROP)
-    program(*options, "-output", out, "-dump_problem", "two  words", ranks=ranks, own=True)
+    program(*options, "-output", out, "-dump_problem", "two  words", ranks=2, own=True)
     assert {path.name for path in tmp_path.iterdir()} - {"__pycache__"} == {out, "two  words", options[1]}
     (problem,) = (tmp_path / "two  words").iterdir()
     said = refused(program, tmp_path / out, *options, "-output", out, own=True)
     assert f"-output {out}: holds a run" in said
-    program(*options, "-output", out, "-restart", f"{out}/checkpoint.h5", ranks=ranks, own=True)
+    program(*options, "-output", out, "-restart", f"{out}/checkpoint.h5", ranks=2, own=True)
     assert len(steps_of(tmp_path / out)) == 2
-    program("-problem", problem, "-output", "solved -overwrite", "-quiet", ranks=ranks, own=True)
+    program("-problem", problem, "-output", "solved -overwrite", "-quiet", ranks=2, own=True)
     assert summary_of(tmp_path / "solved -overwrite")
 
 
