@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from pctt.blocks import shell_of
 from pctt.mat.order import Places, places_of
-from pctt.options import NOT_NEGATIVE, OptionError, describe, option, read
+from pctt.options import NOT_NEGATIVE, describe, option, read
 from pctt.pc.incomplete_cholesky import BAD_BLOCK, BAD_PIVOT, MOST, Array, Blocks, Factor, compile_loops, factorised
 from pctt.pc.mat import is_symmetric
 from pctt.petsc import Context, block_values, given_options, on_coordinates, set_failed, warn
@@ -53,10 +53,6 @@ class Options:
         "auto", "added to the diagonal of the scaled matrix; auto: half of tau, and twice as much whenever a pivot is "
         "not positive", check=("auto or a number >= 0", _is_shift),
     )  # fmt: skip
-
-    def __post_init__(self) -> None:
-        if isinstance(self.shift, (int, float)) and not isinstance(self.shift, bool):
-            raise OptionError(f"shift {self.shift!r}: allowed is a text, 'auto' or a number >= 0")
 
 
 class BlockICC(Context):
