@@ -127,7 +127,9 @@ class Simulation:
         self.restart = str(restart)  #: the file from which it goes on
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
-        self.expected_overlap = expected_overlap(scene, float(self.world.pairs.stiffness.min()))
+        self.expected_overlap = expected_overlap(
+            scene, float(self.world.pairs.stiffness.min()), self.settings.dt
+        )
         self.last: Step | None = None
         self.figures: dict[str, Any] = {}
         self.output: Writer | None = None
