@@ -14,7 +14,7 @@ import numpy as np
 
 from dem import bodies, quaternion, shapes
 from dem.arrays import Floats
-from dem.bodies import BOX, CAPSULE, CLUMP, MESH, PLANE, Bodies
+from dem.bodies import BOX, CAPSULE, MESH, PLANE, Bodies
 from dem.motion import Dynamic
 from dem.scene import LargeBody, Scene
 from dem.shapes import Plane, Shape, placed
@@ -31,9 +31,10 @@ class Fall(NamedTuple):
     last: float  #: the greatest speed with which a grain meets a body or the bed of the others [m/s]
     block: float  #: the speed of all grains of time zero together where the first of them meets a body [m/s]
     gap: float  #: between the layers of these grains [m]
+    column: float  #: their mass over the area of the box about them [kg/m^2]
 
 
-NONE = Fall(0.0, 0.0, np.inf)
+NONE = Fall(0.0, 0.0, np.inf, 0.0)
 
 
 def fall(scene: Scene, acceleration: Floats, start: float = 0.0) -> Fall:
@@ -41,29 +42,23 @@ def fall(scene: Scene, acceleration: Floats, start: float = 0.0) -> Fall:
     size = float(np.linalg.norm(acceleration))
     if size == 0.0:
         return NONE
-    along, grains = acceleration / size, scene.survey()
+    along, grains, every = acceleration / size, scene.survey(), scene.expected()
     planes, levels = _ends(scene, along)
     if not len(planes) and not len(levels):
         return NONE
-    every = scene.expected()
-    half, first, longest = float(bodies.least_half_thickness(every).min()), np.inf, 0.0
-    gap = np.inf
+    halves = bodies.least_half_thickness(every)
+    half = float(halves.min())
+    first, gap, column = 0.0, np.inf, 0.0
+    lasts = [_last(_corners(*bounds(source.region)), along, planes, levels) for source in scene.sources.values()]
     if grains.count:
-        to_planes, to_levels = _ways(_corners(grains.low, grains.high), along, planes, levels)
-        first = min(to_planes.min(initial=np.inf), to_levels[to_levels >= 0.0].min(initial=np.inf)) - half
-        bed, gap = _bed(scene, along, every)
-        last = to_planes.max() if len(planes) else to_levels.max()
-        longest = max(last - half - bed, first if np.isfinite(first) else 0.0)
-    elif not scene.sources:  # large bodies alone: at most the way down beside all others
-        to_planes, to_levels = _ways(every.position, along, planes, levels)
-        others = 2.0 * (bodies.least_half_thickness(every).sum() - half)
-        longest = float(to_planes.max() if len(planes) else to_levels.max()) - half - others
-    for source in scene.sources.values():
-        to_planes, to_levels = _ways(_corners(*bounds(source.region)), along, planes, levels)
-        longest = max(longest, float(to_planes.max() if len(planes) else to_levels.max()) - half)
-    first = first if np.isfinite(first) else 0.0
-    reached = [float(np.sqrt(start**2 + 2.0 * size * max(way, 0.0))) for way in (longest, first)]
-    return Fall(*reached, gap)
+        corners = _corners(grains.low, grains.high)
+        bed, gap, column = _bed(scene, along, every)
+        first = _first(corners, along, planes, levels) - half
+        lasts += [_last(corners, along, planes, levels) - bed, first + half]
+    elif not lasts:  # large bodies alone: the highest falls on all others
+        lasts = [_last(every.position, along, planes, levels) - 2.0 * float(halves.sum() - half)]
+    reached = (float(np.sqrt(start**2 + 2.0 * size * max(way, 0.0))) for way in (max(lasts) - half, first))
+    return Fall(next(reached), next(reached), gap, column)
 
 
 def way_of(scene: Scene, body: LargeBody, along: Floats) -> float:
@@ -73,8 +68,9 @@ def way_of(scene: Scene, body: LargeBody, along: Floats) -> float:
                if np.isfinite(extent).all()]  # fmt: skip
     if not corners or not (len(planes) or len(levels)):
         return 0.0
-    to_planes, to_levels = _ways(np.concatenate(corners), along, planes, levels)
-    return max(float(to_planes.min() if len(planes) else to_levels.min()), 0.0)
+    place = np.concatenate(corners)
+    ways = _to_planes(place, along, planes) if len(planes) else levels.max() - place @ along
+    return max(float(ways.min()), 0.0)
 
 
 def area(scene: Scene, along: Floats) -> float:
@@ -89,15 +85,16 @@ def area(scene: Scene, along: Floats) -> float:
     return float(width.prod())
 
 
-def _bed(scene: Scene, along: Floats, every: Bodies) -> tuple[float, float]:
-    """The thickness of the bed that the grains of time zero make, and the gap between their layers along a direction
-    (3,), as in a cubic lattice of their solid fraction [m]."""
+def _bed(scene: Scene, along: Floats, every: Bodies) -> tuple[float, float, float]:
+    """The thickness of the bed that the grains of time zero make along a direction (3,), and the gap between their
+    layers, as in a cubic lattice of their solid fraction [m]; their mass over the area of the box about them
+    [kg/m^2]."""
     grains = scene.survey()
-    volume, across = grains.mass / float(_density(every).max()), area(scene, along)
-    radius = grains.radius / grains.count
-    high = float((grains.high - grains.low) @ np.abs(along)) + 2.0 * radius
-    pitch = max((CUBIC * across * high / volume) ** (1.0 / 3.0), 1.0)
-    return volume / (across * DENSE), 2.0 * radius * (pitch - 1.0)
+    volume, radius = grains.mass / float(_density(every).max()), grains.radius / grains.count
+    wide = grains.high - grains.low + 2.0 * radius
+    pitch = max((CUBIC * wide.prod() / volume) ** (1.0 / 3.0), 1.0)
+    column = grains.mass / float(np.abs(along) @ (wide[[1, 2, 0]] * wide[[2, 0, 1]]))
+    return volume / (area(scene, along) * DENSE), 2.0 * radius * (pitch - 1.0), column
 
 
 def _density(grains: Bodies) -> Floats:
@@ -114,13 +111,25 @@ def _corners(low: Floats, high: Floats) -> Floats:
     return np.array(list(product(*np.stack([low, high], axis=1))))
 
 
-def _ways(place: Floats, along: Floats, planes: Floats, levels: Floats) -> tuple[Floats, Floats]:
-    """From places (n, 3) along a direction to the nearest of half spaces (p, 2, 3), (n,), and to each of some levels
-    (l,), (n, l) [m]."""
+def _to_planes(place: Floats, along: Floats, planes: Floats) -> Floats:
+    """From places (n, 3) along a direction to the nearest of half spaces (p, 2, 3) [m]; inf without."""
     drop = np.full(len(place), np.inf)
     for center, normal in planes:
         drop = np.minimum(drop, (place - center) @ normal / -(normal @ along))
-    return drop if len(planes) else np.zeros(0), levels - (place @ along)[:, None]
+    return drop
+
+
+def _last(place: Floats, along: Floats, planes: Floats, levels: Floats) -> float:
+    """The longest way from places (n, 3): through a half space nothing goes, past other parts of bodies it may."""
+    if len(planes):
+        return float(_to_planes(place, along, planes).max())
+    return float(levels.max() - (place @ along).min())
+
+
+def _first(place: Floats, along: Floats, planes: Floats, levels: Floats) -> float:
+    """The shortest way from places (n, 3) to a half space or to a part of a body beyond all of them."""
+    ways = np.append(levels - (place @ along).max(), _to_planes(place, along, planes).min())
+    return float(ways[ways >= 0.0].min(initial=np.inf)) if np.isfinite(ways[ways >= 0.0]).any() else 0.0
 
 
 def _ends(scene: Scene, along: Floats, besides: LargeBody | None = None) -> tuple[Floats, Floats]:

@@ -1,4 +1,4 @@
-"""What presses bodies together beside the weight of a bed: springs, loads, motors, and tools with a force of their own."""
+"""What presses bodies together beside the weight of a bed: springs, loads, motors, tools with a force of their own."""
 
 from __future__ import annotations
 
@@ -77,7 +77,8 @@ def _springs(scene: Scene) -> tuple[float, list[tuple[float, float]], float]:
 
 def _loads(scene: Scene) -> tuple[float, list[Floats], list[Floats]]:
     """The greatest force of loads on a grain, their sums (3,) over grains, and the accelerations (3,) of grains."""
-    single, spread, accelerations = 0.0, [], [scene.gravity]
+    single, accelerations = 0.0, [scene.gravity]
+    spread: list[Floats] = []
     names = {body.name for body in scene.large_bodies}
     every = scene.expected()
     half, mass = (float(values.min()) for values in (bodies.least_half_thickness(every), every.mass))
@@ -90,7 +91,7 @@ def _loads(scene: Scene) -> tuple[float, list[Floats], list[Floats]]:
         count = scene.count if load.on is None else len(load.on)
         if isinstance(load.on, str):
             count = sum(part.count for part in scene.parts if scene.materials[part.material] == load.on)
-        spread.append(count * force if force.ndim == 1 else force.sum(axis=0))
+        spread.append(np.array(count * force if force.ndim == 1 else force.sum(axis=0)))
         accelerations.append(scene.gravity + np.atleast_2d(force)[each.argmax()] / mass)
     return single, spread, accelerations
 

@@ -36,7 +36,7 @@ from dem.compiled import inlined, loop
 from dem.falls import DENSE, area, fall
 from dem.motion import Dynamic
 from dem.pairs import Pairs
-from dem.pressing import CHAINS, pressing
+from dem.pressing import CHAINS, Pressing, pressing
 from dem.scene import Scene
 from dem.shapes import Plane, placed
 from dem.sources import bounds
@@ -47,7 +47,6 @@ OVERLAP = 0.003  #: the greatest overlap that `recommended` allows, as a part of
 FALLEN = 0.005  #: the same for a moment, of a grain that has fallen
 RESISTS = 10.0  #: the strongest forces between grains that a tool pushes over those of a bed at rest
 STOPPED = 0.22  #: of v sqrt(m / k): how far a grain of speed v goes into a contact of this DAMPING
-LAYERS = 0.5  #: of the layers of falling grains that close within a step, those that a contact stops at once
 TANGENTIAL = 2.0 / 7.0  #: k_t / k: both directions of an impact of spheres take as long (Silbert et al., PRE 64, 2001)
 DAMPING = 2.0  #: c as a part of 2 sqrt(k m): an impact leaves 5 % of the speed (Schwager, Poeschel); 1: 14 %
 
@@ -73,14 +72,14 @@ def recommended(scene: Scene) -> float:
     that of the single grain that the tool throws. What has fallen (`dem.falls`) is stopped in a step of the time step
     that the scene needs.
     """
-    grains, dt = scene.expected(), recommended_step(scene)
+    grains, pressed, dt = scene.expected(), pressing(scene), recommended_step(scene)
     half = bodies.least_half_thickness(grains)
     allowed = OVERLAP * half
     with np.errstate(over="ignore", invalid="ignore"):  # inf: rigid
         speeds = fastest_grain(scene), fastest_tool(scene)
         thrown, pushed = (grains.mass * (speed / allowed) ** 2 for speed in speeds)
-        needed = [_strongest(_load(scene) / allowed, thrown, pushed, STOPPED**2), pressing(scene).force / allowed]
-        needed += [_stopping(*impact, dt, FALLEN * half) for impact in _impacts(scene, dt)]
+        needed = [_strongest(_load(scene, pressed) / allowed, thrown, pushed, STOPPED**2), pressed.force / allowed]
+        needed += [_stopping(*impact, dt, FALLEN * half) for impact in _impacts(scene, pressed, dt)]
         stiffness = max(float(values.max()) for values in needed)
     return float(f"{stiffness:.1e}") if stiffness > 0.0 else np.inf  # the same on processors that round in other ways
 
@@ -88,14 +87,16 @@ def recommended(scene: Scene) -> float:
 def expected_overlap(scene: Scene, stiffness: float, dt: float) -> float:
     """The greatest overlap, as a part of a half thickness, that `recommended` would expect of a stiffness [N/m] in
     steps of dt [s]."""
-    grains = scene.expected()
     if np.isinf(stiffness):
         return 0.0
+    grains, pressed = scene.expected(), pressing(scene)
     speeds = fastest_grain(scene), fastest_tool(scene)
     thrown, pushed = (speed * np.sqrt(grains.mass / stiffness) for speed in speeds)
-    overlaps = [_strongest(_load(scene) / stiffness, thrown, pushed, STOPPED), pressing(scene).force / stiffness]
-    overlaps += [_stopped(*impact, dt, stiffness) for impact in _impacts(scene, dt)]
-    return max(float((values / bodies.least_half_thickness(grains)).max()) for values in overlaps)
+    half = bodies.least_half_thickness(grains)
+    overlaps = [_strongest(_load(scene, pressed) / stiffness, thrown, pushed, STOPPED)]
+    overlaps.append(np.full(len(half), pressed.force / stiffness))
+    overlaps += [_stopped(*impact, dt, stiffness) for impact in _impacts(scene, pressed, dt)]
+    return max(float((values / half).max()) for values in overlaps)
 
 
 def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:
@@ -192,19 +193,18 @@ def spring_energies(
     return start, end, strained, strained_at_end
 
 
-def _impacts(scene: Scene, dt: float) -> list[tuple[Floats, float, float]]:
+def _impacts(scene: Scene, pressed: Pressing, dt: float) -> list[tuple[Floats, float, float]]:
     """What meets a body or the bed in steps of dt [s]: masses (n,) for the grains that stand for all, speed [m/s], and
     how many layers of them come in a step."""
-    every, pressed, start = scene.expected(), pressing(scene), fastest_grain(scene)
+    every, start = scene.expected(), fastest_grain(scene)
     found = [(np.full(len(every), mass), speed, 1.0) for mass, speed in pressed.impacts]
     for acceleration in pressed.accelerations:
-        last, block, gap = fall(scene, acceleration, start)
+        last, block, gap, column = fall(scene, acceleration, start)
         found.append((every.mass, last, 1.0))
         if block > 0.0:
-            width = 2.0 * bodies.bounding_radius(every)
-            column = scene.survey().mass / area(scene, acceleration / np.linalg.norm(acceleration)) * width**2
-            layers = min(float((column / every.mass).max()), block * dt / max(gap, 1e-300))
-            found.append((every.mass, block, max(LAYERS * layers, 1.0)))
+            most = float((column * (2.0 * bodies.bounding_radius(every)) ** 2 / every.mass).max())
+            layers = min(most, block * dt / max(gap, 1e-300))
+            found.append((every.mass, block, max(layers, 1.0)))
     return found
 
 
@@ -233,7 +233,7 @@ def _strongest(weight: Floats, thrown: Floats, pushed: Floats, single: float) ->
     return strongest
 
 
-def _load(scene: Scene) -> Floats:
+def _load(scene: Scene, pressed: Pressing) -> Floats:
     """The weight that the whole bed, or the stress of the cell, would lay on each of the grains that stand for all, and
     the strongest cohesion (n,) [N]."""
     every, gravity = scene.expected(), math.hypot(*scene.gravity)
@@ -243,7 +243,7 @@ def _load(scene: Scene) -> Floats:
         down = np.asarray(scene.gravity) / gravity
         pressure = max(_pressure(scene, gravity, down), _bed(scene, gravity, down))
     if scene.count:
-        sizes = [(float(np.linalg.norm(force)), force) for force in pressing(scene).spread]
+        sizes = [(float(np.linalg.norm(force)), force) for force in pressed.spread]
         pressure += sum(size / area(scene, force / size) for size, force in sizes if size > 0.0)
     radius = bodies.bounding_radius(every)
     return np.maximum(CHAINS * pressure * (2.0 * radius) ** 2, gravity * every.mass) + pull

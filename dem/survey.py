@@ -51,8 +51,10 @@ def survey(
 def _of(grains: Bodies, speed: Callable[[Bodies], Floats]) -> Survey:
     centre = grains.position.mean(axis=0)
     way, radius = grains.position - centre, bodies.bounding_radius(grains)
-    sums, ends = (float(grains.mass.sum()), float(radius.sum())), (grains.position.min(axis=0), grains.position.max(axis=0))
-    return Survey(len(grains), _extremes(grains, speed), *sums, centre, way.T @ way, *ends)
+    sums, place = (float(grains.mass.sum()), float(radius.sum())), grains.position
+    return Survey(
+        len(grains), _extremes(grains, speed), *sums, centre, way.T @ way, place.min(axis=0), place.max(axis=0)
+    )
 
 
 def _extremes(grains: Bodies, speed: Callable[[Bodies], Floats]) -> Bodies:

@@ -47,6 +47,21 @@ def needs(scene: Scene) -> dict[str, float]:
     return found
 
 
+def reason(scene: Scene) -> str:
+    """What the recommended time step is for."""
+    found = needs(scene)
+    return min(found, key=lambda name: found[name])
+
+
+def fall_remark(scene: Scene, dt: float) -> str:
+    """What to say of a dt [s] in which grains that fall go so far that `dem.fast` may end the run; empty if none do."""
+    speed, size = falling(scene, pressing(scene)), smallest(scene)
+    if dt * speed <= 2.0 * size:
+        return ""
+    most = _rounded(FALLS * size / speed)
+    return f"dt {dt:g} s is too large: falls lead to {speed:.3g} m/s, further than two radii in a step; take {most:g} s"
+
+
 def falling(scene: Scene, pressed: Pressing) -> float:
     """The greatest speed with which a grain may meet a body or the bed, by gravity and loads [m/s]."""
     start = fastest_grain(scene)
